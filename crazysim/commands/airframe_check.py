@@ -98,9 +98,11 @@ def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
     yield "wheelbase", f"{1000 * wheelbase:.0f} mm, the largest distance of two rotors"
     signs = airframe.value("rotors.yaw_torque_sign")
     for number, ((x, y, _), sign) in enumerate(zip(1000 * positions, signs, strict=True), 1):
-        place = f"{abs(x):.0f} mm {'forward' if x > 0 else 'back'}, {abs(y):.0f} mm {'left' if y > 0 else 'right'}"
+        position_text = (
+            f"{abs(x):.0f} mm {'forward' if x > 0 else 'back'}, {abs(y):.0f} mm {'left' if y > 0 else 'right'}"
+        )
         sense = "counter-clockwise" if sign < 0 else "clockwise"
-        yield f"rotor {number}", f"{place}; turns {sense} seen from above"
+        yield f"rotor {number}", f"{position_text}; turns {sense} seen from above"
     yield "thrust over weight", f"{ratio:.2f}"
     yield "hover", f"{1 / ratio:.0%} of the largest thrust"
     yield "tilt at full thrust", f"holds height up to {np.degrees(np.arccos(1 / ratio)):.0f} degrees"
@@ -119,8 +121,8 @@ def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
 
 def _rotors(airframe: Airframe) -> Iterator[tuple[str, str]]:
     """Yield speeds, lag and the rates of the default controller."""
-    hover, top = float(np.max(hover_rotor_vel(airframe))), float(np.max(airframe.rotor_vel_limits))
-    yield "rotor speed", f"{hover:,.0f} rpm in hover, {hover / top:.0%} of {top:,.0f} rpm"
+    hover, max_speed = float(np.max(hover_rotor_vel(airframe))), float(np.max(airframe.rotor_vel_limits))
+    yield "rotor speed", f"{hover:,.0f} rpm in hover, {hover / max_speed:.0%} of {max_speed:,.0f} rpm"
     yield "rotor time constant", f"{1 / rotor_rate(airframe):.3g} s in hover"
     gains: Any = Auto().params(airframe)
     damping, stiffness = float(gains.damping[0]), float(gains.stiffness[0])
@@ -151,19 +153,19 @@ def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tupl
         return
     for name in STATE_CONTROLLERS:
         controller: Any = find_controller(name)
-        lack = _missing_parameters(functools.partial(controller.params, airframe))
-        yield f"  {name}", _levels({", ".join(level.value for level in controller.levels): lack})
+        missing = _missing_parameters(functools.partial(controller.params, airframe))
+        yield f"  {name}", _levels({", ".join(level.value for level in controller.levels): missing})
     stages = {"state": StateParams, "attitude, body_rate": AttitudeParams, "force_torque": AllocationParams}
-    lacks = {
+    missing_by_level = {
         levels: _missing_parameters(functools.partial(params.create, airframe)) for levels, params in stages.items()
     }
-    yield f"  {Crazyflow.name}", _levels(lacks)
+    yield f"  {Crazyflow.name}", _levels(missing_by_level)
 
 
-def _levels(lacks: Mapping[str, str]) -> str:
+def _levels(missing_by_level: Mapping[str, str]) -> str:
     """Return the levels for which nothing is missing, and the reasons why others are not followed."""
-    followed = ", ".join(levels for levels, lack in lacks.items() if not lack)
-    reasons = [f"not {levels}: {lack}" for levels, lack in lacks.items() if lack]
+    followed = ", ".join(levels for levels, missing in missing_by_level.items() if not missing)
+    reasons = [f"not {levels}: {missing}" for levels, missing in missing_by_level.items() if missing]
     return "; ".join([followed or "none", *reasons])
 
 

@@ -29,4 +29,4 @@ def run(options: argparse.Namespace) -> None:
     """Run the demonstration."""
     from crazysim.commands import demo_flight
 
-    demo_flight.fly(**given_options(options, "n_worlds", "n_drones", "seconds", "device", "out", "film"))
+    demo_flight.run_demo_flight(**given_options(options, "n_worlds", "n_drones", "seconds", "device", "out", "film"))

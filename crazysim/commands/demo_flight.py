@@ -38,7 +38,7 @@ POLE_RADIUS = 0.03
 """Radius of a pole, m."""
 
 
-def fly(
+def run_demo_flight(
     n_worlds: int = 1024,
     n_drones: int = 4,
     seconds: float = 10.0,

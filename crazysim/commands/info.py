@@ -39,12 +39,12 @@ def run(options: argparse.Namespace) -> None:
     For a part that is missing or broken, its line gives the reason.
     """
     del options
-    text = "\n".join(f"{name + ':':<14}{_or_reason(value)}" for name, value in _parts())
+    text = "\n".join(f"{name + ':':<14}{_or_reason(value)}" for name, value in _info_lines())
     home = os.path.expanduser("~")
     print(text.replace(f"{home}{os.sep}", f"~{os.sep}") if home != "~" else text)  # reports are public
 
 
-def _parts() -> Iterator[tuple[str, Callable[[], str]]]:
+def _info_lines() -> Iterator[tuple[str, Callable[[], str]]]:
     """Yield the name of each line and a function that returns the rest of it."""
     yield "crazysim", lambda: f"{crazysim.__version__}, {Path(crazysim.__file__).parent}"
     yield "Python", lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}"
@@ -140,14 +140,16 @@ def _rendering() -> str:
     environment = os.environ | startup.refused
     backend = environment.get("MUJOCO_GL") or "MUJOCO_GL is not set"
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, env=environment
         )
     except subprocess.TimeoutExpired:
         return f"{backend}, gave no answer in 60 s"
-    lines = [line for line in done.stderr.strip().splitlines() if line and not line.startswith(" ")]
-    result = "works" if done.returncode == 0 else f"fails: {lines[-1][:300] if lines else f'exit {done.returncode}'}"
-    return f"{backend}, {result}"
+    lines = [line for line in process.stderr.strip().splitlines() if line and not line.startswith(" ")]
+    outcome = (
+        "works" if process.returncode == 0 else f"fails: {lines[-1][:300] if lines else f'exit {process.returncode}'}"
+    )
+    return f"{backend}, {outcome}"
 
 
 def _variables() -> str:

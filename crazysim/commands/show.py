@@ -35,7 +35,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fly a show, and write figures, films and pages of it."""
-    from crazysim.lab.shows import film, fly, page, report, summary
+    from crazysim.lab.shows import film, fly_show, page, report, summary
     from crazysim.lab.shows.view import play
     from crazysim.progress import progress_bar
 
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
     if options.live:
         _run_live(show, options, settings)
         return
-    flight = fly(show, options.seconds, progress_bar, **settings)
+    flight = fly_show(show, options.seconds, progress_bar, **settings)
     figures = report(flight)
     print(summary(flight, figures))
     if options.report is not None:

@@ -73,8 +73,8 @@ def _add_policy_command(commands: argparse._SubParsersAction, name: str, text: s
 
 def _add_task_and_device(add: Any) -> None:
     """Add the options of a command that rebuilds the environment of a run."""
-    place = "FILE.py:CLASS of your task, if it has moved since training"
-    add("--task", metavar="FILE.py:CLASS", help=place)
+    task_help = "FILE.py:CLASS of your task, if it has moved since training"
+    add("--task", metavar="FILE.py:CLASS", help=task_help)
     add("--device", help="device: cpu, gpu; by default the training's")
 
 

@@ -233,31 +233,31 @@ class Auto(Controller):
         matrix = rotation.matrix(s.quat)
         to_body = jnp.swapaxes(matrix, -1, -2)
         drag = matvec(matrix, matvec(p.drag_matrix, matvec(to_body, s.vel))) / p.mass
-        push = jnp.sum(quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust), axis=-1, keepdims=True) / p.mass
-        known = drag + push * matrix[..., 2]
+        rotor_acc = jnp.sum(quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust), axis=-1, keepdims=True) / p.mass
+        known_acc = drag + rotor_acc * matrix[..., 2]
         # There is an outer loop, so none of these is None.
         freq, loop, target = (
             cast(int, self.outer_freq),
             cast(PositionParams, p.position),
             cast(AutoTarget, memory.target),
         )
-        specific, position = specific_force(s.pos, s.vel, known, sp, target.position, freq, loop)
+        specific_thrust, position = specific_force(s.pos, s.vel, known_acc, sp, target.position, freq, loop)
         # The attitude is held for a period, in whose middle the setpoint's acceleration has changed by half a step.
-        specific = keep_upright(specific - drag + 0.5 / freq * sp.jerk, sp, loop)
+        specific_thrust = keep_upright(specific_thrust - drag + 0.5 / freq * sp.jerk, sp, loop)
 
         # The heading of a state command follows from its quaternion, which needs no angles.
         ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
-        squared = dot(specific, specific)
-        falls = squared < MIN_THRUST**2
-        inverse = jnp.where(falls, 0.0, lax.rsqrt(jnp.where(falls, 1.0, squared)))
-        z = jnp.where(falls, jnp.asarray([0.0, 0.0, 1.0], specific.dtype), specific * inverse)
+        squared = dot(specific_thrust, specific_thrust)
+        is_falling = squared < MIN_THRUST**2
+        inverse = jnp.where(is_falling, 0.0, lax.rsqrt(jnp.where(is_falling, 1.0, squared)))
+        z = jnp.where(is_falling, jnp.asarray([0.0, 0.0, 1.0], specific_thrust.dtype), specific_thrust * inverse)
         across = cross(z, ahead)
         x_ahead = rotation.safe_norm(across)
-        parallel = x_ahead < MIN_THRUST
-        y = jnp.where(parallel, left, across / jnp.where(parallel, 1.0, x_ahead))
+        is_parallel = x_ahead < MIN_THRUST
+        y = jnp.where(is_parallel, left, across / jnp.where(is_parallel, 1.0, x_ahead))
         z_rate = (sp.jerk - dot(z, sp.jerk) * z) * inverse
-        turned = sp.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, ahead)
-        yaw_rate = turned / jnp.maximum(x_ahead, MIN_HEADING_SINE)
+        heading_terms = sp.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, ahead)
+        yaw_rate = heading_terms / jnp.maximum(x_ahead, MIN_HEADING_SINE)
         ang_vel = cross(z, z_rate) + safe_clip(yaw_rate, -YAW_RATE_MAX, YAW_RATE_MAX) * z
         attitude, thrust = rotation.quat_from_axes(cross(y, z), y, z), p.mass * squared * inverse
         return memory.replace(target=AutoTarget(position, attitude, matvec(to_body, ang_vel), thrust))
@@ -278,26 +278,28 @@ class Auto(Controller):
             z, w = error[..., 2:3], error[..., 3:]
             thrust = target.thrust * (2 * (w * w + z * z) - 1)  # its component along the current z axis
             error, rate = quat_error(error), target.ang_vel
-            on: Any = True
+            is_on: Any = True
         else:
             thrust = command[..., 3:]
             error, rate = self._command_errors(s, command, data.controls.mode)
-            on = thrust > 0
+            is_on = thrust > 0
 
-        rotors = matvec(p.mixing_matrix, quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust))
+        rotor_torque = matvec(p.mixing_matrix, quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust))
         momentum = matvec(p.J, s.ang_vel)
         gyroscopic = cross(s.ang_vel, momentum)
         # Rotors that speed up turn the body the other way: their momentum is added to the body's.
-        total = momentum - rotation.along_z((p.reaction * rotors[..., 2:])[..., 0])
+        total_momentum = momentum - rotation.along_z((p.reaction * rotor_torque[..., 2:])[..., 0])
         impulse = p.torque_max / self.freq
-        measured = jnp.clip(total - memory.momentum, -impulse, impulse)
+        measured_impulse = jnp.clip(total_momentum - memory.momentum, -impulse, impulse)
         at_rest = dot(s.ang_vel, s.ang_vel) == 0  # taken to stand on the floor
-        unknown = (1 - p.observer) * memory.torque + jnp.where(at_rest, 0.0, p.observer * self.freq) * measured
-        expected = total + (rotors - gyroscopic) / self.freq
-        torque = gyroscopic - unknown - matvec(p.J * p.damping[..., None, :], s.ang_vel - rate)
+        disturbance_torque = (1 - p.observer) * memory.torque + jnp.where(
+            at_rest, 0.0, p.observer * self.freq
+        ) * measured_impulse
+        expected_momentum = total_momentum + (rotor_torque - gyroscopic) / self.freq
+        torque = gyroscopic - disturbance_torque - matvec(p.J * p.damping[..., None, :], s.ang_vel - rate)
         if error is not None:
             torque = torque + matvec(p.J * p.stiffness[..., None, :], error)
-        yaw = rotors[..., 2:] + p.share * (torque[..., 2:] - rotors[..., 2:])
+        yaw = rotor_torque[..., 2:] + p.share * (torque[..., 2:] - rotor_torque[..., 2:])
 
         wrench = jnp.concatenate([thrust, torque[..., :2], yaw], axis=-1)
         thrusts = prioritized_thrusts(wrench, params=p.allocation)
@@ -306,7 +308,7 @@ class Auto(Controller):
         lead = p.lead / (2 * k2)
         driven = lead * thrust_slope(thrusts, p.allocation.rpm2thrust) + ((1 - p.lead) * s.rotor_vel - lead * k1)
         driven = jnp.maximum(driven, 1.0)  # zero would be off
-        return jnp.where(on, driven, 0.0), memory.replace(momentum=expected, torque=unknown)
+        return jnp.where(is_on, driven, 0.0), memory.replace(momentum=expected_momentum, torque=disturbance_torque)
 
     def _command_errors(self, s: FlightState, command: Array, mode: Control) -> tuple[Array | None, Array]:
         """Return the rotation error, rad, None at the level of body rates, and the desired body rates, rad/s. (3,)"""

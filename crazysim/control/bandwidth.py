@@ -58,15 +58,15 @@ def rotor_rate(airframe: Airframe) -> float:
 
     The lag is ``a (cmd - r) + b (cmd^2 - r^2)``; its slope at the hover speed is ``a + 2 b r``.
     """
-    return float(np.min(_slopes(airframe, hover_rotor_vel(airframe))))
+    return float(np.min(_lag_rates(airframe, hover_rotor_vel(airframe))))
 
 
 def fastest_rotor_rate(airframe: Airframe) -> float:
     """Return the rate of the lag of the rotors at their highest speed, in the faster direction, 1/s."""
-    return float(np.max(_slopes(airframe, airframe.rotor_vel_limits[1])))
+    return float(np.max(_lag_rates(airframe, airframe.rotor_vel_limits[1])))
 
 
-def _slopes(airframe: Airframe, rotor_vel: np.ndarray) -> np.ndarray:
+def _lag_rates(airframe: Airframe, rotor_vel: np.ndarray) -> np.ndarray:
     """Return the rates of the lag at a speed of the rotors, rpm, on spin-up and spin-down, 1/s. (n, 2)"""
     lag = np.atleast_2d(airframe.value("rotors.lag"))
     return lag[:, 0::2] + 2 * lag[:, 1::2] * rotor_vel[:, None]
@@ -94,19 +94,22 @@ def max_ang_acc(airframe: Airframe) -> np.ndarray:
 
     Roll and pitch may lower the collective thrust below hover, as in ``prioritized_thrusts``; yaw may not.
     """
-    shares = allocation_matrix(airframe) / np.concatenate([[1.0], hover_arms(airframe)])
+    thrusts_per_wrench = allocation_matrix(airframe) / np.concatenate([[1.0], hover_arms(airframe)])
     low, high = (float(airframe.value(f"rotors.thrust_{end}", ())) for end in ("min", "max"))
     weight = GRAVITY_MAGNITUDE * float(airframe.value("rigid_body.mass", ()))
-    lift, turn = shares[:, 0], shares[:, 3]
+    lift_shares, yaw_shares = thrusts_per_wrench[:, 0], thrusts_per_wrench[:, 3]
     torques = []
     for axis in (1, 2):
-        ratio = shares[:, axis] / lift
+        ratio = thrusts_per_wrench[:, axis] / lift_shares
         # At a torque t, rotor i needs a collective thrust of at least low / lift_i - t ratio_i. Rotor k allows at most
         # high / lift_k - t ratio_k, and the weight is an upper limit too.
-        rooms = np.append(high / lift, weight)[None] - (low / lift)[:, None]
-        needs = np.abs(np.append(ratio, 0.0)[None] - ratio[:, None])
-        torques.append(np.min(rooms[needs > 0] / needs[needs > 0]))
-    torques.append(min(np.min(high / lift) - weight, weight - np.max(low / lift)) / np.max(np.abs(turn / lift)))
+        thrust_margins = np.append(high / lift_shares, weight)[None] - (low / lift_shares)[:, None]
+        margin_rates = np.abs(np.append(ratio, 0.0)[None] - ratio[:, None])
+        torques.append(np.min(thrust_margins[margin_rates > 0] / margin_rates[margin_rates > 0]))
+    torques.append(
+        min(np.min(high / lift_shares) - weight, weight - np.max(low / lift_shares))
+        / np.max(np.abs(yaw_shares / lift_shares))
+    )
     return np.array(torques) / np.diag(airframe.inertia)
 
 
@@ -115,17 +118,19 @@ def turn_rates(airframe: Airframe) -> np.ndarray:
     return np.sqrt(max_ang_acc(airframe) / STOPPABLE_ERRORS)
 
 
-def bandwidth(airframe: Airframe, freq: int, rate: float | None = None, reacts: bool = True) -> Bandwidth:
+def bandwidth(airframe: Airframe, freq: int, rate: float | None = None, limits_reaction: bool = True) -> Bandwidth:
     """Return the rates of the loops of an airframe under a controller that runs at ``freq`` Hz.
 
     Args:
         airframe: The airframe.
         freq: Rate of the controller, Hz.
         rate: Rate of the lag of the rotors, 1/s; None for ``rotor_rate``.
-        reacts: True for a controller that does not compensate the reaction to accelerating rotors.
+        limits_reaction: True for a controller that does not compensate the reaction to accelerating rotors.
     """
     rate = 1 / (1 / (rotor_rate(airframe) if rate is None else rate) + 1.5 / freq)
-    axes = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turn_rates(airframe) / ATTITUDE_STIFFNESS)
-    if reacts:
-        axes[2] = min(axes[2], MAX_REACTION * freq / (1 + rotor_rate(airframe) * reaction_time(airframe)))
-    return Bandwidth(float(POSITION_RATE_RATIO * np.min(axes[:2])), ATTITUDE_STIFFNESS * axes**2, axes)
+    axis_rates = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turn_rates(airframe) / ATTITUDE_STIFFNESS)
+    if limits_reaction:
+        axis_rates[2] = min(axis_rates[2], MAX_REACTION * freq / (1 + rotor_rate(airframe) * reaction_time(airframe)))
+    return Bandwidth(
+        float(POSITION_RATE_RATIO * np.min(axis_rates[:2])), ATTITUDE_STIFFNESS * axis_rates**2, axis_rates
+    )

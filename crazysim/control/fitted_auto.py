@@ -78,18 +78,18 @@ class FittedAuto(Controller):
         self, data: DroneData, command: Setpoint | Array, memory: PositionMemory, params: FittedParams
     ) -> tuple[Array, PositionMemory]:
         s, p, model = data.states, params, params.model
-        present = data.controls.attitude.cmd[..., 3:] if model.thrust_dyn_coef is None else s.rotor_vel[..., :1]
+        thrust_state = data.controls.attitude.cmd[..., 3:] if model.thrust_dyn_coef is None else s.rotor_vel[..., :1]
         matrix = rotation.matrix(s.quat)
-        force = rotation.along_z((model.acc_coef + model.cmd_f_coef * present)[..., 0])
+        force = rotation.along_z((model.acc_coef + model.cmd_f_coef * thrust_state)[..., 0])
         drag = jnp.zeros_like(s.vel)
         if model.drag_matrix is not None:
             drag = matvec(model.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), s.vel))
-        known = matvec(matrix, force + drag) / model.mass
-        specific, memory = specific_force(s.pos, s.vel, known, command, memory, self.freq, p.position)  # type: ignore
-        specific = keep_upright(specific - matvec(matrix, drag) / model.mass, command, p.position)  # type: ignore
+        known_acc = matvec(matrix, force + drag) / model.mass
+        specific_thrust, memory = specific_force(s.pos, s.vel, known_acc, command, memory, self.freq, p.position)  # type: ignore
+        specific_thrust = keep_upright(specific_thrust - matvec(matrix, drag) / model.mass, command, p.position)  # type: ignore
 
         ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
-        later = specific + p.ahead[..., :1] * command.jerk + p.ahead[..., 1:] * command.snap
-        angles = p.angles * rotation.from_axes(*rotation.axes_along(later, ahead, left))
-        thrust = (model.mass * dot(specific, matrix[..., 2]) - model.acc_coef) / model.cmd_f_coef
+        advanced_thrust = specific_thrust + p.ahead[..., :1] * command.jerk + p.ahead[..., 1:] * command.snap
+        angles = p.angles * rotation.from_axes(*rotation.axes_along(advanced_thrust, ahead, left))
+        thrust = (model.mass * dot(specific_thrust, matrix[..., 2]) - model.acc_coef) / model.cmd_f_coef
         return jnp.concatenate([angles, jnp.maximum(thrust, model.thrust_min)], axis=-1), memory

@@ -80,9 +80,9 @@ def flat_state(
 
 
 def attitude_of_thrust(
-    thrust: Array,
-    thrust_rate: Array,
-    thrust_acc: Array,
+    specific_thrust: Array,
+    specific_thrust_rate: Array,
+    specific_thrust_acc: Array,
     yaw: Array,
     yaw_rate: Array,
     yaw_acc: Array,
@@ -95,21 +95,21 @@ def attitude_of_thrust(
 
         w_z x.c = w_x z.c + yaw' y.l
 
-    The angular acceleration follows from the derivatives of these two equations.
+    The angular acceleration follows from the derivatives of these equations.
 
     A thrust below ``MIN_THRUST`` is replaced by one along the vertical that does not change. Where thrust and heading
     are parallel, y is the horizontal ``l``, and the rate about z is limited (``MIN_HEADING_SINE``).
 
     Args:
-        thrust: Thrust vector over the mass, world frame, m/s^2. (..., 3)
-        thrust_rate: Its derivative, m/s^3. (..., 3)
-        thrust_acc: Its second derivative, m/s^4. (..., 3)
+        specific_thrust: Thrust vector over the mass, world frame, m/s^2. (..., 3)
+        specific_thrust_rate: Its derivative, m/s^3. (..., 3)
+        specific_thrust_acc: Its second derivative, m/s^4. (..., 3)
         yaw: Heading, rad. (..., 1)
         yaw_rate: Its derivative, rad/s. (..., 1)
         yaw_acc: Its second derivative, rad/s^2. (..., 1)
     """
     ahead, left = rotation.level_axes(yaw)
-    z, z_rate, z_acc = thrust_direction(thrust, thrust_rate, thrust_acc)
+    z, z_rate, z_acc = thrust_direction(specific_thrust, specific_thrust_rate, specific_thrust_acc)
     across = cross(z, ahead)
     y = jnp.where(dot(across, across) < 1e-10, left, rotation.safe_normalize(across, left))
     x = rotation.safe_normalize(cross(y, z), ahead)  # of length one already, unless thrust and heading are parallel
@@ -126,23 +126,25 @@ def attitude_of_thrust(
     return Attitude(jnp.stack([x, y, z], axis=-1), ang_vel, ang_acc)
 
 
-def thrust_direction(thrust: Array, thrust_rate: Array, thrust_acc: Array) -> tuple[Array, Array, Array]:
+def thrust_direction(
+    specific_thrust: Array, specific_thrust_rate: Array, specific_thrust_acc: Array
+) -> tuple[Array, Array, Array]:
     """Return the unit vector along a thrust vector, with its first two derivatives.
 
     Below ``MIN_THRUST`` it is e_z, with derivatives of zero.
 
     Args:
-        thrust: Thrust vector over the mass, m/s^2. (..., 3)
-        thrust_rate: Its derivative, m/s^3. (..., 3)
-        thrust_acc: Its second derivative, m/s^4. (..., 3)
+        specific_thrust: Thrust vector over the mass, m/s^2. (..., 3)
+        specific_thrust_rate: Its derivative, m/s^3. (..., 3)
+        specific_thrust_acc: Its second derivative, m/s^4. (..., 3)
 
     Returns:
         Direction, its derivative, 1/s, and its second derivative, 1/s^2. (..., 3) each
     """
-    is_undefined = dot(thrust, thrust) < MIN_THRUST**2
-    inverse = jnp.where(is_undefined, 0.0, 1 / rotation.safe_norm(jnp.where(is_undefined, 1.0, thrust)))
-    z = jnp.where(is_undefined, jnp.asarray([0.0, 0.0, 1.0], thrust.dtype), thrust * inverse)
-    growth = dot(z, thrust_rate) * inverse
-    z_rate = thrust_rate * inverse - growth * z
-    growth_rate = (dot(z_rate, thrust_rate) + dot(z, thrust_acc)) * inverse
-    return z, z_rate, thrust_acc * inverse - 2 * growth * z_rate - growth_rate * z
+    is_undefined = dot(specific_thrust, specific_thrust) < MIN_THRUST**2
+    inverse = jnp.where(is_undefined, 0.0, 1 / rotation.safe_norm(jnp.where(is_undefined, 1.0, specific_thrust)))
+    z = jnp.where(is_undefined, jnp.asarray([0.0, 0.0, 1.0], specific_thrust.dtype), specific_thrust * inverse)
+    growth = dot(z, specific_thrust_rate) * inverse
+    z_rate = specific_thrust_rate * inverse - growth * z
+    growth_rate = (dot(z_rate, specific_thrust_rate) + dot(z, specific_thrust_acc)) * inverse
+    return z, z_rate, specific_thrust_acc * inverse - 2 * growth * z_rate - growth_rate * z

@@ -117,8 +117,8 @@ def geometric_control(
     """
     p, sp = params, setpoint
     if not feedforward:
-        zero, still = jnp.zeros_like(pos), jnp.zeros_like(sp.yaw)
-        sp = sp.replace(acc=zero, jerk=zero, snap=zero, yaw_rate=still, yaw_acc=still)
+        zero, zero_yaw_rate = jnp.zeros_like(pos), jnp.zeros_like(sp.yaw)
+        sp = sp.replace(acc=zero, jerk=zero, snap=zero, yaw_rate=zero_yaw_rate, yaw_acc=zero_yaw_rate)
     matrix = rotation.matrix(quat)
     feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
     if integral is not None:
@@ -130,11 +130,16 @@ def geometric_control(
             return rate
         return rate - matvec(matrix, matvec(p.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), motion))) / p.mass
 
-    specific = subtract_drag(sp.vel, sp.acc) - p.gravity_vec + feedback
+    specific_thrust = subtract_drag(sp.vel, sp.acc) - p.gravity_vec + feedback
     desired = attitude_of_thrust(
-        specific, subtract_drag(sp.acc, sp.jerk), subtract_drag(sp.jerk, sp.snap), sp.yaw, sp.yaw_rate, sp.yaw_acc
+        specific_thrust,
+        subtract_drag(sp.acc, sp.jerk),
+        subtract_drag(sp.jerk, sp.snap),
+        sp.yaw,
+        sp.yaw_rate,
+        sp.yaw_acc,
     )
-    thrust = p.mass * dot(specific, matrix[..., 2])
+    thrust = p.mass * dot(specific_thrust, matrix[..., 2])
     torque = attitude_torque(matrix, ang_vel, desired, params=p)
     return prioritized_wrench(jnp.concatenate([thrust, torque], axis=-1), params=p.allocation)
 

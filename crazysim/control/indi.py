@@ -68,7 +68,7 @@ class INDIParams(PyTree):
         params = GeometricParams.create(airframe, freq)
         lag, reaction = rotor_rate(airframe), reaction_time(airframe)
         lead = max(min(ROTOR_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
-        gains = bandwidth_gains(airframe, bandwidth(airframe, freq, lead * lag, reacts=False))
+        gains = bandwidth_gains(airframe, bandwidth(airframe, freq, lead * lag, limits_reaction=False))
         return INDIParams(
             geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),
             mixing_matrix=as_parameter(wrench_matrix(airframe)),
@@ -164,35 +164,37 @@ def indi_control(
     p, sp, allocation = params.geometric, setpoint, params.geometric.allocation
     matrix = rotation.matrix(quat)
     wrench = matvec(params.mixing_matrix, quadratic_curve(rotor_vel, allocation.rpm2thrust))
-    push = matrix[..., 2] * wrench[..., :1] / p.mass
-    fresh = memory.started == 0
-    yaw = wrench[..., 3:]
+    rotor_acc = matrix[..., 2] * wrench[..., :1] / p.mass
+    is_first_tick = memory.started == 0
+    yaw_torque = wrench[..., 3:]
     momentum = matvec(p.J, ang_vel)
-    total = momentum - rotation.along_z((params.reaction * yaw)[..., 0])
-    known = wrench[..., 1:] - cross(ang_vel, momentum)
-    turn = jnp.where(fresh, known, (total - memory.momentum) * freq)
-    acc = jnp.where(fresh, push + p.gravity_vec, (vel - memory.vel) * freq)
-    signals = jnp.concatenate([acc, push, turn, wrench[..., 1:]], axis=-1)
-    state = jnp.where(fresh, steady_filter_states(signals, params.filter), memory.filter)
+    total_momentum = momentum - rotation.along_z((params.reaction * yaw_torque)[..., 0])
+    modelled_torque = wrench[..., 1:] - cross(ang_vel, momentum)
+    momentum_rate = jnp.where(is_first_tick, modelled_torque, (total_momentum - memory.momentum) * freq)
+    acc = jnp.where(is_first_tick, rotor_acc + p.gravity_vec, (vel - memory.vel) * freq)
+    signals = jnp.concatenate([acc, rotor_acc, momentum_rate, wrench[..., 1:]], axis=-1)
+    state = jnp.where(is_first_tick, steady_filter_states(signals, params.filter), memory.filter)
     signals, state = apply_filter(signals, state, params.filter)
-    acc, push, turn, torque = (signals[..., i : i + 3] for i in (0, 3, 6, 9))
+    acc, rotor_acc, momentum_rate, torque = (signals[..., i : i + 3] for i in (0, 3, 6, 9))
 
     feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
-    disturbance = rotation.safe_clip(acc - push - p.gravity_vec, -DISTURBANCE_MAX, DISTURBANCE_MAX)
-    specific = sp.acc - p.gravity_vec + feedback - disturbance
-    attitude = attitude_of_thrust(specific, sp.jerk, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
+    disturbance = rotation.safe_clip(acc - rotor_acc - p.gravity_vec, -DISTURBANCE_MAX, DISTURBANCE_MAX)
+    specific_thrust = sp.acc - p.gravity_vec + feedback - disturbance
+    attitude = attitude_of_thrust(specific_thrust, sp.jerk, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
     rotation_error, rate_error, ang_acc_des = attitude_errors(matrix, ang_vel, attitude)
-    wanted = matvec(p.J, ang_acc_des) - p.kR * rotation_error - p.kw * rate_error
+    torque_des = matvec(p.J, ang_acc_des) - p.kR * rotation_error - p.kw * rate_error
     limit = TORQUE_MAX * p.kR
-    torque = wanted - rotation.safe_clip(turn - torque, -limit, limit)
+    torque = torque_des - rotation.safe_clip(momentum_rate - torque, -limit, limit)
 
-    thrust = p.mass * dot(specific, matrix[..., 2])
-    drag = yaw + params.share * (torque[..., 2:] - yaw)
-    command = prioritized_wrench(jnp.concatenate([thrust, torque[..., :2], drag], axis=-1), params=allocation)
-    desired = force_torque2rotor_vel(command, params=allocation)
-    slowest = rotor_vel_of_thrust(allocation.thrust_min, allocation.rpm2thrust)
-    driven = jnp.maximum(rotor_vel + params.lead * (desired - rotor_vel), jnp.maximum(slowest, 1.0))
-    return driven, INDIMemory(vel, total, state, jnp.ones_like(memory.started))
+    thrust = p.mass * dot(specific_thrust, matrix[..., 2])
+    yaw_drag_torque = yaw_torque + params.share * (torque[..., 2:] - yaw_torque)
+    wrench_cmd = prioritized_wrench(
+        jnp.concatenate([thrust, torque[..., :2], yaw_drag_torque], axis=-1), params=allocation
+    )
+    rotor_vel_des = force_torque2rotor_vel(wrench_cmd, params=allocation)
+    rotor_vel_min = rotor_vel_of_thrust(allocation.thrust_min, allocation.rpm2thrust)
+    rotor_vel_cmd = jnp.maximum(rotor_vel + params.lead * (rotor_vel_des - rotor_vel), jnp.maximum(rotor_vel_min, 1.0))
+    return rotor_vel_cmd, INDIMemory(vel, total_momentum, state, jnp.ones_like(memory.started))
 
 
 class INDI(Controller):

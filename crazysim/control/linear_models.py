@@ -83,21 +83,21 @@ def load_derivative(
     else:
         matrix = rotation.matrix(rotation.from_rpy(rpy))
         lever = cross(attach, matvec(matrix.T, q))
-        turn = jnp.linalg.solve(J, lever)
+        ang_acc_per_pull = jnp.linalg.solve(J, lever)
 
         def joint_acceleration(acc: Array, ang_acc: Array) -> Array:
             """Return the acceleration of the joint."""
             return acc + matvec(matrix, cross(ang_acc, attach) + cross(ang_vel, cross(ang_vel, attach)))
 
         acc = force / mass + gravity_vec
-        along = dot(q, gravity_vec - joint_acceleration(acc, ang_acc)) + length * dot(q_rate, q_rate)
-        pull = along / (1 + load_mass / mass + load_mass * dot(lever, turn))
-        acc, ang_acc = acc + load_mass / mass * pull * q, ang_acc + load_mass * pull * turn
+        rod_acc = dot(q, gravity_vec - joint_acceleration(acc, ang_acc)) + length * dot(q_rate, q_rate)
+        pull = rod_acc / (1 + load_mass / mass + load_mass * dot(lever, ang_acc_per_pull))
+        acc, ang_acc = acc + load_mass / mass * pull * q, ang_acc + load_mass * pull * ang_acc_per_pull
         q_acc = (gravity_vec - pull * q - joint_acceleration(acc, ang_acc)) / length
     # q'' = D a'' + D' a' with D = dq/da: its columns are orthogonal, so the angles' accelerations are two projections.
     slope, slope_rate = jax.jvp(jax.jacfwd(rod_direction), (angles,), (rates,))
-    rest = q_acc - slope_rate @ rates
-    angles_acc = slope.T @ rest / jnp.sum(slope * slope, axis=0)
+    angle_acc_part = q_acc - slope_rate @ rates
+    angles_acc = slope.T @ angle_acc_part / jnp.sum(slope * slope, axis=0)
     return jnp.concatenate([vel, acc, rpy_rate, ang_acc, rates, angles_acc])
 
 
@@ -120,11 +120,11 @@ def rod_angles(direction: Array, direction_rate: Array) -> tuple[Array, Array]:
         Angles (..., 2), rates (..., 2).
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
-    across = rotation.safe_norm(jnp.stack([x, z], axis=-1))[..., 0]
-    angles = jnp.stack([jnp.arctan2(y, across), rotation.safe_arctan2(-x, -z)], axis=-1)
-    safe = jnp.maximum(across, 1e-3)
-    b_rate = (direction_rate[..., 0] * z - x * direction_rate[..., 2]) / safe**2
-    a_rate = direction_rate[..., 1] / safe
+    level_length = rotation.safe_norm(jnp.stack([x, z], axis=-1))[..., 0]
+    angles = jnp.stack([jnp.arctan2(y, level_length), rotation.safe_arctan2(-x, -z)], axis=-1)
+    safe_length = jnp.maximum(level_length, 1e-3)
+    b_rate = (direction_rate[..., 0] * z - x * direction_rate[..., 2]) / safe_length**2
+    a_rate = direction_rate[..., 1] / safe_length
     return angles, jnp.stack([a_rate, b_rate], axis=-1)
 
 

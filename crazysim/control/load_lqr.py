@@ -82,14 +82,14 @@ class LoadLQRParams(RigidBodyParams):
             )
         mass, inertia = airframe.value("rigid_body.mass"), airframe.inertia
         Q, R = lqr_weights(airframe, freq, Q, R, load_mass, length)
-        off_centre = [joint] if np.any(joint) else []
-        gain = solve_on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R, *off_centre)
+        joint_args = [joint] if np.any(joint) else []
+        gain = solve_on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R, *joint_args)
         return LoadLQRParams(
             **rigid_body_params(airframe),
             load_mass=as_parameter(load_mass),
             length=as_parameter(length),
             gain=as_parameter(gain),
-            attach=as_parameter(joint) if off_centre else None,
+            attach=as_parameter(joint) if joint_args else None,
         )
 
 
@@ -152,16 +152,16 @@ def load_reference(
         Reference of the drone; direction of the rod from drone to load (..., 3); its derivative, 1/s (..., 3).
     """
     p, sp = params, setpoint
-    up, up_rate, up_acc = thrust_direction(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
-    vel, total = sp.vel + p.length * up_rate, p.mass + p.load_mass
-    force = total * (sp.acc - p.gravity_vec) + p.mass * p.length * up_acc - matvec(p.drag_matrix, vel)
-    rate = total * sp.jerk - (0.0 if rod_jerk is None else p.mass * p.length * rod_jerk)
-    rate = rate - matvec(p.drag_matrix, sp.acc + p.length * up_acc)
-    reference = _reference(sp.pos + p.length * up, vel, force, rate, sp, p)
+    rod_up, rod_up_rate, rod_up_acc = thrust_direction(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
+    vel, total_mass = sp.vel + p.length * rod_up_rate, p.mass + p.load_mass
+    force = total_mass * (sp.acc - p.gravity_vec) + p.mass * p.length * rod_up_acc - matvec(p.drag_matrix, vel)
+    force_rate = total_mass * sp.jerk - (0.0 if rod_jerk is None else p.mass * p.length * rod_jerk)
+    force_rate = force_rate - matvec(p.drag_matrix, sp.acc + p.length * rod_up_acc)
+    reference = _reference(sp.pos + p.length * rod_up, vel, force, force_rate, sp, p)
     if p.attach is not None:
-        arm, moving = _joint_motion(reference.matrix, reference.ang_vel, p.attach)
-        reference = reference._replace(pos=reference.pos - arm, vel=reference.vel - moving)
-    return reference, -up, -up_rate
+        arm, joint_vel = _joint_motion(reference.matrix, reference.ang_vel, p.attach)
+        reference = reference._replace(pos=reference.pos - arm, vel=reference.vel - joint_vel)
+    return reference, -rod_up, -rod_up_rate
 
 
 def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Reference, Array, Array]:
@@ -175,11 +175,11 @@ def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Refere
         As ``load_reference``.
     """
     p, sp = params, setpoint
-    up, up_rate, _ = thrust_direction(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
-    total = p.mass + p.load_mass
-    force = total * (sp.acc - p.gravity_vec) - matvec(p.drag_matrix, sp.vel)
-    rate = total * sp.jerk - matvec(p.drag_matrix, sp.acc)
-    return _reference(sp.pos, sp.vel, force, rate, sp, p), -up, -up_rate
+    rod_up, rod_up_rate, _ = thrust_direction(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
+    total_mass = p.mass + p.load_mass
+    force = total_mass * (sp.acc - p.gravity_vec) - matvec(p.drag_matrix, sp.vel)
+    force_rate = total_mass * sp.jerk - matvec(p.drag_matrix, sp.acc)
+    return _reference(sp.pos, sp.vel, force, force_rate, sp, p), -rod_up, -rod_up_rate
 
 
 def _joint_motion(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, Array]:
@@ -188,13 +188,13 @@ def _joint_motion(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, 
     return matvec(matrix, attach), matvec(matrix, cross(ang_vel, attach))
 
 
-def _reference(pos: Array, vel: Array, force: Array, rate: Array, sp: Setpoint, p: LoadLQRParams) -> Reference:
-    """Return the reference of a drone whose thrust vector is ``force``, N, with the derivative ``rate``, N/s.
+def _reference(pos: Array, vel: Array, force: Array, force_rate: Array, sp: Setpoint, p: LoadLQRParams) -> Reference:
+    """Return the reference of a drone whose thrust vector is ``force``, N, with the derivative ``force_rate``, N/s.
 
     The torque includes compensation for the pull at the joint of a load that accelerates like the setpoint.
     """
-    total = p.mass + p.load_mass
-    attitude = attitude_of_thrust(force / total, rate / total, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
+    total_mass = p.mass + p.load_mass
+    attitude = attitude_of_thrust(force / total_mass, force_rate / total_mass, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
     torque = matvec(p.J, attitude.ang_acc) + cross(attitude.ang_vel, matvec(p.J, attitude.ang_vel))
     if p.attach is not None:
         pull = matvec(jnp.swapaxes(attitude.matrix, -1, -2), p.load_mass * (p.gravity_vec - sp.acc))
@@ -307,15 +307,15 @@ class LoadLQR(Controller):
         tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
         offset, rate = tip_pos - s.pos, tip_vel - s.vel
         if params.attach is not None:
-            arm, moving = _joint_motion(rotation.matrix(s.quat), s.ang_vel, params.attach)
-            offset, rate = offset - arm, rate - moving
+            arm, joint_vel = _joint_motion(rotation.matrix(s.quat), s.ang_vel, params.attach)
+            offset, rate = offset - arm, rate - joint_vel
         distance = jnp.maximum(rotation.safe_norm(offset), 1e-3)
         direction = offset / distance
-        turning = (rate - dot(direction, rate) * direction) / distance
+        direction_rate = (rate - dot(direction, rate) * direction) / distance
         rod_acc = -thrust_direction(command.acc - params.gravity_vec, command.jerk, command.snap)[2]
         rod_jerk = memory.started * (rod_acc - memory.rod_acc) * self.freq
         wrench = load_lqr_control(
-            *(s.pos, s.quat, s.vel, s.ang_vel, direction, turning, command),
+            *(s.pos, s.quat, s.vel, s.ang_vel, direction, direction_rate, command),
             params=params,
             target=self.target,
             rod_jerk=rotation.safe_clip(rod_jerk, -ROD_JERK_MAX, ROD_JERK_MAX),

@@ -101,9 +101,9 @@ def weight_matrix(name: str, weights: ArrayLike, n: int) -> np.ndarray:
     array = read_numbers(f"weights {name}", weights, shapes=((n,), (n, n)), remedy=f"Give a diagonal of {n} numbers.")
     array = np.diag(array) if array.ndim == 1 else array
     is_symmetric = np.allclose(array, array.T)
-    least, rounding = np.linalg.eigvalsh(array)[0], 1e-12 * np.abs(array).max()
-    if not is_symmetric or (least <= 0 if name == "R" else least < -rounding):
-        reason = f"the eigenvalue {least:.3g}" if is_symmetric else "a matrix that is not symmetric"
+    min_eigenvalue, rounding = np.linalg.eigvalsh(array)[0], 1e-12 * np.abs(array).max()
+    if not is_symmetric or (min_eigenvalue <= 0 if name == "R" else min_eigenvalue < -rounding):
+        reason = f"the eigenvalue {min_eigenvalue:.3g}" if is_symmetric else "a matrix that is not symmetric"
         kind = "definite" if name == "R" else "semidefinite"
         raise ConfigError(
             f"expected weights {name} as a symmetric, positive {kind} matrix, got {reason}. Give a diagonal of {n} "
@@ -168,11 +168,13 @@ def flat_reference(setpoint: Setpoint, params: RigidBodyParams) -> Reference:
         params: A record with ``mass``, ``gravity_vec``, ``J`` and ``drag_matrix``.
     """
     p, sp = params, setpoint
-    specific = sp.acc - p.gravity_vec - matvec(p.drag_matrix, sp.vel) / p.mass
-    rate = sp.jerk - matvec(p.drag_matrix, sp.acc) / p.mass
-    second = sp.snap - matvec(p.drag_matrix, sp.jerk) / p.mass
-    attitude = attitude_of_thrust(specific, rate, second, sp.yaw, sp.yaw_rate, sp.yaw_acc)
-    thrust = p.mass * rotation.safe_norm(specific)
+    specific_thrust = sp.acc - p.gravity_vec - matvec(p.drag_matrix, sp.vel) / p.mass
+    specific_thrust_rate = sp.jerk - matvec(p.drag_matrix, sp.acc) / p.mass
+    specific_thrust_acc = sp.snap - matvec(p.drag_matrix, sp.jerk) / p.mass
+    attitude = attitude_of_thrust(
+        specific_thrust, specific_thrust_rate, specific_thrust_acc, sp.yaw, sp.yaw_rate, sp.yaw_acc
+    )
+    thrust = p.mass * rotation.safe_norm(specific_thrust)
     torque = matvec(p.J, attitude.ang_acc) + cross(attitude.ang_vel, matvec(p.J, attitude.ang_vel))
     return Reference(sp.pos, sp.vel, attitude.matrix, attitude.ang_vel, jnp.concatenate([thrust, torque], axis=-1))
 

@@ -143,8 +143,8 @@ def torque_of_rotation(
     integral = safe_clip(m.integral_m - error / freq, -p.integral_m_max, p.integral_m_max)
     rate_error_dot = ((ang_vel_des - m.ang_vel_des) - (ang_vel - m.ang_vel)) * freq
     torque = -p.kR * error + p.kw * (ang_vel_des - ang_vel) + p.ki_m * integral + p.kd_omega * rate_error_dot
-    after = m.replace(integral_m=integral, ang_vel=ang_vel, ang_vel_des=ang_vel_des)
-    return safe_clip(torque, -p.torque_max, p.torque_max), after
+    new_memory = m.replace(integral_m=integral, ang_vel=ang_vel, ang_vel_des=ang_vel_des)
+    return safe_clip(torque, -p.torque_max, p.torque_max), new_memory
 
 
 class Mellinger(Controller):
@@ -176,9 +176,9 @@ class Mellinger(Controller):
     ) -> tuple[Array, MellingerMemory]:
         p = params
         thrust, torque, memory, _ = self._command(data, command, memory, p)
-        off = thrust <= 0
+        is_off = thrust <= 0
         memory = memory.replace(
-            integral=jnp.where(off, 0.0, memory.integral), integral_m=jnp.where(off, 0.0, memory.integral_m)
+            integral=jnp.where(is_off, 0.0, memory.integral), integral_m=jnp.where(is_off, 0.0, memory.integral_m)
         )
         pwm = distribute(thrust, torque, params=p.motors, whole_numbers=self.whole_numbers)
         return rotor_vel_of_pwm(pwm, params=p.motors), memory
@@ -195,16 +195,18 @@ class Mellinger(Controller):
         p, s = params, data.states
         rates = _desired_rates(data, command)
         zero = jnp.zeros_like(s.ang_vel)
-        rest = MellingerMemory(zero, zero, s.ang_vel, rates)
+        initial_memory = MellingerMemory(zero, zero, s.ang_vel, rates)
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
-        _, _, _, force = self._command(data, command, rest, p)
-        wanted = thrust / p.mass_thrust * rotation.z_axis(s.quat)
-        integral = safe_clip(_divide_by_gain(wanted - force, p.ki), -p.integral_max, p.integral_max)
+        _, _, _, force = self._command(data, command, initial_memory, p)
+        current_force = thrust / p.mass_thrust * rotation.z_axis(s.quat)
+        integral = safe_clip(_divide_by_gain(current_force - force, p.ki), -p.integral_max, p.integral_max)
         integral = integral if isinstance(command, Setpoint) else zero
-        rest = rest.replace(integral=integral)
-        _, out, _, _ = self._command(data, command, rest, p)
-        return rest.replace(
-            integral_m=safe_clip(_divide_by_gain(torque - out, p.ki_m), -p.integral_m_max, p.integral_m_max)
+        initial_memory = initial_memory.replace(integral=integral)
+        _, torque_without_integral, _, _ = self._command(data, command, initial_memory, p)
+        return initial_memory.replace(
+            integral_m=safe_clip(
+                _divide_by_gain(torque - torque_without_integral, p.ki_m), -p.integral_m_max, p.integral_m_max
+            )
         )
 
     def _command(

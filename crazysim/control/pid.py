@@ -83,48 +83,49 @@ class PID(Controller):
         torque, rate = desired_torque(ang_vel, ang_vel_des, memory.rate, self.freq, loop=params.rate)
         pwm = distribute(thrust, torque, params=params.motors, whole_numbers=self.whole_numbers)
         rotor_vel = rotor_vel_of_pwm(pwm, params=params.motors)
-        after = memory.replace(
+        new_memory = memory.replace(
             attitude=attitude, rate=rate, rpy_des=rpy_des, thrust=thrust, started=jnp.ones_like(memory.started)
         )
-        return rotor_vel, _reset_at_zero_thrust(after, rpy, data.states.pos)
+        return rotor_vel, _reset_at_zero_thrust(new_memory, rpy, data.states.pos)
 
     def take_over(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rotor_vel: Array
     ) -> PIDMemory:
         # At the level ``state``, the integrals of the velocity loop absorb the difference in thrust, roll and pitch.
         # At every level, the integrals of the rate loop absorb the difference in torque.
-        s, p, rest = data.states, params, jax.tree.map(jnp.zeros_like, memory)
+        s, p, initial_memory = data.states, params, jax.tree.map(jnp.zeros_like, memory)
         rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(s.quat), DEGREES_PER_RADIAN * s.ang_vel
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
         if isinstance(command, Setpoint):
             heading = heading_vector(s.quat)
-            position = rest.position.started_at(to_heading_frame(heading, s.pos), rest.started)
+            position = initial_memory.position.started_at(to_heading_frame(heading, s.pos), initial_memory.started)
             vel_des, _ = desired_velocity(s.pos, heading, command.pos, position, self.outer_freq, loop=p.position)
             measured = to_heading_frame(heading, s.vel)
-            velocity = rest.velocity.started_at(measured, rest.started)
-            out, _ = pid_step(vel_des - measured, measured, velocity, self.outer_freq, loop=p.velocity)
+            velocity = initial_memory.velocity.started_at(measured, initial_memory.started)
+            output, _ = pid_step(vel_des - measured, measured, velocity, self.outer_freq, loop=p.velocity)
             lift = (thrust - p.thrust_base) / THRUST_SCALE
-            wanted = jnp.stack([rpy[1], -rpy[0], lift[0]])
-            velocity = continue_integral(velocity, out, wanted, loop=p.velocity)
-            rest = rest.replace(position=position, velocity=velocity)
-        rest = rest.replace(
-            attitude=rest.attitude.started_at(rpy, rest.started), rate=rest.rate.started_at(ang_vel, rest.started)
+            current_attitude = jnp.stack([rpy[1], -rpy[0], lift[0]])
+            velocity = continue_integral(velocity, output, current_attitude, loop=p.velocity)
+            initial_memory = initial_memory.replace(position=position, velocity=velocity)
+        initial_memory = initial_memory.replace(
+            attitude=initial_memory.attitude.started_at(rpy, initial_memory.started),
+            rate=initial_memory.rate.started_at(ang_vel, initial_memory.started),
         )
-        started = rest.replace(rpy_des=rpy, thrust=thrust, started=jnp.ones_like(rest.started))
+        started = initial_memory.replace(rpy_des=rpy, thrust=thrust, started=jnp.ones_like(initial_memory.started))
         _, _, ang_vel_des = self._desired_rates(data, command, started, p, rpy)
-        out, _ = desired_torque(ang_vel, ang_vel_des, started.rate, self.freq, loop=p.rate)
-        return started.replace(rate=continue_integral(started.rate, out, torque, loop=p.rate))
+        output, _ = desired_torque(ang_vel, ang_vel_des, started.rate, self.freq, loop=p.rate)
+        return started.replace(rate=continue_integral(started.rate, output, torque, loop=p.rate))
 
     def _desired_rates(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rpy: Array
     ) -> tuple[Array, PIDLoopMemory, Array]:
         """Return the desired angles, degrees, the memory of the attitude loop, and the desired rates, degrees/s."""
-        by_rate = data.controls.mode == Control.body_rate
-        if by_rate and not self.hold_yaw:
+        is_rate_command = data.controls.mode == Control.body_rate
+        if is_rate_command and not self.hold_yaw:
             return memory.rpy_des, memory.attitude, DEGREES_PER_RADIAN * command[:3]  # type: ignore[index]
         if isinstance(command, Setpoint):
             rpy_des = jnp.concatenate([memory.rpy_des[:2], DEGREES_PER_RADIAN * command.yaw])
-        elif by_rate:
+        elif is_rate_command:
             yaw = jnp.where(memory.started, memory.rpy_des[2:], rpy[2:]) + DEGREES_PER_RADIAN * command[2:3] / self.freq
             rpy_des = jnp.concatenate([rpy[:2], yaw])
         else:
@@ -132,7 +133,7 @@ class PID(Controller):
         rpy_des = jnp.concatenate([rpy_des[:2], wrap_degrees(rpy_des[2:])])
         attitude = memory.attitude.started_at(rpy, memory.started)
         ang_vel_des, attitude = desired_rates(rpy, rpy_des, attitude, self.freq, loop=params.attitude)
-        if by_rate:
+        if is_rate_command:
             ang_vel_des = jnp.concatenate([DEGREES_PER_RADIAN * command[:2], ang_vel_des[2:]])  # type: ignore[index]
         return rpy_des, attitude, ang_vel_des
 

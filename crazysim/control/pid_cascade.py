@@ -88,9 +88,9 @@ class PIDMemory(PyTree):
     @staticmethod
     def at_rest(params: PIDParams) -> PIDMemory:
         """Return the memory of one drone before the first tick."""
-        p, rest = params, PIDLoopMemory.at_rest
+        p, memory_at_rest = params, PIDLoopMemory.at_rest
         zeros: Any = np.zeros(3)
-        loops = {name: rest(getattr(p, name)) for name in _LOOPS}
+        loops = {name: memory_at_rest(getattr(p, name)) for name in _LOOPS}
         return PIDMemory(**loops, rpy_des=zeros, thrust=zeros[:1], started=zeros[:1] > 0)
 
 
@@ -131,9 +131,9 @@ def desired_attitude(
         Desired roll and pitch, degrees (..., 2); thrust of each motor, PWM (..., 1); the memory.
     """
     p, measured = params, to_heading_frame(heading, vel)
-    out, memory = pid_step(vel_des - measured, measured, memory, freq, loop=p.velocity)
-    tilt = jnp.stack([-out[..., 1], out[..., 0]], axis=-1)
-    thrust = safe_clip(THRUST_SCALE * out[..., 2:] + p.thrust_base, p.thrust_min, p.motors.pwm_max)
+    output, memory = pid_step(vel_des - measured, measured, memory, freq, loop=p.velocity)
+    tilt = jnp.stack([-output[..., 1], output[..., 0]], axis=-1)
+    thrust = safe_clip(THRUST_SCALE * output[..., 2:] + p.thrust_base, p.thrust_min, p.motors.pwm_max)
     return safe_clip(tilt, -p.tilt_max, p.tilt_max), thrust, memory
 
 

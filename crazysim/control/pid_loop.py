@@ -45,14 +45,16 @@ class PIDLoop(PyTree):
         gains = {key: airframe.value(f"{path}.{key}", (3,)) for key in ("kp", "ki", "kd")}
         ki, kd = (as_parameter(gains[key]) if np.any(gains[key]) else None for key in ("ki", "kd"))
         limit = airframe.value(f"{path}.integral_max", (3,)) if "integral_max" in table else [DEFAULT_INTEGRAL_MAX] * 3
-        filtered = kd is not None and "cutoff" in table
+        has_low_pass = kd is not None and "cutoff" in table
         return PIDLoop(
             kp=as_parameter(gains["kp"]),
             ki=ki,
             kd=kd,
             integral_max=None if ki is None else as_parameter(limit),
             output_max=as_parameter(airframe.value(f"{path}.output_max", (3,))) if "output_max" in table else None,
-            low_pass=as_parameter(butterworth(float(airframe.value(f"{path}.cutoff", ())), freq)) if filtered else None,
+            low_pass=as_parameter(butterworth(float(airframe.value(f"{path}.cutoff", ())), freq))
+            if has_low_pass
+            else None,
         )
 
 
@@ -123,44 +125,44 @@ def pid_step(
         Outputs (..., 3); the memory.
     """
     error = _wrap_angle(error, wrapped)
-    out = loop.kp * error
+    output = loop.kp * error
     if loop.kd is not None:
         derivative = _wrap_angle(memory.measured - measured, wrapped) * freq
         memory = memory.replace(measured=measured)
         if loop.low_pass is not None:
             derivative, delays = _low_pass(derivative, memory.delays, loop.low_pass)
             memory = memory.replace(delays=delays)
-        out = out + loop.kd * derivative
+        output = output + loop.kd * derivative
     if loop.ki is not None:
         integral_max: Any = loop.integral_max
         integral = safe_clip(memory.integral + error / freq, -integral_max, integral_max)
         memory = memory.replace(integral=integral)
-        out = out + loop.ki * integral
-    return (out if loop.output_max is None else safe_clip(out, -loop.output_max, loop.output_max)), memory
+        output = output + loop.ki * integral
+    return (output if loop.output_max is None else safe_clip(output, -loop.output_max, loop.output_max)), memory
 
 
-def continue_integral(memory: PIDLoopMemory, out: Array, wanted: Array, *, loop: PIDLoop) -> PIDLoopMemory:
+def continue_integral(memory: PIDLoopMemory, output: Array, desired: Array, *, loop: PIDLoop) -> PIDLoopMemory:
     """Return the memory with integrals, within their limits, that turn the outputs of a tick into desired ones.
 
     Args:
         memory: Memory of the loops.
-        out: Outputs with this memory. (3,)
-        wanted: Desired outputs. (3,)
+        output: Outputs with this memory. (3,)
+        desired: Desired outputs. (3,)
         loop: Gains and limits.
     """
     integral_max: Any = loop.integral_max
     if loop.ki is None:
         return memory
-    missing = jnp.where(loop.ki == 0, 0.0, (wanted - out) / jnp.where(loop.ki == 0, 1.0, loop.ki))
-    return memory.replace(integral=safe_clip(memory.integral + missing, -integral_max, integral_max))
+    missing_integral = jnp.where(loop.ki == 0, 0.0, (desired - output) / jnp.where(loop.ki == 0, 1.0, loop.ki))
+    return memory.replace(integral=safe_clip(memory.integral + missing_integral, -integral_max, integral_max))
 
 
 def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array, Array]:
     """Return the output of the low-pass filter, and its delays after a tick (``lpf2pApply``)."""
     b0, a1, a2 = coefficients[..., 0:1], coefficients[..., 1:2], coefficients[..., 2:3]
     first, second = delays[..., 0, :], delays[..., 1, :]
-    new = sample - first * a1 - second * a2
-    return b0 * (new + 2 * first + second), jnp.stack([new, first], axis=-2)
+    latest = sample - first * a1 - second * a2
+    return b0 * (latest + 2 * first + second), jnp.stack([latest, first], axis=-2)
 
 
 def _wrap_angle(angle: Array, wrapped: Sequence[bool]) -> Array:

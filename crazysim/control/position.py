@@ -66,16 +66,18 @@ class PositionParams(PyTree):
             freq: Rate of the controller, Hz.
         """
         g = -GRAVITY[2]
-        most = MAX_THRUST_SHARE * level_thrust(airframe) / float(airframe.value("rigid_body.mass", ()))
-        up, down = max(most - g, MIN_FEEDBACK_RATIO * g), MAX_FALL_RATIO * g
-        side = min(MAX_HORIZONTAL_RATIO * g, np.sqrt(max(most**2 - g**2, (MIN_FEEDBACK_RATIO * g) ** 2)))
+        max_specific_force = MAX_THRUST_SHARE * level_thrust(airframe) / float(airframe.value("rigid_body.mass", ()))
+        up, down = max(max_specific_force - g, MIN_FEEDBACK_RATIO * g), MAX_FALL_RATIO * g
+        sideways_acc = min(
+            MAX_HORIZONTAL_RATIO * g, np.sqrt(max(max_specific_force**2 - g**2, (MIN_FEEDBACK_RATIO * g) ** 2))
+        )
         frequency = POSITION_RATE_RATIO / delay
         return PositionParams(
             gravity_vec=as_parameter(GRAVITY),
             stiffness=as_parameter(frequency**2),
             damping=as_parameter(2 * frequency),
-            reach=as_parameter(2 * np.array([side, min(up, down)]) / frequency**2),
-            acc_max=as_parameter([side, up, down]),
+            reach=as_parameter(2 * np.array([sideways_acc, min(up, down)]) / frequency**2),
+            acc_max=as_parameter([sideways_acc, up, down]),
             observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO / delay / freq)),
         )
 
@@ -97,7 +99,7 @@ class PositionMemory(PyTree):
 def specific_force(
     pos: Array,
     vel: Array,
-    known: Array,
+    known_acc: Array,
     setpoint: Setpoint,
     memory: PositionMemory,
     freq: float,
@@ -113,7 +115,7 @@ def specific_force(
     Args:
         pos: Position, world frame, m. (..., 3)
         vel: Velocity, world frame, m/s. (..., 3)
-        known: Acceleration by the known forces other than gravity, world frame, m/s^2. (..., 3)
+        known_acc: Acceleration by the known forces other than gravity, world frame, m/s^2. (..., 3)
         setpoint: Setpoint with the leading axes of the state.
         memory: Memory of the last tick.
         freq: Rate of the controller, Hz.
@@ -134,11 +136,11 @@ def specific_force(
     acc = p.stiffness * error + p.damping * (setpoint.vel - vel)
     height = safe_clip(acc[..., 2:], -p.acc_max[..., 2:], p.acc_max[..., 1:2])
     acc = _join_height(_limit_length(acc[..., :2], p.acc_max[..., :1]), height)
-    specific = setpoint.acc + acc - p.gravity_vec - disturbance
-    return specific, PositionMemory(vel + (known + p.gravity_vec) / freq, disturbance)
+    specific_thrust = setpoint.acc + acc - p.gravity_vec - disturbance
+    return specific_thrust, PositionMemory(vel + (known_acc + p.gravity_vec) / freq, disturbance)
 
 
-def keep_upright(specific: Array, setpoint: Setpoint, params: PositionParams) -> Array:
+def keep_upright(specific_thrust: Array, setpoint: Setpoint, params: PositionParams) -> Array:
     """Return the specific force of the rotors, raised so that it does not turn the drone on its back.
 
     Where feedback, drag and estimates cancel the weight, as in a fall, the sum may point in any direction. A small
@@ -146,13 +148,15 @@ def keep_upright(specific: Array, setpoint: Setpoint, params: PositionParams) ->
     more than gravity does turn the drone over: the limit is lowered by twice the excess over gravity.
 
     Args:
-        specific: Specific force of the rotors, world frame, m/s^2. (..., 3)
+        specific_thrust: Specific force of the rotors, world frame, m/s^2. (..., 3)
         setpoint: Setpoint with the leading axes of the force.
         params: Gains and limits, shared or with the leading axes of the force.
     """
-    wanted = setpoint.acc[..., 2:] - params.gravity_vec[..., 2:]
-    least = -MIN_UPWARD_RATIO * GRAVITY[2] + 2 * jnp.where(wanted < 0, wanted, 0.0)
-    return _join_height(specific[..., :2], jnp.where(specific[..., 2:] < least, least, specific[..., 2:]))
+    desired_lift = setpoint.acc[..., 2:] - params.gravity_vec[..., 2:]
+    min_lift = -MIN_UPWARD_RATIO * GRAVITY[2] + 2 * jnp.where(desired_lift < 0, desired_lift, 0.0)
+    return _join_height(
+        specific_thrust[..., :2], jnp.where(specific_thrust[..., 2:] < min_lift, min_lift, specific_thrust[..., 2:])
+    )
 
 
 def _limit_length(x: Array, limit: Array) -> Array:

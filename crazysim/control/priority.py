@@ -51,9 +51,9 @@ def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
         params: Parameters of the allocation, shared or with the leading axes of the wrench.
     """
-    force, scale, yaw, ratio = _prioritize(wrench, params)
-    lift, turn = params.allocation_matrix[..., 0], params.allocation_matrix[..., 3]
-    return lift * (force + scale * ratio) + turn * yaw
+    force, scale, yaw, tilt_thrusts = _prioritize(wrench, params)
+    lift_shares, yaw_shares = params.allocation_matrix[..., 0], params.allocation_matrix[..., 3]
+    return lift_shares * (force + scale * tilt_thrusts) + yaw_shares * yaw
 
 
 def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, Array, Array]:
@@ -63,28 +63,40 @@ def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, 
     collective thrust, N. (..., n_rotors)
     """
     p = params
-    lift = mask_rotors(p.rotors, p.allocation_matrix[..., 0], 1.0)  # rotor thrust per collective thrust, positive
-    turn = _reduce_rotors(
-        jnp.maximum, jnp.abs(p.allocation_matrix[..., 3] / lift)
+    lift_shares = mask_rotors(
+        p.rotors, p.allocation_matrix[..., 0], 1.0
+    )  # rotor thrust per collective thrust, positive
+    max_yaw_share = _reduce_rotors(
+        jnp.maximum, jnp.abs(p.allocation_matrix[..., 3] / lift_shares)
     )  # largest collective thrust per yaw torque over its arm
-    ratio = matvec(p.allocation_matrix[..., 1:3] / lift[..., None] / p.arms[..., None, :2], wrench[..., 1:3])
+    tilt_thrusts = matvec(
+        p.allocation_matrix[..., 1:3] / lift_shares[..., None] / p.arms[..., None, :2], wrench[..., 1:3]
+    )
 
     # Rotor i allows collective thrusts F with low <= lift_i (F + s ratio_i) <= high. A masked rotor allows any F.
-    least = mask_rotors(p.rotors, p.thrust_min / lift, -UNLIMITED_THRUST)
-    most = mask_rotors(p.rotors, p.thrust_max / lift, UNLIMITED_THRUST)
-    still_low, still_high = _reduce_rotors(jnp.maximum, least), _reduce_rotors(jnp.minimum, most)
-    full_low, full_high = _reduce_rotors(jnp.maximum, least - ratio), _reduce_rotors(jnp.minimum, most - ratio)
-    weight = still_high if p.weight is None else p.weight
-    limit = jnp.maximum(wrench[..., :1], jnp.maximum(weight, still_low))
+    low = mask_rotors(p.rotors, p.thrust_min / lift_shares, -UNLIMITED_THRUST)
+    high = mask_rotors(p.rotors, p.thrust_max / lift_shares, UNLIMITED_THRUST)
+    low_untilted, high_untilted = _reduce_rotors(jnp.maximum, low), _reduce_rotors(jnp.minimum, high)
+    low_tilted, high_tilted = (
+        _reduce_rotors(jnp.maximum, low - tilt_thrusts),
+        _reduce_rotors(jnp.minimum, high - tilt_thrusts),
+    )
+    weight = high_untilted if p.weight is None else p.weight
+    limit = jnp.maximum(wrench[..., :1], jnp.maximum(weight, low_untilted))
 
     # The room between the bounds is concave in s, so it is at least the chord from s = 0, where it is positive, to 1.
-    still, full = jnp.minimum(still_high, limit) - still_low, jnp.minimum(full_high, limit) - full_low
-    scale = still / jnp.maximum(still - jnp.minimum(full, 0.0), 1 / UNLIMITED_THRUST)
-    chord = still_low + scale * (full_low - still_low)
-    force = safe_clip(wrench[..., :1], chord, jnp.where(full < 0, chord, jnp.minimum(full_high, limit)))
+    room_untilted, room_tilted = (
+        jnp.minimum(high_untilted, limit) - low_untilted,
+        jnp.minimum(high_tilted, limit) - low_tilted,
+    )
+    scale = room_untilted / jnp.maximum(room_untilted - jnp.minimum(room_tilted, 0.0), 1 / UNLIMITED_THRUST)
+    force_low = low_untilted + scale * (low_tilted - low_untilted)
+    force = safe_clip(
+        wrench[..., :1], force_low, jnp.where(room_tilted < 0, force_low, jnp.minimum(high_tilted, limit))
+    )
 
-    room = jnp.maximum(jnp.minimum(force - chord, full_high - force), 0.0) / turn
-    return force, scale, safe_clip(wrench[..., 3:] / p.arms[..., 2:], -room, room), ratio
+    yaw_room = jnp.maximum(jnp.minimum(force - force_low, high_tilted - force), 0.0) / max_yaw_share
+    return force, scale, safe_clip(wrench[..., 3:] / p.arms[..., 2:], -yaw_room, yaw_room), tilt_thrusts
 
 
 def _reduce_rotors(function: Callable[[Array, Array], Array], x: Array) -> Array:

@@ -72,32 +72,32 @@ class Switch(Controller):
 
     def memory(self, airframe: Airframe) -> SwitchMemory:
         memory = tuple(c.memory(airframe) for c in self.controllers)
-        rest: Any = np.zeros(airframe.n_rotors)
-        return SwitchMemory(memory, np.full(1, -1, np.int32), rest)  # type: ignore[arg-type]
+        zero_rotor_vel: Any = np.zeros(airframe.n_rotors)
+        return SwitchMemory(memory, np.full(1, -1, np.int32), zero_rotor_vel)  # type: ignore[arg-type]
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: SwitchMemory, params: SwitchParams
     ) -> tuple[Array, SwitchMemory]:
         index = self._index(data, command, params)
         switched = (memory.active[0] >= 0) & (memory.active[0] != index)
-        rotor_vel, after = memory.rotor_vel, []
+        rotor_vel, new_memories = memory.rotor_vel, []
         for k, (controller, state, p) in enumerate(
             zip(self.controllers, memory.controllers, params.controllers, strict=True)
         ):
-            chosen = index == k
-            starts = chosen & switched
-            state = _select_tree(starts, controller.take_over(data, command, state, p, memory.rotor_vel), state)
+            is_chosen = index == k
+            takes_over = is_chosen & switched
+            state = _select_tree(takes_over, controller.take_over(data, command, state, p, memory.rotor_vel), state)
             if isinstance(command, Setpoint) and controller.has_outer:
-                due = chosen & (starts | _is_due(data, controller.outer_freq))
-                state = _select_tree(due, controller.outer(data, command, state, p), state)
-            due = chosen & (starts | _is_due(data, controller.freq))
-            out, new = controller.update(data, command, state, p)
+                is_due = is_chosen & (takes_over | _is_due(data, controller.outer_freq))
+                state = _select_tree(is_due, controller.outer(data, command, state, p), state)
+            is_due = is_chosen & (takes_over | _is_due(data, controller.freq))
+            output, new_state = controller.update(data, command, state, p)
             if controller.output == Control.force_torque:
-                out = force_torque2rotor_vel(out, params=params.allocation)
-            rotor_vel = jnp.where(due, out, rotor_vel)
-            after.append(_select_tree(due, new, state))
+                output = force_torque2rotor_vel(output, params=params.allocation)
+            rotor_vel = jnp.where(is_due, output, rotor_vel)
+            new_memories.append(_select_tree(is_due, new_state, state))
         active = jnp.full_like(memory.active, index)
-        return rotor_vel, SwitchMemory(tuple(after), active, rotor_vel)
+        return rotor_vel, SwitchMemory(tuple(new_memories), active, rotor_vel)
 
     def _index(self, data: DroneData, command: Setpoint | Array, params: SwitchParams) -> Array:
         """Return the number of the controller to use. ()"""

@@ -64,14 +64,16 @@ def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc:
     Returns:
         Derivative, per second. (12,)
     """
-    vel, turn, rate = error[3:6], error[6:9], error[9:12]
+    vel_error, rot_error, rate_error = error[3:6], error[6:9], error[9:12]
     w_d = reference.ang_vel
-    w = w_d + rate - cross(turn, w_d)
+    w = w_d + rate_error - cross(rot_error, w_d)
     z = reference.matrix[..., 2]
-    tilted = z + matvec(reference.matrix, cross(turn, jnp.asarray([0.0, 0.0, 1.0], turn.dtype)))
+    tilted = z + matvec(reference.matrix, cross(rot_error, jnp.asarray([0.0, 0.0, 1.0], rot_error.dtype)))
     acc = ((reference.wrench[:1] + wrench[:1]) * tilted - reference.wrench[:1] * z) / mass
     w_rate = jnp.linalg.solve(J, reference.wrench[1:] + wrench[1:] - cross(w, matvec(J, w)))
-    return jnp.concatenate([vel, acc, rate, w_rate - ang_acc + cross(rate, w_d) + cross(turn, ang_acc)])
+    return jnp.concatenate(
+        [vel_error, acc, rate_error, w_rate - ang_acc + cross(rate_error, w_d) + cross(rot_error, ang_acc)]
+    )
 
 
 def tracking_gains(
@@ -105,11 +107,11 @@ def tracking_gains(
         w = reference.ang_vel
         ang_acc = jnp.linalg.solve(J, reference.wrench[1:] - cross(w, matvec(J, w)))
 
-        def of(error: Array, wrench: Array) -> Array:
+        def derivative(error: Array, wrench: Array) -> Array:
             return error_derivative(error, wrench, reference, ang_acc, mass, J)
 
-        zero, none = jnp.zeros(12, J.dtype), jnp.zeros(4, J.dtype)
-        return jax.jacfwd(of, 0)(zero, none), jax.jacfwd(of, 1)(zero, none)
+        zero, no_wrench = jnp.zeros(12, J.dtype), jnp.zeros(4, J.dtype)
+        return jax.jacfwd(derivative, 0)(zero, no_wrench), jax.jacfwd(derivative, 1)(zero, no_wrench)
 
     A, B = jax.vmap(matrices)(setpoints)
     eye, h = jnp.eye(12, dtype=J.dtype), dt / substeps
@@ -120,14 +122,14 @@ def tracking_gains(
     def backward(P: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         F, G = step
 
-        def once(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
+        def riccati_step(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
             P, _ = carry
             K = jnp.linalg.solve(h * R + G.T @ P @ G, G.T @ P @ F)
             closed = F - G @ K
             P = closed.T @ P @ closed + h * (Q + K.T @ R @ K)
             return ((P + P.T) / 2, K), None
 
-        (P, K), _ = jax.lax.scan(once, (P, end), length=substeps)
+        (P, K), _ = jax.lax.scan(riccati_step, (P, end), length=substeps)
         return P, K
 
     _, gains = jax.lax.scan(backward, P, (transition, input_matrix), reverse=True)

@@ -92,7 +92,7 @@ def parameter(
 
     ``sim.replace`` exchanges such numbers without compiling the step again. The plugin's stages, ``influence`` and
     ``derivative`` must read the number from the record, never from the field. Its range is checked as in
-    ``setting``, and its shape by ``Plugin.filled`` or ``shapes``.
+    ``setting``, and its shape by ``Plugin.fill_record`` or ``shapes``.
     """
     declared = Setting(range_between(low, high, positive), True, per_axis, dtype, shapes)
     return dataclasses.field(default=default, metadata={"setting": declared})
@@ -236,7 +236,7 @@ class Plugin:
         """Return the record that resets restore; by default the same as ``record``."""
         return self.record(sim)
 
-    def filled(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
+    def fill_record(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
         """Return a record for all worlds; fields that are not passed follow from their declarations.
 
         A parameter has the value of the plugin's setting of that name, checked; without a fixed core shape it has one

@@ -112,10 +112,10 @@ def _check_rotors(airframe: Airframe) -> str | None:
             f"expected rotors that turn the body with at most {MAX_ANG_ACC:g} rad/s^2, got {high} N on arms of "
             f"{airframe.arm:g} m for moments of inertia from {moments[0]:.4g} kg m^2"
         )
-    spun = np.sum(np.broadcast_to(airframe.values.get("rotors.inertia", 0.0), n))
-    if spun > moments[-1]:
+    rotor_inertia = np.sum(np.broadcast_to(airframe.values.get("rotors.inertia", 0.0), n))
+    if rotor_inertia > moments[-1]:
         return (
-            f"expected propellers with a smaller inertia than the whole drone, got {spun:.4g} and at most "
+            f"expected propellers with a smaller inertia than the whole drone, got {rotor_inertia:.4g} and at most "
             f"{moments[-1]:.4g} kg m^2"
         )
     return None
@@ -136,17 +136,17 @@ def _check_curves(airframe: Airframe) -> str | None:
         if "rotors.torque_curve" in numbers:
             k0, k1, k2 = np.atleast_2d(numbers["rotors.torque_curve"]).T
             torques = np.array([k0 + speed * (k1 + speed * k2) for speed in (low, high)])
-            most = MAX_ANG_ACC * np.min(np.linalg.eigvalsh(airframe.inertia)) / airframe.n_rotors
+            max_torque = MAX_ANG_ACC * np.min(np.linalg.eigvalsh(airframe.inertia)) / airframe.n_rotors
             hover = airframe.rotor_vel([numbers["rigid_body.mass"] * GRAVITY_MAGNITUDE / airframe.n_rotors])
             if not np.all(k1 + 2 * k2 * hover > 0):
                 return (
                     f"expected torque_curve that rises at the speed of hover, got "
                     f"{short_repr(np.atleast_2d(numbers['rotors.torque_curve']).tolist())}"
                 )
-            if not np.all((torques >= 0) & (torques <= most)):
+            if not np.all((torques >= 0) & (torques <= max_torque)):
                 return (
                     f"expected torque_curve of at least 0 N m at the speeds of thrust_min and thrust_max, and at most "
-                    f"{most:.4g} N m, got {torques.min():.4g} to {torques.max():.4g} N m"
+                    f"{max_torque:.4g} N m, got {torques.min():.4g} to {torques.max():.4g} N m"
                 )
     if "rotors.lag" in numbers:
         lag = np.atleast_2d(numbers["rotors.lag"])
@@ -161,7 +161,7 @@ def _check_curves(airframe: Airframe) -> str | None:
 def _check_forces(airframe: Airframe) -> str | None:
     """Check drag, and the forces of the fitted models and the battery."""
     numbers, n = airframe.values, airframe.n_rotors
-    weight, most = numbers["rigid_body.mass"] * GRAVITY_MAGNITUDE, n * numbers["rotors.thrust_max"]
+    weight, max_thrust = numbers["rigid_body.mass"] * GRAVITY_MAGNITUDE, n * numbers["rotors.thrust_max"]
     for path in ("drag.coefficients", "fitted.so_rpy_rotor_drag.drag_coefficients"):
         if (
             path in numbers
@@ -169,11 +169,11 @@ def _check_forces(airframe: Airframe) -> str | None:
         ):
             return f"expected {path} that brakes, so negative or zero, got {short_repr(numbers[path].tolist())}"
     for model in airframe.tables.get("fitted", {}):
-        known = [numbers.get(f"fitted.{model}.{key}") for key in ("acc_coef", "cmd_f_coef")]
-        if known[0] is not None and known[1] is not None and known[0] + known[1] * most <= weight:
+        coefs = [numbers.get(f"fitted.{model}.{key}") for key in ("acc_coef", "cmd_f_coef")]
+        if coefs[0] is not None and coefs[1] is not None and coefs[0] + coefs[1] * max_thrust <= weight:
             return (
                 f"expected acc_coef and cmd_f_coef of fitted.{model} to lift {weight:.4g} N, got "
-                f"{known[0] + known[1] * most:.4g} N at the largest thrust"
+                f"{coefs[0] + coefs[1] * max_thrust:.4g} N at the largest thrust"
             )
     if numbers.get("battery.cells", 1.0) % 1:
         return f"expected battery.cells as a whole number, got {numbers['battery.cells']}"

@@ -150,22 +150,22 @@ def estimate_airframe(
         if value is not None:
             read_number(key, value, POSITIVE)
     file = _File(name)
-    places, signs = _rotors(file, arm, n_rotors, layout, positions, spins, propeller)
+    rotor_pos, signs = _rotors(file, arm, n_rotors, layout, positions, spins, propeller)
     file.add("rigid_body", "mass", mass, "kg", "given")
     if inertia is None:
-        file.add("rigid_body", "inertia", _inertia(mass, places), "kg m^2", "inertia")
+        file.add("rigid_body", "inertia", _inertia(mass, rotor_pos), "kg m^2", "inertia")
     else:
         file.add("rigid_body", "inertia", np.asarray(inertia, float), "kg m^2", "given")
     file.add(
         "rotors",
         "position",
-        places,
+        rotor_pos,
         "m; x ahead, y left, z up, from the centre of mass",
         "layout" if positions is None else "given",
     )
     file.add("rotors", "yaw_torque_sign", signs, "1", "spins" if positions is not None or spins else "layout")
-    thrust = _add_thrust(file, mass, len(places), propeller, thrust_to_weight, motor_table, pitch)
-    _check_units(mass, propeller, places, thrust)
+    thrust = _add_thrust(file, mass, len(rotor_pos), propeller, thrust_to_weight, motor_table, pitch)
+    _check_units(mass, propeller, rotor_pos, thrust)
     file.add("rotors", "thrust_min", IDLE_THRUST_RATIO * thrust, "N", "thrust_min")
     blade = 0.015 * (propeller / 0.279) ** 2
     file.add("rotors", "inertia", blade * propeller**2 / 12, "kg m^2", "rotor_inertia")
@@ -247,44 +247,50 @@ def _rotors(
                 f"expected an even number of rotors from 4 to {MAX_ROTORS}, which alternate, got {n_rotors}. Use "
                 "positions and spins."
             )
-        turn = 2 * np.pi / n_rotors
-        angles = -turn * (np.arange(n_rotors) + (0.5 if layout == "x" else 0.0))
-        places = arm * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=-1)
+        angle_step = 2 * np.pi / n_rotors
+        angles = -angle_step * (np.arange(n_rotors) + (0.5 if layout == "x" else 0.0))
+        rotor_pos = arm * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=-1)
         file.describe("layout", SOURCES["layout"].format(n=n_rotors, arm=arm))
     else:
-        places = np.asarray(positions, float)
-        if places.ndim != 2 or places.shape[1] not in (2, 3) or len(places) < 3:
-            raise ConfigError(f"expected positions of shape (n, 3) or (n, 2) of at least 3 rotors, got {places.shape}")
-        places = np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
-    places = np.where(np.abs(places) < 1e-9, 0.0, places)
-    gaps = places[:, None] - places[None]
-    beside = (np.abs(gaps[..., 2]) < 0.1 * propeller) & ~np.eye(len(places), dtype=bool)
-    closest = np.min(np.linalg.norm(gaps[..., :2], axis=-1)[beside], initial=np.inf)
+        rotor_pos = np.asarray(positions, float)
+        if rotor_pos.ndim != 2 or rotor_pos.shape[1] not in (2, 3) or len(rotor_pos) < 3:
+            raise ConfigError(
+                f"expected positions of shape (n, 3) or (n, 2) of at least 3 rotors, got {rotor_pos.shape}"
+            )
+        rotor_pos = np.pad(rotor_pos, ((0, 0), (0, 3 - rotor_pos.shape[1])))
+    rotor_pos = np.where(np.abs(rotor_pos) < 1e-9, 0.0, rotor_pos)
+    gaps = rotor_pos[:, None] - rotor_pos[None]
+    same_height = (np.abs(gaps[..., 2]) < 0.1 * propeller) & ~np.eye(len(rotor_pos), dtype=bool)
+    closest = np.min(np.linalg.norm(gaps[..., :2], axis=-1)[same_height], initial=np.inf)
     if closest < propeller * (1 - 1e-6):
         raise ConfigError(
             f"expected propellers that do not touch, got a diameter of {propeller:g} m and rotors {closest:.3g} m "
             f"apart. Use a longer arm, a smaller propeller (5 inches are 0.127 m), or other heights of the rotors."
         )
     if spins is None:
-        if len(places) % 2:
+        if len(rotor_pos) % 2:
             raise ConfigError(
-                f"expected spins for {len(places)} rotors, which cannot alternate. Use spins=[1, -1, ...]."
+                f"expected spins for {len(rotor_pos)} rotors, which cannot alternate. Use spins=[1, -1, ...]."
             )
-        spins = [1, -1] * (len(places) // 2)
-    turning = np.asarray(spins)
-    if turning.shape != (len(places),) or not np.all(np.isin(turning, (1, -1))) or abs(np.sum(turning)) == len(places):
+        spins = [1, -1] * (len(rotor_pos) // 2)
+    spin_signs = np.asarray(spins)
+    if (
+        spin_signs.shape != (len(rotor_pos),)
+        or not np.all(np.isin(spin_signs, (1, -1)))
+        or abs(np.sum(spin_signs)) == len(rotor_pos)
+    ):
         raise ConfigError(
-            f"expected spins of 1 and -1 for {len(places)} rotors, and not all equal, got {short_repr(spins)}"
+            f"expected spins of 1 and -1 for {len(rotor_pos)} rotors, and not all equal, got {short_repr(spins)}"
         )
-    return places, -turning
+    return rotor_pos, -spin_signs
 
 
-def _inertia(mass: float, places: NDArray) -> NDArray:
+def _inertia(mass: float, rotor_pos: NDArray) -> NDArray:
     """Return the inertia of points at the rotors: moments, or a matrix if its principal axes are not the body's."""
-    squares = np.einsum("ni,nj->ij", places, places) / len(places)
+    squares = np.einsum("ni,nj->ij", rotor_pos, rotor_pos) / len(rotor_pos)
     matrix = OUTER_MASS_SHARE * mass * (np.trace(squares) * np.eye(3) - squares)
-    off = matrix - np.diag(np.diag(matrix))
-    return np.diag(matrix) if np.max(np.abs(off)) < 1e-6 * np.max(matrix) else matrix
+    off_diagonal = matrix - np.diag(np.diag(matrix))
+    return np.diag(matrix) if np.max(np.abs(off_diagonal)) < 1e-6 * np.max(matrix) else matrix
 
 
 def _add_thrust(
@@ -303,48 +309,48 @@ def _add_thrust(
             "4 for an agile one."
         )
     rows = {} if table is None else _motor_table(table)
-    named = f"motor table {Path(table).name}" if isinstance(table, (str, Path)) else "motor table that was given"
+    table_name = f"motor table {Path(table).name}" if isinstance(table, (str, Path)) else "motor table that was given"
     if table is None:
         thrust = ratio * mass * GRAVITY_MAGNITUDE / n
         file.add("rotors", "thrust_max", thrust, "N", "thrust_to_weight", ratio=ratio)
     else:
         thrust = float(np.max(rows["thrust"]))
-        file.describe("motor_thrust", f"Largest thrust of the {named}")
+        file.describe("motor_thrust", f"Largest thrust of the {table_name}")
         file.add("rotors", "thrust_max", thrust, "N", "motor_thrust")
     beta = PITCH_RATIO if pitch is None else pitch / diameter
     ct = 0.0427 + 0.144 * beta
     if "rpm" in rows:
         k, error = _fit_quadratic(rows["rpm"], rows["thrust"])
-        file.describe("motor_curve", f"Least squares T = k rpm^2 to the {named}, off by at most {error:.2g} N")
+        file.describe("motor_curve", f"Least squares T = k rpm^2 to the {table_name}, off by at most {error:.2g} N")
         source = "motor_curve"
     else:
         k, source = ct * AIR_DENSITY * diameter**4 / 3600, "thrust_curve"
-    pitched = f"pitch {beta:g} D" + (" assumed" if pitch is None else "")
-    file.add("rotors", "thrust_curve", np.array([0, 0, k]), "N, N/rpm, N/rpm^2", source, ct=ct, pitch=pitched)
+    pitch_text = f"pitch {beta:g} D" + (" assumed" if pitch is None else "")
+    file.add("rotors", "thrust_curve", np.array([0, 0, k]), "N, N/rpm, N/rpm^2", source, ct=ct, pitch=pitch_text)
 
     area, to_rad = np.pi * diameter**2 / 4, 2 * np.pi / 60
     merit = float(np.interp(diameter, MERIT_DIAMETERS, MERITS))
     torque, source = k**1.5 / np.sqrt(2 * AIR_DENSITY * area) / merit / to_rad, "torque_curve"
     if "rpm" in rows and "torque" in rows:
         torque, error = _fit_quadratic(rows["rpm"], rows["torque"])
-        file.describe("motor_torque", f"Least squares Q = k rpm^2 to the {named}, off by at most {error:.2g} N m")
+        file.describe("motor_torque", f"Least squares Q = k rpm^2 to the {table_name}, off by at most {error:.2g} N m")
         source = "motor_torque"
     elif "rpm" in rows and "power" in rows:
         shaft = MOTOR_EFFICIENCY * rows["power"] / (rows["rpm"] * to_rad)
         torque, error = _fit_quadratic(rows["rpm"], shaft)
         file.describe(
             "motor_power",
-            f"estimate: least squares Q = k rpm^2 to the {named}, with {MOTOR_EFFICIENCY:g} of the electric power at "
-            f"the propeller, off by at most {error:.2g} N m",
+            f"estimate: least squares Q = k rpm^2 to the {table_name}, with {MOTOR_EFFICIENCY:g} of the electric power "
+            f"at the propeller, off by at most {error:.2g} N m",
         )
         source = "motor_power"
     file.add("rotors", "torque_curve", np.array([0, 0, torque]), "N m, N m/rpm, N m/rpm^2", source, merit=merit)
     return thrust
 
 
-def _check_units(mass: float, propeller: float, places: NDArray, thrust: float) -> None:
+def _check_units(mass: float, propeller: float, rotor_pos: NDArray, thrust: float) -> None:
     """Refuse numbers in other units, such as grams or inches."""
-    pressure, reach = thrust / (np.pi * propeller**2 / 4), float(np.max(np.linalg.norm(places, axis=-1)))
+    pressure, reach = thrust / (np.pi * propeller**2 / 4), float(np.max(np.linalg.norm(rotor_pos, axis=-1)))
     if pressure > MAX_DISC_LOADING or reach > 20 * propeller:
         raise ConfigError(
             f"expected mass in kg and lengths in m, got {mass:g} kg, propellers of {propeller:g} m, rotors up to "
@@ -363,11 +369,11 @@ def _fit_quadratic(rpm: NDArray, values: NDArray) -> tuple[float, float]:
 def _motor_table(table: MotorTable) -> dict[str, NDArray]:
     """Return the columns of a motor table by quantity, in SI units and rpm."""
     columns = table if isinstance(table, Mapping) else _read_columns(Path(table))
-    known = ", ".join(COLUMNS)
+    column_names = ", ".join(COLUMNS)
     by_quantity: dict[str, NDArray] = {}
     for key, values in columns.items():
         if str(key).strip().lower() not in COLUMNS:
-            raise ConfigError(f"expected columns of a motor table among {known}, got {short_repr(key)}")
+            raise ConfigError(f"expected columns of a motor table among {column_names}, got {short_repr(key)}")
         quantity, factor = COLUMNS[str(key).strip().lower()]
         try:
             array = np.asarray(values, float) * factor
@@ -377,11 +383,11 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
             raise ConfigError(
                 f"expected finite numbers of at least 0 in column {key!r}, got {short_repr(array.tolist())}"
             )
-        earlier = by_quantity.setdefault(quantity, array)
-        if earlier.shape == array.shape and np.any(np.abs(earlier - array) > MAX_TABLE_ERROR * np.max(earlier)):
-            k = int(np.argmax(np.abs(earlier - array)))
+        previous = by_quantity.setdefault(quantity, array)
+        if previous.shape == array.shape and np.any(np.abs(previous - array) > MAX_TABLE_ERROR * np.max(previous)):
+            k = int(np.argmax(np.abs(previous - array)))
             raise ConfigError(
-                f"expected columns of the motor table that agree on the {quantity}, got {earlier[k]:.4g} and "
+                f"expected columns of the motor table that agree on the {quantity}, got {previous[k]:.4g} and "
                 f"{array[k]:.4g} in row {k + 1}, in SI units. Remove the column that is wrong."
             )
     if "thrust" not in by_quantity or not np.max(by_quantity["thrust"]) > 0:
@@ -389,11 +395,11 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
     if len({len(array) for array in by_quantity.values()}) != 1:
         raise ConfigError("expected columns of equal lengths in the motor table")
     if "rpm" in by_quantity:
-        running = by_quantity["rpm"] > 0
-        if not np.any(running):
+        is_running = by_quantity["rpm"] > 0
+        if not np.any(is_running):
             raise ConfigError("expected a speed above 0 in column 'rpm' of the motor table, got none")
-        order = np.argsort(by_quantity["rpm"][running], kind="stable")
-        by_quantity = {quantity: array[running][order] for quantity, array in by_quantity.items()}
+        order = np.argsort(by_quantity["rpm"][is_running], kind="stable")
+        by_quantity = {quantity: array[is_running][order] for quantity, array in by_quantity.items()}
         for quantity in ("thrust", "torque"):
             values = by_quantity.get(quantity, np.zeros(1))
             fall = np.maximum.accumulate(values) - values

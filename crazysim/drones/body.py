@@ -87,17 +87,19 @@ def outline(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
 
     plate, battery, led = shape["plate"], shape["battery"], shape["led_radius"]
     shape = {"battery_height": (plate[2] + battery[2]) / 2} | shape
-    top = shape["battery_height"] + battery[2] / 2
+    battery_top = shape["battery_height"] + battery[2] / 2
     half = max(0.5 * shape["motor_height"] + shape["propeller_height"], abs(height) / 2 + battery[2])
     sides = np.max(np.abs(rotors[:, :2]), axis=0) + shape["propeller_radius"]
-    away = 0.7 + 7 * reach
+    camera_distance = 0.7 + 7 * reach
     shape = {
-        "led_heights": np.array([max(top, plate[2] / 2), min(shape["battery_height"] - battery[2] / 2, -plate[2] / 2)])
+        "led_heights": np.array(
+            [max(battery_top, plate[2] / 2), min(shape["battery_height"] - battery[2] / 2, -plate[2] / 2)]
+        )
         + led / 2 * np.array([1, -1]),
         "collision_sphere": np.array([0, 0, height / 2, reach + shape["propeller_radius"]]),
         "collision_box": np.array([0, 0, height / 2, *sides, half]),
         "fpv_camera": np.array([0.9 * plate[0], 0, 0]),
-        "track_camera": np.array([-away, 0, away / 2]),
+        "track_camera": np.array([-camera_distance, 0, camera_distance / 2]),
     } | shape
     return {key: np.asarray(value, np.float64) for key, value in shape.items()}
 
@@ -138,11 +140,13 @@ def body_geoms(airframe: Airframe) -> list[BodyGeom]:
 def body_cameras(airframe: Airframe) -> list[BodyCamera]:
     """Return ``fpv_cam``, which looks ahead from the drone, and ``track_cam``, which follows it from behind."""
     shape = outline(airframe)
-    back = shape["track_camera"]
+    camera_pos = shape["track_camera"]
     # Looking ahead from behind: right is body -y, and up is tilted forward by as much as the camera looks down.
-    up = np.array([-back[2] * np.sign(back[0]), 0, abs(back[0])]) / np.hypot(back[0], back[2])
+    up = np.array([-camera_pos[2] * np.sign(camera_pos[0]), 0, abs(camera_pos[0])]) / np.hypot(
+        camera_pos[0], camera_pos[2]
+    )
     right = np.array([0.0, -1.0, 0.0])
     return [
-        BodyCamera("track_cam", back, np.concatenate([right, up]), tracks=True),
+        BodyCamera("track_cam", camera_pos, np.concatenate([right, up]), tracks=True),
         BodyCamera("fpv_cam", shape["fpv_camera"], np.concatenate([right, [0, 0, 1]]), fovy=70.0),
     ]

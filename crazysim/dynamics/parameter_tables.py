@@ -116,9 +116,9 @@ def load_controller_params(
     core = {"gravity_vec": GRAVITY, "L": airframe.arm, "mixing_matrix": airframe.mixing_matrix}
     tables: dict[str, dict[str, Any]] = {"core": core}
     for name, table, keys in SOURCES:
-        known = airframe.table(table)
+        airframe_table = airframe.table(table)
         tables.setdefault(name, {}).update(
-            {new: airframe.value(f"{table}.{k}") for k, new in keys.items() if k in known}
+            {new: airframe.value(f"{table}.{k}") for k, new in keys.items() if k in airframe_table}
         )
     return convert_arrays(tables, xp, device)
 

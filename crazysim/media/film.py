@@ -97,7 +97,7 @@ class Film:
         """
         first = self.view.worlds[0]
         require_world(sim, first)
-        elapsed = self._clock.at(float(sim.time[first, 0]))
+        elapsed = self._clock.elapsed_at(float(sim.time[first, 0]))
         due = int(elapsed * self.fps / self.speed + 1e-4) + 1 - self.n_frames
         if due > 0:
             self.write(self.view.render(sim), due)

@@ -29,7 +29,7 @@ class Clock:
         self.elapsed = 0.0
         self._last: float | None = None
 
-    def at(self, time: float) -> float:
+    def elapsed_at(self, time: float) -> float:
         """Return the time since the first call, s, given the world's time since its last reset, s."""
         if self._last is not None:
             self.elapsed += time - self._last if time >= self._last else time
@@ -89,7 +89,7 @@ class Recorder:
         """
         sim, worlds = self._sim, self._worlds
         if time is None:
-            time = self._clock.at(float(sim.time[self._worlds[0], 0]))
+            time = self._clock.elapsed_at(float(sim.time[self._worlds[0], 0]))
         if self._n and self._last == time:
             if self._journal is not None:
                 return

@@ -50,24 +50,24 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
     first, second = np.triu_indices(n, 1)
     if not len(first):
         return []
-    best, when = np.full(len(first), np.inf), np.zeros(len(first))
+    best, best_time = np.full(len(first), np.inf), np.zeros(len(first))
     n_cells = int(np.ceil(pieces.duration / CELL_DURATION))
     dt, motion = pieces.duration / n_cells, _Motion(pieces)
     pair, cell = np.repeat(np.arange(len(first)), n_cells), np.tile(np.arange(n_cells), len(first))
     while len(pair) and dt > MIN_CELL_DURATION:
-        worthwhile = n_cells * pieces.n_drones <= min(MAX_TABLE_CELLS, len(pair))
-        table = motion.table(n_cells, dt) if worthwhile else None
+        uses_table = n_cells * pieces.n_drones <= min(MAX_TABLE_CELLS, len(pair))
+        table = motion.table(n_cells, dt) if uses_table else None
         keep = np.zeros(len(pair), bool)
         for k in range(0, len(pair), CELLS_PER_BATCH):
             part = slice(k, k + CELLS_PER_BATCH)
             i, j = first[pair[part]], second[pair[part]]
             motion_i, motion_j = (motion.in_cells(drone, cell[part], dt, table) for drone in (i, j))
-            lower = _lower_bounds(pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, best, when)
+            lower = _lower_bounds(pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, best, best_time)
             keep[part] = lower < best[pair[part]] - tolerance
         pair, cell = np.repeat(pair[keep], N_SPLITS), (cell[keep][:, None] * N_SPLITS + np.arange(N_SPLITS)).ravel()
         dt, n_cells = dt / N_SPLITS, n_cells * N_SPLITS
     order = np.argsort(best, kind="stable")
-    return [Approach((int(first[k]), int(second[k])), float(best[k]), float(when[k])) for k in order]
+    return [Approach((int(first[k]), int(second[k])), float(best[k]), float(best_time[k])) for k in order]
 
 
 class _Motion:
@@ -81,8 +81,8 @@ class _Motion:
         jumps = np.zeros((4, len(pieces.drone)))
         piece = np.flatnonzero(pieces.drone[1:] == pieces.drone[:-1])
         for order in range(4):
-            before = pieces.within(piece, np.ones(len(piece)), order)
-            after = pieces.within(piece + 1, np.zeros(len(piece)), order)
+            before = pieces.evaluate_pieces(piece, np.ones(len(piece)), order)
+            after = pieces.evaluate_pieces(piece + 1, np.zeros(len(piece)), order)
             jumps[order, piece + 1] = np.linalg.norm((after - before)[:, :3], axis=-1)
         self.jumps = np.cumsum(jumps, axis=1)
 
@@ -99,13 +99,13 @@ class _Motion:
             return tuple(x[drone, cell] for x in table)
         drone, cell = np.broadcast_arrays(drone, cell)
         start, end = cell * dt, (cell + 1) * dt
-        a, b = self.pieces.piece(drone, start), self.pieces.piece(drone, end)
+        a, b = self.pieces.find_pieces(drone, start), self.pieces.find_pieces(drone, end)
         jumps = self.jumps[:, b] - self.jumps[:, a]
         snap = self.snaps[b] - np.where(a > 0, self.snaps[a - 1], 0.0)  # the sum over all pieces of the cell
         acc_change = dt / 2 * (dt / 2 * snap + jumps[3]) + jumps[2]
         bound = dt**2 / 8 * acc_change + dt / 4 * jumps[1] + jumps[0]
         times = ((start, 0), (end, 0), (start + dt / 2, 2), (start + dt / 2, 3))
-        return *(self.pieces.at(drone, t, order)[..., :3] for t, order in times), bound
+        return *(self.pieces.evaluate(drone, t, order)[..., :3] for t, order in times), bound
 
 
 def _lower_bounds(
@@ -117,7 +117,7 @@ def _lower_bounds(
     cell: Ints,
     dt: float,
     best: Floats,
-    when: Floats,
+    best_time: Floats,
 ) -> Floats:
     """Return a lower bound of the distance in each cell; update the smallest distance of each pair in place."""
     start, end, acc, jerk = (a - b for a, b in zip(motion_i[:4], motion_j[:4], strict=True))
@@ -130,9 +130,9 @@ def _lower_bounds(
     order = np.lexsort((to_chord, pair))  # the cell in which each pair comes closest is evaluated exactly
     k = order[np.unique(pair[order], return_index=True)[1]]
     t = (cell[k] + u[k]) * dt
-    distance = _norm((pieces.at(drones[0][k], t) - pieces.at(drones[1][k], t))[:, :3])
-    closer = distance < best[pair[k]]
-    best[pair[k[closer]]], when[pair[k[closer]]] = distance[closer], t[closer]
+    distance = _norm((pieces.evaluate(drones[0][k], t) - pieces.evaluate(drones[1][k], t))[:, :3])
+    is_closer = distance < best[pair[k]]
+    best[pair[k[is_closer]]], best_time[pair[k[is_closer]]] = distance[is_closer], t[is_closer]
     return to_chord - deviation
 
 

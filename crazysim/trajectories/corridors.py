@@ -20,7 +20,7 @@ iteration ends."""
 HEIGHT_TOLERANCE = 2e-5
 """Distance by which a curve may be below the smallest height or above the largest one, m."""
 MAX_ITERATIONS = 100
-"""Largest number of rounds; a few are typical."""
+"""Largest number of iterations; a few are typical."""
 
 
 class OutsideError(ConfigError):
@@ -33,7 +33,7 @@ def fill_in_corridors(
     """Return the derivatives at all waypoints that minimise the cost within corridors and between two heights.
 
     The corridor of a piece contains all points up to its radius from the line segment between its waypoints. It is
-    convex, and therefore an intersection of half-spaces, as is the space between two heights. Each round adds the
+    convex, and therefore an intersection of half-spaces, as is the space between two heights. Each iteration adds the
     half-spaces where the curve is farthest outside to a quadratic program over the free derivatives, until the curve
     stays inside (cutting planes, Kelley 1960). The program finds the point of least distance in the metric of the cost,
     which reduces to non-negative least squares (Lawson and Hanson, *Solving Least Squares Problems*, 1974, section
@@ -47,7 +47,7 @@ def fill_in_corridors(
 
     Raises:
         OutsideError: If fixed derivatives lead out of the corridor or beyond a height, or if the curve is still outside
-            after ``MAX_ITERATIONS`` rounds.
+            after ``MAX_ITERATIONS`` iterations.
     """
     unit = float(np.mean(durations))
     powers = unit ** np.arange(nodes.shape[1])[:, None]
@@ -63,9 +63,9 @@ def fill_in_corridors(
 
         piece, u = _maxima(lambda piece, u: deviation(piece, u)[2], 0.5 * radii)
         outside, nearest, distance = deviation(piece, u)
-        leaves = distance > limit[piece]
-        piece, normal = piece[leaves], outside[leaves] / distance[leaves, None]
-        cuts = [(piece, u[leaves], normal, np.sum(normal * nearest[leaves], axis=-1) + inner[piece])]
+        is_outside = distance > limit[piece]
+        piece, normal = piece[is_outside], outside[is_outside] / distance[is_outside, None]
+        cuts = [(piece, u[is_outside], normal, np.sum(normal * nearest[is_outside], axis=-1) + inner[piece])]
         cuts += [_height_half_spaces(paths[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)]
         piece, u, normal, reach = (np.concatenate(parts) for parts in zip(*cuts, strict=True))
         if not len(piece):
@@ -73,7 +73,7 @@ def fill_in_corridors(
         program.add(piece, u, normal, reach)
         filled = program.solve()
     raise OutsideError(
-        f"expected a curve inside its corridors and heights after {MAX_ITERATIONS} rounds, got one whose piece "
+        f"expected a curve inside its corridors and heights after {MAX_ITERATIONS} iterations, got one whose piece "
         f"{piece[0]} is not. Make the corridor wider, or add a waypoint."
     )
 
@@ -96,9 +96,9 @@ def _height_half_spaces(heights: Floats, limit: float, sign: int) -> tuple[np.nd
         )
 
     piece, u = _maxima(excess, np.full(len(heights), -np.inf if np.isfinite(limit) else np.inf))
-    beyond = excess(piece, u) > HEIGHT_TOLERANCE
-    n = int(np.sum(beyond))
-    return piece[beyond], u[beyond], np.tile([0.0, 0.0, float(sign)], (n, 1)), np.full(n, sign * limit)
+    is_beyond = excess(piece, u) > HEIGHT_TOLERANCE
+    n = int(np.sum(is_beyond))
+    return piece[is_beyond], u[is_beyond], np.tile([0.0, 0.0, float(sign)], (n, 1)), np.full(n, sign * limit)
 
 
 def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Vectors:
@@ -113,30 +113,32 @@ def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Vectors:
     Returns:
         (n, 3) or (n, n_times, 3), twice, and the same without the last axis.
     """
-    u, along = np.asarray(u), end - start
+    u, segment = np.asarray(u), end - start
     shape = (len(u), *[1] * (u.ndim - 1), 3)
-    start, along = start.reshape(shape), along.reshape(shape)
+    start, segment = start.reshape(shape), segment.reshape(shape)
     pos = np.einsum("n...k,nak->n...a", u[..., None] ** np.arange(paths.shape[-1]), paths)
-    square = np.sum(along**2, axis=-1)
-    part = np.sum((pos - start) * along, axis=-1) / np.where(square > 0, square, 1.0)
-    nearest = start + np.clip(part, 0.0, 1.0)[..., None] * along
+    square = np.sum(segment**2, axis=-1)
+    segment_fraction = np.sum((pos - start) * segment, axis=-1) / np.where(square > 0, square, 1.0)
+    nearest = start + np.clip(segment_fraction, 0.0, 1.0)[..., None] * segment
     return pos - nearest, nearest, np.linalg.norm(pos - nearest, axis=-1)
 
 
-def _maxima(value: Callable[[np.ndarray, Floats], Floats], least: Floats) -> tuple[np.ndarray, Floats]:
+def _maxima(value: Callable[[np.ndarray, Floats], Floats], thresholds: Floats) -> tuple[np.ndarray, Floats]:
     """Return pieces, and times within them, of the local maxima of a quantity along curves. (n,) each
 
     Args:
         value: Function from pieces (n,) and times within them (n, n_times) to the quantity (n, n_times).
-        least: Value of each piece below which maxima do not count. (n_pieces,)
+        thresholds: Value of each piece below which maxima do not count. (n_pieces,)
     """
     samples = np.linspace(0.0, 1.0, N_SAMPLES)
-    along = value(np.arange(len(least)), np.broadcast_to(samples, (len(least), N_SAMPLES)))
-    padded = np.pad(along, ((0, 0), (1, 1)), constant_values=-np.inf)
-    is_peak = (along >= padded[:, :-2]) & (along >= padded[:, 2:]) & (along > least[:, None])
-    piece, at = np.nonzero(is_peak)
-    around = np.clip(samples[at][:, None] + (2 * samples - 1) / (N_SAMPLES - 1), 0.0, 1.0)
-    return piece, around[np.arange(len(piece)), np.argmax(value(piece, around), axis=-1)]
+    sampled_values = value(np.arange(len(thresholds)), np.broadcast_to(samples, (len(thresholds), N_SAMPLES)))
+    padded = np.pad(sampled_values, ((0, 0), (1, 1)), constant_values=-np.inf)
+    is_peak = (
+        (sampled_values >= padded[:, :-2]) & (sampled_values >= padded[:, 2:]) & (sampled_values > thresholds[:, None])
+    )
+    piece, sample = np.nonzero(is_peak)
+    fine_times = np.clip(samples[sample][:, None] + (2 * samples - 1) / (N_SAMPLES - 1), 0.0, 1.0)
+    return piece, fine_times[np.arange(len(piece)), np.argmax(value(piece, fine_times), axis=-1)]
 
 
 class _Program:

@@ -72,7 +72,7 @@ def lissajous(
                                                   (amplitudes, frequencies, phases, center), strict=True))  # fmt: skip
     if np.any(k != np.round(k)):
         raise ConfigError(f"expected frequencies as whole numbers, got {frequencies!r}")
-    w = 2 * np.pi / _period(period, speed, 2 * np.pi * float(np.linalg.norm(a * k)))
+    w = 2 * np.pi / _resolve_period(period, speed, 2 * np.pi * float(np.linalg.norm(a * k)))
 
     def curve(t: np.ndarray, order: int) -> np.ndarray:
         pos = a * (k * w) ** order * np.sin(k * w * t[:, None] + phi + order * np.pi / 2)
@@ -123,12 +123,12 @@ def helix(
     require_positive("turns", turns)
     lengths = {"radius": radius, "climb": climb, "height": height}
     radius, climb, height = (float(require_vector(name, x, ())) for name, x in lengths.items())
-    w = 2 * np.pi / _period(period, speed, math.hypot(2 * np.pi * radius, climb))
+    w = 2 * np.pi / _resolve_period(period, speed, math.hypot(2 * np.pi * radius, climb))
 
     def curve(t: np.ndarray, order: int) -> np.ndarray:
         angle = w * t + order * np.pi / 2
-        line = (w * t if order == 0 else np.full_like(t, w)) if order < 2 else np.zeros_like(t)
-        z, yaw = climb / (2 * np.pi) * line + (height if order == 0 else 0.0), line * along
+        progress = (w * t if order == 0 else np.full_like(t, w)) if order < 2 else np.zeros_like(t)
+        z, yaw = climb / (2 * np.pi) * progress + (height if order == 0 else 0.0), progress * along
         yaw = yaw + np.pi / 2 * (along and order == 0)
         return np.stack([radius * w**order * np.cos(angle), radius * w**order * np.sin(angle), z, yaw], axis=-1)
 
@@ -150,7 +150,7 @@ def line(
     a, b = require_vector("start", start), require_vector("end", end)
     # u^4 (35 - 84 u + 70 u^2 - 20 u^3) goes from 0 to 1, with three derivatives equal to zero at both ends. Its slope
     # is at most 140 (1/2)^6 = 35/16.
-    time = _period(duration, speed, 35 / 16 * float(np.linalg.norm(b - a)), "duration")
+    time = _resolve_period(duration, speed, 35 / 16 * float(np.linalg.norm(b - a)), "duration")
     c = np.zeros((1, 4, 8))
     c[0, :3] = np.outer(b - a, [0, 0, 0, 0, 35, -84, 70, -20]) / time ** np.arange(8)
     c[0, :, 0] = [*a, require_vector("yaw", yaw, ())]
@@ -165,40 +165,46 @@ def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 
         yaw: Yaw, rad.
         duration: Duration, s, after which a trajectory appended with ``then`` starts.
     """
-    _period(duration, None, 0.0, "duration")
+    _resolve_period(duration, None, 0.0, "duration")
     return Trajectory.of_pieces(
         [duration], np.append(require_vector("pos", pos), require_vector("yaw", yaw, ()))[None, :, None]
     )
 
 
-def fit_curve(curve: Curve, duration: float, eighth: float, repeats: bool = False) -> Trajectory:
+def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repeats: bool = False) -> Trajectory:
     """Return a smooth curve as a trajectory of pieces of equal length, each within ``TOLERANCE``.
 
     Args:
         curve: The curve with its derivatives up to the third.
         duration: Length of the curve, s.
-        eighth: Upper bound of the eighth derivative of the curve, m/s^8.
+        max_eighth_derivative: Upper bound of the eighth derivative of the curve, m/s^8.
         repeats: True to start again after the end.
     """
-    longest = 2 * (TOLERANCE * math.factorial(8) / eighth) ** (1 / 8) if eighth > 0 else math.inf
-    if duration / longest > MAX_PIECES:
+    max_piece_duration = (
+        2 * (TOLERANCE * math.factorial(8) / max_eighth_derivative) ** (1 / 8)
+        if max_eighth_derivative > 0
+        else math.inf
+    )
+    if duration / max_piece_duration > MAX_PIECES:
         raise ConfigError(
             f"expected a curve of at most {MAX_PIECES} polynomials within {TOLERANCE * 1e6:g} um, got one of "
-            f"{duration / longest:.3g}. Use fewer turns or lower frequencies, or a smaller size."
+            f"{duration / max_piece_duration:.3g}. Use fewer turns or lower frequencies, or a smaller size."
         )
-    n = max(1, math.ceil(duration / longest))
+    n = max(1, math.ceil(duration / max_piece_duration))
     h = duration / n
     knots = np.linspace(0.0, duration, n + 1)
     # Derivatives with respect to u = t / h, divided by k!: at the start they are the first four coefficients, at the
     # end they give four conditions for the others.
     at_knots = np.stack([curve(knots, k) * h**k / math.factorial(k) for k in range(4)], axis=-1)
     binomials = np.array([[math.comb(j, k) for j in range(8)] for k in range(4)], float)
-    rest = at_knots[1:] - at_knots[:-1] @ binomials[:, :4].T
-    coefficients = np.concatenate([at_knots[:-1], np.linalg.solve(binomials[:, 4:], rest[..., None])[..., 0]], axis=-1)
+    end_residuals = at_knots[1:] - at_knots[:-1] @ binomials[:, :4].T
+    coefficients = np.concatenate(
+        [at_knots[:-1], np.linalg.solve(binomials[:, 4:], end_residuals[..., None])[..., 0]], axis=-1
+    )
     return Trajectory.of_pieces(np.full(n, h), coefficients / h ** np.arange(8), repeats)
 
 
-def _period(period: float | None, speed: float | None, length: float, name: str = "period") -> float:
+def _resolve_period(period: float | None, speed: float | None, length: float, name: str = "period") -> float:
     """Return the period, s: the given one, the default, or ``length`` over ``speed``, where ``length`` is in m."""
     if period is not None and speed is not None:
         raise ConfigError(f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.")

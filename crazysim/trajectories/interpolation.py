@@ -111,16 +111,22 @@ def _fill_axis(nodes: Floats, blocks: Floats) -> Floats:
     is_free = np.isnan(values)
     if not np.any(is_free):
         return nodes
-    number = np.cumsum(is_free) - 1
-    at = order * np.arange(len(blocks))[:, None] + np.arange(2 * order)
-    rows, columns = np.broadcast_arrays(at[:, :, None], at[:, None, :])
-    lower = is_free[rows] & is_free[columns] & (rows >= columns)
-    known = is_free[rows] & ~is_free[columns]
+    free_index = np.cumsum(is_free) - 1
+    node_entries = order * np.arange(len(blocks))[:, None] + np.arange(2 * order)
+    rows, columns = np.broadcast_arrays(node_entries[:, :, None], node_entries[:, None, :])
+    is_lower_free = is_free[rows] & is_free[columns] & (rows >= columns)
+    is_fixed_column = is_free[rows] & ~is_free[columns]
     matrix = np.zeros((2 * order, int(np.sum(is_free))))  # lower diagonals
-    np.add.at(matrix, (number[rows[lower]] - number[columns[lower]], number[columns[lower]]), blocks[lower])
-    right = np.zeros(matrix.shape[1])
-    np.add.at(right, number[rows[known]], -blocks[known] * values[columns[known]])
-    values[is_free] = solveh_banded(matrix[: min(2 * order, len(right))], right, lower=True)
+    np.add.at(
+        matrix,
+        (free_index[rows[is_lower_free]] - free_index[columns[is_lower_free]], free_index[columns[is_lower_free]]),
+        blocks[is_lower_free],
+    )
+    right_side = np.zeros(matrix.shape[1])
+    np.add.at(
+        right_side, free_index[rows[is_fixed_column]], -blocks[is_fixed_column] * values[columns[is_fixed_column]]
+    )
+    values[is_free] = solveh_banded(matrix[: min(2 * order, len(right_side))], right_side, lower=True)
     return values.reshape(nodes.shape)
 
 

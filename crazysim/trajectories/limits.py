@@ -185,14 +185,14 @@ def check(
         names: Names of the drones for the report; None for their numbers.
         tolerance: Largest error of a distance, m.
     """
-    several = trajectories.unstacked() if isinstance(trajectories, Trajectory) else list(trajectories)
-    if len(several) == 1 and np.ndim(starts) == 1:
-        several *= np.size(starts)
-    table = PieceTable.of(several, starts, duration)
-    labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(several)))
-    if len(labels) != len(several):
+    flights = trajectories.unstacked() if isinstance(trajectories, Trajectory) else list(trajectories)
+    if len(flights) == 1 and np.ndim(starts) == 1:
+        flights *= np.size(starts)
+    table = PieceTable.create(flights, starts, duration)
+    labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(flights)))
+    if len(labels) != len(flights):
         raise ConfigError(
-            f"expected {len(several)} names, one for each drone, got {len(labels)}. Pass one name per trajectory."
+            f"expected {len(flights)} names, one for each drone, got {len(labels)}. Pass one name per trajectory."
         )
     if not 0 < tolerance < np.inf:
         raise ConfigError(f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3.")
@@ -210,6 +210,6 @@ def check(
     separation = allowed.get("separation", 0.0)
     for pair in closest:
         if pair.distance < separation * (1 - LIMIT_TOLERANCE):
-            who = tuple(labels[k] for k in pair.drones)
-            violations.append(Violation("separation", pair.drones, pair.time, pair.distance, separation, who))
+            pair_names = tuple(labels[k] for k in pair.drones)
+            violations.append(Violation("separation", pair.drones, pair.time, pair.distance, separation, pair_names))
     return Report(tuple(violations), closest, extremes, labels, table.duration)

@@ -50,8 +50,8 @@ def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:
     """Return the size of the angular velocity of a drone that flies these derivatives exactly."""
     columns = (_specific_thrust(acc), jerk[..., :3], pos[..., 3:], vel[..., 3:])
     rows = np.concatenate(columns, axis=-1).reshape(-1, 8)
-    few, many = BATCH_SIZES
-    chunk = few if len(rows) <= few else many
+    small_batch, large_batch = BATCH_SIZES
+    chunk = small_batch if len(rows) <= small_batch else large_batch
     padded = np.zeros((-(-len(rows) // chunk) * chunk, 8))
     padded[: len(rows)] = rows
     with jax.enable_x64(True):
@@ -112,27 +112,27 @@ def _peak(table: PieceTable, quantity: Quantity) -> Peak:
     u = np.linspace(0.0, 1.0, N_INTERVALS + 1)
     powers = u ** np.arange(table.coefficients.shape[-1])[:, None]
 
-    def sampled(part: slice) -> Floats:
+    def sample_pieces(part: slice) -> Floats:
         derivatives = [table.coefficients_of(k)[part] for k in quantity.orders]
         values = [np.swapaxes(c @ powers[: c.shape[-1]], 1, 2) for c in derivatives]
         return quantity.sign * quantity.compute(*values)
 
     samples = np.concatenate(
-        [sampled(slice(k, k + PIECES_PER_BATCH)) for k in range(0, len(table.drone), PIECES_PER_BATCH)]
+        [sample_pieces(slice(k, k + PIECES_PER_BATCH)) for k in range(0, len(table.drone), PIECES_PER_BATCH)]
     )
-    high = np.maximum.reduceat(samples.max(axis=1), table.first)
-    low = np.minimum.reduceat(samples.min(axis=1), table.first)
-    piece, at = _candidates(samples, (high - REFINED_PART * (high - low))[table.drone])
+    high = np.maximum.reduceat(samples.max(axis=1), table.first_pieces)
+    low = np.minimum.reduceat(samples.min(axis=1), table.first_pieces)
+    piece, sample = _candidates(samples, (high - REFINED_PART * (high - low))[table.drone])
 
     def value(u: Floats) -> Floats:
-        return quantity.sign * quantity.compute(*(table.within(piece, u, k) for k in quantity.orders))
+        return quantity.sign * quantity.compute(*(table.evaluate_pieces(piece, u, k) for k in quantity.orders))
 
-    refined, where = _golden_sections(value, np.maximum(u[at] - u[1], 0.0), np.minimum(u[at] + u[1], 1.0))
-    is_better = refined > samples[piece, at]
-    best, where = np.where(is_better, refined, samples[piece, at]), np.where(is_better, where, u[at])
+    refined, best_u = _golden_sections(value, np.maximum(u[sample] - u[1], 0.0), np.minimum(u[sample] + u[1], 1.0))
+    is_better = refined > samples[piece, sample]
+    best, best_u = np.where(is_better, refined, samples[piece, sample]), np.where(is_better, best_u, u[sample])
     order = np.lexsort((-best, table.drone[piece]))
     first = order[np.searchsorted(table.drone[piece][order], np.arange(table.n_drones))]
-    time = table.start[piece] + where * table.length[piece]
+    time = table.start[piece] + best_u * table.length[piece]
     return Peak(quantity.sign * best[first], time[first])
 
 
@@ -151,8 +151,8 @@ def _golden_sections(function: Callable[[Floats], Floats], low: Floats, high: Fl
     for _ in range(N_SECTIONS):
         goes_left = at_left > at_right
         low, high = np.where(goes_left, low, left), np.where(goes_left, right, high)
-        new = np.where(goes_left, high - ratio * (high - low), low + ratio * (high - low))
-        at_new = function(new)
-        left, right = np.where(goes_left, new, right), np.where(goes_left, left, new)
-        at_left, at_right = np.where(goes_left, at_new, at_right), np.where(goes_left, at_left, at_new)
+        probe = np.where(goes_left, high - ratio * (high - low), low + ratio * (high - low))
+        at_probe = function(probe)
+        left, right = np.where(goes_left, probe, right), np.where(goes_left, left, probe)
+        at_left, at_right = np.where(goes_left, at_probe, at_right), np.where(goes_left, at_left, at_probe)
     return np.where(at_left > at_right, at_left, at_right), np.where(at_left > at_right, left, right)

@@ -34,7 +34,9 @@ class PieceTable:
     """Coefficients of x, y, z, m, and yaw, rad, in a piece's time divided by its length. (n_pieces, 4, degree + 1)"""
 
     @staticmethod
-    def of(trajectories: Sequence[Trajectory], starts: ArrayLike = 0.0, duration: float | None = None) -> PieceTable:
+    def create(
+        trajectories: Sequence[Trajectory], starts: ArrayLike = 0.0, duration: float | None = None
+    ) -> PieceTable:
         """Return the pieces of trajectories, with pieces at rest before their start and after their end.
 
         Args:
@@ -67,7 +69,7 @@ class PieceTable:
         return int(self.drone[-1]) + 1
 
     @functools.cached_property
-    def first(self) -> Ints:
+    def first_pieces(self) -> Ints:
         """First piece of each drone. (n_drones,)"""
         return np.searchsorted(self.drone, np.arange(self.n_drones))
 
@@ -90,13 +92,13 @@ class PieceTable:
         """Return the coefficients of a derivative, up to snap. (n_pieces, 4, degree + 1 - order)"""
         return self._derivatives[order]
 
-    def piece(self, drone: Ints, t: NDArray) -> Ints:
+    def find_pieces(self, drone: Ints, t: NDArray) -> Ints:
         """Return the piece that contains each drone's time; where two meet, the later one. (...)"""
         t = np.clip(t, 0.0, self.duration)
         index = np.searchsorted(self._keys, np.asarray(drone) * (self.duration + 1) + t, side="right") - 1
-        return np.maximum(index, self.first[drone])
+        return np.maximum(index, self.first_pieces[drone])
 
-    def within(self, piece: Ints, u: Floats, order: int = 0) -> Floats:
+    def evaluate_pieces(self, piece: Ints, u: Floats, order: int = 0) -> Floats:
         """Return a derivative of x, y, z and yaw at times within pieces.
 
         Args:
@@ -113,33 +115,33 @@ class PieceTable:
             value = value * u[..., None] + c[..., k]
         return value
 
-    def at(self, drone: Ints, t: NDArray, order: int = 0) -> Floats:
+    def evaluate(self, drone: Ints, t: NDArray, order: int = 0) -> Floats:
         """Return a derivative of x, y, z and yaw of drones at times. (...) -> (..., 4)"""
-        piece = self.piece(drone, t)
-        return self.within(piece, (t - self.start[piece]) / self.length[piece], order)
+        piece = self.find_pieces(drone, t)
+        return self.evaluate_pieces(piece, (t - self.start[piece]) / self.length[piece], order)
 
 
 def _pieces(t: Trajectory, start: float, duration: float, size: int) -> tuple[Floats, Floats, Floats]:
     """Return starts, lengths and coefficients of the pieces of one trajectory up to a duration."""
     ends = np.asarray(t.ends, float)
     starts = np.concatenate([[0.0], ends[:-1]])
-    real = ends > starts  # others are padding
-    starts, lengths = starts[real], (ends - starts)[real]
+    has_length = ends > starts  # others are padding
+    starts, lengths = starts[has_length], (ends - starts)[has_length]
     c = np.zeros((len(starts), 4, size))
-    c[..., : t.coefficients.shape[-1]] = t.coefficients[real]
+    c[..., : t.coefficients.shape[-1]] = t.coefficients[has_length]
     period = ends[-1]
     if t.repeats:
         start -= period * max(0.0, np.floor(-start / period))  # rounds that have ended before time zero
     n_rounds = max(1, int(np.ceil((duration - start) / period - 1e-9))) if t.repeats else 1
     starts = (start + period * np.arange(n_rounds)[:, None] + starts).ravel()
-    begun = _cut_at_zero(starts, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))
-    parts = [begun]
+    after_zero = _cut_at_zero(starts, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))
+    parts = [after_zero]
     first, last = c[0, :, :1], c[-1].sum(axis=-1, keepdims=True)
     end = max(start + period * n_rounds, 0.0)
     if start > 0:
-        parts.insert(0, _rest_piece(0.0, start, first, size))
+        parts.insert(0, _resting_piece(0.0, start, first, size))
     if end < duration:
-        parts.append(_rest_piece(end, duration - end, last, size))
+        parts.append(_resting_piece(end, duration - end, last, size))
     starts, lengths, c = (np.concatenate(x) for x in zip(*parts, strict=True))
     inside = starts < duration
     return starts[inside], lengths[inside], c[inside]
@@ -147,14 +149,14 @@ def _pieces(t: Trajectory, start: float, duration: float, size: int) -> tuple[Fl
 
 def _cut_at_zero(starts: Floats, lengths: Floats, c: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the pieces that end after time zero; the first one is cut there."""
-    later = starts + lengths > 0
-    starts, lengths, c = starts[later], lengths[later], c[later]
+    ends_after_zero = starts + lengths > 0
+    starts, lengths, c = starts[ends_after_zero], lengths[ends_after_zero], c[ends_after_zero]
     if len(starts) and starts[0] < 0:
         c[0] = restrict_interval(c[0], -starts[0] / lengths[0], 1.0)
         lengths[0], starts[0] = lengths[0] + starts[0], 0.0
     return starts, lengths, c
 
 
-def _rest_piece(start: float, length: float, at: Floats, size: int) -> tuple[Floats, Floats, Floats]:
+def _resting_piece(start: float, length: float, pose: Floats, size: int) -> tuple[Floats, Floats, Floats]:
     """Return a piece that stays at one position and yaw, (4, 1)."""
-    return np.array([start]), np.array([length]), np.pad(at, ((0, 0), (0, size - 1)))[None]
+    return np.array([start]), np.array([length]), np.pad(pose, ((0, 0), (0, size - 1)))[None]

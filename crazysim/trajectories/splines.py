@@ -34,23 +34,25 @@ def spline(
     """
     if degree not in SPLINE_ORDERS:
         raise ConfigError(f"expected a spline of degree 3, 5 or 7, got {degree!r}. Use spline(times, points, 7).")
-    at, x = np.asarray(times, float), np.asarray(points, float)
-    if at.ndim != 1 or x.shape != (len(at), 3):
+    knots, x = np.asarray(times, float), np.asarray(points, float)
+    if knots.ndim != 1 or x.shape != (len(knots), 3):
         raise ConfigError(
-            f"expected times (n_points,) and points (n_points, 3), got shapes {at.shape} and {x.shape}. Pass one "
+            f"expected times (n_points,) and points (n_points, 3), got shapes {knots.shape} and {x.shape}. Pass one "
             "time per point."
         )
-    least = 2 if at_rest else SPLINE_ORDERS[degree]
-    if len(at) < least:
+    n_min = 2 if at_rest else SPLINE_ORDERS[degree]
+    if len(knots) < n_min:
         raise ConfigError(
-            f"expected at least {least} points for a spline of degree {degree}, got {len(at)}. Add points, or lower "
+            f"expected at least {n_min} points for a spline of degree {degree}, got {len(knots)}. Add points, or lower "
             "the degree."
         )
-    durations = np.diff(at)
-    if not np.all(np.isfinite(at)) or not np.all(durations > 0):
-        raise ConfigError(f"expected finite, ascending times, got {at.tolist()}. Remove points that share their time.")
-    nodes = np.full((len(at), SPLINE_ORDERS[degree], 4), np.nan)
-    nodes[:, 0] = np.concatenate([require_finite(x, "points"), unwrap_yaw(yaw, len(at))[:, None]], axis=1)
+    durations = np.diff(knots)
+    if not np.all(np.isfinite(knots)) or not np.all(durations > 0):
+        raise ConfigError(
+            f"expected finite, ascending times, got {knots.tolist()}. Remove points that share their time."
+        )
+    nodes = np.full((len(knots), SPLINE_ORDERS[degree], 4), np.nan)
+    nodes[:, 0] = np.concatenate([require_finite(x, "points"), unwrap_yaw(yaw, len(knots))[:, None]], axis=1)
     if at_rest:
         nodes[[0, -1], 1:] = 0.0
     filled = interpolation.fill_derivatives(nodes, durations)
@@ -68,13 +70,13 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
             rad, in all curves or in none. The degrees may differ. n_pieces times (degree + 1, 3) or (degree + 1, 4)
         repeats: True to start again after the end.
     """
-    at = np.asarray(ends, float)
+    end_times = np.asarray(ends, float)
     curves = [np.asarray(points, float) for points in control_points]
     shapes = [curve.shape for curve in curves]
-    if at.shape != (len(curves),) or not curves:
+    if end_times.shape != (len(curves),) or not curves:
         raise ConfigError(
-            f"expected ends (n_pieces,) for {len(curves)} curves, at least one, got shape {at.shape}. Pass the time "
-            "at which each ends."
+            f"expected ends (n_pieces,) for {len(curves)} curves, at least one, got shape {end_times.shape}. Pass the "
+            "time at which each ends."
         )
     is_curve = [len(shape) == 2 and shape[0] > 0 and shape[1] in (3, 4) for shape in shapes]
     if not all(is_curve) or len({shape[1] for shape in shapes}) != 1:
@@ -82,10 +84,10 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
             f"expected control points (degree + 1, 3) for all curves or (degree + 1, 4) for all, got {shapes}. Give "
             "all curves a yaw, or none."
         )
-    durations = np.diff(at, prepend=0.0)
-    if not np.all(np.isfinite(at)) or not np.all(durations > 0):
+    durations = np.diff(end_times, prepend=0.0)
+    if not np.all(np.isfinite(end_times)) or not np.all(durations > 0):
         raise ConfigError(
-            f"expected finite, positive, ascending ends, got {at.tolist()}. Remove curves without length."
+            f"expected finite, positive, ascending ends, got {end_times.tolist()}. Remove curves without length."
         )
     degree = max(len(curve) for curve in curves) - 1
     pieces = [

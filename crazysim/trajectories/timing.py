@@ -51,12 +51,12 @@ def best_ratios(nodes: Floats, durations: Floats) -> Floats:
 
     total = float(np.sum(durations))
 
-    def of(ratios: Floats) -> Floats:
+    def durations_of(ratios: Floats) -> Floats:
         weights = np.exp(ratios - np.max(ratios))
         return total * weights / np.sum(weights)
 
     def logarithm_of_cost(ratios: Floats) -> tuple[float, Floats]:
-        lengths = of(ratios)
+        lengths = durations_of(ratios)
         filled = interpolation.fill_derivatives(nodes, lengths)
         cost = interpolation.derivative_cost(filled, lengths)
         slope = interpolation.cost_gradient(filled, lengths) * lengths
@@ -65,7 +65,7 @@ def best_ratios(nodes: Floats, durations: Floats) -> Floats:
     if len(durations) == 1:
         return durations
     result = minimize(logarithm_of_cost, np.log(durations / total), jac=True, method="L-BFGS-B")
-    return of(result.x)
+    return durations_of(result.x)
 
 
 def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> list[str]:
@@ -102,7 +102,7 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
         ConfigError: If the limits cannot be met however slow the flight, or do not bound its speed.
     """
 
-    def excess(factor: float) -> list[str]:
+    def exceeded_limits(factor: float) -> list[str]:
         try:
             return violated_limits(durations * factor, solve(durations * factor), limits)
         except OutsideError:  # fixed velocities lead out at this speed
@@ -110,7 +110,7 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
 
     high = 1.0
     for _ in range(N_STEPS):
-        names = excess(high)
+        names = exceeded_limits(high)
         if not names:
             break
         high *= DURATION_FACTOR
@@ -121,7 +121,7 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
         )
     low = high / DURATION_FACTOR
     for _ in range(N_STEPS):
-        if excess(low):
+        if exceeded_limits(low):
             break
         low, high = low / DURATION_FACTOR, low
     else:
@@ -131,5 +131,5 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
         )
     while high > low * (1 + PRECISION):
         middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if excess(middle) else (low, middle)
+        low, high = (middle, high) if exceeded_limits(middle) else (low, middle)
     return durations * high

@@ -118,18 +118,18 @@ def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Traje
         * powers[:, None]
         * (lengths ** (1 - 2 * k))[..., None]
     )
-    at = k * np.arange(n_pieces)[:, None] + np.arange(2 * k)
+    entries = k * np.arange(n_pieces)[:, None] + np.arange(2 * k)
     size = k * (n_pieces + 1)
-    matrix = jnp.zeros((size, size), dtype).at[at[:, :, None], at[:, None, :]].add(scaled)
+    matrix = jnp.zeros((size, size), dtype).at[entries[:, :, None], entries[:, None, :]].add(scaled)
 
     position, inner = np.arange(0, size, k), np.setdiff1d(np.arange(k, size - k), np.arange(0, size, k))
     values = jnp.zeros((size, 3), dtype).at[position].set(waypoints)
     block = matrix[inner[:, None], inner]
     weight = 1 / jnp.sqrt(jnp.diagonal(block))[:, None]  # to a diagonal of ones
-    right = -matrix[inner[:, None], position] @ waypoints
-    values = values.at[inner].set(weight * jnp.linalg.solve(weight * block * weight.T, weight * right))
+    right_side = -matrix[inner[:, None], position] @ waypoints
+    values = values.at[inner].set(weight * jnp.linalg.solve(weight * block * weight.T, weight * right_side))
 
-    ends = values[at]  # (n_pieces, 2k, 3)
+    ends = values[entries]  # (n_pieces, 2k, 3)
     cost = jnp.sum(ends * jnp.einsum("pij,pja->pia", scaled, ends)) * unit ** (1 - 2 * k)
     paths = jnp.einsum("cj,pj,pja->pac", jnp.asarray(interpolation.hermite_basis(k), dtype), powers, ends)
     coefficients = jnp.concatenate([paths, jnp.zeros_like(paths[:, :1])], axis=1)
@@ -161,8 +161,8 @@ def _plan(
                 f"waypoints, or fix the derivatives at the ends."
             ) from error
         paths = interpolation.unit_coefficients(filled, lengths)
-        turns = interpolation.unit_coefficients(interpolation.fill_derivatives(angles, lengths), lengths)
-        return np.concatenate([paths, interpolation.pad_degree(turns, paths.shape[-1] - 1)], axis=1)
+        yaw_paths = interpolation.unit_coefficients(interpolation.fill_derivatives(angles, lengths), lengths)
+        return np.concatenate([paths, interpolation.pad_degree(yaw_paths, paths.shape[-1] - 1)], axis=1)
 
     if durations is not None:
         lengths = _piece_durations(durations, n_pieces)
@@ -194,21 +194,22 @@ def _plan(
 
 def _nodes(waypoints: ArrayLike, fixed: Sequence[ArrayLike | None]) -> Floats:
     """Return the derivatives at each waypoint, NaN where free. (n, k, 3)"""
-    at = np.asarray(waypoints, float)
-    if at.ndim != 2 or at.shape[1] != 3 or len(at) < 2:
+    positions = np.asarray(waypoints, float)
+    if positions.ndim != 2 or positions.shape[1] != 3 or len(positions) < 2:
         raise ConfigError(
-            f"expected waypoints (n, 3), at least two, got shape {at.shape}. Pass an array with a row for each point."
+            f"expected waypoints (n, 3), at least two, got shape {positions.shape}. Pass an array with a row for each "
+            f"point."
         )
-    nodes = np.full((len(at), len(fixed) + 1, 3), np.nan)
-    nodes[:, 0] = require_finite(at, "waypoints")
+    nodes = np.full((len(positions), len(fixed) + 1, 3), np.nan)
+    nodes[:, 0] = require_finite(positions, "waypoints")
     for k, (name, values) in enumerate(zip(("velocities", "accelerations", "jerks"), fixed, strict=False), start=1):
         if values is None:
             nodes[[0, -1], k] = 0.0
             continue
         array = np.asarray(values, float)
-        if array.shape != at.shape or np.any(np.isinf(array)):
+        if array.shape != positions.shape or np.any(np.isinf(array)):
             raise ConfigError(
-                f"expected finite {name} {at.shape}, NaN where free, got shape {array.shape}. Pass one row per "
+                f"expected finite {name} {positions.shape}, NaN where free, got shape {array.shape}. Pass one row per "
                 "waypoint."
             )
         nodes[:, k] = array
@@ -229,9 +230,9 @@ def _heights(limits: Limits | None, heights: Floats) -> tuple[float, float]:
     bounds = -np.inf if low is None else low, np.inf if high is None else high
     for k, z in enumerate(heights):
         if not bounds[0] - HEIGHT_TOLERANCE <= z <= bounds[1] + HEIGHT_TOLERANCE:
-            beyond, name, limit = ("above", "floor", low) if z < bounds[0] else ("below", "height", high)
+            side, name, limit = ("above", "floor", low) if z < bounds[0] else ("below", "height", high)
             raise ConfigError(
-                f"expected waypoints {beyond} the {name} of {limit} m, got number {k} at {z:g} m. Move it, or set "
+                f"expected waypoints {side} the {name} of {limit} m, got number {k} at {z:g} m. Move it, or set "
                 f"Limits({name}=...)."
             )
     return bounds

@@ -327,7 +327,7 @@ class Place(Plugin):
     name: str = "place"
 
     def record(self, sim):
-        return self.filled(sim, PlaceData)
+        return self.fill_record(sim, PlaceData)
 
     def reset_episode(self, data):
         return self.write(data, PlaceData(data.states.pos + 0.0))

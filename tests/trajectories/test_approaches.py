@@ -20,7 +20,7 @@ def straight(begin, end, duration):
 
 def distances(table, i, j, times):
     return np.linalg.norm(
-        (table.at(np.full(len(times), i), times) - table.at(np.full(len(times), j), times))[:, :3], axis=-1
+        (table.evaluate(np.full(len(times), i), times) - table.evaluate(np.full(len(times), j), times))[:, :3], axis=-1
     )
 
 
@@ -31,7 +31,7 @@ def test_distances_are_those_of_dense_samples(seed, n_drones):
         spline(np.cumsum(rng.uniform(0.3, 2.0, n)), rng.normal(size=(n, 3)), rng.choice([3, 5, 7]))
         for n in rng.integers(2, 6, n_drones)
     ]
-    table = PieceTable.of(trajectories, rng.uniform(0, 3, n_drones))
+    table = PieceTable.create(trajectories, rng.uniform(0, 3, n_drones))
     found = closest_approaches(table, TOLERANCE)
     assert sorted(x.drones for x in found) == [(i, j) for i in range(n_drones) for j in range(i + 1, n_drones)]
     assert [x.distance for x in found] == sorted(x.distance for x in found)
@@ -45,7 +45,7 @@ def test_crossing_flights_by_hand():
     """They pass the crossing half a second apart, at 1 m/s and at right angles: sqrt(2) / 4 m."""
     one = straight([-5, 0, 1], [5, 0, 1], 10.0)
     other = straight([0, -5.5, 1], [0, 4.5, 1], 10.0)
-    (approach,) = closest_approaches(PieceTable.of([one, other]))
+    (approach,) = closest_approaches(PieceTable.create([one, other]))
     np.testing.assert_allclose(approach.distance, 0.5 / np.sqrt(2), atol=1e-3)
     np.testing.assert_allclose(approach.time, 5.25, atol=0.01)
 
@@ -55,7 +55,7 @@ def test_a_short_meeting_at_high_speed_is_found():
     wait, rush = straight([0, 0, 1], [0, 0, 1], 1800.123), straight([0, 0, 1], [20, 0, 1], 1.0)
     one = wait.then(rush).then(straight([20, 0, 1], [20, 0, 1], 1800.0))
     other = straight([20, 0.01, 1], [20, 0.01, 1], 1800.123).then(straight([20, 0.01, 1], [0, 0.01, 1], 1.0))
-    (approach,) = closest_approaches(PieceTable.of([one, other]))
+    (approach,) = closest_approaches(PieceTable.create([one, other]))
     np.testing.assert_allclose(approach.distance, 0.01, atol=1e-3)
     np.testing.assert_allclose(approach.time, 1800.623, atol=1e-3)
 
@@ -70,15 +70,15 @@ def test_a_dash_within_a_cell_is_found(smooth):
     home, away = np.array([0, 0, 1.0]), np.array([1, 0, 1.0])
     one = straight(home, home, 0.82).then(dash(home, away)).then(dash(away, home)).then(straight(home, home, 3.02))
     other = straight(away + [0.02, 0, 0], away + [0.02, 0, 0], 4.0)
-    (approach,) = closest_approaches(PieceTable.of([one, other]))
+    (approach,) = closest_approaches(PieceTable.create([one, other]))
     np.testing.assert_allclose(approach.distance, 0.02, atol=1e-3)
     np.testing.assert_allclose(approach.time, 0.9, atol=0.01)
 
 
 def test_starts_shift_the_meeting():
     flights = [straight([-5, 0, 1], [5, 0, 1], 10.0), straight([5, 0, 1], [-5, 0, 1], 10.0)]
-    (together,) = closest_approaches(PieceTable.of(flights))
-    (shifted,) = closest_approaches(PieceTable.of(flights, [0.0, 2.0]))
+    (together,) = closest_approaches(PieceTable.create(flights))
+    (shifted,) = closest_approaches(PieceTable.create(flights, [0.0, 2.0]))
     np.testing.assert_allclose([together.distance, shifted.distance], 0.0, atol=1e-3)
     np.testing.assert_allclose([together.time, shifted.time], [5.0, 6.0], atol=1e-2)
 
@@ -87,12 +87,12 @@ def test_a_jump_of_the_position_is_a_flight_through_nothing():
     """A drone that jumps past another never is between: the distances before and after it count."""
     jumps = straight([-2, 0, 0], [-2, 0, 0], 1.05).then(straight([1, 0, 0], [1, 0, 0], 1.0))
     stays = straight([0, 0, 0], [0, 0, 0], 2.05)
-    (approach,) = closest_approaches(PieceTable.of([jumps, stays]))
+    (approach,) = closest_approaches(PieceTable.create([jumps, stays]))
     np.testing.assert_allclose(approach.distance, 1.0, atol=1e-6)
 
 
 def test_one_drone_has_no_pairs():
-    assert closest_approaches(PieceTable.of([straight([0, 0, 0], [1, 0, 0], 1.0)])) == []
+    assert closest_approaches(PieceTable.create([straight([0, 0, 0], [1, 0, 0], 1.0)])) == []
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -101,7 +101,7 @@ def test_blocks_and_tables_do_not_change_the_result(table, seed, monkeypatch):
     from crazysim.trajectories import approaches
 
     rng = np.random.default_rng(seed)
-    pieces = PieceTable.of([spline(np.arange(4.0), rng.normal(size=(4, 3))) for _ in range(4)])
+    pieces = PieceTable.create([spline(np.arange(4.0), rng.normal(size=(4, 3))) for _ in range(4)])
     expected = closest_approaches(pieces)
     monkeypatch.setattr(approaches, "MAX_TABLE_CELLS", table)
     monkeypatch.setattr(approaches, "CELLS_PER_BATCH", 7)

@@ -29,31 +29,31 @@ def test_peaks_are_those_of_dense_samples(seed):
         spline(np.cumsum(rng.uniform(0.8, 2.0, n)), rng.normal(size=(n, 3)), rng.choice([3, 5, 7]), rng.normal(size=n))
         for n in rng.integers(2, 7, 3)
     ]
-    table = PieceTable.of(trajectories, rng.uniform(0, 2, 3))
+    table = PieceTable.create(trajectories, rng.uniform(0, 2, 3))
     found = peaks(table, [name for name in QUANTITIES if name != "body_rate"])
     times = np.linspace(0, table.duration, 20_001)[:-1]
     for name, peak in found.items():
         quantity = QUANTITIES[name]
         for k in range(3):
-            at = [table.at(np.full(len(times), k), times, order) for order in quantity.orders]
+            at = [table.evaluate(np.full(len(times), k), times, order) for order in quantity.orders]
             dense = np.max(quantity.sign * quantity.compute(*at))
             here = quantity.sign * peak.value[k]
             assert dense - 1e-7 * abs(dense) - 1e-12 <= here <= dense * (1 + 0.01 * np.sign(dense)) + 1e-6, name
             # Where pieces meet, the record has the derivatives of either side.
             near = peak.time[k] + np.array([-1e-6, 0.0, 1e-6])
-            at = [table.at(np.full(3, k), near, order) for order in quantity.orders]
+            at = [table.evaluate(np.full(3, k), near, order) for order in quantity.orders]
             assert np.min(np.abs(quantity.compute(*at) - peak.value[k])) < 1e-3 * (1 + abs(here)), name
 
 
 def test_body_rate_peaks_are_those_of_dense_samples():
     rng = np.random.default_rng(1)
-    table = PieceTable.of(
+    table = PieceTable.create(
         [spline(np.arange(5.0), 0.5 * rng.normal(size=(5, 3)), 7, rng.normal(size=5)) for _ in range(3)]
     )
     peak = peaks(table, ["body_rate"])["body_rate"]
     quantity, times = QUANTITIES["body_rate"], np.linspace(0, 4, 40_001)
     for k in range(3):
-        at = [table.at(np.full(len(times), k), times, order) for order in quantity.orders]
+        at = [table.evaluate(np.full(len(times), k), times, order) for order in quantity.orders]
         np.testing.assert_allclose(peak.value[k], np.max(quantity.compute(*at)), rtol=1e-6)
 
 

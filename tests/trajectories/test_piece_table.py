@@ -17,7 +17,7 @@ TRAJECTORIES = [
 ]
 TRAJECTORIES[1] = TRAJECTORIES[1].replace(repeats=np.bool_(True))
 STARTS = np.array([0.5, 0.0, 2.0])
-TABLE = PieceTable.of(TRAJECTORIES, STARTS, duration=12.0)
+TABLE = PieceTable.create(TRAJECTORIES, STARTS, duration=12.0)
 STACK = Trajectory.stack(TRAJECTORIES)
 evaluate = jax.jit(lambda k, t: STACK.evaluate_one(k, t))
 
@@ -25,41 +25,41 @@ evaluate = jax.jit(lambda k, t: STACK.evaluate_one(k, t))
 @given(drone=st.integers(0, 2), t=st.floats(0.01, 11.99))
 def test_it_evaluates_as_the_record_does(drone, t):
     setpoint = evaluate(drone, t - STARTS[drone])
-    np.testing.assert_allclose(TABLE.at(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
+    np.testing.assert_allclose(TABLE.evaluate(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
     end = STARTS[drone] + float(TRAJECTORIES[drone].duration)
     if abs(t - end) > 1e-3 and abs(t - STARTS[drone]) > 1e-3:  # there the derivatives jump
         for order, expected in enumerate((setpoint.vel, setpoint.acc, setpoint.jerk), start=1):
-            np.testing.assert_allclose(TABLE.at(drone, t, order)[:3], expected, atol=5e-3, rtol=1e-3)
+            np.testing.assert_allclose(TABLE.evaluate(drone, t, order)[:3], expected, atol=5e-3, rtol=1e-3)
 
 
 EARLY = np.array([-1.3, -7.7, -60.0])
-BEGUN = PieceTable.of(TRAJECTORIES, EARLY, duration=12.0)
+BEGUN = PieceTable.create(TRAJECTORIES, EARLY, duration=12.0)
 
 
 @given(drone=st.integers(0, 2), t=st.floats(0.0, 12.0))
 def test_drones_that_started_before_zero_are_in_the_middle(drone, t):
     """One that repeats is in one of its rounds, and one whose end is over rests there."""
     setpoint = evaluate(drone, t - EARLY[drone])
-    np.testing.assert_allclose(BEGUN.at(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
-    assert BEGUN.start[BEGUN.first].tolist() == [0.0, 0.0, 0.0]
+    np.testing.assert_allclose(BEGUN.evaluate(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
+    assert BEGUN.start[BEGUN.first_pieces].tolist() == [0.0, 0.0, 0.0]
     assert np.all(np.diff(BEGUN._keys) > 0)
 
 
 def test_many_at_once_are_those_one_by_one():
     drones, times = np.repeat([0, 1, 2], 7), np.tile(np.linspace(0, 12, 7), 3)
-    together = TABLE.at(drones, times, 1)
-    alone = [TABLE.at(int(d), float(t), 1) for d, t in zip(drones, times, strict=True)]
+    together = TABLE.evaluate(drones, times, 1)
+    alone = [TABLE.evaluate(int(d), float(t), 1) for d, t in zip(drones, times, strict=True)]
     np.testing.assert_array_equal(together, alone)
 
 
 def test_padding_has_no_pieces():
     padded = TRAJECTORIES[0].padded(9, 7)
-    assert len(PieceTable.of([padded]).start) == 3
+    assert len(PieceTable.create([padded]).start) == 3
 
 
 def test_the_default_duration_ends_with_the_last_drone():
     ends = [float(t.duration) + s for t, s in zip(TRAJECTORIES, STARTS, strict=True)]
-    assert PieceTable.of(TRAJECTORIES, STARTS).duration == max(ends)
+    assert PieceTable.create(TRAJECTORIES, STARTS).duration == max(ends)
 
 
 @pytest.mark.parametrize(
@@ -74,4 +74,4 @@ def test_the_default_duration_ends_with_the_last_drone():
 )
 def test_law_09_bad_fleets_are_errors(arguments, message):
     with pytest.raises(ConfigError, match=message):
-        PieceTable.of(*arguments)
+        PieceTable.create(*arguments)

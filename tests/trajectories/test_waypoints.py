@@ -93,10 +93,10 @@ def test_sixty_pieces_are_the_spline_of_scipy(method, x64):
     rest = [(k, np.zeros(3)) for k in range(1, order)]
     expected = make_interp_spline(at, waypoints, k=2 * order - 1, bc_type=(rest, rest))
     times = np.linspace(0, at[-1], 500)
-    table = PieceTable.of([method(waypoints, durations)])
+    table = PieceTable.create([method(waypoints, durations)])
     for k in range(3):
         values = expected.derivative(k)(times) if k else expected(times)
-        found = table.at(np.zeros(500, int), times, k)[:, :3]
+        found = table.evaluate(np.zeros(500, int), times, k)[:, :3]
         np.testing.assert_allclose(found, values, atol=1e-8 * np.abs(values).max())
 
 
@@ -119,10 +119,10 @@ def test_planned_flights_pass_the_waypoints_at_rest_within_tight_limits(method, 
     use = [report.peaks[name].value[0] / limit for name, limit in limits.as_dict().items()]
     assert max(use) > 0.999
     ends = np.concatenate([[0.0], trajectory.ends])
-    table = PieceTable.of([trajectory])
-    np.testing.assert_allclose(table.at(np.zeros(n, int), ends)[:, :3], waypoints, atol=1e-4)
+    table = PieceTable.create([trajectory])
+    np.testing.assert_allclose(table.evaluate(np.zeros(n, int), ends)[:, :3], waypoints, atol=1e-4)
     for order in (1, 2):
-        at_ends = table.at(np.zeros(2, int), ends[[0, -1]], order)[:, :3]
+        at_ends = table.evaluate(np.zeros(2, int), ends[[0, -1]], order)[:, :3]
         np.testing.assert_allclose(at_ends, 0.0, atol=1e-3 * max(limits.acceleration, limits.speed))
 
 
@@ -165,28 +165,28 @@ def test_fixed_derivatives_are_met_and_the_others_are_free():
     velocities[[0, -1]], velocities[2] = 0.0, [0.0, 1.0, 0.5]
     trajectory = minimum_snap(WAYPOINTS, limits=LIMITS, velocities=velocities)
     assert check(trajectory, LIMITS).ok
-    table, at = PieceTable.of([trajectory]), float(trajectory.ends[1])
-    np.testing.assert_allclose(table.at(0, at, 1)[:3], velocities[2], atol=1e-4)
+    table, at = PieceTable.create([trajectory]), float(trajectory.ends[1])
+    np.testing.assert_allclose(table.evaluate(0, at, 1)[:3], velocities[2], atol=1e-4)
     passing = minimum_snap(WAYPOINTS[:2], [1.0], velocities=[[1, 0, 0], [1, 0, 0]], jerks=np.full((2, 3), np.nan))
-    np.testing.assert_allclose(PieceTable.of([passing]).at(0, 1.0, 1)[:3], [1, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(PieceTable.create([passing]).evaluate(0, 1.0, 1)[:3], [1, 0, 0], atol=1e-5)
 
 
 def test_yaw_turns_the_shorter_way_and_ends_at_rest(x64):
     trajectory = minimum_snap(WAYPOINTS, DURATIONS, yaw=[3.0, -3.0, -2.0, 0.0, 1.0])
     expected = np.unwrap([3.0, -3.0, -2.0, 0.0, 1.0])
-    table, at = PieceTable.of([trajectory]), np.concatenate([[0], np.cumsum(DURATIONS)])
-    np.testing.assert_allclose(table.at(np.zeros(5, int), at)[:, 3], expected, atol=1e-9)
-    np.testing.assert_allclose(table.at(np.zeros(2, int), at[[0, -1]], 1)[:, 3], 0.0, atol=1e-9)
+    table, at = PieceTable.create([trajectory]), np.concatenate([[0], np.cumsum(DURATIONS)])
+    np.testing.assert_allclose(table.evaluate(np.zeros(5, int), at)[:, 3], expected, atol=1e-9)
+    np.testing.assert_allclose(table.evaluate(np.zeros(2, int), at[[0, -1]], 1)[:, 3], 0.0, atol=1e-9)
     rest = [(1, 0.0)]
     spline = make_interp_spline(at, expected, k=3, bc_type=(rest, rest))
-    np.testing.assert_allclose(table.at(0, 2.0)[3], spline(2.0), atol=1e-9)
+    np.testing.assert_allclose(table.evaluate(0, 2.0)[3], spline(2.0), atol=1e-9)
 
 
 def deviations(trajectory, waypoints):
     """Return the largest distance of each piece from its line segment, m."""
-    table, found = PieceTable.of([trajectory]), []
+    table, found = PieceTable.create([trajectory]), []
     for p, (a, b) in enumerate(pairwise(waypoints)):
-        pos = table.within(np.full(2001, p), np.linspace(0, 1, 2001))[:, :3]
+        pos = table.evaluate_pieces(np.full(2001, p), np.linspace(0, 1, 2001))[:, :3]
         part = np.clip((pos - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)
         found.append(np.linalg.norm(pos - a - part[:, None] * (b - a), axis=-1).max())
     return np.array(found)

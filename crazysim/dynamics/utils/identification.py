@@ -109,31 +109,31 @@ def fit_translation(
 
     kind = Dynamics(dynamics)
 
-    def solved(rate: float) -> tuple[float, NDArray, NDArray, NDArray]:
+    def solve_for_rate(rate: float) -> tuple[float, NDArray, NDArray, NDArray]:
         parts = [_terms(kind, mass, log, rate, gravity) for log in logs]
         terms, acc = (np.concatenate(x) for x in zip(*parts, strict=True))
         coefs = np.linalg.lstsq(terms.reshape(-1, terms.shape[-1]), acc.ravel(), rcond=None)[0]
-        rest = acc - terms @ coefs
-        return float(np.sum(rest**2)), coefs, terms, rest
+        residuals = acc - terms @ coefs
+        return float(np.sum(residuals**2)), coefs, terms, residuals
 
     rate = np.inf
     if kind != Dynamics.so_rpy:
         grid = np.geomspace(*RATE_RANGE, 31)
-        k = int(np.argmin([solved(x)[0] for x in grid]))
+        k = int(np.argmin([solve_for_rate(x)[0] for x in grid]))
         bounds = np.log(grid[[max(0, k - 1), min(len(grid) - 1, k + 1)]])
         result = minimize_scalar(
-            lambda x: solved(np.exp(x))[0], bounds=bounds, method="bounded", options={"xatol": 1e-7}
+            lambda x: solve_for_rate(np.exp(x))[0], bounds=bounds, method="bounded", options={"xatol": 1e-7}
         )
         rate = float(np.exp(result.x))
-    _, coefs, terms, rest = solved(rate)
+    _, coefs, terms, residuals = solve_for_rate(rate)
     names, values, jacobian = ["cmd_f_coef"], [coefs[0]], terms
     if kind != Dynamics.so_rpy:
         names, values = [*names, "thrust_dyn_coef"], [*values, rate]
-        slope = (solved(1.001 * rate)[2] - solved(rate / 1.001)[2]) @ coefs / (rate * 0.002)
-        jacobian = np.insert(jacobian, 1, slope, axis=-1)
+        rate_slopes = (solve_for_rate(1.001 * rate)[2] - solve_for_rate(rate / 1.001)[2]) @ coefs / (rate * 0.002)
+        jacobian = np.insert(jacobian, 1, rate_slopes, axis=-1)
     if kind == Dynamics.so_rpy_rotor_drag:
         names, values = [*names, "drag_xy_coef", "drag_z_coef"], [*values, *coefs[1:]]
-    deviations = _deviations(jacobian, rest, np.arange(len(rest)) * len(logs) * 10 // len(rest))
+    deviations = _deviations(jacobian, residuals, np.arange(len(residuals)) * len(logs) * 10 // len(residuals))
     return dict(zip(names, map(float, values), strict=True)), dict(zip(names, map(float, deviations), strict=True))
 
 
@@ -145,10 +145,10 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
     for axes in ([0, 1], [2]):
         data = [_angles(log, axes) for log in logs]
 
-        def rest(x: NDArray, data: list = data) -> NDArray:
+        def residuals(x: NDArray, data: list = data) -> NDArray:
             return np.concatenate([_rotation_error(x, *log) for log in data])
 
-        def slope(x: NDArray, data: list = data) -> NDArray:
+        def slopes(x: NDArray, data: list = data) -> NDArray:
             return np.concatenate([np.asarray(_rotation_slope(jnp.asarray(x), *log), np.float64) for log in data])
 
         # Angles, rates and accelerations satisfy the equation up to noise, so least squares give the first guess.
@@ -158,14 +158,14 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
         ]
         guess = np.linalg.lstsq(np.stack(columns[:3], -1), columns[3], rcond=None)[0]
         start = np.where(np.sign(guess) == [-1, -1, 1], guess, [-100.0, -20.0, 100.0])
-        error = lambda x, rest=rest: rest(x).ravel()  # noqa: E731
-        jacobian: Any = lambda x, slope=slope: -slope(x).reshape(-1, 3)  # noqa: E731
+        error = lambda x, residuals=residuals: residuals(x).ravel()  # noqa: E731
+        jacobian: Any = lambda x, slopes=slopes: -slopes(x).reshape(-1, 3)  # noqa: E731
         x = least_squares(error, start, jacobian, method="lm").x
-        groups.append((x, _deviations(slope(x), rest(x), _blocks(logs))))
-    (tilt, tilt_spread), (turn, turn_spread) = groups
+        groups.append((x, _deviations(slopes(x), residuals(x), _blocks(logs))))
+    (tilt, tilt_spread), (yaw, yaw_spread) = groups
     names = ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")
-    values = {name: np.array([tilt[k], tilt[k], turn[k]]) for k, name in enumerate(names)}
-    deviations = {name: np.array([tilt_spread[k], tilt_spread[k], turn_spread[k]]) for k, name in enumerate(names)}
+    values = {name: np.array([tilt[k], tilt[k], yaw[k]]) for k, name in enumerate(names)}
+    deviations = {name: np.array([tilt_spread[k], tilt_spread[k], yaw_spread[k]]) for k, name in enumerate(names)}
     return values, deviations
 
 
@@ -180,8 +180,8 @@ def _terms(
     matrix = np.asarray(rotation.matrix(jnp.asarray(quat)), np.float64)
     terms = [matrix[..., 2] * thrust[:, None]]
     if kind == Dynamics.so_rpy_rotor_drag:
-        along = matrix[..., 2] * np.sum(matrix[..., 2] * vel, axis=-1, keepdims=True)
-        terms += [vel - along, along]
+        axial_vel = matrix[..., 2] * np.sum(matrix[..., 2] * vel, axis=-1, keepdims=True)
+        terms += [vel - axial_vel, axial_vel]
     inner = (time >= time[0] + EDGE_DURATION) & (time <= time[-1] - EDGE_DURATION)
     inner = inner if np.any(inner) else np.ones(len(time), bool)
     return (np.stack(terms, axis=-1) / mass)[inner], (acc - np.asarray(gravity, np.float64))[inner]
@@ -199,13 +199,13 @@ def lag_signal(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
         Samples in the unit of ``x``. (n, ...)
     """
     decay = np.exp(-rate * dt)
-    after = 1 - (1 - decay) / (rate * dt)  # weight of the later sample
-    inputs = (1 - decay - after) * x[:-1] + after * x[1:]
-    out = np.empty((len(x), *inputs.shape[1:]))
-    out[0] = x[0]
+    later_weight = 1 - (1 - decay) / (rate * dt)  # weight of the later sample
+    inputs = (1 - decay - later_weight) * x[:-1] + later_weight * x[1:]
+    lagged = np.empty((len(x), *inputs.shape[1:]))
+    lagged[0] = x[0]
     for k, u in enumerate(inputs):
-        out[k + 1] = decay * out[k] + u
-    return out
+        lagged[k + 1] = decay * lagged[k] + u
+    return lagged
 
 
 def _angles(log: Mapping[str, ArrayLike], axes: Sequence[int]) -> tuple[float, Array, Array, Array]:
@@ -254,10 +254,10 @@ def _blocks(logs: Sequence[Mapping[str, ArrayLike]]) -> NDArray:
     return np.concatenate(parts)
 
 
-def _deviations(jacobian: NDArray, rest: NDArray, blocks: NDArray) -> NDArray:
+def _deviations(jacobian: NDArray, residuals: NDArray, blocks: NDArray) -> NDArray:
     """Return standard deviations from the scatter between blocks of time. (k,)"""
     inverse = np.linalg.pinv(np.einsum("nri,nrj->ij", jacobian, jacobian), hermitian=True)
-    scores = np.einsum("nri,nr->ni", jacobian, rest)
+    scores = np.einsum("nri,nr->ni", jacobian, residuals)
     block_scores = np.stack([scores[blocks == b].sum(axis=0) for b in np.unique(blocks)])
     return np.sqrt(np.diag(inverse @ (block_scores.T @ block_scores) @ inverse))
 

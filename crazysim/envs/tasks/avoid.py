@@ -54,7 +54,7 @@ class Crossing(PyTree):
     """True where the drone has reached its goal. (n_worlds, n_drones)"""
     disabled: Array = leaf("drone", 0)
     """True where it has touched something, or left the arena. (n_worlds, n_drones)"""
-    out_before: Array = leaf("drone", 0)
+    flight_over_before: Array = leaf("drone", 0)
     """True where it had arrived or was disabled before this environment step. (n_worlds, n_drones)"""
     remaining_way_before: Array = leaf("drone", 0)
     """Distance from the goal before this environment step, m. (n_worlds, n_drones)"""
@@ -62,7 +62,7 @@ class Crossing(PyTree):
     """Handles of the poles, then of the boxes."""
 
     @property
-    def out(self) -> Array:
+    def flight_over(self) -> Array:
         """True where the drone has arrived or is disabled. (n_worlds, n_drones)"""
         return self.reached | self.disabled
 
@@ -134,7 +134,7 @@ class Avoid(Task):
         half = self.field(sim.n_drones).half
 
         @stage("drone")
-        def check(data: SimData) -> SimData:
+        def update_record(data: SimData) -> SimData:
             """Disable a drone that touches something or leaves the arena, and record when it reaches its goal."""
             record, pos = crossing_of(data), data.states.pos
             left = jnp.any(jnp.abs(pos[:2]) > half.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
@@ -144,7 +144,7 @@ class Avoid(Task):
             return with_record(data, record.replace(disabled=disabled, reached=reached))
 
         record = Crossing(zero, no, no, no, zero[..., 0], tuple(handles))
-        install_rules(sim, record, check, collisions=True)
+        install_rules(sim, record, update_record, collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight before the field, and obstacles in cells of their own."""
@@ -164,8 +164,8 @@ class Avoid(Task):
         quat = jnp.concatenate([0 * angle, 0 * angle, jnp.sin(angle), jnp.cos(angle)], axis=-1)
         first, record = 0, crossing_of(data)
         for handle in record.handles:
-            some = slice(first, first + len(handle))
-            data, first = handle.set_pose(data, pos[some], quat[some]), some.stop
+            rows = slice(first, first + len(handle))
+            data, first = handle.set_pose(data, pos[rows], quat[rows]), rows.stop
         offset, aim, rpy, vel = jnp.split(2 * x["drones"] - 1, 4, axis=-1)
         goals = field.goals.astype(dtype)
         start = goals * np.array([-1, 1, 1], dtype) + JITTER * offset
@@ -174,7 +174,9 @@ class Avoid(Task):
 
     def before_step(self, data: SimData) -> SimData:
         record = crossing_of(data)
-        return with_record(data, record.replace(out_before=record.out, remaining_way_before=self.error(data)))
+        return with_record(
+            data, record.replace(flight_over_before=record.flight_over, remaining_way_before=self.error(data))
+        )
 
     def nearest_obstacles(self, data: SimData) -> tuple[Array, Array]:
         """Return vectors from each drone to its nearest obstacles, and from there to their middles, world frame.
@@ -217,7 +219,7 @@ class Avoid(Task):
             "obstacles_middle": to_middle.reshape(n_drones, -1),
         }
         if n_drones > 1:
-            others, _ = nearest_drones(data, 2, ~crossing_of(data).out)
+            others, _ = nearest_drones(data, 2, ~crossing_of(data).flight_over)
             obs["drones_near"] = others.reshape(n_drones, -1)
         return obs
 
@@ -234,10 +236,10 @@ class Avoid(Task):
             "reached": 10.0 * record.reached,
             "disabled": -10.0 * record.disabled,
         }
-        return terms.only_where(~record.out_before, paid)
+        return terms.only_where(~record.flight_over_before, paid)
 
     def terminated(self, data: SimData) -> Array:
-        return jnp.all(crossing_of(data).out)
+        return jnp.all(crossing_of(data).flight_over)
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the goal, m."""

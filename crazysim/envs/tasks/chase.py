@@ -49,9 +49,9 @@ class Chase(TouchDown):
     """
 
     name = "chase"
-    what = "roof"
-    progress = 6.0
-    crash = 4.0
+    target_name = "roof"
+    progress_reward = 6.0
+    crash_cost = 4.0
 
     speed: float = setting(default=1.0, low=0.0, high=3.0)
     """Largest speed of a car, m/s; the smallest is 0.3 times that."""

@@ -90,7 +90,7 @@ class Deliver(BringLoad):
         sim.add(Hook(self.mass, length=self.length, size=SIZE, ring=RING, load_at=rings, **hook))
 
         @stage("drone")
-        def judge(data: SimData) -> SimData:
+        def update_record(data: SimData) -> SimData:
             """Move a load that waits along with its trailer; record pick-ups, deliveries and crashes."""
             load = data.plugins["load"]
             taken = delivery_of(data).taken | load.attached
@@ -101,7 +101,7 @@ class Deliver(BringLoad):
             return with_record(data, self.update_outcome(data, crashed).replace(taken=taken))
 
         not_taken = device_array(np.zeros((sim.n_worlds, sim.n_drones)), bool)
-        install_rules(sim, TrailerDelivery(**initial_outcome(sim.data), taken=not_taken), judge)
+        install_rules(sim, TrailerDelivery(**initial_outcome(sim.data), taken=not_taken), update_record)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, loads on their trailers, drones in flight above, and goals."""
@@ -183,10 +183,10 @@ def rings_of(car: CarData) -> Array:
     vehicle = load_vehicle(VEHICLE)
     centre, thickness = vehicle.value("trailer.deck_centre"), vehicle.value("trailer.deck")[2]
     front, _ = trailer_axles(car.state, car.params)
-    back = jnp.concatenate([car.yaw * 0 + centre[0], car.yaw * 0], axis=-1)
-    at = front + to_world_frame(car.joints[..., 1:], back)  # type: ignore[index]
+    deck_offset = jnp.concatenate([car.yaw * 0 + centre[0], car.yaw * 0], axis=-1)
+    deck_centre = front + to_world_frame(car.joints[..., 1:], deck_offset)  # type: ignore[index]
     height = vehicle.number("trailer.wheel_radius") + centre[2] + thickness / 2 + SIZE[2] / 2 + RING
-    return jnp.concatenate([at, jnp.full_like(car.yaw, height)], axis=-1)
+    return jnp.concatenate([deck_centre, jnp.full_like(car.yaw, height)], axis=-1)
 
 
 def moving_rings(car: CarData) -> tuple[Array, Array]:
@@ -196,11 +196,11 @@ def moving_rings(car: CarData) -> tuple[Array, Array]:
     2e-4 m/s.
     """
 
-    def place(*moved: Array) -> Array:
-        return rings_of(car.replace(**dict(zip(("pos", "yaw", "joints"), moved, strict=True))))
+    def ring_positions(*state: Array) -> Array:
+        return rings_of(car.replace(**dict(zip(("pos", "yaw", "joints"), state, strict=True))))
 
     rates = car.vel, car.yaw_rate, trailer_rates(car.state, car.params)
-    return jax.jvp(place, (car.pos, car.yaw, car.joints), rates)
+    return jax.jvp(ring_positions, (car.pos, car.yaw, car.joints), rates)
 
 
 def middle_of(data: SimData) -> Array:

@@ -117,17 +117,17 @@ def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
     return on_floor(data) | (pos[..., 2] > height) | jnp.any(jnp.abs(pos[..., :2]) > half_width, axis=-1)
 
 
-def pick(x: Array, number: Array) -> Array:
+def pick(x: Array, index: Array) -> Array:
     """Return the entry with a given index, by masking all entries, which is faster than indexing.
 
     Args:
         x: Entries. (..., n, k)
-        number: Index of the entry. (...)
+        index: Index of the entry. (...)
 
     Returns:
         (..., k)
     """
-    chosen = number[..., None, None] == np.arange(x.shape[-2], dtype=np.int32)[:, None]
+    chosen = index[..., None, None] == np.arange(x.shape[-2], dtype=np.int32)[:, None]
     return jnp.sum(jnp.where(chosen, x, 0), axis=-2)
 
 
@@ -142,12 +142,12 @@ def nearest_entries(distance: Array, x: Array, n: int) -> Array:
     Returns:
         (..., n, k)
     """
-    out = []
+    entries = []
     for _ in range(n):
         first = lax.argmin(distance, distance.ndim - 1, np.int32)
-        out.append(pick(x, first))
+        entries.append(pick(x, first))
         distance = jnp.where(first[..., None] == np.arange(x.shape[-2], dtype=np.int32), jnp.inf, distance)
-    return jnp.stack(out, axis=-2)
+    return jnp.stack(entries, axis=-2)
 
 
 def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = False) -> None:
@@ -168,31 +168,31 @@ def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = Fal
 def collision_stage(sim: Sim) -> Stage:
     """Return a stage that disables drones that touch each other, in the task's record.
 
-    Drones whose ``out`` is true in the record are ignored. The record needs leaves ``disabled`` and
-    ``out``, (n_worlds, n_drones) each.
+    Drones whose ``flight_over`` is true in the record are ignored. The record needs leaves ``disabled`` and
+    ``flight_over``, (n_worlds, n_drones) each.
     """
     contacts = sim.scene.contact_fn((), floor=False)
 
     @stage("world")
     def collide(data: SimData) -> SimData:
         record, s = data.plugins[NAME], data.states
-        out = record.out
-        # Only for this query: drones that are out are moved far apart from each other and from all others.
-        far = 1000.0 * (1 + np.arange(len(out)))[:, None] * np.array([0.0, 0.0, 1.0])
-        elsewhere = jnp.where(out[:, None], far.astype(s.pos.dtype), s.pos)
-        hit = contacts(data.replace(states=s.replace(pos=elsewhere))).any & ~out
+        flight_over = record.flight_over
+        # Only for this query: drones whose flight is over are moved far apart from each other and from all others.
+        far = 1000.0 * (1 + np.arange(len(flight_over)))[:, None] * np.array([0.0, 0.0, 1.0])
+        elsewhere = jnp.where(flight_over[:, None], far.astype(s.pos.dtype), s.pos)
+        hit = contacts(data.replace(states=s.replace(pos=elsewhere))).any & ~flight_over
         return with_record(data, record.replace(disabled=record.disabled | hit))
 
     return collide
 
 
-def nearest_drones(data: SimData, n: int, counts: Array | None = None) -> tuple[Array, Array]:
+def nearest_drones(data: SimData, n: int, is_visible: Array | None = None) -> tuple[Array, Array]:
     """Return positions, m, and velocities, m/s, of the nearest other drones of a world relative to each drone.
 
     Args:
         data: The data of one world.
         n: Number of others to return; fewer if there are fewer.
-        counts: True where a drone can be seen; None for all. Entries for other drones are zero. (n_drones,)
+        is_visible: True where a drone can be seen; None for all. Entries for other drones are zero. (n_drones,)
 
     Returns:
         (n_drones, n, 3) each
@@ -200,8 +200,10 @@ def nearest_drones(data: SimData, n: int, counts: Array | None = None) -> tuple[
     s = data.states
     n_drones = s.pos.shape[0]
     others = ~np.eye(n_drones, dtype=bool)
-    seen = others if counts is None else counts[None] & others
-    relative, passing = (jnp.where(seen[..., None], x[None] - x[:, None], 0) for x in (s.pos, s.vel))
-    far = jnp.where(seen, jnp.sum(relative * relative, axis=-1), jnp.inf)
-    found = nearest_entries(far, jnp.concatenate([relative, passing], axis=-1), min(n, n_drones - 1))
-    return found[..., :3], found[..., 3:]
+    is_candidate = others if is_visible is None else is_visible[None] & others
+    relative_pos, relative_vel = (jnp.where(is_candidate[..., None], x[None] - x[:, None], 0) for x in (s.pos, s.vel))
+    square_distance = jnp.where(is_candidate, jnp.sum(relative_pos * relative_pos, axis=-1), jnp.inf)
+    nearest = nearest_entries(
+        square_distance, jnp.concatenate([relative_pos, relative_vel], axis=-1), min(n, n_drones - 1)
+    )
+    return nearest[..., :3], nearest[..., 3:]

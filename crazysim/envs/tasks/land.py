@@ -30,7 +30,7 @@ SPACING = 3.0
 """Distance between the pads of several drones, m; a drone observes its own pad only."""
 HALF_WIDTH, CEILING = 1.4, 2.5
 """Largest distance from the middle of the pad's path along x and y, and largest height, of a drone, m."""
-CIRCLE = (0.3, 0.7)
+CIRCLE_RADII = (0.3, 0.7)
 """Smallest and largest radius of a moving pad's circle, m."""
 
 
@@ -59,8 +59,10 @@ class Land(TouchDown):
 
     name = "land"
     Record = PadLanding
-    what = "pad"
-    crash = 2.0  # at 10, the reward of a landing, policies hover beside the pad: few of their first contacts are soft
+    target_name = "pad"
+    crash_cost = (
+        2.0  # at 10, the reward of a landing, policies hover beside the pad: few of their first contacts are soft
+    )
 
     speed: float = setting(default=0.0, low=0.0, high=10.0)
     """Speed of a pad on a circle of 0.3 to 0.7 m radius, in either direction, m/s; zero for pads that stand still."""
@@ -69,11 +71,13 @@ class Land(TouchDown):
 
     def install(self, sim: Sim) -> None:
         """Add the pads, their motion and the check of contacts."""
-        pads = sim.scene.add("landing_pad", "pad", count=sim.n_drones, pos=middles(sim.n_drones), radius=self.radius)
+        pads = sim.scene.add(
+            "landing_pad", "pad", count=sim.n_drones, pos=path_centres(sim.n_drones), radius=self.radius
+        )
         contacts = sim.scene.contact_fn([pads], drones=False)
 
         @stage("world")
-        def move(data: SimData) -> SimData:
+        def move_pads(data: SimData) -> SimData:
             """Move the pads to their places at the end of this step."""
             pos, vel = pad_of(data, data.core.steps + 1)
             return pads.set_pose(data, pos, vel=vel)
@@ -82,7 +86,7 @@ class Land(TouchDown):
         record = PadLanding(circle=zero, rate=zero, phase=zero, pads=pads, **initial_outcome(sim.data))
         placements = [StagePlacement(self.touch(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:
-            placements.insert(0, StagePlacement(move, before="increment_steps", name=f"{NAME}_pads"))
+            placements.insert(0, StagePlacement(move_pads, before="increment_steps", name=f"{NAME}_pads"))
         self.add_record(sim, record, placements)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
@@ -91,15 +95,21 @@ class Land(TouchDown):
         x = draw(key, n_drones, start=3, rpy=3, vel=3, circle=1, direction=1, phase=1)
         dtype = data.states.pos.dtype
         start, rpy, vel = (2 * x[name] - 1 for name in ("start", "rpy", "vel"))
-        at = middles(n_drones).astype(dtype) + start * np.array([1.0, 1.0, 0.4], dtype) + np.array([0, 0, 1.0], dtype)
-        data = flying(data, at, rotation.from_rpy(0.2 * rpy), 0.3 * vel)
-        circle = CIRCLE[0] + (CIRCLE[1] - CIRCLE[0]) * x["circle"]
+        start_pos = (
+            path_centres(n_drones).astype(dtype)
+            + start * np.array([1.0, 1.0, 0.4], dtype)
+            + np.array([0, 0, 1.0], dtype)
+        )
+        data = flying(data, start_pos, rotation.from_rpy(0.2 * rpy), 0.3 * vel)
+        circle = CIRCLE_RADII[0] + (CIRCLE_RADII[1] - CIRCLE_RADII[0]) * x["circle"]
         rate = jnp.where(x["direction"] < 0.5, -self.speed, self.speed) / circle
-        moves = float(self.speed > 0)
-        new = landing_of(data).replace(circle=moves * circle, rate=moves * rate, phase=2 * jnp.pi * x["phase"])
-        data = with_record(data, new)
-        pos, along = pad_of(data, data.core.steps)
-        return new.pads.set_pose(data, pos, vel=along) if self.speed > 0 else data
+        is_moving = float(self.speed > 0)
+        record = landing_of(data).replace(
+            circle=is_moving * circle, rate=is_moving * rate, phase=2 * jnp.pi * x["phase"]
+        )
+        data = with_record(data, record)
+        pos, pad_vel = pad_of(data, data.core.steps)
+        return record.pads.set_pose(data, pos, vel=pad_vel) if self.speed > 0 else data
 
     def target_motion(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's pad, of one drone or one world. (..., 3) each"""
@@ -108,7 +118,7 @@ class Land(TouchDown):
     def has_left_arena(self, data: SimData) -> Array:
         """Return true where a drone has left its part of the arena. (...)"""
         pos = data.states.pos
-        return jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
+        return jnp.any(jnp.abs(pos - path_centre_of(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
 
     def subjects(self, data: SimData) -> Array:
         """Return four points on the rim of each pad, m. (4 n_drones, 3)"""
@@ -121,14 +131,14 @@ class Land(TouchDown):
         return {"elevation": -20}
 
 
-def middles(n_drones: int) -> np.ndarray:
+def path_centres(n_drones: int) -> np.ndarray:
     """Return the middle of each pad's path, m. (n_drones, 3)"""
     return np.concatenate([SPACING * grid_2d(n_drones), np.full((n_drones, 1), HEIGHT)], axis=-1)
 
 
-def middle_of(data: SimData) -> Array:
+def path_centre_of(data: SimData) -> Array:
     """Return the middle of the path of each drone's pad, of one drone or one world, m. (..., 3)"""
-    return pick(jnp.asarray(middles(data.core.n_drones), data.states.pos.dtype), data.core.drone_id)
+    return pick(jnp.asarray(path_centres(data.core.n_drones), data.states.pos.dtype), data.core.drone_id)
 
 
 def pad_of(data: SimData, steps: Array) -> tuple[Array, Array]:
@@ -139,6 +149,6 @@ def pad_of(data: SimData, steps: Array) -> tuple[Array, Array]:
     """
     record = landing_of(data)
     angle = record.phase + record.rate * (steps / data.core.freq)
-    out = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
-    along = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)
-    return middle_of(data) + record.circle * out, record.circle * record.rate * along
+    radial = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
+    tangential = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)
+    return path_centre_of(data) + record.circle * radial, record.circle * record.rate * tangential

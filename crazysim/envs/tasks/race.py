@@ -100,19 +100,19 @@ class Race(Task):
         def zeros(*shape: int, dtype: DTypeLike = pos.dtype) -> Array:
             return device_array(np.zeros(shape), dtype)
 
-        zero, none = zeros(*shape, dtype=np.int32), zeros(*shape, dtype=bool)
-        n, moved = course.n_gates + course.n_obstacles, self.level >= 2
+        zero, false = zeros(*shape, dtype=np.int32), zeros(*shape, dtype=bool)
+        n, is_displaced = course.n_gates + course.n_obstacles, self.level >= 2
         record = rules.RaceRecord(
             passed=zero,
-            disabled=none,
+            disabled=false,
             last_pos=zeros(*shape, 3),
             gates_visited=zeros(*shape, course.n_gates, dtype=bool),
             obstacles_visited=zeros(*shape, course.n_obstacles, dtype=bool),
             passed_before=zero,
-            out_before=none,
+            flight_over_before=false,
             remaining_way_before=zeros(*shape),
-            nominal_pos=zeros(sim.n_worlds, 1, n, 3) if moved else None,
-            nominal_quat=zeros(sim.n_worlds, 1, course.n_gates, 4) if moved else None,
+            nominal_pos=zeros(sim.n_worlds, 1, n, 3) if is_displaced else None,
+            nominal_quat=zeros(sim.n_worlds, 1, course.n_gates, 4) if is_displaced else None,
             gates=gates,
             obstacles=obstacles,
         )
@@ -120,15 +120,15 @@ class Race(Task):
         contacts = sim.scene.contact_fn([gates, obstacles], drones=False)
 
         @stage("drone")
-        def judge(data: SimData) -> SimData:
+        def update_record(data: SimData) -> SimData:
             """Disable a drone that touches something or leaves the arena; else count the gate that it passes."""
             record, pos = race_of(data), data.states.pos
-            left = jnp.any((pos < low) | (pos > high), axis=-1)
-            disabled = record.disabled | (~record.finished & (left | contacts(data).any))
+            has_left = jnp.any((pos < low) | (pos > high), axis=-1)
+            disabled = record.disabled | (~record.finished & (has_left | contacts(data).any))
             passed = record.passed + (rules.passes_gate(data) & ~disabled)
             return with_record(data, record.replace(passed=passed, disabled=disabled, last_pos=pos))
 
-        install_rules(sim, record, judge, collisions=True)
+        install_rules(sim, record, update_record, collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight at the start, and gates and obstacles in their places."""
@@ -168,7 +168,7 @@ class Race(Task):
             gates_visited=seen_gates,
             obstacles_visited=seen_obstacles,
             passed_before=record.passed,
-            out_before=record.out,
+            flight_over_before=record.flight_over,
             remaining_way_before=rules.remaining_way(data),
         )
         return with_record(data, new)
@@ -181,7 +181,7 @@ class Race(Task):
         return self.reward(data, action, last_action)
 
     def terminated(self, data: SimData) -> Array:
-        return jnp.all(race_of(data).out)
+        return jnp.all(race_of(data).flight_over)
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the next gate, m."""
@@ -225,11 +225,11 @@ def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
     """Give every drone parameters of its own, by name and number of dimensions."""
 
     def repeat_params(data: SimData) -> SimData:
-        params, shape, each = data.params, data.states.pos.shape[:2], {}
+        params, shape, per_drone = data.params, data.states.pos.shape[:2], {}
         for name, ndim in names.items():  # they may be one per drone already
             value = getattr(params, name)
-            each[name] = device_array(np.broadcast_to(value, (*shape, *value.shape[-ndim:])), value.dtype)
-        return data.replace(params=params.replace(**each))
+            per_drone[name] = device_array(np.broadcast_to(value, (*shape, *value.shape[-ndim:])), value.dtype)
+        return data.replace(params=params.replace(**per_drone))
 
     sim.data, sim.default_data = repeat_params(sim.data), repeat_params(sim.default_data)
 

@@ -78,5 +78,5 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
         "obstacles_near": in_body(nearest_entries(far, to_poles, min(2, n_obstacles))),
     }
     if n_drones > 1:
-        obs["drones_near"] = in_body(nearest_drones(data, 2, ~record.out)[0])
+        obs["drones_near"] = in_body(nearest_drones(data, 2, ~record.flight_over)[0])
     return {name: x.reshape(n_drones, -1).astype(s.pos.dtype) for name, x in obs.items()}

@@ -43,7 +43,7 @@ class RaceRecord(PyTree):
     """True for obstacles that it was near before this environment step. (n_worlds, n_drones, n_obstacles)"""
     passed_before: Array = leaf("drone", 0)
     """Number of gates passed before this environment step. (n_worlds, n_drones)"""
-    out_before: Array = leaf("drone", 0)
+    flight_over_before: Array = leaf("drone", 0)
     """True where it was finished or disabled before this environment step. (n_worlds, n_drones)"""
     remaining_way_before: Array = leaf("drone", 0)
     """Way to go before this environment step, m. (n_worlds, n_drones)"""
@@ -62,7 +62,7 @@ class RaceRecord(PyTree):
         return self.passed >= self.gates_visited.shape[-1]
 
     @property
-    def out(self) -> Array:
+    def flight_over(self) -> Array:
         """True where a drone is finished or disabled. (n_worlds, n_drones)"""
         return self.finished | self.disabled
 
@@ -75,8 +75,8 @@ def race_of(data: SimData) -> RaceRecord:
 def gates_of(data: SimData) -> tuple[Array, Array]:
     """Return positions, m (..., n_gates, 3), and attitudes, xyzw (..., n_gates, 4), of the gates."""
     rows = race_of(data).gates.rows
-    some = slice(rows[0], rows[-1] + 1)
-    return data.objects.pos[..., some, :], data.objects.quat[..., some, :]  # type: ignore[union-attr]
+    gate_rows = slice(rows[0], rows[-1] + 1)
+    return data.objects.pos[..., gate_rows, :], data.objects.quat[..., gate_rows, :]  # type: ignore[union-attr]
 
 
 def obstacles_of(data: SimData) -> Array:
@@ -150,7 +150,7 @@ def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         "action_rate": -0.01 * terms.action_rate(action, last_action),
         "disabled": -2.0 * record.disabled,
     }
-    return terms.only_where(~record.out_before, paid)
+    return terms.only_where(~record.flight_over_before, paid)
 
 
 def sparse(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
@@ -158,4 +158,4 @@ def sparse(data: SimData, action: Array, last_action: Array) -> dict[str, Array]
     del action, last_action
     record, dtype = race_of(data), data.states.pos.dtype
     gates, disabled = (record.passed - record.passed_before).astype(dtype), record.disabled.astype(dtype)
-    return terms.only_where(~record.out_before, {"gates": gates, "disabled": -disabled})
+    return terms.only_where(~record.flight_over_before, {"gates": gates, "disabled": -disabled})

@@ -28,16 +28,16 @@ SEPARATION = (0.24, 0.24, 0.6)
 """Half axes of the ellipsoid around a drone that no other's centre may enter, m: twice the radii of 0.12 m across and
 0.3 m along the thrust with which Preiss, Hoenig, Ayanian and Sukhatme (Downwash-aware trajectory planning for large
 quadrotor teams, 2017) describe a Crazyflie."""
-CROWDING = 2.5
+CROWDING_SEPARATION = 2.5
 """Separation below which another drone costs reward, in half axes of the ellipsoid. With 1.5, drones that cross the
 middle evade too late: a third of the episodes ended in a crash."""
-SPACING = 0.9
+MIN_START_SPACING = 0.9
 """Smallest distance between neighbours on the circle of the starts, m."""
 HEIGHT = 1.2
 """Height of the circle, m."""
-ROOM = 1.5
+ARENA_MARGIN = 1.5
 """Distance of the arena's limits from the circle and the formation, m."""
-JITTER = 0.1
+START_JITTER = 0.1
 """Largest component of the offset of a start from its place on the circle, m."""
 
 
@@ -83,52 +83,58 @@ class Swarm(Task):
             as_formation(self.formation, sim.n_drones)
 
         @stage("drone")
-        def keep_closest(data: SimData) -> SimData:
+        def update_closest(data: SimData) -> SimData:
             """Keep the smallest separation from another drone."""
-            record, place = swarm_of(data), data.states.pos / np.array(SEPARATION, data.states.pos.dtype)
+            record, scaled_pos = swarm_of(data), data.states.pos / np.array(SEPARATION, data.states.pos.dtype)
 
-            def square(other: Array, is_self: Array) -> Array:
-                return jnp.where(is_self, jnp.inf, jnp.sum((place - other) ** 2))
+            def square_separation(other: Array, is_self: Array) -> Array:
+                return jnp.where(is_self, jnp.inf, jnp.sum((scaled_pos - other) ** 2))
 
-            nearest = rotation.safe_sqrt(reduce_over_others(square, place, "min"))
+            nearest = rotation.safe_sqrt(reduce_over_others(square_separation, scaled_pos, "min"))
             return with_record(data, record.replace(closest=jnp.minimum(record.closest, nearest)))
 
         pos = sim.data.states.pos
-        zero, far = (
+        zero, infinity = (
             device_array(np.zeros(pos.shape), pos.dtype),
             device_array(np.full(pos.shape[:2], np.inf), pos.dtype),
         )
-        record = SwarmRecord(zero, far)
-        install_rules(sim, record, keep_closest)
+        record = SwarmRecord(zero, infinity)
+        install_rules(sim, record, update_closest)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight on the circle, and their goals."""
         n, dtype = data.core.n_drones, data.states.pos.dtype
         x = draw(key, turn=1, places=1, drones=(n, 9))
         offset, rpy, vel = jnp.split(2 * x["drones"] - 1, 3, axis=-1)
-        begin = 2 * jnp.pi * (x["turn"] + np.arange(n, dtype=dtype) / n)
+        start_angle = 2 * jnp.pi * (x["turn"] + np.arange(n, dtype=dtype) / n)
         # All drones move on by the same number of places, from 1 to n - 1.
         places = 1 + jnp.floor((n - 1) * x["places"])
-        end = begin + 2 * jnp.pi * places / n
-        goal = on_circle(end, n) if self.formation is None else jnp.asarray(np.asarray(self.formation, float), dtype)
-        data = flying(data, on_circle(begin, n) + JITTER * offset, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
+        goal_angle = start_angle + 2 * jnp.pi * places / n
+        goal = (
+            circle_points(goal_angle, n)
+            if self.formation is None
+            else jnp.asarray(np.asarray(self.formation, float), dtype)
+        )
+        data = flying(
+            data, circle_points(start_angle, n) + START_JITTER * offset, rotation.from_rpy(0.1 * rpy), 0.1 * vel
+        )
         return with_record(data, SwarmRecord(goal, separation(data.states.pos)))
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the way to its goal, and the nearest other drones, m and m/s."""
-        near, passing = (x.reshape(x.shape[0], -1) for x in nearest_drones(data, self.n_seen))
+        relative_pos, relative_vel = (x.reshape(x.shape[0], -1) for x in nearest_drones(data, self.n_seen))
         return state_of(data) | {
             "difference_to_goal": swarm_of(data).goal - data.states.pos,
-            "drones_near": near,
-            "drones_near_vel": passing,
+            "drones_near": relative_pos,
+            "drones_near_vel": relative_vel,
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return proximity to the goal, and costs of crowding, turning, changing actions and ending the episode."""
-        gap = separation(data.states.pos)
+        nearest_separation = separation(data.states.pos)
         return {
             "proximity": terms.proximity(self.error(data)),
-            "crowding": -(jnp.maximum(CROWDING - gap, 0) + 2.0 * (gap < 1)),
+            "crowding": -(jnp.maximum(CROWDING_SEPARATION - nearest_separation, 0) + 2.0 * (nearest_separation < 1)),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "lost": -10.0 * self.is_lost(data),
@@ -137,15 +143,15 @@ class Swarm(Task):
     def is_lost(self, data: SimData) -> Array:
         """Return true where a drone is on the floor, outside of the arena, or too close to another. (n_drones,)"""
         pos = data.states.pos
-        beyond = jnp.any(jnp.abs(pos) > self.limits(data.core.n_drones).astype(pos.dtype), axis=-1)
-        return on_floor(data) | beyond | (self.strict & (swarm_of(data).closest < 1))
+        is_outside = jnp.any(jnp.abs(pos) > self.limits(data.core.n_drones).astype(pos.dtype), axis=-1)
+        return on_floor(data) | is_outside | (self.strict & (swarm_of(data).closest < 1))
 
     def limits(self, n_drones: int) -> np.ndarray:
         """Return the largest absolute coordinates within the arena, m. (3,)"""
         radius = circle_radius(n_drones)
         if self.formation is None:
-            return np.array([radius, radius, HEIGHT]) + ROOM
-        return np.maximum(radius, np.abs(np.asarray(self.formation, float)).max(axis=0)) + ROOM
+            return np.array([radius, radius, HEIGHT]) + ARENA_MARGIN
+        return np.maximum(radius, np.abs(np.asarray(self.formation, float)).max(axis=0)) + ARENA_MARGIN
 
     def terminated(self, data: SimData) -> Array:
         """Return true where a drone is lost."""
@@ -186,22 +192,22 @@ def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndar
         raise ConfigError(f"expected a formation of finite numbers ({n_drones}, 3), m, got shape {slots.shape}")
     if slots[:, 2].min() < 0.2:
         raise ConfigError(f"expected a formation at least 0.2 m over the floor, got {slots[:, 2].min()} m")
-    apart = np.asarray(separation(jnp.asarray(slots)))
-    if apart.min() < 1.2:
-        pair = sorted(np.argsort(apart)[:2].tolist())
+    separations = np.asarray(separation(jnp.asarray(slots)))
+    if separations.min() < 1.2:
+        pair = sorted(np.argsort(separations)[:2].tolist())
         raise ConfigError(
             f"expected places of the formation at 1.2 times the smallest separation, which is {SEPARATION[0]} m beside "
-            f"and {SEPARATION[2]} m above each other, got {apart.min():.2f} between places {pair}"
+            f"and {SEPARATION[2]} m above each other, got {separations.min():.2f} between places {pair}"
         )
     return slots
 
 
 def circle_radius(n_drones: int) -> float:
     """Return the radius of the circle of the starts, m."""
-    return max(SPACING, SPACING / (2 * np.sin(np.pi / n_drones)))
+    return max(MIN_START_SPACING, MIN_START_SPACING / (2 * np.sin(np.pi / n_drones)))
 
 
-def on_circle(angle: Array, n_drones: int) -> Array:
+def circle_points(angle: Array, n_drones: int) -> Array:
     """Return points of the circle of the starts, m. (..., 3)"""
     radius, height = circle_radius(n_drones), jnp.full_like(angle, HEIGHT)
     return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), height], axis=-1)
@@ -216,7 +222,7 @@ def separation(pos: Array) -> Array:
     Returns:
         (..., n_drones)
     """
-    apart = (pos[..., :, None, :] - pos[..., None, :, :]) / np.array(SEPARATION, pos.dtype)
-    square = jnp.sum(apart * apart, axis=-1)
-    other = ~np.eye(pos.shape[-2], dtype=bool)
-    return rotation.safe_sqrt(jnp.min(jnp.where(other, square, jnp.inf), axis=-1))
+    scaled_offset = (pos[..., :, None, :] - pos[..., None, :, :]) / np.array(SEPARATION, pos.dtype)
+    square_distance = jnp.sum(scaled_offset * scaled_offset, axis=-1)
+    is_other = ~np.eye(pos.shape[-2], dtype=bool)
+    return rotation.safe_sqrt(jnp.min(jnp.where(is_other, square_distance, jnp.inf), axis=-1))

@@ -31,13 +31,13 @@ class Landing(PyTree):
     """True where the drone has touched down softly. (n_worlds, n_drones)"""
     crashed: Array = leaf("drone", 0)
     """True where it has touched anything in another way, or left its part of the arena. (n_worlds, n_drones)"""
-    out_before: Array = leaf("drone", 0)
+    flight_over_before: Array = leaf("drone", 0)
     """True where it had landed or crashed before this environment step. (n_worlds, n_drones)"""
     remaining_way_before: Array = leaf("drone", 0)
     """Distance from its place before this environment step, m. (n_worlds, n_drones)"""
 
     @property
-    def out(self) -> Array:
+    def flight_over(self) -> Array:
         """True where the drone has landed or crashed. (n_worlds, n_drones)"""
         return self.landed | self.crashed
 
@@ -50,11 +50,11 @@ class TouchDown(Task):
     """
 
     Record = Landing
-    what: ClassVar[str] = "place"
-    """Name of the place in observations: ``difference_to_{what}``."""
-    progress: ClassVar[float] = 2.0
+    target_name: ClassVar[str] = "place"
+    """Name of the place in observations: ``difference_to_{target_name}``."""
+    progress_reward: ClassVar[float] = 2.0
     """Reward of a metre of progress towards the place."""
-    crash: ClassVar[float] = 10.0
+    crash_cost: ClassVar[float] = 10.0
     """Cost of a crash."""
 
     seconds: float = 6.0
@@ -89,18 +89,19 @@ class TouchDown(Task):
             pos, vel = self.target_motion(data, ahead=1)
             if report.objects is None or report.floor is None:
                 raise TypeError("expected contacts with objects and floor, got None")
-            mine = np.arange(data.core.n_drones, dtype=np.int32) == data.core.drone_id[..., None]
-            on_place = jnp.any(report.objects & mine, axis=-1)
-            elsewhere = jnp.any(report.objects & ~mine, axis=-1) | report.floor
+            is_own_target = np.arange(data.core.n_drones, dtype=np.int32) == data.core.drone_id[..., None]
+            touches_target = jnp.any(report.objects & is_own_target, axis=-1)
+            touches_other = jnp.any(report.objects & ~is_own_target, axis=-1) | report.floor
             offset, drift = s.pos - pos, s.vel - vel
-            within = offset[..., 0] * offset[..., 0] + offset[..., 1] * offset[..., 1] < radius**2
-            soft = (rotation.dot(drift, drift)[..., 0] <= MAX_TOUCH_DOWN_SPEED**2) & (
+            is_centred = offset[..., 0] * offset[..., 0] + offset[..., 1] * offset[..., 1] < radius**2
+            is_soft = (rotation.dot(drift, drift)[..., 0] <= MAX_TOUCH_DOWN_SPEED**2) & (
                 rotation.z_axis(s.quat)[..., 2] >= MIN_UP_AXIS_Z
             )
-            good = on_place & (offset[..., 2] > 0) & within & soft & ~elsewhere
-            bad = (on_place & ~good) | elsewhere | self.has_left_arena(data)
+            has_landed = touches_target & (offset[..., 2] > 0) & is_centred & is_soft & ~touches_other
+            has_crashed = (touches_target & ~has_landed) | touches_other | self.has_left_arena(data)
             new = record.replace(
-                landed=record.landed | (good & ~record.crashed), crashed=record.crashed | (bad & ~record.landed)
+                landed=record.landed | (has_landed & ~record.crashed),
+                crashed=record.crashed | (has_crashed & ~record.landed),
             )
             return with_record(data, new)
 
@@ -108,31 +109,33 @@ class TouchDown(Task):
 
     def before_step(self, data: SimData) -> SimData:
         record = landing_of(data)
-        return with_record(data, record.replace(out_before=record.out, remaining_way_before=self.error(data)))
+        return with_record(
+            data, record.replace(flight_over_before=record.flight_over, remaining_way_before=self.error(data))
+        )
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the vector to its place, m, and the place's relative velocity, m/s."""
         pos, vel = self.target_motion(data)
         return state_of(data) | {
-            f"difference_to_{self.what}": pos - data.states.pos,
-            f"difference_to_{self.what}_vel": vel - data.states.vel,
+            f"difference_to_{self.target_name}": pos - data.states.pos,
+            f"difference_to_{self.target_name}_vel": vel - data.states.vel,
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         record, d = landing_of(data), self.error(data)
         drift = rotation.safe_norm(self.target_motion(data)[1] - data.states.vel)[..., 0]
         paid = {
-            "progress": self.progress * (record.remaining_way_before - d),
+            "progress": self.progress_reward * (record.remaining_way_before - d),
             "speed": -0.1 * drift * jnp.exp(-4 * d),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "landed": 10.0 * record.landed,
-            "crashed": -self.crash * record.crashed,
+            "crashed": -self.crash_cost * record.crashed,
         }
-        return terms.only_where(~record.out_before, paid)
+        return terms.only_where(~record.flight_over_before, paid)
 
     def terminated(self, data: SimData) -> Array:
-        return jnp.all(landing_of(data).out)
+        return jnp.all(landing_of(data).flight_over)
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the place, m."""
@@ -157,4 +160,4 @@ def initial_outcome(data: SimData) -> dict[str, Array]:
     """Return the fields of ``Landing`` for drones in the air, of all worlds."""
     pos = data.states.pos
     zero, no = device_array(np.zeros(pos.shape[:2]), pos.dtype), device_array(np.zeros(pos.shape[:2]), bool)
-    return {"landed": no, "crashed": no, "out_before": no, "remaining_way_before": zero}
+    return {"landed": no, "crashed": no, "flight_over_before": no, "remaining_way_before": zero}

@@ -28,7 +28,7 @@ MAX_ERROR = 1.5
 """Distance from the trajectory at which an episode ends, m."""
 MAX_SAMPLES = 1000
 """Largest number of samples ahead; they are 3,000 numbers of an observation."""
-LATEST = 20.0
+MAX_START_TIME = 20.0
 """Latest time on the trajectory at which an episode starts, s."""
 
 
@@ -74,9 +74,9 @@ class TrackTrajectory(Task):
         dtype = data.states.pos.dtype
         offset = (2 * x["offset"] - 1) * np.asarray(self.spread, dtype)
         rpy, vel = ((2 * x[name] - 1) * np.asarray(0.2, dtype) for name in ("rpy", "vel"))
-        begin = LATEST * x["begin"]
-        pos, along = self.motion(begin[..., 0])
-        return with_record(flying(data, pos + offset, rotation.from_rpy(rpy), along + vel), Phase(begin))
+        start_time = MAX_START_TIME * x["begin"]
+        pos, path_vel = self.motion(start_time[..., 0])
+        return with_record(flying(data, pos + offset, rotation.from_rpy(rpy), path_vel + vel), Phase(start_time))
 
     def time(self, data: SimData) -> Array:
         """Return the time on the trajectory, s. (n_drones,)"""

@@ -95,13 +95,13 @@ class Transport(BringLoad):
         contacts = sim.scene.contact_fn([gates], drones=False)
 
         @stage("drone")
-        def judge(data: SimData) -> SimData:
+        def update_record(data: SimData) -> SimData:
             """Record crashes, and loads that stay at their goals."""
             return with_record(
                 data, self.update_outcome(data, contacts(data).any | self.misses(data) | out_of_lane(data))
             )
 
-        install_rules(sim, GateDelivery(**initial_outcome(sim.data), gates=gates), judge)
+        install_rules(sim, GateDelivery(**initial_outcome(sim.data), gates=gates), update_record)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight with swinging loads before the gates, and goals behind them."""
@@ -216,8 +216,8 @@ def lanes(n_drones: int) -> np.ndarray:
 def gate_of(data: SimData) -> tuple[Array, Array]:
     """Return position, m, and attitude, xyzw, of each drone's gate, of one drone or one world. (..., 3), (..., 4)"""
     rows = delivery_of(data).gates.rows
-    some = slice(rows[0], rows[-1] + 1)
-    pos, quat = (x[..., some, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
+    gate_rows = slice(rows[0], rows[-1] + 1)
+    pos, quat = (x[..., gate_rows, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
     return pick(pos, data.core.drone_id), pick(quat, data.core.drone_id)
 
 

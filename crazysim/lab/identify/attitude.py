@@ -23,7 +23,7 @@ from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.prediction import PADDING, State, Windows
 from crazysim.pytree import PyTree
 
-UNITS = {
+PARAMETER_UNITS = {
     "acc_coef": "N", "cmd_f_coef": "1", "thrust_dyn_coef": "1/s", "drag_coefficients": "N s/m",
     "rpy_coef": "1/s^2", "rpy_rates_coef": "1/s", "cmd_rpy_coef": "1/s^2",
 }  # fmt: skip
@@ -47,7 +47,7 @@ class FittedModel(PyTree):
         params = fitted.Params.create(airframe, Dynamics(dynamics))
         return FittedModel(params if mass is None else params.replace(mass=jnp.asarray([mass], jnp.float32)))
 
-    def prepared(self, log: Log) -> Log:
+    def prepare_log(self, log: Log) -> Log:
         """Return the log with attitudes relative to the first 0.1 s, and the thrust in place of the rotor speeds.
 
         The thrust is lagged if the model has ``thrust_dyn_coef``.
@@ -119,21 +119,21 @@ def identify_attitude(
     check_turning(logs)
     data = [derivatives_svf(preprocessing(_columns(log))) for log in logs]
     force, force_spread = fit_translation(dynamics, weight, data)
-    turn, turn_spread = fit_rotation(data)
+    rotation_params, rotation_spread = fit_rotation(data)
     table: dict[str, float | list[float]] = {"acc_coef": 0.0, "cmd_f_coef": force["cmd_f_coef"]}
     if "thrust_dyn_coef" in force:
         table["thrust_dyn_coef"] = force["thrust_dyn_coef"]
     if "drag_xy_coef" in force:
         table["drag_coefficients"] = [force["drag_xy_coef"], force["drag_xy_coef"], force["drag_z_coef"]]
-    table |= {name: x.tolist() for name, x in turn.items()}
+    table |= {name: x.tolist() for name, x in rotation_params.items()}
     tables: dict = {"name": f"{base.name}_identified", "base": str(airframe), "fitted": {dynamics: table}}
     lines = [f"base = {json.dumps(str(airframe))}", "", "[sources]", f"flights = {json.dumps(source)}"]
     if weight != mass_of_base:
         tables["rigid_body"] = {"mass": weight}
         lines += ["", "[rigid_body]", f'mass = {{ value = {weight}, unit = "kg", source = "flights" }}']
     lines += ["", f"[fitted.{dynamics}]"]
-    lines += [f'{k} = {{ value = {x}, unit = "{UNITS[k]}", source = "flights" }}' for k, x in table.items()]
+    lines += [f'{k} = {{ value = {x}, unit = "{PARAMETER_UNITS[k]}", source = "flights" }}' for k, x in table.items()]
     lines += ["", "# Standard deviations:"]
     lines += [f"# {name}: {x:.2g}" for name, x in force_spread.items()]
-    lines += [f"# {name}: {', '.join(f'{v:.2g}' for v in x)}" for name, x in turn_spread.items()]
+    lines += [f"# {name}: {', '.join(f'{v:.2g}' for v in x)}" for name, x in rotation_spread.items()]
     return load_airframe(tables), "\n".join(lines) + "\n"

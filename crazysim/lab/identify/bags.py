@@ -100,19 +100,19 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
     with AnyReader([_BagPath(folder)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
         topics = {c.topic: c.msgtype for c in bag.connections}
         if names:
-            columns = {name: _split(path.name, name, topics) for name in names}
+            columns = {name: _split_column(path.name, name, topics) for name in names}
         else:
-            columns = _default(path.name, topics)
+            columns = _default_columns(path.name, topics)
         streams: dict[str, Stream] = {}
         for topic in {topic for topic, _ in columns.values()}:
             fields = {name: field for name, (column_topic, field) in columns.items() if column_topic == topic}
-            streams[topic] = _stream(path.name, bag, topic, topics[topic], fields)
+            streams[topic] = _read_stream(path.name, bag, topic, topics[topic], fields)
     if not names:
-        streams = {topic: _turned(stream) for topic, stream in streams.items()}
+        streams = {topic: _with_world_velocity(stream) for topic, stream in streams.items()}
     return resample(path.name, streams, repairs, wanted if names else None)
 
 
-def _split(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
+def _split_column(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
     """Return the topic and the field of a column."""
     fitting = [topic for topic in topics if column.startswith(f"{topic}/")]
     if not fitting:
@@ -125,10 +125,10 @@ def _split(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
     return topic, column[len(topic) + 1 :]
 
 
-def _default(name: str, topics: dict[str, str]) -> dict[str, tuple[str, str]]:
+def _default_columns(name: str, topics: dict[str, str]) -> dict[str, tuple[str, str]]:
     """Return the topic and the field of each column, chosen by message type."""
 
-    def only(kinds: Sequence[str]) -> tuple[str, str] | None:
+    def find_topic(kinds: Sequence[str]) -> tuple[str, str] | None:
         for kind in kinds:
             matches = sorted(topic for topic, topic_kind in topics.items() if topic_kind == kind)
             if len(matches) > 1:
@@ -142,16 +142,16 @@ def _default(name: str, topics: dict[str, str]) -> dict[str, tuple[str, str]]:
 
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
     columns = {}
-    pose, imu, rotors = only(list(POSES)), only(["sensor_msgs/msg/Imu"]), only(list(ROTORS))
+    pose, imu, rotors = find_topic(list(POSES)), find_topic(["sensor_msgs/msg/Imu"]), find_topic(list(ROTORS))
     if pose is None:
         raise ConfigError(
             f"{name}: expected a topic of {', '.join(POSES)}, got {listed}. Name the columns, such as "
             "pos=/topic/x,/topic/y,/topic/z."
         )
     topic, kind = pose
-    place, turn = POSES[kind]
-    columns |= {axis: (topic, f"{place}/{axis}") for axis in XYZ}
-    columns |= {f"q{axis}": (topic, f"{turn}/{axis}") for axis in XYZW}
+    position, attitude = POSES[kind]
+    columns |= {axis: (topic, f"{position}/{axis}") for axis in XYZ}
+    columns |= {f"q{axis}": (topic, f"{attitude}/{axis}") for axis in XYZW}
     if kind == "nav_msgs/msg/Odometry":
         columns |= {f"v{axis}": (topic, f"twist/twist/linear/{axis}") for axis in XYZ}
         columns |= {f"w{axis}": (topic, f"twist/twist/angular/{axis}") for axis in XYZ}
@@ -162,7 +162,7 @@ def _default(name: str, topics: dict[str, str]) -> dict[str, tuple[str, str]]:
     return columns
 
 
-def _stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, str]) -> Stream:
+def _read_stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, str]) -> Stream:
     """Return the messages of a topic as a stream."""
     get = {column: _getter(field) for column, field in fields.items()}
     times, rows = [], []
@@ -204,7 +204,7 @@ def _getter(field: str) -> Callable[[Any], Any]:
     return get
 
 
-def _turned(stream: Stream) -> Stream:
+def _with_world_velocity(stream: Stream) -> Stream:
     """Return the stream with its velocity, if it has one, rotated from the body frame to the world frame."""
     c = stream.columns
     if "vx" not in c:

@@ -19,7 +19,7 @@ HEADER_WITHIN = 1000
 """Number of lines in which the column names are sought; the Blackbox Explorer writes settings before them."""
 
 
-def header_of(path: Path) -> tuple[int, list[str], dict[str, str]] | None:
+def find_header(path: Path) -> tuple[int, list[str], dict[str, str]] | None:
     """Return the index and cells of the line of column names, and the settings before it; None if there is none."""
     settings: dict[str, str] = {}
     with path.open(encoding="utf-8", errors="replace") as file:
@@ -50,7 +50,7 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     Raises:
         ConfigError: If columns are missing, or too many rows are damaged.
     """
-    header = header_of(path)
+    header = find_header(path)
     if header is None:
         raise ConfigError(
             f"{path.name}: expected columns time and gyroADC[0] in the first {HEADER_WITHIN} lines, got none. "

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 RATIOS = (0.5, 2.0)
 """Ratios of measured to expected motion that count as agreement, on each axis that moves. In the logs of two
 public benchmarks, delays between streams, drag and noise give 0.6 to 1.3."""
-UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
+LENGTH_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
 """Units of positions, in m. Velocities have these units per second."""
 DIVERGED_ERROR = 10.0
 """Ratio of error to motion above which a rate counts as diverged. In the logs of those benchmarks it is below 4 or
@@ -40,7 +40,7 @@ PIECE_DURATION = 2.0
 class Pair(NamedTuple):
     """Measured and expected changes over windows of equal duration, which must agree."""
 
-    what: str
+    requirement: str
     """Property of the columns that makes them agree."""
     measured: NDArray
     """Measured changes. (n, 3)"""
@@ -57,21 +57,21 @@ class Pair(NamedTuple):
         sizes = np.zeros((3, 2))
         for k, (x, y) in enumerate(zip(self.measured.T, self.expected.T, strict=True)):
             is_large = np.abs(y) >= np.quantile(np.abs(y), 0.75)
-            along, size = np.median(x[is_large] * np.sign(y[is_large])), np.median(np.abs(y[is_large]))
+            measured_size, size = np.median(x[is_large] * np.sign(y[is_large])), np.median(np.abs(y[is_large]))
             if max(size, np.median(np.abs(x[is_large]))) > self.floor:
-                sizes[k] = (along, size) if size > 0 else (np.inf, 1.0)
+                sizes[k] = (measured_size, size) if size > 0 else (np.inf, 1.0)
         return sizes
 
     def ratios(self) -> NDArray:
         """Return the ratio of measured to expected changes on each axis, NaN for axes that do not move. (3,)"""
-        along, size = self.sizes().T
-        return np.divide(along, size, out=np.full(3, np.nan), where=size > 0)
+        measured_size, size = self.sizes().T
+        return np.divide(measured_size, size, out=np.full(3, np.nan), where=size > 0)
 
     def agrees(self) -> bool:
         """Return True if measured and expected motion agree on every axis that moves, within half of the floor."""
-        along, size = self.sizes().T
+        measured_size, size = self.sizes().T
         slack = self.floor / 2
-        return bool(np.all((along >= RATIOS[0] * size - slack) & (along <= RATIOS[1] * size + slack)))
+        return bool(np.all((measured_size >= RATIOS[0] * size - slack) & (measured_size <= RATIOS[1] * size + slack)))
 
 
 def check_motion(
@@ -95,10 +95,10 @@ def check_motion(
     """
     keep = np.ones(len(t), bool)
     for pair, width in _rates(t, data, derived):
-        bad = _diverged_windows(pair, round(PIECE_DURATION / float(np.median(np.diff(t)))))
-        if 0 < np.sum(bad) <= len(bad) / 2:
-            keep[np.flatnonzero(bad)[:, None] + np.arange(width + 1)] = False
-            repairs.append(f"dropped {np.sum(~keep)} samples without {pair.what}, which the others have")
+        is_diverged = _diverged_windows(pair, round(PIECE_DURATION / float(np.median(np.diff(t)))))
+        if 0 < np.sum(is_diverged) <= len(is_diverged) / 2:
+            keep[np.flatnonzero(is_diverged)[:, None] + np.arange(width + 1)] = False
+            repairs.append(f"dropped {np.sum(~keep)} samples without {pair.requirement}, which the others have")
     t, data = t[keep], {key: x[keep] for key, x in data.items()}
     laws = _laws(t, data, derived)
     broken = [k for k, law in enumerate(laws) if law.fault]
@@ -112,13 +112,16 @@ def check_motion(
             f"{MIN_SPAN:g} m or more, or give metres_per_unit."
         )
     remedy, n_faults = "", len(broken)
-    for words, changed in _alternatives(data, derived):
-        after = _laws(t, changed, derived)
+    for remedy_text, changed in _alternatives(data, derived):
+        new_laws = _laws(t, changed, derived)
         # Another law may be broken by another mistake. A factor that makes a motion vanish explains nothing.
-        worse = any((y.fault and not x.fault) or (x.moves and not y.moves) for x, y in zip(laws, after, strict=True))
-        n_left = sum(bool(law.fault) for law in after)
-        if n_left < n_faults and not worse and not after[broken[0]].fault:
-            remedy, n_faults = words, n_left
+        breaks_another = any(
+            (y.fault and not x.fault) or (x.has_motion and not y.has_motion)
+            for x, y in zip(laws, new_laws, strict=True)
+        )
+        n_left = sum(bool(law.fault) for law in new_laws)
+        if n_left < n_faults and not breaks_another and not new_laws[broken[0]].fault:
+            remedy, n_faults = remedy_text, n_left
             if not n_left:
                 break
     if remedy:
@@ -144,7 +147,7 @@ class Law(NamedTuple):
 
     fault: str
     """Description of the violation; empty for none."""
-    moves: bool
+    has_motion: bool
     """True if the log contains the motion that the law describes."""
 
 
@@ -155,7 +158,9 @@ def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> 
     for pair in (*(pair for pair, _ in _rates(t, data, derived)), _thrust(t, data)):
         ratios = pair.ratios()
         listed = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in ratios)
-        text = f"{pair.what}, got ratios of measured to expected changes of {listed} on x, y, z, where 1 is right"
+        text = (
+            f"{pair.requirement}, got ratios of measured to expected changes of {listed} on x, y, z, where 1 is right"
+        )
         laws.append(Law("" if pair.agrees() else text, not np.all(np.isnan(ratios))))
     return laws
 
@@ -190,10 +195,10 @@ def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
     expected = integral(thrust[:, None] * axis - [0, 0, GRAVITY_MAGNITUDE], t)
     ground = np.cumsum(~flying)[:, None] * np.ones(3)
     width, (measured, expected, ground) = _changes(t, 0.25, data["vel"], expected, ground)
-    air = (ground[width:, 0] == 0) & (ground[:-width, 0] == 0)
-    if not np.any(air):
+    is_airborne = (ground[width:, 0] == 0) & (ground[:-width, 0] == 0)
+    if not np.any(is_airborne):
         return Pair("", np.zeros((1, 3)), np.zeros((1, 3)), 0.1)
-    measured, expected = ((x[width:] - x[:-width])[air] for x in (measured, expected))
+    measured, expected = ((x[width:] - x[:-width])[is_airborne] for x in (measured, expected))
     if not data["rotor_vel"].shape[1]:
         measured = measured * [1, 1, 0]  # Without speeds, changes along z are not predicted.
     return Pair("accelerations that follow from thrust and gravity", measured, expected, 0.1)
@@ -203,18 +208,18 @@ def _changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[N
     """Return the samples per window, and the changes of series over all windows; zero for windows across a gap."""
     dt = float(np.median(np.diff(t)))
     width = min(max(1, round(duration / dt)), len(t) - 1)
-    whole = t[width:] - t[:-width] < 1.5 * width * dt
-    return width, [(x[width:] - x[:-width]) * whole[:, None] for x in series]
+    has_no_gap = t[width:] - t[:-width] < 1.5 * width * dt
+    return width, [(x[width:] - x[:-width]) * has_no_gap[:, None] for x in series]
 
 
 def _diverged_windows(pair: Pair, size: int) -> NDArray:
     """Return True for the windows of pieces in which the error exceeds ten times the motion. (n,)"""
     motion, error = (np.linalg.norm(x, axis=-1) for x in (pair.measured, pair.expected - pair.measured))
-    typical, bad = max(float(np.median(motion)), pair.floor / 2), np.zeros(len(motion), bool)
+    typical, is_diverged = max(float(np.median(motion)), pair.floor / 2), np.zeros(len(motion), bool)
     for k in range(0, len(motion), size):
         part = slice(k, k + size)
-        bad[part] = np.median(error[part]) > DIVERGED_ERROR * max(typical, float(np.median(motion[part])))
-    return bad
+        is_diverged[part] = np.median(error[part]) > DIVERGED_ERROR * max(typical, float(np.median(motion[part])))
+    return is_diverged
 
 
 def _thrust_axis(quat: NDArray) -> NDArray:
@@ -229,18 +234,18 @@ def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iter
     def scaled(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
         return {**data, **{key: data[key] * np.asarray(x) for key, x in factors.items()}}
 
-    for (unit, x), (other, y) in product(UNITS.items(), repeat=2):
+    for (unit, x), (speed_unit, y) in product(LENGTH_UNITS.items(), repeat=2):
         if "vel" in derived and x != y:
             continue
         if y == 1 or "vel" in derived:
-            words = f"The position seems to be in {unit}: give metres_per_unit={x:g}"
+            remedy_text = f"The position seems to be in {unit}: give metres_per_unit={x:g}"
         elif x == 1:
-            words = f"The velocity seems to be in {other}/s: give speed_per_unit={y:g}"
+            remedy_text = f"The velocity seems to be in {speed_unit}/s: give speed_per_unit={y:g}"
         else:
             factors = f"metres_per_unit={x:g} and speed_per_unit={y:g}"
-            words = f"Position and velocity seem to be in {unit} and {other}/s: give {factors}"
+            remedy_text = f"Position and velocity seem to be in {unit} and {speed_unit}/s: give {factors}"
         if (x, y) != (1, 1):
-            yield words, scaled(pos=x, vel=y)
+            yield remedy_text, scaled(pos=x, vel=y)
     degrees = math.pi / 180
     yield (
         f"The angular velocity seems to be in degrees per second: give rad_per_unit={degrees:.6g}",
@@ -252,22 +257,22 @@ def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iter
             names = ",".join(
                 ("-" if s < 0 else "") + key for s, key in zip(signs, ("roll", "pitch", "yaw"), strict=True)
             )
-            turned = np.asarray(rotation.from_rpy(jnp.asarray(angles * np.array(signs))), np.float64)
+            turned_quat = np.asarray(rotation.from_rpy(jnp.asarray(angles * np.array(signs))), np.float64)
             also = "" if x == 1 else f", and the angular velocity in degrees per second: give rad_per_unit={x:.6g}"
             yield (
                 f"The angles seem to be rpy={names}, with names of your columns{also}",
-                {**scaled(ang_vel=x), "quat": turned},
+                {**scaled(ang_vel=x), "quat": turned_quat},
             )
     else:
-        first, inverse = data["quat"][:, [1, 2, 3, 0]], (-1, -1, -1, 1)
+        reordered, inverse = data["quat"][:, [1, 2, 3, 0]], (-1, -1, -1, 1)
         yield (
             "The quaternions seem to be in the order w, x, y, z: name them in the order x, y, z, w",
-            {**data, "quat": first},
+            {**data, "quat": reordered},
         )
         yield "The quaternions seem to be world to body: give the signs quat=-qx,-qy,-qz,qw", scaled(quat=inverse)
         yield (
             "The quaternions seem to be in the order w, x, y, z and world to body: give quat=-qx,-qy,-qz,qw",
-            {**data, "quat": first * np.array(inverse)},
+            {**data, "quat": reordered * np.array(inverse)},
         )
     down = (1, -1, -1)
     yield (

@@ -36,7 +36,7 @@ from crazysim.rotation import rotate, rotate_inverse
 
 WINDOW_DURATION = 0.5
 """Duration of the windows over which forces and torques change the velocities, s."""
-SLOW_CORNER = 0.2
+SLOW_TORQUE_DELAY_STD = 0.2
 """Standard deviation of delays for slow torques, samples. In simulated flights at 100 Hz whose commands change at
 samples, torques per velocity had the errors that a delay of 0.4 to 0.5 samples would cause, for an unknown reason."""
 MAX_FACTOR = 10.0
@@ -57,7 +57,7 @@ TORQUES = (
     "centre of mass x", "centre of mass y", "torque z", *(f"torque {a} per velocity {b}" for a in "xyz" for b in "xyz"),
 )  # fmt: skip
 """Parameters of the torque, m, N m and N s."""
-UNITS = dict(
+PARAMETER_UNITS = dict(
     zip((*FORCES, *TORQUES), ("", *["N s/m"] * 3, *["N s^2/m^2"] * 3, "m", "m", "N m", *["N s"] * 9), strict=True)
 )
 """Units of these parameters; empty for factors."""
@@ -77,8 +77,9 @@ class Identification:
     """Identified parameters by name, see ``FACTORS``, ``FORCES`` and ``TORQUES``, and ``motor lag``, 1/s, for logs with
     commands and measured speeds."""
     deviations: dict[str, float]
-    """Standard deviations of the parameters, from the scatter between blocks of 10 s, enlarged if there are few blocks,
-    so that three standard deviations contain the truth in 99% of the fits; NaN for fewer than three blocks."""
+    """Standard deviations of the parameters, from the scatter between blocks of 10 s, enlarged if there are few blocks
+    so that three of them are as likely to contain the truth as with many; NaN for fewer than three blocks. In simulated
+    flights three contain the truth for at least 99% of the parameters."""
     delays: dict[str, float]
     """Delay of the state behind the rotor speeds in each log, by its name, s."""
     changes: dict[str, NDArray]
@@ -95,7 +96,7 @@ class Identification:
 
     def describe(self) -> list[str]:
         """Return a line for each parameter: name, value, standard deviation and unit."""
-        units = UNITS | {"motor lag": "1/s"}
+        units = PARAMETER_UNITS | {"motor lag": "1/s"}
         spreads = {key: "unknown" if math.isnan(x) else f"{x:.2g}" for key, x in self.deviations.items()}
         return [f"{key:26}{x:10.4g} +- {spreads[key]} {units.get(key, '')}".rstrip() for key, x in self.values.items()]
 
@@ -162,12 +163,12 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     force, force_spread = _forces(logs, params)
     force_spread[0] = math.hypot(force_spread[0], SAMPLING_ERROR * force[0])
     torque, torque_spread = _torques(logs, params, float(force[0]), fast.values)
-    late = [aligned(log, SLOW_CORNER * log.dt) for log in logs]
-    torque_spread = np.hypot(torque_spread, _torques(late, params, float(force[0]), fast.values)[0] - torque)
+    delayed_logs = [aligned(log, SLOW_TORQUE_DELAY_STD * log.dt) for log in logs]
+    torque_spread = np.hypot(torque_spread, _torques(delayed_logs, params, float(force[0]), fast.values)[0] - torque)
     for k, step in enumerate(fast.deviations):
         if math.isfinite(step):
-            other = _torques(logs, params, float(force[0]), fast.values + step * (np.arange(5) == k))[0]
-            torque_spread = np.hypot(torque_spread, other - torque)
+            shifted_torque = _torques(logs, params, float(force[0]), fast.values + step * (np.arange(5) == k))[0]
+            torque_spread = np.hypot(torque_spread, shifted_torque - torque)
 
     def named(force: NDArray, torque: NDArray, fast: NDArray) -> dict[str, float]:
         numbers = [*force, *torque, *fast]

@@ -96,16 +96,16 @@ def _lag(a: NDArray, b: NDArray) -> tuple[float, float]:
 
     ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
     count = np.round(product(ones_a, ones_b))
-    safe = np.maximum(count, 1)
-    mean_a, mean_b = product(a, ones_b) / safe, product(ones_a, b) / safe
-    covariance = product(a, b) / safe - mean_a * mean_b
-    variance = (product(a * a, ones_b) / safe - mean_a**2) * (product(ones_a, b * b) / safe - mean_b**2)
+    safe_count = np.maximum(count, 1)
+    mean_a, mean_b = product(a, ones_b) / safe_count, product(ones_a, b) / safe_count
+    covariance = product(a, b) / safe_count - mean_a * mean_b
+    variance = (product(a * a, ones_b) / safe_count - mean_a**2) * (product(ones_a, b * b) / safe_count - mean_b**2)
     overlap = count >= 0.5 * min(len(a), len(b))
     agreement = np.where(overlap, covariance / np.sqrt(np.maximum(variance, 1e-12)), -1.0)
     k = int(np.argmax(agreement))
     left, middle, right = agreement[k - 1], agreement[k], agreement[(k + 1) % n]
-    bend = left - 2 * middle + right
-    peak = k + (0.5 * (left - right) / bend if bend < 0 else 0.0)
+    curvature = left - 2 * middle + right
+    peak = k + (0.5 * (left - right) / curvature if curvature < 0 else 0.0)
     return (peak if k < len(a) else peak - n), float(middle)
 
 

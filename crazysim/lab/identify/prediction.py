@@ -55,7 +55,7 @@ State = tuple[Array, Array, Array, Array, Array]
 class Predictor(Protocol):
     """Model that predicts logged flights: ``Model`` or ``FittedModel``."""
 
-    def prepared(self, log: Log) -> Log:
+    def prepare_log(self, log: Log) -> Log:
         """Return the log with its columns converted to the variables of the model."""
         ...
 
@@ -95,7 +95,7 @@ class Model(PyTree):
         residual = ResidualData.create(airframe) if has_residual else ResidualData(jnp.zeros((6, N_INPUTS)), None, None)
         return Model(params=params, residual=residual)
 
-    def prepared(self, log: Log) -> Log:
+    def prepare_log(self, log: Log) -> Log:
         """Return the log."""
         return log
 
@@ -117,12 +117,12 @@ class Model(PyTree):
 
     def derivative(self, state: State, inputs: Array) -> State:
         """Return the time derivatives of a state under rotor speeds and their accelerations."""
-        (pos, quat, vel, ang_vel, none), (speed, acceleration), p = state, inputs, self.params
+        (pos, quat, vel, ang_vel, no_states), (speed, acceleration), p = state, inputs, self.params
         force, torque = residual_wrench(residual_inputs(quat, vel, ang_vel, speed, p), self.residual)
         torque = torque + reaction_torque(acceleration, p.mixing_matrix[..., 2, :], p.prop_inertia)
         force, torque = rotation.rotate(quat, force), rotation.rotate(quat, torque)
         _, acc, ang_acc, _ = first_principles.dynamics(pos, quat, vel, ang_vel, speed, speed, force, torque, params=p)
-        return vel, ang_vel, acc, ang_acc, none
+        return vel, ang_vel, acc, ang_acc, no_states
 
 
 def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
@@ -174,7 +174,7 @@ def predict(
         vel, ang_vel, acc, ang_acc, more_rates = model.derivative(state, inputs)
         return vel, ang_vel, acc, jnp.zeros_like(ang_acc) if constant_rates else ang_acc, more_rates
 
-    def moved(state: State, rates: State, duration: float) -> State:
+    def advance_state(state: State, rates: State, duration: float) -> State:
         pos, quat, vel, ang_vel, more_states = state
         return (
             pos + duration * rates[0],
@@ -186,12 +186,12 @@ def predict(
 
     def step(state: State, inputs: Array) -> tuple[State, State]:
         k1 = derivative(state, inputs[0])
-        k2 = derivative(moved(state, k1, dt / 2), inputs[1])
-        k3 = derivative(moved(state, k2, dt / 2), inputs[1])
-        k4 = derivative(moved(state, k3, dt), inputs[2])
+        k2 = derivative(advance_state(state, k1, dt / 2), inputs[1])
+        k3 = derivative(advance_state(state, k2, dt / 2), inputs[1])
+        k4 = derivative(advance_state(state, k3, dt), inputs[2])
         mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-        new = moved(state, mean, dt)
-        return new, new
+        next_state = advance_state(state, mean, dt)
+        return next_state, next_state
 
     start = (window.pos[0], window.quat[0], window.vel[0], window.ang_vel[0], model.start(window))
     _, path = jax.lax.scan(step, start, model.inputs(window, dt))
@@ -224,7 +224,7 @@ def prediction_errors(
         ``position at constant velocity``, ``attitude unchanged``. The same names with `` (mean)`` appended have the
         mean distances, m, and angles, degrees, between predicted and measured states. (len(horizons),) each
     """
-    batch, dt = windows([model.prepared(log) for log in logs], max(horizons), 0.05), logs[0].dt
+    batch, dt = windows([model.prepare_log(log) for log in logs], max(horizons), 0.05), logs[0].dt
     pos, quat, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt)))(batch)
     pos_turning, quat_turning, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt, constant_rates=True)))(batch)
     samples = np.asarray([round(h / dt) for h in horizons])

@@ -55,7 +55,10 @@ def resample(
     """
     columns = columns or Columns()
     quat, angles = ([unsigned_name(x) for x in names] for names in (columns.quat, columns.rpy))
-    required, slowly = {*map(unsigned_name, columns.pos), *quat, *angles}, set(map(unsigned_name, columns.voltage))
+    required, slow_columns = (
+        {*map(unsigned_name, columns.pos), *quat, *angles},
+        set(map(unsigned_name, columns.voltage)),
+    )
     sorted_streams = {}
     for key, stream in streams.items():
         order = np.unique(stream.t, return_index=True)[1]
@@ -66,17 +69,17 @@ def resample(
             raise ConfigError(f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often.")
         values = {c: without_huge_numbers(x[order]) for c, x in stream.columns.items()}
         step = float(np.median(np.diff(stream.t[order])))
-        if step > PERIOD_RANGE[1] and not set(values) <= slowly:
+        if step > PERIOD_RANGE[1] and not set(values) <= slow_columns:
             interval = f"{key} every {PERIOD_RANGE[1]:g} s or more often, got every {step:.2g} s"
             if required & set(values):
                 raise ConfigError(f"{name}: expected {interval}. Log it faster.")
             repairs.append(f"left out a slow stream: expected {interval}")
             continue
         if quat and all(c in values for c in quat):
-            turned = align_signs(np.stack([values[c] for c in quat], axis=-1))
-            values |= dict(zip(quat, turned.T, strict=True))
-        turn = 2 * np.pi / abs(columns.rad_per_angle)
-        values |= {c: unwrap_angles(values[c], turn) for c in angles if c in values}
+            continuous_quat = align_signs(np.stack([values[c] for c in quat], axis=-1))
+            values |= dict(zip(quat, continuous_quat.T, strict=True))
+        full_turn = 2 * np.pi / abs(columns.rad_per_angle)
+        values |= {c: unwrap_angles(values[c], full_turn) for c in angles if c in values}
         sorted_streams[key] = Stream(stream.t[order], values)
     if not sorted_streams:
         raise ConfigError(

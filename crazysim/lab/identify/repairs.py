@@ -106,16 +106,17 @@ def find_gaps(name: str, t: NDArray, repairs: list[str]) -> NDArray:
     """
     steps = np.diff(t)
     dt = float(np.median(steps))
-    wide = 1 + np.flatnonzero(steps > 1.5 * dt)
-    over = min(5 * N_NEIGHBOURS, len(t) - 1)
-    lateness = t - t[0] - np.median(t[over:] - t[:-over]) / over * np.arange(len(t))
-    sides = [(lateness[max(k - N_NEIGHBOURS, 0) : k], lateness[k : k + N_NEIGHBOURS]) for k in wide]
+    late_samples = 1 + np.flatnonzero(steps > 1.5 * dt)
+    n_intervals = min(5 * N_NEIGHBOURS, len(t) - 1)
+    lateness = t - t[0] - np.median(t[n_intervals:] - t[:-n_intervals]) / n_intervals * np.arange(len(t))
+    sides = [(lateness[max(k - N_NEIGHBOURS, 0) : k], lateness[k : k + N_NEIGHBOURS]) for k in late_samples]
     lost = [np.median(b) - np.median(a) > dt / 2 and np.min(b) > np.max(a) for a, b in sides]
-    gaps = wide[np.array(lost, bool)]
-    if len(wide) > len(gaps):
+    gaps = late_samples[np.array(lost, bool)]
+    if len(late_samples) > len(gaps):
+        longest = float(np.max(steps[late_samples - 1]))
         repairs.append(
-            f"kept {len(wide) - len(gaps)} intervals of the time of up to {np.max(steps[wide - 1]):.3g} s that the "
-            "next ones make up for, as jitter"
+            f"kept {len(late_samples) - len(gaps)} intervals of the time of up to {longest:.3g} s that the next ones "
+            "make up for, as jitter"
         )
     if len(gaps):
         longest = float(np.max(steps[gaps - 1]))
@@ -135,7 +136,7 @@ def interpolate_missing(
     A value is missing where it is not finite, an attitude also where its quaternion is zero, as motion capture gives
     for a lost body.
     """
-    keep, lost, whole = np.ones(len(t), bool), [], {}
+    keep, lost, repaired = np.ones(len(t), bool), [], {}
     for key, x in data.items():
         is_valid = np.all(np.isfinite(x), axis=-1)
         if key == "quat":
@@ -172,12 +173,12 @@ def interpolate_missing(
         if not np.all(is_valid):
             x = np.stack([np.interp(t, t[is_valid], c[is_valid]) for c in x.T], axis=-1)
             x = x / np.linalg.norm(x, axis=-1, keepdims=True) if key == "quat" else x
-        whole[key] = x
+        repaired[key] = x
     if lost:
         repairs.append(
             f"dropped {np.sum(~keep)} samples, in which {', '.join(lost)} were missing for over {MAX_INTERPOLATION:g} s"
         )
-    return t[keep], {key: x[keep] for key, x in whole.items()}
+    return t[keep], {key: x[keep] for key, x in repaired.items()}
 
 
 def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str]) -> NDArray:
@@ -226,15 +227,15 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
 def remove_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
     """Return rotor speeds, interpolated where they are negative or more than three times their median. (n, n_rotors)"""
     is_valid = (x >= 0) & (x <= 3 * np.median(x, axis=0))
-    bad = int(np.sum(~is_valid))
-    if bad > MAX_REPAIRED_SHARE * x.size:
+    n_invalid = int(np.sum(~is_valid))
+    if n_invalid > MAX_REPAIRED_SHARE * x.size:
         raise ConfigError(
-            f"{name}: expected rotor speeds from 0 to three times their median, got {bad} others. "
+            f"{name}: expected rotor speeds from 0 to three times their median, got {n_invalid} others. "
             "Cut the log to the flight, and check that the columns are speeds."
         )
-    if not bad:
+    if not n_invalid:
         return x
-    repairs.append(f"interpolated {bad} rotor speeds that were negative or more than three times the median")
+    repairs.append(f"interpolated {n_invalid} rotor speeds that were negative or more than three times the median")
     index = np.arange(len(x))
     return np.stack([np.interp(index, index[g], c[g]) for c, g in zip(x.T, is_valid.T, strict=True)], axis=-1)
 
@@ -250,12 +251,12 @@ def normalise_quats(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
             "Name four components, x, y, z and w in this order, as quat."
         )
     solution, *_ = np.linalg.lstsq(np.c_[2 * quat, np.ones(len(quat))], norm**2, rcond=None)
-    moved = quat - solution[:4]
-    moved_norm = np.linalg.norm(moved, axis=-1)
-    if np.all(np.abs(moved_norm - 1) < NORM_TOLERANCE):
+    centred = quat - solution[:4]
+    centred_norm = np.linalg.norm(centred, axis=-1)
+    if np.all(np.abs(centred_norm - 1) < NORM_TOLERANCE):
         offset = ", ".join(f"{x:.4f}" for x in solution[:4])
         repairs.append(f"subtracted ({offset}) from the quaternions, which makes them unit")
-        return moved / moved_norm[:, None]
+        return centred / centred_norm[:, None]
     repairs.append(f"normalised quaternions of norms from {norm.min():.4f} to {norm.max():.4f}")
     return quat / norm[:, None]
 

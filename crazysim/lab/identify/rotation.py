@@ -91,18 +91,19 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
         x, y = 1 / roll / moments[0], 1 / pitch / moments[1]
         z = (x * moments[0] + y * moments[1]) / (moments[0] + moments[1])
         values = np.array([x, y, z, *(max(c, 0.0) * moments[2] * z for c in (drag, reaction))])
-    late = np.concatenate(
+    delayed = np.concatenate(
         [_blocks(_LogTerms.create(log, params, thrust_factor, values), DELAY_DEVIATION) for log in logs]
     )
-    turned = [weighted_median(late[:, k], late[:, k + 5])[0] - medians[k][0] for k in (2, 3)]
+    yaw_changes = [weighted_median(delayed[:, k], delayed[:, k + 5])[0] - medians[k][0] for k in (2, 3)]
     inertia = moments * values[:3]
     tilt = np.array(deviations[:2]) / [roll, pitch]
-    turn = np.hypot(*(tilt * inertia[:2])) / np.sum(inertia[:2])
+    mean_tilt_deviation = np.hypot(*(tilt * inertia[:2])) / np.sum(inertia[:2])
     spread = np.hypot(
-        [*tilt * [x, y], turn * z, *inertia[2] * np.hypot(deviations[2:], turned)], SAMPLING_ERROR * values
+        [*tilt * [x, y], mean_tilt_deviation * z, *inertia[2] * np.hypot(deviations[2:], yaw_changes)],
+        SAMPLING_ERROR * values,
     )
-    every = weighted_median(estimates[:, 4], np.ones(len(estimates)))[0]
-    delays = [weighted_median(b[:, 4], b[:, 5])[0] if len(b) else every for b in blocks]
+    overall_delay = weighted_median(estimates[:, 4], np.ones(len(estimates)))[0]
+    delays = [weighted_median(b[:, 4], b[:, 5])[0] if len(b) else overall_delay for b in blocks]
     return FastRotation(values, spread, np.array(delays))
 
 
@@ -143,7 +144,7 @@ class _LogTerms(NamedTuple):
 
     dt: float
     gaps: NDArray
-    turned: NDArray
+    ang_vel_change: NDArray
     """Change of the angular velocity, plus the change by gyroscopic torques, rad/s. (n, 3)"""
     angle: NDArray
     """Integral of the angular velocity, rad. (n, 3)"""
@@ -238,14 +239,14 @@ def _band(x: NDArray, dt: float, slow: float) -> NDArray:
     return smooth(FAST_WIDTH) - smooth(slow)
 
 
-def _blocks(d: _LogTerms, late: float = 0.0) -> NDArray:
-    """Return the solution of each block, about z with a delay that is longer by ``late`` samples.
+def _blocks(d: _LogTerms, extra_delay: float = 0.0) -> NDArray:
+    """Return the solution of each block, about z with a delay that is longer by ``extra_delay`` samples.
 
     The columns are the coefficients of torque about x and y, of drag torque and of reaction; the delay, s; and the
     variances of the four coefficients.
     (n_blocks, 9)
     """
-    n, margin = len(d.turned), round(YAW_SLOW_WIDTH / d.dt / 2)
+    n, margin = len(d.ang_vel_change), round(YAW_SLOW_WIDTH / d.dt / 2)
     keep = np.ones(n, bool)
     for gap in (0, *d.gaps, n):
         keep[max(0, gap - margin) : gap + margin] = False
@@ -260,8 +261,8 @@ def _blocks(d: _LogTerms, late: float = 0.0) -> NDArray:
             # Torque and its rate over time: torque(t - e) = torque - e rate.
             delay -= float(np.mean([x[1] / x[0] for x, _ in tilt]))
             delay = float(np.clip(delay, -MAX_DELAY, MAX_DELAY))
-        turn, variance = _solve(d, 2, delay + late * d.dt, indices)
-        blocks.append([*(x[0] for x, _ in tilt), *turn[:2], delay, *(v[0] for _, v in tilt), *variance[:2]])
+        yaw, variance = _solve(d, 2, delay + extra_delay * d.dt, indices)
+        blocks.append([*(x[0] for x, _ in tilt), *yaw[:2], delay, *(v[0] for _, v in tilt), *variance[:2]])
     return np.reshape(blocks, (-1, 9))
 
 
@@ -280,12 +281,13 @@ def _solve(d: _LogTerms, axis: int, delay: float, samples: NDArray) -> tuple[NDA
         return np.c_[shift_series(np.stack(columns, axis=-1), delay / d.dt), d.angle[:, axis]]
 
     slow = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH
-    regressors, instruments, turned = (
-        _band(x, d.dt, slow)[samples] for x in (terms(d.rotors), terms(d.instruments), d.turned[:, axis : axis + 1])
+    regressors, instruments, ang_vel_change = (
+        _band(x, d.dt, slow)[samples]
+        for x in (terms(d.rotors), terms(d.instruments), d.ang_vel_change[:, axis : axis + 1])
     )
     inverse = np.linalg.pinv(instruments.T @ regressors)
-    x = inverse @ instruments.T @ turned[:, 0]
-    residual = turned[:, 0] - regressors @ x
+    x = inverse @ instruments.T @ ang_vel_change[:, 0]
+    residual = ang_vel_change[:, 0] - regressors @ x
     return x, np.mean(residual**2) * np.diag(inverse @ (instruments.T @ instruments) @ inverse.T)
 
 
@@ -294,11 +296,11 @@ def shift_series(x: NDArray, samples: float) -> NDArray:
 
     A straight line between two samples would lower a sine of 20 Hz at 100 Hz by up to 19%; this lowers it by 1.5%.
     """
-    whole = math.floor(samples)
-    part, taps = samples - whole, np.arange(-2, 4)
-    late, n = np.zeros_like(x), len(x)
+    whole_samples = math.floor(samples)
+    fraction, taps = samples - whole_samples, np.arange(-2, 4)
+    delayed, n = np.zeros_like(x), len(x)
     for k in taps:
-        others = taps[taps != k]
-        weight = np.prod((part - others) / (k - others))
-        late += weight * x[np.clip(np.arange(n) - whole - k, 0, n - 1)]
-    return late
+        other_taps = taps[taps != k]
+        weight = np.prod((fraction - other_taps) / (k - other_taps))
+        delayed += weight * x[np.clip(np.arange(n) - whole_samples - k, 0, n - 1)]
+    return delayed

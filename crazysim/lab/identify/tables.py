@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from crazysim import rotation
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.bags import is_bag, read_bag
-from crazysim.lab.identify.blackbox import header_of, read_blackbox
+from crazysim.lab.identify.blackbox import find_header, read_blackbox
 from crazysim.lab.identify.columns import KNOWN_COLUMNS, Columns, stack_columns, unsigned_name
 from crazysim.lab.identify.delimited import read_delimited
 from crazysim.lab.identify.readers import read_crazyflie
@@ -72,7 +72,7 @@ def _read(
                 table = read_arrays(file, path.name)
         elif path.suffix != ".csv":
             return path.stem, read_crazyflie(path, repairs, columns)
-        elif header_of(path) is not None:
+        elif find_header(path) is not None:
             return path.stem, read_blackbox(path, repairs)
         else:
             table = read_delimited(path, repairs)

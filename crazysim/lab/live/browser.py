@@ -115,7 +115,7 @@ class Browser(Viewer[Live]):
             self._server = guarded_server(viser, access, label="crazysim")
         scene = self._server.scene
         scene.set_up_direction("+z")
-        drones = self._picture.drones
+        drones = self._picture.drone_pos
         extent = float(np.nanmax(np.ptp(drones, axis=1)[..., :2])) + 2 * WORLD_MARGIN
         spacing = extent if self._spacing is None else self._spacing
         self._scene = BrowserScene(self._server, shapes, bodies, self._picture, spacing, self._trail)

@@ -100,8 +100,8 @@ class BrowserPanel:
                 self._drone.value = picture.selected[1]
             if picture.followed is not None and self._world.value != picture.followed[0]:
                 self._world.value = picture.followed[0]
-            if self._body is not None and self._body.value != picture.name:
-                self._body.value = picture.name
+            if self._body is not None and self._body.value != picture.followed_name:
+                self._body.value = picture.followed_name
         plotted = (self.plot, picture.selected, len(picture.plot))
         if plotted != self._plotted or (self._samples and picture.time < self._samples[-1][0]):
             self._plotted = plotted

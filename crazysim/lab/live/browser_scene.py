@@ -50,7 +50,7 @@ class BrowserScene:
         """
         self._scene, self._bodies = server.scene, bodies
         scene = server.scene
-        n_worlds, n_drones = picture.drones.shape[:2]
+        n_worlds, n_drones = picture.drone_pos.shape[:2]
         self.offsets = grid_offsets(n_worlds, spacing)
         self._root = scene.add_frame("/world", show_axes=False)
         by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
@@ -69,15 +69,15 @@ class BrowserScene:
                 node = scene.add_frame(f"/world/fixed/{w}/{k}", position=offset, show_axes=False)
                 add_static(scene, node.name, others, rgba)
         self._batches: list[tuple[Any, NDArray]] = []
-        for alike in _group_equal_bodies(by_body):
-            self._add_bodies(np.array(alike), by_body[alike[0]], picture)
+        for equal_bodies in _group_equal_bodies(by_body):
+            self._add_bodies(np.array(equal_bodies), by_body[equal_bodies[0]], picture)
 
         colors = np.tile(colors_of(n_drones, None)[:, :3], (n_worlds, 1))
-        drones = self._moved(picture.drones).reshape(-1, 3)
+        drones = self._to_grid(picture.drone_pos).reshape(-1, 3)
         self._setpoints = self._add_balls("setpoints", SETPOINT_RADIUS, picture.setpoint, rgb_of(colors), 0.8)
-        self._contacts = self._add_balls("contacts", MARK_RADIUS, picture.drones, CONTACT_COLOR, 0.45)
+        self._contacts = self._add_balls("contacts", MARK_RADIUS, picture.drone_pos, CONTACT_COLOR, 0.45)
         self._contacts.batched_scales = np.full(len(drones), HIDDEN_SCALE, np.float32)
-        self._lights = self._add_balls("lights", LIGHT_RADIUS, picture.drones, rgb_of(0 * colors), 0.7)
+        self._lights = self._add_balls("lights", LIGHT_RADIUS, picture.drone_pos, rgb_of(0 * colors), 0.7)
         self._lights.batched_scales = np.full(len(drones), HIDDEN_SCALE, np.float32)
         self._lit = np.zeros_like(colors)
         self._followed = scene.add_icosphere(
@@ -86,7 +86,7 @@ class BrowserScene:
         self._label = scene.add_label("/world/followed/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
         self._wind = None
         self._tracked = bodies.tracked
-        tracked = self._moved(picture.pos[:, self._tracked]).reshape(-1, 3)
+        tracked = self._to_grid(picture.pos[:, self._tracked]).reshape(-1, 3)
         trail_colors = np.tile(colors_of(len(self._tracked), None)[:, :3], (n_worlds, 1))
         self._trail = Trails(scene, tracked, trail_colors, trail) if trail > 0 else None
         self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind", "lights"), True)
@@ -98,19 +98,19 @@ class BrowserScene:
             picture: Picture.
             follow: True to keep the followed body in the middle: the worlds move, and the camera stays.
         """
-        pos, show = self._moved(picture.pos), self.visible
+        pos, show = self._to_grid(picture.pos), self.visible
         for handle, bodies in self._batches:
             handle.batched_positions = finite_rows(pos[:, bodies].reshape(-1, 3))
             handle.batched_wxyzs = finite_rows(
                 np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4), (1, 0, 0, 0)
             )
-        drones = self._moved(picture.drones)
+        drones = self._to_grid(picture.drone_pos)
         if self._setpoints is not None:
             self._setpoints.visible = show["setpoints"]
-            self._setpoints.batched_positions = finite_rows(self._moved(picture.setpoint).reshape(-1, 3))
-        touching = picture.touching.ravel() & show["contacts"]
-        self._contacts.batched_scales = np.where(touching, 1.0, HIDDEN_SCALE).astype(np.float32)
-        if touching.any():
+            self._setpoints.batched_positions = finite_rows(self._to_grid(picture.setpoint).reshape(-1, 3))
+        has_contact = picture.has_contact.ravel() & show["contacts"]
+        self._contacts.batched_scales = np.where(has_contact, 1.0, HIDDEN_SCALE).astype(np.float32)
+        if has_contact.any():
             self._contacts.batched_positions = finite_rows(drones.reshape(-1, 3))
         self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * show["lights"])
         self._show_wind(drones, picture)
@@ -154,7 +154,7 @@ class BrowserScene:
             origin: Start of the ray, frame of the grid of worlds, m. (3,)
             direction: Unit vector. (3,)
         """
-        start = origin - self._moved(picture.pos)
+        start = origin - self._to_grid(picture.pos)
         away = np.linalg.norm(start, axis=-1, keepdims=True)
         low, high = self._bodies.low, self._bodies.high
         drones = np.array([self._bodies.items[k].kind == DRONE for k in self._bodies.owner])
@@ -173,7 +173,7 @@ class BrowserScene:
         by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
         for shape in shapes:
             by_color[tuple(np.round(shape.rgba, 3))].append(shape)
-        pos = self._moved(picture.pos)[:, bodies].reshape(-1, 3)
+        pos = self._to_grid(picture.pos)[:, bodies].reshape(-1, 3)
         quat = np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4)
         for k, (rgba, same) in enumerate(by_color.items()):
             mesh = mesh_of(same)
@@ -192,7 +192,7 @@ class BrowserScene:
         import trimesh
 
         ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-        points = finite_rows(self._moved(pos).reshape(-1, 3))
+        points = finite_rows(self._to_grid(pos).reshape(-1, 3))
         return self._scene.add_batched_meshes_simple(
             f"/world/{name}", np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32),
             np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), points, batched_colors=colors, opacity=opacity, lod="off",
@@ -238,10 +238,10 @@ class BrowserScene:
         self._followed.position = pos
         if radius != self._followed.radius:  # only on a change, because browsers rebuild the sphere
             self._followed.radius, self._label.position = radius, (0.0, 0.0, radius)
-        self._label.text = picture.name
+        self._label.text = picture.followed_name
         self._root.position = -pos if follow else (0.0, 0.0, 0.0)
 
-    def _moved(self, pos: NDArray) -> NDArray:
+    def _to_grid(self, pos: NDArray) -> NDArray:
         """Return positions in the frame of the grid, from positions in the frame of each world, m."""
         return pos + self.offsets[:, None]
 

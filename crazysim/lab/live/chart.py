@@ -8,11 +8,11 @@ import numpy as np
 from crazysim.lab.live.picture import Picture
 from crazysim.media.trail import COLORS
 
-LENGTH = 400
-"""Number of samples of a line."""
+MAX_SAMPLES = 400
+"""Largest number of samples of a line."""
 MAX_LINES = 6
 """Largest number of lines."""
-PART = 0.3
+PLOT_FRACTION = 0.3
 """Width and height of the plot, as a fraction of the window's."""
 
 
@@ -46,7 +46,7 @@ class Chart:
         if len(values) and np.isfinite(values).all() and (not self._times or picture.time > self._times[-1]):
             self._times.append(picture.time)
             self._values.append(values)
-            del self._times[:-LENGTH], self._values[:-LENGTH]
+            del self._times[:-MAX_SAMPLES], self._values[:-MAX_SAMPLES]
 
     def draw(self, window: mujoco.MjrRect, context: mujoco.MjrContext) -> None:
         """Draw the lines into the lower right corner of a window."""
@@ -60,6 +60,6 @@ class Chart:
         low, high = float(lines.min()), float(lines.max())
         margin = max(0.05 * (high - low), 1e-3)
         self._figure.range[:] = (self._times[0], self._times[-1]), (low - margin, high + margin)
-        width, height = int(PART * window.width), int(PART * window.height)
+        width, height = int(PLOT_FRACTION * window.width), int(PLOT_FRACTION * window.height)
         corner = mujoco.MjrRect(window.left + window.width - width, window.bottom, width, height)
         mujoco.mjr_figure(corner, self._figure, context)

@@ -76,7 +76,7 @@ class Frames:
 
     def _reset_scan(self) -> None:
         """Restart the search for the end of the message at the front."""
-        self._at = self._depth = 0
+        self._scan_position = self._depth = 0
         self._in_string = False
 
     @property
@@ -97,29 +97,29 @@ class Frames:
 
     def _next(self) -> Message | Request | ShowFile | None:
         """Return the message at the front of the buffer and remove it; None if it is incomplete."""
-        if not self._at and self._buffer[:1] and self._buffer[0] in SPACE_BYTES:
+        if not self._scan_position and self._buffer[:1] and self._buffer[0] in SPACE_BYTES:
             del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(SPACE_BYTES))]
         buffer = self._buffer
         if not buffer:
             return None
         if buffer.startswith(ZIP):
-            return self._show()
+            return self._read_show()
         if buffer.startswith(b"START"):
-            self._take(5)
+            self._discard(5)
             return Message(None, "show", "")
         if buffer.startswith(b"REQ_"):
             digits = bytes(buffer[4:6])
             if len(digits) == 2 and digits.isdigit():
-                self._take(6)
+                self._discard(6)
                 return Request(int(digits))
             if digits and not digits.isdigit():
-                raise FramingError(f"expected REQ_ and an ID of two digits, got {_shown(buffer)}")
+                raise FramingError(f"expected REQ_ and an ID of two digits, got {_excerpt(buffer)}")
             return None
         head = HEAD_PATTERN.match(buffer)
         if head is not None:
-            return self._message(head)
+            return self._read_message(head)
         if not self._may_begin(bytes(buffer[: MAX_TEXT + 1])):
-            raise FramingError(f"expected a message such as 07_CMDSTART_land_EOF, got {_shown(buffer)}")
+            raise FramingError(f"expected a message such as 07_CMDSTART_land_EOF, got {_excerpt(buffer)}")
         return None
 
     def _may_begin(self, front: bytes) -> bool:
@@ -132,7 +132,7 @@ class Frames:
             return False
         return bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", after[10:]))
 
-    def _message(self, head: re.Match[bytes]) -> Message | None:
+    def _read_message(self, head: re.Match[bytes]) -> Message | None:
         """Return the text message at the front of the buffer."""
         buffer = self._buffer
         brace = buffer.find(b"{", head.end() - 1, MAX_TEXT)
@@ -141,10 +141,10 @@ class Frames:
             return self._json_message(head, brace)
         if end < 0:
             if len(buffer) >= MAX_TEXT:
-                raise FramingError(f"expected _EOF or JSON within {MAX_TEXT} bytes, got {_shown(buffer)}")
+                raise FramingError(f"expected _EOF or JSON within {MAX_TEXT} bytes, got {_excerpt(buffer)}")
             return None
-        message = _message(head, bytes(buffer[head.end() : end]))
-        self._take(end + 4)
+        message = _make_message(head, bytes(buffer[head.end() : end]))
+        self._discard(end + 4)
         return message
 
     def _json_message(self, head: re.Match[bytes], brace: int) -> Message | None:
@@ -158,72 +158,72 @@ class Frames:
         rest = bytes(buffer[end : end + 16]).lstrip(SPACE_BYTES)
         if not rest.startswith(b"_EOF"):
             if len(rest) >= 4 or not b"_EOF".startswith(rest) or len(buffer) - end >= 16:
-                raise FramingError(f"expected _EOF after the JSON, got {_shown(buffer[end:])}")
+                raise FramingError(f"expected _EOF after the JSON, got {_excerpt(buffer[end:])}")
             return None
-        message = _message(head, bytes(buffer[head.end() : brace]).rstrip(b"_"), bytes(buffer[brace:end]))
-        self._take(buffer.index(b"_EOF", end) + 4)
+        message = _make_message(head, bytes(buffer[head.end() : brace]).rstrip(b"_"), bytes(buffer[brace:end]))
+        self._discard(buffer.index(b"_EOF", end) + 4)
         return message
 
     def _end_of_json(self, brace: int) -> int | None:
         """Return the end of a JSON object; each byte is examined only once, however the bytes arrive."""
-        self._at = max(self._at, brace)
-        while (token := TOKEN_PATTERN.search(self._buffer, self._at)) is not None:
+        self._scan_position = max(self._scan_position, brace)
+        while (token := TOKEN_PATTERN.search(self._buffer, self._scan_position)) is not None:
             kind = token[0]
             if kind == b"\\":
                 if token.end() >= len(self._buffer):
-                    self._at = token.start()
+                    self._scan_position = token.start()
                     return None
-                self._at = token.end() + 1  # skip the escaped character
+                self._scan_position = token.end() + 1  # skip the escaped character
                 continue
-            self._at = token.end()
+            self._scan_position = token.end()
             if kind == b'"':
                 self._in_string = not self._in_string
             elif not self._in_string:
                 self._depth += 1 if kind == b"{" else -1
                 if not self._depth:
-                    return self._ended()
-        self._at = len(self._buffer)
+                    return self._mark_json_end()
+        self._scan_position = len(self._buffer)
         return None
 
-    def _ended(self) -> int:
+    def _mark_json_end(self) -> int:
         """Return the end of the JSON object; the next search finds it again if the message is still incomplete."""
-        end = self._at
-        self._at, self._depth = end - 1, 1
+        end = self._scan_position
+        self._scan_position, self._depth = end - 1, 1
         return end
 
-    def _show(self) -> ShowFile | None:
+    def _read_show(self) -> ShowFile | None:
         """Return the show at the front of the buffer: an archive ends with its directory, and then comes SKYC."""
         buffer = self._buffer
-        while (zip_end := buffer.find(ZIP_END, self._at)) >= 0:
+        while (zip_end := buffer.find(ZIP_END, self._scan_position)) >= 0:
             if zip_end + 22 > len(buffer):
-                self._at = zip_end
+                self._scan_position = zip_end
                 break
             end = zip_end + 22 + struct.unpack_from("<H", buffer, zip_end + 20)[0]
             if buffer[end : end + 4] == b"SKYC":
                 content = bytes(buffer[:end])
-                self._take(end + 4)
+                self._discard(end + 4)
                 return ShowFile(content)
             if end + 4 > len(buffer):
-                self._at = zip_end
+                self._scan_position = zip_end
                 break
-            self._at = zip_end + 4
+            self._scan_position = zip_end + 4
         else:
-            self._at = max(len(buffer) - 3, 0)
+            self._scan_position = max(len(buffer) - 3, 0)
         if len(buffer) > MAX_SHOW:
             raise FramingError(f"expected a show of at most {MAX_SHOW} bytes, got more")
         return None
 
-    def _take(self, n: int) -> None:
+    def _discard(self, n: int) -> None:
         del self._buffer[:n]
         self._reset_scan()
 
 
-def _message(head: re.Match[bytes], argument: bytes, payload: bytes | None = None) -> Message:
+def _make_message(head: re.Match[bytes], argument: bytes, payload: bytes | None = None) -> Message:
     drone = head[1] or head[2]
     return Message(
         None if drone is None else int(drone), head[3].decode(), argument.decode("ascii", "replace"), payload
     )
 
 
-def _shown(buffer: bytes | bytearray) -> str:
+def _excerpt(buffer: bytes | bytearray) -> str:
     return repr(bytes(buffer[:40]))

@@ -28,11 +28,11 @@ from crazysim.lab.live.viewers import Viewers
 from crazysim.sim.sim import Sim
 from crazysim.storage import Closing
 
-SLICE = 0.01
+MAX_SLEEP = 0.01
 """Longest sleep before clicks and keys are handled again, s."""
-ALARM = 0.02
+WARNING_LATENESS = 0.02
 """Lateness of a control step above which a warning is logged, s."""
-ALARM_PERIOD = 10.0
+WARNING_PERIOD = 10.0
 """Shortest time between two such warnings, s."""
 
 V = TypeVar("V", bound="Viewer[Live]")
@@ -53,7 +53,7 @@ class Live(Interaction, Closing):
 
     step: int
     """Control steps since the last reset."""
-    flown: int
+    n_steps_run: int
     """Control steps since the loop was created; resets and jumps do not set it back."""
 
     def __init__(
@@ -85,7 +85,7 @@ class Live(Interaction, Closing):
         self.control_freq = control_freq
         self.n_substeps = sim.freq // control_freq
         self.step = round(float(sim.time[0, 0]) * control_freq)
-        self.flown = 0
+        self.n_steps_run = 0
         self._dt = 1.0 / control_freq
         self._pace = Pace(self._dt, speed)
         self._commands = StagedCommands(sim)
@@ -98,7 +98,7 @@ class Live(Interaction, Closing):
         self._paused = self._stopped = self._in_step = False
         self._refused = 0
         self._factor = (perf_counter(), 0, 0.0)
-        self._may_warn = RateLimit(ALARM_PERIOD)
+        self._may_warn = RateLimit(WARNING_PERIOD)
         for key, call in KEYS.items():
             self.keyboard.bind(key, call)
 
@@ -247,20 +247,20 @@ class Live(Interaction, Closing):
         """
         if seconds is not None and (not np.isfinite(seconds) or seconds <= 0):
             raise ConfigError(f"expected a positive duration, s, got {seconds!r}")
-        end = None if seconds is None else self.flown + round(seconds * self.control_freq)
+        end = None if seconds is None else self.n_steps_run + round(seconds * self.control_freq)
         self._stopped = False
         self._warm_up()
         self._pace = Pace(self._dt, self._pace.speed)
-        first, pictures, paused_s, start_time = self.flown, self._viewers.n_pictures, 0.0, perf_counter()
+        first_step, pictures, paused_s, start_time = self.n_steps_run, self._viewers.n_pictures, 0.0, perf_counter()
         with protect_loop(), contextlib.suppress(KeyboardInterrupt):
-            while not self._stopped and (end is None or self.flown < end):
-                paused_s += self._turn()
+            while not self._stopped and (end is None or self.n_steps_run < end):
+                paused_s += self._run_once()
         jax.block_until_ready(self.sim.data.states.pos)
-        wall = perf_counter() - start_time - paused_s
-        simulated = (self.flown - first) * self._dt
+        wall_s = perf_counter() - start_time - paused_s
+        simulated_s = (self.n_steps_run - first_step) * self._dt
         failures = self._refused + self._viewers.failures + self._recordings.failures
         n_pictures = self._viewers.n_pictures - pictures
-        return self._pace.report(self._processes, simulated, wall, n_pictures, failures)
+        return self._pace.report(self._processes, simulated_s, wall_s, n_pictures, failures)
 
     def close(self) -> None:
         self._recordings.close()
@@ -269,15 +269,15 @@ class Live(Interaction, Closing):
     @property
     def status(self) -> str:
         """State of the loop for viewers: time, speed, pause, recording."""
-        now, (last_time, flown, factor) = perf_counter(), self._factor
+        now, (last_time, n_steps_run, factor) = perf_counter(), self._factor
         if now - last_time > 0.5:
-            factor = (self.flown - flown) * self._dt / (now - last_time)
-            self._factor = (now, self.flown, factor)
+            factor = (self.n_steps_run - n_steps_run) * self._dt / (now - last_time)
+            self._factor = (now, self.n_steps_run, factor)
         marks = [f"{self.time:.2f} s", f"{factor:.2f} x real time"]
         marks += ["paused"] * self._paused + ["recording"] * self.is_recording
         return ", ".join(marks)
 
-    def _turn(self) -> float:
+    def _run_once(self) -> float:
         """Run the tasks that are due, or sleep; return the time spent in a pause, s."""
         viewers = self._viewers
         self._run_posted()
@@ -286,16 +286,16 @@ class Live(Interaction, Closing):
         if self._paused:
             start_time = perf_counter()
             viewers.draw(self, viewers.next_at)
-            sleep(SLICE)
+            sleep(MAX_SLEEP)
             return perf_counter() - start_time
         wait = self._pace.due_in()
         if wait > 0:
             if not viewers.draw(self, viewers.next_at):
-                until_picture = viewers.next_at - perf_counter() if viewers else SLICE
-                sleep(max(min(wait, until_picture, SLICE), 0.0))
+                until_picture = viewers.next_at - perf_counter() if viewers else MAX_SLEEP
+                sleep(max(min(wait, until_picture, MAX_SLEEP), 0.0))
             return 0.0
         lateness = self._pace.record_step(self.time)
-        if lateness > ALARM and self._may_warn():
+        if lateness > WARNING_LATENESS and self._may_warn():
             log.warning("real time missed at %.2f s: %.0f ms late", self.time, 1e3 * lateness)
         self._control_step()
         # At real-time speeds a picture waits for idle time, but at most until the next picture is due.
@@ -318,7 +318,7 @@ class Live(Interaction, Closing):
         finally:
             self._in_step = False
         self.step += 1
-        self.flown += 1
+        self.n_steps_run += 1
         self._recordings.add()
 
     def _run_posted(self) -> None:

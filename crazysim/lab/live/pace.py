@@ -162,12 +162,12 @@ class Pace:
         self._due += self._dt / float(self._speed)
         return lateness
 
-    def quantile(self, part: float) -> float:
+    def quantile(self, fraction: float) -> float:
         """Return the lateness that a fraction of the control steps, 0 to 1, did not exceed, s."""
         total = self._counts.sum()
         if not total:
             return 0.0
-        k = int(np.searchsorted(np.cumsum(self._counts), part * total))
+        k = int(np.searchsorted(np.cumsum(self._counts), fraction * total))
         return min((k + 1) * BIN_WIDTH, self.worst) if k < N_BINS - 1 else self.worst
 
     def report(

@@ -40,11 +40,11 @@ class Picture:
     """Positions of all mocap bodies, world frame, m. (n, n_mocap, 3)"""
     quat: NDArray
     """Attitudes of all mocap bodies, body to world, xyzw. (n, n_mocap, 4)"""
-    drones: NDArray
+    drone_pos: NDArray
     """Positions of the drones, world frame, m. (n, n_drones, 3)"""
     setpoint: NDArray
     """Goals of the loop, or positions in the state commands, world frame, m; empty without. (n, n_drones or 0, 3)"""
-    touching: NDArray
+    has_contact: NDArray
     """True where a drone touches something. (n, n_drones)"""
     wind: NDArray
     """Velocity of the air at every drone, world frame, m/s; empty without wind. (n, n_drones or 0, 3)"""
@@ -54,7 +54,7 @@ class Picture:
     """World and index of the selected drone; None if no drone is selected."""
     followed: tuple[int, int] | None
     """World and mocap id of the body that the camera follows; None if it follows none."""
-    name: str
+    followed_name: str
     """Name of the followed body; empty if there is none."""
     controls: tuple[str, ...]
     """Lines of text that list the buttons and sliders of the loop, for viewers without a panel."""
@@ -90,7 +90,7 @@ class PictureSource:
         sim, worlds = self._sim, self._worlds
         data = sim.data
         pos, quat = mocap_poses(sim, worlds)
-        drones = np.asarray(data.states.pos, float)[worlds]
+        drone_pos = np.asarray(data.states.pos, float)[worlds]
         empty = np.zeros((len(worlds), 0, 3))
         state, setpoint, wind = data.controls.state, empty, empty
         if live.goals is not None:
@@ -99,7 +99,9 @@ class PictureSource:
             setpoint = np.asarray(state.staged_cmd, float)[worlds, :, :3]
         if self._wind and _winds(data):
             wind = np.asarray(self._wind_fn(data), float)[worlds]
-        touching = np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drones.shape[:2], bool)
+        has_contact = (
+            np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drone_pos.shape[:2], bool)
+        )
         plotted = np.zeros(0)
         if plot and live.selected is not None:
             quantity_fn = live.quantities.get(plot)
@@ -116,14 +118,14 @@ class PictureSource:
             status=live.status,
             pos=pos,
             quat=quat,
-            drones=drones,
+            drone_pos=drone_pos,
             setpoint=setpoint,
-            touching=touching,
+            has_contact=has_contact,
             wind=wind,
             lights=np.clip(live.lights[worlds], 0.0, 1.0),
             selected=live.selected,
             followed=None if body is None or followed is None else (followed[0], body.mocap),
-            name="" if body is None else body.name,
+            followed_name="" if body is None else body.name,
             controls=live.control_lines,
             plot=plotted,
         )

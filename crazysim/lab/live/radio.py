@@ -31,7 +31,7 @@ LOG = {
     "acc": ("acc.x", "acc.y", "acc.z"),
 }
 """Log variables of each part of the state."""
-UNITS = {"ang_vel": math.pi / 180, "acc": GRAVITY_MAGNITUDE}
+UNIT_FACTORS = {"ang_vel": math.pi / 180, "acc": GRAVITY_MAGNITUDE}
 """Factors to the units of ``DroneState`` from those of log variables: degrees/s and multiples of standard gravity."""
 
 log = logging.getLogger(__name__)
@@ -120,7 +120,7 @@ class Radio(Closing):
         """Return the latest state that the drone has sent, with the time on the drone's clock."""
         self._require_armed()
         with self._lock:
-            v = {part: UNITS.get(part, 1.0) * x for part, x in self._values.items()}
+            v = {part: UNIT_FACTORS.get(part, 1.0) * x for part, x in self._values.items()}
             norm = np.linalg.norm(v["quat"])
             quat = v["quat"] / norm if norm > 0.1 else np.array([0.0, 0.0, 0.0, 1.0])
             return DroneState(self._stamp, v["pos"], quat, v["vel"], v["ang_vel"], v["acc"])

@@ -30,11 +30,11 @@ from crazysim.scene.render import camera_id, require_size
 from crazysim.scene.scene_window import require_screen
 from crazysim.scene.visual_geoms import visual_geoms
 
-START = 60.0
+OPEN_TIMEOUT = 60.0
 """Longest time to wait for the window to open, s."""
-STOP = 3.0
+CLOSE_TIMEOUT = 3.0
 """Longest time to wait for it to close, s."""
-LENGTH = struct.Struct("<Q")
+LENGTH_PREFIX = struct.Struct("<Q")
 """Length in front of each message to the process of the window."""
 
 log = logging.getLogger(__name__)
@@ -107,7 +107,7 @@ class Window(Viewer[Live]):
         _send(process, {"model": model_bytes(sim.mj_model), "bodies": bodies, "settings": settings})
         ready = threading.Event()
         threading.Thread(target=self._listen, args=(live, process, ready), daemon=True).start()
-        if not ready.wait(START) or not self.is_open:
+        if not ready.wait(OPEN_TIMEOUT) or not self.is_open:
             self.close()
             raise RenderError("expected a screen that can open a window, got none. Use Browser() without one.")
         threading.Thread(target=self._write, args=(process,), daemon=True).start()
@@ -127,7 +127,7 @@ class Window(Viewer[Live]):
         with contextlib.suppress(OSError):
             process.stdin.close()  # the process ends at the end of its input
         try:
-            process.wait(STOP)
+            process.wait(CLOSE_TIMEOUT)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -174,5 +174,5 @@ def model_bytes(model: mujoco.MjModel) -> bytes:
 
 def _send(process: subprocess.Popen[bytes], message: object) -> None:
     content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
-    process.stdin.write(LENGTH.pack(len(content)) + content)
+    process.stdin.write(LENGTH_PREFIX.pack(len(content)) + content)
     process.stdin.flush()

@@ -18,7 +18,7 @@ from crazysim.errors import RenderError
 from crazysim.lab.live.chart import Chart
 from crazysim.lab.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
 from crazysim.lab.live.scene_bodies import MARK_RADIUS, SceneBodies
-from crazysim.lab.live.window import LENGTH
+from crazysim.lab.live.window import LENGTH_PREFIX
 from crazysim.media.trail import Trail, colors_of
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.render import camera_id
@@ -55,10 +55,10 @@ class Inbox:
 
 def read_message(stream: BinaryIO) -> Any:
     """Return the next message of a stream; None at its end."""
-    head = stream.read(LENGTH.size)
-    if len(head) < LENGTH.size:
+    head = stream.read(LENGTH_PREFIX.size)
+    if len(head) < LENGTH_PREFIX.size:
         return None
-    (length,) = LENGTH.unpack(head)
+    (length,) = LENGTH_PREFIX.unpack(head)
     content = stream.read(length)
     return pickle.loads(content) if len(content) == length else None
 
@@ -155,14 +155,14 @@ class Program:
         mujoco.mj_comPos(self._model, data)
         mujoco.mj_camlight(self._model, data)
         overlays.clear()
-        drones = picture.drones[k]
+        drones = picture.drone_pos[k]
         colors = colors_of(len(drones), None)
         if self._trail is not None:
             self._trail.draw(overlays, k)
         if settings["setpoints"] and len(picture.setpoint[k]):
             overlays.points(picture.setpoint[k], colors, SETPOINT_RADIUS)
-        if picture.touching[k].any():
-            overlays.points(drones[picture.touching[k]], CONTACT_COLOR, MARK_RADIUS)
+        if picture.has_contact[k].any():
+            overlays.points(drones[picture.has_contact[k]], CONTACT_COLOR, MARK_RADIUS)
         for pos, air in zip(drones, picture.wind[k], strict=False):
             if air.any():
                 overlays.capsule(pos, pos + WIND_SCALE * air, 0.006, WIND_COLOR, cylinder=True)
@@ -173,7 +173,7 @@ class Program:
         if picture.followed is not None and picture.followed[0] == picture.worlds[k]:
             place, radius = picture.pos[k, picture.followed[1]], self._bodies.radius(picture.followed[1])
             overlays.points(place[None], FOLLOWED_COLOR, radius)
-            overlays.label(_ascii(picture.name), place + [0.0, 0.0, radius])
+            overlays.label(_ascii(picture.followed_name), place + [0.0, 0.0, radius])
         text = picture.status if k == 0 else ""
         if len(picture.worlds) > 1:
             text = f"world {picture.worlds[k]}\n{text}".strip()

@@ -29,22 +29,22 @@ REMEDY = "Export it again, or use another copy."
 class Archive:
     """A zip archive of JSON files."""
 
-    def __init__(self, content: bytes, place: str):
+    def __init__(self, content: bytes, location: str):
         """Open an archive.
 
         Args:
             content: Contents of the file.
-            place: Name of the file, for messages.
+            location: Name of the file, for messages.
 
         Raises:
             ConfigError: If it has too many files.
             DamagedFileError: If the file is not a zip archive.
         """
-        self.place = place
+        self.location = location
         self._parsed: dict[str, Any] = {}
         limit = min(MAX_TOTAL, max(MIN_TOTAL, MAX_RATIO * len(content)))
-        with reading(place, "a zip archive", REMEDY):
-            self._zip = ZipReader(io.BytesIO(content), place, MAX_MEMBERS, MAX_MEMBER, limit)
+        with reading(location, "a zip archive", REMEDY):
+            self._zip = ZipReader(io.BytesIO(content), location, MAX_MEMBERS, MAX_MEMBER, limit)
 
     def json(self, name: str) -> Any:
         """Return the contents of a JSON file of the archive.
@@ -55,29 +55,29 @@ class Archive:
         """
         if name in self._parsed:
             return self._parsed[name]
-        place = f"{self.place}: {name}"
+        location = f"{self.location}: {name}"
         if name not in self._zip.names:
-            raise ConfigError(f"expected a file {name!r} in {self.place}, got an archive without it")
-        with reading(place, "a file that can be unpacked", REMEDY):
-            self._parsed[name] = checks.parse_json(self._zip.read(name), place)
+            raise ConfigError(f"expected a file {name!r} in {self.location}, got an archive without it")
+        with reading(location, "a file that can be unpacked", REMEDY):
+            self._parsed[name] = checks.parse_json(self._zip.read(name), location)
         return self._parsed[name]
 
-    def resolve(self, value: Any, place: str) -> tuple[Any, str]:
-        """Return a value, or the contents of the file it refers to by ``{"$ref": "./name#"}``, and its place.
+    def resolve(self, value: Any, location: str) -> tuple[Any, str]:
+        """Return a value, or the contents of the file it refers to by ``{"$ref": "./name#"}``, and its location.
 
         Raises:
             ConfigError: If the file is missing, or references form a cycle or a chain that is too long.
         """
         for _ in range(MAX_CHAIN):
             if not isinstance(value, dict) or "$ref" not in value:
-                return value, place
-            reference = checks.require_text(value["$ref"], f"{place}, $ref", 1000)
+                return value, location
+            reference = checks.require_text(value["$ref"], f"{location}, $ref", 1000)
             name, _, fragment = reference.partition("#")
             if fragment.strip("/"):
-                checks.refuse("a reference to a whole file, such as ./cues.json#", short_repr(reference), place)
+                checks.refuse("a reference to a whole file, such as ./cues.json#", short_repr(reference), location)
             name = str(PurePosixPath(name))
-            value, place = self.json(name), f"{self.place}: {name}"
-        return checks.refuse(f"a chain of at most {MAX_CHAIN} references", "a longer one", place)
+            value, location = self.json(name), f"{self.location}: {name}"
+        return checks.refuse(f"a chain of at most {MAX_CHAIN} references", "a longer one", location)
 
 
 def write_archive(path: str | Path, files: Mapping[str, str]) -> None:

@@ -36,7 +36,7 @@ BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 
 def decode_lights(
-    program: bytes | str, until: float = 3600.0, place: str = "a light program", max_repeated: int = MAX_REPEATED
+    program: bytes | str, until: float = 3600.0, location: str = "a light program", max_repeated: int = MAX_REPEATED
 ) -> Lights:
     """Return the lights of a light program.
 
@@ -46,7 +46,7 @@ def decode_lights(
     Args:
         program: Byte code, or its base64 form as in ``lights.json``.
         until: Time at which the program is stopped, s; endless loops end there.
-        place: File and place in it, for messages.
+        location: File and location in it, for messages.
         max_repeated: Most commands that loops and jumps may repeat.
 
     Raises:
@@ -57,10 +57,10 @@ def decode_lights(
         try:
             program = base64.b64decode(program, validate=True)
         except (binascii.Error, ValueError) as error:
-            raise ConfigError(f"expected base64 in {place}, got {str(error)[:60]}") from error
+            raise ConfigError(f"expected base64 in {location}, got {str(error)[:60]}") from error
     if len(program) > MAX_BYTES:
-        raise ConfigError(f"expected at most {MAX_BYTES} bytes in {place}, got {len(program)}")
-    machine = _Machine(program, place)
+        raise ConfigError(f"expected at most {MAX_BYTES} bytes in {location}, got {len(program)}")
+    machine = _Machine(program, location)
     machine.run(round(until / TICK_DURATION), len(program) + max_repeated)
     return machine.lights()
 
@@ -68,26 +68,26 @@ def decode_lights(
 class _Machine:
     """State of a running program."""
 
-    def __init__(self, code: bytes, place: str):
-        self.code, self.place, self.at = code, place, 0
+    def __init__(self, code: bytes, location: str):
+        self.code, self.location, self.address = code, location, 0
         self.now = self.origin = 0  # in ticks
         self.color = BLACK
         self.loops: list[tuple[int, int]] = []  # address of the body, iterations left; 0 for endless
         self.pieces: list[tuple[int, tuple, tuple]] = [(0, BLACK, BLACK)]
 
     def refuse(self, expected: str, got: str) -> None:
-        raise ConfigError(f"expected {expected}, got {got} in {self.place}, byte {self.at}")
+        raise ConfigError(f"expected {expected}, got {got} in {self.location}, byte {self.address}")
 
-    def byte(self) -> int:
-        if self.at >= len(self.code):
+    def read_byte(self) -> int:
+        if self.address >= len(self.code):
             self.refuse("an argument", "the end of the program")
-        self.at += 1
-        return self.code[self.at - 1]
+        self.address += 1
+        return self.code[self.address - 1]
 
-    def varint(self) -> int:
+    def read_varint(self) -> int:
         value = shift = 0
         while True:
-            byte = self.byte()
+            byte = self.read_byte()
             value |= (byte & 0x7F) << shift
             shift += 7
             if value > MAX_VARINT or shift > 35:
@@ -98,20 +98,20 @@ class _Machine:
     def run(self, end: int, max_commands: int) -> None:
         """Run until the program ends, or until the time exceeds ``end``, ticks."""
         for _ in range(max_commands):
-            if self.at >= len(self.code) or self.now > end or not self.command(self.byte()):
+            if self.address >= len(self.code) or self.now > end or not self.run_command(self.read_byte()):
                 return
         self.refuse(f"a program that runs at most {max_commands} commands in {end * TICK_DURATION:g} s", "more")
 
-    def command(self, code: int) -> bool:
+    def run_command(self, code: int) -> bool:
         """Run one command; return False at the end of the program."""
         if code == END:
             return False
         if code in (NOP, SET_PYRO, SET_PYRO_ALL):
-            self.at += code != NOP
+            self.address += code != NOP
         elif code == SLEEP:
-            self.now += self.varint()
+            self.now += self.read_varint()
         elif code == WAIT_UNTIL:
-            self.now = max(self.now, self.origin + self.varint())
+            self.now = max(self.now, self.origin + self.read_varint())
         elif code == RESET_CLOCK:
             self.origin = self.now
         elif SET_COLOR <= code <= FADE_TO_WHITE or code in (SET_COLOR_FROM_CHANNELS, FADE_TO_COLOR_FROM_CHANNELS):
@@ -119,33 +119,33 @@ class _Machine:
         elif code == LOOP_BEGIN:
             if len(self.loops) == MAX_LOOPS:
                 self.refuse(f"loops nested at most {MAX_LOOPS} deep", "a further one")
-            iterations = self.byte()
-            self.loops.append((self.at, iterations))
+            iterations = self.read_byte()
+            self.loops.append((self.address, iterations))
         elif code == LOOP_END:
             self.end_loop()
         elif code == JUMP:
-            self.jump(self.varint())
+            self.jump(self.read_varint())
         elif code == TRIGGERED_JUMP:
-            if self.byte() & 0x30:  # an address follows if the jump reacts to a rising or falling edge
-                self.varint()
+            if self.read_byte() & 0x30:  # an address follows if the jump reacts to a rising or falling edge
+                self.read_varint()
         else:
-            self.at -= 1
+            self.address -= 1
             self.refuse("a command of Skybrush's light programs, 0x00 to 0x15", f"0x{code:02x}")
         return True
 
     def set_color(self, code: int) -> None:
         fades = FADE_TO_COLOR <= code <= FADE_TO_WHITE or code == FADE_TO_COLOR_FROM_CHANNELS
         if code in (SET_COLOR, FADE_TO_COLOR):
-            color = (self.byte(), self.byte(), self.byte())
+            color = (self.read_byte(), self.read_byte(), self.read_byte())
         elif code in (SET_GRAY, FADE_TO_GRAY):
-            color = (self.byte(),) * 3
+            color = (self.read_byte(),) * 3
         elif code in (SET_WHITE, FADE_TO_WHITE):
             color = WHITE
         else:
             if code in (SET_COLOR_FROM_CHANNELS, FADE_TO_COLOR_FROM_CHANNELS):
-                _ = self.byte(), self.byte(), self.byte()
+                _ = self.read_byte(), self.read_byte(), self.read_byte()
             color = BLACK
-        duration = self.varint()
+        duration = self.read_varint()
         if fades and duration:
             self.pieces.append((self.now, self.color, color))
             self.now += duration
@@ -159,15 +159,15 @@ class _Machine:
     def end_loop(self) -> None:
         if not self.loops:
             self.refuse("the start of a loop in front of its end", "none")
-        start, left = self.loops.pop()
-        if left != 1:
-            self.loops.append((start, max(left - 1, 0)))
-            self.at = start
+        start, iterations_left = self.loops.pop()
+        if iterations_left != 1:
+            self.loops.append((start, max(iterations_left - 1, 0)))
+            self.address = start
 
     def jump(self, address: int) -> None:
         if address >= len(self.code):
             self.refuse(f"a jump to one of {len(self.code)} bytes", f"one to byte {address}")
-        self.at = address
+        self.address = address
         self.loops.clear()
 
     def lights(self) -> Lights:
@@ -191,7 +191,7 @@ def encode_lights(lights: Lights) -> bytes:
     code = bytearray()
     color = None
     if ticks[0] > 0:
-        code += _colored(SET_COLOR, first[0], ticks[0])
+        code += _color_command(SET_COLOR, first[0], ticks[0])
     for k, start in enumerate(ticks):
         duration = ticks[k + 1] - start if k + 1 < len(ticks) else 0
         if k + 1 < len(ticks) and not duration:
@@ -199,17 +199,17 @@ def encode_lights(lights: Lights) -> bytes:
         fades = duration and not np.array_equal(first[k], last[k])
         if fades:
             if color is None or not np.array_equal(color, first[k]):
-                code += _colored(SET_COLOR, first[k], 0)
-            code += _colored(FADE_TO_COLOR, last[k], duration)
+                code += _color_command(SET_COLOR, first[k], 0)
+            code += _color_command(FADE_TO_COLOR, last[k], duration)
             color = last[k]
         else:
-            code += _colored(SET_COLOR, first[k], duration)
+            code += _color_command(SET_COLOR, first[k], duration)
             color = first[k]
     code.append(END)
     return bytes(code)
 
 
-def _colored(code: int, color: np.ndarray, duration: int) -> bytes:
+def _color_command(code: int, color: np.ndarray, duration: int) -> bytes:
     """Return the shortest command that sets, or fades to, a colour."""
     red, green, blue = (int(x) for x in color)
     if (red, green, blue) == BLACK:
@@ -220,10 +220,10 @@ def _colored(code: int, color: np.ndarray, duration: int) -> bytes:
         head = [code + 1, red]
     else:
         head = [code, red, green, blue]
-    return bytes(head) + _varint(int(duration))
+    return bytes(head) + _encode_varint(int(duration))
 
 
-def _varint(value: int) -> bytes:
+def _encode_varint(value: int) -> bytes:
     if value > MAX_VARINT:
         raise ConfigError(
             f"expected durations of at most {MAX_VARINT * TICK_DURATION:g} s, got {value * TICK_DURATION:g} s. "

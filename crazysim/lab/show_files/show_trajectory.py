@@ -20,7 +20,7 @@ TOLERANCE = 1e-6
 """Size of coefficients that a file omits, m or rad."""
 
 
-def parse_trajectory(value: object, place: str, yaw_control: object = None) -> tuple[Trajectory, str]:
+def parse_trajectory(value: object, location: str, yaw_control: object = None) -> tuple[Trajectory, str]:
     """Return the trajectory in a ``trajectory.json``, from the start of the show on, and its encoding.
 
     Each point is ``[t, [x, y, z], [control points]]``: the end of a Bezier curve that begins at the previous point,
@@ -29,30 +29,30 @@ def parse_trajectory(value: object, place: str, yaw_control: object = None) -> t
 
     Args:
         value: The JSON object.
-        place: File and place in it, for messages.
+        location: File and location in it, for messages.
         yaw_control: Skybrush's ``yawControl`` object, whose setpoints, degrees, are connected linearly and replace the
             yaw of the points; None if there is none.
 
     Raises:
-        ConfigError: If the trajectory is invalid; the message names the place.
+        ConfigError: If the trajectory is invalid; the message names the location.
     """
-    value = checks.require_object(value, place)
-    checks.require_version_one(value, place)
+    value = checks.require_object(value, location)
+    checks.require_version_one(value, location)
     encoding = value.get("type", ENCODINGS[0])
     if encoding not in ENCODINGS:
-        checks.refuse(f"type {' or '.join(ENCODINGS)}", short_repr(encoding), place)
-    points = checks.require_array(value.get("points"), checks.MAX_POINTS, f"{place}, points")
+        checks.refuse(f"type {' or '.join(ENCODINGS)}", short_repr(encoding), location)
+    points = checks.require_array(value.get("points"), checks.MAX_POINTS, f"{location}, points")
     if not points:
-        checks.refuse("at least one point", "none", place)
+        checks.refuse("at least one point", "none", location)
     for key in ("takeoffTime", "landingTime"):
         if value.get(key) is not None:
-            checks.require_number(value[key], f"{place}, {key}", 0.0, checks.MAX_TIME)
+            checks.require_number(value[key], f"{location}, {key}", 0.0, checks.MAX_TIME)
     takeoff = float(value.get("takeoffTime") or 0.0)
 
     times, curves, last = [], [], None
     n_axes = len(points[0][1]) if _is_point(points[0]) else 3
     for i, point in enumerate(points):
-        where = f"{place}, point {i}"
+        where = f"{location}, point {i}"
         if not _is_point(point):
             checks.refuse("[time, [x, y, z], [control points]]", short_repr(point), where)
         times.append(checks.require_number(point[0], where, 0.0, checks.MAX_TIME))
@@ -64,22 +64,22 @@ def parse_trajectory(value: object, place: str, yaw_control: object = None) -> t
             via = [checks.require_numbers(x, [n_axes], checks.MAX_COORDINATE, where) for x in inner]
             curves.append(np.stack([last, *via, end]))
         last = end
-    checks.require_ascending(np.array(times), checks.MIN_LENGTH, place)
+    checks.require_ascending(np.array(times), checks.MIN_LENGTH, location)
     start = takeoff + times[0]
     if times[-1] + takeoff > checks.MAX_TIME:
-        checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1] + takeoff:g} s", place)
+        checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1] + takeoff:g} s", location)
     first = curves[0][:1] if curves else np.asarray(last)[None]
     ends = [takeoff + t for t in times[1:]]
     if start >= checks.MIN_LENGTH or not curves:  # a shorter rest belongs to the first curve
         ends, curves = [max(start, checks.MIN_LENGTH), *ends], [first, *curves]
-    return _of_curves(np.array(ends), curves, yaw_control, place), encoding
+    return _of_curves(np.array(ends), curves, yaw_control, location), encoding
 
 
 def _is_point(point: object) -> TypeGuard[list[Any]]:
     return isinstance(point, list) and 2 <= len(point) <= 3 and isinstance(point[1], list)
 
 
-def _of_curves(ends: NDArray, curves: list, yaw_control: object, place: str) -> Trajectory:
+def _of_curves(ends: NDArray, curves: list, yaw_control: object, location: str) -> Trajectory:
     """Return the trajectory of Bezier curves."""
     degree = max(len(curve) for curve in curves) - 1
     c = np.zeros((len(curves), 4, max(degree, 1) + 1))
@@ -87,22 +87,25 @@ def _of_curves(ends: NDArray, curves: list, yaw_control: object, place: str) -> 
         c[k, : curve.shape[1], : len(curve)] = power_coefficients(curve)
     c[:, 3] = np.deg2rad(c[:, 3])
     if yaw_control is not None:
-        ends, c = _with_yaw(ends, c, yaw_control, f"{place}, yawControl")
+        ends, c = _with_yaw(ends, c, yaw_control, f"{location}, yawControl")
     return trajectory_of_unit_pieces(np.diff(ends, prepend=0.0), c)
 
 
-def _with_yaw(ends: NDArray, c: NDArray, yaw_control: object, place: str) -> tuple[NDArray, NDArray]:
+def _with_yaw(ends: NDArray, c: NDArray, yaw_control: object, location: str) -> tuple[NDArray, NDArray]:
     """Return the pieces with the yaw of setpoints that are connected linearly, in the time of the show."""
-    value = checks.require_object(yaw_control, place)
-    checks.require_version_one(value, place)
-    setpoints = checks.require_array(value.get("setpoints"), checks.MAX_POINTS, place)
+    value = checks.require_object(yaw_control, location)
+    checks.require_version_one(value, location)
+    setpoints = checks.require_array(value.get("setpoints"), checks.MAX_POINTS, location)
     if not setpoints:
         return ends, c
     pairs = np.array(
-        [checks.require_numbers(x, [2], checks.MAX_COORDINATE, f"{place}, entry {i}") for i, x in enumerate(setpoints)]
+        [
+            checks.require_numbers(x, [2], checks.MAX_COORDINATE, f"{location}, entry {i}")
+            for i, x in enumerate(setpoints)
+        ]
     )
     times, yaw = pairs[:, 0], np.deg2rad(pairs[:, 1])
-    checks.require_ascending(times, checks.MIN_LENGTH, place)
+    checks.require_ascending(times, checks.MIN_LENGTH, location)
     ends, c = split_pieces(ends, c, times)
     starts = np.concatenate([[0.0], ends[:-1]])
     c[:, 3] = 0.0

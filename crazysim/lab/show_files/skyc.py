@@ -42,23 +42,23 @@ def load_show(path: str | Path) -> Show:
     in Skybrush. A drone without a name is named after its index.
 
     Raises:
-        ConfigError: If the file is not a valid show; the message names the place.
+        ConfigError: If the file is not a valid show; the message names the location.
     """
     return parse_show(read_bytes(path, checks.MAX_FILE_BYTES), str(path))
 
 
-def parse_show(content: bytes, place: str = "a show") -> Show:
+def parse_show(content: bytes, location: str = "a show") -> Show:
     """Return the show in the contents of a ``.skyc`` file; see ``load_show``.
 
     Args:
         content: Contents of the file.
-        place: Name of the file, for messages.
+        location: Name of the file, for messages.
 
     Raises:
-        ConfigError: If the file is not a valid show; the message names the place.
+        ConfigError: If the file is not a valid show; the message names the location.
     """
-    archive = Archive(content, place)
-    where = f"{place}: show.json"
+    archive = Archive(content, location)
+    where = f"{location}: show.json"
     show = checks.require_object(archive.json("show.json"), where)
     checks.require_version_one(show, where)
     settings, _ = archive.resolve(show.get("settings", {}), where)
@@ -101,48 +101,52 @@ def parse_show(content: bytes, place: str = "a show") -> Show:
     )
 
 
-def _bound(n_pieces: int, place: str) -> None:
+def _bound(n_pieces: int, location: str) -> None:
     if n_pieces > MAX_PIECES:
-        checks.refuse(f"at most {MAX_PIECES} pieces, padded to the longest", str(n_pieces), place)
+        checks.refuse(f"at most {MAX_PIECES} pieces, padded to the longest", str(n_pieces), location)
 
 
-def _drone(archive: Archive, value: object, place: str, index: int) -> dict[str, Any]:
+def _drone(archive: Archive, value: object, location: str, index: int) -> dict[str, Any]:
     """Return the entry of one drone in the show; its lights are not decoded yet."""
-    value, place = archive.resolve(value, place)
-    settings, place = archive.resolve(checks.require_object(value, place).get("settings"), f"{place}, settings")
-    settings = checks.require_object(settings, place)
-    data, where = archive.resolve(settings.get("trajectory"), f"{place}, trajectory")
-    yaw_control, _ = archive.resolve(settings.get("yawControl"), f"{place}, yawControl")
+    value, location = archive.resolve(value, location)
+    settings, location = archive.resolve(
+        checks.require_object(value, location).get("settings"), f"{location}, settings"
+    )
+    settings = checks.require_object(settings, location)
+    data, where = archive.resolve(settings.get("trajectory"), f"{location}, trajectory")
+    yaw_control, _ = archive.resolve(settings.get("yawControl"), f"{location}, yawControl")
     if isinstance(yaw_control, dict) and yaw_control.get("autoYaw"):
-        log.warning("%s: autoYaw is ignored; the drone keeps the yaw of the setpoints", place)
+        log.warning("%s: autoYaw is ignored; the drone keeps the yaw of the setpoints", location)
     trajectory, encoding = parse_trajectory(data, where, yaw_control)
     c = np.asarray(trajectory.coefficients, float)
     start, end = c[0, :, 0], c[-1].sum(-1)
     if settings.get("startYaw") is not None:
-        checks.require_number(settings["startYaw"], f"{place}, startYaw", -checks.MAX_COORDINATE, checks.MAX_COORDINATE)
+        checks.require_number(
+            settings["startYaw"], f"{location}, startYaw", -checks.MAX_COORDINATE, checks.MAX_COORDINATE
+        )
     name = settings.get("name")
     return {
-        "at": place,
-        "name": f"drone_{index}" if name is None else checks.require_text(name, f"{place}, name"),
+        "at": location,
+        "name": f"drone_{index}" if name is None else checks.require_text(name, f"{location}, name"),
         "trajectory": trajectory,
         "encoding": encoding,
-        "home": _position(settings.get("home"), start[:3], f"{place}, home"),
-        "landing": _position(settings.get("landAt"), end[:3], f"{place}, landAt"),
-        "parameters": _parameters(settings.get("parameters"), f"{place}, parameters"),
+        "home": _position(settings.get("home"), start[:3], f"{location}, home"),
+        "landing": _position(settings.get("landAt"), end[:3], f"{location}, landAt"),
+        "parameters": _parameters(settings.get("parameters"), f"{location}, parameters"),
         "lights": settings.get("lights"),
     }
 
 
-def _position(value: object, default: NDArray, place: str) -> NDArray:
-    return default if value is None else checks.require_numbers(value, [3], checks.MAX_COORDINATE, place)
+def _position(value: object, default: NDArray, location: str) -> NDArray:
+    return default if value is None else checks.require_numbers(value, [3], checks.MAX_COORDINATE, location)
 
 
-def _parameters(value: object, place: str) -> tuple[ParameterChange, ...]:
+def _parameters(value: object, location: str) -> tuple[ParameterChange, ...]:
     changes = []
-    for i, entry in enumerate(checks.require_array(value, checks.MAX_POINTS, place) if value is not None else []):
+    for i, entry in enumerate(checks.require_array(value, checks.MAX_POINTS, location) if value is not None else []):
         if not isinstance(entry, list) or len(entry) != 3:
-            checks.refuse("[time, name, value]", short_repr(entry), f"{place}, entry {i}")
-        where = f"{place}, entry {i}"
+            checks.refuse("[time, name, value]", short_repr(entry), f"{location}, entry {i}")
+        where = f"{location}, entry {i}"
         time = checks.require_number(entry[0], where, 0.0, checks.MAX_TIME)
         changes.append(
             ParameterChange(time, checks.require_text(entry[1], where), checks.require_number(entry[2], where))
@@ -150,15 +154,15 @@ def _parameters(value: object, place: str) -> tuple[ParameterChange, ...]:
     return tuple(changes)
 
 
-def _cues(archive: Archive, value: object, place: str) -> tuple[Cue, ...]:
+def _cues(archive: Archive, value: object, location: str) -> tuple[Cue, ...]:
     if value is None:
         return ()
-    value, place = archive.resolve(value, place)
-    value = checks.require_object(value, place)
-    checks.require_version_one(value, place)
+    value, location = archive.resolve(value, location)
+    value = checks.require_object(value, location)
+    checks.require_version_one(value, location)
     cues = []
-    for i, item in enumerate(checks.require_array(value.get("items", []), checks.MAX_POINTS, place)):
-        where = f"{place}, item {i}"
+    for i, item in enumerate(checks.require_array(value.get("items", []), checks.MAX_POINTS, location)):
+        where = f"{location}, item {i}"
         item = checks.require_object(item, where)
         time = checks.require_number(item.get("time"), where, 0.0, checks.MAX_TIME)
         cues.append(Cue(time, checks.require_text(item.get("name", ""), where)))
@@ -171,20 +175,20 @@ def _lights(
     """Return the lights of one drone; equal programs are decoded once."""
     if drone["lights"] is None:
         return Lights.constant()
-    value, place = archive.resolve(drone["lights"], f"{drone['at']}, lights")
-    value = checks.require_object(value, place)
-    checks.require_version_one(value, place)
+    value, location = archive.resolve(drone["lights"], f"{drone['at']}, lights")
+    value = checks.require_object(value, location)
+    checks.require_version_one(value, location)
     if value.get("data") is not None:
-        data = checks.require_text(value["data"], f"{place}, data", 2**22)
+        data = checks.require_text(value["data"], f"{location}, data", 2**22)
         if data not in decoded:
-            decoded[data] = decode_lights(data, until, place, min(max_looped, MAX_REPEATED))
+            decoded[data] = decode_lights(data, until, location, min(max_looped, MAX_REPEATED))
         return decoded[data]
     if value.get("colors") is not None:
-        return parse_colors(value["colors"], f"{place}, colors")
+        return parse_colors(value["colors"], f"{location}, colors")
     return Lights.constant()
 
 
-def parse_colors(value: object, place: str) -> Lights:
+def parse_colors(value: object, location: str) -> Lights:
     """Return the lights of the lab's ``colors``, in either form.
 
     The newer form is ``[[time, [red, green, blue]], ...]``, each colour from its time on, the older
@@ -192,12 +196,12 @@ def parse_colors(value: object, place: str) -> Lights:
 
     Args:
         value: The JSON array.
-        place: File and place in it, for messages.
+        location: File and location in it, for messages.
     """
-    entries = checks.require_array(value, MAX_REPEATED, place)
+    entries = checks.require_array(value, MAX_REPEATED, location)
     times, colors, now = [], [], 0.0
     for i, entry in enumerate(entries):
-        where = f"{place}, entry {i}"
+        where = f"{location}, entry {i}"
         if not isinstance(entry, list) or len(entry) != 2:
             checks.refuse("[time, [red, green, blue]] or ['red, green, blue', duration]", short_repr(entry), where)
         first, second = entry
@@ -213,16 +217,16 @@ def parse_colors(value: object, place: str) -> Lights:
             checks.refuse("colours from 0 to 255", short_repr(channels), where)
     if not entries:
         return Lights.constant((0.0, 0.0, 0.0))
-    checks.require_ascending(np.array(times), 0.0, place)
+    checks.require_ascending(np.array(times), 0.0, location)
     if times[0] > 0:
         times, colors = [0.0, *times], [np.zeros(3), *colors]
     return Lights.of_pieces(times, colors)
 
 
-def _integer(text: str, place: str) -> int:
+def _integer(text: str, location: str) -> int:
     text = text.strip()
     if not (text.isascii() and text.isdigit() and len(text) <= 3):
-        checks.refuse("colours as 'red, green, blue', 0 to 255", short_repr(text), place)
+        checks.refuse("colours as 'red, green, blue', 0 to 255", short_repr(text), location)
     return int(text)
 
 

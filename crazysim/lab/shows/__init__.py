@@ -1,7 +1,7 @@
 """Light shows in the simulation: flying them, measuring separation and tracking, and showing them with lights."""
 
 from crazysim.lab.show_files import Cue, Lights, Show, load_show, save_show
-from crazysim.lab.shows.flight import ShowFlight, fly
+from crazysim.lab.shows.flight import ShowFlight, fly_show
 from crazysim.lab.shows.show_report import collisions, report, sampled_approaches, summary, tracking_rms
 from crazysim.lab.shows.view import ShowLights, film, live_show, page, play
 
@@ -13,7 +13,7 @@ __all__ = [
     "ShowLights",
     "collisions",
     "film",
-    "fly",
+    "fly_show",
     "live_show",
     "load_show",
     "page",

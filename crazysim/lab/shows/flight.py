@@ -58,7 +58,7 @@ class ShowFlight:
         return float(self.times[-1])
 
 
-def fly(show: Show, seconds: float | None = None, progress: Progress | None = None, **settings: Any) -> ShowFlight:
+def fly_show(show: Show, seconds: float | None = None, progress: Progress | None = None, **settings: Any) -> ShowFlight:
     """Return the flight of a show: its drones start hovering at the first points of their trajectories.
 
     Args:

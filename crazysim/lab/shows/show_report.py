@@ -30,7 +30,7 @@ def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArr
     t, p = np.asarray(times, float), np.asarray(pos)
     n, n_drones = p.shape[:2]
     x = np.ascontiguousarray(np.transpose(p, (2, 1, 0)))  # time last, so that the reduced axis is contiguous
-    distance, when = np.full((n_drones, n_drones), np.inf), np.zeros((n_drones, n_drones))
+    distance, closest_times = np.full((n_drones, n_drones), np.inf), np.zeros((n_drones, n_drones))
     for i in range(n_drones - 1):
         squares = np.zeros((n_drones - 1 - i, n), x.dtype)
         for axis in x:
@@ -39,8 +39,8 @@ def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArr
             squares += difference
         minimum, time = _refine_approach(squares, t)
         distance[i, i + 1 :] = distance[i + 1 :, i] = np.sqrt(minimum)
-        when[i, i + 1 :] = when[i + 1 :, i] = time
-    return distance, when
+        closest_times[i, i + 1 :] = closest_times[i + 1 :, i] = time
+    return distance, closest_times
 
 
 def _refine_approach(squares: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
@@ -76,8 +76,8 @@ def collisions(flight: ShowFlight) -> list[dict[str, Any]]:
     distance, _ = sampled_approaches(flight.times, flight.pos)
     pairs = []
     for i, j in np.argwhere(np.triu(distance < reach, 1)):
-        apart = np.linalg.norm(flight.pos[:, i] - flight.pos[:, j], axis=-1)
-        first = int(np.argmax(apart <= max(reach, apart.min())))
+        distances = np.linalg.norm(flight.pos[:, i] - flight.pos[:, j], axis=-1)
+        first = int(np.argmax(distances <= max(reach, distances.min())))
         pairs.append({"drones": [flight.show.names[i], flight.show.names[j]], "time": float(flight.times[first])})
     return sorted(pairs, key=lambda pair: pair["time"])
 
@@ -105,13 +105,13 @@ def report(flight: ShowFlight) -> dict[str, Any]:
 
 
 def _pairs(flight: ShowFlight, pos: NDArray) -> list[dict[str, Any]]:
-    distance, when = sampled_approaches(flight.times, pos)
+    distance, closest_times = sampled_approaches(flight.times, pos)
     first, second = np.triu_indices(len(distance), 1)
     names = flight.show.names
     order = np.argsort(distance[first, second], kind="stable")
     rows = zip(
         first[order].tolist(), second[order].tolist(), distance[first, second][order].tolist(),
-        when[first, second][order].tolist(), strict=True,
+        closest_times[first, second][order].tolist(), strict=True,
     )  # fmt: skip
     return [{"drones": [names[i], names[j]], "distance": d, "time": t} for i, j, d, t in rows]
 
@@ -142,7 +142,7 @@ def summary(flight: ShowFlight, figures: dict[str, Any]) -> str:
         if isinstance(limit, (int, float)):
             n = sum(pair["distance"] < limit for pair in pairs)
             lines.append(f"                  {n} of {len(pairs)} pairs closer than the show's {limit:g} m")
-    touched = collisions(flight)
-    shown = ", ".join(f"{' and '.join(pair['drones'])} at {pair['time']:.1f} s" for pair in touched[:N_LISTED])
-    lines.append(f"collisions        {len(touched)}{': ' + shown if touched else ''}")
+    collided_pairs = collisions(flight)
+    shown = ", ".join(f"{' and '.join(pair['drones'])} at {pair['time']:.1f} s" for pair in collided_pairs[:N_LISTED])
+    lines.append(f"collisions        {len(collided_pairs)}{': ' + shown if collided_pairs else ''}")
     return "\n".join(lines)

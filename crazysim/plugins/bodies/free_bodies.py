@@ -55,10 +55,10 @@ class FreeBodiesData(Members):
     """External torque, world frame, N m; kept until it is changed. (n_worlds, n_members, 3)"""
     impulse: Array = leaf("member", 1, (3,))
     """Impulse of all contacts in the last step, world frame, N s. (n_worlds, n_members, 3)"""
-    press: Array = leaf("world", 1)
+    normal_impulse: Array = leaf("world", 1)
     """Impulses of the last step along the normals of the contact points, N s, with which the next step begins.
     (n_worlds, 1, n_contacts)"""
-    drag: Array = leaf("world", 2)
+    friction_impulse: Array = leaf("world", 2)
     """The same across the normals, world frame, N s. (n_worlds, 1, n_contacts, 3)"""
     mass: Array = leaf("member", 1, (1,))
     """Mass, kg. (n_worlds, n_members, 1)"""
@@ -157,8 +157,8 @@ class FreeBodies(Population):
             force=zero,
             torque=zero,
             impulse=zero,
-            press=host_array(0.0, sim.n_worlds, 1, n_contacts),
-            drag=host_array(0.0, sim.n_worlds, 1, n_contacts, 3),
+            normal_impulse=host_array(0.0, sim.n_worlds, 1, n_contacts),
+            friction_impulse=host_array(0.0, sim.n_worlds, 1, n_contacts, 3),
             inertia=zero,
             **numbers,
         )

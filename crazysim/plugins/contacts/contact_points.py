@@ -123,24 +123,33 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
     dtype = pos.dtype
     corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
     plate = Shape("box", (*box[3:5].tolist(), PLATE_SHARE * box[5]))
-    middles = [jnp.asarray(box[:3] + np.array([0, 0, side * (1 - PLATE_SHARE) * box[5]]), dtype) for side in (-1, 1)]
-    turn = quat[..., None, :]
-    in_world = pos[..., None, :] + rotation.rotate(turn, corners)
+    plate_centres = [
+        jnp.asarray(box[:3] + np.array([0, 0, side * (1 - PLATE_SHARE) * box[5]]), dtype) for side in (-1, 1)
+    ]
+    drone_quat = quat[..., None, :]
+    in_world = pos[..., None, :] + rotation.rotate(drone_quat, corners)
     points = []
     for surface in surfaces:
         geom = surface.geom
-        into, back, vel = _geom_frame(data, surface)
-        still = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(turn, vel(in_world))
+        to_geom, to_world, vel = _geom_frame(data, surface)
+        surface_vel = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(drone_quat, vel(in_world))
         if geom.shape.kind == "hfield":
-            gap, normal = _height_above_field(data, geom, in_world, into, back)
-            normal = rotation.rotate_inverse(turn, normal)
-            points.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
+            gap, normal = _height_above_field(data, geom, in_world, to_geom, to_world)
+            normal = rotation.rotate_inverse(drone_quat, normal)
+            points.append(
+                ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, surface_vel)))
+            )
         if geom.shape.kind in FLAT_KINDS:
-            gap, pull = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), into(in_world, True))
-            normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
-            points.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
+            gap, pull_back = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), to_geom(in_world, True))
+            normal = rotation.rotate_inverse(drone_quat, to_world(pull_back(jnp.ones_like(gap))[0]))
+            points.append(
+                ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, surface_vel)))
+            )
         if geom.shape.kind not in ("plane", "hfield"):
-            points += [_nearest_plate_point(data, geom, into, plate, middle, still[..., :1, :]) for middle in middles]
+            points += [
+                _nearest_plate_point(data, geom, to_geom, plate, plate_centre, surface_vel[..., :1, :])
+                for plate_centre in plate_centres
+            ]
     arrays = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*points, strict=True)))
     return ContactPoints(*arrays)
 
@@ -159,14 +168,14 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
     gaps, normals, vels = [], [], []
     for surface in surfaces:
         geom = surface.geom
-        into, back, vel = _geom_frame(data, surface)
+        to_geom, to_world, vel = _geom_frame(data, surface)
         if geom.shape.kind == "hfield":
-            gap, normal = _height_above_field(data, geom, pos, into, back)
+            gap, normal = _height_above_field(data, geom, pos, to_geom, to_world)
             gap = gap - _extent_along(shape, jnp.stack([rotation.dot(axis, normal)[..., 0] for axis in axes], axis=-1))
         else:
-            rot = jnp.stack([into(axis, False) for axis in axes], axis=-1)
-            gap, pull = jax.vjp(lambda x, s=geom.shape, f=into, r=rot: distance(shape, s, f(x, True), r), pos)
-            normal = pull(jnp.ones_like(gap))[0]
+            rot = jnp.stack([to_geom(axis, False) for axis in axes], axis=-1)
+            gap, pull_back = jax.vjp(lambda x, s=geom.shape, f=to_geom, r=rot: distance(shape, s, f(x, True), r), pos)
+            normal = pull_back(jnp.ones_like(gap))[0]
         gaps.append(gap)
         normals.append(normal)
         vels.append(jnp.zeros_like(pos) if vel is None else vel(pos))
@@ -176,14 +185,14 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
 
 
 def _height_above_field(
-    data: SimData, geom: CollisionGeom, points: Array, into: Callable, back: Callable
+    data: SimData, geom: CollisionGeom, points: Array, to_geom: Callable, to_world: Callable
 ) -> tuple[Array, Array]:
     """Return the distance of points to the plane of a height field below them, m, and its normal, world frame."""
     terrain = data.plugins.get(geom.name)
     if isinstance(terrain, TerrainData):
         return terrain.gap_at(points)
-    gap, normal = field_gap(geom.shape, into(points, True))
-    return gap, back(normal)
+    gap, normal = field_gap(geom.shape, to_geom(points, True))
+    return gap, to_world(normal)
 
 
 def _extent_along(shape: Shape, direction: Array) -> Array:
@@ -194,7 +203,7 @@ def _extent_along(shape: Shape, direction: Array) -> Array:
 
 
 def _nearest_plate_point(
-    data: SimData, geom: CollisionGeom, into: Callable, shape: Shape, middle: Array, vel: Array
+    data: SimData, geom: CollisionGeom, to_geom: Callable, shape: Shape, plate_centre: Array, vel: Array
 ) -> ContactPoints:
     """Return the point of a plate that is nearest to a geom.
 
@@ -204,10 +213,10 @@ def _nearest_plate_point(
     """
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
-    def pose(move: Array, turn: Array) -> tuple[Array, Array]:
-        q = rotation.integrate_attitude(quat, turn, 1.0, normalize=False)
-        columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
-        return into(pos + move + rotation.rotate(q, middle), True), jnp.stack(columns, axis=-1)
+    def pose(displacement: Array, rotvec: Array) -> tuple[Array, Array]:
+        q = rotation.integrate_attitude(quat, rotvec, 1.0, normalize=False)
+        columns = [to_geom(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
+        return to_geom(pos + displacement + rotation.rotate(q, plate_centre), True), jnp.stack(columns, axis=-1)
 
     frame, pull_back = jax.vjp(pose, jnp.zeros_like(pos), jnp.zeros_like(pos))
     gap, slopes = _distance_and_slopes(shape, geom.shape, *frame)
@@ -243,31 +252,31 @@ def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Ca
     dtype = data.states.pos.dtype
     pos = jnp.asarray(geom.pos, dtype)
     rot = None if geom.rot is None else jnp.asarray(geom.rot, dtype)
-    own_pos = own_quat = vel = spin = None
+    object_pos = object_quat = vel = spin = None
     if surface.population is not None:
         record = data.plugins[surface.population]
-        own_pos, own_quat, vel, ang_vel = (
+        object_pos, object_quat, vel, ang_vel = (
             getattr(record, name)[..., row, :] for name in ("pos", "quat", "vel", "ang_vel")
         )
-        spin = rotation.rotate(own_quat, ang_vel)
+        spin = rotation.rotate(object_quat, ang_vel)
     elif row is not None:
         objects: Any = data.objects
-        own_pos, own_quat, vel = (x[..., row, :] for x in (objects.pos, objects.quat, objects.vel))
+        object_pos, object_quat, vel = (x[..., row, :] for x in (objects.pos, objects.quat, objects.vel))
 
-    def into(x: Array, is_point: bool) -> Array:
-        if own_quat is not None and own_pos is not None:
-            x = rotation.rotate_inverse(own_quat[..., None, :], x - own_pos[..., None, :] if is_point else x)
+    def to_geom(x: Array, is_point: bool) -> Array:
+        if object_quat is not None and object_pos is not None:
+            x = rotation.rotate_inverse(object_quat[..., None, :], x - object_pos[..., None, :] if is_point else x)
         x = x - pos if is_point else x
         return x if rot is None else rotation.matvec(rot.T, x)
 
-    def back(x: Array) -> Array:
+    def to_world(x: Array) -> Array:
         x = x if rot is None else rotation.matvec(rot, x)
-        return x if own_quat is None else rotation.rotate(own_quat[..., None, :], x)
+        return x if object_quat is None else rotation.rotate(object_quat[..., None, :], x)
 
-    def moving(x: Array) -> Array:
+    def velocity_at(x: Array) -> Array:
         out = jnp.broadcast_to(vel[..., None, :], x.shape)  # type: ignore[index]
-        if spin is None or own_pos is None:
+        if spin is None or object_pos is None:
             return out
-        return out + rotation.cross(jnp.broadcast_to(spin[..., None, :], x.shape), x - own_pos[..., None, :])
+        return out + rotation.cross(jnp.broadcast_to(spin[..., None, :], x.shape), x - object_pos[..., None, :])
 
-    return into, back, None if vel is None else moving
+    return to_geom, to_world, None if vel is None else velocity_at

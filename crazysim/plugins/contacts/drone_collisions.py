@@ -37,10 +37,10 @@ class DroneCollisionsData(PyTree):
     """Ratio of the speeds after and before a bounce, 1. (1,)"""
     impulse: Array = leaf("drone", 1)
     """Impulse of the other drones in the last step, world frame, N s. (n_worlds, n_drones, 3)"""
-    press: Array = leaf("world", 1)
+    normal_impulse: Array = leaf("world", 1)
     """Impulses along the normals of the contact points, N s, with which the next step begins.
     (n_worlds, 1, n_contacts)"""
-    drag: Array = leaf("world", 2)
+    friction_impulse: Array = leaf("world", 2)
     """The same across the normals, world frame, N s. (n_worlds, 1, n_contacts, 3)"""
 
 
@@ -70,8 +70,8 @@ class DroneCollisions(Plugin):
             friction=device_array([self.friction]),
             restitution=device_array([self.restitution]),
             impulse=drone_array(sim, 0.0, 3),
-            press=device_array(np.zeros((sim.n_worlds, 1, n_contacts))),
-            drag=device_array(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
+            normal_impulse=device_array(np.zeros((sim.n_worlds, 1, n_contacts))),
+            friction_impulse=device_array(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
@@ -84,9 +84,13 @@ class DroneCollisions(Plugin):
             solids = Solids(np.arange(n), np.zeros(n, bool), boxes[:, 3:], pos, rot)
             surface = (jnp.broadcast_to(x, (n,)) for x in (record.friction, record.restitution))
             contacts = join_contacts(contacts_between(solids, pairs), *surface)
-            before, dt = Impulses(record.press, record.drag), 1 / data.core.freq
+            before, dt = Impulses(record.normal_impulse, record.friction_impulse), 1 / data.core.freq
             solved = solve_contacts(drones_as_bodies(data), contacts, before, dt, self.softness, self.iterations)
-            changes: Any = {"impulse": solved.impulse, "press": solved.at.press, "drag": solved.at.drag}
+            changes: Any = {
+                "impulse": solved.impulse,
+                "normal_impulse": solved.contact_impulses.normal,
+                "friction_impulse": solved.contact_impulses.friction,
+            }
             states = states_after_contact(data.states, solved, slice(n))
             return self.write(data.replace(states=states), record.replace(**changes))
 

@@ -35,7 +35,7 @@ class Material(NamedTuple):
 
 
 def velocity_after_contact(
-    points: ContactPoints, before: Array, mass: Array, inertia: Array, material: Material, iterations: int
+    points: ContactPoints, initial_vel: Array, mass: Array, inertia: Array, material: Material, iterations: int
 ) -> Array:
     """Return the velocity of a body after the impulses of the surfaces that it touches. (..., 6) or (..., 3)
 
@@ -48,7 +48,7 @@ def velocity_after_contact(
 
     Args:
         points: Contact points, in the frame of the velocity.
-        before: Velocity, m/s, followed by the angular velocity, rad/s, for a drone. (..., 6) or (..., 3)
+        initial_vel: Velocity, m/s, followed by the angular velocity, rad/s, for a drone. (..., 6) or (..., 3)
         mass: Mass, kg. (..., 1)
         inertia: Mass and moment of inertia, as ``inertia_matrix`` returns them. (..., 6, 6) or (..., 3, 3)
         material: Parameters of the contact.
@@ -56,55 +56,59 @@ def velocity_after_contact(
     """
     n, p, s = points.normal, points.point, points.vel
     active = points.gap < 0
-    stiff = PENALTY_STIFFNESS * mass
+    stiffness = PENALTY_STIFFNESS * mass
     row = _with_torque(n, p)
-    along = jnp.sum(n * s, axis=-1)
+    surface_speed = jnp.sum(n * s, axis=-1)
 
     def slip(u: Array) -> tuple[Array, Array]:
         """Return the speed of each point out of its surface, and its slip speed, m/s."""
         vel = u[..., None, :3] - s
         vel = vel if p is None else vel + rotation.cross(u[..., None, 3:], p)
-        out = jnp.sum(vel * n, axis=-1)
-        return out, rotation.safe_norm(vel - out[..., None] * n)[..., 0]
+        normal_speed = jnp.sum(vel * n, axis=-1)
+        return normal_speed, rotation.safe_norm(vel - normal_speed[..., None] * n)[..., 0]
 
-    fast = active & (-slip(before)[0] > BOUNCE_SPEED)
-    target_speed = jnp.where(fast, 0.0, jnp.minimum(-points.gap / material.softness, MAX_PUSH_SPEED))
+    is_impact = active & (-slip(initial_vel)[0] > BOUNCE_SPEED)
+    target_speed = jnp.where(is_impact, 0.0, jnp.minimum(-points.gap / material.softness, MAX_PUSH_SPEED))
 
-    def turn(k: Array, u: Array) -> Array:
-        out, aside = slip(u)
-        pressed = active & (out < target_speed)
-        push = jnp.where(pressed, stiff * (target_speed - out), 0.0)
-        w_n = jnp.where(pressed, stiff, 0.0)
+    def iterate(k: Array, u: Array) -> Array:
+        normal_speed, slip_speed = slip(u)
+        is_pressed = active & (normal_speed < target_speed)
+        normal_impulse = jnp.where(is_pressed, stiffness * (target_speed - normal_speed), 0.0)
+        w_n = jnp.where(is_pressed, stiffness, 0.0)
         # In the first iteration every point by itself stops the whole fall: the normal force, and so the friction
         # force, is known only from the second on.
-        w_t = jnp.where(k == 0, 0.0, jnp.minimum(w_n, material.friction * push / (aside + STICKING_SPEED)))
+        w_t = jnp.where(
+            k == 0, 0.0, jnp.minimum(w_n, material.friction * normal_impulse / (slip_speed + STICKING_SPEED))
+        )
         w_rest = w_n - w_t
-        steep = jnp.sum(w_rest[..., None, None] * row[..., None] * row[..., None, :], axis=-3)
-        matrix = inertia + _weighted_inertia(w_t, p, n.dtype) + steep
+        normal_stiffness = jnp.sum(w_rest[..., None, None] * row[..., None] * row[..., None, :], axis=-3)
+        matrix = inertia + _weighted_inertia(w_t, p, n.dtype) + normal_stiffness
         friction_pull = w_t[..., None] * _with_torque(s, p)
-        normal_pull = (w_rest * along + w_n * target_speed)[..., None] * row
-        return solve_symmetric(matrix, rotation.matvec(inertia, before) + jnp.sum(friction_pull + normal_pull, axis=-2))
+        normal_pull = (w_rest * surface_speed + w_n * target_speed)[..., None] * row
+        return solve_symmetric(
+            matrix, rotation.matvec(inertia, initial_vel) + jnp.sum(friction_pull + normal_pull, axis=-2)
+        )
 
-    after = jax.lax.fori_loop(0, iterations, turn, before)
-    push = jnp.where(active, stiff * jnp.maximum(target_speed - slip(after)[0], 0.0), 0.0)
-    after = after + material.restitution * solve_symmetric(
-        inertia, jnp.sum(jnp.where(fast, push, 0.0)[..., None] * row, axis=-2)
+    new_vel = jax.lax.fori_loop(0, iterations, iterate, initial_vel)
+    normal_impulse = jnp.where(active, stiffness * jnp.maximum(target_speed - slip(new_vel)[0], 0.0), 0.0)
+    new_vel = new_vel + material.restitution * solve_symmetric(
+        inertia, jnp.sum(jnp.where(is_impact, normal_impulse, 0.0)[..., None] * row, axis=-2)
     )
     # Energy is measured relative to the surfaces that push.
-    total = jnp.sum(push, axis=-1, keepdims=True)
-    surface_vel = jnp.sum(push[..., None] * s, axis=-2) / jnp.where(total > 0, total, 1.0)
+    total_impulse = jnp.sum(normal_impulse, axis=-1, keepdims=True)
+    surface_vel = jnp.sum(normal_impulse[..., None] * s, axis=-2) / jnp.where(total_impulse > 0, total_impulse, 1.0)
     surface_vel = surface_vel if p is None else jnp.concatenate([surface_vel, jnp.zeros_like(surface_vel)], axis=-1)
     energy_before, energy_after = (
-        rotation.dot(u - surface_vel, rotation.matvec(inertia, u - surface_vel)) for u in (before, after)
+        rotation.dot(u - surface_vel, rotation.matvec(inertia, u - surface_vel)) for u in (initial_vel, new_vel)
     )
     max_energy = energy_before + mass * MAX_PUSH_SPEED**2
-    after = jnp.where(
+    new_vel = jnp.where(
         energy_after > max_energy,
         surface_vel
-        + (after - surface_vel) * rotation.safe_sqrt(max_energy / jnp.where(energy_after > 0, energy_after, 1.0)),
-        after,
+        + (new_vel - surface_vel) * rotation.safe_sqrt(max_energy / jnp.where(energy_after > 0, energy_after, 1.0)),
+        new_vel,
     )
-    return jnp.where(jnp.any(active, axis=-1, keepdims=True), after, before)
+    return jnp.where(jnp.any(active, axis=-1, keepdims=True), new_vel, initial_vel)
 
 
 def inertia_matrix(mass: Array, inertia: Array | None = None) -> Array:
@@ -124,13 +128,13 @@ def _with_torque(force: Array, p: Array | None) -> Array:
 
 def _weighted_inertia(weight: Array, p: Array | None, dtype: jnp.dtype) -> Array:
     """Return the sum of ``weight * B^T B``; ``B`` maps velocities of the body to its point ``p``. (..., k, k)"""
-    total = jnp.sum(weight, axis=-1)[..., None, None] * jnp.eye(3, dtype=dtype)
+    translation = jnp.sum(weight, axis=-1)[..., None, None] * jnp.eye(3, dtype=dtype)
     if p is None:
-        return total
+        return translation
     x, y, z = (jnp.sum(weight * p[..., k], axis=-1) for k in range(3))
     o = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack(r, axis=-1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
     square = jnp.sum(weight * jnp.sum(p * p, axis=-1), axis=-1)[..., None, None] * jnp.eye(3, dtype=p.dtype)
     angular = square - jnp.sum(weight[..., None, None] * p[..., None] * p[..., None, :], axis=-3)
-    upper = jnp.concatenate([total, -cross], axis=-1)
+    upper = jnp.concatenate([translation, -cross], axis=-1)
     return jnp.concatenate([upper, jnp.concatenate([cross, angular], axis=-1)], axis=-2)

@@ -123,18 +123,20 @@ def velocity_change(
         material: Parameters of the contact.
         response: Returns the change of the relative velocity for a change of the body's velocity, both m/s.
     """
-    out = rotation.dot(vel, normal)
+    separation_speed = rotation.dot(vel, normal)
     pushed_out = jnp.clip(-gap[..., None] / material.softness, 0.0, MAX_PUSH_SPEED)
-    target_speed = jnp.where(out < -BOUNCE_SPEED, -material.restitution * out, pushed_out)
+    target_speed = jnp.where(separation_speed < -BOUNCE_SPEED, -material.restitution * separation_speed, pushed_out)
     response_along = response(normal)
     # The product is at least one, except where the normal is zero, between balls with the same centre.
-    speed = jnp.maximum(target_speed - out, 0.0) / jnp.maximum(rotation.dot(normal, response_along), 1.0)
+    speed = jnp.maximum(target_speed - separation_speed, 0.0) / jnp.maximum(rotation.dot(normal, response_along), 1.0)
     vel = vel + speed * response_along
     slip = vel - rotation.dot(vel, normal) * normal
-    fast = rotation.safe_norm(slip)
-    along = slip / (fast + STICKING_SPEED)
-    brake = jnp.minimum(material.friction * speed, fast / jnp.maximum(rotation.dot(along, response(along)), 1.0))
-    return speed * normal - brake * along
+    slip_speed = rotation.safe_norm(slip)
+    slip_direction = slip / (slip_speed + STICKING_SPEED)
+    friction_speed = jnp.minimum(
+        material.friction * speed, slip_speed / jnp.maximum(rotation.dot(slip_direction, response(slip_direction)), 1.0)
+    )
+    return speed * normal - friction_speed * slip_direction
 
 
 class _PairContacts(NamedTuple):
@@ -184,15 +186,15 @@ def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Mater
 def _pair_contacts(data: SimData, first: Collider, second: Collider, material: Material, same: bool) -> _PairContacts:
     """Return the contacts of two groups of bodies, or of one group, in which each pair counts once."""
     a, b = first.body(data), second.body(data)
-    turn = b.quat[None]
-    offset = rotation.rotate_inverse(turn, a.pos[:, None] - b.pos[None])
+    second_quat = b.quat[None]
+    offset = rotation.rotate_inverse(second_quat, a.pos[:, None] - b.pos[None])
     if same:
         offset = offset + SELF_GAP * np.eye(len(offset), dtype=offset.dtype)[..., None]
     eye = jnp.eye(3, dtype=offset.dtype)
-    axes = [rotation.rotate_inverse(turn, rotation.rotate(a.quat[:, None], eye[k])) for k in range(3)]
+    axes = [rotation.rotate_inverse(second_quat, rotation.rotate(a.quat[:, None], eye[k])) for k in range(3)]
     rot = jnp.stack(axes, axis=-1)
-    gap, pull = jax.vjp(lambda x: distance(first.shape, second.shape, x, rot), offset)
-    normal = rotation.rotate(turn, pull(jnp.ones_like(gap))[0])
+    gap, pull_back = jax.vjp(lambda x: distance(first.shape, second.shape, x, rot), offset)
+    normal = rotation.rotate(second_quat, pull_back(jnp.ones_like(gap))[0])
     touches = gap < 0
     if same:
         touches = touches & np.triu(np.ones(gap.shape, bool), 1)

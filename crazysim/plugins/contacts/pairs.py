@@ -142,16 +142,16 @@ def _distance_and_normal(shape: Shape, point: Array) -> tuple[Array, Array]:
     return gap, pull(jnp.ones_like(gap))[0]
 
 
-def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, at: Array, turn: Array) -> Manifold:
+def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, shape_pos: Array, shape_rot: Array) -> Manifold:
     """Return the contact at a box's point nearest to a shape; normal and torque are the gradient of the gap."""
 
-    def gap_at(move: Array, turn_offset: Array) -> Array:
-        spun = rot + jnp.stack([rotation.cross(turn_offset, rot[:, k]) for k in range(3)], axis=-1)
-        columns = [matvec(turn.T, spun[:, k]) for k in range(3)]
-        return distance(box, shape, matvec(turn.T, pos + move - at), jnp.stack(columns, axis=-1))
+    def gap_at(displacement: Array, rotvec: Array) -> Array:
+        turned_rot = rot + jnp.stack([rotation.cross(rotvec, rot[:, k]) for k in range(3)], axis=-1)
+        columns = [matvec(shape_rot.T, turned_rot[:, k]) for k in range(3)]
+        return distance(box, shape, matvec(shape_rot.T, pos + displacement - shape_pos), jnp.stack(columns, axis=-1))
 
-    gap, pull = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
-    normal, torque = pull(jnp.ones_like(gap))
+    gap, pull_back = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
+    normal, torque = pull_back(jnp.ones_like(gap))
     half = jnp.asarray(box.size, pos.dtype)
     reach = jnp.sum(jnp.abs(matvec(rot.T, normal)) * half)
     point = pos + rotation.cross(normal, torque) - reach * normal

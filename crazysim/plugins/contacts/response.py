@@ -91,9 +91,9 @@ class ContactResponse(Plugin):
 
         placements = [StagePlacement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
         obstacles = [surface for surface in surfaces if not is_ground(surface)]
-        hits = any(body.name in names for body in select_bodies(sim.scene.collision_model, self.objects))
+        touch_drones = any(body.name in names for body in select_bodies(sim.scene.collision_model, self.objects))
         for plugin in plugins:
-            placements += self._load_stages(plugin, obstacles, boxes if hits else [], sim.n_drones)
+            placements += self._load_stages(plugin, obstacles, boxes if touch_drones else [], sim.n_drones)
         return placements
 
     def _load_stages(
@@ -108,7 +108,7 @@ class ContactResponse(Plugin):
             n_drones: Number of drones in a world.
         """
         colliders = plugin.colliders()
-        meet = len(colliders) > 1 or (plugin.coupling == "drone" and n_drones > 1)
+        touch_each_other = len(colliders) > 1 or (plugin.coupling == "drone" and n_drones > 1)
 
         def stop(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
@@ -137,7 +137,7 @@ class ContactResponse(Plugin):
             stages.append((Stage(stop, plugin.coupling), f"{self.name}_of_{plugin.name}"))
         if boxes:
             stages.append((Stage(hit, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
-            if meet:
+            if touch_each_other:
                 stages.append((Stage(hit_others, "world"), f"{self.name}_between_{plugin.name}"))
         return [StagePlacement(stage, before="increment_steps", name=name) for stage, name in stages]
 

@@ -86,10 +86,14 @@ class BodyContacts:
             jnp.concatenate([x[:, 0], jnp.zeros(size - n_free, x.dtype)]) for x in (record.friction, record.restitution)
         )
         contacts = join_contacts(groups, friction, restitution)
-        before = Impulses(record.press, record.drag)
+        before = Impulses(record.normal_impulse, record.friction_impulse)
         solved = solve_contacts(bodies, contacts, before, 1 / data.core.freq, plugin.softness, plugin.iterations)
         record = states_after_contact(record, solved, slice(n_free))
-        changes: Any = {"impulse": solved.impulse[:n_free], "press": solved.at.press, "drag": solved.at.drag}
+        changes: Any = {
+            "impulse": solved.impulse[:n_free],
+            "normal_impulse": solved.contact_impulses.normal,
+            "friction_impulse": solved.contact_impulses.friction,
+        }
         data = plugin.write(data, record.replace(**changes))
         if n_drones:
             data = data.replace(states=states_after_contact(s, solved, slice(n_free, first_carrier)))

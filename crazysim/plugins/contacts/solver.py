@@ -70,9 +70,9 @@ class Contacts(NamedTuple):
 class Impulses(NamedTuple):
     """Impulses at the contacts, on the first bodies."""
 
-    press: Array
+    normal: Array
     """Along the normals, N s. (k,)"""
-    drag: Array
+    friction: Array
     """Across the normals, world frame, N s. (k, 3)"""
 
 
@@ -83,14 +83,14 @@ class SolvedBodies(NamedTuple):
     """The bodies with their new velocities and positions."""
     turned: Array
     """Rotations that remove overlaps, world frame, rad. (n, 3)"""
-    at: Impulses
+    contact_impulses: Impulses
     """Impulses at the contacts, with which the next step begins."""
     impulse: Array
     """Sum of the impulses on each body, world frame, N s. (n, 3)"""
 
 
 def solve_contacts(
-    bodies: Bodies, contacts: Contacts, before: Impulses, dt: float, softness: float, iterations: int
+    bodies: Bodies, contacts: Contacts, initial_impulses: Impulses, dt: float, softness: float, iterations: int
 ) -> SolvedBodies:
     """Return the bodies after contact.
 
@@ -105,8 +105,8 @@ def solve_contacts(
     Args:
         bodies: The bodies.
         contacts: The contacts, each with at least one body that can be pushed.
-        before: Initial impulses. With the impulses of the last step, bodies at rest stay at rest from the first
-            iteration on.
+        initial_impulses: Initial impulses. With the impulses of the last step, bodies at rest stay at rest from the
+            first iteration on.
         dt: Step, s.
         softness: Time constant with which an overlap is pushed out, s.
         iterations: Iterations of the solver.
@@ -115,7 +115,7 @@ def solve_contacts(
     dtype = bodies.pos.dtype
     a, b = contacts.first, contacts.second
     pair = np.repeat(np.arange(len(a)), contacts.n_points)
-    sums = [jnp.asarray(np.eye(n)[:, numbers], dtype) for numbers in (a, b)]  # (n, n_pairs)
+    sums = [jnp.asarray(np.eye(n)[:, body_indices], dtype) for body_indices in (a, b)]  # (n, n_pairs)
     normal = contacts.normal
     offset = bodies.pos[a] - bodies.pos[b]
     arm = contacts.point - bodies.pos[a][pair]
@@ -128,70 +128,85 @@ def solve_contacts(
     def change(impulse: Array) -> tuple[Array, Array]:
         """Return the changes of the velocities by impulses on the first bodies and opposite ones on the second."""
         force, torque = contacts.sum_pairs(impulse), contacts.sum_pairs(rotation.cross(arm, impulse))
-        against = torque + rotation.cross(offset, force)
+        second_torque = torque + rotation.cross(offset, force)
         force, torque = (
             _sum_for_bodies(sums[0] - sums[1], force),
-            _sum_for_bodies(sums[0], torque) - _sum_for_bodies(sums[1], against),
+            _sum_for_bodies(sums[0], torque) - _sum_for_bodies(sums[1], second_torque),
         )
         return bodies.inv_mass[:, None] * force, matvec(bodies.inv_inertia, torque)
 
-    start = slip(bodies.vel, bodies.ang_vel)
-    out = rotation.dot(start, normal)[:, 0]
-    is_near = contacts.gap < MAX_ACTING_GAP + dt * jnp.abs(out)
+    initial_vel = slip(bodies.vel, bodies.ang_vel)
+    separation_speed = rotation.dot(initial_vel, normal)[:, 0]
+    is_near = contacts.gap < MAX_ACTING_GAP + dt * jnp.abs(separation_speed)
     closes = jnp.minimum(-contacts.gap / dt, 0.0)
-    bounces = (out < -BOUNCE_SPEED) & (contacts.gap + dt * out < 0)
-    target_speed = jnp.where(bounces, -contacts.restitution * out, closes)
+    bounces = (separation_speed < -BOUNCE_SPEED) & (contacts.gap + dt * separation_speed < 0)
+    target_speed = jnp.where(bounces, -contacts.restitution * separation_speed, closes)
 
-    along, across = jnp.zeros(k, dtype), jnp.zeros(k, dtype)
-    for numbers, sum_of, lever in ((a, sums[0], arm), (b, sums[1], arm + offset[pair])):
-        turn = rotation.cross_matrix(lever)
-        inverse, inv_mass = bodies.inv_inertia[numbers][pair], bodies.inv_mass[numbers][pair]
-        spun = matmul(inverse, turn)
+    normal_response, slip_response = jnp.zeros(k, dtype), jnp.zeros(k, dtype)
+    for body_indices, sum_of, lever in ((a, sums[0], arm), (b, sums[1], arm + offset[pair])):
+        lever_matrix = rotation.cross_matrix(lever)
+        inverse, inv_mass = bodies.inv_inertia[body_indices][pair], bodies.inv_mass[body_indices][pair]
+        spun = matmul(inverse, lever_matrix)
         of_normal = inv_mass + rotation.dot(rotation.cross(lever, normal), matvec(spun, normal))[:, 0]
-        of_slip = 0.5 * (3 * inv_mass + jnp.sum(turn * spun, axis=(-2, -1)) - of_normal)
+        of_slip = 0.5 * (3 * inv_mass + jnp.sum(lever_matrix * spun, axis=(-2, -1)) - of_normal)
         acts = is_near & (of_normal > 0)
         n_weight, s_weight = (jnp.where(acts, 1 / jnp.where(acts, x, 1.0), 0.0) for x in (of_normal, of_slip))
-        together = _shared_response(bodies, sum_of, contacts, normal, turn, n_weight, s_weight)[numbers][pair]
-        along, across = along + together * of_normal, across + together * of_slip
-    along, across = (jnp.where(x > 0, x, 1.0) for x in (along, across))
+        together = _shared_response(bodies, sum_of, contacts, normal, lever_matrix, n_weight, s_weight)[body_indices][
+            pair
+        ]
+        normal_response, slip_response = normal_response + together * of_normal, slip_response + together * of_slip
+    normal_response, slip_response = (jnp.where(x > 0, x, 1.0) for x in (normal_response, slip_response))
 
-    def turn_once(_: int, carry: tuple[Impulses, Impulses, Array]) -> tuple[Impulses, Impulses, Array]:
-        (press, drag), old, age = carry
-        ahead = age / (age + 3)
-        y, z = press + ahead * (press - old.press), drag + ahead * (drag - old.drag)
-        moving = start + slip(*change(y[:, None] * normal + z))
-        speed = rotation.dot(moving, normal)[:, 0]
-        new = jnp.where(is_near, jnp.maximum(y + (target_speed - speed) / along, 0.0), 0.0)
-        held = z - (moving - speed[:, None] * normal) / across[:, None]
-        size, limit = rotation.safe_norm(held), (contacts.friction * new)[:, None]
-        held = jnp.where(size > limit, held * (limit / jnp.where(size > 0, size, 1.0)), held)
+    def iterate(_: int, carry: tuple[Impulses, Impulses, Array]) -> tuple[Impulses, Impulses, Array]:
+        current, previous, n_accelerated = carry
+        momentum = n_accelerated / (n_accelerated + 3)
+        y = current.normal + momentum * (current.normal - previous.normal)
+        z = current.friction + momentum * (current.friction - previous.friction)
+        contact_vel = initial_vel + slip(*change(y[:, None] * normal + z))
+        speed = rotation.dot(contact_vel, normal)[:, 0]
+        normal_impulse = jnp.where(is_near, jnp.maximum(y + (target_speed - speed) / normal_response, 0.0), 0.0)
+        friction_impulse = z - (contact_vel - speed[:, None] * normal) / slip_response[:, None]
+        size, limit = rotation.safe_norm(friction_impulse), (contacts.friction * normal_impulse)[:, None]
+        friction_impulse = jnp.where(
+            size > limit, friction_impulse * (limit / jnp.where(size > 0, size, 1.0)), friction_impulse
+        )
         # Momentum that points uphill is dropped (O'Donoghue and Candes 2015).
-        rise = jnp.sum((y - new) * along * (new - press)) + jnp.sum((z - held) * across[:, None] * (held - drag))
-        return Impulses(new, held), Impulses(press, drag), jnp.where(rise > 0, 0.0, age + 1)
+        normal_slope = (y - normal_impulse) * normal_response * (normal_impulse - current.normal)
+        friction_slope = (z - friction_impulse) * slip_response[:, None] * (friction_impulse - current.friction)
+        uphill = jnp.sum(normal_slope) + jnp.sum(friction_slope)
+        return Impulses(normal_impulse, friction_impulse), current, jnp.where(uphill > 0, 0.0, n_accelerated + 1)
 
-    press = jnp.where(is_near, before.press, 0.0)
-    drag = jnp.where(is_near[:, None], before.drag - rotation.dot(before.drag, normal) * normal, 0.0)
-    first = Impulses(press, drag)
-    impulses, *_ = jax.lax.fori_loop(0, iterations, turn_once, (first, first, jnp.zeros((), dtype)))
-    total = impulses.press[:, None] * normal + impulses.drag
+    normal_start = jnp.where(is_near, initial_impulses.normal, 0.0)
+    friction_start = jnp.where(
+        is_near[:, None], initial_impulses.friction - rotation.dot(initial_impulses.friction, normal) * normal, 0.0
+    )
+    first = Impulses(normal_start, friction_start)
+    impulses, *_ = jax.lax.fori_loop(0, iterations, iterate, (first, first, jnp.zeros((), dtype)))
+    total = impulses.normal[:, None] * normal + impulses.friction
     vel, ang_vel = change(total)
-    share = _energy_share(total, start, slip(vel, ang_vel))
+    share = _energy_share(total, initial_vel, slip(vel, ang_vel))
     impulses, total, vel, ang_vel = jax.tree.map(lambda x: share * x, (impulses, total, vel, ang_vel))
 
     # One gradient step with exact line search reduces the overlaps; the next time step continues.
-    leaves = out + rotation.dot(slip(vel, ang_vel), normal)[:, 0]
+    leaves = separation_speed + rotation.dot(slip(vel, ang_vel), normal)[:, 0]
     push = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, MAX_PUSH_SPEED) - jnp.maximum(leaves, 0.0)
     push = jnp.maximum(push, 0.0)
-    vel_change, ang_vel_change = change((push / along)[:, None] * normal)
-    slip_change = jnp.sum(push / along * rotation.dot(slip(vel_change, ang_vel_change), normal)[:, 0])
-    size = dt * jnp.sum(push / along * push) / jnp.where(slip_change > 0, slip_change, 1.0)
+    vel_change, ang_vel_change = change((push / normal_response)[:, None] * normal)
+    slip_change = jnp.sum(push / normal_response * rotation.dot(slip(vel_change, ang_vel_change), normal)[:, 0])
+    size = dt * jnp.sum(push / normal_response * push) / jnp.where(slip_change > 0, slip_change, 1.0)
     after = bodies._replace(pos=bodies.pos + size * vel_change, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel)
     impulse = _sum_for_bodies(sums[0] - sums[1], contacts.sum_pairs(total))
     return SolvedBodies(after, size * ang_vel_change, impulses, impulse)
 
 
 def _shared_response(
-    bodies: Bodies, sum_of: Array, contacts: Contacts, normal: Array, turn: Array, along: Array, across: Array
+    bodies: Bodies,
+    sum_of: Array,
+    contacts: Contacts,
+    normal: Array,
+    lever_matrix: Array,
+    normal_weight: Array,
+    slip_weight: Array,
 ) -> Array:
     """Return for each body its contacts' response to all impulses, divided by their response to their own one. (n,)
 
@@ -204,15 +219,18 @@ def _shared_response(
         sum_of: 1 where a pair contains the body, and else 0. (n, n_pairs)
         contacts: The contacts.
         normal: Normals. (k, 3)
-        turn: Torque of impulses about the body. (k, 3, 3)
-        along: Inverse responses to impulses along the normals, kg; zero where nothing acts. (k,)
-        across: The same across the normals. (k,)
+        lever_matrix: Torque of impulses about the body. (k, 3, 3)
+        normal_weight: Inverse responses to impulses along the normals, kg; zero where nothing acts. (k,)
+        slip_weight: The same across the normals. (k,)
     """
     eye = jnp.eye(3, dtype=normal.dtype)
-    weight = across[:, None, None] * eye + (along - across)[:, None, None] * normal[:, :, None] * normal[:, None]
-    angular = matmul(turn, weight)
+    weight = (
+        slip_weight[:, None, None] * eye
+        + (normal_weight - slip_weight)[:, None, None] * normal[:, :, None] * normal[:, None]
+    )
+    angular = matmul(lever_matrix, weight)
     upper = jnp.concatenate([weight, jnp.swapaxes(angular, -1, -2)], axis=-1)
-    lower = jnp.concatenate([angular, matmul(angular, jnp.swapaxes(turn, -1, -2))], axis=-1)
+    lower = jnp.concatenate([angular, matmul(angular, jnp.swapaxes(lever_matrix, -1, -2))], axis=-1)
     blocks = jnp.concatenate([upper, lower], axis=-2).reshape(-1, 36)
     total = _sum_for_bodies(sum_of, contacts.sum_pairs(blocks)).reshape(-1, 6, 6)
     response = jnp.concatenate(
@@ -223,7 +241,7 @@ def _shared_response(
     return jnp.where(trace > 0, jnp.where(trace > 0, trace, 1.0) ** 0.125, 1.0)
 
 
-def _energy_share(impulse: Array, before: Array, change: Array) -> Array:
+def _energy_share(impulse: Array, initial_vel: Array, vel_change: Array) -> Array:
     """Return the share of impulses, at most one, with which they add no kinetic energy. ()
 
     The energy that the impulses add, in the frame of immovable bodies, is the sum of the products of each impulse with
@@ -231,10 +249,10 @@ def _energy_share(impulse: Array, before: Array, change: Array) -> Array:
 
     Args:
         impulse: Impulses on the first bodies, N s. (k, 3)
-        before: Velocities of the contacts before, m/s. (k, 3)
-        change: Their changes by the impulses, m/s. (k, 3)
+        initial_vel: Velocities of the contacts before, m/s. (k, 3)
+        vel_change: Their changes by the impulses, m/s. (k, 3)
     """
-    first, second = jnp.sum(impulse * before), jnp.sum(impulse * change)
+    first, second = jnp.sum(impulse * initial_vel), jnp.sum(impulse * vel_change)
     gains = first + 0.5 * second > 0
     return jnp.where(gains, jnp.maximum(-2 * first, 0.0) / jnp.where(gains, second, 1.0), 1.0)
 

@@ -107,7 +107,7 @@ class Battery(Plugin):
                 voltage[..., None] > 0, voltage[..., None], NOMINAL_VOLTAGE * np.asarray(cells)
             )
         charge = drone_array(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0), 1)
-        return self.filled(
+        return self.fill_record(
             sim,
             BatteryData,
             charge=charge,

@@ -64,7 +64,7 @@ class Downwash(Plugin):
         require_drag(sim, "downwash")
         radius = checked_propeller_radius(sim, self.propeller_radius)
         # Far below a rotor the cross-section of its stream is half the rotor's disc (momentum theory).
-        return self.filled(sim, DownwashData, diameter=stream_diameter(sim, radius))
+        return self.fill_record(sim, DownwashData, diameter=stream_diameter(sim, radius))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         return [StagePlacement(stage("drone")(self.sum_jets))]

@@ -52,7 +52,7 @@ class MotorFailure(Plugin):
         require_rotors(sim, "motor failure")
         n = sim.data.states.rotor_vel.shape[-1]
         effectiveness = check_parameter(sim, "effectiveness", self.effectiveness, (n,))
-        return self.filled(sim, MotorFailureData, effectiveness=drone_array(sim, effectiveness, n))
+        return self.fill_record(sim, MotorFailureData, effectiveness=drone_array(sim, effectiveness, n))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         can_fail = self.fail_step is not None or self.rate is not None

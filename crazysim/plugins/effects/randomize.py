@@ -156,7 +156,7 @@ class Randomize(Plugin):
         elif blows:
             require_drag(sim, "wind")
         settings = self if blows or self.wind is None else dataclasses.replace(self, wind=None)
-        record = settings.filled(
+        record = settings.fill_record(
             sim,
             RandomizeData,
             factors=drone_array(sim, 1.0, len(FACTORS)),

@@ -101,7 +101,7 @@ class RotorAerodynamics(Plugin):
                 f"radius and air density, got {np.max(inflow):.3g}. Use RotorAerodynamics(inflow=...) with a "
                 f"smaller number."
             )
-        return self.filled(
+        return self.fill_record(
             sim,
             RotorAerodynamicsData,
             drag=self._own_or_drag_value(sim, "drag", lambda drag: -0.5 * (drag[0, 0] + drag[1, 1])),

@@ -21,7 +21,7 @@ from crazysim.rotation import dot, safe_clip, safe_normalize
 
 FOOT = 0.3048
 """Metres per foot: the low-altitude model is stated in feet."""
-LOWEST, HIGHEST = 10.0, 1000.0
+MIN_HEIGHT_FT, MAX_HEIGHT_FT = 10.0, 1000.0
 """Range of heights in which the low-altitude model holds, ft; heights outside are clipped to it."""
 MIN_PROFILE_HEIGHT = 0.01
 """Height below which the wind of a power law stays constant, m: its slope would be infinite at zero."""
@@ -98,10 +98,10 @@ class Wind(Plugin):
                 "logarithmic profile, exponent for the power law."
             )
 
-        absent = [] if self.speed_20ft is not None else ["filters", "gust"]
+        unused_fields = [] if self.speed_20ft is not None else ["filters", "gust"]
         if self.roughness is None and self.exponent is None:
-            absent.append("reference_height")
-        record = self.filled(sim, WindData, **dict.fromkeys(absent))
+            unused_fields.append("reference_height")
+        record = self.fill_record(sim, WindData, **dict.fromkeys(unused_fields))
         if record.roughness is not None and np.any(np.asarray(record.roughness) >= np.asarray(record.reference_height)):
             raise ConfigError(
                 f"expected a roughness below the reference height, got {self.roughness} m and "
@@ -126,14 +126,14 @@ class Wind(Plugin):
         step = airspeed / (data.core.freq * length)
 
         noise = normal(drone_key(data, self.name), (6,), s.vel.dtype)
-        begins = data.core.steps == 0
+        is_first_step = data.core.steps == 0
         first, second = wind.filters[:3], wind.filters[3:]
-        first = jnp.where(begins, noise[3:], first)
-        filters = shape_noise(first, second, noise[:3], jnp.where(begins, 1.0, step / (1 + step / 2)))
+        first = jnp.where(is_first_step, noise[3:], first)
+        filters = shape_noise(first, second, noise[:3], jnp.where(is_first_step, 1.0, step / (1 + step / 2)))
 
         first, second = filters[:3], filters[3:]
-        across = (3**0.5 * first[1:] + (1 - 3**0.5) * second) / 2**0.5
-        gust = wind_axes_to_world(deviation * jnp.concatenate([first[:1], across]), mean)
+        transverse = (3**0.5 * first[1:] + (1 - 3**0.5) * second) / 2**0.5
+        gust = wind_axes_to_world(deviation * jnp.concatenate([first[:1], transverse]), mean)
         return self.write(data, wind.replace(filters=filters, gust=gust))
 
 
@@ -188,7 +188,7 @@ def low_altitude_gusts(height: Array, speed_20ft: Array) -> tuple[Array, Array]:
     Returns:
         Scale lengths along the mean wind, across and vertically, m, and standard deviations, m/s. (..., 3) each
     """
-    h = safe_clip(height / FOOT, LOWEST, HIGHEST)
+    h = safe_clip(height / FOOT, MIN_HEIGHT_FT, MAX_HEIGHT_FT)
     log = jnp.log(0.177 + 0.000823 * h)
     horizontal, sigma = h * jnp.exp(-1.2 * log), 0.1 * speed_20ft
     length = FOOT * jnp.concatenate([horizontal, horizontal, h], axis=-1)
@@ -212,9 +212,9 @@ def shape_noise(first: Array, second: Array, noise: Array, loss: Array) -> Array
     Returns:
         x1, then x2. (..., 5)
     """
-    new = first - loss * first + jnp.sqrt(loss * (2 - loss)) * noise
-    mean = 0.5 * (first + new)[..., 1:]
-    return jnp.concatenate([new, second - loss[..., 1:] * (second - mean)], axis=-1)
+    new_first = first - loss * first + jnp.sqrt(loss * (2 - loss)) * noise
+    mean = 0.5 * (first + new_first)[..., 1:]
+    return jnp.concatenate([new_first, second - loss[..., 1:] * (second - mean)], axis=-1)
 
 
 def wind_axes_to_world(vector: Array, velocity: Array) -> Array:
@@ -222,7 +222,7 @@ def wind_axes_to_world(vector: Array, velocity: Array) -> Array:
 
     The axes are level, as in MIL-F-8785C at low altitude; without mean wind they are the world's.
     """
-    along = safe_normalize(velocity[..., :2], jnp.asarray([1.0, 0.0], velocity.dtype))
-    c, s = along[..., 0], along[..., 1]
+    direction = safe_normalize(velocity[..., :2], jnp.asarray([1.0, 0.0], velocity.dtype))
+    c, s = direction[..., 0], direction[..., 1]
     u, v = vector[..., 0], vector[..., 1]
     return jnp.stack([c * u - s * v, s * u + c * v, vector[..., 2]], axis=-1)

@@ -76,7 +76,7 @@ class WindField(Plugin):
             )
         grid = self.field.checked("field", 3)
         dtype = sim.data.states.pos.dtype
-        return self.filled(
+        return self.fill_record(
             sim,
             WindFieldData,
             field=device_array(grid.values, dtype),

@@ -97,7 +97,7 @@ class Complementary(Estimator):
                 f"expected control at the level 'attitude' or below with {self.name!r}, which estimates no position, "
                 f"got 'state'. Use estimator=\"kalman\"."
             )
-        return self.filled(sim, ComplementaryData, quat=drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4))
+        return self.fill_record(sim, ComplementaryData, quat=drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4))
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         period = freq // dividing_rate("freq", self.freq, freq)

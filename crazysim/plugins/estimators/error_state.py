@@ -118,16 +118,16 @@ def predict(
     # The linearised step: rows of the errors of position, velocity and attitude.
     to_pos = dt * rot
     att_to_pos = -to_pos @ rotation.cross_matrix(vel)
-    keep_vel = identity - rotation.cross_matrix(angle)
+    vel_to_vel = identity - rotation.cross_matrix(angle)
     att_to_vel = -dt * rotation.cross_matrix(gravity)
-    turn = _error_rotation(0.5 * angle)
+    error_rot = _error_rotation(0.5 * angle)
     p = covariance(estimate.cov)
     pos_rows = p[:3] + to_pos @ p[3:6] + att_to_pos @ p[6:]
-    vel_rows = keep_vel @ p[3:6] + att_to_vel @ p[6:]
-    rows = jnp.concatenate([pos_rows, vel_rows, turn @ p[6:]])
+    vel_rows = vel_to_vel @ p[3:6] + att_to_vel @ p[6:]
+    rows = jnp.concatenate([pos_rows, vel_rows, error_rot @ p[6:]])
     pos_columns = rows[:, :3] + rows[:, 3:6] @ to_pos.T + rows[:, 6:] @ att_to_pos.T
-    vel_columns = rows[:, 3:6] @ keep_vel.T + rows[:, 6:] @ att_to_vel.T
-    p = jnp.concatenate([pos_columns, vel_columns, rows[:, 6:] @ turn.T], axis=1)
+    vel_columns = rows[:, 3:6] @ vel_to_vel.T + rows[:, 6:] @ att_to_vel.T
+    p = jnp.concatenate([pos_columns, vel_columns, rows[:, 6:] @ error_rot.T], axis=1)
 
     force = rotation.along_z(accel[2]) if resting is None and not all_axes else accel
     shift = dt * vel + 0.5 * dt**2 * force
@@ -185,28 +185,31 @@ def predict_biased(
         accel_variance: Variances of the mean specific force, m^2/s^4. (3,)
         gyro_variance: Variances of the mean angular velocity, rad^2/s^2. (3,)
     """
-    vel, after = estimate.vel, propagate(estimate, accel, gyro, dt, gravity)
+    vel, predicted = estimate.vel, propagate(estimate, accel, gyro, dt, gravity)
     middle = turn_attitude(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
-    rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, middle, after.quat))
+    rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, middle, predicted.quat))
 
-    turn, accel_to_vel = rot_end.T @ rot, -dt * (rot_end.T @ rot_middle)
+    error_rot, accel_to_vel = rot_end.T @ rot, -dt * (rot_end.T @ rot_middle)
     vel_to_pos, att_to_pos = dt * rot, -dt * rot @ rotation.cross_matrix(vel)
-    fall, gyro_to_vel = dt * rotation.cross_matrix(rot_end.T @ gravity), -dt * rotation.cross_matrix(after.vel)
+    gravity_to_vel, gyro_to_vel = (
+        dt * rotation.cross_matrix(rot_end.T @ gravity),
+        -dt * rotation.cross_matrix(predicted.vel),
+    )
 
     def rows(p: Array) -> Array:
         """Return the linearised step times a matrix."""
-        turned = turn @ p[6:9]
+        rotated_att = error_rot @ p[6:9]
         pos_rows = p[:3] + vel_to_pos @ p[3:6] + att_to_pos @ p[6:9]
-        vel_rows = turn @ p[3:6] + fall @ turned + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
-        return jnp.concatenate([pos_rows, vel_rows, turned - dt * p[12:], p[9:]])
+        vel_rows = error_rot @ p[3:6] + gravity_to_vel @ rotated_att + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
+        return jnp.concatenate([pos_rows, vel_rows, rotated_att - dt * p[12:], p[9:]])
 
     p = rows(rows(covariance(estimate.cov)).T)
-    by_gyro = gyro_to_vel * gyro_variance
-    vel_noise = (accel_to_vel * accel_variance) @ accel_to_vel.T + by_gyro @ gyro_to_vel.T
-    both = -dt * by_gyro
-    p = p.at[3:6, 3:6].add(vel_noise).at[3:6, 6:9].add(both).at[6:9, 3:6].add(both.T)
+    gyro_noise = gyro_to_vel * gyro_variance
+    vel_noise = (accel_to_vel * accel_variance) @ accel_to_vel.T + gyro_noise @ gyro_to_vel.T
+    vel_att_noise = -dt * gyro_noise
+    p = p.at[3:6, 3:6].add(vel_noise).at[3:6, 6:9].add(vel_att_noise).at[6:9, 3:6].add(vel_att_noise.T)
     p = p.at[6:9, 6:9].add(dt**2 * jnp.diag(gyro_variance))
-    return after.replace(cov=bound_covariance(p))
+    return predicted.replace(cov=bound_covariance(p))
 
 
 def add_noise(estimate: Estimate, variances: Array) -> Estimate:
@@ -233,11 +236,11 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     gain = ph * (1 / (jnp.dot(h, ph[jnp.asarray(rows)]) + r))
     # Joseph's form (I - K H) P (I - K H)' + K R K'; only the columns ``rows`` of I - K H differ from the identity.
     reduction = jnp.eye(n, dtype=p.dtype)[:, rows] - gain[:, None] * h
-    others = np.setdiff1d(np.arange(n), rows)
-    keep = np.zeros((n, 1), bool)
-    keep[others] = True
-    p = jnp.where(keep, p, 0.0) + reduction @ p[jnp.asarray(rows)]
-    p = jnp.where(keep.T, p, 0.0) + p[:, rows] @ reduction.T
+    unused_rows = np.setdiff1d(np.arange(n), rows)
+    is_unused = np.zeros((n, 1), bool)
+    is_unused[unused_rows] = True
+    p = jnp.where(is_unused, p, 0.0) + reduction @ p[jnp.asarray(rows)]
+    p = jnp.where(is_unused.T, p, 0.0) + p[:, rows] @ reduction.T
     p = p + r * gain[:, None] * gain
     step = error * gain
     biases = {}
@@ -252,20 +255,20 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     )
 
 
-def finalize(estimate: Estimate, least: float = SMALL_ANGLE) -> Estimate:
+def finalize(estimate: Estimate, min_angle: float = SMALL_ANGLE) -> Estimate:
     """Return the estimate with its attitude error moved into the attitude.
 
     Args:
         estimate: The estimate.
-        least: Size, rad, up to which an error is dropped; by default the firmware's.
+        min_angle: Size, rad, up to which an error is dropped; by default the firmware's.
     """
     error, p = estimate.att_error, covariance(estimate.cov)
     size = jnp.abs(error)
-    moves = jnp.any(size > least) & jnp.all(size < LARGE_ANGLE)
-    turn = _error_rotation(0.5 * jnp.where(moves, error, 0.0))
-    p = jnp.concatenate([p[:6], turn @ p[6:9], p[9:]])
-    p = jnp.concatenate([p[:, :6], p[:, 6:9] @ turn.T, p[:, 9:]], axis=1)
-    quat = jnp.where(moves, turn_attitude(estimate.quat, error), estimate.quat)
+    is_moved = jnp.any(size > min_angle) & jnp.all(size < LARGE_ANGLE)
+    error_rot = _error_rotation(0.5 * jnp.where(is_moved, error, 0.0))
+    p = jnp.concatenate([p[:6], error_rot @ p[6:9], p[9:]])
+    p = jnp.concatenate([p[:, :6], p[:, 6:9] @ error_rot.T, p[:, 9:]], axis=1)
+    quat = jnp.where(is_moved, turn_attitude(estimate.quat, error), estimate.quat)
     return estimate.replace(quat=quat, att_error=jnp.zeros_like(error), cov=bound_covariance(p))
 
 
@@ -274,9 +277,9 @@ def is_within_bounds(estimate: Estimate, max_pos: float = MAX_POS, max_vel: floa
     return jnp.all(jnp.abs(estimate.pos) <= max_pos) & jnp.all(jnp.abs(estimate.vel) <= max_vel)
 
 
-def select_estimate(which: Array, new: Estimate, old: Estimate) -> Estimate:
+def select_estimate(mask: Array, new: Estimate, old: Estimate) -> Estimate:
     """Return the new estimate where a flag is set, and the old one elsewhere."""
-    return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
+    return jax.tree.map(lambda a, b: jnp.where(mask, a, b), new, old)
 
 
 def bound_covariance(p: Array) -> Array:

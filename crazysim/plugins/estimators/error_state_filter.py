@@ -59,7 +59,7 @@ class ErrorStateFilter(Estimator):
         """
         raise NotImplementedError
 
-    def initial_record(self, sim: Simulation, kind: type[R], estimate: Estimate, **given: Any) -> R:
+    def initial_record(self, sim: Simulation, kind: type[R], estimate: Estimate, **fields: Any) -> R:
         """Return the record before the first step.
 
         In ``used``, the step in which the latest used measurement of each sensor was taken, all values are -1.
@@ -69,12 +69,12 @@ class ErrorStateFilter(Estimator):
             sim: The simulation.
             kind: Class of the record.
             estimate: Estimate of all drones.
-            given: Other fields, see ``filled``.
+            fields: Other fields, see ``fill_record``.
         """
         shape = sim.data.states.pos.shape[:2]
         used = device_array(np.full((*shape, len(self.aids)), -1), np.int32)
         failures = device_array(np.zeros((*shape, 1)), np.int32)
-        return self.filled(sim, kind, estimate=estimate, used=used, failures=failures, **given)
+        return self.fill_record(sim, kind, estimate=estimate, used=used, failures=failures, **fields)
 
     def prediction_schedule(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
         """Return the steps between predictions at ``freq`` steps per second, and the predicate for when one is due."""

@@ -88,13 +88,13 @@ class ESKF(ErrorStateFilter):
     def record(self, sim: Simulation) -> ESKFData:
         self.check_sensors(sim)
         n = error_state.N_BIASED
-        level, still = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
+        level, zero = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
         cov = drone_array(sim, 0.0, n * (n + 1) // 2)
         rows = sum(_rows_in_transit(sensor, sim.data) for sensor in self.aids)
         paths = (
             drone_array(sim, inertial_path.EMPTY_PATH_ROW, rows, len(inertial_path.EMPTY_PATH_ROW)) if rows else None
         )
-        return self.initial_record(sim, ESKFData, Estimate(still, still, level, still, cov, still, still), paths=paths)
+        return self.initial_record(sim, ESKFData, Estimate(zero, zero, level, zero, cov, zero, zero), paths=paths)
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         period, is_due = self.prediction_schedule(freq)
@@ -131,8 +131,8 @@ class ESKF(ErrorStateFilter):
     def reset_episode(self, data: SimData) -> SimData:
         s = data.states
         estimate = self._initial_estimate(data, s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, INITIAL_STD)
-        half = 0.5 * (s.ang_vel + estimate.gyro_bias)  # type: ignore[operator]
-        return self.write(data, self.read(data).replace(estimate=estimate, gyro=half))
+        half_rate = 0.5 * (s.ang_vel + estimate.gyro_bias)  # type: ignore[operator]
+        return self.write(data, self.read(data).replace(estimate=estimate, gyro=half_rate))
 
     def _initial_estimate(
         self, data: SimData, pos: Array, vel: Array, quat: Array, deviations: Sequence[float]
@@ -140,7 +140,9 @@ class ESKF(ErrorStateFilter):
         """Return the estimate of one drone before any measurement, with the mean biases of its sensors."""
         imu = self.imu.read(data)
         spreads = [
-            x for triad in (imu.accel, imu.gyro) for x in _combined_std(triad.spread[:3], triad.instability, least=0.0)
+            x
+            for triad in (imu.accel, imu.gyro)
+            for x in _combined_std(triad.spread[:3], triad.instability, min_std=0.0)
         ]
         means = [rotation.rotate(imu.quat, triad.mean[:3]) for triad in (imu.accel, imu.gyro)]
         return error_state.initial_estimate(pos, vel, quat, [*deviations, *spreads], *means)
@@ -151,12 +153,12 @@ class ESKF(ErrorStateFilter):
             record, imu, dt = self.read(data), self.imu.read(data), period / data.core.freq
             half = 0.5 * self.inertial(data)[0]
             accel, gyro = record.accel / period, (record.gyro - half) / period
-            white = [0.5 / dt * triad.noise**2 for triad in (imu.accel, imu.gyro)]
+            noise_variances = [0.5 / dt * triad.noise**2 for triad in (imu.accel, imu.gyro)]
             estimate = error_state.predict_biased(
-                record.estimate, accel, gyro, dt, data.params.gravity_vec, white[0], white[1]
+                record.estimate, accel, gyro, dt, data.params.gravity_vec, noise_variances[0], noise_variances[1]
             )
-            walks = [_bias_walk(triad, dt) for triad in (imu.accel, imu.gyro)]
-            estimate = error_state.add_noise(estimate, jnp.concatenate([jnp.zeros(9, accel.dtype), *walks]))
+            walk_variances = [_bias_walk(triad, dt) for triad in (imu.accel, imu.gyro)]
+            estimate = error_state.add_noise(estimate, jnp.concatenate([jnp.zeros(9, accel.dtype), *walk_variances]))
             if record.paths is not None:
                 paths = [InertialPath.from_row(row, jnp.zeros_like(dt)).extend(accel, gyro, dt) for row in record.paths]
                 record = record.replace(paths=jnp.stack([path.to_row() for path in paths]))
@@ -168,11 +170,16 @@ class ESKF(ErrorStateFilter):
         def begin_path(data: SimData) -> SimData:
             """Start a path at the measurement of one sensor; for now it leads back to the last prediction."""
             record, (gyro, accel) = self.read(data), self.inertial(data)
-            since = ((data.core.steps + 1) % period).astype(gyro.dtype) / data.core.freq
-            start = jnp.asarray(inertial_path.EMPTY_PATH_ROW, gyro.dtype)
-            back = InertialPath.from_row(start, jnp.zeros_like(since)).extend(accel, gyro, since).reverse().to_row()
+            since_prediction = ((data.core.steps + 1) % period).astype(gyro.dtype) / data.core.freq
+            empty_row = jnp.asarray(inertial_path.EMPTY_PATH_ROW, gyro.dtype)
+            path_back = (
+                InertialPath.from_row(empty_row, jnp.zeros_like(since_prediction))
+                .extend(accel, gyro, since_prediction)
+                .reverse()
+                .to_row()
+            )
             first, last = self._path_rows(sensor, data)
-            paths = [record.paths[:first], back[None], record.paths[first : last - 1], record.paths[last:]]
+            paths = [record.paths[:first], path_back[None], record.paths[first : last - 1], record.paths[last:]]
             return self.write(data, record.replace(paths=jnp.concatenate(paths)))
 
         return begin_path
@@ -187,19 +194,21 @@ class ESKF(ErrorStateFilter):
         """Return one drone's estimate after a sensor's latest measurement, applied to the state when it was taken."""
         steps, taken, gravity = data.core.steps, sensor.read(data).samples.taken[0], data.params.gravity_vec
         period, (gyro, accel) = self.prediction_schedule(data.core.freq)[0], self.inertial(data)
-        since = (taken - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq  # the last prediction
+        since_prediction = (taken - steps + (steps + 1) % period).astype(
+            gyro.dtype
+        ) / data.core.freq  # the last prediction
         if not sensor.is_late:
-            past_estimate = error_state.propagate(record.estimate, accel, gyro, since, gravity)
+            past_estimate = error_state.propagate(record.estimate, accel, gyro, since_prediction, gravity)
             past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
-            return error_state.propagate(past_estimate, accel, gyro, -since, gravity)
+            return error_state.propagate(past_estimate, accel, gyro, -since_prediction, gravity)
         interval, (first, last) = data.core.freq // (sensor.freq or data.core.freq), self._path_rows(sensor, data)
         paths: Array = record.paths  # type: ignore[assignment]
         row, number = paths[first], (steps - taken) // interval
         for k in range(first + 1, last):
             row = jnp.where(number == k - first, paths[k], row)
-        path, estimate = InertialPath.from_row(row, -since), record.estimate
-        back = path.without_biases(estimate).reverse()
-        past_estimate = inertial_path.propagate_along(estimate, back, gravity)
+        path, estimate = InertialPath.from_row(row, -since_prediction), record.estimate
+        path_back = path.without_biases(estimate).reverse()
+        past_estimate = inertial_path.propagate_along(estimate, path_back, gravity)
         past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
         return inertial_path.propagate_along(past_estimate, path.without_biases(past_estimate), gravity)
 
@@ -227,12 +236,12 @@ def _bias_walk(triad: TriadData, dt: float) -> Array:
 
 
 def _finalize(estimate: Estimate) -> Estimate:
-    return error_state.finalize(estimate, least=0.0)
+    return error_state.finalize(estimate, min_angle=0.0)
 
 
-def _combined_std(*deviations: Array | float, least: float = MIN_STD) -> Array:
-    """Return the standard deviation of a sum of independent errors, at least ``least``. (...)"""
-    return jnp.sqrt(sum((x * x for x in deviations), jnp.asarray(least * least)))
+def _combined_std(*deviations: Array | float, min_std: float = MIN_STD) -> Array:
+    """Return the standard deviation of a sum of independent errors, at least ``min_std``. (...)"""
+    return jnp.sqrt(sum((x * x for x in deviations), jnp.asarray(min_std * min_std)))
 
 
 def _use_pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
@@ -253,7 +262,7 @@ def _use_pressure(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate
     altitude = estimate.pos[2:] + record.altitude
     predicted = pressure_at(altitude)
     slope = -PRESSURE_EXPONENT * LAPSE * predicted / (SEA_LEVEL_TEMPERATURE - LAPSE * altitude)
-    std = _combined_std(record.noise, record.drift, record.offset_spread, least=100 * MIN_STD)
+    std = _combined_std(record.noise, record.drift, record.offset_spread, min_std=100 * MIN_STD)
     error = sensor.part(data, "pressure") - predicted
     return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
 
@@ -291,7 +300,10 @@ def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Es
 
 
 def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    rot, std = rotation.matrix(estimate.quat), {"sweep": _combined_std(sensor.read(data).noise[0], least=0.1 * MIN_STD)}
+    rot, std = (
+        rotation.matrix(estimate.quat),
+        {"sweep": _combined_std(sensor.read(data).noise[0], min_std=0.1 * MIN_STD)},
+    )
     return FIRMWARE[Lighthouse](sensor, imu, data, estimate, rot, std)
 
 

@@ -59,9 +59,9 @@ class InertialPath(NamedTuple):
 
     def reverse(self) -> InertialPath:
         """Return the path from the end to the start."""
-        back = rotation.conjugate(self.quat)
-        pos = rotation.rotate(back, self.duration * self.vel - self.pos)
-        return InertialPath(back, -rotation.rotate(back, self.vel), pos, -self.duration)
+        inverse = rotation.conjugate(self.quat)
+        pos = rotation.rotate(inverse, self.duration * self.vel - self.pos)
+        return InertialPath(inverse, -rotation.rotate(inverse, self.vel), pos, -self.duration)
 
     def without_biases(self, estimate: Estimate) -> InertialPath:
         """Return the path for measurements without the biases of an estimate, to first order in them."""
@@ -91,23 +91,26 @@ def propagate_along(estimate: Estimate, path: InertialPath, gravity: Array) -> E
         path: The path, without the biases of the estimate.
         gravity: Acceleration of gravity, world frame, m/s^2. (3,)
     """
-    t, rot, half = path.duration, rotation.matrix(estimate.quat), rotation.matrix(_half_rotation(path.quat))
-    quat, speed = rotation.multiply(estimate.quat, path.quat), rotation.matvec(rot, estimate.vel)
-    pos = rotation.matvec(rot, path.pos, estimate.pos + t * speed + 0.5 * t**2 * gravity)
-    vel = rotation.rotate_inverse(quat, rotation.matvec(rot, path.vel, speed + t * gravity))
+    t, rot, half_rot = path.duration, rotation.matrix(estimate.quat), rotation.matrix(_half_rotation(path.quat))
+    quat, world_vel = rotation.multiply(estimate.quat, path.quat), rotation.matvec(rot, estimate.vel)
+    pos = rotation.matvec(rot, path.pos, estimate.pos + t * world_vel + 0.5 * t**2 * gravity)
+    vel = rotation.rotate_inverse(quat, rotation.matvec(rot, path.vel, world_vel + t * gravity))
 
-    back, across = rotation.matrix(path.quat).T, rotation.cross_matrix
-    gyro_to_att = -t * half
-    att_to_vel, att_to_pos = -across(estimate.vel + path.vel), -rot @ across(t * estimate.vel + path.pos)
-    gyro_to_vel, gyro_to_pos = across(t * path.vel - path.pos) @ half, t / 3 * rot @ across(path.pos) @ half
-    accel_to_vel, accel_to_pos, turn = -t * half, -0.5 * t**2 * rot @ half, across(vel)
+    inverse_rot, cross_matrix = rotation.matrix(path.quat).T, rotation.cross_matrix
+    gyro_to_att = -t * half_rot
+    att_to_vel, att_to_pos = -cross_matrix(estimate.vel + path.vel), -rot @ cross_matrix(t * estimate.vel + path.pos)
+    gyro_to_vel, gyro_to_pos = (
+        cross_matrix(t * path.vel - path.pos) @ half_rot,
+        t / 3 * rot @ cross_matrix(path.pos) @ half_rot,
+    )
+    accel_to_vel, accel_to_pos, vel_cross = -t * half_rot, -0.5 * t**2 * rot @ half_rot, cross_matrix(vel)
 
     def rows(p: Array) -> Array:
         """Return the derivatives of the errors at the end times a matrix."""
-        att = back @ (p[6:9] + gyro_to_att @ p[12:])
-        pushed = p[3:6] + att_to_vel @ p[6:9] + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
+        att = inverse_rot @ (p[6:9] + gyro_to_att @ p[12:])
+        vel_error = p[3:6] + att_to_vel @ p[6:9] + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
         pos_rows = p[:3] + t * rot @ p[3:6] + att_to_pos @ p[6:9] + accel_to_pos @ p[9:12] + gyro_to_pos @ p[12:]
-        return jnp.concatenate([pos_rows, back @ pushed + turn @ att, att, p[9:]])
+        return jnp.concatenate([pos_rows, inverse_rot @ vel_error + vel_cross @ att, att, p[9:]])
 
     cov = bound_covariance(rows(rows(covariance(estimate.cov)).T))
     return estimate.replace(pos=pos, vel=vel, quat=quat, cov=cov)

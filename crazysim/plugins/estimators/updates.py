@@ -34,22 +34,24 @@ def update_vel(estimate: Estimate, vel: Array, deviation: Array | float) -> Esti
     """Return the estimate after a measured velocity, world frame, m/s, (3,), of a standard deviation. () or (3,)"""
     rot = rotation.matrix(estimate.quat)
     for k, std in enumerate(_per_axis(deviation)):
-        across = rotation.cross(estimate.vel, rot[k])  # the derivative with respect to the attitude
-        predicted = rotation.dot(rot[k], estimate.vel)[0] + rotation.dot(across, estimate.att_error)[0]
-        estimate = update(estimate, [*VEL, *ATT], jnp.concatenate([rot[k], across]), vel[k] - predicted, std)
+        attitude_slope = rotation.cross(estimate.vel, rot[k])  # the derivative with respect to the attitude
+        predicted = rotation.dot(rot[k], estimate.vel)[0] + rotation.dot(attitude_slope, estimate.att_error)[0]
+        estimate = update(estimate, [*VEL, *ATT], jnp.concatenate([rot[k], attitude_slope]), vel[k] - predicted, std)
     return estimate
 
 
-def update_direction(estimate: Estimate, direction: Array, known: Array, deviation: Array | float) -> Estimate:
+def update_direction(
+    estimate: Estimate, direction: Array, world_direction: Array, deviation: Array | float
+) -> Estimate:
     """Return the estimate after a measured direction, such as the direction of a magnetic field.
 
     Args:
         estimate: The estimate.
-        direction: Measured direction, body frame, as long as ``known`` but for errors. (3,)
-        known: The direction, world frame, unit. (3,)
+        direction: Measured direction, body frame, as long as ``world_direction`` but for errors. (3,)
+        world_direction: The direction, world frame, unit. (3,)
         deviation: Standard deviation along each axis, rad. () or (3,)
     """
-    predicted = rotation.rotate_inverse(estimate.quat, known)
+    predicted = rotation.rotate_inverse(estimate.quat, world_direction)
     slopes = rotation.cross_matrix(predicted)
     for k, std in enumerate(_per_axis(deviation)):
         error = direction[k] - predicted[k] - rotation.dot(slopes[k], estimate.att_error)[0]
@@ -89,11 +91,11 @@ def update_flow(
     for k, (axis, sign) in enumerate(((1, -1.0), (0, 1.0))):
         height = jnp.maximum(predicted_from.pos[2], MIN_FLOW_HEIGHT)
         rate = rot[2, 2] / height
-        turn, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-predicted_from.vel[k] * rate / height, rate]
+        turn_rate, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-predicted_from.vel[k] * rate / height, rate]
         if predicted_from.gyro_bias is not None:
-            turn = turn - predicted_from.gyro_bias[axis]
+            turn_rate = turn_rate - predicted_from.gyro_bias[axis]
             rows, slopes = [*rows, GYRO[axis]], [*slopes, jnp.full_like(rate, -sign)]
-        predicted = scale * (predicted_from.vel[k] * rate + sign * turn)
+        predicted = scale * (predicted_from.vel[k] * rate + sign * turn_rate)
         estimate = update(estimate, rows, scale * jnp.stack(slopes), flow[k] - predicted, deviation)
         predicted_from = predicted_from if estimate.gyro_bias is None else estimate
     return estimate
@@ -112,8 +114,8 @@ def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Arr
     cosine = jnp.where(upright, rot[2, 2], 1.0)
     tilt = rotation.safe_arctan2(rotation.safe_sqrt(jnp.maximum((1 - cosine) * (1 + cosine), 0.0)), cosine)
     gain = 1 / jnp.cos(jnp.maximum(tilt - HALF_CONE_ANGLE, 0.0))
-    after = update(estimate, [POS[2]], gain[None], distance - gain * estimate.pos[2], deviation)
-    return select_estimate(upright, after, estimate)
+    updated = update(estimate, [POS[2]], gain[None], distance - gain * estimate.pos[2], deviation)
+    return select_estimate(upright, updated, estimate)
 
 
 def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) -> Estimate:
@@ -124,20 +126,24 @@ def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) ->
         distance: The distance, m; a drone tilted by 84 degrees measures none. ()
         deviation: Standard deviation of the distance, m.
     """
-    down = rotation.matrix(estimate.quat)[2]
-    sees = down[2] > MIN_TILT_COSINE
-    gain = 1 / jnp.where(sees, down[2], 1.0)
+    world_z = rotation.matrix(estimate.quat)[2]
+    is_visible = world_z[2] > MIN_TILT_COSINE
+    gain = 1 / jnp.where(is_visible, world_z[2], 1.0)
     predicted = gain * estimate.pos[2]
-    h = gain * jnp.stack([jnp.ones_like(gain), predicted * down[1], -predicted * down[0]])
-    return select_estimate(sees, update(estimate, [POS[2], *ATT[:2]], h, distance - predicted, deviation), estimate)
+    h = gain * jnp.stack([jnp.ones_like(gain), predicted * world_z[1], -predicted * world_z[0]])
+    return select_estimate(
+        is_visible, update(estimate, [POS[2], *ATT[:2]], h, distance - predicted, deviation), estimate
+    )
 
 
 def update_distance(estimate: Estimate, anchor: Array, distance: Array, deviation: Array | float) -> Estimate:
     """Return the estimate after a measured distance, m, () to an anchor, world frame, m. (3,)"""
     offset = estimate.pos - anchor
     predicted = rotation.safe_norm(offset)
-    away = predicted > 0
-    direction = jnp.where(away, offset / jnp.where(away, predicted, 1.0), jnp.asarray([1.0, 0.0, 0.0], offset.dtype))
+    is_apart = predicted > 0
+    direction = jnp.where(
+        is_apart, offset / jnp.where(is_apart, predicted, 1.0), jnp.asarray([1.0, 0.0, 0.0], offset.dtype)
+    )
     return update(estimate, POS, direction, distance - predicted[0], deviation)
 
 
@@ -155,10 +161,10 @@ def update_difference(
     """
     to_first, to_second = estimate.pos - first, estimate.pos - second
     d_first, d_second = rotation.safe_norm(to_first), rotation.safe_norm(to_second)
-    away = (d_first > 0) & (d_second > 0)
-    h = to_second / jnp.where(away, d_second, 1.0) - to_first / jnp.where(away, d_first, 1.0)
-    after = update(estimate, POS, h, difference - (d_second - d_first)[0], deviation)
-    return select_estimate(away[0], after, estimate)
+    is_apart = (d_first > 0) & (d_second > 0)
+    h = to_second / jnp.where(is_apart, d_second, 1.0) - to_first / jnp.where(is_apart, d_first, 1.0)
+    updated = update(estimate, POS, h, difference - (d_second - d_first)[0], deviation)
+    return select_estimate(is_apart[0], updated, estimate)
 
 
 def update_differences(estimate: Estimate, anchors: Array, differences: Array, deviation: Array | float) -> Estimate:
@@ -209,13 +215,13 @@ def update_sweep(
     x, y, z = frame.T @ (rotation.matvec(rot, sensor, estimate.pos) - origin)
     tangent, squared = math.tan(tilt), x * x + y * y
     radicand = squared - (z * tangent) ** 2
-    sees = radicand > 1e-4
-    squared, radicand = jnp.where(sees, squared, 1.0), jnp.where(sees, radicand, 1.0)
-    ratio = jnp.where(sees, z * tangent, 0.0) / jnp.sqrt(squared)
+    is_visible = radicand > 1e-4
+    squared, radicand = jnp.where(is_visible, squared, 1.0), jnp.where(is_visible, radicand, 1.0)
+    ratio = jnp.where(is_visible, z * tangent, 0.0) / jnp.sqrt(squared)
     predicted = rotation.safe_arctan2(y, x) + rotation.safe_arctan2(ratio, jnp.sqrt((1 - ratio) * (1 + ratio)))
     q = tangent / jnp.sqrt(radicand)
     h = frame @ jnp.stack([(-y - x * z * q) / squared, (x - y * z * q) / squared, q])
-    return select_estimate(sees, update(estimate, POS, h, angle - predicted, deviation), estimate)
+    return select_estimate(is_visible, update(estimate, POS, h, angle - predicted, deviation), estimate)
 
 
 def _per_axis(deviation: Array | float) -> Sequence[Array | float]:

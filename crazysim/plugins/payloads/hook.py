@@ -131,22 +131,22 @@ class Hook(CollidingPlugin, Plugin):
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
         load, p = self.read(data), data.params
-        falling = free_acceleration(data, load, self.name, dt)
+        fall_acc = free_acceleration(data, load, self.name, dt)
         link = self._link_params(load)
-        free = jnp.where(
+        tip_free_acc = jnp.where(
             load.attached,
-            p.gravity_vec + load.mass / (link.mass + MIN_MASS) * (falling - p.gravity_vec),
+            p.gravity_vec + load.mass / (link.mass + MIN_MASS) * (fall_acc - p.gravity_vec),
             p.gravity_vec,
         )
         linked = couple_bodies(
-            data.states, deriv, p.mass, p.J_inv, link, load.tip_pos, load.tip_vel, free, dt, data.core.freq
+            data.states, deriv, p.mass, p.J_inv, link, load.tip_pos, load.tip_vel, tip_free_acc, dt, data.core.freq
         )
-        loose = load.vel if dt is None else load.vel + dt * falling
+        free_rate = load.vel if dt is None else load.vel + dt * fall_acc
         rates = {
             "tip_pos": linked.rate,
             "tip_vel": linked.acc,
-            "pos": jnp.where(load.attached, linked.rate, loose),
-            "vel": jnp.where(load.attached, linked.acc, falling),
+            "pos": jnp.where(load.attached, linked.rate, free_rate),
+            "vel": jnp.where(load.attached, linked.acc, fall_acc),
         }
         return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
 
@@ -157,21 +157,27 @@ class Hook(CollidingPlugin, Plugin):
         velocities, and then the rigid rod passes on an impulse along itself to the drone.
         """
         load, p, s = self.read(data), data.params, data.states
-        offset, speed = load.pos - load.tip_pos, load.vel - load.tip_vel
-        can_grip = (dot(offset, offset) < load.reach**2) & (dot(speed, speed) < load.max_speed**2) & (load.mass > 0)
+        offset, relative_vel = load.pos - load.tip_pos, load.vel - load.tip_vel
+        can_grip = (
+            (dot(offset, offset) < load.reach**2)
+            & (dot(relative_vel, relative_vel) < load.max_speed**2)
+            & (load.mass > 0)
+        )
         picks = load.grip & ~load.attached & can_grip[..., 0]
-        held = load.replace(attached=load.grip & (load.attached | picks))
-        link = self._link_params(held)
-        joint = load.tip_vel + load.mass / (link.mass + MIN_MASS) * speed
-        after, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, joint)
+        new_load = load.replace(attached=load.grip & (load.attached | picks))
+        link = self._link_params(new_load)
+        joint_vel = load.tip_vel + load.mass / (link.mass + MIN_MASS) * relative_vel
+        new_state, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, joint_vel)
 
-        def change(new: Array, old: Array) -> Array:
-            return jnp.where(picks, new, old)
+        def where_picked(picked: Array, unchanged: Array) -> Array:
+            return jnp.where(picks, picked, unchanged)
 
-        tip_vel = change(tip_vel, load.tip_vel)
-        held = held.replace(tip_vel=tip_vel, vel=change(tip_vel, load.vel), pos=change(load.tip_pos, load.pos))
-        states = s.replace(vel=change(after.vel, s.vel), ang_vel=change(after.ang_vel, s.ang_vel))
-        return self.write(data.replace(states=states), held)
+        tip_vel = where_picked(tip_vel, load.tip_vel)
+        new_load = new_load.replace(
+            tip_vel=tip_vel, vel=where_picked(tip_vel, load.vel), pos=where_picked(load.tip_pos, load.pos)
+        )
+        states = s.replace(vel=where_picked(new_state.vel, s.vel), ang_vel=where_picked(new_state.ang_vel, s.ang_vel))
+        return self.write(data.replace(states=states), new_load)
 
     def stop_at_floor(self, data: SimData) -> SimData:
         """Stop one drone's hook and load at the floor."""
@@ -194,8 +200,8 @@ class Hook(CollidingPlugin, Plugin):
         load = self.read(data)
         flags = grip if isinstance(grip, jax.Array) else np.asarray(grip)
         lengths = zip(flags.shape[::-1], load.grip.shape[::-1], strict=False)
-        fits = flags.ndim <= load.grip.ndim and all(n in (1, length) for n, length in lengths)
-        if flags.dtype != bool or not fits:
+        has_valid_shape = flags.ndim <= load.grip.ndim and all(n in (1, length) for n, length in lengths)
+        if flags.dtype != bool or not has_valid_shape:
             raise ConfigError(
                 f"expected grip as True or False, or a bool for each drone {load.grip.shape} = (n_worlds, n_drones), "
                 f"got {short_repr(grip)}"
@@ -228,8 +234,8 @@ class Hook(CollidingPlugin, Plugin):
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
-        holds = np.ones(load.tip_pos.shape[0], bool)
-        objects = move_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring, show_free_links=True)  # type: ignore[arg-type]
+        has_load = np.ones(load.tip_pos.shape[0], bool)
+        objects = move_loads(data, self.name, load, load.tip_pos, has_load, 1, self.ring, show_free_links=True)  # type: ignore[arg-type]
         heads = {f"{self.name}_hook": (load.tip_pos, rotation_from_z(-self._rod_directions(data, load)))}
         return objects.with_poses(heads)
 

@@ -52,7 +52,7 @@ class LinkParams(NamedTuple):
     """Viscous torque of the joint per angular velocity, N m s; None without damping. (1,)"""
     restitution: Array | None = None
     """Ratio of radial speeds after and before a cable becomes taut, 1; None for no bounce. (1,)"""
-    holds: Array | None = None
+    is_attached: Array | None = None
     """True where the link is connected; None if it always is. ()"""
     is_cable: bool = False
     """True for a cable, which can be slack; False for a rod."""
@@ -107,7 +107,7 @@ class UnitPull(NamedTuple):
     """Direction, world frame. (3,)"""
     lever: Array | None
     """Torque on the body, body frame, m; None without torque. (3,)"""
-    turn: Array | None
+    ang_acc: Array | None
     """Angular acceleration of the body, body frame, 1/(kg m). (3,)"""
 
     @staticmethod
@@ -120,8 +120,10 @@ class UnitPull(NamedTuple):
 
     def response(self, other: UnitPull, mass: Array) -> Array:
         """Return the acceleration of the body at this pull, along it, under the other. (1,)"""
-        along = dot(self.direction, other.direction) / mass
-        return along if self.lever is None or other.turn is None else along + dot(self.lever, other.turn)
+        linear_response = dot(self.direction, other.direction) / mass
+        if self.lever is None or other.ang_acc is None:
+            return linear_response
+        return linear_response + dot(self.lever, other.ang_acc)
 
 
 def couple_bodies(
@@ -149,51 +151,54 @@ def couple_bodies(
         freq: Steps per second, Hz.
     """
     r, m = link_geometry(s, pos, vel, link.attach), link.mass
-    out = dot(r.direction, r.vel)
+    radial_speed = dot(r.direction, r.vel)
     attach_acc = acceleration_at(s, deriv, r.rot, link.attach, 1.0 if dt is None else 0.5)
     rel_acc = free_acc - attach_acc
 
-    first = UnitPull.create(r.direction, r.rot, J_inv, link.attach)
+    link_pull = UnitPull.create(r.direction, r.rot, J_inv, link.attach)
     # Of equal directions: their product is 1 but for rounding.
-    share = m / mass if first.lever is None or first.turn is None else m / mass + m * dot(first.lever, first.turn)
-    rhs = dot(r.direction, rel_acc) + (1.0 if dt is None else 0.5) / link.length * (dot(r.vel, r.vel) - out * out)
-    rhs = rhs + _radial_term(r, out, rhs, link, dt, freq)
-    pulls = [first]
+    mass_ratio = m / mass
+    if link_pull.lever is not None and link_pull.ang_acc is not None:
+        mass_ratio = m / mass + m * dot(link_pull.lever, link_pull.ang_acc)
+    swing_square = dot(r.vel, r.vel) - radial_speed * radial_speed
+    rhs = dot(r.direction, rel_acc) + (1.0 if dt is None else 0.5) / link.length * swing_square
+    rhs = rhs + _radial_term(r, radial_speed, rhs, link, dt, freq)
+    pulls = [link_pull]
     if link.is_hinge:
-        second, rhs_2 = _hinge_pull(s, deriv, r, rel_acc, J_inv, link, dt, freq)
-        cross_share = dot(first.direction, second.direction) + m * first.response(second, mass)
-        share_2 = m * second.response(second, mass)
-        inverse = 1 / ((1 + share) * (1 + share_2) - cross_share * cross_share)
-        tension = ((1 + share_2) * rhs - cross_share * rhs_2) * inverse
-        aside = ((1 + share) * rhs_2 - cross_share * rhs) * inverse
-        tensions, pulls = [tension, aside], [first, second]
+        hinge_pull, hinge_rhs = _hinge_pull(s, deriv, r, rel_acc, J_inv, link, dt, freq)
+        cross_ratio = dot(link_pull.direction, hinge_pull.direction) + m * link_pull.response(hinge_pull, mass)
+        hinge_ratio = m * hinge_pull.response(hinge_pull, mass)
+        inverse = 1 / ((1 + mass_ratio) * (1 + hinge_ratio) - cross_ratio * cross_ratio)
+        tension = ((1 + hinge_ratio) * rhs - cross_ratio * hinge_rhs) * inverse
+        hinge_tension = ((1 + mass_ratio) * hinge_rhs - cross_ratio * rhs) * inverse
+        tensions, pulls = [tension, hinge_tension], [link_pull, hinge_pull]
     else:
-        tension = rhs * (1 / (1 + share))
+        tension = rhs * (1 / (1 + mass_ratio))
         tensions = [jnp.maximum(tension, 0.0) if link.is_cable else tension]
-    if link.holds is not None:
-        tensions = [jnp.where(link.holds, t, 0.0) for t in tensions]
+    if link.is_attached is not None:
+        tensions = [jnp.where(link.is_attached, t, 0.0) for t in tensions]
     damping = None
     if link.damping is not None:  # it pulls against the swing across the link
         rate, swing = _damping_rate(link, dt, freq), _swing_velocities(s, r)[1]
         damping = rate * swing
-        tensions[0] = tensions[0] - rate * out
+        tensions[0] = tensions[0] - rate * radial_speed
     parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
     pull = sum(parts[1:], parts[0])
     # Constants are multiplied first, which is then done once, and the rest are multiply-adds.
-    share, coupled = m / mass, deriv
+    mass_ratio, coupled = m / mass, deriv
     if damping is not None:
         pull = pull + damping
         # All that pulls at the tip turns the body as if it were part of it: along the link no force has another lever.
         torque = to_body_frame(r.rot, cross(pos - s.pos, pull))
         coupled = _with_torque(deriv, m * J_inv, torque, dt)
-    elif any(p.turn is not None for p in pulls):
-        turns = [m * t * p.turn for t, p in zip(tensions, pulls, strict=True) if p.turn is not None]
+    elif any(p.ang_acc is not None for p in pulls):
+        turns = [m * t * p.ang_acc for t, p in zip(tensions, pulls, strict=True) if p.ang_acc is not None]
         coupled = _with_torque(deriv, None, sum(turns[1:], turns[0]), dt)
     tip_acc = free_acc - pull
-    after = coupled.replace(acc=deriv.acc + share * pull)
-    after = after if dt is None else after.replace(vel=deriv.vel + dt * share * pull)
+    new_deriv = coupled.replace(acc=deriv.acc + mass_ratio * pull)
+    new_deriv = new_deriv if dt is None else new_deriv.replace(vel=deriv.vel + dt * mass_ratio * pull)
     rate = _tip_rate(s, deriv, r, link, vel, tip_acc, attach_acc, dt, freq)
-    return LinkedMotion(after, rate, tip_acc)
+    return LinkedMotion(new_deriv, rate, tip_acc)
 
 
 def _with_torque(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
@@ -241,36 +246,40 @@ def drag_rate(coefficient: Array, mass: Array, dt: float | None, freq: int) -> A
         dt: Duration of the step, s; None for the derivative at an instant.
         freq: Steps per second, Hz.
     """
-    heavy = jnp.maximum(mass, coefficient / freq) if dt is None else mass + coefficient / freq
-    return coefficient / (heavy + MIN_MASS)
+    effective_mass = jnp.maximum(mass, coefficient / freq) if dt is None else mass + coefficient / freq
+    return coefficient / (effective_mass + MIN_MASS)
 
 
 def _damping_rate(link: LinkParams, dt: float | None, freq: int) -> Array:
     """Return the deceleration of the tip by the damped joint divided by its speed of swing, 1/s. (1,)"""
     rate = drag_rate(link.damping / (link.length * link.length), link.mass, dt, freq)  # type: ignore[operator]
-    return rate if link.holds is None else jnp.where(link.holds, rate, 0.0)
+    return rate if link.is_attached is None else jnp.where(link.is_attached, rate, 0.0)
 
 
-def _radial_term(r: LinkGeometry, out: Array, free: Array, link: LinkParams, dt: float | None, freq: int) -> Array:
+def _radial_term(
+    r: LinkGeometry, radial_speed: Array, free_acc: Array, link: LinkParams, dt: float | None, freq: int
+) -> Array:
     """Return the term of the tension, before it is shared, that ends relative motion along the link."""
     if dt is None:
         if not link.is_cable:
-            return 2 * correction_rate(freq) * out
+            return 2 * correction_rate(freq) * radial_speed
         # A faster tip gets the impulse of ``end_relative_motion`` in front of the next step.
-        is_taut = (r.distance > (1 - TAUT_BAND) * link.length) & (out < BOUNCE_SPEED)
-        return jnp.where(is_taut, 2 * correction_rate(freq) * out, -SLACK_ACCELERATION)
+        is_taut = (r.distance > (1 - TAUT_BAND) * link.length) & (radial_speed < BOUNCE_SPEED)
+        return jnp.where(is_taut, 2 * correction_rate(freq) * radial_speed, -SLACK_ACCELERATION)
     if not link.is_cable:
-        return freq * out
+        return freq * radial_speed
     # Within the band a cable is taut, and smooth in its parameters like a rod.
     slack = link.length - r.distance
     gap = jnp.where(slack > TAUT_BAND * link.length, freq * slack, 0.0)
     if link.restitution is None:
-        return freq * (out - gap)
+        return freq * (radial_speed - gap)
     # It bounces in the step at whose end it would be taut, with the speed that it had when it became taut.
     overshoot = jnp.maximum(r.distance - link.length, 0.0)
-    back = link.restitution * rotation.safe_sqrt(out * out - 2 * overshoot * jnp.maximum(free, 0.0))
-    bounces = (link.restitution > 0) & (out > BOUNCE_SPEED) & (out + dt * free > gap)
-    return freq * (out - jnp.where(bounces, -back, gap))
+    rebound_speed = link.restitution * rotation.safe_sqrt(
+        radial_speed * radial_speed - 2 * overshoot * jnp.maximum(free_acc, 0.0)
+    )
+    bounces = (link.restitution > 0) & (radial_speed > BOUNCE_SPEED) & (radial_speed + dt * free_acc > gap)
+    return freq * (radial_speed - jnp.where(bounces, -rebound_speed, gap))
 
 
 def _hinge_pull(
@@ -282,11 +291,11 @@ def _hinge_pull(
     ang_vel, swing = _swing_velocities(s, r)
     offset = to_body_frame(r.rot, r.offset)
     pull = UnitPull.create(y, r.rot, J_inv, offset if link.attach is None else offset + link.attach)
-    turning = matvec(r.rot, cross(deriv.ang_acc, offset))
+    turning_acc = matvec(r.rot, cross(deriv.ang_acc, offset))
     coriolis = cross(ang_vel, cross(ang_vel, r.offset) - 2 * r.vel)
-    aside = dot(y, swing)
-    end = freq * aside if dt is not None else 2 * correction_rate(freq) * aside
-    return pull, dot(y, rel_acc - turning + (1.0 if dt is None else 0.5) * coriolis) + end
+    hinge_speed = dot(y, swing)
+    correction = freq * hinge_speed if dt is not None else 2 * correction_rate(freq) * hinge_speed
+    return pull, dot(y, rel_acc - turning_acc + (1.0 if dt is None else 0.5) * coriolis) + correction
 
 
 def _tip_rate(
@@ -294,11 +303,11 @@ def _tip_rate(
     dt: float | None, freq: int,
 ) -> Array:  # fmt: skip
     """Return the rate of the tip's position, which removes errors in length, m/s. (3,)"""
-    holds, stretch = link.holds, r.distance - link.length
+    is_attached, stretch = link.is_attached, r.distance - link.length
     if link.is_cable:
         stretch = jnp.where(stretch > -TAUT_BAND * link.length, stretch, 0.0)
     share = freq if dt is not None else correction_rate(freq)
-    share = share if holds is None else jnp.where(holds, share, 0.0)
+    share = share if is_attached is None else jnp.where(is_attached, share, 0.0)
     rate = vel if dt is None else vel + dt * tip_acc  # as the integrator has it: computed once
     rate = rate - share * stretch * r.direction
     if link.is_hinge:
@@ -306,12 +315,12 @@ def _tip_rate(
     if dt is None:
         return rate
     # ``deriv.vel`` moves the body; the tip moves with its new velocity relative to that.
-    carried = attach_acc
+    attach_motion = attach_acc
     if deriv.vel is not s.vel:  # it is the new velocity of the body
-        carried = carried - deriv.acc
+        attach_motion = attach_motion - deriv.acc
         if link.attach is not None:
-            carried = carried - matvec(r.rot, cross(deriv.ang_acc, link.attach))
-    return rate - (dt if holds is None else jnp.where(holds, dt, 0.0)) * carried
+            attach_motion = attach_motion - matvec(r.rot, cross(deriv.ang_acc, link.attach))
+    return rate - (dt if is_attached is None else jnp.where(is_attached, dt, 0.0)) * attach_motion
 
 
 def end_relative_motion(
@@ -331,15 +340,15 @@ def end_relative_motion(
         vel: Velocity of the tip, world frame, m/s. (3,)
     """
     r = link_geometry(s, pos, vel, link.attach)
-    out = dot(r.direction, r.vel)
+    radial_speed = dot(r.direction, r.vel)
     pull = UnitPull.create(r.direction, r.rot, J_inv, link.attach)
-    change = out / (1 + link.mass * pull.response(pull, mass))
+    change = radial_speed / (1 + link.mass * pull.response(pull, mass))
     if link.is_cable:
-        back = 1.0 if link.restitution is None else 1 + link.restitution
-        taut = (r.distance > (1 - TAUT_BAND) * link.length) & (out > 0)
-        change = jnp.where(taut, jnp.where(out > BOUNCE_SPEED, back, 1.0) * change, 0.0)
-    change = change if link.holds is None else jnp.where(link.holds, change, 0.0)
+        bounce_factor = 1.0 if link.restitution is None else 1 + link.restitution
+        is_taut = (r.distance > (1 - TAUT_BAND) * link.length) & (radial_speed > 0)
+        change = jnp.where(is_taut, jnp.where(radial_speed > BOUNCE_SPEED, bounce_factor, 1.0) * change, 0.0)
+    change = change if link.is_attached is None else jnp.where(link.is_attached, change, 0.0)
     s = s.replace(vel=s.vel + link.mass / mass * change * pull.direction)
-    if pull.turn is not None:
-        s = s.replace(ang_vel=s.ang_vel + link.mass * change * pull.turn)
+    if pull.ang_acc is not None:
+        s = s.replace(ang_vel=s.ang_vel + link.mass * change * pull.ang_acc)
     return s, vel - change * pull.direction

@@ -159,13 +159,15 @@ def hanging_state(
     """
     rot = rotation.matrix(s.quat)
     arm = jnp.zeros(3, s.pos.dtype) if attach is None else attach
-    top = s.pos + rotation.matvec(rot, arm)
-    drop = jnp.clip(top[..., 2:] - clearance, -length, length)
-    back = jnp.zeros_like(drop) if is_cable else rotation.safe_sqrt((length - drop) * (length + drop))
+    attach_pos = s.pos + rotation.matvec(rot, arm)
+    drop = jnp.clip(attach_pos[..., 2:] - clearance, -length, length)
+    horizontal_offset = jnp.zeros_like(drop) if is_cable else rotation.safe_sqrt((length - drop) * (length + drop))
     heading = rotation.yaw(s.quat)[..., None]
-    offset = jnp.concatenate([-back * jnp.cos(heading), -back * jnp.sin(heading), -drop], axis=-1)
+    offset = jnp.concatenate(
+        [-horizontal_offset * jnp.cos(heading), -horizontal_offset * jnp.sin(heading), -drop], axis=-1
+    )
     vel = s.vel + rotation.matvec(rot, rotation.cross(s.ang_vel, jnp.broadcast_to(arm, s.ang_vel.shape)))
-    return top + offset, vel
+    return attach_pos + offset, vel
 
 
 @jit_unless_traced("name")
@@ -179,9 +181,9 @@ def direction(data: SimData, name: str = "load") -> tuple[Array, Array]:
     load: Any = data.plugins[name]
     pos, vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
     r = link_geometry(data.states, pos, vel, load.attach)
-    across = r.vel - rotation.dot(r.direction, r.vel) * r.direction
+    swing_vel = r.vel - rotation.dot(r.direction, r.vel) * r.direction
     is_zero = r.distance == 0
-    return r.direction, jnp.where(is_zero, 0.0, across / jnp.where(is_zero, 1.0, r.distance))
+    return r.direction, jnp.where(is_zero, 0.0, swing_vel / jnp.where(is_zero, 1.0, r.distance))
 
 
 def load_pos(data: SimData, name: str = "load") -> Array:
@@ -266,10 +268,10 @@ def link_pieces(top: Array, offset: Array, length: Array, n: int) -> tuple[Array
         rotation.safe_sqrt(0.375 * jnp.maximum(length - span, 0.0) * jnp.maximum(span, 0.1 * length)) if n > 1 else 0.0
     )
     share = jnp.linspace(0.0, 1.0, n + 1)[:, None, None]
-    down = jnp.asarray([0.0, 0.0, -1.0], top.dtype)
-    nodes = top + share * offset + 4 * share * (1 - share) * sag * down
-    centre, along = (nodes[1:] + nodes[:-1]) / 2, nodes[1:] - nodes[:-1]
-    return tuple(jnp.swapaxes(x, 0, 1).reshape(-1, x.shape[-1]) for x in (centre, rotation_from_z(along)))  # type: ignore[return-value]
+    downwards = jnp.asarray([0.0, 0.0, -1.0], top.dtype)
+    nodes = top + share * offset + 4 * share * (1 - share) * sag * downwards
+    centre, axis = (nodes[1:] + nodes[:-1]) / 2, nodes[1:] - nodes[:-1]
+    return tuple(jnp.swapaxes(x, 0, 1).reshape(-1, x.shape[-1]) for x in (centre, rotation_from_z(axis)))  # type: ignore[return-value]
 
 
 def rotation_from_z(axis: Array) -> Array:

@@ -87,7 +87,7 @@ class RotorJet(Plugin):
         names = ("speeds", "pressure", "velocity", "origin", "spacing")
         values = {name: getattr(table, name, None) for name in names}
         shared = {name: None if x is None else device_array(x, radius.dtype) for name, x in values.items()}
-        return self.filled(sim, RotorJetData, diameter=stream_diameter(sim, radius), load=self.load, **shared)
+        return self.fill_record(sim, RotorJetData, diameter=stream_diameter(sim, radius), load=self.load, **shared)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         loads, shape = self._loads(sim), self._loads(sim).shape()
@@ -157,35 +157,35 @@ def jet_pressure(
         vel: Velocity of the loads, world frame, m/s. (..., 3)
     """
     s = data.states
-    of_one = (s.pos, s.quat, mean_rotor_vel(data), collective_thrust(data), record.diameter, record.air_density)
+    drone_values = (s.pos, s.quat, mean_rotor_vel(data), collective_thrust(data), record.diameter, record.air_density)
     if drone is not None:
-        of_one = tuple(x if x.ndim == 1 else x[drone] for x in of_one)
+        drone_values = tuple(x if x.ndim == 1 else x[drone] for x in drone_values)
     # Insert an axis for the panels.
-    load_pos, quat, rotor_vel, thrust, diameter, density = (x[..., None, :] for x in of_one)
-    offset = pos - load_pos
+    drone_pos, quat, rotor_vel, thrust, diameter, density = (x[..., None, :] for x in drone_values)
+    offset = pos - drone_pos
 
     def momentum(air: Array) -> Array:
         relative = air - vel[..., None, :]
-        arrives = -rotation.dot(relative, normal)
+        closing_speed = -rotation.dot(relative, normal)
         # Only air in the jet transfers momentum: still air outside it exerts no force on a load that moves.
-        blows = rotation.dot(air, air) > 0
-        return jnp.where(blows & (arrives > 0), density * arrives, 0.0) * relative
+        is_in_jet = rotation.dot(air, air) > 0
+        return jnp.where(is_in_jet & (closing_speed > 0), density * closing_speed, 0.0) * relative
 
     if record.speeds is None:
         axis = rotation.z_axis(quat)
         return momentum(-hover_jet_speed(offset, axis, thrust, diameter, density) * axis)
     speed = rotor_vel * RPM_TO_RAD_S
-    share, table = table_position(speed, record.speeds)
+    jet_factor, table = table_position(speed, record.speeds)
     # With tables, ``origin`` and ``spacing`` are arrays.
     cell = (rotation.rotate_inverse(quat, offset) - record.origin) / record.spacing  # type: ignore[operator]
     shape = record.velocity.shape if record.pressure is None else record.pressure.shape
-    share = jnp.where(is_inside(shape[1:4], cell)[..., None], share, 0.0)
-    where = jnp.concatenate([jnp.broadcast_to(table, (*cell.shape[:-1], 1)), cell], axis=-1)
+    jet_factor = jnp.where(is_inside(shape[1:4], cell)[..., None], jet_factor, 0.0)
+    table_index = jnp.concatenate([jnp.broadcast_to(table, (*cell.shape[:-1], 1)), cell], axis=-1)
     total: Any = 0.0
     if record.pressure is not None:
-        total = total - share * interpolate(record.pressure, where)[..., None] * normal
+        total = total - jet_factor * interpolate(record.pressure, table_index)[..., None] * normal
     if record.velocity is not None:
-        total = total + momentum(rotation.rotate(quat, share * interpolate(record.velocity, where)))
+        total = total + momentum(rotation.rotate(quat, jet_factor * interpolate(record.velocity, table_index)))
     return total
 
 

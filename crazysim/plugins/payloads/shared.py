@@ -32,8 +32,9 @@ from crazysim.plugins.payloads.point_load import (
 from crazysim.pytree import PyTree, device_array, leaf
 
 TENSION_REGULARIZATION = 1e-6
-"""Term added to the diagonal of the matrix of tensions, 1, without which the tensions of four rods would not be
-unique."""
+"""Term added to the diagonal of the matrix of tensions, 1. The ratio of the masses of load and drone on the diagonal
+makes the tensions unique already. With four or more links and a light load, the matrix is close to singular without
+this term."""
 N_ITERATIONS = 3
 """Number of times that the tensions are solved for, each without the cables that would push in the previous
 solution."""
@@ -161,7 +162,9 @@ class SharedLoad(PointLoad, Plugin):
             gap = jnp.maximum(load.length - r.distance, 0.0) if self.cable else 0.0
             rhs = rhs + freq * (out - freq * gap)
         ratio = jnp.broadcast_to(m / p.mass, (n, 1))
-        ratio = ratio if pull.lever is None or pull.turn is None else ratio + m * rotation.dot(pull.lever, pull.turn)
+        ratio = (
+            ratio if pull.lever is None or pull.ang_acc is None else ratio + m * rotation.dot(pull.lever, pull.ang_acc)
+        )
         gram = jnp.sum(q[:, None] * q[None], axis=-1) + jnp.eye(n, dtype=q.dtype) * (ratio + TENSION_REGULARIZATION)
         tension = _tensions(gram, rhs[:, 0], acts, self.cable)[:, None]
 
@@ -171,8 +174,8 @@ class SharedLoad(PointLoad, Plugin):
         changes = {"acc": deriv.acc + acc}
         if dt is not None:
             changes["vel"] = deriv.vel + dt * acc
-        if pull.turn is not None:
-            ang_acc = m * tension * pull.turn
+        if pull.ang_acc is not None:
+            ang_acc = m * tension * pull.ang_acc
             changes["ang_acc"] = deriv.ang_acc + ang_acc
             if dt is not None:
                 changes["ang_vel"] = deriv.ang_vel + dt * ang_acc

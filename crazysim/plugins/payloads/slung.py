@@ -159,7 +159,7 @@ def load_record(
     height_at_rest, states = check_parameter(sim, "size", clearance, low=0.0), sim.data.states
     attached = device_array(np.ones(states.pos.shape[:2]), bool)
     fields |= {} if is_cable else {"restitution": None}
-    load = plugin.filled(sim, kind, clearance=height_at_rest, attached=attached, **fields)
+    load = plugin.fill_record(sim, kind, clearance=height_at_rest, attached=attached, **fields)
     # A setting that is zero everywhere becomes None and is not computed.
     optional = [name for name in ("attach", "damping", "restitution", "drag") if getattr(load, name) is not None]
     load = load.replace(**{name: None for name in optional if not np.any(np.asarray(getattr(load, name)))})
@@ -198,13 +198,13 @@ def move_loads(
         ring: Height of the point by which a load hangs above its middle, m.
         show_free_links: True to show links of loads that do not exist.
     """
-    away = jnp.where(load.mass > 0, 0.0, ABSENT_LOAD_DEPTH) * np.array([0.0, 0.0, 1.0], tip.dtype)
+    hidden_offset = jnp.where(load.mass > 0, 0.0, ABSENT_LOAD_DEPTH) * np.array([0.0, 0.0, 1.0], tip.dtype)
     r = link_geometry(data.states, tip, load.vel, load.attach)
     offset = jnp.where(holds[..., None], r.offset, -load.length * r.rot[..., 2])
     up = shape_axis(data, load, tip)
     top = data.states.pos if r.arm is None else data.states.pos + r.arm
-    links = link_pieces(top if show_free_links else top - away, offset, load.length, n_pieces)
-    rows = {name: (load.pos - away - ring * up, rotation_from_z(up)), f"{name}_link": links}
+    links = link_pieces(top if show_free_links else top - hidden_offset, offset, load.length, n_pieces)
+    rows = {name: (load.pos - hidden_offset - ring * up, rotation_from_z(up)), f"{name}_link": links}
     return data.objects.with_poses(rows)  # type: ignore[union-attr]
 
 

@@ -79,7 +79,7 @@ class UWB(Sensor):
 
     def record(self, sim: Simulation) -> UWBData:
         anchors = _point_array("anchors", self.anchors, 2 if self.tdoa else 1)
-        return self.filled(sim, UWBData, anchors=device_array(anchors, sim.data.states.pos.dtype))
+        return self.fill_record(sim, UWBData, anchors=device_array(anchors, sim.data.states.pos.dtype))
 
     def ideal(self, data: SimData) -> Array:
         """Return the distances, or their differences, m. (n,)"""
@@ -150,7 +150,7 @@ class Lighthouse(Sensor):
         if stations.shape != rpy.shape:
             raise ConfigError(f"expected rpy of shape {stations.shape}, one for each station, got {rpy.shape}")
         dtype = sim.data.states.pos.dtype
-        return self.filled(
+        return self.fill_record(
             sim,
             LighthouseData,
             stations=device_array(stations, dtype),

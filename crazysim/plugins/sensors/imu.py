@@ -176,7 +176,7 @@ class IMU(Sensor):
         shakes = self.imbalance is not None
         if shakes:
             require_rotors(sim, "vibration")
-        return self.filled(
+        return self.fill_record(
             sim,
             IMUData,
             gyro=self.gyro.record(sim, "gyro"),

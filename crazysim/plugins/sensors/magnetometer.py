@@ -63,7 +63,7 @@ class Magnetometer(Sensor):
                 f"Use 20e-6 for 20 microtesla, 1e-4 for one gauss."
             )
         errors, quat = self.errors.record(sim, "errors"), mounting(sim, self.rpy)
-        return self.filled(sim, MagnetometerData, errors=errors, quat=quat)
+        return self.fill_record(sim, MagnetometerData, errors=errors, quat=quat)
 
     def ideal(self, data: SimData) -> Array:
         """Return the field in the sensor's frame, T. (3,)"""

@@ -66,7 +66,7 @@ class MotionCapture(Sensor):
         return {"pos": 3, "quat": 4, "vel": 3}
 
     def record(self, sim: Simulation) -> MotionCaptureData:
-        return self.filled(sim, MotionCaptureData, quat=mounting(sim, self.rpy))
+        return self.fill_record(sim, MotionCaptureData, quat=mounting(sim, self.rpy))
 
     def ideal(self, data: SimData) -> Array:
         """Return the pose and the velocity of the tracked body. (10,)"""

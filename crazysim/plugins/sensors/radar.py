@@ -19,7 +19,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.rotation import safe_clip, safe_norm
 
-CLEAR, ALARM = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)
+CLEAR_COLOR, ALARM_COLOR = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)
 """RGBA colours of an empty lobe, and of a lobe with a drone in it."""
 N_MERIDIANS, N_POINTS = 12, 40
 """Number of teardrop outlines drawn for a lobe, and number of points on each half of an outline."""
@@ -111,7 +111,7 @@ class Radar(Plugin):
         for k, pos in enumerate(np.asarray(record.pos, np.float64)):
             shape = (float(x[k]) for x in (record.max_range, record.exponent, record.height_scale, record.tilt))
             for curve in lobe_curves(*shape):
-                sim.scene.renderer.overlays.line(pos + curve, ALARM if detected[k] else CLEAR, 2.0, 2.0)
+                sim.scene.renderer.overlays.line(pos + curve, ALARM_COLOR if detected[k] else CLEAR_COLOR, 2.0, 2.0)
 
 
 @jit_unless_traced()
@@ -130,32 +130,36 @@ def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: 
         height_scale: Factor h of the thickness, 1. (...)
         tilt: Elevation of the lobe, rad. (...)
     """
-    away, up = safe_norm(offset[..., :2])[..., 0], offset[..., 2]
+    level_distance, up = safe_norm(offset[..., :2])[..., 0], offset[..., 2]
     size, c, s = 0.5 * max_range, jnp.cos(tilt), jnp.sin(tilt)
 
-    def margin(away: Array) -> Array:
-        along, across = c * away + s * up, c * up - s * away
-        u = along / size
+    def margin(level_distance: Array) -> Array:
+        axial, lateral = c * level_distance + s * up, c * up - s * level_distance
+        u = axial / size
         inside = safe_clip(u, 1e-6, 2.0)
         root = rotation.safe_sqrt(2 - inside)
         limit = height_scale * size * jnp.exp(0.5 * ((1 + exponent) * jnp.log(inside) - exponent * math.log(2))) * root
-        beyond = jnp.maximum(u - 2, 0.0) + jnp.maximum(-u, 0.0)
-        return limit - jnp.abs(across) - size * beyond
+        overshoot = jnp.maximum(u - 2, 0.0) + jnp.maximum(-u, 0.0)
+        return limit - jnp.abs(lateral) - size * overshoot
 
     # A steep lobe reaches across the vertical axis, so that the lobe in the opposite direction counts too.
-    return jnp.maximum(margin(away), margin(-away))
+    return jnp.maximum(margin(level_distance), margin(-level_distance))
 
 
 def lobe_curves(max_range: float, exponent: float, height_scale: float, tilt: float) -> list[np.ndarray]:
     """Return outlines of a lobe relative to its radar, m: teardrops in vertical planes, and circles. (n, 3) each"""
     size, t = 0.5 * max_range, np.linspace(0.0, math.pi, N_POINTS)
-    along, across = size * (1 - np.cos(t)), height_scale * size * np.sin(t) * np.sin(t / 2) ** exponent
-    along, across = np.concatenate([along, along[::-1]]), np.concatenate([across, -across[::-1]])
-    away = along * math.cos(tilt) - across * math.sin(tilt)
-    up = along * math.sin(tilt) + across * math.cos(tilt)
-    turns = np.linspace(0.0, 2 * math.pi, N_MERIDIANS, endpoint=False)
-    curves = [np.stack([away * math.cos(a), away * math.sin(a), up], axis=-1) for a in turns]
-    around = np.linspace(0.0, 2 * math.pi, 2 * N_POINTS)
-    for k in (int(np.argmax(away)), int(np.argmax(up)), int(np.argmin(up))):
-        curves.append(np.stack([away[k] * np.cos(around), away[k] * np.sin(around), 0 * around + up[k]], axis=-1))
+    axial, lateral = size * (1 - np.cos(t)), height_scale * size * np.sin(t) * np.sin(t / 2) ** exponent
+    axial, lateral = np.concatenate([axial, axial[::-1]]), np.concatenate([lateral, -lateral[::-1]])
+    level_distance = axial * math.cos(tilt) - lateral * math.sin(tilt)
+    up = axial * math.sin(tilt) + lateral * math.cos(tilt)
+    meridians = np.linspace(0.0, 2 * math.pi, N_MERIDIANS, endpoint=False)
+    curves = [np.stack([level_distance * math.cos(a), level_distance * math.sin(a), up], axis=-1) for a in meridians]
+    angles = np.linspace(0.0, 2 * math.pi, 2 * N_POINTS)
+    for k in (int(np.argmax(level_distance)), int(np.argmax(up)), int(np.argmin(up))):
+        curves.append(
+            np.stack(
+                [level_distance[k] * np.cos(angles), level_distance[k] * np.sin(angles), 0 * angles + up[k]], axis=-1
+            )
+        )
     return curves

@@ -99,36 +99,36 @@ class Sensor(Plugin):
     def record(self, sim: Simulation) -> PyTree:
         if not hasattr(self, "kind"):
             raise NotImplementedError(f"{type(self).__name__} needs kind, the class of its record, or a method record")
-        return self.filled(sim, self.kind)
+        return self.fill_record(sim, self.kind)
 
-    def filled(self, sim: Simulation, kind: type[R], **given: Any) -> R:
-        return super().filled(sim, kind, samples=self.samples(sim), **given)
+    def fill_record(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
+        return super().fill_record(sim, kind, samples=self.samples(sim), **fields)
 
     def samples(self, sim: Simulation) -> Samples:
         """Return the field ``samples`` of the record, before the first measurement; check the common settings."""
         period = steps_between(self, sim)
-        k, shape, longest = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
-        rows = math.floor(longest * sim.data.core.freq / period + 0.5) + 2 if longest > 0 else 0
-        if rows > MAX_ROWS:
+        k, shape, max_delay = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
+        n_rows = math.floor(max_delay * sim.data.core.freq / period + 0.5) + 2 if max_delay > 0 else 0
+        if n_rows > MAX_ROWS:
             raise ConfigError(
                 f"expected a delay of {self.name!r} of zero to {MAX_ROWS - 2} measurements, with its jitter, got "
-                f"{longest} s. Use a shorter delay or a lower freq=."
+                f"{max_delay} s. Use a shorter delay or a lower freq=."
             )
-        lossy = bool(np.any(np.asarray(self.dropout)))
+        can_lose = bool(np.any(np.asarray(self.dropout)))
         transit = {}
-        if rows:
+        if n_rows:
             transit = {
-                "delay": check_parameter(sim, "delay", self.delay, (1,), 0.0, longest),
-                "jitter": check_parameter(sim, "jitter", self.jitter, (1,), 0.0, longest),
-                "queue": drone_array(sim, 0.0, rows, k),
-                "due": device_array(np.full((*shape, rows), NEVER_ARRIVES), np.int32),
+                "delay": check_parameter(sim, "delay", self.delay, (1,), 0.0, max_delay),
+                "jitter": check_parameter(sim, "jitter", self.jitter, (1,), 0.0, max_delay),
+                "queue": drone_array(sim, 0.0, n_rows, k),
+                "due": device_array(np.full((*shape, n_rows), NEVER_ARRIVES), np.int32),
             }
         return Samples(
             value=drone_array(sim, 0.0, k),
             taken=device_array(np.full((*shape, 1), -1), np.int32),
             delay=transit.get("delay"),
             jitter=transit.get("jitter"),
-            dropout=check_parameter(sim, "dropout", self.dropout, (1,), 0.0, 1.0) if lossy else None,
+            dropout=check_parameter(sim, "dropout", self.dropout, (1,), 0.0, 1.0) if can_lose else None,
             queue=transit.get("queue"),
             due=transit.get("due"),
         )
@@ -189,21 +189,23 @@ class Sensor(Plugin):
         """Take a measurement of one drone, and queue it, or hold it if there is no delay."""
         key, step = drone_key(data, self.name), data.core.steps
         value, record = self.measure(data, self.read(data), key)
-        samples, lost, late = record.samples, False, 0.0
+        samples, is_lost, jitter_share = record.samples, False, 0.0
         if samples.dropout is not None or samples.queue is not None:
             chance = uniform(drone_key(data, f"{self.name}_arrival"), (2,), value.dtype)
-            lost = False if samples.dropout is None else chance[:1] < samples.dropout
-            late = chance[1:]
+            is_lost = False if samples.dropout is None else chance[:1] < samples.dropout
+            jitter_share = chance[1:]
         if samples.queue is None:
             taken = jnp.broadcast_to(step, (1,))
             if samples.dropout is not None:
-                value, taken = jnp.where(lost, samples.value, value), jnp.where(lost, samples.taken, taken)
+                value, taken = jnp.where(is_lost, samples.value, value), jnp.where(is_lost, samples.taken, taken)
             samples = samples.replace(value=value, taken=taken)
         else:
-            due = step + jnp.round(data.core.freq * (samples.delay + late * samples.jitter)).astype(jnp.int32)
-            due = due if samples.dropout is None else jnp.where(lost, NEVER_ARRIVES, due)
+            arrival_step = step + jnp.round(data.core.freq * (samples.delay + jitter_share * samples.jitter)).astype(
+                jnp.int32
+            )
+            arrival_step = arrival_step if samples.dropout is None else jnp.where(is_lost, NEVER_ARRIVES, arrival_step)
             queue = jnp.concatenate([value[None], samples.queue[:-1]])
-            samples = samples.replace(queue=queue, due=jnp.concatenate([due, samples.due[:-1]]))
+            samples = samples.replace(queue=queue, due=jnp.concatenate([arrival_step, samples.due[:-1]]))
         return self.write(data, record.replace(samples=samples))
 
     def _deliver_measurement(self, data: SimData) -> SimData:
@@ -259,5 +261,5 @@ def gauss_markov_step(state: Array, deviation: Array, time: Array, dt: float, no
         dt: The interval, s.
         noise: Standard normal numbers. (..., k)
     """
-    keep = jnp.exp(-dt / time)
-    return keep * state + deviation * rotation.safe_sqrt((1 - keep) * (1 + keep)) * noise
+    decay = jnp.exp(-dt / time)
+    return decay * state + deviation * rotation.safe_sqrt((1 - decay) * (1 + decay)) * noise

@@ -18,10 +18,10 @@ from crazysim.plugins.vehicles.car_state import ackermann, heading_quat, tilted_
 from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle
 from crazysim.plugins.vehicles.trailer import trailer_axles
 
-BODY, DARK, STEEL = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 0.65, 1.0)
+BODY_COLOR, DARK, STEEL = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 0.65, 1.0)
 RUBBER, WOOD = (0.16, 0.16, 0.16, 1.0), (0.7, 0.6, 0.35, 1.0)
 """Colours of bodies, rims, spokes, tyres and decks."""
-TOUCHES, GHOST = 'contype="0" conaffinity="2"', 'contype="0" conaffinity="0"'
+CONTACT_ATTRIBUTES, NO_CONTACT_ATTRIBUTES = 'contype="0" conaffinity="2"', 'contype="0" conaffinity="0"'
 """Attributes of geoms that drones touch, and of other geoms."""
 N_SPOKES = 5
 """Spokes of a wheel, which make its rotation visible."""
@@ -42,13 +42,16 @@ def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
     """Add the objects of cars to the scene, if they are not there yet."""
     number, n = vehicle.number, cars.n_members
     wheel = _wheel(number("wheels.radius"), number("wheels.width"))
-    parts = {"body": (_body(vehicle, as_rgba(BODY if cars.rgba is None else cars.rgba)), n)}
+    parts = {"body": (_body(vehicle, as_rgba(BODY_COLOR if cars.rgba is None else cars.rgba)), n)}
     parts["wheel"] = (wheel, n * len(wheel_positions(vehicle)))
     if cars.trailer:
-        length, small = number("trailer.drawbar"), _wheel(number("trailer.wheel_radius"), number("trailer.wheel_width"))
+        length, trailer_wheel = (
+            number("trailer.drawbar"),
+            _wheel(number("trailer.wheel_radius"), number("trailer.wheel_width")),
+        )
         parts["drawbar"] = (_drawbar(length, number("trailer.track")), n)
         parts["trailer"] = (_deck(vehicle), n)
-        parts["trailer_wheel"] = (small, 4 * n)
+        parts["trailer_wheel"] = (trailer_wheel, 4 * n)
     for part, (geoms, count) in parts.items():
         sim.scene.add_once(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", _kind(cars, part), count)
 
@@ -84,8 +87,8 @@ def _wheels(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
     pos = car.pos[:, None] + rotation.rotate(body, jnp.asarray(np.pad(positions, ((0, 0), (0, 1))), car.pos.dtype))
     front = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.track"))[:, : len(positions) // 2]
     steer = jnp.concatenate([front, jnp.zeros_like(front)], axis=-1)[..., None]
-    rolled = _rolled(jnp.broadcast_to((car.distance / vehicle.number("wheels.radius"))[:, None], steer.shape))
-    quat = rotation.multiply(body, rotation.multiply(heading_quat(steer), rolled))
+    roll_quat = _rolling_quat(jnp.broadcast_to((car.distance / vehicle.number("wheels.radius"))[:, None], steer.shape))
+    quat = rotation.multiply(body, rotation.multiply(heading_quat(steer), roll_quat))
     return pos.reshape(-1, 3), quat.reshape(-1, 4)
 
 
@@ -95,36 +98,36 @@ def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]
     radius, half = number("trailer.wheel_radius"), number("trailer.track") / 2
     bar, deck = (tilted_quat(car.joints[:, k : k + 1], car.normal) for k in range(2))
     front, rear = (_above_plane(x, car, radius - number("wheels.radius")) for x in trailer_axles(car.state, car.params))
-    turn = _rolled(car.distance / radius)
+    roll_quat = _rolling_quat(car.distance / radius)
     wheels = []
     for origin, attitude in ((front, bar), (rear, deck)):
         for side in (half, -half):
             offset = rotation.rotate(attitude, jnp.asarray([0.0, side, 0.0], origin.dtype))
-            wheels.append((origin + offset, rotation.multiply(attitude, turn)))
+            wheels.append((origin + offset, rotation.multiply(attitude, roll_quat)))
     pos, quat = (jnp.stack(x, axis=1) for x in zip(*wheels, strict=True))
     wheel = (pos.reshape(-1, 3), quat.reshape(-1, 4))
     return {"drawbar": (front, bar), "trailer": (front, deck), "trailer_wheel": wheel}
 
 
-def _above_plane(at: Array, car: CarData, height: float) -> Array:
+def _above_plane(level_pos: Array, car: CarData, height: float) -> Array:
     """Return level positions, (n, 2), at a height above the plane through the cars' centres of mass, m. (n, 3)"""
-    off, normal = at - car.pos[:, :2], car.normal
-    rise = -(normal[:, :1] * off[:, :1] + normal[:, 1:2] * off[:, 1:]) / normal[:, 2:]
-    return jnp.concatenate([at, car.pos[:, 2:] + rise + height], axis=-1)
+    offset, normal = level_pos - car.pos[:, :2], car.normal
+    rise = -(normal[:, :1] * offset[:, :1] + normal[:, 1:2] * offset[:, 1:]) / normal[:, 2:]
+    return jnp.concatenate([level_pos, car.pos[:, 2:] + rise + height], axis=-1)
 
 
-def _rolled(angle: Array) -> Array:
+def _rolling_quat(angle: Array) -> Array:
     """Return the rotation about y by an angle, (..., 1), as a quaternion, xyzw. (..., 4)"""
     zero = jnp.zeros_like(angle)
     return jnp.concatenate([zero, jnp.sin(angle / 2), zero, jnp.cos(angle / 2)], axis=-1)
 
 
 def _geom(
-    kind: str, size: Iterable[float], pos: Iterable[float], rgba: Iterable[float], bits: str, more: str = ""
+    kind: str, size: Iterable[float], pos: Iterable[float], rgba: Iterable[float], bits: str, attributes: str = ""
 ) -> str:
     text = " ".join(f"{float(x):.6g}" for x in size), " ".join(f"{float(x):.6g}" for x in pos)
     colour = " ".join(f"{float(x):.3g}" for x in rgba)
-    return f'<geom type="{kind}" size="{text[0]}" pos="{text[1]}" rgba="{colour}" {bits} {more}/>'
+    return f'<geom type="{kind}" size="{text[0]}" pos="{text[1]}" rgba="{colour}" {bits} {attributes}/>'
 
 
 def _body(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
@@ -132,34 +135,42 @@ def _body(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
     length, width, height = (vehicle.number(f"shape.{x}") / 2 for x in ("length", "width", "height"))
     front, floor = vehicle.number("axles.front"), 0.02
     if vehicle.number("wheels.number") != 4:
-        return _geom("box", (length, width / 2, height * 2), (0, 0, 0), rgba, TOUCHES)
+        return _geom("box", (length, width / 2, height * 2), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
     inner = min(width, vehicle.number("axles.track") / 2 - vehicle.number("wheels.width") / 2 - 0.005)
     roof = (height - floor / 2, 0.12 * length, floor + height)
     return (
-        _geom("box", (length * 0.92, inner, floor), (0, 0, 0), rgba, TOUCHES)
-        + _geom("box", (length * 0.45, inner * 0.8, roof[0]), (-roof[1], 0, 2 * height - roof[0]), rgba, TOUCHES)
-        + _geom("box", (length * 0.2, inner * 0.7, floor / 2), (front - length * 0.12, 0, 1.5 * floor), rgba, GHOST)
-        + _geom("box", (0.008, width * 0.85, floor), (length - 0.008, 0, 0), DARK, TOUCHES)
-        + _geom("box", (0.008, width * 0.85, floor), (0.008 - length, 0, 0), DARK, TOUCHES)
+        _geom("box", (length * 0.92, inner, floor), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
+        + _geom(
+            "box", (length * 0.45, inner * 0.8, roof[0]), (-roof[1], 0, 2 * height - roof[0]), rgba, CONTACT_ATTRIBUTES
+        )
+        + _geom(
+            "box",
+            (length * 0.2, inner * 0.7, floor / 2),
+            (front - length * 0.12, 0, 1.5 * floor),
+            rgba,
+            NO_CONTACT_ATTRIBUTES,
+        )
+        + _geom("box", (0.008, width * 0.85, floor), (length - 0.008, 0, 0), DARK, CONTACT_ATTRIBUTES)
+        + _geom("box", (0.008, width * 0.85, floor), (0.008 - length, 0, 0), DARK, CONTACT_ATTRIBUTES)
     )
 
 
 def _wheel(radius: float, width: float) -> str:
     """Return geoms of a wheel whose axis is y: a tyre, a rim and spokes."""
     axis, reach = 'zaxis="0 1 0"', 0.29 * radius
-    rim = _geom("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, GHOST, axis)
+    rim = _geom("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, NO_CONTACT_ATTRIBUTES, axis)
     spokes = ""
     for angle in np.arange(N_SPOKES) * 2 * np.pi / N_SPOKES:
-        pos, turn = (reach * np.cos(angle), 0, -reach * np.sin(angle)), (np.cos(angle / 2), np.sin(angle / 2))
-        quat = f'quat="{turn[0]:.6g} 0 {turn[1]:.6g} 0"'
-        spokes += _geom("box", (reach, width / 2 + 0.0016, 0.06 * radius), pos, STEEL, GHOST, quat)
-    return _geom("cylinder", (radius, width / 2), (0, 0, 0), RUBBER, TOUCHES, axis) + rim + spokes
+        pos, quat_wy = (reach * np.cos(angle), 0, -reach * np.sin(angle)), (np.cos(angle / 2), np.sin(angle / 2))
+        quat = f'quat="{quat_wy[0]:.6g} 0 {quat_wy[1]:.6g} 0"'
+        spokes += _geom("box", (reach, width / 2 + 0.0016, 0.06 * radius), pos, STEEL, NO_CONTACT_ATTRIBUTES, quat)
+    return _geom("cylinder", (radius, width / 2), (0, 0, 0), RUBBER, CONTACT_ATTRIBUTES, axis) + rim + spokes
 
 
 def _drawbar(length: float, track: float) -> str:
     """Return geoms of a drawbar and the axle behind it, in the frame of the axle's middle."""
-    bar = _geom("box", (length / 2, 0.004, 0.004), (length / 2, 0, 0), DARK, GHOST)
-    return bar + _geom("box", (0.0075, track / 2, 0.0075), (0, 0, 0), DARK, TOUCHES)
+    bar = _geom("box", (length / 2, 0.004, 0.004), (length / 2, 0, 0), DARK, NO_CONTACT_ATTRIBUTES)
+    return bar + _geom("box", (0.0075, track / 2, 0.0075), (0, 0, 0), DARK, CONTACT_ATTRIBUTES)
 
 
 def _deck(vehicle: VehicleModel) -> str:
@@ -167,11 +178,14 @@ def _deck(vehicle: VehicleModel) -> str:
     size, centre = vehicle.value("trailer.deck") / 2, vehicle.value("trailer.deck_centre")
     axles, track = vehicle.number("trailer.axle_distance"), vehicle.number("trailer.track")
     posts = "".join(
-        _geom("cylinder", (0.008, centre[2] / 2), (x, 0, centre[2] / 2), DARK, GHOST) for x in (0.0, -axles)
+        _geom("cylinder", (0.008, centre[2] / 2), (x, 0, centre[2] / 2), DARK, NO_CONTACT_ATTRIBUTES)
+        for x in (0.0, -axles)
     )
     return (
-        _geom("box", size, centre, WOOD, TOUCHES)
-        + _geom("box", (axles / 2 + 0.025, track / 2 - 0.025, 0.0025), (-axles / 2, 0, 0.014), STEEL, GHOST)
-        + _geom("box", (0.0075, track / 2, 0.0075), (-axles, 0, 0), DARK, TOUCHES)
+        _geom("box", size, centre, WOOD, CONTACT_ATTRIBUTES)
+        + _geom(
+            "box", (axles / 2 + 0.025, track / 2 - 0.025, 0.0025), (-axles / 2, 0, 0.014), STEEL, NO_CONTACT_ATTRIBUTES
+        )
+        + _geom("box", (0.0075, track / 2, 0.0075), (-axles, 0, 0), DARK, CONTACT_ATTRIBUTES)
         + posts
     )

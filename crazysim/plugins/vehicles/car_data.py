@@ -50,7 +50,7 @@ class CarData(Members):
     """Paths; None for cars that follow no path."""
     index: Array | None = leaf("parameter", 1, (1,))
     """Index of the path that a car follows. (1,)"""
-    start: Array | None = leaf("parameter", 1, (1,))
+    start_time: Array | None = leaf("parameter", 1, (1,))
     """Simulated time at which a car is at the start of its path, s. (1,)"""
     arc: Array | None = leaf("member", 1)
     """Arc length of the car's projection on its path, m. (n_worlds, n_members, 1)"""

@@ -157,7 +157,7 @@ class Cars(Population):
             params=params,
             path=paths,
             index=index,
-            start=start,
+            start_time=start,
             arc=arc,
             memory=_repeat_for_members(memory, counts),
             gains=gains,
@@ -181,7 +181,7 @@ class Cars(Population):
             acc = SPEED_GAIN * (car.command[:1] - car.body_vel[:1])
             drive = motor_reference(car.command[:1], acc, car.params)
             return car.replace(applied=jnp.concatenate([drive, car.command[1:]]))
-        time = data.core.steps / data.core.freq - car.start[0] if self.reference == "time" else None
+        time = data.core.steps / data.core.freq - car.start_time[0] if self.reference == "time" else None
         path_point = path_state(car.state, car.path, car.index[0], car.arc, follows.ahead(car.params), time)
         applied, memory = follows.update(car.state, path_point, car.memory, car.gains, car.params)
         return car.replace(applied=applied, arc=path_point.arc, memory=memory)

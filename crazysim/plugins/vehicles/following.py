@@ -66,7 +66,7 @@ def path_state(state: CarState, path: Path, index: Array, guess: Array, ahead: A
     point = path.at(index, arc)
     backwards = path.speed_at(index, jnp.zeros_like(arc)) < 0
     sign = jnp.where(backwards, -1.0, 1.0)
-    tangent, off = sign * point.tangent, lookahead_pos - point.pos
+    tangent, offset = sign * point.tangent, lookahead_pos - point.pos
     cross = tangent[0] * heading[1] - tangent[1] * heading[0]
     dot = tangent[0] * heading[0] + tangent[1] * heading[1]
     if time is None:
@@ -78,7 +78,7 @@ def path_state(state: CarState, path: Path, index: Array, guess: Array, ahead: A
         path=path,
         index=index,
         arc=arc[None],
-        offset=(tangent[0] * off[1] - tangent[1] * off[0])[None],
+        offset=(tangent[0] * offset[1] - tangent[1] * offset[0])[None],
         heading_error=safe_arctan2(cross, dot)[None],
         curvature=sign * point.curvature,
         speed=speed,

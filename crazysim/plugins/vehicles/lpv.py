@@ -96,8 +96,8 @@ class LPV(PathController):
     ) -> tuple[Array, LPVMemory]:
         right, speed = -at.offset, state.body_vel[:1]
         integral = safe_clip(memory.integral + RATE * gains.period * right, -INTEGRAL_MAX, INTEGRAL_MAX)
-        newest = (right - memory.offset) / gains.period
-        rate = memory.started * (memory.rate + SMOOTHING * (newest - memory.rate))
+        raw_rate = (right - memory.offset) / gains.period
+        rate = memory.started * (memory.rate + SMOOTHING * (raw_rate - memory.rate))
         terms = (integral, right, rate)
         feedback = sum(polynomial(c, speed) * x for c, x in zip(self.lateral, terms, strict=True))
         steer = -at.heading_error + feedback + gains.feedforward * at.curvature
@@ -106,8 +106,8 @@ class LPV(PathController):
     def driving(self, state: CarState, at: PathState, gains: LPVGains, car: CarParams) -> Array:
         vx, vy = state.body_vel[:1], state.body_vel[1:]
         slip = safe_arctan2(vy, jnp.abs(vx))
-        room = jnp.maximum(1 - at.curvature * at.offset, 0.2)
-        p = jnp.maximum(jnp.abs(jnp.cos(at.heading_error + slip)) / (jnp.cos(slip) * room), 0.2)
+        curvature_factor = jnp.maximum(1 - at.curvature * at.offset, 0.2)
+        p = jnp.maximum(jnp.abs(jnp.cos(at.heading_error + slip)) / (jnp.cos(slip) * curvature_factor), 0.2)
         speed = at.speed / p
         sign = speed / jnp.sqrt(speed * speed + car.slip_speed * car.slip_speed)
         hold = (car.drive[1:2] * speed + car.drive[2:] * sign) / car.drive[:1]

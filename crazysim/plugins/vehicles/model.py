@@ -34,8 +34,8 @@ GUIDE = "docs/guides/vehicles.md"
 DYNAMICS_NAMES = ("single_track", "kinematic")
 """Names of the dynamics of vehicles."""
 
-_SIZE, _MAYBE_SIZE = Key(((),), LENGTH), Key(((),), LENGTH_OR_ZERO)
-_POSITIVE, _NOT_NEGATIVE, _UNLIMITED = (Key(((),), found) for found in (POSITIVE, NOT_NEGATIVE, NOT_NEGATIVE_OR_INF))
+_SIZE, _SIZE_OR_ZERO = Key(((),), LENGTH), Key(((),), LENGTH_OR_ZERO)
+_POSITIVE, _NOT_NEGATIVE, _UNLIMITED = (Key(((),), limits) for limits in (POSITIVE, NOT_NEGATIVE, NOT_NEGATIVE_OR_INF))
 _DRIVE = Key(((3,),), Range("a positive gain, then damping and friction of at least zero", (1 / MAX_NUMBER, 0.0, 0.0)))
 
 KEYS: dict[str, Key] = {
@@ -43,12 +43,12 @@ KEYS: dict[str, Key] = {
     "rigid_body.yaw_inertia": Key(((),), INERTIA),
     "axles.front": _SIZE,
     "axles.rear": _SIZE,
-    "axles.track": _MAYBE_SIZE,
-    "axles.kingpin_track": _MAYBE_SIZE,
+    "axles.track": _SIZE_OR_ZERO,
+    "axles.kingpin_track": _SIZE_OR_ZERO,
     "wheels.number": Key(((),), Range("from 1 to 100", 1.0, 100.0)),
     "wheels.mass": Key(((),), Range("from 0 to 1e6 kg", 0.0, MASS.high)),
     "wheels.radius": _SIZE,
-    "wheels.width": _MAYBE_SIZE,
+    "wheels.width": _SIZE_OR_ZERO,
     "wheels.armature": _NOT_NEGATIVE,
     "wheels.friction_loss": _NOT_NEGATIVE,
     "wheels.damping": _NOT_NEGATIVE,

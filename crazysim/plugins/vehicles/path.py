@@ -194,8 +194,8 @@ class Path(PyTree):
             (1,) each
         """
         duration, closed = _entry_at(self.duration, index), _entry_at(self.closed, index)
-        rounds = jnp.where(closed, lax.floor(t / duration), 0.0)
-        local = safe_clip(t - rounds * duration, 0.0, duration)
+        laps = jnp.where(closed, lax.floor(t / duration), 0.0)
+        local = safe_clip(t - laps * duration, 0.0, duration)
         step = duration / (N_TIMES - 1)
         node = jnp.minimum(lax.floor(local / step), N_TIMES - 2.0)
         k, u = node.astype(jnp.int32), local / step - node
@@ -203,10 +203,10 @@ class Path(PyTree):
         rise, v0, v1 = s1 - s0, v0 * step, v1 * step
         c2, c3 = 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise  # cubic of Hermite
         s = s0 + u * (v0 + u * (c2 + u * c3))
-        moving = (t >= 0) & (closed | (t <= duration))
-        v = jnp.where(moving, (v0 + u * (2 * c2 + 3 * u * c3)) / step, 0.0)
+        is_moving = (t >= 0) & (closed | (t <= duration))
+        v = jnp.where(is_moving, (v0 + u * (2 * c2 + 3 * u * c3)) / step, 0.0)
         sign = jnp.where(_entry_at(self.speeds, index, 0) < 0, -1.0, 1.0)
-        return (s + rounds * _entry_at(self.length, index))[None], (sign * v)[None]
+        return (s + laps * _entry_at(self.length, index))[None], (sign * v)[None]
 
     def project(self, index: Array | int, pos: Array, guess: Array) -> Array:
         """Return the arc length of the point of a path nearest to a position, from a guess nearby; compiled.
@@ -225,11 +225,11 @@ class Path(PyTree):
         s, length, closed = guess, _entry_at(self.length, index), _entry_at(self.closed, index)
         for _ in range(NEWTON_STEPS):
             point = self.at(index, s)
-            off = pos - point.pos
-            along = off[0] * point.tangent[0] + off[1] * point.tangent[1]
-            lateral = point.tangent[0] * off[1] - point.tangent[1] * off[0]
+            offset = pos - point.pos
+            along_error = offset[0] * point.tangent[0] + offset[1] * point.tangent[1]
+            lateral = point.tangent[0] * offset[1] - point.tangent[1] * offset[0]
             s = s + safe_clip(
-                along / jnp.maximum(1 - point.curvature[0] * lateral, 0.2), -MAX_NEWTON_STEP, MAX_NEWTON_STEP
+                along_error / jnp.maximum(1 - point.curvature[0] * lateral, 0.2), -MAX_NEWTON_STEP, MAX_NEWTON_STEP
             )
             s = jnp.where(closed, s, safe_clip(s, 0.0, length))
         return s
@@ -277,8 +277,8 @@ def _point_at_time(path: Path, index: Array, t: Array) -> tuple[PathPoint, Array
 
 def _level_curve(trajectory: Trajectory) -> tuple[PieceTable, Callable[[Floats, int], Floats]]:
     """Return the pieces of a trajectory, and its derivatives along x and y as a function of times and order."""
-    pieces = PieceTable.of([trajectory])
-    return pieces, lambda t, order: pieces.at(np.zeros(len(t), int), t, order)[:, :2]
+    pieces = PieceTable.create([trajectory])
+    return pieces, lambda t, order: pieces.evaluate(np.zeros(len(t), int), t, order)[:, :2]
 
 
 def _path_of_curve(
@@ -311,15 +311,15 @@ def _path_of_curve(
         raise ConfigError(
             f"expected a path of at most {MAX_PIECES * MAX_PIECE_LENGTH:g} m, got {arc[-1]:.4g} m. Split it."
         )
-    moving = np.flatnonzero(rate > 1e-3 * rate.max())
-    if len(moving) != moving[-1] - moving[0] + 1:
-        stop = times[moving[0] + np.argmax(np.diff(moving) > 1)]
+    moving_samples = np.flatnonzero(rate > 1e-3 * rate.max())
+    if len(moving_samples) != moving_samples[-1] - moving_samples[0] + 1:
+        stop = times[moving_samples[0] + np.argmax(np.diff(moving_samples) > 1)]
         raise ConfigError(
             f"expected a path that stops only at its ends, got one without a tangent at {stop:.3g} s. Split it there."
         )
     n = max(4, int(np.ceil(arc[-1] / MAX_PIECE_LENGTH)))
     nodes = np.interp(np.linspace(0.0, arc[-1], n + 1), arc, times)
-    inner = np.clip(nodes, times[moving[0]], times[moving[-1]])  # at rest the tangent is undefined
+    inner = np.clip(nodes, times[moving_samples[0]], times[moving_samples[-1]])  # at rest the tangent is undefined
     pos, vel, acc = curve(nodes, 0), curve(inner, 1), curve(inner, 2)
     if closed and not np.allclose(pos[0], pos[-1], atol=1e-3):
         raise ConfigError(
@@ -328,10 +328,12 @@ def _path_of_curve(
         )
     size = np.hypot(*vel.T)[:, None]
     tangent = vel / size
-    bend = (acc - np.sum(acc * tangent, axis=1, keepdims=True) * tangent) / size**2
-    bend[size[:, 0] < STRAIGHT_RATE * rate.max()] = 0.0  # near rest the curvature of a polynomial grows without bound
+    curvature = (acc - np.sum(acc * tangent, axis=1, keepdims=True) * tangent) / size**2
+    curvature[size[:, 0] < STRAIGHT_RATE * rate.max()] = (
+        0.0  # near rest the curvature of a polynomial grows without bound
+    )
     spacing = arc[-1] / n
-    derivatives = np.stack([pos, tangent, bend], axis=1)
+    derivatives = np.stack([pos, tangent, curvature], axis=1)
     coefficients = interpolation.unit_coefficients(derivatives, np.full(n, spacing))
     speeds = np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], MIN_SPEED_SHARE * rate.max())
     end = progress[-1, 0] / speed if speed is not None else times[-1]
@@ -352,8 +354,8 @@ def _evaluate(coefficients: Array, u: Array) -> PathPoint:
     rate = x[1] + u * (2 * x[2] + u * (3 * x[3] + u * (4 * x[4] + u * 5 * x[5])))
     second = 2 * x[2] + u * (6 * x[3] + u * (12 * x[4] + u * 20 * x[5]))
     inverse = lax.rsqrt(rate[0] * rate[0] + rate[1] * rate[1])
-    bend = (rate[0] * second[1] - rate[1] * second[0]) * inverse * inverse * inverse
-    return PathPoint(pos, rate * inverse, bend[None])
+    curvature = (rate[0] * second[1] - rate[1] * second[0]) * inverse * inverse * inverse
+    return PathPoint(pos, rate * inverse, curvature[None])
 
 
 def _entry_at(x: Array, *index: Array | int) -> Array:

@@ -100,7 +100,7 @@ def lateral_gains(
     discrete = matrix_exponential(block * period)  # the input is held for a period
     K = gain_discrete(discrete[:4, :4], discrete[:4, 4:], Q, R)[0]
     # Steady cornering of curvature 1: the yaw rate is the speed, and sideways velocity and steering angle balance it.
-    # For vehicles without slip the two equations are multiples of the tangent of the steering angle, and still regular.
+    # Without slip both rates are multiples of the tangent of the steering angle, and the matrix is still regular.
     rows = jnp.array([1, 3])
     balance = jnp.stack([A[rows, 1], B[rows, 0]], axis=1)
     side, steer = jnp.linalg.solve(balance, -A[rows, 3] * speed)

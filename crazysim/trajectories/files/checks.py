@@ -1,4 +1,4 @@
-"""Checks of values that come from a file or a socket, with bounds on their sizes, and messages that name the place."""
+"""Checks of values from a file or a socket, with bounds on their sizes, and messages that name the location."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ MAX_COORDINATE = 1e5
 """Largest coordinate, m, and largest yaw, degrees."""
 
 
-def refuse(expected: str, got: str, place: str) -> NoReturn:
+def refuse(expected: str, got: str, location: str) -> NoReturn:
     """Raise the error for a value that is not accepted.
 
     Args:
         expected: Description of an accepted value.
         got: Description of the value.
-        place: File and place in it.
+        location: File and location in it.
     """
-    raise ConfigError(f"expected {expected}, got {got} in {place}")
+    raise ConfigError(f"expected {expected}, got {got} in {location}")
 
 
-def parse_json(content: bytes | str, place: str) -> Any:
+def parse_json(content: bytes | str, location: str) -> Any:
     """Return the value of a JSON document.
 
     Raises:
@@ -43,60 +43,60 @@ def parse_json(content: bytes | str, place: str) -> Any:
     try:
         return json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"expected JSON in {place}, got {type(error).__name__}: {str(error)[:100]}") from error
+        raise ConfigError(f"expected JSON in {location}, got {type(error).__name__}: {str(error)[:100]}") from error
 
 
-def require_object(value: object, place: str) -> dict[str, Any]:
+def require_object(value: object, location: str) -> dict[str, Any]:
     """Return a value that must be a JSON object."""
     if not isinstance(value, dict):
-        refuse("an object {...}", short_repr(value), place)
+        refuse("an object {...}", short_repr(value), location)
     return value
 
 
-def require_array(value: object, n_max: int, place: str) -> list[Any]:
+def require_array(value: object, n_max: int, location: str) -> list[Any]:
     """Return a value that must be a JSON array of at most ``n_max`` entries."""
     if not isinstance(value, list):
-        refuse("an array [...]", short_repr(value), place)
+        refuse("an array [...]", short_repr(value), location)
     if len(value) > n_max:
-        refuse(f"at most {n_max} entries", str(len(value)), place)
+        refuse(f"at most {n_max} entries", str(len(value)), location)
     return value
 
 
-def require_version_one(value: dict[str, Any], place: str) -> None:
+def require_version_one(value: dict[str, Any], location: str) -> None:
     """Check that an object has version 1."""
     version = value.get("version")
     if version != 1 or isinstance(version, bool):
-        refuse("version 1", short_repr(version), place)
+        refuse("version 1", short_repr(version), location)
 
 
-def require_number(value: object, place: str, low: float = -np.inf, high: float = np.inf) -> float:
+def require_number(value: object, location: str, low: float = -np.inf, high: float = np.inf) -> float:
     """Return a value that must be a finite number in a range."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or value != value:
         refuse(
             "a number" if np.isinf([low, high]).any() else f"a number from {low:g} to {high:g}",
             short_repr(value),
-            place,
+            location,
         )
     return float(value)
 
 
-def require_text(value: object, place: str, n_max: int = 200) -> str:
+def require_text(value: object, location: str, n_max: int = 200) -> str:
     """Return a value that must be a string of at most ``n_max`` characters."""
     if not isinstance(value, str) or len(value) > n_max:
-        refuse(f"a text of at most {n_max} characters", short_repr(value), place)
+        refuse(f"a text of at most {n_max} characters", short_repr(value), location)
     return value
 
 
-def require_numbers(value: object, lengths: Sequence[int], bound: float, place: str) -> NDArray:
+def require_numbers(value: object, lengths: Sequence[int], bound: float, location: str) -> NDArray:
     """Return a value that must be an array of finite numbers up to ``bound`` in size, of one of the ``lengths``."""
     if isinstance(value, tuple):
         value = list(value)
     if not isinstance(value, list) or len(value) not in lengths:
-        refuse(f"an array of {' or '.join(map(str, lengths))} numbers", short_repr(value), place)
-    return np.array([require_number(x, place, -bound, bound) for x in value])
+        refuse(f"an array of {' or '.join(map(str, lengths))} numbers", short_repr(value), location)
+    return np.array([require_number(x, location, -bound, bound) for x in value])
 
 
-def require_ascending(times: NDArray, least: float, place: str) -> None:
+def require_ascending(times: NDArray, least: float, location: str) -> None:
     """Check that times ascend by at least ``least``, so that no pieces overlap or have zero length."""
     steps = np.diff(times)
     if len(steps) and steps.min() < least * (1 - 1e-6):
@@ -104,5 +104,5 @@ def require_ascending(times: NDArray, least: float, place: str) -> None:
         refuse(
             f"times that ascend by at least {least:g} s",
             f"{times[k]:g} s followed by {times[k + 1]:g} s at entry {k + 1}",
-            place,
+            location,
         )

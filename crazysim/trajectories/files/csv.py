@@ -35,7 +35,7 @@ def load_csv(path: str | Path) -> Trajectory:
     return trajectory_of_rows(rows, str(path)) if rows.shape[1] > 5 else _fit_samples(rows, str(path))
 
 
-def _parse_table(lines: list[str], place: str) -> NDArray:
+def _parse_table(lines: list[str], location: str) -> NDArray:
     """Return the numbers of the lines. (n, n_columns)"""
     rows: list[list[float]] = []
     for i, line in enumerate(lines, start=1):
@@ -43,32 +43,32 @@ def _parse_table(lines: list[str], place: str) -> NDArray:
         if cells == [""] or cells[0].startswith("#"):
             continue
         if len(rows) >= checks.MAX_POINTS:
-            checks.refuse(f"at most {checks.MAX_POINTS} rows", "more", f"{place}, line {i}")
+            checks.refuse(f"at most {checks.MAX_POINTS} rows", "more", f"{location}, line {i}")
         try:
             row = [float(cell) for cell in cells]
         except ValueError:
             if not rows and any(cell[:1].isalpha() for cell in cells):
                 continue  # the header
-            checks.refuse("numbers", short_repr(line), f"{place}, line {i}")
+            checks.refuse("numbers", short_repr(line), f"{location}, line {i}")
         if len(row) not in (4, 5, 25, 33) or (rows and len(row) != len(rows[0])):
             expected = f"{len(rows[0])} columns, as before" if rows else "4, 5, 25 or 33 columns"
-            checks.refuse(expected, str(len(row)), f"{place}, line {i}")
+            checks.refuse(expected, str(len(row)), f"{location}, line {i}")
         rows.append(row)
     if not rows:
-        checks.refuse("at least one row of numbers", "none", place)
+        checks.refuse("at least one row of numbers", "none", location)
     return np.array(rows)
 
 
-def _fit_samples(rows: NDArray, place: str) -> Trajectory:
+def _fit_samples(rows: NDArray, location: str) -> Trajectory:
     """Return the cubic trajectory through samples of time, position and, optionally, yaw."""
     if not np.all(np.isfinite(rows)) or np.abs(rows[:, 1:]).max() > checks.MAX_COORDINATE:
-        checks.refuse(f"finite numbers up to {checks.MAX_COORDINATE:g}", "others", place)
+        checks.refuse(f"finite numbers up to {checks.MAX_COORDINATE:g}", "others", location)
     if len(rows) < 2:
-        checks.refuse("at least two samples", "one", place)
+        checks.refuse("at least two samples", "one", location)
     times = rows[:, 0] - rows[0, 0]
-    checks.require_ascending(times, checks.MIN_LENGTH, place)
+    checks.require_ascending(times, checks.MIN_LENGTH, location)
     if times[-1] > checks.MAX_TIME:
-        checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1]:g} s", place)
+        checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1]:g} s", location)
     values = np.zeros((len(rows), 4))
     values[:, : rows.shape[1] - 1] = rows[:, 1:]
     values[:, 3] = np.unwrap(values[:, 3])

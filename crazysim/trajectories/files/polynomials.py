@@ -47,49 +47,49 @@ def pack_poly4d(trajectory: Trajectory) -> bytes:
     return trajectory_rows(trajectory).astype("<f4")[:, [*range(1, POLY4D_FLOATS), 0]].tobytes()
 
 
-def unpack_poly4d(content: bytes, place: str = "a trajectory memory") -> Trajectory:
+def unpack_poly4d(content: bytes, location: str = "a trajectory memory") -> Trajectory:
     """Return the trajectory of uncompressed polynomials.
 
     Args:
         content: Contents of the memory.
-        place: File, for messages.
+        location: File, for messages.
 
     Raises:
         ConfigError: If the size is wrong, or a number is out of range.
     """
     size = 4 * POLY4D_FLOATS
     if not content or len(content) % size or len(content) // size > checks.MAX_POINTS:
-        checks.refuse(f"1 to {checks.MAX_POINTS} pieces of {size} bytes", f"{len(content)} bytes", place)
+        checks.refuse(f"1 to {checks.MAX_POINTS} pieces of {size} bytes", f"{len(content)} bytes", location)
     rows = np.frombuffer(content, "<f4").reshape(-1, POLY4D_FLOATS).astype(float)
-    return trajectory_of_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], place)
+    return trajectory_of_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], location)
 
 
-def trajectory_of_rows(rows: NDArray, place: str) -> Trajectory:
+def trajectory_of_rows(rows: NDArray, location: str) -> Trajectory:
     """Return the trajectory of rows as ``trajectory_rows`` returns them.
 
     Args:
         rows: Duration, s, and coefficients of x, y, z, m, and yaw, rad, for the time in seconds. (n_pieces, 33), or
             (n_pieces, 25) without yaw.
-        place: File, for messages.
+        location: File, for messages.
     """
     lengths, c = rows[:, 0], rows[:, 1:].reshape(len(rows), -1, 8)
     if not np.all(np.isfinite(rows)):
-        checks.refuse("finite numbers", "others", f"{place}, piece {int(np.argmin(np.isfinite(rows).all(1)))}")
+        checks.refuse("finite numbers", "others", f"{location}, piece {int(np.argmin(np.isfinite(rows).all(1)))}")
     if not np.all(lengths >= checks.MIN_LENGTH * (1 - 1e-6)) or lengths.sum() > checks.MAX_TIME:
         k = int(np.argmin(lengths))
         checks.refuse(
             f"durations of at least {checks.MIN_LENGTH:g} s and at most {checks.MAX_TIME:g} s in all",
             f"{lengths[k]:g} s and {lengths.sum():g} s",
-            f"{place}, piece {k}",
+            f"{location}, piece {k}",
         )
     scaled = np.abs(c) * lengths[:, None, None] ** np.arange(8)
     if not np.all(scaled < checks.MAX_COORDINATE):
         k = int(np.argmax(scaled.max((1, 2))))
-        checks.refuse(f"coordinates up to {checks.MAX_COORDINATE:g}", f"{scaled[k].max():g}", f"{place}, piece {k}")
+        checks.refuse(f"coordinates up to {checks.MAX_COORDINATE:g}", f"{scaled[k].max():g}", f"{location}, piece {k}")
     return Trajectory.of_pieces(lengths, c)
 
 
-def _pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
+def _checked_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     """Return the pieces of a trajectory, after a check that the Crazyflie can fly their degree."""
     ends, c = trajectory_pieces(trajectory)
     if c.shape[2] > 8:
@@ -101,7 +101,7 @@ def _pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
 
 def trajectory_rows(trajectory: Trajectory) -> NDArray:
     """Return the duration of each piece, s, and its coefficients for the time in seconds. (n_pieces, 33)"""
-    ends, c = _pieces(trajectory)
+    ends, c = _checked_pieces(trajectory)
     lengths = np.diff(ends, prepend=0.0)
     c = np.pad(c, ((0, 0), (0, 0), (0, 8 - c.shape[2]))) / lengths[:, None, None] ** np.arange(8)
     return np.concatenate([lengths[:, None], c.reshape(len(c), -1)], axis=1)
@@ -120,7 +120,7 @@ def pack_compressed(trajectory: Trajectory) -> bytes:
         ConfigError: If its degree is higher, a piece is shorter than 1 ms or does not begin where the one before ends,
             or a coordinate exceeds the 32.767 m or 3276.7 degrees that 16 bits can hold.
     """
-    ends, c = _pieces(trajectory)
+    ends, c = _checked_pieces(trajectory)
     require_no_jumps(ends, c)
     ends, c = split_pieces(ends, c, np.arange(MAX_PIECE_DURATION, ends[-1], MAX_PIECE_DURATION))
     c = c / AXIS_UNITS[:, None]
@@ -148,29 +148,29 @@ def _pack_shorts(values: NDArray) -> bytes:
     return rounded.astype("<i2").tobytes()
 
 
-def unpack_compressed(content: bytes, place: str = "a trajectory memory") -> Trajectory:
+def unpack_compressed(content: bytes, location: str = "a trajectory memory") -> Trajectory:
     """Return the trajectory of compressed polynomials.
 
     Args:
         content: Contents of the memory; bytes after a piece of zero duration are ignored.
-        place: File, for messages.
+        location: File, for messages.
 
     Raises:
         ConfigError: If the contents end within a piece, have no piece, or are too long.
     """
     try:
         points = np.array(struct.unpack_from("<hhhh", content), float)
-        at, durations, pieces = 8, [], []
-        while at < len(content):
-            header, duration = struct.unpack_from("<BH", content, at)
-            at += 3
+        offset, durations, pieces = 8, [], []
+        while offset < len(content):
+            header, duration = struct.unpack_from("<BH", content, offset)
+            offset += 3
             if not duration:
                 break
             piece, last = np.zeros((4, 8)), points.copy()
             for axis in range(4):
                 degree = STORED_DEGREES[header >> 2 * axis & 3]
-                stored = struct.unpack_from(f"<{degree}h", content, at)
-                at += 2 * degree
+                stored = struct.unpack_from(f"<{degree}h", content, offset)
+                offset += 2 * degree
                 curve = np.array([points[axis], *stored], float)
                 piece[axis, : degree + 1] = power_coefficients(curve[:, None])[0]
                 last[axis] = curve[-1]
@@ -178,12 +178,14 @@ def unpack_compressed(content: bytes, place: str = "a trajectory memory") -> Tra
             durations.append(duration)
             pieces.append(piece)
             if len(pieces) > checks.MAX_POINTS:
-                checks.refuse(f"at most {checks.MAX_POINTS} pieces", "more", place)
+                checks.refuse(f"at most {checks.MAX_POINTS} pieces", "more", location)
     except struct.error:
-        checks.refuse("complete pieces", f"{len(content)} bytes that end within one", place)
+        checks.refuse("complete pieces", f"{len(content)} bytes that end within one", location)
     ends = DURATION_UNIT * np.cumsum(durations)
     if not pieces or ends[-1] > checks.MAX_TIME:
-        checks.refuse(f"pieces of up to {checks.MAX_TIME:g} s in all", "none" if not pieces else "longer ones", place)
+        checks.refuse(
+            f"pieces of up to {checks.MAX_TIME:g} s in all", "none" if not pieces else "longer ones", location
+        )
     return trajectory_of_unit_pieces(np.diff(ends, prepend=0.0), np.stack(pieces) * AXIS_UNITS[:, None])
 
 

@@ -331,20 +331,20 @@ def test_a_picture_has_what_is_drawn():
     bodies = SceneBodies(sim)
     source = PictureSource(sim, bodies, [1, 2], contacts=True, wind=True)
     picture = source.take(live, "states.pos")
-    np.testing.assert_allclose(picture.drones[0, 0], [0.3, 0.2, 1.0], atol=1e-6)
-    np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.core.drone_mocap_ids)], picture.drones)
+    np.testing.assert_allclose(picture.drone_pos[0, 0], [0.3, 0.2, 1.0], atol=1e-6)
+    np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.core.drone_mocap_ids)], picture.drone_pos)
     np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.objects.mocap_ids)], [[[0, 0, 3]]] * 2)
     np.testing.assert_allclose(picture.setpoint[0, 0], [1, 2, 3])
     np.testing.assert_allclose(picture.wind, np.broadcast_to([1, 2, 0], (2, 2, 3)))
-    np.testing.assert_array_equal(picture.touching, [[False, True], [False, False]])  # one stands on the floor
+    np.testing.assert_array_equal(picture.has_contact, [[False, True], [False, False]])  # one stands on the floor
     np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)
     np.testing.assert_allclose(source.take(live, "double").plot, [2.0])
     assert "0.00 s" in picture.status
-    assert picture.name == sim.drone_names[0]
+    assert picture.followed_name == sim.drone_names[0]
     np.testing.assert_allclose(picture.lights[0], [[1.0, 0.5, 0.0], [0.0, 0.0, 0.0]])
     live.follow(2, "ball", 0)
     picture = source.take(live, "states.pos")
-    assert (picture.followed, picture.name) == ((2, bodies.find("ball", 0).mocap), "ball")
+    assert (picture.followed, picture.followed_name) == ((2, bodies.find("ball", 0).mocap), "ball")
     assert picture.selected == (1, 0)
     np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)  # of the selected drone
     live.select(1, 0)

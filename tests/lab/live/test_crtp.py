@@ -410,7 +410,7 @@ def test_own_log_variables(swarm):
     send(device, 5, 1, b"\x06\x01" + struct.pack("<BH", 2, k))
     send(device, 5, 1, b"\x03\x01\x01")
     swarm.advance(0.05)
-    (packet,) = device.due()
+    (packet,) = device.due_packets()
     assert struct.unpack("<H", packet[5:]) == (1234,)
 
 
@@ -423,7 +423,7 @@ def test_a_failing_log_variable_is_nan_and_reported(swarm):
     send(device, 5, 1, b"\x06\x01" + struct.pack("<BH", 7, device.log.ids["range.front"]))
     send(device, 5, 1, b"\x03\x01\x01")
     swarm.advance(0.05)
-    (packet,) = device.due()
+    (packet,) = device.due_packets()
     assert np.isnan(struct.unpack("<f", packet[5:])[0])
     assert "no sensor" in swarm.reports.latest[-1].text
 
@@ -465,7 +465,7 @@ def test_any_packet_is_answered_or_reported_and_the_setpoint_stays_finite(swarm,
             assert 1 <= len(answer) <= 31
         command = device.commander.tick(device.commander.now + 0.01, np.zeros(3), np.zeros(3), 0.0)
         assert command is None or np.isfinite(command.astype(np.float32)).all()
-        for due in device.due():
+        for due in device.due_packets():
             assert len(due) <= 31
 
 

@@ -158,9 +158,9 @@ def test_going_back_repeats_what_was_flown_bit_for_bit(live):
 
 
 def test_a_reset_within_a_step_happens_after_it(live):
-    live.at(0.03, lambda live: live.reset() if live.flown < 5 else None)
+    live.at(0.03, lambda live: live.reset() if live.n_steps_run < 5 else None)
     live.run(0.1)
-    assert live.flown == 10
+    assert live.n_steps_run == 10
     assert live.step == 6  # four steps, then six more
 
 
@@ -225,7 +225,7 @@ def test_the_run_ends_when_the_last_viewer_is_closed(live):
     live.run()
     assert first.closed
     assert second.closed
-    assert live.flown > 0
+    assert live.n_steps_run > 0
 
 
 def test_a_broken_viewer_is_closed_and_named(live, caplog):
@@ -334,7 +334,7 @@ def test_commands_of_the_network_and_resets():
     fleet, queue = Fleet(sim, teleport=False), CommandQueue()
     with Live(sim, speed="max") as live:
         live.add(RemoteCommands(fleet, queue))
-        live.at(0.1, lambda live: queue._enqueue(TakeOff(None, 0.5)) if live.flown < 50 else None)
+        live.at(0.1, lambda live: queue._enqueue(TakeOff(None, 0.5)) if live.n_steps_run < 50 else None)
         live.run(3.0)
         np.testing.assert_allclose(sim.data.states.pos[0, :, 2], 0.5, atol=0.15)
         live.lights[:] = 1.0

@@ -19,7 +19,7 @@ from crazysim.lab.show_files import Lights, Show, save_show
 from crazysim.lab.shows import (
     collisions,
     film,
-    fly,
+    fly_show,
     live_show,
     page,
     report,
@@ -51,7 +51,7 @@ SHOW = Show(
 
 @pytest.fixture(scope="module")
 def flight():
-    return fly(SHOW)
+    return fly_show(SHOW)
 
 
 def test_closest_approach_of_straight_lines():
@@ -180,12 +180,12 @@ def test_collisions_are_listed(flight):
 
 
 def test_part_of_a_show_and_wrong_settings():
-    short = fly(SHOW, seconds=0.5)
+    short = fly_show(SHOW, seconds=0.5)
     assert short.duration == pytest.approx(0.5)
     assert len(short.times) == len(short.pos) == len(short.planned) == len(short.colors)
     for seconds in (0.0, -1.0, float("nan")):
         with pytest.raises(ConfigError, match="positive duration"):
-            fly(SHOW, seconds=seconds)
+            fly_show(SHOW, seconds=seconds)
     with pytest.raises(ConfigError, match="different names"):
         SHOW.replace(names=("a", "a", "c"))
     with pytest.raises(ConfigError, match="one entry for each of 2 drones"):

@@ -383,7 +383,7 @@ def test_law_10_and_05_resets_and_the_scene():
     after = np.asarray(plugin.read(sim.data).pos)
     np.testing.assert_array_equal(after[0], first[0])
     np.testing.assert_array_equal(after[1:], fallen[1:])
-    assert not np.asarray(plugin.read(sim.data).press)[0].any()
+    assert not np.asarray(plugin.read(sim.data).normal_impulse)[0].any()
     report = sim.contact_report(drones=False)
     assert {"bodies:0", "bodies:1"} <= set(report.object_names)
     sim.data = with_states(sim.data, pos=fallen[1, 0])

@@ -94,7 +94,7 @@ def test_resets_clear_the_impulses():
     sim.step(2)
     assert np.abs(np.asarray(plugin.read(sim.data).impulse)).max() > 0
     sim.reset()
-    assert not np.asarray(plugin.read(sim.data).press).any()
+    assert not np.asarray(plugin.read(sim.data).normal_impulse).any()
     assert np.isfinite(np.asarray(sim.data.states.pos)).all()
 
 

@@ -53,7 +53,7 @@ def deviations(record, time):
         reference = record.path.time_reference(0, time - start[0])[0]
         return jnp.linalg.norm(pos[:2] - record.path.at(0, arc).pos), reference[0] - arc
 
-    return jax.vmap(of_one)(record.pos[0], record.arc[0], record.start[0])
+    return jax.vmap(of_one)(record.pos[0], record.arc[0], record.start_time[0])
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

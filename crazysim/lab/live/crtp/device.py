@@ -64,7 +64,7 @@ class LogBlock:
     """Number in the table, and format, of each variable."""
     period: float | None = None
     """Time between two packets, s; None while the block is stopped."""
-    due: float = 0.0
+    next_time: float = 0.0
     """Time of the next packet, s."""
 
 
@@ -123,7 +123,7 @@ class CrtpDevice:
                 self._report(f"packet of a wrong form to port {port}, channel {channel}: {data.hex()}")
             return []
 
-    def due(self) -> list[bytes]:
+    def due_packets(self) -> list[bytes]:
         """Return the packets that have become due at the swarm's time: lines of the console, and logs."""
         now, packets = self.swarm.time, []
         with self.swarm.lock:
@@ -131,11 +131,11 @@ class CrtpDevice:
                 packets.append(bytes([CONSOLE << 4 | 0x0C]) + self._console.popleft())
             state = self.commander.estimate(self.swarm.state(self.drone))
             for identity, block in self.blocks.items():
-                if block.period is None or now < block.due - 1e-9:
-                    if block.period is not None and block.due - now > block.period:  # after a reset
-                        block.due = now
+                if block.period is None or now < block.next_time - 1e-9:
+                    if block.period is not None and block.next_time - now > block.period:  # after a reset
+                        block.next_time = now
                     continue
-                block.due = max(block.due + block.period, now)
+                block.next_time = max(block.next_time + block.period, now)
                 stamp = struct.pack("<I", round(now * 1000) & 0xFFFFFF)[:3]
                 values = b"".join(self._value(k, layout, state) for k, layout in block.variables)
                 packets.append(bytes([LOGGING << 4 | 0x0C | 2, identity]) + stamp + values)
@@ -264,11 +264,11 @@ class CrtpDevice:
             del self.blocks[identity]
             code = 0
         elif command in (3, 8):
-            tens = 10 * data[2] if command == 3 else struct.unpack("<H", data[2:4])[0]
+            period_ms = 10 * data[2] if command == 3 else struct.unpack("<H", data[2:4])[0]
             block = self.blocks[identity]
-            code = 0 if tens > 0 else errno.ENOEXEC
-            if tens > 0:
-                block.period, block.due = tens / 1000, self.swarm.time + tens / 1000
+            code = 0 if period_ms > 0 else errno.ENOEXEC
+            if period_ms > 0:
+                block.period, block.next_time = period_ms / 1000, self.swarm.time + period_ms / 1000
         elif command == 4:
             self.blocks[identity].period, code = None, 0
         else:
@@ -282,13 +282,13 @@ class CrtpDevice:
         if command == 7 and identity not in self.blocks:
             return errno.ENOENT
         formats = {number: layout for number, layout in LOG_TYPES.values()}
-        new = []
+        new_variables = []
         for kind, k in struct.iter_unpack("<BH", data):
             if k >= len(self.log.variables) or kind & 15 not in formats:
                 return errno.ENOENT
-            new.append((k, formats[kind & 15]))
+            new_variables.append((k, formats[kind & 15]))
         block = self.blocks.get(identity, LogBlock([]))
-        variables = block.variables + new
+        variables = block.variables + new_variables
         if sum(struct.calcsize(layout) for _, layout in variables) > MAX_LOG:
             return errno.E2BIG
         n_others = sum(len(other.variables) for i, other in self.blocks.items() if i != identity)

@@ -98,7 +98,7 @@ def _driver(swarm: Swarm) -> type:
         def _send_due(self) -> None:
             device = self._device
             if device is not None:
-                for packet in device.due():
+                for packet in device.due_packets():
                     self._enqueue(packet)
 
         def _enqueue(self, packet: bytes) -> None:

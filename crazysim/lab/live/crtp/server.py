@@ -99,6 +99,6 @@ class CrtpServer(Closing):
         """Send the log and console packets that are due; the swarm calls it after every control step."""
         for device, peer, client in zip(self.devices, self._sockets, self._clients, strict=True):
             if client is not None:
-                for packet in device.due():
+                for packet in device.due_packets():
                     with contextlib.suppress(OSError):
                         peer.sendto(packet, client)

@@ -29,7 +29,7 @@ READ_ONLY_BIT = 0x40
 """Bit of the type of a parameter that cannot be written."""
 OUT_OF_RANGE_DISTANCE = 32767
 """Distance if no object is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
-RANGES = {"down": "zrange"}
+RANGE_VARIABLES = {"down": "zrange"}
 """Name of the log variable in the group ``range``, for each direction with a different name."""
 
 Reading = Callable[[DroneState, Commander], float]
@@ -143,7 +143,9 @@ def log_of(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]:
 
         return millimetres
 
-    ranges = {f"range.{RANGES.get(name, name)}": ("uint16_t", distance(name)) for name in ranges_of(sim, drone)}
+    ranges = {
+        f"range.{RANGE_VARIABLES.get(name, name)}": ("uint16_t", distance(name)) for name in ranges_of(sim, drone)
+    }
     battery: dict[str, tuple[str, Reading]] = {
         "pm.vbat": ("float", lambda _s, _c: battery_of(sim, drone).voltage),
         "pm.state": ("uint8_t", lambda _s, _c: battery_of(sim, drone).state),

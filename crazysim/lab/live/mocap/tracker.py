@@ -112,19 +112,21 @@ class Tracker:
         if self._stalled:
             self._stalled = False
             self._report("resumed", self.source, now, "frames arrive again")
-        before = self._stamp
-        if before is not None and now <= before:
-            if now == before:
+        last_stamp = self._stamp
+        if last_stamp is not None and now <= last_stamp:
+            if now == last_stamp:
                 self._report("repeated", self.source, now, "frame refused")
                 return False
-            if before - now <= rules.restart:
-                self._report("backwards", self.source, now, f"frame refused: {before - now:.4f} s before the last one")
+            if last_stamp - now <= rules.restart:
+                self._report(
+                    "backwards", self.source, now, f"frame refused: {last_stamp - now:.4f} s before the last one"
+                )
                 return False
-            self._report("restarted", self.source, now, f"clock stepped back by {before - now:.3f} s")
+            self._report("restarted", self.source, now, f"clock stepped back by {last_stamp - now:.3f} s")
             self.restart()
-            before, self._received = None, frame.received
-        if before is not None:
-            self._watch_interval(now, now - before)
+            last_stamp, self._received = None, frame.received
+        if last_stamp is not None:
+            self._watch_interval(now, now - last_stamp)
         self._watch_delay(now, frame.received - now)
         self._stamp = now
         self.n_frames += 1
@@ -156,11 +158,11 @@ class Tracker:
             self._report("ended", self.source, now, ended)
         if self._received is None:
             self._received = now
-        quiet = now - self._received
-        if quiet > self.rules.stalled and not self._stalled:
+        silence = now - self._received
+        if silence > self.rules.stalled and not self._stalled:
             self._stalled = True
             self.vel[:] = 0.0
-            self._report("stalled", self.source, now, f"no frame for {quiet:.3f} s; all bodies stay where they are")
+            self._report("stalled", self.source, now, f"no frame for {silence:.3f} s; all bodies stay where they are")
 
     def _report(self, kind: str, name: str, time: float, text: str) -> None:
         self.reports.add(kind, name, time, text)
@@ -186,10 +188,10 @@ class Tracker:
         """Return the indices of the frame's entries that are used, and the rows of their bodies in the tracker."""
         mapping = self._maps.get(names)
         if mapping is None:
-            twice = sorted({name for name in names if names.count(name) > 1} & set(self._rows_of))
-            entries = [i for i, name in enumerate(names) if name in self._rows_of and name not in twice]
+            duplicates = sorted({name for name in names if names.count(name) > 1} & set(self._rows_of))
+            entries = [i for i, name in enumerate(names) if name in self._rows_of and name not in duplicates]
             rows = np.array([self._rows_of[names[i]] for i in entries], int)
-            mapping = np.array(entries, int), rows, twice
+            mapping = np.array(entries, int), rows, duplicates
             if len(self._maps) > 1000:
                 self._maps.clear()
             self._maps[names] = mapping
@@ -197,8 +199,8 @@ class Tracker:
                 if len(self._unknown) < 1000:
                     self._unknown.add(name)
                     self._report("unknown", name, now, "no object of the scene has this name; it is ignored")
-        entries, rows, twice = mapping
-        for name in twice:
+        entries, rows, duplicates = mapping
+        for name in duplicates:
             self._report("duplicate", name, now, "name twice in a frame; it keeps its pose")
         return entries, rows
 
@@ -206,41 +208,52 @@ class Tracker:
         entries, rows = self._rows(frame.names, now)
         pos, quat = frame.pos[entries], frame.quat[entries]
         norm = np.sqrt((quat * quat).sum(-1))
-        valid = (np.abs(pos) < MAX_COORDINATE).all(-1) & (norm > 1e-3) & np.isfinite(norm)
-        if not valid.all():
-            for k in rows[~valid]:
+        is_valid = (np.abs(pos) < MAX_COORDINATE).all(-1) & (norm > 1e-3) & np.isfinite(norm)
+        if not is_valid.all():
+            for k in rows[~is_valid]:
                 self._report("invalid", self.names[k], now, "pose not finite, or quaternion zero; it keeps its pose")
-            rows, pos, quat, norm = rows[valid], pos[valid], quat[valid], norm[valid]
+            rows, pos, quat, norm = rows[is_valid], pos[is_valid], quat[is_valid], norm[is_valid]
         dt = now - self._stamps[rows]
-        step = pos - self.pos[rows]
+        displacement = pos - self.pos[rows]
         was_seen = self.seen[rows] & np.isfinite(dt)
-        far = np.sqrt((step * step).sum(-1))
-        ok = ~was_seen | (far <= self.rules.max_speed * np.where(was_seen, dt, 0.0) + self.rules.slack)
+        distance = np.sqrt((displacement * displacement).sum(-1))
+        is_plausible = ~was_seen | (distance <= self.rules.max_speed * np.where(was_seen, dt, 0.0) + self.rules.slack)
         relocated = np.zeros(len(rows), bool)
-        if not ok.all():
-            relocated = self._suspects(rows, pos, far, ok, now)
-            ok |= relocated
-        self._n_suspect[rows[ok]] = 0
-        for k in rows[ok & self._lost[rows]]:
+        if not is_plausible.all():
+            relocated = self._confirm_jumps(rows, pos, distance, is_plausible, now)
+            is_plausible |= relocated
+        self._n_suspect[rows[is_plausible]] = 0
+        for k in rows[is_plausible & self._lost[rows]]:
             self._report("found", self.names[k], now, "valid pose again")
-        rows, pos, quat, norm, dt, step = rows[ok], pos[ok], quat[ok], norm[ok], dt[ok], step[ok]
-        still = ~was_seen[ok] | relocated[ok] | self._lost[rows]
-        dt = np.where(still, np.inf, np.maximum(dt, far[ok] / self.rules.max_speed))
-        self.vel[rows] = step / np.where(dt > 0, dt, np.inf)[:, None]
+        rows, pos, quat, norm, dt, displacement = (
+            rows[is_plausible],
+            pos[is_plausible],
+            quat[is_plausible],
+            norm[is_plausible],
+            dt[is_plausible],
+            displacement[is_plausible],
+        )
+        has_no_speed = ~was_seen[is_plausible] | relocated[is_plausible] | self._lost[rows]
+        dt = np.where(has_no_speed, np.inf, np.maximum(dt, distance[is_plausible] / self.rules.max_speed))
+        self.vel[rows] = displacement / np.where(dt > 0, dt, np.inf)[:, None]
         self.pos[rows], self.quat[rows] = pos, quat / norm[:, None]
         self._stamps[rows], self.seen[rows], self._lost[rows] = now, True, False
 
-    def _suspects(self, rows: NDArray, pos: NDArray, far: NDArray, ok: NDArray, now: float) -> NDArray:
+    def _confirm_jumps(
+        self, rows: NDArray, pos: NDArray, distance: NDArray, is_plausible: NDArray, now: float
+    ) -> NDArray:
         """Return True for bodies that jumped and have stayed at their new position for ``confirm`` frames. (n,)"""
         accepted = np.zeros(len(rows), bool)
-        for i in np.flatnonzero(~ok):
+        for i in np.flatnonzero(~is_plausible):
             k = rows[i]
             is_near = np.linalg.norm(pos[i] - self._suspect[k]) <= self.rules.slack
             self._n_suspect[k] = self._n_suspect[k] + 1 if is_near and self._n_suspect[k] else 1
             self._suspect[k] = pos[i]
             if self._n_suspect[k] >= self.rules.confirm:
                 accepted[i] = True
-                self._report("relocated", self.names[k], now, f"{far[i]:.3f} m away in {self.rules.confirm} frames")
+                self._report(
+                    "relocated", self.names[k], now, f"{distance[i]:.3f} m away in {self.rules.confirm} frames"
+                )
             else:
-                self._report("jumped", self.names[k], now, f"{far[i]:.3f} m; it keeps its pose")
+                self._report("jumped", self.names[k], now, f"{distance[i]:.3f} m; it keeps its pose")
         return accepted

@@ -41,7 +41,7 @@ class Twin:
     its position follows from the parent's pose and its own measurement.
     """
 
-    what: Any = "box"
+    model: Any = "box"
     """Name of a primitive, or an MJCF file, text, spec or body, as for ``sim.scene.add``."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Settings of the primitive, such as ``{"size": (0.1, 0.1, 0.2)}``."""
@@ -127,7 +127,7 @@ class Twins(Closing):
         self._order = _parents_first(twin_by_name)
         with sim.scene.unchanged_on_error():
             self.handles: dict[str, Handle] = {
-                name: sim.scene.add(t.what, name, pos=HIDDEN_POSITION, mocap=True, **t.options)
+                name: sim.scene.add(t.model, name, pos=HIDDEN_POSITION, mocap=True, **t.options)
                 for name, t in twin_by_name.items()
             }
         self._rows = np.array([handle.rows[0] for handle in self.handles.values()], np.int32)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
-from crazysim.lab.live.sitl.measured import HALF_TURN_COSINE, ZURICH, Measurements, Origin, as_origin, frd
+from crazysim.lab.live.sitl.measured import COS_45_DEGREES, ZURICH, Measurements, Origin, as_origin, frd
 from crazysim.tables import range_between, read_numbers
 
 PORTS = (9002, 9003, 9004)
@@ -95,7 +95,7 @@ class Betaflight(FirmwareLink):
             self._start = self._start or (latitude, longitude)  # the bridge mirrors positions about the first one
             latitude, longitude = (2 * x - y for x, y in zip(self._start, (latitude, longitude), strict=True))
         else:
-            quat = HALF_TURN_COSINE * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
+            quat = COS_45_DEGREES * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
             gyro = gyro * [1, 1, -1]
         place = (longitude, latitude, altitude)
         state = (*gyro, *frd(measured.accel), *quat, *measured.gps_vel, *place, self.origin.pressure(measured.height))

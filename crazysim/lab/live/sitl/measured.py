@@ -20,7 +20,7 @@ MAX_LATITUDE = 89.0
 """Largest latitude, degrees; longitude is undefined on the tangent plane at a pole."""
 MIN_ALTITUDE, MAX_ALTITUDE = -1000.0, 11000.0
 """Limits of the origin's altitude, m: the lowest layer of the standard atmosphere, up to the tropopause."""
-HALF_TURN_COSINE = np.sqrt(0.5)
+COS_45_DEGREES = np.sqrt(0.5)
 """Cosine and sine of 45 degrees, half of a quarter turn, 1."""
 
 
@@ -121,4 +121,4 @@ def quat_ned(quat: NDArray) -> NDArray:
         quat: Attitude of the body (forward, left, up) in the world (east, north, up), xyzw. (4,)
     """
     x, y, z, w = quat
-    return HALF_TURN_COSINE * np.array([w + z, x + y, x - y, w - z])
+    return COS_45_DEGREES * np.array([w + z, x + y, x - y, w - z])

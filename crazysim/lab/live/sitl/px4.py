@@ -21,7 +21,7 @@ PORT = 4560
 FIELDS: dict[type[Sensor], int] = {IMU: 0x003F, Magnetometer: 0x01C0, Barometer: 0x1A00}
 """Bits of ``HIL_SENSOR.fields_updated`` for the fields of each sensor, without which PX4 ignores them: ``ACCEL`` with
 ``GYRO``, ``MAG`` and ``BARO`` of ``SensorSource`` in SimulatorMavlink.hpp of PX4/PX4-Autopilot."""
-START = 0.02
+STARTUP_LAG = 0.02
 """Time by which the simulation lags behind the clock until PX4 has started, s."""
 TEMPERATURE = 25.0
 """Temperature that is reported, degrees Celsius."""
@@ -128,7 +128,7 @@ class Px4(FirmwareLink):
         if self._answers:
             must_answer, patience = self._asked, timeout * self._asked
         else:
-            must_answer, patience = passed > timeout, min(max(simulated + START - passed, 0.0), timeout)
+            must_answer, patience = passed > timeout, min(max(simulated + STARTUP_LAG - passed, 0.0), timeout)
         motors = self._newest(now + patience)
         if motors is not None:
             self._answers, self._motors = True, motors
