@@ -6,12 +6,13 @@ from crazysim.startup import lazy
 
 if TYPE_CHECKING:
     from crazysim.train.config import TrainConfig
+    from crazysim.train.dagger import imitate
     from crazysim.train.evaluation import evaluate
     from crazysim.train.runs import run, run_many
     from crazysim.train.show import film, plot_episode
     from crazysim.train.training import load_policy
 
-__all__ = ["TrainConfig", "evaluate", "film", "load_policy", "plot_episode", "run", "run_many"]
+__all__ = ["TrainConfig", "evaluate", "film", "imitate", "load_policy", "plot_episode", "run", "run_many"]
 
 __getattr__ = lazy(
     __name__,
@@ -19,6 +20,7 @@ __getattr__ = lazy(
         "TrainConfig": "crazysim.train.config",
         "evaluate": "crazysim.train.evaluation",
         "film": "crazysim.train.show",
+        "imitate": "crazysim.train.dagger",
         "load_policy": "crazysim.train.training",
         "plot_episode": "crazysim.train.show",
         "run": "crazysim.train.runs",

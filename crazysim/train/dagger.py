@@ -8,9 +8,10 @@ of all iterations would not fit in memory.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -220,7 +221,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
 def imitate(
     env: Env,
     teacher: Callable[[Obs], Array],
-    config: Config | None = None,
+    config: Mapping[str, Any] | None = None,
     seed: int = 0,
     observe: Callable[[SimData], Obs] | None = None,
     on_iteration: Callable[[int, dict[str, float]], None] | None = None,
@@ -233,7 +234,7 @@ def imitate(
     Args:
         env: Environment of the student without automatic resets.
         teacher: Trained policy, or any function from the teacher's observations to actions.
-        config: Hyperparameters; None for the defaults.
+        config: Hyperparameters by name, those of ``Config``; omitted ones have their defaults.
         seed: Random seed.
         observe: Function from the true data of one world to the teacher's observations, of all worlds if the task is
             batched; None for the observations of the task.
@@ -242,12 +243,15 @@ def imitate(
     Raises:
         DivergedError: If weights or losses become non-finite.
     """
-    config = Config() if config is None else config
+    known = [field.name for field in dataclasses.fields(Config) if field.name != "teacher"]
+    if wrong := [name for name in config or {} if name not in known]:
+        raise ConfigError(f"expected hyperparameters of dagger, got {', '.join(wrong)}; use {', '.join(known)}")
+    hyperparameters = Config(**config or {})
     env = AutoReset(Guided(env, env.task.observe if observe is None else observe))
-    learner = jax.jit(functools.partial(init, env, (config,), teacher=teacher))(jax.random.key(seed)[None])
+    learner = jax.jit(functools.partial(init, env, (hyperparameters,), teacher=teacher))(jax.random.key(seed)[None])
     metrics: dict[str, Array] = {}
-    for i in range(config.iterations):
-        learner, metrics = iterate(learner, env, (config,))
+    for i in range(hyperparameters.iterations):
+        learner, metrics = iterate(learner, env, (hyperparameters,))
         if on_iteration is not None:
             numbers = jax.device_get(metrics)
             on_iteration(i + 1, {name: float(x[0]) for name, x in numbers.items() if name != "finite"})

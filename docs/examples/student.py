@@ -7,16 +7,15 @@ way to the goal, and how both have changed since the last step, and learns the t
 import tempfile
 
 import jax.numpy as jnp
+from jax import Array
 
 import crazysim.envs as envs
 from crazysim import train
-from crazysim.envs.state import Obs
-from crazysim.train import dagger
 
 SEEN = ("rot", "difference_to_goal")
 
 
-def add_changes(obs: Obs, _) -> Obs:
+def add_changes(obs: dict[str, Array], _) -> dict[str, Array]:
     """Return the last observations, and their differences from those before them."""
     pairs = {name: jnp.split(x, 2, axis=-1) for name, x in obs.items()}
     return {name: new for name, (_, new) in pairs.items()} | {
@@ -35,7 +34,7 @@ def main(iterations: int = 100) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder:
         config = {"iterations": 100}
         result = train.run("hover", folder, algorithm="apg", config=config, film=False, progress=False)
-    student = dagger.imitate(student_env(256), result.policy, dagger.Config(iterations=iterations))
+    student = train.imitate(student_env(256), result.policy, {"iterations": iterations})
     metrics = train.evaluate(student_env(1000), student)
     for name, figures in (("teacher", result.metrics), ("student", metrics)):
         print(f"{name}: success {figures['success']:.1%} of 1,000 starts, mean error {figures['error']:.4f} m")

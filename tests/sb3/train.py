@@ -1,6 +1,8 @@
-"""Stable-Baselines3 on our environments: its contract, and PPO, which must learn. Run by .ci/sb3, not by pytest."""
+"""Stable-Baselines3 on our environments: contract, PPO, which must learn, and SAC. Run by .ci/sb3, not by pytest."""
 
+import importlib.util
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -120,9 +122,23 @@ def check_training():
     assert near < 0.3
 
 
+def check_example():
+    """Check that the example with SAC runs, and that its actor as a JAX function acts like the model."""
+    path = Path(__file__).parents[2] / "docs" / "examples" / "sac.py"
+    spec = importlib.util.spec_from_file_location("example_sac", path)
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    model, metrics = example.main(30 * example.WORLDS, starts=64)
+    assert np.isfinite(metrics["reward"])
+    obs = np.random.default_rng(0).normal(size=(5, 21)).astype(np.float32)
+    expected, _ = model.predict(obs, deterministic=True)
+    np.testing.assert_allclose(example.actor_of(model)({"all": obs}), expected, atol=1e-5)
+
+
 if __name__ == "__main__":
     torch.set_num_threads(1)  # small networks: more threads only wait for each other
     check_contract()
     check_named_observations()
     check_training()
+    check_example()
     print("sb3: passed")

@@ -10,7 +10,7 @@ from crazysim import ConfigError, MotionCapture
 from crazysim.__main__ import main
 from crazysim.envs import Observe, make
 from crazysim.envs.state import flatten
-from crazysim.train import dagger
+from crazysim.train import dagger, imitate
 from crazysim.train.config import TrainConfig
 from crazysim.train.training import load_policy, train
 
@@ -28,8 +28,8 @@ def test_a_student_learns_the_actions_from_its_own_observations():
     """The rollouts begin with the teacher's flight, and the student's actions become those of the teacher."""
     env = Observe(make("hover", 64), lambda obs, _: {name: obs[name] for name in SEEN})
     rows = []
-    config = dagger.Config(iterations=60, hidden=(16,), n_steps=8)
-    student = dagger.imitate(env, steer, config, on_iteration=lambda i, metrics: rows.append((i, metrics)))
+    config = {"iterations": 60, "hidden": (16,), "n_steps": 8}
+    student = imitate(env, steer, config, on_iteration=lambda i, metrics: rows.append((i, metrics)))
     assert [i for i, _ in rows] == list(range(1, 61))
     assert rows[0][1].keys() == {"reward", "crashed", "error", "difference"}
     assert rows[-1][1]["difference"] < 0.05 < 0.2 < rows[0][1]["difference"]
@@ -92,6 +92,8 @@ def test_teachers_that_do_not_fit_are_refused(teacher, tmp_path):
         run("track", str(teacher))
     with pytest.raises(ConfigError, match="actions have the meaning of the student's"):
         run("hover", str(teacher), control="body_rate")
+    with pytest.raises(ConfigError, match="expected hyperparameters of dagger, got rate"):
+        imitate(make("hover"), steer, {"rate": 1.0})
     with pytest.raises(ConfigError, match="expected teacher as a text, got 3"):
         run("hover", 3)
     assert not (tmp_path / "run").exists()
