@@ -153,11 +153,12 @@ def _of_user(x):
 SNIPPET = """
 import jax
 import numpy as np
-from crazysim import Sim
+from crazysim import IMU, Sim
 from crazysim import functional as F
-sim = Sim(n_worlds=2, n_drones=2, control="state")
+sim = Sim(n_worlds=2, n_drones=2, control="state", plugins=[IMU()])
 sim.step()
 print(sim.mjx_data.mocap_pos.shape, sim.contacts().any(), sim.data.states.pos[0, 0])
+print(sim.plugins.observations(sim.data).keys())
 step = sim.build_step_fn()
 print(jax.grad(lambda z: step(F.state_control(sim.data, pos=z * np.eye(3)[2]), 10).states.pos[..., 2].mean())(1.0))
 print(jax.config.jax_compilation_cache_dir)
@@ -183,7 +184,7 @@ def test_a_second_process_finds_what_the_first_one_compiled_without_being_asked(
     assert first == second
     assert first.splitlines()[-1] == "None", "JAX's own configuration is left alone"
     assert n_first == n_second >= 2, "nothing is compiled again"
-    assert any(path.name.startswith("jit_sync_sim2mjx") for path in programs)
+    assert {"jit_sync_sim2mjx", "jit__observations"} <= {path.name.split("-")[0] for path in programs}
     assert sorted((tmp_path / "crazysim").rglob("*-cache")) == programs
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.cache import keep_programs
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
@@ -216,9 +217,11 @@ class PluginRegistry(Mapping[str, Plugin]):
             measured: True for observations that are calculated from the states as sensors measure them.
         """
         plugins = tuple(self.values())
-        if [*map(id, plugins)] != [*map(id, self._observing[0])]:
+        first = [*map(id, plugins)] != [*map(id, self._observing[0])]
+        if first:
             self._observing = plugins, jit_unless_traced("measured")(functools.partial(_observations, plugins))
-        return self._observing[1](data, measured=measured)
+        with keep_programs(when=first):
+            return self._observing[1](data, measured=measured)
 
     def measured_states(self, data: SimData) -> SimData:
         """Return the data of one world with the states that sensors measure in place of the true ones."""
