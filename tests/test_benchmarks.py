@@ -60,6 +60,16 @@ def test_loop_prints_the_time_of_an_iteration(run):
     assert 0 < box["shortest_s"] <= box["iteration_s"]
 
 
+@pytest.mark.long("compiles two trainings and evaluations of four airframes")
+def test_memory_prints_the_success_of_each_variant_on_other_airframes(run, tmp_path):
+    small = ["--worlds", 8, "--iterations", 1, "--starts", 8, "--seconds", 0.1, "--tasks", "hover", "--out", tmp_path]
+    lines = run("memory.py", *small, "--variants", "memoryless", "memory-privileged", "--seeds", "3:4")
+    assert [(line["variant"], line["seed"]) for line in lines] == [("memoryless", 3), ("memory-privileged", 3)]
+    assert all(line["env_steps"] == 8 * 64 for line in lines)
+    for line in lines:
+        assert all(0 <= line[drones]["success"] <= 1 for drones in ("drawn", "cf2x_L250", "cf2x_P250", "cf2x_T350"))
+
+
 def test_compile_prints_its_parts_from_a_process_of_its_own():
     """As a user runs it: the script is a program, and each case is compiled by a process that has compiled nothing."""
     command = [sys.executable, BENCHMARKS / "compile.py", *SMALL]

@@ -19,6 +19,9 @@ from crazysim.tables import read_numbers
 NAME = "environment"
 """Key of the environment's record in the plugins of its data."""
 
+PRIVILEGED = "privileged"
+"""Name of the observation that only a critic may use; see ``PrivilegedObservation``."""
+
 Obs = dict[str, Array]
 """Named observations. (n_worlds, n_drones, k) each, or (n_drones, k) in one world"""
 

@@ -8,15 +8,17 @@ if TYPE_CHECKING:
     from crazysim.train.config import TrainConfig
     from crazysim.train.dagger import imitate
     from crazysim.train.evaluation import evaluate
+    from crazysim.train.networks import Network
     from crazysim.train.runs import run, run_many
     from crazysim.train.show import film, plot_episode
     from crazysim.train.training import load_policy
 
-__all__ = ["TrainConfig", "evaluate", "film", "imitate", "load_policy", "plot_episode", "run", "run_many"]
+__all__ = ["Network", "TrainConfig", "evaluate", "film", "imitate", "load_policy", "plot_episode", "run", "run_many"]
 
 __getattr__ = lazy(
     __name__,
     {
+        "Network": "crazysim.train.networks",
         "TrainConfig": "crazysim.train.config",
         "evaluate": "crazysim.train.evaluation",
         "film": "crazysim.train.show",

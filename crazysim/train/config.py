@@ -21,6 +21,7 @@ from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.train import apg, dagger, ppo
 from crazysim.train.hyperparameters import SWEEPABLE
+from crazysim.train.networks import Network, choose_network
 
 ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg, "dagger": dagger}
 """Algorithms by name: modules with ``Config``, ``init`` and ``iterate``."""
@@ -121,6 +122,10 @@ class TrainConfig:
     """Options of ``crazysim.envs.make``."""
     config: dict[str, Any]
     """Hyperparameters of the algorithm; omitted ones have their defaults."""
+    own_network: bool = False
+    """True if the policy has a network of one's own."""
+    network: Network | None = field(default=None, compare=False)
+    """Network of one's own, of which the files of a run have the weights alone; None for the built-in one."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -133,6 +138,13 @@ class TrainConfig:
             raise ConfigError(
                 f"expected hyperparameters of {self.algorithm}, got {', '.join(wrong)}; use {', '.join(known)}"
             )
+        if self.network is not None:
+            if self.algorithm != "ppo":
+                raise ConfigError(
+                    f"expected no network of your own for {self.algorithm}, got one. Use algorithm='ppo'."
+                )
+            choose_network(self.config.get("memory", 0), self.network)
+            object.__setattr__(self, "own_network", True)
         config = dataclasses.asdict(self.algorithm_config())
         values = {
             "seed": int(self.seed),
@@ -152,6 +164,7 @@ class TrainConfig:
         options: dict[str, Any] | None = None,
         config: dict[str, Any] | None = None,
         resumed: TrainConfig | None = None,
+        network: Network | None = None,
     ) -> TrainConfig:
         """Return the configuration of a run; omitted values come from the recipe of the task.
 
@@ -163,6 +176,7 @@ class TrainConfig:
             options: Options of ``crazysim.envs.make``.
             config: Hyperparameters of the algorithm.
             resumed: Configuration of the run to continue, from which omitted values come instead; None for a new run.
+            network: Network of one's own in place of the built-in one; None for that.
         """
         entry = entry_of(task)
         known = {} if resumed is None else resumed.options
@@ -183,7 +197,8 @@ class TrainConfig:
         options, config = known | dict(options or {}), recipe.config | dict(config or {})
         if is_airframe_file(options.get("drone")):  # so that the run can be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())
-        return TrainConfig(task, recipe.algorithm, 0 if seed is None else seed, n_worlds, options, config)
+        seed = 0 if seed is None else seed
+        return TrainConfig(task, recipe.algorithm, seed, n_worlds, options, config, network=network)
 
     @property
     def title(self) -> str:

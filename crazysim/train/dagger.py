@@ -165,6 +165,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
     state = env.reset(k_env)
     obs, shown = split_obs(state.obs)
     teacher = _load_teacher(config.teacher, env, shown) if teacher is None else teacher
+    if isinstance(teacher, Policy) and teacher.has_memory:
+        raise ConfigError("expected a teacher without memory, got one with a memory. Train the teacher with memory=0.")
 
     def init_agent(k_student: Array, key: Array, obs: Array) -> Agent:
         student = init_mlp(k_student, (obs.shape[-1], *config.hidden, env.actions.size), 0.01)

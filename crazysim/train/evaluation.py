@@ -17,6 +17,7 @@ from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import Obs
 from crazysim.envs.wrappers import RewardTerms
 from crazysim.pytree import PyTree, static
+from crazysim.train.networks import Policies, Policy
 
 EVALUATION_SEED = 0x5EED
 """Seed of the held-out initial states. Keys of training are made with ``fold_in``, and never coincide with its key."""
@@ -40,6 +41,24 @@ def as_tree(policy: Callable[[Obs], Array]) -> Any:
     return policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
 
 
+def act(policy: Callable[[Obs], Array], obs: Obs, memory: Any) -> tuple[Array, Any]:
+    """Return the actions of a policy with or without memory, and its memory after the step.
+
+    Args:
+        policy: Trained policy, or any function from observations to actions.
+        obs: Observations by name. (n_worlds, n_drones, k) each
+        memory: Memory before the step, first that of ``initial_memory``.
+    """
+    return policy.act(obs, memory) if isinstance(policy, Policy | Policies) else (policy(obs), memory)
+
+
+def initial_memory(policy: Callable[[Obs], Array], env: Env) -> Any:
+    """Return the memory of a policy at the start of an episode; ``()`` for none. (n_worlds, n_drones, ...) each"""
+    if not isinstance(policy, Policy | Policies):
+        return ()
+    return policy.initial_memory(env.sim.n_worlds, env.sim.n_drones)
+
+
 @partial(jax.jit, static_argnames=("env", "n_blocks"))
 def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[str, Array]:
     """Fly one episode in every world and return its record.
@@ -61,9 +80,9 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
     env = RewardTerms(env)
     state = env.reset(jnp.broadcast_to(key, (n_blocks,)))
 
-    def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
+    def fly_step(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
         del key
-        return policy(obs), memory, ()
+        return *act(policy, obs, memory), ()
 
     def keep(transition: Transition) -> dict[str, Any]:
         state = transition.state
@@ -74,7 +93,7 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
         }
         return kept | {"reward": state.reward, "terminated": state.terminated, "succeeded": env.succeeded(state)}
 
-    _, _, kept = rollout(env, state, act, key, env.max_steps, keep)
+    _, _, kept = rollout(env, state, fly_step, key, env.max_steps, keep, initial_memory(policy, env))
     over = jnp.cumsum(kept["terminated"], axis=0) > 0
     before = jnp.concatenate([jnp.zeros_like(over[:1]), over[:-1]])
     flies = ~before[..., None]

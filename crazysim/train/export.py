@@ -1,7 +1,8 @@
 """Export of policies: an ONNX file, and a C header that includes only ``math.h``.
 
 Both take the observations of one drone, concatenated in the order of their names, and return its action in [-1, 1].
-Both contain a description of their inputs and outputs.
+Both contain a description of their inputs and outputs. A policy with memory also takes and returns its memory, which is
+zero at the start of an episode.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -21,7 +22,7 @@ from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
 from crazysim.errors import ConfigError, not_installed
 from crazysim.storage import write_file
-from crazysim.train.networks import Policy
+from crazysim.train.networks import MEMORYLESS, Gru, Policy
 
 OBSERVATIONS = {
     "pos": "position, world frame, m",
@@ -39,10 +40,29 @@ COMMANDS: dict[Control, Sequence[str]] = {
     Control.force_torque: ("collective thrust, N", "torque about x, N m", "about y, N m", "about z, N m"),
 }
 """Components of a command with their units; a rotor command is one speed per rotor, rpm."""
-HostLayers = list[tuple[np.ndarray, np.ndarray]]
-"""Weights and biases of a network."""
+GATES = ("reset", "update", "candidate")
+"""Gates of a gated recurrent unit, in the order of its weights."""
 OPSET, IR_VERSION = 17, 8
 """Versions of ONNX operators and of the file format, of 2022, so that older runtimes can read the files."""
+
+
+class Numbers(NamedTuple):
+    """Numbers of a policy, float32."""
+
+    mean: np.ndarray
+    """Mean of the observations. (n_obs,)"""
+    std: np.ndarray
+    """Standard deviation of the observations. (n_obs,)"""
+    gru: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    """Weights of the observations, (n_obs, n_memory), and of the memory, (n_memory, n_memory), and bias of each gate;
+    empty without memory."""
+    layers: list[tuple[np.ndarray, np.ndarray]]
+    """Weights and biases of the layers."""
+
+    @property
+    def n_memory(self) -> int:
+        """Size of the memory; 0 for none."""
+        return len(self.gru[0][2]) if self.gru else 0
 
 
 def describe(env: Env) -> dict[str, Any]:
@@ -67,8 +87,10 @@ def describe(env: Env) -> dict[str, Any]:
 def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     """Write a policy as ONNX: input ``observation`` (batch, n_obs), output ``action`` (batch, n_actions), float32.
 
-    The description of inputs and outputs is stored in the model's ``metadata_props`` as JSON: ``observations`` (names
-    and sizes, in order), and ``level``, ``centre``, ``scale`` and ``units`` of the actions.
+    A policy with memory also has the input ``memory`` (batch, n_memory), zero at the start of an episode, and the
+    output ``next_memory``, which is the input of the next step. The description of inputs and outputs is stored in the
+    model's ``metadata_props`` as JSON: ``observations`` (names and sizes, in order), and ``level``, ``centre``,
+    ``scale`` and ``units`` of the actions.
 
     Args:
         policy: The policy.
@@ -86,23 +108,46 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise ImportError(not_installed("ONNX files need", "onnx", "onnx")) from error
-    mean, std, layers = _numbers(policy, meta)
-    constants = {"mean": mean, "std": std, "low": np.float32(-CLIP), "high": np.float32(CLIP)}
-    nodes = [
-        helper.make_node("Sub", ["observation", "mean"], ["centred"]),
-        helper.make_node("Div", ["centred", "std"], ["scaled"]),
-        helper.make_node("Clip", ["scaled", "low", "high"], ["x0"]),
-    ]
-    for i, (weight, bias) in enumerate(layers):
+    numbers = _numbers(policy, meta)
+    constants = {"mean": numbers.mean, "std": numbers.std, "low": np.float32(-CLIP), "high": np.float32(CLIP)}
+    nodes = []
+
+    def add(operator: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
+        nodes.append(helper.make_node(operator, inputs, [output], **attributes))
+        return output
+
+    x = add("Clip", [add("Div", [add("Sub", ["observation", "mean"], "centred"), "std"], "scaled"), "low", "high"], "x")
+    if numbers.n_memory:
+        constants["one"] = np.float32(1.0)
+        for gate, (inputs, recurrent, bias) in zip(GATES, numbers.gru, strict=True):
+            constants |= {f"{gate}_inputs": inputs, f"{gate}_recurrent": recurrent, f"{gate}_bias": bias}
+            add("Gemm", [x, f"{gate}_inputs", f"{gate}_bias"], f"{gate}_x")
+            add("MatMul", ["memory", f"{gate}_recurrent"], f"{gate}_h")
+        for gate in ("reset", "update"):
+            add("Sigmoid", [add("Add", [f"{gate}_x", f"{gate}_h"], f"{gate}_sum")], gate)
+        add(
+            "Tanh",
+            [add("Add", ["candidate_x", add("Mul", ["reset", "candidate_h"], "recalled")], "c_sum")],
+            "candidate",
+        )
+        add("Mul", ["update", "memory"], "kept")
+        add("Mul", [add("Sub", ["one", "update"], "share"), "candidate"], "written")
+        add("Add", ["kept", "written"], "next_memory")
+        x = add("Concat", [x, "next_memory"], "features", axis=1)
+    for i, (weight, bias) in enumerate(numbers.layers):
         constants |= {f"weight{i}": weight, f"bias{i}": bias}
-        out = "action" if i == len(layers) - 1 else f"x{i + 1}"
-        nodes.append(helper.make_node("Gemm", [f"x{i}", f"weight{i}", f"bias{i}"], [f"sum{i}"]))
-        nodes.append(helper.make_node("Tanh", [f"sum{i}"], [out]))
+        last = i == len(numbers.layers) - 1
+        x = add("Tanh", [add("Gemm", [x, f"weight{i}", f"bias{i}"], f"sum{i}")], "action" if last else f"x{i + 1}")
+    n_memory = numbers.n_memory
+
+    def values(sizes: Mapping[str, int]) -> list[Any]:
+        return [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", n]) for name, n in sizes.items() if n]
+
     graph = helper.make_graph(
         nodes,
         "policy",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", len(mean)])],
-        [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["batch", len(layers[-1][1])])],
+        values({"observation": len(numbers.mean), "memory": n_memory}),
+        values({"action": len(numbers.layers[-1][1]), "next_memory": n_memory}),
         [numpy_helper.from_array(np.asarray(x), name) for name, x in constants.items()],
         doc_string="\n".join(_description(meta)),
     )
@@ -126,8 +171,9 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
 def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = "policy") -> Path:
     """Write a policy as a C99 header that defines ``void policy(const float observation[n], float action[k])``.
 
-    The weights are constants, so that they stay in flash memory. The function allocates nothing and calls only
-    ``tanhf``.
+    A policy with memory has the state of a drone as its first argument: ``policy_state state; policy_reset(&state);``
+    at the start of an episode, and ``policy(&state, observation, action)`` in each step. The weights are constants, so
+    that they stay in flash memory. The functions allocate nothing and call only ``tanhf``, and ``expf`` with memory.
 
     Args:
         policy: The policy.
@@ -140,7 +186,8 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ConfigError(f"expected the name of a C function, got {name!r}; use letters, digits and underscores")
-    mean, std, layers = _numbers(policy, meta)
+    numbers = _numbers(policy, meta)
+    n_obs, n_memory, n_actions = len(numbers.mean), numbers.n_memory, len(numbers.layers[-1][1])
     guard = f"CRAZYSIM_{name.upper()}_H"
     lines = [
         f"/* Policy generated by crazysim {meta.get('crazysim', crazysim.__version__)}; do not edit.",
@@ -151,26 +198,42 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
         f"#define {guard}",
         "#include <math.h>",
         "",
-        f"static const float {name}_mean[{len(mean)}] = {_array(mean)};",
-        f"static const float {name}_std[{len(std)}] = {_array(std)};",
     ]
-    for i, (weight, bias) in enumerate(layers):
-        lines.append(f"static const float {name}_weight{i}[{weight.shape[0]}][{weight.shape[1]}] = {_array(weight)};")
-        lines.append(f"static const float {name}_bias{i}[{len(bias)}] = {_array(bias)};")
-    lines += [
-        "",
-        f"static inline void {name}(const float observation[{len(mean)}], float action[{len(layers[-1][1])}])",
-    ]
-    lines += ["{", *(f"    {line}" for line in _body(name, layers)), "}", "", f"#endif /* {guard} */", ""]
+    constants = {"mean": numbers.mean, "std": numbers.std}
+    for gate, arrays in zip(GATES, numbers.gru, strict=False):
+        constants |= {f"{gate}_{kind}": x for kind, x in zip(("inputs", "recurrent", "bias"), arrays, strict=True)}
+    for i, (weight, bias) in enumerate(numbers.layers):
+        constants |= {f"weight{i}": weight, f"bias{i}": bias}
+    for constant, x in constants.items():
+        lines.append(f"static const float {name}_{constant}{''.join(f'[{n}]' for n in x.shape)} = {_array(x)};")
+    lines.append("")
+    if n_memory:
+        lines += [
+            "/* Memory of one drone between steps. */",
+            f"typedef struct {{ float memory[{n_memory}]; }} {name}_state;",
+            "",
+            "/* Call it at the start of an episode. */",
+            f"static inline void {name}_reset({name}_state *state)",
+            f"{{ for (int i = 0; i < {n_memory}; ++i) state->memory[i] = 0.0f; }}",
+            "",
+        ]
+    state = f"{name}_state *state, " if n_memory else ""
+    lines.append(f"static inline void {name}({state}const float observation[{n_obs}], float action[{n_actions}])")
+    lines += ["{", *(f"    {line}" for line in _body(name, numbers)), "}", "", f"#endif /* {guard} */", ""]
     path = Path(path)
     write_file(path, "\n".join(lines))
     return path
 
 
-def _numbers(policy: Policy, meta: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, HostLayers]:
-    """Return mean and standard deviation of the inputs, and the layers, as float32."""
-    layers = [(np.asarray(weight, np.float32), np.asarray(bias, np.float32)) for weight, bias in policy.layers]
-    mean, var = np.asarray(policy.stats.mean, np.float32), np.asarray(policy.stats.var, np.float32)
+def _numbers(policy: Policy, meta: Mapping[str, Any]) -> Numbers:
+    """Return the numbers of a policy, after checking them."""
+    if policy.network is not MEMORYLESS and not isinstance(policy.body, Gru):
+        raise ConfigError(
+            "expected a policy with the built-in network, got one with a network of your own. Export it with its "
+            "library, or with jax.export."
+        )
+    host = jax.tree.map(lambda x: np.asarray(x, np.float32), policy)
+    mean, var, layers = host.stats.mean, host.stats.var, host.layers
     n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
     if (len(mean), len(layers[-1][1])) != (n_obs, n_actions):
         raise ConfigError(
@@ -178,9 +241,13 @@ def _numbers(policy: Policy, meta: Mapping[str, Any]) -> tuple[np.ndarray, np.nd
             f"({', '.join(f'{k} {n}' for k, n in meta['observations'].items())}) to {n_actions} actions, got one from "
             f"{len(mean)} to {len(layers[-1][1])}; describe the environment that it was trained in"
         )
-    if not all(np.isfinite(x).all() for x in (mean, var, *(x for layer in layers for x in layer))):
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(host)):
         raise ConfigError("expected finite weights, got NaN or infinity; the training diverged, so train again")
-    return mean, np.sqrt(var + np.float32(EPSILON)), layers
+    gru = []
+    if isinstance(host.body, Gru):
+        arrays = (host.body.inputs, host.body.recurrent, host.body.bias)
+        gru = list(zip(*(np.split(x, len(GATES), axis=-1) for x in arrays), strict=True))
+    return Numbers(mean, np.sqrt(var + np.float32(EPSILON)), gru, layers)
 
 
 def _units(actions: Mapping[str, Any]) -> list[str]:
@@ -203,18 +270,30 @@ def _description(meta: Mapping[str, Any]) -> Iterator[str]:
         yield f"  [{i}] {unit} = {centre:.9g} + {scale:.9g} * action[{i}]"
 
 
-def _body(name: str, layers: HostLayers) -> Iterator[str]:
+def _body(name: str, numbers: Numbers) -> Iterator[str]:
     """Yield the lines of the function's body."""
-    n_obs = layers[0][0].shape[0]
-    limit = _number(CLIP)
-    yield f"float x0[{n_obs}];"
+    n_obs, n_memory, limit = len(numbers.mean), numbers.n_memory, _number(CLIP)
+    yield f"float x0[{n_obs + n_memory}];"
     yield f"for (int i = 0; i < {n_obs}; ++i) {{"
     yield f"    const float x = (observation[i] - {name}_mean[i]) / {name}_std[i];"
     yield f"    x0[i] = x < -{limit} ? -{limit} : (x > {limit} ? {limit} : x);"
     yield "}"
-    for k, (weight, _) in enumerate(layers):
+    if n_memory:
+        yield f"for (int j = 0; j < {n_memory}; ++j) {{"
+        for gate in GATES:
+            yield f"    float {gate} = {name}_{gate}_bias[j], {gate}_memory = 0.0f;"
+            yield f"    for (int i = 0; i < {n_obs}; ++i) {gate} += x0[i] * {name}_{gate}_inputs[i][j];"
+            yield f"    for (int i = 0; i < {n_memory}; ++i)"
+            yield f"        {gate}_memory += state->memory[i] * {name}_{gate}_recurrent[i][j];"
+        yield "    reset = 1.0f / (1.0f + expf(-(reset + reset_memory)));"
+        yield "    update = 1.0f / (1.0f + expf(-(update + update_memory)));"
+        yield "    candidate = tanhf(candidate + reset * candidate_memory);"
+        yield f"    x0[{n_obs} + j] = update * state->memory[j] + (1.0f - update) * candidate;"
+        yield "}"
+        yield f"for (int j = 0; j < {n_memory}; ++j) state->memory[j] = x0[{n_obs} + j];"
+    for k, (weight, _) in enumerate(numbers.layers):
         n_in, n_out = weight.shape
-        out = "action" if k == len(layers) - 1 else f"x{k + 1}"
+        out = "action" if k == len(numbers.layers) - 1 else f"x{k + 1}"
         if out != "action":
             yield f"float {out}[{n_out}];"
         yield f"for (int j = 0; j < {n_out}; ++j) {{"

@@ -22,16 +22,24 @@ LIMITS = ("max_grad_norm",)
 """Hyperparameters that are larger than 0, and may be infinite. All other numbers are finite and larger than 0."""
 
 
+COUNTS = ("memory",)
+"""Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
+CHOICES = {"critic": ("observations", "privileged", "all_drones")}
+"""Hyperparameters that are one of some words."""
+
+
 def check_hyperparameters(config: Any) -> None:
     """Check the fields of a frozen ``Config``, and convert them to Python numbers and tuples."""
     for field in dataclasses.fields(config):
         value, default = getattr(config, field.name), field.default
         if isinstance(default, tuple):
             value = _sizes(field.name, value)
+        elif field.name in CHOICES:
+            value = _choice(field.name, value, CHOICES[field.name])
         elif isinstance(default, str):
             value = _text(field.name, value)
         elif isinstance(default, int):
-            value = positive_integer(field.name, value)
+            value = (_count if field.name in COUNTS else positive_integer)(field.name, value)
         else:
             value = _number(field.name, value, default)
         object.__setattr__(config, field.name, value)
@@ -49,6 +57,20 @@ def _sizes(name: str, value: object) -> tuple[int, ...]:
             f"expected {name} as the sizes of the hidden layers, got {value!r}. Use for example [64, 64]."
         )
     return tuple(positive_integer(f"{name}[{i}]", size) for i, size in enumerate(value))
+
+
+def _count(name: str, value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
+        raise ConfigError(f"expected {name} as a whole number of at least 0, got {value!r}. Use for example 64.")
+    return int(value)
+
+
+def _choice(name: str, value: object, choices: tuple[str, ...]) -> str:
+    if value not in choices:
+        raise ConfigError(
+            f"expected {name} as one of {', '.join(choices)}, got {value!r}. Use for example {choices[0]}."
+        )
+    return str(value)
 
 
 def _number(name: str, value: Any, default: Any) -> float:

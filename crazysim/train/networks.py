@@ -1,9 +1,16 @@
-"""Multilayer perceptrons as plain arrays: a list of layers, each a weight matrix and a bias."""
+"""Networks as pure functions of weights, observations and memory.
+
+A policy and a value function are a ``Network``, which turns the normalised observations of a drone into features and
+may keep a memory between steps, and a multilayer perceptron from the features to the outputs. Without a network the
+features are the observations themselves.
+"""
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -13,7 +20,8 @@ from jax import Array
 
 from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
-from crazysim.pytree import PyTree
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, select_worlds, static
 from crazysim.train.seeds import for_each_seed, join_blocks, split_blocks
 
 Layers = list[tuple[Array, Array]]
@@ -60,22 +68,228 @@ def mlp(layers: Layers, x: Array) -> Array:
     return (x @ weight + bias).astype(dtype)
 
 
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A network from the normalised observations of one drone to features, in place of the built-in one.
+
+    Its functions are pure and written for one drone. A linear layer from the features to the actions, or to the
+    value, follows it. ``Network(init, apply)`` has no memory; its ``apply`` returns the memory that it gets, ``()``.
+    """
+
+    init: Callable[[Array, int], Any]
+    """``init(key, n_obs) -> weights``: initial weights, any tree of arrays, for a number of inputs."""
+    apply: Callable[[Any, Array, Any], tuple[Array, Any]]
+    """``apply(weights, obs, memory) -> (features, memory)``: features (n_features,) for observations (n_obs,), and the
+    memory after the step, of the structure and shapes of ``initial_memory``."""
+    initial_memory: Any = ()
+    """Memory at the start of an episode, any tree of arrays; ``()`` for none."""
+
+    @property
+    def has_memory(self) -> bool:
+        """True if the network keeps a memory between steps."""
+        return bool(jax.tree.leaves(self.initial_memory))
+
+    def start(self, *batch: int) -> Any:
+        """Return the memory at the start of an episode. (*batch, ...) each"""
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *jnp.shape(x))), self.initial_memory)
+
+
+class Gru(PyTree):
+    """Weights of a gated recurrent unit (Cho et al. 2014), for its reset gate, update gate and candidate, in order."""
+
+    inputs: Array
+    """Weights of the observations. (n_obs, 3 n_memory)"""
+    recurrent: Array
+    """Weights of the memory. (n_memory, 3 n_memory)"""
+    bias: Array
+    """Biases. (3 n_memory,)"""
+
+    def __call__(self, obs: Array, memory: Array) -> Array:
+        """Return the memory after a step. (n_memory,)"""
+        reset_x, update_x, candidate_x = jnp.split(obs @ self.inputs + self.bias, 3)
+        reset_h, update_h, candidate_h = jnp.split(memory @ self.recurrent, 3)
+        update = jax.nn.sigmoid(update_x + update_h)
+        candidate = jnp.tanh(candidate_x + jax.nn.sigmoid(reset_x + reset_h) * candidate_h)
+        return update * memory + (1.0 - update) * candidate
+
+
+MEMORYLESS = Network(lambda _key, _n_obs: (), lambda _weights, obs, memory: (obs, memory))
+"""The network without weights, whose features are the observations."""
+
+
+@functools.cache
+def gru_network(size: int) -> Network:
+    """Return the network with the memory of a gated recurrent unit; features are the observations and the memory."""
+
+    def init(key: Array, n_obs: int) -> Gru:
+        k_inputs, k_recurrent = jax.random.split(key)
+        ((inputs, bias),) = init_mlp(k_inputs, (n_obs, 3 * size), 1.0)
+        ((recurrent, _),) = init_mlp(k_recurrent, (size, 3 * size), 1.0)
+        return Gru(inputs, recurrent, bias)
+
+    def apply(gru: Gru, obs: Array, memory: Array) -> tuple[Array, Array]:
+        memory = gru(obs, memory)
+        return jnp.concatenate([obs, memory]), memory
+
+    return Network(init, apply, np.zeros(size, np.float32))
+
+
+def choose_network(memory: int, network: Network | None) -> Network:
+    """Return a network of one's own if there is one, or the built-in one.
+
+    Args:
+        memory: Size of the memory of the built-in network; 0 for none.
+        network: Network of one's own; None for the built-in one.
+
+    Raises:
+        ConfigError: If both are given.
+    """
+    if network is None:
+        return gru_network(memory) if memory else MEMORYLESS
+    if not isinstance(network, Network):
+        raise ConfigError(f"expected a Network, got {network!r}. Use crazysim.train.Network(init, apply).")
+    if memory:
+        raise ConfigError(
+            f"expected memory=0 with a network of your own, got {memory}. Give the network an initial_memory instead."
+        )
+    return network
+
+
+class Weights(PyTree):
+    """Weights of a network and of the layers after it."""
+
+    layers: Layers
+    """Layers from the features to the outputs."""
+    body: Any = ()
+    """Weights of the network; ``()`` for the one without memory."""
+
+
+def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int], last_scale: float) -> Weights:
+    """Return initial weights.
+
+    Args:
+        network: The network.
+        key: Random key.
+        n_obs: Number of inputs.
+        sizes: Sizes of the hidden layers after the network, and number of outputs.
+        last_scale: Scale of the weights of the last layer, see ``init_mlp``.
+    """
+    body = network.init(jax.random.fold_in(key, 1), n_obs)
+    result = jax.eval_shape(network.apply, body, jnp.zeros(n_obs), network.start())
+    features, memory = result if isinstance(result, tuple) and len(result) == 2 else (None, None)
+    if getattr(features, "ndim", None) != 1:
+        raise ConfigError(
+            f"expected apply(weights, obs, memory) to return features (n_features,) of one drone and the memory, got "
+            f"{result}. Return a tuple of the two."
+        )
+    expected = jax.eval_shape(network.start)
+    if jax.tree.structure(memory) != jax.tree.structure(expected) or any(
+        (x.shape, x.dtype) != (y.shape, y.dtype)
+        for x, y in zip(jax.tree.leaves(memory), jax.tree.leaves(expected), strict=True)
+    ):
+        raise ConfigError(
+            f"expected apply to return a memory like initial_memory, {expected}, got {memory}. Return the memory that "
+            f"it gets if it keeps none."
+        )
+    return Weights(init_mlp(key, (features.shape[-1], *sizes), last_scale), body)
+
+
+def forward(network: Network, weights: Weights, obs: Array, memory: Any) -> tuple[Array, Any]:
+    """Return the outputs of one step, and the memory after it.
+
+    Args:
+        network: The network.
+        weights: Its weights, and those of the layers after it.
+        obs: Normalised observations. (..., n_obs)
+        memory: Memory before the step. (..., ...) each
+    """
+    features, memory = _batched(network, weights, obs.ndim - 1)(obs, memory)
+    return mlp(weights.layers, features), memory
+
+
+def unroll(network: Network, weights: Weights, obs: Array, memory: Any, done: Array) -> Array:
+    """Return the outputs of consecutive steps, through which gradients flow back in time.
+
+    Args:
+        network: The network.
+        weights: Its weights, and those of the layers after it.
+        obs: Normalised observations. (n_steps, ..., n_obs)
+        memory: Memory before the first step. (..., ...) each
+        done: True where an episode ended with the step, after which the memory begins anew. (n_steps, ...)
+    """
+    if not network.has_memory:
+        return forward(network, weights, obs, memory)[0]
+    apply, start = _batched(network, weights, obs.ndim - 2), network.start(*done.shape[1:])
+
+    def step(memory: Any, inputs: tuple[Array, Array]) -> tuple[Any, Array]:
+        seen, over = inputs
+        features, memory = apply(seen, memory)
+        return jax.tree.map(lambda first, x: select_worlds(over, first, x), start, memory), features
+
+    _, features = jax.lax.scan(step, memory, (obs, done))
+    return mlp(weights.layers, features)
+
+
+def _batched(network: Network, weights: Weights, n_axes: int) -> Callable[[Array, Any], tuple[Array, Any]]:
+    """Return the function of a network with its weights, for observations and memory with some leading axes."""
+    fn: Any = functools.partial(network.apply, weights.body)
+    for _ in range(n_axes):
+        fn = jax.vmap(fn)
+    return fn
+
+
 def all_finite(tree: Any) -> Array:
     """Return True if every number of a pytree is finite. ()"""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))
 
 
 class Policy(PyTree):
-    """Deterministic policy: observation statistics and a network."""
+    """Deterministic policy: observation statistics and a network.
+
+    ``policy(obs)`` returns actions. A policy with memory has to be called as ``policy.act(obs, memory)``, which also
+    returns the memory for the next step; an episode begins with ``policy.initial_memory(n_worlds, n_drones)``.
+    """
 
     stats: RunningStats
     """Mean and variance with which observations are normalised."""
     layers: Any
-    """``Layers`` from normalised observations to actions before tanh."""
+    """``Layers`` from the features of the network to actions before tanh."""
+    body: Any = ()
+    """Weights of the network."""
+    network: Network = static(default=MEMORYLESS)
+    """Network from normalised observations to features."""
+
+    @property
+    def has_memory(self) -> bool:
+        """True if the policy keeps a memory between steps."""
+        return self.network.has_memory
 
     def __call__(self, obs: dict[str, Array]) -> Array:
-        """Return the action, between -1 and 1, for observations. (..., n_obs) -> (..., n_actions)"""
-        return jnp.tanh(mlp(self.layers, self.stats.normalize(flatten(obs))))
+        """Return the action, between -1 and 1, for observations. (..., n_obs) -> (..., n_actions)
+
+        Raises:
+            ConfigError: If the policy has a memory.
+        """
+        if self.has_memory:
+            raise ConfigError(
+                "expected a memory besides the observations, got none for a policy that has one. Use action, memory = "
+                "policy.act(obs, memory), and begin episodes with policy.initial_memory(n_worlds, n_drones)."
+            )
+        return self.act(obs, ())[0]
+
+    def act(self, obs: dict[str, Array], memory: Any) -> tuple[Array, Any]:
+        """Return the action, between -1 and 1, and the memory after the step.
+
+        Args:
+            obs: Observations by name. (..., k) each
+            memory: Memory before the step. (..., ...) each; ``()`` without memory
+        """
+        out, memory = forward(self.network, Weights(self.layers, self.body), self.stats.normalize(flatten(obs)), memory)
+        return jnp.tanh(out), memory
+
+    def initial_memory(self, *batch: int) -> Any:
+        """Return the memory at the start of an episode, for a batch such as (n_worlds, n_drones). (*batch, ...) each"""
+        return self.network.start(*batch)
 
 
 class Policies(PyTree):
@@ -86,5 +300,16 @@ class Policies(PyTree):
 
     def __call__(self, obs: dict[str, Array]) -> Array:
         """Return the action, between -1 and 1, for observations. (n_worlds, n_drones, n_obs) -> (..., n_actions)"""
-        blocks = split_blocks(obs, self.policies.stats.mean.shape[0])
-        return join_blocks(for_each_seed(lambda policy, obs: policy(obs), self.policies, blocks))
+        return self._for_each(lambda policy, obs: policy(obs), obs)
+
+    def act(self, obs: dict[str, Array], memory: Any) -> tuple[Array, Any]:
+        """Return the action, between -1 and 1, and the memory after the step; see ``Policy.act``."""
+        return self._for_each(Policy.act, obs, memory)
+
+    def initial_memory(self, *batch: int) -> Any:
+        """Return the memory at the start of an episode, for a batch such as (n_worlds, n_drones). (*batch, ...) each"""
+        return self.policies.initial_memory(*batch)
+
+    def _for_each(self, fn: Callable[..., Any], *args: Any) -> Any:
+        blocks = split_blocks(args, self.policies.stats.mean.shape[0])
+        return join_blocks(for_each_seed(fn, self.policies, *blocks))

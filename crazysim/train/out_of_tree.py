@@ -55,8 +55,14 @@ def to_out_of_tree(
         Paths of both files.
 
     Raises:
-        ConfigError: If the drone's state and a goal do not give all observations, or if ``freq`` does not divide 1000.
+        ConfigError: If the policy has a memory, if the drone's state and a goal do not give all observations, or if
+            ``freq`` does not divide 1000.
     """
+    if policy.has_memory:
+        raise ConfigError(
+            "expected a policy without memory, got one with a memory. Use the export as C, and keep its policy_state "
+            "in your controller."
+        )
     freq = positive_integer("freq", freq)
     if MAIN_LOOP % freq:
         raise ConfigError(

@@ -15,12 +15,21 @@ from jax import Array
 
 from crazysim.envs.env import Env
 from crazysim.envs.rollout import Transition, rollout
-from crazysim.envs.state import EnvState, Obs, flatten
+from crazysim.envs.state import PRIVILEGED, EnvState, Obs, flatten
 from crazysim.envs.statistics import EPSILON, RunningStats
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree
+from crazysim.pytree import PyTree, static
 from crazysim.train.hyperparameters import check_hyperparameters
-from crazysim.train.networks import Layers, Policy, all_finite, init_mlp, mlp
+from crazysim.train.networks import (
+    Network,
+    Policy,
+    Weights,
+    all_finite,
+    choose_network,
+    forward,
+    init_weights,
+    unroll,
+)
 from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates
 
 MAX_GROUPS = 64
@@ -41,7 +50,12 @@ class Config:
     minibatches: int = 8
     """Minibatches, and hence updates, per epoch; each contains all samples of a subset of the worlds."""
     hidden: tuple[int, ...] = (64, 64)
-    """Sizes of the hidden layers of policy and value function."""
+    """Sizes of the hidden layers of policy and value function; not used with a network of one's own."""
+    memory: int = 0
+    """Size of the memory of policy and value function, a gated recurrent unit before the hidden layers; 0 for none."""
+    critic: str = "observations"
+    """Input of the value function: ``observations``, those of the policy; ``privileged``, these and the true state and
+    parameters of the drone; ``all_drones``, the observations of all drones of the world."""
     learning_rate: float = 1e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     discount: float = 0.98
@@ -67,20 +81,31 @@ class Config:
 class Agent(PyTree):
     """Networks, optimiser and statistics of one seed; in a ``Learner`` stacked, with a leading axis over seeds."""
 
-    policy: Layers
-    """Network from normalised observations to the mean action before tanh."""
+    policy: Weights
+    """Weights from normalised observations to the mean action before tanh."""
     log_std: Array
     """Logarithm of the standard deviation of the actions. (n_actions,)"""
-    value: Layers
-    """Network from normalised observations to the normalised expected return."""
+    value: Weights
+    """Weights from the normalised inputs of the critic to the normalised expected return."""
     optimizer: optax.OptState
     """State of the optimiser."""
     stats: RunningStats
-    """Mean and variance with which observations are normalised."""
+    """Mean and variance with which observations are normalised; those of the policy come first."""
     returns: RunningStats
     """Mean and variance of returns, with which the outputs of the value network are scaled. (1,) each"""
     key: Array
     """Random key. ()"""
+    n_obs: int = static()
+    """Number of observations of the policy."""
+    network: Network = static()
+    """Network of policy and value function."""
+
+    def as_policy(self) -> Policy:
+        """Return the deterministic policy."""
+        stats = self.stats
+        if stats.mean.shape[-1] > self.n_obs:
+            stats = stats.replace(mean=stats.mean[..., : self.n_obs], var=stats.var[..., : self.n_obs])
+        return Policy(stats, self.policy.layers, self.policy.body, self.network)
 
 
 class Learner(PyTree):
@@ -90,19 +115,21 @@ class Learner(PyTree):
     """The agents of all seeds. (n_seeds, ...) each"""
     env: EnvState
     """State of the environments: a block of worlds for each seed, of equal size."""
+    memory: tuple[Any, Any]
+    """Memories of policy and value function; ``()`` each without memory. (n_worlds, n_drones, ...) each"""
     iteration: Array
     """Number of completed iterations. ()"""
 
     def as_policy(self) -> Policy:
         """Return the deterministic policies of all seeds. (n_seeds, ...) each"""
-        return Policy(self.agents.stats, self.agents.policy)
+        return self.agents.as_policy()
 
 
 class Sample(PyTree):
     """Transitions of a rollout; leading axes (n_steps, n_worlds, n_drones)."""
 
     obs: Array
-    """Normalised observations."""
+    """Normalised observations; those of the policy come first."""
     action: Array
     """Actions before clipping."""
     log_prob: Array
@@ -115,13 +142,15 @@ class Sample(PyTree):
     """True where the episode ended with the step."""
 
 
-def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
-    """Return an untrained learner; ``env`` resets automatically within the step that ends an episode.
+def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | None = None) -> Learner:
+    """Return an untrained learner of one or more seeds.
 
     Args:
-        env: Environment, with a block of worlds for each seed.
+        env: Environment that resets automatically within the step that ends an episode, with a block of worlds for
+            each seed; of ``PrivilegedObservation`` for ``critic="privileged"``.
         configs: Hyperparameters of each seed, which differ in those of ``SWEEPABLE`` at most.
         keys: Random keys of the seeds. (n_seeds,)
+        network: Network of one's own, for policy and value function; None for the built-in one.
     """
     config, n_worlds = configs[0], env.sim.n_worlds // len(configs)
     if n_worlds % config.minibatches:
@@ -130,19 +159,23 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
             f"example {math.gcd(n_worlds, 8)}."
         )
     k_policy, k_value, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 4), keys), 1, 0)
+    hidden = config.hidden if network is None else ()
+    network = choose_network(config.memory, network)
     state = env.reset(k_env)
+    n_obs = flatten({name: x for name, x in state.obs.items() if name != PRIVILEGED}).shape[-1]
 
     def init_agent(k_policy: Array, k_value: Array, key: Array, obs: Array) -> Agent:
-        n_obs, n_actions = obs.shape[-1], env.actions.size
-        policy = init_mlp(k_policy, (n_obs, *config.hidden, n_actions), 0.01)
-        value = init_mlp(k_value, (n_obs, *config.hidden, 1), 1.0)
-        log_std = jnp.full(n_actions, jnp.log(config.init_std), policy[0][0].dtype)
+        n_actions = env.actions.size
+        policy = init_weights(network, k_policy, n_obs, (*hidden, n_actions), 0.01)
+        value = init_weights(network, k_value, _critic_input(obs, config).shape[-1], (*hidden, 1), 1.0)
+        log_std = jnp.full(n_actions, jnp.log(config.init_std), policy.layers[0][0].dtype)
         optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init((policy, log_std, value))
-        stats = RunningStats.create(n_obs).update(obs)
-        return Agent(policy, log_std, value, optimizer, stats, RunningStats.create(1), key)
+        stats = RunningStats.create(obs.shape[-1]).update(obs)
+        return Agent(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, n_obs, network)
 
-    obs = split_blocks(flatten(state.obs), len(configs))
-    return Learner(for_each_seed(init_agent, k_policy, k_value, k_agent, obs), state, jnp.int32(0))
+    obs = split_blocks(_observed(state.obs, config), len(configs))
+    agents = for_each_seed(init_agent, k_policy, k_value, k_agent, obs)
+    return Learner(agents, state, _start(network, state), jnp.int32(0))
 
 
 @partial(jax.jit, static_argnames=("env", "configs"))
@@ -153,34 +186,40 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     """
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
     agents, rates = learner.agents.replace(key=key), stack_rates(configs)
-    state, samples, raw, metrics = _collect(agents, learner.env, env, configs[0], rates, k_fly)
-    last_obs = split_blocks(flatten(state.obs), len(configs))
+    state, memory, samples, raw, metrics = _collect(agents, learner, env, configs[0], rates, k_fly)
+    last = (_observed(state.obs, configs[0]), memory[1])
+    blocks = split_blocks((learner.memory, last), len(configs))
     learn = partial(_learn, config=configs[0])
-    agents, losses = for_each_seed(learn, agents, samples, raw, last_obs, rates, k_learn, axes=(0, 1, 1, 0, 0, 0))
-    return Learner(agents, state, learner.iteration + 1), metrics | losses
+    axes = (0, 1, 1, 0, 0, 0, 0)
+    agents, losses = for_each_seed(learn, agents, samples, raw, *blocks, rates, k_learn, axes=axes)
+    return Learner(agents, state, memory, learner.iteration + 1), metrics | losses
 
 
 def _collect(
-    agents: Agent, state: EnvState, env: Env, config: Config, rates: Rates, keys: Array
-) -> tuple[EnvState, Sample, Array, dict[str, Array]]:
-    """Return the state after a rollout of all seeds, its samples, its observations before normalisation, and metrics.
+    agents: Agent, learner: Learner, env: Env, config: Config, rates: Rates, keys: Array
+) -> tuple[EnvState, tuple[Any, Any], Sample, Array, dict[str, Array]]:
+    """Return state and memories after a rollout of all seeds, samples, observations before normalisation, and metrics.
 
     Samples and observations have leading axes (n_steps, n_seeds, n_worlds, n_drones), metrics (n_seeds,).
     """
     split = partial(split_blocks, n_seeds=keys.shape[0])
 
-    def act(agent: Agent, raw: Array, key: Array) -> tuple[Array, Any]:
+    def act(agent: Agent, raw: Array, memory: Any, key: Array) -> tuple[Array, Any, Any]:
         seen = agent.stats.normalize(raw)
-        mean, value = _mean_action(agent.policy, seen), _value(agent, seen)
+        out, policy_memory = forward(agent.network, agent.policy, seen[..., : agent.n_obs], memory[0])
+        value, value_memory = _value(agent, seen, memory[1], config)
+        mean = jnp.tanh(out)
         action = mean + jnp.exp(agent.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
-        return action, (raw, seen, value, _log_prob(mean, agent.log_std, action))
+        log_prob = _log_prob(mean, agent.log_std, action)
+        return action, (policy_memory, value_memory), (raw, seen, value, log_prob, value_memory)
 
     def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:
-        action, extras = for_each_seed(act, agents, split(flatten(obs)), keys)
-        return join_blocks(action), memory, (action, *extras)
+        raw, memory = split((_observed(obs, config), memory))
+        action, memory, extras = for_each_seed(act, agents, raw, memory, keys)
+        return join_blocks(action), join_blocks(memory), (action, *extras)
 
     def keep(transition: Transition) -> tuple[Sample, Array, Any]:
-        action, raw, seen, value, log_prob = transition.extras
+        action, raw, seen, value, log_prob, memory = transition.extras
         reward, over, truncated, terminated, error = split(
             (
                 transition.reward,
@@ -191,10 +230,10 @@ def _collect(
             )
         )
 
-        def final_value(agent: Agent, raw: Array) -> Array:
-            return _value(agent, agent.stats.normalize(raw))
+        def final_value(agent: Agent, raw: Array, memory: Any) -> Array:
+            return _value(agent, agent.stats.normalize(raw), memory, config)[0]
 
-        final = for_each_seed(final_value, agents, split(flatten(transition.final_obs)))
+        final = for_each_seed(final_value, agents, split(_observed(transition.final_obs, config)), memory)
         discount = rates["discount"][:, None, None]
         sample = Sample(
             seen,
@@ -206,18 +245,21 @@ def _collect(
         )
         return sample, raw, (reward.mean(axis=(1, 2)), terminated, error.mean(axis=(1, 2)))
 
-    state, _, (samples, raw, (reward, crashed, error)) = rollout(env, state, policy, keys, config.n_steps, keep)
+    start = _start(agents.network, learner.env)
+    state, memory, (samples, raw, (reward, crashed, error)) = rollout(
+        env, learner.env, policy, keys, config.n_steps, keep, start, learner.memory
+    )
     over = samples.done.any(axis=-1)
     metrics = {
         "reward": reward.mean(axis=0),
         "crashed": crashed.sum(axis=(0, 2)) / jnp.maximum(over.sum(axis=(0, 2)), 1),
         "error": error.mean(axis=0),
     }
-    return state, samples, raw, metrics
+    return state, memory, samples, raw, metrics
 
 
 def _learn(
-    agent: Agent, samples: Sample, raw: Array, last_obs: Array, rates: Rates, key: Array, config: Config
+    agent: Agent, samples: Sample, raw: Array, memory: Any, last: Any, rates: Rates, key: Array, config: Config
 ) -> tuple[Agent, dict[str, Array]]:
     """Return the agent of one seed after the updates on its rollout, and metrics.
 
@@ -225,22 +267,24 @@ def _learn(
         agent: The agent before.
         samples: Its samples. (n_steps, n_worlds, n_drones, ...) each
         raw: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
-        last_obs: Observations after the rollout. (n_worlds, n_drones, n_obs)
+        memory: Memories of policy and value function before the rollout. (n_worlds, n_drones, ...) each
+        last: Observations, (n_worlds, n_drones, n_obs), and memory of the value function, after the rollout.
         rates: Hyperparameters of the seed. () each
         key: Random key.
         config: Hyperparameters of all seeds; those in ``rates`` count.
     """
-    last = _value(agent, agent.stats.normalize(last_obs))
-    advantages, targets = _advantages(samples, last, rates)
+    last_obs, last_memory = last
+    last_value, _ = _value(agent, agent.stats.normalize(last_obs), last_memory, config)
+    advantages, targets = _advantages(samples, last_value, rates)
     returns = agent.returns.update(targets[..., None])
     targets = (targets - returns.mean) / _scale(returns)
     parameters = (agent.policy, agent.log_std, _rescale_value(agent.value, agent.returns, returns))
-    data = (samples.obs, samples.action, samples.log_prob, advantages, targets)
-    parameters, optimizer, losses = _update(parameters, agent.optimizer, data, rates, key, config)
+    data = (samples, advantages, targets)
+    parameters, optimizer, losses = _update(agent, parameters, data, memory, rates, key, config)
     policy, log_std, value = parameters
     stats = agent.stats.update(raw)
     finite = all_finite((parameters, optimizer, stats, returns, losses))
-    agent = Agent(policy, log_std, value, optimizer, stats, returns, agent.key)
+    agent = Agent(policy, log_std, value, optimizer, stats, returns, agent.key, agent.n_obs, agent.network)
     return agent, losses | {"std": jnp.exp(log_std).mean(), "finite": finite}
 
 
@@ -260,31 +304,39 @@ def _advantages(samples: Sample, last: Array, rates: Rates) -> tuple[Array, Arra
 
 
 def _update(
-    parameters: Any, optimizer: Any, data: Any, rates: Rates, key: Array, config: Config
+    agent: Agent, parameters: Any, data: Any, memory: Any, rates: Rates, key: Array, config: Config
 ) -> tuple[Any, Any, dict[str, Array]]:
     """Return parameters, optimiser state and mean losses after all epochs on the samples of one seed."""
-    n_worlds = data[0].shape[1]
+    n_worlds, network, n_obs = data[1].shape[1], agent.network, agent.n_obs
     n_groups = math.gcd(n_worlds // config.minibatches, MAX_GROUPS)
     transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
 
     def samples_of(worlds: Array) -> Any:
-        """Return the samples of some worlds, by their indices in each group. (n_steps, n_groups, k, n_drones, ...) each
+        """Return the samples of some worlds, by their indices in each group, and the memories before them.
 
         Args:
             worlds: Indices. (n_groups, k)
+
+        Returns:
+            Samples, (n_steps, n_groups, k, n_drones, ...) each, and memories, (n_groups, k, n_drones, ...) each.
         """
         take = jax.vmap(lambda x, worlds: x[:, worlds], (1, 0), 1)
-        return jax.tree.map(lambda x: take(x.reshape(x.shape[0], n_groups, -1, *x.shape[2:]), worlds), data)
+
+        def taken(x: Array) -> Array:
+            return take(x.reshape(x.shape[0], n_groups, -1, *x.shape[2:]), worlds)
+
+        return *jax.tree.map(taken, data), jax.tree.map(lambda x: taken(x[None])[0], memory)
 
     def loss(parameters: Any, batch: Any) -> tuple[Array, dict[str, Array]]:
         policy, log_std, value = parameters
-        obs, action, log_prob, advantage, target = batch
-        mean = _mean_action(policy, obs)
-        ratio = jnp.exp(_log_prob(mean, log_std, action) - log_prob)
+        sample, advantage, target, (policy_memory, value_memory) = batch
+        mean = jnp.tanh(unroll(network, policy, sample.obs[..., :n_obs], policy_memory, sample.done))
+        values = unroll(network, value, _critic_input(sample.obs, config), value_memory, sample.done)[..., 0]
+        ratio = jnp.exp(_log_prob(mean, log_std, sample.action) - sample.log_prob)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
         clipped = jnp.clip(ratio, 1 - rates["clip"], 1 + rates["clip"])
         gain = jnp.minimum(ratio * advantage, clipped * advantage).mean()
-        error = 0.5 * jnp.square(mlp(value, obs)[..., 0] - target).mean()
+        error = 0.5 * jnp.square(values - target).mean()
         total = -gain + rates["value_weight"] * error - rates["entropy"] * log_std.sum()
         return total, {"value_error": error, "ratio_off": jnp.abs(ratio - 1).mean()}
 
@@ -300,7 +352,7 @@ def _update(
         minibatches = jnp.moveaxis(orders.reshape(n_groups, config.minibatches, -1), 1, 0)
         return jax.lax.scan(lambda carry, worlds: update(carry, samples_of(worlds)), carry, minibatches)
 
-    carry, losses = jax.lax.scan(epoch, (parameters, optimizer), jax.random.split(key, config.epochs))
+    carry, losses = jax.lax.scan(epoch, (parameters, agent.optimizer), jax.random.split(key, config.epochs))
     return *carry, jax.tree.map(jnp.mean, losses)
 
 
@@ -310,14 +362,41 @@ def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(schedule))
 
 
-def _mean_action(policy: Layers, obs: Array) -> Array:
-    """Return the mean action for normalised observations. (..., n_obs) -> (..., n_actions)"""
-    return jnp.tanh(mlp(policy, obs))
+def _observed(obs: Obs, config: Config) -> Array:
+    """Return the observations of the policy, and after them what only the critic may use. (..., k)"""
+    if config.critic != "privileged":
+        return flatten(obs)
+    if PRIVILEGED not in obs:
+        raise ConfigError(
+            f"expected the observation {PRIVILEGED!r} for critic='privileged', got {', '.join(obs)}. Use "
+            f"AutoReset(PrivilegedObservation(env))."
+        )
+    rest = {name: x for name, x in obs.items() if name != PRIVILEGED}
+    return jnp.concatenate([flatten(rest), obs[PRIVILEGED]], axis=-1)
 
 
-def _value(agent: Agent, obs: Array) -> Array:
-    """Return the expected return for normalised observations. (..., n_obs) -> (...)"""
-    return mlp(agent.value, obs)[..., 0] * _scale(agent.returns) + agent.returns.mean
+def _critic_input(obs: Array, config: Config) -> Array:
+    """Return the inputs of the value function: the drone's own, then with ``all_drones`` those of the next drones.
+
+    Args:
+        obs: Result of ``_observed``, normalised or not. (..., n_drones, k)
+        config: Hyperparameters.
+    """
+    if config.critic != "all_drones":
+        return obs
+    return jnp.concatenate([jnp.roll(obs, -i, axis=-2) for i in range(obs.shape[-2])], axis=-1)
+
+
+def _start(network: Network, state: EnvState) -> tuple[Any, Any]:
+    """Return the memories of policy and value function at the start of an episode. (n_worlds, n_drones, ...) each"""
+    batch = state.reward.shape
+    return network.start(*batch), network.start(*batch)
+
+
+def _value(agent: Agent, obs: Array, memory: Any, config: Config) -> tuple[Array, Any]:
+    """Return the expected return for normalised observations, and the memory after the step. (..., k) -> (...)"""
+    out, memory = forward(agent.network, agent.value, _critic_input(obs, config), memory)
+    return out[..., 0] * _scale(agent.returns) + agent.returns.mean, memory
 
 
 def _scale(returns: RunningStats) -> Array:
@@ -325,11 +404,11 @@ def _scale(returns: RunningStats) -> Array:
     return jnp.sqrt(returns.var + EPSILON)
 
 
-def _rescale_value(layers: Layers, old: RunningStats, new: RunningStats) -> Layers:
+def _rescale_value(weights: Weights, old: RunningStats, new: RunningStats) -> Weights:
     """Return the value network with outputs that, scaled by the new statistics, equal those scaled by the old ones."""
-    *hidden, (weight, bias) = layers
+    *hidden, (weight, bias) = weights.layers
     ratio = _scale(old) / _scale(new)
-    return [*hidden, (weight * ratio, bias * ratio + (old.mean - new.mean) / _scale(new))]
+    return weights.replace(layers=[*hidden, (weight * ratio, bias * ratio + (old.mean - new.mean) / _scale(new))])
 
 
 def _log_prob(mean: Array, log_std: Array, action: Array) -> Array:

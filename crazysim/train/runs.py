@@ -15,7 +15,7 @@ from crazysim.train.show import film as film_policy
 from crazysim.train.show import plot_curve, plot_episode, plot_spread, read_curve
 from crazysim.train.training import CHECKPOINT, CURVE, POLICY, TABLE, TrainResult, stored_configs, train, train_many
 
-SETTINGS = ("algorithm", "seed", "n_worlds", "options", "config")
+SETTINGS = ("algorithm", "seed", "n_worlds", "options", "config", "network")
 """Settings of ``TrainConfig.create`` that ``run`` takes."""
 
 
@@ -51,7 +51,8 @@ def run(
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
             names of metrics of an evaluation after it begin with ``"evaluation "``. Each call waits for the device.
             None for none.
-        settings: ``algorithm``, ``seed``, ``n_worlds``, ``options`` and ``config`` of ``TrainConfig.create``.
+        settings: ``algorithm``, ``seed``, ``n_worlds``, ``options``, ``config`` and ``network`` of
+            ``TrainConfig.create``.
 
     Raises:
         ConfigError: If the folder holds a run and ``resume`` is False, or the run has other settings than those that

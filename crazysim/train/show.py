@@ -19,7 +19,7 @@ from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points
 from crazysim.storage import reading, write_figure
-from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, as_tree, fly_episodes
+from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, act, as_tree, fly_episodes, initial_memory
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE
 
@@ -210,8 +210,13 @@ def film(
             draw_points(sim, at, TARGET_COLOR, max(TARGET_SIZE, 0.02 * float(away)))
 
     targets, subjects = jax.jit(env.target), jax.jit(env.subjects)
-    step = jax.jit(lambda state: env.step(state, policy(state.obs)))
-    state = jax.jit(env.reset)(jax.random.key(seed))
+
+    @jax.jit
+    def step(state: EnvState, memory: Any) -> tuple[EnvState, Any]:
+        action, memory = act(policy, state.obs, memory)
+        return env.step(state, action), memory
+
+    state, memory = jax.jit(env.reset)(jax.random.key(seed)), initial_memory(policy, env)
     shown = min(worlds, sim.n_worlds)
     camera = dict(env.task.camera(sim.n_drones) or {"elevation": -20})
     rows, columns = View(worlds=range(shown)).grid
@@ -233,5 +238,5 @@ def film(
             if i % skip == 0:
                 sim.data = state.data
                 recording.add(sim)
-            state = step(state)
+            state, memory = step(state, memory)
         return recording.n_frames

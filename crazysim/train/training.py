@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import itertools
 import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from crazysim.envs.references import code_digest, is_reference, split_reference
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import require_finite_start
-from crazysim.envs.wrappers import AutoReset
+from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
 from crazysim.errors import ConfigError, DivergedError
 from crazysim.progress import progress_bar
 from crazysim.storage import replacing
@@ -39,7 +39,7 @@ from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainCo
 from crazysim.train.evaluation import evaluate_blocks, outcome
 from crazysim.train.export import describe
 from crazysim.train.hyperparameters import SWEEPABLE
-from crazysim.train.networks import Policies, Policy
+from crazysim.train.networks import Network, Policies, Policy, choose_network, init_weights
 from crazysim.train.seeds import seed_of
 
 CHECKPOINT, POLICY, CURVE, TABLE = "checkpoint.npz", "policy.npz", "curve.json", "seeds.json"
@@ -147,12 +147,14 @@ def train_many(
     hyperparameters = tuple([training.config.algorithm_config() for training in trainings])
     n_iterations, n_steps = hyperparameters[0].iterations, hyperparameters[0].n_steps
     base = config.make_env(n * config.n_worlds, **config.practice_options())
-    guided = dagger.with_teacher(base, hyperparameters[0]) if algorithm is dagger else base
-    env = base if algorithm is apg else AutoReset(guided)
+    wrapped = dagger.with_teacher(base, hyperparameters[0]) if algorithm is dagger else base
+    wrapped = PrivilegedObservation(base) if config.config.get("critic") == "privileged" else wrapped
+    env = base if algorithm is apg else AutoReset(wrapped)
     eval_env = config.make_env(n * evaluation_worlds)
     check_key = jax.random.key(CHECK_SEED)
     keys = jnp.stack([jax.random.fold_in(jax.random.key(training.config.seed), 1) for training in trainings])
-    init = jax.jit(algorithm.init, static_argnums=(0, 1))
+    begin = algorithm.init if config.network is None else partial(algorithm.init, network=config.network)
+    init = jax.jit(begin, static_argnums=(0, 1))
     shapes = init.eval_shape(env, hyperparameters, keys)
     policy_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
     kept_shapes = [jax.eval_shape(lambda policies: seed_of(policies, 0), policy_shapes)] * n
@@ -403,7 +405,9 @@ def _attach_device(shapes: Learner, device: jax.Device) -> Learner:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes)
 
 
-def load_policy(folder: str | Path, task: str | None = None) -> tuple[Policy, TrainConfig, dict[str, Any]]:
+def load_policy(
+    folder: str | Path, task: str | None = None, network: Network | None = None
+) -> tuple[Policy, TrainConfig, dict[str, Any]]:
     """Return the policy of a run, its configuration, and the description of its inputs and outputs.
 
     Args:
@@ -411,9 +415,10 @@ def load_policy(folder: str | Path, task: str | None = None) -> tuple[Policy, Tr
         task: Reference of the task's class, ``FILE.py:NAME`` or ``MODULE:NAME``, if it has moved since the training, or
             if this user has not named it on this machine before; its code is executed. None for the reference in the
             run, which ``config.make_env`` only loads if this user has named it before.
+        network: Network of one's own with which the policy was trained; None for the built-in one.
 
     Raises:
-        ConfigError: If the folder holds no policy that this version can read.
+        ConfigError: If the folder holds no policy that this version can read, or one of another network.
     """
     path = Path(folder) / POLICY
     arrays, meta = checkpoint.read(path)
@@ -422,18 +427,25 @@ def load_policy(folder: str | Path, task: str | None = None) -> tuple[Policy, Tr
         if task is not None:
             config = dataclasses.replace(config, task=TrainConfig.create(task).task)
         n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
-    sizes = (n_obs, *config.config["hidden"], n_actions)
-    dtype = jnp.zeros(()).dtype
-    layers = [
-        (jax.ShapeDtypeStruct((a, b), dtype), jax.ShapeDtypeStruct((b,), dtype)) for a, b in itertools.pairwise(sizes)
-    ]
-    stats = jax.eval_shape(lambda: RunningStats.create(n_obs))
-    return checkpoint.restore(path, arrays, Policy(stats, layers)), config, meta
+    if config.own_network != (network is not None):
+        expected = "the network of your own" if config.own_network else "no network besides the built-in one"
+        raise ConfigError(
+            f"expected {expected} with which {path} was trained, got {network}. Use crazysim.train.load_policy(folder, "
+            f"network={'network' if config.own_network else None})."
+        )
+    used = choose_network(config.config.get("memory", 0), network)
+    hidden = () if config.own_network else config.config["hidden"]
+
+    def outline() -> Policy:
+        weights = init_weights(used, jax.random.key(0), n_obs, (*hidden, n_actions), 1.0)
+        return Policy(RunningStats.create(n_obs), weights.layers, weights.body, used)
+
+    return checkpoint.restore(path, arrays, jax.eval_shape(outline)), config, meta
 
 
 def _meta(config: TrainConfig) -> dict[str, Any]:
     """Return the metadata of the files of a run."""
-    settings = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    settings = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name != "network"}
     meta = {"crazysim": crazysim.__version__, "settings": settings, "code": code_digest(config.task)}
     try:
         return json.loads(json.dumps(meta))

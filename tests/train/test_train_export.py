@@ -15,7 +15,7 @@ from crazysim import ConfigError
 from crazysim.envs import make
 from crazysim.envs.statistics import RunningStats
 from crazysim.train.export import describe, to_c, to_onnx
-from crazysim.train.networks import Policy, init_mlp
+from crazysim.train.networks import Policy, gru_network, init_mlp, init_weights
 
 FLAGS = ("-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 
@@ -52,6 +52,30 @@ def flights(meta, policy):
     return x, actions
 
 
+def remembering(policy, size):
+    """Return a policy with memory, and the statistics of another one."""
+    network = gru_network(size)
+    weights = init_weights(network, jax.random.key(2), len(policy.stats.mean), (16, 4), 1.0)
+    body = weights.body.replace(bias=jax.random.normal(jax.random.key(3), weights.body.bias.shape))
+    return Policy(policy.stats, weights.layers, body, network)
+
+
+@pytest.fixture(scope="module")
+def episodes(policy, flights):
+    """Return a policy with memory, observations of 25 steps of 20 drones, where memories begin anew, and actions."""
+    policy, obs = remembering(policy, 9), flights[0].reshape(25, 20, -1)
+    reset = np.random.default_rng(4).uniform(size=(25, 20)) < 0.1
+    seen, memory, actions = jnp.asarray(obs), policy.initial_memory(20), []
+    act = jax.jit(policy.act)
+    for t in range(25):
+        memory = jnp.where(reset[t][:, None], 0.0, memory)
+        action, memory = act({"all": seen[t]}, memory)
+        actions.append(np.asarray(action))
+    lost = act({"all": seen[-1]}, policy.initial_memory(20))[0]
+    assert np.abs(lost - actions[-1]).max() > 0.05, "memories matter"
+    return policy, obs, reset, np.stack(actions), np.asarray(memory)
+
+
 def compiled(path, folder, name="policy"):
     """Return the function of a header, compiled by the C compiler."""
     source, library = folder / "use.c", folder / "use.so"
@@ -77,6 +101,54 @@ def test_c_gives_the_actions_of_jax(tmp_path, policy, meta, flights):
     obs, actions = flights
     path = to_c(policy, tmp_path / "policy.h", meta)
     np.testing.assert_allclose(compiled(path, tmp_path)(obs), actions, atol=5e-6)
+
+
+def test_c_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta, episodes):
+    policy, obs, reset, actions, memory = episodes
+    path = to_c(policy, tmp_path / "hover.h", meta, name="hover")
+    source, library = tmp_path / "use.c", tmp_path / "use.so"
+    source.write_text(
+        f'#include "{path}"\nvoid reset(hover_state *state);\n'
+        f"void step(hover_state *state, const float *obs, float *action);\n"
+        f"void reset(hover_state *state) {{ hover_reset(state); }}\n"
+        f"void step(hover_state *state, const float *obs, float *action) {{ hover(state, obs, action); }}\n"
+    )
+    cc = shutil.which("cc") or shutil.which("gcc") or "cc"
+    subprocess.run([cc, "-std=c99", *FLAGS, "-shared", "-fPIC", source, "-o", library, "-lm"], check=True)
+    code, states = ctypes.CDLL(str(library)), np.full((20, 9), np.nan, np.float32)
+
+    def pointer(x):
+        return x.ctypes.data_as(ctypes.POINTER(ctypes.c_float))
+
+    for t, drone in np.ndindex(25, 20):
+        if t == 0 or reset[t, drone]:
+            code.reset(pointer(states[drone]))
+        action = np.empty(4, np.float32)
+        code.step(pointer(states[drone]), pointer(np.ascontiguousarray(obs[t, drone])), pointer(action))
+        np.testing.assert_allclose(action, actions[t, drone], atol=2e-5)
+    np.testing.assert_allclose(states, memory, atol=2e-5)
+    both = tmp_path / "both.cpp"
+    both.write_text(f'#include "{path}"\nvoid fly(hover_state *s, const float *x, float *a) {{ hover(s, x, a); }}\n'
+                    "void begin(hover_state *s) { hover_reset(s); }\n")  # fmt: skip
+    subprocess.run(["g++", "-std=c++11", *FLAGS, "-fsyntax-only", both], check=True)
+
+
+def test_onnx_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta, episodes):
+    runtime = pytest.importorskip("onnxruntime")
+    policy, obs, reset, actions, last = episodes
+    path = to_onnx(policy, tmp_path / "policy.onnx", meta)
+    session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    assert [(x.name, x.shape) for x in session.get_inputs()] == [
+        ("observation", ["batch", 21]),
+        ("memory", ["batch", 9]),
+    ]
+    assert [x.name for x in session.get_outputs()] == ["action", "next_memory"]
+    memory = np.zeros((20, 9), np.float32)
+    for t in range(25):
+        memory[reset[t]] = 0.0
+        action, memory = session.run(None, {"observation": obs[t], "memory": memory})
+        np.testing.assert_allclose(action, actions[t], atol=2e-5)
+    np.testing.assert_allclose(memory, last, atol=2e-5)
 
 
 def test_the_function_may_have_another_name_and_the_header_compiles_as_cpp(tmp_path, policy, meta, flights):

@@ -343,6 +343,12 @@ INVALID = {
     "iterations": ({"iterations": -1}, "iterations is -1; it must be"),
     "hidden": ({"hidden": [0]}, r"hidden\[0\] is 0; it must be"),
     "hidden number": ({"hidden": 64}, r"expected hidden as the sizes .*, got 64. Use for example \[64, 64\]"),
+    "memory": ({"memory": -1}, "expected memory as a whole number of at least 0, got -1. Use for example 64"),
+    "memory of a fraction": ({"memory": 0.5}, "expected memory as a whole number of at least 0, got 0.5"),
+    "critic": (
+        {"critic": "all"},
+        "expected critic as one of observations, privileged, all_drones, got 'all'. Use for example observations",
+    ),
     "discount": ({"discount": 1.01}, "expected discount as a number from 0 to 1, got 1.01"),
     "value_weight": ({"value_weight": -1}, "expected value_weight as a finite number of at least 0, got -1"),
     "max_grad_norm": ({"max_grad_norm": 0}, "expected max_grad_norm as a number larger than 0, got 0"),
@@ -470,15 +476,13 @@ def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
     config = ppo.Config(n_steps=4, minibatches=4, discount=0.5, hidden=(8,))
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     collect = jax.jit(ppo._collect, static_argnums=(2, 3))
-    _, samples, _, _ = collect(
-        learner.agents, learner.env, env, config, stack_rates((config,)), jax.random.key(1)[None]
-    )
+    _, _, samples, _, _ = collect(learner.agents, learner, env, config, stack_rates((config,)), jax.random.key(1)[None])
     agent = seed_of(learner.agents, 0)
     state, step = learner.env, jax.jit(env.step)
     n_truncated = 0
     for k in range(4):
         state = step(state, samples.action[k, 0])
-        value = ppo._value(agent, agent.stats.normalize(flatten(state.info["final_obs"])))
+        value, _ = ppo._value(agent, agent.stats.normalize(flatten(state.info["final_obs"])), (), config)
         truncated = np.asarray(state.truncated & ~state.terminated)[:, None]
         n_truncated += truncated.sum()
         np.testing.assert_allclose(samples.reward[k, 0], state.reward + 0.5 * truncated * value, atol=1e-5)
@@ -493,11 +497,11 @@ def test_values_stay_when_the_returns_that_scale_them_change(rng):
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     agent = seed_of(learner.agents, 0)
     obs = jnp.asarray(rng.normal(size=(5, agent.stats.mean.shape[0])), jnp.float32)
-    before = ppo._value(agent, obs)
+    before = ppo._value(agent, obs, (), config)[0]
     returns = agent.returns.update(jnp.asarray(rng.normal(30.0, 7.0, (1000, 1)), jnp.float32))
     after = agent.replace(value=ppo._rescale_value(agent.value, agent.returns, returns), returns=returns)
-    np.testing.assert_allclose(ppo._value(after, obs), before, atol=30 * 1e-6)
-    assert np.abs(ppo._value(agent.replace(returns=returns), obs) - before).min() > 1
+    np.testing.assert_allclose(ppo._value(after, obs, (), config)[0], before, atol=30 * 1e-6)
+    assert np.abs(ppo._value(agent.replace(returns=returns), obs, (), config)[0] - before).min() > 1
     np.testing.assert_allclose(ppo._scale(returns), 7.0, rtol=0.1)
 
 

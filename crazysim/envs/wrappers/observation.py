@@ -6,17 +6,21 @@ from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.core.plugin import Plugin
 from crazysim.core.random import normal, world_key
 from crazysim.core.settings import positive_integer
+from crazysim.core.stage import vmap_drones
 from crazysim.envs.env import Env
-from crazysim.envs.state import EnvState, Obs
+from crazysim.envs.state import PRIVILEGED, EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
+from crazysim.envs.tasks.goals import state_of
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.errors import ConfigError, short_repr
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, scopes
 from crazysim.tables import NOT_NEGATIVE, read_number
 
 
@@ -35,6 +39,33 @@ class Observe(Wrapper):
 
     def after_step(self, state: EnvState) -> EnvState:
         return state.replace(obs=self.fn(state.obs, state.data))
+
+
+class PrivilegedObservation(Observe):
+    """Add ``obs["privileged"]``, which a critic may use in training and a policy may not: true state and parameters.
+
+    It has, for every drone: attitude (rotation matrix), angular velocity, position and velocity, rotor speeds, the
+    parameters that are one per drone, as parts of the airframe's largest entry, and the observations of plugins that
+    change the dynamics, such as the factors that ``Randomize`` has drawn and the charge of a ``Battery``.
+    """
+
+    def __init__(self, env: Env):
+        super().__init__(env, self._add_privileged)
+        scales = jax.tree.map(lambda x: np.abs(x).max(), env.sim.default_data.params)
+        self._scales = [float(x) or 1.0 for x in jax.tree.leaves(scales)]
+        plugins = env.sim.plugins.values()
+        self._plugins = [plugin for plugin in plugins if type(plugin).influence is not Plugin.influence]
+
+    def _add_privileged(self, obs: Obs, data: SimData) -> Obs:
+        if PRIVILEGED in obs:
+            raise ConfigError(
+                f"expected observations without {PRIVILEGED!r}, got {', '.join(obs)}. Give it another name in the task."
+            )
+        params = zip(jax.tree.leaves(data.params), jax.tree.leaves(scopes(data.params)), self._scales, strict=True)
+        own = [(x / scale).reshape(len(x), -1) for x, scope, scale in params if scope == "drone"]
+        effects = vmap_drones(lambda drone: [plugin.observations(drone) for plugin in self._plugins])(data)
+        parts = [flatten(state_of(data)), data.states.rotor_vel, *own, *jax.tree.leaves(effects)]
+        return obs | {PRIVILEGED: jnp.concatenate(parts, axis=-1)}
 
 
 class ObservationNoise(Wrapper):

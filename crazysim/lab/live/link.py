@@ -102,6 +102,7 @@ class TrainedPolicy:
     """A trained policy as a function of the state of a drone, for ``fly_policy``.
 
     ``crazysim.train.load_policy`` returns the policy and its ``meta``, whose actions name the level of its commands.
+    The memory of a policy that has one is kept between calls; ``reset`` begins a new flight.
     """
 
     def __init__(
@@ -115,6 +116,7 @@ class TrainedPolicy:
             goal: Position to fly to, m. (3,)
         """
         self.policy, self.goal = policy, np.asarray(goal, float)
+        self.reset()
         self._names = list(meta["observations"])
         self._centre, self._scale = (np.asarray(meta["actions"][key], float) for key in ("centre", "scale"))
         unknown = sorted(set(self._names) - set(self._observations(_at_rest())))
@@ -123,11 +125,20 @@ class TrainedPolicy:
                 f"expected observations of a drone's state, got {', '.join(unknown)}. Use a policy without them."
             )
 
+    def reset(self) -> None:
+        """Begin a new flight, with the initial memory of a policy that has one."""
+        has_memory = getattr(self.policy, "has_memory", False)
+        self._memory: Any = self.policy.initial_memory() if has_memory else None  # type: ignore[attr-defined]
+
     def __call__(self, state: DroneState) -> NDArray:
         """Return the command for a state. (k,)"""
-        obs = self._observations(state)
-        action = np.asarray(self.policy({name: obs[name].astype(np.float32) for name in self._names}), float)
-        return self._centre + self._scale * np.clip(action, -1.0, 1.0)
+        known = self._observations(state)
+        obs = {name: known[name].astype(np.float32) for name in self._names}
+        if self._memory is None:
+            action = self.policy(obs)
+        else:
+            action, self._memory = self.policy.act(obs, self._memory)  # type: ignore[attr-defined]
+        return self._centre + self._scale * np.clip(np.asarray(action, float), -1.0, 1.0)
 
     def _observations(self, state: DroneState) -> dict[str, NDArray]:
         rows = rotate(np.tile(state.quat, (3, 1)), np.eye(3)).T  # columns are the body's axes

@@ -24,6 +24,7 @@ from crazysim.envs.tasks.goals import FLOOR, GoalTask
 from crazysim.errors import ConfigError
 from crazysim.lab.live.loop import Live
 from crazysim.storage import reading
+from crazysim.train.evaluation import act, initial_memory
 
 CLOSE = 0.15
 """Distance from a listed goal at which a drone gets the next one, m."""
@@ -59,6 +60,7 @@ class PolicyPilot:
         self._points = None if points is None else np.asarray(points, float)
         self._set_goal = jax.jit(lambda data, pos: env.set_goal(state_of_data(data), pos).data)
         self._command = jax.jit(partial(_command, env, policy))
+        self._memory = self._initial_memory = initial_memory(policy, env)
         self._target = jax.jit(vectorize_over_worlds(env.task.target, env.task.batched))
         self._start = jax.jit(env.reset)(jax.random.key(seed)).data
         shape = self._start.states.pos.shape
@@ -75,7 +77,7 @@ class PolicyPilot:
             self.goals[:] = self._points[0]
             self._start = self._set_goal(self._start, self.goals)
         env.sim.data = self._start
-        self._command(self._start)  # compiles it before the clock starts
+        self._command(self._start, self._memory)  # compiles it before the clock starts
 
     def join(self, live: Live) -> None:
         """Fly in a loop from now on; clicks set goals, and viewers mark them."""
@@ -86,10 +88,14 @@ class PolicyPilot:
         """Write the command of this control step."""
         if self._points is not None:
             self._pass_points(live)
-        live.command[:] = self._command(live.sim.data)
+        live.command[:], self._memory = self._command(live.sim.data, self._memory)
 
     def reset(self, live: Live) -> None:
-        """Begin the episode again after a reset, or take the goals of the time to which the loop went back."""
+        """Begin the episode again after a reset, or take the goals of the time to which the loop went back.
+
+        The memory of a policy that has one begins anew in both cases.
+        """
+        self._memory = self._initial_memory
         if live.step == 0:
             live.sim.data = self._start
             self.passed[:], self._follows[:] = 0, self._points is not None
@@ -212,7 +218,8 @@ def read_points(path: str | Path) -> NDArray:
     return np.array(points)
 
 
-def _command(env: DroneEnv, policy: Callable[[Obs], Array], data: SimData) -> Array:
-    """Return the command of the policy's action for every drone. (n_worlds, n_drones, k)"""
+def _command(env: DroneEnv, policy: Callable[[Obs], Array], data: SimData, memory: Any) -> tuple[Array, Any]:
+    """Return the command of the policy's action for every drone, (n_worlds, n_drones, k), and the policy's memory."""
     seen = data if env.measure_states is None else vectorize_over_worlds(env.measure_states, env.task.batched)(data)
-    return env.actions.command(policy(vectorize_over_worlds(env.task.observe, env.task.batched)(seen)))
+    action, memory = act(policy, vectorize_over_worlds(env.task.observe, env.task.batched)(seen), memory)
+    return env.actions.command(action), memory

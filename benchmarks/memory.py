@@ -1,0 +1,82 @@
+"""Success on airframes that policies have not seen, with and without memory and privileged critic.
+
+    python benchmarks/memory.py [--device gpu] [--tasks hover track] [--variants memoryless memory] [--seeds 0:4]
+    python benchmarks/memory.py --device gpu --tasks hover --variants memory --seeds 0:4 --iterations 300
+    python benchmarks/memory.py --worlds 16 --iterations 2 --starts 8 --seeds 0:2 --seconds 0.4
+
+Every variant of a task is trained by PPO on drones drawn by ``randomize="generic"`` around one airframe, all seeds in
+one program. Each kept policy is then flown on other drones, drawn in the same way around the training's airframe
+(``drawn``) and around each of the other Crazyflies, with the controller and the actions of that airframe.
+
+A JSON line for each seed. Runs in the folder ``--out`` are continued from their checkpoints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from measure import digits, machine
+
+from crazysim.commands.training import seeds_of
+from crazysim.envs import make
+from crazysim.train import evaluate, run_many
+from crazysim.train.training import CHECKPOINT
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "memoryless": {},
+    "privileged": {"critic": "privileged"},
+    "memory": {"memory": 64},
+    "memory-privileged": {"memory": 64, "critic": "privileged"},
+}
+"""Hyperparameters of the variants, by name."""
+AIRFRAMES = ("cf2x_L250", "cf2x_P250", "cf2x_T350")
+"""Crazyflies other than that of the training, cf21B_500."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--tasks", nargs="+", default=["hover", "track"])
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["memoryless", "memory"])
+    parser.add_argument("--seeds", type=seeds_of, default=[0], help="such as 0:4")
+    parser.add_argument("--worlds", type=int, default=2048, help="worlds of each seed")
+    parser.add_argument("--iterations", type=int, default=300)
+    parser.add_argument("--starts", type=int, default=1000, help="drones of each evaluation")
+    parser.add_argument("--out", type=Path, default=Path("out/memory"), help="folder of the runs")
+    parser.add_argument("--seconds", type=float, help="length of an episode, s; by default the task's")
+    args = parser.parse_args()
+    options = {"randomize": "generic", "device": args.device}
+    options |= {} if args.seconds is None else {"seconds": args.seconds}
+    sets = {"drawn": options} | {drone: options | {"drone": drone} for drone in AIRFRAMES}
+    about = machine(args.device)
+    for task in args.tasks:
+        envs = {name: make(task, args.starts, **given) for name, given in sets.items()}
+        for variant in args.variants:
+            folder = args.out / f"{task}-{variant}"
+            training = {"n_steps": 64, "minibatches": 8, "discount": 0.99, "iterations": args.iterations}
+            results = run_many(
+                task,
+                folder,
+                seeds=args.seeds,
+                resume=(folder / CHECKPOINT).exists(),
+                evaluation_worlds=args.starts,
+                progress=False,
+                algorithm="ppo",
+                n_worlds=args.worlds,
+                options=options,
+                config=training | VARIANTS[variant],
+            )
+            for seed, result in zip(args.seeds, results.values(), strict=True):
+                line = {"benchmark": "memory", "task": task, "variant": variant, "seed": seed, "starts": args.starts}
+                line |= {name: digits(result.metrics[name]) for name in ("env_steps", "seconds")}
+                for name, env in envs.items():
+                    found = evaluate(env, result.policy)
+                    line[name] = {x: digits(found[x]) for x in ("success", "crashed", "error") if found[x] == found[x]}
+                print(json.dumps(line | about), flush=True)
+
+
+if __name__ == "__main__":
+    main()

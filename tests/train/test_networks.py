@@ -1,0 +1,330 @@
+"""Policies with memory, networks of one's own, and critics with more inputs than the policy."""
+
+import dataclasses
+import functools
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.envs import AutoReset, DroneEnv, PrivilegedObservation, RandomizeWith, make, state_of, uniform
+from crazysim.envs.state import flatten
+from crazysim.envs.tasks.hover import Hover
+from crazysim.lab.live.link import TrainedPolicy
+from crazysim.lab.live.policy_pilot import PolicyPilot
+from crazysim.plugins.sensors import MotionCapture
+from crazysim.train import Network, ppo
+from crazysim.train import config as configs
+from crazysim.train.checkpoint import read
+from crazysim.train.config import TrainConfig
+from crazysim.train.dagger import imitate
+from crazysim.train.evaluation import evaluate
+from crazysim.train.export import to_c
+from crazysim.train.networks import Policies, gru_network, init_weights, unroll
+from crazysim.train.out_of_tree import to_out_of_tree
+from crazysim.train.seeds import seed_of, stack_rates
+from crazysim.train.show import film
+from crazysim.train.training import CHECKPOINT, load_policy, train
+
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "training.md"
+SHORT = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,)}
+SIZES = {"n_worlds": 16, "options": {"seconds": 0.1, "randomize": "generic"}}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_environments():
+    """Let runs with equal options share environments, and with them all that was compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(configs, "make", functools.cache(make))
+        yield
+
+
+def trained(folder, config, network=None, iterations=2, **options):
+    """Train hover with a tiny network."""
+    config = TrainConfig.create("hover", **SIZES, config=SHORT | {"iterations": iterations} | config, network=network)
+    return train(config, folder, evaluation_worlds=8, log=lambda line: None, progress=False, **options)
+
+
+def started(env, **config):
+    """Return an untrained learner of one seed, and its configuration."""
+    config = ppo.Config(**SHORT | config)
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
+    return learner, config
+
+
+def test_an_update_computes_what_the_rollout_did(rng):
+    """Unrolled over a rollout in which episodes end, the networks give the same actions and values, to rounding."""
+    env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))  # three steps an episode
+    learner, config = started(env, memory=5)
+    memory = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), learner.memory)
+    collect = jax.jit(ppo._collect, static_argnums=(2, 3))
+    key, rates = jax.random.key(1)[None], stack_rates((config,))
+    _, after, samples, _, _ = collect(learner.agents, learner.replace(memory=memory), env, config, rates, key)
+    agent, samples = seed_of(learner.agents, 0), jax.tree.map(lambda x: x[:, 0], samples)
+    assert samples.done.sum() == 2 * 4
+
+    def outputs(done):
+        out = unroll(agent.network, agent.policy, samples.obs, memory[0], done)
+        log_prob = ppo._log_prob(jnp.tanh(out), agent.log_std, samples.action)
+        return log_prob, unroll(agent.network, agent.value, samples.obs, memory[1], done)[..., 0]
+
+    log_prob, value = outputs(samples.done)
+    np.testing.assert_allclose(log_prob, samples.log_prob, atol=1e-4)
+    scaled = value * ppo._scale(agent.returns) + agent.returns.mean
+    np.testing.assert_allclose(scaled, samples.value, atol=1e-5)
+    assert np.abs(outputs(jnp.zeros_like(samples.done))[1] - value)[3:].max() > 1e-3, "memories begin anew"
+    assert np.abs(after[0]).max() > 0
+    assert after[0].shape == (4, 1, 5)
+
+
+def test_gradients_flow_back_in_time_to_the_start_of_an_episode(rng):
+    network = gru_network(4)
+    weights = init_weights(network, jax.random.key(0), 3, (8, 2), 1.0)
+    obs = jnp.asarray(rng.normal(size=(6, 2, 3)), jnp.float32)
+    done = jnp.zeros((6, 2), bool).at[2, 1].set(True)
+
+    def last(obs):
+        return unroll(network, weights, obs, network.start(2), done)[-1].sum()
+
+    grads = np.abs(jax.grad(last)(obs)).max(axis=-1)
+    assert (grads[:, 0] > 0).all()
+    np.testing.assert_array_equal(grads[:, 1] > 0, [False, False, False, True, True, True])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Recall(Hover):
+    """A cue is shown in the first step of an episode alone, and pays in all of them."""
+
+    def _cue(self, data):
+        return jnp.where(data.plugins["task"].pos[..., :1] > data.states.pos[..., :1], 1.0, -1.0)
+
+    def observe(self, data):
+        """Return the cue in the first step, and zero later."""
+        return {"cue": jnp.where(data.core.steps == 0, self._cue(data), 0.0)}
+
+    def rewards(self, data, action, last_action):
+        """Return how near the first action is to half the cue."""
+        return {"action": -jnp.sum((action[..., :1] - 0.5 * self._cue(data)) ** 2, axis=-1)}
+
+
+@pytest.mark.long("trains two policies")
+def test_a_memory_learns_what_a_policy_without_cannot():
+    """Without memory the best action in four steps of five is 0, which costs 0.25 each: 0.2 on average."""
+    base = make("hover", 128, freq=500, seconds=0.01)
+    env = AutoReset(DroneEnv(base.sim, Recall(seconds=0.01), freq=500))
+    rewards = {}
+    for memory in (0, 8):
+        learner, config = started(
+            env, memory=memory, iterations=40, n_steps=20, epochs=4, init_std=0.2, discount=0.5, learning_rate=5e-3
+        )
+        for _ in range(config.iterations):
+            learner, metrics = ppo.iterate(learner, env, (config,))
+        assert metrics["finite"]
+        rewards[memory] = float(metrics["reward"][0]) + float(metrics["std"][0]) ** 2  # without exploration
+    assert rewards[8] > -0.06
+    assert rewards[0] < -0.15
+
+
+@pytest.mark.long("compiles a training and renders a film")
+def test_a_run_with_memory_resumes_is_evaluated_filmed_and_exported(tmp_path):
+    config = {"memory": 4, "critic": "privileged"}
+    whole = trained(tmp_path / "whole", config, iterations=4)
+
+    def interrupt(i, _):
+        if i == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "cut", config, iterations=4, on_iteration=interrupt)
+    trained(tmp_path / "cut", config, iterations=4, resume=True)
+    mine, others = (read(tmp_path / name / CHECKPOINT)[0] for name in ("cut", "whole"))
+    assert mine.keys() == others.keys()
+    for name, x in mine.items():
+        np.testing.assert_array_equal(x, others[name], err_msg=name)
+    memories = [x for name, x in mine.items() if name.startswith("['learner'].memory")]
+    assert [x.shape for x in memories] == [(16, 1, 4)] * 2
+    assert all(np.abs(x).max() > 0 for x in memories)
+    policy, loaded, meta = load_policy(tmp_path / "whole")
+    assert loaded.config["memory"] == 4
+    assert evaluate(whole.env, policy)["reward"] == evaluate(whole.env, whole.policy)["reward"]
+    assert film(loaded.make_env(1), policy, tmp_path / "film.gif", worlds=1) == 3
+    assert "void policy_reset(policy_state *state)" in to_c(policy, tmp_path / "policy.h", meta).read_text()
+    with pytest.raises(ConfigError, match="expected a policy without memory, got one with a memory"):
+        to_out_of_tree(policy, tmp_path, meta, whole.env.sim.airframes[0], 50)
+    with pytest.raises(ConfigError, match="expected a teacher without memory, got one with a memory"):
+        imitate(whole.env, policy)
+    pilot = PolicyPilot(loaded.make_env(1), policy)
+    live: Any = SimpleNamespace(sim=pilot.env.sim, command=np.zeros((1, 1, 4)), step=0)
+    pilot(live)
+    assert np.any(pilot._memory)
+    pilot.reset(live)
+    assert not np.any(pilot._memory)
+    obs = whole.env.reset(jax.random.key(0)).obs
+    with pytest.raises(ConfigError, match=r"expected a memory besides .*policy\.act\(obs, memory\)"):
+        policy(obs)
+    link = TrainedPolicy(policy, meta, goal=(0, 0, 1))
+    memory = policy.initial_memory(8, 1)
+    for _ in range(2):
+        action, memory = policy.act(obs, memory)
+        one = {name: np.asarray(x[0, 0]) for name, x in obs.items()}
+        link._observations = lambda _, one=one: one
+        np.testing.assert_allclose(link(None), link._centre + link._scale * action[0, 0], atol=1e-6)
+    np.testing.assert_allclose(link._memory, memory[0, 0], atol=1e-6)
+    link.reset()
+    assert not np.any(link._memory)
+
+
+def test_policies_of_several_seeds_keep_memories_of_their_own(rng):
+    env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))
+    config = ppo.Config(**SHORT | {"minibatches": 1, "memory": 3})
+    keys = jax.random.split(jax.random.key(0), 2)
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,) * 2, keys)
+    policies, obs = learner.as_policy(), learner.env.obs
+    memory = jnp.asarray(rng.normal(size=(4, 1, 3)), jnp.float32)
+    action, after = Policies(policies).act(obs, memory)
+    for i, worlds in enumerate((slice(2), slice(2, 4))):
+        one = seed_of(policies, i).act({name: x[worlds] for name, x in obs.items()}, memory[worlds])
+        np.testing.assert_allclose(action[worlds], one[0], atol=1e-6)
+        np.testing.assert_allclose(after[worlds], one[1], atol=1e-6)
+    assert Policies(policies).initial_memory(4, 1).shape == (4, 1, 3)
+
+
+@pytest.mark.long("compiles an environment with a sensor")
+def test_privileged_observations_are_true_states_and_drawn_parameters():
+    """With a sensor, the task observes measurements; the critic also gets true states, factors and masses."""
+
+    def heavier(data, key):
+        mass = data.params.mass * uniform(key, data.core.n_drones, 1, low=0.9, high=1.1)
+        return data.replace(params=data.params.replace(mass=mass))
+
+    base = make("hover", 3, randomize="generic", sensors=[MotionCapture(noise=0.1)])
+    env = AutoReset(PrivilegedObservation(RandomizeWith(base, heavier, params=("mass",))))
+    state = env.reset(jax.random.key(0))
+    for _ in range(2):
+        data, seen = state.data, np.asarray(state.obs["privileged"])
+        nominal = base.sim.default_data.params.mass
+        record = data.plugins["randomize"]
+        expected = [flatten(state_of(data)), data.states.rotor_vel, data.params.mass / nominal]
+        expected += [record.factors, record.thrust_factors]
+        np.testing.assert_allclose(seen, np.concatenate(expected, axis=-1), rtol=1e-6)
+        state = env.step(state, jnp.zeros((3, 1, 4)))
+    assert np.abs(state.obs["pos"] - state.data.states.pos).max() > 0.01
+    assert len(np.unique(seen[..., -5:])) > 10
+    learner, _ = started(env, minibatches=1, critic="privileged")
+    other = state.obs | {"privileged": 1 + state.obs["privileged"]}
+    config = ppo.Config(critic="privileged")
+    agent = seed_of(learner.agents, 0)
+    values = [
+        ppo._value(agent, agent.stats.normalize(ppo._observed(obs, config)), (), config)[0]
+        for obs in (state.obs, other)
+    ]
+    assert np.abs(values[0] - values[1]).min() > 1e-4
+    assert agent.n_obs == flatten(base.reset(jax.random.key(0)).obs).shape[-1] == agent.as_policy().stats.mean.shape[0]
+    with pytest.raises(ConfigError, match=r"expected the observation 'privileged' .*AutoReset\(PrivilegedObservation"):
+        started(AutoReset(base), minibatches=1, critic="privileged")
+    with pytest.raises(ConfigError, match="expected observations without 'privileged', got "):
+        PrivilegedObservation(PrivilegedObservation(base)).reset(jax.random.key(0))
+
+
+def test_a_critic_of_all_drones_gets_the_observations_of_each_its_own_first():
+    obs = jnp.arange(2 * 3 * 2).reshape(2, 3, 2)
+    seen = np.asarray(ppo._critic_input(obs, ppo.Config(critic="all_drones")))
+    np.testing.assert_array_equal(seen[0], [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5, 0, 1], [4, 5, 0, 1, 2, 3]])
+    np.testing.assert_array_equal(seen[1, 2], [10, 11, 6, 7, 8, 9])
+
+
+@pytest.mark.long("compiles two trainings")
+@pytest.mark.parametrize("task", ["swarm", "multi_race"])
+def test_tasks_of_several_drones_train_with_a_critic_of_all(task):
+    env = AutoReset(make(task, 4, seconds=0.1))
+    learner, config = started(env, critic="all_drones")
+    value = seed_of(learner.agents, 0).value
+    n_obs = learner.agents.n_obs
+    assert value.layers[0][0].shape[0] == env.sim.n_drones * n_obs
+    for _ in range(2):
+        learner, metrics = ppo.iterate(learner, env, (config,))
+    assert metrics["finite"]
+    assert np.abs(seed_of(learner.agents, 0).value.layers[0][0] - value.layers[0][0])[n_obs:].max() > 1e-6
+
+
+def plain_network():
+    """Return a network in JAX alone, without memory."""
+
+    def init(key, n_obs):
+        return {"weight": jax.random.normal(key, (n_obs, 8)) / np.sqrt(n_obs)}
+
+    return Network(init, lambda weights, obs, memory: (jax.nn.relu(obs @ weights["weight"]), memory))
+
+
+def network_of_page(library):
+    """Return the network that the page on training makes with a library."""
+    pytest.importorskip(library)
+    blocks = re.findall(r"```py\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    (block,) = (block for block in blocks if re.search(rf"(import|from) {library}\b", block))
+    names = {}
+    exec(block, names)
+    return names["network"]
+
+
+def flax_network():
+    """Return a module of Flax, without memory."""
+    return network_of_page("flax")
+
+
+def equinox_network():
+    """Return a cell of Equinox, with memory."""
+    return network_of_page("equinox")
+
+
+@pytest.mark.long("compiles a training with each")
+@pytest.mark.parametrize("make_network", [plain_network, flax_network, equinox_network])
+def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_network):
+    network = make_network()
+    result = trained(tmp_path, {}, network)
+    policy, config, meta = load_policy(tmp_path, network=network)
+    assert config.own_network
+    for x, y in zip(jax.tree.leaves(policy), jax.tree.leaves(result.policy), strict=True):
+        np.testing.assert_array_equal(x, y)
+    obs, memory = result.env.reset(jax.random.key(0)).obs, policy.initial_memory(8, 1)
+    np.testing.assert_array_equal(policy.act(obs, memory)[0], result.policy.act(obs, memory)[0])
+    assert evaluate(result.env, policy)["nonfinite"] == 0
+    start = seed_of(ppo.init(AutoReset(result.env), (ppo.Config(),), jax.random.key(0)[None], network).as_policy(), 0)
+    changed = jax.tree.map(lambda x, y: bool(np.any(x != y)), start.body, policy.body)
+    assert all(jax.tree.leaves(changed)), "all weights are trained"
+    with pytest.raises(
+        ConfigError, match=r"expected the network of your own with which .* was trained, got None\. Use"
+    ):
+        load_policy(tmp_path)
+    with pytest.raises(ConfigError, match=r"expected the arrays of this task and version|expected .* in .* as float32"):
+        load_policy(tmp_path, network=Network(lambda key, n: jnp.zeros((n, 3)), lambda w, x, m: (x @ w, m)))
+    with pytest.raises(ConfigError, match=r"expected own_network = True as in .*, got False; resume with the same"):
+        trained(tmp_path, {}, resume=True)
+    with pytest.raises(
+        ConfigError, match="expected a policy with the built-in network, got one with a network of your"
+    ):
+        to_c(policy, tmp_path / "policy.h", meta)
+
+
+def test_wrong_networks_are_refused():
+    network = plain_network()
+    given = {"task": "hover", **SIZES}
+    with pytest.raises(ConfigError, match="expected memory=0 with a network of your own, got 8"):
+        TrainConfig.create(**given, config={"memory": 8}, network=network)
+    with pytest.raises(ConfigError, match=r"expected no network of your own for apg, got one\. Use algorithm='ppo'"):
+        TrainConfig.create(**given, algorithm="apg", network=network)
+    with pytest.raises(ConfigError, match=r"expected a Network, got <function"):
+        TrainConfig.create(**given, network=plain_network)
+    for apply, memory, message in (
+        (lambda w, x, m: x @ w, (), "features .* and the memory, got ShapeDtypeStruct"),
+        (lambda w, x, m: ((x @ w)[None], m), (), "features .* and the memory, got"),
+        (lambda w, x, m: (x @ w, ()), jnp.zeros(3), "expected apply to return a memory like initial_memory"),
+        (lambda w, x, m: (x @ w, m[:2]), jnp.zeros(3), r"memory like initial_memory, .*3.*got .*2"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            init_weights(Network(lambda key, n: jnp.zeros((n, 3)), apply, memory), jax.random.key(0), 4, (2,), 1.0)
