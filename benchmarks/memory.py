@@ -56,7 +56,7 @@ def main() -> None:
         envs = {name: make(task, args.starts, **given) for name, given in sets.items()}
         for variant in args.variants:
             folder = args.out / f"{task}-{variant}"
-            training = {"n_steps": 64, "minibatches": 8, "discount": 0.99, "iterations": args.iterations}
+            training = {"n_steps": 64, "minibatches": 16, "discount": 0.98, "iterations": args.iterations}
             results = run_many(
                 task,
                 folder,
