@@ -62,7 +62,7 @@ def test_loop_prints_the_time_of_an_iteration(run):
 
 @pytest.mark.long("compiles two trainings and evaluations of four airframes")
 def test_memory_prints_the_success_of_each_variant_on_other_airframes(run, tmp_path):
-    small = ["--worlds", 8, "--iterations", 1, "--starts", 8, "--seconds", 0.1, "--tasks", "hover", "--out", tmp_path]
+    small = ["--worlds", 16, "--iterations", 1, "--starts", 8, "--seconds", 0.1, "--tasks", "hover", "--out", tmp_path]
     lines = run("memory.py", *small, "--variants", "memoryless", "memory-privileged", "--seeds", "3:4")
     assert [(line["variant"], line["seed"]) for line in lines] == [("memoryless", 3), ("memory-privileged", 3)]
     assert all(line["env_steps"] == 8 * 64 for line in lines)

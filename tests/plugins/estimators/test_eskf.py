@@ -117,7 +117,7 @@ def test_updates_move_by_the_derivatives_of_the_measurement(estimate, kind):
     h = jax.jacfwd(lambda e: MEASURED[kind](moved(estimate, e), rot))(jnp.zeros(15))
     p = error_state.covariance(estimate.cov)
     gain = p @ h.T @ jnp.linalg.inv(h @ p @ h.T + variance)
-    found = difference(error_state.finalize(after, least=0.0), estimate)
+    found = difference(error_state.finalize(after, min_angle=0.0), estimate)
     # rounding of float64 and the 1e-6 that the firmware adds to norms
     np.testing.assert_allclose(found, gain @ error, rtol=0, atol=1e-11)
     np.testing.assert_allclose(error_state.covariance(after.cov), p - gain @ h @ p, rtol=1e-6, atol=1e-8)
