@@ -116,8 +116,8 @@ class SimCore(PyTree):
     drone_mocap_ids: Array = leaf("shared", 1)
     """MuJoCo mocap ids of the bodies of the drones. (n_drones,)"""
     rng_key: Array = leaf("parameter", 0)
-    """Random key of the seed; a reset does not change it. Where blocks of worlds have keys of their own, there is one for
-    each drone of each world. ()"""
+    """Random key of the seed; a reset does not change it. Where blocks of worlds have keys of their own, each drone of
+    each world has one. ()"""
     mjx_synced: Array = leaf("shared", 0)
     """True where the scene matches this data. ()"""
 
