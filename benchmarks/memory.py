@@ -48,9 +48,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/memory"), help="folder of the runs")
     parser.add_argument("--seconds", type=float, help="length of an episode, s; by default the task's")
     args = parser.parse_args()
-    options = {"randomize": "generic", "device": args.device}
+    options: dict[str, Any] = {"randomize": "generic", "device": args.device}
     options |= {} if args.seconds is None else {"seconds": args.seconds}
-    sets = {"drawn": options} | {drone: options | {"drone": drone} for drone in AIRFRAMES}
+    sets: dict[str, dict[str, Any]] = {"drawn": options} | {drone: options | {"drone": drone} for drone in AIRFRAMES}
     about = machine(args.device)
     for task in args.tasks:
         envs = {name: make(task, args.starts, **given) for name, given in sets.items()}

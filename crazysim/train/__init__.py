@@ -13,7 +13,17 @@ if TYPE_CHECKING:
     from crazysim.train.show import film, plot_episode
     from crazysim.train.training import load_policy
 
-__all__ = ["Network", "TrainConfig", "evaluate", "film", "imitate", "load_policy", "plot_episode", "run", "run_many"]
+__all__ = [
+    "Network",
+    "TrainConfig",
+    "evaluate",
+    "film",
+    "imitate",
+    "load_policy",
+    "plot_episode",
+    "run",
+    "run_many",
+]
 
 __getattr__ = lazy(
     __name__,

@@ -169,7 +169,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
         policy = init_weights(network, k_policy, n_obs, (*hidden, n_actions), 0.01)
         value = init_weights(network, k_value, _critic_input(obs, config).shape[-1], (*hidden, 1), 1.0)
         log_std = jnp.full(n_actions, jnp.log(config.init_std), policy.layers[0][0].dtype)
-        optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init((policy, log_std, value))
+        parameters: Any = (policy, log_std, value)
+        optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(parameters)
         stats = RunningStats.create(obs.shape[-1]).update(obs)
         return Agent(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, n_obs, network)
 

@@ -127,7 +127,17 @@ def test_a_checkpoint_between_evaluations_resumes_bit_for_bit(whole, tmp_path, m
 @pytest.mark.long("trains in a process of its own")
 def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path):
     """Sent SIGTERM twice, as ``timeout`` does, it ends with the status of that signal and continues from there."""
-    small = ["--worlds", "8", "--set", "seconds=0.1", "--config", "n_steps=4", "hidden=[8]", "iterations=1000000"]
+    small = [
+        "--worlds",
+        "8",
+        "--set",
+        "seconds=0.1",
+        "--config",
+        "n_steps=4",
+        "hidden=[8]",
+        "minibatches=1",
+        "iterations=1000000",
+    ]
     options = ["--out", tmp_path, "--checkpoint-every", "0.01", *small]
     command = [sys.executable, "-m", "crazysim", "train", "hover", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
