@@ -160,7 +160,7 @@ def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
         if isinstance(segment, UnfusedStage):
             raise _refusal(segment.name, segment.error.reason)
         reader = next((op.stage for op in segment.block.operations if op.name == "over_others"), segment.stages[0])
-        if segment.couples:
+        if segment.couples_drones:
             raise _refusal(reader, "it reads all drones of its world, but a step of one drone is exported")
     after: dict[Slot, Any] = {}
     for segment in program.fused_segments:
