@@ -41,7 +41,8 @@ def run(options: argparse.Namespace) -> None:
     del options
     text = "\n".join(f"{name + ':':<14}{_or_reason(value)}" for name, value in _info_lines())
     home = os.path.expanduser("~")
-    print(text.replace(f"{home}{os.sep}", f"~{os.sep}") if home != "~" else text)  # reports are public
+    # Bug reports are public, so they do not contain the path of the home folder.
+    print(text.replace(f"{home}{os.sep}", f"~{os.sep}") if home != "~" else text)
 
 
 def _info_lines() -> Iterator[tuple[str, Callable[[], str]]]:

@@ -26,12 +26,12 @@ class AllocationParams(PyTree):
     rpm2thrust: Array = leaf("parameter", 2)
     """Coefficients of the thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
     allocation_matrix: Array = leaf("parameter", 2)
-    """Matrix from collective thrust and torque divided by ``arms`` to rotor thrusts, 1. (n_rotors, 4)"""
+    """Matrix from collective thrust, and torque divided by ``arms``, to rotor thrusts, 1. (n_rotors, 4)"""
     rotors: Array | None = leaf("parameter", 1, default=None)
     """True for the rotors that the drone has; None if all drones have the same number of rotors. (n_rotors,)"""
     weight: Array | None = leaf("parameter", 1, (1,), default=None)
-    """Weight, N: the limit up to which roll and pitch torque may raise the collective thrust. None if clipping does not
-    use priorities. (1,)"""
+    """Weight, N: roll and pitch torque may raise the collective thrust up to this value. None for allocation without
+    priorities. (1,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> AllocationParams:
@@ -60,7 +60,7 @@ def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
 
 
 def level_thrust(airframe: Airframe) -> float:
-    """Return the largest collective thrust without torque, N: the first rotor is then at its maximum thrust."""
+    """Return the collective thrust without torque, N, at which the most loaded rotor is at its maximum thrust."""
     return float(airframe.value("rotors.thrust_max", ()) / np.max(allocation_matrix(airframe)[:, 0]))
 
 
@@ -74,7 +74,7 @@ def torque_arms(airframe: Airframe) -> np.ndarray:
 
 
 def yaw_arm(airframe: Airframe) -> float:
-    """Return the change of a rotor's drag torque per change of its thrust around hover, m: the mean of all rotors."""
+    """Return the change of a rotor's drag torque per change of its thrust around hover, m, averaged over the rotors."""
     hover = hover_rotor_vel(airframe)
     slopes = []
     for key in ("torque_curve", "thrust_curve"):

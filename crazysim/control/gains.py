@@ -14,7 +14,7 @@ def require_gains(airframe: Airframe, paths: Iterable[str], controller: str) -> 
 
     Args:
         airframe: The airframe.
-        paths: Tables and keys of the values.
+        paths: Dotted paths of the values, such as ``controller.pwm_max``.
         controller: Name of the controller, for the message.
     """
     missing = [path for path in dict.fromkeys(paths) if path not in airframe.values]

@@ -33,7 +33,7 @@ MAX_FEEDBACK_STEP = 0.5
 DISTURBANCE_MAX = 5.0
 """Largest acceleration by a disturbance that is compensated along an axis, m/s^2: about half of gravity."""
 TORQUE_MAX = 0.5
-"""Largest torque by a disturbance that is compensated, as the rotation error to which it is the response, rad."""
+"""Largest torque by a disturbance that is compensated, as the rotation error whose feedback is as large, rad."""
 
 
 class INDIParams(PyTree):
@@ -42,11 +42,11 @@ class INDIParams(PyTree):
     geometric: GeometricParams
     """Gains, mass, inertia and limits."""
     mixing_matrix: Array = leaf("parameter", 2)
-    """Rotor thrusts to collective thrust, 1, and body torque, m. (4, n_rotors)"""
+    """Matrix from rotor thrusts to collective thrust, 1, and body torque, m. (4, n_rotors)"""
     lead: Array = leaf("parameter", 1)
     """Factor on the difference between commanded and current rotor speeds, 1. (1,)"""
     reaction: Array = leaf("parameter", 1, (1,))
-    """Angular momentum of the rotors about body z over their drag torque, both as changes around hover, s. (1,)"""
+    """Ratio of the changes of a rotor's angular momentum and drag torque around hover, s. (1,)"""
     share: Array = leaf("parameter", 1, (1,))
     """Fraction of the missing yaw torque demanded from rotor drag, 1; the reaction to spin-up gives the rest. (1,)"""
     filter: Array = leaf("parameter", 1)
@@ -56,12 +56,13 @@ class INDIParams(PyTree):
     def create(airframe: Airframe, freq: int, cutoff: float) -> INDIParams:
         """Return the shared parameters of an airframe.
 
-        The gains follow the rule of ``crazysim.control.bandwidth`` for rotors that are ``ROTOR_LEAD`` times as fast.
+        The gains follow the rule of ``crazysim.control.bandwidth`` for rotors that are ``lead`` times as fast. ``lead``
+        is ``ROTOR_LEAD``, or less if ``MAX_FEEDBACK_STEP`` requires it.
 
         Args:
             airframe: The airframe.
             freq: Rate of the controller, Hz.
-            cutoff: Cutoff frequency of the filter, Hz; at most 0.45 of the rate is used.
+            cutoff: Cutoff frequency of the filter, Hz; values above ``0.45 freq`` are reduced to it.
         """
         if not 0 < cutoff < math.inf:
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
@@ -98,7 +99,7 @@ class INDIMemory(PyTree):
 
 
 def apply_filter(x: Array, state: Array, coefficients: Array) -> tuple[Array, Array]:
-    """Return signals after a filter of order 2, and the filter's new states (direct form II transposed).
+    """Return signals after a second-order low-pass filter, and its new states (transposed direct form II).
 
     Args:
         x: Signals. (..., n)
@@ -139,13 +140,14 @@ def indi_control(
         f = f_rotors + m (a_desired - a),   tau = tau_rotors + J (w'_desired - w')
 
     The disturbances ``m a - f_rotors - m g`` and ``J w' - tau_rotors`` are limited (``DISTURBANCE_MAX``,
-    ``TORQUE_MAX``), so that the rotors of a drone that stands do not push against the floor.
+    ``TORQUE_MAX``), so that the rotors of a drone on the floor do not push it against the floor.
 
-    Acceleration a and angular acceleration w' are differences of the velocities over one tick. They and the force and
-    torque of the rotors, from their measured speeds, pass through the same low-pass filter, so that their delays
-    cancel. Effects that the model omits, such as wind, a shifted load or a wrong mass, appear in a and w', and are
-    compensated. The returned speed is the current speed plus ``params.lead`` times the difference to the desired speed,
-    which makes the rotors faster than their lag.
+    The acceleration a is the rate of change of the velocity over one tick. ``J w'`` is the rate of change of the
+    angular momentum of body and rotors, so that the reaction to accelerating rotors does not count as a disturbance.
+    Both pass through the same low-pass filter as the force and torque of the rotors, which follow from measured rotor
+    speeds, so that their delays cancel. Effects that the model omits, such as wind, a shifted load or a wrong mass,
+    appear in a and w', and are compensated. The returned speed is the current speed plus ``params.lead`` times the
+    difference to the desired speed, which makes the rotors faster than their lag.
 
     Args:
         pos: Position, world frame, m. (..., 3)

@@ -1,4 +1,7 @@
-"""Algebraic Riccati equations by structure-preserving doubling, under jit, differentiable, in float32 and float64."""
+"""Solvers of algebraic Riccati equations by structure-preserving doubling.
+
+They can be jitted and differentiated, and work in float32 and float64.
+"""
 
 from __future__ import annotations
 
@@ -121,10 +124,10 @@ def gain_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
 
 def check_gain(K: Any) -> Any:
-    """Return a gain computed on the host, after a check that it is finite.
+    """Return a gain after checking on the host that it is finite.
 
     Raises:
-        ConfigError: If it is not, because the Riccati equation has no stabilising solution.
+        ConfigError: If it is not finite, because the Riccati equation has no stabilising solution.
     """
     if not np.all(np.isfinite(K)):
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Drones of several airframes: what differs between them becomes one value per drone."""
+"""Airframes of the drones of a simulation: names of the drones, and parameters that differ between airframes."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ from crazysim.pytree import PyTree
 T = TypeVar("T")
 
 NAME_PREFIXES = {"Crazyflie": ("cf", "crazyflie"), "Bumblebee": ("bumblebee",)}
-"""Prefixes of drones' names, as in AIMotionLab-Virtual, to the lower-case beginnings of names of their airframes."""
+"""Lower-case beginnings of airframe names, by the prefix of the drones' names, as in AIMotionLab-Virtual."""
 ROTOR_MASK = "rotors"
-"""Name of fields that are True for the rotors that a drone has; None where all drones have equally many."""
+"""Name of the field of a record that masks rotors: True for the rotors that a drone has. The field is None if all
+drones have the same number of rotors."""
 PER_ROTOR_FIELDS = ("L", "prop_inertia", "rpm2thrust", "rpm2torque", "rotor_dyn_coef")
 """Fields in which missing rotors repeat the value of the last rotor; all other fields are zero for missing rotors."""
 
 
 Airframes = Airframe | Sequence[Airframe]
-"""Airframe of all drones, or of each."""
+"""One airframe for all drones, or a sequence with one for each drone."""
 
 
 def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: int) -> tuple[Airframe, ...]:
@@ -47,7 +48,7 @@ def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: i
 
 
 def is_list(drone: object) -> TypeGuard[Sequence[AirframeSource]]:
-    """Check for a list of airframes, one for each drone."""
+    """Return True for a sequence with one airframe for each drone, False for a single airframe."""
     return isinstance(drone, Sequence) and not isinstance(drone, str)
 
 
@@ -67,12 +68,12 @@ def airframe_of(airframes: Airframes) -> Airframe:
 
 def n_rotors_of(airframes: Airframes) -> int:
     """Return the largest number of rotors of any of the airframes."""
-    kinds = {id(airframe): airframe for airframe in as_airframes(airframes)}  # thousands of drones have a few kinds
+    kinds = {id(airframe): airframe for airframe in as_airframes(airframes)}  # thousands of drones share a few
     return max(airframe.n_rotors for airframe in kinds.values())
 
 
 def prefix_of(airframe: Airframe) -> str:
-    """Return the beginning of the names of drones of an airframe: ``Crazyflie``, ``Bumblebee``, or its own name."""
+    """Return the prefix of drone names for an airframe: ``Crazyflie``, ``Bumblebee``, or its own name in PascalCase."""
     name = airframe.name.lower()
     for prefix, beginnings in NAME_PREFIXES.items():
         if name.startswith(beginnings):
@@ -92,14 +93,14 @@ def drone_names(airframes: Sequence[Airframe]) -> tuple[str, ...]:
 
 
 def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_worlds: int) -> T:
-    """Return the record of parameters of all drones: leaves with equal values are shared, others are per drone.
+    """Return one record for all drones: leaves that are equal for all airframes are shared, others have one per drone.
 
-    Axes over rotors are as long as the largest number of rotors. For the rotors that a drone lacks, thrust, entries of
-    the mixing matrix and largest speed are zero.
+    If airframes have different numbers of rotors, axes over rotors are padded to the largest number. The padding
+    repeats the last rotor in ``PER_ROTOR_FIELDS`` and is zero in other fields, such as a mixing matrix.
 
     Args:
         airframes: Airframe of each drone.
-        create: Function from an airframe to its record, which all drones of the airframe share.
+        create: Function that returns the record of one airframe.
         n_worlds: Number of worlds.
     """
     airframes = as_airframes(airframes)
@@ -131,7 +132,10 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
 
 
 def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
-    """Return arrays padded to equal lengths along the axes over rotors, along which their lengths differ."""
+    """Return one array per airframe, padded to a common shape along the axes over rotors.
+
+    A length of 1 means that all rotors share a value, which is repeated.
+    """
     shape = tuple(np.max([x.shape for x in arrays], axis=0)) if arrays[0].ndim else ()
     out = []
     for x in arrays:
@@ -147,7 +151,7 @@ def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
 
 
 def _add_rotor_masks(record: Any, n_rotors: int) -> Any:
-    """Return a record with the masks over rotors that it and the records within it declare."""
+    """Return a record with the rotor masks filled in, where it or a record within it has a field for one."""
     if not isinstance(record, PyTree):
         return record
     changes = {}

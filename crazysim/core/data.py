@@ -85,7 +85,7 @@ class SimStateDeriv(PyTree):
         Args:
             n_worlds: Number of worlds.
             n_drones: Number of drones per world.
-            device: Device of the arrays; None for arrays of the host.
+            device: Device of the arrays; None for NumPy arrays.
             n_rotors: Number of rotors.
         """
         sizes = {"vel": 3, "ang_vel": 3, "acc": 3, "ang_acc": 3, "rotor_acc": n_rotors}
@@ -101,7 +101,7 @@ class SimCore(PyTree):
     steps: Array = leaf("world")
     """Number of physics steps since the last reset of the world, at most ``MAX_STEPS``. (n_worlds, 1)"""
     episode: Array = leaf("world")
-    """Number of resets of the world; enters its random numbers. (n_worlds, 1)"""
+    """Number of resets of the world. Its random numbers depend on it. (n_worlds, 1)"""
     nonfinite: Array = leaf("world")
     """True where the world has become non-finite, or taken more than ``MAX_STEPS``, since its last reset.
     (n_worlds, 1)"""
@@ -110,16 +110,16 @@ class SimCore(PyTree):
     n_drones: int = static()
     """Number of drones per world."""
     world_id: Array = leaf("world")
-    """Index of the world; enters its random numbers. (n_worlds, 1)"""
+    """Index of the world, within its block if blocks of worlds have keys of their own. Its random numbers depend on it.
+    (n_worlds, 1)"""
     drone_id: Array = leaf("drone")
-    """Index of the drone in its world; enters its random numbers. (n_worlds, n_drones)"""
+    """Index of the drone in its world. Its random numbers depend on it. (n_worlds, n_drones)"""
     drone_mocap_ids: Array = leaf("shared", 1)
     """MuJoCo mocap ids of the bodies of the drones. (n_drones,)"""
     rng_key: Array = leaf("parameter", 0)
-    """Random key of the seed; a reset does not change it. Where blocks of worlds have keys of their own, each drone of
-    each world has one. ()"""
+    """Random key; resets do not change it. (), or (n_worlds, n_drones) if blocks of worlds have keys of their own."""
     mjx_synced: Array = leaf("shared", 0)
-    """True where the scene matches this data. ()"""
+    """True if the scene matches this data. ()"""
 
     @staticmethod
     def create(freq: int, n_worlds: int, n_drones: int, drone_mocap_ids: ArrayLike, rng_key: int | Array) -> SimCore:
@@ -154,10 +154,10 @@ class Objects(PyTree):
     names: tuple[str, ...] = static()
     """Names of the bodies of the objects."""
     recorded: bool = static(default=False)
-    """True where poses come from a recording, also of objects that plugins place, such as loads."""
+    """True if a recording determines the poses of all objects, even those that plugins move, such as loads."""
 
     def with_poses(self, rows: Mapping[str, tuple[Array, Array]]) -> Objects:
-        """Return the objects of one world with some at other poses.
+        """Return the objects of one world with new poses for some of them.
 
         Args:
             rows: Positions (n, 3) and attitudes, xyzw (n, 4), of all objects of a kind, by the kind's name.
@@ -202,7 +202,7 @@ class SimData(PyTree):
         """Return data of drones at rest, without plugins.
 
         ``airframe`` is one airframe for all drones, or a list with one for each. ``freqs`` are the rates of commands,
-        Hz. ``controller`` is None where commands need none.
+        Hz. ``controller`` is None if the commands need no controller.
         """
         airframes = as_airframes(airframe, n_drones)
         return SimData(
@@ -218,7 +218,7 @@ def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) ->
 
     Args:
         dynamics: Dynamics model.
-        airframe: Airframe of all drones, or of each.
+        airframe: One airframe for all drones, or a list with one for each.
         n_worlds: Number of worlds.
     """
     n_rotors = n_rotors_of(airframe)
@@ -237,7 +237,7 @@ def n_rotor_states(dynamics: Dynamics, airframes: Airframes) -> int:
 
 
 def controls_of(data: SimData) -> Any:
-    """Return the controls untyped: the command level and the model determine which of their fields are None."""
+    """Return ``data.controls`` as ``Any``, because the command level and the model determine which fields are None."""
     return data.controls
 
 

@@ -34,10 +34,11 @@ def state_control(
     yaw: ArrayLike | None = None,
     feedforward: ArrayLike | None = None,
 ) -> SimData:
-    """Stage a full-state setpoint for every drone: a vector, or ``pos`` and the other parts that are not zero.
+    """Stage a full-state setpoint for every drone: one vector per drone, or ``pos`` and optional parts.
 
     ``pos``, ``vel`` and ``acc`` broadcast to (n_worlds, n_drones, 3) by NumPy's rules, ``yaw`` to (n_worlds, n_drones):
-    (3,) is one position for all, (n_drones, 3) one for each drone, (n_worlds, 1, 3) one for each world.
+    (3,) is one position for all, (n_drones, 3) one for each drone, (n_worlds, 1, 3) one for each world. Omitted parts
+    are zero.
 
     Args:
         data: Data of a simulation built with ``control="state"``.
@@ -48,8 +49,9 @@ def state_control(
         vel: Velocity, world frame, m/s, with ``pos``. (..., 3)
         acc: Acceleration, world frame, m/s^2, with ``pos``. (..., 3)
         yaw: Yaw, rad, with ``pos``. (...)
-        feedforward: Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2; None for the yaw rate of the
-            setpoint and zeros. Crazyflow's controller accepts none. (n_worlds, n_drones, 8)
+        feedforward: Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2. None for the yaw rate of the
+            setpoint, and zeros for the rest. Must be None with controllers without feedforward, such as Crazyflow's.
+            (n_worlds, n_drones, 8)
     """
     command, feedforward = check_setpoint(
         data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward
@@ -68,7 +70,7 @@ def check_setpoint(
 ) -> tuple[Array | NDArray, Array | NDArray | None]:
     """Return a full-state setpoint and its feedforward as arrays of the state's dtype, for ``stage_command``.
 
-    Arguments and errors as in ``state_control``; ``data`` may hold shapes and types instead of arrays.
+    Arguments and errors as in ``state_control``; leaves of ``data`` may be ``jax.ShapeDtypeStruct`` instead of arrays.
     """
     present = {name: x for name, x in parts.items() if x is not None}
     if controls is None:
@@ -163,13 +165,13 @@ def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 def stage_command(data: SimData, command: Array, feedforward: Array | None = None) -> SimData:
     """Return the data with a command staged at its command level; the command is not checked.
 
-    For data of one drone, one world or all worlds alike. Rotor speeds take effect at the next step, other commands at
-    the next tick of their controller.
+    The data may be of one drone, of one world or of all worlds. Rotor speeds take effect at the next step, other
+    commands at the next tick of their controller.
 
     Args:
         data: The simulation.
         command: Command in the units of ``data.controls.mode``. (..., k)
-        feedforward: Feedforward of a setpoint; None for the yaw rate of the setpoint and zeros. (..., 8)
+        feedforward: Feedforward of a setpoint; None for ``feedforward_of(command)``. (..., 8)
     """
     controls, mode = data.controls, data.controls.mode
     fields = staged_fields(data, command, feedforward)
@@ -180,7 +182,10 @@ def stage_command(data: SimData, command: Array, feedforward: Array | None = Non
 
 
 def staged_fields(data: SimData, command: Array, feedforward: Array | None = None) -> dict[str, Array]:
-    """Return the fields that ``stage_command`` writes: of ``data.controls``, or of the record of the command level."""
+    """Return the fields that ``stage_command`` writes, by name.
+
+    Rotor speeds are a field of ``data.controls``; other commands are fields of the record of their command level.
+    """
     mode = data.controls.mode
     if mode == Control.rotor_vel:
         return {"rotor_vel": command}
@@ -200,7 +205,7 @@ def staged_leaves(data: SimData) -> list[Any]:
 
 
 def feedforward_of(command: Any) -> Any:
-    """Return the feedforward of a setpoint that is given without one: its yaw rate and zeros. (..., 8)"""
+    """Return the feedforward of a setpoint without an explicit one: its yaw rate, and zeros for the rest. (..., 8)"""
     if isinstance(command, np.ndarray):
         feedforward = np.zeros((*command.shape[:-1], 8), command.dtype)
         feedforward[..., 6] = command[..., 15]
@@ -226,9 +231,10 @@ def controllable(data: SimData) -> Array:
 
 
 def check_command(data: SimData, control: Control, command: ArrayLike, check_finite: bool = False) -> Array | NDArray:
-    """Return a command as an array of the state's dtype; ``data`` may hold shapes and types instead of arrays.
+    """Return a command as an array of the state's dtype.
 
-    A command on the host is copied and stays on the host; ``put_command`` moves it to the device.
+    Leaves of ``data`` may be ``jax.ShapeDtypeStruct`` instead of arrays. A command on the host is copied and
+    stays on the host; ``put_command`` moves it to the device.
     """
     if data.controls.mode != control:
         raise ConfigError(
@@ -276,7 +282,10 @@ def _as_command(
 
 
 def put_command(data: SimData, command: Array | NDArray) -> Array:
-    """Return a checked command as an array on the device of the data, whose leaves may be shapes with shardings."""
+    """Return a checked command as an array on the device of the data.
+
+    Leaves of ``data`` may be ``jax.ShapeDtypeStruct`` with a sharding instead of arrays.
+    """
     if isinstance(command, jax.core.Tracer) or isinstance(data.states.pos, jax.core.Tracer):
         return jnp.asarray(command)
     sharding = data.states.pos.sharding

@@ -19,11 +19,11 @@ T = TypeVar("T")
 
 
 def apply_influence(plugin: Plugin, data: SimData) -> SimData:
-    """Return the data as the plugin's ``influence`` returns it, for the dynamics alone.
+    """Return the data with the plugin's ``influence`` applied, for the dynamics only.
 
-    It may write what the dynamics read besides the states that they advance: ``states.force``, ``states.torque``, the
-    rotor command (``controls.attitude.cmd`` in fitted dynamics), and ``params``. Anything else would be discarded
-    without effect, or count in the derivative as a state that the drone does not have.
+    An influence may change the inputs of the dynamics: ``states.force``, ``states.torque``, the rotor command
+    (``controls.attitude.cmd`` in fitted dynamics) and ``params``. Other changes are refused. They would be lost without
+    an effect, or the derivative would be evaluated at a state that the drone does not have.
     """
     where = f"influence of plugin {plugin.name!r} ({type(plugin).__name__})"
     after = _call_method(where, plugin.influence, data)
@@ -86,13 +86,13 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
 
 
 def apply_constraint(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
-    """Return the derivative under the constraint of a plugin; its errors carry a note with plugin and method."""
+    """Return the derivative with the constraint of a plugin applied."""
     where = f"constrain of plugin {plugin.name!r} ({type(plugin).__name__})"
     return _call_method(where, lambda data_seen: plugin.constrain(data_seen, deriv, dt), data, plugin.coupling)
 
 
 def _call_method(where: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:
-    """Return the result of a plugin's method; its errors carry a note with plugin and method."""
+    """Return the result of a plugin's method; an error of the method gets a note that names plugin and method."""
     try:
         return method(data)
     except Exception as error:

@@ -59,7 +59,7 @@ class Config:
     learning_rate: float = 3e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     teacher_decay: float = 0.8
-    """Ratio of the probability that the teacher acts in a step to that of the iteration before; it begins at 1."""
+    """Factor by which an iteration multiplies the probability that the teacher acts in a step, which begins at 1."""
     max_grad_norm: float = 1.0
     """Largest global norm of a gradient; larger ones are scaled down to it."""
 
@@ -71,7 +71,7 @@ class Config:
 
 
 class Agent(PyTree):
-    """Network, optimiser and statistics of one student; in a ``Learner`` stacked, with a leading axis over seeds."""
+    """Network, optimiser and statistics of one student; a ``Learner`` stacks them along a leading axis over seeds."""
 
     student: Layers
     """Network from normalised observations to the action before tanh."""
@@ -101,15 +101,15 @@ class Learner(PyTree):
 
 
 class Guided(Wrapper):
-    """Add the teacher's observations, ``teacher NAME``, to those of the student."""
+    """Wrapper that adds the teacher's observations to the student's, under the names ``teacher NAME``."""
 
     def __init__(self, env: Env, observe: Callable[[SimData], Obs]):
         """Wrap the student's environment.
 
         Args:
             env: Environment without automatic resets.
-            observe: Function from the true data to the teacher's observations, of one world, or of all if the task of
-                the environment is batched.
+            observe: Function from the true data to the teacher's observations. It is called with the data of one world,
+                or of all worlds if the task of the environment is batched.
         """
         super().__init__(env)
         self.observe, self.batched = observe, env.task.batched
@@ -125,10 +125,10 @@ class Guided(Wrapper):
 
 
 def with_teacher(env: Env, config: Config) -> Guided:
-    """Return an environment with the observations of the teacher in ``config.teacher`` as well.
+    """Return the environment with the observations of the teacher in ``config.teacher`` added.
 
     Raises:
-        ConfigError: If there is no teacher, or its task observes what the student's task does not keep.
+        ConfigError: If there is no teacher, or its task needs a record that the student's task does not have.
     """
     from crazysim.train.training import load_policy
 
@@ -151,9 +151,9 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
 
     Args:
         env: Environment of the training, with a block of worlds for each seed: ``Guided``, inside ``AutoReset``.
-        configs: Hyperparameters of each seed, which differ in those of ``SWEEPABLE`` at most.
+        configs: Hyperparameters of each seed. Only those in ``crazysim.train.hyperparameters.SWEEPABLE`` may differ.
         keys: Random keys of the seeds. (n_seeds,)
-        teacher: Policy of the teacher; None for that of the folder in the hyperparameters.
+        teacher: Policy of the teacher; None to load it from the folder in the hyperparameters.
     """
     config, n_worlds = configs[0], env.sim.n_worlds // len(configs)
     if n_worlds % config.minibatches:
@@ -236,10 +236,10 @@ def imitate(
     Args:
         env: Environment of the student without automatic resets.
         teacher: Trained policy, or any function from the teacher's observations to actions.
-        config: Hyperparameters by name, those of ``Config``; omitted ones have their defaults.
+        config: Hyperparameters by name, the fields of ``Config`` except ``teacher``; omitted ones have their defaults.
         seed: Random seed.
-        observe: Function from the true data of one world to the teacher's observations, of all worlds if the task is
-            batched; None for the observations of the task.
+        observe: Function from the true data to the teacher's observations. It is called with the data of one world, or
+            of all worlds if the task is batched. None for the observations of the task.
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name.
 
     Raises:
@@ -263,13 +263,13 @@ def imitate(
 
 
 def split_obs(obs: Obs) -> tuple[Obs, Obs]:
-    """Return the observations of the student and those of the teacher."""
+    """Return the student's observations, and the teacher's without ``PREFIX``."""
     shown = {name.removeprefix(PREFIX): x for name, x in obs.items() if name.startswith(PREFIX)}
     return {name: x for name, x in obs.items() if not name.startswith(PREFIX)}, shown
 
 
 def _load_teacher(folder: str, env: Env, shown: Obs) -> Policy:
-    """Return the policy of a run, after checking that its observations and actions are those of the environment."""
+    """Return the policy of a run, after checking that its observations and actions match the environment's."""
     from crazysim.train.training import load_policy
 
     policy, _, meta = load_policy(folder)
@@ -299,7 +299,7 @@ def _learn(agent: Agent, raw: Array, labels: Array, rates: Rates, key: Array, co
         labels: Actions of the teacher. (n_steps, n_worlds, n_drones, n_actions)
         rates: Hyperparameters of the seed. () each
         key: Random key.
-        config: Hyperparameters of all seeds; those in ``rates`` count.
+        config: Hyperparameters of all seeds; ``rates`` takes precedence.
     """
     transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
     samples = agent.stats.normalize(raw), labels

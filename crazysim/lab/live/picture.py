@@ -43,7 +43,8 @@ class Picture:
     drone_pos: NDArray
     """Positions of the drones, world frame, m. (n, n_drones, 3)"""
     setpoint: NDArray
-    """Goals of the loop, or positions in the state commands, world frame, m; empty without. (n, n_drones or 0, 3)"""
+    """Goals of the loop, or else the positions in the state commands, world frame, m; empty if there are neither.
+    (n, n_drones or 0, 3)"""
     has_contact: NDArray
     """True where a drone touches something. (n, n_drones)"""
     wind: NDArray
@@ -59,7 +60,7 @@ class Picture:
     controls: tuple[str, ...]
     """Lines of text that list the buttons and sliders of the loop, for viewers without a panel."""
     plot: NDArray
-    """Values of the plotted quantity of the selected drone. (k,)"""
+    """Values of the plotted quantity; empty if nothing is plotted. (k,)"""
 
 
 class PictureSource:
@@ -85,7 +86,7 @@ class PictureSource:
 
         Args:
             live: Loop of the simulation.
-            plot: Path of the quantity to plot, one of ``quantities``; empty for none.
+            plot: Quantity to plot, one of ``live.quantities`` or of the paths of ``quantities``; empty for none.
         """
         sim, worlds = self._sim, self._worlds
         data = sim.data

@@ -1,4 +1,4 @@
-"""ROS 2: poses, speeds and inertial measurements of drones and objects as messages, commands from messages, the clock.
+"""ROS 2 bridge: publishes the clock, states of drones and poses of objects, and receives commands.
 
 The package does not depend on ROS. ``RosBridge`` takes a node and the message classes that it uses; without classes it
 imports those of the ROS installation in which it runs.
@@ -6,12 +6,13 @@ imports those of the ROS installation in which it runs.
 | Topic | Message | |
 | --- | --- | --- |
 | `/clock` | `rosgraph_msgs/Clock` | simulated time |
-| `/NAME/pose` | `geometry_msgs/PoseStamped` | pose in the frame `world` |
-| `/NAME/odom` | `nav_msgs/Odometry` | pose in `world`, speeds in the drone's axes |
+| `/NAME/pose` | `geometry_msgs/PoseStamped` | pose of a drone or object in the frame `world` |
+| `/NAME/odom` | `nav_msgs/Odometry` | pose in `world`, linear and angular velocity in the body frame |
 | `/NAME/imu` | `sensor_msgs/Imu` | attitude, angular velocity, specific force |
 | `/NAME/cmd_vel` | `geometry_msgs/Twist` | velocity, world frame, and yaw rate |
 | `/NAME/cmd_pose` | `geometry_msgs/PoseStamped` | position and yaw |
-| `/NAME/cmd_attitude` | `geometry_msgs/QuaternionStamped` and `/NAME/cmd_thrust`, `std_msgs/Float64` | attitude, N |
+| `/NAME/cmd_thrust` | `std_msgs/Float64` | collective thrust of the next attitude commands, N |
+| `/NAME/cmd_attitude` | `geometry_msgs/QuaternionStamped` | attitude, with the latest thrust |
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ MESSAGES = {
     "Imu": "sensor_msgs.msg",
     "Float64": "std_msgs.msg",
 }
-"""Message classes, and the Python modules of ROS that contain them."""
+"""ROS modules that contain the message classes, by the name of the class."""
 DEPTH = 10
 """Length of the queues of publishers and subscriptions."""
 
@@ -84,7 +85,7 @@ class RosBridge:
         Args:
             swarm: Swarm.
             node: Node, ``rclpy.node.Node`` or an object with its ``create_publisher`` and ``create_subscription``.
-            messages: Object with the classes of ``MESSAGES`` as attributes; None for ROS's own.
+            messages: Object with the classes of ``MESSAGES`` as attributes; None to import them from ROS.
             objects: Names of movable objects of the scene, such as ``"cf1:0"``, whose poses are published too.
             freq: Messages per second of simulated time, Hz.
             frame: Name of the world frame.
@@ -122,7 +123,7 @@ class RosBridge:
                 node.create_subscription(kind, f"/{name}/{topic}", self._guarded(k, take), DEPTH)
 
     def __call__(self, live: Live) -> None:
-        """Publish messages that are due, as a process of a live loop."""
+        """Publish messages that are due; for a bridge that is added to a live loop as a process."""
         del live
         self.update()
 
@@ -225,7 +226,7 @@ def _get(part: Any, names: str = "xyz") -> NDArray:
 
 
 def _unit_rpy(quat: NDArray) -> NDArray:
-    """Return roll, pitch and yaw, rad, of a quaternion of any length."""
+    """Return roll, pitch and yaw, rad, of a quaternion, xyzw, whose length is finite and above 1e-3."""
     norm = float(np.linalg.norm(quat))
     if not 1e-3 < norm < math.inf:
         raise ConfigError(f"expected a unit quaternion, xyzw, got {quat.tolist()}")

@@ -16,14 +16,14 @@ class Button:
     name: str
     """Text on the button."""
     call: Callable[[], object]
-    """Function."""
+    """Function to call."""
     key: str | None = None
-    """Key that calls the same function; None for none."""
+    """Key that calls the same function; None if no key does."""
 
 
 @dataclass(frozen=True)
 class Slider:
-    """A slider that calls a function between two steps, with its value."""
+    """A slider that calls a function with its value, between two steps."""
 
     name: str
     """Label of the slider."""
@@ -34,14 +34,14 @@ class Slider:
     value: float
     """Initial value."""
     call: Callable[[float], object]
-    """Function of the value."""
+    """Function to call with the value."""
 
 
 Control = Button | Slider
 
 
 class Viewer(Generic[L]):
-    """Base of viewers of a loop ``L``, which calls their methods in its thread; the methods must not wait."""
+    """Base class of viewers. A loop of type ``L`` calls their methods in its own thread, so they must not block."""
 
     def open(self, live: L) -> None:
         """Show the simulation of a loop from now on, with the controls that it has.

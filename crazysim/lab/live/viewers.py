@@ -32,7 +32,7 @@ class Viewers(Generic[L]):
 
         Args:
             fps: Pictures per second.
-            on_last_closed: Function that is called when no viewer is left.
+            on_last_closed: Function that is called when ``update`` has removed the last viewer.
         """
         self.period = 1.0 / fps
         self.n_pictures = self.failures = 0
@@ -54,11 +54,11 @@ class Viewers(Generic[L]):
         self._open.append(viewer)
 
     def draw(self, live: L, due: float) -> bool:
-        """Send a picture to every viewer if it is due, and return True if it was.
+        """Send a picture to every viewer if one is due; return True if so.
 
         Args:
             live: Loop.
-            due: Time from which a picture is sent, s, by ``time.perf_counter``.
+            due: Earliest time at which to send a picture, s, by ``time.perf_counter``.
         """
         now = time.perf_counter()
         if not self._open or now < due:

@@ -1,4 +1,4 @@
-"""Closed loop against logs: controller and filter of the firmware follow the setpoints of real flights."""
+"""Closed-loop simulations against flight logs: the firmware's controller and filter track the logged setpoints."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from crazysim.sim.sim import Sim
 FREQ = 100
 """Rate of the samples of a flight, and of commanded setpoints, Hz."""
 COLUMNS = ("t", "px", "py", "pz", "sp_ctrltarget_x", "sp_ctrltarget_y", "sp_ctrltarget_z", "sp_ctrltarget_yaw")
-"""Columns of a log of NanoBench (arXiv 2603.09908): time, s, motion capture, m, setpoint, m and degrees."""
+"""Columns of a log of NanoBench (arXiv 2603.09908): time, s; position from motion capture, m; setpoint of the
+position, m, and of the yaw, degrees."""
 AIRBORNE_SHARE, SETTLING_TIME, LANDING_TIME = 0.9, 2.0, 0.5
-"""A flight is compared from ``SETTLING_TIME`` seconds after its setpoint has reached ``AIRBORNE_SHARE`` of its median
-height, until ``LANDING_TIME`` seconds before it leaves that height."""
+"""A flight is compared from ``SETTLING_TIME`` seconds after its setpoint first rises above ``AIRBORNE_SHARE`` of its
+median height, until ``LANDING_TIME`` seconds before it last drops below it. The median is over the samples above half
+of the largest height."""
 MAX_DISTANCE = 2.0
 """Distance from the setpoint, m, beyond which a flight has failed; setpoints jump by up to 1.2 m."""
 MAX_LAG = 1.2
@@ -36,9 +38,9 @@ class Flight:
     name: str
     """Name of the log."""
     setpoint: NDArray
-    """Commanded position, with the height relative to the tracked body at rest on the floor, m, and yaw, rad. (n, 4)"""
+    """Commanded position, m, and yaw, rad. Heights are relative to the tracked body at rest on the floor. (n, 4)"""
     pos: NDArray
-    """Measured position, likewise, m. (n, 3)"""
+    """Measured position, with heights as in ``setpoint``, m. (n, 3)"""
 
     @property
     def compared_samples(self) -> slice:
@@ -53,7 +55,7 @@ class Flight:
         return float(np.sqrt(np.mean(np.sum(error**2, axis=-1))))
 
     def lag(self, pos: NDArray) -> float:
-        """Return the lag behind the setpoint at which positions, (n, 3), are closest to it horizontally, s."""
+        """Return the lag, s: the delay of the setpoint that brings it horizontally closest to the positions, (n, 3)."""
         first, last = self.compared_samples.start, self.compared_samples.stop
 
         def distance(k: int) -> float:
@@ -77,7 +79,7 @@ class Comparison:
     simulated_lag: float
     """The same in the simulation, s."""
     failed: bool
-    """True if the real drone was farther than ``MAX_DISTANCE`` from its setpoint."""
+    """True if the real drone was farther than ``MAX_DISTANCE`` from its setpoint in a compared sample."""
 
     @property
     def ratio(self) -> float:
@@ -130,10 +132,11 @@ def commanded_samples(name: str, height: NDArray) -> NDArray:
 
 
 def laboratory_estimator(quat_deviation: float = 0.06) -> Estimator:
-    """Return the firmware's filter as laboratories with motion capture set it up.
+    """Return the firmware's Kalman filter with the settings of a laboratory with motion capture.
 
-    Positions at rest in NanoBench's logs scatter by 0.1 mm at most. The default of ``quat_deviation``, rad, is the
-    value in Bitcraze's examples for motion capture (crazyflie-lib-python, examples/mocap/qualisys_hl_commander.py).
+    The noise of positions is 0.1 mm, the most by which they scatter at rest in NanoBench's logs. The default of
+    ``quat_deviation``, rad, is the value in Bitcraze's examples for motion capture (crazyflie-lib-python,
+    examples/mocap/qualisys_hl_commander.py).
     """
     sensors = [IMU.crazyflie(), MotionCapture(noise=1e-4)]
     return Kalman(sensors, deviations={"quat": quat_deviation})
@@ -144,13 +147,13 @@ def simulate_flights(
 ) -> NDArray:
     """Return the positions of simulated drones that follow the setpoints of flights, m. (n, n_flights, 3)
 
-    The controller is the firmware's ``"pid"``, and each drone starts where the real one did. Flights are continued with
-    their last setpoint until the longest one ends.
+    The controller is the firmware's ``"pid"``. Each drone starts on the floor, at the horizontal position at which the
+    real one started. Shorter flights continue with their last setpoint until the longest one ends.
 
     Args:
         flights: Flights.
         drone: Airframe.
-        estimator: Filter that the controllers fly on; None for the true state.
+        estimator: Filter whose estimates the controllers use; None for the true state.
     """
     sim = Sim(len(flights), drone=drone, control="state", controller="pid", estimator=estimator)
     start = np.stack([flight.pos[0] * [1, 1, 0] for flight in flights])[:, None]

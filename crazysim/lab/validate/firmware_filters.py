@@ -1,4 +1,4 @@
-"""The firmware's filters against recorded outputs of its compiled C sources."""
+"""Our versions of the firmware's filters against recorded outputs of the compiled C sources."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from crazysim.plugins.estimators import error_state, updates
 
 FILTER_RECORDINGS = RECORDINGS / "plugins" / "estimators"
 MEASUREMENT_KINDS = ("difference", "distance", "flow", "ground", "pose", "position", "range", "sweep")
-"""Measurements of the recordings of the Kalman filter."""
+"""Kinds of measurements of the Kalman filter, one for each recording."""
 ANCHORS = ((-3.0, -3.0, 0.2), (3.0, -3.0, 2.4), (3.0, 3.0, 0.2), (-3.0, 3.0, 2.4))
 """Positions of the anchors, m."""
 DIODE_OFFSET = np.array([0.015, 0.0075, 0.0], np.float32)
@@ -29,7 +29,20 @@ PROCESS_VARIANCE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4,
 
 
 def update_with_measurements(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, stations: Any) -> Any:
-    """Return the estimate after the measurements of a loop, as tests/plugins/estimators/record_filter.py takes them."""
+    """Return the estimate after the measurements of one loop of the Kalman filter.
+
+    The loops in which measurements are used, and their deviations, are as in
+    tests/plugins/estimators/record_filter.py.
+
+    Args:
+        kind: One of ``MEASUREMENT_KINDS``.
+        k: Number of the loop, from 1. ()
+        m: Measurements of the loop. (9,)
+        gyro: Angular velocity, body frame, rad/s. (3,)
+        estimate: The estimate before.
+        rot: Attitude at the end of the previous loop, as a matrix. (3, 3)
+        stations: Positions, m, (2, 3), and attitudes, station to world, (2, 3, 3), of the two Lighthouse stations.
+    """
     if kind in ("position", "ground"):
         return error_state.select_estimate(k % 10 == 5, updates.update_pos(estimate, m[:3], 0.01), estimate)
     if kind == "pose":
@@ -56,13 +69,14 @@ def update_with_measurements(kind: str, k: Any, m: Any, gyro: Array, estimate: A
 
 
 def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
-    """Return states and covariances of the Kalman filter in flights of 4 s, every 0.1 s, ours and the firmware's.
+    """Return states and covariances of our Kalman filter and of the firmware's, every 0.1 s of a recording of 4 s.
 
     Args:
-        kind: One of ``MEASUREMENT_KINDS``; ``"ground"`` is a drone at rest, the others fly fast.
+        kind: One of ``MEASUREMENT_KINDS``. In ``"ground"`` the drone is on the ground, in the others it flies fast.
 
     Returns:
-        Position, m, velocity, m/s, error of attitude, rad, quaternion wxyz, and covariance. (40, n)
+        Position, m, velocity, body frame, m/s, attitude error, rad, quaternion, wxyz, and the upper triangle of the
+        covariance, row by row. (40, 58) each
     """
     level = jnp.array([0.0, 0.0, 0.0, 1.0])
     with np.load(FILTER_RECORDINGS / "firmware_filter.npz") as file:
@@ -90,13 +104,13 @@ def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
 
 
 def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
-    """Return states of the complementary filter in 2 s at steps of 1 ms, every 20 ms, ours and the firmware's.
+    """Return states of our complementary filter and of the firmware's, every 20 ms of a recording of 2 s.
 
     Args:
         kind: Source of the height: ``"pressure"`` or ``"ground"``.
 
     Returns:
-        Quaternion xyzw, height, m, and climb rate, m/s. (100, 6)
+        Quaternion, xyzw, height, m, and climb rate, m/s. (100, 6) each
     """
     with np.load(FILTER_RECORDINGS / "firmware_complementary.npz") as file:
         inputs, recorded = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"]
@@ -123,11 +137,11 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
 
 
 def compare_filters() -> Iterable[Row]:
-    """Yield the largest differences of states from the compiled firmware's."""
+    """Yield the largest differences between the states of our filters and of the compiled firmware."""
     for kind in MEASUREMENT_KINDS:
         estimates, recorded = kalman_states(kind)
         difference = np.abs(estimates - recorded)
-        # rounding of float32, which 4,000 loops add up
+        # the limits allow for float32 rounding errors, which accumulate over 4,000 loops
         yield Row(f"Kalman filter, {kind}: position, velocity, attitude error", "compiled C, 4 s",
                   float(difference[:, :9].max()), "m, m/s, rad", (0, 2e-4))  # fmt: skip
         yield Row(f"Kalman filter, {kind}: quaternion", "compiled C, 4 s",

@@ -41,7 +41,7 @@ class ComplementaryData(PyTree):
     quat: Array = leaf("drone", 1)
     """Attitude, body to world, xyzw. (n_worlds, n_drones, 4)"""
     integral: Array = leaf("drone", 1, (3,))
-    """Integral of the attitude error, rad/s. (n_worlds, n_drones, 3)"""
+    """Integral of the attitude error, times ``ki``, rad/s. (n_worlds, n_drones, 3)"""
     height: Array = leaf("drone", 1, (1,))
     """Height, m. (n_worlds, n_drones, 1)"""
     climb: Array = leaf("drone", 1, (1,))
@@ -54,7 +54,7 @@ class ComplementaryData(PyTree):
     kp: Array = leaf("parameter", 1, (1,))
     """Gain of the attitude error, 1/s. (1,)"""
     ki: Array = leaf("parameter", 1, (1,))
-    """Gain of its integral, 1/s^2. (1,)"""
+    """Gain of the integral of the attitude error, 1/s^2. (1,)"""
 
 
 class Complementary(Estimator):
@@ -62,10 +62,10 @@ class Complementary(Estimator):
 
     The gyroscope is integrated, and the attitude is slowly corrected towards the direction of gravity that the
     accelerometer measures (Mahony's filter); the heading is not corrected. Positions and velocities along x and y are
-    zero, as in the firmware, so drones can be controlled with it at the level of attitude and below. Sources:
-    sensfusion6.c, estimator_complementary.c and position_estimator_altitude.c of bitcraze/crazyflie-firmware, commit
-    2a18fc29. The filter begins at the true attitude and height, and assumes that the accelerometer measures 1 g at
-    rest.
+    zero, as in the firmware, so controllers can use the estimate only for commands at the level of attitude and below.
+    Sources: sensfusion6.c, estimator_complementary.c and position_estimator_altitude.c of bitcraze/crazyflie-firmware,
+    commit 2a18fc29. The filter begins at the true attitude, height and vertical velocity, and assumes that the
+    accelerometer measures 1 g at rest.
     """
 
     _: dataclasses.KW_ONLY
@@ -74,7 +74,7 @@ class Complementary(Estimator):
     kp: ArrayLike = parameter(default=0.4, low=0.0)
     """Gain of the attitude error, 1/s. () or (n_worlds, n_drones)"""
     ki: ArrayLike = parameter(default=0.001, low=0.0)
-    """Gain of its integral, 1/s^2. () or (n_worlds, n_drones)"""
+    """Gain of the integral of the attitude error, 1/s^2. () or (n_worlds, n_drones)"""
     name: str = "complementary"
 
     @classmethod
@@ -127,7 +127,7 @@ class Complementary(Estimator):
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated attitude, height and vertical velocity of one drone; along x and y both are zero."""
+        """Return the estimated attitude, position and velocity of one drone; x and y of the last two are zero."""
         record, s = self.read(data), data.states
         zero = jnp.zeros_like(s.pos[..., :2])
         pos, vel = (jnp.concatenate([zero, up], axis=-1) for up in (record.height, record.climb))
@@ -139,7 +139,7 @@ class Complementary(Estimator):
         return self.write(data, record.replace(quat=s.quat, height=s.pos[2:], climb=up, inertial_climb=up))
 
     def _height(self, data: SimData, record: ComplementaryData, dt: float) -> tuple[Array, Array]:
-        """Return the height of one drone, m, and 1 once it has measured the ground. (1,) each"""
+        """Return the height of one drone, m, and its new ``over_surface``. (1,) each"""
         height, over_surface, shift = record.height, record.over_surface, dt * record.inertial_climb
         after = height
         for sensor in self.aids:
@@ -154,22 +154,28 @@ class Complementary(Estimator):
 
 
 def filtered_height(height: Array, measured: Array, shift: Array) -> Array:
-    """Return the height, m, from the last one, a measured one and the inertial change in the interval, m. (1,) each"""
+    """Return the height after an update, m. (1,)
+
+    Args:
+        height: Height before, m. (1,)
+        measured: Measured height, m. (1,)
+        shift: Change of the height in the interval by the inertial velocity, m. (1,)
+    """
     return KEEP_HEIGHT * height + (1 - KEEP_HEIGHT) * measured + shift
 
 
 def height_over_surface(
     height: Array, by_pressure: Array, distance: Array, useful: Array, over_surface: Array, shift: Array
 ) -> tuple[Array, Array]:
-    """Return the height, m, and 1 once the ground has been measured, else 0 (``positionEstimateInternal``). (1,) each
+    """Return the height after an update, m, and the new ``over_surface`` (``positionEstimateInternal``). (1,) each
 
     Args:
-        height: Height before. (1,)
-        by_pressure: Height to use if the ground was never measured, m. (1,)
+        height: Height before, m. (1,)
+        by_pressure: Height to use if the distance to the ground was never measured, m. (1,)
         distance: Distance to the ground, m. (1,)
         useful: True where the distance is recent and within the sensor's range. (1,)
-        over_surface: 1 if the ground has been measured before. (1,)
-        shift: Inertial change of the height in the interval, m. (1,)
+        over_surface: 1 if the distance to the ground has been measured before, else 0. (1,)
+        shift: Change of the height in the interval by the inertial velocity, m. (1,)
     """
     over_surface = jnp.where(useful, 1.0, over_surface)
     height_estimate = jnp.where(over_surface > 0, height, by_pressure)
@@ -185,12 +191,12 @@ def update_mahony(
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (4,)
-        integral: Integral of the attitude error, rad/s. (3,)
+        integral: Integral of the attitude error, times ``ki``, rad/s. (3,)
         gyro: Angular velocity, body frame, rad/s. (3,)
         accel: Specific force, body frame, in any unit; zero for no correction. (3,)
         dt: Length of the interval, s.
         kp: Gain of the attitude error, 1/s. (1,)
-        ki: Gain of its integral, 1/s^2. (1,)
+        ki: Gain of the integral of the attitude error, 1/s^2. (1,)
     """
     error = rotation.cross(rotation.safe_normalize(accel, jnp.zeros_like(accel)), rotation.matrix(quat)[2])
     integral = integral + ki * dt * error
@@ -201,10 +207,10 @@ def update_mahony(
 
 
 def inertial_climb(climb: Array, quat: Array, accel: Array, dt: float) -> Array:
-    """Return the velocity upwards, m/s, (1,), after an interval (``positionUpdateVelocity``).
+    """Return the upward velocity after an interval, m/s (``positionUpdateVelocity``). (1,)
 
     Args:
-        climb: The velocity before. (1,)
+        climb: Upward velocity before, m/s. (1,)
         quat: Attitude, body to world, unit, xyzw. (4,)
         accel: Specific force, body frame, m/s^2. (3,)
         dt: Length of the interval, s.

@@ -1,4 +1,4 @@
-"""Error-state Kalman filter with biases of the inertial sensors, for any airframe, and flight on its estimate."""
+"""Error-state Kalman filter for any airframe, which also estimates the biases of the inertial sensors."""
 
 from __future__ import annotations
 
@@ -38,8 +38,9 @@ RESTART_STD = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
 """The same for the restart of a filter that diverged. These are assumptions: 10 is the square root of
 ``error_state.MAX_COVARIANCE``."""
 MIN_STD = 1e-3
-"""Least standard deviation assumed for a measurement, in m, m/s, rad or pixels, and as a share of the field for a
-magnetometer; 100 times as much, 0.1 Pa, for pressures. An assumption for sensors without noise, and for float32."""
+"""Smallest standard deviation assumed for a measurement: in m, m/s, rad or pixels, and as a share of the field for a
+magnetometer. It is 100 times as large for pressures, 0.1 Pa, and a tenth for sweeps of a ``Lighthouse``, 1e-4 rad. This
+is an assumption, for sensors without noise and for float32."""
 
 
 class ESKFData(PyTree):
@@ -53,30 +54,33 @@ class ESKFData(PyTree):
     """Sum of half the angular velocity at the last prediction and the angular velocities since then, for the
     trapezoidal rule, body frame, rad/s. (n_worlds, n_drones, 3)"""
     used: Array = leaf("drone", 1)
-    """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
+    """Step in which the latest used measurement of each sensor was taken; -1 before the first.
+    (n_worlds, n_drones, n_sensors)"""
     failures: Array = leaf("drone", 1)
     """Number of times that the estimate left its bounds and the filter restarted. (n_worlds, n_drones, 1)"""
     paths: Array | None = leaf("drone", 2)
-    """Paths from where measurements in transit were taken to the last prediction, newest first, for each sensor whose
-    measurements are late; None without such a sensor. (n_worlds, n_drones, n_rows, 10)"""
+    """Inertial paths to the last prediction, from the times at which the measurements in transit were taken. They are
+    grouped by sensor, newest first; None if no sensor is late. (n_worlds, n_drones, n_rows, 10)"""
 
 
 class ESKF(ErrorStateFilter):
     """Error-state Kalman filter: position, velocity, attitude and biases of the ``IMU``, for any airframe.
 
     The filter of J. Solà, Quaternion kinematics for the error-state Kalman filter (2017, arXiv 1711.02508), with the
-    velocity in the body frame. It takes its noise from the records of its sensors, so it has no gains to tune:
-    densities, random walk and spread of the biases of the ``IMU``, and the noise of the other sensors, whose wandering
-    and constant errors are treated as white noise. It takes any of ``MotionCapture``, ``GPS``, ``Barometer``,
-    ``Magnetometer``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and ``Lighthouse``, and assumes that they are at the
-    centre of mass.
+    velocity in the body frame. It reads the noise from the records of its sensors, so it has no gains to tune. Of the
+    ``IMU`` it uses the noise densities, and the random walk, wander and spread of the biases. Wandering and constant
+    errors of the other sensors are treated as white noise.
+
+    The filter takes any of ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``, ``OpticalFlow``,
+    ``TimeOfFlight``, ``UWB`` and ``Lighthouse``. It assumes that they are at the centre of mass, except for the diodes
+    of ``Lighthouse``, and that the body that ``MotionCapture`` tracks has the attitude of the drone.
     """
 
     _: dataclasses.KW_ONLY
     max_pos: float = setting(default=1e4, positive=True)
-    """Coordinate beyond which the estimate has diverged, m."""
+    """Magnitude of a position coordinate beyond which the estimate has diverged, m."""
     max_vel: float = setting(default=100.0, positive=True)
-    """Velocity along an axis beyond which the estimate has diverged, m/s."""
+    """Magnitude of the velocity along an axis beyond which the estimate has diverged, m/s."""
     reset_before: ClassVar[str | None] = "integration"
     """Name of the stage before which an episode is reset, so that the reset uses the state before the first step."""
     name: str = "eskf"
@@ -137,7 +141,7 @@ class ESKF(ErrorStateFilter):
     def _initial_estimate(
         self, data: SimData, pos: Array, vel: Array, quat: Array, deviations: Sequence[float]
     ) -> Estimate:
-        """Return the estimate of one drone before any measurement, with the mean biases of its sensors."""
+        """Return the estimate of one drone before any measurement, with the mean biases of its ``IMU``."""
         imu = self.imu.read(data)
         spreads = [
             x
@@ -168,7 +172,10 @@ class ESKF(ErrorStateFilter):
 
     def _path_start_stage(self, sensor: Sensor, period: int) -> Callable[[SimData], SimData]:
         def begin_path(data: SimData) -> SimData:
-            """Start a path at the measurement of one sensor; for now it leads back to the last prediction."""
+            """Start a path at a new measurement of one sensor.
+
+            It leads back to the last prediction; the next prediction extends it.
+            """
             record, (gyro, accel) = self.read(data), self.inertial(data)
             since_prediction = ((data.core.steps + 1) % period).astype(gyro.dtype) / data.core.freq
             empty_row = jnp.asarray(inertial_path.EMPTY_PATH_ROW, gyro.dtype)
@@ -191,12 +198,15 @@ class ESKF(ErrorStateFilter):
         return first, first + counts[self.aids.index(sensor)]
 
     def update_estimate(self, sensor: Sensor, data: SimData, record: ESKFData) -> Estimate:
-        """Return one drone's estimate after a sensor's latest measurement, applied to the state when it was taken."""
+        """Return the estimate of one drone after the latest measurement of a sensor.
+
+        The estimate is moved to the time at which the measurement was taken, updated, and moved back.
+        """
         steps, taken, gravity = data.core.steps, sensor.read(data).samples.taken[0], data.params.gravity_vec
         period, (gyro, accel) = self.prediction_schedule(data.core.freq)[0], self.inertial(data)
         since_prediction = (taken - steps + (steps + 1) % period).astype(
             gyro.dtype
-        ) / data.core.freq  # the last prediction
+        ) / data.core.freq  # negative before the last prediction
         if not sensor.is_late:
             past_estimate = error_state.propagate(record.estimate, accel, gyro, since_prediction, gravity)
             past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
@@ -226,12 +236,12 @@ def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
 
 
 def _sampling_predicate(sensor: Sensor) -> Callable[[SimData], Array | None]:
-    """Return a function that is true in the steps in which a sensor takes a measurement."""
+    """Return a function that returns True in the steps in which a sensor measures, or None if it always does."""
     return lambda data: acts_now(data, sensor.freq or data.core.freq)
 
 
 def _bias_walk(triad: TriadData, dt: float) -> Array:
-    """Return the variance of the change of a bias in an interval, with the wandering part as a random walk. (3,)"""
+    """Return the variance of the change of a bias in an interval, approximating its wander as a random walk. (3,)"""
     return dt * (triad.random_walk**2 + 2 * triad.instability**2 / triad.correlation_time)
 
 

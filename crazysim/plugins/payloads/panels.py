@@ -32,7 +32,7 @@ def shape_panels(shape: Shape, largest: float) -> Panels:
 
     Args:
         shape: Sphere or box.
-        largest: Largest edge of a panel, m.
+        largest: Largest edge of a panel, m; on a ball, the square root of its largest area.
     """
     if shape.kind == "sphere":
         return _ball_panels(shape.size[0], largest)

@@ -1,4 +1,4 @@
-"""Motion capture: position, attitude and velocity from cameras, late and with gaps."""
+"""Motion capture: position, attitude and velocity from cameras, optionally delayed and with lost measurements."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class MotionCaptureData(PyTree):
     last: Array = leaf("drone", 1, (3,))
     """Last measured position, world frame, m. (n_worlds, n_drones, 3)"""
     vel: Array = leaf("drone", 1, (3,))
-    """Low-passed difference quotient of the positions, m/s. (n_worlds, n_drones, 3)"""
+    """Low-pass filtered difference quotient of the positions, world frame, m/s. (n_worlds, n_drones, 3)"""
     noise: Array = leaf("parameter", 1, (3,), sparse=True)
     """Standard deviation of a position, m. (3,)"""
     angle_noise: Array = leaf("parameter", 1, (3,), sparse=True)
