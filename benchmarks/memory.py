@@ -33,7 +33,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 """Hyperparameters of the variants, by name."""
 AIRFRAMES = ("cf2x_L250", "cf2x_P250", "cf2x_T350")
-"""Crazyflies other than that of the training, cf21B_500."""
+"""Crazyflies other than ``cf21B_500``, with which the policies are trained."""
 
 
 def main() -> None:

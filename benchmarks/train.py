@@ -111,7 +111,7 @@ def main() -> None:
 
 
 def sources() -> str:
-    """Return a hash of the sources of the package, by which finished runs of others are told."""
+    """Return a hash of the package's sources, which shows whether a finished run is of the same sources."""
     digest = hashlib.sha256()
     for path in sorted(path for path in PACKAGE.rglob("*") if path.suffix in (".py", ".toml", ".xml")):
         digest.update(str(path.relative_to(PACKAGE)).encode() + path.read_bytes())
@@ -135,7 +135,7 @@ def read(store: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
 
 
 def groups_of(missing: list[tuple[Any, ...]], largest: int) -> list[list[tuple[Any, ...]]]:
-    """Return the runs to train in groups that differ in their seeds alone, of limited size, the longest first."""
+    """Return the runs to train in groups of at most ``largest`` that differ only in the seed, the longest first."""
     groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
     for key in missing:
         groups.setdefault((key[0], *key[2:]), []).append(key)
@@ -155,7 +155,7 @@ def train_all(
     about: dict[str, Any],
     results: dict[Any, dict[str, Any]],
 ) -> list[str]:
-    """Train each group, add what ends well to the results and their file, and return what went wrong."""
+    """Train each group, add the results of successful trainings to ``results`` and its file, and return failures."""
     failures = []
     out.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(about["parallel"]) as pool:
@@ -182,7 +182,7 @@ def train_all(
 
 
 def folder_of(out: Path, task: str, seeds: str, device: str, *arguments: str) -> Path:
-    """Return the folder of a run, which is in ``out`` whatever the place of the task, such as ``../task.py:NAME``."""
+    """Return the folder of a run, which is in ``out`` even if the task is elsewhere, such as ``../task.py:NAME``."""
     return out / re.sub(r"[^A-Za-z0-9_.-]+", "_", "-".join([task, device, seeds, *arguments]))
 
 
@@ -190,7 +190,7 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
     """Train some seeds of a task in a new process and return the results of each.
 
     Args:
-        group: Task, seed, device and further arguments of ``crazysim train``, which differ in the seed alone.
+        group: Task, seed, device and further arguments of ``crazysim train`` for each run; only the seeds differ.
         out: Folder of the runs.
         about: Hash of the sources, and the number of processes that run at the same time.
 
@@ -302,7 +302,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def time_of(row: dict[str, Any]) -> str:
-    """Return the time of the training of a row, and what else ran in it."""
+    """Return the training time in a row as text, with the number of seeds and processes that shared it."""
     text = f"{digits(row['seconds'], 2):g} s"
     text += f" for {row['together']} seeds" if row.get("together", 1) != 1 else ""
     return text + (f", {row['parallel']} at a time" if row["parallel"] != 1 else "")

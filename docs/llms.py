@@ -12,12 +12,12 @@ LINK = re.compile(r"\[([^\]]*)\]\(([^)]+\.md)\)")
 
 
 def page_list(name: str, description: str, places: dict[str, str]) -> str:
-    """Return ``llms.txt``: the list of pages in ``docs/README.md``, with the pages of the site as targets.
+    """Return ``llms.txt``: the list of pages in ``docs/README.md``, with links to the pages of the site.
 
     Args:
         name: Name of the site.
-        description: What the site is about, one line.
-        places: Places on the site of pages outside of ``docs/``.
+        description: Description of the site, one line.
+        places: Pages of the site by their files, for files outside of ``docs/``.
     """
 
     def link(match: re.Match[str]) -> str:

@@ -88,7 +88,7 @@ DEFAULT_RECIPES: dict[str, Recipe] = {
     "apg": Recipe("apg", n_worlds=64, config={"iterations": 200}, evaluate_every=40),
     "dagger": Recipe("dagger", n_worlds=256, evaluate_every=50),
 }
-"""Recipes by algorithm, for tasks that have none for it."""
+"""Recipes by algorithm, for tasks without a recipe for it."""
 
 
 def recipe_of(task: str, algorithm: str | None = None) -> Recipe:
@@ -123,9 +123,9 @@ class TrainConfig:
     config: dict[str, Any]
     """Hyperparameters of the algorithm; omitted ones have their defaults."""
     own_network: bool = False
-    """True if the policy has a network of one's own."""
+    """True if the policy has a network of your own instead of the built-in one."""
     network: Network | None = field(default=None, compare=False)
-    """Network of one's own, of which the files of a run have the weights alone; None for the built-in one."""
+    """Network of your own; None for the built-in one. The files of a run hold its weights, but not its functions."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -175,8 +175,8 @@ class TrainConfig:
             n_worlds: Number of parallel worlds.
             options: Options of ``crazysim.envs.make``.
             config: Hyperparameters of the algorithm.
-            resumed: Configuration of the run to continue, from which omitted values come instead; None for a new run.
-            network: Network of one's own in place of the built-in one; None for that.
+            resumed: Configuration of the run to continue, which then provides omitted values; None for a new run.
+            network: Network of your own; None for the built-in one.
         """
         entry = entry_of(task)
         known = {} if resumed is None else resumed.options
@@ -233,7 +233,7 @@ class TrainConfig:
 
 
 def _is_same_setting(x: Any, y: Any) -> bool:
-    """Return true if two values of a setting are the same in JSON, where lists and tuples are alike."""
+    """Return True if two values of a setting have the same JSON, in which lists and tuples do not differ."""
     try:
         return json.dumps(x) == json.dumps(y)
     except (TypeError, ValueError):

@@ -1,9 +1,9 @@
 """DAgger (Ross, Gordon and Bagnell 2011): a student learns a teacher's actions from other observations.
 
 The student flies, so that it learns in the states that its own errors lead to, and the teacher's action in each state
-is its label. The paper's algorithm fits all samples so far. This one takes gradient steps on each rollout and drops it;
-the paper's bounds hold for any no-regret learner. A rollout of hundreds of worlds is large enough for that, and images
-of all iterations would not fit in memory.
+is its label. The paper's algorithm fits all samples so far. This one takes gradient steps on each rollout and then
+discards it; the paper's bounds hold for any no-regret learner. A rollout of hundreds of worlds has enough samples for
+such steps, and images of all iterations would not fit in memory.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Config:
     learning_rate: float = 3e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     teacher_decay: float = 0.8
-    """Factor by which an iteration multiplies the probability that the teacher acts in a step, which begins at 1."""
+    """Factor by which the probability that the teacher acts in a step changes with every iteration; it begins at 1."""
     max_grad_norm: float = 1.0
     """Largest global norm of a gradient; larger ones are scaled down to it."""
 
@@ -71,7 +71,7 @@ class Config:
 
 
 class Agent(PyTree):
-    """Network, optimiser and statistics of one student; a ``Learner`` stacks them along a leading axis over seeds."""
+    """Network, optimiser and statistics of one student; in a ``Learner`` stacked, with a leading axis over seeds."""
 
     student: Layers
     """Network from normalised observations to the action before tanh."""
@@ -101,15 +101,15 @@ class Learner(PyTree):
 
 
 class Guided(Wrapper):
-    """Wrapper that adds the teacher's observations to the student's, under the names ``teacher NAME``."""
+    """Add the teacher's observations, ``teacher NAME``, to those of the student."""
 
     def __init__(self, env: Env, observe: Callable[[SimData], Obs]):
         """Wrap the student's environment.
 
         Args:
             env: Environment without automatic resets.
-            observe: Function from the true data to the teacher's observations. It is called with the data of one world,
-                or of all worlds if the task of the environment is batched.
+            observe: Function from the true data to the teacher's observations, of one world, or of all if the task of
+                the environment is batched.
         """
         super().__init__(env)
         self.observe, self.batched = observe, env.task.batched
@@ -125,10 +125,10 @@ class Guided(Wrapper):
 
 
 def with_teacher(env: Env, config: Config) -> Guided:
-    """Return the environment with the observations of the teacher in ``config.teacher`` added.
+    """Return an environment with the observations of the teacher in ``config.teacher`` as well.
 
     Raises:
-        ConfigError: If there is no teacher, or its task needs a record that the student's task does not have.
+        ConfigError: If there is no teacher, or the student's task does not keep the record of the teacher's task.
     """
     from crazysim.train.training import load_policy
 
@@ -151,9 +151,9 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
 
     Args:
         env: Environment of the training, with a block of worlds for each seed: ``Guided``, inside ``AutoReset``.
-        configs: Hyperparameters of each seed. Only those in ``crazysim.train.hyperparameters.SWEEPABLE`` may differ.
+        configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
-        teacher: Policy of the teacher; None to load it from the folder in the hyperparameters.
+        teacher: Policy of the teacher; None to load it from the folder ``teacher`` of the hyperparameters.
     """
     config, n_worlds = configs[0], env.sim.n_worlds // len(configs)
     if n_worlds % config.minibatches:
@@ -182,7 +182,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     """Return the learner after one rollout and its updates, and the metrics of the iteration. (n_seeds,) each
 
     The metric ``difference`` is the root mean square of the difference between the actions of student and teacher in
-    the states of the rollout; ``finite`` is True if weights and losses are finite.
+    the states of the rollout; ``finite`` is True if weights, optimiser state, statistics and losses are finite.
     """
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
     agents, rates, config = learner.agents.replace(key=key), stack_rates(configs), configs[0]
@@ -236,13 +236,14 @@ def imitate(
     Args:
         env: Environment of the student without automatic resets.
         teacher: Trained policy, or any function from the teacher's observations to actions.
-        config: Hyperparameters by name, the fields of ``Config`` except ``teacher``; omitted ones have their defaults.
+        config: Hyperparameters of ``Config`` by name, except ``teacher``; omitted ones have their defaults.
         seed: Random seed.
-        observe: Function from the true data to the teacher's observations. It is called with the data of one world, or
-            of all worlds if the task is batched. None for the observations of the task.
+        observe: Function from the true data of one world to the teacher's observations, or from the data of all
+            worlds if the task is batched; None for the observations of the task.
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name.
 
     Raises:
+        ConfigError: If a hyperparameter is unknown or invalid.
         DivergedError: If weights or losses become non-finite.
     """
     known = [field.name for field in dataclasses.fields(Config) if field.name != "teacher"]
@@ -263,13 +264,13 @@ def imitate(
 
 
 def split_obs(obs: Obs) -> tuple[Obs, Obs]:
-    """Return the student's observations, and the teacher's without ``PREFIX``."""
+    """Return the observations of the student and those of the teacher."""
     shown = {name.removeprefix(PREFIX): x for name, x in obs.items() if name.startswith(PREFIX)}
     return {name: x for name, x in obs.items() if not name.startswith(PREFIX)}, shown
 
 
 def _load_teacher(folder: str, env: Env, shown: Obs) -> Policy:
-    """Return the policy of a run, after checking that its observations and actions match the environment's."""
+    """Return the policy of a run, after checking that its observations and actions are those of the environment."""
     from crazysim.train.training import load_policy
 
     policy, _, meta = load_policy(folder)
@@ -299,7 +300,7 @@ def _learn(agent: Agent, raw: Array, labels: Array, rates: Rates, key: Array, co
         labels: Actions of the teacher. (n_steps, n_worlds, n_drones, n_actions)
         rates: Hyperparameters of the seed. () each
         key: Random key.
-        config: Hyperparameters of all seeds; ``rates`` takes precedence.
+        config: Hyperparameters of the first seed; values in ``rates`` take precedence.
     """
     transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
     samples = agent.stats.normalize(raw), labels

@@ -37,7 +37,7 @@ class _FunctionPolicy(PyTree):
 
 
 def as_tree(policy: Callable[[Obs], Array]) -> Any:
-    """Return a policy as an argument of compiled functions."""
+    """Return a policy as a pytree, which compiled functions can take as an argument."""
     return policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
 
 
@@ -47,7 +47,7 @@ def act(policy: Callable[[Obs], Array], obs: Obs, memory: Any) -> tuple[Array, A
     Args:
         policy: Trained policy, or any function from observations to actions.
         obs: Observations by name. (n_worlds, n_drones, k) each
-        memory: Memory before the step, first that of ``initial_memory``.
+        memory: Memory before the step; at the start of an episode the result of ``initial_memory``.
     """
     return policy.act(obs, memory) if isinstance(policy, Policy | Policies) else (policy(obs), memory)
 
@@ -71,7 +71,7 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
 
     Returns:
         ``error``: task error after every step, constant after the end of the episode (n_steps, n_worlds, n_drones);
-        ``over``: True once the episode has terminated (n_steps, n_worlds); ``nonfinite``: True where it did so because
+        ``over``: True once the episode has terminated (n_steps, n_worlds); ``nonfinite``: True where it did because
         the world became non-finite (n_worlds,); ``reward``: sum over the episode (n_worlds, n_drones); ``terms``: terms
         of the reward by name, means over the worlds and drones of a block, zero from the end of an episode on
         (n_steps, n_blocks) each;
@@ -149,7 +149,7 @@ def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: i
         n_blocks: Number of blocks.
     """
     key = jax.random.key(EVALUATION_SEED) if key is None else key
-    # The rest takes less time on the host than compiling it.
+    # Computing the rest on the host takes less time than compiling it would.
     flight = jax.device_get(fly_episodes(env, policy, key, n_blocks))
     n_worlds = env.sim.n_worlds // n_blocks
     return [_metrics(env, flight, i, slice(i * n_worlds, (i + 1) * n_worlds)) for i in range(n_blocks)]

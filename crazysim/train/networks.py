@@ -77,12 +77,12 @@ class Network:
     """
 
     init: Callable[[Array, int], Any]
-    """``init(key, n_obs) -> weights``: initial weights, any tree of arrays, for a number of inputs."""
+    """``init(key, n_obs) -> weights``: initial weights for ``n_obs`` inputs, any pytree of arrays."""
     apply: Callable[[Any, Array, Any], tuple[Array, Any]]
     """``apply(weights, obs, memory) -> (features, memory)``: features (n_features,) for observations (n_obs,), and the
     memory after the step, of the structure and shapes of ``initial_memory``."""
     initial_memory: Any = ()
-    """Memory at the start of an episode, any tree of arrays; ``()`` for none."""
+    """Memory at the start of an episode, any pytree of arrays; ``()`` for none."""
 
     @property
     def has_memory(self) -> bool:
@@ -95,7 +95,10 @@ class Network:
 
 
 class Gru(PyTree):
-    """Weights of a gated recurrent unit (Cho et al. 2014), for its reset gate, update gate and candidate, in order."""
+    """Weights of a gated recurrent unit (Cho et al. 2014), in the order reset gate, update gate, candidate.
+
+    As in cuDNN, the reset gate scales the memory after the multiplication by its weights, not before.
+    """
 
     inputs: Array
     """Weights of the observations. (n_obs, 3 n_memory)"""
@@ -135,14 +138,14 @@ def gru_network(size: int) -> Network:
 
 
 def choose_network(memory: int, network: Network | None) -> Network:
-    """Return a network of one's own if there is one, or the built-in one.
+    """Return ``network``, or the built-in network if it is None.
 
     Args:
         memory: Size of the memory of the built-in network; 0 for none.
-        network: Network of one's own; None for the built-in one.
+        network: Network of your own; None for the built-in one.
 
     Raises:
-        ConfigError: If both are given.
+        ConfigError: If ``network`` is not a ``Network``, or is given together with a size of the memory.
     """
     if network is None:
         return gru_network(memory) if memory else MEMORYLESS
@@ -161,7 +164,7 @@ class Weights(PyTree):
     layers: Layers
     """Layers from the features to the outputs."""
     body: Any = ()
-    """Weights of the network; ``()`` for the one without memory."""
+    """Weights of the network; ``()`` for the built-in one without memory."""
 
 
 def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int], last_scale: float) -> Weights:
@@ -199,7 +202,7 @@ def forward(network: Network, weights: Weights, obs: Array, memory: Any) -> tupl
 
     Args:
         network: The network.
-        weights: Its weights, and those of the layers after it.
+        weights: Weights of the network and of the layers after it.
         obs: Normalised observations. (..., n_obs)
         memory: Memory before the step. (..., ...) each
     """
@@ -212,10 +215,10 @@ def unroll(network: Network, weights: Weights, obs: Array, memory: Any, done: Ar
 
     Args:
         network: The network.
-        weights: Its weights, and those of the layers after it.
+        weights: Weights of the network and of the layers after it.
         obs: Normalised observations. (n_steps, ..., n_obs)
         memory: Memory before the first step. (..., ...) each
-        done: True where an episode ended with the step, after which the memory begins anew. (n_steps, ...)
+        done: True where an episode ended with the step; the next step begins with the initial memory. (n_steps, ...)
     """
     if not network.has_memory:
         return forward(network, weights, obs, memory)[0]
@@ -231,7 +234,7 @@ def unroll(network: Network, weights: Weights, obs: Array, memory: Any, done: Ar
 
 
 def _batched(network: Network, weights: Weights, n_axes: int) -> Callable[[Array, Any], tuple[Array, Any]]:
-    """Return the function of a network with its weights, for observations and memory with some leading axes."""
+    """Return ``network.apply`` with its weights, mapped over the leading axes of observations and memory."""
     fn: Any = functools.partial(network.apply, weights.body)
     for _ in range(n_axes):
         fn = jax.vmap(fn)

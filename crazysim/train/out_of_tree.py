@@ -32,7 +32,7 @@ FIELDS = {
     "ang_vel": ("ang_vel[{i}]", 3),
     "difference_to_goal": ("goal[{i}] - pos[{i}]", 3),
 }
-"""C expression and size of the observations that follow from a drone's state and its goal."""
+"""C expression and size of the observations that can be computed from a drone's state and its goal."""
 
 
 def to_out_of_tree(
@@ -48,15 +48,15 @@ def to_out_of_tree(
         policy: The policy.
         folder: Existing folder for ``policy.h`` and ``controller.c``.
         meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
-        airframe: The drone, for the largest thrust of its rotors.
+        airframe: The drone, which provides the thrust curve and the largest thrust of the rotors.
         freq: Rate of the policy, a divisor of 1000 Hz.
 
     Returns:
         Paths of both files.
 
     Raises:
-        ConfigError: If the policy has a memory, if the drone's state and a goal do not give all observations, or if
-            ``freq`` does not divide 1000.
+        ConfigError: If the policy has a memory, commands positions, or commands rotor speeds of other than four rotors;
+            if the drone's state and a goal do not give all observations; or if ``freq`` does not divide 1000.
     """
     if policy.has_memory:
         raise ConfigError(
@@ -142,7 +142,7 @@ static void policy_command(const float pos[3], const float quat[4], const float 
 
 
 def _library(level: Control, freq: int) -> str:
-    """Return the part of the comment about the simulator."""
+    """Return the lines of the comment that explain the use in crazysim; empty without such a use."""
     if level != Control.rotor_vel:
         return ""
     return f"""

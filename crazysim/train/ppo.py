@@ -33,8 +33,8 @@ from crazysim.train.networks import (
 from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates
 
 MAX_GROUPS = 64
-"""Groups of neighbouring worlds, at most, of which each minibatch gets as many worlds. A device holds whole groups, so
-that no device needs the samples of another one, and minibatches do not depend on the number of devices."""
+"""Largest number of groups of neighbouring worlds. A minibatch takes the same number of worlds from every group. A
+device holds whole groups, so it needs no samples of others, and minibatches do not depend on the number of devices."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class Config:
     minibatches: int = 8
     """Minibatches, and hence updates, per epoch; each contains all samples of a subset of the worlds."""
     hidden: tuple[int, ...] = (64, 64)
-    """Sizes of the hidden layers of policy and value function; not used with a network of one's own."""
+    """Sizes of the hidden layers of policy and value function; not used with a network of your own."""
     memory: int = 0
     """Size of the memory of policy and value function, a gated recurrent unit before the hidden layers; 0 for none."""
     critic: str = "observations"
-    """Input of the value function: ``observations``, those of the policy; ``privileged``, these and the true state and
-    parameters of the drone; ``all_drones``, the observations of all drones of the world."""
+    """Inputs of the value function: ``observations``, the observations of the policy; ``privileged``, the same and the
+    true state and parameters of the drone; ``all_drones``, the observations of all drones of the world."""
     learning_rate: float = 1e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     discount: float = 0.98
@@ -90,7 +90,7 @@ class Agent(PyTree):
     optimizer: optax.OptState
     """State of the optimiser."""
     stats: RunningStats
-    """Mean and variance with which observations are normalised; those of the policy come first."""
+    """Mean and variance with which observations are normalised; the policy's observations come first."""
     returns: RunningStats
     """Mean and variance of returns, with which the outputs of the value network are scaled. (1,) each"""
     key: Array
@@ -129,7 +129,7 @@ class Sample(PyTree):
     """Transitions of a rollout; leading axes (n_steps, n_worlds, n_drones)."""
 
     obs: Array
-    """Normalised observations; those of the policy come first."""
+    """Normalised observations; the policy's come first."""
     action: Array
     """Actions before clipping."""
     log_prob: Array
@@ -147,10 +147,10 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
 
     Args:
         env: Environment that resets automatically within the step that ends an episode, with a block of worlds for
-            each seed; of ``PrivilegedObservation`` for ``critic="privileged"``.
-        configs: Hyperparameters of each seed, which differ in those of ``SWEEPABLE`` at most.
+            each seed; with the wrapper ``PrivilegedObservation`` for ``critic="privileged"``.
+        configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
-        network: Network of one's own, for policy and value function; None for the built-in one.
+        network: Network of your own, for policy and value function; None for the built-in one.
     """
     config, n_worlds = configs[0], env.sim.n_worlds // len(configs)
     if n_worlds % config.minibatches:
@@ -272,7 +272,7 @@ def _learn(
         last: Observations, (n_worlds, n_drones, n_obs), and memory of the value function, after the rollout.
         rates: Hyperparameters of the seed. () each
         key: Random key.
-        config: Hyperparameters of all seeds; those in ``rates`` count.
+        config: Hyperparameters of the first seed; values in ``rates`` take precedence.
     """
     last_obs, last_memory = last
     last_value, _ = _value(agent, agent.stats.normalize(last_obs), last_memory, config)
@@ -313,7 +313,7 @@ def _update(
     transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
 
     def samples_of(worlds: Array) -> Any:
-        """Return the samples of some worlds, by their indices in each group, and the memories before them.
+        """Return the samples of some worlds, by their indices in each group, and their memories before the rollout.
 
         Args:
             worlds: Indices. (n_groups, k)
@@ -364,7 +364,7 @@ def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.
 
 
 def _observed(obs: Obs, config: Config) -> Array:
-    """Return the observations of the policy, and after them what only the critic may use. (..., k)"""
+    """Return the observations of the policy, followed by those that only the critic may use. (..., k)"""
     if config.critic != "privileged":
         return flatten(obs)
     if PRIVILEGED not in obs:
@@ -377,7 +377,7 @@ def _observed(obs: Obs, config: Config) -> Array:
 
 
 def _critic_input(obs: Array, config: Config) -> Array:
-    """Return the inputs of the value function: the drone's own, then with ``all_drones`` those of the next drones.
+    """Return the inputs of the value function for each drone; ``all_drones`` appends the observations of the others.
 
     Args:
         obs: Result of ``_observed``, normalised or not. (..., n_drones, k)
@@ -406,7 +406,7 @@ def _scale(returns: RunningStats) -> Array:
 
 
 def _rescale_value(weights: Weights, old: RunningStats, new: RunningStats) -> Weights:
-    """Return the value network with outputs that, scaled by the new statistics, equal those scaled by the old ones."""
+    """Return the value network with outputs rescaled so that its values are the same with the new statistics."""
     *hidden, (weight, bias) = weights.layers
     ratio = _scale(old) / _scale(new)
     return weights.replace(layers=[*hidden, (weight * ratio, bias * ratio + (old.mean - new.mean) / _scale(new))])

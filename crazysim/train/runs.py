@@ -95,10 +95,10 @@ def run_many(
 ) -> dict[str, TrainResult]:
     """Train with several seeds, and several values of hyperparameters, in one program: ``crazysim train --seeds``.
 
-    A seed gives the same training, to rounding, whatever other ones are trained beside it. The folder then has one
-    ``checkpoint.npz`` of all, ``seeds.csv`` and ``seeds.json`` with a row for each training, ``curve.png`` with their
-    medians and spreads, and for each training a folder with ``policy.npz`` and ``curve.json``, such as ``seed-3`` or
-    ``learning_rate-0.0003-seed-3``.
+    A seed gives the same training, to rounding, whichever other seeds are trained with it. The folder then has one
+    ``checkpoint.npz`` of all trainings, ``seeds.csv`` and ``seeds.json`` with a row for each training, ``curve.png``
+    with medians, quartiles and extremes, and for each training a folder with ``policy.npz`` and ``curve.json``, such as
+    ``seed-3`` or ``learning_rate-0.0003-seed-3``.
 
     Args:
         task: As in ``run``.
@@ -111,14 +111,15 @@ def run_many(
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         on_iteration: As in ``run``, but each metric is an array with a number for each training.
-        settings: ``algorithm``, ``n_worlds`` of each training, ``options`` and ``config`` of ``TrainConfig.create``.
+        settings: ``algorithm``, ``n_worlds`` of each training, ``options``, ``config`` and ``network`` of
+            ``TrainConfig.create``.
 
     Returns:
         The results by the names of their folders.
 
     Raises:
-        ConfigError, DivergedError, KeyboardInterrupt, SystemExit: As ``run``; a training that diverges ends alone, and
-            ``DivergedError`` is raised if all did.
+        ConfigError, DivergedError, KeyboardInterrupt, SystemExit: As ``run``, but a training that diverges does not
+            end the others; ``DivergedError`` is raised if all have diverged.
     """
     _check_settings(settings, tuple(x for x in SETTINGS if x != "seed"))
     variants = variants_of(seeds, sweep or {}, settings.get("config") or {})
@@ -153,8 +154,8 @@ def variants_of(
         config: Hyperparameters of all trainings, which a sweep must not change.
 
     Raises:
-        ConfigError: If there are no seeds or no values, or some twice, or if a hyperparameter cannot differ between
-            trainings of one program.
+        ConfigError: If there are no seeds or no values, if one of them occurs twice, or if a hyperparameter to sweep
+            cannot differ between trainings of one program or is also in ``config``.
     """
     chosen: dict[str, list[Any]] = {"seeds": list(seeds)} | {name: list(values) for name, values in sweep.items()}
     for name, values in chosen.items():

@@ -14,13 +14,13 @@ from crazysim.train.hyperparameters import SWEEPABLE
 
 T = TypeVar("T")
 Rates = dict[str, Any]
-"""Hyperparameters of ``SWEEPABLE`` by name, of one seed, (), or of all, (n_seeds,)."""
+"""Values of the ``SWEEPABLE`` hyperparameters by name: of one seed, (), or of all seeds, (n_seeds,)."""
 
 
 def stack_rates(configs: Sequence[Any]) -> Rates:
     """Return the hyperparameters that may differ between seeds. (n_seeds,) each
 
-    They are arrays of the host, which are constants of the program where there is one seed.
+    They are host arrays, so that those of a single seed are scalar constants of the compiled program.
     """
     names = [name for name in SWEEPABLE if hasattr(configs[0], name)]
     return {name: np.array([getattr(config, name) for config in configs], float_dtype()) for name in names}
@@ -42,9 +42,9 @@ def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | in
     A single seed is computed without ``jax.vmap``, so that its program is that of the function itself.
 
     Args:
-        fn: Function of the arrays of one seed.
-        args: Trees of arrays that are stacked along an axis of seeds.
-        axes: That axis, of all arguments or of each.
+        fn: Function that takes the arguments of one seed.
+        args: Arguments of all seeds: pytrees whose arrays are stacked along an axis of seeds.
+        axes: Index of this axis: one for all arguments, or one for each.
     """
     axes = (axes,) * len(args) if isinstance(axes, int) else axes
     if jax.tree.leaves(args[0])[0].shape[axes[0]] > 1:

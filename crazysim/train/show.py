@@ -31,7 +31,8 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
     """Plot success, error and reward terms over the course of training, as measured by the evaluations.
 
     Args:
-        curves: Contents of ``curve.json`` of each run, by the name of the run. Reward terms are those of the first.
+        curves: Contents of ``curve.json`` of each run, by the name of the run. Reward terms are plotted for the
+            first one only.
         path: Image to write, such as a ``.png``.
 
     Raises:
@@ -64,8 +65,8 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> 
     """Plot median, quartiles and extremes of success, error and reward of several trainings over environment steps.
 
     Args:
-        groups: Contents of ``curve.json`` of the trainings of each group, such as all seeds of one learning rate. A
-            training that diverged ends earlier, and counts until then.
+        groups: Contents of ``curve.json`` of the trainings of each group, such as all seeds of one learning rate. The
+            curve of a training that diverged ends earlier, and counts up to its end.
         path: Image to write, such as a ``.png``.
 
     Raises:

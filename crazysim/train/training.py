@@ -98,17 +98,18 @@ def train_many(
 ) -> dict[str, TrainResult]:
     """Train policies in one program and write their files.
 
-    Each training has a block of worlds, and its learning curve and policy in a folder of its own; the checkpoint in the
-    folder above is of all. Every evaluation flies two sets of initial states that are not used for training. The
-    success on the check set decides which policy is kept; the held-out set is only used for the reported figures.
+    Each training has a block of worlds, and a folder of its own for its learning curve and policy. The folder above
+    these holds one checkpoint of all trainings. Every evaluation flies two sets of initial states that are not used for
+    training. The success on the check set decides which policy is kept; the held-out set is only used for the reported
+    figures.
 
     Each evaluation writes a checkpoint. So does an interrupt (Ctrl-C), or a ``SystemExit`` from a signal handler,
-    before it is raised again. A resumed run is bit for bit the same as an uninterrupted one on the same machine. A
-    training that diverges keeps its last policy, and the others go on.
+    before it is raised again. A resumed run is bit for bit the same as an uninterrupted one on the same machine. If a
+    training diverges, its kept policy stays and the other trainings go on.
 
     Args:
-        configs: Configuration of each training, by the name of its folder; they differ in seed and ``SWEEPABLE``
-            hyperparameters at most. The name may be empty if there is one.
+        configs: Configuration of each training, by the name of its folder. Only the seed and the ``SWEEPABLE``
+            hyperparameters may differ. The name may be empty if there is only one.
         folder: Folder of the run.
         resume: True to continue from the checkpoint in the folder.
         evaluation_worlds: Number of initial states of the held-out set, and of the check set.
@@ -116,8 +117,9 @@ def train_many(
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
-            names of metrics of an evaluation after it begin with ``"evaluation "``. A metric is a number, or an array
-            of the trainings if there are several. Each call waits for the device. None for none.
+            names of metrics of an evaluation after the iteration begin with ``"evaluation "``. A metric is a number, or
+            an array with one number for each training if there are several. Each call waits for the device. None for
+            none.
 
     Raises:
         ConfigError: If the folder holds a run and ``resume`` is False, or the run has another configuration or is
@@ -173,7 +175,7 @@ def train_many(
         return learner, [seed_of(policies, i) for i in range(n)]
 
     def evaluate_all(policies: Policy, key: Array | None) -> list[dict[str, float]]:
-        """Return the metrics of the policy of each training. Arrays of the host are sliced without a compilation."""
+        """Return the metrics of each training's policy. The policies are host arrays, so slices need no compilation."""
         policy = seed_of(policies, 0) if n == 1 else Policies(policies)
         return evaluate_blocks(eval_env, jax.device_put(policy, base.sim.device), key, n)
 
@@ -239,7 +241,7 @@ def train_many(
         return [training.curve[-1] for training in trainings]
 
     def stop_diverged(finite: Any, iteration: int) -> None:
-        """Mark trainings that are no longer finite; raise an error if none is."""
+        """Mark the trainings that have diverged; raise an error if all have."""
         for training, is_finite in zip(trainings, np.asarray(finite), strict=True):
             if is_finite or training.diverged is not None:
                 continue
@@ -307,10 +309,10 @@ def train_many(
 
 @dataclass
 class _Training:
-    """One of the trainings of a program."""
+    """One of the trainings that run in a program."""
 
     name: str
-    """Name in messages and of its folder; empty if it is alone."""
+    """Name in messages and of its folder; empty for a single training."""
     config: TrainConfig
     """Its configuration."""
     folder: Path
@@ -327,7 +329,7 @@ class _Training:
     def record(
         self, point: dict[str, Any], policy: Policy, n_starts: int, description: dict[str, Any], interrupted: bool
     ) -> None:
-        """Add an evaluation to the curve, keep the policy if none was clearly better, and write both."""
+        """Add an evaluation to the curve, keep the policy if no earlier one was clearly better, and write both."""
         self.curve[:] = [earlier for earlier in self.curve if earlier["iteration"] < point["iteration"]]
         best_check = max((earlier["check"] for earlier in self.curve if earlier["kept"]), default=0.0)
         point["kept"] = point["check"] >= least_kept_success(best_check, n_starts)
@@ -370,7 +372,7 @@ def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
 def _numbers(metrics: dict[str, Array], points: list[dict[str, Any]] | None) -> dict[str, Any]:
     """Return the metrics of an iteration, and of the evaluations after it if there were any.
 
-    They are floats, or arrays of several trainings.
+    They are floats, or arrays with one number for each training if there are several.
     """
     numbers = {name: x for name, x in jax.device_get(metrics).items() if name != "finite"}
     for name in points[0] if points else ():
@@ -415,10 +417,10 @@ def load_policy(
         task: Reference of the task's class, ``FILE.py:NAME`` or ``MODULE:NAME``, if it has moved since the training, or
             if this user has not named it on this machine before; its code is executed. None for the reference in the
             run, which ``config.make_env`` only loads if this user has named it before.
-        network: Network of one's own with which the policy was trained; None for the built-in one.
+        network: Network of your own with which the policy was trained; None for the built-in one.
 
     Raises:
-        ConfigError: If the folder holds no policy that this version can read, or one of another network.
+        ConfigError: If the folder holds no policy that this version can read, or its policy has another network.
     """
     path = Path(folder) / POLICY
     arrays, meta = checkpoint.read(path)
@@ -479,7 +481,7 @@ def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
 def _read_run(
     path: Path, configs: Mapping[str, TrainConfig]
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str, float]:
-    """Return the arrays of a checkpoint, what it says of each training, the hash of the task's code, and seconds.
+    """Return the arrays of a checkpoint, the metadata of each training, the hash of the task's code, and its time, s.
 
     Raises:
         ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.

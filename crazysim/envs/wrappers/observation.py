@@ -42,11 +42,12 @@ class Observe(Wrapper):
 
 
 class PrivilegedObservation(Observe):
-    """Add ``obs["privileged"]``, which a critic may use in training and a policy may not: true state and parameters.
+    """Add ``obs["privileged"]``: true state and parameters, which a critic may use in training, but no policy.
 
-    It has, for every drone: attitude (rotation matrix), angular velocity, position and velocity, rotor speeds, the
-    parameters that are one per drone, as parts of the airframe's largest entry, and the observations of plugins that
-    change the dynamics, such as the factors that ``Randomize`` has drawn and the charge of a ``Battery``.
+    It contains, for every drone: attitude (rotation matrix), angular velocity, position, velocity and rotor speeds; the
+    parameters of which each drone has its own, divided by the largest magnitude in the same parameter of the default
+    data; and the observations of plugins that change the dynamics, such as the factors that ``Randomize`` has drawn and
+    the charge of a ``Battery``.
     """
 
     def __init__(self, env: Env):

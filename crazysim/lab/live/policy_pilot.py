@@ -54,7 +54,8 @@ class PolicyPilot:
             seed: Random seed of the episode.
 
         Raises:
-            ConfigError: If the task has no goals that can be set, or points lie outside of its arena.
+            ConfigError: If there are points, and the task has no goals that can be set or a point lies outside of its
+                arena.
         """
         self.env = env
         self._points = None if points is None else np.asarray(points, float)
@@ -103,7 +104,7 @@ class PolicyPilot:
             self.goals[:] = self._target(live.sim.data)
 
     def go_to(self, live: Live, pos: ArrayLike) -> None:
-        """Set the goal of the selected drone; it passes no further listed points.
+        """Set the goal of the selected drone, which then no longer follows the listed points.
 
         Args:
             live: Loop.
@@ -190,7 +191,7 @@ def as_point(text: str, place: str = "") -> NDArray:
 
     Args:
         text: The numbers.
-        place: Beginning of the message of an error.
+        place: Beginning of the error message.
     """
     try:
         point = np.array([float(x) for x in re.split(r"[,;\s]+", text.strip())])

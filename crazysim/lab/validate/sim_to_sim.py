@@ -98,9 +98,9 @@ class Result:
     success: float
     """Fraction of flights whose error is below the tolerance of the task for the last ``task.hold`` seconds."""
     crashed: float
-    """Fraction of flights that the task ended before."""
+    """Fraction of flights that ended early: the task terminated, or a state became non-finite."""
     error: float
-    """Mean error of the other flights over these seconds, m; NaN if there are none."""
+    """Mean error of the other flights over the last ``task.hold`` seconds, m; NaN if there are none."""
     observed: NDArray
     """Observations of all flights. (n_steps, n_starts, n_obs)"""
 
@@ -111,7 +111,7 @@ def exported(name: str, folder: Path | None = None) -> Exported:
 
     Args:
         name: Name of the policy.
-        folder: Folder that holds or receives a folder of each training; None to keep none.
+        folder: Folder that contains or receives the folders of the trainings; None to keep none.
     """
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(temporary if folder is None else folder) / name
@@ -161,8 +161,8 @@ def _onnx(path: Path) -> Act:
 def fly(task: str, command: Callable[[NDArray], NDArray], simulator: type[Simulator], starts: int = STARTS) -> Result:
     """Fly a task from its held-out starts in another simulator.
 
-    Starts, goals, observations, errors and ends of episodes are those of the task, which reads the states of the other
-    simulator: they replace the states in our data.
+    The task provides starts, goals, observations, errors and ends of episodes. It reads the states of the other
+    simulator, which replace the states in our data.
 
     Args:
         task: Name of the task.
@@ -204,7 +204,7 @@ def checks(data: Path | None) -> Sequence[Callable[[], Iterable[Row]]]:
     """Return the comparisons of all policies in all simulators.
 
     Args:
-        data: Folder whose folder ``policies`` keeps the trainings; None to keep none.
+        data: Folder in whose folder ``policies`` the trainings are kept; None to keep none.
     """
     folder = None if data is None else data / "policies"
     return [partial(compare, name, simulator, folder) for name in POLICIES for simulator in SIMULATORS]
@@ -213,8 +213,8 @@ def checks(data: Path | None) -> Sequence[Callable[[], Iterable[Row]]]:
 def compare(name: str, simulator: str, folder: Path | None = None) -> Iterable[Row]:
     """Yield the success of an exported policy in one simulator, or nothing if the simulator is not installed.
 
-    In crazysim itself also the largest difference between the actions of both exports on all observations of the
-    flights.
+    For crazysim itself, also yield the largest difference between the actions of the two exports on all observations of
+    the flights.
     """
     module = SIMULATORS[simulator].module
     if module and importlib.util.find_spec(module) is None:

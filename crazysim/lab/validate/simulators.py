@@ -34,10 +34,10 @@ DRONE = "cf21B_500"
 PERIOD = 0.02
 """Time between two commands, s."""
 STEP = 0.004
-"""Time between two ticks of the controller in simulators without one of ours, s."""
+"""Period of the controller in simulators that do not use our controller, s."""
 
 States = dict[str, NDArray]
-"""``pos``, ``quat``, ``vel`` and ``ang_vel`` of all drones, in our frames, units and order. (n, k) each"""
+"""``pos``, ``quat``, ``vel`` and ``ang_vel`` of all drones, with our frames, units and components. (n, k) each"""
 
 
 class Simulator(Protocol):
@@ -118,7 +118,12 @@ class AttitudeController:
         self._data = attitude_control(self._data, commands[:, None])
 
     def thrusts(self, states: States, thrusts: NDArray) -> NDArray:
-        """Return the commanded thrusts of a tick, N; the arguments are the states and the present thrusts. (n, 4)"""
+        """Advance the controller by a step, and return the commanded thrusts, N. (n, 4)
+
+        Args:
+            states: Present states.
+            thrusts: Present thrusts of the rotors, N. (n, 4)
+        """
         rows = {name: x.astype(np.float32) for name, x in _rows(states).items()}
         self._data, commanded = self._control(self._data, rows, thrusts[:, None].astype(np.float32))
         return np.asarray(commanded, np.float64)[:, 0]
@@ -163,7 +168,7 @@ class RotorPy(Simulator):
         self._torch: Any = importlib.import_module("torch")
         module: Any = importlib.import_module("rotorpy.vehicles.multirotor")
         module: Any = importlib.import_module("rotorpy.vehicles.multirotor")
-        self._torch.set_num_threads(1)  # threads would take longer to meet than to work on arrays of this size
+        self._torch.set_num_threads(1)  # synchronising threads would take longer than the work on arrays of this size
         n, device = len(start["pos"]), self._torch.device("cpu")
         params = rotorpy_params(load_airframe(DRONE))
         hover = np.sqrt(params["mass"] * GRAVITY_MAGNITUDE / (4 * params["k_eta"]))
@@ -191,7 +196,7 @@ class RotorPy(Simulator):
 
 
 class RotorPyRotors(RotorPy):
-    """The same drone, flown by our default controller, which commands thrusts of the rotors."""
+    """RotorPy's brushless Crazyflie, flown by our default controller, which commands the thrusts of the rotors."""
 
     level = "cmd_motor_thrusts"
 
@@ -211,7 +216,7 @@ class RotorPyRotors(RotorPy):
 class PyBullet(Simulator):
     """gym-pybullet-drones' PyBullet model, with the controller of attitudes in its ``DSLPIDControl``.
 
-    A body in it is nothing but its pose and velocities, so one body flies all drones, one after another.
+    The state of its body is only a pose and velocities, so one body flies all drones, one after another.
     """
 
     module = "gym_pybullet_drones"
@@ -242,7 +247,7 @@ class PyBullet(Simulator):
         s = self._now
         ang_vel = np.array(
             rotation.rotate(jnp.asarray(s["quat"]), jnp.asarray(s["ang_vel"])), np.float64
-        )  # PyBullet's is in the world frame
+        )  # PyBullet's angular velocity is in the world frame
         angles = _intrinsic_angles(commands[:, :3])
         for k, (command, controller) in enumerate(zip(commands, self._controllers, strict=True)):
             self._p.resetBasePositionAndOrientation(self._body, s["pos"][k], s["quat"][k], physicsClientId=self._client)
