@@ -14,7 +14,7 @@ from crazysim.errors import ConfigError
 SWEEPABLE = ("learning_rate", "discount", "gae_lambda", "clip", "entropy", "value_weight", "max_grad_norm")
 """Hyperparameters that may differ between the seeds of one program, and change when a run is resumed: neither shapes
 nor counters of its state depend on them."""
-FRACTIONS = ("discount", "gae_lambda")
+FRACTIONS = ("discount", "gae_lambda", "teacher_decay")
 """Hyperparameters from 0 to 1."""
 WEIGHTS = ("entropy", "value_weight")
 """Hyperparameters that are finite, and 0 or larger."""

@@ -21,7 +21,7 @@ from jax import Array
 from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, select_worlds, static
+from crazysim.pytree import PyTree, float_dtype, select_worlds, static
 from crazysim.train.seeds import for_each_seed, join_blocks, split_blocks
 
 Layers = list[tuple[Array, Array]]
@@ -120,9 +120,14 @@ MEMORYLESS = Network(lambda _key, _n_obs: (), lambda _weights, obs, memory: (obs
 """The network without weights, whose features are the observations."""
 
 
-@functools.cache
 def gru_network(size: int) -> Network:
     """Return the network with the memory of a gated recurrent unit; features are the observations and the memory."""
+    return _gru_network(size, np.dtype(float_dtype()))
+
+
+@functools.cache
+def _gru_network(size: int, dtype: np.dtype) -> Network:
+    """Return the network of ``gru_network``, the same object for the same size and type of the memory."""
 
     def init(key: Array, n_obs: int) -> Gru:
         k_inputs, k_recurrent = jax.random.split(key)
@@ -134,7 +139,7 @@ def gru_network(size: int) -> Network:
         memory = gru(obs, memory)
         return jnp.concatenate([obs, memory]), memory
 
-    return Network(init, apply, np.zeros(size, np.float32))
+    return Network(init, apply, np.zeros(size, dtype))
 
 
 def choose_network(memory: int, network: Network | None) -> Network:

@@ -6,6 +6,7 @@ The firmware calls such a controller in place of its own. The same C file is a l
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -117,7 +118,7 @@ static void policy_command(const float pos[3], const float quat[4], const float 
                           2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};"""
     read = "".join(FIELDS[name][0] for name in names)
     for name in ("pos", "quat", "vel", "ang_vel", "goal"):
-        if f"{name}[" not in read and not (name == "quat" and "rot" in names):
+        if not re.search(rf"\b{name}\[", read) and not (name == "quat" and "rot" in names):
             yield f"    (void){name};"
     values = [FIELDS[name][0].format(i=i) for name in names for i in range(FIELDS[name][1])]
     yield f"    const float observation[{len(values)}] = {{"
@@ -173,10 +174,12 @@ OUT_OF_TREE = """
 
 static const float degree = 57.2957795f;
 static float command[{n}];
+static bool flying = false; /* the policy has commanded since the motors were last off */
 
 void controllerOutOfTreeInit(void)
 {{
     memset(command, 0, sizeof command);
+    flying = false;
     {init}
 }}
 
@@ -187,9 +190,10 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
 {{
     if (setpoint->mode.x != modeAbs || setpoint->mode.y != modeAbs || setpoint->mode.z != modeAbs) {{
         {off}
+        flying = false;
         return;
     }}
-    if (stabilizerStep % {period} == 0) {{
+    if (!flying || stabilizerStep % {period} == 0) {{
         const float pos[3] = {{state->position.x, state->position.y, state->position.z}};
         const float quat[4] = {{state->attitudeQuaternion.x, state->attitudeQuaternion.y, state->attitudeQuaternion.z,
                                state->attitudeQuaternion.w}};
@@ -197,6 +201,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
         const float ang_vel[3] = {{sensors->gyro.x / degree, sensors->gyro.y / degree, sensors->gyro.z / degree}};
         const float goal[3] = {{setpoint->position.x, setpoint->position.y, setpoint->position.z}};
         policy_command(pos, quat, vel, ang_vel, goal, command);
+        flying = true;
     }}
 {output}
 }}"""

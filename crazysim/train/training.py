@@ -508,6 +508,12 @@ def _read_run(
 def _require_same(path: Path, settings: dict[str, Any], config: TrainConfig) -> None:
     """Check that a stored run has this configuration, except for settings that may change."""
     stored, given = (_settings(settings) for settings in (settings, _meta(config)["settings"]))
+    if settings.get("own_network", False) != config.own_network:
+        own = not config.own_network
+        raise ConfigError(
+            f"expected {path} to be resumed with {'its network of your own' if own else 'the built-in network'}. Use "
+            f"network={'network' if own else None}, or start a new run in another folder with --out."
+        )
     for name in {**stored, **given}:
         if stored.get(name, "its default") != given.get(name, "its default"):
             alterable = [x for x in ALTERABLE_HYPERPARAMETERS if x in config.config]

@@ -279,6 +279,13 @@ def test_noise_is_as_large_as_said_and_reproducible(env):
     assert trees_equal(one.obs["pos"][1:], again.obs["pos"][1:]), "nobody else is seen anew"
 
 
+def test_noise_of_two_wrappers_is_independent(env):
+    wrapped = ObservationNoise(ObservationNoise(env, {"vel": 1.0}), {"ang_vel": 1.0})
+    noisy, plain = wrapped.reset(jax.random.key(0)), env.reset(jax.random.key(0))
+    noise = [np.asarray(noisy.obs[name] - plain.obs[name]) for name in ("vel", "ang_vel")]
+    assert np.abs(noise[0] - noise[1]).min() > 1e-4
+
+
 def test_noise_on_an_unknown_observation_is_refused(env):
     with pytest.raises(ConfigError, match=r"expected names of observations, ang_vel, .* got colour"):
         ObservationNoise(env, {"pos": 0.1, "colour": 0.1}).reset(jax.random.key(0))

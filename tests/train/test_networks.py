@@ -85,6 +85,8 @@ def test_an_update_computes_what_the_rollout_did(rng):
 
 def test_gradients_flow_back_in_time_to_the_start_of_an_episode(rng):
     network = gru_network(4)
+    with jax.enable_x64(True):
+        assert gru_network(4).initial_memory.dtype == np.float64
     weights = init_weights(network, jax.random.key(0), 3, (8, 2), 1.0)
     obs = jnp.asarray(rng.normal(size=(6, 2, 3)), jnp.float32)
     done = jnp.zeros((6, 2), bool).at[2, 1].set(True)
@@ -303,7 +305,7 @@ def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_networ
         load_policy(tmp_path)
     with pytest.raises(ConfigError, match=r"expected the arrays of this task and version|expected .* in .* as float32"):
         load_policy(tmp_path, network=Network(lambda key, n: jnp.zeros((n, 3)), lambda w, x, m: (x @ w, m)))
-    with pytest.raises(ConfigError, match=r"expected own_network = True as in .*, got False; resume with the same"):
+    with pytest.raises(ConfigError, match=r"to be resumed with its network of your own. Use network=network"):
         trained(tmp_path, {}, resume=True)
     with pytest.raises(
         ConfigError, match="expected a policy with the built-in network, got one with a network of your"

@@ -161,6 +161,8 @@ def test_the_controller_gives_the_commands_of_the_policy_in_units_of_the_firmwar
     call(0, 60, x, off)
     assert off[3] == 0
     assert off[len(expected) - 1] == expected[-1]
+    call(1, 61, x, later)  # switched on between two ticks, it does not fly the last command from before
+    np.testing.assert_array_equal(later[:4], flying[:4])
 
 
 def test_the_c_controller_flies_the_flight_of_the_policy_in_python(exported):

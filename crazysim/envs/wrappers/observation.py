@@ -92,7 +92,7 @@ class ObservationNoise(Wrapper):
     def _add_noise(self, obs: Obs, data: SimData) -> Obs:
         if missing := set(self.std) - set(obs):
             raise ConfigError(f"expected names of observations, {', '.join(obs)}, got {', '.join(sorted(missing))}")
-        key = world_key(data, "observation noise")
+        key = world_key(data, f"observation noise {self.name}")
         keys = jax.vmap(lambda drone: jax.random.fold_in(key, drone))(data.core.drone_id)
         noisy = dict(obs)
         for i, (name, std) in enumerate(sorted(self.std.items())):

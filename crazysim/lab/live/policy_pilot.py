@@ -59,6 +59,8 @@ class PolicyPilot:
         """
         self.env = env
         self._points = None if points is None else np.asarray(points, float)
+        if self._points is not None and not len(self._points):
+            raise ConfigError("expected at least one point, got none. Use points=None for the goal of the task.")
         self._set_goal = jax.jit(lambda data, pos: env.set_goal(state_of_data(data), pos).data)
         self._command = jax.jit(partial(_command, env, policy))
         self._memory = self._initial_memory = initial_memory(policy, env)
@@ -99,9 +101,11 @@ class PolicyPilot:
         self._memory = self._initial_memory
         if live.step == 0:
             live.sim.data = self._start
-            self.passed[:], self._follows[:] = 0, self._points is not None
         if np.isfinite(self.goals).all():
             self.goals[:] = self._target(live.sim.data)
+        if self._points is not None:  # the goals of that time tell how many points had been passed
+            is_goal = np.isclose(self.goals[..., None, :], self._points, atol=1e-5).all(axis=-1)
+            self._follows[:], self.passed[:] = is_goal.any(axis=-1), is_goal.argmax(axis=-1)
 
     def go_to(self, live: Live, pos: ArrayLike) -> None:
         """Set the goal of the selected drone, which then no longer follows the listed points.

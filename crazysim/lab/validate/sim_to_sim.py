@@ -6,6 +6,7 @@ import ctypes
 import dataclasses
 import functools
 import importlib.util
+import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
@@ -117,8 +118,10 @@ def exported(name: str, folder: Path | None = None) -> Exported:
         place = Path(temporary if folder is None else folder) / name
         if not (place / "policy.npz").exists():
             task, options = POLICIES[name]
-            place.mkdir(parents=True, exist_ok=True)
-            run(task, place, film=False, log=lambda _: None, progress=False, options=options)
+            partial_run = place.with_name(f"{name}.partial")  # an interrupted training is no policy to fly
+            shutil.rmtree(partial_run, ignore_errors=True)
+            run(task, partial_run, film=False, log=lambda _: None, progress=False, options=options)
+            partial_run.rename(place)
         policy, _, meta = load_policy(place)
         actions, n_obs = meta["actions"], sum(meta["observations"].values())
         centre, scale = (np.asarray(actions[key], float) for key in ("centre", "scale"))

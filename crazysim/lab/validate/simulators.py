@@ -167,7 +167,6 @@ class RotorPy(Simulator):
     def __init__(self, start: States) -> None:
         self._torch: Any = importlib.import_module("torch")
         module: Any = importlib.import_module("rotorpy.vehicles.multirotor")
-        module: Any = importlib.import_module("rotorpy.vehicles.multirotor")
         self._torch.set_num_threads(1)  # synchronising threads would take longer than the work on arrays of this size
         n, device = len(start["pos"]), self._torch.device("cpu")
         params = rotorpy_params(load_airframe(DRONE))

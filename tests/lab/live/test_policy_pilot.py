@@ -97,6 +97,10 @@ def test_listed_points_are_passed_in_order(env):
         assert pilot.passed.tolist() == [[2], [2]]
         np.testing.assert_array_equal(pilot.goals[:, 0], [POINTS[1]] * 2)
         assert np.linalg.norm(positions(live) - POINTS[1], axis=-1).max() < CLOSE
+        live.go_to(0.1)
+        assert pilot.passed.tolist() == [[0], [0]]
+        live.go_to(6.0)
+        assert pilot.passed.tolist() == [[2], [2]]
         live.reset()
         assert pilot.passed.tolist() == [[0], [0]]
         np.testing.assert_array_equal(pilot.goals[:, 0], [POINTS[0]] * 2)
