@@ -63,7 +63,7 @@ def test_the_help_of_a_command_states_defaults_once(command, capsys):
 
 def test_the_demo_has_the_defaults_of_its_function(monkeypatch):
     settings = []
-    monkeypatch.setattr(demo_flight, "fly", lambda **given: settings.append(given))
+    monkeypatch.setattr(demo_flight, "run_demo_flight", lambda **given: settings.append(given))
     assert main(["demo"]) == main(["demo", "--worlds", "8", "--no-film"]) == 0
     assert settings == [{}, {"n_worlds": 8, "film": False}]
 

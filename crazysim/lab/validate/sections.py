@@ -140,6 +140,6 @@ def sections(data: Path | None = None) -> Sequence[Section]:
         ),
         Section(
             "sim2sim", "Sim to sim", sim_to_sim.TEXT, sim_to_sim.checks(data),
-            packages={"onnx": "onnx", "onnxruntime": "onnxruntime"}, peers=sim_to_sim.PEERS,
+            packages={"onnx": "onnx", "onnxruntime": "onnxruntime", "optax": "optax"}, peers=sim_to_sim.PEERS,
         ),
     )  # fmt: skip

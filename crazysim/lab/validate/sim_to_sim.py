@@ -27,9 +27,6 @@ from crazysim.envs.state import flatten
 from crazysim.errors import ConfigError
 from crazysim.lab.validate.rows import Row
 from crazysim.lab.validate.simulators import PERIOD, SIMULATORS, Simulator, States
-from crazysim.train import load_policy, run
-from crazysim.train.evaluation import EVALUATION_SEED
-from crazysim.train.export import to_c, to_onnx
 
 STARTS = 200
 """Number of starts of each policy in each simulator."""
@@ -114,6 +111,9 @@ def exported(name: str, folder: Path | None = None) -> Exported:
         name: Name of the policy.
         folder: Folder that contains or receives the folders of the trainings; None to keep none.
     """
+    from crazysim.train import load_policy, run  # only here: they need packages of the extra train
+    from crazysim.train.export import to_c, to_onnx
+
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(temporary if folder is None else folder) / name
         if not (place / "policy.npz").exists():
@@ -173,6 +173,8 @@ def fly(task: str, command: Callable[[NDArray], NDArray], simulator: type[Simula
         simulator: The simulator.
         starts: Number of starts.
     """
+    from crazysim.train.evaluation import EVALUATION_SEED
+
     env = make(task, n_worlds=starts, freq=round(1 / PERIOD))
     data = env.reset(jax.random.key(EVALUATION_SEED)).data
 
