@@ -84,7 +84,7 @@ PLAYED = """
 import sys
 from crazysim.__main__ import main
 from crazysim.scene.scene_window import SceneWindow
-from crazysim.lab.shows import fly, view
+from crazysim.lab.shows import fly_show, view
 from crazysim.lab.show_files import load_show
 
 opened, frames = SceneWindow.__init__, []
@@ -103,7 +103,7 @@ def close(sim, world):
         window._glfw.set_window_should_close(window._window, True)
 
 assert main(["show", sys.argv[1], "--window"]) == 0
-view.play(fly(load_show(sys.argv[1])), speed=0.0015, draw=close, width=64, height=48)
+view.play(fly_show(load_show(sys.argv[1])), speed=0.0015, draw=close, width=64, height=48)
 print("frames", len(frames))
 """
 
