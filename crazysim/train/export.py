@@ -272,7 +272,7 @@ def _description(meta: Mapping[str, Any]) -> Iterator[str]:
 
 def _body(name: str, numbers: Numbers) -> Iterator[str]:
     """Yield the lines of the function's body."""
-    n_obs, n_memory, limit = len(numbers.mean), numbers.n_memory, _number(CLIP)
+    n_obs, n_memory, limit = len(numbers.mean), numbers.n_memory, float_literal(CLIP)
     yield f"float x0[{n_obs + n_memory}];"
     yield f"for (int i = 0; i < {n_obs}; ++i) {{"
     yield f"    const float x = (observation[i] - {name}_mean[i]) / {name}_std[i];"
@@ -303,7 +303,7 @@ def _body(name: str, numbers: Numbers) -> Iterator[str]:
         yield "}"
 
 
-def _number(x: float) -> str:
+def float_literal(x: float) -> str:
     """Return a number as a C literal that is read back bit for bit: nine digits identify any float32."""
     text = f"{float(x):.9g}"
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
@@ -312,4 +312,4 @@ def _number(x: float) -> str:
 def _array(x: np.ndarray) -> str:
     if x.ndim > 1:
         return "{\n" + ",\n".join(f"    {_array(row)}" for row in x) + "\n}"
-    return "{" + ", ".join(map(_number, x)) + "}"
+    return "{" + ", ".join(map(float_literal, x)) + "}"

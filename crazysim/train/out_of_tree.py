@@ -18,7 +18,7 @@ from crazysim.core.settings import positive_integer
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError
 from crazysim.storage import write_file
-from crazysim.train.export import to_c
+from crazysim.train.export import float_literal, to_c
 from crazysim.train.networks import Policy
 
 HEADER, SOURCE = "policy.h", "controller.c"
@@ -127,7 +127,7 @@ static void policy_command(const float pos[3], const float quat[4], const float 
     yield f"    float action[{len(actions['centre'])}];"
     yield "    policy(observation, action);"
     for i, (centre, scale) in enumerate(zip(actions["centre"], actions["scale"], strict=True)):
-        yield f"    command[{i}] = {_number(centre)} + {_number(scale)} * action[{i}];"
+        yield f"    command[{i}] = {float_literal(centre)} + {float_literal(scale)} * action[{i}];"
     yield "}"
     if level == Control.rotor_vel:
         yield CFIRMWARE
@@ -227,7 +227,7 @@ def _output(level: Control, airframe: Airframe) -> str:
     control->torqueY = command[2];
     control->torqueZ = command[3];"""
     if level == Control.rotor_vel:
-        k0, k1, k2 = (_number(x / top) for x in airframe.value("rotors.thrust_curve", (3,)))
+        k0, k1, k2 = (float_literal(x / top) for x in airframe.value("rotors.thrust_curve", (3,)))
         return f"""
     control->controlMode = controlModeForce;
     for (int i = 0; i < 4; ++i) {{ /* thrust over its maximum, from the speed, rpm */
@@ -246,12 +246,6 @@ def _output(level: Control, airframe: Airframe) -> str:
     below.{fields}.roll = degree * command[0];
     below.{fields}.pitch = -degree * command[1]; /* the firmware's pitch is positive with the nose up */
     below.{fields}.yaw = degree * command[2];
-    const float thrust = command[3] / {_number(airframe.n_rotors * top)}; /* of the largest of all rotors */
+    const float thrust = command[3] / {float_literal(airframe.n_rotors * top)}; /* of the largest of all rotors */
     below.thrust = 65535 * (thrust < 0 ? 0 : (thrust > 1 ? 1 : thrust));
     controllerPid(control, &below, sensors, state, stabilizerStep);"""
-
-
-def _number(x: float) -> str:
-    """Return a number as a C literal of type float."""
-    text = f"{float(x):.9g}"
-    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
