@@ -36,9 +36,7 @@ def main() -> None:
 def measure(control: str, integrator: str, n_worlds: int, engine: str, device: str) -> dict[str, Any]:
     """Return the times of one case."""
     begin = time.perf_counter()
-    sim = Sim(
-        n_worlds=n_worlds, control=control, integrator=integrator, controller="crazyflow", engine=engine, device=device
-    )
+    sim = Sim(n_worlds=n_worlds, control=control, integrator=integrator, engine=engine, device=device)
     hovering(sim, control)
     built = time.perf_counter()
     lowered = sim.build_step_fn().lower(sim.data, jnp.int32(1))

@@ -57,8 +57,6 @@ def build(package: str, task: str, case: dict[str, Any], device: str) -> Any:
         return Question(package, task, case, device)
     settings = dict(case)
     n_steps = settings.pop("n_steps")
-    if package == "crazysim":
-        settings["controller"] = "crazyflow"  # the same flights in both
     sim = importlib.import_module(f"{package}.sim").Sim(**settings, device=device)
     if task == "loop":
         return Loop(sim, case["control"], n_steps)

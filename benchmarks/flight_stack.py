@@ -5,7 +5,7 @@
 Drones hover, in calls of 100 steps; all cases alternate. ``ratio`` is the time over the reference's: constant
 state commands for trajectories and controllers, the bare drone with rotor commands for loads.
 
-- state: the default cascade, a constant command; follow: a figure eight for all; starts: with a start per world
+- state: the default controller, a constant command; follow: a figure eight for all; starts: with a start per world
 - slots: 16 trajectories of 60 pieces, index and start per world
 - geometric: geometric control at 100 Hz along a figure eight
 - pid, mellinger: the firmware's controllers, a constant command
@@ -57,7 +57,6 @@ def main() -> None:
 def fly(args: argparse.Namespace, name: str) -> Flight:
     """Return the compiled flight of a case."""
     reference, settings, add = CASES[name]
-    settings = {"controller": "crazyflow", **settings}
     sim = Sim(args.worlds, device=args.device, engine=args.engine, **settings)
     if add is not None:
         add(sim)

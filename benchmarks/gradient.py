@@ -41,7 +41,7 @@ def main() -> None:
 
 def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int) -> None:
     """Print the line of one case."""
-    sim = Sim(n_worlds, control=control, controller="crazyflow", device=args.device, engine=args.engine)
+    sim = Sim(n_worlds, control=control, device=args.device, engine=args.engine)
     hovering(sim, control)
     step, start = sim.build_step_fn(), sim.data
     send, zeros = getattr(functional, f"{control}_control"), sim.step_fn.zeros(sim.data)

@@ -74,9 +74,7 @@ def measure(
     args: argparse.Namespace, machine: Machine, control: str, integrator: str, n_worlds: int, n_steps: int, engine: str
 ) -> None:
     """Print lower bound and measured time of one case."""
-    sim = Sim(
-        n_worlds, control=control, integrator=integrator, controller="crazyflow", device=args.device, engine=engine
-    )
+    sim = Sim(n_worlds, control=control, integrator=integrator, device=args.device, engine=engine)
     flight = Flight(sim, control, n_steps, args.device)
     measured = medians({"step": flight.seconds}, args.repeats)["step"]
     flight.require_flying()
@@ -110,7 +108,7 @@ def work(sim: Sim) -> tuple[float, float, int]:
     Raises:
         SystemExit: If a stage is not part of the program, so that its operations cannot be counted.
     """
-    one = Sim(1, control=sim.control, integrator=sim.integrator, controller="crazyflow", engine="lanes")
+    one = Sim(1, control=sim.control, integrator=sim.integrator, engine="lanes")
     program = one.build_step_fn().plan(one.data).program
     assert program is not None
     if program.unfused_stages:

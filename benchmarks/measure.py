@@ -181,7 +181,8 @@ def machine(device: str) -> dict[str, Any]:
     return {
         "device": "cpu" if device == "cpu" else jax.devices(device)[0].device_kind,
         "processor": _processor(),
-        "cores": os.cpu_count(),
+        "vectors": _vectors(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "jax": jax.__version__,
         "python": platform.python_version(),
         "date": time.strftime("%Y-%m-%d"),
@@ -190,7 +191,17 @@ def machine(device: str) -> dict[str, Any]:
 
 def _processor() -> str:
     """Return the name of the processor as reported by the system."""
+    return _cpu_info("model name") or platform.machine()
+
+
+def _vectors() -> str:
+    """Return the widest vectors of the processor that kernels use."""
+    features = _cpu_info("flags").split()
+    return next((name for flag, name in (("avx512f", "AVX-512"), ("avx2", "AVX2")) if flag in features), "128 bit")
+
+
+def _cpu_info(key: str) -> str:
+    """Return what Linux reports about the first processor, an empty text elsewhere."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")

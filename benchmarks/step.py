@@ -26,7 +26,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", nargs="+", default=["auto"], choices=ENGINES)
-    parser.add_argument("--controllers", nargs="+", default=["crazyflow"])
+    parser.add_argument("--controllers", nargs="+", default=["auto"])
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384])
     parser.add_argument("--drones", type=int, nargs="+", default=[1], help="drones per world")
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])

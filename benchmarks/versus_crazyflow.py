@@ -1,7 +1,8 @@
 """Comparison of crazysim with Crazyflow 0.4.0, which runs in a virtual environment that this script creates.
 
 Each program runs in its own process with the same JAX. The two alternate batch by batch, so that the noise of a shared
-machine affects both. Medians and the ratios of medians are printed. The cases:
+machine affects both. Medians and the ratios of medians are printed. Steps, loops, calls and gradients are measured with
+each controller of ``--controllers``: ``crazyflow`` is the control of the other program. The cases:
 
     first_step  from Sim(n_worlds=1) to its first step, in fresh processes
     step        100 physics steps per call, for each command level, integrator and number of worlds
@@ -40,6 +41,8 @@ FOLDER = Path(__file__).parent
 PEER_FOLDER = FOLDER.parent / ".cache" / "crazyflow"
 CASES = ("first_step", "step", "loop", "call", "gradient", "swarm", "contacts", "depth", "swarm_build", "gym", "memory")
 LEVELS = ("rotor_vel", "force_torque", "body_rate", "attitude", "state")
+CONTROLLED = ("body_rate", "attitude", "state")
+"""Command levels at which a controller runs."""
 
 
 def main() -> None:
@@ -47,6 +50,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=CASES, default=CASES, help="cases to run")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", nargs="+", default=["auto"], help="engines of crazysim")
+    parser.add_argument("--controllers", nargs="+", default=["auto", "crazyflow"], help="controllers of crazysim")
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384], help="values for 'step'")
     parser.add_argument("--loop-worlds", type=int, nargs="+", default=[1, 64, 1024, 16384], help="values for 'loop'")
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"], help="values for 'step'")
@@ -65,7 +69,7 @@ def main() -> None:
     if "first_step" in args.only:
         first_steps(pythons, args.device)
     workers = {name: Worker(python, name) for name, python in pythons.items()}
-    versus = Versus(workers, args.engine, args.device, args.repeats)
+    versus = Versus(workers, args.engine, args.controllers, args.device, args.repeats)
     if "step" in args.only:
         for control, integrator, n_worlds in itertools.product(args.controls, args.integrators, args.worlds):
             versus.compare("step", control=control, integrator=integrator, n_worlds=n_worlds, n_steps=100)
@@ -98,24 +102,32 @@ def main() -> None:
 class Versus:
     """Comparisons of engines of crazysim with Crazyflow."""
 
-    def __init__(self, workers: dict[str, Worker], engines: list[str], device: str, repeats: int):
+    def __init__(
+        self, workers: dict[str, Worker], engines: list[str], controllers: list[str], device: str, repeats: int
+    ):
         """Store the two programs."""
-        self.workers, self.engines, self.device, self.repeats = workers, engines, device, repeats
+        self.workers, self.engines, self.controllers = workers, engines, controllers
+        self.device, self.repeats = device, repeats
         self.machine = workers["crazysim"].request(do="machine", device=device)
 
     def compare(self, benchmark: str, **case: Any) -> None:
-        """Print steps per second and compile time of each engine and of Crazyflow, and the ratio."""
+        """Print steps per second and compile time of each engine and controller and of Crazyflow, and the ratio."""
         ours, peer = self.workers["crazysim"], self.workers["crazyflow"]
-        contestants = {engine: (ours, case | {"engine": engine}) for engine in self.engines}
+        controllers = self.controllers if case["control"] in CONTROLLED else self.controllers[:1]
+        variants = [
+            {"engine": engine, "controller": controller} for engine in self.engines for controller in controllers
+        ]
+        contestants = {json.dumps(variant): (ours, case | variant) for variant in variants}
         found = self._measure(benchmark, contestants | {"crazyflow": (peer, case)})
         steps = case["n_worlds"] * case["n_steps"]
-        for engine in self.engines:
-            line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{benchmark}", "engine": engine, **case}
-            for name, (seconds, compile_s) in (("crazysim", found[engine]), ("crazyflow", found["crazyflow"])):
+        for variant in variants:
+            line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{benchmark}", **variant, **case}
+            own = found[json.dumps(variant)]
+            for name, (seconds, compile_s) in (("crazysim", own), ("crazyflow", found["crazyflow"])):
                 line[f"{name}_call_s"] = digits(seconds)
                 line[f"{name}_steps_per_s"] = digits(steps / seconds)
                 line[f"{name}_compile_s"] = round(compile_s, 2)
-            line["ratio"] = round(found["crazyflow"][0] / found[engine][0], 2)
+            line["ratio"] = round(found["crazyflow"][0] / own[0], 2)
             print(json.dumps(line | self.machine), flush=True)
 
     def question(self, task: str, **case: Any) -> None:

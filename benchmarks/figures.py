@@ -1,0 +1,435 @@
+"""Figures of README.md and of the pages: make them again, write their tables, and list those that are too old.
+
+    python benchmarks/figures.py --list
+    python benchmarks/figures.py --write [--only loop step] [--device gpu] [--peer-python PATH/OF/python]
+    python benchmarks/figures.py --stale
+
+``FIGURES`` has a command for each figure. ``--write`` runs the commands for a device, stores what they print in
+``docs/concepts/figures.json`` with machine, versions, date and commit, and writes their tables into the pages, between
+the comments ``<!-- figure NAME -->`` and ``<!-- end of NAME -->``. Records of other machines stay. On a machine without
+the repository, ``--records FILE --commit COMMIT`` writes the records to a file, and ``--write --take FILE`` in the
+repository puts them into the pages.
+
+``--stale`` lists each record that is older than a change of what it measures, and ends with status 1 if there is one.
+Changes of comments, docstrings, annotations, local names and error messages do not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import types
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tables
+from tables import Line
+
+ROOT = Path(__file__).parents[1]
+STORE = ROOT / "docs" / "concepts" / "figures.json"
+MACHINE_KEYS = ("device", "processor", "vectors", "cores", "jax", "python", "date", "crazysim")
+"""Keys of lines that a record has once."""
+
+ENGINE = ("crazysim/engine", ":(exclude)crazysim/engine/tools")
+STEP = (*ENGINE, "crazysim/core", "crazysim/dynamics", "crazysim/control", "crazysim/sim/sim.py")
+"""Sources of a step, as Git's path specifications."""
+SCENE = ("crazysim/geometry", "crazysim/scene")
+ENVS = (*STEP, "crazysim/envs")
+PLUGINS = (*STEP, "crazysim/plugins")
+VERSUS = ("benchmarks/versus_crazyflow.py", "benchmarks/contestant.py")
+
+
+class Figure(NamedTuple):
+    """What one command measures and one page shows."""
+
+    page: str
+    """Page with the figure."""
+    sources: tuple[str, ...]
+    """What the figure measures, as Git's path specifications; the script of the command is added."""
+    cpu: str = ""
+    """Command on two cores, without ``python benchmarks/``; empty if there is none."""
+    gpu: str = ""
+    """Command on one GPU."""
+    table: Callable[[list[Line]], str] | None = None
+    """Function that returns the Markdown of a record's lines; None where the page is written by hand."""
+    commits: Callable[[], dict[str, str]] | None = None
+    """Commits of figures that a command of their own stores, by name."""
+
+    def command(self, device: str) -> str:
+        """Return the command for a device."""
+        return self.gpu if device == "gpu" else self.cpu
+
+    def spec(self) -> tuple[str, ...]:
+        """Return the sources with the scripts of the commands."""
+        scripts = {f"benchmarks/{shlex.split(command)[0]}" for command in (self.cpu, self.gpu) if command}
+        return (*self.sources, *sorted(scripts))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--list", action="store_true", help="list figures, pages, commands and records")
+    parser.add_argument("--stale", action="store_true", help="list records that are older than what they measure")
+    parser.add_argument("--write", action="store_true", help="measure, and write records and pages")
+    parser.add_argument("--only", nargs="*", choices=list(FIGURES), default=list(FIGURES), help="figures to measure")
+    parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu")
+    parser.add_argument("--peer-python", help="interpreter with Crazyflow 0.4.0, for comparisons with it")
+    parser.add_argument("--records", type=Path, help="file for the new records, instead of the pages")
+    parser.add_argument(
+        "--take", type=Path, nargs="+", default=[], help="files with records to write instead of new ones"
+    )
+    parser.add_argument("--commit", help="commit of the sources; by default the one that is checked out")
+    args = parser.parse_args()
+    failures: list[str] = []
+    if args.list:
+        print("\n".join(listing()))
+    if args.write:
+        if args.take:
+            records = [record for path in args.take for record in json.loads(path.read_text())]
+        else:
+            records, failures = measure(args)
+        if args.records is None:
+            keep(records)
+            write_pages()
+    if args.stale:
+        failures += stale()
+    if failures:
+        raise SystemExit("\n".join(failures))
+
+
+def listing() -> list[str]:
+    """Return a line for each figure."""
+    machines = {name: [record["machine"] for record in load() if record["figure"] == name] for name in FIGURES}
+    return [
+        f"{name}: {figure.page}; {figure.cpu or '-'}; {figure.gpu or '-'}; {', '.join(machines[name]) or 'no record'}"
+        for name, figure in FIGURES.items()
+    ]
+
+
+def measure(args: argparse.Namespace) -> tuple[list[Line], list[str]]:
+    """Run the commands of figures on a device, and return their records and what failed."""
+    commit, records, failures = args.commit or checked_out(), [], []
+    for name in args.only:
+        command = FIGURES[name].command(args.device)
+        if not command:
+            continue
+        words = shlex.split(command)
+        words += ["--device", "gpu"] * (args.device == "gpu")
+        shown = shlex.join(words)
+        words += ["--peer-python", args.peer_python] if args.peer_python and words[0] == Path(VERSUS[0]).name else []
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+        print(f"{name}: {shown}", file=sys.stderr, flush=True)
+        done = subprocess.run(
+            [sys.executable, *words], cwd=ROOT / "benchmarks", env=environment, stdout=subprocess.PIPE, text=True
+        )
+        lines = [json.loads(text) for text in done.stdout.splitlines() if text.startswith("{")]
+        if done.returncode or not lines:
+            failures.append(f"{name}: {shown} failed with status {done.returncode}; its error is above.")
+            continue
+        records.append(record(name, shown, commit, lines))
+        if args.records is not None:
+            args.records.write_text(as_text(records))
+    return records, failures
+
+
+def record(name: str, command: str, commit: str, lines: list[Line]) -> Line:
+    """Return the record of a figure."""
+    about = next(line for line in lines if "device" in line)
+    cores = f"{about['cores']} cores of {about['processor']} ({about['vectors']})"
+    return {
+        "figure": name,
+        "machine": cores if about["device"] == "cpu" else about["device"],
+        "jax": about["jax"],
+        "python": about["python"],
+        "date": about["date"],
+        "commit": commit,
+        "command": command,
+        "lines": [{key: value for key, value in line.items() if key not in MACHINE_KEYS} for line in lines],
+    }
+
+
+def checked_out() -> str:
+    """Return the commit that is checked out."""
+    return git("rev-parse", "--short=9", "HEAD").strip()
+
+
+def git(*words: str) -> str:
+    """Return what Git prints about this repository."""
+    done = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(done.stderr.strip())
+    return done.stdout
+
+
+def load() -> list[Line]:
+    """Return the stored records."""
+    return json.loads(STORE.read_text())
+
+
+def as_text(records: Iterable[Line]) -> str:
+    """Return records as the store holds them."""
+    return "[\n" + ",\n".join(json.dumps(record) for record in records) + "\n]\n"
+
+
+def keep(records: list[Line]) -> None:
+    """Store records instead of earlier ones of the same figures and machines."""
+    known = {(record["figure"], record["machine"]): record for record in [*load(), *records]}
+    order = list(FIGURES)
+    STORE.write_text(as_text(sorted(known.values(), key=lambda x: (order.index(x["figure"]), x["machine"]))))
+
+
+def write_pages() -> None:
+    """Write the tables of all stored records into the pages."""
+    for path in sorted({figure.page for figure in FIGURES.values()}):
+        page = ROOT / path
+        text = page.read_text()
+        if (written := with_tables(text, load())) != text:
+            page.write_text(written)
+
+
+def blocks(text: str) -> list[str]:
+    """Return the names of the figures that a page has places for."""
+    return re.findall(r"^<!-- figure (\S+) -->$", text, re.MULTILINE)
+
+
+def with_tables(text: str, records: list[Line]) -> str:
+    """Return a page with the tables of records between its comments."""
+    for name in blocks(text):
+        begin, end = f"<!-- figure {name} -->", f"<!-- end of {name} -->"
+        before, _, rest = text.partition(begin)
+        _, _, after = rest.partition(end)
+        text = f"{before}{begin}\n\n{markdown(name, records)}\n\n{end}{after}"
+    return text
+
+
+def markdown(name: str, records: list[Line]) -> str:
+    """Return the tables of a figure, each with its machine, versions, date, commit and command."""
+    if name == "readme":
+        return tables.readme(records)
+    table = FIGURES[name].table
+    parts = []
+    for record in records:
+        if record["figure"] == name and table is not None:
+            about = f"jax {record['jax']}, Python {record['python']}, {record['date']}, commit {record['commit']}"
+            parts.append(f"{record['machine']} ({about}, `{record['command']}`):\n\n{table(record['lines'])}")
+    return "\n\n".join(parts)
+
+
+def stale() -> list[str]:
+    """Return a line for each record that is older than a change of what it measures."""
+    found = []
+    for name, figure in FIGURES.items():
+        measured = [(record["machine"], record["commit"]) for record in load() if record["figure"] == name]
+        measured += list(figure.commits().items()) if figure.commits else []
+        if not measured:
+            found.append(f"{name}: no record")
+        for machine, commit in measured:
+            try:
+                paths = changed(commit, figure.spec())
+            except RuntimeError as error:
+                found.append(f"{name}, {machine}: {error}")
+                continue
+            if paths:
+                others = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
+                found.append(f"{name}, {machine}: {', '.join(paths[:3])}{others} changed after {commit}")
+    return found
+
+
+def changed(commit: str, spec: Iterable[str]) -> list[str]:
+    """Return the files whose code differs between a commit and the working tree."""
+    if commit.endswith("+"):
+        raise RuntimeError(f"measured with changes beyond commit {commit[:-1]}")
+    paths = git("diff", "--name-only", "--no-renames", commit, "--", *spec).split()
+    return [path for path in paths if not is_same_code(commit, path)]
+
+
+def is_same_code(commit: str, path: str) -> bool:
+    """Return True if a Python file that differs from a commit's compiles to the same code."""
+    if not path.endswith(".py") or not (ROOT / path).exists():
+        return False
+    try:
+        before = git("show", f"{commit}:{path}")
+    except RuntimeError:
+        return False
+    return code_of(before) == code_of((ROOT / path).read_text())
+
+
+def code_of(source: str) -> Any:
+    """Return what a Python source compiles to, without docstrings, annotations of functions and error messages."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.arg):
+            node.annotation = None
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            node.returns = None
+        elif isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+            node.exc.args, node.exc.keywords = [], []
+
+    def comparable(value: Any) -> Any:
+        """Return a constant, or of code all but the names of local variables and the numbers of lines."""
+        if isinstance(value, types.CodeType):
+            return value.co_code, value.co_exceptiontable, value.co_names, [comparable(x) for x in value.co_consts]
+        return repr(value)
+
+    return comparable(compile(tree, "source", "exec", dont_inherit=True, optimize=2))
+
+
+def training_commits() -> dict[str, str]:
+    """Return the commits of the table that ``train.py --write`` writes, by task."""
+    return {
+        row["task"]: row["commit"] for row in json.loads((ROOT / "docs/concepts/training-results.json").read_text())
+    }
+
+
+def validation_commits() -> dict[str, str]:
+    """Return the commit that ``crazysim validate`` wrote into its page."""
+    found = re.search(r"commit ([0-9a-f]{7,})", (ROOT / "docs/validation.md").read_text())
+    return {"all": found[1]} if found else {}
+
+
+PAGE = "docs/concepts/figures.md"
+ENGINE_PAGE = "docs/concepts/engine.md"
+FIGURES: dict[str, Figure] = {
+    "loop": Figure(
+        PAGE,
+        (*STEP, "crazysim/sim", VERSUS[1]),
+        cpu="versus_crazyflow.py --only loop --repeats 9",
+        gpu="loop.py",
+        table=tables.loops,
+    ),
+    "step": Figure(
+        PAGE,
+        STEP,
+        gpu="step.py --controllers auto crazyflow --worlds 1024 16384 262144 4194304 --repeats 5",
+        table=tables.rates,
+    ),
+    "step-randomised": Figure(
+        PAGE,
+        STEP,
+        gpu="step.py --controllers auto --worlds 4194304 --integrators euler --randomised",
+        table=tables.rates,
+    ),
+    "limits": Figure(PAGE, STEP, gpu="limits.py", table=tables.limits),
+    "versus": Figure(
+        PAGE,
+        (*STEP, VERSUS[1]),
+        cpu="versus_crazyflow.py --only step --repeats 5",
+        gpu="versus_crazyflow.py --only step --worlds 1024 16384 262144 --integrators euler --repeats 5",
+        table=tables.versus,
+    ),
+    "gradient-versus": Figure(
+        PAGE, (*STEP, VERSUS[1]), cpu="versus_crazyflow.py --only gradient --repeats 9", table=tables.versus
+    ),
+    "gradient": Figure(
+        ENGINE_PAGE,
+        STEP,
+        cpu="gradient.py --worlds 1024",
+        gpu="gradient.py --worlds 1024 16384 131072",
+        table=tables.gradients,
+    ),
+    "coupled": Figure(PAGE, (*STEP, "crazysim/plugins/effects"), gpu="coupled.py", table=tables.coupled),
+    "envs": Figure(
+        PAGE, ENVS, cpu="envs.py --actions random policy", gpu="envs.py --actions random policy", table=tables.env_rates
+    ),
+    "envs-training": Figure(
+        PAGE,
+        (*ENVS, "crazysim/train"),
+        gpu="envs.py --actions training --worlds 4096 65536 262144",
+        table=tables.env_rates,
+    ),
+    "envs-depth": Figure(
+        PAGE,
+        (*ENVS, *SCENE),
+        gpu="envs.py --tasks avoid --worlds 4096 --depth 16 12 --actions policy",
+        table=tables.env_rates,
+    ),
+    "queries": Figure(
+        PAGE,
+        (*ENVS, *SCENE, VERSUS[1]),
+        cpu="versus_crazyflow.py --only contacts depth swarm_build gym memory --repeats 3",
+        gpu="versus_crazyflow.py --only contacts depth gym --repeats 3",
+        table=tables.queries,
+    ),
+    "depth": Figure(
+        PAGE, (*ENGINE, *SCENE), cpu="depth.py --poles 30 1000", gpu="depth.py --worlds 16384", table=tables.depths
+    ),
+    "depth-small": Figure(
+        PAGE, (*ENGINE, *SCENE), gpu="depth.py --worlds 4096 --size 16 12 --poles 30", table=tables.depths
+    ),
+    "range-finder": Figure(
+        PAGE,
+        (*STEP, *SCENE, "crazysim/plugins/sensors"),
+        cpu="depth.py --range-finder --worlds 1024 --poles 0 4 30 100 1000",
+        gpu="depth.py --range-finder --worlds 16384 --poles 0 30 1000",
+        table=tables.range_finders,
+    ),
+    "plugins": Figure(
+        PAGE, PLUGINS, cpu="plugins.py --repeats 7", gpu="plugins.py --worlds 1048576 --repeats 7", table=tables.costs
+    ),
+    "randomize": Figure(
+        PAGE,
+        (*ENVS, "crazysim/plugins/effects"),
+        cpu="envs.py --randomize --actions random policy --worlds 1024",
+        gpu="envs.py --randomize --actions random policy --worlds 4096 1048576",
+        table=tables.env_rates,
+    ),
+    "loads": Figure(
+        PAGE,
+        (*STEP, "crazysim/plugins/payloads"),
+        cpu="flight_stack.py --cases rod cable offset",
+        gpu="flight_stack.py --worlds 4194304 --cases rod cable offset",
+        table=tables.costs,
+    ),
+    "vehicles": Figure(PAGE, (*STEP, "crazysim/plugins/vehicles"), gpu="vehicles.py", table=tables.vehicles),
+    "fleets": Figure(
+        "docs/guides/fleets.md",
+        (*STEP, "crazysim/plugins/vehicles"),
+        cpu="fleets.py",
+        gpu="fleets.py",
+        table=tables.fleets,
+    ),
+    "controllers": Figure(
+        PAGE,
+        ("crazysim/control", "crazysim/dynamics", "crazysim/drones"),
+        cpu="controllers.py --worlds 0",
+        table=tables.control,
+    ),
+    "controllers-rates": Figure(
+        "docs/concepts/control-results.md",
+        STEP,
+        gpu="controllers.py --worlds 1048576 --drones cf21B_500 --attitudes 1",
+        table=tables.control_rates,
+    ),
+    "follow": Figure(
+        "docs/concepts/control-results.md",
+        (*STEP, "crazysim/plugins/follow.py", "crazysim/trajectories"),
+        cpu="flight_stack.py --cases follow starts slots",
+        gpu="flight_stack.py --worlds 4194304 --cases follow starts slots",
+        table=tables.costs,
+    ),
+    "mppi": Figure(PAGE, (*STEP, "crazysim/sim/mppi.py"), cpu="mppi.py", gpu="mppi.py", table=tables.commands),
+    "live": Figure(PAGE, (*STEP, "crazysim/lab/live"), cpu="live.py", table=tables.live),
+    "mocap": Figure(PAGE, ("crazysim/lab/live/mocap",), cpu="mocap.py", table=tables.mocap),
+    "first-results": Figure(
+        "docs/install.md",
+        ("crazysim/cache.py", "crazysim/startup.py", "crazysim/sim", *ENGINE, "crazysim/envs"),
+        cpu="first_results.py --repeat 1",
+        table=tables.first_results,
+    ),
+    "training": Figure("docs/concepts/training-results.md", (*ENVS, "crazysim/train"), commits=training_commits),
+    "validation": Figure(
+        "docs/validation.md",
+        ("crazysim/dynamics", "crazysim/control", "crazysim/lab/validate"),
+        commits=validation_commits,
+    ),
+}
+
+
+if __name__ == "__main__":
+    main()

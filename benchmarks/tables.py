@@ -1,0 +1,335 @@
+"""Markdown tables of the JSON lines of benchmarks, as ``figures.py`` writes them into the pages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from measure import digits
+
+Line = dict[str, Any]
+"""JSON line of a benchmark, or record of a figure."""
+
+
+def pivot(
+    lines: list[Line], row: Callable[..., str], column: Callable[..., str], value: Callable[..., str], corner: str
+) -> str:
+    """Return a table of lines by row and column."""
+    cells = {(row(line), column(line)): value(line) for line in lines}
+    columns = list(dict.fromkeys(name for _, name in cells))
+    rows = dict.fromkeys(name for name, _ in cells)
+    return table_of([corner, *columns], [[name, *(cells.get((name, x), "") for x in columns)] for name in rows])
+
+
+def table_of(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a Markdown table."""
+    head = list(head)
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
+def columns(**getters: Callable[[Line], str]) -> Callable[[list[Line]], str]:
+    """Return a function that makes a table with a row for each line; underscores of headings are spaces."""
+    head = [name.replace("_", " ") for name in getters]
+    return lambda lines: table_of(head, [[get(line) for get in getters.values()] for line in lines])
+
+
+LEVELS = {"rotor_vel": "rotor speeds", "attitude": "attitude", "state": "state"}
+INTEGRATORS = {"euler": "Euler", "rk4": "RK4"}
+
+
+def case_of(line: Line) -> str:
+    """Return command level, integrator and controller of a line as text."""
+    parts = [LEVELS[line["control"]], *([INTEGRATORS[line["integrator"]]] if "integrator" in line else [])]
+    return ", ".join(
+        [*parts, *([f"`{line['controller']}`"] if "controller" in line and line["control"] != "rotor_vel" else [])]
+    )
+
+
+def worlds_of(line: Line) -> str:
+    """Return the number of worlds as text."""
+    return f"{line['n_worlds']:,}"
+
+
+def si(value: float, unit: str = "") -> str:
+    """Return a number with three digits and a prefix, such as ``46.2 G``."""
+    value, k = digits(value), 0
+    while value >= 1000 and k < 3:
+        value, k = digits(value / 1000), k + 1
+    return f"{value:g} {' kMG'[k]}{unit}".replace("  ", " ").strip()
+
+
+def duration(seconds: float) -> str:
+    """Return a duration with three digits and its unit."""
+    factor, unit = next(((f, u) for f, u in ((1, "s"), (1e3, "ms"), (1e6, "us")) if seconds * f >= 1), (1e9, "ns"))
+    return f"{digits(seconds * factor):g} {unit}"
+
+
+def loops(lines: list[Line]) -> str:
+    """Return times of an iteration, with Crazyflow's over ours, or alone."""
+
+    def time_of(line: Line) -> str:
+        if "ratio" in line:
+            return f"{duration(line['crazysim_call_s'])}, {line['ratio']:.2g}"
+        return duration(line["iteration_s"])
+
+    names = {"loop/jax": "a compiled sum, read", "loop/mj_step": "C MuJoCo, one box"}
+
+    def row_of(line: Line) -> str:
+        return names[line["benchmark"]] if line["benchmark"] in names else case_of(line).replace(", Euler", "")
+
+    return pivot(lines, row_of, worlds_of, time_of, "Commands, worlds")
+
+
+def versus(lines: list[Line]) -> str:
+    """Return rates of crazysim and Crazyflow, their ratio, and the times of compilation."""
+    return columns(
+        Commands=case_of,
+        Worlds=worlds_of,
+        crazysim=lambda x: si(x["crazysim_steps_per_s"]),
+        Crazyflow=lambda x: si(x["crazyflow_steps_per_s"]),
+        Ratio=lambda x: f"{x['ratio']:.2g}",
+        Compilation=lambda x: f"{x['crazysim_compile_s']:.2g} s, Crazyflow {x['crazyflow_compile_s']:.2g} s",
+    )(lines)
+
+
+def rates(lines: list[Line]) -> str:
+    """Return steps per second by case and number of worlds."""
+    return pivot(lines, case_of, worlds_of, lambda x: si(x["steps_per_s"]), "Commands, worlds")
+
+
+def gradients(lines: list[Line]) -> str:
+    """Return rates of gradients and their times over those of the steps alone."""
+    return columns(
+        Commands=lambda x: LEVELS[x["control"]],
+        Worlds=worlds_of,
+        Gradient=lambda x: si(x["n_worlds"] * x["n_steps"] / x["gradient_s"], "steps/s"),
+        Over_steps_alone=lambda x: f"{x['forward_passes']:.2g}",
+        Forward_mode_over_steps_alone=lambda x: f"{x['jvp_passes']:.2g}",
+        First_gradient_compiles_in=lambda x: f"{x['compile_s']:.2g} s",
+    )(lines)
+
+
+def env_rates(lines: list[Line]) -> str:
+    """Return environment steps per second by task and actions, and number of worlds."""
+    names = {"random": "random actions", "policy": "a 64 x 64 policy", "bfloat16": "the same in bfloat16",
+             "training": "iterations of PPO"}  # fmt: skip
+
+    def row_of(line: Line) -> str:
+        image = f", a depth image of {line['depth'][0]} x {line['depth'][1]}" if line["depth"] else ""
+        drawn = ", `Randomize.crazyflie()`" if line["drones"] == "randomized" else ""
+        return f"`{line['task']}`, {names[line['actions']]}{image}{drawn}"
+
+    return pivot(lines, row_of, worlds_of, lambda x: si(x["env_steps_per_s"]), "Environment steps/s, worlds")
+
+
+def queries(lines: list[Line]) -> str:
+    """Return times of queries, environments and constructions of both programs."""
+    names = {
+        "contacts": "contacts after a step, 4,096 worlds of 4 drones, 8 objects",
+        "depth": "64 x 64 depth of 1,024 worlds, 8 objects",
+        "swarm_build": "`Sim(n_drones=1024)`",
+        "gym": "100 steps of the Gymnasium environment, 4,096 worlds",
+    }
+
+    def row_of(line: Line) -> list[str]:
+        name = line["benchmark"].partition("/")[2]
+        if name == "memory":
+            key, label = "bytes_per_world", f"memory of a world after a contact query, {line['n_drones']} drones"
+            ours, theirs = (f"{digits(line[f'{x}_{key}'] / 1000):g} kB" for x in ("crazysim", "crazyflow"))
+            return [label, ours, theirs, f"{1 / line['ratio']:.2g}"]
+        return [names[name], duration(line["crazysim_s"]), duration(line["crazyflow_s"]), f"{line['ratio']:.2g}"]
+
+    return table_of(["", "crazysim", "Crazyflow", "Crazyflow over crazysim"], [row_of(line) for line in lines])
+
+
+def poles_of(line: Line) -> str:
+    """Return the poles of a scene as text."""
+    return f"{line['n_poles']:,} {'movable' if line['movable'] else 'fixed'} poles" if line["n_poles"] else "none"
+
+
+depths = columns(
+    Poles=poles_of,
+    Image=lambda x: f"{x['width']} x {x['height']}, {x['n_worlds']:,} worlds",
+    Rays_per_second=lambda x: si(x["rays_per_s"]),
+    per_second_of_processor_time=lambda x: si(x["rays_per_processor_s"]),
+    First_image=lambda x: duration(x["first_s"]),
+)
+range_finders = columns(
+    Poles=poles_of,
+    Worlds=worlds_of,
+    One_step=lambda x: duration(1e-6 * x["step_us"]),
+    Processor_time_per_drone=lambda x: duration(1e-9 * x["processor_ns_per_drone"]),
+    First_step=lambda x: duration(x["first_s"]),
+)
+
+
+def costs(lines: list[Line]) -> str:
+    """Return times of cases over their references', and their rates."""
+    return columns(
+        Case=lambda x: f"`{x['case']}`",
+        Time_over_reference=lambda x: f"{x['ratio']:.3g}",
+        Reference=lambda x: f"`{x['reference']}`",
+        Steps_per_second=lambda x: si(x["steps_per_s"]),
+        First_call=lambda x: duration(x["first_s"]),
+    )(lines)
+
+
+coupled = columns(
+    Drones_per_world=lambda x: str(x["n_drones"]),
+    with_downwash=lambda x: si(x["steps_per_s"]["downwash"]),
+    without=lambda x: si(x["steps_per_s"]["uncoupled"]),
+)
+fleets = columns(
+    Fleet=lambda x: {
+        "cars": "four drones and two cars, over the drones alone",
+        "airframes": "two airframes, over one with parameters per drone",
+    }[x["case"]],
+    Worlds=worlds_of,
+    Rate_of_the_drones=lambda x: f"{x['ratio']:.2g}",
+)
+vehicles = columns(Case=lambda x: f"`{x['case']}`", Steps_per_second=lambda x: si(x["steps_per_s"]))
+commands = columns(
+    Samples=lambda x: f"{x['samples']:,}",
+    Commands_per_second=lambda x: si(x["commands_per_s"]),
+    Compilation=lambda x: duration(x["compile_s"]),
+)
+live = columns(
+    Case=lambda x: f"`{x['case']}`, {x['n_drones']} drones",
+    Times_real_time=lambda x: f"{x['factor']:g}",
+    Pictures_per_second=lambda x: f"{x['pictures_per_s']:g}",
+    Late_in_99_9_percent_at_most=lambda x: f"{x['lateness_999_ms']:g} ms",
+    worst=lambda x: f"{x['worst_ms']:g} ms",
+)
+mocap = columns(
+    Objects=lambda x: f"{x['n_objects']} at {x['freq']:g} Hz",
+    Rules_of_a_frame=lambda x: f"{x['frame_ms']:g} ms",
+    Update_of_the_simulation=lambda x: f"{x['update_ms']:g} ms",
+    Lost_frames=lambda x: str(x["lost"]),
+)
+
+
+def first_results(lines: list[Line]) -> str:
+    """Return times to the first results without and with programs in the cache."""
+    names = {
+        "step": "step",
+        "gradient": "gradient of 100 steps, 64 worlds of 2 drones",
+        "contacts": "step and `contacts()`, 64 worlds of 2 drones",
+        "gymnasium": "Gymnasium: make, reset, step",
+        "render": "`render`",
+    }
+    heads = {"off": "`CRAZYSIM_CACHE=off`", "on": "second run"}
+    return pivot(
+        lines,
+        lambda x: names[x["case"]],
+        lambda x: heads[x["cache"]],
+        lambda x: f"{x['wall_s']:.1f} s, {x['cpu_s']:.1f} s of processors",
+        "First result",
+    )
+
+
+def control(lines: list[Line]) -> str:
+    """Return the flights of all controllers with all airframes."""
+
+    def metres(value: float | None) -> str:
+        return "" if value is None else "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+    def percent(value: float | None) -> str:
+        return "" if value is None else "< 1%" if value < 0.01 else f"{value:.0%}"
+
+    def row_of(line: Line) -> list[str]:
+        lost = line.get("lost_178")
+        rate = "levels" if line.get("error_body_rate", 0) > 0.5 else percent(line.get("overshoot_body_rate"))
+        return [
+            f"`\"{line['controller']}\"`", f"`{line['drone']}`",
+            *(metres(line.get(key)) for key in ("hover", "tracking", "pushed", "heavier")),
+            "" if "home" not in line else f"{line['home']:.0%}",
+            "" if lost is None else "all" if lost > 99 else f"{lost:.1f}",
+            percent(line.get("overshoot_attitude")), rate,
+        ]  # fmt: skip
+
+    head = (
+        "`controller`",
+        "Drone",
+        "Hover, m",
+        "Eight, m",
+        "Pushed, m",
+        "Heavier, m",
+        "Home",
+        "Lost, m",
+        "Attitude",
+        "Rate",
+    )
+    return table_of(head, [row_of(line) for line in lines if "drone" in line])
+
+
+def control_rates(lines: list[Line]) -> str:
+    """Return rates of the controllers over that of ``crazyflow``."""
+    found = {line["controller"]: line["steps_per_s"] for line in lines if "steps_per_s" in line}
+    cells = [f"{rate / found['crazyflow']:.2f} ({si(rate)})" for rate in found.values()]
+    return table_of([f'`"{name}"`' for name in found], [cells])
+
+
+def limits(lines: list[Line]) -> str:
+    """Return the part of the rate that arithmetic allows."""
+    lines = [line for line in lines if "ratio" in line]
+    return pivot(lines, case_of, worlds_of, lambda x: f"{1 / x['ratio']:.0%}", "Commands, worlds")
+
+
+def readme(records: list[Line]) -> str:
+    """Return the table of README.md: two cores without AVX-512, and one H100."""
+    kinds = {"cpu": "AVX2", "gpu": "H100"}
+    head = ["", "two CPU cores (AVX2)", "one NVIDIA H100"]
+
+    def lines_of(name: str, device: str, **case: Any) -> list[Line]:
+        """Return the lines of a figure's record that have some values."""
+        lines = [
+            line
+            for record in records
+            if record["figure"] == name and kinds[device] in record["machine"]
+            for line in record["lines"]
+        ]
+        return [line for line in lines if all(line.get(key) == value for key, value in case.items())]
+
+    def span(values: Iterable[float]) -> str:
+        """Return the least and the largest number, of two digits."""
+        found = sorted(digits(value, 2) for value in values)
+        return f"{found[0]:g} to {found[-1]:g}" if found else ""
+
+    def joined(values: Iterable[str]) -> str:
+        return " and ".join(values)
+
+    auto, same = {"control": "attitude", "controller": "auto"}, {"control": "attitude", "controller": "crazyflow"}
+    euler = {"integrator": "euler"}
+    most = {"cpu": ("versus", "crazysim_steps_per_s", 16384), "gpu": ("step", "steps_per_s", 4194304)}
+
+    def steps(device: str, case: Line) -> str:
+        name, key, n_worlds = most[device]
+        return joined(si(x[key]) for x in lines_of(name, device, n_worlds=n_worlds, **case, **euler))
+
+    def gym(device: str) -> str:
+        return joined(
+            si(x["n_worlds"] * x["n_steps"] / x["crazysim_s"])
+            for x in lines_of("queries", device, benchmark="versus_crazyflow/gym")
+        )
+
+    rows = {
+        "one iteration of a script (attitude command, 5 steps, read), 64 and 1,024 worlds": lambda device: joined(
+            duration(x["crazysim_call_s"]) for n in (64, 1024) for x in lines_of("loop", device, n_worlds=n, **auto)
+        ),
+        "the same, 1 to 16,384 worlds: Crazyflow 0.4.0's time over ours, same control": lambda device: span(
+            x["ratio"] for x in lines_of("loop", device, **same)
+        ),
+        "physics steps per second, attitude commands, the default controller": lambda device: steps(device, auto),
+        "the same with Crazyflow's control": lambda device: steps(device, same),
+        "physics steps per second: ours over Crazyflow 0.4.0's, same control": lambda device: span(
+            x["ratio"] for x in lines_of("versus", device, **same, **euler)
+        ),
+        "gradient of 100 steps of 1,024 worlds: Crazyflow 0.4.0's time over ours": lambda device: span(
+            x["ratio"] for x in lines_of("gradient-versus", device, **same)
+        ).partition(" to ")[0],
+        "environment steps per second through Gymnasium, 4,096 worlds": gym,
+        "environment steps per second in compiled rollouts": lambda device: joined(
+            si(x["env_steps_per_s"]) for x in lines_of("envs", device, actions="random", n_worlds=1048576)
+        ),
+    }
+    return table_of(head, [[name, cells("cpu"), cells("gpu")] for name, cells in rows.items()])

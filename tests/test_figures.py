@@ -1,0 +1,136 @@
+"""Figures of the pages: each has a command and a place, and those that are older than what they measure are found."""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+MEASURED = '''
+def thrust(speed: float) -> float:
+    """Return the thrust."""
+    if speed < 0:
+        raise ValueError(f"expected a speed, got {speed}")
+    squared = speed * speed
+    return 2.0 * squared
+'''
+SCRIPT = f"""
+import json, sys
+sys.path.insert(0, {str(ROOT / "benchmarks")!r})
+from measure import machine
+print("something else")
+print(json.dumps(dict(machine("cpu"), case=sys.argv[1], rate=5e3)))
+"""
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return importlib.import_module("figures")
+
+
+@pytest.fixture
+def repository(figures, monkeypatch, tmp_path):
+    """Return the script for another repository, with one figure, one source and no record."""
+    (tmp_path / "benchmarks").mkdir()
+    (tmp_path / "benchmarks" / "speed.py").write_text("print(1)\n")
+    (tmp_path / "thrust.py").write_text(MEASURED)
+    (tmp_path / "page.md").write_text("Before.\n\n<!-- figure speed -->\n\n<!-- end of speed -->\n\nAfter.\n")
+    (tmp_path / "figures.json").write_text("[]\n")
+    table = figures.tables.columns(Case=lambda x: x["case"], Rate=lambda x: figures.tables.si(x["rate"]))
+    figure = figures.Figure("page.md", ("thrust.py",), cpu="speed.py --fast", table=table)
+    monkeypatch.setattr(figures, "ROOT", tmp_path)
+    monkeypatch.setattr(figures, "STORE", tmp_path / "figures.json")
+    monkeypatch.setattr(figures, "FIGURES", {"speed": figure})
+    figures.git("init", "-q")
+    commit_all(figures)
+    return figures
+
+
+def commit_all(figures):
+    figures.git("add", "-A")
+    figures.git("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false", "commit", "-qm", "x")
+    return figures.checked_out()
+
+
+def record(figures, commit, processor="EPYC", rate=2e9):
+    about = {"device": "cpu", "processor": processor, "cores": 2, "vectors": "AVX2", "jax": "0.10.1",
+             "python": "3.11.7", "date": "2026-11-26"}  # fmt: skip
+    return figures.record("speed", "speed.py --fast", commit, [{"case": "hover", "rate": rate} | about])
+
+
+def test_each_figure_has_a_script_and_a_place_on_its_page(figures):
+    for name, figure in figures.FIGURES.items():
+        assert figure.cpu or figure.gpu or figure.commits, name
+        for path in figure.spec():
+            assert (ROOT / path.removeprefix(":(exclude)")).exists(), f"{name}: {path} does not exist"
+    places = [(name, str(page.relative_to(ROOT))) for page in PAGES for name in figures.blocks(page.read_text())]
+    wanted = [(name, figure.page) for name, figure in figures.FIGURES.items() if figure.table]
+    assert set(places) <= {*wanted, ("readme", "README.md")}
+
+
+def test_pages_show_the_records(figures):
+    records = figures.load()
+    for page in PAGES:
+        text = page.read_text()
+        assert figures.with_tables(text, records) == text, (
+            f"run benchmarks/figures.py --write --only; {page.name} differs"
+        )
+
+
+def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(repository):
+    assert repository.stale() == ["speed: no record"]
+    commit = repository.checked_out()
+    repository.keep([record(repository, commit)])
+    assert repository.stale() == []
+    source = repository.ROOT / "thrust.py"
+    text = MEASURED.replace("squared", "square").replace("Return the", "Give back the").replace(": float)", ")")
+    source.write_text("# A comment.\n" + text.replace("expected a speed", "expected m/s"))
+    commit_all(repository)
+    assert repository.stale() == []
+    source.write_text(MEASURED.replace("2.0", "3.0"))
+    (found,) = repository.stale()
+    assert found == f"speed, 2 cores of EPYC (AVX2): thrust.py changed after {commit}"
+    repository.keep([record(repository, commit_all(repository))])
+    assert repository.stale() == []
+    (repository.ROOT / "benchmarks" / "speed.py").write_text("print(2)\n")
+    assert "benchmarks/speed.py changed after" in repository.stale()[0]
+    repository.keep([record(repository, "0123abc")])
+    assert "0123abc" in repository.stale()[0]
+
+
+def test_a_written_table_keeps_the_rows_of_other_machines(repository):
+    commit = repository.checked_out()
+    repository.keep([record(repository, commit), record(repository, commit, "Xeon", 3e9)])
+    repository.keep([record(repository, commit, rate=4e6)])
+    repository.write_pages()
+    text = (repository.ROOT / "page.md").read_text()
+    assert text.startswith(
+        "Before.\n\n<!-- figure speed -->\n\n2 cores of EPYC (AVX2) (jax 0.10.1, Python 3.11.7, 2026-11-26"
+    )
+    assert text.endswith("| hover | 3 G |\n\n<!-- end of speed -->\n\nAfter.\n")
+    assert "| Case | Rate |\n| --- | --- |\n| hover | 4 M |" in text
+
+
+def test_figures_are_measured_and_written_by_one_command(repository, monkeypatch, tmp_path, capsys):
+    (repository.ROOT / "benchmarks" / "speed.py").write_text(SCRIPT)
+    monkeypatch.setattr(sys, "argv", ["figures.py", "--write", "--commit", "abc"])
+    repository.main()
+    (row,) = json.loads((repository.ROOT / "figures.json").read_text())
+    assert (row["commit"], row["lines"]) == ("abc", [{"case": "--fast", "rate": 5e3}])
+    assert "| --fast | 5 k |" in (repository.ROOT / "page.md").read_text()
+    (repository.ROOT / "benchmarks" / "speed.py").write_text("raise SystemExit(3)\n")
+    with pytest.raises(SystemExit, match=r"speed: speed\.py --fast failed with status 3"):
+        repository.main()
+    assert json.loads((repository.ROOT / "figures.json").read_text()) == [row]
+    other = tmp_path / "other.json"
+    other.write_text(repository.as_text([row | {"machine": "another", "lines": [{"case": "there", "rate": 7.0}]}]))
+    monkeypatch.setattr(sys, "argv", ["figures.py", "--write", "--take", str(other)])
+    repository.main()
+    assert "| there | 7 |" in (repository.ROOT / "page.md").read_text()
+    monkeypatch.setattr(sys, "argv", ["figures.py", "--stale"])
+    with pytest.raises(SystemExit, match="speed, "):
+        repository.main()
