@@ -26,18 +26,12 @@ Function = Callable[..., Sequence[Array]]
 
 
 class MapKernels:
-    """Kernels of one function: one for the given platform, and others that are compiled when JAX first needs them."""
+    """Kernels of one function, each of which is compiled when it is first needed."""
 
-    def __init__(self, block: Block, platform: str):
-        """Compile the kernel for a platform.
-
-        Args:
-            block: The function.
-            platform: ``"cpu"`` or ``"gpu"``.
-        """
+    def __init__(self, block: Block):
+        """Store the function; nothing is compiled."""
         self._block = block
         self._launches: dict[str, Launch] = {}
-        self.on(platform)
 
     def on(self, platform: str) -> Launch:
         """Return the function that calls the kernel of a platform."""
@@ -68,7 +62,9 @@ map_p = jaxcompat.primitive_by_platform(
 """Call of a kernel: from its tables to its results for all indices."""
 
 
-def map_indices(fn: Function, n: int, tables: Sequence[Array], platform: str | None) -> list[Array]:
+def map_indices(
+    fn: Function, n: int, tables: Sequence[Array], platform: str | None, compile_now: bool = True
+) -> list[Array]:
     """Return the results of a function for the indices 0 to ``n - 1``. (n,) each
 
     It has no derivative. Under ``vmap`` the kernel is called for one batch at a time.
@@ -78,6 +74,7 @@ def map_indices(fn: Function, n: int, tables: Sequence[Array], platform: str | N
         n: Number of indices.
         tables: The tables that it reads. (n_rows, k) each
         platform: Platform of the kernel, ``"cpu"`` or ``"gpu"``; None for XLA without a kernel.
+        compile_now: False to compile the kernel only when JAX compiles a program that uses the results.
 
     Raises:
         UnsupportedError: If the engine does not support the function, or its compiler refuses the kernel.
@@ -85,7 +82,9 @@ def map_indices(fn: Function, n: int, tables: Sequence[Array], platform: str | N
     if platform is None:
         numbers = jnp.arange(n, dtype=np.int32)
         return list(jax.vmap(lambda i: fn(i, *tables))(numbers))
-    kernels = MapKernels(lower_map(fn, tables), platform)
+    kernels = MapKernels(lower_map(fn, tables))
+    if compile_now:
+        kernels.on(platform)
 
     def run(tables: list[Array]) -> list[Array]:
         return list(map_p.bind(*tables, kernels=kernels, n=n))

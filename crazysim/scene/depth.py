@@ -21,7 +21,7 @@ from crazysim.scene.collision import CollisionModel, body_name
 from crazysim.scene.first_hit import IGNORES_NONE
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
-from crazysim.scene.ray_casting import Hits, RayKernels, cast_rays_in_worlds
+from crazysim.scene.ray_casting import Hits, RayKernels, cast_rays, cast_rays_in_worlds
 
 MAX_RAYS = 1 << 22
 """Largest number of rays that XLA casts at a time; larger batches of worlds are split."""
@@ -132,7 +132,9 @@ def build_depth_fn(
     plugins: ListPlugins,
     kernels: RayKernels,
 ) -> DepthFn:
-    """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width); see ``Scene.depth_fn``."""
+    """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width), without n_worlds in one world;
+    see ``Scene.depth_fn``.
+    """
     if along not in ("axis", "ray"):
         raise ConfigError(f"expected along='axis' of the camera or along='ray', got {along!r}")
     drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
@@ -147,30 +149,45 @@ def build_depth_fn(
         rays[:, 3] = camera.row if camera.carrier == "drone" and hide_own else IGNORES_NONE
     n_rays = len(cameras) * width * height
 
+    ignored = looks[..., 3].reshape(-1).astype(int)
+
     def cast_in_worlds(data: SimData) -> Hits:
-        eyes = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1)
-                          for pos, rot in (_camera_pose(camera, data) for camera in cameras)], axis=1)  # fmt: skip
-        hits = cast_rays_in_worlds(in_data, data, eyes, looks, drones, kernels)
-        cosine = jnp.asarray(-looks[..., 2].reshape(-1), eyes.dtype) if along == "axis" else 1.0
-        hits = hits.replace(distance=hits.distance * cosine)
+        poses = [_camera_pose(camera, data) for camera in cameras]
+        if data.states.pos.ndim == 2:
+            origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
+            direction = jnp.concatenate([_directions(rot, rays) for (_, rot), rays in zip(poses, looks, strict=True)])
+            return pictures(cast_rays(in_data, data, origin, direction, ignored, drones))
+        eyes = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
+        return pictures(cast_rays_in_worlds(in_data, data, eyes, looks, drones, kernels))
 
-        def picture(x: Array) -> Array:
-            """Return the results of tiles of rays as a picture, row by row."""
-            x = x.reshape(x.shape[0], len(cameras), height // h, width // w, h, w, *x.shape[2:])
-            return jnp.moveaxis(x, 4, 3).reshape(*x.shape[:2], height, width, *x.shape[6:])
+    def pictures(hits: Hits) -> Hits:
+        """Return the results of rays, which follow each other by tiles, as pictures, row by row."""
+        cosine = jnp.asarray(-looks[..., 2].reshape(-1), hits.distance.dtype) if along == "axis" else 1.0
 
-        return jax.tree.map(picture, hits)
+        def picture(x: Array, n_last: int) -> Array:
+            leading, last = x.shape[: x.ndim - n_last - 1], x.shape[x.ndim - n_last :]
+            x = x.reshape(*leading, len(cameras), height // h, width // w, h, w, *last)
+            return jnp.swapaxes(x, -3 - n_last, -2 - n_last).reshape(*leading, len(cameras), height, width, *last)
+
+        return hits.replace(
+            distance=picture(hits.distance * cosine, 0),
+            normal=picture(hits.normal, 1),
+            point=picture(hits.point, 1),
+            body_index=picture(hits.body_index, 0),
+        )
 
     # Poses of mocap bodies become part of the data before the rays are cast.
     in_data = model.without_mocap_bodies()
 
     def depth(data: SimData, mocap: MocapPoses = None) -> Hits:
+        if data.states.pos.ndim == 1:
+            raise ConfigError("expected data of all worlds or of one world for images, got data of one drone")
         bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]
         require_poses(model, bodies, mocap)
         data = with_mocap_bodies(model, with_moved_objects(data, moving_plugins(plugins(), bodies)), mocap)
         max_rays = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
         n_worlds, at_a_time = data.core.n_worlds, max(1, max_rays // n_rays)
-        if n_worlds <= at_a_time:
+        if data.states.pos.ndim == 2 or n_worlds <= at_a_time:
             return cast_in_worlds(data)
         objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
 
@@ -184,17 +201,33 @@ def build_depth_fn(
     return depth
 
 
+def _directions(rot: Array, rays: np.ndarray) -> Array:
+    """Return the directions of rays of one camera, world frame. (n_rays, 3)
+
+    Args:
+        rot: Axes of the camera as columns. (3, 3)
+        rays: Unit directions in the frame of the camera, in the first three columns. (n_rays, 4)
+    """
+    # By components: a GPU may round matrix products to 10 bits.
+    return sum(rot[:, k] * jnp.asarray(rays[:, k, None], rot.dtype) for k in range(3))
+
+
 def _camera_pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
-    """Return the camera's position in every world, m (n_worlds, 3), and its axes as columns (n_worlds, 3, 3)."""
-    states, n = data.states, data.states.pos.shape[0]
+    """Return the camera's position, m (..., 3), and its axes as columns (..., 3, 3), in all worlds or in one."""
+    states = data.states
     pos, rot = (jnp.asarray(x, states.pos.dtype) for x in (camera.pos, camera.rot))
+    leading = states.pos.shape[:-2]
     if camera.carrier == "world":
-        return jnp.broadcast_to(pos, (n, 3)), jnp.broadcast_to(rot, (n, 3, 3))
-    objects = data.objects
-    poses = (states.pos, states.quat) if camera.carrier == "drone" else (objects.pos[:, 0], objects.quat[:, 0])
-    camera_pos, quat = (x[:, camera.row] for x in poses)
+        return jnp.broadcast_to(pos, (*leading, 3)), jnp.broadcast_to(rot, (*leading, 3, 3))
+    if camera.carrier == "drone":
+        poses = states.pos, states.quat
+    else:
+        poses = data.objects.pos, data.objects.quat
+        if leading:
+            poses = poses[0][:, 0], poses[1][:, 0]
+    camera_pos, quat = (x[..., camera.row, :] for x in poses)
     if not camera.turns:
-        return camera_pos + pos, jnp.broadcast_to(rot, (n, 3, 3))
+        return camera_pos + pos, jnp.broadcast_to(rot, (*leading, 3, 3))
     # By components: a GPU may round matrix products to 10 bits.
     return camera_pos + rotation.rotate(quat, pos), jnp.stack(
         [rotation.rotate(quat, rot[:, k]) for k in range(3)], axis=-1

@@ -20,8 +20,8 @@ from crazysim.core.branches import any_lane, compute_where, table_rows
 from crazysim.core.data import SimData
 from crazysim.geometry import Shape
 from crazysim.geometry.fieldrays import MIN_COMPONENT, field_ray
-from crazysim.geometry.points import Components
-from crazysim.geometry.rays import Interval, SizedShapes, first_distance, hit_distance
+from crazysim.geometry.points import Components, components
+from crazysim.geometry.rays import Interval, SizedShapes, first_distance, hit_distance, hit_normal
 from crazysim.geometry.shapes import N_SIZES, bounding_box, bounding_radius
 from crazysim.scene import hierarchy
 from crazysim.scene.collision import CollisionGeom, CollisionModel
@@ -231,13 +231,8 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     """
     t = Tables(*tables)
     n_nodes, n_fixed, n_movable = table_rows(t.counts, jnp.int32(0))
-    view = lax.div(index, jnp.int32(n_pixels))
-    world = lax.div(view, jnp.int32(n_cameras))
-    camera, pixel = view - world * n_cameras, index - view * n_pixels
-    eye, (*look, ignored_drone) = table_rows(t.eyes, view), table_rows(t.pixels, camera * n_pixels + pixel)
-    x, y, z = (eye[k] * look[0] + eye[k + 1] * look[1] + eye[k + 2] * look[2] for k in (3, 6, 9))
-    ray = Ray((eye[0], eye[1], eye[2]), (x, y, z), ignored_drone.astype(jnp.int32))
-    best = jnp.full_like(eye[0], jnp.inf), jnp.int32(-1)
+    world, ray = _camera_ray(t, n_pixels, n_cameras, index)
+    best = jnp.full_like(ray.origin[0], jnp.inf), jnp.int32(-1)
 
     best = first_fixed_hit(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed), ray, best, n_nodes)
 
@@ -253,6 +248,87 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
         return k + 1, compute_where(any_lane(meets), visit, best)
 
     return lax.while_loop(lambda carry: carry[0] < n_movable, check_movable, (jnp.int32(0), best))[1]
+
+
+def _camera_ray(t: Tables, n_pixels: int, n_cameras: int, index: Array) -> tuple[Array, Ray]:
+    """Return the world of a ray with a number, and the ray; see ``first_hit``."""
+    view = lax.div(index, jnp.int32(n_pixels))
+    world = lax.div(view, jnp.int32(n_cameras))
+    camera, pixel = view - world * n_cameras, index - view * n_pixels
+    eye, (*look, ignored_drone) = table_rows(t.eyes, view), table_rows(t.pixels, camera * n_pixels + pixel)
+    x, y, z = (eye[k] * look[0] + eye[k + 1] * look[1] + eye[k + 2] * look[2] for k in (3, 6, 9))
+    return world, Ray((eye[0], eye[1], eye[2]), (x, y, z), ignored_drone.astype(jnp.int32))
+
+
+def normal_at_hit(
+    surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index: Array, *tables: Array
+) -> Components:
+    """Return the unit normal where a ray meets its first geom, world frame, zero where it meets nothing.
+
+    Args:
+        surfaces: ``Targets.surfaces``.
+        n_pixels: Rays of a camera.
+        n_cameras: Cameras of a world.
+        index: Number of the ray, as in ``first_hit``. ()
+        *tables: ``Tables``, then the two results of ``first_hit`` for all rays. (n_rays, 1) each
+    """
+    t, (distances, geoms) = Tables(*tables[:-2]), tables[-2:]
+    _, n_fixed, n_movable = table_rows(t.counts, jnp.int32(0))
+    world, ray = _camera_ray(t, n_pixels, n_cameras, index)
+    (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)
+    code, _ = table_rows(t.codes, _maximum(geom, jnp.int32(0)))
+
+    def in_world_frame(row: Sequence[Array], normal: Components) -> Components:
+        """Return the normal of the geom with the given row."""
+        start, along = ray_in_frame(row, ray.origin, ray.direction)
+        for k, surface in enumerate(surfaces):
+
+            def of_surface(_: Components, surface: Surface = surface) -> Components:
+                local = _normal_in_frame(surface, row, start, along, distance)
+                a, b, c = local
+                x, y, z = (row[i] * a + row[i + 1] * b + row[i + 2] * c for i in (4, 7, 10))
+                return x, y, z
+
+            normal = compute_where(code == k, of_surface, normal) if len(surfaces) > 1 else of_surface(normal)
+        return normal
+
+    def of_fixed(normal: Components) -> Components:
+        return in_world_frame(table_rows(t.fixed, geom), normal)
+
+    def of_movable(normal: Components) -> Components:
+        return in_world_frame(table_rows(t.movable, world * n_movable + geom - n_fixed), normal)
+
+    zero = jnp.zeros_like(distance)
+    normal = compute_where((geom >= 0) & (geom < n_fixed), of_fixed, (zero, zero, zero))
+    return compute_where(geom >= n_fixed, of_movable, normal)
+
+
+def _normal_in_frame(
+    surface: Surface, row: Sequence[Array], start: Components, along: Components, distance: Array
+) -> Components:
+    """Return the outward unit normal where one ray in the frame of a geom hits it, at a distance in m. 3 of ()"""
+    if isinstance(surface, Shape) and surface.kind == "hfield":
+        return components(field_ray(surface, jnp.stack(start), jnp.stack(along))[1])
+    if isinstance(surface, Shape):
+        return _mesh_normal(surface, *(s + distance * a for s, a in zip(start, along, strict=True)))
+    return components(hit_normal(geom_shape(surface, row), jnp.stack(start), jnp.stack(along), distance))
+
+
+def _mesh_normal(shape: Shape, x: Array, y: Array, z: Array) -> Components:
+    """Return the normal of the plane of a mesh that a point of its surface is nearest to, in a loop over the planes."""
+    planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), x.dtype)
+
+    def compare_plane(carry: tuple[Array, Array, Components], _: None) -> tuple[tuple[Array, Array, Components], None]:
+        k, highest, normal = carry
+        a, b, c, offset = table_rows(planes, k)
+        above = a * x + b * y + c * z - offset
+        nearer = above > highest
+        u, v, w = (jnp.where(nearer, new, old) for new, old in zip((a, b, c), normal, strict=True))
+        return (k + 1, jnp.where(nearer, above, highest), (u, v, w)), None
+
+    zero = jnp.zeros_like(x)
+    initial = jnp.int32(0), jnp.full_like(x, -jnp.inf), (zero, zero, zero)
+    return lax.scan(compare_plane, initial, length=len(planes))[0][2]
 
 
 def first_fixed_hit(

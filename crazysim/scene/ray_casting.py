@@ -32,6 +32,7 @@ from crazysim.scene.first_hit import (
     first_fixed_hit,
     first_hit,
     geom_shape,
+    normal_at_hit,
     ray_in_frame,
 )
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
@@ -52,6 +53,8 @@ class Hits(PyTree):
     """Length of the ray, m; infinite where it meets nothing."""
     normal: Array
     """Unit normal of the surface, world frame; zero where the ray meets nothing. (..., 3)"""
+    point: Array
+    """Point of the surface, world frame, m; zero where the ray meets nothing. (..., 3)"""
     body_index: Array
     """Index of the body in ``names``; -1 where the ray meets nothing."""
     names: tuple[str, ...] = static()
@@ -103,6 +106,7 @@ def cast_rays(
     best = Hits(
         distance=jnp.full(origin.shape[:-1], jnp.inf, origin.dtype),
         normal=jnp.zeros_like(origin),
+        point=jnp.zeros_like(origin),
         body_index=jnp.full(origin.shape[:-1], -1, jnp.int32),
         names=body_names(model, data.core.n_drones if drones else 0),
     )
@@ -126,7 +130,13 @@ def cast_rays(
             rows = np.arange(data.core.n_drones) if kind.drones is None else np.asarray(kind.drones)
             group = np.stack([rows, rows + 1 + len(model.objects)], axis=-1)
             best = _hit_bodies(best, kind.geoms, pos, quat, group, origin, direction, ignored_drones)
-    return best
+    return best.replace(point=_hit_points(origin, direction, best.distance))
+
+
+def _hit_points(origin: Array, direction: Array, distance: Array) -> Array:
+    """Return the points at distances along rays, m, zero where a distance is infinite. (..., 3)"""
+    hit = jnp.isfinite(distance)[..., None]
+    return jnp.where(hit, origin + jnp.where(hit, distance[..., None], 0.0) * direction, 0.0)
 
 
 def _hit_bodies(
@@ -282,8 +292,8 @@ def cast_rays_in_worlds(
     """Return the first surfaces that the rays of cameras meet, in all worlds. (n_worlds, n_cameras * n_pixels)
 
     A function of one ray finds the distance and the nearest geom, without a derivative, in a kernel of the engine where
-    that is possible. The normal and the derivative of the distance depend on that geom alone; XLA computes them
-    where they are used.
+    that is possible; a second one finds the normal there. Derivatives depend on that geom alone; XLA computes them.
+    Within ``jit``, what is not used is neither computed nor compiled.
 
     Args:
         model: Model, without bodies whose poses are not part of the data.
@@ -300,22 +310,29 @@ def cast_rays_in_worlds(
     balls, movable = targets.movable_rows(data)
     n, tables = n_worlds * n_cameras * n_pixels, targets.tables(balls, movable, eyes, jnp.asarray(pixels, eyes.dtype))
     fn = functools.partial(first_hit, targets.surfaces, n_pixels, n_cameras)
-    far, which = kernels.run(fn, n, jax.lax.stop_gradient(tables), targets)
+    tables = jax.lax.stop_gradient(tables)
+    (far, which), platform = kernels.run(fn, n, tables, targets)
+    hit_table = far[:, None], which[:, None]
     distance, which = far.reshape(n_worlds, -1), which.reshape(n_worlds, -1)
 
     look, axes = jnp.asarray(pixels[..., :3], eyes.dtype), eyes[..., 3:].reshape(n_worlds, n_cameras, 1, 3, 3)
     direction = sum(axes[..., k] * look[..., k, None] for k in range(3)).reshape(n_worlds, -1, 3)
     origin = jnp.repeat(eyes[..., :3], n_pixels, axis=1)
+    names = body_names(model, data.core.n_drones if drones else 0)
     if not targets.all:
-        return Hits(distance, jnp.zeros_like(origin), which, body_names(model, data.core.n_drones if drones else 0))
+        return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), which, names)
     fixed = jnp.broadcast_to(tables.fixed[: len(targets.fixed)], (n_worlds, len(targets.fixed), 16))
     rows = jnp.concatenate([fixed, movable], axis=1)
     rows = jnp.take_along_axis(rows, jnp.maximum(which, 0)[..., None], axis=1)
     exact, normal_at = _hit_rows(targets.surfaces, targets.codes, which, rows, origin, direction)
     distance = _replace_derivative(distance, exact)
     normal = normal_at(distance)
+    if platform is not None:
+        fn = functools.partial(normal_at_hit, targets.surfaces, n_pixels, n_cameras)
+        by_kernel = map_indices(fn, n, [*tables, *hit_table], platform, compile_now=False)
+        normal = _replace_derivative(jnp.stack(by_kernel, axis=-1).reshape(normal.shape), normal)
     body_indices = jnp.asarray([*(target.body_index for target in targets.all), -1], jnp.int32)
-    return Hits(distance, normal, body_indices[which], body_names(model, data.core.n_drones if drones else 0))
+    return Hits(distance, normal, _hit_points(origin, direction, distance), body_indices[which], names)
 
 
 @dataclasses.dataclass
@@ -344,19 +361,26 @@ class RayKernels:
         has_kernels = mesh is None and engine in ("auto", "fused") and not fused.unavailable_reason(device.platform)
         return cls(device.platform if has_kernels else None, strict)
 
-    def run(self, fn: Callable[..., Any], n: int, tables: Sequence[Array], targets: Targets) -> list[Array]:
-        """Return the results of a function of one ray for ``n`` rays; see ``map_indices``."""
+    def run(
+        self, fn: Callable[..., Any], n: int, tables: Sequence[Array], targets: Targets
+    ) -> tuple[list[Array], str | None]:
+        """Return the results of a function of one ray for ``n`` rays, as ``map_indices`` does.
+
+        Returns:
+            The results. (n,) each
+            Platform of the kernel that computed them; None for XLA.
+        """
         where = f"{len(targets.fixed)} fixed geoms in a hierarchy, {len(targets.movable)} movable geoms in a list"
         if self.platform is not None:
             try:
                 hits = map_indices(fn, n, tables, self.platform)
                 self.used = f"one kernel with a lane for each ray; {where}"
-                return hits
+                return hits, self.platform
             except UnsupportedError as error:
                 problem, remedy = f"rays have no kernel: {error.reason}", "Leave out the geoms that need it"
                 report_unsupported([problem], self.strict, self.reported, remedy)
         self.used = f"XLA, without a kernel; {where}"
-        return map_indices(fn, n, tables, None)
+        return map_indices(fn, n, tables, None), None
 
 
 @jax.custom_jvp

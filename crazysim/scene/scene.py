@@ -258,9 +258,11 @@ class Scene:
     ) -> depth.DepthFn:
         """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
 
-        ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), along with ``normal`` and
+        ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), along with ``normal``, ``point`` and
         ``body_index``, the index of the body that was hit. Inside jit, fields that are not used are not computed.
-        Objects of plugins, such as loads, are where the plugins' records in ``data`` have them.
+        Objects of plugins, such as loads, are where the plugins' records in ``data`` have them. In a function of one
+        world, such as the observations of a task, images have no axis n_worlds, and rays are cast without a kernel of
+        their own.
 
         Args:
             camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); or the name

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
+from crazysim.core.stage import vmap_worlds
 from crazysim.errors import EngineWarning
 from crazysim.scene.depth import pixel_directions
 
@@ -111,6 +112,27 @@ def test_a_drone_sees_others_and_not_itself(room):
     assert np.argwhere(others)[:, 1].min() > 48, "what is at -y is in the right half"
     assert (own.body_index[0, 0] == first + 1).sum() > 8
     assert not (hidden.body_index[0, 0] == first + 1).any()
+
+
+def test_an_image_in_one_world_is_that_of_the_world_among_all(room):
+    """What a task of one world observes: the same rays in the loop over bodies as in the kernel, to rounding."""
+    sim = room[0]
+    depth = sim.scene.depth_fn("fpv_cam", 9, 6, drones=False)
+    names = ("body_index", "distance", "normal", "point")
+    together, each = (
+        jax.jit(transform(lambda data: [getattr(depth(data), name) for name in names]))(sim.data)
+        for transform in (lambda fn: fn, vmap_worlds)
+    )
+    for k, name in enumerate(names):
+        np.testing.assert_allclose(together[k], each[k], rtol=2e-6, atol=2e-6, err_msg=name)
+    assert together[-1].shape == (2, 2, 6, 9, 3)
+
+
+def test_law_09_data_of_one_drone_has_no_image(room):
+    sim = room[0]
+    of_one = sim.data.replace(states=jax.tree.map(lambda x: x[0, 0], sim.data.states))
+    with pytest.raises(ConfigError, match="expected data of all worlds or of one world for images, got data of one dr"):
+        sim.scene.depth_fn()(of_one)
 
 
 @pytest.mark.usefixtures("opengl")
@@ -408,8 +430,10 @@ def test_rays_of_all_worlds_are_those_of_each_world(x64, crowd, rng):
     np.testing.assert_allclose(together.distance, each.distance, rtol=1e-9)
     np.testing.assert_allclose(together.normal, each.normal, atol=1e-9)
     unfused = jax.jit(by_xla)(data, origin, direction)
-    for name in ("body_index", "distance", "normal"):
+    for name in ("body_index", "distance", "normal", "point"):
         np.testing.assert_allclose(getattr(unfused, name), getattr(together, name), rtol=1e-9, atol=1e-9)
+    far = np.where(np.isfinite(each.distance), each.distance, 0.0)[..., None]
+    np.testing.assert_allclose(together.point, np.where(far > 0, origin + far * direction, 0.0), atol=1e-9)
     for slope, known in zip(slopes, expected, strict=True):
         assert np.abs(known).max() > 0.1
         np.testing.assert_allclose(slope, known, rtol=1e-6, atol=1e-8 * np.abs(known).max())
