@@ -209,7 +209,8 @@ def _directions(rot: Array, rays: np.ndarray) -> Array:
         rays: Unit directions in the frame of the camera, in the first three columns. (n_rays, 4)
     """
     # By components: a GPU may round matrix products to 10 bits.
-    return sum(rot[:, k] * jnp.asarray(rays[:, k, None], rot.dtype) for k in range(3))
+    x, y, z = (rot[:, k] * jnp.asarray(rays[:, k, None], rot.dtype) for k in range(3))
+    return x + y + z
 
 
 def _camera_pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
