@@ -42,7 +42,7 @@ from measure import digits, machine, run_in_process
 import crazysim
 from crazysim.commands.training import seeds_of
 from crazysim.envs.registry import TASKS, entry_of
-from crazysim.train.config import recipe_of
+from crazysim.train.config import find_recipe
 from crazysim.train.show import read_curve
 from crazysim.train.training import CHECKPOINT, kept_point, least_kept_success, stored_configs
 
@@ -142,7 +142,7 @@ def groups_of(missing: list[tuple[Any, ...]], largest: int) -> list[list[tuple[A
     parts = [group[i : i + largest] for group in groups.values() for i in range(0, len(group), largest)]
 
     def n_samples(part: list[tuple[Any, ...]]) -> int:
-        recipe = recipe_of(part[0][0])
+        recipe = find_recipe(part[0][0])
         return len(part) * recipe.n_worlds * recipe.config.get("iterations", 1) * recipe.config.get("n_steps", 1)
 
     return sorted(parts, key=n_samples, reverse=True)

@@ -163,7 +163,7 @@ def evaluate(options: argparse.Namespace) -> None:
     """Evaluate a policy, and print and plot the results."""
     import jax
 
-    from crazysim.train.evaluation import TERM_PREFIX, evaluate, outcome
+    from crazysim.train.evaluation import TERM_PREFIX, describe_outcome, evaluate
     from crazysim.train.show import plot_episode
     from crazysim.train.training import load_policy
 
@@ -176,7 +176,7 @@ def evaluate(options: argparse.Namespace) -> None:
     terms = ", ".join(f"{k.removeprefix(TERM_PREFIX)} {x:.4g}" for k, x in metrics.items() if k.startswith(TERM_PREFIX))
     print(
         f"{config.title}, {options.worlds:,} starts: success {metrics['success']:.1%}, "
-        f"{outcome(metrics, env.task.unit)}, mean return {metrics['reward']:.4g} ({terms})"
+        f"{describe_outcome(metrics, env.task.unit)}, mean return {metrics['reward']:.4g} ({terms})"
     )
     if options.plot is not None:
         plot_episode(env, policy, options.plot, key)

@@ -104,46 +104,52 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     worlds whose episode is over start a new one. A non-finite gradient is skipped. The scan stores its intermediates
     instead of recomputing them under ``jax.checkpoint``: tens of steps fit in memory.
     """
-    start = env.restart(learner.env, learner.env.done)
+    initial_state = env.restart(learner.env, learner.env.done)
     agents, rates, config = learner.agents, stack_rates(configs), configs[0]
-    split = partial(split_blocks, n_seeds=len(configs))
+    split_seeds = partial(split_blocks, n_seeds=len(configs))
 
     def loss(policies: Layers) -> tuple[Array, Any]:
         """Return the sum of the losses of all seeds, whose gradient is that of each, stacked."""
-        actors = Policies(Policy(agents.stats, policies))
+        seed_policies = Policies(Policy(agents.stats, policies))
 
         def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
             del key
-            return actors(obs), memory, ()
+            return seed_policies(obs), memory, ()
 
-        def keep(transition: Transition) -> Any:
-            reward, raw, terminated = split((transition.reward, flatten(transition.obs), transition.terminated))
-            return reward.mean(axis=(1, 2)), raw, terminated.mean(axis=1)
+        def record_transition(transition: Transition) -> Any:
+            reward, raw_obs, terminated = split_seeds(
+                (transition.reward, flatten(transition.obs), transition.terminated)
+            )
+            return reward.mean(axis=(1, 2)), raw_obs, terminated.mean(axis=1)
 
-        state, _, (rewards, raw, crashed) = rollout(env, start, act, agents.key, config.n_steps, keep)
+        state, _, (rewards, raw_obs, crashed) = rollout(
+            env, initial_state, act, agents.key, config.n_steps, record_transition
+        )
         discounts = rates["discount"] ** jnp.arange(config.n_steps, dtype=rewards.dtype)[:, None]
-        error = jnp.nanmean(split(state.info["error"]), axis=(1, 2))
+        error = jnp.nanmean(split_seeds(state.info["error"]), axis=(1, 2))
         metrics = {"reward": rewards.mean(axis=0), "crashed": crashed.mean(axis=0), "error": error}
         losses = -(discounts * rewards).mean(axis=0)
-        return losses.sum(), (losses, state, raw, metrics)
+        return losses.sum(), (losses, state, raw_obs, metrics)
 
-    def update(agent: Agent, loss: Array, grads: Layers, raw: Array, rates: Rates) -> tuple[Agent, dict[str, Array]]:
-        norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
+    def update(
+        agent: Agent, loss: Array, grads: Layers, raw_obs: Array, rates: Rates
+    ) -> tuple[Agent, dict[str, Array]]:
+        grad_norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
         transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
         updates, optimizer = transform.update(grads, agent.optimizer, agent.policy)
-        new = (optax.apply_updates(agent.policy, updates), optimizer)
+        updated_state = (optax.apply_updates(agent.policy, updates), optimizer)
         policy, optimizer = jax.tree.map(
-            lambda x, old: jnp.where(jnp.isfinite(norm), x, old), new, (agent.policy, agent.optimizer)
+            lambda x, old: jnp.where(jnp.isfinite(grad_norm), x, old), updated_state, (agent.policy, agent.optimizer)
         )
         # Normalisation that keeps shifting would degrade a policy that is already good, so it is frozen early.
-        updated, early = agent.stats.update(raw), learner.iteration < STATS_ITERATIONS
-        stats = jax.tree.map(lambda x, old: jnp.where(early, x, old), updated, agent.stats)
+        updated_stats, updates_stats = agent.stats.update(raw_obs), learner.iteration < STATS_ITERATIONS
+        stats = jax.tree.map(lambda x, old: jnp.where(updates_stats, x, old), updated_stats, agent.stats)
         finite = all_finite((policy, optimizer, stats, loss))
-        return Agent(policy, optimizer, stats, agent.key), {"gradient": norm, "finite": finite}
+        return Agent(policy, optimizer, stats, agent.key), {"gradient": grad_norm, "finite": finite}
 
-    (_, (losses, state, raw, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(agents.policy)
-    agents, others = for_each_seed(update, agents, losses, grads, raw, rates, axes=(0, 0, 0, 1, 0))
-    return Learner(agents, state, learner.iteration + 1), metrics | others
+    (_, (losses, state, raw_obs, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(agents.policy)
+    agents, update_metrics = for_each_seed(update, agents, losses, grads, raw_obs, rates, axes=(0, 0, 0, 1, 0))
+    return Learner(agents, state, learner.iteration + 1), metrics | update_metrics
 
 
 def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:

@@ -17,7 +17,7 @@ from crazysim.errors import ConfigError
 from crazysim.storage import read_arrays, reading, replacing
 
 T = TypeVar("T")
-META = "meta"
+META_ENTRY = "meta"
 """Name of the entry that holds the metadata as JSON."""
 
 
@@ -34,7 +34,7 @@ def save(path: str | Path, tree: Any, meta: dict[str, Any]) -> None:
     """
     arrays = {name: np.asarray(_key_data(x)) for name, x in _named_leaves(tree)}
     with replacing(path) as file:
-        np.savez(file, allow_pickle=False, **{META: np.array(json.dumps(meta))}, **arrays)
+        np.savez(file, allow_pickle=False, **{META_ENTRY: np.array(json.dumps(meta))}, **arrays)
 
 
 def read(path: str | Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
@@ -46,7 +46,7 @@ def read(path: str | Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """
     with reading_checkpoint(path), open(path, "rb") as file:
         arrays = read_arrays(file, str(path))
-        return arrays, dict(json.loads(str(arrays.pop(META))))
+        return arrays, dict(json.loads(str(arrays.pop(META_ENTRY))))
 
 
 def reading_checkpoint(path: str | Path) -> AbstractContextManager[None]:
@@ -55,22 +55,22 @@ def reading_checkpoint(path: str | Path) -> AbstractContextManager[None]:
     return reading(path, "a checkpoint of crazysim", remedy)
 
 
-def restore(path: str | Path, arrays: Mapping[str, NDArray], like: T) -> T:
+def restore(path: str | Path, arrays: Mapping[str, NDArray], template: T) -> T:
     """Return a pytree with the arrays of a file.
 
     Args:
         path: The file, for messages.
         arrays: Its arrays, from ``read``.
-        like: Pytree of the same structure and shapes, of arrays or of ``jax.ShapeDtypeStruct``.
+        template: Pytree of the same structure and shapes, of arrays or of ``jax.ShapeDtypeStruct``.
     """
-    named = _named_leaves(like)
-    if others := {name for name, _ in named} ^ set(arrays):
+    named_leaves = _named_leaves(template)
+    if mismatches := {name for name, _ in named_leaves} ^ set(arrays):
         raise ConfigError(
-            f"expected the arrays of this task and version in {path}, got others: {', '.join(sorted(others)[:5])}. "
+            f"expected the arrays of this task and version in {path}, got others: {', '.join(sorted(mismatches)[:5])}. "
             f"Use the settings it was saved with, or another folder."
         )
     leaves = []
-    for name, x in named:
+    for name, x in named_leaves:
         is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
         with reading_checkpoint(path):
             value = jax.device_put(arrays[name])
@@ -81,7 +81,7 @@ def restore(path: str | Path, arrays: Mapping[str, NDArray], like: T) -> T:
                 f"settings it was saved with, or another folder"
             )
         leaves.append(value)
-    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
 def _named_leaves(tree: Any) -> list[tuple[str, Any]]:

@@ -91,7 +91,7 @@ DEFAULT_RECIPES: dict[str, Recipe] = {
 """Recipes by algorithm, for tasks without a recipe for it."""
 
 
-def recipe_of(task: str, algorithm: str | None = None) -> Recipe:
+def find_recipe(task: str, algorithm: str | None = None) -> Recipe:
     """Return the recipe of a task for an algorithm.
 
     Args:
@@ -133,10 +133,10 @@ class TrainConfig:
             raise UnknownNameError(f"expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}")
         if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)):
             raise ConfigError(f"expected an integer as seed, got {self.seed!r}. Use for example 0.")
-        known = [f.name for f in dataclasses.fields(ALGORITHMS[self.algorithm].Config)]
-        if wrong := [name for name in self.config if name not in known]:
+        names = [f.name for f in dataclasses.fields(ALGORITHMS[self.algorithm].Config)]
+        if unknown := [name for name in self.config if name not in names]:
             raise ConfigError(
-                f"expected hyperparameters of {self.algorithm}, got {', '.join(wrong)}; use {', '.join(known)}"
+                f"expected hyperparameters of {self.algorithm}, got {', '.join(unknown)}; use {', '.join(names)}"
             )
         if self.network is not None:
             if self.algorithm != "ppo":
@@ -179,22 +179,24 @@ class TrainConfig:
             network: Network of your own; None for the built-in one.
         """
         entry = entry_of(task)
-        known = {} if resumed is None else resumed.options
+        stored_options = {} if resumed is None else resumed.options
         if isinstance(task, Task):
             fields = [f for f in dataclasses.fields(task) if f.init]
             values = {f.name: getattr(task, f.name) for f in fields}
-            defaults = {f.name: known.get(f.name, f.default) for f in fields}
+            defaults = {f.name: stored_options.get(f.name, f.default) for f in fields}
             options = {k: x for k, x in values.items() if not _is_same_setting(x, defaults[k])} | dict(options or {})
-            task = next((name for name, one in TASKS.items() if one is entry), None) or reference_of(entry.task)
+            task = next((name for name, candidate in TASKS.items() if candidate is entry), None) or reference_of(
+                entry.task
+            )
         elif is_reference(task):
             task = absolute_reference(task) if split_reference(task)[1] else reference_of(entry.task)
-        recipe = recipe_of(task, algorithm)
+        recipe = find_recipe(task, algorithm)
         if resumed is not None:
             seed = resumed.seed if seed is None else seed
             if algorithm in (None, resumed.algorithm):
                 recipe = Recipe(resumed.algorithm, resumed.n_worlds, resumed.config)
         n_worlds = recipe.n_worlds if n_worlds is None else n_worlds
-        options, config = known | dict(options or {}), recipe.config | dict(config or {})
+        options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
         if is_airframe_file(options.get("drone")):  # so that the run can be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())
         seed = 0 if seed is None else seed

@@ -34,9 +34,9 @@ from crazysim.pytree import PyTree
 from crazysim.train.evaluation import as_tree
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Layers, Policy, all_finite, init_mlp, mlp
-from crazysim.train.seeds import Rates, for_each_seed, join_blocks, seed_of, split_blocks, stack_rates
+from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates, take_seed
 
-PREFIX = "teacher "
+TEACHER_PREFIX = "teacher "
 """Beginning of the names of the teacher's observations."""
 
 
@@ -100,7 +100,7 @@ class Learner(PyTree):
         return Policy(self.agents.stats, self.agents.student)
 
 
-class Guided(Wrapper):
+class TeacherObservation(Wrapper):
     """Add the teacher's observations, ``teacher NAME``, to those of the student."""
 
     def __init__(self, env: Env, observe: Callable[[SimData], Obs]):
@@ -121,10 +121,10 @@ class Guided(Wrapper):
         return self._add(state)
 
     def _add(self, state: EnvState) -> EnvState:
-        return state.replace(obs=state.obs | {PREFIX + name: x for name, x in self.observe(state.data).items()})
+        return state.replace(obs=state.obs | {TEACHER_PREFIX + name: x for name, x in self.observe(state.data).items()})
 
 
-def with_teacher(env: Env, config: Config) -> Guided:
+def wrap_with_teacher(env: Env, config: Config) -> TeacherObservation:
     """Return an environment with the observations of the teacher in ``config.teacher`` as well.
 
     Raises:
@@ -134,23 +134,24 @@ def with_teacher(env: Env, config: Config) -> Guided:
 
     if not config.teacher:
         raise ConfigError("expected the folder of a teacher, got none. Use --teacher out/hover, for example.")
-    _, run, _ = load_policy(config.teacher)
-    entry = entry_of(run.task, named=False)
-    task = entry.task(**{name: x for name, x in run.options.items() if name in entry.options})
-    needs, has = type(task).Record, type(env.task).Record
-    if needs is not None and not (has is not None and issubclass(has, needs)):
+    _, teacher_config, _ = load_policy(config.teacher)
+    entry = entry_of(teacher_config.task, named=False)
+    task = entry.task(**{name: x for name, x in teacher_config.options.items() if name in entry.options})
+    teacher_record, student_record = type(task).Record, type(env.task).Record
+    if teacher_record is not None and not (student_record is not None and issubclass(student_record, teacher_record)):
         raise ConfigError(
             f"expected a teacher whose task has the same record as {env.task.name!r}, got {config.teacher} of "
-            f"{run.title!r}. Train the teacher with the same task, or with the base class of its class."
+            f"{teacher_config.title!r}. Train the teacher with the same task, or with the base class of its class."
         )
-    return Guided(env, task.observe)
+    return TeacherObservation(env, task.observe)
 
 
 def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Obs], Array] | None = None) -> Learner:
     """Return an untrained learner.
 
     Args:
-        env: Environment of the training, with a block of worlds for each seed: ``Guided``, inside ``AutoReset``.
+        env: Environment of the training, with a block of worlds for each seed: ``TeacherObservation`` inside
+            ``AutoReset``.
         configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
         teacher: Policy of the teacher; None to load it from the folder ``teacher`` of the hyperparameters.
@@ -163,8 +164,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
         )
     k_student, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), keys), 1, 0)
     state = env.reset(k_env)
-    obs, shown = split_obs(state.obs)
-    teacher = _load_teacher(config.teacher, env, shown) if teacher is None else teacher
+    obs, teacher_obs = split_obs(state.obs)
+    teacher = _load_teacher(config.teacher, env, teacher_obs) if teacher is None else teacher
     if isinstance(teacher, Policy) and teacher.has_memory:
         raise ConfigError("expected a teacher without memory, got one with a memory. Train the teacher with memory=0.")
 
@@ -186,33 +187,33 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     """
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
     agents, rates, config = learner.agents.replace(key=key), stack_rates(configs), configs[0]
-    split = functools.partial(split_blocks, n_seeds=len(configs))
+    split_seeds = functools.partial(split_blocks, n_seeds=len(configs))
     teacher_share = config.teacher_decay**learner.iteration
 
-    def act(agent: Agent, raw: Array, label: Array, key: Array) -> tuple[Array, Any]:
-        action = jnp.tanh(mlp(agent.student, agent.stats.normalize(raw)))
-        leads = jax.random.bernoulli(key, teacher_share, (len(action), 1, 1))
-        return jnp.where(leads, label, action), (raw, label, jnp.square(action - label).mean())
+    def act(agent: Agent, raw_obs: Array, label: Array, key: Array) -> tuple[Array, Any]:
+        action = jnp.tanh(mlp(agent.student, agent.stats.normalize(raw_obs)))
+        teacher_acts = jax.random.bernoulli(key, teacher_share, (len(action), 1, 1))
+        return jnp.where(teacher_acts, label, action), (raw_obs, label, jnp.square(action - label).mean())
 
     def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:
-        obs, shown = split_obs(obs)
-        label = jnp.clip(learner.teacher(shown), -1.0, 1.0)
-        action, extras = for_each_seed(act, agents, split(flatten(obs)), split(label), keys)
+        obs, teacher_obs = split_obs(obs)
+        label = jnp.clip(learner.teacher(teacher_obs), -1.0, 1.0)
+        action, extras = for_each_seed(act, agents, split_seeds(flatten(obs)), split_seeds(label), keys)
         return join_blocks(action), memory, extras
 
-    def keep(transition: Transition) -> Any:
-        reward, error = split((transition.reward, transition.state.info["error"]))
-        crashed, over = split((transition.terminated, transition.done))
+    def record_transition(transition: Transition) -> Any:
+        reward, error = split_seeds((transition.reward, transition.state.info["error"]))
+        terminated, done = split_seeds((transition.terminated, transition.done))
         means = reward.mean(axis=(1, 2)), error.mean(axis=(1, 2))
-        return transition.extras, means, (crashed.sum(axis=1), over.sum(axis=1))
+        return transition.extras, means, (terminated.sum(axis=1), done.sum(axis=1))
 
-    state, _, kept = rollout(env, learner.env, policy, k_fly, config.n_steps, keep)
-    (raw, labels, difference), (reward, error), (crashed, over) = kept
-    learn = functools.partial(_learn, config=config)
-    agents, finite = for_each_seed(learn, agents, raw, labels, rates, k_learn, axes=(0, 1, 1, 0, 0))
+    state, _, records = rollout(env, learner.env, policy, k_fly, config.n_steps, record_transition)
+    (raw_obs, labels, difference), (reward, error), (terminated, done) = records
+    update_agent = functools.partial(_update_agent, config=config)
+    agents, finite = for_each_seed(update_agent, agents, raw_obs, labels, rates, k_learn, axes=(0, 1, 1, 0, 0))
     metrics = {
         "reward": reward.mean(axis=0),
-        "crashed": crashed.sum(axis=0) / jnp.maximum(over.sum(axis=0), 1),
+        "crashed": terminated.sum(axis=0) / jnp.maximum(done.sum(axis=0), 1),
         "error": error.mean(axis=0),
         "difference": jnp.sqrt(difference.mean(axis=0)),
         "finite": finite,
@@ -246,11 +247,11 @@ def imitate(
         ConfigError: If a hyperparameter is unknown or invalid.
         DivergedError: If weights or losses become non-finite.
     """
-    known = [field.name for field in dataclasses.fields(Config) if field.name != "teacher"]
-    if wrong := [name for name in config or {} if name not in known]:
-        raise ConfigError(f"expected hyperparameters of dagger, got {', '.join(wrong)}; use {', '.join(known)}")
+    names = [field.name for field in dataclasses.fields(Config) if field.name != "teacher"]
+    if unknown := [name for name in config or {} if name not in names]:
+        raise ConfigError(f"expected hyperparameters of dagger, got {', '.join(unknown)}; use {', '.join(names)}")
     hyperparameters = Config(**config or {})
-    env = AutoReset(Guided(env, env.task.observe if observe is None else observe))
+    env = AutoReset(TeacherObservation(env, env.task.observe if observe is None else observe))
     learner = jax.jit(functools.partial(init, env, (hyperparameters,), teacher=teacher))(jax.random.key(seed)[None])
     metrics: dict[str, Array] = {}
     for i in range(hyperparameters.iterations):
@@ -260,50 +261,52 @@ def imitate(
             on_iteration(i + 1, {name: float(x[0]) for name, x in numbers.items() if name != "finite"})
     if not metrics["finite"].all():
         raise DivergedError("expected finite weights and losses, got NaN or infinity. Use a smaller learning_rate.")
-    return seed_of(learner.as_policy(), 0)
+    return take_seed(learner.as_policy(), 0)
 
 
 def split_obs(obs: Obs) -> tuple[Obs, Obs]:
     """Return the observations of the student and those of the teacher."""
-    shown = {name.removeprefix(PREFIX): x for name, x in obs.items() if name.startswith(PREFIX)}
-    return {name: x for name, x in obs.items() if not name.startswith(PREFIX)}, shown
+    teacher_obs = {name.removeprefix(TEACHER_PREFIX): x for name, x in obs.items() if name.startswith(TEACHER_PREFIX)}
+    return {name: x for name, x in obs.items() if not name.startswith(TEACHER_PREFIX)}, teacher_obs
 
 
-def _load_teacher(folder: str, env: Env, shown: Obs) -> Policy:
+def _load_teacher(folder: str, env: Env, teacher_obs: Obs) -> Policy:
     """Return the policy of a run, after checking that its observations and actions are those of the environment."""
     from crazysim.train.training import load_policy
 
     policy, _, meta = load_policy(folder)
-    sizes = {name: x.shape[-1] for name, x in shown.items()}
+    sizes = {name: x.shape[-1] for name, x in teacher_obs.items()}
     if sizes != meta["observations"]:
         raise ConfigError(
             f"expected a teacher that observes {sizes}, got {folder}, which observes {meta['observations']}. Train it "
             f"again with this version."
         )
-    own, actions = env.actions, meta["actions"]
-    same = own.control.value == actions["level"] and own.centre.shape == np.shape(actions["centre"])
-    if not (same and np.allclose([own.centre, own.scale], [actions["centre"], actions["scale"]])):
+    actions, spec = env.actions, meta["actions"]
+    same_layout = actions.control.value == spec["level"] and actions.centre.shape == np.shape(spec["centre"])
+    if not (same_layout and np.allclose([actions.centre, actions.scale], [spec["centre"], spec["scale"]])):
         raise ConfigError(
-            f"expected a teacher whose actions have the meaning of the student's, {own}, got {folder} with "
-            f"{actions['level']} commands of centre {actions['centre']} and scale {actions['scale']}. Use the same "
-            f"control and drone for both."
+            f"expected a teacher whose actions have the meaning of the student's, {actions}, got {folder} with "
+            f"{spec['level']} commands of centre {spec['centre']} and scale "
+            f"{spec['scale']}. Use the same control and drone for both."
         )
     return policy
 
 
-def _learn(agent: Agent, raw: Array, labels: Array, rates: Rates, key: Array, config: Config) -> tuple[Agent, Array]:
+def _update_agent(
+    agent: Agent, raw_obs: Array, labels: Array, rates: Rates, key: Array, config: Config
+) -> tuple[Agent, Array]:
     """Return the student of one seed after the updates on its rollout, and True if all its numbers are finite.
 
     Args:
         agent: The student before.
-        raw: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
+        raw_obs: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
         labels: Actions of the teacher. (n_steps, n_worlds, n_drones, n_actions)
         rates: Hyperparameters of the seed. () each
         key: Random key.
         config: Hyperparameters of the first seed; values in ``rates`` take precedence.
     """
     transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
-    samples = agent.stats.normalize(raw), labels
+    samples = agent.stats.normalize(raw_obs), labels
 
     def loss(student: Layers, batch: tuple[Array, Array]) -> Array:
         obs, label = batch
@@ -311,17 +314,17 @@ def _learn(agent: Agent, raw: Array, labels: Array, rates: Rates, key: Array, co
 
     def update(carry: Any, worlds: Array) -> tuple[Any, Array]:
         student, optimizer = carry
-        value, grads = jax.value_and_grad(loss)(student, jax.tree.map(lambda x: x[:, worlds], samples))
+        loss_value, grads = jax.value_and_grad(loss)(student, jax.tree.map(lambda x: x[:, worlds], samples))
         updates, optimizer = transform.update(grads, optimizer, student)
-        return (optax.apply_updates(student, updates), optimizer), value
+        return (optax.apply_updates(student, updates), optimizer), loss_value
 
     def epoch(carry: Any, key: Array) -> tuple[Any, Array]:
-        minibatches = jax.random.permutation(key, raw.shape[1]).reshape(config.minibatches, -1)
+        minibatches = jax.random.permutation(key, raw_obs.shape[1]).reshape(config.minibatches, -1)
         return jax.lax.scan(update, carry, minibatches)
 
     keys = jax.random.split(key, config.epochs)
     (student, optimizer), losses = jax.lax.scan(epoch, (agent.student, agent.optimizer), keys)
-    stats = agent.stats.update(raw)
+    stats = agent.stats.update(raw_obs)
     return Agent(student, optimizer, stats, agent.key), all_finite((student, optimizer, stats, losses))
 
 

@@ -84,38 +84,38 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
         del key
         return *act(policy, obs, memory), ()
 
-    def keep(transition: Transition) -> dict[str, Any]:
+    def record_transition(transition: Transition) -> dict[str, Any]:
         state = transition.state
-        kept = {
+        record = {
             name: state.info[name]
             for name in state.info
             if name in ("error", "nonfinite") or name.startswith(TERM_PREFIX)
         }
-        return kept | {"reward": state.reward, "terminated": state.terminated, "succeeded": env.succeeded(state)}
+        return record | {"reward": state.reward, "terminated": state.terminated, "succeeded": env.succeeded(state)}
 
-    _, _, kept = rollout(env, state, fly_step, key, env.max_steps, keep, initial_memory(policy, env))
-    over = jnp.cumsum(kept["terminated"], axis=0) > 0
-    before = jnp.concatenate([jnp.zeros_like(over[:1]), over[:-1]])
-    flies = ~before[..., None]
-    last = jnp.minimum(jnp.arange(env.max_steps)[:, None], before.shape[0] - before.sum(axis=0) - 1)[..., None]
+    _, _, records = rollout(env, state, fly_step, key, env.max_steps, record_transition, initial_memory(policy, env))
+    is_over = jnp.cumsum(records["terminated"], axis=0) > 0
+    was_over = jnp.concatenate([jnp.zeros_like(is_over[:1]), is_over[:-1]])
+    is_flying = ~was_over[..., None]
+    last_step = jnp.minimum(jnp.arange(env.max_steps)[:, None], was_over.shape[0] - was_over.sum(axis=0) - 1)[..., None]
 
-    def blocks_of(x: Array) -> Array:
+    def split_blocks(x: Array) -> Array:
         """(n_steps, n_worlds, n_drones) -> (n_steps, n_blocks, n_worlds / n_blocks, n_drones)"""
         return x.reshape(x.shape[0], n_blocks, -1, x.shape[-1])
 
     flight = {
-        "error": jnp.take_along_axis(kept["error"], last, axis=0),
-        "over": over,
-        "nonfinite": jnp.any(kept["nonfinite"] & ~before, axis=0),
-        "reward": jnp.where(flies, kept["reward"], 0.0).sum(axis=0),
+        "error": jnp.take_along_axis(records["error"], last_step, axis=0),
+        "over": is_over,
+        "nonfinite": jnp.any(records["nonfinite"] & ~was_over, axis=0),
+        "reward": jnp.where(is_flying, records["reward"], 0.0).sum(axis=0),
         "terms": {
-            name[len(TERM_PREFIX) :]: blocks_of(jnp.where(flies, x, 0.0)).mean(axis=(2, 3))
-            for name, x in kept.items()
+            name[len(TERM_PREFIX) :]: split_blocks(jnp.where(is_flying, x, 0.0)).mean(axis=(2, 3))
+            for name, x in records.items()
             if name.startswith(TERM_PREFIX)
         },
     }
-    succeeded = kept["succeeded"]
-    return flight if succeeded is None else flight | {"succeeded": jnp.any(succeeded & flies, axis=0)}
+    succeeded = records["succeeded"]
+    return flight if succeeded is None else flight | {"succeeded": jnp.any(succeeded & is_flying, axis=0)}
 
 
 def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None) -> dict[str, float]:
@@ -157,27 +157,29 @@ def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: i
 
 def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dict[str, float]:
     """Return the metrics of ``evaluate`` for the worlds of a block."""
-    by_task = "succeeded" in flight
-    last = 1 if by_task else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
-    all_over = flight["over"][:, worlds]
-    steps = 1 + (~all_over[:-1]).sum(axis=0)
-    error, over = flight["error"][-last:, worlds], all_over[-1]
-    settled = flight["succeeded"][worlds] if by_task else np.all(error < env.task.tolerance, axis=0) & ~over[:, None]
-    crashed = over & ~np.all(settled, axis=-1)
+    task_decides = "succeeded" in flight
+    n_final_steps = 1 if task_decides else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
+    over_by_step = flight["over"][:, worlds]
+    n_steps = 1 + (~over_by_step[:-1]).sum(axis=0)
+    error, is_over = flight["error"][-n_final_steps:, worlds], over_by_step[-1]
+    succeeded = (
+        flight["succeeded"][worlds] if task_decides else np.all(error < env.task.tolerance, axis=0) & ~is_over[:, None]
+    )
+    crashed = is_over & ~np.all(succeeded, axis=-1)
     error = error[:, ~crashed]
     error = error[~np.isnan(error)]
     return {
-        "success": float(settled.mean()),
+        "success": float(succeeded.mean()),
         "crashed": float(crashed.mean()),
         "nonfinite": float(flight["nonfinite"][worlds].mean()),
-        "length": float(steps.mean()) * env.task.seconds / env.max_steps,
+        "length": float(n_steps.mean()) * env.task.seconds / env.max_steps,
         "error": float(error.mean()) if error.size else float("nan"),
         "reward": float(flight["reward"][worlds].mean()),
         **{f"{TERM_PREFIX}{name}": float(x[:, block].sum()) for name, x in flight["terms"].items()},
     }
 
 
-def outcome(metrics: Mapping[str, float], unit: str) -> str:
+def describe_outcome(metrics: Mapping[str, float], unit: str) -> str:
     """Return the error and the crashes in the metrics of ``evaluate`` as text, which explains a missing error.
 
     Args:

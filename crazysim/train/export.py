@@ -46,7 +46,7 @@ OPSET, IR_VERSION = 17, 8
 """Versions of ONNX operators and of the file format, of 2022, so that older runtimes can read the files."""
 
 
-class Numbers(NamedTuple):
+class PolicyNumbers(NamedTuple):
     """Numbers of a policy, float32."""
 
     mean: np.ndarray
@@ -108,48 +108,54 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise ImportError(not_installed("ONNX files need", "onnx", "onnx")) from error
-    numbers = _numbers(policy, meta)
+    numbers = _check_numbers(policy, meta)
     constants = {"mean": numbers.mean, "std": numbers.std, "low": np.float32(-CLIP), "high": np.float32(CLIP)}
     nodes = []
 
-    def add(operator: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
+    def add_node(operator: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
         nodes.append(helper.make_node(operator, inputs, [output], **attributes))
         return output
 
-    x = add("Clip", [add("Div", [add("Sub", ["observation", "mean"], "centred"), "std"], "scaled"), "low", "high"], "x")
+    x = add_node(
+        "Clip",
+        [add_node("Div", [add_node("Sub", ["observation", "mean"], "centred"), "std"], "scaled"), "low", "high"],
+        "x",
+    )
     if numbers.n_memory:
         constants["one"] = np.float32(1.0)
         for gate, (inputs, recurrent, bias) in zip(GATES, numbers.gru, strict=True):
             constants |= {f"{gate}_inputs": inputs, f"{gate}_recurrent": recurrent, f"{gate}_bias": bias}
-            add("Gemm", [x, f"{gate}_inputs", f"{gate}_bias"], f"{gate}_x")
-            add("MatMul", ["memory", f"{gate}_recurrent"], f"{gate}_h")
+            add_node("Gemm", [x, f"{gate}_inputs", f"{gate}_bias"], f"{gate}_x")
+            add_node("MatMul", ["memory", f"{gate}_recurrent"], f"{gate}_h")
         for gate in ("reset", "update"):
-            add("Sigmoid", [add("Add", [f"{gate}_x", f"{gate}_h"], f"{gate}_sum")], gate)
-        add(
+            add_node("Sigmoid", [add_node("Add", [f"{gate}_x", f"{gate}_h"], f"{gate}_sum")], gate)
+        add_node(
             "Tanh",
-            [add("Add", ["candidate_x", add("Mul", ["reset", "candidate_h"], "recalled")], "c_sum")],
+            [add_node("Add", ["candidate_x", add_node("Mul", ["reset", "candidate_h"], "recalled")], "c_sum")],
             "candidate",
         )
-        add("Mul", ["update", "memory"], "kept")
-        add("Mul", [add("Sub", ["one", "update"], "share"), "candidate"], "written")
-        add("Add", ["kept", "written"], "next_memory")
-        x = add("Concat", [x, "next_memory"], "features", axis=1)
+        add_node("Mul", ["update", "memory"], "kept")
+        add_node("Mul", [add_node("Sub", ["one", "update"], "share"), "candidate"], "written")
+        add_node("Add", ["kept", "written"], "next_memory")
+        x = add_node("Concat", [x, "next_memory"], "features", axis=1)
     for i, (weight, bias) in enumerate(numbers.layers):
         constants |= {f"weight{i}": weight, f"bias{i}": bias}
-        last = i == len(numbers.layers) - 1
-        x = add("Tanh", [add("Gemm", [x, f"weight{i}", f"bias{i}"], f"sum{i}")], "action" if last else f"x{i + 1}")
+        is_last = i == len(numbers.layers) - 1
+        x = add_node(
+            "Tanh", [add_node("Gemm", [x, f"weight{i}", f"bias{i}"], f"sum{i}")], "action" if is_last else f"x{i + 1}"
+        )
     n_memory = numbers.n_memory
 
-    def values(sizes: Mapping[str, int]) -> list[Any]:
+    def value_infos(sizes: Mapping[str, int]) -> list[Any]:
         return [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", n]) for name, n in sizes.items() if n]
 
     graph = helper.make_graph(
         nodes,
         "policy",
-        values({"observation": len(numbers.mean), "memory": n_memory}),
-        values({"action": len(numbers.layers[-1][1]), "next_memory": n_memory}),
+        value_infos({"observation": len(numbers.mean), "memory": n_memory}),
+        value_infos({"action": len(numbers.layers[-1][1]), "next_memory": n_memory}),
         [numpy_helper.from_array(np.asarray(x), name) for name, x in constants.items()],
-        doc_string="\n".join(_description(meta)),
+        doc_string="\n".join(_description_lines(meta)),
     )
     model = helper.make_model(
         graph,
@@ -159,7 +165,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         producer_version=str(meta.get("crazysim", crazysim.__version__)),
     )
     actions = meta["actions"]
-    properties = {"observations": meta["observations"], "units": _units(actions)} | actions
+    properties = {"observations": meta["observations"], "units": _action_units(actions)} | actions
     properties |= {name: meta[name] for name in ("settings",) if name in meta}
     helper.set_model_props(model, {k: v if isinstance(v, str) else json.dumps(v) for k, v in properties.items()})
     onnx.checker.check_model(model)
@@ -186,13 +192,13 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ConfigError(f"expected the name of a C function, got {name!r}; use letters, digits and underscores")
-    numbers = _numbers(policy, meta)
+    numbers = _check_numbers(policy, meta)
     n_obs, n_memory, n_actions = len(numbers.mean), numbers.n_memory, len(numbers.layers[-1][1])
     guard = f"CRAZYSIM_{name.upper()}_H"
     lines = [
         f"/* Policy generated by crazysim {meta.get('crazysim', crazysim.__version__)}; do not edit.",
         " *",
-        *(f" * {line}".rstrip() for line in _description(meta)),
+        *(f" * {line}".rstrip() for line in _description_lines(meta)),
         " */",
         f"#ifndef {guard}",
         f"#define {guard}",
@@ -205,7 +211,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     for i, (weight, bias) in enumerate(numbers.layers):
         constants |= {f"weight{i}": weight, f"bias{i}": bias}
     for constant, x in constants.items():
-        lines.append(f"static const float {name}_{constant}{''.join(f'[{n}]' for n in x.shape)} = {_array(x)};")
+        lines.append(f"static const float {name}_{constant}{''.join(f'[{n}]' for n in x.shape)} = {_array_literal(x)};")
     lines.append("")
     if n_memory:
         lines += [
@@ -219,21 +225,21 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
         ]
     state = f"{name}_state *state, " if n_memory else ""
     lines.append(f"static inline void {name}({state}const float observation[{n_obs}], float action[{n_actions}])")
-    lines += ["{", *(f"    {line}" for line in _body(name, numbers)), "}", "", f"#endif /* {guard} */", ""]
+    lines += ["{", *(f"    {line}" for line in _body_lines(name, numbers)), "}", "", f"#endif /* {guard} */", ""]
     path = Path(path)
     write_file(path, "\n".join(lines))
     return path
 
 
-def _numbers(policy: Policy, meta: Mapping[str, Any]) -> Numbers:
+def _check_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     """Return the numbers of a policy, after checking them."""
     if policy.network is not MEMORYLESS and not isinstance(policy.body, Gru):
         raise ConfigError(
             "expected a policy with the built-in network, got one with a network of your own. Export it with its "
             "library, or with jax.export."
         )
-    host = jax.tree.map(lambda x: np.asarray(x, np.float32), policy)
-    mean, var, layers = host.stats.mean, host.stats.var, host.layers
+    host_policy = jax.tree.map(lambda x: np.asarray(x, np.float32), policy)
+    mean, var, layers = host_policy.stats.mean, host_policy.stats.var, host_policy.layers
     n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
     if (len(mean), len(layers[-1][1])) != (n_obs, n_actions):
         raise ConfigError(
@@ -241,36 +247,38 @@ def _numbers(policy: Policy, meta: Mapping[str, Any]) -> Numbers:
             f"({', '.join(f'{k} {n}' for k, n in meta['observations'].items())}) to {n_actions} actions, got one from "
             f"{len(mean)} to {len(layers[-1][1])}; describe the environment that it was trained in"
         )
-    if not all(np.isfinite(x).all() for x in jax.tree.leaves(host)):
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(host_policy)):
         raise ConfigError("expected finite weights, got NaN or infinity; the training diverged, so train again")
     gru = []
-    if isinstance(host.body, Gru):
-        arrays = (host.body.inputs, host.body.recurrent, host.body.bias)
+    if isinstance(host_policy.body, Gru):
+        arrays = (host_policy.body.inputs, host_policy.body.recurrent, host_policy.body.bias)
         gru = list(zip(*(np.split(x, len(GATES), axis=-1) for x in arrays), strict=True))
-    return Numbers(mean, np.sqrt(var + np.float32(EPSILON)), gru, layers)
+    return PolicyNumbers(mean, np.sqrt(var + np.float32(EPSILON)), gru, layers)
 
 
-def _units(actions: Mapping[str, Any]) -> list[str]:
+def _action_units(actions: Mapping[str, Any]) -> list[str]:
     n = len(actions["centre"])
-    known = COMMANDS.get(Control(actions["level"]), [f"speed of rotor {i}, rpm" for i in range(n)])
-    return [known[i] if i < len(known) else "?" for i in range(n)]
+    units = COMMANDS.get(Control(actions["level"]), [f"speed of rotor {i}, rpm" for i in range(n)])
+    return [units[i] if i < len(units) else "?" for i in range(n)]
 
 
-def _description(meta: Mapping[str, Any]) -> Iterator[str]:
+def _description_lines(meta: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that describe inputs and outputs."""
     yield "Observation, concatenated:"
-    begin = 0
+    offset = 0
     for name, size in meta["observations"].items():
         description = f": {OBSERVATIONS[name]}" if name in OBSERVATIONS else ""
-        yield f"  [{begin}..{begin + size - 1}] {name}{description}"
-        begin += size
+        yield f"  [{offset}..{offset + size - 1}] {name}{description}"
+        offset += size
     actions = meta["actions"]
     yield f"Action, between -1 and 1, for commands of level {actions['level']}:"
-    for i, (unit, centre, scale) in enumerate(zip(_units(actions), actions["centre"], actions["scale"], strict=True)):
+    for i, (unit, centre, scale) in enumerate(
+        zip(_action_units(actions), actions["centre"], actions["scale"], strict=True)
+    ):
         yield f"  [{i}] {unit} = {centre:.9g} + {scale:.9g} * action[{i}]"
 
 
-def _body(name: str, numbers: Numbers) -> Iterator[str]:
+def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
     """Yield the lines of the function's body."""
     n_obs, n_memory, limit = len(numbers.mean), numbers.n_memory, float_literal(CLIP)
     yield f"float x0[{n_obs + n_memory}];"
@@ -293,13 +301,13 @@ def _body(name: str, numbers: Numbers) -> Iterator[str]:
         yield f"for (int j = 0; j < {n_memory}; ++j) state->memory[j] = x0[{n_obs} + j];"
     for k, (weight, _) in enumerate(numbers.layers):
         n_in, n_out = weight.shape
-        out = "action" if k == len(numbers.layers) - 1 else f"x{k + 1}"
-        if out != "action":
-            yield f"float {out}[{n_out}];"
+        output = "action" if k == len(numbers.layers) - 1 else f"x{k + 1}"
+        if output != "action":
+            yield f"float {output}[{n_out}];"
         yield f"for (int j = 0; j < {n_out}; ++j) {{"
         yield f"    float sum = {name}_bias{k}[j];"
         yield f"    for (int i = 0; i < {n_in}; ++i) sum += x{k}[i] * {name}_weight{k}[i][j];"
-        yield f"    {out}[j] = tanhf(sum);"
+        yield f"    {output}[j] = tanhf(sum);"
         yield "}"
 
 
@@ -309,7 +317,7 @@ def float_literal(x: float) -> str:
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
 
 
-def _array(x: np.ndarray) -> str:
+def _array_literal(x: np.ndarray) -> str:
     if x.ndim > 1:
-        return "{\n" + ",\n".join(f"    {_array(row)}" for row in x) + "\n}"
+        return "{\n" + ",\n".join(f"    {_array_literal(row)}" for row in x) + "\n}"
     return "{" + ", ".join(map(float_literal, x)) + "}"

@@ -33,25 +33,25 @@ def check_hyperparameters(config: Any) -> None:
     for field in dataclasses.fields(config):
         value, default = getattr(config, field.name), field.default
         if isinstance(default, tuple):
-            value = _sizes(field.name, value)
+            value = _check_sizes(field.name, value)
         elif field.name in CHOICES:
-            value = _choice(field.name, value, CHOICES[field.name])
+            value = _check_choice(field.name, value, CHOICES[field.name])
         elif isinstance(default, str):
-            value = _text(field.name, value)
+            value = _check_text(field.name, value)
         elif isinstance(default, int):
-            value = (_count if field.name in COUNTS else positive_integer)(field.name, value)
+            value = (_check_count if field.name in COUNTS else positive_integer)(field.name, value)
         else:
-            value = _number(field.name, value, default)
+            value = _check_number(field.name, value, default)
         object.__setattr__(config, field.name, value)
 
 
-def _text(name: str, value: object) -> str:
+def _check_text(name: str, value: object) -> str:
     if not isinstance(value, str):
         raise ConfigError(f"expected {name} as a text, got {value!r}. Use for example 'out/hover'.")
     return value
 
 
-def _sizes(name: str, value: object) -> tuple[int, ...]:
+def _check_sizes(name: str, value: object) -> tuple[int, ...]:
     if not isinstance(value, (list, tuple)):
         raise ConfigError(
             f"expected {name} as the sizes of the hidden layers, got {value!r}. Use for example [64, 64]."
@@ -59,13 +59,13 @@ def _sizes(name: str, value: object) -> tuple[int, ...]:
     return tuple(positive_integer(f"{name}[{i}]", size) for i, size in enumerate(value))
 
 
-def _count(name: str, value: object) -> int:
+def _check_count(name: str, value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
         raise ConfigError(f"expected {name} as a whole number of at least 0, got {value!r}. Use for example 64.")
     return int(value)
 
 
-def _choice(name: str, value: object, choices: tuple[str, ...]) -> str:
+def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> str:
     if value not in choices:
         raise ConfigError(
             f"expected {name} as one of {', '.join(choices)}, got {value!r}. Use for example {choices[0]}."
@@ -73,7 +73,7 @@ def _choice(name: str, value: object, choices: tuple[str, ...]) -> str:
     return str(value)
 
 
-def _number(name: str, value: Any, default: Any) -> float:
+def _check_number(name: str, value: Any, default: Any) -> float:
     if name in FRACTIONS:
         low, high, expected = 0.0, 1.0, "a number from 0 to 1"
     elif name in WEIGHTS:

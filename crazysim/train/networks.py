@@ -41,12 +41,12 @@ def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
             The scale of the other layers is the square root of 2.
     """
     pairs = list(itertools.pairwise(sizes))
-    ends = np.cumsum([n_in * n_out for n_in, n_out in pairs])
-    parts = jnp.split(jax.random.uniform(key, (ends[-1],), minval=-1.0, maxval=1.0), ends[:-1])
+    offsets = np.cumsum([n_in * n_out for n_in, n_out in pairs])
+    blocks = jnp.split(jax.random.uniform(key, (offsets[-1],), minval=-1.0, maxval=1.0), offsets[:-1])
     scales = [np.sqrt(2.0)] * (len(pairs) - 1) + [last_scale]
     return [
         (scale * np.sqrt(3.0 / max(n_in, n_out)) * x.reshape(n_in, n_out), jnp.zeros(n_out))
-        for x, (n_in, n_out), scale in zip(parts, pairs, scales, strict=True)
+        for x, (n_in, n_out), scale in zip(blocks, pairs, scales, strict=True)
     ]
 
 
@@ -89,7 +89,7 @@ class Network:
         """True if the network keeps a memory between steps."""
         return bool(jax.tree.leaves(self.initial_memory))
 
-    def start(self, *batch: int) -> Any:
+    def make_memory(self, *batch: int) -> Any:
         """Return the memory at the start of an episode. (*batch, ...) each"""
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *jnp.shape(x))), self.initial_memory)
 
@@ -182,15 +182,15 @@ def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int],
         sizes: Sizes of the hidden layers after the network, and number of outputs.
         last_scale: Scale of the weights of the last layer, see ``init_mlp``.
     """
-    body = network.init(jax.random.fold_in(key, 1), n_obs)
-    result = jax.eval_shape(network.apply, body, jnp.zeros(n_obs), network.start())
-    features, memory = result if isinstance(result, tuple) and len(result) == 2 else (None, None)
+    network_weights = network.init(jax.random.fold_in(key, 1), n_obs)
+    output_shapes = jax.eval_shape(network.apply, network_weights, jnp.zeros(n_obs), network.make_memory())
+    features, memory = output_shapes if isinstance(output_shapes, tuple) and len(output_shapes) == 2 else (None, None)
     if getattr(features, "ndim", None) != 1:
         raise ConfigError(
             f"expected apply(weights, obs, memory) to return features (n_features,) of one drone and the memory, got "
-            f"{result}. Return a tuple of the two."
+            f"{output_shapes}. Return a tuple of the two."
         )
-    expected = jax.eval_shape(network.start)
+    expected = jax.eval_shape(network.make_memory)
     if jax.tree.structure(memory) != jax.tree.structure(expected) or any(
         (x.shape, x.dtype) != (y.shape, y.dtype)
         for x, y in zip(jax.tree.leaves(memory), jax.tree.leaves(expected), strict=True)
@@ -199,7 +199,7 @@ def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int],
             f"expected apply to return a memory like initial_memory, {expected}, got {memory}. Return the memory that "
             f"it gets if it keeps none."
         )
-    return Weights(init_mlp(key, (features.shape[-1], *sizes), last_scale), body)
+    return Weights(init_mlp(key, (features.shape[-1], *sizes), last_scale), network_weights)
 
 
 def forward(network: Network, weights: Weights, obs: Array, memory: Any) -> tuple[Array, Any]:
@@ -211,7 +211,7 @@ def forward(network: Network, weights: Weights, obs: Array, memory: Any) -> tupl
         obs: Normalised observations. (..., n_obs)
         memory: Memory before the step. (..., ...) each
     """
-    features, memory = _batched(network, weights, obs.ndim - 1)(obs, memory)
+    features, memory = _batch_apply(network, weights, obs.ndim - 1)(obs, memory)
     return mlp(weights.layers, features), memory
 
 
@@ -227,23 +227,23 @@ def unroll(network: Network, weights: Weights, obs: Array, memory: Any, done: Ar
     """
     if not network.has_memory:
         return forward(network, weights, obs, memory)[0]
-    apply, start = _batched(network, weights, obs.ndim - 2), network.start(*done.shape[1:])
+    apply, initial_memory = _batch_apply(network, weights, obs.ndim - 2), network.make_memory(*done.shape[1:])
 
     def step(memory: Any, inputs: tuple[Array, Array]) -> tuple[Any, Array]:
-        seen, over = inputs
-        features, memory = apply(seen, memory)
-        return jax.tree.map(lambda first, x: select_worlds(over, first, x), start, memory), features
+        step_obs, step_done = inputs
+        features, memory = apply(step_obs, memory)
+        return jax.tree.map(lambda initial, x: select_worlds(step_done, initial, x), initial_memory, memory), features
 
     _, features = jax.lax.scan(step, memory, (obs, done))
     return mlp(weights.layers, features)
 
 
-def _batched(network: Network, weights: Weights, n_axes: int) -> Callable[[Array, Any], tuple[Array, Any]]:
+def _batch_apply(network: Network, weights: Weights, n_axes: int) -> Callable[[Array, Any], tuple[Array, Any]]:
     """Return ``network.apply`` with its weights, mapped over the leading axes of observations and memory."""
-    fn: Any = functools.partial(network.apply, weights.body)
+    apply: Any = functools.partial(network.apply, weights.body)
     for _ in range(n_axes):
-        fn = jax.vmap(fn)
-    return fn
+        apply = jax.vmap(apply)
+    return apply
 
 
 def all_finite(tree: Any) -> Array:
@@ -292,12 +292,14 @@ class Policy(PyTree):
             obs: Observations by name. (..., k) each
             memory: Memory before the step. (..., ...) each; ``()`` without memory
         """
-        out, memory = forward(self.network, Weights(self.layers, self.body), self.stats.normalize(flatten(obs)), memory)
-        return jnp.tanh(out), memory
+        output, memory = forward(
+            self.network, Weights(self.layers, self.body), self.stats.normalize(flatten(obs)), memory
+        )
+        return jnp.tanh(output), memory
 
     def initial_memory(self, *batch: int) -> Any:
         """Return the memory at the start of an episode, for a batch such as (n_worlds, n_drones). (*batch, ...) each"""
-        return self.network.start(*batch)
+        return self.network.make_memory(*batch)
 
 
 class Policies(PyTree):

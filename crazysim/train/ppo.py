@@ -159,24 +159,24 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
             f"example {math.gcd(n_worlds, 8)}."
         )
     k_policy, k_value, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 4), keys), 1, 0)
-    hidden = config.hidden if network is None else ()
+    hidden_sizes = config.hidden if network is None else ()
     network = choose_network(config.memory, network)
     state = env.reset(k_env)
     n_obs = flatten({name: x for name, x in state.obs.items() if name != PRIVILEGED}).shape[-1]
 
     def init_agent(k_policy: Array, k_value: Array, key: Array, obs: Array) -> Agent:
         n_actions = env.actions.size
-        policy = init_weights(network, k_policy, n_obs, (*hidden, n_actions), 0.01)
-        value = init_weights(network, k_value, _critic_input(obs, config).shape[-1], (*hidden, 1), 1.0)
+        policy = init_weights(network, k_policy, n_obs, (*hidden_sizes, n_actions), 0.01)
+        value = init_weights(network, k_value, _critic_input(obs, config).shape[-1], (*hidden_sizes, 1), 1.0)
         log_std = jnp.full(n_actions, jnp.log(config.init_std), policy.layers[0][0].dtype)
         parameters: Any = (policy, log_std, value)
         optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(parameters)
         stats = RunningStats.create(obs.shape[-1]).update(obs)
         return Agent(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, n_obs, network)
 
-    obs = split_blocks(_observed(state.obs, config), len(configs))
+    obs = split_blocks(_critic_obs(state.obs, config), len(configs))
     agents = for_each_seed(init_agent, k_policy, k_value, k_agent, obs)
-    return Learner(agents, state, _start(network, state), jnp.int32(0))
+    return Learner(agents, state, _initial_memories(network, state), jnp.int32(0))
 
 
 @partial(jax.jit, static_argnames=("env", "configs"))
@@ -187,41 +187,41 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     """
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
     agents, rates = learner.agents.replace(key=key), stack_rates(configs)
-    state, memory, samples, raw, metrics = _collect(agents, learner, env, configs[0], rates, k_fly)
-    last = (_observed(state.obs, configs[0]), memory[1])
-    blocks = split_blocks((learner.memory, last), len(configs))
-    learn = partial(_learn, config=configs[0])
+    state, memory, samples, raw_obs, metrics = _collect_samples(agents, learner, env, configs[0], rates, k_fly)
+    final_critic_inputs = (_critic_obs(state.obs, configs[0]), memory[1])
+    blocks = split_blocks((learner.memory, final_critic_inputs), len(configs))
+    update_agent = partial(_update_agent, config=configs[0])
     axes = (0, 1, 1, 0, 0, 0, 0)
-    agents, losses = for_each_seed(learn, agents, samples, raw, *blocks, rates, k_learn, axes=axes)
+    agents, losses = for_each_seed(update_agent, agents, samples, raw_obs, *blocks, rates, k_learn, axes=axes)
     return Learner(agents, state, memory, learner.iteration + 1), metrics | losses
 
 
-def _collect(
+def _collect_samples(
     agents: Agent, learner: Learner, env: Env, config: Config, rates: Rates, keys: Array
 ) -> tuple[EnvState, tuple[Any, Any], Sample, Array, dict[str, Array]]:
     """Return state and memories after a rollout of all seeds, samples, observations before normalisation, and metrics.
 
     Samples and observations have leading axes (n_steps, n_seeds, n_worlds, n_drones), metrics (n_seeds,).
     """
-    split = partial(split_blocks, n_seeds=keys.shape[0])
+    split_seeds = partial(split_blocks, n_seeds=keys.shape[0])
 
-    def act(agent: Agent, raw: Array, memory: Any, key: Array) -> tuple[Array, Any, Any]:
-        seen = agent.stats.normalize(raw)
-        out, policy_memory = forward(agent.network, agent.policy, seen[..., : agent.n_obs], memory[0])
-        value, value_memory = _value(agent, seen, memory[1], config)
-        mean = jnp.tanh(out)
+    def act(agent: Agent, raw_obs: Array, memory: Any, key: Array) -> tuple[Array, Any, Any]:
+        normalized_obs = agent.stats.normalize(raw_obs)
+        output, policy_memory = forward(agent.network, agent.policy, normalized_obs[..., : agent.n_obs], memory[0])
+        value, value_memory = _value(agent, normalized_obs, memory[1], config)
+        mean = jnp.tanh(output)
         action = mean + jnp.exp(agent.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
         log_prob = _log_prob(mean, agent.log_std, action)
-        return action, (policy_memory, value_memory), (raw, seen, value, log_prob, value_memory)
+        return action, (policy_memory, value_memory), (raw_obs, normalized_obs, value, log_prob, value_memory)
 
     def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:
-        raw, memory = split((_observed(obs, config), memory))
-        action, memory, extras = for_each_seed(act, agents, raw, memory, keys)
+        raw_obs, memory = split_seeds((_critic_obs(obs, config), memory))
+        action, memory, extras = for_each_seed(act, agents, raw_obs, memory, keys)
         return join_blocks(action), join_blocks(memory), (action, *extras)
 
-    def keep(transition: Transition) -> tuple[Sample, Array, Any]:
-        action, raw, seen, value, log_prob, memory = transition.extras
-        reward, over, truncated, terminated, error = split(
+    def record_transition(transition: Transition) -> tuple[Sample, Array, Any]:
+        action, raw_obs, normalized_obs, value, log_prob, memory = transition.extras
+        reward, done, truncated, terminated, error = split_seeds(
             (
                 transition.reward,
                 transition.done[:, None],
@@ -231,80 +231,92 @@ def _collect(
             )
         )
 
-        def final_value(agent: Agent, raw: Array, memory: Any) -> Array:
-            return _value(agent, agent.stats.normalize(raw), memory, config)[0]
+        def compute_final_value(agent: Agent, raw_obs: Array, memory: Any) -> Array:
+            return _value(agent, agent.stats.normalize(raw_obs), memory, config)[0]
 
-        final = for_each_seed(final_value, agents, split(_observed(transition.final_obs, config)), memory)
+        final_values = for_each_seed(
+            compute_final_value, agents, split_seeds(_critic_obs(transition.final_obs, config)), memory
+        )
         discount = rates["discount"][:, None, None]
         sample = Sample(
-            seen,
+            normalized_obs,
             action,
             log_prob,
             value,
-            reward + discount * jnp.where(truncated, final, 0.0),
-            jnp.broadcast_to(over, reward.shape),
+            reward + discount * jnp.where(truncated, final_values, 0.0),
+            jnp.broadcast_to(done, reward.shape),
         )
-        return sample, raw, (reward.mean(axis=(1, 2)), terminated, error.mean(axis=(1, 2)))
+        return sample, raw_obs, (reward.mean(axis=(1, 2)), terminated, error.mean(axis=(1, 2)))
 
-    start = _start(agents.network, learner.env)
-    state, memory, (samples, raw, (reward, crashed, error)) = rollout(
-        env, learner.env, policy, keys, config.n_steps, keep, start, learner.memory
+    initial_memory = _initial_memories(agents.network, learner.env)
+    state, memory, (samples, raw_obs, (reward, terminated_counts, error)) = rollout(
+        env, learner.env, policy, keys, config.n_steps, record_transition, initial_memory, learner.memory
     )
-    over = samples.done.any(axis=-1)
+    done = samples.done.any(axis=-1)
     metrics = {
         "reward": reward.mean(axis=0),
-        "crashed": crashed.sum(axis=(0, 2)) / jnp.maximum(over.sum(axis=(0, 2)), 1),
+        "crashed": terminated_counts.sum(axis=(0, 2)) / jnp.maximum(done.sum(axis=(0, 2)), 1),
         "error": error.mean(axis=0),
     }
-    return state, memory, samples, raw, metrics
+    return state, memory, samples, raw_obs, metrics
 
 
-def _learn(
-    agent: Agent, samples: Sample, raw: Array, memory: Any, last: Any, rates: Rates, key: Array, config: Config
+def _update_agent(
+    agent: Agent,
+    samples: Sample,
+    raw_obs: Array,
+    memory: Any,
+    final_critic_inputs: Any,
+    rates: Rates,
+    key: Array,
+    config: Config,
 ) -> tuple[Agent, dict[str, Array]]:
     """Return the agent of one seed after the updates on its rollout, and metrics.
 
     Args:
         agent: The agent before.
         samples: Its samples. (n_steps, n_worlds, n_drones, ...) each
-        raw: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
+        raw_obs: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
         memory: Memories of policy and value function before the rollout. (n_worlds, n_drones, ...) each
-        last: Observations, (n_worlds, n_drones, n_obs), and memory of the value function, after the rollout.
+        final_critic_inputs: Observations, (n_worlds, n_drones, n_obs), and memory of the value function, after the
+            rollout.
         rates: Hyperparameters of the seed. () each
         key: Random key.
         config: Hyperparameters of the first seed; values in ``rates`` take precedence.
     """
-    last_obs, last_memory = last
+    last_obs, last_memory = final_critic_inputs
     last_value, _ = _value(agent, agent.stats.normalize(last_obs), last_memory, config)
-    advantages, targets = _advantages(samples, last_value, rates)
+    advantages, targets = _estimate_advantages(samples, last_value, rates)
     returns = agent.returns.update(targets[..., None])
-    targets = (targets - returns.mean) / _scale(returns)
+    targets = (targets - returns.mean) / _return_std(returns)
     parameters = (agent.policy, agent.log_std, _rescale_value(agent.value, agent.returns, returns))
     data = (samples, advantages, targets)
-    parameters, optimizer, losses = _update(agent, parameters, data, memory, rates, key, config)
+    parameters, optimizer, losses = _run_epochs(agent, parameters, data, memory, rates, key, config)
     policy, log_std, value = parameters
-    stats = agent.stats.update(raw)
+    stats = agent.stats.update(raw_obs)
     finite = all_finite((parameters, optimizer, stats, returns, losses))
     agent = Agent(policy, log_std, value, optimizer, stats, returns, agent.key, agent.n_obs, agent.network)
     return agent, losses | {"std": jnp.exp(log_std).mean(), "finite": finite}
 
 
-def _advantages(samples: Sample, last: Array, rates: Rates) -> tuple[Array, Array]:
+def _estimate_advantages(samples: Sample, last_value: Array, rates: Rates) -> tuple[Array, Array]:
     """Return generalised advantage estimates and value targets. (n_steps, n_worlds, n_drones)"""
 
-    def back(carry: tuple[Array, Array], sample: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], Array]:
+    def accumulate_advantage(
+        carry: tuple[Array, Array], sample: tuple[Array, Array, Array]
+    ) -> tuple[tuple[Array, Array], Array]:
         advantage, value_after = carry
-        reward, value, over = sample
-        discount = rates["discount"] * ~over
+        reward, value, done = sample
+        discount = rates["discount"] * ~done
         advantage = reward + discount * value_after - value + discount * rates["gae_lambda"] * advantage
         return (advantage, value), advantage
 
     sequence = (samples.reward, samples.value, samples.done)
-    _, advantages = jax.lax.scan(back, (jnp.zeros_like(last), last), sequence, reverse=True)
+    _, advantages = jax.lax.scan(accumulate_advantage, (jnp.zeros_like(last_value), last_value), sequence, reverse=True)
     return advantages, advantages + samples.value
 
 
-def _update(
+def _run_epochs(
     agent: Agent, parameters: Any, data: Any, memory: Any, rates: Rates, key: Array, config: Config
 ) -> tuple[Any, Any, dict[str, Array]]:
     """Return parameters, optimiser state and mean losses after all epochs on the samples of one seed."""
@@ -312,7 +324,7 @@ def _update(
     n_groups = math.gcd(n_worlds // config.minibatches, MAX_GROUPS)
     transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
 
-    def samples_of(worlds: Array) -> Any:
+    def select_minibatch(worlds: Array) -> Any:
         """Return the samples of some worlds, by their indices in each group, and their memories before the rollout.
 
         Args:
@@ -321,12 +333,12 @@ def _update(
         Returns:
             Samples, (n_steps, n_groups, k, n_drones, ...) each, and memories, (n_groups, k, n_drones, ...) each.
         """
-        take = jax.vmap(lambda x, worlds: x[:, worlds], (1, 0), 1)
+        index_groups = jax.vmap(lambda x, worlds: x[:, worlds], (1, 0), 1)
 
-        def taken(x: Array) -> Array:
-            return take(x.reshape(x.shape[0], n_groups, -1, *x.shape[2:]), worlds)
+        def take_worlds(x: Array) -> Array:
+            return index_groups(x.reshape(x.shape[0], n_groups, -1, *x.shape[2:]), worlds)
 
-        return *jax.tree.map(taken, data), jax.tree.map(lambda x: taken(x[None])[0], memory)
+        return *jax.tree.map(take_worlds, data), jax.tree.map(lambda x: take_worlds(x[None])[0], memory)
 
     def loss(parameters: Any, batch: Any) -> tuple[Array, dict[str, Array]]:
         policy, log_std, value = parameters
@@ -335,11 +347,11 @@ def _update(
         values = unroll(network, value, _critic_input(sample.obs, config), value_memory, sample.done)[..., 0]
         ratio = jnp.exp(_log_prob(mean, log_std, sample.action) - sample.log_prob)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
-        clipped = jnp.clip(ratio, 1 - rates["clip"], 1 + rates["clip"])
-        gain = jnp.minimum(ratio * advantage, clipped * advantage).mean()
-        error = 0.5 * jnp.square(values - target).mean()
-        total = -gain + rates["value_weight"] * error - rates["entropy"] * log_std.sum()
-        return total, {"value_error": error, "ratio_off": jnp.abs(ratio - 1).mean()}
+        clipped_ratio = jnp.clip(ratio, 1 - rates["clip"], 1 + rates["clip"])
+        objective = jnp.minimum(ratio * advantage, clipped_ratio * advantage).mean()
+        value_loss = 0.5 * jnp.square(values - target).mean()
+        total_loss = -objective + rates["value_weight"] * value_loss - rates["entropy"] * log_std.sum()
+        return total_loss, {"value_error": value_loss, "ratio_off": jnp.abs(ratio - 1).mean()}
 
     def update(carry: Any, batch: Any) -> tuple[Any, dict[str, Array]]:
         parameters, optimizer = carry
@@ -351,7 +363,7 @@ def _update(
         keys = jax.random.split(key, n_groups)
         orders = jax.vmap(lambda key: jax.random.permutation(key, n_worlds // n_groups))(keys)
         minibatches = jnp.moveaxis(orders.reshape(n_groups, config.minibatches, -1), 1, 0)
-        return jax.lax.scan(lambda carry, worlds: update(carry, samples_of(worlds)), carry, minibatches)
+        return jax.lax.scan(lambda carry, worlds: update(carry, select_minibatch(worlds)), carry, minibatches)
 
     carry, losses = jax.lax.scan(epoch, (parameters, agent.optimizer), jax.random.split(key, config.epochs))
     return *carry, jax.tree.map(jnp.mean, losses)
@@ -363,7 +375,7 @@ def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(schedule))
 
 
-def _observed(obs: Obs, config: Config) -> Array:
+def _critic_obs(obs: Obs, config: Config) -> Array:
     """Return the observations of the policy, followed by those that only the critic may use. (..., k)"""
     if config.critic != "privileged":
         return flatten(obs)
@@ -372,15 +384,15 @@ def _observed(obs: Obs, config: Config) -> Array:
             f"expected the observation {PRIVILEGED!r} for critic='privileged', got {', '.join(obs)}. Use "
             f"AutoReset(PrivilegedObservation(env))."
         )
-    rest = {name: x for name, x in obs.items() if name != PRIVILEGED}
-    return jnp.concatenate([flatten(rest), obs[PRIVILEGED]], axis=-1)
+    policy_obs = {name: x for name, x in obs.items() if name != PRIVILEGED}
+    return jnp.concatenate([flatten(policy_obs), obs[PRIVILEGED]], axis=-1)
 
 
 def _critic_input(obs: Array, config: Config) -> Array:
     """Return the inputs of the value function for each drone; ``all_drones`` appends the observations of the others.
 
     Args:
-        obs: Result of ``_observed``, normalised or not. (..., n_drones, k)
+        obs: Result of ``_critic_obs``, normalised or not. (..., n_drones, k)
         config: Hyperparameters.
     """
     if config.critic != "all_drones":
@@ -388,28 +400,30 @@ def _critic_input(obs: Array, config: Config) -> Array:
     return jnp.concatenate([jnp.roll(obs, -i, axis=-2) for i in range(obs.shape[-2])], axis=-1)
 
 
-def _start(network: Network, state: EnvState) -> tuple[Any, Any]:
+def _initial_memories(network: Network, state: EnvState) -> tuple[Any, Any]:
     """Return the memories of policy and value function at the start of an episode. (n_worlds, n_drones, ...) each"""
     batch = state.reward.shape
-    return network.start(*batch), network.start(*batch)
+    return network.make_memory(*batch), network.make_memory(*batch)
 
 
 def _value(agent: Agent, obs: Array, memory: Any, config: Config) -> tuple[Array, Any]:
     """Return the expected return for normalised observations, and the memory after the step. (..., k) -> (...)"""
-    out, memory = forward(agent.network, agent.value, _critic_input(obs, config), memory)
-    return out[..., 0] * _scale(agent.returns) + agent.returns.mean, memory
+    output, memory = forward(agent.network, agent.value, _critic_input(obs, config), memory)
+    return output[..., 0] * _return_std(agent.returns) + agent.returns.mean, memory
 
 
-def _scale(returns: RunningStats) -> Array:
+def _return_std(returns: RunningStats) -> Array:
     """Return the standard deviation of returns. (1,)"""
     return jnp.sqrt(returns.var + EPSILON)
 
 
-def _rescale_value(weights: Weights, old: RunningStats, new: RunningStats) -> Weights:
+def _rescale_value(weights: Weights, old_stats: RunningStats, new_stats: RunningStats) -> Weights:
     """Return the value network with outputs rescaled so that its values are the same with the new statistics."""
     *hidden, (weight, bias) = weights.layers
-    ratio = _scale(old) / _scale(new)
-    return weights.replace(layers=[*hidden, (weight * ratio, bias * ratio + (old.mean - new.mean) / _scale(new))])
+    ratio = _return_std(old_stats) / _return_std(new_stats)
+    return weights.replace(
+        layers=[*hidden, (weight * ratio, bias * ratio + (old_stats.mean - new_stats.mean) / _return_std(new_stats))]
+    )
 
 
 def _log_prob(mean: Array, log_std: Array, action: Array) -> Array:

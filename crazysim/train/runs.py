@@ -122,14 +122,14 @@ def run_many(
             end the others; ``DivergedError`` is raised if all have diverged.
     """
     _check_settings(settings, tuple(x for x in SETTINGS if x != "seed"))
-    variants = variants_of(seeds, sweep or {}, settings.get("config") or {})
+    variants = make_variants(seeds, sweep or {}, settings.get("config") or {})
     config = TrainConfig.create(task, **settings)
     folder = Path("out") / config.title if folder is None else Path(folder)
-    stored = stored_configs(folder) if resume else {}
+    stored_by_name = stored_configs(folder) if resume else {}
     configs = {}
     for name, (seed, changes) in variants.items():
-        given = settings | {"seed": seed, "config": {**(settings.get("config") or {}), **changes}}
-        configs[name] = TrainConfig.create(task, **given, resumed=stored.get(name))
+        seed_settings = settings | {"seed": seed, "config": {**(settings.get("config") or {}), **changes}}
+        configs[name] = TrainConfig.create(task, **seed_settings, resumed=stored_by_name.get(name))
     results = train_many(configs, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
     log(f"wrote {folder / CHECKPOINT}, {folder / TABLE}, and {POLICY} and {CURVE} in {', '.join(configs)}")
     curves: dict[str, list[Any]] = {}
@@ -143,7 +143,7 @@ def run_many(
     return results
 
 
-def variants_of(
+def make_variants(
     seeds: Iterable[int], sweep: Mapping[str, Sequence[float]], config: Mapping[str, Any]
 ) -> dict[str, tuple[int, dict[str, float]]]:
     """Return the seed and the changed hyperparameters of each training, by the name of its folder.
@@ -157,8 +157,10 @@ def variants_of(
         ConfigError: If there are no seeds or no values, if one of them occurs twice, or if a hyperparameter to sweep
             cannot differ between trainings of one program or is also in ``config``.
     """
-    chosen: dict[str, list[Any]] = {"seeds": list(seeds)} | {name: list(values) for name, values in sweep.items()}
-    for name, values in chosen.items():
+    values_by_name: dict[str, list[Any]] = {"seeds": list(seeds)} | {
+        name: list(values) for name, values in sweep.items()
+    }
+    for name, values in values_by_name.items():
         if not values or len(set(map(str, values))) < len(values):
             raise ConfigError(
                 f"expected at least one value of {name}, and each once, got {values or 'none'}. Leave out the others."
@@ -176,15 +178,15 @@ def variants_of(
             seed,
             dict(zip(names, values, strict=True)),
         )
-        for *values, seed in itertools.product(*(chosen[name] for name in names), chosen["seeds"])
+        for *values, seed in itertools.product(*(values_by_name[name] for name in names), values_by_name["seeds"])
     }
 
 
-def _check_settings(settings: Mapping[str, Any], known: Sequence[str]) -> None:
+def _check_settings(settings: Mapping[str, Any], names: Sequence[str]) -> None:
     """Check the names of the settings of ``TrainConfig.create``."""
-    if unknown := settings.keys() - set(known):
+    if unknown := settings.keys() - set(names):
         raise ConfigError(
-            f"expected settings among {', '.join(known)}, got {', '.join(sorted(unknown))}. Hyperparameters belong "
+            f"expected settings among {', '.join(names)}, got {', '.join(sorted(unknown))}. Hyperparameters belong "
             f"in config={{...}}, such as config={{'iterations': 100}}."
         )
 

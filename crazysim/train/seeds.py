@@ -49,10 +49,12 @@ def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | in
     axes = (axes,) * len(args) if isinstance(axes, int) else axes
     if jax.tree.leaves(args[0])[0].shape[axes[0]] > 1:
         return jax.vmap(fn, in_axes=axes)(*args)
-    first = [jax.tree.map(lambda x, axis=axis: x.squeeze(axis), arg) for arg, axis in zip(args, axes, strict=True)]
-    return jax.tree.map(lambda x: jnp.expand_dims(x, 0), fn(*first))
+    squeezed_args = [
+        jax.tree.map(lambda x, axis=axis: x.squeeze(axis), arg) for arg, axis in zip(args, axes, strict=True)
+    ]
+    return jax.tree.map(lambda x: jnp.expand_dims(x, 0), fn(*squeezed_args))
 
 
-def seed_of(tree: T, i: int) -> T:
+def take_seed(tree: T, i: int) -> T:
     """Return the arrays of one seed. (n_seeds, ...) -> (...) each"""
     return jax.tree.map(lambda x: x[i], tree)

@@ -38,19 +38,19 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
     Raises:
         ImportError: If matplotlib is not installed.
     """
-    figure, axes = _figure(4)
+    figure, axes = _make_figure(4)
     for name, curve in curves.items():
-        steps = np.array([p["env_steps"] for p in curve]) / 1e6
-        seconds = [p["seconds"] for p in curve]
-        success = [100 * p["success"] for p in curve]
+        steps = np.array([point["env_steps"] for point in curve]) / 1e6
+        seconds = [point["seconds"] for point in curve]
+        success = [100 * point["success"] for point in curve]
         axes[0].plot(steps, success, label=name)
         axes[1].plot(seconds, success)
-        axes[2].semilogy(steps, [p["error"] for p in curve])
-    first = next(iter(curves.values()))
-    steps = np.array([p["env_steps"] for p in first]) / 1e6
-    for name in (name for name in first[-1] if name.startswith(TERM_PREFIX)):
-        axes[3].plot(steps, [p[name] for p in first], label=name.removeprefix(TERM_PREFIX))
-    axes[3].plot(steps, [p["reward"] for p in first], "k--", label="sum")
+        axes[2].semilogy(steps, [point["error"] for point in curve])
+    first_curve = next(iter(curves.values()))
+    steps = np.array([point["env_steps"] for point in first_curve]) / 1e6
+    for name in (name for name in first_curve[-1] if name.startswith(TERM_PREFIX)):
+        axes[3].plot(steps, [point[name] for point in first_curve], label=name.removeprefix(TERM_PREFIX))
+    axes[3].plot(steps, [point["reward"] for point in first_curve], "k--", label="sum")
     axes[3].legend(fontsize="small")
     million = "environment steps, millions"
     labels = ("success, %", "success, %", "mean error", "reward in an episode, by term")
@@ -58,7 +58,7 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
         axis.set(xlabel=x, ylabel=y)
     if len(curves) > 1:
         axes[0].legend()
-    _save(figure, path)
+    _save_figure(figure, path)
 
 
 def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> None:
@@ -72,7 +72,7 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> 
     Raises:
         ImportError: If matplotlib is not installed.
     """
-    figure, axes = _figure(3)
+    figure, axes = _make_figure(3)
     for name, curves in groups.items():
         longest = max(curves, key=len)
         steps = np.array([point["env_steps"] for point in longest]) / 1e6
@@ -80,18 +80,20 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> 
             values = np.full((len(curves), len(steps)), np.nan)
             for row, curve in zip(values, curves, strict=True):
                 row[: len(curve)] = [point[metric] for point in curve]
-            known = ~np.isnan(values).all(axis=0)
-            values, shown = values[:, known] * (100 if metric == "success" else 1), steps[known]
-            low, first, median, third, high = np.nanquantile(values, (0, 0.25, 0.5, 0.75, 1), axis=0)
-            (line,) = axis.plot(shown, median, label=f"{name}, {len(curves)} seeds" if metric == "success" else None)
-            axis.fill_between(shown, first, third, color=line.get_color(), alpha=0.3, linewidth=0)
-            axis.fill_between(shown, low, high, color=line.get_color(), alpha=0.12, linewidth=0)
+            has_value = ~np.isnan(values).all(axis=0)
+            values, plotted_steps = values[:, has_value] * (100 if metric == "success" else 1), steps[has_value]
+            minimum, quartile_1, median, quartile_3, maximum = np.nanquantile(values, (0, 0.25, 0.5, 0.75, 1), axis=0)
+            (line,) = axis.plot(
+                plotted_steps, median, label=f"{name}, {len(curves)} seeds" if metric == "success" else None
+            )
+            axis.fill_between(plotted_steps, quartile_1, quartile_3, color=line.get_color(), alpha=0.3, linewidth=0)
+            axis.fill_between(plotted_steps, minimum, maximum, color=line.get_color(), alpha=0.12, linewidth=0)
     axes[1].set_yscale("log")
     for axis, label in zip(axes, ("success, %", "mean error", "reward in an episode"), strict=True):
         axis.set(xlabel="environment steps, millions", ylabel=label)
     axes[0].legend(fontsize="small")
     axes[0].set_title("median, quartiles and extremes", fontsize=9)
-    _save(figure, path)
+    _save_figure(figure, path)
 
 
 def plot_episode(
@@ -113,14 +115,14 @@ def plot_episode(
     """
     key = jax.random.key(EVALUATION_SEED) if key is None else key
     flight = jax.device_get(fly_episodes(env, as_tree(policy), key))
-    terms, over = {name: x[:, 0] for name, x in flight["terms"].items()}, flight["over"]
-    t = env.task.seconds * (1 + np.arange(len(over))) / len(over)
-    figure, axes = _figure(3)
+    terms, is_over = {name: x[:, 0] for name, x in flight["terms"].items()}, flight["over"]
+    t = env.task.seconds * (1 + np.arange(len(is_over))) / len(is_over)
+    figure, axes = _make_figure(3)
     for name, x in terms.items():
         axes[0].plot(t, x, label=name)
         axes[1].plot(t, np.cumsum(x), label=name)
     axes[1].plot(t, np.cumsum(sum(terms.values())), "k--", label="sum")
-    error = flight["error"].reshape(len(over), -1)
+    error = flight["error"].reshape(len(is_over), -1)
     axes[2].plot(t, np.nanquantile(error, (0.1, 0.5, 0.9), axis=1).T, label=["best tenth", "median", "worst tenth"])
     axes[2].axhline(env.task.tolerance, color="grey", linestyle=":", label="tolerance")
     labels = ("reward of a step, by term", "reward until then, by term", "error")
@@ -128,13 +130,13 @@ def plot_episode(
         axis.set(xlabel="time in the episode, s", ylabel=y)
         axis.legend(fontsize="small")
     axes[0].set_title(
-        f"flying: 100% of {over.shape[1]:,} worlds at 0 s, {(~over[-1]).mean():.0%} at the end", fontsize=9
+        f"flying: 100% of {is_over.shape[1]:,} worlds at 0 s, {(~is_over[-1]).mean():.0%} at the end", fontsize=9
     )
-    _save(figure, Path(path))
+    _save_figure(figure, Path(path))
     return terms
 
 
-def _figure(n: int) -> Any:
+def _make_figure(n: int) -> Any:
     """Return a figure with panels in a row.
 
     Raises:
@@ -153,7 +155,7 @@ def _figure(n: int) -> Any:
     return figure, axes
 
 
-def _save(figure: Any, path: Path) -> None:
+def _save_figure(figure: Any, path: Path) -> None:
     """Write a figure and close it."""
     import matplotlib.pyplot as plt
 
@@ -194,21 +196,21 @@ def film(
         ImportError: If imageio-ffmpeg is not installed.
         RenderError: If this machine cannot render.
     """
-    sim, rate = env.sim, env.freq
-    skip = max(rate // 25, 1)
+    sim, freq = env.sim, env.freq
+    frame_steps = max(freq // 25, 1)
 
-    def points(of: Callable[[EnvState], Array | None], world: int) -> np.ndarray:
-        found = of(state)
-        return np.zeros((0, 3)) if found is None else np.asarray(found[world]).reshape(-1, 3)
+    def points_of_world(read_points: Callable[[EnvState], Array | None], world: int) -> np.ndarray:
+        positions = read_points(state)
+        return np.zeros((0, 3)) if positions is None else np.asarray(positions[world]).reshape(-1, 3)
 
     def points_in_view(_: Sim, world: int) -> np.ndarray:
-        return np.concatenate([points(targets, world), points(subjects, world)])
+        return np.concatenate([points_of_world(targets, world), points_of_world(subjects, world)])
 
     def draw_target(sim: Sim, world: int) -> None:
-        at = points(targets, world)
-        if len(at):
-            away = np.abs(at[:, None] - np.asarray(sim.data.states.pos[world])).max()
-            draw_points(sim, at, TARGET_COLOR, max(TARGET_SIZE, 0.02 * float(away)))
+        target_pos = points_of_world(targets, world)
+        if len(target_pos):
+            distance = np.abs(target_pos[:, None] - np.asarray(sim.data.states.pos[world])).max()
+            draw_points(sim, target_pos, TARGET_COLOR, max(TARGET_SIZE, 0.02 * float(distance)))
 
     targets, subjects = jax.jit(env.target), jax.jit(env.subjects)
 
@@ -218,12 +220,12 @@ def film(
         return env.step(state, action), memory
 
     state, memory = jax.jit(env.reset)(jax.random.key(seed)), initial_memory(policy, env)
-    shown = min(worlds, sim.n_worlds)
+    n_shown = min(worlds, sim.n_worlds)
     camera = dict(env.task.camera(sim.n_drones) or {"elevation": -20})
-    rows, columns = View(worlds=range(shown)).grid
+    rows, columns = View(worlds=range(n_shown)).grid
     width, height = film_size(960, 2 * round(360 * rows / columns))  # 4:3 for each world
     view = View(
-        worlds=range(shown),
+        worlds=range(n_shown),
         width=width,
         height=height,
         trail=1.5,
@@ -233,10 +235,10 @@ def film(
         hold=None if "distance" in camera else points_in_view,
         lag=0.6,
     )
-    n_frames = env.max_steps // skip + 1
-    with Film(path, view, fps=rate / skip, progress=progress, total=n_frames) as recording:
+    n_frames = env.max_steps // frame_steps + 1
+    with Film(path, view, fps=freq / frame_steps, progress=progress, total=n_frames) as recording:
         for i in range(env.max_steps + 1):
-            if i % skip == 0:
+            if i % frame_steps == 0:
                 sim.data = state.data
                 recording.add(sim)
             state, memory = step(state, memory)

@@ -35,12 +35,12 @@ from crazysim.progress import progress_bar
 from crazysim.storage import replacing
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
-from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, recipe_of
-from crazysim.train.evaluation import evaluate_blocks, outcome
+from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
+from crazysim.train.evaluation import describe_outcome, evaluate_blocks
 from crazysim.train.export import describe
 from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.networks import Network, Policies, Policy, choose_network, init_weights
-from crazysim.train.seeds import seed_of
+from crazysim.train.seeds import take_seed
 
 CHECKPOINT, POLICY, CURVE, TABLE = "checkpoint.npz", "policy.npz", "curve.json", "seeds.json"
 """Names of the files of a run."""
@@ -129,17 +129,20 @@ def train_many(
     """
     folder = Path(folder)
     path = folder / CHECKPOINT
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
     if checkpoint_every is not None:
         checkpoint_every = read_number("checkpoint_every", checkpoint_every, POSITIVE)
-    metas = {name: _meta(config) for name, config in configs.items()}
-    code = next(iter(metas.values()))["code"]
-    stored, runs, stored_code, seconds_before = _read_run(path, configs) if resume else ({}, {}, code, 0.0)
-    trainings = [_Training(name, config, folder / name, metas[name]) for name, config in configs.items()]
+    metadata = {name: _run_metadata(config) for name, config in configs.items()}
+    code = next(iter(metadata.values()))["code"]
+    stored_arrays, runs, stored_code, seconds_before = _read_run(path, configs) if resume else ({}, {}, code, 0.0)
+    trainings = [_Training(name, config, folder / name, metadata[name]) for name, config in configs.items()]
     for training in trainings if resume else ():
-        training.curve, training.diverged = list(runs[training.name]["curve"]), runs[training.name]["diverged"]
-    config, n = trainings[0].config, len(trainings)
+        training.curve, training.divergence_iteration = (
+            list(runs[training.name]["curve"]),
+            runs[training.name]["diverged"],
+        )
+    config, n_trainings = trainings[0].config, len(trainings)
     if path.exists() and not resume:
         raise ConfigError(
             f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
@@ -148,149 +151,151 @@ def train_many(
     algorithm = ALGORITHMS[config.algorithm]
     hyperparameters = tuple([training.config.algorithm_config() for training in trainings])
     n_iterations, n_steps = hyperparameters[0].iterations, hyperparameters[0].n_steps
-    base = config.make_env(n * config.n_worlds, **config.practice_options())
-    wrapped = dagger.with_teacher(base, hyperparameters[0]) if algorithm is dagger else base
-    wrapped = PrivilegedObservation(base) if config.config.get("critic") == "privileged" else wrapped
-    env = base if algorithm is apg else AutoReset(wrapped)
-    eval_env = config.make_env(n * evaluation_worlds)
+    base_env = config.make_env(n_trainings * config.n_worlds, **config.practice_options())
+    wrapped_env = dagger.wrap_with_teacher(base_env, hyperparameters[0]) if algorithm is dagger else base_env
+    wrapped_env = PrivilegedObservation(base_env) if config.config.get("critic") == "privileged" else wrapped_env
+    env = base_env if algorithm is apg else AutoReset(wrapped_env)
+    eval_env = config.make_env(n_trainings * evaluation_worlds)
     check_key = jax.random.key(CHECK_SEED)
     keys = jnp.stack([jax.random.fold_in(jax.random.key(training.config.seed), 1) for training in trainings])
-    begin = algorithm.init if config.network is None else partial(algorithm.init, network=config.network)
-    init = jax.jit(begin, static_argnums=(0, 1))
+    init_fn = algorithm.init if config.network is None else partial(algorithm.init, network=config.network)
+    init = jax.jit(init_fn, static_argnums=(0, 1))
     shapes = init.eval_shape(env, hyperparameters, keys)
     policy_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
-    kept_shapes = [jax.eval_shape(lambda policies: seed_of(policies, 0), policy_shapes)] * n
+    kept_shapes = [jax.eval_shape(lambda policies: take_seed(policies, 0), policy_shapes)] * n_trainings
     for training in trainings:
         _make_folder(training.folder)
 
     @keep_programs()
-    def start() -> tuple[Learner, list[Policy]]:
+    def load_or_init() -> tuple[Learner, list[Policy]]:
         if resume:
-            files = checkpoint.restore(path, stored, {"learner": shapes, "kept": kept_shapes})
-            files = jax.device_put(files, base.sim.device)
+            files = checkpoint.restore(path, stored_arrays, {"learner": shapes, "kept": kept_shapes})
+            files = jax.device_put(files, base_env.sim.device)
             return files["learner"], files["kept"]
-        learner = init(env, hyperparameters, jax.device_put(keys, base.sim.device))
-        require_finite_start(base.task, learner.env)
+        learner = init(env, hyperparameters, jax.device_put(keys, base_env.sim.device))
+        require_finite_start(base_env.task, learner.env)
         policies = jax.device_get(learner.as_policy())
-        return learner, [seed_of(policies, i) for i in range(n)]
+        return learner, [take_seed(policies, i) for i in range(n_trainings)]
 
-    def evaluate_all(policies: Policy, key: Array | None) -> list[dict[str, float]]:
+    def evaluate_policies(policies: Policy, key: Array | None) -> list[dict[str, float]]:
         """Return the metrics of each training's policy. The policies are host arrays, so slices need no compilation."""
-        policy = seed_of(policies, 0) if n == 1 else Policies(policies)
-        return evaluate_blocks(eval_env, jax.device_put(policy, base.sim.device), key, n)
+        policy = take_seed(policies, 0) if n_trainings == 1 else Policies(policies)
+        return evaluate_blocks(eval_env, jax.device_put(policy, base_env.sim.device), key, n_trainings)
 
     @keep_programs()
     def compile_evaluation() -> dict[str, Any]:
         zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy_shapes)
-        evaluate_all(zeros, None)
-        return describe(base)
+        evaluate_policies(zeros, None)
+        return describe(base_env)
 
     @keep_programs()
     def compile_iteration() -> tuple[Any, float]:
-        compiling = time.perf_counter()
-        compiled = algorithm.iterate.lower(_attach_device(shapes, base.sim.device), env, hyperparameters).compile()
-        return compiled, time.perf_counter() - compiling
+        compile_start = time.perf_counter()
+        compiled = algorithm.iterate.lower(_attach_device(shapes, base_env.sim.device), env, hyperparameters).compile()
+        return compiled, time.perf_counter() - compile_start
 
     # Each compilation takes seconds, mostly on one core, so they run in parallel.
-    with announce_if_slow("compiling the training", "5 to 20 s"), compiling_threads(3) as pool:
-        compiling, starting = pool.submit(compile_iteration), pool.submit(start)
-        evaluating = pool.submit(compile_evaluation)
-        (learner, kept), description = starting.result(), evaluating.result()
-        iterate, compile_s = compiling.result()
-    for training, policy in zip(trainings, kept, strict=True):
-        training.kept = policy
-    done = saved = int(learner.iteration)
-    saved_at = time.perf_counter()
-    steps_per_iteration = config.n_worlds * base.sim.n_drones * n_steps
-    times = "" if n == 1 else f"{n} times "
+    with announce_if_slow("compiling the training", "5 to 20 s"), compiling_threads(3) as executor:
+        iteration_future, init_future = executor.submit(compile_iteration), executor.submit(load_or_init)
+        evaluation_future = executor.submit(compile_evaluation)
+        (learner, kept_policies), description = init_future.result(), evaluation_future.result()
+        iterate, compile_s = iteration_future.result()
+    for training, policy in zip(trainings, kept_policies, strict=True):
+        training.kept_policy = policy
+    n_done = saved_iteration = int(learner.iteration)
+    save_time = time.perf_counter()
+    steps_per_iteration = config.n_worlds * base_env.sim.n_drones * n_steps
+    times = "" if n_trainings == 1 else f"{n_trainings} times "
     log(
-        f"{config.title} by {config.algorithm}, {f'seed {config.seed}' if n == 1 else ', '.join(configs)}: "
+        f"{config.title} by {config.algorithm}, {f'seed {config.seed}' if n_trainings == 1 else ', '.join(configs)}: "
         f"{n_iterations} iterations of {times}{steps_per_iteration:,} steps in {times}{config.n_worlds:,} worlds, "
-        f"{base.sim.control.value} commands, "
-        f"{base.sim.explain().splitlines()[0]}" + (f"; continues after iteration {done}" if done else "")
+        f"{base_env.sim.control.value} commands, "
+        f"{base_env.sim.explain().splitlines()[0]}" + (f"; continues after iteration {n_done}" if n_done else "")
     )
     if stored_code != code:
         log("the file of the task has changed since the checkpoint was written; it is used as it is now")
-    if done >= n_iterations:
-        log(f"nothing is left to train after {done} iterations; continue with more: --iterations {2 * done or 100}")
+    if n_done >= n_iterations:
+        log(f"nothing is left to train after {n_done} iterations; continue with more: --iterations {2 * n_done or 100}")
 
     def seconds() -> float:
-        return seconds_before + time.perf_counter() - started
+        return seconds_before + time.perf_counter() - start_time
 
-    def save(learner: Learner) -> None:
+    def save_checkpoint(learner: Learner) -> None:
         """Write the checkpoint."""
-        nonlocal saved, saved_at
-        runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.diverged} for x in trainings}
+        nonlocal saved_iteration, save_time
+        runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.divergence_iteration} for x in trainings}
         meta = {"crazysim": crazysim.__version__, "code": code, "runs": runs, "seconds": seconds()}
-        checkpoint.save(path, {"learner": learner, "kept": [training.kept for training in trainings]}, meta)
-        saved, saved_at = int(learner.iteration), time.perf_counter()
+        checkpoint.save(path, {"learner": learner, "kept": [training.kept_policy for training in trainings]}, meta)
+        saved_iteration, save_time = int(learner.iteration), time.perf_counter()
 
-    def record(learner: Learner, interrupted: bool = False) -> list[dict[str, Any]]:
+    def evaluate_and_save(learner: Learner, interrupted: bool = False) -> list[dict[str, Any]]:
         """Evaluate the policies, keep each if none was clearly better, write all files, and return the points."""
         iteration, policies = int(learner.iteration), jax.device_get(learner.as_policy())
         stop_diverged(finite, iteration)
-        metrics, checks = evaluate_all(policies, None), evaluate_all(policies, check_key)
-        progress = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds()}
+        metrics, checks = evaluate_policies(policies, None), evaluate_policies(policies, check_key)
+        counters = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds()}
         for i, training in enumerate(trainings):
-            if training.diverged is None:
-                point = progress | metrics[i] | {"compile_seconds": compile_s, "check": checks[i]["success"]}
-                training.record(point, seed_of(policies, i), evaluation_worlds, description, interrupted)
-        if n > 1:
+            if training.divergence_iteration is None:
+                point = counters | metrics[i] | {"compile_seconds": compile_s, "check": checks[i]["success"]}
+                training.add_evaluation(point, take_seed(policies, i), evaluation_worlds, description, interrupted)
+        if n_trainings > 1:
             write_table(folder, [training.row for training in trainings])
-        save(learner)
+        save_checkpoint(learner)
         return [training.curve[-1] for training in trainings]
 
     def stop_diverged(finite: Any, iteration: int) -> None:
         """Mark the trainings that have diverged; raise an error if all have."""
         for training, is_finite in zip(trainings, np.asarray(finite), strict=True):
-            if is_finite or training.diverged is not None:
+            if is_finite or training.divergence_iteration is not None:
                 continue
-            training.diverged = iteration
-            if n > 1:
+            training.divergence_iteration = iteration
+            if n_trainings > 1:
                 log(f"{training.name} diverged: NaN or infinity in iteration {iteration}; the others go on")
-        if all(training.diverged is not None for training in trainings):
+        if all(training.divergence_iteration is not None for training in trainings):
             raise DivergedError(
                 f"expected finite weights and losses, got NaN or infinity in iteration {iteration} of {config.title} "
-                f"by {config.algorithm}; {path} is of iteration {saved}, {POLICY} of "
+                f"by {config.algorithm}; {path} is of iteration {saved_iteration}, {POLICY} of "
                 f"iteration {kept_point(trainings[0].curve)['iteration']}. Use a smaller learning_rate or "
                 f"max_grad_norm, with another --out."
             )
 
-    finite: Any = np.full(n, True)
+    finite: Any = np.full(n_trainings, True)
     metrics: dict[str, Array] = {}
     if not resume:
-        record(learner)
-    every = recipe_of(config.task, config.algorithm).evaluate_every
+        evaluate_and_save(learner)
+    evaluation_period = find_recipe(config.task, config.algorithm).evaluate_every
     try:
-        with _bar(n_iterations, done, progress) as show:
-            for i in range(done, n_iterations):
+        with _iteration_bar(n_iterations, n_done, progress) as show_progress:
+            for i in range(n_done, n_iterations):
                 learner, metrics = iterate(learner)
                 stop_diverged(finite, i)  # checks the previous iteration while this one runs
                 finite = metrics["finite"]
-                show(metrics if i % 5 == 0 else None)
+                show_progress(metrics if i % 5 == 0 else None)
                 points = None
-                if (i + 1) % every == 0 and i + 1 < n_iterations:
-                    points = record(learner)
-                    show({name: [point[name] for point in points] for name in ("success", "error", "reward")}, 0)
-                elif checkpoint_every is not None and time.perf_counter() - saved_at > checkpoint_every:
+                if (i + 1) % evaluation_period == 0 and i + 1 < n_iterations:
+                    points = evaluate_and_save(learner)
+                    show_progress(
+                        {name: [point[name] for point in points] for name in ("success", "error", "reward")}, 0
+                    )
+                elif checkpoint_every is not None and time.perf_counter() - save_time > checkpoint_every:
                     stop_diverged(finite, i + 1)
-                    save(learner)
+                    save_checkpoint(learner)
                 if on_iteration is not None and i + 1 < n_iterations:
-                    on_iteration(i + 1, _numbers(metrics, points))
+                    on_iteration(i + 1, _host_metrics(metrics, points))
     except (KeyboardInterrupt, SystemExit):
         jax.block_until_ready(learner)
-        record(learner, interrupted=True)
+        evaluate_and_save(learner, interrupted=True)
         log(f"interrupted after iteration {int(learner.iteration)}; wrote {path}; continue with --resume")
         raise
-    last = record(learner)
+    final_points = evaluate_and_save(learner)
     if on_iteration is not None and metrics:
-        on_iteration(n_iterations, _numbers(metrics, last))
-    judged = f"error below {base.task.tolerance:g} {base.task.unit} for the last {base.task.hold:g} s"
-    if type(base.task).succeeded is not Task.succeeded:
-        judged = "as the task judges it"
+        on_iteration(n_iterations, _host_metrics(metrics, final_points))
+    criterion = f"error below {base_env.task.tolerance:g} {base_env.task.unit} for the last {base_env.task.hold:g} s"
+    if type(base_env.task).succeeded is not Task.succeeded:
+        criterion = "as the task judges it"
     results = {}
     for training in trainings:
-        best, latest, name = kept_point(training.curve), training.curve[-1], f"{training.name}: " * (n > 1)
+        best, latest, name = kept_point(training.curve), training.curve[-1], f"{training.name}: " * (n_trainings > 1)
         if best is not latest:
             log(
                 f"{name}kept the policy of iteration {best['iteration']}: later ones succeeded less often on "
@@ -298,11 +303,11 @@ def train_many(
             )
         point = best | {name: latest[name] for name in ("env_steps", "seconds", "compile_seconds")}
         log(
-            f"{name}success {point['success']:.1%} of {evaluation_worlds:,} held-out starts ({judged}), "
-            f"{outcome(point, base.task.unit)}; "
+            f"{name}success {point['success']:.1%} of {evaluation_worlds:,} held-out starts ({criterion}), "
+            f"{describe_outcome(point, base_env.task.unit)}; "
             f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
         )
-        policy = jax.device_put(training.kept, base.sim.device)
+        policy = jax.device_put(training.kept_policy, base_env.sim.device)
         results[training.name] = TrainResult(training.folder, point, policy, eval_env)
     return results
 
@@ -321,24 +326,24 @@ class _Training:
     """Metadata of its files."""
     curve: list[dict[str, Any]] = field(default_factory=list)
     """Its evaluations."""
-    kept: Any = None
+    kept_policy: Any = None
     """The kept policy."""
-    diverged: int | None = None
+    divergence_iteration: int | None = None
     """Iteration in which it became non-finite; None if it did not."""
 
-    def record(
+    def add_evaluation(
         self, point: dict[str, Any], policy: Policy, n_starts: int, description: dict[str, Any], interrupted: bool
     ) -> None:
         """Add an evaluation to the curve, keep the policy if no earlier one was clearly better, and write both."""
         self.curve[:] = [earlier for earlier in self.curve if earlier["iteration"] < point["iteration"]]
         best_check = max((earlier["check"] for earlier in self.curve if earlier["kept"]), default=0.0)
         point["kept"] = point["check"] >= least_kept_success(best_check, n_starts)
-        best = policy if point["kept"] else self.kept
+        best = policy if point["kept"] else self.kept_policy
         checkpoint.save(self.folder / POLICY, best, self.meta | description)
         with replacing(self.folder / CURVE) as file:
             file.write(json.dumps([*self.curve, point], indent=1).encode())
         # An uninterrupted run makes no evaluation here, so this one must not influence the resumed run.
-        self.kept, point["kept"] = (self.kept, False) if interrupted else (best, point["kept"])
+        self.kept_policy, point["kept"] = (self.kept_policy, False) if interrupted else (best, point["kept"])
         self.curve.append(point)
 
     @property
@@ -352,7 +357,7 @@ class _Training:
             | swept
             | {name: best[name] for name in names}
             | {name: latest[name] for name in ("env_steps", "seconds")}
-            | {"diverged": self.diverged}
+            | {"diverged": self.divergence_iteration}
         )
 
 
@@ -369,7 +374,7 @@ def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
         file.write(text.getvalue().encode())
 
 
-def _numbers(metrics: dict[str, Array], points: list[dict[str, Any]] | None) -> dict[str, Any]:
+def _host_metrics(metrics: dict[str, Array], points: list[dict[str, Any]] | None) -> dict[str, Any]:
     """Return the metrics of an iteration, and of the evaluations after it if there were any.
 
     They are floats, or arrays with one number for each training if there are several.
@@ -403,8 +408,8 @@ def kept_point(curve: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _attach_device(shapes: Learner, device: jax.Device) -> Learner:
     """Return the shapes with a device attached."""
-    place = jax.sharding.SingleDeviceSharding(device)
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes)
+    sharding = jax.sharding.SingleDeviceSharding(device)
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
 
 
 def load_policy(
@@ -435,17 +440,17 @@ def load_policy(
             f"expected {expected} with which {path} was trained, got {network}. Use crazysim.train.load_policy(folder, "
             f"network={'network' if config.own_network else None})."
         )
-    used = choose_network(config.config.get("memory", 0), network)
+    used_network = choose_network(config.config.get("memory", 0), network)
     hidden = () if config.own_network else config.config["hidden"]
 
-    def outline() -> Policy:
-        weights = init_weights(used, jax.random.key(0), n_obs, (*hidden, n_actions), 1.0)
-        return Policy(RunningStats.create(n_obs), weights.layers, weights.body, used)
+    def make_policy() -> Policy:
+        weights = init_weights(used_network, jax.random.key(0), n_obs, (*hidden, n_actions), 1.0)
+        return Policy(RunningStats.create(n_obs), weights.layers, weights.body, used_network)
 
-    return checkpoint.restore(path, arrays, jax.eval_shape(outline)), config, meta
+    return checkpoint.restore(path, arrays, jax.eval_shape(make_policy)), config, meta
 
 
-def _meta(config: TrainConfig) -> dict[str, Any]:
+def _run_metadata(config: TrainConfig) -> dict[str, Any]:
     """Return the metadata of the files of a run."""
     settings = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name != "network"}
     meta = {"crazysim": crazysim.__version__, "settings": settings, "code": code_digest(config.task)}
@@ -501,53 +506,56 @@ def _read_run(
                 f"--out"
             )
         for name, config in configs.items():
-            _require_same(path, runs[name]["settings"], config)
+            _require_same_settings(path, runs[name]["settings"], config)
         return arrays, runs, meta["code"], float(meta["seconds"])
 
 
-def _require_same(path: Path, settings: dict[str, Any], config: TrainConfig) -> None:
+def _require_same_settings(path: Path, settings: dict[str, Any], config: TrainConfig) -> None:
     """Check that a stored run has this configuration, except for settings that may change."""
-    stored, given = (_settings(settings) for settings in (settings, _meta(config)["settings"]))
+    stored_settings, requested_settings = (
+        _fixed_settings(settings) for settings in (settings, _run_metadata(config)["settings"])
+    )
     if settings.get("own_network", False) != config.own_network:
-        own = not config.own_network
+        has_own_network = not config.own_network
         raise ConfigError(
-            f"expected {path} to be resumed with {'its network of your own' if own else 'the built-in network'}. Use "
-            f"network={'network' if own else None}, or start a new run in another folder with --out."
+            f"expected {path} to be resumed with "
+            f"{'its network of your own' if has_own_network else 'the built-in network'}. "
+            f"Use network={'network' if has_own_network else None}, or start a new run in another folder with --out."
         )
-    for name in {**stored, **given}:
-        if stored.get(name, "its default") != given.get(name, "its default"):
+    for name in {**stored_settings, **requested_settings}:
+        if stored_settings.get(name, "its default") != requested_settings.get(name, "its default"):
             alterable = [x for x in ALTERABLE_HYPERPARAMETERS if x in config.config]
             raise ConfigError(
-                f"expected {name} = {stored.get(name, 'its default')!r} as in {path}, got "
-                f"{given.get(name, 'its default')!r}; resume with the same value, or start a new run in another folder "
-                f"with --out. A resumed run may change {', '.join(alterable)} and device."
+                f"expected {name} = {stored_settings.get(name, 'its default')!r} as in {path}, got "
+                f"{requested_settings.get(name, 'its default')!r}; resume with the same value, or start a new run in "
+                f"another folder with --out. A resumed run may change {', '.join(alterable)} and device."
             )
 
 
-def _settings(settings: dict[str, Any]) -> dict[str, Any]:
+def _fixed_settings(settings: dict[str, Any]) -> dict[str, Any]:
     """Return the settings, options and hyperparameters that a resumed run must keep, by name."""
-    place, name = split_reference(settings["task"]) if is_reference(settings["task"]) else ("", settings["task"])
-    flat = {k: x for k, x in settings.items() if k not in ("options", "config")}
-    kept = {k: x for k, x in settings["config"].items() if k not in ALTERABLE_HYPERPARAMETERS}
+    location, name = split_reference(settings["task"]) if is_reference(settings["task"]) else ("", settings["task"])
+    run_settings = {k: x for k, x in settings.items() if k not in ("options", "config")}
+    hyperparameters = {k: x for k, x in settings["config"].items() if k not in ALTERABLE_HYPERPARAMETERS}
     options = {k: x for k, x in settings["options"].items() if k != "device"}
-    return flat | {"task": f"{Path(place).name}:{name}" if place else name} | options | kept
+    return run_settings | {"task": f"{Path(location).name}:{name}" if location else name} | options | hyperparameters
 
 
 @contextmanager
-def _bar(total: int, done: int, wanted: bool) -> Iterator[Callable[..., None]]:
-    """Yield a function that shows metrics on a progress bar; without ``wanted`` or tqdm it does nothing."""
-    bar = progress_bar(unit="iteration", total=total, initial=done, ncols=100) if wanted else None
+def _iteration_bar(total: int, n_done: int, enabled: bool) -> Iterator[Callable[..., None]]:
+    """Yield a function that shows metrics on a progress bar; without ``enabled`` or tqdm it does nothing."""
+    bar = progress_bar(unit="iteration", total=total, initial=n_done, ncols=100) if enabled else None
     if bar is None:
         yield lambda *_: None
         return
     with bar:
-        shown: dict[str, str] = {}
+        postfix: dict[str, str] = {}
 
         def show(metrics: dict[str, Any] | None, iterations: int = 1) -> None:
             if metrics is not None:
-                known = {k: metrics[k] for k in ("success", "error", "reward") if k in metrics}
-                shown.update({k: f"{np.median(v):.3f}" for k, v in known.items()})
-                bar.set_postfix(shown, refresh=False)
+                values = {k: metrics[k] for k in ("success", "error", "reward") if k in metrics}
+                postfix.update({k: f"{np.median(v):.3f}" for k, v in values.items()})
+                bar.set_postfix(postfix, refresh=False)
             bar.update(iterations)
 
         yield show

@@ -40,7 +40,7 @@ def test_a_student_learns_the_actions_from_its_own_observations():
 
 def test_the_teacher_acts_first_and_less_and_less():
     """With a student of zero actions, the share of the teacher's actions is the decay to the power of the iteration."""
-    env = dagger.AutoReset(dagger.Guided(make("hover", 64), lambda data: {"x": data.states.pos}))
+    env = dagger.AutoReset(dagger.TeacherObservation(make("hover", 64), lambda data: {"x": data.states.pos}))
     config = dagger.Config(teacher_decay=0.5, n_steps=4)
     init = jax.jit(lambda key: dagger.init(env, (config,), key[None], lambda obs: jnp.ones((64, 1, 4))))
     learner = init(jax.random.key(0))
@@ -53,7 +53,7 @@ def test_the_teacher_acts_first_and_less_and_less():
 
 def test_the_teacher_observes_the_truth_and_the_student_what_is_measured():
     env = make("hover", 2, sensors=[MotionCapture(noise=0.1)])
-    guided = dagger.Guided(env, env.task.observe)
+    guided = dagger.TeacherObservation(env, env.task.observe)
     state = jax.jit(guided.step)(jax.jit(guided.reset)(jax.random.key(0)), jnp.zeros((2, 1, 4)))
     student, shown = dagger.split_obs(state.obs)
     np.testing.assert_array_equal(shown["pos"], state.data.states.pos)

@@ -28,7 +28,7 @@ from crazysim.train.evaluation import evaluate
 from crazysim.train.export import to_c
 from crazysim.train.networks import Policies, gru_network, init_weights, unroll
 from crazysim.train.out_of_tree import to_out_of_tree
-from crazysim.train.seeds import seed_of, stack_rates
+from crazysim.train.seeds import stack_rates, take_seed
 from crazysim.train.show import film
 from crazysim.train.training import CHECKPOINT, load_policy, train
 
@@ -63,10 +63,10 @@ def test_an_update_computes_what_the_rollout_did(rng):
     env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))  # three steps an episode
     learner, config = started(env, memory=5)
     memory = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), learner.memory)
-    collect = jax.jit(ppo._collect, static_argnums=(2, 3))
+    collect = jax.jit(ppo._collect_samples, static_argnums=(2, 3))
     key, rates = jax.random.key(1)[None], stack_rates((config,))
     _, after, samples, _, _ = collect(learner.agents, learner.replace(memory=memory), env, config, rates, key)
-    agent, samples = seed_of(learner.agents, 0), jax.tree.map(lambda x: x[:, 0], samples)
+    agent, samples = take_seed(learner.agents, 0), jax.tree.map(lambda x: x[:, 0], samples)
     assert samples.done.sum() == 2 * 4
 
     def outputs(done):
@@ -76,7 +76,7 @@ def test_an_update_computes_what_the_rollout_did(rng):
 
     log_prob, value = outputs(samples.done)
     np.testing.assert_allclose(log_prob, samples.log_prob, atol=1e-4)
-    scaled = value * ppo._scale(agent.returns) + agent.returns.mean
+    scaled = value * ppo._return_std(agent.returns) + agent.returns.mean
     np.testing.assert_allclose(scaled, samples.value, atol=1e-5)
     assert np.abs(outputs(jnp.zeros_like(samples.done))[1] - value)[3:].max() > 1e-3, "memories begin anew"
     assert np.abs(after[0]).max() > 0
@@ -92,7 +92,7 @@ def test_gradients_flow_back_in_time_to_the_start_of_an_episode(rng):
     done = jnp.zeros((6, 2), bool).at[2, 1].set(True)
 
     def last(obs):
-        return unroll(network, weights, obs, network.start(2), done)[-1].sum()
+        return unroll(network, weights, obs, network.make_memory(2), done)[-1].sum()
 
     grads = np.abs(jax.grad(last)(obs)).max(axis=-1)
     assert (grads[:, 0] > 0).all()
@@ -191,7 +191,7 @@ def test_policies_of_several_seeds_keep_memories_of_their_own(rng):
     memory = jnp.asarray(rng.normal(size=(4, 1, 3)), jnp.float32)
     action, after = Policies(policies).act(obs, memory)
     for i, worlds in enumerate((slice(2), slice(2, 4))):
-        one = seed_of(policies, i).act({name: x[worlds] for name, x in obs.items()}, memory[worlds])
+        one = take_seed(policies, i).act({name: x[worlds] for name, x in obs.items()}, memory[worlds])
         np.testing.assert_allclose(action[worlds], one[0], atol=1e-6)
         np.testing.assert_allclose(after[worlds], one[1], atol=1e-6)
     assert Policies(policies).initial_memory(4, 1).shape == (4, 1, 3)
@@ -221,9 +221,9 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
     learner, _ = started(env, minibatches=1, critic="privileged")
     other = state.obs | {"privileged": 1 + state.obs["privileged"]}
     config = ppo.Config(critic="privileged")
-    agent = seed_of(learner.agents, 0)
+    agent = take_seed(learner.agents, 0)
     values = [
-        ppo._value(agent, agent.stats.normalize(ppo._observed(obs, config)), (), config)[0]
+        ppo._value(agent, agent.stats.normalize(ppo._critic_obs(obs, config)), (), config)[0]
         for obs in (state.obs, other)
     ]
     assert np.abs(values[0] - values[1]).min() > 1e-4
@@ -246,13 +246,13 @@ def test_a_critic_of_all_drones_gets_the_observations_of_each_its_own_first():
 def test_tasks_of_several_drones_train_with_a_critic_of_all(task):
     env = AutoReset(make(task, 4, seconds=0.1))
     learner, config = started(env, critic="all_drones")
-    value = seed_of(learner.agents, 0).value
+    value = take_seed(learner.agents, 0).value
     n_obs = learner.agents.n_obs
     assert value.layers[0][0].shape[0] == env.sim.n_drones * n_obs
     for _ in range(2):
         learner, metrics = ppo.iterate(learner, env, (config,))
     assert metrics["finite"]
-    assert np.abs(seed_of(learner.agents, 0).value.layers[0][0] - value.layers[0][0])[n_obs:].max() > 1e-6
+    assert np.abs(take_seed(learner.agents, 0).value.layers[0][0] - value.layers[0][0])[n_obs:].max() > 1e-6
 
 
 def plain_network():
@@ -296,7 +296,7 @@ def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_networ
     obs, memory = result.env.reset(jax.random.key(0)).obs, policy.initial_memory(8, 1)
     np.testing.assert_array_equal(policy.act(obs, memory)[0], result.policy.act(obs, memory)[0])
     assert evaluate(result.env, policy)["nonfinite"] == 0
-    start = seed_of(ppo.init(AutoReset(result.env), (ppo.Config(),), jax.random.key(0)[None], network).as_policy(), 0)
+    start = take_seed(ppo.init(AutoReset(result.env), (ppo.Config(),), jax.random.key(0)[None], network).as_policy(), 0)
     changed = jax.tree.map(lambda x, y: bool(np.any(x != y)), start.body, policy.body)
     assert all(jax.tree.leaves(changed)), "all weights are trained"
     with pytest.raises(

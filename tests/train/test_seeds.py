@@ -18,8 +18,8 @@ from crazysim.train import config as configs
 from crazysim.train import training as trainings
 from crazysim.train.evaluation import evaluate, evaluate_blocks
 from crazysim.train.networks import Policies
-from crazysim.train.runs import run_many, variants_of
-from crazysim.train.seeds import seed_of
+from crazysim.train.runs import make_variants, run_many
+from crazysim.train.seeds import take_seed
 from crazysim.train.show import read_curve
 from crazysim.train.training import load_policy
 
@@ -60,7 +60,7 @@ def test_a_seed_trains_beside_others_as_it_does_alone(algorithm, hyperparameters
             for name in metrics:
                 np.testing.assert_allclose(metrics[name][i], others[name][0], rtol=1e-3, atol=1e-5, err_msg=name)
     for i in range(2):
-        mine, others = (jax.tree.leaves(seed_of(x.agents, j)) for x, j in ((many, i), (alone[i], 0)))
+        mine, others = (jax.tree.leaves(take_seed(x.agents, j)) for x, j in ((many, i), (alone[i], 0)))
         for x, y in zip(mine, others, strict=True):
             if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
                 x, y = map(jax.random.key_data, (x, y))
@@ -70,7 +70,7 @@ def test_a_seed_trains_beside_others_as_it_does_alone(algorithm, hyperparameters
     policies = many.as_policy()
     found = evaluate_blocks(make("hover", 16, **SECONDS), Policies(policies), n_blocks=2)
     for i in range(2):
-        expected = evaluate(make("hover", 8, **SECONDS), seed_of(policies, i))
+        expected = evaluate(make("hover", 8, **SECONDS), take_seed(policies, i))
         for name, x in expected.items():
             np.testing.assert_allclose(found[i][name], x, rtol=1e-4, atol=1e-6, err_msg=name)
 
@@ -199,5 +199,5 @@ def test_wrong_seeds_and_sweeps_are_refused(capsys, tmp_path):
     ):
         run_many("hover", tmp_path / "out", seed=1)
     with pytest.raises(ConfigError, match="expected at least one value of seeds, and each once, got none"):
-        variants_of([], {}, {})
+        make_variants([], {}, {})
     assert not (tmp_path / "out").exists()

@@ -30,10 +30,10 @@ from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import config as configs
 from crazysim.train import training as runs
 from crazysim.train.config import TrainConfig
-from crazysim.train.evaluation import evaluate, outcome
+from crazysim.train.evaluation import describe_outcome, evaluate
 from crazysim.train.networks import Policies
 from crazysim.train.runs import run
-from crazysim.train.seeds import seed_of, stack_rates
+from crazysim.train.seeds import stack_rates, take_seed
 from crazysim.train.show import plot_episode, read_curve
 from crazysim.train.training import CHECKPOINT, POLICY, load_policy, train
 
@@ -72,7 +72,7 @@ def whole(tmp_path_factory):
 
 def arrays(folder):
     with np.load(folder / CHECKPOINT) as file:
-        return {name: file[name] for name in file.files if name != checkpoint.META}
+        return {name: file[name] for name in file.files if name != checkpoint.META_ENTRY}
 
 
 @contextlib.contextmanager
@@ -90,7 +90,7 @@ def interrupted_after(iterations, monkeypatch, by=KeyboardInterrupt):
         yield show
 
     with monkeypatch.context() as patch:
-        patch.setattr(runs, "_bar", bar)
+        patch.setattr(runs, "_iteration_bar", bar)
         yield
 
 
@@ -304,7 +304,7 @@ def other_meta(content):
     with np.load(io.BytesIO(content)) as file:
         arrays = dict(file)
     changed = io.BytesIO()
-    np.savez(changed, **arrays | {checkpoint.META: np.array(json.dumps({"crazysim": crazysim.__version__}))})
+    np.savez(changed, **arrays | {checkpoint.META_ENTRY: np.array(json.dumps({"crazysim": crazysim.__version__}))})
     return changed.getvalue()
 
 
@@ -452,11 +452,13 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
     crashed = evaluate(easy, falling)
     assert crashed["crashed"] == 1
     assert crashed["success"] == 0
-    assert re.fullmatch(r"crashed 100\.0%, on average after 0\.\d+ s, so there is no mean error", outcome(crashed, "m"))
-    assert re.match(r"mean error 0\.\d+ m/s, ", outcome(evaluate(easy, idle), "m/s"))
+    assert re.fullmatch(
+        r"crashed 100\.0%, on average after 0\.\d+ s, so there is no mean error", describe_outcome(crashed, "m")
+    )
+    assert re.match(r"mean error 0\.\d+ m/s, ", describe_outcome(evaluate(easy, idle), "m/s"))
     lost = evaluate(easy, Always(jnp.full(4, jnp.nan)))
     assert lost["nonfinite"] == 1
-    assert "of all worlds 100.0% became non-finite" in outcome(lost, "m")
+    assert "of all worlds 100.0% became non-finite" in describe_outcome(lost, "m")
 
 
 def test_advantages_are_sums_of_discounted_errors(rng):
@@ -467,7 +469,7 @@ def test_advantages_are_sums_of_discounted_errors(rng):
     over = np.zeros((6, 3, 1), bool)
     over[2, 0], over[5, 1] = True, True
     sample = ppo.Sample(*(jnp.zeros(0),) * 3, value, reward, over)
-    advantages, returns = jax.jit(ppo._advantages)(sample, last, seed_of(rates, 0))
+    advantages, returns = jax.jit(ppo._estimate_advantages)(sample, last, take_seed(rates, 0))
     after = np.concatenate([value[1:], last[None]])
     delta = reward + 0.9 * after * ~over - value
     expected = np.zeros_like(delta)
@@ -485,9 +487,9 @@ def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
     env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))  # three steps an episode
     config = ppo.Config(n_steps=4, minibatches=4, discount=0.5, hidden=(8,))
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
-    collect = jax.jit(ppo._collect, static_argnums=(2, 3))
+    collect = jax.jit(ppo._collect_samples, static_argnums=(2, 3))
     _, _, samples, _, _ = collect(learner.agents, learner, env, config, stack_rates((config,)), jax.random.key(1)[None])
-    agent = seed_of(learner.agents, 0)
+    agent = take_seed(learner.agents, 0)
     state, step = learner.env, jax.jit(env.step)
     n_truncated = 0
     for k in range(4):
@@ -505,14 +507,14 @@ def test_values_stay_when_the_returns_that_scale_them_change(rng):
     env = AutoReset(make("hover", 4, engine="interpret"))
     config = ppo.Config(minibatches=4, hidden=(8,))
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
-    agent = seed_of(learner.agents, 0)
+    agent = take_seed(learner.agents, 0)
     obs = jnp.asarray(rng.normal(size=(5, agent.stats.mean.shape[0])), jnp.float32)
     before = ppo._value(agent, obs, (), config)[0]
     returns = agent.returns.update(jnp.asarray(rng.normal(30.0, 7.0, (1000, 1)), jnp.float32))
     after = agent.replace(value=ppo._rescale_value(agent.value, agent.returns, returns), returns=returns)
     np.testing.assert_allclose(ppo._value(after, obs, (), config)[0], before, atol=30 * 1e-6)
     assert np.abs(ppo._value(agent.replace(returns=returns), obs, (), config)[0] - before).min() > 1
-    np.testing.assert_allclose(ppo._scale(returns), 7.0, rtol=0.1)
+    np.testing.assert_allclose(ppo._return_std(returns), 7.0, rtol=0.1)
 
 
 def test_ppo_finds_the_action_that_pays():
