@@ -52,6 +52,8 @@ class CollisionBody:
     """Row of its pose in ``data.objects``, as ``with_mocap_bodies`` extends it; None for a body that cannot move."""
     geoms: tuple[CollisionGeom, ...]
     """Geoms in the frame of the body; in the world frame where ``row`` is None."""
+    initial_pos: tuple[float, ...] = dataclasses.field(default=(0.0, 0.0, 0.0), compare=False)
+    """Position in the compiled scene, m. (3,)"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +182,14 @@ def _model(
     for root, geoms in geoms_of.items():
         row = rows.get(body_name(model, root))
         frame = None if row is None else root
-        objects.append(CollisionBody(body_name(model, root), row, tuple(_geom(model, data, g, frame) for g in geoms)))
+        objects.append(
+            CollisionBody(
+                body_name(model, root),
+                row,
+                tuple(_geom(model, data, geom, frame) for geom in geoms),
+                tuple(map(float, data.xpos[root])),
+            )
+        )
     drones = tuple([DroneGeoms(tuple(geoms), kind) for geoms, kind in zip(drone_geoms.values(), kinds, strict=True)])
     return CollisionModel(tuple(floor), tuple(objects), drones, tuple(mocap), tuple(mocap.values()))
 

@@ -1,13 +1,13 @@
 """The first geom that a ray meets: a function of one ray, for kernels of all rays and for stages of a step.
 
 Geoms that do not move are in a hierarchy of boxes. For kernels of all rays, geoms of movable bodies and drones are in a
-list with a ball around each, for every world.
+second one, whose nodes every world fills with boxes of its own.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -17,20 +17,21 @@ from jax.typing import DTypeLike
 
 from crazysim import rotation
 from crazysim.core.branches import any_lane, compute_where, table_rows
-from crazysim.core.data import SimData
+from crazysim.core.data import SimData, grid_2d
 from crazysim.geometry import Shape
 from crazysim.geometry.fieldrays import MIN_COMPONENT, field_ray
 from crazysim.geometry.points import Components, components
 from crazysim.geometry.rays import Interval, SizedShapes, first_distance, hit_distance, hit_normal
-from crazysim.geometry.shapes import N_SIZES, bounding_box, bounding_radius
+from crazysim.geometry.shapes import N_SIZES, bounding_box
 from crazysim.scene import hierarchy
 from crazysim.scene.collision import CollisionGeom, CollisionModel
 
 IGNORES_NONE, NOT_A_DRONE = -1, -2
 """Drone index of rays that ignore no drone, and drone index of geoms that belong to no drone."""
 
-BALL_SLACK = 1e-3
-"""Relative enlargement of a ball for rounding, in addition to ``hierarchy.BOX_PADDING``."""
+FAR_FROM_OBJECTS = 1e4
+"""Distance of the drones from the objects where the hierarchy of movable geoms is planned, m: drones get a branch of
+their own."""
 
 Surface = Shape | str
 """A mesh or height field, or the kind of shapes that their sizes describe."""
@@ -48,6 +49,8 @@ class Target:
     """Row of the body among the objects or drones."""
     body_index: int
     """Index of the body, as in ``Hits.body_index``."""
+    initial_pos: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """Position of an object in the compiled scene, m. (3,)"""
 
     @property
     def surface(self) -> Surface:
@@ -85,7 +88,7 @@ class Tables(NamedTuple):
     """Everything that rays of all worlds need, as tables in memory."""
 
     counts: Array
-    """Numbers of nodes in one order, of fixed geoms and of movable geoms. (1, 3)"""
+    """Numbers of nodes in one order, of fixed geoms, of movable geoms, and of nodes of these in one order. (1, 4)"""
     codes: Array
     """Index of the surface, and the drone that a geom belongs to, of fixed and then movable geoms. (n, 2)"""
     boxes: Array
@@ -94,8 +97,10 @@ class Tables(NamedTuple):
     """As in ``Hierarchy``. (8 * n_nodes, 2)"""
     fixed: Array
     """Fixed geoms, world frame; see ``Target.table_row``. (n_fixed, 16)"""
-    balls: Array
-    """Centre and radius of a ball around each movable geom, m. (n_worlds * n_movable, 4)"""
+    movable_boxes: Array
+    """Boxes of the nodes of the movable geoms in every world, in the first order. (n_worlds * n_movable_nodes, 6)"""
+    movable_links: Array
+    """As ``links``, then the index of the node in the first order. (8 * n_movable_nodes, 3)"""
     movable: Array
     """Movable geoms, world frame. (n_worlds * n_movable, 16)"""
     eyes: Array
@@ -119,7 +124,7 @@ class Targets:
         targets = [Target(geom, "world", 0, 0) for geom in model.floor]
         for index, body in enumerate(model.objects, start=1):
             carrier = "world" if body.row is None else "object"
-            targets += [Target(geom, carrier, body.row or 0, index) for geom in body.geoms]
+            targets += [Target(geom, carrier, body.row or 0, index, body.initial_pos) for geom in body.geoms]
         for kind in model.drones if drones else ():
             for row in range(n_drones) if kind.drones is None else kind.drones:
                 if row != ignored_drone:
@@ -150,16 +155,41 @@ class Targets:
         codes = self.codes[: len(self.fixed)]
         return Hierarchy(jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links), jnp.asarray(geoms, dtype))
 
-    def movable_rows(self, data: SimData) -> tuple[Array, Array]:
-        """Return centres and radii of balls around the movable geoms, and the geoms, world frame.
+    def movable_nodes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the nodes of the hierarchy of movable geoms, ordered by where the geoms are in the compiled scene.
 
         Returns:
-            Balls. (n_worlds, n_movable, 4)
+            First and end of the leaves of each node in the first order. (n_nodes, 2)
+            Index among the movable geoms of each leaf in the first order. (n_movable,)
+            As in ``Tables.movable_links``. (8, n_nodes, 3)
+        """
+        low, high = np.zeros((2, len(self.movable), 3))
+        drone_pos = np.pad(grid_2d(1 + max([x.row for x in self.movable], default=0)), ((0, 0), (0, 1)))
+        for k, target in enumerate(self.movable):
+            pos = (
+                drone_pos[target.row] + FAR_FROM_OBJECTS if target.carrier == "drone" else np.array(target.initial_pos)
+            )
+            middle, half = pos + np.array(target.geom.pos), bounding_box(target.geom.shape)[1]
+            low[k], high[k] = middle - half, middle + half
+        _, links = hierarchy.build_hierarchy(low, high)
+        geoms = links[0, :, 1]
+        leaves_before = np.concatenate([[0], np.cumsum(geoms >= 0)])
+        ranges = np.stack([leaves_before[:-1], leaves_before[links[0, :, 0]]], axis=-1)
+        # A node is known by its leaves, which are the same in all orders.
+        node_of = {_leaf_set(links[0], k): k for k in range(len(geoms))}
+        indices = np.array([[node_of[_leaf_set(order, k)] for k in range(len(geoms))] for order in links], np.int32)
+        return ranges.astype(np.int32), geoms[geoms >= 0], np.concatenate([links, indices[..., None]], axis=-1)
+
+    def movable_rows(self, data: SimData) -> tuple[Array, Array]:
+        """Return boxes around the movable geoms, and the geoms, world frame.
+
+        Returns:
+            Lower and upper corners, m. (n_worlds, n_movable, 6)
             Geoms. (n_worlds, n_movable, 16)
         """
         states, dtype = data.states, data.states.pos.dtype
         n_worlds = states.pos.shape[0]
-        balls, geoms = [jnp.zeros((n_worlds, 0, 4), dtype)], [jnp.zeros((n_worlds, 0, 16), dtype)]
+        boxes, geoms = [jnp.zeros((n_worlds, 0, 6), dtype)], [jnp.zeros((n_worlds, 0, 16), dtype)]
         for carrier in ("object", "drone"):
             targets = [x for x in self.movable if x.carrier == carrier]
             if not targets:
@@ -171,35 +201,67 @@ class Targets:
             pos, quat = (x[:, np.array([t.row for t in targets])] for x in poses)
             rows = np.array([t.table_row(np.array(t.geom.pos)) for t in targets])
             rot = rows[:, 4:13].reshape(-1, 3, 3)
-            middles = [r @ bounding_box(t.geom.shape)[0] for r, t in zip(rot, targets, strict=True)]
-            radii = np.array([bounding_radius(t.geom.shape) for t in targets])
-            centre = pos + rotation.rotate(quat, jnp.asarray(rows[:, :3] + np.array(middles), dtype))
-            radius = jnp.broadcast_to(
-                jnp.asarray(radii * (1 + BALL_SLACK) + hierarchy.BOX_PADDING, dtype), centre.shape[:2]
-            )
-            balls.append(jnp.concatenate([centre, radius[..., None]], axis=-1))
+            middle, half = (np.array(x) for x in zip(*(bounding_box(t.geom.shape) for t in targets), strict=True))
             geom_pos = pos + rotation.rotate(quat, jnp.asarray(rows[:, :3], dtype))
             axes = jnp.stack([rotation.rotate(quat, jnp.asarray(rot[:, :, k], dtype)) for k in range(3)], axis=-1)
+            middle, half = (jnp.asarray(x, dtype)[:, None] for x in (middle, half))
+            centre, reach = geom_pos + jnp.sum(axes * middle, axis=-1), jnp.sum(jnp.abs(axes) * half, axis=-1)
+            reach = reach + hierarchy.BOX_PADDING
+            boxes.append(jnp.concatenate([centre - reach, centre + reach], axis=-1))
             size = jnp.broadcast_to(jnp.asarray(rows[:, 13:], dtype), (*geom_pos.shape[:2], 3))
             zero = jnp.zeros_like(geom_pos[..., :1])
             geoms.append(jnp.concatenate([geom_pos, zero, axes.reshape(*geom_pos.shape[:2], 9), size], axis=-1))
-        return jnp.concatenate(balls, axis=1), jnp.concatenate(geoms, axis=1)
+        return jnp.concatenate(boxes, axis=1), jnp.concatenate(geoms, axis=1)
 
-    def tables(self, balls: Array, geoms: Array, eyes: Array, pixels: Array) -> Tables:
+    def tables(self, boxes: Array, links: np.ndarray, geoms: Array, eyes: Array, pixels: Array) -> Tables:
         """Return the tables of rays of all worlds.
 
         Args:
-            balls: From ``movable_rows``.
+            boxes: Boxes of the nodes of the movable geoms in every world. (n_worlds, n_nodes, 6)
+            links: From ``movable_nodes``.
             geoms: From ``movable_rows``.
             eyes: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
             pixels: Directions in the frame of the camera, and ``Ray.ignored_drone``. (n_cameras, n_pixels, 4)
         """
         fixed = self.hierarchy(eyes.dtype)
-        counts = np.array([[len(fixed.boxes) // hierarchy.N_ORDERS, len(self.fixed), len(self.movable)]], np.int32)
-        tables = (jnp.asarray(counts), jnp.asarray(self.codes), *fixed[1:], balls, geoms, eyes, pixels)
+        n_nodes = len(fixed.boxes) // hierarchy.N_ORDERS
+        counts = np.array([[n_nodes, len(self.fixed), len(self.movable), links.shape[1]]], np.int32)
+        tables = (
+            jnp.asarray(counts), jnp.asarray(self.codes), *fixed[1:], boxes, jnp.asarray(links), geoms, eyes, pixels
+        )  # fmt: skip
         # Empty tables get a row of zeros, since an array without rows has no memory.
         flat = [x.reshape(-1, x.shape[-1]) for x in tables]
         return Tables(*(x if x.shape[0] else jnp.zeros((1, x.shape[1]), x.dtype) for x in flat))
+
+
+def _leaf_set(links: np.ndarray, node: int) -> frozenset[int]:
+    """Return the geoms of the leaves of a node."""
+    geoms = links[node : links[node, 0], 1]
+    return frozenset(geoms[geoms >= 0].tolist())
+
+
+def node_box(index: Array, counts: Array, ranges: Array, leaf_boxes: Array) -> list[Array]:
+    """Return the box around the leaves of a node in one world, as lower and upper corner. 6 of ()
+
+    Args:
+        index: Number of the node: those of the first world come first. ()
+        counts: Numbers of nodes and of leaves of a world. (1, 2)
+        ranges: First and end of the leaves of each node. (n_nodes, 2)
+        leaf_boxes: Boxes of the leaves of every world. (n_worlds * n_leaves, 6)
+    """
+    n_nodes, n_leaves = table_rows(counts, jnp.int32(0))
+    world = lax.div(index, n_nodes)
+    first, end = table_rows(ranges, index - world * n_nodes)
+
+    def include(carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
+        k, box = carry
+        leaf = table_rows(leaf_boxes, world * n_leaves + k)
+        low = [_minimum(a, b) for a, b in zip(box[:3], leaf[:3], strict=True)]
+        high = [_maximum(a, b) for a, b in zip(box[3:], leaf[3:], strict=True)]
+        return k + 1, [*low, *high]
+
+    infinite = jnp.asarray(jnp.inf, leaf_boxes.dtype)
+    return lax.while_loop(lambda carry: carry[0] < end, include, (first, [infinite] * 3 + [-infinite] * 3))[1]
 
 
 class Ray(NamedTuple):
@@ -230,24 +292,22 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
         *tables: ``Tables``.
     """
     t = Tables(*tables)
-    n_nodes, n_fixed, n_movable = table_rows(t.counts, jnp.int32(0))
+    n_nodes, n_fixed, n_movable, n_movable_nodes = table_rows(t.counts, jnp.int32(0))
     world, ray = _camera_ray(t, n_pixels, n_cameras, index)
     best = jnp.full_like(ray.origin[0], jnp.inf), jnp.int32(-1)
-
     best = first_fixed_hit(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed), ray, best, n_nodes)
 
-    def check_movable(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
-        k, best = carry
-        row, geom = world * n_movable + k, n_fixed + k
-        code, owner = table_rows(t.codes, geom)
-        meets = _meets_ball(table_rows(t.balls, row), ray, best[0]) & (owner != ray.ignored_drone)
+    def node(k: Array) -> tuple[Sequence[Array], Array, Array]:
+        after, geom, first_order = table_rows(t.movable_links, k)
+        return table_rows(t.movable_boxes, world * n_movable_nodes + first_order), after, geom
 
-        def visit(best: BestHit) -> BestHit:
-            return _nearer_hit(surfaces, code, geom, table_rows(t.movable, row), ray, meets, best)
+    def hit(k: Array, meets: Array, best: BestHit) -> BestHit:
+        code, owner = table_rows(t.codes, n_fixed + k)
+        meets = meets & (owner != ray.ignored_drone)
+        row = table_rows(t.movable, world * n_movable + k)
+        return _nearer_hit(surfaces, code, n_fixed + k, row, ray, meets, best)
 
-        return k + 1, compute_where(any_lane(meets), visit, best)
-
-    return lax.while_loop(lambda carry: carry[0] < n_movable, check_movable, (jnp.int32(0), best))[1]
+    return _walk_hierarchy(node, hit, ray, best, n_movable_nodes)
 
 
 def _camera_ray(t: Tables, n_pixels: int, n_cameras: int, index: Array) -> tuple[Array, Ray]:
@@ -273,7 +333,7 @@ def normal_at_hit(
         *tables: ``Tables``, then the two results of ``first_hit`` for all rays. (n_rays, 1) each
     """
     t, (distances, geoms) = Tables(*tables[:-2]), tables[-2:]
-    _, n_fixed, n_movable = table_rows(t.counts, jnp.int32(0))
+    _, n_fixed, n_movable, _ = table_rows(t.counts, jnp.int32(0))
     world, ray = _camera_ray(t, n_pixels, n_cameras, index)
     (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)
     code, _ = table_rows(t.codes, _maximum(geom, jnp.int32(0)))
@@ -344,22 +404,47 @@ def first_fixed_hit(
         n_nodes: Number of nodes in one order of the hierarchy; None to take it from the tables.
     """
     n_nodes = len(tables.boxes) // hierarchy.N_ORDERS if n_nodes is None else n_nodes
+
+    def node(k: Array) -> tuple[Sequence[Array], Array, Array]:
+        after, geom = table_rows(tables.links, k)
+        return table_rows(tables.boxes, k), after, geom
+
+    def hit(geom: Array, meets: Array, best: BestHit) -> BestHit:
+        code, _ = table_rows(tables.codes, geom)
+        return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, meets, best)
+
+    return _walk_hierarchy(node, hit, ray, best, n_nodes)
+
+
+def _walk_hierarchy(
+    node: Callable[[Array], tuple[Sequence[Array], Array, Array]],
+    hit: Callable[[Array, Array, BestHit], BestHit],
+    ray: Ray,
+    best: BestHit,
+    n_nodes: Array | int,
+) -> BestHit:
+    """Return the nearer of the best hit and the first geom of a hierarchy that a ray meets.
+
+    Args:
+        node: Returns the box of a node, the index of the node after its subtree, and its geom or -1; it takes the index
+            of the node, where nodes of the first order come first.
+        hit: Returns the nearer of the best hit and the hit of a geom, if the ray meets the box of the geom.
+        ray: The ray.
+        best: Best hit so far.
+        n_nodes: Number of nodes in one order.
+    """
     inverse = [1 / jnp.where(jnp.abs(d) < MIN_COMPONENT, MIN_COMPONENT, d) for d in ray.direction]
     scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
     signs = [any_lane(d < 0) for d in ray.direction]
     start = sum(jnp.where(sign, jnp.int32(1 << k), 0) for k, sign in enumerate(signs)) * n_nodes
 
     def check_node(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
-        node, best = carry
-        box, (after, geom) = table_rows(tables.boxes, start + node), table_rows(tables.links, start + node)
+        k, best = carry
+        box, after, geom = node(start + k)
         meets = _meets_box(box[:3], box[3:], scaled, inverse, best[0])
 
-        def visit(best: BestHit) -> BestHit:
-            code, _ = table_rows(tables.codes, geom)
-            return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, meets, best)
-
         def descend(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
-            return node + 1, compute_where(geom >= 0, visit, carry[1])
+            return k + 1, compute_where(geom >= 0, lambda best: hit(geom, meets, best), carry[1])
 
         return compute_where(any_lane(meets), descend, (after, best))
 
@@ -392,17 +477,6 @@ def _meets_box(
     x, y, z = (_maximum(*pair) for pair in ends)
     far = _minimum(_minimum(x, y), z)
     return (near <= far) & (far >= 0) & (near <= best)
-
-
-def _meets_ball(ball: Sequence[Array], ray: Ray, best: Array) -> Array:
-    """Return True where a ray meets a ball before its best hit."""
-    *centre, radius = ball
-    away = [c - o for c, o in zip(centre, ray.origin, strict=True)]
-    middle = sum(a * d for a, d in zip(away, ray.direction, strict=True))
-    # From the nearest point of the line to the centre; a difference of squares would lose precision for distant balls.
-    aside = [a - middle * d for a, d in zip(away, ray.direction, strict=True)]
-    square = sum(a * a for a in aside)
-    return (square <= radius * radius) & (middle + radius >= 0) & (middle - radius <= best)
 
 
 def _nearer_hit(

@@ -1,4 +1,4 @@
-"""Bounding volume hierarchy of geoms that do not move, as a table that a ray walks without a stack.
+"""Bounding volume hierarchy of geoms, as a table that a ray walks without a stack.
 
 Nodes are in depth-first order, each with the index of the node after its subtree, where a ray that misses its box
 continues. Each of the eight octants of directions has an order of its own, in which nearer boxes come first.

@@ -32,6 +32,7 @@ from crazysim.scene.first_hit import (
     first_fixed_hit,
     first_hit,
     geom_shape,
+    node_box,
     normal_at_hit,
     ray_in_frame,
 )
@@ -307,10 +308,11 @@ def cast_rays_in_worlds(
     ignored = np.unique(pixels[..., 3])
     targets = Targets(model, data.core.n_drones, drones, int(ignored[0]) if len(ignored) == 1 else IGNORES_NONE)
     n_worlds, (n_cameras, n_pixels, _) = eyes.shape[0], pixels.shape
-    balls, movable = targets.movable_rows(data)
-    n, tables = n_worlds * n_cameras * n_pixels, targets.tables(balls, movable, eyes, jnp.asarray(pixels, eyes.dtype))
+    boxes, movable = targets.movable_rows(data)
+    boxes, links = kernels.node_boxes(targets, jax.lax.stop_gradient(boxes))
+    tables = targets.tables(boxes, links, movable, eyes, jnp.asarray(pixels, eyes.dtype))
+    n, tables = n_worlds * n_cameras * n_pixels, jax.lax.stop_gradient(tables)
     fn = functools.partial(first_hit, targets.surfaces, n_pixels, n_cameras)
-    tables = jax.lax.stop_gradient(tables)
     (far, which), platform = kernels.run(fn, n, tables, targets)
     hit_table = far[:, None], which[:, None]
     distance, which = far.reshape(n_worlds, -1), which.reshape(n_worlds, -1)
@@ -361,25 +363,45 @@ class RayKernels:
         has_kernels = mesh is None and engine in ("auto", "fused") and not fused.unavailable_reason(device.platform)
         return cls(device.platform if has_kernels else None, strict)
 
+    def node_boxes(self, targets: Targets, leaf_boxes: Array) -> tuple[Array, np.ndarray]:
+        """Return the boxes of the nodes of the movable geoms in every world, (n_worlds, n_nodes, 6), and their links.
+
+        Args:
+            targets: The geoms.
+            leaf_boxes: Boxes of the movable geoms, from ``Targets.movable_rows``. (n_worlds, n_movable, 6)
+        """
+        ranges, leaves, links = targets.movable_nodes()
+        n_worlds, n_nodes = len(leaf_boxes), len(ranges)
+        if not n_nodes:
+            return leaf_boxes, links
+        counts = jnp.array([[n_nodes, len(leaves)]], jnp.int32)
+        tables = counts, jnp.asarray(ranges), leaf_boxes[:, leaves].reshape(-1, 6)
+        boxes, _ = self._map(node_box, n_worlds * n_nodes, tables)
+        return jnp.stack(boxes, axis=-1).reshape(n_worlds, n_nodes, 6), links
+
     def run(
         self, fn: Callable[..., Any], n: int, tables: Sequence[Array], targets: Targets
     ) -> tuple[list[Array], str | None]:
-        """Return the results of a function of one ray for ``n`` rays, as ``map_indices`` does.
+        """Return the results of a function of one ray for ``n`` rays, and the platform of the kernel; see ``_map``."""
+        hits, platform = self._map(fn, n, tables)
+        by = "XLA, without a kernel" if platform is None else "one kernel with a lane for each ray"
+        counts = f"{len(targets.fixed)} fixed geoms in a hierarchy, {len(targets.movable)} movable geoms in another"
+        self.used = f"{by}; {counts}"
+        return hits, platform
+
+    def _map(self, fn: Callable[..., Any], n: int, tables: Sequence[Array]) -> tuple[list[Array], str | None]:
+        """Return what ``map_indices`` does, by a kernel if possible.
 
         Returns:
             The results. (n,) each
             Platform of the kernel that computed them; None for XLA.
         """
-        where = f"{len(targets.fixed)} fixed geoms in a hierarchy, {len(targets.movable)} movable geoms in a list"
         if self.platform is not None:
             try:
-                hits = map_indices(fn, n, tables, self.platform)
-                self.used = f"one kernel with a lane for each ray; {where}"
-                return hits, self.platform
+                return map_indices(fn, n, tables, self.platform), self.platform
             except UnsupportedError as error:
                 problem, remedy = f"rays have no kernel: {error.reason}", "Leave out the geoms that need it"
                 report_unsupported([problem], self.strict, self.reported, remedy)
-        self.used = f"XLA, without a kernel; {where}"
         return map_indices(fn, n, tables, None), None
 
 
