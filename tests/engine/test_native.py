@@ -112,6 +112,40 @@ def test_the_key_holds_machine_compiler_and_versions(source, place, compilations
     changed("another C library")
 
 
+def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
+    source, place, monkeypatch, tmp_path_factory
+):
+    """The image has a kernel of each machine; the other machine's may have instructions that this CPU lacks."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    (folder / "cpuinfo").write_text("flags : fpu sse2 avx2 avx512f amx_tile\n")
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr("crazysim.cache.CPU_INFO", folder / "cpuinfo")
+        key = again(source).removeprefix("crazysim_advance_")
+    (library,) = place.iterdir()
+    library.unlink()
+    (folder / "other.c").write_text("void crazysim_advance() { __builtin_trap(); } int crazysim_call() { return -1; }")
+    other = [
+        *COMPILER.split()[:1],
+        "-x",
+        "c",
+        "-shared",
+        "-fPIC",
+        str(folder / "other.c"),
+        "-o",
+        str(folder / "other.so"),
+    ]
+    subprocess.run(other, check=True)
+    kernel_cache.store(place, key, (folder / "other.so").read_bytes(), ".so")
+
+    assert again(source) != f"crazysim_advance_{key}"
+    assert len(list(place.iterdir())) == 2
+    zeros, steps, flags = np.zeros(64), np.zeros(2, np.int32), np.zeros(2, bool)
+    inputs = [zeros.ctypes.data] * len(source.inputs)
+    addresses = (ctypes.c_void_p * (len(inputs) + 2))(*inputs, steps.ctypes.data, flags.ctypes.data)
+    assert native.HostLaunch(source).on_memory()(2, 5, addresses, len(inputs)) == 1
+    assert steps.tolist() == [5, 5]
+
+
 @pytest.mark.parametrize("damage", [lambda raw: raw[: len(raw) // 2], lambda raw: b"", lambda raw: raw[:-8] + b"x" * 8])
 def test_a_damaged_file_is_compiled_again(source, place, compilations, damage):
     """Loading half of a library can end the process, so it is found out before."""
