@@ -24,7 +24,7 @@ TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
 unexport PYTHONDONTWRITEBYTECODE
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 
-.PHONY: demo test test-rest test-all test-gpu check docs format benchmark clean
+.PHONY: demo test test-rest test-all test-gpu check docs format benchmark release clean
 
 # The stamp of an extra of pyproject.toml that is installed; `test` includes `demo`.
 $(VENV)/installed-%: pyproject.toml
@@ -70,6 +70,14 @@ benchmark: $(VENV)/installed-demo
 	$(RUN) benchmarks/compile.py
 	$(RUN) benchmarks/limits.py
 	$(RUN) benchmarks/versus_crazyflow.py
+
+# Builds and tries the distribution in empty environments, and uploads it to PyPI; CONTRIBUTING.md says what comes before.
+release: $(VENV)/installed-test
+	$(RUN) benchmarks/figures.py --stale
+	.ci/dist $(PYTHON) out/dist
+	$(RUN) -m pip install --quiet --disable-pip-version-check --no-compile twine
+	git tag v$$($(RUN) -c "import crazysim; print(crazysim.__version__)")
+	$(RUN) -m twine upload out/dist/*
 
 clean:
 	rm -rf .venv .venv-* .cache out dist build

@@ -414,7 +414,7 @@ FIGURES: dict[str, Figure] = {
         table=tables.costs,
     ),
     "mppi": Figure(PAGE, (*STEP, "crazysim/sim/mppi.py"), cpu="mppi.py", gpu="mppi.py", table=tables.commands),
-    "live": Figure(PAGE, (*STEP, "crazysim/lab/live"), cpu="live.py", table=tables.live),
+    "live": Figure(PAGE, (*STEP, "crazysim/lab/live"), cpu="live.py --only max recorded jitter", table=tables.live),
     "mocap": Figure(PAGE, ("crazysim/lab/live/mocap",), cpu="mocap.py", table=tables.mocap),
     "first-results": Figure(
         "docs/install.md",

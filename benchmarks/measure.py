@@ -195,8 +195,8 @@ def _processor() -> str:
 
 
 def _vectors() -> str:
-    """Return the widest vectors of the processor that kernels use."""
-    features = _cpu_info("flags").split()
+    """Return the widest vectors of the processor that kernels use; CXXFLAGS can exclude some."""
+    features = [x for x in _cpu_info("flags").split() if f"-mno-{x}" not in os.environ.get("CXXFLAGS", "")]
     return next((name for flag, name in (("avx512f", "AVX-512"), ("avx2", "AVX2")) if flag in features), "128 bit")
 
 

@@ -196,7 +196,6 @@ commands = columns(
 live = columns(
     Case=lambda x: f"`{x['case']}`, {x['n_drones']} drones",
     Times_real_time=lambda x: f"{x['factor']:g}",
-    Pictures_per_second=lambda x: f"{x['pictures_per_s']:g}",
     Late_in_99_9_percent_at_most=lambda x: f"{x['lateness_999_ms']:g} ms",
     worst=lambda x: f"{x['worst_ms']:g} ms",
 )
@@ -222,7 +221,7 @@ def first_results(lines: list[Line]) -> str:
         lines,
         lambda x: names[x["case"]],
         lambda x: heads[x["cache"]],
-        lambda x: f"{x['wall_s']:.1f} s, {x['cpu_s']:.1f} s of processors",
+        lambda x: f"{x['wall_s']:.1f} s",
         "First result",
     )
 
