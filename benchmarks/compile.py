@@ -15,7 +15,7 @@ import time
 from typing import Any
 
 import jax.numpy as jnp
-from measure import engine_of, hovering, machine, run_in_process
+from measure import engine_name, hovering, machine, run_in_process
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
@@ -35,23 +35,23 @@ def main() -> None:
 
 def measure(control: str, integrator: str, n_worlds: int, engine: str, device: str) -> dict[str, Any]:
     """Return the times of one case."""
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     sim = Sim(n_worlds=n_worlds, control=control, integrator=integrator, engine=engine, device=device)
     hovering(sim, control)
     built = time.perf_counter()
     lowered = sim.build_step_fn().lower(sim.data, jnp.int32(1))
     traced = time.perf_counter()
     lowered.compile()
-    done = time.perf_counter()
+    end_time = time.perf_counter()
     return {
         "benchmark": "compile",
-        "engine": engine_of(sim),
+        "engine": engine_name(sim),
         "control": control,
         "integrator": integrator,
         "n_worlds": n_worlds,
-        "build_s": round(built - begin, 4),
+        "build_s": round(built - start_time, 4),
         "trace_s": round(traced - built, 4),
-        "compile_s": round(done - traced, 4),
+        "compile_s": round(end_time - traced, 4),
         "crazysim": __version__,
         **machine(device),
     }

@@ -15,29 +15,29 @@ from typing import Any
 
 def main(package: str) -> None:
     """Answer requests until standard input ends."""
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     module = importlib.import_module(f"{package}.sim")
     import jax  # after the package, so that its import counts as part of the package's
     from measure import machine
 
-    import_s = time.perf_counter() - begin
+    import_s = time.perf_counter() - start_time
     timed: dict[str, Any] = {}
     for line in sys.stdin:
         request = json.loads(line)
         answer: dict[str, Any] = {}
         match request["do"]:
             case "first_step":
-                begin = time.perf_counter()
+                start_time = time.perf_counter()
                 sim = module.Sim(n_worlds=1, device=request["device"])
                 sim.step()
                 jax.block_until_ready(sim.data.states.pos)
-                answer = {"import_s": import_s, "to_first_step_s": time.perf_counter() - begin}
+                answer = {"import_s": import_s, "to_first_step_s": time.perf_counter() - start_time}
             case "memory":
                 sim = scene(module, package, request["n_worlds"], request["n_drones"], request["device"])
                 answer = {"bytes": memory(sim, package)}
             case "build":
-                made = build(package, request["task"], request["case"], request["device"])
-                timed[request["name"]], answer = made, {"seconds": made.first_s}
+                contestant = build(package, request["task"], request["case"], request["device"])
+                timed[request["name"]], answer = contestant, {"seconds": contestant.first_s}
             case "time":
                 answer = {"seconds": timed[request["name"]].seconds()}
             case "end":
@@ -72,7 +72,7 @@ class Loop:
         from measure import hovering
 
         hovering(sim, control)
-        self._sim, self._start, self._n_steps, self._iterations = sim, sim.data, n_steps, iterations
+        self._sim, self._initial_data, self._n_steps, self._iterations = sim, sim.data, n_steps, iterations
         self._send = getattr(sim, f"{control}_control")
         self._command = np.array(getattr(sim.data.controls, control).staged_cmd)
         self.first_s = self.seconds()
@@ -81,13 +81,13 @@ class Loop:
         """Return the time of one iteration, s."""
         import numpy as np
 
-        self._sim.data = self._start
-        begin = time.perf_counter()
+        self._sim.data = self._initial_data
+        start_time = time.perf_counter()
         for _ in range(self._iterations):
             self._send(self._command)
             self._sim.step(self._n_steps)
             np.asarray(self._sim.data.states.pos)
-        return (time.perf_counter() - begin) / self._iterations
+        return (time.perf_counter() - start_time) / self._iterations
 
     def require_flying(self) -> None:
         """Check that the drones are still flying.
@@ -112,13 +112,13 @@ class Gradient:
 
         functional = importlib.import_module(f"{package}.sim.functional")
         hovering(sim, "attitude")
-        step, start = sim.build_step_fn(), sim.data
+        step, initial_data = sim.build_step_fn(), sim.data
 
         def loss(cmd: jax.Array) -> jax.Array:
-            end = step(functional.attitude_control(start, cmd), n_steps)
-            return jnp.sum((end.states.pos - start.states.pos) ** 2)
+            final_data = step(functional.attitude_control(initial_data, cmd), n_steps)
+            return jnp.sum((final_data.states.pos - initial_data.states.pos) ** 2)
 
-        self._grad, self._cmd = jax.jit(jax.grad(loss)), 1.01 * start.controls.attitude.staged_cmd
+        self._grad, self._cmd = jax.jit(jax.grad(loss)), 1.01 * initial_data.controls.attitude.staged_cmd
         self._seconds = seconds
         self.first_s = self.seconds()
 
@@ -167,11 +167,11 @@ class GymSteps:
         """Return the time of several steps with one synchronisation at the end, s."""
         import jax
 
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         for _ in range(self._steps):
-            self._out = self._env.step(self._action)
-        jax.block_until_ready(self._out[:4])
-        return time.perf_counter() - begin
+            self._results = self._env.step(self._action)
+        jax.block_until_ready(self._results[:4])
+        return time.perf_counter() - start_time
 
     def require_flying(self) -> None:
         """Check that the drones do not crash all the time.
@@ -181,7 +181,7 @@ class GymSteps:
         """
         import numpy as np
 
-        if np.mean(np.asarray(self._out[2])) > 0.1:
+        if np.mean(np.asarray(self._results[2])) > 0.1:
             raise SystemExit("more than a tenth of the worlds ends with every step; no figure")
 
 
@@ -202,16 +202,16 @@ def scene(module: Any, package: str, n_worlds: int, n_drones: int, device: str) 
     from measure import hovering
 
     sim = module.Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude", device=device)
-    for name, (geom, places) in OBJECTS.items():
+    for name, (geom, positions) in OBJECTS.items():
         text = f'<mujoco><worldbody><body name="{name}">{geom}</body></worldbody></mujoco>'
         if package == "crazysim":
-            sim.scene.add(mujoco.MjSpec.from_string(text).body(name), name, count=len(places), pos=places)
+            sim.scene.add(mujoco.MjSpec.from_string(text).body(name), name, count=len(positions), pos=positions)
             continue
         frame = sim.spec.worldbody.add_frame()
-        for k, place in enumerate(places):
+        for k, pos in enumerate(positions):
             spec = mujoco.MjSpec.from_string(text)
             body = frame.attach_body(spec.body(name), "", f":{k}")
-            body.pos, body.mocap = place, True
+            body.pos, body.mocap = pos, True
     if package != "crazysim":
         sim.build_mjx()
     hovering(sim, "attitude")
@@ -237,12 +237,12 @@ class Question:
         if task != "swarm_build":
             self._sim = scene(self._module, package, case["n_worlds"], case["n_drones"], device)
         if task == "contacts":
-            self._ask = lambda: self._sim.contact_report() if package == "crazysim" else self._sim.contacts()
+            self._query = lambda: self._sim.contact_report() if package == "crazysim" else self._sim.contacts()
         elif package == "crazysim":
-            self._ask = lambda: self._sim.depth("fpv_cam:0", 64, 64)
+            self._query = lambda: self._sim.depth("fpv_cam:0", 64, 64)
         else:
             depth = importlib.import_module("crazyflow.sim.sensors.depth")
-            self._ask = lambda: depth.render_depth(self._sim, camera=1, resolution=(64, 64))
+            self._query = lambda: depth.render_depth(self._sim, camera=1, resolution=(64, 64))
         self.first_s = self.seconds()
 
     def seconds(self) -> float:
@@ -250,16 +250,16 @@ class Question:
         import jax
 
         if self._task == "swarm_build":
-            begin = time.perf_counter()
+            start_time = time.perf_counter()
             self._sim = self._module.Sim(n_drones=self._case["n_drones"], device=self._device)
-            return time.perf_counter() - begin
+            return time.perf_counter() - start_time
         seconds: list[float] = []
         while sum(seconds) < TURN:
             self._sim.step()
             jax.block_until_ready(self._sim.data.states.pos)
-            begin = time.perf_counter()
-            jax.block_until_ready(self._ask())
-            seconds.append(time.perf_counter() - begin)
+            start_time = time.perf_counter()
+            jax.block_until_ready(self._query())
+            seconds.append(time.perf_counter() - start_time)
         return statistics.median(seconds)
 
     def require_flying(self) -> None:

@@ -24,7 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from measure import digits, engine_of, medians, report, seconds
+from measure import digits, engine_name, medians, report, seconds
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
@@ -117,13 +117,13 @@ def main() -> None:
 def is_able(name: str, airframe: Airframe, dynamics: str, level: str = "state") -> bool:
     """Return True if a controller takes commands of a level and an airframe has the numbers that it needs."""
     try:
-        Sim(drone=airframe, dynamics=dynamics, control=level, controller=controller_of(name))
+        Sim(drone=airframe, dynamics=dynamics, control=level, controller=make_controller(name))
     except ConfigError:
         return False
     return True
 
 
-def controller_of(name: str, speed: float = 2.0) -> Any:
+def make_controller(name: str, speed: float = 2.0) -> Any:
     """Return the argument ``controller`` of a simulation."""
     if name == "tracking_lqr":
         eight = figure_eight(2.0, 1.0, speed=speed, height=1.0)
@@ -141,16 +141,16 @@ def fly(
 ) -> dict[str, dict[str, float]]:
     """Return the figures of a controller for each airframe; all fly at once, one drone each in every world."""
     worlds, drones = FIRST_TUMBLING_WORLD + n, len(airframes)
-    controller = controller_of(name, speed)
+    controller = make_controller(name, speed)
     sim = Sim(worlds, drone=airframes, dynamics=dynamics, control="state", controller=controller, device=device)
     eight, s, params = figure_eight(2.0, 1.0, speed=speed, height=1.0), sim.data.states, sim.data.params
-    start, rng = eight.evaluate(jnp.float32(0)), np.random.default_rng(0)
+    start_setpoint, rng = eight.evaluate(jnp.float32(0)), np.random.default_rng(0)
 
     pos, vel, quat, ang_vel = (np.array(x) for x in (s.pos, s.vel, s.quat, s.ang_vel))
     rotor_vel = np.array(np.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
     pos[:], rotor_vel[TAKE_OFF_WORLD] = [0, 0, 1], 0
     pos[TAKE_OFF_WORLD, :, 2], pos[INVERTED_WORLD:, :, 2] = 0, START_HEIGHT
-    pos[TRACKING_WORLD], vel[TRACKING_WORLD] = start.pos, start.vel
+    pos[TRACKING_WORLD], vel[TRACKING_WORLD] = start_setpoint.pos, start_setpoint.vel
     quat[INVERTED_WORLD] = [np.sin(np.radians(89)), 0, 0, np.cos(np.radians(89))]
     quat[FIRST_TUMBLING_WORLD:], ang_vel[FIRST_TUMBLING_WORLD:] = (
         rng.normal(size=(n, drones, 4)),
@@ -170,8 +170,8 @@ def fly(
     )
     target = np.array(np.broadcast_to([0, 0, 1.0], pos.shape))
     target[INVERTED_WORLD:, :, 2] = START_HEIGHT
-    flown, wanted = positions(sim, eight, target, as_data(force))
-    return {airframe.name: figures(flown[:, :, k], wanted, name) for k, airframe in enumerate(airframes)}
+    flown_pos, path_pos = positions(sim, eight, target, as_data(force))
+    return {airframe.name: figures(flown_pos[:, :, k], path_pos, name) for k, airframe in enumerate(airframes)}
 
 
 def turn(name: str, airframes: list[Airframe], level: str, device: str = "cpu") -> dict[str, dict[str, float]]:
@@ -190,26 +190,26 @@ def responses(name: str, airframes: list[Airframe], level: str, device: str = "c
     One every 0.02 s. (n_times, n_steps, n_airframes)
     """
     steps = STEPS[level]
-    sim = Sim(len(steps), drone=airframes, control=level, controller=controller_of(name), device=device)
+    sim = Sim(len(steps), drone=airframes, control=level, controller=make_controller(name), device=device)
     s, params = sim.data.states, sim.data.params
-    high = jnp.broadcast_to(jnp.array([0, 0, START_HEIGHT], s.pos.dtype), s.pos.shape)
+    start_pos = jnp.broadcast_to(jnp.array([0, 0, START_HEIGHT], s.pos.dtype), s.pos.shape)
     sim.data = sim.data.replace(
-        states=s.replace(pos=high, rotor_vel=jnp.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
+        states=s.replace(pos=start_pos, rotor_vel=jnp.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
     )
     command = np.zeros((len(steps), len(airframes), 4), np.float32)
     command[..., 3] = [9.81 * airframe.value("rigid_body.mass") for airframe in airframes]
     for k, (axis, size) in enumerate(steps):
         command[k, :, axis] = size
     getattr(sim, f"{level}_control")(command)
-    out = []
+    results = []
     for _ in range(150):
         sim.step(sim.freq // 50)
         s = sim.data.states
         quat = np.asarray(s.quat)
         angles = Rotation.from_quat(quat.reshape(-1, 4)).as_euler("xyz").reshape(*quat.shape[:2], 3)
-        now = angles if level == "attitude" else np.asarray(s.ang_vel)
-        out.append(np.stack([now[k, :, axis] / size for k, (axis, size) in enumerate(steps)]))
-    return np.array(out)
+        response = angles if level == "attitude" else np.asarray(s.ang_vel)
+        results.append(np.stack([response[k, :, axis] / size for k, (axis, size) in enumerate(steps)]))
+    return np.array(results)
 
 
 def positions(sim: Sim, eight: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:
@@ -228,32 +228,32 @@ def positions(sim: Sim, eight: Any, target: np.ndarray, force: jax.Array) -> tup
         return data, (data.states.pos, eight.evaluate((k + 1) / sim.freq).pos)
 
     steps = jnp.arange(15 * sim.freq)
-    _, (flown, wanted) = jax.jit(lambda data: jax.lax.scan(fly_step, data, steps))(sim.data)
-    return np.asarray(flown), np.asarray(wanted)
+    _, (flown_pos, path_pos) = jax.jit(lambda data: jax.lax.scan(fly_step, data, steps))(sim.data)
+    return np.asarray(flown_pos), np.asarray(path_pos)
 
 
 def figures(pos: np.ndarray, eight: np.ndarray, name: str) -> dict[str, float]:
     """Return the figures of one airframe from its positions. (n_steps, n_worlds, 3)"""
     per_s, home = len(pos) // 15, np.array([0, 0, 1.0])
-    off = np.linalg.norm(pos - home, axis=-1)
-    found = {"tracking": float(np.sqrt(np.mean(np.sum((pos[:, TRACKING_WORLD] - eight)[: 9 * per_s] ** 2, axis=-1))))}
+    distance = np.linalg.norm(pos - home, axis=-1)
+    results = {"tracking": float(np.sqrt(np.mean(np.sum((pos[:, TRACKING_WORLD] - eight)[: 9 * per_s] ** 2, axis=-1))))}
     if name == "tracking_lqr":
-        return found
+        return results
     return {
-        "hover": float(off[5 * per_s, TAKE_OFF_WORLD]),
-        **found,
-        "pushed": float(off[7 * per_s, PUSHED_WORLD]),
-        "pushed_largest": float(off[:, PUSHED_WORLD].max()),
-        "heavier": float(off[5 * per_s, HEAVY_WORLD]),
+        "hover": float(distance[5 * per_s, TAKE_OFF_WORLD]),
+        **results,
+        "pushed": float(distance[7 * per_s, PUSHED_WORLD]),
+        "pushed_largest": float(distance[:, PUSHED_WORLD].max()),
+        "heavier": float(distance[5 * per_s, HEAVY_WORLD]),
         "home": float(np.mean(np.linalg.norm(pos[-1, FIRST_TUMBLING_WORLD:] - [0, 0, START_HEIGHT], axis=-1) < 0.1)),
         "lost_178": float(START_HEIGHT - pos[:, INVERTED_WORLD, 2].min()),
     }
 
 
 def cost(args: argparse.Namespace) -> None:
-    """Print the rates of steps of many worlds that hover, measured in turns."""
+    """Print the step rates of many hovering worlds, measured alternately."""
 
-    def steps_of(sim: Sim) -> Any:
+    def compile_steps(sim: Sim) -> Any:
         def steps() -> Any:
             sim.step(100)
             return sim.data.states.pos
@@ -265,10 +265,10 @@ def cost(args: argparse.Namespace) -> None:
     command[..., 2], command[..., 12] = 1, 1
     sims = {}
     for name in args.controllers:
-        sims[name] = Sim(args.worlds, control="state", controller=controller_of(name), device=args.device)
+        sims[name] = Sim(args.worlds, control="state", controller=make_controller(name), device=args.device)
         sims[name].state_control(command)
-    for name, duration in medians({name: steps_of(sim) for name, sim in sims.items()}, args.repeats).items():
-        rate, engine = args.worlds * 100 / duration, engine_of(sims[name])
+    for name, duration in medians({name: compile_steps(sim) for name, sim in sims.items()}, args.repeats).items():
+        rate, engine = args.worlds * 100 / duration, engine_name(sims[name])
         line = {"n_worlds": args.worlds, "engine": engine, "steps_per_s": digits(rate)}
         report(args.device, benchmark="controllers", controller=name, **line)
 

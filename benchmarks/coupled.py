@@ -1,7 +1,7 @@
-"""Steps per second of worlds whose drones act on each other, beside the same worlds without that.
+"""Steps per second of worlds whose drones act on each other, compared with the same worlds without an effect.
 
 One JSON line for each number of drones a world, the total being constant. ``downwash`` adds up the jets of all drones
-of a world at each of them; ``uncoupled`` is the same simulation without an effect. The two are measured in turns.
+of a world at each of them; ``uncoupled`` is the same simulation without an effect. The two are measured alternately.
 
     python benchmarks/coupled.py [--device gpu] [--total 262144] [--drones 4 8 16 64 256] [--check]
 """
@@ -13,7 +13,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from measure import Flight, digits, engine_of, medians, report
+from measure import Flight, digits, engine_name, medians, report
 
 from crazysim import Downwash, Sim, __version__
 
@@ -32,7 +32,7 @@ def main() -> None:
     for n_drones in args.drones:
         n_worlds = max(args.total // n_drones, 1)
         case = {"control": args.control, "integrator": args.integrator, "n_worlds": n_worlds, "n_drones": n_drones}
-        line = check(case, args) if args.check else measure(case, args)
+        line = check_agreement(case, args) if args.check else measure(case, args)
         report(args.device, benchmark="coupled", **case, n_steps=args.steps, crazysim=__version__, **line)
 
 
@@ -41,13 +41,13 @@ def measure(case: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
     sims = {name: Sim(**case, device=args.device) for name in ("uncoupled", "downwash")}
     sims["downwash"].add(Downwash())
     flights = {name: Flight(sim, args.control, args.steps, args.device) for name, sim in sims.items()}
-    taken = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
+    durations = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
     n_steps = case["n_worlds"] * case["n_drones"] * args.steps
-    rates = {name: digits(n_steps / seconds) for name, seconds in taken.items()}
-    return {"engine": engine_of(sims["downwash"]), "steps_per_s": rates}
+    rates = {name: digits(n_steps / seconds) for name, seconds in durations.items()}
+    return {"engine": engine_name(sims["downwash"]), "steps_per_s": rates}
 
 
-def check(case: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+def check_agreement(case: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
     """Return the largest differences of velocities between the fastest engine and ``plain``, m/s."""
     case = case | {"n_worlds": min(case["n_worlds"], 100)}
     pos = np.random.default_rng(0).uniform(-1, 1, (case["n_worlds"], case["n_drones"], 3))
@@ -60,7 +60,7 @@ def check(case: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
         sim.data = sim.data.replace(states=states.replace(pos=jnp.asarray(pos, states.pos.dtype) + 2, rotor_vel=hover))
         sim.step(args.steps)
         vels.append(np.asarray(sim.data.states.vel))
-        engines.append(engine_of(sim))
+        engines.append(engine_name(sim))
     return {"engine": engines[0], "difference": float(np.abs(vels[0] - vels[1]).max()),
             "largest": float(np.abs(vels[1]).max())}  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Rays per second of depth images, beside the time to the first image; or the time of a step with a range finder.
+"""Rays per second of depth images, and the time to the first image; or the time of a step with a range finder.
 
 One JSON line for each number of poles, fixed and movable, with rays or steps by the clock (median) and by the time of
 processors (least). For the figures of another version, run this file with its folder in PYTHONPATH, in turns with this
@@ -17,7 +17,7 @@ from functools import partial
 import jax
 import numpy as np
 from jax import Array
-from measure import digits, engine_of, medians, report, seconds
+from measure import digits, engine_name, medians, report, seconds
 
 from crazysim import RangeFinder, Sim, __version__
 
@@ -39,17 +39,17 @@ def main() -> None:
         if args.range_finder:
             range_finder_steps(sim, n_poles, movable, args)
             continue
-        look = partial(sim.depth, "fpv_cam", args.size[0], args.size[1])
-        begin = time.perf_counter()
-        jax.block_until_ready(look())
-        first = time.perf_counter() - begin
-        taken = medians({"depth": partial(seconds, look)}, args.repeats)["depth"]
-        used = min(processor_seconds(look) for _ in range(args.repeats))
+        render = partial(sim.depth, "fpv_cam", args.size[0], args.size[1])
+        start_time = time.perf_counter()
+        jax.block_until_ready(render())
+        first_s = time.perf_counter() - start_time
+        render_s = medians({"depth": partial(seconds, render)}, args.repeats)["depth"]
+        processor_s = min(processor_seconds(render) for _ in range(args.repeats))
         n_rays = args.worlds * args.size[0] * args.size[1]
         report(
             args.device, benchmark="depth", n_poles=n_poles, movable=movable, n_worlds=args.worlds, width=args.size[0],
-            height=args.size[1], first_s=digits(first), rays_per_s=digits(n_rays / taken),
-            rays_per_processor_s=digits(n_rays / used), crazysim=__version__,
+            height=args.size[1], first_s=digits(first_s), rays_per_s=digits(n_rays / render_s),
+            rays_per_processor_s=digits(n_rays / processor_s), crazysim=__version__,
         )  # fmt: skip
 
 
@@ -68,26 +68,26 @@ def range_finder_steps(sim: Sim, n_poles: int, movable: bool, args: argparse.Nam
         sim.step(n_steps)
         return sim.data.states.pos
 
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     jax.block_until_ready(steps())
-    first = time.perf_counter() - begin
-    taken = medians({"step": partial(seconds, steps)}, args.repeats)["step"] / n_steps
-    used = min(processor_seconds(steps) for _ in range(args.repeats)) / n_steps
-    near = float(np.mean(np.asarray(sim.data.plugins["range_finder"].distance)[..., :4] < 4))
+    first_s = time.perf_counter() - start_time
+    step_s = medians({"step": partial(seconds, steps)}, args.repeats)["step"] / n_steps
+    processor_s = min(processor_seconds(steps) for _ in range(args.repeats)) / n_steps
+    share_near = float(np.mean(np.asarray(sim.data.plugins["range_finder"].distance)[..., :4] < 4))
     report(
-        args.device, benchmark="range_finder", n_poles=n_poles, movable=movable, n_worlds=n, first_s=digits(first),
-        step_us=digits(1e6 * taken), processor_ns_per_drone=digits(1e9 * used / n), fraction_that_meets=digits(near),
-        engine=engine_of(sim), crazysim=__version__,
+        args.device, benchmark="range_finder", n_poles=n_poles, movable=movable, n_worlds=n, first_s=digits(first_s),
+        step_us=digits(1e6 * step_s), processor_ns_per_drone=digits(1e9 * processor_s / n),
+        fraction_that_meets=digits(share_near), engine=engine_name(sim), crazysim=__version__,
     )  # fmt: skip
 
 
-def processor_seconds(look: Callable[[], Array]) -> float:
+def processor_seconds(render: Callable[[], Array]) -> float:
     """Return the time that all threads of this process compute for a call, which other work on the machine disturbs
     less than the time by the clock.
     """
-    begin = time.process_time()
-    jax.block_until_ready(look())
-    return time.process_time() - begin
+    start_time = time.process_time()
+    jax.block_until_ready(render())
+    return time.process_time() - start_time
 
 
 def scene(n_worlds: int, n_poles: int, movable: bool, device: str) -> Sim:

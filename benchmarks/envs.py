@@ -19,7 +19,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from measure import digits, engine_of, medians, report
+from measure import digits, engine_name, medians, report
 
 import crazysim.envs as envs
 from crazysim import Randomize
@@ -66,14 +66,14 @@ def rollouts(
     base = envs.make(task, n_worlds, device=device)
     places = {"as the airframe": envs.AutoReset(base)}
     if randomize:
-        drawn = envs.make(task, n_worlds, device=device, effects=[Randomize.crazyflie()])
-        places["randomized"] = envs.AutoReset(drawn)
-    place = base.sim.device
-    key = jax.device_put(jax.random.key(0), place)
+        randomized_env = envs.make(task, n_worlds, device=device, effects=[Randomize.crazyflie()])
+        places["randomized"] = envs.AutoReset(randomized_env)
+    env_device = base.sim.device
+    key = jax.device_put(jax.random.key(0), env_device)
     starts = {drones: jax.jit(env.reset)(key) for drones, env in places.items()}
     n_obs = flatten(starts["as the airframe"].obs).shape[-1] + (size[0] * size[1] if size else 0)
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
-    policy = jax.device_put(policy, place)
+    policy = jax.device_put(policy, env_device)
 
     shape = starts["as the airframe"].action.shape
 
@@ -83,12 +83,12 @@ def rollouts(
     def figures(step: Any) -> Any:
         return step.reward.mean(), step.done.mean()
 
-    def looking(env: Any, state: Any, act: Any, key: Any) -> Any:
+    def rollout_with_images(env: Any, state: Any, act: Any, key: Any) -> Any:
         """Return what a rollout does for a policy that also gets images, which no observation of a task has."""
-        look = base.sim.scene.depth_fn("fpv_cam", *size)  # type: ignore[misc]
+        render = base.sim.scene.depth_fn("fpv_cam", *size)  # type: ignore[misc]
 
         def step(state: Any, key: Any) -> Any:
-            depth = jnp.minimum(look(state.data).distance, MAX_DEPTH)
+            depth = jnp.minimum(render(state.data).distance, MAX_DEPTH)
             action, _, _ = act({**state.obs, "depth": depth.reshape(*depth.shape[:2], -1)}, (), key)
             state = env.step(state, action)
             return state, figures(state)
@@ -98,12 +98,12 @@ def rollouts(
     def jitted(env: Any, act: Any) -> Any:
         def run(carry: Any) -> Any:
             state, key = carry
-            key, now = jax.random.split(key)
+            key, step_key = jax.random.split(key)
             if size:
-                state, kept = looking(env, state, act, now)
+                state, outputs = rollout_with_images(env, state, act, step_key)
             else:
-                state, _, kept = envs.rollout(env, state, act, now, n_steps, figures)
-            return (state, key), kept
+                state, _, outputs = envs.rollout(env, state, act, step_key, n_steps, figures)
+            return (state, key), outputs
 
         return jax.jit(run)
 
@@ -121,25 +121,25 @@ def rollouts(
                 carry = ppo.init(env, (recipe,), key[None])
                 lowered = ppo.iterate.lower(carry, env, (recipe,))
             else:
-                carry = (starts[drones], jax.device_put(jax.random.key(2), place))
+                carry = (starts[drones], jax.device_put(jax.random.key(2), env_device))
                 lowered = jitted(env, acts[name]).lower(carry)
-            begin = time.perf_counter()
+            start_time = time.perf_counter()
             run = lowered.compile()
-            compile_s[drones] = time.perf_counter() - begin
+            compile_s[drones] = time.perf_counter() - start_time
             carry, _ = run(carry)
-            last: list[Any] = [carry]
+            results: list[Any] = [carry]
 
-            def measure(run: Any = run, last: list[Any] = last) -> float:
-                jax.block_until_ready(last[0])
-                begin = time.perf_counter()
-                last[0], last[1:] = (out := run(last[0]))[0], [out[1]]
-                jax.block_until_ready(last)
-                return time.perf_counter() - begin
+            def measure(run: Any = run, results: list[Any] = results) -> float:
+                jax.block_until_ready(results[0])
+                start_time = time.perf_counter()
+                results[0], results[1:] = (out := run(results[0]))[0], [out[1]]
+                jax.block_until_ready(results)
+                return time.perf_counter() - start_time
 
-            measures[drones], lasts[drones] = measure, last
+            measures[drones], lasts[drones] = measure, results
         steps = recipe.n_steps if name == "training" else n_steps
         for drones, seconds in medians(measures, repeats).items():
-            ended = {} if name == "training" else {"ended": digits(float(jnp.mean(lasts[drones][1][1])))}
+            ended_share = {} if name == "training" else {"ended": digits(float(jnp.mean(lasts[drones][1][1])))}
             report(
                 device,
                 benchmark="envs",
@@ -149,10 +149,10 @@ def rollouts(
                 n_worlds=n_worlds,
                 n_steps=steps,
                 depth=size,
-                engine=engine_of(base.sim),
+                engine=engine_name(base.sim),
                 compile_s=round(compile_s[drones], 2),
                 env_steps_per_s=digits(n_worlds * base.sim.n_drones * steps / seconds),
-                **ended,
+                **ended_share,
             )
 
 

@@ -80,10 +80,10 @@ def measure_cases(case: str, cache: str) -> tuple[float, float]:
     """Return the wall time and the CPU time of a process, s."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {CACHE_VARIABLE: cache}
     program = f"import crazysim\n{CASES[case]}"
-    before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    usage_before, start_time = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run([sys.executable, "-c", program], env=environment, check=True, stdout=subprocess.DEVNULL)
-    wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
-    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    wall, usage_after = time.perf_counter() - start_time, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, usage_after.ru_utime + usage_after.ru_stime - usage_before.ru_utime - usage_before.ru_stime
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Steps per second of mixed fleets: drones beside cars, and drones of two airframes in one world.
+"""Steps per second of mixed fleets: drones with cars, and drones of two airframes in one world.
 
-One JSON line for each case. ``cars``: worlds of drones and cars, beside the same worlds without cars; the figure is
-the ratio of their rates. ``airframes``: every other drone has a second airframe, beside drones of one airframe with
-parameters of their own. The two simulations of a case are measured in turns.
+One JSON line for each case. ``cars``: worlds of drones and cars, and the same worlds without cars; the figure is
+the ratio of their rates. ``airframes``: every other drone has a second airframe; the reference has one airframe,
+and parameters for each drone. The two simulations of a case are measured alternately.
 
     python benchmarks/fleets.py [--device gpu] [--worlds 4096] [--drones 4] [--cars 2]
 """
@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from measure import Flight, digits, engine_of, medians, report
+from measure import Flight, digits, engine_name, medians, report
 
 from crazysim import Sim, __version__
 from crazysim.plugins.vehicles import Cars
@@ -37,13 +37,13 @@ def main() -> None:
     for case, (reference, fleet) in cases.items():
         flights = {name: Flight(sim, "state", args.steps, args.device)
                    for name, sim in (("reference", reference), ("fleet", fleet))}  # fmt: skip
-        taken = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
+        durations = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
         n_steps = args.worlds * args.drones * args.steps
-        rates = {name: digits(n_steps / seconds) for name, seconds in taken.items()}
+        rates = {name: digits(n_steps / seconds) for name, seconds in durations.items()}
         report(args.device, benchmark="fleets", case=case, n_worlds=args.worlds, n_drones=args.drones,
-               n_cars=args.cars * (case == "cars"), n_steps=args.steps, engine=engine_of(fleet),
+               n_cars=args.cars * (case == "cars"), n_steps=args.steps, engine=engine_name(fleet),
                drone_steps_per_s=rates,
-               ratio=digits(taken["reference"] / taken["fleet"]), crazysim=__version__)  # fmt: skip
+               ratio=digits(durations["reference"] / durations["fleet"]), crazysim=__version__)  # fmt: skip
 
 
 def drones(args: argparse.Namespace, own: bool = False) -> Sim:

@@ -49,9 +49,9 @@ def main() -> None:
     references = [name for name in REFERENCES if any(CASES[case][0] == name for case in args.cases)]
     cases = dict.fromkeys([*references, *args.cases])
     flights = {name: fly(args, name) for name in cases}
-    counted = {"operations": operations} if args.operations else {}
+    counts = {"operations": operations} if args.operations else {}
     reference = {name: CASES[name][0] for name in flights}
-    report_flights(args.device, flights, args.repeats, reference, benchmark="flight_stack", **counted)
+    report_flights(args.device, flights, args.repeats, reference, benchmark="flight_stack", **counts)
 
 
 def fly(args: argparse.Namespace, name: str) -> Flight:

@@ -1,4 +1,4 @@
-"""Gradients beside the steps they go through: one JSON line for each command level and number of worlds.
+"""Gradients, and the steps that they go through: one JSON line for each command level and number of worlds.
 
     python benchmarks/gradient.py [--device gpu] [--worlds 1024 16384 131072] [--controls attitude] [--steps 100]
 
@@ -43,14 +43,14 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
     """Print the line of one case."""
     sim = Sim(n_worlds, control=control, device=args.device, engine=args.engine)
     hovering(sim, control)
-    step, start = sim.build_step_fn(), sim.data
+    step, initial_data = sim.build_step_fn(), sim.data
     send, zeros = getattr(functional, f"{control}_control"), sim.step_fn.zeros(sim.data)
     hover = jnp.asarray(COMMANDS[control](0.0434 * 9.81, 15864.0), jnp.float32)
     cmd = jax.device_put(jnp.broadcast_to(1.01 * hover, (n_worlds, 1, hover.size)), sim.device)
 
     def distance(cmd: jax.Array) -> jax.Array:
-        end = step(send(start, cmd), n_steps, zeros)
-        return jnp.sum((end.states.pos - start.states.pos) ** 2)
+        final_data = step(send(initial_data, cmd), n_steps, zeros)
+        return jnp.sum((final_data.states.pos - initial_data.states.pos) ** 2)
 
     functions = {
         "forward": jax.jit(distance),
@@ -59,12 +59,12 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
     }
     first_s = {name: seconds(fn, cmd, 1) for name, fn in functions.items()}
     batch = BATCH["cpu" if args.device == "cpu" else "gpu"]
-    taken = medians({name: lambda fn=fn: seconds(fn, cmd, batch) for name, fn in functions.items()}, args.repeats)
+    durations = medians({name: lambda fn=fn: seconds(fn, cmd, batch) for name, fn in functions.items()}, args.repeats)
     slope = functions["gradient"](cmd)
     if not (jnp.all(jnp.isfinite(slope)) and jnp.any(slope != 0)):
         raise SystemExit("the gradient is zero or not finite; no figure")
-    _, along = functions["jvp"](cmd)
-    if not jnp.allclose(along, jnp.sum(slope * cmd), rtol=1e-3):
+    _, derivative = functions["jvp"](cmd)
+    if not jnp.allclose(derivative, jnp.sum(slope * cmd), rtol=1e-3):
         raise SystemExit("the gradient and the derivative in one direction differ; no figure")
     report(
         args.device,
@@ -73,23 +73,23 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
         n_worlds=n_worlds,
         n_steps=n_steps,
         ran=[line for line in sim.explain().splitlines() if line.startswith(("gradient: ", "jvp: "))],
-        compile_s=digits(first_s["gradient"] - taken["gradient"]),
-        jvp_compile_s=digits(first_s["jvp"] - taken["jvp"]),
-        forward_s=digits(taken["forward"]),
-        gradient_s=digits(taken["gradient"]),
-        jvp_s=digits(taken["jvp"]),
-        forward_passes=digits(taken["gradient"] / taken["forward"]),
-        jvp_passes=digits(taken["jvp"] / taken["forward"]),
-        steps_per_s=digits(n_worlds * n_steps / taken["gradient"]),
+        compile_s=digits(first_s["gradient"] - durations["gradient"]),
+        jvp_compile_s=digits(first_s["jvp"] - durations["jvp"]),
+        forward_s=digits(durations["forward"]),
+        gradient_s=digits(durations["gradient"]),
+        jvp_s=digits(durations["jvp"]),
+        forward_passes=digits(durations["gradient"] / durations["forward"]),
+        jvp_passes=digits(durations["jvp"] / durations["forward"]),
+        steps_per_s=digits(n_worlds * n_steps / durations["gradient"]),
         crazysim=__version__,
     )
 
 
 def seconds(fn: Callable[[jax.Array], Any], cmd: jax.Array, n_calls: int) -> float:
     """Return the time of a call in a batch, s."""
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     jax.block_until_ready([fn(cmd) for _ in range(n_calls)])
-    return (time.perf_counter() - begin) / n_calls
+    return (time.perf_counter() - start_time) / n_calls
 
 
 if __name__ == "__main__":

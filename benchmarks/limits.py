@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from measure import Flight, digits, engine_of, medians, report, seconds
+from measure import Flight, digits, engine_name, medians, report, seconds
 
 from crazysim import PyTree, Sim, __version__, leaf
 from crazysim.core.stage import stage
@@ -84,7 +84,7 @@ def measure(
     report(
         args.device,
         benchmark="limits",
-        engine=engine_of(sim),
+        engine=engine_name(sim),
         control=control,
         integrator=integrator,
         n_worlds=n_worlds,
@@ -108,20 +108,24 @@ def work(sim: Sim) -> tuple[float, float, int]:
     Raises:
         SystemExit: If a stage is not part of the program, so that its operations cannot be counted.
     """
-    one = Sim(1, control=sim.control, integrator=sim.integrator, engine="lanes")
-    program = one.build_step_fn().plan(one.data).program
+    reference_sim = Sim(1, control=sim.control, integrator=sim.integrator, engine="lanes")
+    program = reference_sim.build_step_fn().plan(reference_sim.data).program
     assert program is not None
     if program.unfused_stages:
         stage = program.unfused_stages[0]
         raise SystemExit(f"{stage.explanation}; its operations cannot be counted. Remove the stage.")
     often = sim.control_freq / sim.freq  # the one condition in the built-in pipelines is the state controller's rate
     each_step = sum(operations(segment.block, often) for segment in program.fused_segments)
-    blocks = [s.hoisted for s in program.fused_segments] + ([program.check.block] if program.check else [])
+    blocks = [s.hoisted for s in program.fused_segments] + (
+        [program.check_segment.block] if program.check_segment else []
+    )
     each_call = sum(operations(block, often) for block in blocks)
     batched = [i for i, leaf in enumerate(program.leaves) if leaf.scope in ("drone", "world")]
     sizes = {i: program.leaves[i].size * program.leaves[i].number_type.itemsize for i in batched}
-    read, written = (sum(sizes[i] for i in batched if i in leaves) for leaves in (program.read, program.written))
-    return each_step, each_call, read + written
+    read_numbers, written_numbers = (
+        sum(sizes[i] for i in batched if i in leaves) for leaves in (program.read_leaves, program.written_leaves)
+    )
+    return each_step, each_call, read_numbers + written_numbers
 
 
 def operations(block: Block, often: float) -> float:
@@ -140,14 +144,14 @@ def _contracted(block: Block) -> int:
         for x in op.args:
             if isinstance(x, Value):
                 users.setdefault(x, []).append(op)
-    kept = {x for inner in block.blocks() for x in inner.outputs}
-    full: set[Value] = set()
+    outputs = {x for inner in block.blocks() for x in inner.outputs}
+    products: set[Value] = set()
     contracted = 0
     for op in block.operations:
         sums = {user.results[0]: user for x in op.results for user in users.get(x, []) if user.results}
-        fits = all(u.name in ("add", "sub") and k not in full for k, u in sums.items())
-        if op.name == "mul" and op.dtype.kind == "f" and sums and fits and op.results[0] not in kept:
-            full |= sums.keys()
+        fits = all(u.name in ("add", "sub") and k not in products for k, u in sums.items())
+        if op.name == "mul" and op.dtype.kind == "f" and sums and fits and op.results[0] not in outputs:
+            products |= sums.keys()
             contracted += 1
     return contracted
 

@@ -37,11 +37,11 @@ def main() -> None:
     for control, n_worlds in itertools.product(args.controls, args.worlds):
         sim = Sim(n_worlds, control=control, device=args.device)
         hovering(sim, control)
-        start, command = sim.data, np.asarray(getattr(sim.data.controls, control).staged_cmd)
+        initial_data, command = sim.data, np.asarray(getattr(sim.data.controls, control).staged_cmd)
         setter = getattr(sim, f"{control}_control")
 
-        def reset(sim: Sim = sim, start=start) -> None:
-            sim.data = start
+        def reset(sim: Sim = sim, initial_data=initial_data) -> None:
+            sim.data = initial_data
 
         def iterate(sim: Sim = sim, command=command, setter=setter) -> None:
             setter(command)
@@ -71,9 +71,9 @@ def measure_times(reset: Callable[[], None], iterate: Callable[[], None], repeat
     for _ in range(repeats):
         reset()
         for _ in range(ITERATIONS):
-            now = time.perf_counter()
+            start_time = time.perf_counter()
             iterate()
-            times.append(time.perf_counter() - now)
+            times.append(time.perf_counter() - start_time)
     return {"iteration_s": float(np.median(times)), "shortest_s": min(times)}
 
 

@@ -44,8 +44,8 @@ def hovering(sim: Any, control: str) -> None:
     states = sim.data.states
     pos, rotor_vel = np.array(states.pos), np.array(states.rotor_vel)
     pos[..., 2], rotor_vel[...] = 1.0, 15864.0
-    put = lambda value: jax.device_put(np.float32(value), states.pos.sharding)  # noqa: E731
-    sim.data = sim.data.replace(states=states.replace(pos=put(pos), rotor_vel=put(rotor_vel)))
+    to_device = lambda value: jax.device_put(np.float32(value), states.pos.sharding)  # noqa: E731
+    sim.data = sim.data.replace(states=states.replace(pos=to_device(pos), rotor_vel=to_device(rotor_vel)))
     command = np.asarray(COMMANDS[control](0.0434 * 9.81, 15864.0), np.float32)
     command = np.tile(command, (n_worlds, n_drones, 1))
     if control == "state":
@@ -59,7 +59,7 @@ def still_flies(sim: Any) -> bool:
     return bool(np.all(np.isfinite(pos)) and pos[..., 2].min() > 0.5 and pos[..., 2].max() < 2.0)
 
 
-def engine_of(sim: Any) -> str:
+def engine_name(sim: Any) -> str:
     """Return the engine that steps a simulation of crazysim, as chosen by ``auto``."""
     return sim.explain().split()[1]
 
@@ -84,13 +84,13 @@ class Flight:
         """Return the time of one call in a batch, s."""
         self.sim.data = self.start
         jax.block_until_ready(self.sim.data.states.pos)
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         for _ in range(self.calls):
             pos = self._step()
             if not self.queued:
                 jax.block_until_ready(pos)
         jax.block_until_ready(self.sim.data.states.pos)
-        return (time.perf_counter() - begin) / self.calls
+        return (time.perf_counter() - start_time) / self.calls
 
     def require_flying(self) -> None:
         """Check that the drones still fly.
@@ -108,21 +108,21 @@ class Flight:
 
 def seconds(call: Callable[[], Any]) -> float:
     """Return the time of a call including synchronisation, s."""
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     jax.block_until_ready(call())
-    return time.perf_counter() - begin
+    return time.perf_counter() - start_time
 
 
 def medians(measures: dict[Any, Callable[[], float]], repeats: int) -> dict[Any, float]:
     """Return the median of each measurement, alternating between them so that noise affects all equally."""
-    found: dict[Any, list[float]] = {name: [] for name in measures}
-    begin = time.perf_counter()
-    for done in range(repeats):
-        if done >= 3 and time.perf_counter() - begin > PATIENCE:
+    durations: dict[Any, list[float]] = {name: [] for name in measures}
+    start_time = time.perf_counter()
+    for n_done in range(repeats):
+        if n_done >= 3 and time.perf_counter() - start_time > PATIENCE:
             break
         for name, measure in measures.items():
-            found[name].append(measure())
-    return {name: statistics.median(values) for name, values in found.items()}
+            durations[name].append(measure())
+    return {name: statistics.median(values) for name, values in durations.items()}
 
 
 def report_flights(
@@ -141,21 +141,21 @@ def report_flights(
         references: Name of the flight that each is compared with.
         line: What else each line contains; a function is called with the simulation.
     """
-    taken = medians({name: flight.seconds for name, flight in flights.items()}, repeats)
+    durations = medians({name: flight.seconds for name, flight in flights.items()}, repeats)
     for name, flight in flights.items():
         flight.require_flying()
         sim, reference = flight.sim, references[name]
         report(
             device,
             case=name,
-            engine=engine_of(sim),
+            engine=engine_name(sim),
             n_worlds=sim.n_worlds,
             n_drones=sim.n_drones,
             first_s=digits(flight.first_s),
-            call_s=digits(taken[name]),
-            steps_per_s=digits(sim.n_worlds * sim.n_drones * flight.n_steps / taken[name]),
+            call_s=digits(durations[name]),
+            steps_per_s=digits(sim.n_worlds * sim.n_drones * flight.n_steps / durations[name]),
             reference=reference,
-            ratio=digits(taken[name] / taken[reference]),
+            ratio=digits(durations[name] / durations[reference]),
             **{key: value(sim) if callable(value) else value for key, value in line.items()},
         )
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from measure import digits, machine
 
-from crazysim.commands.training import seeds_of
+from crazysim.commands.training import parse_seeds
 from crazysim.envs import make
 from crazysim.train import evaluate, run_many
 from crazysim.train.training import CHECKPOINT
@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--tasks", nargs="+", default=["hover", "track"])
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["memoryless", "memory"])
-    parser.add_argument("--seeds", type=seeds_of, default=[0], help="such as 0:4")
+    parser.add_argument("--seeds", type=parse_seeds, default=[0], help="such as 0:4")
     parser.add_argument("--worlds", type=int, default=2048, help="worlds of each seed")
     parser.add_argument("--iterations", type=int, default=300)
     parser.add_argument("--starts", type=int, default=1000, help="drones of each evaluation")
@@ -53,7 +53,7 @@ def main() -> None:
     sets: dict[str, dict[str, Any]] = {"drawn": options} | {drone: options | {"drone": drone} for drone in AIRFRAMES}
     about = machine(args.device)
     for task in args.tasks:
-        envs = {name: make(task, args.starts, **given) for name, given in sets.items()}
+        envs = {name: make(task, args.starts, **env_options) for name, env_options in sets.items()}
         for variant in args.variants:
             folder = args.out / f"{task}-{variant}"
             training = {"n_steps": 64, "minibatches": 16, "discount": 0.98, "iterations": args.iterations}
@@ -73,8 +73,10 @@ def main() -> None:
                 line = {"benchmark": "memory", "task": task, "variant": variant, "seed": seed, "starts": args.starts}
                 line |= {name: digits(result.metrics[name]) for name in ("env_steps", "seconds")}
                 for name, env in envs.items():
-                    found = evaluate(env, result.policy)
-                    line[name] = {x: digits(found[x]) for x in ("success", "crashed", "error") if found[x] == found[x]}
+                    metrics = evaluate(env, result.policy)
+                    line[name] = {
+                        x: digits(metrics[x]) for x in ("success", "crashed", "error") if metrics[x] == metrics[x]
+                    }
                 print(json.dumps(line | about), flush=True)
 
 

@@ -53,24 +53,24 @@ def measure(n_objects: int, freq: float, seconds: float) -> None:
     twins.update(sim)
 
     source.start()
-    updates, n_steps, begin = [], 0, time.monotonic()
-    while time.monotonic() - begin < seconds:
+    updates, n_steps, start_time = [], 0, time.monotonic()
+    while time.monotonic() - start_time < seconds:
         sim.step(5)
         jax.block_until_ready(sim.data.states.pos)
-        start = time.perf_counter()
+        step_start = time.perf_counter()
         twins.update(sim)
         jax.block_until_ready(sim.data.objects.pos)  # type: ignore[union-attr]
-        updates.append(time.perf_counter() - start)
+        updates.append(time.perf_counter() - step_start)
         n_steps += 1
-        time.sleep(max(begin + n_steps / 100 - time.monotonic(), 0.0))
+        time.sleep(max(start_time + n_steps / 100 - time.monotonic(), 0.0))
     twins.close()
 
     frames = [FunctionSource(bodies, freq).frame(100 + k / freq) for k in range(500)]
     rules = []
     for frame in frames:
-        start = time.perf_counter()
+        step_start = time.perf_counter()
         twins.tracker.accept(frame)
-        rules.append(time.perf_counter() - start)
+        rules.append(time.perf_counter() - step_start)
     report(
         "cpu",
         benchmark="mocap",

@@ -42,11 +42,11 @@ def commands(samples: int, args: argparse.Namespace) -> None:
     hovering(sim, args.control)
     settings = {"substeps": args.substeps, "knots": args.knots, "freq": args.freq}
     mppi = MPPI(sim, args.horizon, samples, **settings)
-    zero, none = jnp.zeros(3), jnp.zeros(1)
-    setpoint = jax.device_put(Setpoint(jnp.array([0.5, 0, 1.0]), *[zero] * 4, *[none] * 3), sim.device)
+    zero, no_feedforward = jnp.zeros(3), jnp.zeros(1)
+    setpoint = jax.device_put(Setpoint(jnp.array([0.5, 0, 1.0]), *[zero] * 4, *[no_feedforward] * 3), sim.device)
     compile_s = seconds(lambda: mppi.command(sim.data, setpoint))
     mppi.command(sim.data, setpoint)
-    found = medians({"command": lambda: seconds(lambda: mppi.command(sim.data, setpoint))}, args.repeats)["command"]
+    command_s = medians({"command": lambda: seconds(lambda: mppi.command(sim.data, setpoint))}, args.repeats)["command"]
     report(
         args.device,
         benchmark="mppi",
@@ -57,7 +57,7 @@ def commands(samples: int, args: argparse.Namespace) -> None:
         knots=args.knots,
         engine=mppi.engine,
         compile_s=round(compile_s, 2),
-        commands_per_s=digits(1 / found),
+        commands_per_s=digits(1 / command_s),
     )
 
 

@@ -81,7 +81,7 @@ def _all_aids() -> list[Plugin]:
     return [*aids, Kalman(aids)]  # type: ignore[arg-type]
 
 
-def _everything() -> list[Plugin]:
+def _all_plugins() -> list[Plugin]:
     aids = [*SENSORS["imu"](), *SENSORS["motion_capture"]()]
     others = [plugin for name in (*SENSORS, *EFFECTS) if name not in EXCLUDED for plugin in CASES[name]()]
     return [*others, *aids, Kalman(aids)]  # type: ignore[arg-type]
@@ -104,7 +104,7 @@ CASES: dict[str, Build] = {
     "outdoors": lambda: _with_estimator(ESKF([s for name in OUTDOORS for s in SENSORS[name]()])),  # type: ignore[misc]
     "all_aids": _all_aids,
     **EFFECTS,
-    "everything": _everything,
+    "everything": _all_plugins,
 }
 """Plugins of each case."""
 

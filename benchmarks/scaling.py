@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from measure import Flight, digits, engine_of, machine, medians, run_in_process
+from measure import Flight, digits, engine_name, machine, medians, run_in_process
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
@@ -70,23 +70,23 @@ def measure_cases(args: argparse.Namespace) -> list[dict[str, Any]]:
     return lines
 
 
-def powers_of_4(most: int) -> list[int]:
+def powers_of_4(limit: int) -> list[int]:
     """Return 1, 4, 16, ... up to a maximum."""
-    return [4**k for k in range(most.bit_length()) if 4**k <= most]
+    return [4**k for k in range(limit.bit_length()) if 4**k <= limit]
 
 
 def measure(case: dict[str, Any], n_steps: int, device: str, repeats: int) -> dict[str, Any]:
     """Return the results of one case."""
     sim = Sim(**case, device=device, controller="crazyflow")
     flight = Flight(sim, case["control"], n_steps, device)
-    taken = medians({"step": flight.seconds}, repeats)["step"]
+    step_s = medians({"step": flight.seconds}, repeats)["step"]
     flight.require_flying()
     n_worlds, n_drones = case["n_worlds"], case["n_drones"]
     return {
-        "engine": engine_of(sim),
-        "compile_s": round(flight.first_s - taken, 2),
-        "call_s": digits(taken),
-        "steps_per_s": digits(n_worlds * n_drones * n_steps / taken),
+        "engine": engine_name(sim),
+        "compile_s": round(flight.first_s - step_s, 2),
+        "call_s": digits(step_s),
+        "steps_per_s": digits(n_worlds * n_drones * n_steps / step_s),
         "bytes_a_world": bytes_a_world(sim),
         "crazysim": __version__,
         **machine(device),
@@ -112,26 +112,28 @@ def plot(lines: list[dict[str, Any]], path: Path) -> None:
 
     lines = [line for line in lines if "steps_per_s" in line]
     controls = list(dict.fromkeys(line["control"] for line in lines))
-    present = [series for series in SERIES if any(line["series"] == series for line in lines)]
+    plotted_series = [series for series in SERIES if any(line["series"] == series for line in lines)]
     quantities = {"steps_per_s": "drone steps per second", "compile_s": "compile time, s"}
-    figure, grid = plt.subplots(len(quantities), len(present), figsize=(5 * len(present), 7), squeeze=False)
+    figure, grid = plt.subplots(
+        len(quantities), len(plotted_series), figsize=(5 * len(plotted_series), 7), squeeze=False
+    )
     for row, (quantity, label) in zip(grid, quantities.items(), strict=True):
-        for axes, series in zip(row, present, strict=True):
+        for axes, series in zip(row, plotted_series, strict=True):
             size, name = SERIES[series]
             for engine, (colour, mark) in MARKS.items():
                 for control, style in zip(controls, ("-", "--", ":", "-.", (0, (1, 3))), strict=False):
-                    of = {"series": series, "engine": engine, "control": control}
-                    points = [(line[size], line[quantity]) for line in lines if line.items() >= of.items()]
+                    selection = {"series": series, "engine": engine, "control": control}
+                    points = [(line[size], line[quantity]) for line in lines if line.items() >= selection.items()]
                     if points:
                         title = engine if len(controls) == 1 else f"{engine}, {control}"
                         axes.loglog(*zip(*points, strict=True), marker=mark, color=colour, ls=style, label=title)
             axes.set(xlabel=name, ylabel=label)
             axes.grid(alpha=0.3)
     grid[0][0].legend()
-    first = lines[0]
-    machine_name = first["processor"] if first["device"] == "cpu" else first["device"]
-    figure.suptitle(f"{', '.join(controls)} command, {first['integrator']}, {first['n_steps']} steps a call; "
-                    f"{machine_name}, jax {first['jax']}")  # fmt: skip
+    first_line = lines[0]
+    machine_name = first_line["processor"] if first_line["device"] == "cpu" else first_line["device"]
+    figure.suptitle(f"{', '.join(controls)} command, {first_line['integrator']}, {first_line['n_steps']} steps a call; "
+                    f"{machine_name}, jax {first_line['jax']}")  # fmt: skip
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)

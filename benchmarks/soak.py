@@ -59,7 +59,7 @@ def measure(seconds: float, n_drones: int, n_objects: int) -> None:
         source.start()
         result = live.run(seconds)
         recorded = path.stat().st_size
-    at, used = memory.samples(WARM_UP * seconds)
+    times, memory_bytes = memory.samples(WARM_UP * seconds)
     report(
         "cpu",
         benchmark="soak",
@@ -67,8 +67,8 @@ def measure(seconds: float, n_drones: int, n_objects: int) -> None:
         n_objects=n_objects,
         seconds=seconds,
         factor=digits(result.factor),
-        memory_mb=[round(used[0]), round(used[-1])],
-        growth_mb_per_hour=digits(3600 * np.polyfit(at, used, 1)[0]),
+        memory_mb=[round(memory_bytes[0]), round(memory_bytes[-1])],
+        growth_mb_per_hour=digits(3600 * np.polyfit(times, memory_bytes, 1)[0]),
         frames=twins.tracker.n_frames,
         frames_lost=twins.reports.count("overrun"),
         pictures_per_s=digits(result.pictures / result.wall_s),
@@ -90,28 +90,28 @@ class Memory:
         Args:
             period_s: Time between two readings, s.
         """
-        self._period_s, self._readings, self._ended = period_s, [], threading.Event()
+        self._period_s, self._readings, self._stop_event = period_s, [], threading.Event()
 
     def __enter__(self) -> Memory:
         """Begin to read."""
-        self._begin = time.monotonic()
-        threading.Thread(target=self._read, daemon=True).start()
+        self._start_time = time.monotonic()
+        threading.Thread(target=self._read_memory, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Stop reading."""
-        self._ended.set()
+        self._stop_event.set()
 
-    def samples(self, after: float) -> tuple[np.ndarray, np.ndarray]:
+    def samples(self, start_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return times since the beginning, s, and memory, MB, of the readings after a time, s. (n,), (n,)"""
-        at, used = np.asarray(self._readings).T
-        return at[at >= after], used[at >= after]
+        times, memory_bytes = np.asarray(self._readings).T
+        return times[times >= start_s], memory_bytes[times >= start_s]
 
-    def _read(self) -> None:
+    def _read_memory(self) -> None:
         size = os.sysconf("SC_PAGE_SIZE")
-        while not self._ended.wait(self._period_s):
+        while not self._stop_event.wait(self._period_s):
             pages = int(Path("/proc/self/statm").read_text().split()[1])
-            self._readings.append((time.monotonic() - self._begin, 1e-6 * pages * size))
+            self._readings.append((time.monotonic() - self._start_time, 1e-6 * pages * size))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import itertools
 
 import jax
 import jax.numpy as jnp
-from measure import Flight, digits, engine_of, medians, report
+from measure import Flight, digits, engine_name, medians, report
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
@@ -47,13 +47,13 @@ def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: i
     compile_s: dict[tuple[str, str], float] = {}
     for n_steps in args.steps:
         flights = {case: Flight(sim, control, n_steps, args.device) for case, sim in sims.items()}
-        taken = medians({case: flight.seconds for case, flight in flights.items()}, args.repeats)
+        durations = medians({case: flight.seconds for case, flight in flights.items()}, args.repeats)
         for case, flight in flights.items():
             flight.require_flying()
             report(
                 args.device,
                 benchmark="step",
-                engine=engine_of(sims[case]),
+                engine=engine_name(sims[case]),
                 controller=case[1],
                 control=control,
                 integrator=integrator,
@@ -62,9 +62,9 @@ def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: i
                 n_steps=n_steps,
                 randomised=args.randomised,
                 drag=not args.no_drag,
-                compile_s=compile_s.setdefault(case, round(flight.first_s - taken[case], 2)),
-                call_s=digits(taken[case]),
-                steps_per_s=digits(n_worlds * n_drones * n_steps / taken[case]),
+                compile_s=compile_s.setdefault(case, round(flight.first_s - durations[case], 2)),
+                call_s=digits(durations[case]),
+                steps_per_s=digits(n_worlds * n_drones * n_steps / durations[case]),
                 crazysim=__version__,
             )
 
@@ -90,14 +90,14 @@ def build(
     return sim
 
 
-def randomise_parameters(sim: Sim, spread: float = 1e-4) -> None:
+def randomise_parameters(sim: Sim, deviation: float = 1e-4) -> None:
     """Give every drone its own value of every parameter, varied so little that all of them still hover."""
     batch, key = (sim.n_worlds, sim.n_drones), jax.random.key(0)
 
     def randomise_leaf(scope: str, x: jax.Array) -> jax.Array:
         if scope != "shared" or not jnp.issubdtype(x.dtype, jnp.floating):
             return x
-        return x * jax.random.uniform(key, (*batch, *x.shape), x.dtype, 1 - spread, 1 + spread)
+        return x * jax.random.uniform(key, (*batch, *x.shape), x.dtype, 1 - deviation, 1 + deviation)
 
     data = sim.data
     params = jax.tree.map(randomise_leaf, scopes(data.params), data.params)

@@ -14,8 +14,8 @@ sources of the package are the same: an interrupted command continues where it w
 given this file. A process that was interrupted continues from its last checkpoint if its folder is still there. A
 failed training is reported at the end, and the others go on.
 
-``--write`` puts the rows of the tasks of which all seeds are finished into the committed table,
-docs/concepts/training-results.json, and into the page beside it. ``--check`` trains one seed of each task, and fails
+``--write`` puts the rows of tasks with all seeds finished into the committed table,
+docs/concepts/training-results.json, and into the page next to it. ``--check`` trains one seed of each task, and fails
 where its success is below the table's least by more than two standard errors of 1,000 starts. Arguments after ``--``
 are passed to ``crazysim train``.
 """
@@ -40,7 +40,7 @@ import numpy as np
 from measure import digits, machine, run_in_process
 
 import crazysim
-from crazysim.commands.training import seeds_of
+from crazysim.commands.training import parse_seeds
 from crazysim.envs.registry import TASKS, entry_of
 from crazysim.train.config import find_recipe
 from crazysim.train.show import read_curve
@@ -51,10 +51,10 @@ TABLE = Path(__file__).parents[1] / "docs" / "concepts" / "training-results.json
 """The committed table, a row for each task."""
 PAGE = TABLE.with_suffix(".md")
 """The page that shows the table, between two comments."""
-BEGIN, END = "<!-- table of benchmarks/train.py -->", "<!-- end of the table -->"
+TABLE_START, TABLE_END = "<!-- table of benchmarks/train.py -->", "<!-- end of the table -->"
 STARTS = 1000
 """Held-out starts of an evaluation of ``crazysim train``."""
-SHOWN = ("task", "seed", "success", "crashed", "error", "seconds")
+TABLE_COLUMNS = ("task", "seed", "success", "crashed", "error", "seconds")
 """Entries of a result that are printed."""
 
 
@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--tasks", nargs="+", help="tasks; by default hover, recover, track and race, or all to check")
     parser.add_argument("--all", action="store_true", help="train all built-in tasks")
-    parser.add_argument("--seeds", type=seeds_of, help="such as 0:20 or 3,5; by default 0:5, or 0 to check")
+    parser.add_argument("--seeds", type=parse_seeds, help="such as 0:20 or 3,5; by default 0:5, or 0 to check")
     parser.add_argument("--out", type=Path, default=Path("out/train"), help="folder of the runs")
     parser.add_argument("--parallel", type=int, default=1, help="processes that run at a time")
     parser.add_argument("--together", type=int, default=20, help="largest number of seeds of a process")
@@ -74,30 +74,32 @@ def main() -> None:
     mode = parser.add_mutually_exclusive_group()
     mode.add_argument("--write", action="store_true", help="write the committed table and the page")
     mode.add_argument("--check", action="store_true", help="compare with the committed table")
-    at = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
-    args, arguments = parser.parse_args(sys.argv[1:at]), sys.argv[at + 1 :]
+    split_index = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    args, arguments = parser.parse_args(sys.argv[1:split_index]), sys.argv[split_index + 1 :]
     if arguments and (args.write or args.check):
         parser.error("expected no arguments of the training with --write or --check: the table is of the recipes")
     tasks = args.tasks or (list(TASKS) if args.all or args.check else ["hover", "recover", "track", "race"])
     seeds = args.seeds or ([0] if args.check else [0, 1, 2, 3, 4])
 
     store, source = args.out / "results.jsonl", sources()
-    wanted = [(task, seed, args.device, *arguments) for seed in seeds for task in tasks]
-    results = {key: x for key, x in read(store).items() if key in wanted and (args.keep or x["sources"] == source)}
+    keys = [(task, seed, args.device, *arguments) for seed in seeds for task in tasks]
+    results = {
+        key: x for key, x in read_results(store).items() if key in keys and (args.keep or x["sources"] == source)
+    }
     failures = []
     if not args.only_plot:
-        missing = [key for key in wanted if key not in results]
-        print(json.dumps({"finished": len(results), "to_train": len(missing)}), flush=True)
-        groups = groups_of(missing, args.together)
+        missing_keys = [key for key in keys if key not in results]
+        print(json.dumps({"finished": len(results), "to_train": len(missing_keys)}), flush=True)
+        groups = group_runs(missing_keys, args.together)
         about = {"sources": source, "commit": args.commit, "parallel": min(args.parallel, max(len(groups), 1))}
-        if missing:
+        if missing_keys:
             about |= run_in_process(machine, args.device)  # in this process it would hold memory of the device
             cores = f"{about['cores']} cores of {about['processor']}"
             about["machine"] = cores if about["device"] == "cpu" else about["device"]
         failures = train_all(groups, args.out, store, about, results)
 
-    finished = {task: [results[key] for key in wanted if key[0] == task and key in results] for task in tasks}
-    rows = [row_of(runs) for runs in finished.values() if runs]
+    finished = {task: [results[key] for key in keys if key[0] == task and key in results] for task in tasks}
+    rows = [make_row(runs) for runs in finished.values() if runs]
     for row in rows:
         print(json.dumps(row), flush=True)
     if args.plot is not None:
@@ -105,7 +107,7 @@ def main() -> None:
     if args.write:
         write([row for row in rows if len(row["seeds"]) == len(seeds)])
     if args.check:
-        failures += check([run for runs in finished.values() for run in runs])
+        failures += check_success([run for runs in finished.values() for run in runs])
     if failures:
         raise SystemExit("\n".join(failures))
 
@@ -121,23 +123,23 @@ def sources() -> str:
 def commit() -> str:
     """Return the commit of the sources, with a + if the package has changed since; without Git, the version."""
     git = ["git", "-C", str(PACKAGE)]
-    found = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
-    if found.returncode:
+    process = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
+    if process.returncode:
         return crazysim.__version__
     changed = subprocess.run([*git, "status", "--porcelain", "--", "."], capture_output=True, text=True).stdout
-    return found.stdout.strip() + "+" * bool(changed)
+    return process.stdout.strip() + "+" * bool(changed)
 
 
-def read(store: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
+def read_results(store: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
     """Return the results in a file by task, seed, device and arguments, the last of each."""
     results = [json.loads(line) for line in store.read_text().splitlines()] if store.exists() else []
     return {(x["task"], x["seed"], x["on"], *x["arguments"]): x for x in results}
 
 
-def groups_of(missing: list[tuple[Any, ...]], largest: int) -> list[list[tuple[Any, ...]]]:
+def group_runs(keys: list[tuple[Any, ...]], largest: int) -> list[list[tuple[Any, ...]]]:
     """Return the runs to train in groups of at most ``largest`` that differ only in the seed, the longest first."""
     groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
-    for key in missing:
+    for key in keys:
         groups.setdefault((key[0], *key[2:]), []).append(key)
     parts = [group[i : i + largest] for group in groups.values() for i in range(0, len(group), largest)]
 
@@ -165,23 +167,23 @@ def train_all(
                 task, _, device, *arguments = runs[run][0]
                 seeds = [key[1] for key in runs[run]]
                 try:
-                    found = run.result()
+                    new_results = run.result()
                 except RuntimeError as error:
                     failures.append(f"{task}: training with seeds {', '.join(map(str, seeds))} failed")
                     print(json.dumps({"task": task, "seeds": seeds, "failed": str(error)}), flush=True)
                     continue
-                for key, result in zip(runs[run], found, strict=True):
+                for key, result in zip(runs[run], new_results, strict=True):
                     results[key] = {"task": task, "seed": key[1], "on": device, "arguments": arguments} | result | about
                     with store.open("a") as file:
                         file.write(json.dumps(results[key]) + "\n")
-                    print(json.dumps({name: results[key][name] for name in SHOWN}), flush=True)
+                    print(json.dumps({name: results[key][name] for name in TABLE_COLUMNS}), flush=True)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return failures
 
 
-def folder_of(out: Path, task: str, seeds: str, device: str, *arguments: str) -> Path:
+def run_folder(out: Path, task: str, seeds: str, device: str, *arguments: str) -> Path:
     """Return the folder of a run, which is in ``out`` even if the task is elsewhere, such as ``../task.py:NAME``."""
     return out / re.sub(r"[^A-Za-z0-9_.-]+", "_", "-".join([task, device, seeds, *arguments]))
 
@@ -199,7 +201,7 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
     """
     task, _, device, *arguments = group[0]
     seeds = ",".join(str(key[1]) for key in group)
-    folder = folder_of(out, task, seeds, device, *arguments)
+    folder = run_folder(out, task, seeds, device, *arguments)
     stamp = folder / "sources.txt"
     is_same = stamp.exists() and stamp.read_text() == about["sources"]
     if not is_same:
@@ -212,43 +214,43 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
     environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if about["parallel"] > 1 else {}) | os.environ
     # The same package as here, whatever the folder in which this runs.
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(PACKAGE.parent), os.environ.get("PYTHONPATH")]))
-    log, begin = folder.with_name(f"{folder.name}.log"), time.perf_counter()
+    log, start_time = folder.with_name(f"{folder.name}.log"), time.perf_counter()
     with log.open("w") as file:
-        done = subprocess.run(
+        process = subprocess.run(
             [*command, "--no-film", "--device", device, *arguments],
             stdout=file,
             stderr=subprocess.STDOUT,
             env=environment,
         )
-    wall_s = time.perf_counter() - begin
-    if done.returncode:
-        last = (log.read_text().strip().splitlines() or ["no output"])[-1]
-        raise RuntimeError(f"status {done.returncode}, {last} (see {log})")
+    wall_s = time.perf_counter() - start_time
+    if process.returncode:
+        last_line = (log.read_text().strip().splitlines() or ["no output"])[-1]
+        raise RuntimeError(f"status {process.returncode}, {last_line} (see {log})")
     algorithm = next(iter(stored_configs(folder).values())).algorithm
-    results = [result_of(folder / f"seed-{key[1]}") for key in group]
+    results = [read_result(folder / f"seed-{key[1]}") for key in group]
     shared = {"algorithm": algorithm, "wall_s": digits(wall_s), "together": len(group)}
     return [result | shared for result in results]
 
 
-def result_of(folder: Path) -> dict[str, Any]:
-    """Return the results of one seed from its learning curve; seconds are those of all seeds of its process."""
+def read_result(folder: Path) -> dict[str, Any]:
+    """Return the results of one seed from its learning curve; the seconds are the time of all seeds of its process."""
     curve = read_curve(folder)
-    point, last = kept_point(curve), curve[-1]
+    point, last_point = kept_point(curve), curve[-1]
     solved = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
     return {
         "success": round(point["success"], 4),
         "crashed": round(point["crashed"], 4),
         "error": digits(point["error"]) if point["error"] == point["error"] else None,
         "kept_iteration": point["iteration"],
-        "env_steps": last["env_steps"],
-        "seconds": digits(last["seconds"]),
-        "compile_seconds": digits(last["compile_seconds"]),
+        "env_steps": last_point["env_steps"],
+        "seconds": digits(last_point["seconds"]),
+        "compile_seconds": digits(last_point["compile_seconds"]),
         "seconds_to_95_percent": None if solved is None else digits(solved),
         "curve": [[digits(p["seconds"]), round(p["success"], 4)] for p in curve],
     }
 
 
-def row_of(runs: list[dict[str, Any]]) -> dict[str, Any]:
+def make_row(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the row of a task: quantiles of the success over its seeds, and medians of error and time."""
     success = [run["success"] for run in runs]
     errors = [run["error"] for run in runs if run["error"] is not None]
@@ -268,12 +270,12 @@ def row_of(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def write(rows: list[dict[str, Any]]) -> None:
     """Put rows into the committed table, and the table into the page."""
-    known = {row["task"]: row for row in [*json.loads(TABLE.read_text()), *rows]}
-    rows = [known[task] for task in [*TASKS, *sorted(known.keys() - TASKS)] if task in known]
+    rows_by_task = {row["task"]: row for row in [*json.loads(TABLE.read_text()), *rows]}
+    rows = [rows_by_task[task] for task in [*TASKS, *sorted(rows_by_task.keys() - TASKS)] if task in rows_by_task]
     TABLE.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
     page = PAGE.read_text()
-    before, after = page[: page.index(BEGIN)], page[page.index(END) :]
-    PAGE.write_text(f"{before}{BEGIN}\n\n{markdown(rows)}\n\n{after}")
+    page_start, page_end = page[: page.index(TABLE_START)], page[page.index(TABLE_END) :]
+    PAGE.write_text(f"{page_start}{TABLE_START}\n\n{markdown(rows)}\n\n{page_end}")
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
@@ -285,15 +287,15 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     ]
     for row in rows:
         seeds = row["seeds"]
-        joined = seeds == list(range(seeds[0], seeds[-1] + 1)) and len(seeds) > 2
+        is_range = seeds == list(range(seeds[0], seeds[-1] + 1)) and len(seeds) > 2
         cells = (
             f"`{row['task']}`",
             f"{names[row['algorithm']]}, {digits(row['env_steps'] / 1e6, 2):g} M",
-            f"{seeds[0]} to {seeds[-1]}" if joined else ", ".join(map(str, seeds)),
+            f"{seeds[0]} to {seeds[-1]}" if is_range else ", ".join(map(str, seeds)),
             f"{row['least']:.1%}",
             f"{row['median']:.1%}",
             "" if row["error"] is None else f"{digits(row['error'], 2):g} {row['unit']}",
-            time_of(row),
+            time_text(row),
             f"{row['commit']}, {row['date']}",
             f"{row['machine']}, jax {row['jax']}",
         )
@@ -301,24 +303,24 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def time_of(row: dict[str, Any]) -> str:
+def time_text(row: dict[str, Any]) -> str:
     """Return the training time in a row as text, with the number of seeds and processes that shared it."""
     text = f"{digits(row['seconds'], 2):g} s"
     text += f" for {row['together']} seeds" if row.get("together", 1) != 1 else ""
     return text + (f", {row['parallel']} at a time" if row["parallel"] != 1 else "")
 
 
-def check(runs: list[dict[str, Any]]) -> list[str]:
+def check_success(runs: list[dict[str, Any]]) -> list[str]:
     """Return a message for each run whose success is below the table's least by more than two standard errors."""
-    least = {row["task"]: row["least"] for row in json.loads(TABLE.read_text())}
+    required = {row["task"]: row["least"] for row in json.loads(TABLE.read_text())}
     failures = []
     for run in runs:
         task, success = run["task"], run["success"]
-        if task not in least:
+        if task not in required:
             failures.append(f"{task} has no row in {TABLE.name} to compare with. Add it with --tasks {task} --write.")
-        elif success < least_kept_success(least[task], STARTS):
+        elif success < least_kept_success(required[task], STARTS):
             failures.append(
-                f"{task}: expected at least {least[task]:.1%} as in {TABLE.name}, got {success:.1%} with seed "
+                f"{task}: expected at least {required[task]:.1%} as in {TABLE.name}, got {success:.1%} with seed "
                 f"{run['seed']}, lower by more than two standard errors of {STARTS:,} starts."
             )
     return failures

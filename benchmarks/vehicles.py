@@ -1,4 +1,4 @@
-"""Steps of cars per second: under commands, along paths, with trailers, and beside a drone.
+"""Steps of cars per second: under commands, along paths, with trailers, and together with a drone.
 
     python benchmarks/vehicles.py [--device gpu] [--worlds 1048576] [--cases drive kinematic path] [--steps 20]
 
@@ -12,7 +12,7 @@ import argparse
 from typing import Any
 
 import numpy as np
-from measure import digits, engine_of, medians, report, seconds
+from measure import digits, engine_name, medians, report, seconds
 
 from crazysim import Sim
 from crazysim.plugins.vehicles import Cars, PathLQR, PurePursuit, Stanley
@@ -55,8 +55,8 @@ def measure(case: str, args: argparse.Namespace) -> None:
         command: Any = [1.5 if cars.level == "speed" else 0.08, 0.2]
         sim.data = cars.commanded(sim.data, np.tile(np.asarray(command, np.float32), (n_worlds, args.cars, 1)))
     if case != "beside_drone":
-        of_cars = {k: fn for k, fn in sim.step_pipeline.items() if k.startswith("cars") or k == "increment_steps"}
-        sim.step_pipeline = type(sim.step_pipeline)(of_cars)
+        car_stages = {k: fn for k, fn in sim.step_pipeline.items() if k.startswith("cars") or k == "increment_steps"}
+        sim.step_pipeline = type(sim.step_pipeline)(car_stages)
         sim.build_step_fn()
 
     def step() -> Any:
@@ -66,7 +66,7 @@ def measure(case: str, args: argparse.Namespace) -> None:
     compile_s = seconds(step)
     for _ in range(10):
         step()
-    found = medians({"step": lambda: seconds(step)}, args.repeats)["step"]
+    step_s = medians({"step": lambda: seconds(step)}, args.repeats)["step"]
     record = cars.read(sim.data)
     speed, turn = np.asarray(record.body_vel[..., 0]), np.asarray(record.yaw_rate)
     if not (speed.min() > 0.5 and speed.max() < 3.0 and np.abs(turn).min() > 0.2):
@@ -76,12 +76,12 @@ def measure(case: str, args: argparse.Namespace) -> None:
         benchmark="vehicles",
         case=case,
         alone=case != "beside_drone",
-        engine=engine_of(sim),
+        engine=engine_name(sim),
         n_worlds=n_worlds,
         n_cars=args.cars,
         n_steps=args.steps,
         compile_s=round(compile_s, 2),
-        steps_per_s=digits(n_worlds * args.cars * args.steps / found),
+        steps_per_s=digits(n_worlds * args.cars * args.steps / step_s),
     )
 
 

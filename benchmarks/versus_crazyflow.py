@@ -118,38 +118,38 @@ class Versus:
             {"engine": engine, "controller": controller} for engine in self.engines for controller in controllers
         ]
         contestants = {json.dumps(variant): (ours, case | variant) for variant in variants}
-        found = self._measure(benchmark, contestants | {"crazyflow": (peer, case)})
+        durations = self._measure(benchmark, contestants | {"crazyflow": (peer, case)})
         steps = case["n_worlds"] * case["n_steps"]
         for variant in variants:
             line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{benchmark}", **variant, **case}
-            own = found[json.dumps(variant)]
-            for name, (seconds, compile_s) in (("crazysim", own), ("crazyflow", found["crazyflow"])):
+            own = durations[json.dumps(variant)]
+            for name, (seconds, compile_s) in (("crazysim", own), ("crazyflow", durations["crazyflow"])):
                 line[f"{name}_call_s"] = digits(seconds)
                 line[f"{name}_steps_per_s"] = digits(steps / seconds)
                 line[f"{name}_compile_s"] = round(compile_s, 2)
-            line["ratio"] = round(found["crazyflow"][0] / own[0], 2)
+            line["ratio"] = round(durations["crazyflow"][0] / own[0], 2)
             print(json.dumps(line | self.machine), flush=True)
 
     def question(self, task: str, **case: Any) -> None:
         """Print the time of a query in both programs."""
-        found = self._measure(task, {name: (worker, case) for name, worker in self.workers.items()})
+        durations = self._measure(task, {name: (worker, case) for name, worker in self.workers.items()})
         line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{task}", **case}
-        for name, (seconds, compile_s) in found.items():
+        for name, (seconds, compile_s) in durations.items():
             line[f"{name}_s"] = digits(seconds)
             line[f"{name}_compile_s"] = round(compile_s, 2)
-        line["ratio"] = round(found["crazyflow"][0] / found["crazysim"][0], 2)
+        line["ratio"] = round(durations["crazyflow"][0] / durations["crazysim"][0], 2)
         print(json.dumps(line | self.machine), flush=True)
 
-    def memory(self, few: int = 64, many: int = 1088) -> None:
+    def memory(self, min_worlds: int = 64, max_worlds: int = 1088) -> None:
         """Print the bytes per additional world after a contact query."""
         for n_drones in (1, 4):
             line: dict[str, Any] = {"benchmark": "versus_crazyflow/memory", "n_drones": n_drones}
             for name, worker in self.workers.items():
-                first, last = (
+                first_bytes, last_bytes = (
                     worker.request(do="memory", n_worlds=n, n_drones=n_drones, device=self.device)["bytes"]
-                    for n in (few, many)
+                    for n in (min_worlds, max_worlds)
                 )
-                line[f"{name}_bytes_per_world"] = round((last - first) / (many - few))
+                line[f"{name}_bytes_per_world"] = round((last_bytes - first_bytes) / (max_worlds - min_worlds))
             line["ratio"] = round(line["crazysim_bytes_per_world"] / line["crazyflow_bytes_per_world"], 4)
             print(json.dumps(line | self.machine), flush=True)
 
@@ -162,17 +162,17 @@ class Versus:
                 name: (self.workers["crazysim"], case | {"engine": engine, "n_worlds": worlds, "n_drones": drones})
                 for name, (worlds, drones) in sizes.items()
             }
-            found = self._measure("step", contestants)
+            durations = self._measure("step", contestants)
             line = {"benchmark": "swarm", "engine": engine, **case, "n_worlds": n_worlds, "n_drones": n_drones}
-            for name, (seconds, compile_s) in found.items():
+            for name, (seconds, compile_s) in durations.items():
                 line[f"{name}_steps_per_s"] = digits(n_worlds * n_drones * case["n_steps"] / seconds)
                 line[f"{name}_compile_s"] = round(compile_s, 2)
-            line["ratio"] = round(found["single"][0] / found["swarm"][0], 2)
+            line["ratio"] = round(durations["single"][0] / durations["swarm"][0], 2)
             print(json.dumps(line | self.machine), flush=True)
 
     def _measure(self, task: str, contestants: dict[str, tuple[Worker, Any]]) -> dict[str, tuple[float, float]]:
         """Return the median time of a call and of its compilation, s, alternating between the programs."""
-        first = {
+        first_durations = {
             name: worker.request(do="build", task=task, name=name, device=self.device, case=case)["seconds"]
             for name, (worker, case) in contestants.items()
         }
@@ -180,7 +180,7 @@ class Versus:
         seconds = medians(turns, self.repeats)
         for name, (worker, _) in contestants.items():
             worker.request(do="end", name=name)
-        return {name: (seconds[name], first[name] - seconds[name]) for name in contestants}
+        return {name: (seconds[name], first_durations[name] - seconds[name]) for name in contestants}
 
 
 def first_steps(pythons: dict[str, str], device: str, repeats: int = 3) -> None:

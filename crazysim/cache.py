@@ -139,7 +139,7 @@ def _prepare_folder(root: Path, path: Path) -> None:
     try:
         for folder in (root, path):
             make_private(folder)
-        free = shutil.disk_usage(path).free
+        free_bytes = shutil.disk_usage(path).free
     except OSError as error:
         raise ConfigError(
             f"expected a folder for compiled programs, got {str(path)!r}: {error}. Use another."
@@ -150,10 +150,10 @@ def _prepare_folder(root: Path, path: Path) -> None:
         )
     if not os.access(path, os.R_OK | os.W_OK | os.X_OK):
         raise ConfigError(f"expected a folder that can be written, got {str(path)!r}. Use another.")
-    if free < MIN_FREE_BYTES:
+    if free_bytes < MIN_FREE_BYTES:
         raise ConfigError(
-            f"expected {MIN_FREE_BYTES / 1e6:g} MB of free space for compiled programs, got {free / 1e6:.1f} MB in "
-            f"{str(path)!r}. Free some, or use another folder."
+            f"expected {MIN_FREE_BYTES / 1e6:g} MB of free space for compiled programs, got {free_bytes / 1e6:.1f} MB "
+            f"in {str(path)!r}. Free some, or use another folder."
         )
     trim(root)
 
@@ -204,15 +204,15 @@ class keep_programs(contextlib.ContextDecorator):
 
     _entered = threading.local()
 
-    def __init__(self, when: bool = True):
+    def __init__(self, enabled: bool = True):
         """Choose whether the block keeps programs."""
-        self._when = when
+        self._enabled = enabled
 
     def __enter__(self) -> None:
         """Open the cache, unless an outer block has."""
         stack = self._entered.__dict__.setdefault("stack", [])
         context = None
-        if self._when and not any(stack) and jaxcompat.cache_folder() is None and (path := folder()) is not None:
+        if self._enabled and not any(stack) and jaxcompat.cache_folder() is None and (path := folder()) is not None:
             context = jaxcompat.compilation_cache(str(path))
             context.__enter__()
         stack.append(context)
@@ -258,8 +258,8 @@ def announce(work: str, seconds: str) -> None:
     if work in _announced:
         return
     _announced.add(work)
-    later = "" if folder() is None else ", less in later runs"
-    print(f"{work}: {seconds} on two cores{later}", file=sys.stderr, flush=True)
+    suffix = "" if folder() is None else ", less in later runs"
+    print(f"{work}: {seconds} on two cores{suffix}", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

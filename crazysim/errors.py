@@ -109,8 +109,8 @@ class UnsupportedError(Exception):
     @property
     def reason(self) -> str:
         """Reason, with the primitive."""
-        named = not self.primitive or f"'{self.primitive}'" in self.cause
-        return self.cause if named else f"primitive {self.primitive!r}: {self.cause}"
+        has_name = not self.primitive or f"'{self.primitive}'" in self.cause
+        return self.cause if has_name else f"primitive {self.primitive!r}: {self.cause}"
 
     def __str__(self) -> str:
         """Return the reason, with the stage and the version of JAX where the stage is known."""

@@ -77,6 +77,7 @@ __all__ = [
     "is_symbolic_zero",
     "jaxpr_as_fun",
     "jit_donating",
+    "make_vmap_rule",
     "n_compilations",
     "primitive_by_platform",
     "put_host_array",
@@ -86,7 +87,6 @@ __all__ = [
     "threefry2x32_p",
     "threefry_prng_impl",
     "versions",
-    "vmap_rule_of",
 ]
 
 FALLBACKS = os.environ.get("CRAZYSIM_JAX_FALLBACKS") == "1"
@@ -110,20 +110,20 @@ def select_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
     """
     inner = jaxpr.jaxpr
     if FALLBACKS:
-        unused = [_zeros(v.aval) for v in inner.invars]
+        zero_inputs = [_zeros(v.aval) for v in inner.invars]
 
         def fn(*args: Any) -> list[Any]:
-            arg_at = dict(zip(inputs, args, strict=True))
-            return jaxpr_as_fun(jaxpr)(*(arg_at.get(i, zeros) for i, zeros in enumerate(unused)))
+            arg_by_index = dict(zip(inputs, args, strict=True))
+            return jaxpr_as_fun(jaxpr)(*(arg_by_index.get(i, zeros) for i, zeros in enumerate(zero_inputs)))
 
-        return _traced(fn, [inner.invars[i] for i in inputs])
+        return _trace_function(fn, [inner.invars[i] for i in inputs])
     invars = [inner.invars[i] for i in inputs]
     return ClosedJaxpr(
         Jaxpr(inner.constvars, invars, inner.outvars, inner.eqns, inner.effects, inner.debug_info), jaxpr.consts
     )
 
 
-def _traced(fn: Callable[..., Any], variables: Sequence[Any]) -> ClosedJaxpr:
+def _trace_function(fn: Callable[..., Any], variables: Sequence[Any]) -> ClosedJaxpr:
     """Return the jaxpr of a function of some variables of another jaxpr."""
     avals = [(v.aval, getattr(v.aval, "weak_type", False)) for v in variables]
     return jax.make_jaxpr(fn)(*(jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=weak) for x, weak in avals))
@@ -195,7 +195,7 @@ def read_equation(eqn: Any) -> Iterator[Equation]:
 
 
 def batched_primitive(
-    name: str, results: Callable[..., list[Any]], batched: Callable[..., Any], outside: Callable[..., Any]
+    name: str, results: Callable[..., list[Any]], batched: Callable[..., Any], refuse: Callable[..., Any]
 ) -> Primitive:
     """Return a primitive that ``vmap`` replaces by other operations.
 
@@ -204,14 +204,14 @@ def batched_primitive(
         results: Function from operands and parameters to the shapes and types of the results.
         batched: Function from the axis of ``vmap``, which has ``name`` and ``size``, the operands, their batched
             dimensions and parameters to results and their batched dimensions.
-        outside: Function that raises an error; called if no ``vmap`` has replaced the primitive.
+        refuse: Function that raises an error; called if no ``vmap`` has replaced the primitive.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
-    primitive.def_impl(outside)
+    primitive.def_impl(refuse)
     primitive.def_abstract_eval(results)
     batching.fancy_primitive_batchers[primitive] = batched
-    mlir.register_lowering(primitive, outside)
+    mlir.register_lowering(primitive, refuse)
     return primitive
 
 
@@ -235,7 +235,7 @@ def simple_primitive(name: str, fn: Callable[..., list[Any]], batched: Callable[
 def primitive_by_platform(
     name: str,
     results: Callable[..., Sequence[Any]],
-    on: Mapping[str, Callable[..., Any]],
+    functions: Mapping[str, Callable[..., Any]],
     *,
     derivative: Callable[..., Sequence[Any]] | None = None,
     transposed: Callable[..., Sequence[Any]] | None = None,
@@ -248,9 +248,10 @@ def primitive_by_platform(
     Args:
         name: Its name.
         results: Function that returns the shapes and types of the results.
-        on: Functions that return a list of results, by platform: ``"cpu"``, ``"cuda"``, ...; ``""`` for all others.
+        functions: Functions that return a list of results, by platform: ``"cpu"``, ``"cuda"``, ...; ``""`` for all
+            others.
         derivative: The same function, written so that JAX can differentiate it.
-        transposed: For a function that is linear in all operands but the first ``n_fixed``, which is a
+        transposed: For a function that is linear in all operands but the first ``n_nonlinear``, which is a
             parameter: function from these operands and the cotangents of all results to the cotangents of the others.
         batched: Rule for ``vmap``: function from the primitive, the size of the axis, the operands, whose batched axis
             comes first, and whether each is batched, to results that are all batched.
@@ -259,47 +260,49 @@ def primitive_by_platform(
     primitive.multiple_results = True
     primitive.def_impl(lambda *args, **params: _compiled_primitive(primitive, **params)(*args))
     primitive.def_abstract_eval(lambda *args, **params: list(map(jax.typeof, results(*args, **params))))
-    for platform, fn in on.items():
+    for platform, fn in functions.items():
         mlir.register_lowering(primitive, mlir.lower_fun(fn, multiple_results=True), platform=platform or None)
     if derivative is not None:
-        ad.primitive_jvps[primitive] = functools.partial(_derivative_of, derivative)
+        ad.primitive_jvps[primitive] = functools.partial(_apply_derivative, derivative)
     if transposed is not None:
-        ad.primitive_transposes[primitive] = functools.partial(_transposed_by, transposed)
+        ad.primitive_transposes[primitive] = functools.partial(_apply_transpose, transposed)
     if batched is not None:
-        batching.primitive_batchers[primitive] = functools.partial(_batched_by, batched, primitive)
+        batching.primitive_batchers[primitive] = functools.partial(_apply_batching, batched, primitive)
     return primitive
 
 
-def _derivative_of(fn: Callable[..., Any], primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> Any:
-    changing = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
+def _apply_derivative(fn: Callable[..., Any], primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> Any:
+    perturbed = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
 
-    def apply(*changed: Any) -> Any:
+    def apply(*values: Any) -> Any:
         args = list(primals)
-        for i, x in zip(changing, changed, strict=True):
+        for i, x in zip(perturbed, values, strict=True):
             args[i] = x
         return list(fn(*args, **params))
 
-    return jax.jvp(apply, tuple([primals[i] for i in changing]), tuple([tangents[i] for i in changing]))
+    return jax.jvp(apply, tuple([primals[i] for i in perturbed]), tuple([tangents[i] for i in perturbed]))
 
 
-def _transposed_by(
-    fn: Callable[..., Any], cotangents: Sequence[Any], *args: Any, n_fixed: int, **params: Any
+def _apply_transpose(
+    fn: Callable[..., Any], cotangents: Sequence[Any], *args: Any, n_nonlinear: int, **params: Any
 ) -> list[Any]:
-    fixed, linear = args[:n_fixed], args[n_fixed:]
-    results = fn(fixed, [ad.instantiate_zeros(x) for x in cotangents], n_fixed=n_fixed, **params)
-    of_linear = [x if ad.is_undefined_primal(arg) else None for x, arg in zip(results, linear, strict=True)]
-    return [*(None for _ in fixed), *of_linear]
+    nonlinear, linear_args = args[:n_nonlinear], args[n_nonlinear:]
+    results = fn(nonlinear, [ad.instantiate_zeros(x) for x in cotangents], n_nonlinear=n_nonlinear, **params)
+    linear_cotangents = [
+        x if ad.is_undefined_primal(arg) else None for x, arg in zip(results, linear_args, strict=True)
+    ]
+    return [*(None for _ in nonlinear), *linear_cotangents]
 
 
-def _batched_by(fn: Callable[..., Any], primitive: Primitive, args: Any, dims: Any, **params: Any) -> Any:
+def _apply_batching(fn: Callable[..., Any], primitive: Primitive, args: Any, dims: Any, **params: Any) -> Any:
     batched = [d is not None for d in dims]
-    moved = [jax.numpy.moveaxis(x, d, 0) if b else x for x, d, b in zip(args, dims, batched, strict=True)]
-    n = next(x.shape[0] for x, b in zip(moved, batched, strict=True) if b)
-    out = list(fn(primitive, n, moved, batched, **params))
-    return out, [0] * len(out)
+    moved_args = [jax.numpy.moveaxis(x, d, 0) if b else x for x, d, b in zip(args, dims, batched, strict=True)]
+    n = next(x.shape[0] for x, b in zip(moved_args, batched, strict=True) if b)
+    results = list(fn(primitive, n, moved_args, batched, **params))
+    return results, [0] * len(results)
 
 
-def vmap_rule_of(fn: Callable[..., Any]) -> Callable[..., Any]:
+def make_vmap_rule(fn: Callable[..., Any]) -> Callable[..., Any]:
     """Return a rule for ``vmap`` that replaces a primitive by a function, mapped over the operands."""
 
     def rule(primitive: Primitive, n: int, args: Sequence[Any], batched: Sequence[bool], **params: Any) -> Any:
@@ -314,14 +317,16 @@ def _compiled_primitive(primitive: Primitive, **params: Any) -> Callable[..., An
     return jax.jit(functools.partial(primitive.bind, **params))
 
 
-def constants_to_inputs(closed: ClosedJaxpr) -> ClosedJaxpr:
+def constants_to_inputs(closed_jaxpr: ClosedJaxpr) -> ClosedJaxpr:
     """Return a jaxpr that takes its constants as its first inputs."""
-    x = closed.jaxpr
+    jaxpr = closed_jaxpr.jaxpr
     if FALLBACKS:
-        n = len(closed.consts)
-        fn = lambda *args: jaxpr_as_fun(ClosedJaxpr(x, args[:n]))(*args[n:])  # noqa: E731
-        return _traced(fn, [*x.constvars, *x.invars])
-    return ClosedJaxpr(Jaxpr((), [*x.constvars, *x.invars], x.outvars, x.eqns, x.effects, x.debug_info), ())
+        n = len(closed_jaxpr.consts)
+        fn = lambda *args: jaxpr_as_fun(ClosedJaxpr(jaxpr, args[:n]))(*args[n:])  # noqa: E731
+        return _trace_function(fn, [*jaxpr.constvars, *jaxpr.invars])
+    return ClosedJaxpr(
+        Jaxpr((), [*jaxpr.constvars, *jaxpr.invars], jaxpr.outvars, jaxpr.eqns, jaxpr.effects, jaxpr.debug_info), ()
+    )
 
 
 def bind(eqn: Any, *args: Any, **params: Any) -> list[Any]:
@@ -332,8 +337,8 @@ def bind(eqn: Any, *args: Any, **params: Any) -> list[Any]:
         args: The operands.
         params: Parameters that replace parameters of the equation.
     """
-    out = eqn.primitive.bind(*args, **(dict(eqn.params) | params))
-    return list(out) if eqn.primitive.multiple_results else [out]
+    results = eqn.primitive.bind(*args, **(dict(eqn.params) | params))
+    return list(results) if eqn.primitive.multiple_results else [results]
 
 
 def as_function(eqn: Any) -> Callable[..., Any]:
@@ -399,9 +404,9 @@ def batched_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[.
         fn: The function.
         rule: ``rule(axis_size, in_batched, *args) -> (results, out_batched)``.
     """
-    call = custom_vmap(fn)
-    call.def_vmap(rule)
-    return call
+    batched_fn = custom_vmap(fn)
+    batched_fn.def_vmap(rule)
+    return batched_fn
 
 
 def is_symbolic_zero(tangent: Any) -> bool:
@@ -445,7 +450,7 @@ def compilation_cache(folder: str) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         for setting in settings:
             stack.enter_context(setting)
-        stack.enter_context(_closed_outside(close))
+        stack.enter_context(_close_cache_outside(close))
         yield
 
 
@@ -455,7 +460,7 @@ _BLOCKS_LOCK = threading.Lock()
 
 
 @contextlib.contextmanager
-def _closed_outside(close: Callable[[], None]) -> Iterator[None]:
+def _close_cache_outside(close: Callable[[], None]) -> Iterator[None]:
     """Close JAX's cache before the first and after the last of the blocks that overlap: it does so without a lock."""
     global _blocks
     with _BLOCKS_LOCK:

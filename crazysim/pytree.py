@@ -190,10 +190,10 @@ def leaf_indices(tree: Any) -> Any:
 
 def replace_leaves(leaves: Sequence[T], indices: Sequence[int], values: Sequence[T]) -> list[T]:
     """Return a list of leaves with other values at some indices."""
-    out = list(leaves)
+    new_leaves = list(leaves)
     for i, value in zip(indices, values, strict=True):
-        out[i] = value
-    return out
+        new_leaves[i] = value
+    return new_leaves
 
 
 def leaf_flags(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
@@ -205,7 +205,7 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
     """Check that every leaf has the axes of its scope: a parameter of one drone must not pass for one of a world."""
     batches = {"world": (n_worlds, 1), "shared": ()}
 
-    def check(x: Any, metadata: Any, name: str, members: Members | None) -> None:
+    def check_leaf(x: Any, metadata: Any, name: str, members: Members | None) -> None:
         scope = _scope(x, metadata, members)
         if scope == "opaque":
             return
@@ -240,7 +240,7 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
                 f"with jnp.broadcast_to."
             )
 
-    _map_leaves(check, tree, {}, "data", None)
+    _map_leaves(check_leaf, tree, {}, "data", None)
 
 
 def _map_leaves(

@@ -59,8 +59,8 @@ def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
         (..., m)
     """
     columns = (matrix[..., :, k] * vector[..., k : k + 1] for k in range(matrix.shape[-1]))
-    start: Any = 0 if offset is None else offset
-    return sum(columns, start)
+    initial: Any = 0 if offset is None else offset
+    return sum(columns, initial)
 
 
 @jax.custom_jvp
@@ -244,12 +244,12 @@ def heading(q: Array) -> tuple[Array, Array]:
     are the vectors of yaw zero.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    along = jnp.stack([x * x + w * w - y * y - z * z, 2 * (x * y + w * z)], axis=-1)
-    square = dot(along, along)
+    projection = jnp.stack([x * x + w * w - y * y - z * z, 2 * (x * y + w * z)], axis=-1)
+    square = dot(projection, projection)
     is_zero = square < 1e-24  # the gradient divides by its power 3/2
     inverse = 1 / jnp.sqrt(jnp.where(is_zero, 1.0, square))
-    along = jnp.where(is_zero, jnp.asarray([1.0, 0.0], q.dtype), along * inverse)
-    cos, sin, zero = along[..., 0], along[..., 1], jnp.zeros_like(x)
+    projection = jnp.where(is_zero, jnp.asarray([1.0, 0.0], q.dtype), projection * inverse)
+    cos, sin, zero = projection[..., 0], projection[..., 1], jnp.zeros_like(x)
     return jnp.stack([cos, sin, zero], axis=-1), jnp.stack([-sin, cos, zero], axis=-1)
 
 

@@ -247,7 +247,7 @@ def read_source(
             f"expected a {kind} as a name, the path of a TOML file, a dict or {loaded}, got {short_repr(source)}"
         )
     if str(source) in names:
-        return str(source), "", _built_in(folder / f"{source}.toml", guide)
+        return str(source), "", _read_built_in(folder / f"{source}.toml", guide)
     if not is_file(source):
         raise UnknownNameError(
             f"expected a {kind} as one of {', '.join(names)}, the path of a .toml file, or a dict, got "
@@ -257,7 +257,7 @@ def read_source(
 
 
 @functools.cache
-def _built_in(path: Path, guide: str) -> Mapping[str, Any]:
+def _read_built_in(path: Path, guide: str) -> Mapping[str, Any]:
     return read_toml(path, guide)
 
 

@@ -49,8 +49,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     overview = files.get_file_from_path("README.md")
     if overview is not None:
         files.remove(overview)
-    for source, place in ROOT_PAGES.items():
-        files.append(File.generated(config, place, content=(ROOT / source).read_text()))
+    for source, target in ROOT_PAGES.items():
+        files.append(File.generated(config, target, content=(ROOT / source).read_text()))
     for path in sorted((ROOT / "docs" / "examples").glob("*.py")):
         files.append(File.generated(config, f"examples/{path.stem}.md", content=_example_page(path)))
     for module in _public_modules():
@@ -78,14 +78,14 @@ def _site_link(match: re.Match[str], page: str) -> str:
     A link to a file of the repository that is not on the site becomes plain text.
     """
     text, link, anchor = match[1], match[2], match[3] or ""
-    source = next((source for source, place in ROOT_PAGES.items() if place == page), f"docs/{page}")
+    source = next((source for source, site_path in ROOT_PAGES.items() if site_path == page), f"docs/{page}")
     target = os.path.normpath(PurePosixPath(source).parent / link)
     if target not in ROOT_PAGES and not target.startswith("docs/") and (ROOT / target).exists():
         return text
-    place = ROOT_PAGES.get(target, target.removeprefix("docs/"))
+    site_path = ROOT_PAGES.get(target, target.removeprefix("docs/"))
     if target.startswith("docs/examples/") and target.endswith(".py"):
-        place = place.removesuffix(".py") + ".md"
-    return f"[{text}]({os.path.relpath(place, PurePosixPath(page).parent)}{anchor})"
+        site_path = site_path.removesuffix(".py") + ".md"
+    return f"[{text}]({os.path.relpath(site_path, PurePosixPath(page).parent)}{anchor})"
 
 
 def _example_page(path: Path) -> str:
@@ -110,13 +110,13 @@ def _public_modules() -> list[griffe.Module]:
     return _modules
 
 
-def _collect(module: griffe.Module, found: list[griffe.Module]) -> None:
+def _collect(module: griffe.Module, modules: list[griffe.Module]) -> None:
     if module.name.startswith("_"):
         return
-    found.append(module)
+    modules.append(module)
     for name in sorted(module.modules):
         if not module.modules[name].is_alias:
-            _collect(module.modules[name], found)
+            _collect(module.modules[name], modules)
 
 
 def _reference_path(module: griffe.Module) -> str:
@@ -126,8 +126,8 @@ def _reference_path(module: griffe.Module) -> str:
 
 def _reference_page(module: griffe.Module) -> str:
     """Return the page of a module: its docstring, the names that it exports from elsewhere, and its own members."""
-    own = [name for name, member in module.members.items() if not (name.startswith("_") or _elsewhere(member))]
-    options = f"    options: {{show_root_heading: false, members: {own or 'false'}}}"
+    members = [name for name, member in module.members.items() if not (name.startswith("_") or _elsewhere(member))]
+    options = f"    options: {{show_root_heading: false, members: {members or 'false'}}}"
     lines = [f"# {module.path}\n", f"::: {module.path}\n{options}\n"]
     exported = [name for name in map(str, module.exports or []) if name in module.members and module[name].is_alias]
     if exported:
@@ -169,7 +169,7 @@ def _reference_nav() -> list[dict[str, Any]]:
     for module in modules:
         package = module if module.is_package or module.is_subpackage else module.parent
         assert package is not None
-        place = _reference_path(module)
-        sections.setdefault(package.path, []).append(place if package is module else {module.name: place})
+        path = _reference_path(module)
+        sections.setdefault(package.path, []).append(path if package is module else {module.name: path})
     nav: list[dict[str, Any]] = [{root.path: [_reference_path(root), *sections.pop(root.path)]}]
     return nav + [{name.removeprefix(f"{root.path}."): pages} for name, pages in sections.items()]

@@ -21,8 +21,8 @@ def page_list(name: str, description: str, places: dict[str, str]) -> str:
     """
 
     def link(match: re.Match[str]) -> str:
-        place = places.get(os.path.normpath(f"docs/{match[2]}"), match[2])
-        return f"[{match[1]}]({place.removesuffix('.md')}.html)"
+        target = places.get(os.path.normpath(f"docs/{match[2]}"), match[2])
+        return f"[{match[1]}]({target.removesuffix('.md')}.html)"
 
     pages = CONTENTS.read_text().partition("\n## ")
     return f"# {name}\n\n> {description} [All pages as one text](llms-full.txt).\n{pages[1]}{LINK.sub(link, pages[2])}"

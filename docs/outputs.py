@@ -58,14 +58,14 @@ def blocks(text: str) -> Iterator[Block]:
         yield Block(code, match["file"], match["output"], match["example"] is not None, match.end())
 
 
-def run(block: Block, page: Path, namespace: dict[str, Any]) -> str:
+def run_block(block: Block, page: Path, namespace: dict[str, Any]) -> str:
     """Execute a block, in a namespace or as a file of its own, and return what it prints.
 
     Lines are without spaces at their ends.
     """
-    with contextlib.redirect_stdout(io.StringIO()) as printed, _as_file(block) as own:
+    with contextlib.redirect_stdout(io.StringIO()) as printed, _as_file(block) as file_namespace:
         code = compile(block.code, str(page), "exec", dont_inherit=True)
-        exec(code, namespace if own is None else own)
+        exec(code, namespace if file_namespace is None else file_namespace)
     return "".join(f"{line.rstrip()}\n" for line in printed.getvalue().strip("\n").splitlines())
 
 
@@ -88,29 +88,29 @@ def _as_file(block: Block) -> Iterator[dict[str, Any] | None]:
                 del sys.modules[name]
 
 
-def same(shown: str, printed: str, example: bool = False) -> bool:
-    """Return True where the output that a page shows is that of its block.
+def is_same_output(page_text: str, printed: str, example: bool = False) -> bool:
+    """Return True if a page shows the output of its block.
 
     An example has the same words, whatever the numbers. In other outputs ``...`` stands for any text. Spaces and line
     breaks do not count. Integers are equal. Other numbers may differ by 2%, by 2 in the last digit that the page shows,
     or by 2e-5: processors and versions of JAX round differently.
     """
     if example:
-        return _words(shown) == _words(printed)
-    parts = [TOKEN.findall(part) for part in shown.split("...")]
+        return _words(page_text) == _words(printed)
+    parts = [TOKEN.findall(part) for part in page_text.split("...")]
     tokens = TOKEN.findall(printed)
     if len(parts) == 1:
         return _equal(parts[0], tokens)
-    first, *middle, last = parts
-    start, end = len(first), len(tokens) - len(last)
-    if start > end or not (_equal(first, tokens[:start]) and _equal(last, tokens[end:])):
+    first_part, *middle, last_part = parts
+    start, end = len(first_part), len(tokens) - len(last_part)
+    if start > end or not (_equal(first_part, tokens[:start]) and _equal(last_part, tokens[end:])):
         return False
     for part in middle:
         places = range(start, end - len(part) + 1)
-        found = next((i for i in places if _equal(part, tokens[i : i + len(part)])), None)
-        if found is None:
+        position = next((i for i in places if _equal(part, tokens[i : i + len(part)])), None)
+        if position is None:
             return False
-        start = found + len(part)
+        start = position + len(part)
     return True
 
 
@@ -118,20 +118,20 @@ def _words(text: str) -> set[str]:
     return {token for token in TOKEN.findall(text) if not NUMBER.fullmatch(token)}
 
 
-def _equal(shown: list[str], printed: list[str]) -> bool:
-    return len(shown) == len(printed) and all(map(_token_equal, shown, printed))
+def _equal(page_tokens: list[str], printed: list[str]) -> bool:
+    return len(page_tokens) == len(printed) and all(map(_token_equal, page_tokens, printed))
 
 
-def _token_equal(shown: str, printed: str) -> bool:
-    if shown == printed:
+def _token_equal(page_token: str, printed: str) -> bool:
+    if page_token == printed:
         return True
-    if not (NUMBER.fullmatch(shown) and NUMBER.fullmatch(printed)):
+    if not (NUMBER.fullmatch(page_token) and NUMBER.fullmatch(printed)):
         return False
-    if shown.lstrip("+-").isdigit() and printed.lstrip("+-").isdigit():
-        return int(shown) == int(printed)
-    mantissa, _, exponent = shown.lower().partition("e")
+    if page_token.lstrip("+-").isdigit() and printed.lstrip("+-").isdigit():
+        return int(page_token) == int(printed)
+    mantissa, _, exponent = page_token.lower().partition("e")
     last_digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
-    a, b = float(shown), float(printed)
+    a, b = float(page_token), float(printed)
     return abs(a - b) <= max(0.02 * max(abs(a), abs(b)), 2.1 * last_digit, 2e-5)
 
 
@@ -141,10 +141,10 @@ def _update(page: Path) -> int:
     namespace: dict[str, Any] = {"__name__": "page"}
     pieces, start, changed = [], 0, 0
     for block in blocks(text):
-        printed = run(block, page, namespace)
+        printed = run_block(block, page, namespace)
         piece = text[start : block.end]
         start = block.end
-        if printed and not (block.output is not None and same(block.output, printed, block.example)):
+        if printed and not (block.output is not None and is_same_output(block.output, printed, block.example)):
             if block.output is not None:
                 piece = piece[: piece.rindex("\n```text")]
             title = ' title="for example"' if block.example else ""

@@ -37,12 +37,12 @@ FPS = 20
 def flight() -> None:
     """Five Crazyflies on one figure eight around two poles, for one period: the picture repeats without a jump."""
     path = figure_eight(width=1.8, depth=1.1, period=4.0, height=0.45)
-    start = -float(path.duration) * np.arange(5) / 5
+    start_times = -float(path.duration) * np.arange(5) / 5
     sim = Sim(n_drones=5, control="state", controller="geometric")
     sim.scene.add("pole", count=2, pos=[[-0.5, 0, 0], [0.5, 0, 0]], height=0.9, radius=0.03)
-    sim.add(Follow(path, start=start))
-    at = jax.vmap(path.evaluate)(-start)
-    sim.data = flying(sim.data, at.pos, vel=at.vel)
+    sim.add(Follow(path, start=start_times))
+    positions = jax.vmap(path.evaluate)(-start_times)
+    sim.data = flying(sim.data, positions.pos, vel=positions.vel)
     camera = {"lookat": [0, 0, 0.36], "distance": 1.75, "azimuth": 105, "elevation": -24}
     view = View([0], 640, 360, cam_config=camera, trail=0.9, rgba=COLOURS)
 
@@ -53,9 +53,15 @@ def flight() -> None:
             if frame >= 4 * FPS:  # the first round fills the trails
                 yield Image.fromarray(image)
 
-    first, *rest = frames()
-    first.save(
-        FOLDER / "flight.webp", save_all=True, append_images=rest, duration=1000 // FPS, loop=0, quality=55, method=6
+    first_frame, *other_frames = frames()
+    first_frame.save(
+        FOLDER / "flight.webp",
+        save_all=True,
+        append_images=other_frames,
+        duration=1000 // FPS,
+        loop=0,
+        quality=55,
+        method=6,
     )
     sim.close()
 
@@ -76,26 +82,26 @@ def allan() -> None:
     gyro = sensors.Triad(noise=0.014 * RAD_PER_DEGREE, instability=5.1e-5, correlation_time=20.0, random_walk=5e-6)
     accel = sensors.Triad(noise=160e-6 * STANDARD_GRAVITY, instability=3e-4, correlation_time=20.0, random_walk=3e-5)
     sim.add(IMU(gyro=gyro, accel=accel))
-    kept = sim.rollout(
+    records = sim.rollout(
         lambda _, data: data.controls.rotor_vel, None, 400 * freq, keep=lambda data: data.plugins["imu"].samples.value
     )
-    samples = np.asarray(kept, np.float64)[freq:, :, 0]  # in the first second the drones come to rest on the floor
+    samples = np.asarray(records, np.float64)[freq:, :, 0]  # in the first second the drones come to rest on the floor
     m = np.unique(np.logspace(0, 4.1, 24).astype(int))
     t, fine = m / freq, np.logspace(-2, 2.1, 200)
     figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.2), layout="constrained")
-    for axis, triad, first, unit in ((axes[0], gyro, 0, "rad/s"), (axes[1], accel, 3, "m/s²")):
-        total = np.cumsum(samples[..., first : first + 3], axis=0) / freq
+    for axis, triad, column, unit in ((axes[0], gyro, 0, "rad/s"), (axes[1], accel, 3, "m/s²")):
+        total = np.cumsum(samples[..., column : column + 3], axis=0) / freq
         steps = [total[2 * k :] - 2 * total[k:-k] + total[: -2 * k] for k in m]
-        found = [np.sqrt(np.mean(x**2) / 2) / (k / freq) for x, k in zip(steps, m, strict=True)]
+        deviations = [np.sqrt(np.mean(x**2) / 2) / (k / freq) for x, k in zip(steps, m, strict=True)]
         ratio = fine / triad.correlation_time
         wander = triad.instability**2 * (2 * ratio - 3 + 4 * np.exp(-ratio) - np.exp(-2 * ratio)) / ratio**2
         white, walk = triad.noise**2 / (2 * fine), triad.random_walk**2 * fine / 3
         axis.loglog(fine, np.sqrt(white + wander + walk), "k-", lw=1, label="of the parameters")
         for part, name in ((white, "white noise"), (wander, "wandering bias"), (walk, "random walk")):
             axis.loglog(fine, np.sqrt(part), "--", lw=0.8, label=name)
-        axis.loglog(t, found, "o", ms=4, mfc="none", label=f"simulated, {n} units")
+        axis.loglog(t, deviations, "o", ms=4, mfc="none", label=f"simulated, {n} units")
         axis.set(xlabel="averaging time, s", ylabel=f"Allan deviation, {unit}")
-        axis.set_ylim(min(found) / 4, max(found) * 2)
+        axis.set_ylim(min(deviations) / 4, max(deviations) * 2)
         axis.grid(alpha=0.3)
     axes[0].set_title("gyroscope")
     axes[1].set_title("accelerometer")
@@ -109,24 +115,24 @@ def measured() -> None:
     path = figure_eight(width=1.8, depth=1.1, period=4.0, height=0.6)
     sim = Sim(control="state", rng_key=3)
     sim.add(Follow(path))
-    at = path.evaluate(0.0)
-    sim.data = flying(sim.data, at.pos[None], vel=at.vel[None])
+    start_setpoint = path.evaluate(0.0)
+    sim.data = flying(sim.data, start_setpoint.pos[None], vel=start_setpoint.vel[None])
     sim.add(MotionCapture(5e-3, delay=0.02, dropout=0.1, bandwidth=10.0))
     sim.add(IMU.bmi088())
     sim.add(sensors.TimeOfFlight())
-    truth, seen = [], []
+    true_values, measured_values = [], []
     for _ in range(4 * 100):
         sim.step(sim.freq // 100)
-        s, found = sim.data.states, sim.plugins.observations(sim.data)
-        truth.append([s.vel[0, 0, 0], s.ang_vel[0, 0, 1], s.pos[0, 0, 2]])
+        s, observations = sim.data.states, sim.plugins.observations(sim.data)
+        true_values.append([s.vel[0, 0, 0], s.ang_vel[0, 0, 1], s.pos[0, 0, 2]])
         names = ("motion_capture.vel", "imu.gyro", "time_of_flight.distance")
-        seen.append([found[name][0, 0, k] for name, k in zip(names, (0, 1, 0), strict=True)])
-    t, truth, seen = np.arange(1, 401) / 100, np.array(truth), np.array(seen)
+        measured_values.append([observations[name][0, 0, k] for name, k in zip(names, (0, 1, 0), strict=True)])
+    t, true_values, measured_values = np.arange(1, 401) / 100, np.array(true_values), np.array(measured_values)
     figure, axes = plt.subplots(3, 1, figsize=(8.4, 5.4), sharex=True, layout="constrained")
     labels = ("velocity x, m/s\nMotionCapture", "pitch rate, rad/s\nIMU.bmi088()", "height, m\nTimeOfFlight (slanted)")
     for k, (axis, label) in enumerate(zip(axes, labels, strict=True)):
-        axis.step(t, seen[:, k], where="post", lw=0.9, color="tab:orange", label="measured")
-        axis.plot(t, truth[:, k], lw=1.2, color="tab:blue", label="true")
+        axis.step(t, measured_values[:, k], where="post", lw=0.9, color="tab:orange", label="measured")
+        axis.plot(t, true_values[:, k], lw=1.2, color="tab:blue", label="true")
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
     axes[0].legend(loc="upper center", fontsize=8)

@@ -10,10 +10,10 @@ import urllib.request
 import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
-from pictures import of_colour
+from pictures import has_colour
 from waiting import wait_for
 
-NEAR = 12
+MAX_PIXEL_DISTANCE = 12
 """Pixels between where something is seen and where it is."""
 
 
@@ -32,13 +32,13 @@ class Browser:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        ready = folder / "DevToolsActivePort"
+        port_file = folder / "DevToolsActivePort"
         try:
-            wait_for(lambda: ready.exists() and ready.read_text().count("\n") > 0)
+            wait_for(lambda: port_file.exists() and port_file.read_text().count("\n") > 0)
         except AssertionError:
             self._process.kill()
             raise
-        with urllib.request.urlopen(f"http://127.0.0.1:{ready.read_text().split()[0]}/json") as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port_file.read_text().split()[0]}/json") as answer:
             tabs = json.load(answer)
         tab = next(tab for tab in tabs if tab["type"] == "page")
         self._socket = connect(tab["webSocketDebuggerUrl"], max_size=None)
@@ -79,16 +79,16 @@ class Browser:
 
     def mask(self, rgb):
         """Return rows and columns of what has a hue."""
-        return np.nonzero(of_colour(self.picture(), rgb))
+        return np.nonzero(has_colour(self.picture(), rgb))
 
-    def find(self, rgb, near):
+    def find(self, rgb, tolerance):
         """Return column and row of the middle of what has a hue, once that is near a place."""
-        place, deadline = np.full(2, np.inf), time.monotonic() + 300
-        while time.monotonic() < deadline and not np.allclose(place, near, atol=NEAR):
+        centre, deadline = np.full(2, np.inf), time.monotonic() + 300
+        while time.monotonic() < deadline and not np.allclose(centre, tolerance, atol=MAX_PIXEL_DISTANCE):
             rows, columns = self.mask(rgb)
             if len(rows) > 20:
-                place = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
-        return place
+                centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+        return centre
 
     def close(self):
         self._socket.close()

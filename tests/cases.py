@@ -31,7 +31,7 @@ PAIRS = tuple(("first_principles", control) for control in LEVELS) + tuple(
 )
 """Every dynamics and command level that go together: 11."""
 INTEGRATORS = ("euler", "symplectic_euler", "rk4")
-FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
+COMPILED_ENGINES = ("lanes", "fused") if native.compiler() else ("lanes",)
 """Engines that compile, those that run here."""
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
 
@@ -45,7 +45,7 @@ BOX = """
 </mujoco>
 """
 """The obstacle of the documentation."""
-ABOVE = 2.0
+CAMERA_HEIGHT = 2.0
 """Height of the cameras of the plain scene, m."""
 FOVY = 45.0
 """Vertical fields of view, degrees."""
@@ -55,8 +55,8 @@ PLAIN_SCENE = f"""
   <visual><headlight ambient="0.5 0.5 0.5" diffuse="0.4 0.4 0.4" specular="0 0 0"/><quality shadowsize="0"/></visual>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 1" rgba="0.9 0.9 0.9 1"/>
-    <camera name="down" pos="0 0 {ABOVE}" fovy="{FOVY}"/>
-    <camera name="aside" pos="5 0 {ABOVE}" fovy="{FOVY}"/>
+    <camera name="down" pos="0 0 {CAMERA_HEIGHT}" fovy="{FOVY}"/>
+    <camera name="aside" pos="5 0 {CAMERA_HEIGHT}" fovy="{FOVY}"/>
   </worldbody>
 </mujoco>
 """
@@ -76,8 +76,8 @@ def unit_quats(**options):
 
 def controller_params(record, **changes):
     """Return the parameters of a controller for the usual airframe, some changed."""
-    out = record.create(load_airframe("cf21B_500"))
-    return out.replace(**{k: jnp.asarray(v, float) for k, v in changes.items()})
+    params = record.create(load_airframe("cf21B_500"))
+    return params.replace(**{k: jnp.asarray(v, float) for k, v in changes.items()})
 
 
 def send(data, command, **kwargs):
@@ -97,11 +97,11 @@ def with_states(data, **changes):
     return data.replace(states=states.replace(**{k: broadcast_like(v, getattr(states, k)) for k, v in changes.items()}))
 
 
-def broadcast_like(value, like):
+def broadcast_like(value, template):
     """Return an array of the shape and the type of another; NumPy's are broadcast without a compiled call."""
     if isinstance(value, jax.Array):
-        return jnp.broadcast_to(value.astype(like.dtype), like.shape)
-    return jax.device_put(np.array(np.broadcast_to(np.asarray(value, like.dtype), like.shape)))
+        return jnp.broadcast_to(value.astype(template.dtype), template.shape)
+    return jax.device_put(np.array(np.broadcast_to(np.asarray(value, template.dtype), template.shape)))
 
 
 def with_params(data, **changes):
@@ -120,13 +120,13 @@ def with_airframes(sim, airframes):
 
     params = stacked([create_params(sim.dynamics, airframe) for airframe in kinds])
     settings = sim.configuration.control_freqs, sim.configuration.controller
-    each = [SimControls.create(1, 1, sim.control, sim.dynamics, airframe, *settings) for airframe in kinds]
+    per_airframe = [SimControls.create(1, 1, sim.control, sim.dynamics, airframe, *settings) for airframe in kinds]
     controls = sim.data.controls
     for name in ("state", "attitude", "body_rate", "force_torque"):
         ctrl = getattr(controls, name)
         if ctrl is not None and ctrl.params is not None:
-            own = stacked([getattr(c, name).params for c in each])
-            controls = controls.replace(**{name: ctrl.replace(params=own)})
+            airframe_params = stacked([getattr(c, name).params for c in per_airframe])
+            controls = controls.replace(**{name: ctrl.replace(params=airframe_params)})
     return sim.data.replace(params=params, controls=controls)
 
 
@@ -172,7 +172,7 @@ def zero_thrust_command(data):
     return command
 
 
-def to_all(data, command):
+def repeat_command(data, command):
     """Return a command of one drone for every drone of every world."""
     return np.broadcast_to(command, (*data.states.pos.shape[:2], len(command)))
 
@@ -197,8 +197,8 @@ def repulsion(data):
     """Push a drone away from the others of its world."""
     pos = data.states.pos
 
-    def push(other, is_self):
-        offset = pos - other
+    def push(other_pos, is_self):
+        offset = pos - other_pos
         return jnp.where(is_self, 0.0, 1e-3 * offset / (jnp.dot(offset, offset) + 0.01))
 
     force = reduce_over_others(push, values=pos, reduce="sum")
@@ -209,11 +209,11 @@ def repulsion(data):
 def gap(data):
     """Push a drone up by its distance to the nearest other one, and by the first of equal numbers."""
     pos = data.states.pos
-    near = reduce_over_others(
-        lambda other, is_self: jnp.where(is_self, jnp.inf, jnp.sum((pos - other) ** 2)), pos, "min"
+    square_distance = reduce_over_others(
+        lambda other_pos, is_self: jnp.where(is_self, jnp.inf, jnp.sum((pos - other_pos) ** 2)), pos, "min"
     )
-    equal = reduce_over_others(lambda other, _: other[1] - jax.lax.stop_gradient(other[1]), pos, "max")
-    return data.replace(states=data.states.replace(force=jnp.zeros(3).at[2].set(1e-3 * (near + equal))))
+    equal = reduce_over_others(lambda other_pos, _: other_pos[1] - jax.lax.stop_gradient(other_pos[1]), pos, "max")
+    return data.replace(states=data.states.replace(force=jnp.zeros(3).at[2].set(1e-3 * (square_distance + equal))))
 
 
 @stage("world")
@@ -228,12 +228,12 @@ def by_stages(sim):
     stages = as_stages(sim.step_pipeline)
 
     def step(data, n_steps):
-        def once(data, _):
-            for one in stages:
-                data = one(data)
+        def advance(data, _):
+            for stage_fn in stages:
+                data = stage_fn(data)
             return data, None
 
-        data, _ = jax.lax.scan(once, data, length=n_steps)
+        data, _ = jax.lax.scan(advance, data, length=n_steps)
         return data.replace(core=data.core.replace(nonfinite=nonfinite_worlds(data)))
 
     return step
@@ -266,9 +266,9 @@ def n_documented(record, **sizes):
             if isinstance(part, PyTree):
                 n_arrays += n_documented(part, **sizes)
             elif isinstance(part, (jax.Array, np.ndarray)):
-                words, place = shapes[field.name], f"{type(record).__name__}.{field.name}"
-                assert words is not None, f"{place} has no shape in its docstring"
-                assert tuple(sizes.get(w) or int(w) for w in re.findall(r"\w+", words)) == part.shape, place
+                words, title = shapes[field.name], f"{type(record).__name__}.{field.name}"
+                assert words is not None, f"{title} has no shape in its docstring"
+                assert tuple(sizes.get(w) or int(w) for w in re.findall(r"\w+", words)) == part.shape, title
                 n_arrays += 1
     return n_arrays
 

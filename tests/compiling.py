@@ -8,19 +8,19 @@ from pathlib import Path
 
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 """Folder of compiled programs and kernels."""
-SHORT = 0.05
+MIN_KEPT_COMPILE_S = 0.05
 """Compile time from which XLA keeps a program, s: writing and reading one takes some 10 ms."""
 
 
-def environment(given: Mapping[str, str]) -> dict[str, str]:
+def environment(variables: Mapping[str, str]) -> dict[str, str]:
     """Return the environment of the tests: two host devices, persistent caches, and quick compilers.
 
     ``XLA_FLAGS`` that set ``xla_backend_optimization_level`` keep all optimisations; CI runs laws and engines so.
     """
-    flags = given.get("XLA_FLAGS", "")
-    own = {
+    flags = variables.get("XLA_FLAGS", "")
+    settings = {
         "JAX_COMPILATION_CACHE_DIR": str(CACHE),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(SHORT),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(MIN_KEPT_COMPILE_S),
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
     if "xla_backend_optimization_level" not in flags:
@@ -29,12 +29,12 @@ def environment(given: Mapping[str, str]) -> dict[str, str]:
             "0.10."
         ):  # emitters of fused loops take three times as long; later jaxlibs have no option
             flags += " --xla_cpu_use_fusion_emitters=false"
-        own["CXXFLAGS"] = f"{given.get('CXXFLAGS', '')} {_quick_cxxflags(given)}"
-    return own | {"XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=2"}
+        settings["CXXFLAGS"] = f"{variables.get('CXXFLAGS', '')} {_quick_cxxflags(variables)}"
+    return settings | {"XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=2"}
 
 
-def _quick_cxxflags(given: Mapping[str, str]) -> str:
+def _quick_cxxflags(variables: Mapping[str, str]) -> str:
     """Return options of g++ that take 0.6 of the time of -O1, and as little as -O0, whose kernels are slow."""
-    name = given.get("CXX", "g++")
+    name = variables.get("CXX", "g++")
     is_gcc = sys.platform == "linux" and "clang" not in name and shutil.which(name) is not None
     return "-Og -fira-algorithm=priority -fira-region=one" if is_gcc else "-O1"

@@ -41,11 +41,11 @@ def pytest_collection_finish():
     gc.set_threshold(100_000, 20, 100)
 
 
-LONG = 5
+MAX_UNEXPLAINED_S = 5
 """Processor time above which a test needs a reason, s."""
 REASONS = ("long", "slow")
 """Markers whose argument is the reason."""
-BEGIN = pytest.StashKey[float]()
+START_TIME = pytest.StashKey[float]()
 
 
 def _processor_time():
@@ -55,7 +55,7 @@ def _processor_time():
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item):
     """Keep the processor time at which a test begins."""
-    item.stash[BEGIN] = _processor_time()
+    item.stash[START_TIME] = _processor_time()
     yield
 
 
@@ -68,18 +68,22 @@ def pytest_runtest_makereport(item, call):
         report.outcome = "failed"
         report.longrepr = f"{item.nodeid} was skipped where CRAZYSIM_NO_SKIP forbids it: {report.longrepr}"
     if report.when == "teardown":
-        report.user_properties.append(("processor_s", round(_processor_time() - item.stash[BEGIN], 2)))
+        report.user_properties.append(("processor_s", round(_processor_time() - item.stash[START_TIME], 2)))
         report.user_properties += [("reason", mark.args[0]) for mark in item.iter_markers() if mark.name in REASONS]
 
 
 def pytest_terminal_summary(terminalreporter):
     """List the tests that took long, and why."""
-    ended = (r for reports in terminalreporter.stats.values() for r in reports if getattr(r, "user_properties", None))
-    took = {report.nodeid: dict(report.user_properties) for report in ended}
-    long = sorted((-entry["processor_s"], name) for name, entry in took.items() if entry["processor_s"] > LONG)
-    if long:
-        terminalreporter.section(f"tests over {LONG} s of processor time")
-    for seconds, name in long:
+    reports_with_times = (
+        r for reports in terminalreporter.stats.values() for r in reports if getattr(r, "user_properties", None)
+    )
+    took = {report.nodeid: dict(report.user_properties) for report in reports_with_times}
+    slow_tests = sorted(
+        (-entry["processor_s"], name) for name, entry in took.items() if entry["processor_s"] > MAX_UNEXPLAINED_S
+    )
+    if slow_tests:
+        terminalreporter.section(f"tests over {MAX_UNEXPLAINED_S} s of processor time")
+    for seconds, name in slow_tests:
         reason = took[name].get("reason", "no reason given: share what it builds, or mark it long")
         terminalreporter.write_line(f"{-seconds:5.1f} s  {name}: {reason}")
 

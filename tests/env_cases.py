@@ -58,15 +58,15 @@ def kind(tree):
     return structure, [(x.shape, x.dtype, getattr(x, "weak_type", False)) for x in leaves]
 
 
-def of_worlds(state, mask, but=()):
+def select_state(state, mask, without=()):
     """Return the part of a state that belongs to some worlds, without some of its fields."""
     data = map_batched(lambda x: as_numbers(x)[mask], state.data)
-    names = {"obs", "reward", "terminated", "truncated", "action", "info", "memory"} - set(but)
-    rest = {name: getattr(state, name) for name in sorted(names)}
-    return data, jax.tree.map(lambda x: as_numbers(x)[mask], rest)
+    names = {"obs", "reward", "terminated", "truncated", "action", "info", "memory"} - set(without)
+    fields = {name: getattr(state, name) for name in sorted(names)}
+    return data, jax.tree.map(lambda x: as_numbers(x)[mask], fields)
 
 
-def obs_of(state, mask):
+def select_obs(state, mask):
     """Return what is observed of some worlds."""
     return jax.tree.map(lambda x: as_numbers(x)[mask], state.obs)
 

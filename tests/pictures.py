@@ -5,34 +5,34 @@ import subprocess
 import zlib
 
 import numpy as np
-from cases import ABOVE, FOVY
+from cases import CAMERA_HEIGHT, FOVY
 from imageio_ffmpeg import get_ffmpeg_exe
 
 HEIGHT, WIDTH = 120, 160
 """Size of most pictures, pixels."""
 
 
-def of_colour(picture, rgba):
+def has_colour(picture, rgba):
     """Return which pixels have a colour's hue: its channels far above the others. (height, width)"""
-    picture, on = picture.astype(int), np.asarray(rgba[:3]) > 0.5
-    return picture[..., on].min(-1) > picture[..., ~on].max(-1) + 60
+    picture, is_high = picture.astype(int), np.asarray(rgba[:3]) > 0.5
+    return picture[..., is_high].min(-1) > picture[..., ~is_high].max(-1) + 60
 
 
 def pixel(point, height=HEIGHT, width=WIDTH):
     """Return row and column at which the camera of the plain scene that looks straight down sees a point."""
     focal = 0.5 * height / np.tan(np.deg2rad(FOVY / 2))
     x, y, z = point
-    return 0.5 * height - focal * y / (ABOVE - z), 0.5 * width + focal * x / (ABOVE - z)
+    return 0.5 * height - focal * y / (CAMERA_HEIGHT - z), 0.5 * width + focal * x / (CAMERA_HEIGHT - z)
 
 
-def frames_of(path, height, width, *filters):
+def read_frames(path, height, width, *filters):
     """Return the frames of a film of a size that it has, or gets by filters of ffmpeg. (n, height, width, 3)"""
     decode = [get_ffmpeg_exe(), "-loglevel", "fatal", "-i", path, *filters, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
     return pixels[: len(pixels) // (height * width * 3) * height * width * 3].reshape(-1, height, width, 3)
 
 
-def png_of(pixels):
+def encode_png(pixels):
     """Return an image as the bytes of a PNG file: grey, (height, width), or coloured, (height, width, 3)."""
 
     def chunk(kind, body):

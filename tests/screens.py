@@ -29,10 +29,10 @@ def virtual_screen(folder):
 
 def screen_pixels(path, wait=True):
     """Return what a screen shows, by default once it is at rest, read from its X window dump. (height, width, 3)"""
-    raw, before, deadline = path.read_bytes(), b"", time.monotonic() + 20
-    while wait and raw != before and time.monotonic() < deadline:  # the server draws an image strip by strip
+    raw, last_raw, deadline = path.read_bytes(), b"", time.monotonic() + 20
+    while wait and raw != last_raw and time.monotonic() < deadline:  # the server draws an image strip by strip
         time.sleep(0.3)
-        raw, before = path.read_bytes(), raw
+        raw, last_raw = path.read_bytes(), raw
     header = np.frombuffer(raw[:100], ">u4").astype(int)
     start = header[0] + 12 * header[19]
     width, height, line = header[4], header[5], header[12]

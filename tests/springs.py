@@ -62,12 +62,12 @@ class Crowd(Springs):
     """The same, attracted by each other."""
 
     def derivative(self, data):
-        rates, own = super().derivative(data), self.read(data).pos
+        rates, pos = super().derivative(data), self.read(data).pos
 
         def pull(other, is_self):
-            return jnp.where(is_self, 0.0, other - own)
+            return jnp.where(is_self, 0.0, other - pos)
 
-        return rates | {"vel": rates["vel"] + cs.reduce_over_others(pull, own, "sum")}
+        return rates | {"vel": rates["vel"] + cs.reduce_over_others(pull, pos, "sum")}
 
 
 class Tied(Springs):
@@ -95,11 +95,11 @@ class Tying(Springs):
             data = data.replace(states=states.replace(vel=states.vel.at[0].add(-swapped)))
             return self.write(data, record.replace(vel=record.vel.at[-1].add(swapped)))
 
-        placed = [
+        placements = [
             StagePlacement(pull, name=f"{self.name}_pull"),
             StagePlacement(exchange, name=f"{self.name}_exchange"),
         ]
-        return [*placed, *super().stages(sim)]
+        return [*placements, *super().stages(sim)]
 
 
 KINDS = (Springs, Crowd, Tied, Tying)

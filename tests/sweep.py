@@ -99,14 +99,14 @@ def flying(device="cpu", n_worlds=8, n_drones=2, plugins=(), prepare=None, heigh
     return sim
 
 
-def agree(found, expected, tolerance, label=""):
+def agree(actual, expected, tolerance, label=""):
     """Check that flags and integers are equal, and other numbers but for rounding.
 
     Differences of large numbers carry their errors, so the tolerance is relative to the largest number of an array, or
     to 1.
     """
-    leaves, rest = jax.tree_util.tree_flatten_with_path(found)
-    assert rest == jax.tree.structure(expected)
+    leaves, structure = jax.tree_util.tree_flatten_with_path(actual)
+    assert structure == jax.tree.structure(expected)
     for (path, x), y in zip(leaves, jax.tree.leaves(expected), strict=True):
         x, y, name = as_numbers(x), as_numbers(y), f"{label} {jax.tree_util.keystr(path)}"
         if np.issubdtype(y.dtype, np.floating):
@@ -182,10 +182,10 @@ def errors(size):
 OFFSET, TURN = (0.01, 0.0, -0.02), (0.1, 0.2, 0.3)
 ANCHORS = [(2.0, 2.0, 2.0), (-2.0, -2.0, 2.5)]
 STATIONS = [(0, 0, -2.4), (0, 0.6, 0.8)]
-LATE = {"delay": 0.004, "jitter": 0.004, "dropout": 0.1}
+DELAY_SETTINGS = {"delay": 0.004, "jitter": 0.004, "dropout": 0.1}
 SENSORS = {
-    "imu": lambda: IMU(errors(1.0), errors(1.0), OFFSET, TURN, 1e-8, **LATE),
-    "motion_capture": lambda: MotionCapture(1e-3, 1e-2, 50.0, OFFSET, TURN, freq=250, **LATE),
+    "imu": lambda: IMU(errors(1.0), errors(1.0), OFFSET, TURN, 1e-8, **DELAY_SETTINGS),
+    "motion_capture": lambda: MotionCapture(1e-3, 1e-2, 50.0, OFFSET, TURN, freq=250, **DELAY_SETTINGS),
     "optical_flow": lambda: OpticalFlow(0.1, pos=OFFSET),
     "time_of_flight": lambda: TimeOfFlight(0.01, pos=OFFSET, resolution=None, freq=100, delay=0.01),
     "barometer": lambda: Barometer(1.0, 2.0, 10.0, 30.0, 200.0),
@@ -216,7 +216,7 @@ def biased_imu():
 
 def kalman():
     """Return a filter with every kind of sensor that it uses."""
-    used = [
+    measured_by = [
         biased_imu(),
         MotionCapture(noise=0.01, freq=100),
         OpticalFlow(noise=0.2),
@@ -225,18 +225,18 @@ def kalman():
         UWB(ANCHORS, noise=0.1, tdoa=True, name="tdoa"),
         Lighthouse(ANCHORS[:1], STATIONS[1:], noise=4e-4),
     ]
-    return [*used, Kalman(used)]
+    return [*measured_by, Kalman(measured_by)]
 
 
 def eskf():
     """Return a filter with sensors of one number each, as each number is an update of 15 states to compile."""
-    used = [biased_imu(), UWB(ANCHORS[:1], noise=0.1), TimeOfFlight(noise=0.01)]
-    return [*used, ESKF(used)]
+    measured_by = [biased_imu(), UWB(ANCHORS[:1], noise=0.1), TimeOfFlight(noise=0.01)]
+    return [*measured_by, ESKF(measured_by)]
 
 
 def complementary():
-    used = [IMU.bmi088(), Barometer(noise=2.0), TimeOfFlight(noise=0.01)]
-    return [*used, Complementary(used)]
+    measured_by = [IMU.bmi088(), Barometer(noise=2.0), TimeOfFlight(noise=0.01)]
+    return [*measured_by, Complementary(measured_by)]
 
 
 def drifting_pad(sim):
@@ -266,13 +266,13 @@ def approach(sim):
 def distances(data):
     """Write distances of a sphere to every kind of shape, and the slope of one, where wrenches are."""
     s = data.states
-    turned = rotation.matrix(s.quat)
-    found = jnp.stack([distance(SPHERE, shape, s.pos, turned) for shape in SHAPES])
-    slope = jax.grad(lambda pos: distance(SPHERE, SHAPES[0], pos, turned))(s.pos)
-    return data.replace(states=s.replace(force=found[:3] + found[3:6], torque=found[4:] + slope))
+    rot = rotation.matrix(s.quat)
+    values = jnp.stack([distance(SPHERE, shape, s.pos, rot) for shape in SHAPES])
+    slope = jax.grad(lambda pos: distance(SPHERE, SHAPES[0], pos, rot))(s.pos)
+    return data.replace(states=s.replace(force=values[:3] + values[3:6], torque=values[4:] + slope))
 
 
-def alone(**stages):
+def replace_stages(**stages):
     """Return a function that replaces all stages but the count of steps."""
 
     def prepare(sim):
@@ -297,13 +297,13 @@ def undeclared(data):
     return data.replace(states=data.states.replace(torque=0 * data.states.torque + 1e-6 * mean))
 
 
-NAMED = [name for name in CONTROLLERS if name not in ("auto", "crazyflow", "load_lqr", "tracking_lqr")]
+NAMED_CONTROLLERS = [name for name in CONTROLLERS if name not in ("auto", "crazyflow", "load_lqr", "tracking_lqr")]
 """Controllers of states that need no more than their names; ``"auto"`` is the default."""
 
 
 def turns(state, setpoint, time):
     """Return the number of the controller that flies: each for six steps."""
-    return jnp.int32(time * 500 / 6) % len(NAMED)
+    return jnp.int32(time * 500 / 6) % len(NAMED_CONTROLLERS)
 
 
 def case(plugins=list, **settings):
@@ -347,7 +347,7 @@ STEPS = {
 CASES = {name: case(**settings) for name, settings in STEPS.items()}
 CASES |= {
     "crazyflow": case(control="state", controller="crazyflow"),
-    "controllers": case(control="state", controller=NAMED, switch=turns),
+    "controllers": case(control="state", controller=NAMED_CONTROLLERS, switch=turns),
     "load_lqr": case(
         lambda: [SlungLoad(0.05, 0.4)], drone="bumblebee", control="state", controller=LoadLQR()
     ),
@@ -383,7 +383,7 @@ CASES |= {
     "collisions": case(lambda: [DroneCollisions()], control="attitude", prepare=approach),
     "impact": case(lambda: [ContactResponse()], control="attitude", height=0.03),
     "objects": case(control="attitude", prepare=drifting_pad),
-    "distances": case(height=0.0, control="rotor_vel", prepare=alone(distances=distances)),
+    "distances": case(height=0.0, control="rotor_vel", prepare=replace_stages(distances=distances)),
     "fleet": fleet,
     "populations": lambda **more: build(KINDS, 3, 2, 4, **more),
     "populations of equal sizes": lambda **more: build(KINDS, 2, 2, 2, **more),

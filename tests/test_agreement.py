@@ -9,13 +9,13 @@ import pkgutil
 import jax.numpy as jnp
 import pytest
 import sweep
-from cases import FAST
+from cases import COMPILED_ENGINES
 
 from crazysim import Plugin, plugins
 from crazysim.control.controllers import CONTROLLERS
 from crazysim.engine import Step
 
-ENGINES = ("interpret", *FAST)
+ENGINES = ("interpret", *COMPILED_ENGINES)
 N_STEPS = 20
 """Steps of each simulation; sensors, controllers and delays have their ticks in them."""
 NOT_ON_LANES = ("kalman", "eskf", "terrain")
@@ -42,4 +42,4 @@ def test_every_plugin_and_controller_is_in_the_sweep():
     classes = {x for module in modules for x in vars(module).values() if isinstance(x, type) and issubclass(x, Plugin)}
     assert len(swept) > 30
     assert not {x.__name__ for x in classes if not any(issubclass(y, x) for y in swept)}
-    assert set(sweep.NAMED) | {"auto", "crazyflow", "load_lqr", "tracking_lqr"} == set(CONTROLLERS)
+    assert set(sweep.NAMED_CONTROLLERS) | {"auto", "crazyflow", "load_lqr", "tracking_lqr"} == set(CONTROLLERS)

@@ -279,14 +279,14 @@ def test_the_table_gets_the_rows_of_which_all_seeds_are_finished(run, train, tmp
     assert json.loads(train.TABLE.read_text()) == [other]
     (row,) = run("train.py", "--tasks", "hover", "--seeds", "0,1,2", "--out", tmp_path, "--write")[1:]
     assert json.loads(train.TABLE.read_text()) == [row, other]
-    page, end = train.PAGE.read_text(), train.END
+    page, end = train.PAGE.read_text(), train.TABLE_END
     assert (
         "| `hover` | PPO, 2.6 M | 0 to 2 | 99.0% | 99.5% | 0.02 m | 21 s for 3 seeds | abc1234, 2026-11-26 | a machine"
         in page
     )
     assert "| `track` | analytic gradients, 0.26 M | 3, 7 | 100.0% | 100.0% |  | 5 s, 12 at a time | 0000000" in page
     assert page[page.index(end) :] == before[before.index(end) :]
-    assert page[: page.index(train.BEGIN)] == before[: before.index(train.BEGIN)]
+    assert page[: page.index(train.TABLE_START)] == before[: before.index(train.TABLE_START)]
 
 
 def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, train, tmp_path, capsys):
@@ -311,7 +311,7 @@ def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, tra
 
 def test_the_page_shows_the_committed_table(benchmarks):
     train = importlib.import_module("train")
-    shown = train.PAGE.read_text().partition(train.BEGIN)[2].partition(train.END)[0]
+    shown = train.PAGE.read_text().partition(train.TABLE_START)[2].partition(train.TABLE_END)[0]
     assert shown.strip() == train.markdown(json.loads(train.TABLE.read_text()))
 
 
@@ -400,8 +400,8 @@ def test_gradients_are_timed_beside_the_steps_that_they_go_through(run):
 def test_the_runs_of_any_task_are_below_the_folder_that_was_named(benchmarks, tmp_path):
     train = importlib.import_module("train")
     places = ["hover", "tasks/mine.py:Mine", "../mine.py:Mine", f"{tmp_path}/mine.py:Mine"]
-    folders = [train.folder_of(tmp_path / "out", place, "0", "cpu") for place in places]
-    others = train.folder_of(tmp_path / "out", "hover", "0", "cpu", "--set", "drone=a/b.toml")
+    folders = [train.run_folder(tmp_path / "out", place, "0", "cpu") for place in places]
+    others = train.run_folder(tmp_path / "out", "hover", "0", "cpu", "--set", "drone=a/b.toml")
     assert others.parent == folders[0].parent
     assert folders[0] == tmp_path / "out" / "hover-cpu-0"
     assert {folder.resolve().parent for folder in folders} == {tmp_path / "out"}

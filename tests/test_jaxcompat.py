@@ -165,13 +165,13 @@ def test_a_primitive_is_lowered_as_the_function_of_its_platform():
 def test_a_primitive_has_a_derivative_a_transpose_and_a_rule_for_vmap():
     p = jaxcompat.primitive_by_platform(
         "product",
-        lambda x, y, n_fixed: [jax.ShapeDtypeStruct(y.shape, y.dtype)],
-        {"": lambda x, y, n_fixed: [x * y]},
-        derivative=lambda x, y, n_fixed: [5.0 * x * y],
-        transposed=lambda fixed, seeds, n_fixed: [7.0 * fixed[0] * seeds[0]],
-        batched=jaxcompat.vmap_rule_of(lambda x, y, n_fixed: [x * y + 1.0]),
+        lambda x, y, n_nonlinear: [jax.ShapeDtypeStruct(y.shape, y.dtype)],
+        {"": lambda x, y, n_nonlinear: [x * y]},
+        derivative=lambda x, y, n_nonlinear: [5.0 * x * y],
+        transposed=lambda fixed, seeds, n_nonlinear: [7.0 * fixed[0] * seeds[0]],
+        batched=jaxcompat.make_vmap_rule(lambda x, y, n_nonlinear: [x * y + 1.0]),
     )
-    of = lambda x, y: p.bind(x, y, n_fixed=1)[0]  # noqa: E731
+    of = lambda x, y: p.bind(x, y, n_nonlinear=1)[0]  # noqa: E731
     two, three = jnp.float32(2), jnp.float32(3)
     assert jax.jit(of)(two, three) == 6.0
     assert jax.jvp(of, (two, three), (1.0, 0.0))[1] == 15.0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pictures import frames_of
+from pictures import read_frames
 
 from crazysim import Sim
 from crazysim.__main__ import EXTRAS, main
@@ -82,7 +82,7 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     assert np.ptp(flown.pos[:, 0, :, :2], axis=0).max(-1).min() > 0.4, "every drone is on its way"
     film = tmp_path / "flight.mp4"
     width, height = film_size(960, 544)
-    frames = frames_of(film, height, width)
+    frames = read_frames(film, height, width)
     assert len(frames) == 25  # 1 s
     assert np.mean(np.abs(frames[-1].astype(float) - frames[0])) > 1, "nothing moves in the film"
 

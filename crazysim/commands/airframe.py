@@ -70,11 +70,11 @@ def estimate(options: argparse.Namespace) -> None:
     check_writable(path, (".toml",))
     if path.exists():
         raise ValueError(f"expected a new file, got {str(path)!r}, which exists; choose another name or remove it")
-    if wrong := [x for x in options.spins or () if x.lower() not in SPINS]:
-        raise ValueError(f"expected --spins of ccw and cw, got {wrong[0]!r}")
+    if unknown := [x for x in options.spins or () if x.lower() not in SPINS]:
+        raise ValueError(f"expected --spins of ccw and cw, got {unknown[0]!r}")
     try:
-        places = (options.positions or "").split()
-        positions = [[float(x) for x in f"{place},0".split(",")][:3] for place in places] or None
+        texts = (options.positions or "").split()
+        positions = [[float(x) for x in f"{coordinates},0".split(",")][:3] for coordinates in texts] or None
     except ValueError:
         raise ValueError(f"expected --positions such as '0.1,-0.1 0.1,0.1', got {options.positions!r}") from None
     text = estimate_airframe(

@@ -90,9 +90,9 @@ def _ratio(airframe: Airframe) -> float:
 def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
     """Yield mass, thrust, and quantities that follow from them and the rotors' positions."""
     mass, ratio = float(airframe.value("rigid_body.mass")), _ratio(airframe)
-    high, low = (float(airframe.value(f"rotors.thrust_{end}")) for end in ("max", "min"))
+    max_thrust, min_thrust = (float(airframe.value(f"rotors.thrust_{limit}")) for limit in ("max", "min"))
     hover = mass * GRAVITY_MAGNITUDE / airframe.n_rotors
-    yield "mass", f"{mass:.4g} kg, {airframe.n_rotors} rotors of {low:.3g} to {high:.3g} N"
+    yield "mass", f"{mass:.4g} kg, {airframe.n_rotors} rotors of {min_thrust:.3g} to {max_thrust:.3g} N"
     positions = airframe.value("rotors.position")
     wheelbase = np.max(np.linalg.norm(positions[:, None] - positions, axis=-1))
     yield "wheelbase", f"{1000 * wheelbase:.0f} mm, the largest distance of two rotors"
@@ -110,7 +110,7 @@ def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
     if Dynamics.first_principles in supported_dynamics(airframe):
         arms["yaw"] = yaw_arm(airframe)
     for axis, (name, arm) in enumerate(arms.items()):
-        torque = min(hover - low, high - hover) * arm * np.sum(np.abs(airframe.mixing_matrix[axis]))
+        torque = min(hover - min_thrust, max_thrust - hover) * arm * np.sum(np.abs(airframe.mixing_matrix[axis]))
         acc = torque / airframe.inertia[axis, axis]
         rate, seconds = np.sqrt(acc * QUARTER_TURN), 2 * np.sqrt(QUARTER_TURN / max(acc, 1e-9))
         yield (

@@ -199,12 +199,12 @@ def print_report(errors: np.ndarray, touched: np.ndarray, n_steps: int, step_s: 
         step_s: Time of all steps, s.
         contact_s: Time of one contact query, s.
     """
-    first = round(SETTLING_TIME * FPS * len(errors) / len(touched))
-    settled = 100 * (errors[first:] if first < len(errors) else errors)
-    began = touched[1:] & ~touched[:-1]
+    start = round(SETTLING_TIME * FPS * len(errors) / len(touched))
+    settled = 100 * (errors[start:] if start < len(errors) else errors)
+    contact_starts = touched[1:] & ~touched[:-1]
     print(f"steps per second  {n_steps / step_s / 1e6:.1f} M ({n_steps / 1e6:.1f} M drone steps in {step_s:.1f} s)")
     print(f"tracking error    {settled.mean():.1f} cm mean, {np.percentile(settled, 95):.1f} cm 95th percentile")
-    n_begun, n_worlds = int(began.sum() + touched[0].sum()), int(touched.any((0, 2, 3)).sum())
+    n_begun, n_worlds = int(contact_starts.sum() + touched[0].sum()), int(touched.any((0, 2, 3)).sum())
     print(
         f"contacts          {n_begun:,} begun, in {n_worlds:,} of {count_text(touched.shape[1], 'world')}; "
         f"{1e3 * contact_s:.1f} ms a query"
@@ -221,21 +221,25 @@ def plot_tracks(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) ->
     except ImportError:
         print(f"no plot: {not_installed('plots need', 'matplotlib', 'demo')}")
         return
-    fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    fig, (tracks_axis, error_axis) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
     setpoint = np.asarray(figure_eight_setpoints(jnp.linspace(0, PERIOD, 200)[:, None], 1))[:, 0]
-    left.plot(setpoint[:, 0], setpoint[:, 1], "--", color="0.6", label="setpoint")
+    tracks_axis.plot(setpoint[:, 0], setpoint[:, 1], "--", color="0.6", label="setpoint")
     for i in range(tracks.shape[1]):
-        left.plot(tracks[:, i, 0], tracks[:, i, 1], color=COLORS[i % 4], label=f"drone {i}")
-    for place in np.asarray(sim.data.objects.pos[0, 0]):
-        left.add_patch(plt.Circle(place[:2], POLE_RADIUS, color="0.2"))
-    left.set(title="Tracks in world 0, seen from above", xlabel="x, m", ylabel="y, m", aspect="equal")
-    left.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+        tracks_axis.plot(tracks[:, i, 0], tracks[:, i, 1], color=COLORS[i % 4], label=f"drone {i}")
+    for pole_pos in np.asarray(sim.data.objects.pos[0, 0]):
+        tracks_axis.add_patch(plt.Circle(pole_pos[:2], POLE_RADIUS, color="0.2"))
+    tracks_axis.set(title="Tracks in world 0, seen from above", xlabel="x, m", ylabel="y, m", aspect="equal")
+    tracks_axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     flat = 100 * errors.reshape(len(errors), -1)
     seconds = np.arange(len(flat)) / sim.control_freq
-    right.fill_between(seconds, *np.percentile(flat, [5, 95], axis=1), color="0.85", label="5th to 95th percentile")
-    right.plot(seconds, np.median(flat, axis=1), color=COLORS[1], label="median")
-    right.set(title=f"Tracking error of {flat.shape[1]:,} drones", xlabel="time, s", ylabel="error, cm", ylim=(0, None))
-    right.legend(fontsize=8)
+    error_axis.fill_between(
+        seconds, *np.percentile(flat, [5, 95], axis=1), color="0.85", label="5th to 95th percentile"
+    )
+    error_axis.plot(seconds, np.median(flat, axis=1), color=COLORS[1], label="median")
+    error_axis.set(
+        title=f"Tracking error of {flat.shape[1]:,} drones", xlabel="time, s", ylabel="error, cm", ylim=(0, None)
+    )
+    error_axis.legend(fontsize=8)
     write_figure(fig, path, dpi=110)
     plt.close(fig)
     print(f"wrote {path}")

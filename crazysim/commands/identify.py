@@ -71,53 +71,55 @@ def run(options: argparse.Namespace) -> None:
             f"expected no --network with --dynamics {options.dynamics}, which has no residual. "
             "Leave --network out, or use --dynamics first_principles with logs of rotor speeds."
         )
-    columns = _columns(options.columns) if options.columns else None
+    columns = _read_columns(options.columns) if options.columns else None
     paths = [*options.logs, *options.test]
     if options.motion and len(options.motion) != len(paths):
         raise ValueError(
             f"expected motion capture of each of {len(paths)} logs, got {len(options.motion)} files. "
             "Name them in the order of the logs, then of the logs of --test."
         )
-    every = [
-        read_log(path, columns, motion, between)
-        for (path, between), motion in zip(map(_part, paths), options.motion or [None] * len(paths), strict=True)
+    all_logs = [
+        read_log(path, columns, motion, interval)
+        for (path, interval), motion in zip(
+            map(_split_interval, paths), options.motion or [None] * len(paths), strict=True
+        )
     ]
-    base = load_airframe(options.airframe)
+    airframe = load_airframe(options.airframe)
     if options.dynamics == "first_principles":
-        every = [with_speeds(log, base) for log in every]
-    for log in every:
+        all_logs = [with_speeds(log, airframe) for log in all_logs]
+    for log in all_logs:
         for repair in log.repairs:
             print(f"{log.name}: {repair}")
-    logs, held_out = every[: len(options.logs)], every[len(options.logs) :]
+    logs, held_out = all_logs[: len(options.logs)], all_logs[len(options.logs) :]
     source = f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {', '.join(log.name for log in logs)}"
     if options.dynamics != "first_principles":
         fitted, text = identify_attitude(logs, options.airframe, options.dynamics, source, mass=options.mass)
         models = {"identified": FittedModel.create(fitted, options.dynamics)}
-        if f"fitted.{options.dynamics}.cmd_f_coef" in base.values:
-            models = {options.airframe: FittedModel.create(base, options.dynamics, options.mass)} | models
+        if f"fitted.{options.dynamics}.cmd_f_coef" in airframe.values:
+            models = {options.airframe: FittedModel.create(airframe, options.dynamics, options.mass)} | models
         print(text, end="")
-        _report(options, logs, held_out, models)
-        _write(options.out, text)
+        _report_errors(options, logs, held_out, models)
+        _write_file(options.out, text)
         return
     result = identify(logs, options.airframe, mass=options.mass)
     print("\n".join(result.describe()))
     logs = [aligned(log, result.delays[log.name]) for log in logs]
     held_out = [aligned(log, fast_rotation([log], result.model.params).delays[0]) for log in held_out]
     models = {
-        options.airframe: Model.create(base, options.mass),
+        options.airframe: Model.create(airframe, options.mass),
         "identified": result.model,
     }
     if options.network is not None:
         trained = fit_residual(logs, result.model, n_hidden=options.network, iterations=options.iterations)
         result = result.with_residual(trained.residual)
         models["with residual"] = result.model
-    _report(options, logs, held_out, models)
-    _write(options.out, result.toml(source))
+    _report_errors(options, logs, held_out, models)
+    _write_file(options.out, result.toml(source))
     if result.doubtful:
         print(f"DOUBTFUL, more than three times from the airframe: {', '.join(result.doubtful)}")
 
 
-def _report(
+def _report_errors(
     options: argparse.Namespace, logs: Sequence[Log], held_out: Sequence[Log], models: Mapping[str, Predictor]
 ) -> None:
     """Print the errors of predictions of fitted and held-out logs, and draw them if requested."""
@@ -130,12 +132,12 @@ def _report(
         print(f"wrote {options.plot}")
 
 
-def _write(path: Path, text: str) -> None:
+def _write_file(path: Path, text: str) -> None:
     write_file(path, text)
     print(f"wrote {path}")
 
 
-def _part(text: str) -> tuple[str, tuple[float, float]]:
+def _split_interval(text: str) -> tuple[str, tuple[float, float]]:
     """Return path, start and end of ``LOG@START:END``; start and end may be left out."""
     match = re.fullmatch(r"(.+)@(\d*\.?\d*):(\d*\.?\d*)", text)
     if match is None or Path(text).exists():
@@ -143,7 +145,7 @@ def _part(text: str) -> tuple[str, tuple[float, float]]:
     return match[1], (float(match[2] or 0), float(match[3] or math.inf))
 
 
-def _columns(texts: Sequence[str]) -> Columns:
+def _read_columns(texts: Sequence[str]) -> Columns:
     """Return the columns of FIELD=NAMES pairs."""
     names_of_columns = Columns.__dataclass_fields__
     fields: dict[str, Any] = {}

@@ -103,13 +103,13 @@ def run(options: argparse.Namespace) -> None:
 
 def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
     """Return the pilot of the policy to fly; None for a flight without one."""
-    others = ("drones", "control_freq", "freq", "drone", "controller", "pilot", "gamepad", "commands")
+    excluded = ("drones", "control_freq", "freq", "drone", "controller", "pilot", "gamepad", "commands")
     if options.policy is None:
         if options.goals is not None:
             raise ConfigError("expected --policy with --goals, got none. Use --policy out/hover, for example.")
         return None
-    if given := [f"--{name.replace('_', '-')}" for name in others if getattr(options, name) not in (None, False)]:
-        raise ConfigError(f"expected the settings of the run with --policy, got {', '.join(given)}. Leave them out.")
+    if names := [f"--{name.replace('_', '-')}" for name in excluded if getattr(options, name) not in (None, False)]:
+        raise ConfigError(f"expected the settings of the run with --policy, got {', '.join(names)}. Leave them out.")
     from crazysim.lab.live.policy_pilot import PolicyPilot, read_points
     from crazysim.train.training import load_policy
 

@@ -27,7 +27,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--teacher", metavar="FOLDER", help=teacher)
     add("--seed", type=int, help="random seed; by default 0")
     seeds = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in that of the run"
-    add("--seeds", type=seeds_of, metavar="FIRST:END", help=seeds)
+    add("--seeds", type=parse_seeds, metavar="FIRST:END", help=seeds)
     sweep = "values of hyperparameters, each trained with each seed in one program"
     add("--sweep", nargs="+", default=[], metavar="NAME=VALUE,VALUE", help=sweep)
     add("--worlds", type=int, help="number of parallel worlds of a training; by default the recipe's")
@@ -36,8 +36,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--out", type=Path, help="folder of the run; by default out/TASK")
     resume = "continue from the checkpoint in that folder, with its settings where none are given"
     add("--resume", action="store_true", help=resume)
-    every = "write a checkpoint every so many seconds, besides those of the evaluations"
-    add("--checkpoint-every", type=float, metavar="SECONDS", help=every)
+    checkpoint_every = "write a checkpoint every so many seconds, besides those of the evaluations"
+    add("--checkpoint-every", type=float, metavar="SECONDS", help=checkpoint_every)
     add("--device", help="device: cpu, gpu; by default cpu")
     add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation")
     add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm")
@@ -78,11 +78,11 @@ def _add_task_and_device(add: Any) -> None:
     add("--device", help="device: cpu, gpu; by default the training's")
 
 
-def seeds_of(text: str) -> list[int]:
+def parse_seeds(text: str) -> list[int]:
     """Return the seeds of ``FIRST:END``, from FIRST to END - 1, or of a list with commas."""
-    first, colon, end = text.partition(":")
+    start, colon, stop = text.partition(":")
     try:
-        seeds = list(range(int(first), int(end))) if colon else [int(x) for x in text.split(",")]
+        seeds = list(range(int(start), int(stop))) if colon else [int(x) for x in text.split(",")]
     except ValueError:
         seeds = []
     if not seeds or len(set(seeds)) < len(seeds):
@@ -93,7 +93,7 @@ def seeds_of(text: str) -> list[int]:
     return seeds
 
 
-def _sweep_of(texts: Sequence[str]) -> dict[str, list[float]]:
+def _parse_sweep(texts: Sequence[str]) -> dict[str, list[float]]:
     """Return the values in NAME=VALUE,VALUE by name."""
     sweep: dict[str, list[float]] = {}
     for text in texts:
@@ -108,7 +108,7 @@ def _sweep_of(texts: Sequence[str]) -> dict[str, list[float]]:
     return sweep
 
 
-def _pairs(texts: Sequence[str]) -> dict[str, Any]:
+def _parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
     """Return NAME=VALUE pairs as a dict; a value that is not JSON is a string."""
     pairs = {}
     for text in texts:
@@ -137,10 +137,10 @@ def train(options: argparse.Namespace) -> None:
         "checkpoint_every": options.checkpoint_every,
         "algorithm": options.algorithm or (options.teacher and "dagger"),
         "n_worlds": options.worlds,
-        "options": _pairs(options.set) | given_options(options, "device"),
-        "config": _pairs(options.config) | given_options(options, "iterations", "teacher"),
+        "options": _parse_pairs(options.set) | given_options(options, "device"),
+        "config": _parse_pairs(options.config) | given_options(options, "iterations", "teacher"),
     }
-    before = signal.signal(signal.SIGTERM, _exit)
+    handler = signal.signal(signal.SIGTERM, _exit)
     try:
         if options.seeds is None and not options.sweep:
             run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)
@@ -148,9 +148,9 @@ def train(options: argparse.Namespace) -> None:
         if options.seeds is not None and options.seed is not None:
             raise ConfigError("expected --seed or --seeds, got both. Use --seeds alone.")
         seeds = options.seeds or [options.seed or 0]
-        run_many(options.task, options.out, seeds=seeds, sweep=_sweep_of(options.sweep), **settings)
+        run_many(options.task, options.out, seeds=seeds, sweep=_parse_sweep(options.sweep), **settings)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, handler)
 
 
 def _exit(*_: object) -> NoReturn:

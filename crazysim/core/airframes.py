@@ -57,22 +57,22 @@ def as_airframes(airframes: Airframes, n_drones: int = 1) -> tuple[Airframe, ...
     return (airframes,) * n_drones if isinstance(airframes, Airframe) else tuple(airframes)
 
 
-def airframe_of(airframes: Airframes) -> Airframe:
+def find_common_airframe(airframes: Airframes) -> Airframe:
     """Return the airframe that all drones share."""
-    first, *others = as_airframes(airframes)
-    if any(other is not first for other in others):
-        names = ", ".join(dict.fromkeys(repr(airframe.name) for airframe in (first, *others)))
+    first_airframe, *other_airframes = as_airframes(airframes)
+    if any(other_airframe is not first_airframe for other_airframe in other_airframes):
+        names = ", ".join(dict.fromkeys(repr(airframe.name) for airframe in (first_airframe, *other_airframes)))
         raise ConfigError(f"expected one airframe for all drones, got {names}. Use sim.airframes, one for each drone.")
-    return first
+    return first_airframe
 
 
-def n_rotors_of(airframes: Airframes) -> int:
+def max_n_rotors(airframes: Airframes) -> int:
     """Return the largest number of rotors of any of the airframes."""
     kinds = {id(airframe): airframe for airframe in as_airframes(airframes)}  # thousands of drones share a few
     return max(airframe.n_rotors for airframe in kinds.values())
 
 
-def prefix_of(airframe: Airframe) -> str:
+def name_prefix(airframe: Airframe) -> str:
     """Return the prefix of drone names for an airframe: ``Crazyflie``, ``Bumblebee``, or its own name in PascalCase."""
     name = airframe.name.lower()
     for prefix, beginnings in NAME_PREFIXES.items():
@@ -86,7 +86,7 @@ def drone_names(airframes: Sequence[Airframe]) -> tuple[str, ...]:
     """Return the names of drones, numbered for each prefix: ``Crazyflie_0``, ``Bumblebee_0``, ``Crazyflie_1``."""
     counts: dict[str, int] = {}
     names = []
-    for prefix in map(prefix_of, airframes):
+    for prefix in map(name_prefix, airframes):
         counts[prefix] = counts.get(prefix, -1) + 1
         names.append(f"{prefix}_{counts[prefix]}")
     return tuple(names)
@@ -137,7 +137,7 @@ def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
     A length of 1 means that all rotors share a value, which is repeated.
     """
     shape = tuple(np.max([x.shape for x in arrays], axis=0)) if arrays[0].ndim else ()
-    out = []
+    padded = []
     for x in arrays:
         padding = [(0, n - size) for n, size in zip(shape, x.shape, strict=True)]
         is_repeated = [size == 1 and n > 1 for n, size in zip(shape, x.shape, strict=True)]
@@ -146,8 +146,8 @@ def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
                 x, [n if repeat else size for n, size, repeat in zip(shape, x.shape, is_repeated, strict=True)]
             )
             padding = [(0, n - size) for n, size in zip(shape, x.shape, strict=True)]
-        out.append(np.pad(x, padding, mode="edge" if name in PER_ROTOR_FIELDS else "constant"))
-    return out
+        padded.append(np.pad(x, padding, mode="edge" if name in PER_ROTOR_FIELDS else "constant"))
+    return padded
 
 
 def _add_rotor_masks(record: Any, n_rotors: int) -> Any:

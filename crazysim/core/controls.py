@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim.control import AllocationParams, Control, Controller
 from crazysim.control.protocol import controller_chain
-from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, n_rotors_of
+from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, max_n_rotors
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, float_dtype, host_array, leaf, scopes, static
@@ -164,7 +164,7 @@ def require_same_controllers(controls: SimControls, reference: SimControls, name
         reference: Commands and controllers of the simulation.
         name: Name of the simulation's controller.
     """
-    records, expected = _controllers_of(controls), _controllers_of(reference)
+    records, expected = _controller_records(controls), _controller_records(reference)
     if records == expected:  # the same objects
         return
     if [_layout(controller) for controller in records] != [_layout(controller) for controller in expected]:
@@ -175,7 +175,7 @@ def require_same_controllers(controls: SimControls, reference: SimControls, name
         )
 
 
-def _controllers_of(controls: SimControls) -> list[ControllerData]:
+def _controller_records(controls: SimControls) -> list[ControllerData]:
     """Return the records of all controllers, from the command level down."""
     levels = (controls.state, controls.attitude, controls.body_rate)
     return [level.controller for level in levels if level is not None and level.controller is not None]
@@ -249,7 +249,7 @@ class SimControls(PyTree):
         shape = (n_worlds, n_drones)
         require_pair(dynamics, control)
         require_controller(dynamics, control, controller)
-        followers, last = controller_chain(controller, control)
+        followers, last_level = controller_chain(controller, control)
         by_level = dict(followers)
         data = {level: ControllerData.create(*shape, x, airframes) for level, x in followers}
 
@@ -268,7 +268,7 @@ class SimControls(PyTree):
                 feedforward=zeros(8) if feeds else None,
                 staged_feedforward=zeros(8) if feeds else None,
             )
-        if Control.attitude in (*by_level, last):
+        if Control.attitude in (*by_level, last_level):
             follower = by_level.get(Control.attitude)
             attitude = AttitudeControlData(
                 data.get(Control.attitude),
@@ -280,8 +280,8 @@ class SimControls(PyTree):
         if control == Control.body_rate:
             body_rate = BodyRateControlData(data[control], zeros(4), zeros(4), freqs[control])
         if dynamics == Dynamics.first_principles:
-            rotor_vel = zeros(n_rotors_of(airframes))
-        if last == Control.force_torque:
+            rotor_vel = zeros(max_n_rotors(airframes))
+        if last_level == Control.force_torque:
             params = create_per_drone(airframes, AllocationParams.create, n_worlds)
             force_torque = ForceTorqueControlData(zeros(4), zeros(4), freqs[Control.force_torque], params)
         return SimControls(control, state, attitude, body_rate, force_torque, rotor_vel)
@@ -298,7 +298,7 @@ def require_pair(dynamics: Dynamics, control: Control) -> None:
 
 def require_controller(dynamics: Dynamics, control: Control, controller: Controller | None) -> None:
     """Check that controllers accept their command levels, and the dynamics the output of the last controller."""
-    followers, last = controller_chain(controller, control)
+    followers, last_level = controller_chain(controller, control)
     for level, follower in followers:
         for member in follower.members:
             if level not in member.levels:
@@ -307,13 +307,13 @@ def require_controller(dynamics: Dynamics, control: Control, controller: Control
                     f"got control={level.value!r}. Use another level, or controller='auto', which follows all."
                 )
     name = followers[-1][1].name if followers else None
-    if dynamics != Dynamics.first_principles and last != Control.attitude:
+    if dynamics != Dynamics.first_principles and last_level != Control.attitude:
         raise ConfigError(
             f"expected dynamics with rotors for controller {name!r}, got {dynamics.value!r}, which contains "
             f"a controller of its own. Use dynamics='first_principles' or controller='auto'."
         )
-    if dynamics == Dynamics.first_principles and last not in (Control.force_torque, Control.rotor_vel):
+    if dynamics == Dynamics.first_principles and last_level not in (Control.force_torque, Control.rotor_vel):
         raise ConfigError(
             f"expected a controller that commands rotors for dynamics {dynamics.value!r}, got {name!r} with "
-            f"output {last.value!r}. Use output = Control.force_torque."
+            f"output {last_level.value!r}. Use output = Control.force_torque."
         )

@@ -14,7 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.control import Control, Controller, command_size
-from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, n_rotors_of
+from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, max_n_rotors
 from crazysim.core.controls import SimControls
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
@@ -163,9 +163,12 @@ class Objects(PyTree):
             rows: Positions (n, 3) and attitudes, xyzw (n, 4), of all objects of a kind, by the kind's name.
         """
         pos, quat = self.pos, self.quat
-        for kind, (at, turned) in rows.items():
-            where = np.array([self.names.index(f"{kind}:{k}") for k in range(at.shape[0])])
-            pos, quat = pos.at[where].set(at.astype(pos.dtype)), quat.at[where].set(turned.astype(quat.dtype))
+        for kind, (kind_pos, kind_quat) in rows.items():
+            indices = np.array([self.names.index(f"{kind}:{k}") for k in range(kind_pos.shape[0])])
+            pos, quat = (
+                pos.at[indices].set(kind_pos.astype(pos.dtype)),
+                quat.at[indices].set(kind_quat.astype(quat.dtype)),
+            )
         return self.replace(pos=pos, quat=quat)
 
 
@@ -221,7 +224,7 @@ def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) ->
         airframe: One airframe for all drones, or a list with one for each.
         n_worlds: Number of worlds.
     """
-    n_rotors = n_rotors_of(airframe)
+    n_rotors = max_n_rotors(airframe)
 
     def create(airframe: Airframe) -> SimParams:
         if dynamics == Dynamics.first_principles:
@@ -233,7 +236,7 @@ def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) ->
 
 def n_rotor_states(dynamics: Dynamics, airframes: Airframes) -> int:
     """Return the length of ``states.rotor_vel``: the largest number of rotors, or 4 in fitted models."""
-    return n_rotors_of(airframes) if dynamics == Dynamics.first_principles else 4
+    return max_n_rotors(airframes) if dynamics == Dynamics.first_principles else 4
 
 
 def controls_of(data: SimData) -> Any:

@@ -72,13 +72,13 @@ def check_setpoint(
 
     Arguments and errors as in ``state_control``; leaves of ``data`` may be ``jax.ShapeDtypeStruct`` instead of arrays.
     """
-    present = {name: x for name, x in parts.items() if x is not None}
+    explicit_parts = {name: x for name, x in parts.items() if x is not None}
     if controls is None:
-        controls = _join_setpoint(data, present)
-    elif present:
+        controls = _join_setpoint(data, explicit_parts)
+    elif explicit_parts:
         raise ConfigError(
-            f"expected one vector of 16 numbers per drone or its parts, got both, with {', '.join(present)}. Write "
-            f"them into the vector, or leave it out."
+            f"expected one vector of 16 numbers per drone or its parts, got both, with {', '.join(explicit_parts)}. "
+            f"Write them into the vector, or leave it out."
         )
     command = check_command(data, Control.state, controls, check_finite)
     if feedforward is None:
@@ -110,8 +110,8 @@ def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | 
         fits = np.broadcast_shapes(array.shape, shape) == shape
     except ValueError:  # a list of lists of unequal lengths, or shapes that do not broadcast
         array, fits = np.zeros(0), False
-    numbers = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
-    if not (fits and numbers and (name == "yaw" or array.shape[-1:] == (3,))):
+    is_numeric = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
+    if not (fits and is_numeric and (name == "yaw" or array.shape[-1:] == (3,))):
         raise ConfigError(f"expected {name} as numbers that broadcast to shape {shape}, got {short_repr(value)}")
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
         raise ConfigError(f"expected finite numbers as {name}, got {short_repr(value)}. Check its computation.")
@@ -122,8 +122,8 @@ def _setpoint(xp: Any, counts: tuple[int, ...], dtype: DTypeLike, parts: Mapping
     """Return the setpoint with the given parts, and zeros for other parts and body rates. (n_worlds, n_drones, 16)"""
     zeros = xp.zeros((*counts, 3), dtype)
     vectors = [xp.asarray(parts.get(name, zeros), dtype) for name in ("pos", "vel", "acc")]
-    half = xp.asarray(parts.get("yaw", 0.0), dtype)[..., None] / 2 + zeros[..., :1]
-    quat = [zeros[..., :2], xp.sin(half), xp.cos(half)]
+    half_yaw = xp.asarray(parts.get("yaw", 0.0), dtype)[..., None] / 2 + zeros[..., :1]
+    quat = [zeros[..., :2], xp.sin(half_yaw), xp.cos(half_yaw)]
     return xp.concatenate([*(xp.broadcast_to(x, zeros.shape) for x in vectors), *quat, zeros], axis=-1)
 
 
@@ -171,7 +171,7 @@ def stage_command(data: SimData, command: Array, feedforward: Array | None = Non
     Args:
         data: The simulation.
         command: Command in the units of ``data.controls.mode``. (..., k)
-        feedforward: Feedforward of a setpoint; None for ``feedforward_of(command)``. (..., 8)
+        feedforward: Feedforward of a setpoint; None for ``default_feedforward(command)``. (..., 8)
     """
     controls, mode = data.controls, data.controls.mode
     fields = staged_fields(data, command, feedforward)
@@ -193,7 +193,7 @@ def staged_fields(data: SimData, command: Array, feedforward: Array | None = Non
         return {"staged_cmd": command}
     return {
         "staged_cmd": command,
-        "staged_feedforward": feedforward_of(command) if feedforward is None else feedforward,
+        "staged_feedforward": default_feedforward(command) if feedforward is None else feedforward,
     }
 
 
@@ -204,17 +204,17 @@ def staged_leaves(data: SimData) -> list[Any]:
     return [getattr(level, name) for name in staged_fields(data, level, level)]
 
 
-def feedforward_of(command: Any) -> Any:
+def default_feedforward(command: Any) -> Any:
     """Return the feedforward of a setpoint without an explicit one: its yaw rate, and zeros for the rest. (..., 8)"""
     if isinstance(command, np.ndarray):
         feedforward = np.zeros((*command.shape[:-1], 8), command.dtype)
         feedforward[..., 6] = command[..., 15]
         return feedforward
-    return _feedforward_of(command)
+    return _compiled_default_feedforward(command)
 
 
 @jax.jit
-def _feedforward_of(command: Array) -> Array:
+def _compiled_default_feedforward(command: Array) -> Array:
     return Setpoint.of_command(command).feedforward()
 
 

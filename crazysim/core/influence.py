@@ -25,43 +25,43 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
     (``controls.attitude.cmd`` in fitted dynamics) and ``params``. Other changes are refused. They would be lost without
     an effect, or the derivative would be evaluated at a state that the drone does not have.
     """
-    where = f"influence of plugin {plugin.name!r} ({type(plugin).__name__})"
-    after = _call_method(where, plugin.influence, data)
-    if not isinstance(after, SimData):
-        raise ConfigError(f"expected {where} to return SimData, got {type(after).__name__}. Use 'return data'.")
+    title = f"influence of plugin {plugin.name!r} ({type(plugin).__name__})"
+    changed_data = _call_method(title, plugin.influence, data)
+    if not isinstance(changed_data, SimData):
+        raise ConfigError(f"expected {title} to return SimData, got {type(changed_data).__name__}. Use 'return data'.")
     paths, treedef = jax.tree_util.tree_flatten_with_path(data)
-    if jax.tree.structure(after) != treedef:
+    if jax.tree.structure(changed_data) != treedef:
         raise ConfigError(
-            f"expected {where} to keep the structure of SimData, but a field became None, or a record came or went. "
-            f"Add records with sim.add."
+            f"expected {title} to keep the structure of SimData, but a field became None, or a record came or "
+            f"went. Add records with sim.add."
         )
     command = "controls.attitude.cmd" if data.controls.rotor_vel is None else "controls.rotor_vel"
     keep_shape = ("states.force", "states.torque", command)
-    for (path, old), new in zip(paths, jax.tree.leaves(after), strict=True):
+    for (path, old), new in zip(paths, jax.tree.leaves(changed_data), strict=True):
         if new is old:
             continue
         field = jax.tree_util.keystr(path).lstrip(".")
         if field in keep_shape:
             if jnp.shape(new) != jnp.shape(old):
-                raise ConfigError(f"expected {where} to return {field} of shape {old.shape}, got {jnp.shape(new)}")
+                raise ConfigError(f"expected {title} to return {field} of shape {old.shape}, got {jnp.shape(new)}")
         elif not field.startswith("params."):
             raise ConfigError(
-                f"expected {where} to write only {', '.join(keep_shape)} and params, got other values of {field}. Use "
-                f"a stage of the plugin to change states, records or other commands, and 'derivative' for the rates of "
-                f"its own states."
+                f"expected {title} to write only {', '.join(keep_shape)} and params, got other values of "
+                f"{field}. Use a stage of the plugin to change states, records or other commands, and 'derivative' for "
+                f"the rates of its own states."
             )
-    _check_params(where, data.params, after.params)
-    return after
+    _check_params(title, data.params, changed_data.params)
+    return changed_data
 
 
 def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
     """Return the rates of the plugin's own states, checked."""
-    where = f"derivative of plugin {plugin.name!r} ({type(plugin).__name__})"
-    rates = _call_method(where, plugin.derivative, data, plugin.scope)
+    title = f"derivative of plugin {plugin.name!r} ({type(plugin).__name__})"
+    rates = _call_method(title, plugin.derivative, data, plugin.scope)
     if not isinstance(rates, Mapping):
         raise ConfigError(
-            f"expected {where} to return a dict of fields of its record to rates, got {type(rates).__name__}. Use "
-            f"'return {{}}' for none."
+            f"expected {title} to return a dict of fields of its record to rates, got {type(rates).__name__}. "
+            f"Use 'return {{}}' for none."
         )
     record = data.plugins.get(plugin.name)
     kinds = None if record is None else scopes(record)
@@ -71,7 +71,7 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
         if field not in states:
             owner = "drone" if plugin.scope == "drone" else "member"
             raise ConfigError(
-                f"expected {where} to return rates of leaves of {owner}s in its record, which are "
+                f"expected {title} to return rates of leaves of {owner}s in its record, which are "
                 f"{', '.join(map(repr, states)) or 'none'}, got one of {field!r}. Declare such a state with "
                 f"leaf({owner!r}, ...)."
             )
@@ -79,7 +79,7 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
         same_type = jnp.issubdtype(x.dtype, jnp.floating) and jnp.result_type(x, rate) == x.dtype
         if jnp.shape(rate) != x.shape or not same_type:
             raise ConfigError(
-                f"expected {where} to return a rate of {field!r} with its shape {x.shape} and floating type "
+                f"expected {title} to return a rate of {field!r} with its shape {x.shape} and floating type "
                 f"{x.dtype}, got shape {jnp.shape(rate)} and type {jnp.result_type(rate)}"
             )
     return dict(rates)
@@ -87,21 +87,21 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
 
 def apply_constraint(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
     """Return the derivative with the constraint of a plugin applied."""
-    where = f"constrain of plugin {plugin.name!r} ({type(plugin).__name__})"
-    return _call_method(where, lambda data_seen: plugin.constrain(data_seen, deriv, dt), data, plugin.coupling)
+    title = f"constrain of plugin {plugin.name!r} ({type(plugin).__name__})"
+    return _call_method(title, lambda data_seen: plugin.constrain(data_seen, deriv, dt), data, plugin.coupling)
 
 
-def _call_method(where: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:
+def _call_method(title: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:
     """Return the result of a plugin's method; an error of the method gets a note that names plugin and method."""
     try:
         return method(data)
     except Exception as error:
         shape = "(3,)" if scope == "drone" else "(n_drones, 3)"
-        error.add_note(f"in {where}, which is written for one {scope}: data.states.pos is {shape}")
+        error.add_note(f"in {title}, which is written for one {scope}: data.states.pos is {shape}")
         raise
 
 
-def _check_params(where: str, before: Any, after: Any) -> None:
+def _check_params(title: str, before: Any, after: Any) -> None:
     """Check that parameters have the shapes of one drone; a curve may become one curve per rotor."""
     for f in dataclasses.fields(before):
         old, new = getattr(before, f.name), getattr(after, f.name)
@@ -110,5 +110,5 @@ def _check_params(where: str, before: Any, after: Any) -> None:
         core = f.metadata.get("core")
         if jnp.ndim(new) != jnp.ndim(old) or (core is not None and jnp.shape(new)[-len(core) :] != core):
             raise ConfigError(
-                f"expected {where} to return params.{f.name} of shape {core or jnp.shape(old)}, got {jnp.shape(new)}"
+                f"expected {title} to return params.{f.name} of shape {core or jnp.shape(old)}, got {jnp.shape(new)}"
             )

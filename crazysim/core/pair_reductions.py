@@ -69,8 +69,10 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
 
     def pair(*args: Any) -> list[Array]:
         nonlocal structure
-        *other, is_self = args
-        values_of_pair, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, fn(treedef.unflatten(other), is_self)))
+        *other_values, is_self = args
+        values_of_pair, structure = jax.tree.flatten(
+            jax.tree.map(jnp.asarray, fn(treedef.unflatten(other_values), is_self))
+        )
         return values_of_pair
 
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
@@ -94,17 +96,21 @@ def _result_types(*args: object, jaxpr: ClosedJaxpr, n_own: int, reduce: str) ->
     return [x.update(weak_type=False) for x in jaxpr.out_avals]
 
 
-def _batched(axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> Any:
+def _batching_rule(
+    axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_own: int, reduce: str
+) -> Any:
     """Batch the reduction: compute it over the axis of drones, and bind a batched reduction over any other axis."""
     in_axes = [None if d is None else 0 for d in dims]
     rows = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
     if axis.name == MEMBER_AXIS:
-        out = _reduce_for_all(axis.size, rows[:n_own], in_axes[:n_own], rows[n_own:], in_axes[n_own:], jaxpr, reduce)
+        results = _reduce_for_all(
+            axis.size, rows[:n_own], in_axes[:n_own], rows[n_own:], in_axes[n_own:], jaxpr, reduce
+        )
     else:
         pair_of_batch = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*in_axes, None), axis_size=axis.size)
         pair = jax.make_jaxpr(pair_of_batch)(*rows, jax.ShapeDtypeStruct((), bool))
-        out = reduce_over_others_p.bind(*rows, jaxpr=pair, n_own=n_own, reduce=reduce)
-    return out, [0] * len(out)
+        results = reduce_over_others_p.bind(*rows, jaxpr=pair, n_own=n_own, reduce=reduce)
+    return results, [0] * len(results)
 
 
 def _reduce_for_all(
@@ -121,8 +127,8 @@ def _reduce_for_all(
     batched = [x for x, axis in zip(captured, captured_axes, strict=True) if axis is not None]
 
     def reduce_for_one(i: Array, row: Sequence[Array]) -> list[Array]:
-        rest = iter(row)
-        own_values = [x if axis is None else next(rest) for x, axis in zip(captured, captured_axes, strict=True)]
+        own_rows = iter(row)
+        own_values = [x if axis is None else next(own_rows) for x, axis in zip(captured, captured_axes, strict=True)]
 
         def apply_to_pair(j: Array, values: Sequence[Array]) -> list[Array]:
             return pair(*own_values, *values, i == j)
@@ -136,6 +142,6 @@ def _reduce_for_all(
     return jax.lax.map(reduce_in_batch, (indices, batched), batch_size=max(1, MAX_PAIRS // n))
 
 
-reduce_over_others_p = batched_primitive("reduce_over_others", _result_types, _batched, _refuse_outside)
+reduce_over_others_p = batched_primitive("reduce_over_others", _result_types, _batching_rule, _refuse_outside)
 """The reduction as a primitive: its operands are the values that the function captures, then the published ones.
 ``jaxpr`` maps both and ``is_self`` to the results for one pair; ``n_own`` is the number of captured values."""

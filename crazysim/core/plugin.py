@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.settings import Setting, check_settings, setting, settings_of
+from crazysim.core.settings import Setting, check_settings, collect_settings, setting
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.pytree import PyTree, device_array
@@ -110,9 +110,9 @@ def airframe_numbers(sim: Simulation, number: Callable[[Airframe], ArrayLike]) -
     """
     kinds = {id(airframe): airframe for airframe in sim.airframes}
     values = {key: np.asarray(number(airframe)) for key, airframe in kinds.items()}
-    first = next(iter(values.values()))
+    first_value = next(iter(values.values()))
     if len(kinds) == 1:
-        return first
+        return first_value
     per_drone = np.stack([values[id(airframe)] for airframe in sim.airframes])
     return np.broadcast_to(per_drone, (sim.n_worlds, *per_drone.shape))
 
@@ -247,7 +247,7 @@ class Plugin:
             kind: Class of the record.
             fields: Values of fields. Where one is None, the setting of its name is still checked.
         """
-        settings = {name: declared for name, declared in settings_of(type(self)).items() if declared.is_parameter}
+        settings = {name: declared for name, declared in collect_settings(type(self)).items() if declared.is_parameter}
         values = dict(fields)
         for field in dataclasses.fields(kind):  # type: ignore[arg-type]
             name, scope, core = field.name, field.metadata.get("scope"), field.metadata.get("core")

@@ -75,8 +75,8 @@ class Population(Plugin):
                 f"or {kind}(['{self.prefix}_0'])."
             )
         if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise ConfigError(f"expected distinct names of members, got {twice!r} twice. Rename one.")
+            repeated = next(name for name in names if names.count(name) > 1)
+            raise ConfigError(f"expected distinct names of members, got {repeated!r} twice. Rename one.")
         return names
 
     @property
@@ -108,8 +108,8 @@ class Population(Plugin):
         values = {}
         for name, value in fields.items():
             metadata = kind.__dataclass_fields__[name].metadata  # type: ignore[attr-defined]
-            of_members = metadata.get("scope") == "member" and value is not None and not isinstance(value, PyTree)
-            values[name] = _repeat_for_members(name, value, metadata, counts) if of_members else value
+            is_member_leaf = metadata.get("scope") == "member" and value is not None and not isinstance(value, PyTree)
+            values[name] = _repeat_for_members(name, value, metadata, counts) if is_member_leaf else value
         ids = np.array(np.broadcast_to(np.arange(self.n_members, dtype=np.int32), counts))
         return kind(population=self.name, n_members=self.n_members, member_id=ids, **values)  # type: ignore[call-arg]
 
@@ -137,7 +137,7 @@ class Population(Plugin):
 
         Override it for states that another method advances better, such as fast rotation under Euler's schemes.
         """
-        return scheme_of(integrator, self.positions)
+        return choose_scheme(integrator, self.positions)
 
     def finish(self, record: Members) -> Members:
         """Return the record of one member at the end of a step: unit quaternions restored, states limited."""
@@ -148,12 +148,12 @@ class Population(Plugin):
         cls, placements = type(self), []
         if cls.control is not Population.control:
             rate = self.control_freq
-            when = None if rate is None else functools.partial(acts_now, freq=rate)
+            condition = None if rate is None else functools.partial(acts_now, freq=rate)
             name = f"{self.name}_control"
-            placements.append(StagePlacement(Stage(self._controlled, self.name, when, name=name), name=name))
+            placements.append(StagePlacement(Stage(self._run_controller, self.name, condition, name=name), name=name))
         if cls.derivative is not Population.derivative:
             name = f"{self.name}_integration"
-            step = functools.partial(self._integrated, self.scheme(sim.integrator))
+            step = functools.partial(self._integrate, self.scheme(sim.integrator))
             placements.append(StagePlacement(Stage(step, self.name, name=name), before="increment_steps", name=name))
         return placements
 
@@ -175,18 +175,18 @@ class Population(Plugin):
         staged = getattr(record, field)
         command = check_command(self.name, staged.shape, command, staged.dtype)
         inside_jit = isinstance(staged, jax.core.Tracer) or isinstance(command, jax.core.Tracer)
-        new = jnp.asarray(command) if inside_jit else jax.device_put(command, staged.sharding)
-        return self.write(data, record.replace(**{field: new}))
+        device_command = jnp.asarray(command) if inside_jit else jax.device_put(command, staged.sharding)
+        return self.write(data, record.replace(**{field: device_command}))
 
-    def _controlled(self, data: SimData) -> SimData:
+    def _run_controller(self, data: SimData) -> SimData:
         return self.write(data, self.control(data))
 
-    def _integrated(self, scheme: Callable[..., Members], data: SimData) -> SimData:
+    def _integrate(self, scheme: Callable[..., Members], data: SimData) -> SimData:
         def rates(record: Members) -> dict[str, Array]:
             return plugin_rates(self, self.write(data, record))
 
-        moved = scheme(self.read(data), rates, 1 / data.core.freq)
-        return self.write(data, self.finish(moved))
+        advanced = scheme(self.read(data), rates, 1 / data.core.freq)
+        return self.write(data, self.finish(advanced))
 
 
 Rates = Callable[[R], dict[str, Array]]
@@ -200,8 +200,8 @@ def euler(record: R, rates: Rates, dt: float) -> R:
 
 def symplectic_euler(record: R, rates: Rates, dt: float, positions: Sequence[str]) -> R:
     """Return a record one semi-implicit Euler step later: positions move with the new values of the other states."""
-    others = advance_record(record, {k: rate for k, rate in rates(record).items() if k not in positions}, dt)
-    return advance_record(others, {k: rate for k, rate in rates(others).items() if k in positions}, dt)
+    advanced = advance_record(record, {k: rate for k, rate in rates(record).items() if k not in positions}, dt)
+    return advance_record(advanced, {k: rate for k, rate in rates(advanced).items() if k in positions}, dt)
 
 
 def rk4(record: R, rates: Rates, dt: float) -> R:
@@ -213,7 +213,7 @@ def rk4(record: R, rates: Rates, dt: float) -> R:
     return advance_record(record, jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), dt)
 
 
-def scheme_of(integrator: Integrator, positions: Sequence[str]) -> Callable[..., Any]:
+def choose_scheme(integrator: Integrator, positions: Sequence[str]) -> Callable[..., Any]:
     """Return the function ``(record, rates, dt) -> record`` of an integration scheme."""
     semi_implicit = functools.partial(symplectic_euler, positions=positions)
     return {

@@ -127,10 +127,10 @@ def _fractions(key: Array, shape: Sequence[int], dtype: Any) -> Array | None:
 def _words(key: Array, shape: Sequence[int]) -> Array:
     """Return random 32-bit words, (*shape)."""
     n = math.prod(shape)
-    first, second = jax.random.key_data(key)
+    word_0, word_1 = jax.random.key_data(key)
     counters = np.arange(-(-n // 2), dtype=np.uint32)
     zeros = np.zeros_like(counters)
-    pairs = threefry2x32_p.bind(first + zeros, second + zeros, zeros, counters)
+    pairs = threefry2x32_p.bind(word_0 + zeros, word_1 + zeros, zeros, counters)
     return jnp.stack(pairs, axis=-1).reshape(-1)[:n].reshape(shape)
 
 

@@ -133,7 +133,7 @@ def color(n: bool = False) -> Any:
 
 
 @functools.cache
-def settings_of(kind: type) -> dict[str, Setting]:
+def collect_settings(kind: type) -> dict[str, Setting]:
     """Return the declarations of a class's fields by ``setting`` or ``parameter``.
 
     A field that overrides a field of a base class inherits its declaration, unless it has one of its own.
@@ -159,7 +159,7 @@ def check_settings(settings: Any) -> None:
         value, kinds = getattr(settings, field.name), alternatives(kind)[field.name]
         if (value is None and (type(None) in kinds or field.default is None)) or not kinds:
             continue
-        name, declared = f"{field.name} of {kind.__name__}", settings_of(kind)[field.name]
+        name, declared = f"{field.name} of {kind.__name__}", collect_settings(kind)[field.name]
         remedy = f"help({kind.__name__}) describes it."
         kinds = set(kinds) - {type(None)}
         classes = tuple(kinds - NUMERIC_TYPES)
@@ -282,7 +282,7 @@ def as_rgba(rgba: object, n: int | None = None) -> NDArray[np.float64]:
     return read_numbers("rgba", rgba, range_between(0.0, 1.0), shapes, remedy="Use (1, 0, 0, 1) for red.")
 
 
-def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Array | None:
+def as_mask(mask: object, *shapes: tuple[int, ...], item: str = "world") -> Array | None:
     """Return a mask as an array; None, for all, stays None.
 
     Shape and type are checked, also of a traced mask.
@@ -290,18 +290,18 @@ def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Arra
     Args:
         mask: One bool for each world, or for each of something else.
         shapes: Shapes that it may have: (n_worlds,), or () in functions of one world.
-        each: Name of the things that have one bool each, for the message.
+        item: Name of the things that have one bool each, for the message.
     """
     if mask is None:
         return None
     try:
         array = mask if isinstance(mask, jax.Array) else np.asarray(mask)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"expected a mask of one bool per {each}, got {mask!r}; use a NumPy array") from error
+        raise ConfigError(f"expected a mask of one bool per {item}, got {mask!r}; use a NumPy array") from error
     if array.shape not in shapes or array.dtype != bool:
         n = shapes[0][0] if shapes[0] else 1
         raise ConfigError(
-            f"expected a mask of shape {' or '.join(map(str, shapes))} and bool, one per {each}, got shape "
+            f"expected a mask of shape {' or '.join(map(str, shapes))} and bool, one per {item}, got shape "
             f"{array.shape} and type {array.dtype}; for indices use np.isin(np.arange({n}), indices)"
         )
     return jnp.asarray(array)
@@ -334,37 +334,38 @@ def control_freqs(
         rates: Requested rates, Hz; None for the default, the largest divisor of ``freq`` up to 500 Hz.
         controller: Controller of the command level, from ``controller_at_rates``; None if commands need none.
     """
-    followers, last = controller_chain(controller, control)
+    followers, last_level = controller_chain(controller, control)
     freqs = {}
     for level, follower in followers:
         outer_freq = follower.outer_freq if level == Control.state else None
         freqs[level] = follower.freq if outer_freq is None else outer_freq
-    if last != Control.rotor_vel:
-        name = f"{last.value}_freq"
-        freqs[last] = rates.get(last) or default_rates(freq, {name: min(500, freq)})[name]
+    if last_level != Control.rotor_vel:
+        name = f"{last_level.value}_freq"
+        freqs[last_level] = rates.get(last_level) or default_rates(freq, {name: min(500, freq)})[name]
     return freqs
 
 
-def default_rates(freq: int, defaults: Mapping[str, int], of: str = "") -> dict[str, int]:
+def default_rates(freq: int, defaults: Mapping[str, int], suffix: str = "") -> dict[str, int]:
     """Return default rates in a simulation: the largest divisors of ``freq`` up to the defaults, Hz.
 
     Args:
         freq: Rate of physics steps, Hz.
         defaults: Default rates by the names of their settings, Hz.
-        of: Suffix of the names in messages.
+        suffix: Suffix of the names in messages.
     """
 
-    def low(freq: int) -> list[str]:
+    def find_low_rates(freq: int) -> list[str]:
         limits = {name: min(default, max(freq, SLOW_FREQ)) for name, default in defaults.items()}
         return [name for name, limit in limits.items() if 2 * _largest_divisor(freq, defaults[name]) < limit]
 
-    if names := low(freq):
+    if names := find_low_rates(freq):
         name, default = names[0], defaults[names[0]]
         candidates = (f for k in itertools.count(1) for f in (freq + k, freq - k) if f > 0)
-        good = next(f for f in candidates if not low(f))
+        usable_freq = next(f for f in candidates if not find_low_rates(f))
         raise ConfigError(
-            f"expected a freq with a divisor near {default} Hz, the default of {name}{of}, got {freq} Hz, whose "
-            f"largest divisor up to that is {_largest_divisor(freq, default)} Hz. Use freq={good}, or set {name}{of}."
+            f"expected a freq with a divisor near {default} Hz, the default of {name}{suffix}, got {freq} Hz, whose "
+            f"largest divisor up to that is {_largest_divisor(freq, default)} Hz. Use freq={usable_freq}, or set "
+            f"{name}{suffix}."
         )
     return {name: _largest_divisor(freq, default) for name, default in defaults.items()}
 

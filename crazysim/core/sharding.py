@@ -38,7 +38,7 @@ class Location(NamedTuple):
         return self.mesh is not None or (self.devices is not None and len(self.devices) > 1)
 
 
-def location_of(x: jax.Array) -> Location:
+def find_location(x: jax.Array) -> Location:
     """Return the devices of an array whose first axis is over worlds."""
     devices = tuple(sorted(x.sharding.device_set, key=lambda d: d.id))
     platform = devices[0].platform
@@ -57,14 +57,16 @@ def put_on_device(tree: T, device: jax.Device) -> T:
     """
     sharding = SingleDeviceSharding(device)
     leaves, treedef = jax.tree.flatten(tree)
-    traced = [i for i, x in enumerate(leaves) if isinstance(x, jax.core.Tracer)]
-    away = [i for i, x in enumerate(leaves) if i not in traced and not _is_on(x, sharding)]
-    if not away and not traced:
+    traced_indices = [i for i, x in enumerate(leaves) if isinstance(x, jax.core.Tracer)]
+    moved_indices = [i for i, x in enumerate(leaves) if i not in traced_indices and not _is_on(x, sharding)]
+    if not moved_indices and not traced_indices:
         return tree
-    if away:  # one call for all leaves takes half the time
-        leaves = replace_leaves(leaves, away, jax.device_put([leaves[i] for i in away], sharding))
-    if traced and not _runs_on(device):
-        leaves = replace_leaves(leaves, traced, jax.lax.with_sharding_constraint([leaves[i] for i in traced], sharding))
+    if moved_indices:  # one call for all leaves takes half the time
+        leaves = replace_leaves(leaves, moved_indices, jax.device_put([leaves[i] for i in moved_indices], sharding))
+    if traced_indices and not _runs_on(device):
+        leaves = replace_leaves(
+            leaves, traced_indices, jax.lax.with_sharding_constraint([leaves[i] for i in traced_indices], sharding)
+        )
     return treedef.unflatten(leaves)
 
 
@@ -75,11 +77,11 @@ def _is_on(x: object, sharding: SingleDeviceSharding) -> bool:
 def _runs_on(device: jax.Device) -> bool:
     """Return True if a function that is traced now will run on the device, or on a mesh."""
     with jax.ensure_compile_time_eval():
-        default = jax.device_put(np.int8(0)).devices()
-    return default == {device} or not jax.sharding.get_abstract_mesh().empty
+        default_devices = jax.device_put(np.int8(0)).devices()
+    return default_devices == {device} or not jax.sharding.get_abstract_mesh().empty
 
 
-def default_device_of(x: object) -> AbstractContextManager[object]:
+def use_device_of(x: object) -> AbstractContextManager[object]:
     """Return a context whose default device is the device of an array.
 
     It has no effect on a traced array, whose program runs on the device of its arguments, or on an array of several
@@ -108,15 +110,15 @@ def shardings_of(data: SimData, mesh: Mesh) -> SimData:
             f"{data.core.n_worlds} worlds cannot be split evenly over {n_devices} devices; use a multiple of "
             f"{n_devices}"
         )
-    split = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
-    copied = NamedSharding(mesh, PartitionSpec())
-    return jax.tree.map(lambda scope: split if n_batch_axes(scope) else copied, scopes(data))
+    split_sharding = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
+    replicated_sharding = NamedSharding(mesh, PartitionSpec())
+    return jax.tree.map(lambda scope: split_sharding if n_batch_axes(scope) else replicated_sharding, scopes(data))
 
 
 def shard(data: SimData, mesh: Mesh) -> SimData:
     """Return the data distributed over a mesh; under a trace, constrain the compiled function to distribute it."""
-    put = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else jax.device_put
-    return put(data, shardings_of(data, mesh))
+    distribute = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else jax.device_put
+    return distribute(data, shardings_of(data, mesh))
 
 
 def shard_scene(mjx_data: T, mesh: Mesh) -> T:

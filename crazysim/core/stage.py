@@ -76,15 +76,15 @@ class Stage:
 
     def apply_to_one(self, data: SimData) -> SimData:
         """Return the data after the stage, for data of the scope that the stage is written for."""
-        after = self.fn(data)
+        data_after = self.fn(data)
         mask = None if self.when is None else self.when(data)
         if mask is None:
-            return after
+            return data_after
 
         def select(new: Array, old: Array) -> Array:
             return new if new is old else jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - mask.ndim)), new, old)
 
-        return jax.tree.map(select, after, data)
+        return jax.tree.map(select, data_after, data)
 
     def apply_in_worlds(self, data: SimData, mask: Array | None) -> SimData:
         """Return the data after the stage, with changes only in some worlds.
@@ -93,11 +93,11 @@ class Stage:
             data: Data of the simulation.
             mask: True in the worlds to change; None for all. (n_worlds,)
         """
-        after = self(data)
+        data_after = self(data)
         return (
-            after
+            data_after
             if mask is None
-            else jax.tree.map(lambda x, y: x if x is y else select_worlds(mask, x, y), after, data)
+            else jax.tree.map(lambda x, y: x if x is y else select_worlds(mask, x, y), data_after, data)
         )
 
     def __repr__(self) -> str:
@@ -180,7 +180,7 @@ class Axes:
         """Record with the index of every leaf in place of the leaf."""
         self.scopes: list[str] = jax.tree.leaves(scopes(data))
 
-    def written(self, before: list[Array], after: SimData, stage: Stage) -> list[int]:
+    def written_leaves(self, before: list[Array], after: SimData, stage: Stage) -> list[int]:
         """Return the indices of the leaves that a stage wrote, and check that it may write them.
 
         Args:
@@ -189,16 +189,16 @@ class Axes:
             stage: The stage.
         """
         name = stage.__name__
-        new, treedef = jax.tree.flatten(after)
+        new_leaves, treedef = jax.tree.flatten(after)
         if treedef != self.treedef:
             raise ConfigError(
                 f"stage {name!r} changed the structure of SimData (a field became None, or a plugin came or went); "
                 f"put everything in place before the step, with sim.data = sim.data.replace(...)"
             )
-        written = [i for i, (x, y) in enumerate(zip(before, new, strict=True)) if x is not y]
-        writable_scopes = self.writable(stage)
+        written = [i for i, (x, y) in enumerate(zip(before, new_leaves, strict=True)) if x is not y]
+        writable_scopes = self.writable_scopes(stage)
         for i in written:
-            x, y = before[i], new[i]
+            x, y = before[i], new_leaves[i]
             if jnp.shape(x) != jnp.shape(y) or jnp.result_type(x) != jnp.result_type(y):
                 raise ConfigError(
                     f"stage {name!r} turned {self.names[i]} of shape {jnp.shape(x)} and type {jnp.result_type(x)} into "
@@ -212,7 +212,7 @@ class Axes:
                 )
         return written
 
-    def writable(self, stage: Stage) -> list[str] | None:
+    def writable_scopes(self, stage: Stage) -> list[str] | None:
         """Return the scopes of the leaves that a stage may write; None if it may write all leaves."""
         if stage.scope == "batch":
             return None
@@ -285,14 +285,14 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
             return [x for (_, x), i in zip(paths, unchanged, strict=True) if i is None]
 
         changed = iter(jax.vmap(in_one_world, ([0 if split else None for split in is_split],))(inputs))
-        out = []
+        outputs = []
         for scope, i in zip(returned["scopes"], returned["unchanged"], strict=True):
             if i is not None and leaf_scopes[i] == scope:
-                out.append(leaves[i])
+                outputs.append(leaves[i])
             else:
                 x = next(changed) if i is None else inputs[i]
-                out.append(x[:, None] if scope == "world" else x)
-        return returned["treedef"].unflatten(out)
+                outputs.append(x[:, None] if scope == "world" else x)
+        return returned["treedef"].unflatten(outputs)
 
     return in_all_worlds
 
@@ -329,18 +329,22 @@ def _apply_in_all_worlds(stage: Stage, data: SimData) -> SimData:
 def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
     """Return a stage as a function of the data of one world; its condition selects between new and old leaves."""
 
-    def in_world(world: SimData) -> SimData:
+    def apply_in_world(world: SimData) -> SimData:
         leaves = jax.tree.leaves(world)
         written: list[int] = []
 
-        def apply(values: list[Array]) -> list[Array]:
-            after = stage.apply_to_one(axes.treedef.unflatten(values))
-            written[:] = axes.written(values, after, stage)
-            new = jax.tree.leaves(after)
-            return [new[i] for i in written]
+        def apply_to_values(values: list[Array]) -> list[Array]:
+            data_after = stage.apply_to_one(axes.treedef.unflatten(values))
+            written[:] = axes.written_leaves(values, data_after, stage)
+            new_leaves = jax.tree.leaves(data_after)
+            return [new_leaves[i] for i in written]
 
         in_axes = [0 if s == stage.scope else None for s in axes.scopes]
-        out = apply(leaves) if stage.scope == "world" else jax.vmap(apply, (in_axes,), axis_name=MEMBER_AXIS)(leaves)
-        return axes.treedef.unflatten(replace_leaves(leaves, written, out))
+        outputs = (
+            apply_to_values(leaves)
+            if stage.scope == "world"
+            else jax.vmap(apply_to_values, (in_axes,), axis_name=MEMBER_AXIS)(leaves)
+        )
+        return axes.treedef.unflatten(replace_leaves(leaves, written, outputs))
 
-    return in_world
+    return apply_in_world

@@ -25,12 +25,12 @@ FLOOR_HEIGHT = -0.001
 """Height below which no drone falls, m: a little under zero, so that a negative height marks a landing."""
 
 
-def _built_in(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
+def _built_in_stage(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
     """Return a decorator that declares a built-in stage, whose function takes data of one drone, one world or all."""
     return lambda fn: Stage(fn, scope, when, batched=True, trace_once=True)
 
 
-def _ticks(controller: str) -> Callable[[SimData], Array | None]:
+def _rate_condition(controller: str) -> Callable[[SimData], Array | None]:
     """Return the condition under which a controller acts: at its own rate."""
     return lambda data: acts_now(data, getattr(data.controls, controller).freq)
 
@@ -41,12 +41,12 @@ def build_step_pipeline(
     """Return the stages of one physics step, in order; ``controller`` is None where commands need none."""
     fitted_model = dynamics != Dynamics.first_principles
     stages: Pipeline = {}
-    followers, last = controller_chain(controller, control)
+    followers, last_level = controller_chain(controller, control)
     for level, follower in followers:
         stages |= controller_stages(follower, level)
-    if last == Control.attitude:
+    if last_level == Control.attitude:
         stages["commit_attitude"] = commit_attitude
-    if last == Control.force_torque:
+    if last_level == Control.force_torque:
         stages["force_torque_controller"] = force_torque_controller
     stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
     deriv_fn: DerivFn = first_principles_derivative
@@ -62,7 +62,7 @@ def build_step_pipeline(
     return stages
 
 
-@_built_in("drone", when=_ticks("attitude"))
+@_built_in_stage("drone", when=_rate_condition("attitude"))
 def commit_attitude(data: SimData) -> SimData:
     """Apply the staged attitude command; fitted dynamics contain the controller that follows it."""
     ctrl = data.controls.attitude
@@ -70,7 +70,7 @@ def commit_attitude(data: SimData) -> SimData:
     return data.replace(controls=data.controls.replace(attitude=ctrl))
 
 
-@_built_in("drone", when=_ticks("force_torque"))
+@_built_in_stage("drone", when=_rate_condition("force_torque"))
 def force_torque_controller(data: SimData) -> SimData:
     """Apply the staged wrench, and command the rotor speeds that produce it."""
     controls = controls_of(data)
@@ -80,14 +80,14 @@ def force_torque_controller(data: SimData) -> SimData:
     return data.replace(controls=controls.replace(force_torque=force_torque, rotor_vel=rotor_vel))
 
 
-@_built_in("drone")
+@_built_in_stage("drone")
 def clip_rotor_vel_cmd(data: SimData) -> SimData:
     """Limit commanded rotor speeds to the range of the motors; zero or less switches a motor off."""
     rotor_vel = first_principles.saturate(controls_of(data).rotor_vel, data.params)
     return data.replace(controls=data.controls.replace(rotor_vel=rotor_vel))
 
 
-@_built_in("drone")
+@_built_in_stage("drone")
 def clip_thrust_cmd(data: SimData) -> SimData:
     """Limit the commanded collective thrust to the range of the rotors; zero or less switches them off."""
     ctrl = data.controls.attitude
@@ -146,13 +146,13 @@ def stop_below(s: SimState, lowest: Array | float) -> SimState:
     )
 
 
-@_built_in("drone")
+@_built_in_stage("drone")
 def clip_floor_pos(data: SimData) -> SimData:
     """Stop drones at the floor."""
     return data.replace(states=stop_below(data.states, FLOOR_HEIGHT))
 
 
-@_built_in("world")
+@_built_in_stage("world")
 def increment_steps(data: SimData) -> SimData:
     """Count the step."""
     return data.replace(core=data.core.replace(steps=data.core.steps + 1))
@@ -202,6 +202,6 @@ def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> Si
             return select_worlds(mask, default, x)
         return default if mask is None else x
 
-    new = jax.tree.map(restore, scopes(data), data, default_data.replace(plugins=plugins))
+    new_data = jax.tree.map(restore, scopes(data), data, default_data.replace(plugins=plugins))
     episode = select_worlds(mask, data.core.episode + 1, data.core.episode)
-    return new.replace(core=new.core.replace(episode=episode, rng_key=data.core.rng_key))
+    return new_data.replace(core=new_data.core.replace(episode=episode, rng_key=data.core.rng_key))

@@ -23,16 +23,16 @@ class PackCache:
     """
 
     def __init__(self) -> None:
-        self._last: tuple[Sequence[Any], Array | None] = (), None  # one attribute: other threads may replace it
+        self._cached: tuple[Sequence[Any], Array | None] = (), None  # one attribute: other threads may replace it
 
     def __call__(self, arrays: list[Any]) -> Array:
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return _concatenate(arrays)
-        before, packed = self._last
-        if packed is None or not _are_same(arrays, before):
+        cached_arrays, packed = self._cached
+        if packed is None or not _are_same(arrays, cached_arrays):
             with jax.ensure_compile_time_eval():  # inside a user's trace too: a cached value must be an array
                 packed = _pack_arrays(arrays) if packed is None and _on_one_cpu(arrays) else _compiled(arrays)
-            self._last = _without_numpy(arrays), packed
+            self._cached = _without_numpy(arrays), packed
         return packed
 
 
@@ -64,14 +64,14 @@ class ZerosCache:
     """
 
     def __init__(self) -> None:
-        self._last: tuple[Sequence[Any], Zeros] = (), ()  # one attribute: other threads may replace it
+        self._cached: tuple[Sequence[Any], Zeros] = (), ()  # one attribute: other threads may replace it
         self._shared: dict[Any, list[int]] = {}
 
     def __call__(self, data: SimData, leaves: list[Any], treedef: Any) -> Zeros:
         indices = self._indices(data, leaves, treedef)
         arrays = [leaves[i] for i in indices]
-        before, zeros = self._last
-        if _are_same(arrays, before):
+        cached_arrays, zeros = self._cached
+        if _are_same(arrays, cached_arrays):
             return zeros
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return ()
@@ -79,7 +79,7 @@ class ZerosCache:
             (i, frozenset(np.flatnonzero(np.asarray(x) == 0).tolist())) for i, x in zip(indices, arrays, strict=True)
         ]
         zeros = tuple([(i, zeros_of_leaf) for i, zeros_of_leaf in by_leaf if zeros_of_leaf])
-        self._last = _without_numpy(arrays), zeros
+        self._cached = _without_numpy(arrays), zeros
         return zeros
 
     def _indices(self, data: SimData, leaves: list[Any], treedef: Any) -> list[int]:

@@ -37,7 +37,7 @@ class HostLeaves:
     Indexing returns a leaf as a JAX array, which is made once.
     """
 
-    __slots__ = ("_made", "_sharding", "_views", "addresses", "items")
+    __slots__ = ("_jax_arrays", "_sharding", "_views", "addresses", "items")
 
     def __init__(self, items: list[Any], addresses: list[int], views: Any, sharding: Any):
         """Store leaves.
@@ -49,17 +49,17 @@ class HostLeaves:
             sharding: Device on which JAX arrays are made.
         """
         self.items, self.addresses, self._views, self._sharding = items, addresses, views, sharding
-        self._made: dict[int, Array] = {}
+        self._jax_arrays: dict[int, Array] = {}
 
     def __getitem__(self, i: int) -> Array:
         x = self.items[i]
         if isinstance(x, jax.Array):
             return x
-        if i not in self._made:
-            self._made.setdefault(
+        if i not in self._jax_arrays:
+            self._jax_arrays.setdefault(
                 i, jaxcompat.put_host_array(self.array(i), self._sharding)
             )  # another thread may make the same array: the first one stays
-        return self._made[i]
+        return self._jax_arrays[i]
 
     def array(self, i: int) -> NDArray:
         """Return a leaf as a NumPy array, which must not be written to."""
@@ -73,10 +73,10 @@ class HostLeaves:
 
     def replace_items(self, indices: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
         """Return the leaves with some replaced by items with known addresses."""
-        new = HostLeaves(list(self.items), list(self.addresses), self._views, self._sharding)
+        leaves = HostLeaves(list(self.items), list(self.addresses), self._views, self._sharding)
         for i, x, address in zip(indices, items, addresses, strict=True):
-            new.items[i], new.addresses[i] = x, address
-        return new
+            leaves.items[i], leaves.addresses[i] = x, address
+        return leaves
 
 
 def _address(x: NDArray) -> int:
@@ -122,10 +122,10 @@ class CallResults:
     def __init__(self, layout: _Layout):
         self._layout = layout
         self._memory = [np.empty(size + ALIGNMENT_BYTES, np.uint8) for size in layout.sizes]
-        begins = [_address(x) for x in self._memory]
-        self._starts = [-begin % ALIGNMENT_BYTES for begin in begins]
-        first = [begin + start for begin, start in zip(begins, self._starts, strict=True)]
-        self.addresses = [first[piece] + offset for piece, offset in layout.begins]
+        addresses = [_address(x) for x in self._memory]
+        self._starts = [-begin % ALIGNMENT_BYTES for begin in addresses]
+        aligned_addresses = [begin + start for begin, start in zip(addresses, self._starts, strict=True)]
+        self.addresses = [aligned_addresses[piece] + offset for piece, offset in layout.begins]
 
     def array(self, key: Any) -> NDArray:
         """Return the array of a key; a copy if several share memory, so that keeping it keeps no other array alive."""
@@ -161,34 +161,34 @@ class HostCall:
             leaves: Leaves of the data, for their shapes and types.
             nonfinite: Index of the leaf with the flags of worlds, ``core.nonfinite``.
         """
-        self.used = False
+        self.was_called = False
         """True once it has been called."""
         self._nonfinite = nonfinite
-        self._held: dict[int, tuple[Any, NDArray]] = {}
+        self._views_by_leaf: dict[int, tuple[Any, NDArray]] = {}
         self._launches: list[_Launch] = []
         results: list[tuple[Any, tuple[int, ...], np.dtype]] = []
         n_worlds = leaves[nonfinite].shape[0]
         for k, (kernel, owned_leaves) in enumerate(zip(kernels, owned, strict=True)):
-            first, n_drones = len(results), kernel.program.n_drones
+            first_result, n_drones = len(results), kernel.program.n_drones
             for i in kernel.outputs:
                 key = i if owned_leaves is None or i in owned_leaves else (k, i)
                 results.append((key, leaves[i].shape, np.dtype(leaves[i].dtype)))
             results.append((("flags", k), (n_worlds, n_drones), np.dtype(bool)))
-            outputs = slice(first, len(results))
-            form = struct.Struct(f"{len(kernel.inputs) + len(results) - first}P")
+            outputs = slice(first_result, len(results))
+            form = struct.Struct(f"{len(kernel.inputs) + len(results) - first_result}P")
             self._launches.append(
-                _Launch(kernel.on("cpu").on_memory(), n_worlds * n_drones, kernel.inputs, outputs, form)
+                _Launch(kernel.get_launch("cpu").on_memory(), n_worlds * n_drones, kernel.inputs, outputs, form)
             )
         self._flags = [key for key, _, _ in results if isinstance(key, tuple) and key[0] == "flags"]
         if self._flags == [("flags", 0)] and results[-1][1][1] == 1:  # the flags are the leaf
             results[-1] = (nonfinite, *results[-1][1:])
             self._flags = []
         self._layout = _Layout(results)
-        written = [(i, k) for k, (i, _, _) in enumerate(results) if isinstance(i, int)]
-        self._written, self._positions = [i for i, _ in written], [k for _, k in written]
-        self._read = sorted({i for launch in self._launches for i in launch.inputs})
+        written_pairs = [(i, k) for k, (i, _, _) in enumerate(results) if isinstance(i, int)]
+        self._written_leaves, self._positions = [i for i, _ in written_pairs], [k for _, k in written_pairs]
+        self._read_leaves = sorted({i for launch in self._launches for i in launch.inputs})
 
-    def hold(self, leaves: Sequence[Any], sharding: Any) -> HostLeaves:
+    def make_host_leaves(self, leaves: Sequence[Any], sharding: Any) -> HostLeaves:
         """Return leaves that can be stepped.
 
         Args:
@@ -196,7 +196,7 @@ class HostCall:
             sharding: The device.
         """
         items = list(leaves)
-        views = {i: self._view(i, items[i]) for i in self._read}
+        views = {i: self._view(i, items[i]) for i in self._read_leaves}
         addresses = [0] * len(items)
         for i, view in views.items():
             addresses[i] = view.ctypes.data
@@ -204,26 +204,26 @@ class HostCall:
 
     def _view(self, i: int, x: Any) -> NDArray:
         """Return a NumPy view of a JAX array, after waiting for it. The last view of each leaf is cached."""
-        entry = self._held.get(i)
+        entry = self._views_by_leaf.get(i)
         if entry is None or entry[0] is not x:
             key_data = jax.random.key_data(x) if jaxcompat.is_key(x) else x
-            entry = self._held[i] = x, np.ascontiguousarray(key_data)
+            entry = self._views_by_leaf[i] = x, np.ascontiguousarray(key_data)
         return entry[1]
 
     def __call__(self, leaves: HostLeaves, n_steps: int) -> HostLeaves:
         """Return the leaves some steps later."""
-        self.used = True
+        self.was_called = True
         results, addresses = CallResults(self._layout), leaves.addresses
         for kernel, n_lanes, inputs, outputs, packed in self._launches:
             pointers = packed.pack(*[addresses[i] for i in inputs], *results.addresses[outputs])
             if not kernel(n_lanes, n_steps, pointers, len(inputs)):
                 raise MemoryError("there is no memory for a step")
-        new = [results.addresses[k] for k in self._positions]
-        after = leaves.replace_items(self._written, [results] * len(new), new)
+        result_addresses = [results.addresses[k] for k in self._positions]
+        leaves_after = leaves.replace_items(self._written_leaves, [results] * len(result_addresses), result_addresses)
         if not self._flags:
-            return after
+            return leaves_after
         flagged = functools.reduce(np.logical_or, (results.array(k).any(axis=1, keepdims=True) for k in self._flags))
-        return after.replace([self._nonfinite], [flagged])
+        return leaves_after.replace([self._nonfinite], [flagged])
 
 
 def is_possible(kernels: Sequence[Kernels]) -> bool:
@@ -232,7 +232,7 @@ def is_possible(kernels: Sequence[Kernels]) -> bool:
     Each must check its results and write them into new memory, not into rows in place. None may write random keys.
     """
     return not jaxcompat.FALLBACKS and all(
-        kernel.program.check is not None
+        kernel.program.check_segment is not None
         and not kernel.program.rows
         and not any(jaxcompat.is_key(kernel.program.leaves[i]) for i in kernel.outputs)
         for kernel in kernels

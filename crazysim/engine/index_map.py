@@ -26,14 +26,14 @@ Function = Callable[..., Sequence[Array]]
 
 
 class MapKernels:
-    """Kernels of one function, each of which is compiled when it is first needed."""
+    """Kernels of one function, compiled when they are first needed."""
 
     def __init__(self, block: Block):
         """Store the function; nothing is compiled."""
         self._block = block
         self._launches: dict[str, Launch] = {}
 
-    def on(self, platform: str) -> Launch:
+    def get_launch(self, platform: str) -> Launch:
         """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
             if platform == "gpu":
@@ -53,7 +53,7 @@ def _results(*args: Any, kernels: MapKernels, n: int) -> list[jax.ShapeDtypeStru
 
 
 def _launch(platform: str, *tables: Array, kernels: MapKernels, n: int) -> list[Array]:
-    return kernels.on(platform)(n, jnp.zeros(1, np.int32), tables, kernels.results(n))
+    return kernels.get_launch(platform)(n, jnp.zeros(1, np.int32), tables, kernels.results(n))
 
 
 map_p = jaxcompat.primitive_by_platform(
@@ -84,16 +84,18 @@ def map_indices(
         return list(jax.vmap(lambda i: fn(i, *tables))(numbers))
     kernels = MapKernels(lower_map(fn, tables))
     if compile_now:
-        kernels.on(platform)
+        kernels.get_launch(platform)
 
     def run(tables: list[Array]) -> list[Array]:
         return list(map_p.bind(*tables, kernels=kernels, n=n))
 
-    def batched(size: int, in_batched: Any, tables: list[Array]) -> Any:
-        full = [x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(tables, *in_batched, strict=True)]
-        return jax.lax.map(run, full), [True] * len(kernels.results(n))
+    def batching_rule(size: int, in_batched: Any, tables: list[Array]) -> Any:
+        broadcast_tables = [
+            x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(tables, *in_batched, strict=True)
+        ]
+        return jax.lax.map(run, broadcast_tables), [True] * len(kernels.results(n))
 
-    return jaxcompat.batched_rule(run, batched)(list(tables))
+    return jaxcompat.batched_rule(run, batching_rule)(list(tables))
 
 
 def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
@@ -126,5 +128,7 @@ def write_map(block: Block, target: str) -> Kernel:
     values = writer.block(block, ["LANE", *(f"p{k}" for k in range(len(tables)))], 2)
     for k, (kind, x) in enumerate(zip(outputs, values, strict=True)):
         write_results(writer, f"q{k}", kind, 1, [x], 2)
-    read, written = tuple(range(len(inputs))), tuple(range(len(outputs)))
-    return make_kernel(target, pointers, [], writer.lines, [block], writer.tables, inputs=read, outputs=written)
+    input_indices, output_indices = tuple(range(len(inputs))), tuple(range(len(outputs)))
+    return make_kernel(
+        target, pointers, [], writer.lines, [block], writer.tables, inputs=input_indices, outputs=output_indices
+    )

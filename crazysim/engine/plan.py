@@ -73,7 +73,7 @@ class Plan:
     """Indices of the shared leaves that are passed as one concatenated leaf, the first after the leaves of the data."""
     rows: tuple[PackedRows, ...]
     """Leaves whose rows are other leaves, after the packed leaf; empty if no leaf is stored as rows."""
-    written: tuple[int, ...]
+    written_leaves: tuple[int, ...]
     """Indices of the leaves that the compiled step returns."""
     leaf_indices: SimData
     """Record with the index of every leaf in place of the leaf, as ``leaf_indices`` returns it."""
@@ -155,34 +155,37 @@ class Planner(NamedTuple):
 
         For data on several devices it may be a plan of ``plain``.
         """
-        limit = self._distribution_limit(data)
-        if limit:
-            return self._plan_plain(data, limit), []
+        distribution_limit = self._distribution_limit(data)
+        if distribution_limit:
+            return self._plan_plain(data, distribution_limit), []
         leaf_scopes = jax.tree.leaves(scopes(data))
         # ``zeros`` may be older than ``data``: a parameter that was shared then may have one value per drone now.
-        known = tuple([(i, indices) for i, indices in zeros if leaf_scopes[i] == "shared"])
+        shared_zeros = tuple([(i, indices) for i, indices in zeros if leaf_scopes[i] == "shared"])
         tracer = Tracer()
         groups = independent_groups(self.stages, data, tracer)
-        lowered = [
-            lower_stages(g.stages, data, known, _watched_leaves, population=g.population, tracer=tracer) for g in groups
+        lowered_programs = [
+            lower_stages(g.stages, data, shared_zeros, _watched_leaves, population=g.population, tracer=tracer)
+            for g in groups
         ]
-        one_kernel = self._has_kernels and not self.location.is_distributed and [x.fused for x in lowered] == [True]
+        one_kernel = (
+            self._has_kernels and not self.location.is_distributed and [x.fused for x in lowered_programs] == [True]
+        )
         select = None
         if separate is not None and one_kernel:
-            not_rows = {*separate, leaf_indices(data).core.mjx_synced}
-            select = lambda written: [i for i in written if i not in not_rows]  # noqa: E731
-        programs = tuple([optimise(program, select, pack=k == 0) for k, program in enumerate(lowered)])
+            separate_leaves = {*separate, leaf_indices(data).core.mjx_synced}
+            select = lambda written: [i for i in written if i not in separate_leaves]  # noqa: E731
+        programs = tuple([optimise(program, select, pack=k == 0) for k, program in enumerate(lowered_programs)])
         unfused = [stage for program in programs for stage in program.unfused_stages]
         problems = [f"stage {s.explanation}" for s in unfused if not isinstance(s.error, LimitError)]
         if self.location.is_distributed and unfused:
-            limit = f"with a mesh every stage must be fused, and {unfused[0].explanation}"
-            return self._plan_plain(data, limit), problems
+            distribution_limit = f"with a mesh every stage must be fused, and {unfused[0].explanation}"
+            return self._plan_plain(data, distribution_limit), problems
         engine, reason, runs = self.engine, "it was chosen", []
         if engine in ("auto", "fused"):
             engine, reason = "lanes", fused.unavailable_reason(self.location.platform) or ""
             if not reason:
                 try:
-                    without_rows = None if select is None else optimise(lowered[0])
+                    without_rows = None if select is None else optimise(lowered_programs[0])
                     runs, engine = [fused.build(x, self.location, without_rows) for x in programs], "fused"
                 except UnsupportedError as error:
                     error = self._error_of_stage(error, data)
@@ -229,29 +232,33 @@ class Planner(NamedTuple):
         reason: str,
         data: SimData,
         programs: tuple[Program, ...],
-        needed: Collection[int],
-        written: tuple[int, ...],
-        run: Run,
+        read_leaves: Collection[int],
+        written_leaves: tuple[int, ...],
+        run_programs: Run,
         n_leaves: int,
     ) -> Plan:
-        indices, inputs = leaf_indices(data), tuple(sorted(needed))
+        indices, inputs = leaf_indices(data), tuple(sorted(read_leaves))
         # If a stage writes the flags itself, no check is added.
-        checks = any(p.check is not None for p in programs) if programs else indices.core.nonfinite not in written
+        checks = (
+            any(p.check_segment is not None for p in programs)
+            if programs
+            else indices.core.nonfinite not in written_leaves
+        )
         flags = (indices.core.nonfinite,) if checks else ()
-        written = (*written, *flags)
+        written_leaves = (*written_leaves, *flags)
         main = programs[0] if programs else None
         packed = main.packed if main is not None else ()
         rows = tuple(packed_rows(main)) if main is not None else ()
 
         def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
             leaves = replace_leaves([None] * n_leaves, inputs, values)
-            out, flagged = run(leaves, n_steps)
-            return [*out, flagged] if flags else list(out)
+            outputs, flagged = run_programs(leaves, n_steps)
+            return [*outputs, flagged] if flags else list(outputs)
 
         if programs and self.location.mesh is not None:
-            advance = self._over_mesh(advance, data, inputs, written)
+            advance = self._over_mesh(advance, data, inputs, written_leaves)
         plan = Plan(
-            engine, reason, programs, self.location, inputs, packed, rows, written, indices, *_jit_step(advance)
+            engine, reason, programs, self.location, inputs, packed, rows, written_leaves, indices, *_jit_step(advance)
         )
         in_numpy = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
         return dataclasses.replace(plan, numpy_step=_results_on_device(advance)) if in_numpy else plan
@@ -335,20 +342,22 @@ def _join_runs(
     """Return a function that runs all of the independent programs, and the indices of the leaves that it writes."""
     runs = [on_data_leaves(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:
-        return runs[0], tuple(programs[0].written)
+        return runs[0], tuple(programs[0].written_leaves)
     owned = [group.owned for group in groups]
-    written = sorted({i for program in programs for i in program.written})
+    written = sorted({i for program in programs for i in program.written_leaves})
 
     def run_all(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-        new: dict[int, Any] = {}
+        results: dict[int, Any] = {}
         flags = []
         for program, owned_leaves, run in zip(programs, owned, runs, strict=True):
-            out, flagged = run(leaves[: len(program.leaves)], n_steps)
-            new |= {
-                i: x for i, x in zip(program.written, out, strict=True) if owned_leaves is None or i in owned_leaves
+            outputs, flagged = run(leaves[: len(program.leaves)], n_steps)
+            results |= {
+                i: x
+                for i, x in zip(program.written_leaves, outputs, strict=True)
+                if owned_leaves is None or i in owned_leaves
             }
             flags.append(flagged)
-        return [new[i] for i in written], functools.reduce(operator.or_, flags)
+        return [results[i] for i in written], functools.reduce(operator.or_, flags)
 
     return run_all, tuple(written)
 
@@ -364,11 +373,11 @@ def _inputs(program: Program) -> list[int]:
     These are the leaves that it reads, and a leaf of the drones, whose shape gives the number of worlds. If unfused
     stages split the step, leaves that are written before they are read are passed too.
     """
-    in_rows = {i for leaf in program.leaves for i in leaf.rows_of}
-    alone = [i for i, leaf in enumerate(program.leaves) if not leaf.rows_of and i not in in_rows]
-    drone_leaves = [i for i in alone if program.leaves[i].scope == "drone"]
+    in_rows = {i for leaf in program.leaves for i in leaf.row_leaves}
+    separate = [i for i, leaf in enumerate(program.leaves) if not leaf.row_leaves and i not in in_rows]
+    drone_leaves = [i for i in separate if program.leaves[i].scope == "drone"]
     if program.fused:
         needed = kernel.needed_leaves(program)
         return [*needed, next((i for i in drone_leaves if i in needed), drone_leaves[0])]
-    checked = [leaf for leaf, _ in program.check.reads] if program.check is not None else []
-    return [*program.read, *program.written, *checked, drone_leaves[0]]
+    checked = [leaf for leaf, _ in program.check_segment.reads] if program.check_segment is not None else []
+    return [*program.read_leaves, *program.written_leaves, *checked, drone_leaves[0]]

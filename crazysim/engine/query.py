@@ -65,7 +65,9 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         raise program.unfused_stages[0].error
     packed = [jnp.concatenate([prepared_leaves[i].ravel() for i in program.packed])] if program.packed else []
     written, _ = on_data_leaves(program, fused.build(program, Location(platform)))([*prepared_leaves, *packed], 0)
-    results = treedef.unflatten(replace_leaves(prepared_leaves, program.written, written)).plugins[RECORD_NAME].rows
+    results = (
+        treedef.unflatten(replace_leaves(prepared_leaves, program.written_leaves, written)).plugins[RECORD_NAME].rows
+    )
     return [
         tree.unflatten([results[name].reshape(n_worlds, n_drones, *shape) for name, shape in query_shapes.items()])
         for tree, query_shapes in zip(trees, shapes, strict=True)
@@ -79,7 +81,7 @@ def _writing(fn: Callable[[SimData], Any], names: list[str], scope: str) -> Call
         rows = data.plugins[RECORD_NAME].rows
         outs = jax.tree.leaves(fn(data.replace(plugins={})))
         shape = (data.core.n_drones, -1) if scope == "world" else (-1,)
-        new = {name: x.reshape(shape) for name, x in zip(names, outs, strict=True)}
-        return data.replace(plugins={RECORD_NAME: QueryResults(rows | new)})
+        new_arrays = {name: x.reshape(shape) for name, x in zip(names, outs, strict=True)}
+        return data.replace(plugins={RECORD_NAME: QueryResults(rows | new_arrays)})
 
     return write

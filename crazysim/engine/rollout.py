@@ -24,7 +24,7 @@ Keep = Callable[[SimData], Any]
 """Function from data to the arrays to record: any tree of arrays."""
 
 
-def states_of(data: SimData) -> Any:
+def get_states(data: SimData) -> Any:
     """Return the states, which a rollout records by default."""
     return data.states
 
@@ -36,7 +36,7 @@ def rollout(
     params: Any,
     n_control_steps: int,
     n_substeps: int,
-    keep: Keep = states_of,
+    keep: Keep = get_states,
     every: int = 1,
     zeros: Zeros | None = None,
 ) -> tuple[SimData, Any]:
@@ -66,21 +66,21 @@ def rollout(
         raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it")
     zeros = step.zeros(data) if zeros is None else zeros
     staged = F.staged_leaves(leaf_indices(data))
-    start = step.flatten(data, zeros, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
-    changed = sorted({*start.plan.written, start.plan.synced, *staged})
+    flat = step.flatten(data, zeros, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
+    carried = sorted({*flat.plan.written_leaves, flat.plan.synced, *staged})
 
     def control_step(carry: list[Any]) -> list[Any]:
-        now = start.replace(changed, carry)
-        command = F.check_command(data, data.controls.mode, policy(params, now.data()))
-        after = step.advance(now.stage_command(data, command), n_substeps)
-        return [after.leaves[i] for i in changed]
+        flat_before = flat.replace(carried, carry)
+        command = F.check_command(data, data.controls.mode, policy(params, flat_before.data()))
+        flat_after = step.advance(flat_before.stage_command(data, command), n_substeps)
+        return [flat_after.leaves[i] for i in carried]
 
-    def until_record(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
+    def advance_to_record(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
         carry, _ = jax.lax.scan(lambda c, _: (control_step(c), None), carry, length=every)
-        return carry, keep(start.replace(changed, carry).data())
+        return carry, keep(flat.replace(carried, carry).data())
 
-    carry, records = jax.lax.scan(until_record, [start.leaves[i] for i in changed], length=n_control_steps // every)
-    return start.replace(changed, carry).data(), records
+    carry, records = jax.lax.scan(advance_to_record, [flat.leaves[i] for i in carried], length=n_control_steps // every)
+    return flat.replace(carried, carry).data(), records
 
 
 STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
@@ -107,12 +107,12 @@ def run(
     if not progress:
         return compiled_rollout(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)
     piece = max(n_control_steps // every // 100, 1) * every
-    pieces, rest = divmod(n_control_steps, piece)
+    pieces, remainder = divmod(n_control_steps, piece)
     chunks = []
     with progress_bar(unit="control steps", required=True, total=n_control_steps) as bar:
-        for n in [piece] * pieces + [rest] * (rest > 0):
-            data, part = compiled_rollout(step, data, policy, params, n, every=every, zeros=zeros, **settings)
-            jax.block_until_ready(part)
-            chunks.append(part)
+        for n in [piece] * pieces + [remainder] * (remainder > 0):
+            data, records = compiled_rollout(step, data, policy, params, n, every=every, zeros=zeros, **settings)
+            jax.block_until_ready(records)
+            chunks.append(records)
             bar.update(n)
     return data, jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)

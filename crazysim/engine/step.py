@@ -17,7 +17,7 @@ from crazysim.cache import keep_programs
 from crazysim.core.data import MAX_STEPS, SimData
 from crazysim.core.functional import put_command, staged_fields, staged_leaves
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.sharding import WORLD_AXIS, Location, location_of
+from crazysim.core.sharding import WORLD_AXIS, Location, find_location
 from crazysim.core.stage import Axes, Stage, as_stages
 from crazysim.engine.backends import fused
 from crazysim.engine.flat import PackCache, ZerosCache
@@ -131,8 +131,8 @@ class Step:
         """
         if engine not in ENGINES:
             raise ConfigError(f"engine {engine!r} does not exist; choose one of {', '.join(ENGINES)}")
-        if engine == "fused" and (missing := fused.unavailable_reason(platform)):
-            raise ConfigError(f"engine 'fused' cannot run here: {missing}. Use engine='lanes', or 'auto'.")
+        if engine == "fused" and (reason := fused.unavailable_reason(platform)):
+            raise ConfigError(f"engine 'fused' cannot run here: {reason}. Use engine='lanes', or 'auto'.")
         self.engine, self.platform, self.mesh, self.strict = engine, platform, mesh, strict
         devices = tuple(mesh.devices.flat) if mesh is not None else None if device is None else (device,)
         self.location = Location(platform, devices, mesh, WORLD_AXIS)
@@ -152,8 +152,8 @@ class Step:
     def with_stages(self, stages: Sequence[Stage]) -> Step:
         """Return the step of other stages, with the same engine and devices."""
         names = [stage.__name__ for stage in stages]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ConfigError(f"expected stages of different names, got {', '.join(twice)} twice. Rename yours.")
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise ConfigError(f"expected stages of different names, got {', '.join(repeated)} twice. Rename yours.")
         devices = self.location.devices
         device = devices[0] if self.mesh is None and devices is not None else None
         pipeline: Pipeline = {stage.__name__: stage for stage in stages}
@@ -170,8 +170,8 @@ class Step:
         """
         _check_steps(n_steps)
         leaves, treedef = jax.tree.flatten(data)
-        after = self.advance(self._flat(data, leaves, treedef, zeros, n_steps), n_steps)
-        return treedef.unflatten(after.leaves[: len(leaves)])
+        flat_after = self.advance(self._flatten(data, leaves, treedef, zeros, n_steps), n_steps)
+        return treedef.unflatten(flat_after.leaves[: len(leaves)])
 
     def flatten(
         self,
@@ -189,9 +189,9 @@ class Step:
             separate: Leaves that remain separate arrays. The other leaves that a call writes are stored as rows, which
                 is faster in loops over calls. None for no rows.
         """
-        return self._flat(data, *jax.tree.flatten(data), zeros, n_steps, separate)
+        return self._flatten(data, *jax.tree.flatten(data), zeros, n_steps, separate)
 
-    def _flat(
+    def _flatten(
         self,
         data: SimData,
         leaves: list[Any],
@@ -210,22 +210,22 @@ class Step:
         if plan.numpy_step is not None and not any(isinstance(x, jax.core.Tracer) for x in (*inputs, n_steps)):
             step = plan.numpy_step
         program = id(plan), n_steps if isinstance(n_steps, int) else None
-        with keep_programs(when=program not in self._called):
-            out = step(inputs, n_steps)
+        with keep_programs(enabled=program not in self._called):
+            outputs = step(inputs, n_steps)
         self._called.add(program)
-        leaves = replace_leaves(flat.leaves, plan.written, out)  # type: ignore[arg-type]  # a list, but for a host call
-        leaves[plan.synced] = self._false(leaves[plan.synced])
+        leaves = replace_leaves(flat.leaves, plan.written_leaves, outputs)  # type: ignore[arg-type]  # a list, but for a host call
+        leaves[plan.synced] = self._false_flag(leaves[plan.synced])
         return FlatData(leaves, plan)
 
     def advance_on_host(self, flat: FlatData, n_steps: int) -> FlatData:
         """Return the data some steps later, without XLA; the plan must have a ``host_call``. Wait for the steps."""
         plan, leaves = flat.plan, flat.leaves
-        call: Any = plan.host_call
+        host_call: Any = plan.host_call
         if not isinstance(leaves, HostLeaves):
-            leaves = call.hold(leaves, leaves[plan.synced].sharding)
-        after = call(leaves, n_steps)
-        after.items[plan.synced] = self._false(after.items[plan.synced])
-        return FlatData(after, plan)
+            leaves = host_call.make_host_leaves(leaves, leaves[plan.synced].sharding)
+        leaves_after = host_call(leaves, n_steps)
+        leaves_after.items[plan.synced] = self._false_flag(leaves_after.items[plan.synced])
+        return FlatData(leaves_after, plan)
 
     def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
         """Return the plan that steps this data."""
@@ -256,7 +256,7 @@ class Step:
     def _cache_size(self) -> int:
         """Return the number of compiled programs, as for a jitted function; the tests of law 6 count them."""
         count = jaxcompat.n_compilations
-        called = [plan.host_call is not None and plan.host_call.used for plan in self._plans.values()]
+        called = [plan.host_call is not None and plan.host_call.was_called for plan in self._plans.values()]
         steps = [step for plan in self._plans.values() for step in (plan.traced_count_step, plan.static_count_step)]
         return sum(called) + sum(map(count, steps))
 
@@ -267,12 +267,12 @@ class Step:
         in_rows = [i for rows in plan.rows for i in rows.members]
         return [*replace_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
 
-    def _false(self, before: Any) -> Any:
+    def _false_flag(self, old_flag: Any) -> Any:
         """Return a false flag on the devices of the previous flag; the last such flag is returned again if possible."""
-        if before is self._unsynced:
-            return before
-        traced = isinstance(before, jax.core.Tracer)
-        flag = jnp.asarray(False) if traced else jax.device_put(np.False_, getattr(before, "sharding", None))
+        if old_flag is self._unsynced:
+            return old_flag
+        traced = isinstance(old_flag, jax.core.Tracer)
+        flag = jnp.asarray(False) if traced else jax.device_put(np.False_, getattr(old_flag, "sharding", None))
         if not isinstance(flag, jax.core.Tracer):
             self._unsynced = flag
         return flag
@@ -287,31 +287,31 @@ class Step:
         separate: SeparateLeaves = None,
     ) -> Plan:
         zeros = self._zeros(data, leaves, treedef) if zeros is None else zeros
-        elsewhere = self._elsewhere(data.states.pos)
-        key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, elsewhere, separate)
+        other_location = self._other_location(data.states.pos)
+        key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, other_location, separate)
         plan = self._plans.get(key)
         if plan is None:
             check_axes(data, data.core.n_worlds, data.core.n_drones)
             for stage in self.stages:
-                Axes(data).writable(stage)
-            location = self.location if elsewhere is None else elsewhere
+                Axes(data).writable_scopes(stage)
+            location = self.location if other_location is None else other_location
             planner = Planner(self.stages, self.engine, self.strict, location, self._reported)
 
             def trace(plan: Plan) -> None:
                 flat = FlatData(jax.eval_shape(lambda leaves: self._all_leaves(plan, leaves), leaves), plan)
-                known = isinstance(n_steps, int)
-                step = plan.static_count_step if known else plan.traced_count_step
-                step.trace(flat.inputs(), n_steps if known else jnp.int32(1))
+                is_static = isinstance(n_steps, int)
+                step = plan.static_count_step if is_static else plan.traced_count_step
+                step.trace(flat.inputs(), n_steps if is_static else jnp.int32(1))
 
             plan = self._plans[key] = planner.plan(data, zeros, trace, separate)
         return plan
 
-    def _elsewhere(self, x: Any) -> Location | None:
+    def _other_location(self, x: Any) -> Location | None:
         """Return the location of an array; None if it is unknown, or the one that the step was built for."""
         sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
         if sharding is None or sharding is self._at_home:
             return None
-        location, home = location_of(x), self.location
+        location, home = find_location(x), self.location
         if location.is_distributed:
             at_home = home.mesh is not None and (location.mesh, location.axis) == (home.mesh, home.axis)
         elif home.devices is None or home.mesh is not None:

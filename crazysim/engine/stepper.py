@@ -44,11 +44,11 @@ class Stepper:
         """
         self.device, self.mesh, self.engine, self.strict = device, mesh, engine, strict
         self._data: SimData | FlatData | None = None
-        self._like: tuple[Plan, SimData] | None = None
+        self._shapes: tuple[Plan, SimData] | None = None
         self._counts: dict[int, Array] = {}
         self._unsynced: object = None
         self._most_steps: int | None = None
-        self._counted: tuple[object, int] = (None, 0)
+        self._counted_steps: tuple[object, int] = (None, 0)
         self._compiled: Step | None = None
 
     @property
@@ -68,12 +68,12 @@ class Stepper:
         flat = self._data
         if not isinstance(flat, FlatData):
             return self.data
-        if self._like is None or self._like[0] is not flat.plan:
+        if self._shapes is None or self._shapes[0] is not flat.plan:
             data = flat.data()
             if isinstance(data.states.pos, jax.core.Tracer):
                 return data
-            self._like = flat.plan, jax.tree.map(_without_values, data)
-        return self._like[1]
+            self._shapes = flat.plan, jax.tree.map(_without_values, data)
+        return self._shapes[1]
 
     def stage(self, command: Any, feedforward: Any = None) -> None:
         """Stage a command that was checked with ``data_or_shapes``; flattened data stays flattened.
@@ -135,10 +135,10 @@ class Stepper:
         with announce_if_slow("compiling the step", "5 to 40 s", ANNOUNCED_AFTER) if compiles else nullcontext():
             flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
             if flat.plan.host_call is None:
-                after = self.step.advance(flat, self._as_array(n_steps))
+                flat_after = self.step.advance(flat, self._as_array(n_steps))
             else:
-                after = self.step.advance_on_host(flat, n_steps)
-        self._data, self._unsynced = after, after.leaves[flat.plan.synced]
+                flat_after = self.step.advance_on_host(flat, n_steps)
+        self._data, self._unsynced = flat_after, flat_after.leaves[flat.plan.synced]
 
     def count(self, n_steps: int, times: int = 1) -> None:
         """Count steps that are about to be taken.
@@ -153,9 +153,9 @@ class Stepper:
         n_steps *= times
         if self._most_steps is None or self._most_steps + n_steps > MAX_STEPS:
             steps = self.data.core.steps
-            if self._counted[0] is not steps:  # the same data may be assigned repeatedly
-                self._counted = steps, int(np.asarray(steps).max())  # waits for the device, so not in every call
-            self._most_steps = self._counted[1]
+            if self._counted_steps[0] is not steps:  # the same data may be assigned repeatedly
+                self._counted_steps = steps, int(np.asarray(steps).max())  # waits for the device, so not in every call
+            self._most_steps = self._counted_steps[1]
         if self._most_steps + n_steps > MAX_STEPS:
             freq = self.data.core.freq
             raise ConfigError(

@@ -73,13 +73,13 @@ class Actions:
         command = centre + scale * safe_clip(action, -1.0, 1.0)
         if self.control != Control.state:
             return command
-        rest = jnp.zeros((*command.shape[:-1], 13), dtype).at[..., 9].set(1.0)
-        return jnp.concatenate([command, rest], axis=-1)
+        zero_fields = jnp.zeros((*command.shape[:-1], 13), dtype).at[..., 9].set(1.0)
+        return jnp.concatenate([command, zero_fields], axis=-1)
 
     def __str__(self) -> str:
         """Return the command level, and the commands at -1 and 1."""
-        what = COMMAND_FIELDS[self.control]
-        return f"{self.control.value} ({what}): {self.centre - self.scale} to {self.centre + self.scale}"
+        fields = COMMAND_FIELDS[self.control]
+        return f"{self.control.value} ({fields}): {self.centre - self.scale} to {self.centre + self.scale}"
 
 
 def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: float = MAX_TILT) -> Actions:
@@ -93,28 +93,30 @@ def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: f
         tilt: Largest roll and pitch of the attitude level, rad.
     """
     airframes = as_airframes(airframe)
-    if all(other is airframes[0] for other in airframes):
+    if all(drone_airframe is airframes[0] for drone_airframe in airframes):
         return _drone_actions(airframes[0], params, control, tilt, 0)
-    each = [_drone_actions(one, params, control, tilt, k) for k, one in enumerate(airframes)]
-    return Actions(np.stack([one.centre for one in each]), np.stack([one.scale for one in each]), control)
+    drone_actions = [_drone_actions(drone, params, control, tilt, k) for k, drone in enumerate(airframes)]
+    return Actions(
+        np.stack([drone.centre for drone in drone_actions]), np.stack([drone.scale for drone in drone_actions]), control
+    )
 
 
 def _drone_actions(airframe: Airframe, params: SimParams, control: Control, tilt: float, drone: int) -> Actions:
     """Return the map of one drone of the first world."""
     params = jax.tree.map(lambda scope, x: fetch_rows(x, (0, drone)) if scope == "drone" else x, scopes(params), params)
     n_rotors = airframe.n_rotors
-    each = float(airframe.value("rotors.thrust_max", ()))
+    max_thrust = float(airframe.value("rotors.thrust_max", ()))
     hover = float(hover_thrust(params)[0])
-    span = n_rotors * each - hover
+    thrust_range = n_rotors * max_thrust - hover
     if control == Control.attitude:
-        return Actions(np.array([0, 0, 0, hover]), np.array([tilt, tilt, MAX_YAW, span]), control)
+        return Actions(np.array([0, 0, 0, hover]), np.array([tilt, tilt, MAX_YAW, thrust_range]), control)
     if control == Control.body_rate:
-        return Actions(np.array([0, 0, 0, hover]), np.array([*MAX_BODY_RATES, span]), control)
+        return Actions(np.array([0, 0, 0, hover]), np.array([*MAX_BODY_RATES, thrust_range]), control)
     if control == Control.state:
         return Actions(np.array([0, 0, 1.0]), np.array(MAX_OFFSET), control)
     if control == Control.force_torque:
-        most = each / 2 * torque_arms(airframe) * np.abs(airframe.mixing_matrix).sum(axis=-1)
-        return Actions(np.array([hover, 0, 0, 0]), np.array([span, *most / 4]), control)
+        max_torque = max_thrust / 2 * torque_arms(airframe) * np.abs(airframe.mixing_matrix).sum(axis=-1)
+        return Actions(np.array([hover, 0, 0, 0]), np.array([thrust_range, *max_torque / 4]), control)
     if isinstance(params, fitted.Params):
         raise ConfigError(
             "expected dynamics='first_principles' for rotor commands, got a fitted model, which has no rotors"

@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from crazysim.core.data import SimCore, SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive_integer
-from crazysim.core.sharding import default_device_of, put_on_device, shard
+from crazysim.core.sharding import put_on_device, shard, use_device_of
 from crazysim.core.stage import vmap_worlds
 from crazysim.eager import is_traced
 from crazysim.engine.step import FlatData, Step
@@ -101,18 +101,18 @@ class Env(ABC):
         """The engine's step that ``step`` calls: the stages of the physics and of the phases."""
         batched = [f"wrapper {wrapper.name!r}" for wrapper in self.wrappers if wrapper.batched]
         batched += [f"task {self.task.name!r}"] if self.task.batched else []
-        why = f"{', '.join(batched)} is declared to need all worlds at once" if batched else None
+        unfused_reason = f"{', '.join(batched)} is declared to need all worlds at once" if batched else None
         if self.base.episode_reset.has_foreign_record:
-            why = "a record in data.plugins is of another library, and is not divided among worlds"
+            unfused_reason = "a record in data.plugins is of another library, and is not divided among worlds"
         physics = self.base.physics
-        return physics.with_stages(self.phases.stages(physics.stages, why))
+        return physics.with_stages(self.phases.stages(physics.stages, unfused_reason))
 
     def reset(self, key: Array) -> EnvState:
         """Return all worlds at the start of an episode; the same key gives the same episodes.
 
         Args:
             key: Random key, as ``jax.random.key`` makes, (), or keys of blocks of worlds of equal size, (n_blocks,).
-                The episodes of a block are those of an environment of its size with its key.
+                A block has the same episodes as an environment of its size with its key.
 
         Raises:
             ConfigError: If the number of keys does not divide the number of worlds, or if the task begins in a state
@@ -121,7 +121,7 @@ class Env(ABC):
                 ``info["nonfinite"]``.
         """
         key = put_on_device(key, self.sim.device) if self.sim.mesh is None else key
-        with default_device_of(key):
+        with use_device_of(key):
             data = self.base.initial_data(key)
             for wrapper in self.wrappers:
                 data = wrapper.prepare(data)
@@ -139,11 +139,11 @@ class Env(ABC):
             mask: True where a new episode begins; None for all. (n_worlds,)
         """
         steps = state.full_data.core.steps
-        with default_device_of(steps):
+        with use_device_of(steps):
             mask = as_mask(mask, steps.shape[:1])
-            new = self._reset_episodes(state)
-            new = new if self.reset_policy is None else self.reset_policy.after_step(new)
-            return select_states(mask, new, state)
+            new_state = self._reset_episodes(state)
+            new_state = new_state if self.reset_policy is None else self.reset_policy.after_step(new_state)
+            return select_states(mask, new_state, state)
 
     def set_goal(self, state: EnvState, pos: ArrayLike) -> EnvState:
         """Return the state with new goals, which apply from the next step until the end of the episode.
@@ -159,7 +159,7 @@ class Env(ABC):
             ConfigError: If the goals of the task are not positions, if ``pos`` has another shape, or if it contains
                 host numbers that are not finite.
         """
-        with default_device_of(state.full_data.core.steps):
+        with use_device_of(state.full_data.core.steps):
             pos = validate_goals(pos, state)
             state = state.replace(data=vectorize_over_worlds(self.task.set_goal, self.task.batched)(state.data, pos))
         return state if self.sim.mesh is None else EnvState(shard(state.full_data, self.sim.mesh))
@@ -174,10 +174,10 @@ class Env(ABC):
             action: Action of every drone, clipped to [-1, 1]. (n_worlds, n_drones, k)
         """
         self._check_reset_mode(state)
-        with default_device_of(state.full_data.core.steps):
+        with use_device_of(state.full_data.core.steps):
             action = validate_action(action, state, self.actions)
-            after = self.step_fn(state.replace(next_action=action).full_data, self.n_substeps, ())
-            return EnvState(after).replace(next_action=state.record.next_action)
+            data = self.step_fn(state.replace(next_action=action).full_data, self.n_substeps, ())
+            return EnvState(data).replace(next_action=state.record.next_action)
 
     def flatten(self, state: EnvState) -> FlatData:
         """Return the state as flat data for ``advance``, which is faster in a loop than ``step``."""
@@ -207,7 +207,9 @@ class Env(ABC):
 
     def _reset_episodes(self, state: EnvState) -> EnvState:
         """Return the state with new episodes in all worlds."""
-        state = self.phases.reset_episode(state, self.base.episode_reset.default_for(state.data), vectorize_over_worlds)
+        state = self.phases.reset_episode(
+            state, self.base.episode_reset.make_default(state.data), vectorize_over_worlds
+        )
         core = state.full_data.core.replace(mjx_synced=jnp.asarray(False))
         full_data = state.full_data.replace(core=core)
         return EnvState(full_data if self.sim.mesh is None else shard(full_data, self.sim.mesh))
@@ -220,10 +222,10 @@ class Env(ABC):
         key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]))
         if key not in self._stepped_shapes:
             self._stepped_shapes[key] = jax.eval_shape(self.phases.outline, state)
-        after = self._stepped_shapes[key]
-        missing = {k: x for k, x in after.info.items() if k not in state.info}
-        state = state.replace(info=state.info | jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), missing))
-        check_record(state, after)
+        stepped = self._stepped_shapes[key]
+        added_info = {k: x for k, x in stepped.info.items() if k not in state.info}
+        state = state.replace(info=state.info | jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), added_info))
+        check_record(state, stepped)
         return state
 
     @functools.cached_property
@@ -302,8 +304,8 @@ class DroneEnv(Env):
                     "expected a sensor of states where measured=True, got a simulation without one. Use "
                     "sim.add(MotionCapture()) before the environment is made, or make(..., sensors=[MotionCapture()])."
                 )
-            of_world = sim.plugins.measured_states
-            self.measure_states = vmap_worlds(of_world) if task.batched else of_world
+            measure_world = sim.plugins.measured_states
+            self.measure_states = vmap_worlds(measure_world) if task.batched else measure_world
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
         if self._max_steps < 1:
@@ -350,34 +352,34 @@ class DroneEnv(Env):
 
     def initial_data(self, key: Array) -> SimData:
         """Return the data of all worlds before their first episode, with the random key of ``reset``."""
-        now = tuple(self._sim.plugins.values())
-        if [*map(id, now)] != [*map(id, self._plugins)]:
-            known = ", ".join(plugin.name for plugin in self._plugins)
+        plugins = tuple(self._sim.plugins.values())
+        if [*map(id, plugins)] != [*map(id, self._plugins)]:
+            names = ", ".join(plugin.name for plugin in self._plugins)
             raise ConfigError(
-                f"expected the plugins with which the environment was made ({known or 'none'}), got "
-                f"{', '.join(plugin.name for plugin in now) or 'none'}: an environment does not follow its simulation. "
-                f"Use make(..., effects=[...]), or a new environment."
+                f"expected the plugins with which the environment was made ({names or 'none'}), got "
+                f"{', '.join(plugin.name for plugin in plugins) or 'none'}: an environment does not follow its "
+                f"simulation. Use make(..., effects=[...]), or a new environment."
             )
-        if len(now := _default_arrays(self._sim)) != len(self._default_arrays) or not all(
-            map(is_, now, self._default_arrays)
+        if len(arrays := _default_arrays(self._sim)) != len(self._default_arrays) or not all(
+            map(is_, arrays, self._default_arrays)
         ):
             raise ConfigError(
                 "expected the default data with which the environment was made, got others: an environment does not "
                 "follow its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data of a state."
             )
         data, mesh = self.episode_reset.broadcast_default(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
-        data = data.replace(core=_with_keys(data.core, key))
+        data = data.replace(core=_set_keys(data.core, key))
         if mesh is not None:
             return shard(data, mesh)
         return data if is_traced([key]) else put_on_device(data, self.sim.device)
 
 
-def _with_keys(core: SimCore, key: Array) -> SimCore:
+def _set_keys(core: SimCore, key: Array) -> SimCore:
     """Return the core with the key of all worlds, or with the keys of blocks of worlds."""
     if key.size == 1:
         return core.replace(rng_key=key.reshape(()))
-    n_worlds, rest = divmod(core.n_worlds, key.size)
-    if key.ndim != 1 or rest:
+    n_worlds, remainder = divmod(core.n_worlds, key.size)
+    if key.ndim != 1 or remainder:
         raise ConfigError(
             f"expected one key, or keys of blocks that divide the {core.n_worlds} worlds, got keys of shape "
             f"{key.shape}. Use for example jax.random.key(0)."

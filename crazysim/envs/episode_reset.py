@@ -23,30 +23,30 @@ class EpisodeReset:
 
     def __init__(self, sim: Sim):
         self._default = default = deduplicate(sim.default_data)
-        first, *others = sim.reset_pipeline.items()
-        names = [name for name, fn in others if not isinstance(fn, Stage)]
-        names += [] if first[1] is reset else [first[0]]
+        first_stage, *other_stages = sim.reset_pipeline.items()
+        names = [name for name, fn in other_stages if not isinstance(fn, Stage)]
+        names += [] if first_stage[1] is reset else [first_stage[0]]
         self.has_foreign_record = "batched" in jax.tree.leaves(scopes(sim.default_data))
         """True if a record in ``data.plugins`` is of another library. Such a record is not divided among worlds."""
         self.takes_all_worlds = bool(names) or self.has_foreign_record
         """True if ``reset_data`` takes all worlds at once."""
-        self.why_batched: str | None = None
+        self.batched_reason: str | None = None
         """Reason why resets are computed in all worlds and then selected; None if each world is reset on its own."""
         rows = zip(*map(jax.tree.leaves, (scopes(default), default, leaf_indices(default))), strict=True)
         world_id = leaf_indices(default).core.world_id
         if names:
-            self.why_batched = f"{', '.join(map(repr, names))} of the reset pipeline takes all worlds at once"
+            self.batched_reason = f"{', '.join(map(repr, names))} of the reset pipeline takes all worlds at once"
         elif any(n_batch_axes(kind) == 2 and x.shape[0] > 1 and i != world_id for kind, x, i in rows):
-            self.why_batched = "episodes begin from different data in different worlds"
-        self.reset_data = _reset_all(sim) if self.takes_all_worlds else _reset_world([fn for _, fn in others])
+            self.batched_reason = "episodes begin from different data in different worlds"
+        self.reset_data = _reset_all(sim) if self.takes_all_worlds else _reset_world([fn for _, fn in other_stages])
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``takes_all_worlds``."""
 
-    def default_for(self, data: SimData) -> SimData:
+    def make_default(self, data: SimData) -> SimData:
         """Return the data of all worlds from which an episode begins, with the seed and the ids of ``data``."""
         n_worlds, n_drones = data.states.pos.shape[:2]
         return copy_seed_and_ids(self.broadcast_default(n_worlds, n_drones), data)
 
-    def default_for_world(self, data: SimData) -> SimData:
+    def make_world_default(self, data: SimData) -> SimData:
         """Return the data of one world from which an episode begins; the default data must be equal in all worlds."""
 
         def first_world(scope: str, x: Array) -> Array:
@@ -95,9 +95,9 @@ def deduplicate(data: SimData) -> SimData:
             return x
         host = np.asarray(x)
         for axis in _AXES.get(scope, (0,) if has_members(scope) else ()):
-            first = host.take([0], axis)
-            if np.array_equal(host, np.broadcast_to(first, host.shape), equal_nan=host.dtype.kind == "f"):
-                host = first
+            first_entry = host.take([0], axis)
+            if np.array_equal(host, np.broadcast_to(first_entry, host.shape), equal_nan=host.dtype.kind == "f"):
+                host = first_entry
         return host
 
     return jax.tree.map(deduplicate_leaf, scopes(data), data)
@@ -117,5 +117,5 @@ def copy_seed_and_ids(default: SimData, data: SimData) -> SimData:
 def reset_world(data: SimData, default: SimData) -> SimData:
     """Return the data of one world reset to its default; shared leaves are unchanged. See ``core.stages.reset``."""
     plugins = {name: default.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
-    new = map_batched(lambda x, value: jnp.broadcast_to(value, x.shape), data, default.replace(plugins=plugins))
-    return new.replace(core=new.core.replace(episode=data.core.episode + 1))
+    new_data = map_batched(lambda x, value: jnp.broadcast_to(value, x.shape), data, default.replace(plugins=plugins))
+    return new_data.replace(core=new_data.core.replace(episode=data.core.episode + 1))

@@ -107,8 +107,8 @@ class DroneParallelEnv(ParallelEnv):
         """
         if self.env_state is None or not self.agents:
             raise ConfigError("expected a running episode, got none. Call reset() first.")
-        self.env_state, out = self._step(self.env_state, self._stack_actions(actions))
-        obs, reward, terminated, truncated, info = jax.device_get(out)
+        self.env_state, results = self._step(self.env_state, self._stack_actions(actions))
+        obs, reward, terminated, truncated, info = jax.device_get(results)
         if self.render_mode == "human":
             self.render()
         agents, self.agents = self.agents, [] if terminated or truncated else self.agents

@@ -27,7 +27,7 @@ from crazysim.envs.hooks import Hooks
 from crazysim.envs.random import episode_key
 from crazysim.envs.reset_policy import ResetPolicy
 from crazysim.envs.state import NAME, EnvState, Obs
-from crazysim.envs.task import Task, total
+from crazysim.envs.task import Task, sum_terms
 from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, select_worlds
 
@@ -77,11 +77,13 @@ class Phases:
             batched: Reason why all phases need all worlds at once; None if each runs in one world.
         """
 
-        def stage(
-            name: str, fn: Callable[..., SimData], phase: Phase, unfused_reason: str | None, when: Any = None
+        def make_stage(
+            name: str, fn: Callable[..., SimData], phase: Phase, unfused_reason: str | None, condition: Any = None
         ) -> Stage:
             if unfused_reason is None:
-                return Stage(functools.partial(fn, vectorize=skip_vectorization), "world", when, name=name, phase=phase)
+                return Stage(
+                    functools.partial(fn, vectorize=skip_vectorization), "world", condition, name=name, phase=phase
+                )
             return Stage(
                 functools.partial(fn, vectorize=vectorize_over_worlds),
                 "batch",
@@ -95,15 +97,19 @@ class Phases:
 
         # The flag is set first, so that the task can read it and a new episode clears it.
         stages = [
-            stage("act", self._act, "before", batched),
+            make_stage("act", self._act, "before", batched),
             *physics,
-            stage("flag nonfinite", _flag_nonfinite, "after", batched),
-            stage("observe", self._observe, "after", batched),
+            make_stage("flag nonfinite", _flag_nonfinite, "after", batched),
+            make_stage("observe", self._observe, "after", batched),
         ]
         if self.reset_policy is not None:
             stages.append(
-                stage(
-                    "reset episode", self._reset_episode, "after", batched or self.episode_reset.why_batched, must_reset
+                make_stage(
+                    "reset episode",
+                    self._reset_episode,
+                    "after",
+                    batched or self.episode_reset.batched_reason,
+                    must_reset,
                 )
             )
         return stages
@@ -114,17 +120,21 @@ class Phases:
         return _restore_types(data, state.replace(next_action=action))
 
     def _observe(self, data: SimData, vectorize: Vectorize) -> SimData:
-        before = EnvState(data)
-        return _restore_types(data, self.after_physics(before, before.record.next_action, vectorize))
+        state = EnvState(data)
+        return _restore_types(data, self.after_physics(state, state.record.next_action, vectorize))
 
     def _reset_episode(self, data: SimData, vectorize: Vectorize) -> SimData:
-        ended, batched = EnvState(data), vectorize is vectorize_over_worlds
+        final_state, batched = EnvState(data), vectorize is vectorize_over_worlds
         default = (
-            self.episode_reset.default_for(ended.data) if batched else self.episode_reset.default_for_world(ended.data)
+            self.episode_reset.make_default(final_state.data)
+            if batched
+            else self.episode_reset.make_world_default(final_state.data)
         )
-        new = self.reset_episode(ended, default, vectorize)
-        new = new if self.reset_policy is None else self.reset_policy.after_reset(ended, new)
-        return _restore_types(data, select_states(data.plugins[NAME].must_reset[:, 0], new, ended) if batched else new)
+        new_state = self.reset_episode(final_state, default, vectorize)
+        new_state = new_state if self.reset_policy is None else self.reset_policy.after_reset(final_state, new_state)
+        return _restore_types(
+            data, select_states(data.plugins[NAME].must_reset[:, 0], new_state, final_state) if batched else new_state
+        )
 
     def outline(self, state: EnvState) -> EnvState:
         """Return a state of all worlds with the structure, shapes and types that a step returns."""
@@ -163,7 +173,7 @@ class Phases:
         task, last_step = self.task, self.last_step
 
         def evaluate(data: SimData, action: Array, last_action: Array) -> Any:
-            reward = jnp.asarray(total(task.rewards(data, action, last_action)), action.dtype)
+            reward = jnp.asarray(sum_terms(task.rewards(data, action, last_action)), action.dtype)
             return self._observe_task(data), reward, task.terminated(data), _step_info(task, data)
 
         def conclude(state: EnvState, action: Array, results: Any) -> EnvState:
@@ -193,27 +203,27 @@ class Phases:
             vectorize: ``skip_vectorization`` or ``vectorize_over_worlds``.
         """
         task, shape = self.task, (self.n_drones, self.actions.size)
-        before = vectorize(self.episode_reset.reset_data, self.episode_reset.takes_all_worlds)(state.data, default)
-        key = vectorize(lambda data: episode_key(data, f"spawn {task.name}"), False)(before)
-        data = vectorize(task.spawn, task.batched)(before, key)
+        reset_data = vectorize(self.episode_reset.reset_data, self.episode_reset.takes_all_worlds)(state.data, default)
+        key = vectorize(lambda data: episode_key(data, f"spawn {task.name}"), False)(reset_data)
+        data = vectorize(task.spawn, task.batched)(reset_data, key)
         for wrapper in self.wrappers:
             data = vectorize(wrapper.after_spawn, wrapper.batched)(data)
-        data = _check_spawn(task, before, data)
+        data = _check_spawn(task, reset_data, data)
 
-        def start(state: EnvState, obs: Obs, info: dict[str, Array]) -> EnvState:
+        def fill_state(state: EnvState, obs: Obs, info: dict[str, Array]) -> EnvState:
             dtype = state.data.states.pos.dtype
-            over = jnp.zeros((), bool)
+            is_done = jnp.zeros((), bool)
             return state.replace(
                 obs=obs,
                 reward=jnp.zeros(shape[:1], dtype),
-                terminated=over,
-                truncated=over,
+                terminated=is_done,
+                truncated=is_done,
                 action=jnp.zeros(shape, dtype),
                 info=state.info | {"nonfinite": state.data.core.nonfinite} | info,
             )
 
-        seen = vectorize(lambda data: (self._observe_task(data), _step_info(task, data)), task.batched)(data)
-        state = vectorize(start, False)(state.replace(data=data), *seen)
+        results = vectorize(lambda data: (self._observe_task(data), _step_info(task, data)), task.batched)(data)
+        state = vectorize(fill_state, False)(state.replace(data=data), *results)
         for wrapper in self.wrappers:
             state = vectorize(wrapper.after_reset, wrapper.batched)(state)
         return state
@@ -234,14 +244,14 @@ def _restore_types(data: SimData, state: EnvState) -> SimData:
     if jax.tree.structure(state.full_data) != jax.tree.structure(data):
         return state.full_data  # the engine raises an error that names the change
 
-    def cast(new: Any, old: Array) -> Array:
-        return new if getattr(new, "dtype", None) == old.dtype else jnp.asarray(new, old.dtype)
+    def cast(x: Any, template: Array) -> Array:
+        return x if getattr(x, "dtype", None) == template.dtype else jnp.asarray(x, template.dtype)
 
     return jax.tree.map(cast, state.full_data, data)
 
 
 def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:
-    """Return one state in the worlds of a mask, and another elsewhere. Shared leaves are those of the new state.
+    """Return one state in the worlds of a mask, and another elsewhere. Shared leaves are taken from the new state.
 
     Args:
         mask: True where the new state is taken; None for all. (n_worlds,)
@@ -255,14 +265,21 @@ def _step_info(task: Task, data: SimData) -> dict[str, Array]:
     return {"error": task.error(data)} | task.info(data)
 
 
-def _check_spawn(task: Task, old: SimData, new: Any) -> SimData:
+def _check_spawn(task: Task, reset_data: SimData, spawned: Any) -> SimData:
     """Return the data from ``spawn`` with the shapes and dtypes of before, so that no step is compiled again."""
-    if jax.tree.structure(new) != jax.tree.structure(old):
-        had, has = ({keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (old, new))
-        what = ", ".join([f"without {x}" for x in sorted(had - has)] + [f"with {x}" for x in sorted(has - had)])
+    if jax.tree.structure(spawned) != jax.tree.structure(reset_data):
+        old_paths, new_paths = (
+            {keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (reset_data, spawned)
+        )
+        changes = ", ".join(
+            [f"without {x}" for x in sorted(old_paths - new_paths)]
+            + [f"with {x}" for x in sorted(new_paths - old_paths)]
+        )
         raise ConfigError(
             f"task {task.name!r}: expected spawn to return the data that it is given with other values, got a "
-            f"{type(new).__name__} {what or 'of another structure'}. The task's record is data.plugins['task']; "
+            f"{type(spawned).__name__} {changes or 'of another structure'}. The task's record is data.plugins['task']; "
             f"docs/guides/tasks.md has an example."
         )
-    return jax.tree.map(lambda x, y: y if y is x else jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape), old, new)
+    return jax.tree.map(
+        lambda x, y: y if y is x else jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape), reset_data, spawned
+    )

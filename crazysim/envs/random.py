@@ -49,10 +49,10 @@ def episode_key(data: SimData, name: str) -> Array:
     core = data.core
     seed = jax.random.key_data(seed_key(data)).astype(jnp.uint32)
     world, episode = core.world_id.astype(jnp.uint32), core.episode.astype(jnp.uint32)
-    first = _mix(seed[0] ^ np.uint32(zlib.crc32(name.encode())))
-    second = _mix(seed[1] + first)
-    mixed = _mix(_mix(first + world * STRIDE) ^ (second + episode * STRIDE))
-    return jax.random.wrap_key_data(jnp.stack([mixed, _mix(mixed ^ second)], axis=-1), impl="threefry2x32")
+    hash_1 = _mix(seed[0] ^ np.uint32(zlib.crc32(name.encode())))
+    hash_2 = _mix(seed[1] + hash_1)
+    mixed = _mix(_mix(hash_1 + world * STRIDE) ^ (hash_2 + episode * STRIDE))
+    return jax.random.wrap_key_data(jnp.stack([mixed, _mix(mixed ^ hash_2)], axis=-1), impl="threefry2x32")
 
 
 def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
@@ -102,13 +102,13 @@ def scale_to(x: Array, low: Any, high: Any) -> Array:
     return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
 
 
-def scale_symmetric(x: Array, most: Any) -> Array:
-    """Return numbers in [0, 1) scaled to the range from ``-most`` to ``most``. (...)"""
-    return scale_to(x, -jnp.asarray(most, x.dtype), most)
+def scale_symmetric(x: Array, limit: Any) -> Array:
+    """Return numbers in [0, 1) scaled to the range from ``-limit`` to ``limit``. (...)"""
+    return scale_to(x, -jnp.asarray(limit, x.dtype), limit)
 
 
 def _mix(x: Array) -> Array:
-    """Return a mixed 32-bit number, every bit of which depends on every bit of the input."""
+    """Return a hashed 32-bit number: every bit depends on every bit of the input."""
     x = (x ^ (x >> 16)) * np.uint32(0x21F0AAAD)
     x = (x ^ (x >> 15)) * np.uint32(0xD35A2D97)
     return x ^ (x >> 15)

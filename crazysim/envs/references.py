@@ -38,14 +38,14 @@ def split_reference(reference: str) -> tuple[str, str]:
     """Return the file or module of a reference, and the name in it, which may be empty."""
     if reference.endswith(".py"):
         return reference, ""
-    place, _, name = reference.rpartition(":")
-    return place, name
+    location, _, name = reference.rpartition(":")
+    return location, name
 
 
 def absolute_reference(reference: str) -> str:
     """Return a reference with the absolute path of its file; a reference to a module is unchanged."""
-    place, name = split_reference(reference)
-    return f"{Path(place).expanduser().resolve()}:{name}" if place.endswith(".py") else reference
+    location, name = split_reference(reference)
+    return f"{Path(location).expanduser().resolve()}:{name}" if location.endswith(".py") else reference
 
 
 def reference_of(task: type[Task]) -> str:
@@ -54,8 +54,8 @@ def reference_of(task: type[Task]) -> str:
     file = getattr(module, "__file__", None)
     is_in_file = file is not None and file.endswith(".py") and getattr(module, name, None) is task
     in_package = "." in task.__module__
-    place = str(Path(file).resolve()) if file is not None and is_in_file and not in_package else task.__module__
-    reference = f"{place}:{name}"
+    location = str(Path(file).resolve()) if file is not None and is_in_file and not in_package else task.__module__
+    reference = f"{location}:{name}"
     _CLASSES[reference] = task
     if is_in_file:
         _add_to_list(reference)
@@ -78,21 +78,21 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
     reference = absolute_reference(reference)
     if reference in _CLASSES:
         return _CLASSES[reference]
-    place, name = split_reference(reference)
-    module = _from_file(Path(place)) if place.endswith(".py") else _from_module(place)
+    location, name = split_reference(reference)
+    module = _from_file(Path(location)) if location.endswith(".py") else _from_module(location)
     classes = {k: x for k, x in vars(module).items() if _is_task(x) and x.__module__ == module.__name__}
     if not name and len(classes) == 1:
         name = next(iter(classes))
-    found = getattr(module, name, None) if name else None
-    if not _is_task(found) and name not in names:
-        there = ", ".join(classes) or "none"
+    task_class = getattr(module, name, None) if name else None
+    if not _is_task(task_class) and name not in names:
+        defined = ", ".join(classes) or "none"
         raise ConfigError(
-            f"expected the name of a task in {place}, got {name!r}; it defines {there}. Write {place}:NAME with a "
-            f"subclass of Task, or a name that the file registers; {GUIDE} has an example."
+            f"expected the name of a task in {location}, got {name!r}; it defines {defined}. Write {location}:NAME "
+            f"with a subclass of Task, or a name that the file registers; {GUIDE} has an example."
         )
     _LOADED.add(reference)
     _add_to_list(reference)
-    return found if _is_task(found) else name  # type: ignore[return-value]
+    return task_class if _is_task(task_class) else name  # type: ignore[return-value]
 
 
 def load_noted_task(reference: str, names: Container[str]) -> type[Task] | str:
@@ -101,7 +101,7 @@ def load_noted_task(reference: str, names: Container[str]) -> type[Task] | str:
     Raises:
         ConfigError: If this user has not named it before, others could have changed its file, or ``load_task`` fails.
     """
-    place, name = split_reference(reference)
+    location, name = split_reference(reference)
     if reference in _CLASSES or reference in _LOADED:
         return load_task(reference, names)
     remedy = (
@@ -113,16 +113,16 @@ def load_noted_task(reference: str, names: Container[str]) -> type[Task] | str:
             f"expected a task that you have named on this machine, got {reference!r} from the files of a run, which "
             f"others could have made. {remedy}"
         )
-    if place.endswith(".py") and (reason := untrusted_reason(Path(place))):
-        raise ConfigError(f"expected a file that only you can write, got {place!r}: {reason}. {remedy}")
+    if location.endswith(".py") and (reason := untrusted_reason(Path(location))):
+        raise ConfigError(f"expected a file that only you can write, got {location!r}: {reason}. {remedy}")
     return load_task(reference, names)
 
 
 def code_digest(reference: str) -> str:
     """Return the hash of the file of a reference, as text; empty if it is not a file."""
-    place, _ = split_reference(reference)
+    location, _ = split_reference(reference)
     with contextlib.suppress(OSError):
-        return hashlib.sha256(Path(place).read_bytes()).hexdigest() if place.endswith(".py") else ""
+        return hashlib.sha256(Path(location).read_bytes()).hexdigest() if location.endswith(".py") else ""
     return ""
 
 

@@ -112,8 +112,8 @@ def make(
     name = task if isinstance(task, str) else entry.task.name or entry.task.__name__
     for option in options:
         if option not in SIM_OPTIONS + entry.options:
-            near = difflib.get_close_matches(option, SIM_OPTIONS + entry.options, 1)
-            hint = f"; did you mean {near[0]}?" if near else "."
+            close_names = difflib.get_close_matches(option, SIM_OPTIONS + entry.options, 1)
+            hint = f"; did you mean {close_names[0]}?" if close_names else "."
             raise ConfigError(
                 f"task {name!r} has no option {option!r}{hint} It has {', '.join(entry.options)}; the simulation has "
                 f"{', '.join(SIM_OPTIONS)}"
@@ -131,11 +131,11 @@ def make(
             )
         plugins.append(RANDOMIZATIONS[randomize]())
     sim = Sim(n_worlds=n_worlds, **settings)
-    twice = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
-    if twice:
+    repeated = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
+    if repeated:
         raise ConfigError(
-            f"expected no plugin {twice[0]!r} besides those that the simulation's settings add, got another. Leave it "
-            f"out, give it another name=, or use estimator=Kalman([...]) with sensors of your own."
+            f"expected no plugin {repeated[0]!r} besides those that the simulation's settings add, got another. Leave "
+            f"it out, give it another name=, or use estimator=Kalman([...]) with sensors of your own."
         )
     task.install(sim)
     for plugin in plugins:
@@ -181,15 +181,15 @@ def entry_of(task: str | Task, named: bool = True) -> Entry:
         ConfigError: If there is no such file, module or class, or it may not be executed.
     """
     if isinstance(task, Task):
-        same = (entry for entry in TASKS.values() if entry.task is type(task))
-        return next(same, Entry(_check_class(type(task)), ""))
+        entries = (entry for entry in TASKS.values() if entry.task is type(task))
+        return next(entries, Entry(_check_class(type(task)), ""))
     if not isinstance(task, str):
         raise ConfigError(f"expected the name of a task or a task, got {task!r}. A class has to be called: Task().")
     if task in TASKS:
         return TASKS[task]
     if is_reference(task):
-        found = load_task(task, TASKS) if named else load_noted_task(task, TASKS)
-        return TASKS[found] if isinstance(found, str) else Entry(_check_class(found), "")
+        loaded = load_task(task, TASKS) if named else load_noted_task(task, TASKS)
+        return TASKS[loaded] if isinstance(loaded, str) else Entry(_check_class(loaded), "")
     plugins = importlib.metadata.entry_points(group=ENTRY_POINTS)
     if task in plugins.names:
         register(task, plugins[task].load())

@@ -30,14 +30,14 @@ class Renderer:
         """
         if mode not in (None, *RENDER_MODES):
             raise ConfigError(f"expected render_mode None, {' or '.join(RENDER_MODES)}, got {mode!r}")
-        chosen = np.arange(sim.n_worlds) if worlds is None else np.asarray(worlds)
-        is_index = chosen.ndim == 1 and chosen.size and np.issubdtype(chosen.dtype, np.integer)
-        if not is_index or not np.all((chosen >= 0) & (chosen < sim.n_worlds)):
+        indices = np.arange(sim.n_worlds) if worlds is None else np.asarray(worlds)
+        is_index = indices.ndim == 1 and indices.size and np.issubdtype(indices.dtype, np.integer)
+        if not is_index or not np.all((indices >= 0) & (indices < sim.n_worlds)):
             raise ConfigError(
                 f"expected render_worlds as a list of worlds from 0 to {sim.n_worlds - 1}, got {short_repr(worlds)}. "
                 f"Use [0], or None for all."
             )
-        self.sim, self.mode, self.worlds, self.size = sim, mode, chosen.tolist(), size
+        self.sim, self.mode, self.worlds, self.size = sim, mode, indices.tolist(), size
 
     def __call__(self, state: EnvState | None) -> list[np.ndarray]:
         """Return an image of each world, (height, width, 3), or an empty list after drawing into the window.

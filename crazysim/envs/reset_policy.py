@@ -37,17 +37,19 @@ class ResetPolicy:
     """``after_reset(ended, new)``: the state that begins a new episode, from those before and after the reset."""
 
 
-def _with_final_obs(state: EnvState) -> EnvState:
+def _add_final_obs(state: EnvState) -> EnvState:
     return state.replace(info=state.info | {"final_obs": state.obs})
 
 
-def _with_results(ended: EnvState, new: EnvState) -> EnvState:
-    return new.replace(**{name: getattr(ended, name) for name in ("reward", "terminated", "truncated", "info")})
+def _keep_results(final_state: EnvState, new_state: EnvState) -> EnvState:
+    return new_state.replace(
+        **{name: getattr(final_state, name) for name in ("reward", "terminated", "truncated", "info")}
+    )
 
 
 POLICIES: dict[AutoresetMode, ResetPolicy | None] = {
     AutoresetMode.disabled: None,
     AutoresetMode.next_step: ResetPolicy(lambda was_done, _: was_done, lambda state: state, False, lambda _, new: new),
-    AutoresetMode.same_step: ResetPolicy(lambda _, ended: ended.done, _with_final_obs, True, _with_results),
+    AutoresetMode.same_step: ResetPolicy(lambda _, ended: ended.done, _add_final_obs, True, _keep_results),
 }
 """Reset policy of each mode; None for no automatic resets."""

@@ -90,23 +90,23 @@ def rollout(
     """
     n_steps = positive_integer("n_steps", n_steps)
     memory = initial_memory if memory is None else memory
-    start = env.flatten(state)
-    carried = sorted({*start.plan.written, start.plan.synced})
+    flat = env.flatten(state)
+    carried_indices = sorted({*flat.plan.written_leaves, flat.plan.synced})
 
     def step(carry: tuple[list[Any], Any], key: Array) -> tuple[Any, Any]:
-        before, memory = start.replace(carried, carry[0]), carry[1]
-        seen = EnvState(before.data())
-        action, memory, extras = policy(seen.obs, memory, key)
-        after = env.advance(before, validate_action(action, seen, env.actions))
-        new = EnvState(after.data())
+        flat_before, memory = flat.replace(carried_indices, carry[0]), carry[1]
+        state = EnvState(flat_before.data())
+        action, memory, extras = policy(state.obs, memory, key)
+        flat_after = env.advance(flat_before, validate_action(action, state, env.actions))
+        new_state = EnvState(flat_after.data())
         if env.reset_policy is not None:
-            over = env.reset_policy.must_reset(seen.done, new)
-            memory = jax.tree.map(lambda first, x: select_worlds(over, first, x), initial_memory, memory)
-        kept = keep(Transition(seen.obs, action, extras, new))
-        return ([after.leaves[i] for i in carried], memory), kept
+            must_reset = env.reset_policy.must_reset(state.done, new_state)
+            memory = jax.tree.map(lambda initial, x: select_worlds(must_reset, initial, x), initial_memory, memory)
+        output = keep(Transition(state.obs, action, extras, new_state))
+        return ([flat_after.leaves[i] for i in carried_indices], memory), output
 
-    carry = [start.leaves[i] for i in carried], memory
+    carry = [flat.leaves[i] for i in carried_indices], memory
     split = partial(jax.random.split, num=n_steps)
     keys = jax.vmap(split, out_axes=1)(key) if is_key(key) and key.ndim else split(key)
-    (leaves, memory), kept = jax.lax.scan(step, carry, keys)
-    return EnvState(start.replace(carried, leaves).data()), memory, kept
+    (leaves, memory), outputs = jax.lax.scan(step, carry, keys)
+    return EnvState(flat.replace(carried_indices, leaves).data()), memory, outputs

@@ -97,9 +97,9 @@ class DroneVecEnv(VecEnv):
         """Advance all worlds; return observations, rewards, True where an episode ended, and infos."""
         if self._actions is None:
             raise ConfigError("expected actions before step_wait(), got none. Call step(actions).")
-        self.state, out = self._step_fn(self.state, self._actions)
+        self.state, arrays = self._step_fn(self.state, self._actions)
         self._actions = None
-        obs, final, reward, done, results = jax.device_get(out)
+        obs, final, reward, done, results = jax.device_get(arrays)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for world in np.flatnonzero(done):
             last = {name: x[world] for name, x in final.items()}
@@ -162,21 +162,21 @@ class DroneVecEnv(VecEnv):
     def _step_state(self, state: EnvState, actions: Array) -> tuple[EnvState, Any]:
         state = self.env.step(state, actions.reshape(state.action.shape))
         info = state.info
-        results = {
+        episode_results = {
             "out_of_time": state.truncated & ~state.terminated,
             "return": info["episode_return"].mean(axis=1),
             "length": info["episode_length"],
             "error": info["error"].mean(axis=1),
             "nonfinite": info["nonfinite"],
         }
-        out = (
+        results = (
             self._merge_obs(state.obs),
             self._merge_obs(info["final_obs"]),
             state.reward.mean(axis=1),
             state.done,
-            results,
+            episode_results,
         )
-        return state, out
+        return state, results
 
     def _merge_obs(self, obs: Obs) -> Obs:
         """Return the observations of all drones as one vector ``all``, or by name if ``dict_obs``."""

@@ -47,5 +47,5 @@ def random_attitude(x: Array) -> Array:
         x: Random numbers in [0, 1). (..., 3)
     """
     a, b, c = x[..., 0], 2 * jnp.pi * x[..., 1], 2 * jnp.pi * x[..., 2]
-    low, high = jnp.sqrt(1 - a), jnp.sqrt(a)
-    return jnp.stack([low * jnp.sin(b), low * jnp.cos(b), high * jnp.sin(c), high * jnp.cos(c)], axis=-1)
+    r1, r2 = jnp.sqrt(1 - a), jnp.sqrt(a)
+    return jnp.stack([r1 * jnp.sin(b), r1 * jnp.cos(b), r2 * jnp.sin(c), r2 * jnp.cos(c)], axis=-1)

@@ -144,20 +144,20 @@ class EnvState(PyTree):
     def _split_info(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
         """Return the entries of ``info`` divided into ``drone_info`` and ``world_info``."""
         n, n_drones = max(self.full_data.core.steps.ndim - 1, 0), self.full_data.core.n_drones
-        of_drones, of_worlds = {}, {}
+        drone_info, world_info = {}, {}
         for name, entry in info.items():
             shapes = [jnp.shape(x) for x in jax.tree.leaves(entry)]
             if all(shape[n : n + 1] == (n_drones,) for shape in shapes):
-                of_drones[name] = entry
+                drone_info[name] = entry
             elif all(len(shape) == n for shape in shapes):
-                of_worlds[name] = self._add_axis(entry)
+                world_info[name] = self._add_axis(entry)
             else:
                 raise ConfigError(
                     f"expected info[{name!r}] as one number of a world, (), or with a row for each of {n_drones} "
                     f"drones in front, ({n_drones}, ...), got {', '.join(str(shape[n:]) for shape in shapes)}. "
                     f"Return one row for every drone."
                 )
-        return {"drone_info": of_drones, "world_info": of_worlds}
+        return {"drone_info": drone_info, "world_info": world_info}
 
     def _squeeze_axis(self, x: Any) -> Any:
         """Return a per-world array without its axis of length 1, which the array of a single world does not have."""
@@ -185,8 +185,8 @@ def _map_undeclared(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
 
 def state_of_data(data: SimData) -> EnvState:
     """Return a state with an empty record, from which an episode begins."""
-    nothing: Any = None
-    record = EnvRecord({}, nothing, nothing, nothing, nothing, {}, {}, {}, nothing, nothing)
+    no_array: Any = None
+    record = EnvRecord({}, no_array, no_array, no_array, no_array, {}, {}, {}, no_array, no_array)
     return EnvState(data.replace(plugins=data.plugins | {NAME: record}))
 
 
@@ -224,13 +224,13 @@ def validate_goals(pos: ArrayLike | Array, state: EnvState) -> Array:
             axis of worlds or drones may have length 1.
         state: The state of all worlds.
     """
-    like = state.full_data.states.pos
+    template = state.full_data.states.pos
     goals = pos if isinstance(pos, Array) else read_numbers("pos", pos)
     goals = goals[:, None] if goals.ndim == 2 else goals
-    fits = all(n in (1, expected) for n, expected in zip(goals.shape, like.shape[:2], strict=False))
-    if goals.shape[-1:] != (3,) or not (goals.ndim == 1 or (goals.ndim == 3 and fits)):
+    has_batch_shape = all(n in (1, expected) for n, expected in zip(goals.shape, template.shape[:2], strict=False))
+    if goals.shape[-1:] != (3,) or not (goals.ndim == 1 or (goals.ndim == 3 and has_batch_shape)):
         raise ConfigError(
-            f"expected goals of shape (3,), (n_worlds, 3) or (n_worlds, n_drones, 3) = {like.shape}, got "
+            f"expected goals of shape (3,), (n_worlds, 3) or (n_worlds, n_drones, 3) = {template.shape}, got "
             f"{np.shape(pos)}. Use (1, n_drones, 3) for the same goals in every world."
         )
-    return jnp.broadcast_to(jnp.asarray(goals, like.dtype), like.shape)
+    return jnp.broadcast_to(jnp.asarray(goals, template.dtype), template.shape)

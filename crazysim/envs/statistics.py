@@ -32,8 +32,8 @@ class RunningStats(PyTree):
         n, mean, var = x.size // x.shape[-1], x.mean(axis=axes), x.var(axis=axes)
         total = self.count + n
         delta = mean - self.mean
-        spread = self.var * self.count + var * n + delta * delta * self.count * n / total
-        return RunningStats(self.mean + delta * n / total, spread / total, total)
+        sum_of_squares = self.var * self.count + var * n + delta * delta * self.count * n / total
+        return RunningStats(self.mean + delta * n / total, sum_of_squares / total, total)
 
     def normalize(self, x: Array) -> Array:
         """Return observations with mean zero and variance one, clipped to [-10, 10]. (..., k)"""

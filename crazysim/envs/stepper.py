@@ -38,25 +38,25 @@ class EnvStepper:
         ))  # fmt: skip
         self._flat: FlatData | None = None
         self._ends: tuple[Array, Array]
-        self._carried: list[int] = []
-        self._fixed: list[int] = []
+        self._carried_indices: list[int] = []
+        self._fixed_indices: list[int] = []
         self.compiled: Any = None
         """The compiled step; None before a state is assigned."""
 
     @property
     def state(self) -> EnvState | None:
-        """The state; None before one is assigned. Results of a step may still be those of the assigned state."""
+        """The state; None before one is assigned. Fields that a step computes may still have their assigned values."""
         return None if self._flat is None else self._unflatten(self._flat, *self._ends)
 
     @state.setter
     def state(self, state: EnvState) -> None:
-        before = self._flat
-        if before is None:
+        old_flat = self._flat
+        if old_flat is None:
             require_finite_start(self._env.task, state)
         with keep_programs():
             flat = self._flat = self._flatten(state)
         self._ends = state.terminated, state.truncated
-        if before is None or before.plan is not flat.plan:
+        if old_flat is None or old_flat.plan is not flat.plan:
             self._compile(flat)
 
     def __call__(self, actions: Array | np.ndarray) -> tuple[Any, Array, Array]:
@@ -68,10 +68,12 @@ class EnvStepper:
         flat = self._flat
         if flat is None:
             raise ConfigError("expected a state before the first step, got none. Assign stepper.state.")
-        carry, fixed = ([flat.leaves[i] for i in some] for some in (self._carried, self._fixed))
-        with keep_programs(when=not jaxcompat.n_compilations(self.compiled)):
-            carry, output, self._ends = self.compiled(carry, fixed, self._ends, actions)
-        self._flat = flat.replace(self._carried, carry)
+        carry, fixed_leaves = (
+            [flat.leaves[i] for i in indices] for indices in (self._carried_indices, self._fixed_indices)
+        )
+        with keep_programs(enabled=not jaxcompat.n_compilations(self.compiled)):
+            carry, output, self._ends = self.compiled(carry, fixed_leaves, self._ends, actions)
+        self._flat = flat.replace(self._carried_indices, carry)
         return output, *self._ends
 
     def _compile(self, flat: FlatData) -> None:
@@ -80,16 +82,24 @@ class EnvStepper:
         record, n = plan.leaf_indices.plugins[NAME], len(flat.leaves)
         flags = [record.terminated, record.truncated]
         outputs = set(jax.tree.leaves([getattr(record, name) for name in OUTPUTS]))
-        self._carried = carried = [i for i in plan.written if i not in outputs - set(plan.inputs) and i not in flags]
-        constant = outputs - set(plan.written)  # entries of info that only a reset sets
-        self._fixed = fixed = sorted({*plan.inputs, *constant} - {*carried, *flags, record.next_action})
-        like = flat.leaves[record.next_action]
+        self._carried_indices = carried_indices = [
+            i for i in plan.written_leaves if i not in outputs - set(plan.inputs) and i not in flags
+        ]
+        constant = outputs - set(plan.written_leaves)  # entries of info that only a reset sets
+        self._fixed_indices = fixed_indices = sorted(
+            {*plan.inputs, *constant} - {*carried_indices, *flags, record.next_action}
+        )
+        template = flat.leaves[record.next_action]
 
-        def step(carry: list[Array], rest: list[Array], ends: tuple[Array, Array], actions: ArrayLike) -> Any:
-            leaves = replace_leaves(replace_leaves([None] * n, fixed, rest), carried, carry)
+        def step(carry: list[Array], fixed_leaves: list[Array], ends: tuple[Array, Array], actions: ArrayLike) -> Any:
+            leaves = replace_leaves(replace_leaves([None] * n, fixed_indices, fixed_leaves), carried_indices, carry)
             leaves = replace_leaves(leaves, flags, [x[:, None] for x in ends])
-            after = env.advance(FlatData(leaves, plan), jnp.asarray(actions, like.dtype).reshape(like.shape))
-            state = EnvState(after.data())
-            return [after.leaves[i] for i in carried], self._output(state), (state.terminated, state.truncated)
+            new_flat = env.advance(FlatData(leaves, plan), jnp.asarray(actions, template.dtype).reshape(template.shape))
+            state = EnvState(new_flat.data())
+            return (
+                [new_flat.leaves[i] for i in carried_indices],
+                self._output(state),
+                (state.terminated, state.truncated),
+            )
 
         self.compiled = jaxcompat.jit_donating(step)  # no caller holds the carried arrays

@@ -152,9 +152,9 @@ class Task:
         return f"task {self.name!r}: expected class {type(self).__name__} to define {method}; see docs/guides/tasks.md"
 
 
-def total(terms: Mapping[str, Array]) -> Array:
+def sum_terms(terms: Mapping[str, Array]) -> Array:
     """Return the sum of the terms of a reward, in their order. (...)"""
-    first, *others = terms.values()
-    for term in others:
-        first = first + term
-    return first
+    reward, *other_terms = terms.values()
+    for term in other_terms:
+        reward = reward + term
+    return reward

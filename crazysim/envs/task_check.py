@@ -57,8 +57,8 @@ def check_record(state: EnvState, after: EnvState) -> None:
         after: Shapes and types of the state after a step.
     """
     kinds, n_drones = jax.tree.leaves(scopes(state.record)), state.full_data.core.n_drones
-    had, has = (dict(tree_leaves_with_path(x.record)) for x in (state, after))
-    for (path, x), kind in zip(had.items(), kinds, strict=True):
+    before, stepped_leaves = (dict(tree_leaves_with_path(x.record)) for x in (state, after))
+    for (path, x), kind in zip(before.items(), kinds, strict=True):
         name = keystr(path).lstrip(".")
         if kind in ("batched", "opaque"):
             raise ConfigError(
@@ -70,15 +70,15 @@ def check_record(state: EnvState, after: EnvState) -> None:
                 f"expected {name} of shape (n_drones, ...) in one world, with {n_drones} drones, got {x.shape[1:]}. "
                 f"Return one row for every drone."
             )
-        y = has.get(path)
+        y = stepped_leaves.get(path)
         if y is None or (x.shape, x.dtype) != (y.shape, y.dtype):
             raise ConfigError(
                 f"expected a step to return {name} as it is at the start of an episode, {_describe(x)}, got "
                 f"{'none' if y is None else _describe(y)}. Tasks and wrappers return the same names and shapes always."
             )
-    if further := [keystr(path).lstrip(".") for path in has if path not in had]:
+    if added := [keystr(path).lstrip(".") for path in stepped_leaves if path not in before]:
         raise ConfigError(
-            f"expected a step to return what there is at the start of an episode, got {', '.join(further)} besides. "
+            f"expected a step to return what there is at the start of an episode, got {', '.join(added)} besides. "
             f"Set it in after_reset, too."
         )
 
@@ -94,21 +94,21 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         action_size: Length of the action of one drone.
     """
     title = f"task {task.name or type(task).__name__!r}"
-    missing = [name for name in REQUIRED if getattr(type(task), name) is getattr(Task, name)]
-    if missing:
+    undefined = [name for name in REQUIRED if getattr(type(task), name) is getattr(Task, name)]
+    if undefined:
         raise ConfigError(
             f"{title}: expected class {type(task).__name__} to define {', '.join(REQUIRED)}, got no "
-            f"{', '.join(missing)}. {GUIDE} describes each method."
+            f"{', '.join(undefined)}. {GUIDE} describes each method."
         )
     n_worlds, n_drones = data.states.pos.shape[:2]
     batch, names = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
-    one = data if task.batched else jax.tree.map(_world_shape, scopes(data), data)
+    world = data if task.batched else jax.tree.map(_world_shape, scopes(data), data)
     action = jax.ShapeDtypeStruct((*batch, n_drones, action_size), data.states.pos.dtype)
     obs, rewards, terminated, error, info = jax.eval_shape(
         lambda data, action: (
             task.observe(data), task.rewards(data, action, action), task.terminated(data), task.error(data),
             task.info(data),
-        ), one, action,
+        ), world, action,
     )  # fmt: skip
 
     for method, result in (("observe", obs), ("rewards", rewards)):

@@ -75,10 +75,10 @@ def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Tra
     shapes = {"gates_pos": (-1, 3), "gates_rpy": (len(track.gates_pos), 3), "obstacles_pos": (-1, 3)}
     for name, shape in (shapes | {"start": (3,), "low": (3,), "high": (3,)}).items():
         value = np.asarray(getattr(track, name), float)
-        good = value.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, value.shape, strict=True))
-        if not good or not value.size or not np.all(np.isfinite(value)):
-            needed = str(shape).replace("-1", "n")
-            raise ConfigError(f"the track's {name} has shape {value.shape}; needed are finite numbers, {needed}")
+        is_valid = value.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, value.shape, strict=True))
+        if not is_valid or not value.size or not np.all(np.isfinite(value)):
+            expected = str(shape).replace("-1", "n")
+            raise ConfigError(f"the track's {name} has shape {value.shape}; needed are finite numbers, {expected}")
     low, high = np.asarray(track.low, float), np.asarray(track.high, float)
     if np.any(high <= low):
         raise ConfigError(f"the track's arena reaches from {low} to {high}; every upper limit must be the larger")
@@ -94,13 +94,13 @@ def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Tra
             raise ConfigError(f"{n_drones} drones; a random course has room for 8 at its start. Use level 0, 1 or 2.")
         return track
     starts = np.asarray(track.start) + start_offsets(n_drones)
-    for what, points, room in (("gate", track.gates_pos, 0.45), ("obstacle", track.obstacles_pos, 0.15)):
-        apart = np.linalg.norm((starts[:, None] - np.asarray(points)[None])[..., :2], axis=-1)
-        if np.any(apart < room + jitter):
-            k = int(np.argwhere(apart < room + jitter)[0, 1])
+    for kind, points, room in (("gate", track.gates_pos, 0.45), ("obstacle", track.obstacles_pos, 0.15)):
+        distance = np.linalg.norm((starts[:, None] - np.asarray(points)[None])[..., :2], axis=-1)
+        if np.any(distance < room + jitter):
+            k = int(np.argwhere(distance < room + jitter)[0, 1])
             raise ConfigError(
-                f"{what} {k} of the track is {apart.min():.2f} m from a start, where {room + jitter:.2f} m are needed "
-                f"in the plane; move it, or Track(start=...)"
+                f"{kind} {k} of the track is {distance.min():.2f} m from a start, where {room + jitter:.2f} m are "
+                f"needed in the plane; move it, or Track(start=...)"
             )
     if np.any(starts < low + [0.2, 0.2, 0.2]) or np.any(starts > high - 0.2):
         raise ConfigError(
@@ -143,14 +143,14 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
         of obstacles, m (..., n_obstacles, 3).
     """
     n, (n_x, n_y) = track.n_gates, track.grid
-    cells, corners, within, turns = jnp.split(x, np.cumsum([n_x * n_y, (n_x + 1) * (n_y + 1), 2 * n]), axis=-1)
+    cells, corners, shifts, turns = jnp.split(x, np.cumsum([n_x * n_y, (n_x + 1) * (n_y + 1), 2 * n]), axis=-1)
     middle = (np.asarray(track.low)[:2] + np.asarray(track.high)[:2]) / 2
     size = np.array(CELL)
-    first = middle - size * (np.array([n_x, n_y]) - 1) / 2
+    origin = middle - size * (np.array([n_x, n_y]) - 1) / 2
 
     cell = ranks(cells, n + 1)
-    flat = jnp.asarray(first) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
-    shift = CELL_JITTER * (2 * within.reshape(*x.shape[:-1], n, 2) - 1)
+    flat = jnp.asarray(origin) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
+    shift = CELL_JITTER * (2 * shifts.reshape(*x.shape[:-1], n, 2) - 1)
     gates = flat[..., 1:, :] + shift
     start = jnp.concatenate([flat[..., 0, :], jnp.full_like(flat[..., 0, :1], START_HEIGHT)], axis=-1)
 
@@ -159,7 +159,7 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
     quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
 
     corner = ranks(corners, track.n_obstacles)
-    poles = jnp.asarray(first - size / 2) + size * jnp.stack([corner % (n_x + 1), corner // (n_x + 1)], axis=-1)
+    poles = jnp.asarray(origin - size / 2) + size * jnp.stack([corner % (n_x + 1), corner // (n_x + 1)], axis=-1)
     return start, _add_height(gates, track.gates_pos), quat, _add_height(poles, track.obstacles_pos)
 
 

@@ -63,7 +63,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             "render_fps": round(env.max_steps / env.task.seconds),
         }
         self.num_envs, self._numpy = env.sim.n_worlds, bool(numpy)
-        self._single = env.sim.n_drones == 1
+        self._has_single_drone = env.sim.n_drones == 1
         self._reset_fn = jax.jit(self.env.reset)
         self._restart_fn = jax.jit(self.env.restart)
         self._stepper = EnvStepper(self.env, self._output)
@@ -87,23 +87,23 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         if options:
             raise ConfigError(f"expected no option of reset but reset_mask, got {', '.join(options)}")
         seed = as_seed(seed)
-        before = self.state
+        state_before = self.state
         if mask is not None and seed is not None:
             raise ConfigError(
                 "expected a seed or a reset_mask, got both. Leave the seed out: it belongs to all worlds."
             )
-        if mask is not None and before is None:
+        if mask is not None and state_before is None:
             raise ConfigError("expected a reset of all worlds before the first reset_mask, got none. Call reset().")
         super().reset(seed=seed)
         if mask is not None:
-            state = self._restart_fn(before, mask)
+            state = self._restart_fn(state_before, mask)
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
             with announce_if_slow("compiling the environment", "2 to 4 s"):
                 state = self._reset_fn(jax.random.key(number))
         self._stepper.state, self._outputs = state, self._output(state)
         obs, _, info = self._outputs
-        return self._convert((obs, self._with_final_info(info)))
+        return self._convert((obs, self._add_final_info(info)))
 
     @property
     def state(self) -> EnvState | None:
@@ -113,8 +113,10 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             return None
         obs, reward, info = self._outputs
         n = (self.num_envs, self.sim.n_drones)
-        of_drones = self._drone_entries if self._single else ()
-        entries = {k: v.reshape(*n, *v.shape[1:]) if k in of_drones else v for k, v in info.items() if k in state.info}
+        drone_entries = self._drone_entries if self._has_single_drone else ()
+        entries = {
+            k: v.reshape(*n, *v.shape[1:]) if k in drone_entries else v for k, v in info.items() if k in state.info
+        }
         if "final_obs" in entries:
             entries["final_obs"] = {k: v.reshape(*n, -1) for k, v in info["final_obs"].items()}
         obs = {k: v.reshape(*n, -1) for k, v in obs.items()}
@@ -128,24 +130,24 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         """
         if self._outputs is None:
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
-        needed = self.action_space.shape or ()
+        shape = self.action_space.shape or ()
         if not isinstance(actions, jax.Array):
-            actions = check_actions(actions, needed)
-        elif actions.shape != needed:
-            raise ValueError(f"expected actions of shape {needed}, got {actions.shape}")
+            actions = check_actions(actions, shape)
+        elif actions.shape != shape:
+            raise ValueError(f"expected actions of shape {shape}, got {actions.shape}")
         self._outputs, terminated, truncated = self._stepper(actions)
         obs, reward, info = self._outputs
         if self.render_mode == "human":
             self.render()
-        return self._convert((obs, reward, terminated, truncated, self._with_final_info(info)))
+        return self._convert((obs, reward, terminated, truncated, self._add_final_info(info)))
 
-    def _with_final_info(self, info: dict[str, Any]) -> dict[str, Any]:
+    def _add_final_info(self, info: dict[str, Any]) -> dict[str, Any]:
         """Return the info with ``final_info``, the info of the episodes that have ended, as Gymnasium defines it."""
-        over = info.get("_final_obs")
-        if over is None:
+        is_over = info.get("_final_obs")
+        if is_over is None:
             return info
-        final = {k: v for k, v in info.items() if not k.endswith("final_obs")}
-        return info | {"final_info": final | {f"_{k}": over for k in final}, "_final_info": over}
+        final_info = {k: v for k, v in info.items() if not k.endswith("final_obs")}
+        return info | {"final_info": final_info | {f"_{k}": is_over for k in final_info}, "_final_info": is_over}
 
     def _convert(self, results: Any) -> Any:
         """Return results as NumPy copies if the caller asked for them, and unchanged otherwise."""
@@ -153,14 +155,14 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
     def _output(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
         """Return observations, rewards and infos in Gymnasium's form."""
-        reward = state.reward[:, 0] if self._single else jnp.mean(state.reward, axis=1)
-        return self._squeeze_drones(state.obs), reward, self._info(state)
+        reward = state.reward[:, 0] if self._has_single_drone else jnp.mean(state.reward, axis=1)
+        return self._squeeze_drones(state.obs), reward, self._convert_info(state)
 
     def _squeeze_drones(self, tree: Any) -> Any:
         """Return per-drone arrays, without the axis of drones if there is only one drone."""
-        return jax.tree.map(lambda x: x[:, 0], tree) if self._single else tree
+        return jax.tree.map(lambda x: x[:, 0], tree) if self._has_single_drone else tree
 
-    def _info(self, state: EnvState) -> dict[str, Any]:
+    def _convert_info(self, state: EnvState) -> dict[str, Any]:
         info = {
             k: self._squeeze_drones(v) if k in self._drone_entries else v
             for k, v in state.info.items()
@@ -171,7 +173,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return info
 
     def _box(self, x: Any, limit: float) -> gymnasium.spaces.Box:
-        shape = x.shape[2:] if self._single else x.shape[1:]
+        shape = x.shape[2:] if self._has_single_drone else x.shape[1:]
         return gymnasium.spaces.Box(-limit, limit, shape, x.dtype)
 
     def render(self) -> tuple[Any, ...] | None:

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from crazysim.core.functional import feedforward_of, stage_command, staged_leaves
+from crazysim.core.functional import default_feedforward, stage_command, staged_leaves
 from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError
 from crazysim.media.flight import SAMPLE_CHUNK, SCENE_CHUNK, Flight, pack_sample, pack_scene
@@ -202,7 +202,9 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
     data = data.replace(states=states, core=core, objects=objects)
     if "setpoint" in changed:
         command, (_, *before) = changed["setpoint"], staged_leaves(data)
-        feedforward = [x.at[worlds].set(feedforward_of(command)[worlds]) for x in before]  # other worlds keep theirs
+        feedforward = [
+            x.at[worlds].set(default_feedforward(command)[worlds]) for x in before
+        ]  # other worlds keep theirs
         data = stage_command(data, command, *feedforward)
     sim.data = data
     body_pos, body_quat = _bodies(sim, worlds)

@@ -19,7 +19,7 @@ from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, with_measured_states
 from crazysim.core.population import Population
-from crazysim.core.settings import settings_of
+from crazysim.core.settings import collect_settings
 from crazysim.core.stage import Axes, Stage, is_first_step, vmap_drones, vmap_worlds
 from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError, UnknownNameError
@@ -220,7 +220,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         first = [*map(id, plugins)] != [*map(id, self._observing[0])]
         if first:
             self._observing = plugins, jit_unless_traced("measured")(functools.partial(_observations, plugins))
-        with keep_programs(when=first):
+        with keep_programs(enabled=first):
             return self._observing[1](data, measured=measured)
 
     def measured_states(self, data: SimData) -> SimData:
@@ -357,7 +357,7 @@ def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | 
 
 def _have_same_code(before: Plugin, after: Plugin) -> bool:
     """Return True if two plugins of one class differ at most in numbers of their records."""
-    fixed = [name for name, setting in settings_of(type(before)).items() if not setting.is_parameter]
+    fixed = [name for name, setting in collect_settings(type(before)).items() if not setting.is_parameter]
     return all(_are_equal(getattr(before, name), getattr(after, name)) for name in fixed)
 
 

@@ -68,7 +68,7 @@ class SceneQueries:
         # Only the arrays that the query needs, since a compiled call costs by their number.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
-        with keep_programs(when=is_new):
+        with keep_programs(enabled=is_new):
             return compiled[name, *settings](*poses, mocap)
 
     def _contacts(self, objects: ObjectSelection, floor: bool, drones: bool) -> Callable[..., ContactReport]:

@@ -112,7 +112,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     command = _command_field(data)
     state = [names.index(name) for name in STATES]
     inputs = [names.index(command), *_parameter_leaves(program, parameters, command)]
-    sizes = {leaf: program.leaves[leaf].size for leaf in {*state, *inputs, *program.written}}
+    sizes = {leaf: program.leaves[leaf].size for leaf in {*state, *inputs, *program.written_leaves}}
     symbols = {leaf: casadi.SX.sym(names[leaf], size) for leaf, size in sizes.items()}
     constants: dict[int, Any] = {}
 
@@ -196,7 +196,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
         name
         for leaf, name in enumerate(names)
         if name not in (*STATES, command)
-        and leaf not in program.written
+        and leaf not in program.written_leaves
         and program.leaves[leaf].scope in ("drone", "shared")
         and jax.numpy.issubdtype(program.leaves[leaf].dtype, jax.numpy.floating)
     ]

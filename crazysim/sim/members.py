@@ -98,7 +98,9 @@ class Member:
             command = self._pad_rotors(command, command_shape(data, level)[-1])
         staged = self._replace_checked_row(f"{level.value} command of {self.name}", staged, command)
         # the feedforward of the other drones stays
-        feedforward = [_replace_row(x, self.index, _read_row(F.feedforward_of(staged), self.index)) for x in before]
+        feedforward = [
+            _replace_row(x, self.index, _read_row(F.default_feedforward(staged), self.index)) for x in before
+        ]
         self._stage(staged, *feedforward)
 
     def _pad_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:

@@ -18,7 +18,7 @@ from crazysim.cache import keep_programs
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import DEFAULT_CONTROLLER
 from crazysim.core import functional as F
-from crazysim.core.airframes import AirframeSource, airframe_of, drone_names
+from crazysim.core.airframes import AirframeSource, drone_names, find_common_airframe
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
 from crazysim.core.pipeline import BuiltPipeline, Pipeline
@@ -31,7 +31,7 @@ from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Reset, Step, Stepper, explain
-from crazysim.engine.rollout import Keep, Policy, states_of
+from crazysim.engine.rollout import Keep, Policy, get_states
 from crazysim.engine.rollout import run as run_rollout
 from crazysim.plugins.plugin_registry import P, PluginRegistry
 from crazysim.pytree import device_array
@@ -226,7 +226,7 @@ class Sim:
     @property
     def airframe(self) -> Airframe:
         """Airframe of all drones, if they have only one."""
-        return airframe_of(self.airframes)
+        return find_common_airframe(self.airframes)
 
     @property
     def drone(self) -> str:
@@ -479,7 +479,7 @@ class Sim:
         params: Any = None,
         n_control_steps: int = 1,
         *,
-        keep: Keep = states_of,
+        keep: Keep = get_states,
         every: int = 1,
         progress: bool = False,
     ) -> Any:

@@ -80,7 +80,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
 
     Args:
         env: Environment, with a block of worlds for each seed.
-        configs: Hyperparameters of each seed, which differ in those of ``SWEEPABLE`` at most.
+        configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
     """
     config = configs[0]
@@ -109,7 +109,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     split_seeds = partial(split_blocks, n_seeds=len(configs))
 
     def loss(policies: Layers) -> tuple[Array, Any]:
-        """Return the sum of the losses of all seeds, whose gradient is that of each, stacked."""
+        """Return the sum of the losses of all seeds. Its gradient is the stack of the gradients of all seeds."""
         seed_policies = Policies(Policy(agents.stats, policies))
 
         def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:

@@ -265,13 +265,13 @@ def imitate(
 
 
 def split_obs(obs: Obs) -> tuple[Obs, Obs]:
-    """Return the observations of the student and those of the teacher."""
+    """Return the observations of the student and the observations of the teacher."""
     teacher_obs = {name.removeprefix(TEACHER_PREFIX): x for name, x in obs.items() if name.startswith(TEACHER_PREFIX)}
     return {name: x for name, x in obs.items() if not name.startswith(TEACHER_PREFIX)}, teacher_obs
 
 
 def _load_teacher(folder: str, env: Env, teacher_obs: Obs) -> Policy:
-    """Return the policy of a run, after checking that its observations and actions are those of the environment."""
+    """Return the policy of a run, after checking that its observations and actions match the environment."""
     from crazysim.train.training import load_policy
 
     policy, _, meta = load_policy(folder)

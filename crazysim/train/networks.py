@@ -303,7 +303,7 @@ class Policy(PyTree):
 
 
 class Policies(PyTree):
-    """Policies of several seeds, each of which controls a block of worlds of equal size."""
+    """Policies of several seeds. Each controls a block of worlds of equal size."""
 
     policies: Policy
     """The policies, stacked. (n_seeds, ...) each"""

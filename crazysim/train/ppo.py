@@ -376,7 +376,7 @@ def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.
 
 
 def _critic_obs(obs: Obs, config: Config) -> Array:
-    """Return the observations of the policy, followed by those that only the critic may use. (..., k)"""
+    """Return the observations of the policy, followed by observations that only the critic may use. (..., k)"""
     if config.critic != "privileged":
         return flatten(obs)
     if PRIVILEGED not in obs:

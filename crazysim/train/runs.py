@@ -104,7 +104,7 @@ def run_many(
         task: As in ``run``.
         folder: Folder of the run; None for ``out/NAME``.
         seeds: Seeds.
-        sweep: Values of hyperparameters by name, each of which is trained with each seed; names of ``SWEEPABLE``.
+        sweep: Values of hyperparameters by name, each trained with each seed; names of ``SWEEPABLE``.
         resume: True to continue from the checkpoint in the folder, with the same seeds and values.
         evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.

@@ -20,7 +20,7 @@ Rates = dict[str, Any]
 def stack_rates(configs: Sequence[Any]) -> Rates:
     """Return the hyperparameters that may differ between seeds. (n_seeds,) each
 
-    They are host arrays, so that those of a single seed are scalar constants of the compiled program.
+    They are host arrays, so that the values of a single seed are scalar constants of the compiled program.
     """
     names = [name for name in SWEEPABLE if hasattr(configs[0], name)]
     return {name: np.array([getattr(config, name) for config in configs], float_dtype()) for name in names}
@@ -39,7 +39,7 @@ def join_blocks(tree: T) -> T:
 def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | int = 0) -> Any:
     """Return the results of a function of one seed for all seeds, stacked along their first axis.
 
-    A single seed is computed without ``jax.vmap``, so that its program is that of the function itself.
+    A single seed is computed without ``jax.vmap``, so that it is the same program as the function itself.
 
     Args:
         fn: Function that takes the arguments of one seed.

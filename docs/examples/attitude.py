@@ -15,10 +15,10 @@ SECONDS = 4
 
 def command(pos: np.ndarray, vel: np.ndarray, mass: float) -> np.ndarray:
     """Return roll, pitch and zero yaw, rad, and collective thrust, N. (..., 4)"""
-    wanted = STIFFNESS * (TARGET - pos) - DAMPING * vel + [0.0, 0.0, 9.81]
-    roll = np.arctan2(-wanted[..., 1], wanted[..., 2])
-    pitch = np.arctan2(wanted[..., 0], np.hypot(wanted[..., 1], wanted[..., 2]))
-    thrust = mass * np.linalg.norm(wanted, axis=-1)
+    acc = STIFFNESS * (TARGET - pos) - DAMPING * vel + [0.0, 0.0, 9.81]
+    roll = np.arctan2(-acc[..., 1], acc[..., 2])
+    pitch = np.arctan2(acc[..., 0], np.hypot(acc[..., 1], acc[..., 2]))
+    thrust = mass * np.linalg.norm(acc, axis=-1)
     return np.stack([roll, pitch, np.zeros_like(roll), thrust], axis=-1)
 
 

@@ -22,10 +22,10 @@ def main():
         cf.goTo([RADIUS * np.cos(phase), RADIUS * np.sin(phase), HEIGHT], yaw=0.0, duration=2.5)
     timeHelper.sleep(3.0)
 
-    start, rate, errors = timeHelper.time(), 2 * np.pi / TURN, []
-    while timeHelper.time() - start < TURN:
+    start_time, rate, errors = timeHelper.time(), 2 * np.pi / TURN, []
+    while timeHelper.time() - start_time < TURN:
         for cf, phase in zip(allcfs.crazyflies, phases, strict=True):
-            angle = phase + rate * (timeHelper.time() - start)
+            angle = phase + rate * (timeHelper.time() - start_time)
             e = np.array([np.cos(angle), np.sin(angle), 0.0])
             pos, vel = RADIUS * e + [0, 0, HEIGHT], RADIUS * rate * np.array([-e[1], e[0], 0.0])
             cf.cmdFullState(pos, vel, -RADIUS * rate**2 * e, yaw=0.0, omega=[0.0, 0.0, 0.0])

@@ -52,7 +52,7 @@ def main() -> dict[str, tuple[float, float, float]]:
     cmds = commands(9.81 * float(data_sheet[0]), rng)
     states = sim.data.states
     rotor_vel = jnp.broadcast_to(dynamics.hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
-    start = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(20.0), rotor_vel=rotor_vel))
+    initial_data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(20.0), rotor_vel=rotor_vel))
 
     def fly(ratio: jax.Array) -> dict[str, jax.Array]:
         """Return the measurements of flights with these parameters, which are relative to the data sheet."""
@@ -61,7 +61,7 @@ def main() -> dict[str, tuple[float, float, float]]:
             data = step(F.attitude_control(data, cmd), sim.freq // RATE)
             return data, {name: getattr(data.states, name) for name in NOISE}
 
-        drone = start.replace(params=with_physical(start.params, ratio * data_sheet))
+        drone = initial_data.replace(params=with_physical(initial_data.params, ratio * data_sheet))
         return jax.lax.scan(sample, drone, cmds)[1]
 
     flight = jax.jit(fly)(np.float32(TRUE_OVER_DATA_SHEET))
@@ -80,11 +80,13 @@ def main() -> dict[str, tuple[float, float, float]]:
 
     sigma = np.linalg.norm(np.linalg.inv(np.linalg.qr(slope, mode="r")), axis=1)  # standard deviations due to the noise
     sheet = np.asarray(data_sheet) / UNITS
-    found, true, sigma = (x * sheet for x in (ratio, TRUE_OVER_DATA_SHEET, sigma))
+    estimate, true_value, sigma = (x * sheet for x in (ratio, TRUE_OVER_DATA_SHEET, sigma))
     print(f"\n{'':22} data sheet     found  +- sigma      true     error")
-    for name, a, b, s, c in zip(NAMES, sheet, found, sigma, true, strict=True):
+    for name, a, b, s, c in zip(NAMES, sheet, estimate, sigma, true_value, strict=True):
         print(f"{name:22} {a:10.3f} {b:9.3f} +- {s:5.3f} {c:9.3f} {100 * (b / c - 1):+8.2f} %")
-    return {name: (float(b), float(c), float(s)) for name, b, c, s in zip(NAMES, found, true, sigma, strict=True)}
+    return {
+        name: (float(b), float(c), float(s)) for name, b, c, s in zip(NAMES, estimate, true_value, sigma, strict=True)
+    }
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from crazysim import Sim, dynamics
 from crazysim import functional as F
 
-N_THRUSTS, HELD = 25, 10  # 25 thrusts, each held for 10 steps of 2 ms
+N_THRUSTS, STEPS_PER_THRUST = 25, 10  # 25 thrusts, each held for 10 steps of 2 ms
 RISE = 0.2  # m
 ROUNDS = 60
 
@@ -21,15 +21,15 @@ def main() -> None:
     # The flight starts in hover and above the floor, because a drone whose rotors are at rest falls first.
     states = sim.data.states
     rotor_vel = jnp.broadcast_to(dynamics.hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
-    start = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0), rotor_vel=rotor_vel))
+    initial_data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0), rotor_vel=rotor_vel))
 
     def cost(thrusts: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         def hold(data, thrust):
             cmd = jnp.zeros((1, 1, 4)).at[..., 3].set(thrust)
-            return step(F.attitude_control(data, cmd), HELD), None
+            return step(F.attitude_control(data, cmd), STEPS_PER_THRUST), None
 
-        end, _ = jax.lax.scan(hold, start, thrusts)
-        rise, climb = end.states.pos[0, 0, 2] - 1.0, end.states.vel[0, 0, 2]
+        final_data, _ = jax.lax.scan(hold, initial_data, thrusts)
+        rise, climb = final_data.states.pos[0, 0, 2] - 1.0, final_data.states.vel[0, 0, 2]
         effort = jnp.mean((thrusts / weight - 1) ** 2)
         return (rise - RISE) ** 2 + 0.1 * climb**2 + 1e-4 * effort, (rise, climb)
 

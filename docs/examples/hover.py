@@ -21,8 +21,8 @@ def main() -> None:
 
     height = np.asarray(sim.data.states.pos[:, 0, 2])
     speed = np.linalg.norm(sim.data.states.vel[:, 0], axis=-1)
-    for wanted, reached, v in zip(HEIGHTS, height, speed, strict=True):
-        print(f"target {wanted:.1f} m, reached {reached:.3f} m, off by {reached - wanted:+.3f} m at {v:.3f} m/s")
+    for target, final, v in zip(HEIGHTS, height, speed, strict=True):
+        print(f"target {target:.1f} m, reached {final:.3f} m, off by {final - target:+.3f} m at {v:.3f} m/s")
 
 
 if __name__ == "__main__":

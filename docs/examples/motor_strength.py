@@ -15,11 +15,11 @@ from crazysim import Sim, dynamics
 from crazysim.core import drone_keys, select_worlds
 
 
-def randomize_motors(data, default_data, mask=None, spread=0.0):
-    """Draw the strength of every rotor, with a standard deviation of ``spread``."""
+def randomize_motors(data, default_data, mask=None, deviation=0.0):
+    """Draw the strength of every rotor, with a standard deviation of ``deviation``."""
     p, default, n_rotors = data.params, default_data.params, data.states.rotor_vel.shape[-1]
     keys = drone_keys(data, "randomize_motors")
-    strength = 1 + spread * jax.vmap(jax.vmap(lambda key: jax.random.normal(key, (n_rotors, 1))))(keys)
+    strength = 1 + deviation * jax.vmap(jax.vmap(lambda key: jax.random.normal(key, (n_rotors, 1))))(keys)
     thrust = select_worlds(mask, strength * default.rpm2thrust, p.rpm2thrust)
     torque = select_worlds(mask, strength * default.rpm2torque, p.rpm2torque)
     return data.replace(params=p.replace(rpm2thrust=thrust, rpm2torque=torque))
@@ -33,14 +33,14 @@ def hover(controller: str) -> None:
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0), rotor_vel=rotor_vel))
     sim.build_default_data()
 
-    for spread in (0.0, 0.02, 0.05):
-        sim.reset_pipeline["motors"] = partial(randomize_motors, spread=spread)
+    for deviation in (0.0, 0.02, 0.05):
+        sim.reset_pipeline["motors"] = partial(randomize_motors, deviation=deviation)
         sim.reset()
         sim.state_control(pos=target)
         sim.step(5 * sim.freq)
         error = np.asarray(sim.data.states.pos)[:, 0] - target
         sideways = np.linalg.norm(error[:, :2], axis=-1)
-        print(f"{controller}, spread {spread:.0%}: off by up to {sideways.max():.3f} m sideways,", end=" ")
+        print(f"{controller}, spread {deviation:.0%}: off by up to {sideways.max():.3f} m sideways,", end=" ")
         print(f"{error[:, 2].min():+.3f} to {error[:, 2].max():+.3f} m in height")
 
 

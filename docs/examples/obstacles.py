@@ -43,10 +43,10 @@ def build() -> tuple[Sim, Array]:
     sim.build_mjx()
 
     poles = [sim.mj_model.body(f"pole_pole:{k}").mocapid.item() for k in range(2)]
-    aside = 0.04 * np.arange(N_WORLDS)
+    offset = 0.04 * np.arange(N_WORLDS)
     places = np.zeros((N_WORLDS, 2, 3))
-    places[:, 0, :2] = np.stack([np.full(N_WORLDS, 0.8), aside], axis=-1)
-    places[:, 1, :2] = np.stack([np.full(N_WORLDS, 1.6), aside - 0.28], axis=-1)
+    places[:, 0, :2] = np.stack([np.full(N_WORLDS, 0.8), offset], axis=-1)
+    places[:, 1, :2] = np.stack([np.full(N_WORLDS, 1.6), offset - 0.28], axis=-1)
     mocap_pos = sim.mjx_data.mocap_pos.at[:, jnp.array(poles)].set(places)
 
     states = sim.data.states
@@ -66,11 +66,11 @@ def main() -> None:
         _, mjx_data = sync_sim2mjx(sim_data, mjx_data, mjx_model)
         contact = mjx_data._impl.contact
 
-        def between(a: int, b: int) -> Array:
+        def touches(a: int, b: int) -> Array:
             pair = ((contact.geom1 == a) & (contact.geom2 == b)) | ((contact.geom1 == b) & (contact.geom2 == a))
             return jnp.any(pair & (contact.dist < 0), axis=-1)
 
-        return jnp.stack([between(drone, pole) for pole in poles], axis=-1)
+        return jnp.stack([touches(drone, pole) for pole in poles], axis=-1)
 
     def advance(data: SimData, mocap_pos: Array) -> tuple[SimData, Array]:
         time = data.core.steps[..., None] / data.core.freq
@@ -86,12 +86,12 @@ def main() -> None:
     _, touching = fly(sim.data, mocap_pos)
     touching = np.asarray(touching)  # (checks, worlds, poles)
     for world in range(N_WORLDS):
-        found = [
+        hits = [
             f"pole {k} after {(np.argmax(touching[:, world, k]) + 1) / CHECKS_PER_SECOND:.2f} s"
             for k in range(2)
             if touching[:, world, k].any()
         ]
-        print(f"world {world}: touched {' and '.join(found) or 'nothing'}")
+        print(f"world {world}: touched {' and '.join(hits) or 'nothing'}")
 
 
 if __name__ == "__main__":

@@ -45,8 +45,10 @@ class Progress(Plugin):
     def count(self, data):
         """Count the next gate if its plane was crossed in this step."""
         race = self.read(data)
-        now = self.in_gate(data, race.passed % N_GATES)
-        passed = race.passed + ((race.before[0] < 0) & (now[0] >= 0) & jnp.all(jnp.abs(now[1:]) < OPENING / 2))
+        gate_pos = self.in_gate(data, race.passed % N_GATES)
+        passed = race.passed + (
+            (race.before[0] < 0) & (gate_pos[0] >= 0) & jnp.all(jnp.abs(gate_pos[1:]) < OPENING / 2)
+        )
         return self.write(data, race.replace(passed=passed, before=self.in_gate(data, passed % N_GATES)))
 
     def in_gate(self, data, number):
@@ -61,7 +63,7 @@ def build() -> Sim:
     gates = sim.scene.add("gate", count=N_GATES, width=OPENING, height=OPENING)
     poles = sim.scene.add("pole", count=N_GATES, height=2.0)
 
-    def place(data, _default_data, mask=None):
+    def place_gates(data, _default_data, mask=None):
         """Place the gates on a circle, each turned and moved a little, and a pole on the inside of the way to each."""
         noise = jax.vmap(lambda key: jax.random.uniform(key, (N_GATES, 5), minval=-1.0))(world_keys(data, "course"))
         angle = 2 * jnp.pi * (jnp.arange(N_GATES) + 0.5) / N_GATES + 0.2 * noise[..., 0]
@@ -75,7 +77,7 @@ def build() -> Sim:
     sim.build_default_data()
     sim.add(ContactLog([gates, poles], drones=False))
     sim.add(Progress(gates))
-    sim.reset_pipeline["place"] = place
+    sim.reset_pipeline["place"] = place_gates
     sim.reset()
     return sim
 
@@ -83,22 +85,22 @@ def build() -> Sim:
 def policy(_, data) -> Array:
     """Return setpoints along a curve through the centre of every gate, after a second of hovering. (n_worlds, 1, 16)"""
     pos, quat = data.objects.pos[:, 0, :N_GATES], data.objects.quat[:, 0, :N_GATES]
-    along = SPEED * LEG * rotation.rotate(quat, jnp.array([1.0, 0, 0]))
+    gate_vel = SPEED * LEG * rotation.rotate(quat, jnp.array([1.0, 0, 0]))
 
-    def place(time):
+    def curve_pos(time):
         """Return positions on a cubic Hermite curve between two gates, tangent to their axes, m. (n_worlds, 1, 3)"""
         number = jnp.floor(time / LEG)
         u, k = (time / LEG - number)[..., None], number.astype(int)[..., None]
-        last, target = (lambda x, i=i: jnp.take_along_axis(x, i % N_GATES, axis=1) for i in (k - 1, k))
-        start, leaving = jnp.where(k == 0, START, last(pos)), jnp.where(k == 0, 0.0, last(along))
-        bend = u * (1 - u) * ((1 - u) * leaving - u * target(along))
-        return start + (3 - 2 * u) * u**2 * (target(pos) - start) + bend
+        take_last, target = (lambda x, i=i: jnp.take_along_axis(x, i % N_GATES, axis=1) for i in (k - 1, k))
+        leg_start, leg_vel = jnp.where(k == 0, START, take_last(pos)), jnp.where(k == 0, 0.0, take_last(gate_vel))
+        bend = u * (1 - u) * ((1 - u) * leg_vel - u * target(gate_vel))
+        return leg_start + (3 - 2 * u) * u**2 * (target(pos) - leg_start) + bend
 
     time = jnp.maximum(data.core.steps / data.core.freq - 1.0, 0.0)
-    one = jnp.ones_like(time)
-    (here, vel), (_, acc) = jax.jvp(lambda t: jax.jvp(place, (t,), (one,)), (time,), (one,))
+    unit_rate = jnp.ones_like(time)
+    (setpoint_pos, vel), (_, acc) = jax.jvp(lambda t: jax.jvp(curve_pos, (t,), (unit_rate,)), (time,), (unit_rate,))
     yaw = jnp.broadcast_to(jnp.array([0.0, 0, 0, 1, 0, 0, 0]), (*vel.shape[:-1], 7))
-    return jnp.concatenate([here, vel, acc, yaw], axis=-1)
+    return jnp.concatenate([setpoint_pos, vel, acc, yaw], axis=-1)
 
 
 def main(film: str | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -115,8 +117,8 @@ def main(film: str | None = None) -> tuple[np.ndarray, np.ndarray]:
                 recording.add(sim)
     race, hits = sim.data.plugins["race"], sim.data.plugins["contacts"]
     for world in range(N_WORLDS):
-        hit = np.array(hits.object_names)[np.asarray(hits.objects[world, 0])]
-        print(f"world {world}: passed {int(race.passed[world, 0])} gates, hit {', '.join(hit) or 'nothing'}")
+        hit_names = np.array(hits.object_names)[np.asarray(hits.objects[world, 0])]
+        print(f"world {world}: passed {int(race.passed[world, 0])} gates, hit {', '.join(hit_names) or 'nothing'}")
     return np.asarray(race.passed[:, 0]), np.asarray(hits.any[:, 0])
 
 

@@ -12,7 +12,7 @@ from crazysim.core import append_fn, drone_keys, select_worlds
 
 
 def randomize_inertia(data, default_data, mask=None):
-    """Draw the moment about every axis between half and twice that of the airframe."""
+    """Draw the moment about every axis between half and twice the airframe's moment."""
     keys = drone_keys(data, "randomize_inertia")
     log_scale = jax.vmap(jax.vmap(lambda key: jax.random.uniform(key, (3,), minval=-1.0, maxval=1.0)))(keys)
     root = jnp.exp2(0.5 * log_scale)

@@ -13,7 +13,7 @@ from crazysim.core import append_fn, drone_keys, select_worlds
 
 
 def randomize_mass(data, default_data, mask=None):
-    """Draw masses between 90 % and 110 % of that of the airframe."""
+    """Draw masses between 90 % and 110 % of the airframe's mass."""
     keys = drone_keys(data, "randomize_mass")
     scale = jax.vmap(jax.vmap(lambda key: jax.random.uniform(key, (1,), minval=0.9, maxval=1.1)))(keys)
     mass = select_worlds(mask, scale * default_data.params.mass, data.params.mass)

@@ -8,7 +8,7 @@ import numpy as np
 from crazysim import Sim
 from crazysim.lab.live import FunctionSource, ReplaySource, Twin, Twins
 
-KEEP = 0.6
+MIN_DISTANCE = 0.6
 """Distance that the simulated drone keeps, m."""
 
 
@@ -27,10 +27,10 @@ def fly(source, record=None, seconds=4.0):
     with twins:
         for _ in range(round(100 * seconds)):
             twins.update(sim)
-            away = np.asarray(sim.data.states.pos[0, 0]) - twins.pose("cf7")[0]
-            away[2] = 0.0
-            gap = np.linalg.norm(away)
-            target = home if gap > KEEP else twins.pose("cf7")[0] + 1.5 * KEEP * away / gap
+            offset = np.asarray(sim.data.states.pos[0, 0]) - twins.pose("cf7")[0]
+            offset[2] = 0.0
+            gap = np.linalg.norm(offset)
+            target = home if gap > MIN_DISTANCE else twins.pose("cf7")[0] + 1.5 * MIN_DISTANCE * offset / gap
             sim.state_control(pos=target)
             sim.step(5)
             report = sim.contact_report(twins.handles["cf7"], floor=False, drones=False)
@@ -43,9 +43,9 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "flight.mocap"
         first = fly(FunctionSource(real_flight, freq=120), record=recording)
-        again = fly(ReplaySource(recording))
-    print(f"closest {first[0]:.2f} m; the replay gives the same flight: {np.array_equal(first[1], again[1])}")
-    return first[0], np.array_equal(first[1], again[1])
+        replay = fly(ReplaySource(recording))
+    print(f"closest {first[0]:.2f} m; the replay gives the same flight: {np.array_equal(first[1], replay[1])}")
+    return first[0], np.array_equal(first[1], replay[1])
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from crazysim import train
 WORLDS = 64
 
 
-def actor_of(model: SAC):
+def make_actor(model: SAC):
     """Return the deterministic actor as a function from named observations to actions."""
     modules = [*model.actor.latent_pi, model.actor.mu]
     layers = [x for x in modules if isinstance(x, torch.nn.Linear)]
@@ -41,7 +41,7 @@ def make_model() -> SAC:
     return SAC(
         "MlpPolicy",
         env,
-        learning_rate=lambda left: 3e-3 * left,  # annealed: precision comes last
+        learning_rate=lambda remaining: 3e-3 * remaining,  # annealed: precision comes last
         gamma=0.95,
         tau=0.02,
         ent_coef="auto_0.1",
@@ -59,10 +59,10 @@ def make_model() -> SAC:
 def main(steps: int = 120_000, starts: int = 1000) -> tuple[SAC, dict[str, float]]:
     """Train for some environment steps, evaluate, and return the model and its metrics."""
     torch.set_num_threads(1)  # small networks: more threads only wait for each other
-    model, start = make_model(), time.perf_counter()
+    model, start_time = make_model(), time.perf_counter()
     model.learn(steps)
-    seconds = time.perf_counter() - start
-    metrics = train.evaluate(envs.make("hover", starts), actor_of(model))
+    seconds = time.perf_counter() - start_time
+    metrics = train.evaluate(envs.make("hover", starts), make_actor(model))
     print(
         f"SAC of Stable-Baselines3, hover: {model.num_timesteps:,} environment steps in {seconds:.0f} s; success "
         f"{metrics['success']:.1%} of {starts:,} held-out starts, mean error {metrics['error']:.3f} m"

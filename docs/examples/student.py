@@ -12,7 +12,7 @@ from jax import Array
 import crazysim.envs as envs
 from crazysim import train
 
-SEEN = ("rot", "difference_to_goal")
+STUDENT_OBSERVATIONS = ("rot", "difference_to_goal")
 
 
 def add_changes(obs: dict[str, Array], _) -> dict[str, Array]:
@@ -25,7 +25,7 @@ def add_changes(obs: dict[str, Array], _) -> dict[str, Array]:
 
 def student_env(n_worlds: int) -> envs.Env:
     """Return the task with the observations of the student."""
-    env = envs.Observe(envs.make("hover", n_worlds), lambda obs, _: {name: obs[name] for name in SEEN})
+    env = envs.Observe(envs.make("hover", n_worlds), lambda obs, _: {name: obs[name] for name in STUDENT_OBSERVATIONS})
     return envs.Observe(envs.FrameStack(env, 2), add_changes)
 
 

@@ -38,9 +38,11 @@ def main() -> None:
             sim.step(sim.freq // 10)
             closest = min(closest, closest_pair(np.asarray(sim.data.states.pos[0])))
             n_touching = max(n_touching, int(sim.contacts().sum()))
-        off = np.linalg.norm(np.asarray(sim.data.states.pos[0]) - targets, axis=-1).max()
+        distance = np.linalg.norm(np.asarray(sim.data.states.pos[0]) - targets, axis=-1).max()
         way = "around" if around else "straight"
-        print(f"{way:8s}: closest {closest:.3f} m, at most {n_touching} contacts at once, {off:.3f} m off at the end")
+        print(
+            f"{way:8s}: closest {closest:.3f} m, at most {n_touching} contacts at once, {distance:.3f} m off at the end"
+        )
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import crazysim.envs as envs
 from crazysim import train
 
 POINTS = np.array([[0.7, 0.7, 1.0], [-0.7, 0.7, 1.4], [-0.7, -0.7, 1.0], [0.7, -0.7, 1.4], [0.0, 0.0, 1.2]])  # m
-CLOSE = 0.15  # distance at which the next point becomes the goal, m
+SWITCH_DISTANCE = 0.15  # distance at which the next point becomes the goal, m
 SECONDS = 10.0
 
 
@@ -33,11 +33,11 @@ def fly(env: envs.DroneEnv, policy: Any, key: Array) -> tuple[Array, Array]:
         state = env.set_goal(state, goal)
         state = env.step(state, policy(state.obs))
         pos = state.data.states.pos[:, 0]
-        passed += jnp.linalg.norm(goal - pos, axis=-1) < CLOSE
+        passed += jnp.linalg.norm(goal - pos, axis=-1) < SWITCH_DISTANCE
         return (state, passed), (pos, jnp.minimum(passed, len(points)))
 
-    start = env.reset(key)
-    return jax.lax.scan(step, (start, jnp.zeros(env.sim.n_worlds, int)), length=env.max_steps)[1]
+    initial_state = env.reset(key)
+    return jax.lax.scan(step, (initial_state, jnp.zeros(env.sim.n_worlds, int)), length=env.max_steps)[1]
 
 
 def main(folder: str | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -53,9 +53,12 @@ def main() -> None:
         target = np.array([0.0, 0.0, 1.0])
         sim.state_control(pos=target)
         sim.step(4 * sim.freq)
-        off = np.asarray(sim.data.states.pos)[:, 0] - target
+        offset = np.asarray(sim.data.states.pos)[:, 0] - target
         name = "wind" if windy else "calm"
-        print(f"{name}: x {off[:, 0].mean():+.3f} m (deviation {off[:, 0].std():.3f} m), y {off[:, 1].mean():+.3f} m")
+        print(
+            f"{name}: x {offset[:, 0].mean():+.3f} m (deviation {offset[:, 0].std():.3f} m), "
+            f"y {offset[:, 1].mean():+.3f} m"
+        )
 
 
 if __name__ == "__main__":

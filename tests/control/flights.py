@@ -9,7 +9,7 @@ from crazysim.control import Setpoint
 from crazysim.core import functional as F
 
 
-def setpoint_of(path, t):
+def path_setpoint(path, t):
     """Return the setpoint of a path (x, y, z, yaw) of time at an instant, differentiated by jax.jvp."""
     values = []
     for _ in range(5):
@@ -31,15 +31,15 @@ def hover(t):
     return jnp.stack([0 * t, 0 * t, 1 + 0 * t, 0 * t])
 
 
-def start_at(sim, path):
+def start_on_path(sim, path):
     """Put every drone where a path begins, with its velocity, and rotors at hover."""
     from crazysim.dynamics import first_principles
 
-    sp = setpoint_of(path, jnp.float32(0))
+    sp = path_setpoint(path, jnp.float32(0))
     states, data = sim.data.states, sim.data
     rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(data.params), states.rotor_vel.shape)
-    to = lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape)  # noqa: E731
-    states = states.replace(pos=to(sp.pos, states.pos), vel=to(sp.vel, states.vel), rotor_vel=rotor_vel)
+    broadcast = lambda x, template: jnp.broadcast_to(jnp.asarray(x, template.dtype), template.shape)  # noqa: E731
+    states = states.replace(pos=broadcast(sp.pos, states.pos), vel=broadcast(sp.vel, states.vel), rotor_vel=rotor_vel)
     sim.data = data.replace(states=states)
 
 
@@ -49,7 +49,7 @@ def fly(sim, law, path, seconds, memory=None, change=None):
     The law runs at every tick of the commands of ``sim``, whose level is the level of its output. ``change(data, t)``
     changes the data before each tick.
     """
-    step, every = sim.build_step_fn(), sim.freq // sim.control_freq
+    step, n_substeps = sim.build_step_fn(), sim.freq // sim.control_freq
     zeros, command = step.zeros(sim.data), {"force_torque": F.force_torque_control, "rotor_vel": F.rotor_vel_control,
                                             "body_rate": F.body_rate_control}[sim.control.value]  # fmt: skip
 
@@ -57,24 +57,24 @@ def fly(sim, law, path, seconds, memory=None, change=None):
     def run(data, memory):
         def tick(carry, k):
             data, memory = carry
-            t = k * (every / sim.freq)
+            t = k * (n_substeps / sim.freq)
             data = data if change is None else change(data, t)
-            setpoint = setpoint_of(path, t)
-            out, memory = law(data, setpoint, memory)
-            data = step(command(data, out.reshape(1, 1, -1)), every, zeros)
-            return (data, memory), (data.states, setpoint_of(path, t + every / sim.freq), out)
+            setpoint = path_setpoint(path, t)
+            outputs, memory = law(data, setpoint, memory)
+            data = step(command(data, outputs.reshape(1, 1, -1)), n_substeps, zeros)
+            return (data, memory), (data.states, path_setpoint(path, t + n_substeps / sim.freq), outputs)
 
         times = jnp.arange(round(seconds * sim.control_freq), dtype=jnp.float32)
         return jax.lax.scan(tick, (data, memory), times)
 
-    (data, memory), (states, setpoints, out) = run(sim.data, memory)
-    return jax.tree.map(lambda x: np.asarray(x)[:, 0, 0], states), setpoints, np.asarray(out), data
+    (data, memory), (states, setpoints, outputs) = run(sim.data, memory)
+    return jax.tree.map(lambda x: np.asarray(x)[:, 0, 0], states), setpoints, np.asarray(outputs), data
 
 
-def rms(states, setpoints, after=0.0, total=1.0):
+def rms(states, setpoints, start=0.0, total=1.0):
     """Return the root of the mean square of the position error, m, in the part of a flight after a fraction of it."""
     error = np.linalg.norm(states.pos - np.asarray(setpoints.pos), axis=-1)
-    return float(np.sqrt(np.mean(error[int(len(error) * after / total) :] ** 2)))
+    return float(np.sqrt(np.mean(error[int(len(error) * start / total) :] ** 2)))
 
 
 def simulation(drone="cf21B_500", control="force_torque", **settings):

@@ -13,7 +13,7 @@ from crazysim.core.pipeline import remove_fn
 from crazysim.errors import ConfigError
 
 GRAVITY = 9.81
-LEAST = np.array([4.0, 4.0, 0.2])
+MIN_AUTHORITY = np.array([4.0, 4.0, 0.2])
 """Angular acceleration in hover below which an airframe is not drawn, rad/s^2; ``airframe check`` warns below 0.2."""
 
 SLOWEST = 0.2
@@ -49,14 +49,14 @@ def draw(rng, n, name):
         curve = rng.uniform(0.09, 0.15) * 1.225 * diameter**4 / 3600
         rod = 0.015 * (diameter / 0.279) ** 2 * diameter**2 / 12
         lift = np.linalg.pinv(np.stack([np.ones(n), y, -x, signs]))[:, 0]
-        most = ratio * mass * GRAVITY * np.max(lift)
+        max_thrust = ratio * mass * GRAVITY * np.max(lift)
         hover = np.sqrt(mass * GRAVITY / n / curve)
-        up, down = 1 / tau, 1 / tau * rng.uniform(0.5, 1.0) ** rng.choice([-1, 1])
+        rise_rate, fall_rate = 1 / tau, 1 / tau * rng.uniform(0.5, 1.0) ** rng.choice([-1, 1])
         quadratic = rng.uniform(0.0, 0.8) * rng.choice([0, 1])
-        lag = [rate * part for rate in (up, down) for part in (1 - quadratic, quadratic / 2 / hover)]
-        if min(up, down) < 1 / SLOWEST:
+        lag = [rate * part for rate in (rise_rate, fall_rate) for part in (1 - quadratic, quadratic / 2 / hover)]
+        if min(rise_rate, fall_rate) < 1 / SLOWEST:
             continue
-        if max(up, down) * (1 - quadratic + quadratic * np.sqrt(ratio * n * np.max(lift))) > 600:
+        if max(rise_rate, fall_rate) * (1 - quadratic + quadratic * np.sqrt(ratio * n * np.max(lift))) > 600:
             continue  # too quick for steps of 2 ms
         try:
             airframe = load_airframe(
@@ -66,8 +66,8 @@ def draw(rng, n, name):
                     "rotors": {
                         "position": np.stack([x, y, 0 * x], axis=-1).tolist(),
                         "yaw_torque_sign": signs.tolist(),
-                        "thrust_min": most * rng.uniform(0.01, 0.06),
-                        "thrust_max": most,
+                        "thrust_min": max_thrust * rng.uniform(0.01, 0.06),
+                        "thrust_max": max_thrust,
                         "inertia": rod * log_uniform(rng, 1 / 3, 3),
                         "thrust_curve": [0.0, 0.0, curve],
                         "torque_curve": [0.0, 0.0, curve * log_uniform(rng, 0.002, 0.03) * max(1.0, arm / 0.2)],
@@ -79,7 +79,7 @@ def draw(rng, n, name):
         except ConfigError:
             continue
         acc = max_ang_acc(airframe)
-        if not np.all(acc > LEAST) or 2 * TURN * precession_rate(airframe) > np.min(acc[:2]):
+        if not np.all(acc > MIN_AUTHORITY) or 2 * TURN * precession_rate(airframe) > np.min(acc[:2]):
             continue
         if precession_rate(airframe) < MAX_PRECESSION_RATIO * np.sqrt(Auto().params(airframe).stiffness[0]):
             return airframe
@@ -91,21 +91,21 @@ def fleet(n, count, seed=0):
     return [draw(rng, n, f"{n} rotors, number {k} of seed {seed}") for k in range(count)]
 
 
-def in_the_air(sim, pos=0.0, vel=0.0, quat=(0.0, 0.0, 0.0, 1.0), ang_vel=0.0):
+def put_in_the_air(sim, pos=0.0, vel=0.0, quat=(0.0, 0.0, 0.0, 1.0), ang_vel=0.0):
     """Put all drones into a state, with rotors that keep them level, without a floor."""
     if "clip_floor_pos" in sim.step_pipeline:
         remove_fn(sim.step_pipeline, "clip_floor_pos")
         sim.build_step_fn()
     s = sim.data.states
-    full = lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape)  # noqa: E731
+    broadcast = lambda x, template: jnp.broadcast_to(jnp.asarray(x, template.dtype), template.shape)  # noqa: E731
     weights = [GRAVITY * a.value("rigid_body.mass") for a in sim.airframes]
     rotor_vel = [a.rotor_vel(w * allocation_matrix(a)[:, 0]) for a, w in zip(sim.airframes, weights, strict=True)]
     states = s.replace(
-        pos=full(pos, s.pos),
-        vel=full(vel, s.vel),
-        quat=full(quat, s.quat),
-        ang_vel=full(ang_vel, s.ang_vel),
-        rotor_vel=full(np.stack(rotor_vel), s.rotor_vel),
+        pos=broadcast(pos, s.pos),
+        vel=broadcast(vel, s.vel),
+        quat=broadcast(quat, s.quat),
+        ang_vel=broadcast(ang_vel, s.ang_vel),
+        rotor_vel=broadcast(np.stack(rotor_vel), s.rotor_vel),
     )
     sim.data = sim.data.replace(states=states)
 
@@ -116,7 +116,7 @@ def directions(rng, *shape):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def thrown(sim, seed, tilt=np.pi / 4, rate=2.0, speed=2.0, away=2.0, heading=np.pi):
+def throw_drones(sim, seed, tilt=np.pi / 4, rate=2.0, speed=2.0, away=2.0, heading=np.pi):
     """Throw all drones: a tilt, rad, about a random axis, body rates, rad/s, a speed, m/s, up to ``away`` m off."""
     rng, shape = np.random.default_rng(seed), (sim.n_worlds, sim.n_drones)
     axes = directions(rng, *shape) * [1, 1, 0]
@@ -124,7 +124,7 @@ def thrown(sim, seed, tilt=np.pi / 4, rate=2.0, speed=2.0, away=2.0, heading=np.
     yaws = Rotation.from_rotvec(rng.uniform(-heading, heading, (np.prod(shape), 1)) * [0, 0, 1])
     quat = (Rotation.from_rotvec(axes.reshape(-1, 3)) * yaws).as_quat().reshape(*shape, 4)
     pos = away * directions(rng, *shape) * rng.uniform(0, 1, (*shape, 1))
-    in_the_air(sim, pos, speed * directions(rng, *shape), quat, rate * directions(rng, *shape))
+    put_in_the_air(sim, pos, speed * directions(rng, *shape), quat, rate * directions(rng, *shape))
 
 
 def alternation(sim):
@@ -143,7 +143,7 @@ def flights(airframes, controller, worlds, seconds, seed, **start):
     (n_times, n_worlds, n_drones), the same, (n_drones,)
     """
     sim = Sim(worlds, drone=airframes, control="state", controller=controller)
-    thrown(sim, seed, **start)
+    throw_drones(sim, seed, **start)
     sim.state_control(pos=[0.0, 0.0, 0.0])
     track = []
     for _ in range(round(10 * seconds)):
@@ -153,8 +153,8 @@ def flights(airframes, controller, worlds, seconds, seed, **start):
     return np.linalg.norm(track, axis=-1), track[..., 2], alternation(sim)
 
 
-def settled(distances, limit):
+def settling_time(distances, limit):
     """Return the time after which a distance stays below a limit, s; infinite if it does not. (n_worlds, n_drones)"""
-    above = distances > limit
-    last = len(above) - np.argmax(above[::-1], axis=0)
-    return np.where(above[-1], np.inf, np.where(above.any(0), 0.1 * last, 0.0))
+    is_far = distances > limit
+    last_index = len(is_far) - np.argmax(is_far[::-1], axis=0)
+    return np.where(is_far[-1], np.inf, np.where(is_far.any(0), 0.1 * last_index, 0.0))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import unit_quats, vectors
-from flights import figure_eight, fly, hover, rms, setpoint_of, simulation, start_at
+from flights import figure_eight, fly, hover, path_setpoint, rms, simulation, start_on_path
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
@@ -83,7 +83,7 @@ def test_a_drone_that_tracks_gets_the_wrench_of_its_motion():
     from crazysim.control.flatness import attitude_of_thrust
 
     p, attitude = GeometricParams.create(load_airframe("bumblebee"), 500), jax.jit(attitude_of_thrust)
-    on_the_eight = jax.jit(functools.partial(setpoint_of, figure_eight))
+    on_the_eight = jax.jit(functools.partial(path_setpoint, figure_eight))
     for t in (0.3, 1.0, 2.2):
         sp = jax.tree.map(np.asarray, on_the_eight(t))
         gravity = np.array([0, 0, 9.81])
@@ -225,7 +225,7 @@ def test_gains_by_bandwidth_are_stable_and_damped(drone):
 def test_figure_eight_of_two_metres_at_two_metres_per_second(drone, freq, bound):
     """2 cm RMS from the start, which is not at rest, with the full dynamics: rotor lag, drag and limits."""
     sim = simulation(drone, force_torque_freq=freq)
-    start_at(sim, figure_eight)
+    start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, law(drone, freq=freq), figure_eight, 9.0)
     assert 1.95 < np.linalg.norm(states.vel, axis=-1).max() < 2.15
     assert rms(states, setpoints) < bound
@@ -233,14 +233,14 @@ def test_figure_eight_of_two_metres_at_two_metres_per_second(drone, freq, bound)
 
 def test_without_feedforward_the_error_is_tens_of_centimetres():
     sim = simulation("cf21B_500")
-    start_at(sim, figure_eight)
+    start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, law("cf21B_500", feedforward=False), figure_eight, 9.0)
     assert rms(states, setpoints) > 0.3
 
 
 def test_it_recovers_from_upside_down():
     sim = simulation("cf21B_500")
-    start_at(sim, hover)
+    start_on_path(sim, hover)
     s = sim.data.states
     upside_down = np.broadcast_to([np.sqrt(0.99), 0, 0, 0.1], s.quat.shape)
     high = np.broadcast_to([0, 0, 20.0], s.pos.shape)
@@ -256,7 +256,7 @@ def test_figure_eight_in_a_simulation(freq):
     eight = curves.figure_eight(2.0, 1.0, speed=2.0)
     sim = Sim(control="state", controller=Geometric(freq=freq), strict=True)
     sim.add(Follow(eight))
-    start_at(sim, figure_eight)
+    start_on_path(sim, figure_eight)
     flown = []
     for _ in range(300):
         sim.step(10)
@@ -272,7 +272,7 @@ def test_an_integral_takes_up_a_push(drone):
     offsets, gains = {}, Geometric().params(load_airframe(drone))
     for integral in (0.0, 0.6):
         sim = Sim(drone=drone, control="state", controller=Geometric(integral=integral), strict=True)
-        start_at(sim, hover)
+        start_on_path(sim, hover)
         command = np.zeros((1, 1, 16))
         command[..., 2] = 1.0
         sim.state_control(command)
@@ -291,7 +291,7 @@ def test_an_integral_does_not_wind_up():
     """A drone held beside its setpoint fills the integral up to its limit; far from it the integral stays empty."""
     for distance, largest in ((0.5, 0.5 * 9.81), (10.0, 0.0)):
         sim = Sim(control="state", controller=Geometric(integral=1.0))
-        start_at(sim, hover)
+        start_on_path(sim, hover)
         held, command = sim.data.states, np.zeros((1, 1, 16))
         command[..., :3] = [distance, 0, 1]
         sim.state_control(command)

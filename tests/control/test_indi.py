@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
-from flights import figure_eight, fly, hover, rms, setpoint_of, simulation, start_at
+from flights import figure_eight, fly, hover, path_setpoint, rms, simulation, start_on_path
 
 from crazysim import Sim, load_airframe
 from crazysim.control.geometric import GeometricParams, geometric_control
@@ -53,7 +53,7 @@ def memory():
 
 def test_a_return_to_the_controller_starts_its_filter_anew():
     controller, airframe = INDI(), load_airframe("bumblebee")
-    params, setpoint = controller.params(airframe), jax.jit(lambda t: setpoint_of(hover, t))(np.float32(0))
+    params, setpoint = controller.params(airframe), jax.jit(lambda t: path_setpoint(hover, t))(np.float32(0))
     rotor_vel = np.full(4, 8000.0, np.float32)
     state = {"pos": [0, 0, 0], "quat": [0, 0, 0, 1], "vel": [1.0, 0.0, 0.0], "ang_vel": [0, 0, 0]}
     state = {name: jnp.asarray(np.float32(value)) for name, value in state.items()}
@@ -68,7 +68,7 @@ def test_a_return_to_the_controller_starts_its_filter_anew():
 
 def test_figure_eight_of_two_metres_at_two_metres_per_second():
     sim = simulation("cf21B_500", "rotor_vel")
-    start_at(sim, figure_eight)
+    start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, law("cf21B_500"), figure_eight, 9.0, memory())
     assert rms(states, setpoints) < 0.02
 
@@ -85,7 +85,7 @@ def pushed(data, t):
 def test_a_force_and_a_torque_are_compensated():
     """Within 1 mm after 7 s; geometric control without an integral stays decimetres away."""
     sim = simulation("cf21B_500", "rotor_vel")
-    start_at(sim, hover)
+    start_on_path(sim, hover)
     states, setpoints, _, _ = fly(sim, law("cf21B_500"), hover, 9.0, memory(), pushed)
     error = np.linalg.norm(states.pos - np.asarray(setpoints.pos), axis=-1)
     assert error[-1] < 1e-3
@@ -99,7 +99,7 @@ def test_a_force_and_a_torque_are_compensated():
         return geometric_control(*one, setpoint, params=p), nothing
 
     sim = simulation("cf21B_500")
-    start_at(sim, hover)
+    start_on_path(sim, hover)
     states, setpoints, _, _ = fly(sim, geometric, hover, 9.0, None, pushed)
     assert np.linalg.norm(states.pos[-1] - np.asarray(setpoints.pos)[-1]) > 0.2
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flights import figure_eight, fly, hover, rms, setpoint_of, simulation, start_at
+from flights import figure_eight, fly, hover, path_setpoint, rms, simulation, start_on_path
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
@@ -135,7 +135,7 @@ def test_setpoints_of_a_trajectory_are_finite():
 @pytest.fixture(scope="module")
 def knots():
     times = np.arange(50) * 0.1
-    return jax.jit(jax.vmap(lambda t: setpoint_of(figure_eight, t)))(times)
+    return jax.jit(jax.vmap(lambda t: path_setpoint(figure_eight, t)))(times)
 
 
 @pytest.mark.usefixtures("x64")
@@ -171,7 +171,7 @@ def test_error_dynamics_are_those_of_the_drone(knots):
 @pytest.mark.usefixtures("x64")
 def test_gains_along_a_hover_are_those_of_hover():
     p = LQRParams.create(load_airframe("bumblebee"), 500)
-    still = jax.jit(jax.vmap(lambda t: setpoint_of(hover, t)))(np.arange(4) * 0.1)
+    still = jax.jit(jax.vmap(lambda t: path_setpoint(hover, t)))(np.arange(4) * 0.1)
     Q, R = np.diag(LAB_Q).astype(float), np.diag(LAB_R).astype(float)
     gains = jax.jit(tracking_gains, static_argnames="substeps")(
         still, 0.1, np.asarray(p.mass), np.asarray(p.J), np.zeros((3, 3)), Q, R, substeps=2000
@@ -199,7 +199,7 @@ def test_figure_eight(drone, bound, knots):
     """Of 2 m at 2 m/s, with the gain about hover, and with that along the trajectory."""
     sim = simulation(drone)
     p = LQRParams.create(load_airframe(drone), 500)
-    start_at(sim, figure_eight)
+    start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, lambda d, sp, m: (lqr_control(*state_of(d), sp, params=p), m), figure_eight, 4.8)
     assert rms(states, setpoints) < bound
 
@@ -210,7 +210,7 @@ def test_figure_eight(drone, bound, knots):
         return tracking_lqr_control(*state_of(data), sp, tick / 500, params=along), tick + 1
 
     sim.reset()
-    start_at(sim, figure_eight)
+    start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, law, figure_eight, 4.8, jnp.float32(0))
     assert rms(states, setpoints) < bound
 
@@ -249,13 +249,13 @@ def fly_with_load(load_mass, length, seconds, freq=500):
         states = Record(pos=x[:3], quat=rotation.from_rpy(x[6:9]), vel=x[3:6], ang_vel=x[9:12])
         load = Record(pos=x[:3] + length * q, vel=x[3:6] + length * q_rate)
         data = Record(states=states, plugins={"load": load})
-        u, memory = controller.update(data, setpoint_of(figure_eight, k / freq), memory, p)
+        u, memory = controller.update(data, path_setpoint(figure_eight, k / freq), memory, p)
         x = jax.lax.fori_loop(0, n, lambda _, x: x + dt * deriv(x + dt / 2 * deriv(x, u), u), x)
-        return (x, memory), (x[:3] + length * rod_direction(x[12:14]), setpoint_of(figure_eight, (k + 1) / freq).pos)
+        return (x, memory), (x[:3] + length * rod_direction(x[12:14]), path_setpoint(figure_eight, (k + 1) / freq).pos)
 
     @jax.jit
     def flown(steps):
-        reference, rod, rod_rate = load_reference(setpoint_of(figure_eight, jnp.float32(0)), p)
+        reference, rod, rod_rate = load_reference(path_setpoint(figure_eight, jnp.float32(0)), p)
         start = [reference.pos, reference.vel, jnp.zeros(6), *rod_angles(rod, rod_rate), reference.wrench]
         return jax.lax.scan(tick, (jnp.concatenate(start), memory), steps)[1]
 

@@ -4,7 +4,7 @@ import tomllib
 
 import numpy as np
 import pytest
-from random_airframes import GRAVITY, alternation, fleet, flights, in_the_air, settled, thrown
+from random_airframes import GRAVITY, alternation, fleet, flights, put_in_the_air, settling_time, throw_drones
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
@@ -33,7 +33,7 @@ def test_setpoints_are_reached_from_any_throw(n, seed, count):
     """
     airframes = fleet(n, count, seed)
     distances, heights, alternating = flights(airframes, "auto", 4, 40, seed)
-    times = settled(distances, 2e-3)
+    times = settling_time(distances, 2e-3)
     for k, airframe in enumerate(airframes):
         position = Auto().params(airframe).position
         frequency, acc = float(np.sqrt(position.stiffness[0])), float(np.min(position.acc_max))
@@ -50,12 +50,12 @@ def test_commands_below_are_followed_without_overshoot(level, n, seed, count):
     airframes, steps, throws = fleet(n, count, seed), STEPS[level], 4
     rng = np.random.default_rng(seed)
     sim = Sim(len(steps) + throws, drone=airframes, control=level)
-    thrown(sim, seed)
+    throw_drones(sim, seed)
     s = sim.data.states
     rest = np.arange(sim.n_worlds) < len(steps)
     quat, ang_vel = np.array(s.quat), np.array(s.ang_vel)
     quat[rest], ang_vel[rest] = [0, 0, 0, 1], 0
-    in_the_air(sim, s.pos, s.vel * ~rest[:, None, None], quat, ang_vel)
+    put_in_the_air(sim, s.pos, s.vel * ~rest[:, None, None], quat, ang_vel)
     command = np.zeros((sim.n_worlds, count, 4), np.float32)
     if level == "attitude":
         command[..., :3] = rng.uniform(-1, 1, command[..., :3].shape) * [0.5, 0.5, 3]
@@ -157,7 +157,7 @@ def test_quick_and_heavy_rotors_hover_and_reach_far_setpoints(controller):
     """Within 2 mm, with rotors at constant speeds: near, 30 m aside, which nothing lifts, and 30 m below."""
     sources = [HUMMINGBIRD, RACER, *(heavy(*each) for each in ((1, 1), (2, 1), (3, 1), (5, 1), (1, 0.25), (3, 0.25)))]
     sim = Sim(3, drone=[load_airframe(source) for source in sources], control="state", controller=controller)
-    in_the_air(sim)
+    put_in_the_air(sim)
     goals = np.array([[1.0, 0.0, 1.0], [30.0, 0.0, 0.0], [0.0, 0.0, -30.0]])[:, None]
     if controller == "indi":
         goals[1:] /= 10  # its errors are not limited

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import hover_command, hovering, to_all, trees_equal, with_states
+from cases import hover_command, hovering, repeat_command, trees_equal, with_states
 from jax import Array
 from scipy.linalg import expm
 
@@ -116,7 +116,7 @@ def test_law_08_states_of_a_plugin_keep_the_order_of_the_integrator(integrator, 
 
 
 def fly_on(sim, n_steps=20):
-    sim.attitude_control(to_all(sim.data, hover_command(sim.data) + [0.1, -0.1, 0.2, 0.05]))
+    sim.attitude_control(repeat_command(sim.data, hover_command(sim.data) + [0.1, -0.1, 0.2, 0.05]))
     sim.step(n_steps)
     return sim.data
 
@@ -243,7 +243,7 @@ def test_replace_finds_the_controller_that_latency_had_wrapped():
     controller = sim.step_pipeline["attitude_controller"]
     sim.add(Latency(3))
     sim.replace(Latency(2, max_delay=8))
-    sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+    sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     arrived = []
     for _ in range(4):
         sim.step()

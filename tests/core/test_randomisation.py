@@ -2,7 +2,7 @@
 
 import jax
 import numpy as np
-from cases import hover_command, hover_rotor_state, to_all, with_states
+from cases import hover_command, hover_rotor_state, repeat_command, with_states
 
 from crazysim import Sim
 from crazysim.core.pipeline import append_fn
@@ -50,7 +50,7 @@ def build(*reset_stages, control="rotor_vel"):
         append_fn(sim.reset_pipeline, stage)
     sim.build_reset_fn()
     sim.reset()
-    getattr(sim, f"{control}_control")(to_all(nominal, hover_command(nominal)))
+    getattr(sim, f"{control}_control")(repeat_command(nominal, hover_command(nominal)))
     return sim, nominal
 
 

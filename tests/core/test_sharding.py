@@ -1,4 +1,4 @@
-"""Worlds distributed over two devices: the shardings_of of each leaf, and the same results as on one device."""
+"""Worlds distributed over two devices: the sharding of each leaf, and the same results as on one device."""
 
 import jax
 import jax.numpy as jnp

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-FIRST = [ROOT / "README.md", ROOT / "docs" / "quick_start.md"]
+FIRST_PAGES = [ROOT / "README.md", ROOT / "docs" / "quick_start.md"]
 """What a newcomer reads first."""
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
@@ -23,8 +23,8 @@ def run(page):
             pytest.importorskip(package)
     namespace = {"__name__": "page"}
     for block in outputs.blocks(text):
-        printed = outputs.run(block, page, namespace)
+        printed = outputs.run_block(block, page, namespace)
         line = text[: block.end].count("\n")
-        if block.output is not None and not outputs.same(block.output, printed, block.example):
+        if block.output is not None and not outputs.is_same_output(block.output, printed, block.example):
             name = page.relative_to(ROOT)
             pytest.fail(f"the block that ends at line {line} prints\n{printed}; run `python docs/outputs.py {name}`")

@@ -3,12 +3,12 @@
 import sys
 
 import pytest
-from pages import FIRST, PAGES, ROOT, outputs, run
+from pages import FIRST_PAGES, PAGES, ROOT, outputs, run
 
 
 @pytest.mark.long("runs every block of a page as a reader would")
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if page not in FIRST], ids=lambda page: str(page.relative_to(ROOT))
+    "page", [page for page in PAGES if page not in FIRST_PAGES], ids=lambda page: str(page.relative_to(ROOT))
 )
 def test_page_runs(page, tmp_path, monkeypatch, opengl):
     monkeypatch.chdir(tmp_path)
@@ -70,16 +70,16 @@ def test_pages_have_code():
     ],
 )
 def test_outputs_are_compared_to_the_digits_that_a_page_shows(shown, printed, same):
-    assert outputs.same(shown, printed) is same
+    assert outputs.is_same_output(shown, printed) is same
 
 
 def test_an_example_has_the_words_of_the_output_and_other_numbers():
     text = '```python\nprint(1)\n```\n\n```text title="for example"\nsuccess 0.5% in 12 s\n```\n'
     (block,) = outputs.blocks(text)
     assert block.example
-    assert outputs.same(block.output, "success 100% in 3.2 s", block.example)
-    assert not outputs.same(block.output, "crashed 100% in 3.2 s", block.example)
-    assert not outputs.same(block.output, "success 100% in 3.2 s")
+    assert outputs.is_same_output(block.output, "success 100% in 3.2 s", block.example)
+    assert not outputs.is_same_output(block.output, "crashed 100% in 3.2 s", block.example)
+    assert not outputs.is_same_output(block.output, "success 100% in 3.2 s")
 
 
 def test_an_output_belongs_to_the_block_before_it():
@@ -97,10 +97,10 @@ def test_a_block_with_a_title_is_a_file_of_its_own(tmp_path, monkeypatch):
     )
     first, plain, other, wrong = outputs.blocks(text)
     namespace = {"__name__": "page"}
-    assert outputs.run(first, tmp_path / "page.md", namespace) == "main\n"
-    assert outputs.run(plain, tmp_path / "page.md", namespace) == ""
-    assert outputs.run(other, tmp_path / "page.md", namespace) == "1 False\n"
+    assert outputs.run_block(first, tmp_path / "page.md", namespace) == "main\n"
+    assert outputs.run_block(plain, tmp_path / "page.md", namespace) == ""
+    assert outputs.run_block(other, tmp_path / "page.md", namespace) == "1 False\n"
     with pytest.raises(NameError, match="'x' is not defined"):
-        outputs.run(wrong, tmp_path / "page.md", namespace)
+        outputs.run_block(wrong, tmp_path / "page.md", namespace)
     assert "mine" not in sys.modules
     assert (tmp_path / "mine.py").read_text().startswith("x = 1\n")

@@ -6,7 +6,7 @@ import numpy as np
 from crazysim.engine.ir.program import Leaf, Program, Segment
 
 
-def program_of(block, inputs, n_lanes):
+def make_program(block, inputs, n_lanes):
     """Return a program of one block and its leaves: one for each input, scalars shared, and one for each output.
 
     Args:

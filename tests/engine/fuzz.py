@@ -37,8 +37,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from programs import Program, draw, evaluate, kept
-from rounding import allow_gpu, close, explained, keeps_sign_of_zero
+from programs import Program, draw, evaluate, prune_program
+from rounding import allow_gpu, are_explained, is_close, keeps_sign_of_zero
 
 from crazysim import Sim
 from crazysim.core.stage import Stage, as_stages, stage
@@ -53,7 +53,7 @@ N_WORLDS, N_DRONES = 36, 2
 COMPARED = ("lanes", "interpret", "fused")
 
 
-class Given(PyTree):
+class Inputs(PyTree):
     """Inputs of the programs, by the letter of their type and their shape."""
 
     numbers: dict = leaf("drone", 0)
@@ -81,7 +81,7 @@ SPECIAL = np.float32(
 )  # fmt: skip
 
 
-def given(rng: np.random.Generator) -> Given:
+def draw_inputs(rng: np.random.Generator) -> Inputs:
     """Return inputs: ordinary numbers in a third of the worlds, ties in the next, special numbers in the last."""
     fields: list[dict] = [{}, {}, {}]
     for letter, shapes in SHAPES.items():
@@ -99,15 +99,15 @@ def given(rng: np.random.Generator) -> Given:
             third = np.arange(N_WORLDS) * 3 // N_WORLDS
             x = np.choose(third.reshape(-1, *([1] * (len(size) - 1))), options)
             fields[len(shape)][letter + "".join(map(str, shape))] = jnp.asarray(x.astype(DTYPES[letter]))
-    return Given(*fields)
+    return Inputs(*fields)
 
 
-def flat(g: Given) -> dict:
+def flat(g: Inputs) -> dict:
     """Return inputs by name."""
     return {**g.numbers, **g.vectors, **g.matrices}
 
 
-def inputs_of(scope: str) -> dict[str, jax.ShapeDtypeStruct]:
+def input_shapes(scope: str) -> dict[str, jax.ShapeDtypeStruct]:
     """Return shapes and types that a program sees, of one drone or of one world."""
     lead = () if scope == "drone" else (N_DRONES,)
     return {
@@ -127,7 +127,7 @@ class Case:
     @functools.cached_property
     def avals(self) -> list[jax.ShapeDtypeStruct]:
         """Shapes and types of all values."""
-        return jax.eval_shape(self.program.values, inputs_of(self.scope))
+        return jax.eval_shape(self.program.values, input_shapes(self.scope))
 
     def stage(self, name: str) -> Stage:
         """Return a stage that writes all values of the program under a name."""
@@ -156,7 +156,7 @@ class Case:
         """Whether each line keeps the sign of zero."""
         n = len(self.program.inputs)
         lines = enumerate(self.program.lines)
-        return [keeps_sign_of_zero(functools.partial(_of_values, line), self.avals[: n + j]) for j, line in lines]
+        return [keeps_sign_of_zero(functools.partial(_apply_to_values, line), self.avals[: n + j]) for j, line in lines]
 
     def unpacked(self, floats: np.ndarray, others: np.ndarray) -> list[np.ndarray]:
         """Return the values of the lines from slots, of all worlds."""
@@ -185,22 +185,22 @@ def packed(values: Sequence, n_inputs: int) -> tuple:
 @stage("drone")
 def turned(data):
     """Turn the vectors round, so that they are not the same at every step; engines hoist what is."""
-    given = data.plugins["given"]
-    vectors = {name: x[::-1] for name, x in given.vectors.items()}
-    return data.replace(plugins=data.plugins | {"given": given.replace(vectors=vectors)})
+    inputs = data.plugins["given"]
+    vectors = {name: x[::-1] for name, x in inputs.vectors.items()}
+    return data.replace(plugins=data.plugins | {"given": inputs.replace(vectors=vectors)})
 
 
 @dataclasses.dataclass
-class Find:
+class Finding:
     """A program that an engine gets wrong."""
 
     case: Case
     engine: str
-    what: str
+    description: str
 
     def __str__(self) -> str:
         """Return the program and what is wrong with it."""
-        return f"--- {self.engine}, one {self.case.scope}: {self.what}\n{self.case.program}"
+        return f"--- {self.engine}, one {self.case.scope}: {self.description}\n{self.case.program}"
 
 
 class Fuzzer:
@@ -219,7 +219,7 @@ class Fuzzer:
         self.rng = np.random.default_rng(seed)
         sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel", device=device)
         self.device, self.data = sim.device, sim.data
-        self.given = jax.device_put(given(self.rng), sim.device)
+        self.given = jax.device_put(draw_inputs(self.rng), sim.device)
         self.counts: collections.Counter[str] = collections.Counter()
         self.refused: collections.Counter[str] = collections.Counter()
 
@@ -228,25 +228,25 @@ class Fuzzer:
         cases = []
         for _ in range(n):
             scope = "drone" if self.rng.random() < 0.8 else "world"
-            cases.append(Case(draw(self.rng, inputs_of(scope), int(self.rng.integers(1, 5))), scope))
+            cases.append(Case(draw(self.rng, input_shapes(scope), int(self.rng.integers(1, 5))), scope))
         return cases
 
-    def check(self, cases: Sequence[Case]) -> Iterator[Find]:
+    def check(self, cases: Sequence[Case]) -> Iterator[Finding]:
         """Run programs on all engines, and yield what is wrong."""
         self.counts["programs"] += len(cases)
         yield from self._check(list(cases))
 
-    def _check(self, cases: list[Case]) -> Iterator[Find]:
+    def _check(self, cases: list[Case]) -> Iterator[Finding]:
         if not cases:
             return
-        data, stages = self._step_of(cases)
+        data, stages = self._build_stages(cases)
         try:
             program = lower_stages(as_stages(stages), data)
         except Exception as error:
             if len(cases) == 1 and self._refused_by_jax(cases):
                 self.counts["refused by JAX"] += 1
             elif len(cases) == 1:
-                yield Find(cases[0], "lowering", f"{type(error).__name__}: {error}")
+                yield Finding(cases[0], "lowering", f"{type(error).__name__}: {error}")
             else:
                 yield from self._check(cases[: len(cases) // 2])
                 yield from self._check(cases[len(cases) // 2 :])
@@ -270,7 +270,7 @@ class Fuzzer:
                 return
         yield from self._compare(cases, self.engines)
 
-    def _step_of(self, cases: Sequence[Case]) -> tuple[Any, dict[str, Stage]]:
+    def _build_stages(self, cases: Sequence[Case]) -> tuple[Any, dict[str, Stage]]:
         stages = {f"p{k}": case.stage(f"p{k}") for k, case in enumerate(cases)} | {"turned": turned}
         slots: dict[str, dict] = {"drone": {}, "world": {}}
         for k, case in enumerate(cases):
@@ -280,7 +280,7 @@ class Fuzzer:
 
     def run(self, cases: Sequence[Case], engine: str) -> list[list[np.ndarray]]:
         """Return the values of programs on an engine."""
-        data, stages = self._step_of(cases)
+        data, stages = self._build_stages(cases)
         results = Step(stages, engine, self.platform, device=self.device)(data).plugins["results"]
         slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
         return [case.unpacked(slots[f"p{k}f"], slots[f"p{k}o"]) for k, case in enumerate(cases)]
@@ -293,18 +293,18 @@ class Fuzzer:
             return True
         return False
 
-    def _compare(self, cases: Sequence[Case], engines: Sequence[str]) -> Iterator[Find]:
-        found: dict[str, list[list[np.ndarray]]] = {}
+    def _compare(self, cases: Sequence[Case], engines: Sequence[str]) -> Iterator[Finding]:
+        results: dict[str, list[list[np.ndarray]]] = {}
         for engine in ("plain", *engines):
             try:
-                start = time.perf_counter()
-                found[engine] = self.run(cases, engine)
-                self.counts[f"ms {engine}"] += int(1e3 * (time.perf_counter() - start))
+                start_time = time.perf_counter()
+                results[engine] = self.run(cases, engine)
+                self.counts[f"ms {engine}"] += int(1e3 * (time.perf_counter() - start_time))
             except Exception as error:
                 if len(cases) == 1 and engine == "plain":
                     self.counts["refused by JAX"] += 1
                 elif len(cases) == 1:
-                    yield Find(cases[0], engine, f"{type(error).__name__}: {str(error)[:2000]}")
+                    yield Finding(cases[0], engine, f"{type(error).__name__}: {str(error)[:2000]}")
                 else:
                     half = len(cases) // 2
                     yield from self._compare(cases[:half], engines)
@@ -313,33 +313,37 @@ class Fuzzer:
         for k, case in enumerate(cases):
             for engine in engines:
                 self.counts[f"compared on {engine}"] += 1
-                find = self._first_difference(case, engine, found["plain"][k], found[engine][k])
-                if find is None:
+                finding = self._first_difference(case, engine, results["plain"][k], results[engine][k])
+                if finding is None:
                     continue
-                yield find
+                yield finding
                 break
 
-    def _first_difference(self, case: Case, engine: str, plain: list, other: list) -> Find | None:
+    def _first_difference(self, case: Case, engine: str, plain: list, other_results: list) -> Finding | None:
         """Return the first value that differs for no good reason."""
         n = len(case.program.inputs)
         inputs = [self._lanes(case.scope, name) for name in case.program.inputs]
-        for j, (a, b) in enumerate(zip(plain, other, strict=True)):
-            line = functools.partial(_of_values, case.program.lines[j])
+        for j, (a, b) in enumerate(zip(plain, other_results, strict=True)):
+            line = functools.partial(_apply_to_values, case.program.lines[j])
             signed = case.signed[j]
-            bad = ~close(a, b, signed)
+            bad = ~is_close(a, b, signed)
             lanes = np.flatnonzero(bad.reshape(len(a), -1).any(1))
             # A compiler may compute an operand once more and round it differently, so the inputs are tried as well.
-            whole = functools.partial(_of_inputs, case.program, n + j)
-            for fn, operands in ((line, [*inputs, *other[:j]]), (whole, inputs)):
+            value_fn = functools.partial(_apply_to_inputs, case.program, n + j)
+            for fn, operands in ((line, [*inputs, *other_results[:j]]), (value_fn, inputs)):
                 if len(lanes):
                     self.counts["examined for rounding"] += 1
-                    lanes = lanes[~explained(fn, [x[lanes] for x in operands], b[lanes], signed)]
+                    lanes = lanes[~are_explained(fn, [x[lanes] for x in operands], b[lanes], signed)]
             if len(lanes):
-                values = {f"v{k}": x[lanes[0]] for k, x in enumerate([*inputs, *other[:j]])}
+                values = {f"v{k}": x[lanes[0]] for k, x in enumerate([*inputs, *other_results[:j]])}
                 text = case.program.lines[j]
-                shown = ", ".join(f"{name}={_text(x)}" for name, x in values.items() if re.search(rf"\b{name}\b", text))
-                what = f"{text} with {shown}: plain {_text(a[lanes[0]])}, {engine} {_text(b[lanes[0]])}"
-                return Find(Case(kept(case.program, n + j), case.scope), engine, f"{what} ({len(lanes)} lanes)")
+                inputs_text = ", ".join(
+                    f"{name}={_text(x)}" for name, x in values.items() if re.search(rf"\b{name}\b", text)
+                )
+                description = f"{text} with {inputs_text}: plain {_text(a[lanes[0]])}, {engine} {_text(b[lanes[0]])}"
+                return Finding(
+                    Case(prune_program(case.program, n + j), case.scope), engine, f"{description} ({len(lanes)} lanes)"
+                )
         return None
 
     def _lanes(self, scope: str, name: str) -> np.ndarray:
@@ -347,11 +351,11 @@ class Fuzzer:
         return x.reshape(-1, *x.shape[2:]) if scope == "drone" else x
 
 
-def _of_values(line: str, *values: Any):
+def _apply_to_values(line: str, *values: Any):
     return evaluate(line, values)
 
 
-def _of_inputs(program: Program, k: int, *inputs: Any):
+def _apply_to_inputs(program: Program, k: int, *inputs: Any):
     return program.values(dict(zip(program.inputs, inputs, strict=True)))[k]
 
 
@@ -375,21 +379,22 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=40, help="programs that are compiled together")
     parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu", help="platform that runs the programs")
     args = parser.parse_args()
-    fuzzer, start, n_finds = Fuzzer(args.seed, device=args.device), time.perf_counter(), 0
+    fuzzer, start_time, n_finds = Fuzzer(args.seed, device=args.device), time.perf_counter(), 0
     jax.config.update("jax_default_device", fuzzer.device)  # for what is computed to explain a difference
     if args.device == "gpu":
         allow_gpu()
     print(f"# {', '.join(fuzzer.engines)} against plain on {fuzzer.device.device_kind}", flush=True)
-    for done in range(0, args.programs, args.batch):
-        for find in fuzzer.check(fuzzer.draw(min(args.batch, args.programs - done))):
+    for n_done in range(0, args.programs, args.batch):
+        for finding in fuzzer.check(fuzzer.draw(min(args.batch, args.programs - n_done))):
             n_finds += 1
-            print(find, flush=True)
+            print(finding, flush=True)
         print(
-            f"# {fuzzer.counts['programs']} programs, {n_finds} finds, {time.perf_counter() - start:.0f} s", flush=True
+            f"# {fuzzer.counts['programs']} programs, {n_finds} finds, {time.perf_counter() - start_time:.0f} s",
+            flush=True,
         )
         jax.clear_caches()
-    for why, n in fuzzer.refused.most_common():
-        print(f"# refused {n}: {why}")
+    for reason, n in fuzzer.refused.most_common():
+        print(f"# refused {n}: {reason}")
     print(f"# {args.programs} programs, seed {args.seed}, {n_finds} finds; {dict(fuzzer.counts)}")
     sys.exit(bool(n_finds))
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-LARGEST = 24
+MAX_ELEMENTS = 24
 """Most elements of a value; larger ones only make programs slow."""
 
 NAMES: dict = {"jax": jax, "jnp": jnp, "lax": lax, "np": np}
@@ -546,14 +546,14 @@ def draw(rng: np.random.Generator, given: dict[str, jax.ShapeDtypeStruct], n_lin
     lines: list[str] = []
     while len(lines) < n_lines:
         _, fn = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
-        line, aval = _drawn(rng, fn, avals)
+        line, aval = _draw_line(rng, fn, avals)
         if aval is not None:
             lines.append(line)
             avals.append(aval)
     return shortened(Program(inputs, tuple(lines)))
 
 
-def _drawn(rng: np.random.Generator, fn: Template, avals: Sequence) -> tuple[str, Any]:
+def _draw_line(rng: np.random.Generator, fn: Template, avals: Sequence) -> tuple[str, Any]:
     """Return a line and its shape and type; None instead of those if JAX refuses it or it is too large."""
     try:
         line = fn(Draw(rng, avals))
@@ -562,7 +562,7 @@ def _drawn(rng: np.random.Generator, fn: Template, avals: Sequence) -> tuple[str
             aval = jax.eval_shape(lambda *values: evaluate(line, values), *avals)
     except Exception:  # of any kind: what JAX refuses is no program
         return "", None
-    if not isinstance(aval, jax.ShapeDtypeStruct) or aval.size > LARGEST or aval.dtype.kind == "c":
+    if not isinstance(aval, jax.ShapeDtypeStruct) or aval.size > MAX_ELEMENTS or aval.dtype.kind == "c":
         return "", None
     if jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended):
         return "", None
@@ -571,19 +571,21 @@ def _drawn(rng: np.random.Generator, fn: Template, avals: Sequence) -> tuple[str
 
 def shortened(program: Program) -> Program:
     """Return a program without the inputs and lines that its last line does not need."""
-    return kept(program, len(program.inputs) + len(program.lines) - 1)
+    return prune_program(program, len(program.inputs) + len(program.lines) - 1)
 
 
-def kept(program: Program, last: int) -> Program:
+def prune_program(program: Program, last: int) -> Program:
     """Return the program of one value, and of what it needs."""
     import re
 
     n = len(program.inputs)
-    needed = {last}
+    used = {last}
     for k in range(last, n - 1, -1):
-        if k in needed:
-            needed |= {int(m) for m in re.findall(r"\bv(\d+)\b", program.lines[k - n])}
-    order = sorted(needed)
-    new = {old: k for k, old in enumerate(order)}
-    lines = tuple(re.sub(r"\bv(\d+)\b", lambda m: f"v{new[int(m[1])]}", program.lines[k - n]) for k in order if k >= n)
+        if k in used:
+            used |= {int(m) for m in re.findall(r"\bv(\d+)\b", program.lines[k - n])}
+    order = sorted(used)
+    new_index = {old_index: k for k, old_index in enumerate(order)}
+    lines = tuple(
+        re.sub(r"\bv(\d+)\b", lambda m: f"v{new_index[int(m[1])]}", program.lines[k - n]) for k in order if k >= n
+    )
     return Program(tuple(program.inputs[k] for k in order if k < n), lines)

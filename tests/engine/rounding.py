@@ -59,39 +59,39 @@ def _inlined(fn, args: Sequence):
         return jax.make_jaxpr(fn)(*args)
 
 
-def close(a: np.ndarray, b: np.ndarray, signed: bool) -> np.ndarray:
+def is_close(a: np.ndarray, b: np.ndarray, signed: bool) -> np.ndarray:
     """Return where values are equal, or numbers to a few units in the last place, the sign of zero if asked for."""
     if not jnp.issubdtype(a.dtype, jnp.floating):
         return a == b
     eps = max(EPS, float(jnp.finfo(a.dtype).eps))
     a, b = a.astype(np.float64), b.astype(np.float64)
     with np.errstate(all="ignore"):
-        near = np.abs(a - b) <= UNITS * eps * np.maximum(np.abs(a), np.abs(b))
-        near |= (np.abs(a) <= TINY) & (np.abs(b) <= TINY)  # below is zero to XLA, whose threads flush
+        is_near = np.abs(a - b) <= UNITS * eps * np.maximum(np.abs(a), np.abs(b))
+        is_near |= (np.abs(a) <= TINY) & (np.abs(b) <= TINY)  # below is zero to XLA, whose threads flush
     zeros = np.full(a.shape, True) if not signed else (a != 0) | (b != 0) | (np.signbit(a) == np.signbit(b))
-    return ((a == b) & zeros) | (np.isnan(a) & np.isnan(b)) | (near & zeros & np.isfinite(a) & np.isfinite(b))
+    return ((a == b) & zeros) | (np.isnan(a) & np.isnan(b)) | (is_near & zeros & np.isfinite(a) & np.isfinite(b))
 
 
-def explained(fn, values: list[np.ndarray], found: np.ndarray, signed: bool) -> np.ndarray:
+def are_explained(fn, values: list[np.ndarray], actual: np.ndarray, signed: bool) -> np.ndarray:
     """Return for which lanes a value is what a function gives for its operands, within rounding.
 
     The function is computed primitive by primitive, many times, and every result of arithmetic disturbed by a few units
     in the last place, or to one of its ``alternatives``.
     """
-    results = np.asarray(_disturbed(fn, values, len(found)))
+    results = np.asarray(_disturbed(fn, values, len(actual)))
     if not jnp.issubdtype(results.dtype, jnp.floating):
-        ok = (results == found).any(0)
+        ok = (results == actual).any(0)
         return ok.reshape(len(ok), -1).all(1)
-    r, f = results.astype(np.float64), found.astype(np.float64)
+    r, f = results.astype(np.float64), actual.astype(np.float64)
     eps = max(EPS, float(jnp.finfo(results.dtype).eps))
     with np.errstate(all="ignore"):
         low, high = np.min(np.where(np.isnan(r), np.inf, r), 0), np.max(np.where(np.isnan(r), -np.inf, r), 0)
         slack = UNITS * eps * np.maximum(np.abs(low), np.abs(high)) + (high - low) + TINY
         slack = np.where(np.isfinite(slack), slack, 0)
-        within = (f >= low - slack) & (f <= high + slack)
+        is_within = (f >= low - slack) & (f <= high + slack)
         if signed:
-            within &= ~((f == 0) & (r == 0).all(0) & (np.signbit(f) != np.signbit(r[0])))
-        ok = within | (np.isnan(f) & np.isnan(r).any(0)) | (f == r).any(0) & ((f != 0) | within)
+            is_within &= ~((f == 0) & (r == 0).all(0) & (np.signbit(f) != np.signbit(r[0])))
+        ok = is_within | (np.isnan(f) & np.isnan(r).any(0)) | (f == r).any(0) & ((f != 0) | is_within)
     return ok.reshape(len(ok), -1).all(1)
 
 

@@ -11,7 +11,7 @@ N_WORLDS, N_DRONES = 7, 3  # 21 lanes: not a multiple of any vector's or block's
 N_LANES = N_WORLDS * N_DRONES
 
 
-class Given(PyTree):
+class Inputs(PyTree):
     """Inputs of a case."""
 
     x: jax.Array = leaf("drone", 1)
@@ -255,14 +255,14 @@ def random_numbers(key, g):
 RANDOM = {"random_bits": random_bits, "random_numbers": random_numbers}
 
 
-def given():
+def make_inputs():
     """Return inputs that differ from drone to drone."""
     rng = np.random.default_rng(0)
     shape = (N_WORLDS, N_DRONES)
     x = rng.uniform(-3, 3, (*shape, 6))
     x[..., 3] = x[..., 1]
     special = rng.choice([np.nan, np.inf, -np.inf, 0.5, -2.0, 0.0], (*shape, 6))
-    return Given(
+    return Inputs(
         x=np.float32(x),
         m=np.float32(rng.normal(size=(*shape, 3, 3))),
         big=np.float32(rng.normal(size=(*shape, 6, 6))),
@@ -273,9 +273,9 @@ def given():
     )
 
 
-def of_one(g):
+def drone_shapes(g):
     """Return the shapes and types of what one drone is given."""
-    kinds = Given("d", "d", "d", "d", "d", "shared", "d")
+    kinds = Inputs("d", "d", "d", "d", "d", "shared", "d")
     strip = {"d": 2, "shared": 0}
     return jax.tree.map(lambda s, x: jax.ShapeDtypeStruct(x.shape[strip[s] :], x.dtype), kinds, g)
 
@@ -286,9 +286,9 @@ def function(name):
     return lambda g: jnp.ravel(fn(g))
 
 
-def of_all(name):
+def map_over_drones(name):
     """Return a case as a function of the arrays of all drones, to rows. (n_lanes, k)"""
-    axes = Given(0, 0, 0, 0, 0, None, 0)
+    axes = Inputs(0, 0, 0, 0, 0, None, 0)
     return lambda g: jax.vmap(jax.vmap(function(name), (axes,)), (axes,))(g).reshape(N_LANES, -1)
 
 
@@ -299,13 +299,13 @@ TOLERANCE = {"functions": 16 * ULP, "small_systems": 1e3 * ULP, "far_angles": 8 
 TOLERANCE |= dict.fromkeys(["lanes", "fused"], 32 * ULP)  # sums of products that cancel, contracted or not
 
 
-def agree(found, expected, name):
+def agree(actual, expected, name):
     """Check that what rounds differs by what rounding explains, and the rest not at all."""
-    found, expected = np.asarray(found), np.asarray(expected)
-    assert found.dtype == expected.dtype
+    actual, expected = np.asarray(actual), np.asarray(expected)
+    assert actual.dtype == expected.dtype
     if expected.dtype.kind != "f":
-        np.testing.assert_array_equal(found, expected, err_msg=name)
+        np.testing.assert_array_equal(actual, expected, err_msg=name)
         return
     tolerance = TOLERANCE.get(name, 8 * ULP)
     scale = np.max(np.abs(np.where(np.isfinite(expected), expected, 0)))
-    np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance * min(scale, 1e2), err_msg=name)
+    np.testing.assert_allclose(actual, expected, rtol=tolerance, atol=tolerance * min(scale, 1e2), err_msg=name)

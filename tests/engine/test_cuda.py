@@ -11,7 +11,7 @@ from cases import shared_sim
 from crazysim import ConfigError, Downwash, FreeBodies, Kalman, Sim, jaxcompat
 from crazysim.engine import Step, explain
 from crazysim.engine.backends import cuda, kernel, native
-from crazysim.engine.backends.exchange import exchange_for
+from crazysim.engine.backends.exchange import make_exchange
 from crazysim.engine.backends.source import Writer
 from crazysim.engine.errors import KernelError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder
@@ -119,7 +119,7 @@ def test_a_world_that_does_not_fit_into_a_block_runs_on_lanes():
 
 
 def test_records_that_do_not_fit_into_a_block_are_refused():
-    exchange = exchange_for("cuda", 1024)
+    exchange = make_exchange("cuda", 1024)
     with pytest.raises(UnsupportedError, match="a GPU's block has 49152"):
         exchange.publish(Writer(exchange), [("f32", "0")] * 13, [], 1)
 

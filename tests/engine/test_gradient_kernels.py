@@ -203,11 +203,11 @@ def test_the_derivatives_of_every_pipeline_compile_for_a_gpu(dynamics, control):
     program = Step(sim.step_pipeline, "fused", "gpu").plan(sim.data).program
     back = reverse.reverse_program(program, [i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone"])
     text = cuda.ptx(reverse.write(back, "cuda"), cuda.DEFAULT_ARCHITECTURE)
-    stored = sum(program.leaves[i].size for i in back.perturbed) + len(back.carried)
+    stored = sum(program.leaves[i].size for i in back.perturbed) + len(back.carry)
     assert text.count("st.global") >= stored
     ahead = add_tangents(program, back.perturbed)
     verify(ahead)
-    assert all(ahead.leaves[i].name.startswith("tangent of ") for i in ahead.written)
+    assert all(ahead.leaves[i].name.startswith("tangent of ") for i in ahead.written_leaves)
     assert "st.global" in cuda.ptx(kernel.write(ahead, "cuda"), cuda.DEFAULT_ARCHITECTURE)
 
 

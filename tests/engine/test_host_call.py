@@ -23,7 +23,7 @@ def sim():
     sim = Sim(3, 2, control="attitude")
     sim.attitude_control(COMMAND)
     sim.step(2)
-    assert sim.step_fn.plan(sim.data).host_call.used
+    assert sim.step_fn.plan(sim.data).host_call.was_called
     return sim
 
 
@@ -92,7 +92,7 @@ def test_populations_that_do_not_depend_on_each_other_are_stepped_alike():
     sim.step(5)
     plan = sim.step_fn.plan(sim.data)
     assert len(plan.programs) == 2
-    assert plan.host_call.used
+    assert plan.host_call.was_called
     expected = on_xla(sim, 5)
     sim.step(5)
     assert trees_equal(sim.data, expected)
@@ -199,7 +199,7 @@ def test_other_devices_and_engines_keep_the_compiled_step():
     device = jax.devices("cpu")[1]
     sim = Sim(2, device=device)
     sim.step()
-    assert sim.step_fn.plan(sim.data).host_call.used
+    assert sim.step_fn.plan(sim.data).host_call.was_called
     assert "sim.step calls it without XLA" in sim.explain()
     assert sim.data.states.pos.devices() == {device}
     assert sim.data.states.pos.committed

@@ -106,7 +106,7 @@ def test_a_stage_may_write_random_keys(steps):
     assert isinstance(program.segments[0], Segment)
     written, _ = steps(program, jax.tree.leaves(data), 2)
     expected = draw(draw(data)).plugins["own"]
-    found = dict(zip((program.leaves[i].name.split(".")[-1] for i in program.written), written, strict=True))
+    found = dict(zip((program.leaves[i].name.split(".")[-1] for i in program.written_leaves), written, strict=True))
     assert found["key"].dtype == expected.key.dtype
     np.testing.assert_array_equal(found["drawn"], expected.drawn)
     np.testing.assert_array_equal(jax.random.key_data(found["key"]), jax.random.key_data(expected.key))

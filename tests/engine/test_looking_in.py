@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from blocks import program_of
+from blocks import make_program
 from cases import shared_sim, with_states
 
 from crazysim.core.stage import stage
@@ -137,7 +137,7 @@ def test_a_leaf_of_a_type_that_kernels_do_not_have_is_named(x64):
 
     builder = Builder(stage="all")
     x = builder.input(np.int64)
-    program, _ = program_of(builder.finish([x]), [np.zeros(3, np.int64)], 3)
+    program, _ = make_program(builder.finish([x]), [np.zeros(3, np.int64)], 3)
     with pytest.raises(UnsupportedError, match=r"type int64, which .* has"):
         kernel.write(program, "cuda")
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from rounding import TINY, explained
+from rounding import TINY, are_explained
 
 NAN = np.nan
 DENORMAL = 2.0**-130
@@ -14,7 +14,7 @@ def is_explained(fn, values, found, dtype=np.float32):
     """Return whether a result for one lane is explained."""
     arrays = [np.asarray([x], None if isinstance(x, int) else np.float32) for x in values]
     arrays = [x.astype(np.int32) if x.dtype.kind == "i" else x for x in arrays]
-    return bool(explained(fn, arrays, np.asarray([found], dtype), signed=False)[0])
+    return bool(are_explained(fn, arrays, np.asarray([found], dtype), signed=False)[0])
 
 
 @pytest.mark.parametrize(
@@ -45,8 +45,8 @@ def test_what_rounding_explains(fn, values, found, wrong):
 
 def test_the_sign_of_zero_is_kept_where_it_is_defined():
     values, found = [np.float32([-0.0])], np.float32([0.0])
-    assert explained(jnp.rint, values, -found, signed=True)[0]
-    assert not explained(jnp.rint, values, found, signed=True)[0]
+    assert are_explained(jnp.rint, values, -found, signed=True)[0]
+    assert not are_explained(jnp.rint, values, found, signed=True)[0]
 
 
 def test_zero_by_zero_is_any_integer_that_compilers_make_of_it():

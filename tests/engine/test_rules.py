@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from blocks import program_of
-from cases import FAST
-from rule_cases import CASES, N_LANES, RANDOM, ULP, agree, function, given, of_all, of_one
+from blocks import make_program
+from cases import COMPILED_ENGINES
+from rule_cases import CASES, N_LANES, RANDOM, ULP, agree, drone_shapes, function, make_inputs, map_over_drones
 
 from crazysim import Sim
 from crazysim.core.sharding import Location
@@ -29,15 +29,15 @@ def lanes_of(g):
 @pytest.mark.parametrize("name", [*CASES, *RANDOM])
 def test_a_case_gives_what_jax_gives(name):
     """Integers, bools and random bits exactly; numbers to rounding."""
-    g = given()
-    block = lower_function(function(name), of_one(g))
+    g = make_inputs()
+    block = lower_function(function(name), drone_shapes(g))
     verify_block(block)
     assert block.outputs
     found = interpret.run(block, lanes_of(g), (N_LANES,))
-    agree(np.stack(found, axis=-1), jax.jit(of_all(name)).lower(g).compile()(g), name)
+    agree(np.stack(found, axis=-1), jax.jit(map_over_drones(name)).lower(g).compile()(g), name)
 
 
-@pytest.mark.parametrize("engine", FAST)
+@pytest.mark.parametrize("engine", COMPILED_ENGINES)
 def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
     """One program of the cases whose operations run blocks or have several results: the rest is in test_targets."""
     names = ["cond", "loops", "loop_until", "walk_together", "nested_calls", "own_gradient", *RANDOM]
@@ -45,9 +45,9 @@ def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
     def all_of_them(g):
         return [function(name)(g) for name in names]
 
-    g = given()
-    block = lower_function(all_of_them, of_one(g))
-    program, leaves = program_of(block, lanes_of(g), N_LANES)
+    g = make_inputs()
+    block = lower_function(all_of_them, drone_shapes(g))
+    program, leaves = make_program(block, lanes_of(g), N_LANES)
     expected = interpret.run(block, lanes_of(g), (N_LANES,))
     run = build(program, Location("cpu")) if engine == "fused" else lambda x, n: interpret.lanes.steps(program, x, n)
     written, _ = jax.jit(lambda leaves: run(leaves, 1))(leaves)
@@ -130,7 +130,7 @@ def test_powers_and_angles_of_special_numbers():
     z = np.resize(np.float32(powers), y.shape)
     one = jax.ShapeDtypeStruct((), np.float32)
     block = lower_function(lambda y, x, z: [jnp.arctan2(y, x), jnp.exp(z), jnp.arctan2(z, 2.0)], one, one, one)
-    program, leaves = program_of(block, [y, x, z], len(y))
+    program, leaves = make_program(block, [y, x, z], len(y))
     found, _ = jax.jit(lambda leaves: build(program, Location("cpu"))(leaves, 1))(leaves)
     with np.errstate(all="ignore"):
         expected = [f.astype(np.float32) for f in (np.arctan2(*map(np.float64, (y, x))), np.exp(np.float64(z)),

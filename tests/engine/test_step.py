@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST, by_stages, hover_command, send, shared_sim, to_all, with_params, with_states
+from cases import COMPILED_ENGINES, by_stages, hover_command, repeat_command, send, shared_sim, with_params, with_states
 
 from crazysim import ConfigError, Sim
 from crazysim.control import Control, command_size
@@ -70,7 +70,7 @@ def test_long_runs_agree_in_float64(x64, dynamics, control, integrator):
     data = scattered(sim, dtype=np.float64)
     expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(200))
     # ``lanes`` runs every integrator once; of the two pipelines with rk4, XLA takes long for that with a controller.
-    for engine in FAST[-1:] if (integrator, control) == ("rk4", "attitude") else FAST:
+    for engine in COMPILED_ENGINES[-1:] if (integrator, control) == ("rk4", "attitude") else COMPILED_ENGINES:
         found = Step(sim.step_pipeline, engine)(data, jnp.int32(200))
         for name in ("pos", "quat", "vel"):
             a, b = getattr(found.states, name), getattr(expected.states, name)
@@ -289,7 +289,10 @@ def test_gradients_equal_those_of_the_stages_in_float64(x64):
     command = data.controls.attitude.staged_cmd
     found, expected = (
         jax.jit(derivative(functools.partial(loss, step, data=data, n=40)))(command)
-        for step, derivative in ((Step(sim.step_pipeline, FAST[-1]), jax.grad), (by_stages(sim), jax.jacfwd))
+        for step, derivative in (
+            (Step(sim.step_pipeline, COMPILED_ENGINES[-1]), jax.grad),
+            (by_stages(sim), jax.jacfwd),
+        )
     )
     assert_gradients_equal(found, expected)
 
@@ -308,7 +311,9 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
         return jnp.sum(step(ready, 36).states.ang_vel ** 2)
 
     at = 1e-4 * at[0], at[1]
-    alone, fast = (functools.partial(energy, step) for step in (by_stages(sim), Step(sim.step_pipeline, FAST[-1])))
+    alone, fast = (
+        functools.partial(energy, step) for step in (by_stages(sim), Step(sim.step_pipeline, COMPILED_ENGINES[-1]))
+    )
     expected = jax.jit(jax.jacfwd(alone, (0, 1)))(*at)
     assert abs(float(expected[1][0, 1])) > 0
     assert_gradients_equal(jax.jit(jax.grad(fast, (0, 1)))(*at), expected)
@@ -424,11 +429,11 @@ def test_a_rollout_returns_its_last_command_where_leaves_share_an_array():
 def test_a_rollout_stages_what_the_setter_stages(control):
     """Above all no jerk, snap and yaw rate of a command before."""
     sim = shared_sim(n_worlds=2, n_drones=1, control=control)
-    before = send(sim.data, to_all(sim.data, hover_command(sim.data)))
+    before = send(sim.data, repeat_command(sim.data, hover_command(sim.data)))
     if control == "state":
         feedforward = np.random.default_rng(0).normal(size=(2, 1, 8))
         before = F.state_control(before, pos=(0, 0, 1), feedforward=feedforward)
-    command = to_all(before, hover_command(before, (0.2, 0, 1))).copy()
+    command = repeat_command(before, hover_command(before, (0.2, 0, 1))).copy()
     command[..., -1] += 0.5  # for a setpoint, its yaw rate
     command, n = jnp.asarray(command, jnp.float32), sim.freq // sim.control_freq
     expected = before

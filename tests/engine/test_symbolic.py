@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rule_cases import CASES, given, of_one, random_numbers
+from rule_cases import CASES, drone_shapes, make_inputs, random_numbers
 
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.lowering.jaxprs import lower_function
@@ -26,7 +26,7 @@ OTHER = {"not_finite", "sort_not_finite", "argmin_and_sort", "conversions"}
 def g():
     """Return the inputs of the cases in float64."""
     with jax.enable_x64(True):
-        return jax.tree.map(lambda x: x.astype(float) if x.dtype == np.float32 else x, given())
+        return jax.tree.map(lambda x: x.astype(float) if x.dtype == np.float32 else x, make_inputs())
 
 
 def expressions(fn, *avals):
@@ -46,7 +46,7 @@ def call(function, *args):
 
 @pytest.mark.parametrize("name", [name for name in CASES if name not in {*REFUSED, *OTHER}])
 def test_a_case_gives_what_jax_gives(g, name):
-    function, compiled = expressions(CASES[name], of_one(g)), jax.jit(CASES[name])
+    function, compiled = expressions(CASES[name], drone_shapes(g)), jax.jit(CASES[name])
     for world, drone in ((0, 0), (3, 1), (6, 2)):
         one = jax.tree.map(lambda x, w=world, d=drone: x[w, d], g.replace(table=np.tile(g.table, (7, 3, 1))))
         expected = np.asarray(compiled(one), float).ravel()
@@ -58,12 +58,12 @@ def test_a_case_gives_what_jax_gives(g, name):
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_casadi_has_no_form_for_is_named(g, name):
     with pytest.raises(UnsupportedError, match=REFUSED[name]):
-        expressions(CASES[name], of_one(g))
+        expressions(CASES[name], drone_shapes(g))
 
 
 def test_random_numbers_are_refused(g):
     with pytest.raises(UnsupportedError, match="random numbers"):
-        expressions(lambda g: random_numbers(jax.random.key(0), g), of_one(g))
+        expressions(lambda g: random_numbers(jax.random.key(0), g), drone_shapes(g))
 
 
 def vector(n, dtype=float):

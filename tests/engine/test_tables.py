@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST
+from cases import COMPILED_ENGINES
 
 from crazysim import PyTree, Sim, leaf, stage
 from crazysim.core.stage import as_stages
@@ -19,7 +19,7 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
 from crazysim.errors import EngineWarning
 
-ENGINES = ("interpret", *FAST)
+ENGINES = ("interpret", *COMPILED_ENGINES)
 RNG = np.random.default_rng(0)
 CONSTANTS = RNG.normal(size=(11, 2, 3)).astype(np.float32)
 CONSTANTS[:, 1, 2] = 0.25

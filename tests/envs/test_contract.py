@@ -16,10 +16,10 @@ from env_cases import (
     compiled,
     entries,
     kind,
-    obs_of,
-    of_worlds,
     one_step_to_go,
     random_action,
+    select_obs,
+    select_state,
 )
 from gymnasium.vector.utils import batch_space
 
@@ -208,8 +208,8 @@ def test_the_same_seed_gives_the_same_numbers(env, begun):
     other = env.reset(jax.random.key(5))
     assert not trees_equal(other.obs, begun.obs)
     all_anew, some_anew = env.restart(begun, jnp.ones(N_WORLDS, bool)), env.restart(begun, jnp.asarray(ENDS))
-    assert trees_equal(of_worlds(all_anew, ENDS), of_worlds(some_anew, ENDS))
-    assert trees_equal(of_worlds(some_anew, ~ENDS), of_worlds(begun, ~ENDS))
+    assert trees_equal(select_state(all_anew, ENDS), select_state(some_anew, ENDS))
+    assert trees_equal(select_state(some_anew, ~ENDS), select_state(begun, ~ENDS))
 
 
 def test_gymnasium_makes_it(name):
@@ -313,13 +313,13 @@ def test_next_step_begins_with_the_step_after_the_last(two):
     assert trees_equal(last, env.step(one_step_to_go(env, begun, ENDS), random_action(begun)))
     ignored, other = random_action(begun, 1), random_action(begun, 2)
     after, again = auto.step(last, ignored), auto.step(last, np.where(ENDS[:, None, None], other, ignored))
-    assert trees_equal(of_worlds(after, ENDS), of_worlds(again, ENDS)), "the action is heeded"
+    assert trees_equal(select_state(after, ENDS), select_state(again, ENDS)), "the action is heeded"
     assert not after.done[ENDS].any()
     assert not after.reward[ENDS].any()
     assert not after.data.core.steps[ENDS].any()
     np.testing.assert_array_equal(after.data.core.episode[:, 0] - begun.data.core.episode[:, 0], ENDS)
-    close(obs_of(after, ENDS), obs_of(env.restart(begun, jnp.asarray(ENDS)), ENDS))
-    assert trees_equal(of_worlds(after, ~ENDS), of_worlds(env.step(last, ignored), ~ENDS))
+    close(select_obs(after, ENDS), select_obs(env.restart(begun, jnp.asarray(ENDS)), ENDS))
+    assert trees_equal(select_state(after, ~ENDS), select_state(env.step(last, ignored), ~ENDS))
 
 
 def test_same_step_begins_within_the_last_step(two):
@@ -335,10 +335,10 @@ def test_same_step_begins_within_the_last_step(two):
     assert trees_equal(ended.final_obs, ended.obs)
     assert trees_equal(state.info["error"], ended.info["error"])
     new = env.restart(begun, jnp.asarray(ENDS))
-    close(obs_of(state, ENDS), obs_of(new, ENDS))
+    close(select_obs(state, ENDS), select_obs(new, ENDS))
     assert not state.data.core.steps[ENDS].any()
     assert not state.action[ENDS].any()
-    assert trees_equal(of_worlds(state, ~ENDS, but=("info",)), of_worlds(ended, ~ENDS, but=("info",)))
+    assert trees_equal(select_state(state, ~ENDS, without=("info",)), select_state(ended, ~ENDS, without=("info",)))
     assert not auto.step(state, action).done[ENDS].any()
 
 
@@ -356,7 +356,7 @@ def test_disabled_begins_where_and_when_it_is_said(two):
     np.testing.assert_array_equal(state.data.core.episode[:, 0] - begun.data.core.episode[:, 0], some)
     assert not state.done[some].any()
     assert not state.reward[some].any()
-    assert trees_equal(of_worlds(state, ~some), of_worlds(on, ~some))
+    assert trees_equal(select_state(state, ~some), select_state(on, ~some))
 
 
 def test_a_world_that_is_lost_ends_alone(env, begun):
@@ -368,7 +368,7 @@ def test_a_world_that_is_lost_ends_alone(env, begun):
     is_lost = np.arange(N_WORLDS) == 1
     np.testing.assert_array_equal(lost.info["nonfinite"], is_lost)
     assert lost.terminated[1]
-    assert trees_equal(of_worlds(lost, ~is_lost), of_worlds(fine, ~is_lost))
+    assert trees_equal(select_state(lost, ~is_lost), select_state(fine, ~is_lost))
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])

@@ -353,7 +353,7 @@ def test_episodes_begin_as_the_simulation_resets(hover, make):
     if make is with_reset_stage:
         np.testing.assert_array_equal(state.data.controls.rotor_vel, 7.0)
     else:
-        fresh = np.asarray(jax.jit(env.base.episode_reset.default_for)(state.data).states.pos)
+        fresh = np.asarray(jax.jit(env.base.episode_reset.make_default)(state.data).states.pos)
         np.testing.assert_array_equal(fresh[:, 0, 0], [1.0, *np.zeros(N - 1)])
 
 

@@ -11,7 +11,7 @@ from crazysim import ConfigError, Sim, Wind
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import AutoReset, DroneEnv, DroneVectorEnv, Task, draw, make, uniform
 from crazysim.envs.random import episode_key, scale_symmetric, scale_to
-from crazysim.envs.task import total
+from crazysim.envs.task import sum_terms
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
 
@@ -73,8 +73,8 @@ def test_goals_are_set_for_all_for_each_world_and_for_each_drone():
 
 def test_the_total_of_terms_is_their_sum_in_order():
     terms = {"a": jnp.float32(1e8), "b": jnp.float32(-1e8), "c": jnp.float32(1.0)}
-    assert total(terms) == 1.0
-    assert total({"a": terms["a"], "c": terms["c"], "b": terms["b"]}) == 0.0
+    assert sum_terms(terms) == 1.0
+    assert sum_terms({"a": terms["a"], "c": terms["c"], "b": terms["b"]}) == 0.0
 
 
 def test_named_draws_are_parts_of_one_draw():

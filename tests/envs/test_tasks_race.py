@@ -262,7 +262,7 @@ def test_poses_are_nominal_until_the_drone_was_near(drawn):
 def test_the_same_key_gives_the_same_course_in_any_world(drawn):
     env, _ = drawn[1]
     spawn = jax.jit(vmap_worlds(env.task.spawn))
-    default, keys = env.episode_reset.default_for(env.sim.default_data), world_keys(env.sim.default_data, "spawn")
+    default, keys = env.episode_reset.make_default(env.sim.default_data), world_keys(env.sim.default_data, "spawn")
     data, again, other = spawn(default, keys), spawn(default, keys), spawn(default, jnp.roll(keys, 1))
     for name in ("pos", "quat"):
         one, twice, moved = (np.asarray(getattr(x.states, name)) for x in (data, again, other))

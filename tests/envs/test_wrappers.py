@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import as_numbers, trees_equal
-from env_cases import of_worlds, one_step_to_go, random_action
+from env_cases import one_step_to_go, random_action, select_state
 
 from crazysim import ConfigError
 from crazysim.core.stage import vmap_worlds
@@ -303,7 +303,7 @@ def test_frames_are_stacked_oldest_first(env):
     anew = wrapped.restart(state, jnp.asarray(FIRST))
     first = env.restart(plain, jnp.asarray(FIRST)).obs["pos"][0]
     assert_same_world(anew.obs["pos"][0], np.tile(first, 3))
-    assert trees_equal(of_worlds(anew, ~FIRST), of_worlds(state, ~FIRST))
+    assert trees_equal(select_state(anew, ~FIRST), select_state(state, ~FIRST))
 
 
 def test_actions_arrive_late(env):
@@ -360,7 +360,7 @@ def test_randomised_parameters_are_one_per_drone(env, heavy):
 def test_only_worlds_that_begin_anew_are_randomised_anew(randomized, heavy):
     new = jax.jit(randomized.restart)(heavy, jnp.asarray(FIRST))
     assert new.data.params.mass[0] != heavy.data.params.mass[0]
-    assert trees_equal(of_worlds(new, ~FIRST), of_worlds(heavy, ~FIRST))
+    assert trees_equal(select_state(new, ~FIRST), select_state(heavy, ~FIRST))
 
 
 def test_randomisation_does_not_depend_on_the_number_of_worlds(heavy):

@@ -154,38 +154,38 @@ def poses(rng, n):
 
 
 @functools.cache
-def judge(a, b):
+def distance_and_slopes(a, b):
     """Return a function from poses to distances and their gradients with respect to position and rotation."""
 
     def total(pos, rot):
-        out = distance(a, b, pos, rot)
-        return jnp.sum(out), out
+        values = distance(a, b, pos, rot)
+        return jnp.sum(values), values
 
-    of_sum = jax.jit(jax.value_and_grad(total, (0, 1), has_aux=True))
+    value_and_slopes = jax.jit(jax.value_and_grad(total, (0, 1), has_aux=True))
 
     def answer(pos, rot):
-        (_, value), slopes = of_sum(pos, rot)
+        (_, value), slopes = value_and_slopes(pos, rot)
         return tuple(map(np.asarray, (value, *slopes)))
 
     return answer
 
 
-def check_pair(a, b, rng, n, apart=1e-5, shallow=1e-6, deep=1e-6):
+def check_pair(a, b, rng, n, apart_tolerance=1e-5, shallow=1e-6, deep=1e-6):
     """Check distances of separated shapes against MuJoCo, depths against a search over directions, and all signs."""
     pos, quat = poses(rng, n)
-    rot, answer = rotations(quat), judge(a, b)
-    (found, by_pos, _), expected = answer(pos, rot), distances(a, b, pos, quat)
+    rot, answer = rotations(quat), distance_and_slopes(a, b)
+    (actual, by_pos, _), expected = answer(pos, rot), distances(a, b, pos, quat)
     is_apart = expected > 0
     counts = np.sum(is_apart), np.sum(~is_apart), np.sum(np.abs(expected) < 0.02)
     assert min(counts) > 0.01 * n, counts
-    np.testing.assert_array_equal(found > 0, is_apart)
-    np.testing.assert_allclose(found[is_apart], expected[is_apart], atol=apart)
+    np.testing.assert_array_equal(actual > 0, is_apart)
+    np.testing.assert_allclose(actual[is_apart], expected[is_apart], atol=apart_tolerance)
     inside = np.flatnonzero(~is_apart)[:200]
     depth = -expected[inside] if b.kind == "plane" else overlaps(a, b, pos[inside], rot[inside], rng)
     # The search must not find a shorter translation, and the computed one must separate the shapes.
     limit = np.where(depth < 0.05, shallow, deep)
-    assert np.all(-found[inside] - depth < limit), np.max(-found[inside] - depth)
-    parted = pos[inside] + by_pos[inside] * (1e-5 - found[inside, None])
+    assert np.all(-actual[inside] - depth < limit), np.max(-actual[inside] - depth)
+    parted = pos[inside] + by_pos[inside] * (1e-5 - actual[inside, None])
     assert np.min(distances(a, b, parted, quat[inside])) > 0
 
 
@@ -195,7 +195,7 @@ def check_slopes(a, b, rng, n, deepest=-np.inf):
     Shapes that overlap by more than ``-deepest`` are excluded.
     """
     pos, quat = poses(rng, n)
-    rot, answer, h = rotations(quat), judge(a, b), 1e-6
+    rot, answer, h = rotations(quat), distance_and_slopes(a, b), 1e-6
     spin = unit(rng.normal(size=(n, 3)))
     cross = np.zeros((n, 3, 3))
     cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = spin, -spin
@@ -205,14 +205,16 @@ def check_slopes(a, b, rng, n, deepest=-np.inf):
     np.testing.assert_array_less(np.linalg.norm(by_pos, axis=1), 1 + 1e-6)
     sides = np.array([[answer(pos + s * h * e, rot)[0] for e in np.eye(3)] for s in (1, -1)])
     differences = (sides[0] - sides[1]).T / (2 * h)
-    there, back = (answer(pos, rot + s * h * cross @ rot)[0] for s in (1, -1))
-    turning = (there - back) / (2 * h)
+    forward, backward = (answer(pos, rot + s * h * cross @ rot)[0] for s in (1, -1))
+    turning = (forward - backward) / (2 * h)
     smooth = np.abs(np.linalg.norm(differences, axis=1) - 1) < 1e-3
     smooth = smooth & (value > deepest)
     assert np.mean(smooth) > 0.4
-    turned = smooth & (np.arange(n) >= n // 5)  # where axes are parallel the distance has a crease
+    is_smooth_turn = smooth & (np.arange(n) >= n // 5)  # where axes are parallel the distance has a crease
     by_turn = np.sum(by_rot * (cross @ rot), axis=(1, 2))
-    return np.abs(by_pos[smooth] - differences[smooth]).max(axis=1), np.abs(by_turn[turned] - turning[turned])
+    return np.abs(by_pos[smooth] - differences[smooth]).max(axis=1), np.abs(
+        by_turn[is_smooth_turn] - turning[is_smooth_turn]
+    )
 
 
 def check_finite(a, b, dtype, n):
@@ -227,6 +229,8 @@ def check_finite(a, b, dtype, n):
     pos = np.concatenate([np.repeat(grid * scale, len(turns), axis=0) for scale in (size, reach)])
     rot = np.tile(rotations(unit(turns)), (2 * len(grid), 1, 1))
     with jax.enable_x64(dtype == np.float64):
-        for x in judge(a, b)(np.resize(pos, (n, 3)).astype(dtype), np.resize(rot, (n, 3, 3)).astype(dtype)):
+        for x in distance_and_slopes(a, b)(
+            np.resize(pos, (n, 3)).astype(dtype), np.resize(rot, (n, 3, 3)).astype(dtype)
+        ):
             assert x.dtype == dtype
             assert np.isfinite(x).all()

@@ -7,7 +7,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from oracle import DRONES, SHAPES, check_finite, geom, judge, rotations, unit
+from oracle import DRONES, SHAPES, check_finite, distance_and_slopes, geom, rotations, unit
 
 from crazysim.geometry import Shape, hfield
 from crazysim.geometry import distance as eager_distance
@@ -65,7 +65,7 @@ def near(rng, n):
 def test_drones_over_a_height_field(x64, rng, kind):
     pos, quat = near(rng, N)
     pos[:, :2] = np.clip(pos[:, :2], -0.4, 0.4) if kind != "sphere" else pos[:, :2]
-    found, by_pos, _ = (x[:200] for x in judge(DRONES[kind], FIELD)(pos, rotations(quat)))
+    found, by_pos, _ = (x[:200] for x in distance_and_slopes(DRONES[kind], FIELD)(pos, rotations(quat)))
     expected = distances_to_prisms(DRONES[kind], pos[:200], quat[:200])
     apart = expected > 0
     assert min(np.sum(apart & (expected < 0.1)), np.sum(~apart)) > 30
@@ -79,7 +79,7 @@ def test_drones_over_a_height_field(x64, rng, kind):
 def test_depth_below_a_height_field_is_that_of_the_nearest_surface(x64, rng):
     """Lifted off the ground along the gradient by its depth, a point is on the surface, a wall or the bottom."""
     points = near(rng, N)[0]
-    sphere = lambda p: judge(DRONES["sphere"], FIELD)(p, np.tile(np.eye(3), (N, 1, 1)))  # noqa: E731
+    sphere = lambda p: distance_and_slopes(DRONES["sphere"], FIELD)(p, np.tile(np.eye(3), (N, 1, 1)))  # noqa: E731
     depth, slope, _ = sphere(points)
     depth = depth + 0.1
     shallow = (depth < 0) & (depth > -min(CELL))

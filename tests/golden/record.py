@@ -38,7 +38,7 @@ from pathlib import Path
 
 import numpy as np
 
-HERE = Path(__file__).resolve().parent
+FOLDER = Path(__file__).resolve().parent
 PEER_VERSION = "0.4.0"
 JAX_VERSION = "0.10.1"
 
@@ -212,7 +212,7 @@ def draw_world(dynamics: str, control: str, params: dict, world: int) -> dict[st
 def draw_flight(dynamics: str, control: str, params: dict) -> dict[str, np.ndarray]:
     """Draw what both worlds begin with, with shape (worlds, 1, k) for each quantity."""
     worlds = [draw_world(dynamics, control, params, world) for world in range(N_WORLDS)]
-    return {what: np.stack([world[what] for world in worlds])[:, None, :] for what in worlds[0]}
+    return {name: np.stack([world[name] for world in worlds])[:, None, :] for name in worlds[0]}
 
 
 def check_dtypes(sim, dtype: np.dtype, where: str) -> None:
@@ -338,14 +338,14 @@ def record_pass(pairs: list[tuple[str, str]], path: Path) -> None:
     dtype = np.dtype(np.float64 if jax.config.jax_enable_x64 else np.float32)
     recorded = {}
     for dynamics, control in pairs:
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         for (variant, (integrator, freqs)), airframe in itertools.product(
             variants(dynamics, control).items(), AIRFRAMES[dynamics]
         ):
             flight = fly(dynamics, control, airframe, integrator, freqs, dtype)
-            for what, value in flight.items():
-                recorded[f"{dynamics}-{control}/{variant}/{airframe}/{what}"] = value
-        print(f"{dtype} {dynamics}-{control}: {time.perf_counter() - begin:.0f} s", flush=True)
+            for name, value in flight.items():
+                recorded[f"{dynamics}-{control}/{variant}/{airframe}/{name}"] = value
+        print(f"{dtype} {dynamics}-{control}: {time.perf_counter() - start_time:.0f} s", flush=True)
     np.savez(path, **recorded)
 
 
@@ -358,9 +358,9 @@ def merge(pair: tuple[str, str], double: dict[str, np.ndarray], single: dict[str
     for key, value in double.items():
         if not key.startswith(prefix):
             continue
-        short = key.removeprefix(prefix)
-        golden[short] = value
-        flight, what = short.rsplit("/", 1)
+        label = key.removeprefix(prefix)
+        golden[label] = value
+        flight, what = label.rsplit("/", 1)
         if what in FIELDS:
             error = np.abs(single[key] - value).max(axis=(1, 2, 3))
             golden[f"{flight}/float32_error_{what}"] = error
@@ -368,7 +368,7 @@ def merge(pair: tuple[str, str], double: dict[str, np.ndarray], single: dict[str
             worst[variant, what] = max(worst.get((variant, what), 0.0), float(error.max()))
         elif not np.array_equal(single[key], value):
             raise RuntimeError(f"{key} differs between the passes")
-    path = HERE / f"{name}.npz"
+    path = FOLDER / f"{name}.npz"
     np.savez_compressed(path, **golden)
     print(f"{path.name}: {len(golden)} arrays, {path.stat().st_size / 1000:.0f} kB")
     for variant in dict.fromkeys(variant for variant, _ in worst):

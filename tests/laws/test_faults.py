@@ -14,9 +14,9 @@ from cases import (
     hover_command,
     hover_rotor_state,
     hover_thrust,
+    repeat_command,
     send,
     shared_sim,
-    to_all,
     trees_equal,
     with_params,
     with_states,
@@ -89,7 +89,7 @@ def test_fault_02_a_zero_quaternion_means_yaw_zero(dynamics):
 def test_fault_03_nan_commands_are_refused_flagged_and_healed(dynamics, control):
     data, step, reset = program(dynamics, control)
     data = with_states(data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(data))
-    good = to_all(data, hover_command(data)).astype(np.float32)
+    good = repeat_command(data, hover_command(data)).astype(np.float32)
     # Fitted dynamics contain the attitude controller and have no place for wanted body rates: the last three numbers.
     used = 13 if dynamics in FITTED and control == "state" else good.shape[-1]
     for component in range(used):
@@ -174,7 +174,7 @@ def test_fault_06_zero_thrust_stops_the_motors_at_every_level(dynamics, control)
     if control == "state":
         data = without_force(step, data)
     else:
-        data = run(step, send(data, to_all(data, zero_thrust_command(data))), 250)
+        data = run(step, send(data, repeat_command(data, zero_thrust_command(data))), 250)
     commanded = data.controls.attitude.cmd[..., 3] if dynamics in FITTED else data.controls.rotor_vel
     np.testing.assert_array_equal(commanded, 0.0)
     z, v, r = fall(data, 250)
@@ -220,7 +220,7 @@ def test_fault_09_a_parameter_is_shared_or_per_drone_never_guessed():
     sim = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
     data, step = with_states(sim.data, pos=[0, 0, 10.0]), sim.build_step_fn()
     up, m = hover_rotor_state(data), float(data.params.mass[0])
-    data = send(with_states(data, rotor_vel=up), to_all(data, up))
+    data = send(with_states(data, rotor_vel=up), repeat_command(data, up))
     with pytest.raises(ConfigError, match=r"data.params.mass has shape \(2, 1\).*jnp.broadcast_to"):
         run(step, with_params(data, mass=np.full((2, 1), m, np.float32)), 1)
 
@@ -251,14 +251,14 @@ def test_fault_13_a_drone_on_the_floor_neither_slides_nor_turns_and_takes_off(in
         force=[0.5 * m * 9.81, 0.1 * m * 9.81, 0],
         torque=[1e-5, 2e-5, 1e-4],
     )
-    landed = run(step, send(data, to_all(data, 0.7 * hover)), 500)
+    landed = run(step, send(data, repeat_command(data, 0.7 * hover)), 500)
     for name in ("pos", "quat", "vel", "ang_vel"):
         before, after = getattr(data.states, name), getattr(landed.states, name)
         # at most the rounding of a quaternion that is normalised 500 times
         np.testing.assert_allclose(after, before, atol=1e-5 if name == "quat" else 0, rtol=0, err_msg=name)
 
     level = with_states(landed, quat=[0, 0, 0, 1], force=0.0, torque=0.0)
-    flying = run(step, send(level, to_all(level, 1.2 * hover)), 500)
+    flying = run(step, send(level, repeat_command(level, 1.2 * hover)), 500)
     assert np.all(flying.states.pos[..., 2] > 0.5)
     np.testing.assert_allclose(flying.states.pos[..., :2], data.states.pos[..., :2], atol=0.02)
     assert not flying.core.nonfinite.any()

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, hover_command, to_all, trees_equal, with_states
+from cases import by_stages, hover_command, repeat_command, trees_equal, with_states
 
 from crazysim import Sim, dynamics
 from crazysim.core import functional as F
@@ -25,7 +25,7 @@ def start():
         sim.data, pos=[0.1, 0.2, 2.0], vel=[0.5, -0.3, 0.1], rotor_vel=[12000.0, 13000, 12500, 12000]
     )
     sim.build_default_data()
-    commands = to_all(sim.data, hover_command(sim.data)) * np.ones((4, 3, 2, 1))
+    commands = repeat_command(sim.data, hover_command(sim.data)) * np.ones((4, 3, 2, 1))
     commands = commands + np.random.default_rng(3).uniform(-0.1, 0.1, commands.shape)
     return sim, sim.data, sim.build_step_fn(), sim.build_reset_fn(), commands.astype(np.float32)
 

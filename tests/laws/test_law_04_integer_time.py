@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cases import PAIRS, command_in_force, hover_command, to_all, with_states
+from cases import PAIRS, command_in_force, hover_command, repeat_command, with_states
 
 from crazysim import Cars, ConfigError, Sim
 from crazysim.trajectories import circle
@@ -25,7 +25,7 @@ def test_a_command_is_taken_over_at_its_tick(dynamics, control):
     sim = Sim(2, dynamics=dynamics, control=control, freq=500, engine=engine, **RATES)
     sim.data = with_states(sim.data, pos=[0.0, 0.0, 5.0])
     period = 1 if control == "rotor_vel" else PERIOD
-    hover = to_all(sim.data, hover_command(sim.data, (0.0, 0.0, 5.0)))
+    hover = repeat_command(sim.data, hover_command(sim.data, (0.0, 0.0, 5.0)))
     steps, in_force = np.zeros(2, int), [None, None]
     for k in range(18):
         if k == 7:

@@ -16,7 +16,7 @@ import crazysim.plugins
 from crazysim import Sim
 from crazysim.core.plugin import FunctionPlugin, Plugin
 from crazysim.core.population import Population
-from crazysim.core.settings import alternatives, settings_of
+from crazysim.core.settings import alternatives, collect_settings
 from crazysim.envs.task import Task
 from crazysim.envs.tasks.bring_load import BringLoad
 from crazysim.envs.tasks.goals import GoalTask
@@ -106,7 +106,7 @@ def is_numeric(kind, name):
 
 def numeric_fields(kind):
     """Return the fields of a class with numbers, and what they may be."""
-    return [(name, declared) for name, declared in settings_of(kind).items() if is_numeric(kind, name)]
+    return [(name, declared) for name, declared in collect_settings(kind).items() if is_numeric(kind, name)]
 
 
 def example(kind, **changes):

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import as_numbers, hover_command, to_all
+from cases import as_numbers, hover_command, repeat_command
 
 from crazysim import Sim
 from crazysim.core import functional as F
@@ -44,7 +44,7 @@ def assert_unchanged(tree, before):
     ids=["step", "steps", "reset", "masked-reset", "pure-steps", "pure-step", "pure-reset", "command", "contacts"],
 )
 def test_held_data_stays_readable_and_unchanged(sim, use):
-    sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+    sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     sim.step(5)
     held, default = sim.data, sim.default_data
     kept, kept_default = snapshot(held), snapshot(default)
@@ -77,7 +77,7 @@ def test_a_command_array_stays_its_callers(sim):
 def test_default_data_survives_many_steps_and_resets(sim):
     default, kept = sim.default_data, snapshot(sim.default_data)
     for i in range(30):
-        sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+        sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
         sim.step(2)
         sim.reset(np.array([True, i % 2 == 0]))
     assert sim.default_data is default

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from disks import full_disk
-from pictures import frames_of
+from pictures import read_frames
 
 from crazysim.errors import ConfigError, RenderError
 from crazysim.media import Film, Recorder, View
@@ -48,7 +48,7 @@ def test_a_film_shows_the_drone_go_from_left_to_right(sim, tmp_path, suffix):
         for k in range(11):
             fly(sim, 50 * k)
             assert film.add(sim) == 1
-    frames = frames_of(path, HEIGHT, WIDTH)
+    frames = read_frames(path, HEIGHT, WIDTH)
     assert len(frames) == film.n_frames == 11
     columns = [column(frame) for frame in frames]
     focal = 0.5 * HEIGHT / np.tan(np.deg2rad(45 / 2))
@@ -73,7 +73,7 @@ def test_frames_go_with_simulated_time(sim, tmp_path, fps, speed, n_frames):
         for k in range(21):
             fly(sim, 25 * k)
             drawn.append(film.add(sim))
-    assert sum(drawn) == film.n_frames == len(frames_of(tmp_path / "flight.mp4", HEIGHT, WIDTH)) == n_frames
+    assert sum(drawn) == film.n_frames == len(read_frames(tmp_path / "flight.mp4", HEIGHT, WIDTH)) == n_frames
     assert max(drawn) - min(drawn[1:]) <= 1
 
 
@@ -98,7 +98,7 @@ def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path, capfd):
     assert not capfd.readouterr().err  # no bar without a terminal
     np.testing.assert_allclose(sim.data.states.pos[:, 0, 0], 9.5)
     np.testing.assert_array_equal(sim.data.core.steps, 5000)
-    frames = frames_of(tmp_path / "flight.mp4", HEIGHT, WIDTH)
+    frames = read_frames(tmp_path / "flight.mp4", HEIGHT, WIDTH)
     for k in range(2):
         columns = [column(frame[shown.tile(k)]) for frame in frames]
         focal = 0.25 * HEIGHT / np.tan(np.deg2rad(45 / 2))
@@ -109,7 +109,7 @@ def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path, capfd):
 def test_given_images_are_frames(sim, tmp_path):
     with Film(tmp_path / "flight.mp4", view(), fps=10) as film:
         film.write(np.full((HEIGHT, WIDTH, 3), 200, np.uint8), 3)
-    frames = frames_of(tmp_path / "flight.mp4", HEIGHT, WIDTH)
+    frames = read_frames(tmp_path / "flight.mp4", HEIGHT, WIDTH)
     assert len(frames) == 3
     np.testing.assert_allclose(frames.astype(int), 200, atol=3)
 
@@ -118,7 +118,7 @@ def test_a_name_that_looks_like_an_option_is_a_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with Film("-y.mp4", view(), fps=10) as film:
         film.write(np.full((HEIGHT, WIDTH, 3), 200, np.uint8), 2)
-    assert len(frames_of(tmp_path / "-y.mp4", HEIGHT, WIDTH)) == 2
+    assert len(read_frames(tmp_path / "-y.mp4", HEIGHT, WIDTH)) == 2
 
 
 # Wrong input ----------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from pictures import of_colour
+from pictures import has_colour
 
 from crazysim import SlungLoad
 from crazysim.errors import ConfigError, DamagedFileError
@@ -145,7 +145,7 @@ def test_another_simulation_is_put_where_the_flight_was(flight, opengl):
     above = {"lookat": [2, 0, 0.3], "distance": 2.0, "azimuth": 90, "elevation": -89}
     for world, seen in ((2, True), (0, False)):
         picture = View(worlds=world, width=64, height=48, cam_config=above).render(other).astype(int)
-        red = of_colour(picture, [1, 0, 0])
+        red = has_colour(picture, [1, 0, 0])
         assert red[23:25, 31:33].all() == red.any() == seen
     other.close()
 

@@ -7,7 +7,7 @@ import textwrap
 
 import numpy as np
 import pytest
-from pictures import frames_of
+from pictures import read_frames
 from waiting import wait_for
 
 from crazysim.errors import ConfigError
@@ -116,12 +116,12 @@ def test_a_film_survives_the_end_of_its_process(tmp_path):
     ended = subprocess.run([sys.executable, "-c", KILLED, path, "200", "python"], check=False)
     assert ended.returncode == -signal.SIGKILL
     path = unfinished_path(path)  # only a film that is closed gets its name
-    wait_for(lambda: path.exists() and path.stat().st_size and len(frames_of(path, 48, 64)) == 200)
+    wait_for(lambda: path.exists() and path.stat().st_size and len(read_frames(path, 48, 64)) == 200)
     subprocess.run([sys.executable, "-c", KILLED, film, "400", "ffmpeg"], check=True)
-    assert len(frames_of(path, 48, 64)) > 200
+    assert len(read_frames(path, 48, 64)) > 200
 
 
 def test_film_closes_in_order(tmp_path):
     with Film(tmp_path / "film.mp4", View(width=64, height=48), fps=10) as film:
         film.write(np.zeros((48, 64, 3), np.uint8), 30)
-    assert len(frames_of(tmp_path / "film.mp4", 48, 64)) == 30
+    assert len(read_frames(tmp_path / "film.mp4", 48, 64)) == 30

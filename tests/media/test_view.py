@@ -5,8 +5,8 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import ABOVE
-from pictures import HEIGHT, WIDTH, of_colour, pixel
+from cases import CAMERA_HEIGHT
+from pictures import HEIGHT, WIDTH, has_colour, pixel
 
 from crazysim.errors import ConfigError
 from crazysim.media import View, render_worlds
@@ -89,9 +89,9 @@ def test_what_a_user_drew_is_in_every_tile_and_only_once(sim):
     draw_points(sim, [[0, 0, 1.0]], rgba=GREEN, size=0.05)
     picture = grid.render(sim)
     for k in range(2):
-        rows, columns = np.nonzero(of_colour(picture[grid.tile(k)], GREEN))
+        rows, columns = np.nonzero(has_colour(picture[grid.tile(k)], GREEN))
         np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [HEIGHT / 2, WIDTH / 2], atol=0.5)
-    assert not of_colour(grid.render(sim), GREEN).any()
+    assert not has_colour(grid.render(sim), GREEN).any()
 
 
 def test_overlays_are_kept_when_an_image_fails(sim):
@@ -99,7 +99,7 @@ def test_overlays_are_kept_when_an_image_fails(sim):
     with pytest.raises(ConfigError, match="got 'up'"):
         view(camera="up", text="failed").render(sim)
     picture = view().render(sim)
-    assert of_colour(picture, GREEN).any()
+    assert has_colour(picture, GREEN).any()
     np.testing.assert_array_equal(view().render(sim), sim.render("rgb_array", 0, "down", None, WIDTH, HEIGHT))
 
 
@@ -114,13 +114,13 @@ def test_a_batch_holds_an_image_of_each_world_in_the_requested_order(sim):
         np.testing.assert_allclose(dark(picture), pixel(PLACES[world]), atol=2)
     every = render_worlds(sim, camera="down", width=WIDTH, height=HEIGHT)
     np.testing.assert_array_equal(every[[2, 0, 3]], batch)
-    free = {"lookat": [0, 0, 0], "distance": ABOVE, "azimuth": 90, "elevation": -90}
+    free = {"lookat": [0, 0, 0], "distance": CAMERA_HEIGHT, "azimuth": 90, "elevation": -90}
     draw_points(sim, np.array([[0, 0, 0.5]]), rgba=RED, size=0.05)
     marked = render_worlds(sim, [1, 1], cam_config=free, width=WIDTH, height=HEIGHT)
     for picture in marked:
-        rows, columns = np.nonzero(of_colour(picture, RED))
+        rows, columns = np.nonzero(has_colour(picture, RED))
         np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [HEIGHT / 2, WIDTH / 2], atol=1)
-    assert not of_colour(render_worlds(sim, [1], "down"), RED).any()
+    assert not has_colour(render_worlds(sim, [1], "down"), RED).any()
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_a_camera_holds_drones_and_points_of_each_world_in_view(sim):
     image = held.render(sim)
     for k in range(2):
         tile = image[held.tile(k)]
-        spots = np.array([dark(tile), np.argwhere(of_colour(tile, RED)).mean(axis=0)])
+        spots = np.array([dark(tile), np.argwhere(has_colour(tile, RED)).mean(axis=0)])
         off = np.linalg.norm(spots - [HEIGHT / 2, WIDTH / 2], axis=-1)
         assert (off > 0.25 * HEIGHT).all()
         assert (off < 0.45 * HEIGHT).all()
@@ -216,7 +216,7 @@ def test_a_trail_follows_the_way_of_each_worlds_drone(sim):
         place(sim, pos, 0.1 * k)
         picture = shown.render(sim)
     place(sim, PLACES, 0.0)
-    east, north = (of_colour(picture[shown.tile(k)], BLUE) for k in range(2))
+    east, north = (has_colour(picture[shown.tile(k)], BLUE) for k in range(2))
     rows, columns = np.nonzero(east)
     assert np.abs(rows + 0.5 - pixel([0, 0.1, 1])[0]).max() < 3
     # The drone hides the end of its way, and the faint beginning is no longer blue enough.
@@ -241,7 +241,7 @@ def test_setpoints_are_drawn_at_the_commanded_positions(sim):
     picture = shown.render(sim)
     sim.data = data
     for k in range(4):
-        rows, columns = np.nonzero(of_colour(picture[shown.tile(k)], GREEN))
+        rows, columns = np.nonzero(has_colour(picture[shown.tile(k)], GREEN))
         np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], pixel(command[k, 0, :3]), atol=1.0)
 
 
@@ -314,7 +314,7 @@ def test_warp_draws_what_the_plain_renderer_draws(opengl, plain_scene):
     assert warp.dtype == plain.dtype
     for picture, expected, world in zip(warp, plain, (2, 0, 3), strict=True):
         np.testing.assert_allclose(dark(picture), pixel(PLACES[world]), atol=2)
-        places = [np.argwhere(of_colour(x, RED)).mean(axis=0) for x in (picture, expected)]
+        places = [np.argwhere(has_colour(x, RED)).mean(axis=0) for x in (picture, expected)]
         np.testing.assert_allclose(*places, atol=1)
     assert np.abs(warp.astype(int) - plain).mean() < 6, "of 255: floor and sky are the same"
     moved = render_worlds(sim, [0, 0, 0], renderer="warp", **size)

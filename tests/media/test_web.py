@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from browsing import NEAR
+from browsing import MAX_PIXEL_DISTANCE
 from waiting import wait_for
 
 from crazysim.__main__ import main
@@ -110,7 +110,7 @@ def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
         for part in (0.1, 0.9, 0.3):
             scrub(chromium, part)
             wanted = pixel(chromium, flight, START + part * (END - START), 1)
-            np.testing.assert_allclose(chromium.find(MAGENTA, wanted), wanted, atol=NEAR)
+            np.testing.assert_allclose(chromium.find(MAGENTA, wanted), wanted, atol=MAX_PIXEL_DISTANCE)
     finally:
         program.send_signal(signal.SIGINT)
         assert program.wait(30) == 0
@@ -128,7 +128,7 @@ def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, caps
         scrub(chromium, part)
         for color, place in ((MAGENTA, np.zeros(3)), (GREEN, BOX)):
             wanted = pixel(chromium, flight, place, 0)
-            np.testing.assert_allclose(chromium.find(color, wanted), wanted, atol=NEAR)
+            np.testing.assert_allclose(chromium.find(color, wanted), wanted, atol=MAX_PIXEL_DISTANCE)
     rows, columns = chromium.mask(GREEN)
     assert np.ptp(columns) > 2 * np.ptp(rows), "the box lies"
 

@@ -132,7 +132,7 @@ def check_example():
     assert np.isfinite(metrics["reward"])
     obs = np.random.default_rng(0).normal(size=(5, 21)).astype(np.float32)
     expected, _ = model.predict(obs, deterministic=True)
-    np.testing.assert_allclose(example.actor_of(model)({"all": obs}), expected, atol=1e-5)
+    np.testing.assert_allclose(example.make_actor(model)({"all": obs}), expected, atol=1e-5)
 
 
 if __name__ == "__main__":

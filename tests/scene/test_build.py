@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from cases import BOX
-from pictures import png_of
+from pictures import encode_png
 
 from crazysim.drones import airframe_names, load_airframe
 from crazysim.scene import build
@@ -52,7 +52,7 @@ def scene_file(tmp_path):
     for folder in ("meshes", "textures"):
         (tmp_path / folder).mkdir()
     write_stl(tmp_path / "meshes" / "rock.stl", 0.3)
-    (tmp_path / "textures" / "paint.png").write_bytes(png_of(np.full((8, 8, 3), [255, 0, 0])))
+    (tmp_path / "textures" / "paint.png").write_bytes(encode_png(np.full((8, 8, 3), [255, 0, 0])))
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
     return path

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from pictures import png_of
+from pictures import encode_png
 
 from crazysim import ConfigError, Sim
 from crazysim.core.stage import stage
@@ -191,7 +191,7 @@ def test_law_09_invalid_poses_are_refused(course):
 
 def test_a_scene_loads_whole_with_mesh_texture_and_height_field(tmp_path):
     """A user's own MJCF, its files beside it, with objects added on top."""
-    (tmp_path / "hill.png").write_bytes(png_of(np.arange(16).reshape(4, 4) * 16))
+    (tmp_path / "hill.png").write_bytes(encode_png(np.arange(16).reshape(4, 4) * 16))
     scene = tmp_path / "scene.xml"
     scene.write_text("""
     <mujoco><asset>

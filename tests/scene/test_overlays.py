@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from cases import ABOVE, FOVY
-from pictures import of_colour
+from cases import CAMERA_HEIGHT, FOVY
+from pictures import has_colour
 
 from crazysim.scene.overlays import Overlays
 from crazysim.sim import Sim
@@ -49,7 +49,7 @@ def test_points_are_spheres_of_their_radius(sim):
     plain = shoot(sim)
     draw_points(sim, [[0.0, 0.2, 1.0], [0.0, -0.3, 1.0]], rgba=GREEN, size=0.05)
     marked = shoot(sim)
-    x, y = seen_at(of_colour(marked, GREEN))  # one metre below the camera
+    x, y = seen_at(has_colour(marked, GREEN))  # one metre below the camera
     for north in (0.2, -0.3):
         near = np.sign(y) == np.sign(north)
         np.testing.assert_allclose([x[near].mean(), y[near].mean()], [0, north], atol=0.01)
@@ -61,7 +61,7 @@ def test_points_are_spheres_of_their_radius(sim):
 def test_a_line_goes_through_its_points(sim):
     """Blue along an L: every pixel lies on one of its two legs, and both legs are covered end to end."""
     draw_line(sim, [[-0.4, -0.3, 1.0], [0.4, -0.3, 1.0], [0.4, 0.3, 1.0]], rgba=BLUE, start_size=3, end_size=3)
-    x, y = seen_at(of_colour(shoot(sim), BLUE))
+    x, y = seen_at(has_colour(shoot(sim), BLUE))
     first, second = np.abs(y + 0.3) < 2 / FOCAL, np.abs(x - 0.4) < 2 / FOCAL
     assert (first | second).all()
     np.testing.assert_allclose([x[first].min(), x[first].max()], [-0.4, 0.4], atol=0.02)
@@ -72,7 +72,7 @@ def test_a_line_has_the_requested_width(sim):
     """Its width in pixels grows from piece to piece, as a trail's does."""
     points = np.linspace([-0.5, 0.3, 1.0], [0.5, 0.3, 1.0], 13)
     draw_line(sim, points, rgba=BLUE, start_size=2, end_size=8)
-    mask = of_colour(shoot(sim), BLUE)
+    mask = has_colour(shoot(sim), BLUE)
     widths = mask.sum(0)[mask.any(0)]
     assert abs(widths[:10].mean() - 2) < 1.5
     assert abs(widths[-10:].mean() - 8) < 1.5
@@ -82,18 +82,18 @@ def test_a_line_has_the_requested_width(sim):
 def test_a_capsule_reaches_from_end_to_end(sim, cylinder):
     """A capsule is longer by its round ends than a cylinder; both are as wide as twice their radius."""
     draw_capsule(sim, [-0.2, 0.3, 1.0], [0.3, 0.3, 1.0], radius=0.06, rgba=BLUE, cylinder=cylinder)
-    x, y = seen_at(of_colour(shoot(sim), BLUE))
+    x, y = seen_at(has_colour(shoot(sim), BLUE))
     end = 0.0 if cylinder else 0.06
     np.testing.assert_allclose([x.min(), x.max()], [-0.2 - end, 0.3 + end], atol=0.02)
     np.testing.assert_allclose([y.min(), y.max()], [0.24, 0.36], atol=0.02)
 
 
 def test_overlays_are_red_by_default(sim):
-    nose = of_colour(shoot(sim), RED)
+    nose = has_colour(shoot(sim), RED)
     draw_points(sim, [0.0, 0.3, 1.0], size=0.05)
     draw_line(sim, [[-0.4, -0.3, 1], [0.4, -0.3, 1]])
     draw_capsule(sim, [-0.4, 0.2, 1], [-0.4, 0.3, 1])
-    x, y = seen_at(of_colour(shoot(sim), RED) & ~nose)
+    x, y = seen_at(has_colour(shoot(sim), RED) & ~nose)
     for at in ([0, 0.3], [0.2, -0.3], [-0.4, 0.25]):
         assert (np.hypot(x - at[0], y - at[1]) < 0.03).sum() > 20, at
 
@@ -103,7 +103,7 @@ def test_overlays_are_not_in_depth_images(sim):
     plain = sim.render("depth_array", camera="down", width=WIDTH, height=HEIGHT)
     draw_points(sim, [[0.0, 0.0, 1.0]], rgba=GREEN, size=0.1)
     color, depth = sim.render("rgbd_tuple", camera="down", width=WIDTH, height=HEIGHT)
-    assert of_colour(color.astype(int), GREEN).sum() > 200
+    assert has_colour(color.astype(int), GREEN).sum() > 200
     np.testing.assert_array_equal(depth, plain)
 
 
@@ -112,7 +112,7 @@ def test_overlays_drawn_before_the_first_image_are_in_it(opengl):
     sim = Sim(n_worlds=2)
     draw_points(sim, [[0.0, 0.0, 0.5]], rgba=GREEN, size=0.2)
     view = {"lookat": [0, 0, 0.5], "distance": 2.0}
-    assert of_colour(sim.render("rgb_array", cam_config=view, width=64, height=48).astype(int), GREEN).sum() > 50
+    assert has_colour(sim.render("rgb_array", cam_config=view, width=64, height=48).astype(int), GREEN).sum() > 50
     sim.close()
 
 
@@ -123,7 +123,7 @@ def test_overlays_are_kept_through_steps_and_failed_images(sim):
     sim.step()
     with pytest.raises(ValueError):
         shoot(sim, camera="nobody")
-    assert of_colour(shoot(sim), GREEN).any()
+    assert has_colour(shoot(sim), GREEN).any()
     sim.data = data
 
 
@@ -181,7 +181,7 @@ def test_a_line_may_change_its_colour(sim):
     """Each piece has its own colour: the first green, the second blue."""
     draw_line(sim, [[-0.4, 0.3, 1], [0, 0.3, 1], [0.4, 0.3, 1]], rgba=[GREEN, BLUE])
     picture = shoot(sim)
-    (green, _), (blue, _) = seen_at(of_colour(picture, GREEN)), seen_at(of_colour(picture, BLUE))
+    (green, _), (blue, _) = seen_at(has_colour(picture, GREEN)), seen_at(has_colour(picture, BLUE))
     np.testing.assert_allclose([green.min(), green.max()], [-0.4, 0], atol=0.02)
     np.testing.assert_allclose([blue.min(), blue.max()], [0, 0.4], atol=0.02)
 
@@ -195,7 +195,7 @@ def test_setpoints_are_where_the_last_command_of_a_world_is(opengl, plain_scene)
     draw_setpoints(sim, world=1, rgba=[GREEN, BLUE], size=0.05)
     picture = shoot(sim, world=1)
     for rgba, (east, north, _) in zip((GREEN, BLUE), command[1, :, :3], strict=True):
-        x, y = seen_at(of_colour(picture, rgba))
+        x, y = seen_at(has_colour(picture, rgba))
         np.testing.assert_allclose([x.mean(), y.mean()], [east, north], atol=0.01)
         np.testing.assert_allclose(len(x) / FOCAL**2, np.pi * 0.05**2, rtol=0.15)
     with pytest.raises(ValueError, match="expected a world from 0 to 1, got 2"):
@@ -216,9 +216,9 @@ def test_an_led_lights_up_on_its_drone_only(sim):
     change_material(sim, "led_top", [0, 1], rgba=[1, 1, 1, 0.15], emission=0.0)
     x, y = seen_at(np.abs(dull - before).sum(-1) > 30)
     assert len(x) > 3
-    distance = ABOVE - DRONES[1, 2]
+    distance = CAMERA_HEIGHT - DRONES[1, 2]
     assert np.hypot(x * distance - DRONES[1, 0], y * distance - DRONES[1, 1]).max() < 0.02
-    lit = of_colour(bright, RED)
+    lit = has_colour(bright, RED)
     assert lit.any()
     assert bright[lit][:, 0].mean() > dull[lit][:, 0].mean() + 10
     np.testing.assert_array_equal(shoot(sim), before)
@@ -230,7 +230,7 @@ def test_colours_may_be_one_for_each_drone(sim):
     picture = shoot(sim)
     change_material(sim, "led_top", [0, 1], rgba=[1, 1, 1, 0.15], emission=0.0)
     (east, _), (west, _) = (
-        seen_at(of_colour(picture, rgba) & ~of_colour(before, rgba)) for rgba in (RED, BLUE)
+        seen_at(has_colour(picture, rgba) & ~has_colour(before, rgba)) for rgba in (RED, BLUE)
     )  # the noses of the drones are red, too
     assert len(east) > 0
     assert len(west) > 0
@@ -247,7 +247,7 @@ def test_the_lower_led_is_visible_from_below(opengl):
         for led in ("led_top", "led_bot"):
             change_material(sim, led, [0], rgba=GREEN, emission=1.0)
             view = {"lookat": [1, 1, 1], "distance": 0.2, "azimuth": 0, "elevation": elevation}
-            counts[side, led] = of_colour(sim.render(**shot, cam_config=view).astype(int), GREEN).sum()
+            counts[side, led] = has_colour(sim.render(**shot, cam_config=view).astype(int), GREEN).sum()
             change_material(sim, led, [0], rgba=[1, 1, 1, 0.15], emission=0.0)
     sim.close()
     assert counts["above", "led_top"] > 10 > counts["above", "led_bot"]
@@ -320,6 +320,6 @@ def test_as_many_overlays_as_allowed_fit_into_an_image(sim):
         picture = shoot(sim)
         columns = [int(0.5 * WIDTH + FOCAL * x) for x in xy[:, 0]]
         rows = [int(0.5 * HEIGHT - FOCAL * y) for y in xy[:, 1]]
-        assert of_colour(picture, GREEN)[rows, columns].mean() > 0.9  # a few are hidden by the drones above them
+        assert has_colour(picture, GREEN)[rows, columns].mean() > 0.9  # a few are hidden by the drones above them
     finally:
         sim.max_visual_geom = limit

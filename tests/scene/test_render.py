@@ -11,7 +11,7 @@ import time
 import mujoco
 import numpy as np
 import pytest
-from cases import ABOVE, BOX, FOVY
+from cases import BOX, CAMERA_HEIGHT, FOVY
 from pictures import HEIGHT, WIDTH, pixel
 from screens import screen_pixels, virtual_screen
 
@@ -61,7 +61,7 @@ def test_the_drone_of_the_world_is_drawn_where_it_is(sim, empty, world):
     assert len(rows) > 20
     np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [row, column], atol=1.0)
     focal = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
-    reach = 0.09 * focal / (ABOVE - PLACES[world, 0, 2])  # the propellers' tips are within 9 cm of the centre
+    reach = 0.09 * focal / (CAMERA_HEIGHT - PLACES[world, 0, 2])  # the propellers' tips are within 9 cm of the centre
     assert 0.5 * reach < np.abs(np.stack([rows - row, columns - column])).max() < reach + 1
 
 
@@ -135,7 +135,7 @@ def test_a_camera_by_name_is_the_camera_of_its_id(sim):
 
 def test_the_free_camera_follows_cam_config(sim, empty):
     """A free camera at the place of the fixed one sees what it sees; every call may tell another place."""
-    free = {"lookat": [0, 0, 0], "distance": ABOVE, "azimuth": 90, "elevation": -90}
+    free = {"lookat": [0, 0, 0], "distance": CAMERA_HEIGHT, "azimuth": 90, "elevation": -90}
     sim.mj_model.vis.global_.fovy = FOVY
     shot = SHOT | {"camera": -1}
     seen = difference(sim.render(**shot, cam_config=free), empty)
@@ -212,15 +212,15 @@ def test_depth_is_the_distance_along_the_axis_in_metres(sim):
     depth = sim.render(**SHOT | {"mode": "depth_array"})
     assert depth.shape == (HEIGHT, WIDTH)
     assert depth.dtype == np.float32
-    floor = np.abs(depth - ABOVE) < 2e-3
+    floor = np.abs(depth - CAMERA_HEIGHT) < 2e-3
     assert floor[[0, 0, -1, -1], [0, -1, 0, -1]].all()
     row, column = (int(x) for x in pixel(PLACES[0, 0]))
     around = depth[row - 6 : row + 7, column - 6 : column + 7]
-    distance = ABOVE - PLACES[0, 0, 2]
+    distance = CAMERA_HEIGHT - PLACES[0, 0, 2]
     assert distance - 0.05 < around.min() < distance
     outside = depth.copy()
-    outside[row - 12 : row + 13, column - 12 : column + 13] = ABOVE
-    np.testing.assert_allclose(outside, ABOVE, atol=2e-3)
+    outside[row - 12 : row + 13, column - 12 : column + 13] = CAMERA_HEIGHT
+    np.testing.assert_allclose(outside, CAMERA_HEIGHT, atol=2e-3)
 
 
 def test_colour_and_depth_together_are_colour_and_depth_alone(sim):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from disks import full_disk
-from pictures import frames_of
+from pictures import read_frames
 from waiting import wait_for
 
 import crazysim
@@ -596,7 +596,7 @@ def test_a_film_shows_the_drone_and_its_goal(whole, tmp_path):
     path = tmp_path / "film.gif"
     assert film(env, whole.policy, path, worlds=1) == 11
     env.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
-    images = frames_of(path, 360, 480, "-vf", "scale=480:360").astype(int)
+    images = read_frames(path, 360, 480, "-vf", "scale=480:360").astype(int)
     green = (images[0][..., 1] - images[0][..., 0] > 40) & (images[0][..., 1] - images[0][..., 2] > 20)
     assert TARGET_COLOR[1] > TARGET_COLOR[0]
     assert green.sum() > 20

@@ -178,7 +178,7 @@ def widen_blocks(kernel: Kernel, device: jax.Device) -> Kernel:
 
     Kernels of gradients, of large worlds, and with few registers for each thread stay as they are.
     """
-    keeps_size = kernel.state_bytes or kernel.group > WARP_THREADS or ANY_NUMBER_OF_BLOCKS not in kernel.text
+    keeps_size = kernel.state_bytes or kernel.group_size > WARP_THREADS or ANY_NUMBER_OF_BLOCKS not in kernel.text
     return (
         kernel
         if keeps_size or resources(kernel, device).code <= INSTRUCTION_CACHE_BYTES

@@ -40,9 +40,9 @@ class DerivativeKernels:
             on_lanes: The program on lanes, for derivatives without a kernel.
         """
         self.program, self.location, self.on_lanes = program, location, on_lanes
-        self.used: dict[str, None] = {}
+        self.descriptions: dict[str, None] = {}
         """Ways in which derivatives were computed so far, for ``explain``."""
-        self.floats = tuple(i for i in program.written if program.leaves[i].number_type.kind == "f")
+        self.floats = tuple(i for i in program.written_leaves if program.leaves[i].number_type.kind == "f")
         """Leaves that are written and have derivatives."""
         self._programs: dict[Any, Any] = {}
         self._launches: dict[Any, Launch | None] = {}
@@ -51,38 +51,38 @@ class DerivativeKernels:
         """Return True for a leaf with numbers of its own for each drone or world."""
         return self.program.leaves[leaf].scope in ("drone", "world")
 
-    def forward(self, changing: tuple[int, ...], platform: str) -> Callable[..., list[Array]] | None:
+    def tangent_kernel(self, perturbed: tuple[int, ...], platform: str) -> Callable[..., list[Array]] | None:
         """Return the kernel of the steps and the tangents of some leaves; None where there is none.
 
         It takes all leaves, tangents by leaf, the number of steps, the number of batches, and the shapes and types of
         the tangents after the steps. It returns these tangents.
         """
-        compiled = self._compile("jvp", add_tangents, kernel.write, changing, platform)
-        return None if compiled is None else partial(_forward, self, *compiled)
+        compiled = self._compile("jvp", add_tangents, kernel.write, perturbed, platform)
+        return None if compiled is None else partial(_launch_tangents, self, *compiled)
 
-    def reverse(self, changing: tuple[int, ...], platform: str) -> Callable[..., Leaves] | None:
+    def cotangent_kernel(self, perturbed: tuple[int, ...], platform: str) -> Callable[..., Leaves] | None:
         """Return the kernel that computes the cotangents of some leaves; None where there is none.
 
         It takes all leaves, cotangents of the floats that are written, the number of steps and the number of batches,
         and returns cotangents by leaf. The cotangent of a leaf that all drones share has one row for each batch.
         """
-        compiled = self._compile("gradient", reverse.reverse_program, reverse.write, changing, platform)
-        return None if compiled is None else partial(_reverse, self, *compiled)
+        compiled = self._compile("gradient", reverse.reverse_program, reverse.write, perturbed, platform)
+        return None if compiled is None else partial(_launch_cotangents, self, *compiled)
 
     def _compile(
         self,
         kind: str,
-        transformed: Callable[[Program, Sequence[int]], Any],
+        transform: Callable[[Program, Sequence[int]], Any],
         write: Callable[[Any, str], Kernel],
-        changing: tuple[int, ...],
+        perturbed: tuple[int, ...],
         platform: str,
     ) -> tuple[Any, Launch] | None:
         """Return the transformed program and the function that calls its kernel; None where there is none."""
-        key, launch_key = (kind, changing), (kind, changing, platform)
+        key, launch_key = (kind, perturbed), (kind, perturbed, platform)
         try:
             if key not in self._programs:
                 self._programs[key] = None
-                self._programs[key] = transformed(self.program, changing)
+                self._programs[key] = transform(self.program, perturbed)
             transformed_program = self._programs[key]
             if transformed_program is not None and launch_key not in self._launches:
                 self._launches[launch_key] = None
@@ -90,10 +90,10 @@ class DerivativeKernels:
                 location = self.location if platform == self.location.platform else Location(platform)
                 with announce_if_slow("compiling a derivative of the steps", "2 to 10 s"):
                     self._launches[launch_key] = compile_kernel(source, location)
-                self.used[f"{kind}: one kernel, {describe_kernel(source, platform, location.devices)}"] = None
+                self.descriptions[f"{kind}: one kernel, {describe_kernel(source, platform, location.devices)}"] = None
         except UnsupportedError as error:
             announce("compiling a derivative of the steps on lanes", "10 to 40 s")
-            self.used[f"{kind}: on lanes ({error})"] = None
+            self.descriptions[f"{kind}: on lanes ({error})"] = None
             if not isinstance(error, LimitError):
                 warn(f"the {kind} of the step runs on 'lanes': {error}", EngineWarning)
         launch = self._launches.get(launch_key)
@@ -106,7 +106,7 @@ def _inputs(values: Sequence[Any], leaves: Sequence[int]) -> list[Array]:
     return [jax.random.key_data(x) if jaxcompat.is_key(x) else x for x in arrays]
 
 
-def _forward(
+def _launch_tangents(
     kernels: DerivativeKernels,
     program: Program,
     launch: Launch,
@@ -129,16 +129,16 @@ def _forward(
 
     leaves = [*values, *(broadcast_tangent(i, tangents[i]) if i in tangents else None for i in range(n))]
     inputs = _inputs(leaves, kernel.needed_leaves(program))
-    outputs = [lanes.shape_of(program, i, n_worlds) for i in program.written]
+    outputs = [lanes.leaf_shape(program, i, n_worlds) for i in program.written_leaves]
     results_of_kernel = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
-    by_leaf = dict(zip(program.written, results_of_kernel, strict=True))
+    by_leaf = dict(zip(program.written_leaves, results_of_kernel, strict=True))
     return [by_leaf[n + i] if n + i in by_leaf else jnp.zeros(x.shape, x.dtype)
             for i, x in zip(kernels.floats, results, strict=True)]  # fmt: skip
 
 
-def _reverse(
+def _launch_cotangents(
     kernels: DerivativeKernels,
-    going_back: ReverseProgram,
+    cotangent_program: ReverseProgram,
     launch: Launch,
     values: Sequence[Any],
     cotangents: Leaves,
@@ -152,8 +152,8 @@ def _reverse(
         x = cotangents[i].reshape(n_worlds, -1, program.leaves[i].size)
         return x if x.shape[1] == n_drones else jnp.pad(x, ((0, 0), (0, n_drones - 1), (0, 0)))
 
-    inputs = [*_inputs(values, reverse.needed_leaves(going_back)), *map(seed, kernels.floats)]
-    leaves = [program.leaves[i] for i in going_back.perturbed]
+    inputs = [*_inputs(values, reverse.needed_leaves(cotangent_program)), *map(seed, kernels.floats)]
+    leaves = [program.leaves[i] for i in cotangent_program.perturbed]
     outputs = [jax.ShapeDtypeStruct((n_worlds, n_drones, x.size), x.number_type) for x in leaves]
     sums_of_lanes = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
 
@@ -163,4 +163,4 @@ def _reverse(
             return jnp.sum(x, axis=1)
         return x if kernels.is_own(i) else jnp.sum(x.reshape(size, n_worlds * n_drones // size, -1), axis=1)
 
-    return {i: sum_cotangent(i, x) for i, x in zip(going_back.perturbed, sums_of_lanes, strict=True)}
+    return {i: sum_cotangent(i, x) for i, x in zip(cotangent_program.perturbed, sums_of_lanes, strict=True)}

@@ -25,50 +25,50 @@ CountedRun = Callable[[list[Any], Array], tuple[list[Any], Array]]
 """A ``Run`` whose number of steps is an array."""
 
 
-def make_differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels | None = None) -> Run:
+def make_differentiable(run: CountedRun, run_on_lanes: Run, kernels: DerivativeKernels | None = None) -> Run:
     """Return a differentiable function that runs a program.
 
     Args:
         run: Function that runs the program.
-        other: The program on lanes, which JAX can differentiate. Used without ``kernels``, and if the number of steps
-            is an array.
-        kernels: Kernels of the derivatives; None to differentiate ``other``.
+        run_on_lanes: The program on lanes, which JAX can differentiate. Used without ``kernels``, and if the number of
+            steps is an array.
+        kernels: Kernels of the derivatives; None to differentiate ``run_on_lanes``.
     """
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         @jax.custom_jvp
-        def forward(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+        def advance(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
             return run(leaves, count)
 
         def derivative(primals: Any, tangents: Any) -> Any:
             (values, count), (slopes, _) = primals, tangents
-            changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
-            if kernels is not None and isinstance(n_steps, int) and changing:
-                present = tuple([i for i, x in enumerate(values) if x is not None])
-                case = Case(kernels, n_steps, present, tuple(changing), len(values))
-                fixed = [values[i] for i in present]
-                *written, flagged = advance_p.bind(*fixed, run=run, case=case)
-                in_tangents = [slopes[i] if kernels.is_own(i) else slopes[i][None] for i in changing]
-                out_tangents = tangent_p.bind(*fixed, *in_tangents, case=case, n_fixed=len(fixed))
-                tangent_of = dict(zip(kernels.floats, out_tangents, strict=True))
-                numbers = kernels.program.written
-                rest = [
-                    tangent_of[i] if i in tangent_of else _float0_zeros(x)
-                    for i, x in zip(numbers, written, strict=True)
+            perturbed = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
+            if kernels is not None and isinstance(n_steps, int) and perturbed:
+                array_leaves = tuple([i for i, x in enumerate(values) if x is not None])
+                case = Case(kernels, n_steps, array_leaves, tuple(perturbed), len(values))
+                operands = [values[i] for i in array_leaves]
+                *written, flagged = advance_p.bind(*operands, run=run, case=case)
+                in_tangents = [slopes[i] if kernels.is_own(i) else slopes[i][None] for i in perturbed]
+                out_tangents = tangent_p.bind(*operands, *in_tangents, case=case, n_nonlinear=len(operands))
+                tangent_by_leaf = dict(zip(kernels.floats, out_tangents, strict=True))
+                written_leaves = kernels.program.written_leaves
+                written_tangents = [
+                    tangent_by_leaf[i] if i in tangent_by_leaf else _float0_zeros(x)
+                    for i, x in zip(written_leaves, written, strict=True)
                 ]
-                return (written, flagged), (rest, _float0_zeros(flagged))
+                return (written, flagged), (written_tangents, _float0_zeros(flagged))
 
             if kernels is not None:
                 announce("compiling a derivative of the steps on lanes", "10 to 40 s")
-            known = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
+            count_or_array = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
 
             def advance_floats(floats: list[Any]) -> Any:
-                return other(replace_leaves(values, changing, floats), known)
+                return run_on_lanes(replace_leaves(values, perturbed, floats), count_or_array)
 
-            return jax.jvp(advance_floats, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
+            return jax.jvp(advance_floats, ([values[i] for i in perturbed],), ([slopes[i] for i in perturbed],))
 
-        forward.defjvp(derivative, symbolic_zeros=True)  # to skip the tangents of constant leaves
-        return forward(leaves, jnp.asarray(n_steps, jnp.int32))
+        advance.defjvp(derivative, symbolic_zeros=True)  # to skip the tangents of constant leaves
+        return advance(leaves, jnp.asarray(n_steps, jnp.int32))
 
     return steps
 
@@ -81,18 +81,18 @@ def _float0_zeros(x: Any) -> np.ndarray:
 class Case(NamedTuple):
     """Derivative of a program: static parameters of the primitives.
 
-    The operands are the leaves in ``present``, then the tangents of ``changing``, or the cotangents of the floats that
-    are written. Under ``vmap`` arrays of drones or worlds hold ``size`` batches of worlds, one after another; tangents
-    and cotangents of shared leaves have a leading axis for the batches. (size, ...)
+    The operands are the leaves in ``array_leaves``, then the tangents of ``perturbed``, or the cotangents of the floats
+    that are written. Under ``vmap`` arrays of drones or worlds hold ``size`` batches of worlds, one after another;
+    tangents and cotangents of shared leaves have a leading axis for the batches. (size, ...)
     """
 
     kernels: DerivativeKernels
     """Kernels of the derivatives."""
     n_steps: int
     """Number of steps."""
-    present: tuple[int, ...]
+    array_leaves: tuple[int, ...]
     """Leaves that are given."""
-    changing: tuple[int, ...]
+    perturbed: tuple[int, ...]
     """Leaves whose tangents are given, or whose cotangents are computed."""
     n_leaves: int
     """Number of all leaves."""
@@ -101,20 +101,20 @@ class Case(NamedTuple):
 
     def values(self, args: Sequence[Any]) -> list[Any]:
         """Return all leaves from the operands; None for one that is not given."""
-        return replace_leaves([None] * self.n_leaves, self.present, args[: len(self.present)])
+        return replace_leaves([None] * self.n_leaves, self.array_leaves, args[: len(self.array_leaves)])
 
-    def linear(self, args: Sequence[Any]) -> list[Any]:
+    def linear_operands(self, args: Sequence[Any]) -> list[Any]:
         """Return the operands in which the derivative is linear."""
-        return list(args[len(self.present) :])
+        return list(args[len(self.array_leaves) :])
 
     def is_own(self, leaves: Sequence[int]) -> list[bool]:
         """Return True for leaves with numbers of their own for each drone or world."""
         return list(map(self.kernels.is_own, leaves))
 
-    def over_batches(self, fn: Callable[..., list[Array]], args: Sequence[Any], linear: Sequence[int],
-                     results: Sequence[int]) -> list[Array]:  # fmt: skip
+    def map_batches(self, fn: Callable[..., list[Array]], args: Sequence[Any], linear_leaves: Sequence[int],
+                     result_leaves: Sequence[int]) -> list[Array]:  # fmt: skip
         """Apply a function of the leaves and linear operands of one batch to all batches, and return the results."""
-        leaves_batched, linear_batched = self.is_own(self.present), self.is_own(linear)
+        leaves_batched, linear_batched = self.is_own(self.array_leaves), self.is_own(linear_leaves)
 
         def split(x: Any) -> Any:
             return x.reshape(self.size, -1, *x.shape[1:])
@@ -123,93 +123,95 @@ class Case(NamedTuple):
             return fn(self.values(values), list(operands))
 
         if self.size == 1:
-            slopes = [x if o else x[0] for x, o in zip(self.linear(args), linear_batched, strict=True)]
+            slopes = [x if o else x[0] for x, o in zip(self.linear_operands(args), linear_batched, strict=True)]
             outs = run_batch(args, slopes)
-            return [x if o else x[None] for x, o in zip(outs, self.is_own(results), strict=True)]
+            return [x if o else x[None] for x, o in zip(outs, self.is_own(result_leaves), strict=True)]
         values = [split(x) if o else x for x, o in zip(args, leaves_batched, strict=False)]
-        slopes = [split(x) if o else x for x, o in zip(self.linear(args), linear_batched, strict=True)]
+        slopes = [split(x) if o else x for x, o in zip(self.linear_operands(args), linear_batched, strict=True)]
         outs = jax.vmap(run_batch, ([0 if o else None for o in leaves_batched], 0))(values, slopes)
-        return [x.reshape(-1, *x.shape[2:]) if o else x for x, o in zip(outs, self.is_own(results), strict=True)]
+        return [x.reshape(-1, *x.shape[2:]) if o else x for x, o in zip(outs, self.is_own(result_leaves), strict=True)]
 
 
 # Tangents ----------------------------------------------------------------------------------------------------------
 
 
-def _written(*args: Any, case: Case, **params: Any) -> list[jax.ShapeDtypeStruct]:
+def _tangent_shapes(*args: Any, case: Case, **params: Any) -> list[jax.ShapeDtypeStruct]:
     del params
     program = case.kernels.program
     n_worlds, _ = lanes.batch_counts(program, case.values(args))
-    return [lanes.shape_of(program, i, n_worlds) for i in case.kernels.floats]
+    return [lanes.leaf_shape(program, i, n_worlds) for i in case.kernels.floats]
 
 
 def _tangents_on_lanes(*args: Any, case: Case, **params: Any) -> list[Array]:
     del params
 
     def tangents(values: list[Any], slopes: list[Any]) -> list[Array]:
-        fn = partial(_floats_after, case, values)
-        return jax.jvp(fn, ([values[i] for i in case.changing],), (slopes,))[1]
+        fn = partial(_advance_floats, case, values)
+        return jax.jvp(fn, ([values[i] for i in case.perturbed],), (slopes,))[1]
 
-    return case.over_batches(tangents, args, case.changing, case.kernels.floats)
+    return case.map_batches(tangents, args, case.perturbed, case.kernels.floats)
 
 
 def _tangents(platform: str, *args: Any, case: Case, **params: Any) -> list[Array]:
     del params
-    kernel = case.kernels.forward(case.changing, platform)
+    kernel = case.kernels.tangent_kernel(case.perturbed, platform)
     if kernel is None:
         return _tangents_on_lanes(*args, case=case)
-    in_tangents = dict(zip(case.changing, case.linear(args), strict=True))
-    return kernel(case.values(args), in_tangents, case.n_steps, case.size, _written(*args, case=case))
+    in_tangents = dict(zip(case.perturbed, case.linear_operands(args), strict=True))
+    return kernel(case.values(args), in_tangents, case.n_steps, case.size, _tangent_shapes(*args, case=case))
 
 
 # Cotangents --------------------------------------------------------------------------------------------------------
 
 
-def _before(*args: Any, case: Case) -> list[jax.ShapeDtypeStruct]:
-    leaves = [case.values(args)[i] for i in case.changing]
+def _cotangent_shapes(*args: Any, case: Case) -> list[jax.ShapeDtypeStruct]:
+    leaves = [case.values(args)[i] for i in case.perturbed]
     shapes = [x.shape if is_own else (case.size, *x.shape)
-              for x, is_own in zip(leaves, case.is_own(case.changing), strict=True)]  # fmt: skip
+              for x, is_own in zip(leaves, case.is_own(case.perturbed), strict=True)]  # fmt: skip
     return [jax.ShapeDtypeStruct(shape, x.dtype) for shape, x in zip(shapes, leaves, strict=True)]
 
 
 def _cotangents_on_lanes(*args: Any, case: Case) -> list[Array]:
     def cotangents(values: list[Any], seeds: list[Any]) -> list[Array]:
-        return jax.vjp(partial(_floats_after, case, values), [values[i] for i in case.changing])[1](seeds)[0]
+        return jax.vjp(partial(_advance_floats, case, values), [values[i] for i in case.perturbed])[1](seeds)[0]
 
-    return case.over_batches(cotangents, args, case.kernels.floats, case.changing)
+    return case.map_batches(cotangents, args, case.kernels.floats, case.perturbed)
 
 
 def _cotangents(platform: str, *args: Any, case: Case) -> list[Array]:
-    kernel = case.kernels.reverse(case.changing, platform)
+    kernel = case.kernels.cotangent_kernel(case.perturbed, platform)
     if kernel is None:
         return _cotangents_on_lanes(*args, case=case)
-    seeds = dict(zip(case.kernels.floats, case.linear(args), strict=True))
+    seeds = dict(zip(case.kernels.floats, case.linear_operands(args), strict=True))
     cotangents = kernel(case.values(args), seeds, case.n_steps, case.size)
     return [cotangents[i].reshape(x.shape) if i in cotangents else jnp.zeros(x.shape, x.dtype)
-            for i, x in zip(case.changing, _before(*args, case=case), strict=True)]  # fmt: skip
+            for i, x in zip(case.perturbed, _cotangent_shapes(*args, case=case), strict=True)]  # fmt: skip
 
 
-def _transpose(fixed: Sequence[Any], seeds: Sequence[Any], case: Case, **params: Any) -> list[Array]:
+def _transpose(operands: Sequence[Any], seeds: Sequence[Any], case: Case, **params: Any) -> list[Array]:
     del params
     kernels = case.kernels
     if not kernels.program.fused:  # unfused stages may have effects, such as printing, which a primitive cannot have
-        kernels.reverse(case.changing, kernels.location.platform)  # returns None, and records the reason
-        return _cotangents_on_lanes(*fixed, *seeds, case=case)
-    return cotangent_p.bind(*fixed, *seeds, case=case)
+        kernels.cotangent_kernel(case.perturbed, kernels.location.platform)  # returns None, and records the reason
+        return _cotangents_on_lanes(*operands, *seeds, case=case)
+    return cotangent_p.bind(*operands, *seeds, case=case)
 
 
-def _floats_after(case: Case, values: Sequence[Any], changed: Sequence[Any]) -> list[Array]:
+def _advance_floats(case: Case, values: Sequence[Any], changed: Sequence[Any]) -> list[Array]:
     kernels = case.kernels
-    written, _ = kernels.on_lanes(replace_leaves(values, case.changing, changed), case.n_steps)
-    return [x for i, x in zip(kernels.program.written, written, strict=True) if i in kernels.floats]
+    written, _ = kernels.on_lanes(replace_leaves(values, case.perturbed, changed), case.n_steps)
+    return [x for i, x in zip(kernels.program.written_leaves, written, strict=True) if i in kernels.floats]
 
 
-def _batched(primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], case: Case, **params: Any) -> Any:
+def _batching_rule(
+    primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], case: Case, **params: Any
+) -> Any:
     """Return the results of a primitive for ``n`` batches: one call for more worlds, if parameters do not differ."""
-    n_fixed = len(case.present)
-    is_own = [*case.is_own(case.present), *(True for _ in args[n_fixed:])]
+    n_nonlinear = len(case.array_leaves)
+    is_own = [*case.is_own(case.array_leaves), *(True for _ in args[n_nonlinear:])]
     if any(b and not o for b, o in zip(batched, is_own, strict=True)):  # parameters differ: one batch at a time
-        full = [x if b else jnp.broadcast_to(x, (n, *x.shape)) for x, b in zip(args, batched, strict=True)]
-        return jax.lax.map(lambda xs: list(primitive.bind(*xs, case=case, **params)), full)
+        broadcast_args = [x if b else jnp.broadcast_to(x, (n, *x.shape)) for x, b in zip(args, batched, strict=True)]
+        return jax.lax.map(lambda xs: list(primitive.bind(*xs, case=case, **params)), broadcast_args)
 
     def join(x: Any, b: bool) -> Any:
         x = x if b else jnp.broadcast_to(x, (n, *x.shape))
@@ -222,20 +224,20 @@ def _batched(primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool
 
 cotangent_p = jaxcompat.primitive_by_platform(
     "crazysim_cotangents",
-    _before,
+    _cotangent_shapes,
     {"cpu": partial(_cotangents, "cpu"), "cuda": partial(_cotangents, "gpu")},
     derivative=_cotangents_on_lanes,
-    batched=_batched,
+    batched=_batching_rule,
 )
 """Cotangents before some steps, from the cotangents of the floats after them."""
 
 tangent_p = jaxcompat.primitive_by_platform(
     "crazysim_tangents",
-    _written,
+    _tangent_shapes,
     {"cpu": partial(_tangents, "cpu"), "cuda": partial(_tangents, "gpu")},
     derivative=_tangents_on_lanes,
     transposed=_transpose,
-    batched=_batched,
+    batched=_batching_rule,
 )
 """Tangents of the floats after some steps, from the tangents before them."""
 
@@ -264,6 +266,6 @@ advance_p = jaxcompat.primitive_by_platform(
     _shapes,
     {"": _advance},
     derivative=_advance_on_lanes,
-    batched=jaxcompat.vmap_rule_of(_advance),
+    batched=jaxcompat.make_vmap_rule(_advance),
 )
-"""Steps of a kernel inside a derivative; higher derivatives are those of the program on lanes."""
+"""Steps of a kernel inside a derivative; higher derivatives are derivatives of the program on lanes."""

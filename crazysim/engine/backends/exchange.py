@@ -47,7 +47,7 @@ class LineWriter(Protocol):
         """Write a line."""
         ...
 
-    def new(self, prefix: str = ...) -> str:
+    def new_name(self, prefix: str = ...) -> str:
         """Return an unused name."""
         ...
 
@@ -73,11 +73,11 @@ class Exchange(Protocol):
         """
         ...
 
-    def variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+    def define_variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         """Define a number of a lane that changes, and return the expression for it."""
         ...
 
-    def keep(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+    def define_constant(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         """Define a number of a lane that does not change, and return the expression for it in all later code."""
         ...
 
@@ -100,11 +100,11 @@ class UnsplitLane(Exchange):
 
     depth = 0
 
-    def variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+    def define_variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         writer.line(f"auto {name} = {value};", depth)
         return name
 
-    def keep(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+    def define_constant(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         writer.line(f"const auto {name} = {value};", depth)
         return name
 
@@ -121,7 +121,7 @@ class Registers(UnsplitLane):
     def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
         names = []
         for kind, value in values:
-            names.append(writer.new())
+            names.append(writer.new_name())
             writer.line(f"const auto {names[-1]} = {kind}_lanes({value});", depth)
         return [lambda j, x=x: f"of_drone({x}, {j})" for x in names]
 
@@ -150,13 +150,13 @@ class SharedMemory(UnsplitLane):
                 f"the drones of a world publish {size} bytes for each other, and a GPU's block has "
                 f"{SHARED_MEMORY_BYTES}"
             )
-        where = f"shared_{record}"
+        array = f"shared_{record}"
         numbers = ", ".join(values[k][1] for k in order)
         writer.line("__syncthreads();", depth)
-        writer.line(f"if (threadIdx.x < {self.lanes}) {where}[threadIdx.x] = {record}{{{numbers}}};", depth)
+        writer.line(f"if (threadIdx.x < {self.lanes}) {array}[threadIdx.x] = {record}{{{numbers}}};", depth)
         writer.line("__syncthreads();", depth)
         position = {k: n for n, k in enumerate(order)}
-        return [lambda j, n=position[k]: f"{where}[world + {j}].x{n}" for k in range(len(values))]
+        return [lambda j, n=position[k]: f"{array}[world + {j}].x{n}" for k in range(len(values))]
 
     @property
     def declarations(self) -> list[str]:
@@ -183,22 +183,22 @@ class HostMemory(Exchange):
     def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
         arrays = []
         for kind, value in values:
-            arrays.append(writer.new("g"))
-            self.keep(writer, arrays[-1], kind, value, depth)
+            arrays.append(writer.new_name("g"))
+            self.define_constant(writer, arrays[-1], kind, value, depth)
         for x, kind in live:
-            writer.names[x] = self.keep(writer, writer.new("m"), kind, writer.names[x], depth)
+            writer.names[x] = self.define_constant(writer, writer.new_name("m"), kind, writer.names[x], depth)
         self.close_loop(writer, depth - 1)
         self.open_loop(writer, depth - 1)
         writer.forget()
         return [lambda j, x=x: f"of_place(w.{x}, {j})" for x in arrays]
 
-    def variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+    def define_variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         self._fields.append(f"{kind}v {name}[VECTORS];")
         writer.line(f"w.{name}[v] = {kind}_lanes({value});", depth)
         return f"w.{name}[v]"
 
-    def keep(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
-        return self.variable(writer, name, kind, value, depth)
+    def define_constant(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+        return self.define_variable(writer, name, kind, value, depth)
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
         writer.line("SWEEP {", depth)
@@ -211,27 +211,27 @@ class HostMemory(Exchange):
         return ["struct World {", *(f"  {line}" for line in self._fields), "};"]
 
 
-def exchange_for(target: str, group: int) -> Exchange:
+def make_exchange(target: str, group_size: int) -> Exchange:
     """Return the way in which the drones of a world read each other's numbers on a target."""
     if target == "cuda":
-        return Registers() if group <= WARP_THREADS else SharedMemory(lanes_of_block(group)[1])
-    return Registers() if group <= MAX_IN_VECTOR else HostMemory()
+        return Registers() if group_size <= WARP_THREADS else SharedMemory(lanes_of_block(group_size)[1])
+    return Registers() if group_size <= MAX_IN_VECTOR else HostMemory()
 
 
-def lanes_of_block(group: int) -> tuple[int, int]:
+def lanes_of_block(group_size: int) -> tuple[int, int]:
     """Return the number of threads of a block on a GPU, and how many of them are lanes.
 
     A world of up to ``WARP_THREADS`` drones stays in one warp. For larger worlds, a block has the size of up to 256
     threads (more only if one world needs them) that leaves the smallest share of threads without a drone.
 
     Args:
-        group: Drones of a world that read each other's numbers.
+        group_size: Drones of a world that read each other's numbers.
     """
-    if group <= WARP_THREADS:
-        return BLOCK_SIZE, BLOCK_SIZE // WARP_THREADS * (WARP_THREADS // group * group)
-    min_threads = math.ceil(group / WARP_THREADS) * WARP_THREADS
+    if group_size <= WARP_THREADS:
+        return BLOCK_SIZE, BLOCK_SIZE // WARP_THREADS * (WARP_THREADS // group_size * group_size)
+    min_threads = math.ceil(group_size / WARP_THREADS) * WARP_THREADS
     sizes = range(min_threads, max(min_threads, 256) + 1, WARP_THREADS)
-    return max(((n, n // group * group) for n in sizes), key=lambda x: (round(x[1] / x[0], 2), -x[0]))
+    return max(((n, n // group_size * group_size) for n in sizes), key=lambda x: (round(x[1] / x[0], 2), -x[0]))
 
 
 def _size(record: str) -> int:

@@ -33,7 +33,7 @@ class Kernel:
     """Threads of a block on a GPU."""
     lanes: int = BLOCK_SIZE
     """Threads of a block that are lanes. If drones read each other's numbers, they make up whole worlds."""
-    group: int = 1
+    group_size: int = 1
     """Drones of a world that read each other's numbers."""
     state_bytes: int = 0
     """Memory in which a lane stores the state before a step, bytes; 0 for a kernel without backward pass. A kernel with
@@ -95,7 +95,7 @@ def make_kernel(
     inputs: tuple[int, ...],
     outputs: tuple[int, ...],
     in_place: tuple[int, ...] = (),
-    group: int = 1,
+    group_size: int = 1,
     in_memory: bool = False,
     n_stored: int | None = None,
 ) -> Kernel:
@@ -111,24 +111,24 @@ def make_kernel(
         inputs: Leaves that it reads.
         outputs: Leaves that it writes.
         in_place: Leaves that it updates in place.
-        group: Drones of a world that read each other's numbers.
+        group_size: Drones of a world that read each other's numbers.
         in_memory: True if the numbers of a world are in memory, only on the host.
         n_stored: Numbers that a lane stores for each step; None for a kernel without backward pass.
     """
-    threads, lanes = lanes_of_block(group)
+    threads, lanes = lanes_of_block(group_size)
     lines, body = "\n".join(shared), "\n".join(code)
     if target == "cuda":
         frame = _cuda(pointers, lines, body, n_stored is not None)
     else:
         frame = _host(pointers, lines, body, in_memory, n_stored is not None)
     widest = 8 if any("f64*" in pointer for pointer in pointers) else 4
-    defines = f"#define WIDEST {widest}\n#define GROUP {group}\n" + BLOCK_THREADS.format(threads)
+    defines = f"#define WIDEST {widest}\n#define GROUP {group_size}\n" + BLOCK_THREADS.format(threads)
     defines += f"#define OPERATIONS {sum(map(_n_operations, blocks))}\n"
-    before = "".join(f"{line}\n" for line in declared)
+    prefix = "".join(f"{line}\n" for line in declared)
     if n_stored is not None:
-        before = f"#define N_KEPT {n_stored}\n{_preamble(target + '_kept')}{before}"
-    text = defines + _preamble(target) + before + frame + _epilogue(target)
-    return Kernel(text, inputs, outputs, in_place, threads, lanes, group, (n_stored or 0) * widest)
+        prefix = f"#define N_KEPT {n_stored}\n{_preamble(target + '_kept')}{prefix}"
+    text = defines + _preamble(target) + prefix + frame + _epilogue(target)
+    return Kernel(text, inputs, outputs, in_place, threads, lanes, group_size, (n_stored or 0) * widest)
 
 
 def _n_operations(block: Block) -> int:
@@ -137,15 +137,15 @@ def _n_operations(block: Block) -> int:
     return len(block.operations) + sum(inner)
 
 
-def _cuda(pointers: Sequence[str], shared: str, body: str, keeps: bool) -> str:
+def _cuda(pointers: Sequence[str], shared: str, body: str, stores_states: bool) -> str:
     """Return the CUDA kernel: each thread computes the numbers that all lanes share once, and the rest for its lane.
 
     In a kernel with backward pass, a thread may process several lanes one after the other, to bound the memory.
     """
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
-    arguments = ", ".join([*scalars, *pointers, *(["Kept* __restrict__ kept"] if keeps else [])])
+    arguments = ", ".join([*scalars, *pointers, *(["Kept* __restrict__ kept"] if stores_states else [])])
     interval, loop = "", "const int first = blockIdx.x * BLOCK_LANES;"
-    if keeps:
+    if stores_states:
         loop = "for (int first = blockIdx.x * BLOCK_LANES; first < n_lanes; first += gridDim.x * BLOCK_LANES)"
         interval = ", interval = count[1]"
     return f"""
@@ -166,34 +166,34 @@ extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {ANY_NUMBER_OF_BLOCK
 """
 
 
-def _host(pointers: Sequence[str], shared: str, body: str, in_memory: bool, keeps: bool) -> str:
+def _host(pointers: Sequence[str], shared: str, body: str, in_memory: bool, stores_states: bool) -> str:
     """Return the function of a range of lanes: shared numbers are computed once, the rest per block of lanes."""
     n_in = sum(p.startswith("const") for p in pointers)
     buffers = [f"in[{k}]" if k < n_in else f"out[{k - n_in}]" for k in range(len(pointers))]
-    defined = []
+    definitions = []
     for pointer, buffer in zip(pointers, buffers, strict=True):
         kind, name = pointer.split("* __restrict__ ")
-        defined.append(f"  {kind}* __restrict__ const {name} = ({kind}*){buffer};")
-    pointed, memory, free = "\n".join(defined), "", ""
-    if keeps:  # the number of steps, which XLA passes before the inputs, is followed by the interval
+        definitions.append(f"  {kind}* __restrict__ const {name} = ({kind}*){buffer};")
+    pointed, memory, free_line = "\n".join(definitions), "", ""
+    if stores_states:  # the number of steps, which XLA passes before the inputs, is followed by the interval
         memory = """
   const int interval = ((int*)in[-1])[1];
   char* const kept = static_cast<char*>(ALLOCATE(KEPT_BYTES));
   if (kept == nullptr) return false;"""
-        free = "\n  free(kept);"
+        free_line = "\n  free(kept);"
     if in_memory:
         memory = """
   World* const memory = static_cast<World*>(ALLOCATE(sizeof(World)));
   if (memory == nullptr) return false;
   World& w = *memory;"""
-        free = "\n  free(memory);"
+        free_line = "\n  free(memory);"
     return f"""
 static bool advance_range(int64_t from, int64_t to, int64_t n_lanes, int n_steps, void** in, void** out) {{
 {pointed}{memory}
 {shared}
   {"EACH_WORLD" if in_memory else "EACH_BLOCK"} {{
 {body}
-  }}{free}
+  }}{free_line}
   return true;
 }}
 """

@@ -46,10 +46,10 @@ class Kernels:
             location: The devices.
         """
         self.program = program
-        self.inputs, self.outputs = kernel.needed_leaves(program), tuple(program.written)
+        self.inputs, self.outputs = kernel.needed_leaves(program), tuple(program.written_leaves)
         self._launches = {location.platform: self._compile(location)}
 
-    def on(self, platform: str) -> Launch:
+    def get_launch(self, platform: str) -> Launch:
         """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
             try:
@@ -66,8 +66,10 @@ class Kernels:
 
     def results(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
         """Return the shapes and types of the kernel's outputs: leaves, and flags of drones if there is a check."""
-        flags = [jax.ShapeDtypeStruct((n_worlds, self.program.n_drones), np.bool_)] if self.program.check else []
-        return [*(lanes.shape_of(self.program, i, n_worlds) for i in self.outputs), *flags]
+        flags = (
+            [jax.ShapeDtypeStruct((n_worlds, self.program.n_drones), np.bool_)] if self.program.check_segment else []
+        )
+        return [*(lanes.leaf_shape(self.program, i, n_worlds) for i in self.outputs), *flags]
 
 
 def _results(*args: Any, kernels: Kernels, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
@@ -76,7 +78,7 @@ def _results(*args: Any, kernels: Kernels, n_worlds: int) -> list[jax.ShapeDtype
 
 
 def _launch(platform: str, count: Array, *inputs: Array, kernels: Kernels, n_worlds: int) -> list[Array]:
-    launch = kernels.on(platform)
+    launch = kernels.get_launch(platform)
     return launch(n_worlds * kernels.program.n_drones, count, inputs, kernels.results(n_worlds))
 
 
@@ -117,28 +119,29 @@ class FusedRun:
         return self._run(leaves, n_steps)
 
 
-def build(program: Program, location: Location, in_leaves: Program | None = None) -> FusedRun:
+def build(program: Program, location: Location, unpacked_program: Program | None = None) -> FusedRun:
     """Compile a program to kernels, and return the function that runs them.
 
     Args:
         program: The program.
         location: Devices to compile it for.
-        in_leaves: The same program before ``pack_rows``, from which derivatives are computed, since kernels cannot
-            differentiate rows; None for a program without rows.
+        unpacked_program: The same program before ``pack_rows``, from which derivatives are computed, since kernels
+            cannot differentiate rows; None for a program without rows.
 
     Raises:
         UnsupportedError: If an operation or type has no source.
         KernelError: If the compiler refuses a kernel or takes too long.
     """
     kernels = Kernels(program, location) if program.fused else None
-    run = _split(program, location) if kernels is None else _one_kernel(kernels)
-    if in_leaves is not None:
+    run = _run_parts(program, location) if kernels is None else _one_kernel(kernels)
+    if unpacked_program is not None:
         return FusedRun(
-            make_differentiable(_over_batches(program, run), _run_without_rows(program, in_leaves, location)), kernels
+            make_differentiable(_make_batchable(program, run), _run_without_rows(program, unpacked_program, location)),
+            kernels,
         )
     on_lanes = lanes.build(program, location)
     derivatives = DERIVATIVE_KERNELS[program] = DerivativeKernels(program, location, on_lanes)
-    return FusedRun(make_differentiable(_over_batches(program, run), on_lanes, derivatives), kernels)
+    return FusedRun(make_differentiable(_make_batchable(program, run), on_lanes, derivatives), kernels)
 
 
 DERIVATIVE_KERNELS: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weakref.WeakKeyDictionary()
@@ -154,28 +157,28 @@ def describe(program: Program, platform: str, devices: Sequence[jax.Device] | No
 def describe_derivatives(program: Program) -> list[str]:
     """Return a line for each way in which derivatives of a program were computed so far."""
     derivatives = DERIVATIVE_KERNELS.get(program)
-    return [] if derivatives is None else list(derivatives.used)
+    return [] if derivatives is None else list(derivatives.descriptions)
 
 
-def _over_batches(program: Program, run: CountedRun) -> CountedRun:
+def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
     """Return a kernel call with a rule for ``jax.vmap``, which treats batches as further worlds."""
 
-    def batched(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
-        of_leaves, of_count = in_batched
+    def batching_rule(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
+        leaves_batched, count_batched = in_batched
         is_own = [leaf.scope in ("drone", "world") for leaf in program.leaves]
-        out_batched = ([True] * len(program.written), True)
-        if of_count or not program.fused or any(b and not o for b, o in zip(of_leaves, is_own, strict=True)):
+        out_batched = ([True] * len(program.written_leaves), True)
+        if count_batched or not program.fused or any(b and not o for b, o in zip(leaves_batched, is_own, strict=True)):
             # Shared parameters that differ between batches: one batch after the other.
-            full = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
-                    for x, b in zip(leaves, of_leaves, strict=True)]  # fmt: skip
-            counts = count if of_count else jnp.broadcast_to(count, (size,))
-            return jax.lax.map(lambda xs: run(*xs), (full, counts)), out_batched
+            broadcast_leaves = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
+                    for x, b in zip(leaves, leaves_batched, strict=True)]  # fmt: skip
+            counts = count if count_batched else jnp.broadcast_to(count, (size,))
+            return jax.lax.map(lambda xs: run(*xs), (broadcast_leaves, counts)), out_batched
 
         def join(x: Any, b: bool, in_rows: bool) -> Any:
             x = x if b else jnp.broadcast_to(x, (size, *x.shape))
             return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1) if in_rows else x.reshape(-1, *x.shape[2:])
 
-        def part(x: Any, in_rows: bool) -> Any:
+        def split(x: Any, in_rows: bool) -> Any:
             if in_rows:
                 return jnp.moveaxis(x.reshape(x.shape[0], size, -1), 1, 0)
             return x.reshape(size, -1, *x.shape[1:])
@@ -183,37 +186,39 @@ def _over_batches(program: Program, run: CountedRun) -> CountedRun:
         rows = [i in program.rows for i in range(len(leaves))]
         merged = [
             join(x, b, in_rows) if o and x is not None else x
-            for x, b, o, in_rows in zip(leaves, of_leaves, is_own, rows, strict=True)
+            for x, b, o, in_rows in zip(leaves, leaves_batched, is_own, rows, strict=True)
         ]
         written, flagged = run(merged, count)
         return (
-            [part(x, rows[i]) for i, x in zip(program.written, written, strict=True)],
-            part(flagged, False),
+            [split(x, rows[i]) for i, x in zip(program.written_leaves, written, strict=True)],
+            split(flagged, False),
         ), out_batched
 
-    return jaxcompat.batched_rule(run, batched)
+    return jaxcompat.batched_rule(run, batching_rule)
 
 
-def _run_without_rows(program: Program, in_leaves: Program, location: Location) -> Run:
+def _run_without_rows(program: Program, unpacked_program: Program, location: Location) -> Run:
     """Return a function that runs a program with rows by the same program without rows, compiled at the first call."""
-    built: list[Run] = []
+    built_runs: list[Run] = []
 
     def run(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-        built[:] = built or [build(in_leaves, location)]
+        built_runs[:] = built_runs or [build(unpacked_program, location)]
         row_leaves, unpacked = packed_rows(program), list(leaves)
         for rows in row_leaves:
             for i in rows.members:
                 unpacked[i] = rows.unpack(leaves[rows.leaf], i)
-        out, flagged = built[0](unpacked[: len(in_leaves.leaves)], n_steps)
-        after = replace_leaves(unpacked, in_leaves.written, out)
-        after = replace_leaves(after, [rows.leaf for rows in row_leaves], [rows.pack(after) for rows in row_leaves])
-        return [after[i] for i in program.written], flagged
+        results, flagged = built_runs[0](unpacked[: len(unpacked_program.leaves)], n_steps)
+        leaves_after = replace_leaves(unpacked, unpacked_program.written_leaves, results)
+        leaves_after = replace_leaves(
+            leaves_after, [rows.leaf for rows in row_leaves], [rows.pack(leaves_after) for rows in row_leaves]
+        )
+        return [leaves_after[i] for i in program.written_leaves], flagged
 
     return run
 
 
 def _one_kernel(kernels: Kernels) -> CountedRun:
-    return partial(_call, kernels)
+    return partial(_call_kernel, kernels)
 
 
 def _parts(program: Program) -> list[Program]:
@@ -221,56 +226,58 @@ def _parts(program: Program) -> list[Program]:
     return [program] if program.fused else list(program.parts())
 
 
-def _split(program: Program, location: Location) -> CountedRun:
+def _run_parts(program: Program, location: Location) -> CountedRun:
     """Return the run of a step that unfused stages split: in each phase, one kernel for the stages between them."""
     parts = _parts(program)
     with native.compiling_threads() as pool:
         runs = list(pool.map(lambda part: _one_kernel(Kernels(part, location)) if part.fused else None, parts))
-    by_phase: dict[Phase, list[Any]] = {
+    runs_by_phase: dict[Phase, list[Any]] = {
         phase: [(part, run) for part, run in zip(parts, runs, strict=True) if part.segments[0].phase == phase]
         for phase in PHASES
     }
-    in_loop = sorted({i for part, _ in by_phase["each"] for i in part.written})
+    in_loop = sorted({i for part, _ in runs_by_phase["each"] for i in part.written_leaves})
 
-    def after(phase: Phase, leaves: list[Any], count: Array) -> list[Any]:
-        for part, run in by_phase[phase]:
-            out, _ = lanes.steps(part, leaves, 1) if run is None else run(leaves, count)
-            leaves = replace_leaves(leaves, part.written, out)
+    def run_phase(phase: Phase, leaves: list[Any], count: Array) -> list[Any]:
+        for part, run in runs_by_phase[phase]:
+            results, _ = lanes.steps(part, leaves, 1) if run is None else run(leaves, count)
+            leaves = replace_leaves(leaves, part.written_leaves, results)
         return leaves
 
     def run(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-        once = jnp.asarray(1, jnp.int32)
-        leaves = after("before", leaves, once)
-        if [part.fused for part, _ in by_phase["each"]] == [True]:
-            leaves = after("each", leaves, count)
-        elif by_phase["each"]:
+        one_step = jnp.asarray(1, jnp.int32)
+        leaves = run_phase("before", leaves, one_step)
+        if [part.fused for part, _ in runs_by_phase["each"]] == [True]:
+            leaves = run_phase("each", leaves, count)
+        elif runs_by_phase["each"]:
 
             def body(_: Any, values: list[Any]) -> list[Any]:
-                stepped = after("each", replace_leaves(start, in_loop, values), once)
+                stepped = run_phase("each", replace_leaves(leaves_before, in_loop, values), one_step)
                 return [stepped[i] for i in in_loop]
 
-            start = leaves
-            leaves = replace_leaves(start, in_loop, jax.lax.fori_loop(0, count, body, [start[i] for i in in_loop]))
+            leaves_before = leaves
+            leaves = replace_leaves(
+                leaves_before, in_loop, jax.lax.fori_loop(0, count, body, [leaves_before[i] for i in in_loop])
+            )
         flagged = lanes.nonfinite_worlds(program, lanes.LeafValues(program, leaves))
-        leaves = after("after", leaves, once)
-        return [leaves[i] for i in program.written], flagged
+        leaves = run_phase("after", leaves, one_step)
+        return [leaves[i] for i in program.written_leaves], flagged
 
     return run
 
 
-def _call(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+def _call_kernel(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
     """Return the outputs of a kernel: leaves, and the worlds that are flagged."""
     program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, leaves)
     inputs = [_key_numbers(leaves[i]) for i in kernels.inputs]
-    out = launch_p.bind(count.reshape(1), *inputs, kernels=kernels, n_worlds=n_worlds)
+    results = launch_p.bind(count.reshape(1), *inputs, kernels=kernels, n_worlds=n_worlds)
     written = [
         jax.random.wrap_key_data(x) if jaxcompat.is_key(program.leaves[i]) else x
-        for i, x in zip(kernels.outputs, out[: len(kernels.outputs)], strict=True)
+        for i, x in zip(kernels.outputs, results[: len(kernels.outputs)], strict=True)
     ]
-    if not program.check:
+    if not program.check_segment:
         return written, jnp.zeros((n_worlds, 1), bool)
-    return written, out[-1] if n_drones == 1 else jnp.any(out[-1], axis=1, keepdims=True)
+    return written, results[-1] if n_drones == 1 else jnp.any(results[-1], axis=1, keepdims=True)
 
 
 def _key_numbers(x: Any) -> Array:

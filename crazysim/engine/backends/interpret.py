@@ -129,7 +129,7 @@ _PREPARED_BLOCKS: WeakKeyDictionary[Block, tuple[_Prepared, list[Any]]] = WeakKe
 def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _Prepared:
     """Prepare a block, and add its values to ``indices`` and its constants to ``constants``."""
 
-    def index_of(x: Any) -> int:
+    def get_index(x: Any) -> int:
         if isinstance(x, Value):
             if x not in indices:
                 indices[x] = len(constants)
@@ -138,15 +138,15 @@ def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _Pr
         constants.append(x)
         return len(constants) - 1
 
-    inputs = [index_of(x) for x in block.inputs]
+    inputs = [get_index(x) for x in block.inputs]
     calls = []
     for op in block.operations:
-        args = [index_of(x) for x in op.args]
+        args = [get_index(x) for x in op.args]
         blocks = [_prepare(inner, indices, constants) for inner in op.blocks]
-        results = [index_of(x) for x in op.results]
+        results = [get_index(x) for x in op.results]
         dtype = op.dtype if op.results else np.dtype(bool)
         calls.append(_Call(op, _numpy(op), args, results, dtype, blocks))
-    return _Prepared(inputs, calls, [index_of(x) for x in block.outputs])
+    return _Prepared(inputs, calls, [get_index(x) for x in block.outputs])
 
 
 def _numpy(op: Operation) -> Callable[..., Any] | None:
@@ -267,7 +267,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
         return lanes.steps(program, leaves, n_steps, call)
     n_worlds, _ = lanes.batch_counts(program, leaves)
     present = [i for i, x in enumerate(leaves) if x is not None]
-    written = [lanes.shape_of(program, i, n_worlds) for i in program.written]
+    written = [lanes.leaf_shape(program, i, n_worlds) for i in program.written_leaves]
     flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
 
     def run_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
@@ -280,7 +280,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
         out, flags = jax.pure_callback(run_arrays, (written, flagged), n_steps, *values, vmap_method="sequential")
     else:
         out, flags = run_arrays(n_steps, *values)
-    keys = [is_key(program.leaves[i]) for i in program.written]
+    keys = [is_key(program.leaves[i]) for i in program.written_leaves]
     return [jax.random.wrap_key_data(jnp.asarray(x)) if key else x for x, key in zip(out, keys, strict=True)], flags
 
 
@@ -291,7 +291,7 @@ def _steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.n
         lanes.run(program, now, "each", constants)
     flagged = lanes.nonfinite_worlds(program, now)
     lanes.run(program, now, "after", {})
-    return [np.ascontiguousarray(now.array(i)) for i in program.written], flagged
+    return [np.ascontiguousarray(now.array(i)) for i in program.written_leaves], flagged
 
 
 @contextlib.contextmanager
@@ -301,15 +301,15 @@ def flush_subnormals() -> Iterator[None]:
     if library is None:
         yield
         return
-    before = FloatEnvironment()
-    library.fegetenv(before)
-    inside = FloatEnvironment(*before)
-    inside[MXCSR_INDEX] |= FLUSH_BITS
-    library.fesetenv(inside)
+    saved = FloatEnvironment()
+    library.fegetenv(saved)
+    flushing = FloatEnvironment(*saved)
+    flushing[MXCSR_INDEX] |= FLUSH_BITS
+    library.fesetenv(flushing)
     try:
         yield
     finally:
-        library.fesetenv(before)
+        library.fesetenv(saved)
 
 
 @functools.cache

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from crazysim.core.stage import Phase
-from crazysim.engine.backends.exchange import exchange_for
+from crazysim.engine.backends.exchange import make_exchange
 from crazysim.engine.backends.frame import Kernel, make_kernel
 from crazysim.engine.backends.source import TYPE_NAMES, Writer, require_block_source, type_name
 from crazysim.engine.errors import UnsupportedError
@@ -34,10 +34,10 @@ def write(program: Program, target: str) -> Kernel:
     body.write_loop(hoisted)
     body.write_stores()
 
-    inputs, outputs, rank = needed_leaves(program), tuple(program.written), program.ranks
+    inputs, outputs, rank = needed_leaves(program), tuple(program.written_leaves), program.ranks
     pointers = [f"const {_type(program, i)}* __restrict__ p{rank[i]}" for i in inputs]
     pointers += [f"{_type(program, i)}* __restrict__ q{rank[i]}" for i in outputs]
-    pointers += ["b1* __restrict__ flagged"] if program.check is not None else []
+    pointers += ["b1* __restrict__ flagged"] if program.check_segment is not None else []
     in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
     return body.kernel(pointers, inputs, outputs, in_place, [s.block for s in body.step_segments])
 
@@ -47,7 +47,7 @@ class Body:
 
     def __init__(self, program: Program, target: str):
         self.program, self.target = program, target
-        self.exchange = exchange_for(target, program.group)
+        self.exchange = make_exchange(target, program.group_size)
         self.writer = Writer(self.exchange)
         self.step_segments = [s for s in program.fused_segments if s.phase == "each"]
         self.stored = _written_slots(program)
@@ -90,13 +90,13 @@ class Body:
             if slot in shared:
                 continue
             if slot in written:
-                start = access if slot in loaded else f"{kind}(0)"
-                self.starts[slot] = f"{kind}_lanes({start})"
-                names[slot] = exchange.variable(writer, names[slot], kind, self.starts[slot], self._depth)
+                initial = access if slot in loaded else f"{kind}(0)"
+                self.starts[slot] = f"{kind}_lanes({initial})"
+                names[slot] = exchange.define_variable(writer, names[slot], kind, self.starts[slot], self._depth)
             elif slot not in self.stored and slot in deferred:
                 names[slot] = access
             else:
-                names[slot] = exchange.keep(writer, names[slot], kind, access, self._depth)
+                names[slot] = exchange.define_constant(writer, names[slot], kind, access, self._depth)
         self._write_phase("before")
         hoisted = [self._write_hoisted(segment) for segment in self.step_segments]
         exchange.close_loop(writer, 1)
@@ -113,13 +113,13 @@ class Body:
 
     def write_stores(self) -> None:
         """Write the check, the stages after the steps, and the stores."""
-        program, writer, check = self.program, self.writer, self.program.check
+        program, writer, check = self.program, self.writer, self.program.check_segment
         self.exchange.open_loop(writer, 1)
         if check is not None:
             (flagged,) = writer.block(check.block, [self.names[slot] for slot in check.reads], self._depth)
             write_results(writer, "flagged", "b1", 1, [flagged], self._depth)
         self._write_phase("after")
-        for leaf in program.written:
+        for leaf in program.written_leaves:
             kind, pointer = _type(program, leaf), f"q{program.ranks[leaf]}"
             values = [self.names[leaf, k] for k in range(program.leaves[leaf].size)]
             if leaf in program.rows:
@@ -151,7 +151,7 @@ class Body:
         shared, code = self.writer.lines[: self._n_shared], self.writer.lines[self._n_shared :]
         return make_kernel(
             self.target, pointers, shared, code, blocks, [*self.writer.tables, *self.exchange.declarations],
-            inputs=inputs, outputs=outputs, in_place=in_place, group=self.program.group,
+            inputs=inputs, outputs=outputs, in_place=in_place, group_size=self.program.group_size,
             in_memory=self.exchange.depth > 0, n_stored=n_stored,
         )  # fmt: skip
 
@@ -160,15 +160,18 @@ class Body:
         program, segments = self.program, self.program.fused_segments
         written = dict.fromkeys(slot for s in segments for slot in program.per_drone(s, s.writes))
         read = dict.fromkeys(slot for s in segments for slot in [*program.per_drone(s, s.reads), *s.hoisted_reads])
-        checked = program.check.reads if program.check else ()
+        checked = program.check_segment.reads if program.check_segment else ()
         return written, dict.fromkeys([*read, *written, *checked, *self.stored])
 
     def _write_hoisted(self, segment: Segment) -> list[str]:
         """Write the hoisted block of a segment, and return the names of the results."""
-        writer, keep = self.writer, self.exchange.keep
+        writer, define_constant = self.writer, self.exchange.define_constant
         outs = writer.block(segment.hoisted, [self.names[slot] for slot in segment.hoisted_reads], self._depth)
         kinds = [type_name(x.dtype) for x in segment.hoisted.outputs]
-        return [keep(writer, writer.new("h"), kind, x, self._depth) for kind, x in zip(kinds, outs, strict=True)]
+        return [
+            define_constant(writer, writer.new_name("h"), kind, x, self._depth)
+            for kind, x in zip(kinds, outs, strict=True)
+        ]
 
     def _write_phase(self, phase: Phase) -> None:
         for segment in self.program.phase_segments(phase):
@@ -180,11 +183,11 @@ def require_source(program: Program) -> None:
     for segment in program.fused_segments:
         require_block_source(segment.hoisted)
         require_block_source(segment.block)
-        for i in {*segment.read, *segment.written}:
+        for i in {*segment.read_leaves, *segment.written_leaves}:
             leaf = program.leaves[i]
             if leaf.number_type not in TYPE_NAMES:
-                why = f"kernels have no numbers of type {leaf.number_type}, which {leaf.name} has"
-                raise UnsupportedError(why, stage=", ".join(segment.stages))
+                cause = f"kernels have no numbers of type {leaf.number_type}, which {leaf.name} has"
+                raise UnsupportedError(cause, stage=", ".join(segment.stages))
 
 
 def needed_leaves(program: Program) -> tuple[int, ...]:
@@ -194,34 +197,34 @@ def needed_leaves(program: Program) -> tuple[int, ...]:
 
 def _written_slots(program: Program) -> list[Slot]:
     """Return the numbers that a kernel writes: all numbers of each leaf that it writes to."""
-    return [(leaf, k) for leaf in program.written for k in range(program.leaves[leaf].size)]
+    return [(leaf, k) for leaf in program.written_leaves for k in range(program.leaves[leaf].size)]
 
 
 def _loaded_slots(program: Program) -> set[Slot]:
     """Return the slots to load: they may be used before a stage is certain to have written them."""
     loaded: set[Slot] = set()
-    known: set[Slot] = set()
+    written: set[Slot] = set()
 
-    def use(slots: Iterable[Slot]) -> None:
-        loaded.update(slot for slot in slots if slot not in known)
+    def use_slots(slots: Iterable[Slot]) -> None:
+        loaded.update(slot for slot in slots if slot not in written)
 
-    def run(segment: Segment) -> None:
-        use(program.per_drone(segment, segment.reads))
+    def run_segment(segment: Segment) -> None:
+        use_slots(program.per_drone(segment, segment.reads))
         drones: dict[Slot, int] = {}
         for (leaf, _), slot in zip(segment.writes, program.per_drone(segment, segment.writes), strict=True):
-            of_world = segment.scope == "world" and program.leaves[leaf].scope == "drone"
-            drones[slot] = drones.get(slot, 0) + (1 if of_world else program.n_drones)
-        known.update(slot for slot, n in drones.items() if n >= program.n_drones)
+            is_one_drone = segment.scope == "world" and program.leaves[leaf].scope == "drone"
+            drones[slot] = drones.get(slot, 0) + (1 if is_one_drone else program.n_drones)
+        written.update(slot for slot, n in drones.items() if n >= program.n_drones)
 
     for segment in program.phase_segments("before"):
-        run(segment)
+        run_segment(segment)
     for segment in program.phase_segments("each"):  # there may be no step
-        use([*program.per_drone(segment, [*segment.reads, *segment.writes]), *segment.hoisted_reads])
-    if program.check is not None:
-        use(program.check.reads)
+        use_slots([*program.per_drone(segment, [*segment.reads, *segment.writes]), *segment.hoisted_reads])
+    if program.check_segment is not None:
+        use_slots(program.check_segment.reads)
     for segment in program.phase_segments("after"):
-        run(segment)
-    use(_written_slots(program))
+        run_segment(segment)
+    use_slots(_written_slots(program))
     return loaded
 
 
@@ -242,22 +245,22 @@ def write_segment(
     if segment.scope == "world":  # the numbers of each drone are read from its lane
         for k, (leaf, number) in enumerate(segment.reads):
             if program.leaves[leaf].scope == "drone":
-                name = writer.new()
+                name = writer.new_name()
                 writer.line(f"const auto {name} = of_drone({inputs[k]}, {number // program.leaves[leaf].size});", depth)
                 inputs[k] = name
     outs = writer.block(segment.block, [*inputs, *constants], depth)
-    fresh = [writer.new() for _ in outs]
-    for name, out in zip(fresh, outs, strict=True):
-        writer.line(f"const auto {name} = {out};", depth)
-    for (leaf, number), slot, new in zip(
-        segment.writes, program.per_drone(segment, segment.writes), fresh, strict=True
+    new_names = [writer.new_name() for _ in outs]
+    for name, value in zip(new_names, outs, strict=True):
+        writer.line(f"const auto {name} = {value};", depth)
+    for (leaf, number), slot, new_name in zip(
+        segment.writes, program.per_drone(segment, segment.writes), new_names, strict=True
     ):
         kind, name = _type(program, leaf), names[slot]
         if segment.scope == "world" and program.leaves[leaf].scope == "drone":  # every lane computes all of them
             is_own_drone = f"eq_(own, i32({number // program.leaves[leaf].size}))"
-            writer.line(f"{name} = select_n_({is_own_drone}, {name}, {kind}_lanes({new}));", depth)
+            writer.line(f"{name} = select_n_({is_own_drone}, {name}, {kind}_lanes({new_name}));", depth)
         else:
-            writer.line(f"{name} = {kind}_lanes({new});", depth)
+            writer.line(f"{name} = {kind}_lanes({new_name});", depth)
 
 
 def _deferred_slots(program: Program) -> set[Slot]:
@@ -274,7 +277,7 @@ def _deferred_slots(program: Program) -> set[Slot]:
         at_each_step.update(segment.hoisted_reads)
         for x, slot in zip(block.inputs, program.per_drone(segment, segment.reads), strict=False):
             (at_each_step if segment.scope == "world" or x in used_now else below_rate).add(slot)
-    in_check = set(program.check.reads) if program.check is not None else set()
+    in_check = set(program.check_segment.reads) if program.check_segment is not None else set()
     return (below_rate ^ in_check) - at_each_step
 
 
@@ -287,7 +290,7 @@ def _load(program: Program, slot: Slot) -> str:
     if program.leaves[leaf].scope not in ("drone", "world"):
         return f"p{rank}[{k}]"
     if leaf in program.rows:
-        return f"LOAD_ROW({'q' if leaf in program.written else 'p'}{rank}, {k})"
+        return f"LOAD_ROW({'q' if leaf in program.written_leaves else 'p'}{rank}, {k})"
     return f"LOAD({program.leaves[leaf].size}, {_drones(program, leaf)}, p{rank}, {k})"
 
 

@@ -52,9 +52,9 @@ class LeafValues:
 
     def copy(self) -> LeafValues:
         """Return a copy that can be written to without changing this object."""
-        new = copy.copy(self)
-        new.arrays, new.vectors = dict(self.arrays), dict(self.vectors)
-        return new
+        values = copy.copy(self)
+        values.arrays, values.vectors = dict(self.arrays), dict(self.vectors)
+        return values
 
     @property
     def shape(self) -> tuple[int]:
@@ -81,7 +81,7 @@ class LeafValues:
         if leaf not in self.arrays:
             example = self.program.leaves[leaf]
             items = [self.vectors[leaf, k] for k in range(example.size)]
-            self.arrays[leaf] = self.library.stack(items) if example.rows_of else self._stack(leaf, items)
+            self.arrays[leaf] = self.library.stack(items) if example.row_leaves else self._stack(leaf, items)
         return self.arrays[leaf]
 
     def _stack(self, leaf: int, items: list[Any]) -> Any:
@@ -100,7 +100,7 @@ class LeafValues:
     def _split(self, leaf: int) -> None:
         x, example = self.arrays[leaf], self.program.leaves[leaf]
         size = example.size
-        if example.rows_of or x is None:  # a leaf of None is written before it is read
+        if example.row_leaves or x is None:  # a leaf of None is written before it is read
             self.vectors.update(((leaf, k), self.library.zeros(self.shape) if x is None else x[k]) for k in range(size))
             return
         if is_key(x):
@@ -113,16 +113,16 @@ class LeafValues:
 
 
 def batch_counts(program: Program, leaves: list[Any]) -> tuple[int, int]:
-    """Return the numbers of worlds and of drones per world; within a mesh, those of this device."""
+    """Return the numbers of worlds and of drones per world; within a mesh, the numbers on this device."""
     drone = next(
         i
         for i, (leaf, x) in enumerate(zip(program.leaves, leaves, strict=True))
-        if leaf.scope == "drone" and x is not None and not leaf.rows_of
+        if leaf.scope == "drone" and x is not None and not leaf.row_leaves
     )
     return leaves[drone].shape[0], leaves[drone].shape[1]
 
 
-def shape_of(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct:
+def leaf_shape(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct:
     """Return the shape and type of a leaf that a program writes, for all worlds; random keys as integers."""
     example = program.leaves[leaf]
     shape = (n_worlds, *example.shape[1:])
@@ -197,8 +197,8 @@ def _run_worlds(segment: Segment, values: LeafValues) -> None:
 
 
 def _run_unfused(stage: UnfusedStage, values: LeafValues) -> None:
-    after = jaxcompat.jaxpr_as_fun(stage.jaxpr)(*(values.array(i) for i in stage.used))
-    for i, value in zip(stage.written, after, strict=True):
+    outputs = jaxcompat.jaxpr_as_fun(stage.jaxpr)(*(values.array(i) for i in stage.input_leaves))
+    for i, value in zip(stage.written_leaves, outputs, strict=True):
         values.set_array(i, value)
 
 
@@ -220,40 +220,40 @@ def steps(
         n_steps: Number of steps.
         execute: Function that runs blocks.
     """
-    start = LeafValues(program, leaves, execute)
-    constants = prepare(program, start)
+    initial_values = LeafValues(program, leaves, execute)
+    constants = prepare(program, initial_values)
     segments = program.phase_segments("each")
-    carried_leaves = sorted({i for s in segments if isinstance(s, UnfusedStage) for i in s.written})
+    carried_leaves = sorted({i for s in segments if isinstance(s, UnfusedStage) for i in s.written_leaves})
     fused = [s for s in segments if isinstance(s, Segment)]
     written_slots = {slot for s in fused for slot in program.per_drone(s, s.writes)}
     carried_slots = sorted(slot for slot in written_slots if slot[0] not in carried_leaves)
 
     def advance(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
-        values = values_of(carry)
+        values = unpack_carry(carry)
         run(program, values, "each", constants)
         return [values.get(slot) for slot in carried_slots], [values.array(leaf) for leaf in carried_leaves]
 
-    def values_of(carry: tuple[list[Any], list[Any]]) -> LeafValues:
-        values = start.copy()
+    def unpack_carry(carry: tuple[list[Any], list[Any]]) -> LeafValues:
+        values = initial_values.copy()
         for slot, value in zip(carried_slots, carry[0], strict=True):
             values.set(slot, value)
         for leaf, value in zip(carried_leaves, carry[1], strict=True):
             values.set_array(leaf, value)
         return values
 
-    carry = ([jnp.broadcast_to(start.get(slot), start.shape) for slot in carried_slots],
-             [start.array(leaf) for leaf in carried_leaves])  # fmt: skip
+    carry = ([jnp.broadcast_to(initial_values.get(slot), initial_values.shape) for slot in carried_slots],
+             [initial_values.array(leaf) for leaf in carried_leaves])  # fmt: skip
     for segment in fused:  # leaves that are only read are split into vectors once, outside the loop
         for slot in program.per_drone(segment, segment.reads):
-            start.get(slot)
+            initial_values.get(slot)
     if isinstance(n_steps, int):
         carry = repeat(advance, carry, n_steps)
     else:
         carry = jax.lax.fori_loop(0, n_steps, lambda _, c: advance(c), carry)
-    end = values_of(carry)
-    flagged = nonfinite_worlds(program, end)
-    run(program, end, "after", {})
-    return [end.array(i) for i in program.written], flagged
+    final_values = unpack_carry(carry)
+    flagged = nonfinite_worlds(program, final_values)
+    run(program, final_values, "after", {})
+    return [final_values.array(i) for i in program.written_leaves], flagged
 
 
 def repeat(iterate: Callable[[Any], Any], carry: Any, n: int) -> Any:
@@ -278,7 +278,7 @@ def repeat(iterate: Callable[[Any], Any], carry: Any, n: int) -> Any:
 
 def nonfinite_worlds(program: Program, values: LeafValues) -> Array:
     """Return True for worlds that were flagged before or have a watched value that is not finite. (n_worlds, 1)"""
-    check = program.check
+    check = program.check_segment
     if check is None:
         return values.library.zeros((values.n_worlds, 1), bool)
     (flagged,) = values.execute(check.block, [values.get(slot) for slot in check.reads], values.shape)

@@ -110,13 +110,13 @@ class HostLaunch:
 @functools.cache
 def compiler() -> str | None:
     """Return the C++ compiler: CXX if it is set, else g++, clang++ or zig; None without any."""
-    chosen = _words("CXX")
-    if not chosen:
+    words = _words("CXX")
+    if not words:
         return next((path for name in ("g++", "clang++") if (path := shutil.which(name))), None) or _zig()
-    path = shutil.which(chosen[0])
+    path = shutil.which(words[0])
     if path is None:
         raise ConfigError(f"expected a C++ compiler in CXX, got {os.environ['CXX']!r}. Install it, or unset CXX.")
-    return shlex.join([os.path.abspath(path), *chosen[1:]])
+    return shlex.join([os.path.abspath(path), *words[1:]])
 
 
 def _zig() -> str | None:
@@ -216,17 +216,17 @@ def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
         library = _load_library(path)
         if library is not None:
             return library
-    made, lost = _compile(words, source), None
-    for where in dict.fromkeys((cache_folder, kernel_cache.temporary())):  # code in the first may not be executable
+    content, problem = _compile(words, source), None
+    for folder in dict.fromkeys((cache_folder, kernel_cache.temporary())):  # code in the first may not be executable
         try:
-            library = _load_library(kernel_cache.store(where, key, made, ".so"))
+            library = _load_library(kernel_cache.store(folder, key, content, ".so"))
         except OSError as error:
-            lost = f"the kernel that {words[0]} compiled cannot be written: {error}; make room, or set TMPDIR"
+            problem = f"the kernel that {words[0]} compiled cannot be written: {error}; make room, or set TMPDIR"
             continue
         if library is not None:
             return library
     raise KernelError(
-        lost or f"the kernel that {words[0]} compiled cannot be loaded; check that it compiles for this machine"
+        problem or f"the kernel that {words[0]} compiled cannot be loaded; check that it compiles for this machine"
     )
 
 
@@ -253,10 +253,10 @@ def _compile(words: Sequence[str], source: str) -> bytes:
         work, library = Path(name), Path(name) / "kernel.so"
         try:
             (work / "kernel.cpp").write_text(source)
-            done = _run([*words, str(work / "kernel.cpp"), "-o", str(library)], work, seconds)
-            if done.returncode:
+            process = _run([*words, str(work / "kernel.cpp"), "-o", str(library)], work, seconds)
+            if process.returncode:
                 _check_settings(work)
-                raise KernelError(f"{words[0]} refused the kernel: {done.stderr.strip()[:2000]}")
+                raise KernelError(f"{words[0]} refused the kernel: {process.stderr.strip()[:2000]}")
             return library.read_bytes()
         except OSError as error:
             raise KernelError(f"{words[0]} left no library: {error}") from error
@@ -270,15 +270,15 @@ def _check_settings(work: Path) -> None:
     """
     (work / "empty.cpp").write_text("")
 
-    def error(options: bool) -> str:
+    def compile_empty_file(options: bool) -> str:
         words = [*compiler_command(options), str(work / "empty.cpp"), "-o", str(work / "empty.so")]
-        done = _run(words, work, time_limit())
-        return (done.stderr.strip()[:500] or f"exit status {done.returncode}") if done.returncode else ""
+        process = _run(words, work, time_limit())
+        return (process.stderr.strip()[:500] or f"exit status {process.returncode}") if process.returncode else ""
 
-    message = error(options=True)
+    message = compile_empty_file(options=True)
     if not message:
         return
-    variable = "CXX" if error(options=False) else "CXXFLAGS"
+    variable = "CXX" if compile_empty_file(options=False) else "CXXFLAGS"
     if os.environ.get(variable):
         raise ConfigError(
             f"expected a C++ compiler and options that it accepts, got {variable}={os.environ[variable]!r}: {message}. "
@@ -293,13 +293,13 @@ def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
     Args:
         n: Number of threads; None for the default.
     """
-    with ThreadPoolExecutor(n) as pool:
+    with ThreadPoolExecutor(n) as executor:
         try:
-            yield pool
+            yield executor
         except (KeyboardInterrupt, SystemExit):
-            pool.shutdown(wait=False, cancel_futures=True)
-            for alive in list(_COMPILER_PIPES):
-                alive.close()
+            executor.shutdown(wait=False, cancel_futures=True)
+            for pipe in list(_COMPILER_PIPES):
+                pipe.close()
             raise
 
 
@@ -318,24 +318,24 @@ def _run(words: Sequence[str], work: Path, seconds: float, cwd: str | None = Non
     """
     pipe = subprocess.PIPE
     reader, writer = os.pipe()
-    with os.fdopen(reader) as watched, os.fdopen(writer, "w") as alive:
+    with os.fdopen(reader) as read_end, os.fdopen(writer, "w") as write_end:
         try:
             process = subprocess.Popen(
-                ["/bin/sh", "-c", KILLING_SCRIPT, "sh", *words], stdin=watched, stdout=pipe, stderr=pipe, text=True,
+                ["/bin/sh", "-c", KILLING_SCRIPT, "sh", *words], stdin=read_end, stdout=pipe, stderr=pipe, text=True,
                 start_new_session=True, cwd=cwd, env=os.environ | dict.fromkeys(TEMPORARY_FOLDER_VARIABLES, str(work)),
             )  # fmt: skip
         except OSError as error:
             raise KernelError(f"{words[0]} cannot be run: {error}") from error
         with process:
-            _COMPILER_PIPES.add(alive)
+            _COMPILER_PIPES.add(write_end)
             try:
-                out, err = process.communicate(timeout=seconds)
+                stdout, stderr = process.communicate(timeout=seconds)
             except subprocess.TimeoutExpired:
                 raise KernelError(
                     f"{words[0]} took longer than {seconds:g} s; set CRAZYSIM_COMPILE_TIMEOUT to a larger number of "
                     f"seconds"
                 ) from None
             finally:
-                _COMPILER_PIPES.discard(alive)
-                alive.close()
-    return subprocess.CompletedProcess(list(words), process.returncode, out, err)
+                _COMPILER_PIPES.discard(write_end)
+                write_end.close()
+    return subprocess.CompletedProcess(list(words), process.returncode, stdout, stderr)

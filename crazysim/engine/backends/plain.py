@@ -34,36 +34,36 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
     """
     axes = Axes(data)
 
-    def single(leaves: list[Any], phase: Phase) -> list[Any]:
+    def run_phase(leaves: list[Any], phase: Phase) -> list[Any]:
         for stage in [stage for stage in stages if stage.phase == phase]:
             with jax.named_scope(stage.__name__):
-                after = stage(axes.treedef.unflatten(leaves))
-                written = axes.written(leaves, after, stage)
-                new = jax.tree.leaves(after)
+                data_after = stage(axes.treedef.unflatten(leaves))
+                written = axes.written_leaves(leaves, data_after, stage)
+                new_leaves = jax.tree.leaves(data_after)
                 # Without the barrier, XLA's CPU backend recomputes these values for each result of a later stage.
-                leaves = replace_leaves(leaves, written, jax.lax.optimization_barrier([new[i] for i in written]))
+                leaves = replace_leaves(leaves, written, jax.lax.optimization_barrier([new_leaves[i] for i in written]))
         return leaves
 
-    jaxprs = {phase: jax.make_jaxpr(single, static_argnums=1)(jax.tree.leaves(data), phase) for phase in PHASES}
-    run = {phase: jaxcompat.jaxpr_as_fun(jaxpr) for phase, jaxpr in jaxprs.items()}  # the stages are traced once
+    jaxprs = {phase: jax.make_jaxpr(run_phase, static_argnums=1)(jax.tree.leaves(data), phase) for phase in PHASES}
+    run_jaxprs = {phase: jaxcompat.jaxpr_as_fun(jaxpr) for phase, jaxpr in jaxprs.items()}  # the stages are traced once
     written = {phase: _changed_leaves(jaxpr) for phase, jaxpr in jaxprs.items()}
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-        leaves = run["before"](*leaves)
+        leaves = run_jaxprs["before"](*leaves)
         in_loop = written["each"]
 
         def advance(values: list[Any]) -> list[Any]:
-            after = run["each"](*replace_leaves(leaves, in_loop, values))
-            return [after[i] for i in in_loop]
+            leaves_after = run_jaxprs["each"](*replace_leaves(leaves, in_loop, values))
+            return [leaves_after[i] for i in in_loop]
 
-        out = [leaves[i] for i in in_loop]
+        loop_values = [leaves[i] for i in in_loop]
         if in_loop and isinstance(n_steps, int):
-            out, _ = jax.lax.scan(lambda x, _: (advance(x), None), out, length=n_steps)
+            loop_values, _ = jax.lax.scan(lambda x, _: (advance(x), None), loop_values, length=n_steps)
         elif in_loop:
-            out = jax.lax.fori_loop(0, n_steps, lambda _, x: advance(x), out)
-        leaves = replace_leaves(leaves, in_loop, out)
+            loop_values = jax.lax.fori_loop(0, n_steps, lambda _, x: advance(x), loop_values)
+        leaves = replace_leaves(leaves, in_loop, loop_values)
         flagged = nonfinite_worlds(axes.treedef.unflatten(leaves))
-        leaves = run["after"](*leaves)
+        leaves = run_jaxprs["after"](*leaves)
         return [leaves[i] for i in written_leaves], flagged
 
     scratch = {i for i, x in enumerate(jax.tree.leaves(leaf_flags(data, "scratch"))) if x}
@@ -97,7 +97,7 @@ class Reset:
             mask: True in the worlds to reset; None for all. (n_worlds,)
         """
         mask = as_mask(mask, data.core.steps.shape[:1])
-        with keep_programs(when=not self._cache_size()):
+        with keep_programs(enabled=not self._cache_size()):
             return self._compiled(data, default_data, mask)
 
     def plain(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:

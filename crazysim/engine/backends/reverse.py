@@ -35,25 +35,25 @@ class ReverseProgram:
     """Number of its leaves without cotangents."""
     perturbed: tuple[int, ...]
     """Leaves whose cotangents are computed."""
-    back: dict[Segment, Segment]
+    backward: dict[Segment, Segment]
     """Segments of the backward pass, by the forward segment."""
-    back_hoisted: dict[Segment, Segment]
+    backward_hoisted: dict[Segment, Segment]
     """The same for hoisted blocks."""
-    carried: tuple[Slot, ...]
+    carry: tuple[Slot, ...]
     """State of the loop over the steps: numbers that a step uses and that steps change."""
     read_back: frozenset[Slot]
-    """Members of ``carried`` that the backward pass through a step needs."""
+    """Members of ``carry`` that the backward pass through a step needs."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
         """Leaves with given cotangents: the floats that the program writes."""
-        return tuple(i for i in self.program.written if self.program.leaves[i].number_type.kind == "f")
+        return tuple(i for i in self.program.written_leaves if self.program.leaves[i].number_type.kind == "f")
 
     def slots(self) -> list[Slot]:
         """Return the slots of all cotangents."""
         numbers = [(i, k) for i in {*self.seeds, *self.perturbed} for k in range(self.program.leaves[i].size)]
         ct_slots = {(self.n_leaves + i, k) for i, k in numbers}
-        for s in (*self.back.values(), *self.back_hoisted.values()):
+        for s in (*self.backward.values(), *self.backward_hoisted.values()):
             slots = self.program.per_drone(s, [*s.reads, *s.writes])
             ct_slots.update(slot for slot in slots if slot[0] >= self.n_leaves)
         return sorted(ct_slots)
@@ -74,25 +74,29 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number_type) for x in program.leaves]
     step_segments = [s for s in program.fused_segments if s.phase == "each"]
     hoisted = [
-        Leaf("cotangents of hoisted numbers", "drone", (1, 1, len(s.hoisted.outputs)), _float_of(s.hoisted))
+        Leaf("cotangents of hoisted numbers", "drone", (1, 1, len(s.hoisted.outputs)), _float_type(s.hoisted))
         for s in step_segments
     ]
     extended = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
     changed, constants = changed_slots(program, perturbed)
-    back = {}
+    backward = {}
     for s in program.fused_segments:
-        where = 2 * n + step_segments.index(s) if s in step_segments else -1
-        back[s] = _back(extended, n, s, changed, constants.get(s, ()), where)
-    back_hoisted = {
-        s: _back_hoisted(n, s, changed, constants[s], 2 * n + k) for k, s in enumerate(step_segments) if constants[s]
+        constant_leaf = 2 * n + step_segments.index(s) if s in step_segments else -1
+        backward[s] = _reverse_segment(extended, n, s, changed, constants.get(s, ()), constant_leaf)
+    backward_hoisted = {
+        s: _reverse_hoisted(n, s, changed, constants[s], 2 * n + k) for k, s in enumerate(step_segments) if constants[s]
     }
-    read = {slot for s in step_segments for slot in program.per_drone(s, [*s.reads, *s.writes])}
+    used_by_steps = {slot for s in step_segments for slot in program.per_drone(s, [*s.reads, *s.writes])}
     changing = program.changing_slots()
     if len(step_segments) == 1 and step_segments[0].scope == "drone":
-        read = set(step_segments[0].reads)
-    carried = tuple(sorted(read & changing))
-    used = {slot for s in (*(back[s] for s in step_segments), *step_segments[:-1]) for slot in _used_slots(extended, s)}
-    return ReverseProgram(extended, n, perturbed, back, back_hoisted, carried, frozenset(used.intersection(carried)))
+        used_by_steps = set(step_segments[0].reads)
+    carry = tuple(sorted(used_by_steps & changing))
+    read_back = {
+        slot for s in (*(backward[s] for s in step_segments), *step_segments[:-1]) for slot in _used_slots(extended, s)
+    }
+    return ReverseProgram(
+        extended, n, perturbed, backward, backward_hoisted, carry, frozenset(read_back.intersection(carry))
+    )
 
 
 def _used_slots(program: Program, s: Segment) -> list[Slot]:
@@ -101,91 +105,95 @@ def _used_slots(program: Program, s: Segment) -> list[Slot]:
     return [slot for x, slot in zip(s.block.inputs, slots, strict=False) if x in used]
 
 
-def _float_of(block: Block) -> np.dtype:
+def _float_type(block: Block) -> np.dtype:
     """Return the type of the floats of a block; all floats of a program have the same type."""
     return next((x.dtype for x in block.outputs if x.dtype.kind == "f"), np.dtype(np.float32))
 
 
-def _back(program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int], where: int) -> Segment:
+def _reverse_segment(
+    program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int], constant_leaf: int
+) -> Segment:
     """Return the segment that replaces the cotangents after a segment by the cotangents before it.
 
     In a segment of worlds, each drone has its own cotangents of the world's numbers. The returned segment sums the
     cotangents of the numbers that are written over the drones, and adds its results to the copy of the first drone.
     """
-    n_drones, of_world = program.n_drones, s.scope == "world"
+    n_drones, is_world_segment = program.n_drones, s.scope == "world"
     reads = program.per_drone(s, s.reads)
-    wanted = [k for k, (x, slot) in enumerate(zip(s.block.inputs, reads, strict=False))
+    input_indices = [k for k, (x, slot) in enumerate(zip(s.block.inputs, reads, strict=False))
               if slot in changed and x.dtype.kind == "f" and not x.size]  # fmt: skip
-    wanted_constants = [len(reads) + k for k in constants]
+    constant_indices = [len(reads) + k for k in constants]
     outs = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
-    pull = transpose_block(s.block, [s.block.inputs[k] for k in (*wanted, *wanted_constants)])
+    pullback = transpose_block(s.block, [s.block.inputs[k] for k in (*input_indices, *constant_indices)])
     n_inputs = len(s.block.inputs)
 
-    def copies(slot: Slot) -> list[Slot]:
+    def cotangent_slots(slot: Slot) -> list[Slot]:
         """Return the slots of the cotangents of a number.
 
         In a segment of worlds, a number that drones share has one for each drone. Every other number has one.
         """
         i, k = slot
-        if not of_world or program.leaves[i].scope == "drone":
+        if not is_world_segment or program.leaves[i].scope == "drone":
             return [(n + i, k)]
         return [(n + i, d * program.leaves[i].size + k) for d in range(n_drones)]
 
     builder = Builder(stage=f"gradient of {', '.join(s.stages)}")
-    before: dict[Slot, Value] = {}
-    now: dict[Slot, object] = {}
+    ct_inputs: dict[Slot, Value] = {}
+    ct_outputs: dict[Slot, object] = {}
 
-    def read(slot: Slot, dtype: np.dtype) -> Value:
-        if slot not in before:
-            before[slot] = builder.input(dtype)
-        return before[slot]
+    def read_cotangent(slot: Slot, dtype: np.dtype) -> Value:
+        if slot not in ct_inputs:
+            ct_inputs[slot] = builder.input(dtype)
+        return ct_inputs[slot]
 
-    def total(slot: Slot, dtype: np.dtype) -> object:
-        sums = [read(c, dtype) for c in copies(slot)]
-        out: object = sums[0]
+    def sum_copies(slot: Slot, dtype: np.dtype) -> object:
+        sums = [read_cotangent(c, dtype) for c in cotangent_slots(slot)]
+        result: object = sums[0]
         for x in sums[1:]:
-            out = builder.add("add", (out, x), dtype)
-        return out
+            result = builder.add("add", (result, x), dtype)
+        return result
 
     primal = [builder.input(x.dtype, x.size) for x in s.block.inputs]
-    seeds = [total(s.writes[k], s.block.outputs[k].dtype) for k in outs]
-    parts = inline(builder, pull, dict(zip(pull.inputs, [*primal, *seeds], strict=True)))
+    seeds = [sum_copies(s.writes[k], s.block.outputs[k].dtype) for k in outs]
+    parts = inline(builder, pullback, dict(zip(pullback.inputs, [*primal, *seeds], strict=True)))
     for k in outs:  # a segment overwrites these numbers, so the outputs do not depend on their old values directly
         zero = constant(0, s.block.outputs[k].dtype)
-        now.update(dict.fromkeys(copies(s.writes[k]), zero))
-    for k, part in zip(wanted, parts, strict=False):
-        ct_slot, dtype = copies(s.reads[k])[0], s.block.inputs[k].dtype
-        old = now[ct_slot] if ct_slot in now else read(ct_slot, dtype)
-        now[ct_slot] = builder.add("add", (old, part), dtype)
-    for k, part in zip(constants, parts[len(wanted) :], strict=True):
-        ct_slot, dtype = (where, k), s.block.inputs[len(reads) + k].dtype
-        now[ct_slot] = builder.add("add", (read(ct_slot, dtype), part), dtype)
-    first_inputs, fixed = primal[: len(reads)], primal[len(reads) : n_inputs]
-    block = Block((*first_inputs, *before.values(), *fixed), tuple(builder.operations), tuple(now.values()))
-    return Segment(s.scope, s.stages, s.phase, block, (*s.reads, *before), tuple(now))
+        ct_outputs.update(dict.fromkeys(cotangent_slots(s.writes[k]), zero))
+    for k, part in zip(input_indices, parts, strict=False):
+        ct_slot, dtype = cotangent_slots(s.reads[k])[0], s.block.inputs[k].dtype
+        old_ct = ct_outputs[ct_slot] if ct_slot in ct_outputs else read_cotangent(ct_slot, dtype)
+        ct_outputs[ct_slot] = builder.add("add", (old_ct, part), dtype)
+    for k, part in zip(constants, parts[len(input_indices) :], strict=True):
+        ct_slot, dtype = (constant_leaf, k), s.block.inputs[len(reads) + k].dtype
+        ct_outputs[ct_slot] = builder.add("add", (read_cotangent(ct_slot, dtype), part), dtype)
+    first_inputs, constant_inputs = primal[: len(reads)], primal[len(reads) : n_inputs]
+    block = Block(
+        (*first_inputs, *ct_inputs.values(), *constant_inputs), tuple(builder.operations), tuple(ct_outputs.values())
+    )
+    return Segment(s.scope, s.stages, s.phase, block, (*s.reads, *ct_inputs), tuple(ct_outputs))
 
 
-def _back_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence[int], where: int) -> Segment:
+def _reverse_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence[int], constant_leaf: int) -> Segment:
     """Return the segment that passes the cotangents of hoisted numbers to the inputs of the hoisted block."""
     reads = s.hoisted_reads
-    wanted = [k for k, (x, slot) in enumerate(zip(s.hoisted.inputs, reads, strict=True))
+    input_indices = [k for k, (x, slot) in enumerate(zip(s.hoisted.inputs, reads, strict=True))
               if slot in changed and x.dtype.kind == "f"]  # fmt: skip
-    pull = transpose_block(s.hoisted, [s.hoisted.inputs[k] for k in wanted])
+    pullback = transpose_block(s.hoisted, [s.hoisted.inputs[k] for k in input_indices])
     builder = Builder(stage=f"gradient of {', '.join(s.stages)}")
     primal = [builder.input(x.dtype, x.size) for x in s.hoisted.inputs]
     seeds, ct_slots = [], []
     for k, x in enumerate(s.hoisted.outputs):
         if x.dtype.kind == "f" and k in constants:
             seeds.append(builder.input(x.dtype))
-            ct_slots.append((where, k))
+            ct_slots.append((constant_leaf, k))
         elif x.dtype.kind == "f":
             seeds.append(constant(0, x.dtype))
-    old = [builder.input(s.hoisted.inputs[k].dtype) for k in wanted]
+    old_cts = [builder.input(s.hoisted.inputs[k].dtype) for k in input_indices]
     cts = [x for x in seeds if isinstance(x, Value)]
-    parts = inline(builder, pull, dict(zip(pull.inputs, [*primal, *seeds], strict=True)))
-    sums = [builder.add("add", (a, b), a.dtype) for a, b in zip(old, parts, strict=True)]
-    targets = tuple((n + reads[k][0], reads[k][1]) for k in wanted)
-    block = Block((*primal, *cts, *old), tuple(builder.operations), tuple(sums))
+    parts = inline(builder, pullback, dict(zip(pullback.inputs, [*primal, *seeds], strict=True)))
+    sums = [builder.add("add", (a, b), a.dtype) for a, b in zip(old_cts, parts, strict=True)]
+    targets = tuple((n + reads[k][0], reads[k][1]) for k in input_indices)
+    block = Block((*primal, *cts, *old_cts), tuple(builder.operations), tuple(sums))
     return Segment("drone", s.stages, "each", block, (*reads, *ct_slots, *targets), targets)
 
 
@@ -205,11 +213,11 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         target: ``"cuda"`` or ``"host"``.
     """
     program, n = reverse.program, reverse.n_leaves
-    if target == "host" and program.group > MAX_IN_VECTOR:
+    if target == "host" and program.group_size > MAX_IN_VECTOR:
         raise LimitError(
             f"gradients of worlds of more than {MAX_IN_VECTOR} drones that act on each other have no kernel"
         )
-    checked = dataclasses.replace(program, segments=(*program.segments, *reverse.back.values()))
+    checked = dataclasses.replace(program, segments=(*program.segments, *reverse.backward.values()))
     kernel.require_source(checked)
     body = Body(program, target)
     writer, rank = body.writer, program.ranks
@@ -233,53 +241,55 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         writer.line(f"auto {name} = {kind((i, k))}_lanes({seed});", 1)
         names[i, k] = name
 
-    carried = reverse.carried
-    types = [type_name(program.leaves[i].number_type) for i, _ in carried]
+    carry = reverse.carry
+    types = [type_name(program.leaves[i].number_type) for i, _ in carry]
 
-    def keep(state: str, slots: Collection[Slot], depth: int) -> None:
-        for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
+    def write_states(state: str, slots: Collection[Slot], depth: int) -> None:
+        for k, (slot, t) in enumerate(zip(carry, types, strict=True)):
             if slot in slots:
                 writer.line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
 
-    last, step_segments, first = (program.phase_segments(phase) for phase in ("after", "each", "before"))
+    last_segments, step_segments, first_segments = (
+        program.phase_segments(phase) for phase in ("after", "each", "before")
+    )
     writer.line("const int n_intervals = n_steps > 0 ? (n_steps + interval - 1) / interval : 1;", 1)
     writer.line("for (int turn = 0; turn < 2 * n_intervals - 1; ++turn) {", 1)
     writer.line("const bool back = turn >= n_intervals - 1;", 2)
     writer.line("const int part = back ? 2 * (n_intervals - 1) - turn : turn;", 2)
     writer.line("const int n_here = n_steps - part * interval < interval ? n_steps - part * interval : interval;", 2)
     writer.line("if (turn < n_intervals) {", 2)
-    keep("interval + part", carried, 3)
+    write_states("interval + part", carry, 3)
     writer.line("}", 2)
     writer.line("for (int step = 0; step < n_here; ++step) {", 2)
-    keep("step", reverse.read_back, 3)
-    if not last:  # without stages after the steps, the result of the last step is not needed
+    write_states("step", reverse.read_back, 3)
+    if not last_segments:  # without stages after the steps, the result of the last step is not needed
         writer.line("if (back && step == n_here - 1) break;", 3)
-    for segment, fixed in zip(step_segments, constants, strict=True):
-        kernel.write_segment(writer, program, segment, names, fixed, 3)
+    for segment, segment_constants in zip(step_segments, constants, strict=True):
+        kernel.write_segment(writer, program, segment, names, segment_constants, 3)
     writer.line("}", 2)
     writer.line("if (!back) continue;", 2)
-    if last:
+    if last_segments:
         writer.line("if (part == n_intervals - 1) {", 2)
-        _write_back(body, reverse, last, [()] * len(last), dict(names), 3)
+        _write_backward(body, reverse, last_segments, [()] * len(last_segments), dict(names), 3)
         writer.line("}", 2)
     writer.line("for (int step = n_here - 1; step >= 0; --step) {", 2)
     names_before = dict(names)
-    for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
+    for k, (slot, t) in enumerate(zip(carry, types, strict=True)):
         if slot not in reverse.read_back:
             continue
-        names_before[slot] = writer.new("b")
+        names_before[slot] = writer.new_name("b")
         writer.line(f"const auto {names_before[slot]} = KEPT({t}, step, {k});", 3)
-    _write_back(body, reverse, step_segments, constants, names_before, 3)
+    _write_backward(body, reverse, step_segments, constants, names_before, 3)
     writer.line("}", 2)
     writer.line("const int before = interval + (part > 0 ? part - 1 : 0);", 2)
-    for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
+    for k, (slot, t) in enumerate(zip(carry, types, strict=True)):
         writer.line(f"{names[slot]} = KEPT({t}, before, {k});", 2)
     writer.line("}", 1)
     for s in step_segments:
-        if s in reverse.back_hoisted:
-            kernel.write_segment(writer, program, reverse.back_hoisted[s], names, (), 1)
-    if first:
-        _write_back(body, reverse, first, [()] * len(first), names | body.starts, 1)
+        if s in reverse.backward_hoisted:
+            kernel.write_segment(writer, program, reverse.backward_hoisted[s], names, (), 1)
+    if first_segments:
+        _write_backward(body, reverse, first_segments, [()] * len(first_segments), names | body.starts, 1)
     pointers = [f"const {type_name(program.leaves[i].number_type)}* __restrict__ "
                 f"p{rank[i]}"
                 for i in kernel.needed_leaves(program)]  # fmt: skip
@@ -289,11 +299,11 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         pointers.append(f"{number}* __restrict__ {pointer}")
         values = [names[n + i, k] for k in range(program.leaves[i].size)]
         kernel.write_results(writer, pointer, number, 1, values, 1)
-    blocks = [*(s.block for s in step_segments for _ in range(2)), *(reverse.back[s].block for s in step_segments)]
-    return body.kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carried))
+    blocks = [*(s.block for s in step_segments for _ in range(2)), *(reverse.backward[s].block for s in step_segments)]
+    return body.kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carry))
 
 
-def _write_back(
+def _write_backward(
     body: Body,
     reverse: ReverseProgram,
     segments: Sequence[Segment],
@@ -312,14 +322,14 @@ def _write_back(
         depth: Depth of the lines.
     """
     program, writer = reverse.program, body.writer
-    before = []
-    for s, fixed in zip(segments, constants, strict=True):
-        before.append(dict(names))
+    names_by_segment = []
+    for s, segment_constants in zip(segments, constants, strict=True):
+        names_by_segment.append(dict(names))
         if s is not segments[-1]:
             for slot in dict.fromkeys(program.per_drone(s, s.writes)):
-                fresh, kind = writer.new("a"), type_name(program.leaves[slot[0]].number_type)
-                writer.line(f"auto {fresh} = {kind}_lanes({names[slot]});", depth)
-                names[slot] = fresh
-            kernel.write_segment(writer, program, s, names, fixed, depth)
-    for s, fixed, names_before in reversed(list(zip(segments, constants, before, strict=True))):
-        kernel.write_segment(writer, program, reverse.back[s], names_before, fixed, depth)
+                name, kind = writer.new_name("a"), type_name(program.leaves[slot[0]].number_type)
+                writer.line(f"auto {name} = {kind}_lanes({names[slot]});", depth)
+                names[slot] = name
+            kernel.write_segment(writer, program, s, names, segment_constants, depth)
+    for s, segment_constants, names_before in reversed(list(zip(segments, constants, names_by_segment, strict=True))):
+        kernel.write_segment(writer, program, reverse.backward[s], names_before, segment_constants, depth)

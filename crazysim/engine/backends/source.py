@@ -32,9 +32,9 @@ def require_block_source(block: Block) -> None:
     """
     for op in block.walk():
         row = ops.TABLE[op.name]
-        other = next((x.dtype.name for x in (*op.args, *op.results) if x.dtype not in TYPE_NAMES), None)
-        if other is not None:
-            raise UnsupportedError(f"kernels have no numbers of type {other}", op.name, op.stage)
+        unsupported = next((x.dtype.name for x in (*op.args, *op.results) if x.dtype not in TYPE_NAMES), None)
+        if unsupported is not None:
+            raise UnsupportedError(f"kernels have no numbers of type {unsupported}", op.name, op.stage)
         if not row.source and not row.structured:
             raise UnsupportedError("kernels have no such operation", op.name, op.stage)
 
@@ -70,7 +70,7 @@ class Writer(LineWriter):
         """Variable of each group of four table entries that is read at once; empty before the first read."""
         self._count = 0
 
-    def new(self, prefix: str = "v") -> str:
+    def new_name(self, prefix: str = "v") -> str:
         self._count += 1
         return f"{prefix}{self._count}"
 
@@ -80,7 +80,7 @@ class Writer(LineWriter):
     def block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
         """Write a block's operations, and return the names of its outputs."""
         self.names.update(zip(block.inputs, inputs, strict=True))
-        outside = dict(self.sin_cos_names), self.entry_groups  # variables of a block are not defined outside it
+        outer_names = dict(self.sin_cos_names), self.entry_groups  # variables of a block are not defined outside it
         self.entry_groups = dict.fromkeys(_entry_groups(block), "")
         for position, op in enumerate(block.operations):
             if op.name == "over_others":
@@ -89,7 +89,7 @@ class Writer(LineWriter):
             else:
                 self._operation(op, depth)
                 self.shared.update(shared_results(op, self.shared))
-        self.sin_cos_names, self.entry_groups = outside
+        self.sin_cos_names, self.entry_groups = outer_names
         return [self.element(x) for x in block.outputs]
 
     def forget(self) -> None:
@@ -119,7 +119,7 @@ class Writer(LineWriter):
             case "lookup":
                 self._lookup(op, args, depth)
             case "any_lane":
-                name = self.names[op.results[0]] = self.new()
+                name = self.names[op.results[0]] = self.new_name()
                 self.line(f"const auto {name} = any_lane({args[0]});", depth)
             case "sin" | "cos":
                 self._sin_cos(op, args[0], depth)
@@ -133,18 +133,18 @@ class Writer(LineWriter):
                     self.comparisons[op.results[0]] = op
                 function = _limiting_function(op, self.comparisons)
                 text = expression(op, args) if function is None else f"{function}({args[1]}, {args[2]})"
-                name = self.names[op.results[0]] = self.new()
+                name = self.names[op.results[0]] = self.new_name()
                 self.line(f"const auto {name} = {text};", depth)
 
     def _results(self, op: Operation, name: str | None = None) -> str:
         """Name the results of an operation with several results, and return the prefix of their names."""
-        name = name or self.new()
+        name = name or self.new_name()
         self.names.update((x, f"{name}_{k}") for k, x in enumerate(op.results))
         return name
 
     def _table(self, op: Operation) -> None:
         """Write a table of constants, which stands before the kernel."""
-        name = self.names[op.results[0]] = self.new("t")
+        name = self.names[op.results[0]] = self.new_name("t")
         numbers = ", ".join(_entry(x) for x in op.param("numbers").array)
         self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
 
@@ -152,36 +152,36 @@ class Writer(LineWriter):
         """Write a read of an entry, with its three neighbours if they are read too."""
         offset, key = op.param("offset"), _entry_group(op)
         if key not in self.entry_groups:
-            name = self.names[op.results[0]] = self.new()
+            name = self.names[op.results[0]] = self.new_name()
             self.line(f"const auto {name} = lookup({args[0]}, {args[1]}, {offset});", depth)
             return
         if not self.entry_groups[key]:
-            name = self.entry_groups[key] = self.new()
+            name = self.entry_groups[key] = self.new_name()
             self.line(f"const auto {name} = lookup_four({args[0]}, {args[1]}, {offset // 4 * 4});", depth)
         self.names[op.results[0]] = f"{self.entry_groups[key]}.x[{offset % 4}]"
 
     def _sin_cos(self, op: Operation, x: str, depth: int) -> None:
         """Write sine and cosine together, as they share most of their work."""
         if x not in self.sin_cos_names:
-            pair = self.sin_cos_names[x] = self.new()
+            pair = self.sin_cos_names[x] = self.new_name()
             kind = "auto" if isinstance(op.args[0], Value) else type_name(op.dtype)
             self.line(f"{kind} {pair}_0 = {x}, {pair}_1 = {x};", depth)
             self.line(f"sin_cos({x}, {pair}_0, {pair}_1);", depth)
         self.names[op.results[0]] = f"{self.sin_cos_names[x]}_{0 if op.name == 'sin' else 1}"
 
     def _when(self, op: Operation, args: list[str], depth: int) -> None:
-        mask, *old = args
-        name = self._carry(op, old, [False] * len(old), depth)
+        mask, *old_values = args
+        name = self._carry(op, old_values, [False] * len(old_values), depth)
         self.line(f"if (any({mask})) {{", depth)
-        for k, out in enumerate(self.block(op.blocks[0], [], depth + 1)):
-            self.line(f"{name}_{k} = select_n_({mask}, {name}_{k}, {out});", depth + 1)
+        for k, value in enumerate(self.block(op.blocks[0], [], depth + 1)):
+            self.line(f"{name}_{k} = select_n_({mask}, {name}_{k}, {value});", depth + 1)
         self.line("}", depth)
 
     def _loop(self, op: Operation, args: list[str], depth: int) -> None:
         (body,) = op.blocks
         shared = self._shared_carry(op)
         name = self._carry(op, args, shared, depth)
-        counter = self.new("n")
+        counter = self.new_name("n")
         self.line(f"for (int {counter} = 0; {counter} < {op.param('length')}; ++{counter}) {{", depth)
         outs = self.block(body, [f"{name}_{k}" for k in range(len(args))], depth + 1)
         self._assign(op, name, outs, shared, None, depth + 1)
@@ -192,29 +192,29 @@ class Writer(LineWriter):
         (body,) = op.blocks
         published = [(type_name(x.dtype), self.element(x)) for x in op.args]
         reads = self.exchange.publish(self, published, live, depth)
-        first = [ops.neutral_number(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
-        name = self._carry(op, [literal(x) for x in first], [False] * len(first), depth)
+        neutral = [ops.neutral_number(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
+        name = self._carry(op, [literal(x) for x in neutral], [False] * len(neutral), depth)
         best_numbers: dict[int, str] = {}
         for k, (combine, x) in enumerate(zip(op.param("reduce"), body.outputs, strict=True)):
             if combine in ops.INDEX_REDUCTIONS:
-                best_numbers[k], start = self.new(), literal(ops.neutral_number(combine[3:], x.dtype))
+                best_numbers[k], start = self.new_name(), literal(ops.neutral_number(combine[3:], x.dtype))
                 self.line(f"auto {best_numbers[k]} = {type_name(x.dtype)}_lanes({start});", depth)
-        counter = self.new("j")
+        counter = self.new_name("j")
         self.line(f"UNROLL for (int {counter} = 0; {counter} < GROUP; ++{counter}) {{", depth)
-        inputs = [self.new() for _ in body.inputs]
+        inputs = [self.new_name() for _ in body.inputs]
         for variable, read in zip(inputs, reads, strict=False):
             self.line(f"const auto {variable} = {read(counter)};", depth + 1)
         self.line(f"const auto {inputs[-1]} = eq_(own, i32({counter}));", depth + 1)
         outs = self.block(body, inputs, depth + 1)
-        for k, (combine, out) in enumerate(zip(op.param("reduce"), outs, strict=True)):
+        for k, (combine, value) in enumerate(zip(op.param("reduce"), outs, strict=True)):
             if k in best_numbers:
-                better = self.new()
-                test = f"{ops.INDEX_REDUCTIONS[combine]}_({out}, {best_numbers[k]})"
-                self.line(f"const auto {better} = or_({test}, ne_({out}, {out}));", depth + 1)
-                self.line(f"{name}_{k} = select_n_({better}, {name}_{k}, i32_lanes(i32({counter})));", depth + 1)
-                self.line(f"{best_numbers[k]} = select_n_({better}, {best_numbers[k]}, {out});", depth + 1)
+                is_better = self.new_name()
+                test = f"{ops.INDEX_REDUCTIONS[combine]}_({value}, {best_numbers[k]})"
+                self.line(f"const auto {is_better} = or_({test}, ne_({value}, {value}));", depth + 1)
+                self.line(f"{name}_{k} = select_n_({is_better}, {name}_{k}, i32_lanes(i32({counter})));", depth + 1)
+                self.line(f"{best_numbers[k]} = select_n_({is_better}, {best_numbers[k]}, {value});", depth + 1)
             else:
-                self.line(f"{name}_{k} = {combine}_({name}_{k}, {out});", depth + 1)
+                self.line(f"{name}_{k} = {combine}_({name}_{k}, {value});", depth + 1)
         self.line("}", depth)
 
     def _while(self, op: Operation, args: list[str], depth: int) -> None:
@@ -233,36 +233,39 @@ class Writer(LineWriter):
         """Return which carried numbers of a loop are shared by all lanes, and mark them as such in its iterations."""
         shared = shared_carry(op, self.shared)
         for block in op.blocks:
-            self.shared.update(x for x, same in zip(block.inputs, shared, strict=True) if same)
+            self.shared.update(x for x, is_shared_number in zip(block.inputs, shared, strict=True) if is_shared_number)
         return shared
 
-    def _carry(self, op: Operation, start: Sequence[str], shared: Sequence[bool], depth: int) -> str:
+    def _carry(self, op: Operation, initial: Sequence[str], shared: Sequence[bool], depth: int) -> str:
         """Write a variable with its initial number for each result of an operation that updates them."""
         name = self._results(op)
-        for k, (x, value, same) in enumerate(zip(op.results, start, shared, strict=True)):
+        for k, (x, value, is_shared_number) in enumerate(zip(op.results, initial, shared, strict=True)):
             kind = type_name(x.dtype)
-            self.line(f"{kind} {name}_{k} = {value};" if same else f"auto {name}_{k} = {kind}_lanes({value});", depth)
+            self.line(
+                f"{kind} {name}_{k} = {value};" if is_shared_number else f"auto {name}_{k} = {kind}_lanes({value});",
+                depth,
+            )
         return name
 
     def _assign(
         self, op: Operation, name: str, outs: Sequence[str], shared: Sequence[bool], mask: str | None, depth: int
     ) -> None:
         """Assign all results of an iteration after computing all of them, as one may be the old value of another."""
-        new_names = [self.new() for _ in outs]
-        for k, (new_name, out) in enumerate(zip(new_names, outs, strict=True)):
-            text = out if mask is None or shared[k] else f"select_n_({mask}, {name}_{k}, {out})"
+        new_names = [self.new_name() for _ in outs]
+        for k, (new_name, result) in enumerate(zip(new_names, outs, strict=True)):
+            text = result if mask is None or shared[k] else f"select_n_({mask}, {name}_{k}, {result})"
             self.line(f"const auto {new_name} = {text};", depth)
-        for k, (new_name, x, same) in enumerate(zip(new_names, op.results, shared, strict=True)):
-            value = new_name if same else f"{type_name(x.dtype)}_lanes({new_name})"
+        for k, (new_name, x, is_shared_number) in enumerate(zip(new_names, op.results, shared, strict=True)):
+            value = new_name if is_shared_number else f"{type_name(x.dtype)}_lanes({new_name})"
             self.line(f"{name}_{k} = {value};", depth)
 
 
 def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:
     """Return the values of a block that are computed before an operation, and used in its blocks or after it."""
-    before = [x for op in block.operations[:position] for x in op.results if not x.size]
+    earlier = [x for op in block.operations[:position] for x in op.results if not x.size]
     used = dataclasses.replace(block, operations=block.operations[position + 1 :]).uses()
     used = used.union(*(inner.uses() for inner in block.operations[position].blocks))
-    return [(x, type_name(x.dtype)) for x in before if x in used]
+    return [(x, type_name(x.dtype)) for x in earlier if x in used]
 
 
 def _entry_group(op: Operation) -> EntryGroup:

@@ -21,7 +21,7 @@ def shared_results(op: Operation, shared: Set[Value]) -> list[Value]:
             return [x for x, same in zip(op.results, shared_carry(op, shared), strict=True) if same]
         case "custom_jvp":
             (body,) = op.blocks
-            inside = _inside(body, [is_shared(x, shared) for x in op.args], shared)
+            inside = _shared_in_body(body, [is_shared(x, shared) for x in op.args], shared)
             return [x for x, out in zip(op.results, body.outputs, strict=True) if is_shared(out, inside)]
         case "when" | "over_others" | "threefry2x32":
             return []
@@ -33,17 +33,17 @@ def shared_carry(op: Operation, shared: Set[Value]) -> list[bool]:
     *tests, body = op.blocks
     is_same = [is_shared(x, shared) for x in op.args]
     while True:
-        inside = _inside(body, is_same, shared)
+        inside = _shared_in_body(body, is_same, shared)
         after = [same and is_shared(x, inside) for same, x in zip(is_same, body.outputs, strict=True)]
         for test in tests:  # if lanes may stop at different iterations, they share no number that the loop carries
-            if not all(is_shared(x, _inside(test, is_same, shared)) for x in test.outputs):
+            if not all(is_shared(x, _shared_in_body(test, is_same, shared)) for x in test.outputs):
                 after = [False] * len(is_same)
         if after == is_same:
             return is_same
         is_same = after
 
 
-def _inside(block: Block, inputs: list[bool], shared: Set[Value]) -> set[Value]:
+def _shared_in_body(block: Block, inputs: list[bool], shared: Set[Value]) -> set[Value]:
     """Return the values that lanes share at the end of a block, given which of its inputs they share."""
     inside = {*shared, *(x for x, same in zip(block.inputs, inputs, strict=True) if same)}
     for op in block.operations:

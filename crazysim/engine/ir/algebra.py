@@ -67,8 +67,8 @@ def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tupl
         case "div" if n_known:
             return args[0] if _equals(args[1], 1) else None
         case "and" | "or" if n_known and dtype.kind == "b":
-            known, other = args if isinstance(args[0], np.generic) else args[::-1]
-            return other if bool(known) == (name == "and") else known
+            number, other = args if isinstance(args[0], np.generic) else args[::-1]
+            return other if bool(number) == (name == "and") else number
         case "sin" | "cos" if n_known and _equals(args[0], 0):  # exact on every platform, unlike other arguments
             return dtype.type(name == "cos")
         case "atan2" if n_known == 2 and _equals(args[0], 0) and args[1] > 0:
@@ -100,8 +100,8 @@ def _select(which: Element, no: Element, yes: Element) -> Element | None:
         return yes if which else no
     if no is yes:
         return no
-    same = isinstance(no, np.generic) and isinstance(yes, np.generic) and constant_key(no) == constant_key(yes)
-    return no if same else None
+    is_same = isinstance(no, np.generic) and isinstance(yes, np.generic) and constant_key(no) == constant_key(yes)
+    return no if is_same else None
 
 
 def fold(name: str, args: Sequence[np.generic], dtype: np.dtype, params: tuple) -> np.generic | None:

@@ -120,7 +120,7 @@ class Builder:
         self.stage = outer.stage if outer is not None else stage
         self.inputs: list[Value] = []
         self.operations: list[Operation] = []
-        self._known: dict[Any, tuple[Value, ...]] = {}
+        self._results_by_key: dict[Any, tuple[Value, ...]] = {}
 
     def input(self, dtype: DTypeLike, size: int = 0) -> Value:
         """Add an input, a table if a size is given."""
@@ -164,11 +164,11 @@ class Builder:
         key = (name, dtypes, params, *[x if isinstance(x, Value) else constant_key(x) for x in args])
         builder: Builder | None = self
         while builder is not None:
-            known = builder._known.get(key)
-            if known is not None:
-                return known
+            earlier_results = builder._results_by_key.get(key)
+            if earlier_results is not None:
+                return earlier_results
             builder = builder.outer
-        results = self._known[key] = self._new(name, args, dtypes, params, ())
+        results = self._results_by_key[key] = self._new(name, args, dtypes, params, ())
         return results
 
     def _new(self, name: str, args: tuple, dtypes: tuple, params: tuple, blocks: tuple) -> tuple[Value, ...]:
@@ -204,44 +204,44 @@ def prune(block: Block, keep_inputs: bool = True) -> Block:
     return dataclasses.replace(block, inputs=tuple([x for x in block.inputs if x in used]))
 
 
-def _prune(block: Block, needed: set[Value]) -> Block:
-    needed.update(x for x in block.outputs if isinstance(x, Value))
+def _prune(block: Block, used: set[Value]) -> Block:
+    used.update(x for x in block.outputs if isinstance(x, Value))
     operations = []
     for op in reversed(block.operations):
         if op.name == "barrier":
             operations.append(op)
-        elif not needed.isdisjoint(op.results):
-            op = _drop_results(op, needed) if op.name == "when" else op
-            needed.update(x for x in op.args if isinstance(x, Value))
+        elif not used.isdisjoint(op.results):
+            op = _drop_results(op, used) if op.name == "when" else op
+            used.update(x for x in op.args if isinstance(x, Value))
             if op.blocks:
-                blocks = tuple([_prune(inner, needed) for inner in op.blocks])
+                blocks = tuple([_prune(inner, used) for inner in op.blocks])
                 operations.append(op._replace(blocks=blocks))
             else:
                 operations.append(op)
     return dataclasses.replace(block, operations=tuple(operations[::-1]))
 
 
-def _drop_results(op: Operation, needed: Collection[Value]) -> Operation:
+def _drop_results(op: Operation, used_values: Collection[Value]) -> Operation:
     """Return a ``when`` without the results that are not needed."""
     (mask, *old), (block,) = op.args, op.blocks
-    used = [k for k, x in enumerate(op.results) if x in needed]
-    if len(used) == len(op.results):
+    used_indices = [k for k, x in enumerate(op.results) if x in used_values]
+    if len(used_indices) == len(op.results):
         return op
-    inner = dataclasses.replace(block, outputs=tuple([block.outputs[k] for k in used]))
-    args, results = (mask, *(old[k] for k in used)), tuple([op.results[k] for k in used])
+    inner = dataclasses.replace(block, outputs=tuple([block.outputs[k] for k in used_indices]))
+    args, results = (mask, *(old[k] for k in used_indices)), tuple([op.results[k] for k in used_indices])
     return op._replace(args=args, results=results, blocks=(inner,))
 
 
-def substitute(block: Block, new: Mapping[Value, Element]) -> Block:
+def substitute(block: Block, replacements: Mapping[Value, Element]) -> Block:
     """Return a block in which operands and outputs are replaced; the operations that define the old ones stay."""
 
     def replaced(x: Element) -> Element:
-        return new.get(x, x) if isinstance(x, Value) else x
+        return replacements.get(x, x) if isinstance(x, Value) else x
 
     operations = [
         op._replace(
             args=tuple([replaced(x) for x in op.args]),
-            blocks=tuple([substitute(inner, new) for inner in op.blocks]),
+            blocks=tuple([substitute(inner, replacements) for inner in op.blocks]),
         )
         for op in block.operations
     ]

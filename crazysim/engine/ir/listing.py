@@ -21,12 +21,12 @@ def list_program(program: Program) -> str:
         if segment in program.unfused_stages:
             stage = cast(UnfusedStage, segment)
             lines.append(f"{stage.phase} stage {stage.name} of all worlds, unfused: {stage.error.reason}")
-            lines += [f"{INDENT}reads {program.leaves[i].name}" for i in stage.used]
-            lines += [f"{INDENT}writes {program.leaves[i].name}" for i in stage.written]
+            lines += [f"{INDENT}reads {program.leaves[i].name}" for i in stage.input_leaves]
+            lines += [f"{INDENT}writes {program.leaves[i].name}" for i in stage.written_leaves]
         else:
             lines += _list_segment(program, cast(Segment, segment), _Names())
-    if program.check is not None:
-        lines += ["", *_list_segment(program, program.check, _Names())]
+    if program.check_segment is not None:
+        lines += ["", *_list_segment(program, program.check_segment, _Names())]
     return "\n".join(lines[1:]) + "\n"
 
 
@@ -50,7 +50,7 @@ def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
         number, k = divmod(k, leaf.size)
         drone = f" of drone {number}"
     for member in (
-        program.packed if leaf.name == PACKED_LEAF_NAME else leaf.rows_of
+        program.packed if leaf.name == PACKED_LEAF_NAME else leaf.row_leaves
     ):  # the field that the number belongs to
         if k < program.leaves[member].size:
             return f"{program.leaves[member].name}[{k}]{drone}"
@@ -59,19 +59,21 @@ def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
 
 
 def _list_segment(program: Program, segment: Segment, names: _Names) -> Iterator[str]:
-    when = {"before": "before the first step", "each": "at each step", "after": "after the last step"}[segment.phase]
-    yield f"segment of one {segment.scope}, {when}: {', '.join(segment.stages)}"
+    phase_text = {"before": "before the first step", "each": "at each step", "after": "after the last step"}[
+        segment.phase
+    ]
+    yield f"segment of one {segment.scope}, {phase_text}: {', '.join(segment.stages)}"
     if segment.hoisted.outputs:
         yield f"{INDENT}hoisted, once before the first step:"
         for x, slot in zip(segment.hoisted.inputs, segment.hoisted_reads, strict=True):
-            yield f"{INDENT * 2}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
+            yield f"{INDENT * 2}{names.new_name(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
         yield from _list_operations(segment.hoisted, names, 2)
         for x, y in zip(segment.block.inputs[len(segment.reads) :], segment.hoisted.outputs, strict=True):
-            yield f"{INDENT * 2}{names.new(x)} = {names.name(y)}"
+            yield f"{INDENT * 2}{names.new_name(x)} = {names.name(y)}"
     for x, slot in zip(segment.block.inputs, segment.reads, strict=False):
-        yield f"{INDENT}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
+        yield f"{INDENT}{names.new_name(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
     yield from _list_operations(segment.block, names, 1)
-    if segment is program.check:
+    if segment is program.check_segment:
         yield f"{INDENT}flagged = {names.name(segment.block.outputs[0])}"
         return
     for x, slot in zip(segment.block.outputs, segment.writes, strict=True):
@@ -88,7 +90,7 @@ class _Names:
     def __init__(self) -> None:
         self._names: dict[Value, str] = {}
 
-    def new(self, x: Value) -> str:
+    def new_name(self, x: Value) -> str:
         return self._names.setdefault(x, f"%{len(self._names)}")
 
     def name(self, x: Element) -> str:
@@ -117,12 +119,12 @@ def _list_operations(block: Block, names: _Names, depth: int) -> Iterator[str]:
 
 def _line(op: Operation, names: _Names) -> str:
     params = [f"{k}={v}" for k, v in op.params if not callable(v)]
-    results = ", ".join(f"{names.new(x)}: {_type(x)}" for x in op.results)
+    results = ", ".join(f"{names.new_name(x)}: {_type(x)}" for x in op.results)
     return f"{results} = {op.name}({', '.join([*map(names.name, op.args), *params])})"
 
 
 def _list_inner(block: Block, names: _Names, depth: int) -> Iterator[str]:
     if block.inputs:
-        yield f"{INDENT * depth}block({', '.join(names.new(x) for x in block.inputs)})"
+        yield f"{INDENT * depth}block({', '.join(names.new_name(x) for x in block.inputs)})"
     yield from _list_operations(block, names, depth)
     yield f"{INDENT * depth}return {', '.join(names.name(x) for x in block.outputs)}"

@@ -44,18 +44,18 @@ def round_away(x: Any) -> Any:
     return np.copysign(np.where(np.abs(x - whole) >= 0.5, np.abs(whole) + 1, np.abs(whole)), x)
 
 
-def shift(shift: Callable[[Any, Any], Any], outside: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+def shift(shift: Callable[[Any, Any], Any], fill: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
     """Return a shift that is defined for any number of bits.
 
     Args:
         shift: Shift by fewer bits than the type has.
-        outside: Function of the operand that gives the result for other numbers of bits.
+        fill: Function of the operand that gives the result for other numbers of bits.
     """
 
     def shifted(x: Any, n: Any) -> Any:
         bits = 8 * x.dtype.itemsize
         inside = (n >= 0) & (n < bits) if n.dtype.kind == "i" else n < bits
-        return np.where(inside, shift(x, np.where(inside, n, n.dtype.type(0))), outside(x))
+        return np.where(inside, shift(x, np.where(inside, n, n.dtype.type(0))), fill(x))
 
     return shifted
 

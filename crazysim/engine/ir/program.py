@@ -44,13 +44,13 @@ class Leaf:
     """Shape, for all worlds."""
     dtype: Any
     """Type."""
-    rows_of: tuple[int, ...] = ()
+    row_leaves: tuple[int, ...] = ()
     """Leaves whose numbers are the rows of this leaf in order, (n_rows, n_lanes); empty for a leaf without rows."""
 
     @functools.cached_property
     def size(self) -> int:
         """Number of scalars per drone (or world); a key is two 32-bit integers."""
-        if self.rows_of:
+        if self.row_leaves:
             return self.shape[0]
         shape = self.shape[2:] if self.scope in ("drone", "world") else self.shape
         return int(np.prod(shape, dtype=int)) * (2 if is_key(self) else 1)
@@ -83,12 +83,12 @@ class Segment:
     """Slots of the inputs of ``hoisted``."""
 
     @property
-    def written(self) -> list[int]:
+    def written_leaves(self) -> list[int]:
         """Leaves that it writes."""
         return sorted({leaf for leaf, _ in self.writes})
 
     @property
-    def read(self) -> set[int]:
+    def read_leaves(self) -> set[int]:
         """Leaves that it reads."""
         return {leaf for leaf, _ in (*self.reads, *self.hoisted_reads)}
 
@@ -112,10 +112,10 @@ class UnfusedStage:
     phase: Phase
     """Time within a call at which it runs."""
     jaxpr: Any
-    """The stage, from the leaves in ``used`` to the leaves in ``written``."""
-    used: tuple[int, ...]
+    """The stage, from the leaves in ``input_leaves`` to the leaves in ``written_leaves``."""
+    input_leaves: tuple[int, ...]
     """Leaves that it reads."""
-    written: tuple[int, ...]
+    written_leaves: tuple[int, ...]
     """Leaves that it writes."""
     error: UnsupportedError
     """Reason why the stage is not fused."""
@@ -126,9 +126,9 @@ class UnfusedStage:
         return (self.name,)
 
     @property
-    def read(self) -> set[int]:
+    def read_leaves(self) -> set[int]:
         """Leaves that it reads."""
-        return set(self.used)
+        return set(self.input_leaves)
 
     @property
     def explanation(self) -> str:
@@ -146,7 +146,7 @@ class Program:
     """Drones of a world."""
     segments: tuple[Segment | UnfusedStage, ...]
     """Segments in order, phase by phase."""
-    check: Segment | None = None
+    check_segment: Segment | None = None
     """Segment that flags a drone whose watched numbers are not finite, after the last step."""
     scratch: frozenset[int] = frozenset()
     """Leaves that only carry numbers from one stage to another; their values are not kept."""
@@ -173,20 +173,20 @@ class Program:
         return tuple([s for s in self.segments if isinstance(s, Segment)])
 
     @functools.cached_property
-    def written(self) -> list[int]:
+    def written_leaves(self) -> list[int]:
         """Indices of the leaves that are written, without scratch."""
-        return sorted({i for s in self.segments for i in s.written} - self.scratch)
+        return sorted({i for s in self.segments for i in s.written_leaves} - self.scratch)
 
     @functools.cached_property
-    def read(self) -> list[int]:
+    def read_leaves(self) -> list[int]:
         """Indices of the leaves that are read."""
-        return sorted({i for s in self.segments for i in s.read})
+        return sorted({i for s in self.segments for i in s.read_leaves})
 
     @functools.cached_property
     def ranks(self) -> dict[int, int]:
         """Rank of each used leaf among the used leaves, for names in kernels, so that equal steps have equal source."""
-        checked = [leaf for leaf, _ in self.check.reads] if self.check is not None else []
-        used = {*checked, *(i for s in self.segments for i in (*s.read, *s.written))}
+        checked = [leaf for leaf, _ in self.check_segment.reads] if self.check_segment is not None else []
+        used = {*checked, *(i for s in self.segments for i in (*s.read_leaves, *s.written_leaves))}
         return {leaf: n for n, leaf in enumerate(sorted(used))}
 
     @functools.cached_property
@@ -198,10 +198,10 @@ class Program:
     @functools.cached_property
     def rows(self) -> dict[int, int]:
         """Leaves that are rows, and how many rows they have."""
-        return {i: leaf.shape[0] for i, leaf in enumerate(self.leaves) if leaf.rows_of}
+        return {i: leaf.shape[0] for i, leaf in enumerate(self.leaves) if leaf.row_leaves}
 
     @functools.cached_property
-    def group(self) -> int:
+    def group_size(self) -> int:
         """Number of drones that read each other's numbers: all of a world if a segment needs that, otherwise 1."""
         return self.n_drones if any(s.couples_drones for s in self.fused_segments) else 1
 
@@ -222,11 +222,13 @@ class Program:
             if isinstance(segment, Segment):
                 slots.update(self.per_drone(segment, segment.writes))
             else:
-                slots.update((leaf, k) for leaf in segment.written for k in range(TABLE_INDEX, self.leaves[leaf].size))
+                slots.update(
+                    (leaf, k) for leaf in segment.written_leaves for k in range(TABLE_INDEX, self.leaves[leaf].size)
+                )
         return slots
 
     def parts(self) -> Iterator[Program]:
         """Iterate over programs of one phase each: what one kernel can run, and each unfused stage, in order."""
         kinds = itertools.groupby(self.segments, lambda s: (s.phase, id(s) if isinstance(s, UnfusedStage) else 0))
         for _, segments in kinds:
-            yield dataclasses.replace(self, segments=tuple(segments), check=None, scratch=frozenset())
+            yield dataclasses.replace(self, segments=tuple(segments), check_segment=None, scratch=frozenset())

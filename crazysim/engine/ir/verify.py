@@ -27,7 +27,7 @@ def verify(program: Program) -> Program:
     phases = [PHASES.index(s.phase) for s in program.segments]
     _require(phases == sorted(phases), "segments are not in the order of their phases")
     changing = program.changing_slots()
-    for segment in [*program.fused_segments, *([program.check] if program.check else [])]:
+    for segment in [*program.fused_segments, *([program.check_segment] if program.check_segment else [])]:
         name = " + ".join(segment.stages)
         try:
             _verify_segment(program, segment, changing)
@@ -48,14 +48,14 @@ def _require(condition: bool, message: str) -> None:
 
 
 def _verify_segment(program: Program, segment: Segment, changing: set[Slot]) -> None:
-    if segment is not program.check:
+    if segment is not program.check_segment:
         _slots(program, segment, segment.writes, segment.block.outputs, "output")
     _slots(program, segment, segment.reads, segment.block.inputs[: len(segment.reads)], "input")
     _slots(program, segment, segment.hoisted_reads, segment.hoisted.inputs, "input of the hoisted block")
-    further = segment.block.inputs[len(segment.reads) :]
+    constants = segment.block.inputs[len(segment.reads) :]
     _require(
-        [x.dtype for x in further] == [x.dtype for x in segment.hoisted.outputs],
-        f"{len(further)} further inputs for {len(segment.hoisted.outputs)} hoisted outputs",
+        [x.dtype for x in constants] == [x.dtype for x in segment.hoisted.outputs],
+        f"{len(constants)} further inputs for {len(segment.hoisted.outputs)} hoisted outputs",
     )
     _require(changing.isdisjoint(segment.hoisted_reads), "a hoisted number changes from step to step")
     verify_block(segment.hoisted)
@@ -63,20 +63,20 @@ def _verify_segment(program: Program, segment: Segment, changing: set[Slot]) -> 
 
 
 def _slots(
-    program: Program, segment: Segment, slots: tuple[Slot, ...], elements: tuple[Element, ...], what: str
+    program: Program, segment: Segment, slots: tuple[Slot, ...], elements: tuple[Element, ...], role: str
 ) -> None:
-    _require(len(slots) == len(elements), f"{len(elements)} {what}s for {len(slots)} places")
-    _require(len(set(slots)) == len(slots), f"a place is there twice as {what}")
+    _require(len(slots) == len(elements), f"{len(elements)} {role}s for {len(slots)} places")
+    _require(len(set(slots)) == len(slots), f"a place is there twice as {role}")
     for (i, k), x in zip(slots, elements, strict=True):
         leaf = program.leaves[i]
         if k == TABLE_INDEX:
             has_size_of_leaf = x.size == leaf.size and x.dtype == leaf.number_type
-            is_table = what != "output" and leaf.scope == "shared" and has_size_of_leaf
-            _require(is_table, f"{what} is {leaf.name} as a table, which it is not")
+            is_table = role != "output" and leaf.scope == "shared" and has_size_of_leaf
+            _require(is_table, f"{role} is {leaf.name} as a table, which it is not")
             continue
         n_drones = program.n_drones if segment.scope == "world" and leaf.scope == "drone" else 1
-        _require(0 <= k < leaf.size * n_drones, f"{what} {k} of {leaf.name}, which has {leaf.size * n_drones} numbers")
-        _require(x.dtype == leaf.number_type, f"{what} of type {x.dtype} for {leaf.name} of type {leaf.number_type}")
+        _require(0 <= k < leaf.size * n_drones, f"{role} {k} of {leaf.name}, which has {leaf.size * n_drones} numbers")
+        _require(x.dtype == leaf.number_type, f"{role} of type {x.dtype} for {leaf.name} of type {leaf.number_type}")
 
 
 def _verify_block(block: Block, defined: set[Value]) -> None:
@@ -89,8 +89,8 @@ def _verify_block(block: Block, defined: set[Value]) -> None:
             defined.add(x)
             visible.add(x)
 
-    def use(x: Element, where: str) -> None:
-        _require(isinstance(x, np.generic) or x in visible, f"{where} uses a value before it is defined")
+    def use(x: Element, role: str) -> None:
+        _require(isinstance(x, np.generic) or x in visible, f"{role} uses a value before it is defined")
 
     define(block.inputs)
     for op in block.operations:
@@ -150,6 +150,6 @@ def _verify_types(op: Operation) -> None:
         case _:
             _require(not op.blocks and row.accepts(dtypes), text)
             shared = next((x for x, letter in zip(dtypes, row.operands, strict=True) if letter == "T"), None)
-            wanted = {"T": shared, "b": np.dtype(bool), "u": np.dtype(np.uint32)}
-            fits = [letter == "*" or x == wanted[letter] for x, letter in zip(results, row.results, strict=False)]
+            expected = {"T": shared, "b": np.dtype(bool), "u": np.dtype(np.uint32)}
+            fits = [letter == "*" or x == expected[letter] for x, letter in zip(results, row.results, strict=False)]
             _require(len(results) == len(row.results) and all(fits), text)

@@ -21,7 +21,7 @@ def without_check(program: Program, perturbed: Collection[int]) -> tuple[Program
         raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
     if program.rows:
         raise LimitError("rows of packed leaves have no gradient in a kernel")
-    program = dataclasses.replace(program, check=None)
+    program = dataclasses.replace(program, check_segment=None)
     floats = tuple(sorted(i for i in perturbed if program.leaves[i].number_type.kind == "f" and i in program.ranks))
     if tables := program.tables.intersection(floats):
         names = ", ".join(program.leaves[i].name for i in sorted(tables))
@@ -65,9 +65,9 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
     return changed, constants
 
 
-def active_values(block: Block, wanted: Collection[Value]) -> set[Value]:
+def active_values(block: Block, targets: Collection[Value]) -> set[Value]:
     """Return the values of a block and of its inner blocks that depend differentiably on some of its inputs."""
-    active = set(wanted)
+    active = set(targets)
     _propagate(block, active)
     return active
 

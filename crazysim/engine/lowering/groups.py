@@ -26,14 +26,14 @@ class Group(NamedTuple):
 class _Access(NamedTuple):
     """Leaves that a stage reads and writes, and the populations that it is for."""
 
-    read: frozenset[int]
-    written: frozenset[int]
+    read_leaves: frozenset[int]
+    written_leaves: frozenset[int]
     populations: frozenset[str]
 
     @property
     def touched(self) -> frozenset[int]:
         """Leaves that it reads or writes."""
-        return self.read | self.written
+        return self.read_leaves | self.written_leaves
 
 
 def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Group]:
@@ -53,33 +53,36 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     access = [_access(tracer(stage, axes, leaves), stage, axes) for stage in stages]
     clocks = _clocks(access, axes)
     members = {scope: x.shape[1] for scope, x in zip(axes.scopes, leaves, strict=True) if has_members(scope)}
-    parts = _components([k for k in range(len(stages)) if k not in clocks], access)
-    parts = [(indices, frozenset().union(*(access[k].populations for k in indices))) for indices in parts]
-    parts.sort(key=lambda part: "drone" not in part[1])
-    if not parts or "drone" not in parts[0][1]:
-        parts.insert(0, (set(), frozenset({"drone"})))
-    parts = [(_with_clocks(indices, clocks, access), populations) for indices, populations in parts]
-    parts[0] = (parts[0][0] | clocks, parts[0][1])  # the drones run all clocks, as without other populations
-    groups, taken = [], frozenset()
-    for indices, populations in parts:
-        written = frozenset().union(*(access[k].written for k in indices))
+    components = _components([k for k in range(len(stages)) if k not in clocks], access)
+    components = [(indices, frozenset().union(*(access[k].populations for k in indices))) for indices in components]
+    components.sort(key=lambda part: "drone" not in part[1])
+    if not components or "drone" not in components[0][1]:
+        components.insert(0, (set(), frozenset({"drone"})))
+    components = [(_add_clocks(indices, clocks, access), populations) for indices, populations in components]
+    components[0] = (
+        components[0][0] | clocks,
+        components[0][1],
+    )  # the drones run all clocks, as without other populations
+    groups, owned_leaves = [], frozenset()
+    for indices, populations in components:
+        written = frozenset().union(*(access[k].written_leaves for k in indices))
         main = "drone" if "drone" in populations else max(sorted(populations), key=members.__getitem__)
-        groups.append(Group(main, tuple([stages[k] for k in sorted(indices)]), written - taken))
-        taken |= written
+        groups.append(Group(main, tuple([stages[k] for k in sorted(indices)]), written - owned_leaves))
+        owned_leaves |= written
     return groups
 
 
 def _access(traced: TracedStage, stage: Stage, axes: Axes) -> _Access:
-    populations = {axes.scopes[i] for i in traced.written if has_members(axes.scopes[i])}
+    populations = {axes.scopes[i] for i in traced.written_leaves if has_members(axes.scopes[i])}
     populations |= {stage.scope} if stage.scope in axes.scopes and has_members(stage.scope) else set()
-    return _Access(frozenset(traced.used), frozenset(traced.written), frozenset(populations))
+    return _Access(frozenset(traced.input_leaves), frozenset(traced.written_leaves), frozenset(populations))
 
 
 def _clocks(access: Sequence[_Access], axes: Axes) -> set[int]:
     """Return the stages that use no leaf of a population, and no leaf that a stage outside this set writes."""
     clocks = {k for k, a in enumerate(access) if not any(has_members(axes.scopes[i]) for i in a.touched)}
     while True:
-        others = frozenset().union(*(a.written for k, a in enumerate(access) if k not in clocks))
+        others = frozenset().union(*(a.written_leaves for k, a in enumerate(access) if k not in clocks))
         depending = {k for k in clocks if access[k].touched & others}
         if not depending:
             return clocks
@@ -90,28 +93,28 @@ def _components(stages: Iterable[int], access: Sequence[_Access]) -> list[set[in
     """Return sets of stages that depend on each other, or write the same populations."""
     parts: list[set[int]] = []
     for k in stages:
-        component, rest = {k}, []
+        component, other_parts = {k}, []
         for part in parts:
             if any(_depend(access[k], access[j]) for j in part):
                 component |= part
             else:
-                rest.append(part)
-        parts = [*rest, component]
+                other_parts.append(part)
+        parts = [*other_parts, component]
     return parts
 
 
 def _depend(a: _Access, b: _Access) -> bool:
     # A stage without a population counts as a stage of the drones.
     populations = (a.populations or {"drone"}) & (b.populations or {"drone"})
-    return bool(populations or a.written & b.touched or b.written & a.touched)
+    return bool(populations or a.written_leaves & b.touched or b.written_leaves & a.touched)
 
 
-def _with_clocks(stages: Collection[int], clocks: Collection[int], access: Sequence[_Access]) -> set[int]:
+def _add_clocks(stages: Collection[int], clocks: Collection[int], access: Sequence[_Access]) -> set[int]:
     """Return stages with the clocks whose results they read."""
-    out = set(stages)
+    result = set(stages)
     while True:
-        read = frozenset().union(*(access[k].read for k in out))
-        more = {k for k in clocks if access[k].written & read} - out
-        if not more:
-            return out
-        out |= more
+        read = frozenset().union(*(access[k].read_leaves for k in result))
+        added = {k for k in clocks if access[k].written_leaves & read} - result
+        if not added:
+            return result
+        result |= added

@@ -128,7 +128,7 @@ class Lowering:
         return as_elements([self.builder.add(op, column, dtype, params) for column in zip(*rows, strict=True)], shape)
 
     def scalar(self, op: str, *args: Element, dtype: Any = None) -> Element:
-        """Return the result of an operation on single elements; its default type is that of the last operand."""
+        """Return the result of an operation on single elements; its default type is the type of the last operand."""
         return self.builder.add(op, args, args[-1].dtype if dtype is None else dtype)
 
     def inner(self) -> Lowering:

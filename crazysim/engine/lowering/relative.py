@@ -57,14 +57,19 @@ class RelativeStage(Stage):
 
     def __call__(self, data: Any) -> Any:
         treedef, views = self.axes.treedef, self.axes.views
-        before = jax.tree.leaves(data)
-        restored = restore_leaves(views, before)
-        after, after_treedef = jax.tree.flatten(self.original(treedef.unflatten(restored)))
+        leaves_before = jax.tree.leaves(data)
+        restored = restore_leaves(views, leaves_before)
+        leaves_after, after_treedef = jax.tree.flatten(self.original(treedef.unflatten(restored)))
         if after_treedef != treedef:
-            return after_treedef.unflatten(after)  # the caller raises an error
-        new = view_leaves(views, after)
-        unchanged = [x is y for x, y in zip(after, restored, strict=True)]
-        return treedef.unflatten([old if same else x for old, x, same in zip(before, new, unchanged, strict=True)])
+            return after_treedef.unflatten(leaves_after)  # the caller raises an error
+        new_leaves = view_leaves(views, leaves_after)
+        unchanged = [x is y for x, y in zip(leaves_after, restored, strict=True)]
+        return treedef.unflatten(
+            [
+                old if is_unchanged else x
+                for old, x, is_unchanged in zip(leaves_before, new_leaves, unchanged, strict=True)
+            ]
+        )
 
 
 def view_leaves(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
@@ -85,15 +90,15 @@ def _reshape(x: Any, shape: tuple[int, ...]) -> Any:
 
 def on_data_leaves(program: Program, run: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a function of leaves from ``view_leaves`` as a function of the leaves of the data."""
-    views, written = program.views, program.written
+    views, written = program.views, program.written_leaves
     if not views:
         return run
 
     def steps(leaves: Sequence[Any], n_steps: Any) -> Any:
-        out, flagged = run(view_leaves(views, leaves), n_steps)
-        new_leaves = dict(zip(written, out, strict=True))
+        results, flagged = run(view_leaves(views, leaves), n_steps)
+        new_leaves = dict(zip(written, results, strict=True))
         partial_leaves = [new_leaves.get(i) for i in range(len(leaves))]
-        back = restore_leaves(views, partial_leaves)
-        return [back[i] for i in written], flagged
+        restored = restore_leaves(views, partial_leaves)
+        return [restored[i] for i in written], flagged
 
     return steps

@@ -54,15 +54,17 @@ def _select_own(builder: Builder, op: Operation, indices: list[int], values: dic
         return inner, [*fresh[len(args) :], is_self], [outs[k] for k in indices]
 
     inner, (is_self,), candidates = copy_body(0)
-    one, zero = (constant(x, dtypes[0]) for x in (1, 0))
-    is_largest = inner.add("select_n", (is_self, zero, one), dtypes[0])  # its argmax is the index of the drone itself
+    one_number, zero = (constant(x, dtypes[0]) for x in (1, 0))
+    is_largest = inner.add(
+        "select_n", (is_self, zero, one_number), dtypes[0]
+    )  # its argmax is the index of the drone itself
     names = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in indices), "argmax")
     block = prune(inner.finish([*candidates, is_largest]))
-    *chosen, number = builder.add_many("over_others", args, ["int32"] * len(names), (("reduce", names), n_members),
+    *selected, number = builder.add_many("over_others", args, ["int32"] * len(names), (("reduce", names), n_members),
                                        (block,))  # fmt: skip
 
     inner, (other, _), candidates = copy_body(1)
     terms = [inner.add("select_n", (inner.add("eq", (other, which), bool), constant(0, x.dtype), x), x.dtype)
-             for which, x in zip(chosen, candidates, strict=True)]  # fmt: skip
+             for which, x in zip(selected, candidates, strict=True)]  # fmt: skip
     params = (("reduce", ("add",) * len(indices)), n_members)
     return builder.add_many("over_others", [*args, number], dtypes, params, (prune(inner.finish(terms)),))

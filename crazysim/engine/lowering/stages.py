@@ -51,32 +51,32 @@ def lower_stages(
     tracer = tracer or Tracer()
     axes = RelativeAxes(data, population)
     leaves = view_leaves(axes.views, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(data)])
-    known = dict(zeros)
+    known_zeros = dict(zeros)
     n_drones = next(x.shape[1] for x, scope in zip(leaves, axes.scopes, strict=True) if scope == "drone")
     segments = []
     for phase in PHASES:
         in_phase = [stage for stage in stages if stage.phase == phase]
-        lowered = [_lower_stage(axes.stage(x), phase, axes, leaves, known, n_drones, tracer) for x in in_phase]
-        segments += _before_the_steps(lowered, in_phase, axes.leaf_indices.core.steps) if phase == "each" else lowered
+        lowered = [_lower_stage(axes.stage(x), phase, axes, leaves, known_zeros, n_drones, tracer) for x in in_phase]
+        segments += _move_before_steps(lowered, in_phase, axes.leaf_indices.core.steps) if phase == "each" else lowered
     described = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
     ])  # fmt: skip
     scratch = frozenset(i for i, x in enumerate(jax.tree.leaves(leaf_flags(data, "scratch"))) if x)
     program = Program(described, n_drones, tuple(segments), None, scratch, (), population, axes.views)
-    changed = known.keys() & set(program.written)
+    changed = known_zeros.keys() & set(program.written_leaves)
     if changed:  # an element is only known to be zero while no stage writes it
         zeros = tuple([(i, indices) for i, indices in zeros if i not in changed])
         return lower_stages(stages, data, zeros, watched, population, tracer)
     core = axes.leaf_indices.core
-    if watched is None or core.nonfinite in program.written:
+    if watched is None or core.nonfinite in program.written_leaves:
         return program
     members = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
-    checked = sorted((members | axes.views & set(program.written)) & set(watched(axes.leaf_indices)))
-    return dataclasses.replace(program, check=_finite_check(axes, leaves, core.nonfinite, core.steps, checked))
+    checked = sorted((members | axes.views & set(program.written_leaves)) & set(watched(axes.leaf_indices)))
+    return dataclasses.replace(program, check_segment=_finite_check(axes, leaves, core.nonfinite, core.steps, checked))
 
 
-def _before_the_steps(
+def _move_before_steps(
     segments: Sequence[Segment | UnfusedStage], stages: Sequence[Stage], clock: Any
 ) -> list[Segment | UnfusedStage]:
     """Return the segments of a step. Leading segments that begin an episode run before the first step of a call.
@@ -84,7 +84,7 @@ def _before_the_steps(
     An episode cannot begin during a call as long as at most one stage writes the ``clock``, the leaf of step counts.
     Numbers that only the moved segments write are then constant during the steps, and can be hoisted.
     """
-    if sum(clock in s.written for s in segments) > 1:
+    if sum(clock in s.written_leaves for s in segments) > 1:
         return list(segments)
     begins = [stage.when is is_first_step and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)]
     n = (*begins, False).index(False)
@@ -106,25 +106,27 @@ def _lower_stage(
             raise LimitError(stage.unfused_reason)
         traced = tracer(stage, axes, leaves)
         # If a stage of a world uses no leaf of drones, every drone can run it for its world.
-        of_drones = any(axes.scopes[i] == "drone" for i in (*traced.used, *traced.written))
-        scope: Literal["drone", "world"] = "world" if stage.scope == "world" and of_drones else "drone"
+        uses_drones = any(axes.scopes[i] == "drone" for i in (*traced.input_leaves, *traced.written_leaves))
+        scope: Literal["drone", "world"] = "world" if stage.scope == "world" and uses_drones else "drone"
         if scope == "world" and n_drones > MAX_UNROLLED_DRONES:
             raise LimitError(f"a stage of one world is unrolled for at most {MAX_UNROLLED_DRONES} drones")
-        others = [leaves[i].shape[2] for i in (*traced.used, *traced.written) if i in axes.views]
+        others = [leaves[i].shape[2] for i in (*traced.input_leaves, *traced.written_leaves) if i in axes.views]
         if max(others, default=0) > MAX_UNROLLED_DRONES:
             raise LimitError(f"other populations are unrolled for at most {MAX_UNROLLED_DRONES} members")
-        shared = [i for i in traced.used if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
-        known = {i: zeros[i] for i in traced.used if i in zeros}
+        shared = [i for i in traced.input_leaves if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
+        known_zeros = {i: zeros[i] for i in traced.input_leaves if i in zeros}
         n_members = n_drones if scope == "drone" else 0
-        key = (stage.__name__, scope, phase, n_members, frozenset(known.items()))
+        key = (stage.__name__, scope, phase, n_members, frozenset(known_zeros.items()))
         if key not in traced.segments:
-            traced.segments[key] = _segment(stage, scope, phase, traced, known, shared, n_members)
+            traced.segments[key] = _segment(stage, scope, phase, traced, known_zeros, shared, n_members)
         return traced.segments[key]
     except UnsupportedError as error:
         traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
         traced.dump(stage.__name__)
         error = error.with_location(stage=stage.__name__)
-        return UnfusedStage(stage.__name__, phase, traced.fn, tuple(traced.used), tuple(traced.written), error)
+        return UnfusedStage(
+            stage.__name__, phase, traced.fn, tuple(traced.input_leaves), tuple(traced.written_leaves), error
+        )
 
 
 def _segment(
@@ -137,20 +139,20 @@ def _segment(
     n_members: int,
 ) -> Segment:
     lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
-    before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.used}
+    before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.input_leaves}
     tables = {_table(lowering, before[i]): (i, TABLE_INDEX) for i in shared if i in before and before[i].size > 1}
     lowering.shared.update(x for i in shared for x in scalars(before[i]) if isinstance(x, Value))
-    args = [before[i] for i in traced.used]
+    args = [before[i] for i in traced.input_leaves]
     if traced.when is None:
         after = lowering.lower(traced.fn, args)
     else:
         mask = lowering.lower(traced.when, args)[0][()]
-        for i in traced.written:
+        for i in traced.written_leaves:
             if i not in before:
                 before[i] = inputs(lowering.builder, traced.avals[i])
-        after = _lower_guarded(lowering, mask, traced, args, [before[i] for i in traced.written])
+        after = _lower_guarded(lowering, mask, traced, args, [before[i] for i in traced.written_leaves])
     writes: dict[Slot, Element] = {}
-    for i, new in zip(traced.written, after, strict=True):
+    for i, new in zip(traced.written_leaves, after, strict=True):
         old = scalars(before[i]) if i in before else [None] * len(scalars(new))
         writes.update({(i, k): b for k, (a, b) in enumerate(zip(old, scalars(new), strict=True)) if a is not b})
     slots = {x: (i, k) for i, elements in before.items() for k, x in enumerate(scalars(elements))} | tables
@@ -184,8 +186,10 @@ def _lower_guarded(
         return [_replace_scalars(x, [next(results) for _ in scalars(x)]) for x in old]
     changed = [(a, b) for a, b in pairs if a is not b]
     block = inner.builder.finish([b for _, b in changed])
-    before = [a for a, _ in changed]
-    results = iter(lowering.builder.add_many("when", (mask, *before), [a.dtype for a in before], (), (block,)))
+    old_elements = [a for a, _ in changed]
+    results = iter(
+        lowering.builder.add_many("when", (mask, *old_elements), [a.dtype for a in old_elements], (), (block,))
+    )
     flat = iter([a if a is b else next(results) for a, b in pairs])
     return [_replace_scalars(x, [next(flat) for _ in scalars(x)]) for x in old]
 
@@ -198,7 +202,7 @@ def _replace_scalars(template: Elements, items: Sequence[Element]) -> Elements:
 
 
 def _finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watched: Sequence[int]) -> Segment:
-    """Return a segment that flags a drone whose world was flagged, or of which a watched number is not finite.
+    """Return a segment that flags a drone if its world was flagged or one of its watched numbers is not finite.
 
     It also flags drones of worlds that took more than ``MAX_STEPS`` steps. A call takes at most that many steps, so the
     count has overflowed and is negative.

@@ -45,19 +45,19 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     n = len(program.leaves)
     changed, constants = changed_slots(program, perturbed)
     segments = [_add_segment_tangents(program, n, s, changed, constants.get(s, ())) for s in program.fused_segments]
-    zero = dict.fromkeys((i, k) for s in segments for i in s.written if i >= n and i - n not in perturbed
+    zero = dict.fromkeys((i, k) for s in segments for i in s.written_leaves if i >= n and i - n not in perturbed
                          for k in range(program.leaves[i - n].size))  # fmt: skip
     zeros = [constant(0, program.leaves[i - n].number_type) for i, _ in zero]
-    start = Segment("drone", ("tangents",), "before", Block((), (), tuple(zeros)), (), tuple(zero))
+    zero_segment = Segment("drone", ("tangents",), "before", Block((), (), tuple(zeros)), (), tuple(zero))
     return dataclasses.replace(
         program,
-        leaves=(*program.leaves, *map(_tangent_of, program.leaves)),
-        segments=(start, *segments) if zero else tuple(segments),
-        scratch=program.scratch | set(program.written),
+        leaves=(*program.leaves, *map(_tangent_leaf, program.leaves)),
+        segments=(zero_segment, *segments) if zero else tuple(segments),
+        scratch=program.scratch | set(program.written_leaves),
     )
 
 
-def _tangent_of(leaf: Leaf) -> Leaf:
+def _tangent_leaf(leaf: Leaf) -> Leaf:
     is_own = leaf.scope in ("drone", "world")
     scope, shape = (leaf.scope, leaf.shape) if is_own else ("world", (1, 1, *leaf.shape))
     return Leaf(f"tangent of {leaf.name}", scope, shape, leaf.dtype)
@@ -68,11 +68,18 @@ def _add_segment_tangents(
 ) -> Segment:
     """Return a segment with the tangents of its outputs."""
     reads, n_reads = program.per_drone(s, s.reads), len(s.reads)
-    wanted = [k for k, slot in enumerate(reads) if slot in changed and s.block.inputs[k].dtype.kind == "f"]
-    wanted = [k for k in wanted if not s.block.inputs[k].size]
-    block = add_block_tangents(s.block, [s.block.inputs[k] for k in (*wanted, *(n_reads + k for k in constants))])
+    input_indices = [k for k, slot in enumerate(reads) if slot in changed and s.block.inputs[k].dtype.kind == "f"]
+    input_indices = [k for k in input_indices if not s.block.inputs[k].size]
+    block = add_block_tangents(
+        s.block, [s.block.inputs[k] for k in (*input_indices, *(n_reads + k for k in constants))]
+    )
     primal, input_tangents = block.inputs[: len(s.block.inputs)], block.inputs[len(s.block.inputs) :]
-    inputs = (*primal[:n_reads], *input_tangents[: len(wanted)], *primal[n_reads:], *input_tangents[len(wanted) :])
+    inputs = (
+        *primal[:n_reads],
+        *input_tangents[: len(input_indices)],
+        *primal[n_reads:],
+        *input_tangents[len(input_indices) :],
+    )
     floats = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
     output_tangents = [(k, x) for k, x in zip(floats, block.outputs[len(s.writes) :], strict=True)
               if program.per_drone(s, [s.writes[k]])[0] in changed]  # fmt: skip
@@ -89,35 +96,35 @@ def _add_segment_tangents(
     return dataclasses.replace(
         s,
         block=Block(inputs, block.operations, (*block.outputs[: len(s.writes)], *(x for _, x in output_tangents))),
-        reads=(*s.reads, *((n + s.reads[k][0], s.reads[k][1]) for k in wanted)),
+        reads=(*s.reads, *((n + s.reads[k][0], s.reads[k][1]) for k in input_indices)),
         writes=(*s.writes, *((n + s.writes[k][0], s.writes[k][1]) for k, _ in output_tangents)),
         hoisted=hoisted,
         hoisted_reads=(*s.hoisted_reads, *((n + i, k) for i, k in hoisted_slots)) if constants else s.hoisted_reads,
     )
 
 
-def add_block_tangents(block: Block, wanted: Sequence[Value]) -> Block:
+def add_block_tangents(block: Block, perturbed: Sequence[Value]) -> Block:
     """Return the block that computes tangents of a block's outputs as well.
 
     Args:
         block: The block.
-        wanted: Inputs whose tangents are given, floats.
+        perturbed: Inputs whose tangents are given, floats.
 
     Returns:
-        The extended block. Its inputs are the inputs of ``block``, followed by the tangents of ``wanted``. Its outputs
-        are the outputs of ``block``, followed by a tangent for each output that is a float.
+        The extended block. Its inputs are the inputs of ``block``, followed by the tangents of ``perturbed``. Its
+        outputs are the outputs of ``block``, followed by a tangent for each output that is a float.
     """
-    indices = [block.inputs.index(x) for x in wanted]
+    indices = [block.inputs.index(x) for x in perturbed]
     block = add_selections(block)
-    wanted = [block.inputs[k] for k in indices]
+    perturbed = [block.inputs[k] for k in indices]
     builder = Builder()
     values: Values = {x: builder.input(x.dtype, x.size) for x in block.inputs}
-    tangents: Values = {x: builder.input(x.dtype) for x in wanted}
+    tangents: Values = {x: builder.input(x.dtype) for x in perturbed}
     outputs = _add_with_tangents(builder, block, values, tangents)
-    return prune(builder.finish([*outputs, *_tangents_of(block.outputs, tangents)]))
+    return prune(builder.finish([*outputs, *_collect_tangents(block.outputs, tangents)]))
 
 
-def _tangents_of(elements: Sequence[Element], tangents: Values) -> list[Element]:
+def _collect_tangents(elements: Sequence[Element], tangents: Values) -> list[Element]:
     """Return the tangents of the floats among some elements; a missing tangent is zero."""
     return [_tangent(x, tangents) for x in elements if x.dtype.kind == "f"]
 
@@ -148,7 +155,7 @@ def _add_with_tangents(builder: Builder, block: Block, values: Values, tangents:
         if ops.TABLE[op.name].structured:
             raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
         derivative = _derivative_block(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
-        operands = [*(_map_element(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
+        operands = [*(_map_element(x, values) for x in op.args), *_collect_tangents(op.args, tangents)]
         results = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
         _record_tangents(op.results, results, tangents)
     return [_map_element(x, values) for x in block.outputs]
@@ -219,8 +226,8 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
     inside = values | {x: inner.input(x.dtype) for x in body.inputs}
     inner_tangents = tangents | {x: inner.input(x.dtype) for x in body.inputs if x.dtype.kind == "f"}
     outputs = _add_with_tangents(inner, body, inside, inner_tangents)
-    blocks = [inner.finish([*outputs, *_tangents_of(body.outputs, inner_tangents)])]
-    args = [*(_map_element(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
+    blocks = [inner.finish([*outputs, *_collect_tangents(body.outputs, inner_tangents)])]
+    args = [*(_map_element(x, values) for x in op.args), *_collect_tangents(op.args, tangents)]
     for block in test:
         inner = Builder(builder)
         inside = values | {x: inner.input(x.dtype) for x in block.inputs}

@@ -25,14 +25,14 @@ class TracedStage:
         """
         self.avals = axes.shapes_of_one(list(leaves), stage.scope)
         """Shapes and types of all leaves, as the stage receives them."""
-        self.written: list[int] = []
+        self.written_leaves: list[int] = []
         """Leaves that it writes: the outputs of ``fn``."""
 
         def apply(values: list[Any]) -> list[Any]:
             after = stage.fn(axes.treedef.unflatten(values))
-            self.written = axes.written(values, after, stage)
+            self.written_leaves = axes.written_leaves(values, after, stage)
             new = jax.tree.leaves(after)
-            return [new[i] for i in self.written]
+            return [new[i] for i in self.written_leaves]
 
         def condition(values: list[Any]) -> list[Any]:
             mask = stage.when(axes.treedef.unflatten(values)) if stage.when is not None else None
@@ -43,10 +43,10 @@ class TracedStage:
         if when is not None and not when.jaxpr.outvars:  # it acts at every step
             when = None
         used = _used_inputs(fn) | (_used_inputs(when) if when is not None else set())
-        self.used = sorted(used)
+        self.input_leaves = sorted(used)
         """Leaves that it reads: the inputs of ``fn`` and ``when``."""
-        self.fn = jaxcompat.select_inputs(fn, self.used)
-        self.when = jaxcompat.select_inputs(when, self.used) if when is not None else None
+        self.fn = jaxcompat.select_inputs(fn, self.input_leaves)
+        self.when = jaxcompat.select_inputs(when, self.input_leaves) if when is not None else None
         self.segments: dict[Any, Any] = {}
         """Segments that it was lowered to, by all else that they depend on."""
 
@@ -60,20 +60,20 @@ class Tracer:
     """Cache of traced stages: each is traced once for leaves of the same shapes and types."""
 
     def __init__(self) -> None:
-        self._found: dict[Any, tuple[Stage, TracedStage]] = {}  # the stage keeps its functions, whose ids are keys
+        self._traced: dict[Any, tuple[Stage, TracedStage]] = {}  # the stage keeps its functions, whose ids are keys
 
     def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
         """Return ``TracedStage(stage, axes, leaves)``, from the cache if possible."""
         shapes = tuple([(x.shape, x.dtype) for x in axes.shapes_of_one(list(leaves), stage.scope)])
         key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
-        if key not in self._found:
+        if key not in self._traced:
             if stage.trace_once:
                 traced = _trace_once(stage, axes, leaves, shapes)
             else:
                 traced = TracedStage(stage, axes, leaves)
             traced.dump(stage.__name__)
-            self._found[key] = stage, traced
-        return self._found[key][1]
+            self._traced[key] = stage, traced
+        return self._traced[key][1]
 
 
 _TRACED_STAGES: dict[Any, TracedStage] = {}

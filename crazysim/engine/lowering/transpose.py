@@ -29,21 +29,21 @@ Cotangents = dict[Value, Element]
 """Cotangents by the values of the block that is differentiated."""
 
 
-def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
+def transpose_block(block: Block, perturbed: Sequence[Value]) -> Block:
     """Return the block that computes cotangents of a block's inputs.
 
     Args:
         block: The block.
-        wanted: Inputs whose cotangents are computed, floats.
+        perturbed: Inputs whose cotangents are computed, floats.
 
     Returns:
-        The block that computes the cotangents of ``wanted``. Its inputs are the inputs of ``block``, followed by a
+        The block that computes the cotangents of ``perturbed``. Its inputs are the inputs of ``block``, followed by a
         cotangent for each output that is a float.
     """
-    indices = [block.inputs.index(x) for x in wanted]
+    indices = [block.inputs.index(x) for x in perturbed]
     block = _unroll_loops(add_selections(block))
-    wanted = [block.inputs[k] for k in indices]
-    on_path = active_values(block, wanted)
+    perturbed = [block.inputs[k] for k in indices]
+    on_path = active_values(block, perturbed)
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
     parts = _parts(block)
@@ -58,7 +58,7 @@ def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
     for k, part in reversed(list(enumerate(parts))):
         elements = values if k == len(parts) - 1 else _recompute(builder, part, k, values, on_path)
         _add_cotangents(builder, part, elements, on_path, cotangents)
-    return prune(builder.finish([cotangents.get(x, constant(0, x.dtype)) for x in wanted]))
+    return prune(builder.finish([cotangents.get(x, constant(0, x.dtype)) for x in perturbed]))
 
 
 OPERATIONS_PER_PART = 60
@@ -212,7 +212,7 @@ def _over_others(
     published = [values.get(x, x) for x in op.args]
 
     def backwards(
-        inputs: Sequence[Value], own_values: dict, wanted: Sequence[Value], shared: Sequence[Element]
+        inputs: Sequence[Value], own_values: dict, perturbed: Sequence[Value], shared: Sequence[Element]
     ) -> None:
         """Add a loop over the other drones for the cotangents of some values."""
         inner, inside, local = Builder(builder), dict(values), Cotangents()
@@ -224,16 +224,16 @@ def _over_others(
             if ct is not None and isinstance(x, Value) and x in on_path:
                 _accumulate(inner, local, x, inside.get(ct, ct) if isinstance(ct, Value) else ct)
         _add_cotangents(inner, body, inside, on_path, local)
-        wanted = [x for x in wanted if x in local]
-        if not wanted:
+        perturbed = [x for x in perturbed if x in local]
+        if not perturbed:
             return
-        block = prune(inner.finish([local[x] for x in wanted]))
+        block = prune(inner.finish([local[x] for x in perturbed]))
         read = block.uses()
         pairs = [(y, s) for y, s in zip(fresh, shared, strict=False) if y in read]
         block = Block((*(y for y, _ in pairs), fresh[-1]), block.operations, block.outputs)
-        params = (("reduce", ("add",) * len(wanted)), ("n_members", op.param("n_members")))
-        sums = builder.add_many("over_others", [s for _, s in pairs], [x.dtype for x in wanted], params, (block,))
-        for x, part in zip(wanted, sums, strict=True):
+        params = (("reduce", ("add",) * len(perturbed)), ("n_members", op.param("n_members")))
+        sums = builder.add_many("over_others", [s for _, s in pairs], [x.dtype for x in perturbed], params, (block,))
+        for x, part in zip(perturbed, sums, strict=True):
             target = dict(zip(body.inputs, op.args, strict=False)).get(x, x)
             if isinstance(target, Value) and target in on_path:
                 _accumulate(builder, cts, target, part)

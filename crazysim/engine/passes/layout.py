@@ -20,8 +20,12 @@ def pack_shared(program: Program) -> Program:
     leaves that are read as tables, stay separate.
     """
     leaves = program.leaves
-    direct = {leaf for stage in program.unfused_stages for leaf in stage.used} | program.tables
-    shared = [i for i in program.read if leaves[i].scope == "shared" and i not in direct and i not in program.written]
+    direct = {leaf for stage in program.unfused_stages for leaf in stage.input_leaves} | program.tables
+    shared = [
+        i
+        for i in program.read_leaves
+        if leaves[i].scope == "shared" and i not in direct and i not in program.written_leaves
+    ]
     shared = [i for i in shared if leaves[i].dtype == leaves[0].dtype]
     if not shared:
         return program
@@ -30,8 +34,10 @@ def pack_shared(program: Program) -> Program:
         starts[i] = size
         size += leaves[i].size
     packed = Leaf(PACKED_LEAF_NAME, "shared", (size,), leaves[0].dtype)
-    moved = _move_slots(program, lambda slot: (len(leaves), starts[slot[0]] + slot[1]) if slot[0] in starts else slot)
-    return dataclasses.replace(moved, leaves=(*leaves, packed), packed=tuple(shared))
+    moved_program = _move_slots(
+        program, lambda slot: (len(leaves), starts[slot[0]] + slot[1]) if slot[0] in starts else slot
+    )
+    return dataclasses.replace(moved_program, leaves=(*leaves, packed), packed=tuple(shared))
 
 
 def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Program:
@@ -44,12 +50,12 @@ def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Pro
         select: Function from the written leaves to the leaves that become rows; random keys are never moved.
     """
     leaves = list(program.leaves)
-    chosen = [i for i in sorted(select(program.written)) if not is_key(leaves[i])]
+    row_leaves = [i for i in sorted(select(program.written_leaves)) if not is_key(leaves[i])]
     # If a world has one drone, leaves of the world can be stored with the leaves of drones.
-    kinds = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in chosen}
+    kinds = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in row_leaves}
     positions: dict[int, tuple[int, int, int]] = {}
     for kind in dict.fromkeys(kinds.values()):
-        members = tuple([i for i in chosen if kinds[i] == kind])
+        members = tuple([i for i in row_leaves if kinds[i] == kind])
         n_rows = sum(leaves[i].size for i in members)
         first = 0
         for i in members:
@@ -62,9 +68,9 @@ def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Pro
         leaf, k = slot
         if leaf not in positions:
             return slot
-        new, first, n_rows = positions[leaf]
+        new_leaf, first, n_rows = positions[leaf]
         drone, k = divmod(k, program.leaves[leaf].size)
-        return new, drone * n_rows + first + k
+        return new_leaf, drone * n_rows + first + k
 
     return dataclasses.replace(_move_slots(program, move), leaves=tuple(leaves))
 
@@ -80,7 +86,7 @@ class PackedRows(NamedTuple):
     @property
     def members(self) -> tuple[int, ...]:
         """Leaves whose numbers are the rows, in order."""
-        return self.program.leaves[self.leaf].rows_of
+        return self.program.leaves[self.leaf].row_leaves
 
     def pack(self, leaves: Sequence[Any]) -> Array:
         """Return the rows. (n_rows, n_lanes)"""
@@ -95,14 +101,14 @@ class PackedRows(NamedTuple):
     def unpack(self, rows: Array, leaf: int) -> Array:
         """Return the array of one of ``members``."""
         sizes = {i: self.program.leaves[i].size for i in self.members}
-        first, member = sum(sizes[i] for i in self.members[: self.members.index(leaf)]), self.program.leaves[leaf]
-        x = rows[first : first + member.size].T.reshape(-1, self.program.n_drones, *member.shape[2:])
+        first_row, member = sum(sizes[i] for i in self.members[: self.members.index(leaf)]), self.program.leaves[leaf]
+        x = rows[first_row : first_row + member.size].T.reshape(-1, self.program.n_drones, *member.shape[2:])
         return x[:, :1] if member.scope == "world" else x
 
 
 def packed_rows(program: Program) -> list[PackedRows]:
     """Return the leaves of rows of a program."""
-    return [PackedRows(program, i) for i, leaf in enumerate(program.leaves) if leaf.rows_of]
+    return [PackedRows(program, i) for i, leaf in enumerate(program.leaves) if leaf.row_leaves]
 
 
 def _move_slots(program: Program, move: Callable[[Slot], Slot]) -> Program:
@@ -113,4 +119,6 @@ def _move_slots(program: Program, move: Callable[[Slot], Slot]) -> Program:
         return dataclasses.replace(s, reads=tuple(reads), writes=tuple(writes), hoisted_reads=tuple(hoisted))
 
     segments = tuple([segment(s) if isinstance(s, Segment) else s for s in program.segments])
-    return dataclasses.replace(program, segments=segments, check=program.check and segment(program.check))
+    return dataclasses.replace(
+        program, segments=segments, check_segment=program.check_segment and segment(program.check_segment)
+    )

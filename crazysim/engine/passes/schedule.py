@@ -32,27 +32,27 @@ def fuse(program: Program) -> Program:
     segments: list[Segment | UnfusedStage] = []
     kinds = itertools.groupby(program.segments, lambda s: (s.scope, s.phase) if isinstance(s, Segment) else id(s))
     for _, group in kinds:
-        run = list(group)
-        fusible = [s for s in run if isinstance(s, Segment)]
-        segments += [_join_segments(fusible)] if fusible else run
+        segment_group = list(group)
+        fusible = [s for s in segment_group if isinstance(s, Segment)]
+        segments += [_join_segments(fusible)] if fusible else segment_group
     return dataclasses.replace(program, segments=tuple(segments))
 
 
 def _join_segments(segments: list[Segment]) -> Segment:
     builder = Builder()
-    before: dict[Slot, Value] = {}
-    now: dict[Slot, Element] = {}
+    inputs: dict[Slot, Value] = {}
+    outputs: dict[Slot, Element] = {}
     for segment in segments:
         (builder.stage,) = segment.stages
         values: dict[Value, Element] = {}
         for x, slot in zip(segment.block.inputs, segment.reads, strict=True):
-            if slot not in now:
-                now[slot] = before[slot] = builder.input(x.dtype, x.size)
-            values[x] = now[slot]
-        now.update(zip(segment.writes, inline(builder, segment.block, values), strict=True))
+            if slot not in outputs:
+                outputs[slot] = inputs[slot] = builder.input(x.dtype, x.size)
+            values[x] = outputs[slot]
+        outputs.update(zip(segment.writes, inline(builder, segment.block, values), strict=True))
         builder.barrier()
-    writes = {slot: x for slot, x in now.items() if x is not before.get(slot)}
-    slots = {x: slot for slot, x in before.items()}
+    writes = {slot: x for slot, x in outputs.items() if x is not inputs.get(slot)}
+    slots = {x: slot for slot, x in inputs.items()}
     block = prune(builder.finish(tuple(writes.values())), keep_inputs=False)
     stages = tuple([name for segment in segments for name in segment.stages])
     reads = tuple([slots[x] for x in block.inputs])
@@ -151,22 +151,22 @@ def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
             fixed.update(op.results)
             if ops.TABLE[op.name].cost >= ops.EXPENSIVE_COST or not worth.isdisjoint(op.args):
                 worth.update(op.results)
-    rest = Block(block.inputs, tuple([op for op in operations if worth.isdisjoint(op.results)]), block.outputs)
-    used = rest.uses()
-    moved = [x for op in operations for x in op.results if x in worth and x in used]
-    if not moved:
+    step_block = Block(block.inputs, tuple([op for op in operations if worth.isdisjoint(op.results)]), block.outputs)
+    used = step_block.uses()
+    hoisted_values = [x for op in operations for x in op.results if x in worth and x in used]
+    if not hoisted_values:
         return segment
     # Cheap operations that depend on no hoisted value stay in the step; the hoisted block repeats them if needed.
     fixed_operations = [op for op in operations if op.results and fixed.issuperset(op.results)]
-    once = prune(Block(block.inputs, tuple(fixed_operations), tuple(moved)), keep_inputs=False)
-    further = {x: Value(x.dtype) for x in moved}
-    rest = prune(substitute(rest, further), keep_inputs=False)
+    hoisted_block = prune(Block(block.inputs, tuple(fixed_operations), tuple(hoisted_values)), keep_inputs=False)
+    new_inputs = {x: Value(x.dtype) for x in hoisted_values}
+    step_block = prune(substitute(step_block, new_inputs), keep_inputs=False)
     return dataclasses.replace(
         segment,
-        block=dataclasses.replace(rest, inputs=(*rest.inputs, *further.values())),
-        reads=tuple([slots[x] for x in rest.inputs]),
-        hoisted=once,
-        hoisted_reads=tuple([slots[x] for x in once.inputs]),
+        block=dataclasses.replace(step_block, inputs=(*step_block.inputs, *new_inputs.values())),
+        reads=tuple([slots[x] for x in step_block.inputs]),
+        hoisted=hoisted_block,
+        hoisted_reads=tuple([slots[x] for x in hoisted_block.inputs]),
     )
 
 

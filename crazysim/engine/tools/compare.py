@@ -47,8 +47,8 @@ class Difference:
 
     def __str__(self) -> str:
         (a, b), (x, y) = self.engines, self.values
-        where = f"{self.leaf}{list(self.index)}"
-        text = f"stage {self.stage!r}: {where} is {x} by {a!r} and {y} by {b!r}"
+        location = f"{self.leaf}{list(self.index)}"
+        text = f"stage {self.stage!r}: {location} is {x} by {a!r} and {y} by {b!r}"
         return f"{text}; first at {self.operation}" if self.operation else text
 
 
@@ -74,14 +74,14 @@ def first_difference(
 
     axes = Axes(data)
     for name, stage in pipeline.items():
-        after = [Step({name: stage}, engine)(data, jnp.int32(1)) for engine in engines]
-        for i, (x, y) in enumerate(zip(*map(jax.tree.leaves, after), strict=True)):
+        results = [Step({name: stage}, engine)(data, jnp.int32(1)) for engine in engines]
+        for i, (x, y) in enumerate(zip(*map(jax.tree.leaves, results), strict=True)):
             index = _largest_difference(x, y, tolerance)
             if index is not None:
                 values = (np.asarray(x)[index], np.asarray(y)[index])
                 operation = _operation(pipeline[name], name, data, engines, tolerance)
                 return Difference(name, axes.names[i], index, values, engines, operation)
-        data = after[0]
+        data = results[0]
     return None
 
 
@@ -97,8 +97,8 @@ def _largest_difference(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | N
         size = finite.max(axis=-1, keepdims=True) if x.ndim > 2 else finite
         with np.errstate(all="ignore"):
             relative_error = np.abs(x.astype(np.float64) - y) / np.maximum(size, np.finfo(x.dtype).tiny)
-        same = (x == y) | (np.isnan(x) & np.isnan(y))
-        difference = np.where(same, 0.0, np.where(np.isnan(relative_error), np.inf, relative_error)) > tolerance
+        is_equal = (x == y) | (np.isnan(x) & np.isnan(y))
+        difference = np.where(is_equal, 0.0, np.where(np.isnan(relative_error), np.inf, relative_error)) > tolerance
         difference = np.where(difference, np.where(np.isfinite(relative_error), relative_error, np.inf), 0.0)
     if not difference.any():
         return None
@@ -128,10 +128,10 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
     """
     exposed, operations = expose_values(program)
     n_worlds = lanes.batch_counts(program, leaves)[0]
-    more = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in exposed.leaves[len(leaves) :]]
+    zero_leaves = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in exposed.leaves[len(leaves) :]]
     location = Location("cpu" if jax.default_backend() == "cpu" else "gpu")
-    written = [builder(exposed, location)([*leaves, *more], 1)[0] for builder in (interpret.build, build)]
-    results = [dict(zip(exposed.written, arrays, strict=True)) for arrays in written]
+    written = [builder(exposed, location)([*leaves, *zero_leaves], 1)[0] for builder in (interpret.build, build)]
+    results = [dict(zip(exposed.written_leaves, arrays, strict=True)) for arrays in written]
     (segment,) = exposed.fused_segments
     for op, (leaf, _) in zip(operations, segment.writes, strict=True):
         expected, actual = (np.asarray(result[leaf]) for result in results)
@@ -153,10 +153,10 @@ def expose_values(program: Program) -> tuple[Program, list[Operation]]:
     n_worlds = next(leaf.shape[0] for leaf in program.leaves if leaf.scope == "drone")
     shape = (n_worlds, program.n_drones if segment.scope == "drone" else 1)
     value_leaves = [Leaf(f"value {k}", segment.scope, shape, x.dtype) for k, x in enumerate(values)]
-    first = len(program.leaves)
+    n_leaves = len(program.leaves)
     exposed = dataclasses.replace(
         segment,
         block=Block(segment.block.inputs, segment.block.operations, tuple(values)),
-        writes=tuple([(first + k, 0) for k in range(len(values))]),
+        writes=tuple([(n_leaves + k, 0) for k in range(len(values))]),
     )
     return dataclasses.replace(program, leaves=(*program.leaves, *value_leaves), segments=(exposed,)), operations

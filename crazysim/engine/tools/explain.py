@@ -43,10 +43,10 @@ def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | Non
     if split and measure:
         lines.append(_cost_of_split(step, data, split))
     if plan.engine == "fused":
-        where = plan.location.platform, plan.location.devices
-        lines += dict.fromkeys(line for program in plan.programs for line in fused.describe(program, *where))
-        how = "sim.step calls it without XLA" if plan.host_call is not None else "sim.step is one compiled call"
-        lines[-1] += f"; {how}, and reads make only the fields that are read"
+        location = plan.location.platform, plan.location.devices
+        lines += dict.fromkeys(line for program in plan.programs for line in fused.describe(program, *location))
+        call_text = "sim.step calls it without XLA" if plan.host_call is not None else "sim.step is one compiled call"
+        lines[-1] += f"; {call_text}, and reads make only the fields that are read"
         lines += dict.fromkeys(line for program in step.programs for line in fused.describe_derivatives(program))
     return "\n".join(lines)
 
@@ -56,9 +56,9 @@ def _cost_of_split(step: Step, data: SimData, split: list[str]) -> str:
 
     def seconds(step: Step, n: int = 64) -> float:
         jax.block_until_ready(step(data, jnp.int32(n)))  # compiles
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         jax.block_until_ready(step(data, jnp.int32(n)))
-        return (time.perf_counter() - begin) / n
+        return (time.perf_counter() - start_time) / n
 
     with_them, without = seconds(step), seconds(step.without_stages(split))
     return (

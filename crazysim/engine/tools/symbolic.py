@@ -46,8 +46,8 @@ def require_casadi(block: Block) -> None:
     """Check that CasADi has a form for all operations of a block."""
     refused = [(op.stage, why) for op in block.walk() if (why := _refusal(op)) is not None]
     if refused:
-        drawn = [(stage, why) for stage, why in refused if why == RANDOM_REASON]  # the most informative reason
-        stage, why = (drawn or refused)[0]
+        random = [(stage, why) for stage, why in refused if why == RANDOM_REASON]  # the most informative reason
+        stage, why = (random or refused)[0]
         raise UnsupportedError(why, stage=stage)
 
 
@@ -98,9 +98,9 @@ class _Interpreter:
     def _results(self, op: Operation, args: list[Expression]) -> list[Expression]:
         match op.name:
             case "when":
-                mask, *old = args
-                new = self.run(op.blocks[0], [])
-                return [self.casadi.if_else(mask, x, y) for x, y in zip(new, old, strict=True)]
+                mask, *old_values = args
+                new_values = self.run(op.blocks[0], [])
+                return [self.casadi.if_else(mask, x, y) for x, y in zip(new_values, old_values, strict=True)]
             case "loop":
                 for _ in range(op.param("length")):
                     args = self.run(op.blocks[0], args)
@@ -108,9 +108,9 @@ class _Interpreter:
             case "any_lane":
                 return args
             case "custom_jvp":
-                outside, self.in_custom_jvp = self.in_custom_jvp, True
+                was_in_custom_jvp, self.in_custom_jvp = self.in_custom_jvp, True
                 outputs = self.run(op.blocks[0], args)
-                self.in_custom_jvp = outside
+                self.in_custom_jvp = was_in_custom_jvp
                 return outputs
             case "convert_element_type":
                 return [self._convert(op, args[0])]
@@ -119,23 +119,23 @@ class _Interpreter:
         form = ops.TABLE[op.name].casadi
         if form is None:
             raise UnsupportedError(f"operation {op.name!r} has no form in CasADi", stage=op.stage)
-        named = isinstance(form, str)
-        out = getattr(self.casadi, form)(*args) if named else form(self.casadi, *args, **dict(op.params))
+        is_name = isinstance(form, str)
+        result = getattr(self.casadi, form)(*args) if is_name else form(self.casadi, *args, **dict(op.params))
         if op.name == "div" and op.dtype.kind in "iu":
-            return [self._towards_zero(out)]
-        return [self._wrap(out) if op.dtype.kind == "u" and op.name in ("add", "sub") else out]
+            return [self._towards_zero(result)]
+        return [self._wrap(result) if op.dtype.kind == "u" and op.name in ("add", "sub") else result]
 
     def _convert(self, op: Operation, x: Expression) -> Expression:
-        before, after = op.args[0].dtype, op.dtype
-        if after.kind == "b":
+        old_type, new_type = op.args[0].dtype, op.dtype
+        if new_type.kind == "b":
             return x != 0
-        if after.kind not in "iu" or before.kind == "b":
+        if new_type.kind not in "iu" or old_type.kind == "b":
             return x
-        limits = np.iinfo(after)
-        if before.kind == "f":
+        limits = np.iinfo(new_type)
+        if old_type.kind == "f":
             return self.casadi.fmin(self.casadi.fmax(self._towards_zero(x), limits.min), limits.max)
-        fits = np.iinfo(before).min >= limits.min and np.iinfo(before).max <= limits.max
-        return x if fits else self._wrap(x, float(limits.min), 2.0 ** (8 * after.itemsize))
+        fits = np.iinfo(old_type).min >= limits.min and np.iinfo(old_type).max <= limits.max
+        return x if fits else self._wrap(x, float(limits.min), 2.0 ** (8 * new_type.itemsize))
 
     def _wrap(self, x: Expression, low: float = 0.0, length: float = 2.0**32) -> Expression:
         """Wrap a whole number around to the range from ``low`` to ``low + length - 1``, as integer types do."""

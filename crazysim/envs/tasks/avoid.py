@@ -82,7 +82,7 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Avoid(Task):
-    """Fly some 4.5 m through a field of obstacles, which stand elsewhere in every episode.
+    """Fly about 4.5 m through a field of obstacles, which have new positions in every episode.
 
     Poles reach from the floor to the ceiling; boxes hang in the air. A drone is disabled when it touches one, the floor
     or another drone, or leaves the arena; contacts are checked at every physics step. An episode ends when every drone
@@ -109,7 +109,7 @@ class Avoid(Task):
             raise ConfigError("expected at least one obstacle, got n_poles=0 and n_boxes=0. Set one of them.")
 
     def field(self, n_drones: int) -> Field:
-        """Return the dimensions of the field: a third of the cells stay free, and all drones fit beside each other."""
+        """Return the dimensions of the field: a third of the cells stay free, and all drones fit next to each other."""
         n = self.n_poles + self.n_boxes
         width = max(4, -(-3 * n // (2 * FIELD_LENGTH)), -(-int(10 * SPACING * n_drones) // int(10 * CELL)))
         size = CELL * np.array([FIELD_LENGTH, width])
@@ -137,8 +137,8 @@ class Avoid(Task):
         def update_record(data: SimData) -> SimData:
             """Disable a drone that touches something or leaves the arena, and record when it reaches its goal."""
             record, pos = crossing_of(data), data.states.pos
-            left = jnp.any(jnp.abs(pos[:2]) > half.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
-            disabled = record.disabled | (~record.reached & (left | contacts(data).any))
+            has_left = jnp.any(jnp.abs(pos[:2]) > half.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
+            disabled = record.disabled | (~record.reached & (has_left | contacts(data).any))
             offset = pos - record.goal
             reached = record.reached | (~disabled & (rotation.dot(offset, offset)[0] < self.tolerance**2))
             return with_record(data, record.replace(disabled=disabled, reached=reached))
@@ -151,26 +151,24 @@ class Avoid(Task):
         n, n_drones, dtype = self.n_poles + self.n_boxes, data.core.n_drones, data.states.pos.dtype
         field = self.field(n_drones)
         x = draw(key, cells=FIELD_LENGTH * field.width, obstacles=(n, 4), drones=(n_drones, 12))
-        cell, stands = ranks(x["cells"], n), 2 * x["obstacles"] - 1
+        cell, shift = ranks(x["cells"], n), 2 * x["obstacles"] - 1
         corner = jnp.asarray((CELL - field.size) / 2, dtype)
-        flat = (
-            corner
-            + CELL * jnp.stack([cell % FIELD_LENGTH, cell // FIELD_LENGTH], axis=-1)
-            + CELL_JITTER * stands[:, :2]
+        cell_pos = (
+            corner + CELL * jnp.stack([cell % FIELD_LENGTH, cell // FIELD_LENGTH], axis=-1) + CELL_JITTER * shift[:, :2]
         )
-        hangs = (np.arange(n) >= self.n_poles) * jnp.asarray(HEIGHT / 2 + (HEIGHT / 2 - BOX_WIDTH) * stands[:, 2])
-        angle = jnp.pi * stands[:, 3:] / 2
-        pos = jnp.concatenate([flat, hangs[:, None]], axis=-1)
+        height = (np.arange(n) >= self.n_poles) * jnp.asarray(HEIGHT / 2 + (HEIGHT / 2 - BOX_WIDTH) * shift[:, 2])
+        angle = jnp.pi * shift[:, 3:] / 2
+        pos = jnp.concatenate([cell_pos, height[:, None]], axis=-1)
         quat = jnp.concatenate([0 * angle, 0 * angle, jnp.sin(angle), jnp.cos(angle)], axis=-1)
-        first, record = 0, crossing_of(data)
+        first_row, record = 0, crossing_of(data)
         for handle in record.handles:
-            rows = slice(first, first + len(handle))
-            data, first = handle.set_pose(data, pos[rows], quat[rows]), rows.stop
-        offset, aim, rpy, vel = jnp.split(2 * x["drones"] - 1, 4, axis=-1)
+            rows = slice(first_row, first_row + len(handle))
+            data, first_row = handle.set_pose(data, pos[rows], quat[rows]), rows.stop
+        offset, goal_shift, rpy, vel = jnp.split(2 * x["drones"] - 1, 4, axis=-1)
         goals = field.goals.astype(dtype)
         start = goals * np.array([-1, 1, 1], dtype) + JITTER * offset
         data = flying(data, start, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
-        return with_record(data, record.replace(goal=goals + JITTER * aim))
+        return with_record(data, record.replace(goal=goals + JITTER * goal_shift))
 
     def before_step(self, data: SimData) -> SimData:
         record = crossing_of(data)
@@ -191,19 +189,19 @@ class Avoid(Task):
         # Middle and half size of each solid, in the object's frame; a pole's radius is subtracted from the distance.
         middle = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[0, 0, 0]] * n_boxes)
         size = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[BOX_WIDTH / 2] * 3] * n_boxes)
-        thick = np.array([POLE_RADIUS] * n_poles + [0.0] * n_boxes)
+        radius = np.array([POLE_RADIUS] * n_poles + [0.0] * n_boxes)
         is_box = np.arange(n_poles + n_boxes)[:, None] >= n_poles
         pos, quat = (x[..., rows, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
-        inside = rotation.rotate_inverse(quat, data.states.pos[..., None, :] - pos) - middle.astype(dtype)
-        reach = jnp.asarray(size, dtype)
-        nearest = rotation.safe_clip(inside, -reach, reach)
-        far = rotation.safe_norm(nearest - inside)
-        gap = far - thick[:, None].astype(dtype)
-        ways = rotation.rotate(quat, nearest - inside) * (gap / jnp.where(far > 1e-3, far, 1))
+        local_pos = rotation.rotate_inverse(quat, data.states.pos[..., None, :] - pos) - middle.astype(dtype)
+        half_size = jnp.asarray(size, dtype)
+        nearest = rotation.safe_clip(local_pos, -half_size, half_size)
+        distance = rotation.safe_norm(nearest - local_pos)
+        gap = distance - radius[:, None].astype(dtype)
+        ways = rotation.rotate(quat, nearest - local_pos) * (gap / jnp.where(distance > 1e-3, distance, 1))
         to_middle = jnp.where(is_box, rotation.rotate(quat, -nearest), 0)
-        both = jnp.concatenate([ways, to_middle], axis=-1)
-        seen = nearest_entries(gap[..., 0], both, min(self.n_seen, n_poles + n_boxes))
-        return seen[..., :3], seen[..., 3:]
+        vectors = jnp.concatenate([ways, to_middle], axis=-1)
+        nearest_vectors = nearest_entries(gap[..., 0], vectors, min(self.n_seen, n_poles + n_boxes))
+        return nearest_vectors[..., :3], nearest_vectors[..., 3:]
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and vectors to its goal, to the nearest obstacles and to other drones, m.

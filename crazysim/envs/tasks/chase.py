@@ -16,7 +16,7 @@ from crazysim.core.plugin import StagePlacement
 from crazysim.core.settings import setting
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.goals import pick
+from crazysim.envs.tasks.goals import pick_entry
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, initial_outcome
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
@@ -89,12 +89,12 @@ class Chase(TouchDown):
         arm = rotation.rotate(car.quat, jnp.broadcast_to(top, car.pos.shape))
         turning = jnp.concatenate([0 * car.yaw_rate, 0 * car.yaw_rate, car.yaw_rate], axis=-1)
         vel = car.vel + rotation.cross(turning, arm)
-        return pick(car.pos + arm, data.core.drone_id), pick(vel, data.core.drone_id)
+        return pick_entry(car.pos + arm, data.core.drone_id), pick_entry(vel, data.core.drone_id)
 
     def has_left_arena(self, data: SimData) -> Array:
         pos = data.states.pos
-        away = (pos - self.target_motion(data)[0])[..., :2]
-        return (rotation.dot(away, away)[..., 0] > MAX_DISTANCE**2) | (pos[..., 2] > CEILING)
+        offset = (pos - self.target_motion(data)[0])[..., :2]
+        return (rotation.dot(offset, offset)[..., 0] > MAX_DISTANCE**2) | (pos[..., 2] > CEILING)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the vector to its roof, m, the roof's relative velocity, m/s, and the car's motion.
@@ -103,7 +103,10 @@ class Chase(TouchDown):
         """
         car, drone = data.plugins[CARS], data.core.drone_id
         heading = jnp.concatenate([jnp.cos(car.yaw), jnp.sin(car.yaw)], axis=-1)
-        return super().observe(data) | {"heading": pick(heading, drone), "yaw_rate": pick(car.yaw_rate, drone)}
+        return super().observe(data) | {
+            "heading": pick_entry(heading, drone),
+            "yaw_rate": pick_entry(car.yaw_rate, drone),
+        }
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         del n_drones

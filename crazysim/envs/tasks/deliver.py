@@ -19,7 +19,7 @@ from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, initial_outcome
-from crazysim.envs.tasks.goals import install_rules, pick, state_of, with_record
+from crazysim.envs.tasks.goals import install_rules, pick_entry, state_of, with_record
 from crazysim.plugins.payloads import Hook
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
@@ -94,7 +94,7 @@ class Deliver(BringLoad):
             """Move a load that waits along with its trailer; record pick-ups, deliveries and crashes."""
             load = data.plugins["load"]
             taken = delivery_of(data).taken | load.attached
-            ring, vel = (pick(x, data.core.drone_id) for x in moving_rings(data.plugins[CARS]))
+            ring, vel = (pick_entry(x, data.core.drone_id) for x in moving_rings(data.plugins[CARS]))
             load = load.replace(pos=jnp.where(taken, load.pos, ring), vel=jnp.where(taken, load.vel, vel))
             data = data.replace(plugins=data.plugins | {"load": load})
             crashed = has_left_arena(data) | (taken & (load.pos[2] < DROP_HEIGHT))
@@ -155,12 +155,12 @@ class Deliver(BringLoad):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        record, load, to_go = delivery_of(data), data.plugins["load"], self.remaining_way(data)
-        apart = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
+        record, load, way = delivery_of(data), data.plugins["load"], self.remaining_way(data)
+        distance = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
         drift = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
         return {
-            "progress": 5.0 * (record.remaining_way_before - to_go),
-            "meeting": jnp.where(record.taken, 1.0, 0.1 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
+            "progress": 5.0 * (record.remaining_way_before - way),
+            "meeting": jnp.where(record.taken, 1.0, 0.1 * jnp.exp(-4 * distance) * (1 + jnp.exp(-2 * drift))),
             "proximity": 2.0 * record.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
@@ -206,11 +206,11 @@ def moving_rings(car: CarData) -> tuple[Array, Array]:
 def middle_of(data: SimData) -> Array:
     """Return the initial position of each drone's car, of one drone or one world, m. (..., 3)"""
     places = np.pad(SPACING * grid_2d(data.core.n_drones), ((0, 0), (0, 1)))
-    return pick(jnp.asarray(places, data.states.pos.dtype), data.core.drone_id)
+    return pick_entry(jnp.asarray(places, data.states.pos.dtype), data.core.drone_id)
 
 
 def has_left_arena(data: SimData) -> Array:
     """Return true where a drone has left its part of the arena. (...)"""
     pos = data.states.pos
-    far = jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1)
-    return far | (pos[..., 2] < MIN_HEIGHT) | (pos[..., 2] > CEILING)
+    is_far = jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1)
+    return is_far | (pos[..., 2] < MIN_HEIGHT) | (pos[..., 2] > CEILING)

@@ -117,7 +117,7 @@ def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
     return on_floor(data) | (pos[..., 2] > height) | jnp.any(jnp.abs(pos[..., :2]) > half_width, axis=-1)
 
 
-def pick(x: Array, index: Array) -> Array:
+def pick_entry(x: Array, index: Array) -> Array:
     """Return the entry with a given index, by masking all entries, which is faster than indexing.
 
     Args:
@@ -127,8 +127,8 @@ def pick(x: Array, index: Array) -> Array:
     Returns:
         (..., k)
     """
-    chosen = index[..., None, None] == np.arange(x.shape[-2], dtype=np.int32)[:, None]
-    return jnp.sum(jnp.where(chosen, x, 0), axis=-2)
+    is_entry = index[..., None, None] == np.arange(x.shape[-2], dtype=np.int32)[:, None]
+    return jnp.sum(jnp.where(is_entry, x, 0), axis=-2)
 
 
 def nearest_entries(distance: Array, x: Array, n: int) -> Array:
@@ -144,9 +144,9 @@ def nearest_entries(distance: Array, x: Array, n: int) -> Array:
     """
     entries = []
     for _ in range(n):
-        first = lax.argmin(distance, distance.ndim - 1, np.int32)
-        entries.append(pick(x, first))
-        distance = jnp.where(first[..., None] == np.arange(x.shape[-2], dtype=np.int32), jnp.inf, distance)
+        nearest = lax.argmin(distance, distance.ndim - 1, np.int32)
+        entries.append(pick_entry(x, nearest))
+        distance = jnp.where(nearest[..., None] == np.arange(x.shape[-2], dtype=np.int32), jnp.inf, distance)
     return jnp.stack(entries, axis=-2)
 
 
@@ -178,9 +178,9 @@ def collision_stage(sim: Sim) -> Stage:
         record, s = data.plugins[NAME], data.states
         flight_over = record.flight_over
         # Only for this query: drones whose flight is over are moved far apart from each other and from all others.
-        far = 1000.0 * (1 + np.arange(len(flight_over)))[:, None] * np.array([0.0, 0.0, 1.0])
-        elsewhere = jnp.where(flight_over[:, None], far.astype(s.pos.dtype), s.pos)
-        hit = contacts(data.replace(states=s.replace(pos=elsewhere))).any & ~flight_over
+        far_pos = 1000.0 * (1 + np.arange(len(flight_over)))[:, None] * np.array([0.0, 0.0, 1.0])
+        query_pos = jnp.where(flight_over[:, None], far_pos.astype(s.pos.dtype), s.pos)
+        hit = contacts(data.replace(states=s.replace(pos=query_pos))).any & ~flight_over
         return with_record(data, record.replace(disabled=record.disabled | hit))
 
     return collide
@@ -199,8 +199,8 @@ def nearest_drones(data: SimData, n: int, is_visible: Array | None = None) -> tu
     """
     s = data.states
     n_drones = s.pos.shape[0]
-    others = ~np.eye(n_drones, dtype=bool)
-    is_candidate = others if is_visible is None else is_visible[None] & others
+    is_other = ~np.eye(n_drones, dtype=bool)
+    is_candidate = is_other if is_visible is None else is_visible[None] & is_other
     relative_pos, relative_vel = (jnp.where(is_candidate[..., None], x[None] - x[:, None], 0) for x in (s.pos, s.vel))
     square_distance = jnp.where(is_candidate, jnp.sum(relative_pos * relative_pos, axis=-1), jnp.inf)
     nearest = nearest_entries(

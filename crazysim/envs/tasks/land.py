@@ -18,7 +18,7 @@ from crazysim.core.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME
-from crazysim.envs.tasks.goals import pick, with_record
+from crazysim.envs.tasks.goals import pick_entry, with_record
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, initial_outcome, landing_of
 from crazysim.pytree import device_array, leaf, static
 from crazysim.scene.objects import Handle
@@ -61,7 +61,7 @@ class Land(TouchDown):
     Record = PadLanding
     target_name = "pad"
     crash_cost = (
-        2.0  # at 10, the reward of a landing, policies hover beside the pad: few of their first contacts are soft
+        2.0  # at 10, the reward of a landing, policies hover next to the pad: few of their first contacts are soft
     )
 
     speed: float = setting(default=0.0, low=0.0, high=10.0)
@@ -138,7 +138,7 @@ def path_centres(n_drones: int) -> np.ndarray:
 
 def path_centre_of(data: SimData) -> Array:
     """Return the middle of the path of each drone's pad, of one drone or one world, m. (..., 3)"""
-    return pick(jnp.asarray(path_centres(data.core.n_drones), data.states.pos.dtype), data.core.drone_id)
+    return pick_entry(jnp.asarray(path_centres(data.core.n_drones), data.states.pos.dtype), data.core.drone_id)
 
 
 def pad_of(data: SimData, steps: Array) -> tuple[Array, Array]:

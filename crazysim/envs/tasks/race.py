@@ -20,7 +20,7 @@ from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import Task
 from crazysim.envs.tasks import race_rules as rules
-from crazysim.envs.tasks.goals import install_rules, pick, with_record
+from crazysim.envs.tasks.goals import install_rules, pick_entry, with_record
 from crazysim.envs.tasks.race_observations import observe, visited_objects
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, check_track, random_count, random_course, start_offsets
@@ -145,7 +145,7 @@ class Race(Task):
         x = draw(key, **sizes)
         start = np.asarray(course.start, float).astype(dtype)
         if self.level >= 2:
-            data, start = self._place(data, x)
+            data, start = self._displace_objects(data, x)
         if self.level >= 1:
             data = data.replace(params=_randomize_inertia(data.params, 2 * x["inertia"] - 1))
         offset = (2 * x["start"] - 1) * np.array(START_JITTER, dtype)
@@ -153,10 +153,10 @@ class Race(Task):
         record, vel = race_of(data), jnp.zeros((), dtype)
         if self.practice:
             passed = (x["passed"] * course.n_gates).astype(jnp.int32)
-            others = 1 + (passed - 1 + np.arange(n_drones, dtype=np.int32)) % max(course.n_gates - 1, 1)
-            passed = jnp.where(passed > 0, others, 0)
-            behind, vel = _pos_behind_gate(data, passed, x["behind"])
-            pos = jnp.where(passed[..., None] > 0, behind, pos)
+            passed_gates = 1 + (passed - 1 + np.arange(n_drones, dtype=np.int32)) % max(course.n_gates - 1, 1)
+            passed = jnp.where(passed > 0, passed_gates, 0)
+            pos_behind, vel = _pos_behind_gate(data, passed, x["behind"])
+            pos = jnp.where(passed[..., None] > 0, pos_behind, pos)
             record = record.replace(passed=passed)
         data = flying(data, pos, rotation.from_rpy(offset[..., 3:]), vel)
         return with_record(data, record.replace(last_pos=data.states.pos))
@@ -164,14 +164,14 @@ class Race(Task):
     def before_step(self, data: SimData) -> SimData:
         record = race_of(data)
         seen_gates, seen_obstacles = visited_objects(data, self.sensor_range)
-        new = record.replace(
+        record_after = record.replace(
             gates_visited=seen_gates,
             obstacles_visited=seen_obstacles,
             passed_before=record.passed,
             flight_over_before=record.flight_over,
             remaining_way_before=rules.remaining_way(data),
         )
-        return with_record(data, new)
+        return with_record(data, record_after)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the observations; see ``race_observations.observe``."""
@@ -205,7 +205,7 @@ class Race(Task):
         with jax.ensure_compile_time_eval():  # an array, also while a step is traced
             return np.asarray(jax.jit(rotation.from_rpy)(host_array(self.track.gates_rpy, self.track.n_gates, 3)))
 
-    def _place(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Array]:
+    def _displace_objects(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Array]:
         """Return the data with gates and obstacles displaced from their nominal poses, and the start, m."""
         course, record, dtype = self.track, race_of(data), data.states.pos.dtype
         start, pos, quat, poles = course.start, course.gates_pos, self._gates_quat(), course.obstacles_pos
@@ -215,8 +215,8 @@ class Race(Task):
         gate_x = (2 * x["gates"] - 1) * np.array(GATE_JITTER, dtype)
         pole_x = (2 * x["obstacles"] - 1) * np.array(OBSTACLE_JITTER, dtype)
         record = record.replace(nominal_pos=jnp.concatenate([pos, poles]), nominal_quat=quat)
-        turned = rotation.multiply(quat, rotation.from_rpy(gate_x[..., 3:]))
-        data = record.gates.set_pose(data, pos + gate_x[..., :3], turned)
+        gates_quat = rotation.multiply(quat, rotation.from_rpy(gate_x[..., 3:]))
+        data = record.gates.set_pose(data, pos + gate_x[..., :3], gates_quat)
         data = record.obstacles.set_pose(data, poles + pole_x - FOOT.astype(dtype))
         return with_record(data, record), start
 
@@ -253,6 +253,6 @@ def _pos_behind_gate(data: SimData, passed: Array, x: Array) -> tuple[Array, Arr
     Returns:
         (n_drones, 3) each
     """
-    pos, quat = (pick(v, jnp.maximum(passed - 1, 0)) for v in gates_of(data))
-    ahead = rotation.rotate(quat, jnp.asarray([1.0, 0.0, 0.0], pos.dtype))
-    return pos + (0.15 + 0.15 * x[..., :1]) * ahead, jnp.where(passed[..., None] > 0, x[..., 1:], 0) * ahead
+    pos, quat = (pick_entry(v, jnp.maximum(passed - 1, 0)) for v in gates_of(data))
+    gate_axis = rotation.rotate(quat, jnp.asarray([1.0, 0.0, 0.0], pos.dtype))
+    return pos + (0.15 + 0.15 * x[..., :1]) * gate_axis, jnp.where(passed[..., None] > 0, x[..., 1:], 0) * gate_axis

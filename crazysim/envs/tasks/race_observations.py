@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.envs.tasks.goals import nearest_drones, nearest_entries, pick
+from crazysim.envs.tasks.goals import nearest_drones, nearest_entries, pick_entry
 from crazysim.envs.tasks.race_rules import OPENING, gates_of, obstacles_of, race_of
 
 CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]])
@@ -56,11 +56,11 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
     corners = []
     for k in (0, 1):
         number = jnp.minimum(record.passed + k, n_gates - 1)
-        pos, quat = pick(gates_pos, number)[..., None, :], pick(gates_quat, number)[..., None, :]
-        around = pos + rotation.rotate(quat, jnp.asarray(CORNERS, pos.dtype))
-        corners.append(in_body(around - s.pos[..., None, :]))
+        pos, quat = pick_entry(gates_pos, number)[..., None, :], pick_entry(gates_quat, number)[..., None, :]
+        gate_corners = pos + rotation.rotate(quat, jnp.asarray(CORNERS, pos.dtype))
+        corners.append(in_body(gate_corners - s.pos[..., None, :]))
     to_poles = (poles - s.pos[..., None, :]) * np.array([1, 1, 0], s.pos.dtype)
-    far = jnp.sum(to_poles * to_poles, axis=-1)
+    square_distance = jnp.sum(to_poles * to_poles, axis=-1)
     obs = {
         "pos": s.pos,
         "quat": s.quat,
@@ -75,7 +75,7 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
         "rot": matrix,
         "vel_body": in_body(s.vel[..., None, :]),
         "gate_corners": jnp.concatenate(corners, axis=-2),
-        "obstacles_near": in_body(nearest_entries(far, to_poles, min(2, n_obstacles))),
+        "obstacles_near": in_body(nearest_entries(square_distance, to_poles, min(2, n_obstacles))),
     }
     if n_drones > 1:
         obs["drones_near"] = in_body(nearest_drones(data, 2, ~record.flight_over)[0])

@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.envs import terms
 from crazysim.envs.task import NAME
-from crazysim.envs.tasks.goals import pick
+from crazysim.envs.tasks.goals import pick_entry
 from crazysim.pytree import PyTree, leaf, static
 from crazysim.scene.objects import Handle
 
@@ -90,18 +90,18 @@ def next_gate(data: SimData) -> tuple[Array, Array]:
     """Return position and attitude of each drone's next gate, the last one where it has finished. (..., 3), (..., 4)"""
     pos, quat = gates_of(data)
     number = jnp.minimum(race_of(data).passed, pos.shape[-2] - 1)
-    return pick(pos, number), pick(quat, number)
+    return pick_entry(pos, number), pick_entry(quat, number)
 
 
 def passes_gate(data: SimData) -> Array:
     """Return true where the last physics step led forwards through the opening of the next gate. (...)"""
     record = race_of(data)
     pos, quat = next_gate(data)
-    before, now = (rotation.rotate_inverse(quat, x - pos) for x in (record.last_pos, data.states.pos))
-    crossed = (before[..., 0] < 0) & (now[..., 0] >= 0)
-    share = before[..., :1] / jnp.where(crossed[..., None], before[..., :1] - now[..., :1], 1)
-    there = before + share * (now - before)
-    return crossed & jnp.all(jnp.abs(there[..., 1:]) < OPENING / 2, axis=-1) & ~record.finished
+    pos_before, pos_now = (rotation.rotate_inverse(quat, x - pos) for x in (record.last_pos, data.states.pos))
+    crossed = (pos_before[..., 0] < 0) & (pos_now[..., 0] >= 0)
+    share = pos_before[..., :1] / jnp.where(crossed[..., None], pos_before[..., :1] - pos_now[..., :1], 1)
+    crossing = pos_before + share * (pos_now - pos_before)
+    return crossed & jnp.all(jnp.abs(crossing[..., 1:]) < OPENING / 2, axis=-1) & ~record.finished
 
 
 def next_gate_distance(data: SimData) -> Array:
@@ -115,16 +115,16 @@ def remaining_way(data: SimData) -> Array:
     record = race_of(data)
     pos, quat = gates_of(data)
     legs = way_to_gate(rotation.rotate_inverse(quat[..., 1:, :], pos[..., :-1, :] - pos[..., 1:, :]))
-    left = np.arange(1, pos.shape[-2], dtype=np.int32) > record.passed[..., None]
+    is_ahead = np.arange(1, pos.shape[-2], dtype=np.int32) > record.passed[..., None]
     next_pos, next_quat = next_gate(data)
-    first = way_to_gate(rotation.rotate_inverse(next_quat, data.states.pos - next_pos))
-    return jnp.where(record.finished, 0, first + jnp.sum(jnp.where(left, legs, 0), axis=-1))
+    way_to_next = way_to_gate(rotation.rotate_inverse(next_quat, data.states.pos - next_pos))
+    return jnp.where(record.finished, 0, way_to_next + jnp.sum(jnp.where(is_ahead, legs, 0), axis=-1))
 
 
 def way_to_gate(pos: Array) -> Array:
-    """Return the length of the way to a gate's middle, with a detour from beside, around the frame from behind, m.
+    """Return the length of the way to a gate's middle, with a detour from the side and around the frame from behind, m.
 
-    With the straight-line distance, the best place would be one beside the frame, although the frame is in the way.
+    With the straight-line distance, a drone next to the frame would seem close, although the frame is in its way.
 
     Args:
         pos: Position in the gate's frame, m. (..., 3)
@@ -132,12 +132,12 @@ def way_to_gate(pos: Array) -> Array:
     Returns:
         (...)
     """
-    beside = BYPASS_DISTANCE * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1]], pos.dtype)
-    around = rotation.safe_norm(pos[..., None, :] - beside)[..., 0]
-    off = rotation.safe_norm(pos[..., 1:])[..., 0]
-    detour = jnp.maximum(off - (FUNNEL - pos[..., 0]), 0)
-    behind = 2 * BYPASS_DISTANCE - FUNNEL + jnp.min(around, axis=-1)
-    return jnp.where(pos[..., 0] > 0, behind, rotation.safe_norm(pos)[..., 0] + detour)
+    bypass = BYPASS_DISTANCE * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1]], pos.dtype)
+    bypass_distance = rotation.safe_norm(pos[..., None, :] - bypass)[..., 0]
+    axis_distance = rotation.safe_norm(pos[..., 1:])[..., 0]
+    detour = jnp.maximum(axis_distance - (FUNNEL - pos[..., 0]), 0)
+    way_around = 2 * BYPASS_DISTANCE - FUNNEL + jnp.min(bypass_distance, axis=-1)
+    return jnp.where(pos[..., 0] > 0, way_around, rotation.safe_norm(pos)[..., 0] + detour)
 
 
 def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:

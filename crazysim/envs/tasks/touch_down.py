@@ -99,11 +99,11 @@ class TouchDown(Task):
             )
             has_landed = touches_target & (offset[..., 2] > 0) & is_centred & is_soft & ~touches_other
             has_crashed = (touches_target & ~has_landed) | touches_other | self.has_left_arena(data)
-            new = record.replace(
+            new_record = record.replace(
                 landed=record.landed | (has_landed & ~record.crashed),
                 crashed=record.crashed | (has_crashed & ~record.landed),
             )
-            return with_record(data, new)
+            return with_record(data, new_record)
 
         return touch
 

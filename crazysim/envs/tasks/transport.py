@@ -18,7 +18,7 @@ from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, initial_outcome
-from crazysim.envs.tasks.goals import install_rules, pick, state_of, with_record
+from crazysim.envs.tasks.goals import install_rules, pick_entry, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.plugins.payloads import SlungLoad, direction, load_pos, load_vel
 from crazysim.pytree import static
@@ -111,8 +111,8 @@ class Transport(BringLoad):
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.1))
         data = flying(data, lane + scale_to(x["start"], *np.array(START)), quat, scale_symmetric(x["vel"], 0.3))
         yaw = scale_symmetric(x["turn"], TURN)
-        turned = rotation.from_rpy(jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1))
-        data = record.gates.set_pose(data, lane + scale_to(x["gate"], *np.array(GATE)), turned)
+        gate_quat = rotation.from_rpy(jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1))
+        data = record.gates.set_pose(data, lane + scale_to(x["gate"], *np.array(GATE)), gate_quat)
         data = self.hang(
             data, scale_symmetric(x["swing"], self.swing), scale_symmetric(x["swing_rate"], 1.5 * self.swing)
         )
@@ -146,20 +146,21 @@ class Transport(BringLoad):
         pos, quat = gate_of(data)
         load, goal = load_pos(data), delivery_of(data).goal
         aim = pos - np.array([0.0, 0.0, self.length / 2], pos.dtype)
-        around = rotation.safe_norm(aim - load)[..., 0] + rotation.safe_norm(goal - aim)[..., 0]
-        return jnp.where(is_behind(load, pos, quat), self.error(data), around)
+        way_through_gate = rotation.safe_norm(aim - load)[..., 0] + rotation.safe_norm(goal - aim)[..., 0]
+        return jnp.where(is_behind(load, pos, quat), self.error(data), way_through_gate)
 
     def misses(self, data: SimData) -> Array:
         """Return true where a drone or its load is between the faces of its gate, but not in the opening. (...)"""
         pos, quat = gate_of(data)
-        outside = [
-            (jnp.abs(place[..., 0]) <= BAR / 2) & (jnp.any(jnp.abs(place[..., 1:]) > self.opening / 2 - r, axis=-1))
-            for place, r in (
+        misses_opening = [
+            (jnp.abs(local_pos[..., 0]) <= BAR / 2)
+            & (jnp.any(jnp.abs(local_pos[..., 1:]) > self.opening / 2 - r, axis=-1))
+            for local_pos, r in (
                 (rotation.rotate_inverse(quat, data.states.pos - pos), 0.0),
                 (rotation.rotate_inverse(quat, load_pos(data) - pos), RADIUS),
             )
         ]
-        return outside[0] | outside[1]
+        return misses_opening[0] | misses_opening[1]
 
     def at_goal(self, data: SimData) -> Array:
         return is_behind(load_pos(data), *gate_of(data)) & super().at_goal(data)
@@ -186,11 +187,11 @@ class Transport(BringLoad):
         The ``approach`` term reaches far, so that waiting before the gate pays less than passing it; ``proximity``
         rewards rest at the goal.
         """
-        record, to_go = delivery_of(data), self.remaining_way(data)
+        record, way = delivery_of(data), self.remaining_way(data)
         rate = direction(data)[1]
         return {
-            "progress": 5.0 * (record.remaining_way_before - to_go),
-            "approach": 0.5 * jnp.exp(-to_go),
+            "progress": 5.0 * (record.remaining_way_before - way),
+            "approach": 0.5 * jnp.exp(-way),
             "proximity": terms.proximity(self.error(data), coarse=5.0),
             "swing": -0.01 * rotation.dot(rate, rate)[..., 0],
             "spin": -0.002 * terms.spin(data),
@@ -199,8 +200,8 @@ class Transport(BringLoad):
         }
 
     def info(self, data: SimData) -> dict[str, Array]:
-        behind = is_behind(load_pos(data), *gate_of(data))
-        return {"passed": behind & ~delivery_of(data).crashed} | super().info(data)
+        passed = is_behind(load_pos(data), *gate_of(data))
+        return {"passed": passed & ~delivery_of(data).crashed} | super().info(data)
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         del n_drones
@@ -218,7 +219,7 @@ def gate_of(data: SimData) -> tuple[Array, Array]:
     rows = delivery_of(data).gates.rows
     gate_rows = slice(rows[0], rows[-1] + 1)
     pos, quat = (x[..., gate_rows, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
-    return pick(pos, data.core.drone_id), pick(quat, data.core.drone_id)
+    return pick_entry(pos, data.core.drone_id), pick_entry(quat, data.core.drone_id)
 
 
 def gate_axis(quat: Array) -> Array:
@@ -226,20 +227,20 @@ def gate_axis(quat: Array) -> Array:
     return rotation.matrix(quat)[..., 0]
 
 
-def is_behind(place: Array, pos: Array, quat: Array) -> Array:
+def is_behind(point: Array, pos: Array, quat: Array) -> Array:
     """Return true where a place is behind the plane of a gate. (...)
 
     Args:
-        place: Position, m. (..., 3)
+        point: Position, m. (..., 3)
         pos: Position of the gate, m. (..., 3)
         quat: Its attitude, xyzw. (..., 4)
     """
-    return rotation.dot(place - pos, gate_axis(quat))[..., 0] > 0
+    return rotation.dot(point - pos, gate_axis(quat))[..., 0] > 0
 
 
 def out_of_lane(data: SimData) -> Array:
     """Return true where a drone has left its lane, or its load touches the floor. (...)"""
     pos = data.states.pos
-    middle = pick(jnp.asarray(lanes(data.core.n_drones), pos.dtype), data.core.drone_id)
-    far = jnp.any(jnp.abs(pos - middle)[..., :2] > np.array(HALF_SIZE, pos.dtype), axis=-1) | (pos[..., 2] > CEILING)
-    return far | (load_pos(data)[..., 2] <= RADIUS)
+    middle = pick_entry(jnp.asarray(lanes(data.core.n_drones), pos.dtype), data.core.drone_id)
+    is_far = jnp.any(jnp.abs(pos - middle)[..., :2] > np.array(HALF_SIZE, pos.dtype), axis=-1) | (pos[..., 2] > CEILING)
+    return is_far | (load_pos(data)[..., 2] <= RADIUS)

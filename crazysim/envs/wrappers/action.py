@@ -32,5 +32,5 @@ class ActionDelay(Wrapper):
 
     def before_step(self, state: EnvState, action: Array) -> tuple[EnvState, Array]:
         queue = self.recall(state).actions
-        longer = jnp.concatenate([queue, action[:, None]], axis=1)
-        return self.remember(state, ActionQueue(longer[:, 1:])), longer[:, 0]
+        actions = jnp.concatenate([queue, action[:, None]], axis=1)
+        return self.remember(state, ActionQueue(actions[:, 1:])), actions[:, 0]

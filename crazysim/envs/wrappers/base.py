@@ -28,11 +28,11 @@ class Wrapper(Hooks, Env):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Refuse subclasses that override ``reset``, ``restart`` or ``step``: the step is compiled as a whole."""
         super().__init_subclass__(**kwargs)
-        own = {"reset", "restart", "step"} & set(vars(cls))
-        if own:
+        overridden = {"reset", "restart", "step"} & set(vars(cls))
+        if overridden:
             raise ConfigError(
-                f"expected hooks for one world, got {cls.__name__}.{sorted(own)[0]}. Override before_step, after_step "
-                f"or after_reset: docs/guides/tasks.md"
+                f"expected hooks for one world, got {cls.__name__}.{sorted(overridden)[0]}. Override before_step, "
+                f"after_step or after_reset: docs/guides/tasks.md"
             )
 
     @property

@@ -63,9 +63,9 @@ class PrivilegedObservation(Observe):
                 f"expected observations without {PRIVILEGED!r}, got {', '.join(obs)}. Give it another name in the task."
             )
         params = zip(jax.tree.leaves(data.params), jax.tree.leaves(scopes(data.params)), self._scales, strict=True)
-        own = [(x / scale).reshape(len(x), -1) for x, scope, scale in params if scope == "drone"]
+        drone_params = [(x / scale).reshape(len(x), -1) for x, scope, scale in params if scope == "drone"]
         effects = vmap_drones(lambda drone: [plugin.observations(drone) for plugin in self._plugins])(data)
-        parts = [flatten(state_of(data)), data.states.rotor_vel, *own, *jax.tree.leaves(effects)]
+        parts = [flatten(state_of(data)), data.states.rotor_vel, *drone_params, *jax.tree.leaves(effects)]
         return obs | {PRIVILEGED: jnp.concatenate(parts, axis=-1)}
 
 
@@ -100,8 +100,8 @@ class ObservationNoise(Wrapper):
         return noisy
 
 
-def _draw_normal(key: Array, number: int, like: Array) -> Array:
-    return normal(jax.random.fold_in(key, number), like.shape[1:], like.dtype)
+def _draw_normal(key: Array, number: int, template: Array) -> Array:
+    return normal(jax.random.fold_in(key, number), template.shape[1:], template.dtype)
 
 
 class Normalize(Wrapper):
@@ -158,8 +158,10 @@ class FrameStack(Wrapper):
         return self._stack(state, jax.tree.map(lambda x: jnp.repeat(x[..., None, :], self.n, axis=-2), state.obs))
 
     def after_step(self, state: EnvState) -> EnvState:
-        old = self.recall(state).obs
-        frames = jax.tree.map(lambda x, y: jnp.concatenate([y[..., 1:, :], x[..., None, :]], axis=-2), state.obs, old)
+        old_frames = self.recall(state).obs
+        frames = jax.tree.map(
+            lambda x, y: jnp.concatenate([y[..., 1:, :], x[..., None, :]], axis=-2), state.obs, old_frames
+        )
         return self._stack(state, frames)
 
     def _stack(self, state: EnvState, frames: Obs) -> EnvState:

@@ -22,17 +22,17 @@ class RandomizeWith(Wrapper):
     """Wrapper that changes the data at the start of every episode with a function: masses, motors or other fields.
 
     ``fn(data, key) -> data`` receives the data of one world and the random key of its episode. Parameters that it
-    changes must have one value per drone. Name them in ``params``; those that the drones share are then repeated for
+    changes must have one value per drone. Name them in ``params``; parameters that drones share are then repeated for
     every drone.
     """
 
     def __init__(self, env: Env, fn: Callable[[SimData, Array], SimData], params: tuple[str, ...] = ()):
         super().__init__(env)
         sim_params = env.sim.data.params
-        known = {field.name: getattr(sim_params, field.name) for field in dataclasses.fields(sim_params)}
-        if missing := [name for name in params if known.get(name) is None]:
+        fields = {field.name: getattr(sim_params, field.name) for field in dataclasses.fields(sim_params)}
+        if missing := [name for name in params if fields.get(name) is None]:
             raise ConfigError(
-                f"expected parameters of {env.sim.dynamics.value}, {', '.join(known)}, got {', '.join(missing)}"
+                f"expected parameters of {env.sim.dynamics.value}, {', '.join(fields)}, got {', '.join(missing)}"
             )
         self.fn, self.params = fn, tuple(params)
 
@@ -47,10 +47,10 @@ class RandomizeWith(Wrapper):
         randomised = self.fn(data, episode_key(data, "randomize"))
         axes = Axes(data)
         leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(randomised), strict=True)
-        fixed = [name for name, scope, x, new in leaves if scope in ("shared", "opaque") and new is not x]
-        if fixed:
+        shared_names = [name for name, scope, x, y in leaves if scope in ("shared", "opaque") and y is not x]
+        if shared_names:
             raise ConfigError(
-                f"{', '.join(fixed)} cannot be randomised: all worlds share it. Name parameters that should be one "
-                f"per drone in params=, as in RandomizeWith(env, fn, params=('mass',))."
+                f"{', '.join(shared_names)} cannot be randomised: all worlds share it. Name parameters that should be "
+                f"one per drone in params=, as in RandomizeWith(env, fn, params=('mass',))."
             )
         return randomised

@@ -40,17 +40,17 @@ class EpisodeStatistics(Wrapper):
         return self._record(state, EpisodeSums(jnp.zeros_like(state.reward), jnp.zeros((), jnp.int32)))
 
     def after_step(self, state: EnvState) -> EnvState:
-        before = self.recall(state)
-        return self._record(state, EpisodeSums(before.reward + state.reward, before.length + 1))
+        sums = self.recall(state)
+        return self._record(state, EpisodeSums(sums.reward + state.reward, sums.length + 1))
 
     def _record(self, state: EnvState, sums: EpisodeSums) -> EnvState:
-        def where(over: Array, x: Array) -> Array:
-            return jnp.where(over, x, jnp.zeros((), x.dtype))
+        def zero_outside(mask: Array, x: Array) -> Array:
+            return jnp.where(mask, x, jnp.zeros((), x.dtype))
 
-        ended: Any = jax.tree.map(lambda x: where(state.done, x), sums)
-        left = jax.tree.map(lambda x: where(~state.done, x), sums)
-        info = {"episode_return": ended.reward, "episode_length": ended.length}
-        return self.remember(state, left, info=state.info | info)
+        final_sums: Any = jax.tree.map(lambda x: zero_outside(state.done, x), sums)
+        running_sums = jax.tree.map(lambda x: zero_outside(~state.done, x), sums)
+        info = {"episode_return": final_sums.reward, "episode_length": final_sums.length}
+        return self.remember(state, running_sums, info=state.info | info)
 
 
 class RewardTerms(Wrapper):
@@ -67,6 +67,8 @@ class RewardTerms(Wrapper):
 
     def after_step(self, state: EnvState) -> EnvState:
         terms = self.task.rewards(state.data, state.action, self.recall(state).action)
-        lost, dtype = state.data.core.nonfinite, state.reward.dtype
-        info = {f"reward {k}": jnp.where(lost, jnp.zeros((), dtype), jnp.asarray(x, dtype)) for k, x in terms.items()}
+        nonfinite, dtype = state.data.core.nonfinite, state.reward.dtype
+        info = {
+            f"reward {k}": jnp.where(nonfinite, jnp.zeros((), dtype), jnp.asarray(x, dtype)) for k, x in terms.items()
+        }
         return self.remember(state, LastAction(state.action), info=state.info | info)

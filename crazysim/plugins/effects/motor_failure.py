@@ -88,5 +88,5 @@ class MotorFailure(Plugin):
             raise ConfigError(f"{self.name} is not enabled. Use sim.add(MotorFailure(...)) first.")
         motors = self.read(data)
         before = motors.effectiveness
-        mask = as_mask(mask, before.shape, each="rotor (n_worlds, n_drones, n_rotors)")
+        mask = as_mask(mask, before.shape, item="rotor (n_worlds, n_drones, n_rotors)")
         return self.write(data, motors.replace(effectiveness=select_worlds(mask, jnp.zeros_like(before), before)))

@@ -91,7 +91,7 @@ class PointLoad(CollidingPlugin):
         """
         load = self.read(data)
         shape = load.attached.shape
-        mask = as_mask(mask, shape, shape[:-1], each="drone or world")
+        mask = as_mask(mask, shape, shape[:-1], item="drone or world")
         return self.write(
             data, load.replace(attached=select_worlds(mask, jnp.zeros_like(load.attached), load.attached))
         )

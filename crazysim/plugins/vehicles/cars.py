@@ -172,7 +172,7 @@ class Cars(Population):
         if self.follows is None and self.level == "drive":
             return inherited
         name, when = f"{self.name}_control", functools.partial(acts_now, freq=self.rate_in(sim.data.core.freq))
-        return [StagePlacement(Stage(self._controlled, self.name, when, name=name), name=name), *inherited]
+        return [StagePlacement(Stage(self._run_controller, self.name, when, name=name), name=name), *inherited]
 
     def control(self, data: SimData) -> CarData:
         car = self.read(data)

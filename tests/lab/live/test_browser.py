@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from browsing import NEAR
+from browsing import MAX_PIXEL_DISTANCE
 from waiting import wait_for
 
 from crazysim import SlungLoad, Wind
@@ -113,8 +113,8 @@ def test_a_page_is_watched_and_used(chromium, live, caplog):
         left, right = pixel(chromium, [-1, 0, 1], SIZE), pixel(chromium, [1, 0, 1], SIZE)
         wait_for(lambda: len(chromium.mask(MAGENTA)[0]) > 40)
         columns = np.sort(chromium.mask(MAGENTA)[1])
-        assert abs(columns[0] - left[0]) < 4 * NEAR
-        np.testing.assert_allclose(columns[-1], right[0], atol=4 * NEAR)
+        assert abs(columns[0] - left[0]) < 4 * MAX_PIXEL_DISTANCE
+        np.testing.assert_allclose(columns[-1], right[0], atol=4 * MAX_PIXEL_DISTANCE)
 
         # A click on the right one selects it, one on the ground is reported in the world's frame.
         wait_for(lambda: (click(chromium, right), time.sleep(0.3), live.selected == (0, 1))[-1])
@@ -193,7 +193,7 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(chromium, plain_scene):
         live.selected = None  # without the mark around it
         live.lights[1, 0] = [1.0, 0.0, 1.0]
         place = pixel(chromium, [1.5, 0.0, 1.5], size)
-        np.testing.assert_allclose(chromium.find(MAGENTA, place), place, atol=NEAR)
+        np.testing.assert_allclose(chromium.find(MAGENTA, place), place, atol=MAX_PIXEL_DISTANCE)
         live.lights[:] = 0.0
         wait_for(lambda: len(chromium.mask(MAGENTA)[0]) == 0)
 

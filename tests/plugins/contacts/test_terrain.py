@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from cases import with_states
-from pictures import png_of
+from pictures import encode_png
 
 from crazysim import ConfigError, ContactResponse, GroundEffect, Hook, RangeFinder, Sim, SlungLoad, Terrain, Wind
 from crazysim.core.pipeline import remove_fn
@@ -203,7 +203,7 @@ def test_images_lie_with_their_upper_edge_at_the_largest_y(tmp_path):
     pixels = np.zeros((3, 4), np.uint8)
     pixels[0, 3] = 200  # the upper right corner
     pixels[2, 0] = 100  # the lower left corner
-    (tmp_path / "hill.png").write_bytes(png_of(pixels))
+    (tmp_path / "hill.png").write_bytes(encode_png(pixels))
     sim = Sim()
     plugin = sim.add(Terrain(tmp_path / "hill.png", (4, 3, 2.0), pos=(1.0, 0.0, 0.0)))
     corners = np.float32([[3.0, 1.5, 0], [-1.0, -1.5, 0], [3.0, -1.5, 0]])
@@ -212,7 +212,7 @@ def test_images_lie_with_their_upper_edge_at_the_largest_y(tmp_path):
 
 
 def test_law_09_files_that_are_no_images_are_errors_before_memory_is_allocated(tmp_path):
-    huge = bytearray(png_of(np.zeros((8, 8), np.uint8)))
+    huge = bytearray(encode_png(np.zeros((8, 8), np.uint8)))
     huge[16:24] = (20_000).to_bytes(4, "big") * 2  # 20,000 x 20,000 pixels, which would take 12 GB
     huge[29:33] = zlib.crc32(huge[12:29]).to_bytes(4, "big")
     path = tmp_path / "hill.png"
@@ -222,7 +222,7 @@ def test_law_09_files_that_are_no_images_are_errors_before_memory_is_allocated(t
         (b"no image", "expected a PNG image"),
         (b"\x89PNG\r\n\x1a\n" + bytes(100), "expected a PNG image"),
         (bytes(huge), "at most 16777216 pixels, got .* of 20000 x 20000"),
-        (png_of(np.zeros((8, 8), np.uint8))[:60], "expected a PNG image of heights, got"),
+        (encode_png(np.zeros((8, 8), np.uint8))[:60], "expected a PNG image of heights, got"),
     ):
         if content is not None:
             path.write_bytes(content)

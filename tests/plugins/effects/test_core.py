@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import hover_command, hovering, n_documented, to_all, trees_equal, with_states
+from cases import hover_command, hovering, n_documented, repeat_command, trees_equal, with_states
 from sweep import EFFECTS
 
 from crazysim import (
@@ -69,7 +69,7 @@ def test_off_nothing_is_there_and_without_strength_nothing_changes():
     assert [s for s in idle.step_pipeline if s in stages] == stages
     assert not plain.data.plugins
     for sim in (plain, idle):
-        sim.attitude_control(to_all(sim.data, hover_command(sim.data) + [0.1, -0.1, 0.2, 0.05]))
+        sim.attitude_control(repeat_command(sim.data, hover_command(sim.data) + [0.1, -0.1, 0.2, 0.05]))
         sim.step(50)
     for name in ("pos", "quat", "vel", "ang_vel"):
         a, b = getattr(plain.data.states, name), getattr(idle.data.states, name)
@@ -120,7 +120,7 @@ STAGES = (
 def flown(every):
     """Data in flight, with everything at work."""
     before = every.data
-    every.attitude_control(to_all(before, hover_command(before) + [0.1, -0.2, 0.0, 0.1]))
+    every.attitude_control(repeat_command(before, hover_command(before) + [0.1, -0.2, 0.0, 0.1]))
     every.step(20)
     data, every.data = on_host(every.data), before
     return data
@@ -198,7 +198,7 @@ def test_every_effect_is_fused(every):
 def test_law_06_one_trace_whatever_is_reset_and_changed(every):
     sim = every
     for i in range(4):
-        sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+        sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
         sim.step(i + 1)
         sim.reset(np.array([True, False, i % 2 == 0]))
     sim.reset()
@@ -209,7 +209,7 @@ def test_law_06_one_trace_whatever_is_reset_and_changed(every):
 def test_the_users_wrench_parameters_and_commands_stay(every):
     sim = every
     sim.data = with_states(sim.data, force=[0.01, 0.02, 0.03], torque=[1e-5, 0, 0])
-    sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+    sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     before = sim.data
     sim.step(35)
     after = sim.data
@@ -222,7 +222,7 @@ def test_the_users_wrench_parameters_and_commands_stay(every):
 
 def test_a_reset_brings_every_record_back_in_its_worlds_alone(every):
     sim = every
-    sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+    sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     sim.step(40)
     flown, mask = sim.data.plugins, np.array([False, True, True])
     sim.reset(mask)
@@ -248,7 +248,9 @@ def test_law_07_values_and_gradients_are_finite(every):
     quat = np.array([[[0, 0, 0, 1], [0, 0, 0, 1]], [[1, 0, 0, 0], [0, half, 0, half]], [[0, 0, 0, 1], [0, 0, 0, 1]]])
     pos = np.array([[[0, 0, 0], [0, 0, -0.001]], [[0, 0, 1], [0, 0, 2]], [[0, 0, 3], [0, 0, 3]]])
     data = with_states(sim.data, pos=pos, quat=quat, rotor_vel=0.0)
-    command = np.stack([0 * to_all(data, hover_command(data))[0], 100 + to_all(data, hover_command(data))[0]] * 2)[:3]
+    command = np.stack(
+        [0 * repeat_command(data, hover_command(data))[0], 100 + repeat_command(data, hover_command(data))[0]] * 2
+    )[:3]
     sim.data = data
     sim.attitude_control(command)
     step = Step(sim.step_pipeline, "plain")  # whose gradient compiles soonest
@@ -295,7 +297,7 @@ def test_law_09_effects_need_the_built_in_integration():
 def test_default_data_get_the_record_and_nothing_else():
     """An effect that is added in flight does not make the present state the one that resets return to."""
     sim = hovering()
-    sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+    sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     sim.step(3)
     default = sim.default_data
     switch_on(sim)

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from cases import FITTED, LEVELS, hover_command, hover_rotor_state, to_all, with_states
+from cases import FITTED, LEVELS, hover_command, hover_rotor_state, repeat_command, with_states
 
 from crazysim import ConfigError, Latency, MotorFailure, Sim
 
@@ -13,7 +13,7 @@ STEPS = 24
 
 def command_of(sim, step):
     """Return the command sent before a step: hover, and a little more of everything the later it is."""
-    return to_all(sim.data, hover_command(sim.data) + (1 + step) * 1e-4)
+    return repeat_command(sim.data, hover_command(sim.data) + (1 + step) * 1e-4)
 
 
 def fly(sim, n_steps=STEPS):

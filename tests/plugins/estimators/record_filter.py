@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-HERE, MODULES = Path(__file__).parent, "src/modules"
+FOLDER, MODULES = Path(__file__).parent, "src/modules"
 FOLDERS = (
     f"{MODULES}/interface {MODULES}/interface/kalman_core {MODULES}/interface/outlierfilter src/hal/interface "
     "src/utils/interface src/utils/interface/lighthouse src/config src/drivers/interface src/platform/interface"
 ).split()
 MODELS = "flow position pose tof distance tdoa sweep_angles".split()
 HEADERS = {
-    "arm_math.h": HERE / "record_filter.h",
+    "arm_math.h": FOLDER / "record_filter.h",
     "static_mem.h": "#define NO_DMA_CCM_SAFE_ZERO_INIT",
     "log.h": "#define LOG_GROUP_START(x)\n#define LOG_GROUP_STOP(x)\n#define LOG_ADD(a, b, c)",
     "param.h": "#define PARAM_GROUP_START(x)\n#define PARAM_GROUP_STOP(x)\n#define PARAM_ADD_CORE(a, b, c)",
@@ -41,7 +41,7 @@ def compiled(firmware: Path) -> ctypes.CDLL:
         library = Path(folder, "filter.so")
         flags = ["-w", "-O1", "-ffp-contract=off", "-shared", "-fPIC", "-include", "stdint.h", "-D_GNU_SOURCE"]
         flags += ["-DUNIT_TEST_MODE", f"-I{folder}", *(f"-I{firmware / name}" for name in FOLDERS)]
-        command = ["gcc", *flags, "-o", library, HERE / "record_filter.c", *sources, "-lm"]
+        command = ["gcc", *flags, "-o", library, FOLDER / "record_filter.c", *sources, "-lm"]
         subprocess.run(command, check=True)
         return ctypes.CDLL(str(library))
 
@@ -53,7 +53,7 @@ def v(x):
     return (f * len(x))(*[float(a) for a in x])
 
 
-LOOPS, EVERY, GRAVITY = 4000, 100, 9.81
+LOOPS, SAMPLE_PERIOD, GRAVITY = 4000, 100, 9.81
 PIXELS = 35 / 0.71674
 """Pixels per rad of the flow sensor (mm_flow.c)."""
 ANCHORS = np.float32([[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]])
@@ -157,7 +157,7 @@ def run(lib, kind, flown, sums):
             lib.k_sweep(f(m[0]), f(tilt), v(DIODE), v(STATIONS[station]), frame, f(0.001), k)
         lib.k_finalize()
         inputs.append(m)
-        if k % EVERY == 0:
+        if k % SAMPLE_PERIOD == 0:
             S, q, P = v([0] * 9), v([0] * 4), v([0] * 81)
             lib.k_get(S, q, P)
             out.append(np.concatenate([S[:], q[:], np.float32(P[:]).reshape(9, 9)[np.triu_indices(9)]]))
@@ -172,4 +172,4 @@ if __name__ == "__main__":
     for kind in ("position", "pose", "flow", "range", "distance", "difference", "sweep", "ground"):
         sums = recorded["inertial/ground" if kind == "ground" else "inertial/air"]
         recorded[f"{kind}/inputs"], recorded[f"{kind}/outputs"] = run(library, kind, flown, sums)
-    np.savez_compressed(HERE / "firmware_filter.npz", **recorded)
+    np.savez_compressed(FOLDER / "firmware_filter.npz", **recorded)

@@ -40,8 +40,8 @@ def _digamma(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
 
 @rule("round")
 def _round(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    even = RoundingMethod(eqn.params["rounding_method"]) == RoundingMethod.TO_NEAREST_EVEN
-    return [ctx.elementwise("round_even" if even else "round_away", args, eqn.outvars[0].aval.dtype)]
+    to_even = RoundingMethod(eqn.params["rounding_method"]) == RoundingMethod.TO_NEAREST_EVEN
+    return [ctx.elementwise("round_even" if to_even else "round_away", args, eqn.outvars[0].aval.dtype)]
 
 
 @rule("convert_element_type")
@@ -175,8 +175,8 @@ def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
     while shift < bits.n_bits:
         x = bits.apply("or", x, bits.apply("shift_right_logical", x, shift))
         shift *= 2
-    left = bits.apply("sub", constants(bits.n_bits, bits.dtype), bits.count(x))
-    return [ctx.elementwise("bitcast_convert_type", [left], dtype)]
+    n_zeros = bits.apply("sub", constants(bits.n_bits, bits.dtype), bits.count(x))
+    return [ctx.elementwise("bitcast_convert_type", [n_zeros], dtype)]
 
 
 @rule("reduce_precision")
@@ -197,10 +197,10 @@ def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> lis
         infinite = ((1 << info.nexp) - 1) << info.nmant
         sign = bits.apply("and", x, 1 << (bits.n_bits - 1))
         size = bits.apply("and", x, infinite)
-        over = ctx.elementwise("gt", [size, constants((bias + largest) << info.nmant, bits.dtype)], bool)
-        under = ctx.elementwise("le", [size, constants((bias - largest) << info.nmant, bits.dtype)], bool)
-        x = ctx.elementwise("select_n", [over, x, bits.apply("or", sign, infinite)], bits.dtype)
-        x = ctx.elementwise("select_n", [under, x, sign], bits.dtype)
+        overflows = ctx.elementwise("gt", [size, constants((bias + largest) << info.nmant, bits.dtype)], bool)
+        underflows = ctx.elementwise("le", [size, constants((bias - largest) << info.nmant, bits.dtype)], bool)
+        x = ctx.elementwise("select_n", [overflows, x, bits.apply("or", sign, infinite)], bits.dtype)
+        x = ctx.elementwise("select_n", [underflows, x, sign], bits.dtype)
     rounded = ctx.elementwise("bitcast_convert_type", [x], dtype)
     is_nan = ctx.elementwise("ne", [args[0], args[0]], bool)
     return [ctx.elementwise("select_n", [is_nan, rounded, args[0]], dtype)]

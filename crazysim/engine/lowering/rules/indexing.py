@@ -45,7 +45,7 @@ def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> E
     table = tables.find_table(ctx, x, (axis,), last + 1)
     if table is not None:
         offsets = np.take(table.offsets, range(size), axis)
-        return table.look_up(offsets, [table.base_at([start], [last])] * offsets.size)
+        return table.look_up(offsets, [table.get_base([start], [last])] * offsets.size)
     _check_range(last + 1)
     pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
     taken = pieces[last]
@@ -119,21 +119,21 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
     shape = [1] * len(out.shape)
     for axis, size in zip(batch_axes, row_shape, strict=True):
         shape[axis] = size
-    row_of = np.broadcast_to(np.arange(len(rows)).reshape(shape), out.shape).reshape(-1)
+    row_by_element = np.broadcast_to(np.arange(len(rows)).reshape(shape), out.shape).reshape(-1)
 
     table = tables.find_table(ctx, x, dims.start_index_map, n_places)
     if table is not None:
         zeros = np.zeros(indices.shape, np.int32)
         offsets = move_many(eqn, [table.offsets.astype(object)], [zeros])[0].reshape(-1)
-        bases = [table.base_at(list(row), limits) for row in rows]
-        result = list(table.look_up(offsets, [bases[k] for k in row_of]))
+        bases = [table.get_base(list(row), limits) for row in rows]
+        result = list(table.look_up(offsets, [bases[k] for k in row_by_element]))
     else:
-        result = _select_windows(ctx, eqn, x, indices.shape, rows, row_of, limits)
+        result = _select_windows(ctx, eqn, x, indices.shape, rows, row_by_element, limits)
     if mode == GatherScatterMode.FILL_OR_DROP:
         inside = [_inside(ctx, row, limits) for row in rows]
         fill = eqn.params["fill_value"]
         fill = _fill_value(out.dtype) if fill is None else fill
-        result = [_select(ctx, inside[row_of[o]], as_elements([item], ()), constants(fill, out.dtype))[()]
+        result = [_select(ctx, inside[row_by_element[o]], as_elements([item], ()), constants(fill, out.dtype))[()]
                   for o, item in enumerate(result)]  # fmt: skip
     return [as_elements(result, out.shape)]
 
@@ -144,7 +144,7 @@ def _select_windows(
     x: Elements,
     shape: tuple[int, ...],
     rows: Elements,
-    row_of: np.ndarray,
+    row_by_element: np.ndarray,
     limits: Sequence[int],
 ) -> list[Element]:
     """Return the elements of a gather, selected among all windows that the indices may refer to."""
@@ -156,12 +156,12 @@ def _select_windows(
         if not result:
             result = list(window)
             continue
-        hit = [
+        is_window = [
             _all(ctx, (_is_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0))
             for row in rows
         ]
         for o, item in enumerate(window):
-            condition = hit[row_of[o]]
+            condition = is_window[row_by_element[o]]
             if condition is not None and item is not result[o]:
                 result[o] = _select(ctx, condition, as_elements([item], ()), as_elements([result[o]], ()))[()]
     return result
@@ -208,8 +208,8 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
     collapsed = {*dims.inserted_window_dims, *dims.operand_batching_dims}
     sizes = iter(updates.shape[axis] for axis in window_axes)
     window = [1 if axis in collapsed else next(sizes) for axis in range(x.ndim)]
-    starts_of = dims.scatter_dims_to_operand_dims
-    limits = [x.shape[axis] - window[axis] for axis in starts_of]
+    start_axes = dims.scatter_dims_to_operand_dims
+    limits = [x.shape[axis] - window[axis] for axis in start_axes]
     blocks = updates.transpose(*row_axes, *window_axes)
     out = x.copy()
     for row in np.ndindex(indices.shape[:-1]):
@@ -220,9 +220,9 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
         for axis, batch_axis in zip(dims.operand_batching_dims, dims.scatter_indices_batching_dims, strict=True):
             corner[axis] = row[batch_axis]
         for positions in itertools.product(*options):
-            for axis, k in zip(starts_of, positions, strict=True):
+            for axis, k in zip(start_axes, positions, strict=True):
                 corner[axis] = k
-            here = _all(
+            is_here = _all(
                 ctx,
                 (
                     _is_at(ctx, i, k, limit)
@@ -235,7 +235,7 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
             window_index = tuple(slice(k, k + size) for k, size in zip(corner, window, strict=True))
             old = out[window_index]
             new = _combine(ctx, eqn, old, block.reshape(old.shape))
-            out[window_index] = new if here is None else _select(ctx, here, new, old)
+            out[window_index] = new if is_here is None else _select(ctx, is_here, new, old)
     return [out]
 
 

@@ -65,9 +65,9 @@ def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool
     n, x = len(a), np.empty(b.shape, object)
     order = list(range(n)) if lower else list(range(n))[::-1]
     for column in range(b.shape[1]):
-        for done, i in enumerate(order):
+        for n_done, i in enumerate(order):
             rest = b[i, column]
-            for k in order[:done]:
+            for k in order[:n_done]:
                 rest = ctx.scalar("sub", rest, ctx.scalar("mul", a[i, k], x[k, column]))
             x[i, column] = rest if unit else ctx.scalar("div", rest, a[i, i])
     return x

@@ -43,12 +43,12 @@ def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> l
     return [as_elements([next(outs) for _ in scalars(x)], x.shape) for x in results]
 
 
-def _replace_elements(x: Elements, new: dict[Value, Value]) -> Elements:
+def _replace_elements(x: Elements, replacements: dict[Value, Value]) -> Elements:
     def replace(item: Any) -> Any:
         return (
             tuple(map(replace, item))
             if isinstance(item, tuple)
-            else new.get(item, item)
+            else replacements.get(item, item)
             if isinstance(item, Value)
             else item
         )

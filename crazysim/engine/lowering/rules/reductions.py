@@ -146,7 +146,7 @@ def _sort_rows(
 
 def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Elements]) -> Elements:
     """Return where the first of two sets of keys precedes the second in ascending order, in which NaN is last."""
-    before, tied = constants(False, bool), constants(True, bool)
+    precedes, is_tied = constants(False, bool), constants(True, bool)
     for a, b in zip(first, second, strict=True):
         less, equal = ctx.elementwise("lt", [a, b], bool), ctx.elementwise("eq", [a, b], bool)
         if a.reshape(-1)[0].dtype.kind == "f":
@@ -154,9 +154,9 @@ def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Element
             only_b = ctx.elementwise("and", [b_nan, ctx.elementwise("not", [a_nan], bool)], bool)
             less = ctx.elementwise("or", [less, only_b], bool)
             equal = ctx.elementwise("or", [equal, ctx.elementwise("and", [a_nan, b_nan], bool)], bool)
-        before = ctx.elementwise("or", [before, ctx.elementwise("and", [tied, less], bool)], bool)
-        tied = ctx.elementwise("and", [tied, equal], bool)
-    return before
+        precedes = ctx.elementwise("or", [precedes, ctx.elementwise("and", [is_tied, less], bool)], bool)
+        is_tied = ctx.elementwise("and", [is_tied, equal], bool)
+    return precedes
 
 
 @rule("dot_general")

@@ -34,7 +34,7 @@ class TableView:
         self.same: dict[int, Element] = {}
         """Constants that are equal along the indexed axes, by the offset of the first; they are not looked up."""
 
-    def base_at(self, index: Sequence[Element], limits: Sequence[int]) -> Element:
+    def get_base(self, index: Sequence[Element], limits: Sequence[int]) -> Element:
         """Return the base of the elements at an index along the axes; each part is clamped to 0 and its limit."""
         base = self.base
         for i, limit, stride in zip(index, limits, self.strides.values(), strict=True):
@@ -74,14 +74,16 @@ def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) 
     if all(map(is_constant, items)):
         return _table_of_constants(ctx, x, axes) if n_indices > MAX_SELECTED_CONSTANTS else None
     locations = [ctx.entries.get(item) if isinstance(item, Value) else None for item in items]
-    first = locations[0]
-    if first is None or not all(p is not None and p.table is first.table and p.base is first.base for p in locations):
+    first_location = locations[0]
+    if first_location is None or not all(
+        p is not None and p.table is first_location.table and p.base is first_location.base for p in locations
+    ):
         return None
-    if n_indices <= MAX_SELECTED and first.table.size <= MAX_UNROLL:
+    if n_indices <= MAX_SELECTED and first_location.table.size <= MAX_UNROLL:
         return None
     offsets = np.array([p.offset for p in locations if p is not None]).reshape(x.shape)
     strides = _strides(offsets, axes)
-    return None if strides is None else TableView(ctx, first, offsets, strides)
+    return None if strides is None else TableView(ctx, first_location, offsets, strides)
 
 
 def _table_of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> TableView | None:
@@ -92,10 +94,10 @@ def _table_of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> Tabl
     offsets = np.arange(x.size).reshape(x.shape)
     (value,) = ctx.builder.add_many("table", (), (numbers.dtype,), (("numbers", TableEntries(numbers)),))
     table = TableView(ctx, TableEntry(value, ZERO, 0), offsets, _strides(offsets, axes) or {})
-    first = tuple([slice(0, 1) if axis in axes else slice(None) for axis in range(x.ndim)])
+    first_rows = tuple([slice(0, 1) if axis in axes else slice(None) for axis in range(x.ndim)])
     bits = numbers.view(f"u{numbers.itemsize}").reshape(x.shape)
-    same = np.all(bits == bits[first], tuple(axes), keepdims=True)
-    table.same = {int(k): x.reshape(-1)[k] for k in offsets[first][same]}
+    is_equal = np.all(bits == bits[first_rows], tuple(axes), keepdims=True)
+    table.same = {int(k): x.reshape(-1)[k] for k in offsets[first_rows][is_equal]}
     return table
 
 
