@@ -7,7 +7,7 @@ from typing import Any
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.envs.state import EnvState
+from crazysim.envs.state import EnvState, Obs
 
 
 class Hooks:
@@ -20,6 +20,7 @@ class Hooks:
     | ``after_reset(state)`` | at the start of an episode, after the task has been observed |
     | ``before_step(state, action)`` | before the physics; the outermost wrapper is called first |
     | ``after_step(state)`` | after observations and reward; the innermost wrapper is called first |
+    | ``look(state)`` | at the end of ``reset`` and ``step``, with the state of all worlds |
 
     A hook receives the state without the axis of worlds: (n_drones, k). The memory of a wrapper is
     ``state.memory[self.name]``; see ``remember`` and ``recall``. It is stored per world, except fields that a record
@@ -52,6 +53,14 @@ class Hooks:
     def after_step(self, state: EnvState) -> EnvState:
         """Return the state after the step."""
         return state
+
+    def look(self, state: EnvState) -> Obs:
+        """Return images of all worlds, which are observations under their names. (n_worlds, n_drones, k) each
+
+        They are taken once a step, after new episodes have begun, by kernels of their own.
+        """
+        del state
+        return {}
 
     def recall(self, state: EnvState) -> Any:
         """Return the memory of this wrapper."""

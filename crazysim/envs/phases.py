@@ -112,7 +112,33 @@ class Phases:
                     must_reset,
                 )
             )
+        if self.takes_images:
+            reason = "images are taken by kernels with a lane for each ray"
+            stages.append(Stage(self._look, "batch", name="look", phase="after", unfused_reason=reason))
         return stages
+
+    @property
+    def takes_images(self) -> bool:
+        """True if a wrapper takes images."""
+        return any(type(wrapper).look is not Hooks.look for wrapper in self.wrappers)
+
+    def _look(self, data: SimData) -> SimData:
+        return _restore_types(data, self.look(EnvState(data)))
+
+    def look(self, state: EnvState) -> EnvState:
+        """Return the state of all worlds with new images; those before become the images of the final observations."""
+        before = state.record.images
+        images = {name: x for wrapper in self.wrappers for name, x in wrapper.look(state).items()}
+        if both := images.keys() & state.record.obs.keys():
+            raise ConfigError(f"expected other names of images than those of observations, got {min(both)!r} as both")
+        invalid = state.full_data.core.nonfinite[..., None]
+        images = {name: jnp.where(invalid, jnp.zeros((), x.dtype), x) for name, x in images.items()}
+        state = EnvState(
+            state.full_data.replace(plugins=state.full_data.plugins | {NAME: state.record.replace(images=images)})
+        )
+        if "final_obs" not in state.info:
+            return state
+        return state.replace(info=state.info | {"final_obs": state.info["final_obs"] | (before or images)})
 
     def _act(self, data: SimData, vectorize: Vectorize) -> SimData:
         state = EnvState(data)

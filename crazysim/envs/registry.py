@@ -17,7 +17,7 @@ from crazysim.control import Control
 from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.settings import enum_member, positive_integer
 from crazysim.envs.actions import Actions
-from crazysim.envs.env import DroneEnv
+from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.references import is_reference, load_noted_task, load_task
 from crazysim.envs.task import Task
 from crazysim.envs.tasks.avoid import Avoid
@@ -31,6 +31,7 @@ from crazysim.envs.tasks.recover import Recover
 from crazysim.envs.tasks.swarm import Swarm
 from crazysim.envs.tasks.track import TrackTrajectory
 from crazysim.envs.tasks.transport import Transport
+from crazysim.envs.wrappers.images import DepthImages
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.plugins.effects.randomize import Randomize
 from crazysim.sim.sim import Sim
@@ -90,8 +91,9 @@ def make(
     sensors: Sequence[Plugin] = (),
     effects: Sequence[Plugin] = (),
     randomize: str | None = None,
+    depth: Sequence[int] | None = None,
     **options: Any,
-) -> DroneEnv:
+) -> Env:
     """Return an environment of many worlds of a task, with a simulation of its own.
 
     Args:
@@ -105,6 +107,8 @@ def make(
             by ``env.sim.add``, ``reset`` raises an error.
         randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
             ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
+        depth: Width and height in pixels of images that the drones observe in addition; see ``DepthImages``. None for
+            no images.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
     """
@@ -140,7 +144,14 @@ def make(
     task.install(sim)
     for plugin in plugins:
         sim.add(plugin)
-    return DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
+    env = DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
+    if depth is None:
+        return env
+    if not isinstance(depth, (tuple, list)) or len(depth) != 2:
+        raise ConfigError(
+            f"expected depth as width and height of images in pixels, got {short_repr(depth)}. Try (16, 12)."
+        )
+    return DepthImages(env, width=depth[0], height=depth[1])
 
 
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:

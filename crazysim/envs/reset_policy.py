@@ -18,7 +18,7 @@ class AutoresetMode(StrEnum):
     """In the step after the last one of an episode. That step ignores its action and gives no reward."""
     same_step = "SameStep"
     """At the end of the last step itself: ``obs`` belongs to the new episode, reward and ``info`` to that step, and the
-    last observation is in ``info["final_obs"]``."""
+    last observation is in ``info["final_obs"]``, with the images of the step before."""
     disabled = "Disabled"
     """When the user calls ``restart``."""
 
@@ -38,7 +38,9 @@ class ResetPolicy:
 
 
 def _add_final_obs(state: EnvState) -> EnvState:
-    return state.replace(info=state.info | {"final_obs": state.obs})
+    # Images are added at the end of the step.
+    images = {name: state.info.get("final_obs", state.obs)[name] for name in state.record.images}
+    return state.replace(info=state.info | {"final_obs": state.record.obs | images})
 
 
 def _keep_results(final_state: EnvState, new_state: EnvState) -> EnvState:

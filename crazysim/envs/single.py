@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.envs.env import DroneEnv
+from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES
@@ -25,7 +25,7 @@ class DroneSingleEnv(gymnasium.Env):
     of thousands of worlds. Observations and rewards are NumPy arrays that belong to the caller.
     """
 
-    def __init__(self, env: DroneEnv, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
+    def __init__(self, env: Env, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
         """Wrap a functional environment that does not reset automatically.
 
         Args:

@@ -31,6 +31,8 @@ class EnvRecord(PyTree):
 
     obs: Obs = leaf("drone", 1)
     """Observations. (n_worlds, n_drones, k) each"""
+    images: Obs = leaf("drone", 1)
+    """Observations that are images, taken of all worlds at the end of the step. (n_worlds, n_drones, k) each"""
     reward: Array = leaf("drone")
     """Reward of the last step. (n_worlds, n_drones)"""
     terminated: Array = leaf("world")
@@ -51,7 +53,7 @@ class EnvRecord(PyTree):
     """True where a new episode begins within the step. (n_worlds, 1)"""
 
 
-OUTPUTS = ("obs", "reward", "terminated", "truncated", "drone_info", "world_info")
+OUTPUTS = ("obs", "images", "reward", "terminated", "truncated", "drone_info", "world_info")
 """Fields of the record that are results of a step."""
 
 
@@ -79,7 +81,7 @@ class EnvState(PyTree):
     @property
     def obs(self) -> Obs:
         """Observations passed to the policy. (n_worlds, n_drones, k) each"""
-        return self.record.obs
+        return self.record.obs | self.record.images
 
     @property
     def reward(self) -> Array:
@@ -134,12 +136,24 @@ class EnvState(PyTree):
             full_data = changes.pop("data")
         if "info" in changes:
             changes |= self._split_info(changes.pop("info"))
+        if "obs" in changes:
+            changes["obs"] = self._without_images(changes["obs"])
         if "memory" in changes:
             changes["memory"] = _map_undeclared(self._add_axis, changes["memory"])
         for name in {"terminated", "truncated", "must_reset"} & changes.keys():
             changes[name] = self._add_axis(changes[name])
         record = record.replace(**changes) if changes else record
         return EnvState(full_data.replace(plugins=full_data.plugins | {NAME: record}))
+
+    def _without_images(self, obs: Obs) -> Obs:
+        """Return observations without the images among them, which must be unchanged."""
+        images = self.record.images
+        if changed := [name for name, image in images.items() if name in obs and obs[name] is not image]:
+            raise ConfigError(
+                f"expected images unchanged in functions of one world, got a new {changed[0]!r}. Images are taken "
+                f"after them. Change them where they are used, in the policy."
+            )
+        return {name: x for name, x in obs.items() if name not in images}
 
     def _split_info(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
         """Return the entries of ``info`` divided into ``drone_info`` and ``world_info``."""
@@ -186,7 +200,7 @@ def _map_undeclared(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
 def state_of_data(data: SimData) -> EnvState:
     """Return a state with an empty record, from which an episode begins."""
     no_array: Any = None
-    record = EnvRecord({}, no_array, no_array, no_array, no_array, {}, {}, {}, no_array, no_array)
+    record = EnvRecord({}, {}, no_array, no_array, no_array, no_array, {}, {}, {}, no_array, no_array)
     return EnvState(data.replace(plugins=data.plugins | {NAME: record}))
 
 

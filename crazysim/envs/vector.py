@@ -14,7 +14,7 @@ from jax import Array
 
 from crazysim.cache import announce_if_slow
 from crazysim.core.settings import as_mask, enum_member, positive_integer
-from crazysim.envs.env import DroneEnv, Env
+from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
@@ -228,5 +228,5 @@ def make_vector(
         options["seconds"] = positive_integer("max_episode_steps", max_episode_steps) / positive_integer(
             "freq", options.get("freq", 50)
         )
-    env: DroneEnv = make(task, num_envs, **options)
+    env = make(task, num_envs, **options)
     return DroneVectorEnv(env, autoreset_mode, render_mode, render_worlds, render_size, numpy)

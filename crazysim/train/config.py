@@ -14,7 +14,7 @@ import numpy as np
 from crazysim.core.data import as_key
 from crazysim.core.settings import positive_integer
 from crazysim.drones.loading import is_airframe_file
-from crazysim.envs.env import DroneEnv
+from crazysim.envs.env import Env
 from crazysim.envs.references import absolute_reference, is_reference, reference_of, split_reference
 from crazysim.envs.registry import TASKS, entry_of, make
 from crazysim.envs.task import Task
@@ -208,7 +208,7 @@ class TrainConfig:
         name = split_reference(self.task)[1] if is_reference(self.task) else self.task
         return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(".")[2]).lower()
 
-    def make_env(self, n_worlds: int | None = None, **defaults: Any) -> DroneEnv:
+    def make_env(self, n_worlds: int | None = None, **defaults: Any) -> Env:
         """Return an environment of the run.
 
         Args:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from crazysim.envs.env import DroneEnv, Env
+from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs
 from crazysim.errors import not_installed
 from crazysim.media import Film, View
@@ -179,9 +179,7 @@ def read_curve(folder: Path) -> list[dict[str, float]]:
         return [{"iteration" if name == "round" else name: x for name, x in point.items()} for point in curve]
 
 
-def film(
-    env: DroneEnv, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False
-) -> int:
+def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False) -> int:
     """Film one episode of a policy in several worlds side by side, and return the number of frames.
 
     Args:

@@ -24,7 +24,7 @@ import crazysim
 from crazysim.cache import announce_if_slow, keep_programs
 from crazysim.core.settings import positive_integer
 from crazysim.engine.backends.native import compiling_threads
-from crazysim.envs.env import DroneEnv
+from crazysim.envs.env import Env
 from crazysim.envs.references import code_digest, is_reference, split_reference
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task import Task
@@ -63,7 +63,7 @@ class TrainResult:
     the compilation time within it, s, and ``env_steps``, environment steps of all drones."""
     policy: Policy
     """Kept policy: the latest evaluated one with a success on the check set within two standard errors of the best."""
-    env: DroneEnv
+    env: Env
     """Environment of the evaluations of all trainings of the program, without automatic resets."""
 
 

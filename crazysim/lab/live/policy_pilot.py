@@ -16,7 +16,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import SimData
-from crazysim.envs.env import DroneEnv
+from crazysim.envs.env import Env
 from crazysim.envs.phases import vectorize_over_worlds
 from crazysim.envs.state import Obs, state_of_data
 from crazysim.envs.task import Task
@@ -44,11 +44,11 @@ class PolicyPilot:
     the loop is reset. Policies of tasks without goals fly as well, but refuse goals.
     """
 
-    def __init__(self, env: DroneEnv, policy: Callable[[Obs], Array], points: ArrayLike | None = None, seed: int = 0):
+    def __init__(self, env: Env, policy: Callable[[Obs], Array], points: ArrayLike | None = None, seed: int = 0):
         """Begin an episode in the simulation of the environment.
 
         Args:
-            env: Environment of the policy, without wrappers.
+            env: Environment of the policy, without wrappers but those of images.
             policy: Trained policy, or any function from observations to actions.
             points: Goals of every drone, one after another, world frame, m; None for the goal of the task. (n, 3)
             seed: Random seed of the episode.
@@ -223,8 +223,12 @@ def read_points(path: str | Path) -> NDArray:
     return np.array(points)
 
 
-def _command(env: DroneEnv, policy: Callable[[Obs], Array], data: SimData, memory: Any) -> tuple[Array, Any]:
+def _command(env: Env, policy: Callable[[Obs], Array], data: SimData, memory: Any) -> tuple[Array, Any]:
     """Return the command of the policy's action for every drone, (n_worlds, n_drones, k), and the policy's memory."""
-    seen = data if env.measure_states is None else vectorize_over_worlds(env.measure_states, env.task.batched)(data)
-    action, memory = act(policy, vectorize_over_worlds(env.task.observe, env.task.batched)(seen), memory)
+    measure = env.base.measure_states
+    seen = data if measure is None else vectorize_over_worlds(measure, env.task.batched)(data)
+    obs = vectorize_over_worlds(env.task.observe, env.task.batched)(seen)
+    for wrapper in env.wrappers:
+        obs |= wrapper.look(state_of_data(data))
+    action, memory = act(policy, obs, memory)
     return env.actions.command(action), memory
