@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -199,6 +200,12 @@ def predict(
     return pos, quat, vel, ang_vel
 
 
+@functools.partial(jax.jit, static_argnames=("dt", "constant_rates"))
+def _predict_all(model: Predictor, batch: Windows, dt: float, constant_rates: bool = False) -> tuple[Array, Array]:
+    """Return predicted positions and attitudes of all windows; models of the same kind share the compiled program."""
+    return jax.vmap(lambda window: predict(model, window, dt, constant_rates)[:2])(batch)
+
+
 def attitude_error(quat: Array, reference: Array) -> Array:
     """Return the rotation from a reference attitude to another, body frame. (..., 3)
 
@@ -225,8 +232,8 @@ def prediction_errors(
         mean distances, m, and angles, degrees, between predicted and measured states. (len(horizons),) each
     """
     batch, dt = windows([model.prepare_log(log) for log in logs], max(horizons), 0.05), logs[0].dt
-    pos, quat, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt)))(batch)
-    pos_turning, quat_turning, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt, constant_rates=True)))(batch)
+    pos, quat = _predict_all(model, batch, dt)
+    pos_turning, quat_turning = _predict_all(model, batch, dt, constant_rates=True)
     samples = np.asarray([round(h / dt) for h in horizons])
     times = jnp.asarray(samples * dt, jnp.float32)[:, None]
     true_pos, true_quat = batch.pos[:, samples], batch.quat[:, samples]
