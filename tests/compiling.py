@@ -25,6 +25,7 @@ def environment(variables: Mapping[str, str]) -> dict[str, str]:
     }
     if "xla_backend_optimization_level" not in flags:
         flags += " --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+        flags += " --xla_llvm_disable_expensive_passes=true"
         if version("jaxlib").startswith(
             "0.10."
         ):  # emitters of fused loops take three times as long; later jaxlibs have no option

@@ -35,8 +35,11 @@ class Compiled:
 
 @functools.cache
 def compiled(name="hover", n_worlds=4, mode=None):
-    """Return a compiled environment of a task with its usual settings, with automatic resets if there is a mode."""
-    env = make(name, n_worlds)
+    """Return an environment of a task with its usual settings, with automatic resets if there is a mode.
+
+    Its steps are interpreted: a kernel would take longer to compile than the tests take.
+    """
+    env = make(name, n_worlds, engine="interpret")
     return Compiled(env if mode is None else AutoReset(env, mode))
 
 

@@ -18,18 +18,27 @@ from crazysim.engine import Step
 ENGINES = ("interpret", *COMPILED_ENGINES)
 N_STEPS = 20
 """Steps of each simulation; sensors, controllers and delays have their ticks in them."""
-NOT_ON_LANES = ("kalman", "eskf", "terrain")
-"""Simulations whose lanes XLA takes more than half a minute to compile."""
+LONG_ON_LANES = ("sensors", "load", "bodies", "controllers", "complementary", "impact", "kalman", "eskf", "terrain")
+"""Simulations whose lanes XLA takes more than five seconds to compile."""
 
 
 @pytest.mark.long("compiles every stage of the package for every engine")
 @pytest.mark.parametrize("name", sweep.CASES)
 def test_every_engine_gives_what_plain_gives(name):
+    compare(name, [engine for engine in ENGINES if engine != "lanes" or name not in LONG_ON_LANES])
+
+
+@pytest.mark.slow("XLA compiles a minute; lanes of the other simulations have the same operations")
+@pytest.mark.parametrize("name", LONG_ON_LANES)
+def test_long_programs_on_lanes_give_what_plain_gives(name):
+    compare(name, ["lanes"])
+
+
+def compare(name, engines):
+    """Compare a flight on some engines with that of the reference."""
     sim = sweep.CASES[name]()
     expected = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(N_STEPS))
-    for engine in ENGINES:
-        if engine == "lanes" and name in NOT_ON_LANES:
-            continue
+    for engine in engines:
         step = Step(sim.step_pipeline, engine)
         assert step.plan(sim.data).engine == engine
         found = step(sim.data, jnp.int32(N_STEPS))

@@ -62,7 +62,8 @@ def scattered(sim, extreme=False, dtype=np.float32):
 @pytest.mark.long("compiles every integrator in every engine, in float64")
 @pytest.mark.parametrize("dynamics, control, integrator", [
     ("first_principles", "state", "euler"), ("first_principles", "attitude", "symplectic_euler"),
-    ("so_rpy_rotor_drag", "attitude", "rk4"), ("first_principles", "rotor_vel", "rk4"),
+    pytest.param("so_rpy_rotor_drag", "attitude", "rk4", marks=pytest.mark.slow("the next case has rk4 too")),
+    ("first_principles", "rotor_vel", "rk4"),
 ])  # fmt: skip
 def test_long_runs_agree_in_float64(x64, dynamics, control, integrator):
     """200 steps: what rounding differs in, 2e-16 a step, grows by the closed loop's gains to no more than 1e-9."""

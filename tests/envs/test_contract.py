@@ -39,6 +39,10 @@ N_FLYING, N_STEPS = 32, 1250
 ENDS = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
 
+SAME_CLASS = pytest.mark.slow("another task of its class does it")
+FLOWN = [x if x in entries(classes_once=True) else pytest.param(x, marks=SAME_CLASS) for x in entries()]
+"""Names of the tasks of the random flights."""
+
 
 @pytest.fixture(scope="module", params=entries())
 def name(request):
@@ -155,25 +159,26 @@ def test_an_episode_begins_with_nothing_done(env, begun):
     assert int(ahead.data.core.steps[0, 0]) == env.n_substeps
 
 
-def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(env, begun):
+def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(name, begun):
     """Whichever device the environment was made for: JAX runs what is compiled where its arguments are."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
-    step = jax.jit(env.env.step).trace(begun, begun.action)
+    step = jax.jit(make(name, N_WORLDS).step).trace(begun, begun.action)
     kernels = {"cpu": "crazysim_advance", "cuda": cuda.PTX_TARGET}
     for platform in kernels:
         text = step.lower(lowering_platforms=(platform,)).as_text()
-        assert {name: target in text for name, target in kernels.items()} == {
-            name: name == platform for name in kernels
+        assert {device: target in text for device, target in kernels.items()} == {
+            device: device == platform for device in kernels
         }
 
 
 PLANNED_IN_FLOAT64 = """
+import sys
 import jax, numpy as np
 from crazysim.engine.backends import kernel
 from crazysim.engine.step import Step
-from crazysim.envs import TASKS, AutoReset, make
-for name in TASKS:
+from crazysim.envs import AutoReset, make
+for name in sys.argv[1:]:
     env = AutoReset(make(name))
     state = jax.eval_shape(env.reset, jax.random.key(0))
     assert state.action.dtype == np.float64
@@ -183,11 +188,20 @@ for name in TASKS:
 """
 
 
-@pytest.mark.long("plans the step of every task, in a process of its own")
-def test_every_step_is_one_kernel_where_x64_is_enabled():
+WITH_INDICES = ("race", "avoid", "chase", "deliver")
+"""Tasks that count and choose."""
+
+
+@pytest.mark.long("plans steps in a process of its own")
+@pytest.mark.parametrize(
+    "names",
+    [WITH_INDICES, pytest.param([*TASKS], marks=pytest.mark.slow("the other case has the tasks with indices"))],
+    ids=["indices", "all"],
+)
+def test_every_step_is_one_kernel_where_x64_is_enabled(names):
     """Indices and counts stay int32: kernels have no int64."""
     env = os.environ | {"JAX_ENABLE_X64": "1"}
-    subprocess.run([sys.executable, "-c", PLANNED_IN_FLOAT64], check=True, env=env)
+    subprocess.run([sys.executable, "-c", PLANNED_IN_FLOAT64, *names], check=True, env=env)
 
 
 def test_repeated_steps_are_traced_once(env, begun):
@@ -222,6 +236,7 @@ def test_gymnasium_makes_it(name):
 
 
 @pytest.mark.long("compiles the vector environment of each task")
+@pytest.mark.parametrize("name", FLOWN, indirect=True)
 def test_the_number_of_worlds_changes_nothing(env, begun, flown):
     """Law 10 again: the first of many worlds fly as a few do."""
     (obs, info), state = flown.start, begun
@@ -241,6 +256,7 @@ def test_the_number_of_worlds_changes_nothing(env, begun, flown):
         np.testing.assert_allclose(reward[:N_WORLDS], np.asarray(state.reward).mean(axis=1), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("name", FLOWN, indirect=True)
 def test_random_steps_are_finite_and_within_the_spaces(flown):
     obs, reward, _, _, info = flown.results
     space = flown.env.single_observation_space
@@ -256,6 +272,7 @@ def test_random_steps_are_finite_and_within_the_spaces(flown):
     assert not info["nonfinite"].any()
 
 
+@pytest.mark.parametrize("name", FLOWN, indirect=True)
 def test_episodes_end_in_time_and_are_counted(env, flown):
     """Law 4: the time is over after ``max_steps`` steps, and never else."""
     _, reward, terminated, truncated, info = flown.results
@@ -273,7 +290,15 @@ def test_episodes_end_in_time_and_are_counted(env, flown):
         np.testing.assert_allclose(returns[ends, world], sums, rtol=1e-3, atol=1e-3)
 
 
+BY_STAGES = pytest.mark.slow("other tasks have all operations, and tests/gpu compares all tasks")
+
+
 @pytest.mark.long("compiles the batched step of each task")
+@pytest.mark.parametrize(
+    "name",
+    [x if x in WITH_INDICES else pytest.param(x, marks=BY_STAGES) for x in entries()],
+    indirect=True,
+)
 def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, flown):
     """Actions, physics, task and new episodes as one kernel equal the reference, where random flight leads."""
     vec, plain = flown.env, AutoReset(EpisodeStatistics(make(name, N_WORLDS, engine="plain")), "SameStep")

@@ -55,9 +55,21 @@ def tilted(data):
 
 
 FITTED = ("so_rpy_rotor_drag", "attitude", "auto")
-ENGINES = [*((*pair, "stages") for pair in PAIRS[1:]), (*PAIRS[0], "auto"), FITTED]
-"""Every pair, as its stages are written, without an engine; the longest pipeline on the engine that users get, as well
-as one of fitted dynamics."""
+AS_ATTITUDES = pytest.mark.slow("the state controller commands attitudes, which the fits follow in other cases")
+ENGINES = [
+    *((*pair, "stages") for pair in PAIRS[1:5]),
+    *(
+        pytest.param(
+            *pair, "stages", marks=[AS_ATTITUDES] if pair in (("so_rpy", "state"), ("so_rpy_rotor", "state")) else []
+        )
+        for pair in PAIRS[5:]
+        if pair != FITTED[:2]
+    ),
+    (*PAIRS[0], "auto"),
+    FITTED,
+]
+"""Every pair, most as their stages are written, without an engine; the longest pipeline and one of fitted dynamics on
+the engine that users get."""
 
 
 @functools.cache
@@ -175,8 +187,20 @@ def extreme_commands(airframe, control):
     return np.array([[*(largest * t), force] for force in (hover, n_rotors * most) for t in EXTREMES])
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("dynamics, control", [*PAIRS[:5], ("so_rpy", "attitude"), ("so_rpy_rotor_drag", "attitude")])
+CONSTANT = [*PAIRS[:5], ("so_rpy", "attitude"), ("so_rpy_rotor_drag", "attitude")]
+OTHER_INTEGRATOR = pytest.mark.slow("every level flies with one integrator, and torques with all of them")
+
+
+@pytest.mark.parametrize(
+    "dynamics, control, integrator",
+    [
+        pytest.param(
+            *pair, integrator, marks=[] if pair[1] == "force_torque" or (i + k) % 3 == 0 else [OTHER_INTEGRATOR]
+        )
+        for i, pair in enumerate(CONSTANT)
+        for k, integrator in enumerate(INTEGRATORS)
+    ],
+)
 def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integrator):
     """Law 7: the extremes of every command level on every airframe, as the worlds of one batch.
 

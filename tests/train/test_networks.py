@@ -205,7 +205,7 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
         mass = data.params.mass * uniform(key, data.core.n_drones, 1, low=0.9, high=1.1)
         return data.replace(params=data.params.replace(mass=mass))
 
-    base = make("hover", 3, randomize="generic", sensors=[MotionCapture(noise=0.1)])
+    base = make("hover", 3, randomize="generic", sensors=[MotionCapture(noise=0.1)], engine="interpret")
     env = AutoReset(PrivilegedObservation(RandomizeWith(base, heavier, params=("mass",))))
     state = env.reset(jax.random.key(0))
     for _ in range(2):
@@ -241,8 +241,10 @@ def test_a_critic_of_all_drones_gets_the_observations_of_each_its_own_first():
     np.testing.assert_array_equal(seen[1, 2], [10, 11, 6, 7, 8, 9])
 
 
-@pytest.mark.long("compiles two trainings")
-@pytest.mark.parametrize("task", ["swarm", "multi_race"])
+@pytest.mark.long("compiles a training")
+@pytest.mark.parametrize(
+    "task", ["swarm", pytest.param("multi_race", marks=pytest.mark.slow("swarm has several drones too"))]
+)
 def test_tasks_of_several_drones_train_with_a_critic_of_all(task):
     env = AutoReset(make(task, 4, seconds=0.1))
     learner, config = started(env, critic="all_drones")
@@ -285,7 +287,14 @@ def equinox_network():
 
 
 @pytest.mark.long("compiles a training with each")
-@pytest.mark.parametrize("make_network", [plain_network, flax_network, equinox_network])
+@pytest.mark.parametrize(
+    "make_network",
+    [
+        pytest.param(plain_network, marks=pytest.mark.slow("the network of Flax has no memory either")),
+        flax_network,
+        equinox_network,
+    ],
+)
 def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_network):
     network = make_network()
     result = trained(tmp_path, {}, network)

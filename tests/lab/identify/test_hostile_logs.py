@@ -18,7 +18,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.identify import Columns, read_log
 from crazysim.lab.identify.columns import without_huge_numbers
 
-MUTATIONS = 25 if os.environ.get("CRAZYSIM_HYPOTHESIS") != "explore" else 500
+MUTATIONS = 10 if os.environ.get("CRAZYSIM_HYPOTHESIS") != "explore" else 500
 """Mutated files of each kind."""
 MEMORY = 64 * 2**20
 """Most memory that reading a file of some 200 kB takes, bytes."""

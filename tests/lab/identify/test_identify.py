@@ -479,14 +479,16 @@ def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
 
 
 @pytest.mark.long("compiles the gradient of a flight of 0.5 s, and trains")
-def test_training_a_residual_lowers_the_errors_of_predictions(flights, result):
+@pytest.mark.parametrize(
+    "n_hidden", [4, pytest.param(0, marks=pytest.mark.slow("with hidden units the linear terms are trained too"))]
+)
+def test_training_a_residual_lowers_the_errors_of_predictions(flights, result, n_hidden):
     """Rotor speeds that are 5% too high in the log: the residual takes the thrust away."""
     logs = [read_log(x | {f"rpm{k}": 1.05 * x[f"rpm{k}"] for k in range(1, 5)}) for x in flights[:3]]
     before = prediction_errors(logs, result.model)
-    for n_hidden in (0, 4):
-        steps = {"iterations": 30, "batch_size": 8, "learning_rate": 1e-2}
-        trained = fit_residual(logs, result.model, n_hidden=n_hidden, validation=logs[:1], **steps)
-        assert prediction_errors(logs, trained)["position"][-1] < 0.5 * before["position"][-1], n_hidden
+    steps = {"iterations": 30, "batch_size": 8, "learning_rate": 1e-2}
+    trained = fit_residual(logs, result.model, n_hidden=n_hidden, validation=logs[:1], **steps)
+    assert prediction_errors(logs, trained)["position"][-1] < 0.5 * before["position"][-1]
 
 
 def test_results_are_plain_numbers(result):

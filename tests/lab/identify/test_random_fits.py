@@ -101,7 +101,9 @@ def missed(folder, n, seconds, seed, *, at_samples):
 
 
 @pytest.mark.long("flies four airframes for 40 s and fits each twice")
-@pytest.mark.parametrize("at_samples", [False, True])
+@pytest.mark.parametrize(
+    "at_samples", [False, pytest.param(True, marks=pytest.mark.slow("commands between samples are harder to fit"))]
+)
 def test_three_deviations_contain_the_truth(tmp_path, at_samples):
     wrong, total = missed(tmp_path, 4, 40.0, 0, at_samples=at_samples)
     assert len(wrong) <= 0.02 * total, wrong

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import hover_command, hovering, n_documented, repeat_command, trees_equal, with_states
+from cases import by_stages, hover_command, hovering, n_documented, repeat_command, trees_equal, with_states
 from sweep import EFFECTS
 
 from crazysim import (
@@ -19,7 +19,6 @@ from crazysim import (
 )
 from crazysim.core.pipeline import replace_fn
 from crazysim.core.stage import vmap_drones
-from crazysim.engine import Step
 from crazysim.plugins import effects
 from crazysim.pytree import scopes
 
@@ -81,7 +80,7 @@ def signature(tree):
     return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]
 
 
-@pytest.mark.long("traces all effects for six sizes")
+@pytest.mark.long("traces all effects for four sizes")
 def test_law_02_shapes_and_types_stay_for_any_number_of_worlds_drones_and_rotors():
     tables = dict(load_airframe("cf21B_500").tables)
     angle = np.arange(6) * np.pi / 3
@@ -90,7 +89,7 @@ def test_law_02_shapes_and_types_stay_for_any_number_of_worlds_drones_and_rotors
         "yaw_torque_sign": [1, -1, 1, -1, 1, -1],
     }
     hexacopter = tables | {"rotors": dict(tables["rotors"]) | rotors}
-    for i, (n_worlds, n_drones) in enumerate([(1, 1), (2, 2), (1, 4), (3, 1), (4, 3), (4, 4)]):
+    for i, (n_worlds, n_drones) in enumerate([(2, 2), (1, 4), (3, 1), (4, 3)]):
         control = ("attitude", "rotor_vel")[i % 2]
         drone = ("cf21B_500", hexacopter)[i // 2 % 2]
         sim = Sim(n_worlds, n_drones, drone=drone, control=control, engine="lanes")
@@ -253,7 +252,7 @@ def test_law_07_values_and_gradients_are_finite(every):
     )[:3]
     sim.data = data
     sim.attitude_control(command)
-    step = Step(sim.step_pipeline, "plain")  # whose gradient compiles soonest
+    step = by_stages(sim)
 
     def sum_of_states(data):
         end = step(data, 40)

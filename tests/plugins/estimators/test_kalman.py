@@ -194,7 +194,7 @@ def test_every_kind_of_controller_flies_on_the_estimate(controller):
 
 
 def test_a_task_flies_and_observes_with_one_argument():
-    env = make("hover", n_worlds=4, estimator=Kalman([IMU(), MotionCapture(pos=(0.1, 0.0, 0.0))]))
+    env = make("hover", n_worlds=4, estimator=Kalman([IMU(), MotionCapture(pos=(0.1, 0.0, 0.0))]), engine="interpret")
     state = jax.jit(env.reset)(jax.random.key(0))
     state = env.step(state, jnp.zeros_like(state.action))
     found = np.asarray(state.data.plugins["kalman"].estimate.pos - state.data.states.pos)
@@ -228,7 +228,7 @@ def test_wrong_sensors_are_refused():
 def test_a_task_observes_the_estimate():
     """An estimate that is moved, with no sensor to tell, moves the observed position, and not the reward."""
     imu = IMU()
-    env = make("hover", n_worlds=4, sensors=[imu, Kalman([imu])])
+    env = make("hover", n_worlds=4, sensors=[imu, Kalman([imu])], engine="interpret")
     state = jax.jit(env.reset)(jax.random.key(0))
     action = jnp.zeros_like(state.action)
     state = env.step(state, action)

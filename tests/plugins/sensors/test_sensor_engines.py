@@ -4,16 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import hover_rotor_state, with_states
+from cases import by_stages, hover_rotor_state, with_states
 from sweep import REQUIRED_BY, SENSORS
 
 from crazysim import Sim
-from crazysim.engine import Step
 from crazysim.plugins import sensors
 from crazysim.plugins.sensors import IMU
-
-ROUGH = {"imu": IMU.bmi088, "rotor_speeds": lambda: sensors.RotorSpeeds.telemetry(6)}
-"""Sensors that round."""
 
 
 def test_every_sensor_is_here():
@@ -65,54 +61,62 @@ def test_every_sensor_measures_something(sim):
 
 def test_law_10_measurements_do_not_depend_on_other_worlds(sim):
     alone = flying(2, SENSORS)
-    both = [Step(s.step_pipeline, "plain")(s.data, jnp.int32(9)) for s in (sim, alone)]
-    many, few = measurements(sim, both[0]), measurements(alone, both[1])
+    many, few = (measurements(s, s.step_fn(s.data, jnp.int32(9))) for s in (sim, alone))
     for name, x in few.items():
         np.testing.assert_array_equal(x, many[name][:2], err_msg=name)
 
 
-@pytest.mark.parametrize("name", SENSORS)
-def test_law_08_gradients_are_central_differences(name, x64):
-    """Of all parts of a measurement, by position, velocity, attitude, rates and rotor speeds of the start."""
-    sim = flying(1, [name])
-    step, names = Step(sim.step_pipeline, "plain"), ("pos", "vel", "quat", "ang_vel", "rotor_vel")
+@pytest.mark.long("compiles the derivatives of all sensors in float64")
+def test_law_08_gradients_are_central_differences(x64):
+    """Of all parts of each measurement, by position, velocity, attitude, rates and rotor speeds of the start."""
+    sim = flying(1, SENSORS)
+    step, names = by_stages(sim), ("pos", "vel", "quat", "ang_vel", "rotor_vel")
     start = {k: jnp.asarray(getattr(sim.data.states, k)) for k in names}
-    sensor = sim.plugins[name]
-    sizes = sum(sensor.channels.values())
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=(1, 2, sizes)))
-
-    @jax.jit
-    def loss(x):
-        quat = x["quat"] / jnp.linalg.norm(x["quat"], axis=-1, keepdims=True)
-        data = sim.data.replace(states=sim.data.states.replace(**(x | {"quat": quat})))
-        return jnp.sum(weights * sensor.read(step(data, 8)).samples.value)
-
+    measuring = [sim.plugins[name] for name in SENSORS]
+    rng = np.random.default_rng(1)
+    weights = [jnp.asarray(rng.normal(size=(1, 2, sum(sensor.channels.values())))) for sensor in measuring]
     rng = np.random.default_rng(2)
     directions = {k: jnp.asarray(rng.normal(size=x.shape)) * (100.0 if k == "rotor_vel" else 0.1)
                   for k, x in start.items()}  # fmt: skip
-    slope = jax.jit(lambda x: jax.jvp(loss, (x,), (directions,))[1])(start)
-    gradient = jax.jit(jax.grad(loss))(start)
-    along = sum(float(jnp.sum(gradient[k] * directions[k])) for k in names)
-    h = 1e-4
-    ends = [loss({k: x + sign * h * directions[k] for k, x in start.items()}) for sign in (1, -1)]
-    difference = float(ends[0] - ends[1]) / (2 * h)
-    assert abs(difference) > 1e-6 * float(jnp.abs(sensor.read(step(sim.data, 8)).samples.value).max())
-    np.testing.assert_allclose([float(slope), along], difference, rtol=1e-5)  # h^2 of the difference
 
-
-@pytest.mark.parametrize("name", ROUGH)
-def test_gradients_pass_what_rounds(name, x64):
-    """A measurement is rounded; its gradient is that of what was rounded, and finite."""
-    sim = flying(1, [])
-    sensor = sim.add(ROUGH[name]())
-    step = Step(sim.step_pipeline, "plain")
+    def measure(x):
+        """Return a weighted sum of the measurements of each sensor, and the largest of them. (n_sensors,)"""
+        quat = x["quat"] / jnp.linalg.norm(x["quat"], axis=-1, keepdims=True)
+        end = step(sim.data.replace(states=sim.data.states.replace(**(x | {"quat": quat}))), 8)
+        values = [sensor.read(end).samples.value for sensor in measuring]
+        sums = jnp.stack([jnp.sum(w * value) for w, value in zip(weights, values, strict=True)])
+        return sums, jnp.stack([jnp.abs(value).max() for value in values])
 
     @jax.jit
-    @jax.grad
-    def gradient(rotor_vel):
-        data = sim.data.replace(states=sim.data.states.replace(rotor_vel=rotor_vel))
-        return jnp.sum(jnp.square(sensor.read(step(data, 3)).samples.value))
+    def derivatives(x):
+        """Return the sums, their slopes along the directions by forward and by reverse derivatives, and the sizes."""
+        sums, linear, sizes = jax.linearize(measure, x, has_aux=True)
+        transposed = jax.vmap(lambda row: jax.linear_transpose(linear, x)(row)[0])(jnp.eye(len(measuring)))
+        along = sum(jnp.sum(transposed[k] * directions[k], axis=range(1, 4)) for k in names)
+        return sums, linear(directions), along, sizes
 
-    found = np.asarray(gradient(jnp.asarray(sim.data.states.rotor_vel)))
+    h = 1e-4
+    (_, slopes, along, sizes), *ends = (
+        derivatives({k: x + sign * h * directions[k] for k, x in start.items()}) for sign in (0, 1, -1)
+    )
+    differences = (ends[0][0] - ends[1][0]) / (2 * h)
+    for name, slope, back, difference, size in zip(SENSORS, slopes, along, differences, sizes, strict=True):
+        assert abs(difference) > 1e-6 * size, name
+        np.testing.assert_allclose([slope, back], difference, rtol=1e-5, err_msg=name)  # h^2 of the difference
+
+
+def test_gradients_pass_what_rounds(x64):
+    """A measurement is rounded; its gradient is that of what was rounded, and finite."""
+    sim = flying(1, [])
+    rough = [sim.add(make()) for make in (IMU.bmi088, lambda: sensors.RotorSpeeds.telemetry(6))]
+    step = by_stages(sim)
+
+    @jax.jit
+    @jax.jacrev
+    def gradients(rotor_vel):
+        end = step(sim.data.replace(states=sim.data.states.replace(rotor_vel=rotor_vel)), 3)
+        return jnp.stack([jnp.sum(jnp.square(sensor.read(end).samples.value)) for sensor in rough])
+
+    found = np.asarray(gradients(jnp.asarray(sim.data.states.rotor_vel)))
     assert np.isfinite(found).all()
     assert np.abs(found).min() > 1e-9
