@@ -32,11 +32,11 @@ def main() -> None:
     estimator = None if args.truth else laboratory_estimator(args.quat_deviation)
     for row in compare_tracking([read_flight(path) for path in paths], args.drone, estimator):
         numbers = {
-            "logged_m": round(row.logged, 3),
-            "simulated_m": round(row.simulated, 3),
+            "logged_m": round(row.logged_error, 3),
+            "simulated_m": round(row.simulated_error, 3),
             "ratio": round(row.ratio, 2),
-            "logged_lag_s": row.logged_lag,
-            "simulated_lag_s": row.simulated_lag,
+            "logged_lag_s": row.logged_error_lag,
+            "simulated_lag_s": row.simulated_error_lag,
             "failed": row.failed,
         }
         print(json.dumps({"benchmark": "closed_loop", "log": row.name, **numbers}), flush=True)

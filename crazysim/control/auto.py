@@ -96,7 +96,7 @@ class AutoParams(RigidBodyParams):
     """Factor on the difference between desired and current rotor speeds, 1. (1,)"""
     reaction: Array = leaf("parameter", 1, (1,))
     """Angular momentum of the rotors about body z over their drag torque, both as changes around hover, s. (1,)"""
-    share: Array = leaf("parameter", 1, (1,))
+    drag_torque_share: Array = leaf("parameter", 1, (1,))
     """Fraction of the missing yaw torque demanded from rotor drag, 1; the reaction to spin-up gives the rest. (1,)"""
     position: PositionParams | None
     """Gains and limits of the position loop; None without one."""
@@ -113,11 +113,11 @@ class AutoParams(RigidBodyParams):
             freq: Rate of the controller, Hz.
             outer_freq: Rate of its position loop, Hz, whose command is half a period old on average; None without one.
         """
-        lag, turns = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * turn_rates(airframe)
-        wanted = 1 / max(1 / np.max(turns[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
-        lead = max(min(wanted / lag, MAX_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
+        lag, rate_limits = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * turn_rates(airframe)
+        needed_rate = 1 / max(1 / np.max(rate_limits[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
+        lead = max(min(needed_rate / lag, MAX_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
         rate = 1 / (1 / (lead * lag) + 1.5 / freq)
-        rates = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turns)
+        rates = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), rate_limits)
         stiffness, damping = STIFFNESS_RATIO * rates**2, DAMPING_RATIO * rates
         delay, reaction = DAMPING_RATIO / STIFFNESS_RATIO / np.min(rates[:2]), reaction_time(airframe)
         body = rigid_body_params(airframe)
@@ -135,7 +135,7 @@ class AutoParams(RigidBodyParams):
             observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO * np.max(rates) / freq)),
             lead=as_parameter(lead),
             reaction=as_parameter(reaction),
-            share=as_parameter(1 / (1 + lead * lag * reaction)),
+            drag_torque_share=as_parameter(1 / (1 + lead * lag * reaction)),
             position=position,
         )
 
@@ -153,10 +153,10 @@ class AutoTarget(PyTree):
     """Collective thrust that leads to the setpoint once the attitude is reached, N. (n_worlds, n_drones, 1)"""
 
     @staticmethod
-    def at_rest() -> AutoTarget:
+    def create() -> AutoTarget:
         """Return the target of one drone before the first setpoint."""
         level, zeros = as_parameter([0.0, 0.0, 0.0, 1.0]), as_parameter(np.zeros(3))
-        return AutoTarget(PositionMemory.at_rest(), level, zeros, as_parameter(np.zeros(1)))
+        return AutoTarget(PositionMemory.create(), level, zeros, as_parameter(np.zeros(1)))
 
 
 class AutoMemory(PyTree):
@@ -170,14 +170,14 @@ class AutoMemory(PyTree):
     """Estimated unknown torque, body frame, N m. (n_worlds, n_drones, 3)"""
 
     @staticmethod
-    def at_rest(follows_setpoints: bool) -> AutoMemory:
+    def create(follows_setpoints: bool) -> AutoMemory:
         """Return the memory of one drone before the first tick.
 
         Args:
             follows_setpoints: True at the command level ``state``.
         """
         zeros = as_parameter(np.zeros(3))
-        return AutoMemory(AutoTarget.at_rest() if follows_setpoints else None, zeros, zeros)
+        return AutoMemory(AutoTarget.create() if follows_setpoints else None, zeros, zeros)
 
 
 def quat_error(quat: Array) -> Array:
@@ -195,10 +195,10 @@ def quat_error(quat: Array) -> Array:
     """
     x, y, z, w = (quat[..., i : i + 1] for i in range(4))
     squared = w * w + z * z
-    twice = 2 * lax.rsqrt(jnp.maximum(squared, INVERTED_COSINE / 2))
-    roll = jnp.where(squared < INVERTED_COSINE / 2, 2.0, (w * x - y * z) * twice)
-    yaw = jnp.where(w < 0, -z, z) * twice
-    return jnp.concatenate([roll, (w * y + x * z) * twice, yaw], axis=-1)
+    factor = 2 * lax.rsqrt(jnp.maximum(squared, INVERTED_COSINE / 2))
+    roll = jnp.where(squared < INVERTED_COSINE / 2, 2.0, (w * x - y * z) * factor)
+    yaw = jnp.where(w < 0, -z, z) * factor
+    return jnp.concatenate([roll, (w * y + x * z) * factor, yaw], axis=-1)
 
 
 class Auto(Controller):
@@ -219,7 +219,7 @@ class Auto(Controller):
     yaw_rate: bool = False
     """True if the third entry of an attitude command is a yaw rate, rad/s, instead of a yaw."""
 
-    def adapted(self, control: Control, fitted: str | None) -> Controller | None:
+    def adapt(self, control: Control, fitted: str | None) -> Controller | None:
         if fitted is None and control in self.levels:
             return self if control == Control.state else dataclasses.replace(self, outer_freq=None)
         if fitted is None:
@@ -246,18 +246,18 @@ class Auto(Controller):
         specific_thrust = keep_upright(specific_thrust - drag + 0.5 / freq * sp.jerk, sp, loop)
 
         # The heading of a state command follows from its quaternion, which needs no angles.
-        ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
+        forward, left = rotation.heading(data.controls.state.cmd[..., 9:13])
         squared = dot(specific_thrust, specific_thrust)
         is_falling = squared < MIN_THRUST**2
         inverse = jnp.where(is_falling, 0.0, lax.rsqrt(jnp.where(is_falling, 1.0, squared)))
         z = jnp.where(is_falling, jnp.asarray([0.0, 0.0, 1.0], specific_thrust.dtype), specific_thrust * inverse)
-        across = cross(z, ahead)
-        x_ahead = rotation.safe_norm(across)
-        is_parallel = x_ahead < MIN_THRUST
-        y = jnp.where(is_parallel, left, across / jnp.where(is_parallel, 1.0, x_ahead))
+        z_cross_forward = cross(z, forward)
+        x_forward = rotation.safe_norm(z_cross_forward)
+        is_parallel = x_forward < MIN_THRUST
+        y = jnp.where(is_parallel, left, z_cross_forward / jnp.where(is_parallel, 1.0, x_forward))
         z_rate = (sp.jerk - dot(z, sp.jerk) * z) * inverse
-        heading_terms = sp.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, ahead)
-        yaw_rate = heading_terms / jnp.maximum(x_ahead, MIN_HEADING_SINE)
+        heading_terms = sp.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, forward)
+        yaw_rate = heading_terms / jnp.maximum(x_forward, MIN_HEADING_SINE)
         ang_vel = cross(z, z_rate) + safe_clip(yaw_rate, -YAW_RATE_MAX, YAW_RATE_MAX) * z
         attitude, thrust = rotation.quat_from_axes(cross(y, z), y, z), p.mass * squared * inverse
         return memory.replace(target=AutoTarget(position, attitude, matvec(to_body, ang_vel), thrust))
@@ -266,7 +266,7 @@ class Auto(Controller):
         return AutoParams.create(airframe, self.freq, self.outer_freq)
 
     def memory(self, airframe: Airframe) -> AutoMemory:
-        return AutoMemory.at_rest(follows_setpoints=self.has_outer)
+        return AutoMemory.create(follows_setpoints=self.has_outer)
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: AutoMemory, params: AutoParams
@@ -291,31 +291,31 @@ class Auto(Controller):
         total_momentum = momentum - rotation.along_z((p.reaction * rotor_torque[..., 2:])[..., 0])
         impulse = p.torque_max / self.freq
         measured_impulse = jnp.clip(total_momentum - memory.momentum, -impulse, impulse)
-        at_rest = dot(s.ang_vel, s.ang_vel) == 0  # taken to stand on the floor
+        is_at_rest = dot(s.ang_vel, s.ang_vel) == 0  # taken to stand on the floor
         disturbance_torque = (1 - p.observer) * memory.torque + jnp.where(
-            at_rest, 0.0, p.observer * self.freq
+            is_at_rest, 0.0, p.observer * self.freq
         ) * measured_impulse
         expected_momentum = total_momentum + (rotor_torque - gyroscopic) / self.freq
         torque = gyroscopic - disturbance_torque - matvec(p.J * p.damping[..., None, :], s.ang_vel - rate)
         if error is not None:
             torque = torque + matvec(p.J * p.stiffness[..., None, :], error)
-        yaw = rotor_torque[..., 2:] + p.share * (torque[..., 2:] - rotor_torque[..., 2:])
+        yaw = rotor_torque[..., 2:] + p.drag_torque_share * (torque[..., 2:] - rotor_torque[..., 2:])
 
         wrench = jnp.concatenate([thrust, torque[..., :2], yaw], axis=-1)
         thrusts = prioritized_thrusts(wrench, params=p.allocation)
         # The rotor speeds of rotor_vel_of_thrust, approached with a lead.
         _, k1, k2 = (p.allocation.rpm2thrust[..., i] for i in range(3))
         lead = p.lead / (2 * k2)
-        driven = lead * thrust_slope(thrusts, p.allocation.rpm2thrust) + ((1 - p.lead) * s.rotor_vel - lead * k1)
-        driven = jnp.maximum(driven, 1.0)  # zero would be off
-        return jnp.where(is_on, driven, 0.0), memory.replace(momentum=expected_momentum, torque=disturbance_torque)
+        rotor_vel = lead * thrust_slope(thrusts, p.allocation.rpm2thrust) + ((1 - p.lead) * s.rotor_vel - lead * k1)
+        rotor_vel = jnp.maximum(rotor_vel, 1.0)  # zero would be off
+        return jnp.where(is_on, rotor_vel, 0.0), memory.replace(momentum=expected_momentum, torque=disturbance_torque)
 
-    def _command_errors(self, s: FlightState, command: Array, mode: Control) -> tuple[Array | None, Array]:
+    def _command_errors(self, state: FlightState, command: Array, mode: Control) -> tuple[Array | None, Array]:
         """Return the rotation error, rad, None at the level of body rates, and the desired body rates, rad/s. (3,)"""
         if mode == Control.body_rate:
             return None, command[..., :3]
-        rpy, rate = command[..., :3], jnp.zeros_like(s.ang_vel)
+        rpy, rate = command[..., :3], jnp.zeros_like(state.ang_vel)
         if self.yaw_rate:
-            rpy = jnp.concatenate([rpy[..., :2], rotation.yaw(s.quat)[..., None]], axis=-1)
-            rate = command[..., 2:3] * rotation.matrix(s.quat)[..., 2, :]
-        return quat_error(rotation.multiply(rotation.conjugate(s.quat), rotation.from_rpy(rpy))), rate
+            rpy = jnp.concatenate([rpy[..., :2], rotation.yaw(state.quat)[..., None]], axis=-1)
+            rate = command[..., 2:3] * rotation.matrix(state.quat)[..., 2, :]
+        return quat_error(rotation.multiply(rotation.conjugate(state.quat), rotation.from_rpy(rpy))), rate

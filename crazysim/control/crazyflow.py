@@ -80,7 +80,7 @@ class Crazyflow(Controller):
     freq: int = 500
     """Rate, Hz."""
 
-    def adapted(self, control: Control, fitted: str | None) -> Controller | None:
+    def adapt(self, control: Control, fitted: str | None) -> Controller | None:
         if control == Control.state:
             return CrazyflowState(inner=None if fitted else self)
         return self if fitted is None and control in self.levels else None

@@ -128,8 +128,8 @@ class CFirmware(Controller):
         if self.motors == "rpm":
             return motors
         thrust = motors * params.thrust_max if self.motors == "throttle" else motors
-        limited = jnp.clip(thrust, params.thrust_min, params.thrust_max)
-        return jnp.where(thrust <= 0, 0.0, rotor_vel_of_thrust(limited, params.rpm2thrust))
+        clipped_thrust = jnp.clip(thrust, params.thrust_min, params.thrust_max)
+        return jnp.where(thrust <= 0, 0.0, rotor_vel_of_thrust(clipped_thrust, params.rpm2thrust))
 
 
 def _call_library(library: str, level: int, n_motors: int, words: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -167,23 +167,23 @@ def copy_library(library: str | Path) -> str:
         if reason := _loading_error(copy):
             copy.unlink()
             raise ConfigError(f"expected a shared library at {path}, got one that cannot be loaded: {reason}. {remedy}")
-    loaded = _open_library(str(copy))
-    missing = [name for name in LIBRARY_FUNCTIONS if not hasattr(loaded, name)]
+    library_copy = _open_library(str(copy))
+    missing = [name for name in LIBRARY_FUNCTIONS if not hasattr(library_copy, name)]
     if missing:
-        needed, lacking = ", ".join(LIBRARY_FUNCTIONS), ", ".join(missing)
-        raise ConfigError(f"expected the functions {needed} in {path}, got no {lacking}. {remedy}")
-    if (version := loaded.crazysim_version()) != INTERFACE_VERSION:
+        n_bytes, missing_names = ", ".join(LIBRARY_FUNCTIONS), ", ".join(missing)
+        raise ConfigError(f"expected the functions {n_bytes} in {path}, got no {missing_names}. {remedy}")
+    if (version := library_copy.crazysim_version()) != INTERFACE_VERSION:
         raise ConfigError(f"expected version {INTERFACE_VERSION} of firmware.h in {path}, got {version}. {remedy}")
     pointer, integer, size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
-    loaded.crazysim_memory_size.restype = size
-    if (needed := loaded.crazysim_memory_size()) > MAX_MEMORY:
+    library_copy.crazysim_memory_size.restype = size
+    if (n_bytes := library_copy.crazysim_memory_size()) > MAX_MEMORY:
         raise ConfigError(
-            f"expected a memory of at most {MAX_MEMORY} bytes a drone, got {needed} from {path}. {remedy}"
+            f"expected a memory of at most {MAX_MEMORY} bytes a drone, got {n_bytes} from {path}. {remedy}"
         )
-    loaded.crazysim_init.argtypes = [pointer]
-    loaded.crazysim_init.restype = None
-    loaded.crazysim_update_all.argtypes = [integer, integer, size, pointer, integer, pointer, pointer]
-    loaded.crazysim_update_all.restype = None
+    library_copy.crazysim_init.argtypes = [pointer]
+    library_copy.crazysim_init.restype = None
+    library_copy.crazysim_update_all.argtypes = [integer, integer, size, pointer, integer, pointer, pointer]
+    library_copy.crazysim_update_all.restype = None
     return str(copy)
 
 
@@ -194,12 +194,12 @@ def _loading_error(library: Path) -> str:
     """
     command = [sys.executable, "-I", "-S", "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", str(library)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LOADING_TIMEOUT, check=False)
+        process = subprocess.run(command, capture_output=True, text=True, timeout=LOADING_TIMEOUT, check=False)
     except subprocess.TimeoutExpired:
         return f"it takes over {LOADING_TIMEOUT} s"
-    if done.returncode < 0:
-        return f"it ends the process with {signal.Signals(-done.returncode).name}"
-    return (done.stderr.strip().splitlines() or ["unknown"])[-1] if done.returncode else ""
+    if process.returncode < 0:
+        return f"it ends the process with {signal.Signals(-process.returncode).name}"
+    return (process.stderr.strip().splitlines() or ["unknown"])[-1] if process.returncode else ""
 
 
 _open_library = functools.cache(ctypes.CDLL)

@@ -27,7 +27,7 @@ class FittedParams(PyTree):
     """Parameters of the fitted model that the controller assumes."""
     angles: Array = leaf("parameter", 1)
     """Ratio of commanded roll, pitch and yaw to the angles at which the model settles, 1. (3,)"""
-    ahead: Array = leaf("parameter", 1)
+    lead: Array = leaf("parameter", 1)
     """Factors on jerk, s, and snap, s^2, that advance the attitude command to compensate the response's delay. (2,)"""
     position: PositionParams
     """Gains and limits of the position loop."""
@@ -52,7 +52,7 @@ class FittedParams(PyTree):
         return FittedParams(
             model=model,
             angles=as_parameter(-model.rpy_coef / model.cmd_rpy_coef),
-            ahead=as_parameter([attitude + 0.5 / freq, float(np.max(-1 / np.asarray(model.rpy_coef)[:2]))]),
+            lead=as_parameter([attitude + 0.5 / freq, float(np.max(-1 / np.asarray(model.rpy_coef)[:2]))]),
             position=PositionParams.create(airframe, max(delays) + 1.5 / freq, freq),
         )
 
@@ -72,7 +72,7 @@ class FittedAuto(Controller):
         return FittedParams.create(airframe, self.dynamics, self.freq)
 
     def memory(self, airframe: Airframe) -> PositionMemory:
-        return PositionMemory.at_rest()
+        return PositionMemory.create()
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: PositionMemory, params: FittedParams
@@ -88,8 +88,8 @@ class FittedAuto(Controller):
         specific_thrust, memory = specific_force(s.pos, s.vel, known_acc, command, memory, self.freq, p.position)  # type: ignore
         specific_thrust = keep_upright(specific_thrust - matvec(matrix, drag) / model.mass, command, p.position)  # type: ignore
 
-        ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
-        advanced_thrust = specific_thrust + p.ahead[..., :1] * command.jerk + p.ahead[..., 1:] * command.snap
-        angles = p.angles * rotation.from_axes(*rotation.axes_along(advanced_thrust, ahead, left))
+        forward, left = rotation.heading(data.controls.state.cmd[..., 9:13])
+        advanced_thrust = specific_thrust + p.lead[..., :1] * command.jerk + p.lead[..., 1:] * command.snap
+        angles = p.angles * rotation.from_axes(*rotation.axes_along(advanced_thrust, forward, left))
         thrust = (model.mass * dot(specific_thrust, matrix[..., 2]) - model.acc_coef) / model.cmd_f_coef
         return jnp.concatenate([angles, jnp.maximum(thrust, model.thrust_min)], axis=-1), memory

@@ -108,19 +108,19 @@ def attitude_of_thrust(
         yaw_rate: Its derivative, rad/s. (..., 1)
         yaw_acc: Its second derivative, rad/s^2. (..., 1)
     """
-    ahead, left = rotation.level_axes(yaw)
+    forward, left = rotation.level_axes(yaw)
     z, z_rate, z_acc = thrust_direction(specific_thrust, specific_thrust_rate, specific_thrust_acc)
-    across = cross(z, ahead)
-    y = jnp.where(dot(across, across) < 1e-10, left, rotation.safe_normalize(across, left))
-    x = rotation.safe_normalize(cross(y, z), ahead)  # of length one already, unless thrust and heading are parallel
+    z_cross_forward = cross(z, forward)
+    y = jnp.where(dot(z_cross_forward, z_cross_forward) < 1e-10, left, rotation.safe_normalize(z_cross_forward, left))
+    x = rotation.safe_normalize(cross(y, z), forward)  # of length one already, unless thrust and heading are parallel
 
-    x_ahead = jnp.maximum(dot(x, ahead), MIN_HEADING_SINE)
-    z_ahead, y_left, x_left, z_left = dot(z, ahead), dot(y, left), dot(x, left), dot(z, left)
+    x_forward = jnp.maximum(dot(x, forward), MIN_HEADING_SINE)
+    z_forward, y_left, x_left, z_left = dot(z, forward), dot(y, left), dot(x, left), dot(z, left)
     wx, wy = -dot(y, z_rate), dot(x, z_rate)
-    wz = (wx * z_ahead + yaw_rate * y_left) / x_ahead
+    wz = (wx * z_forward + yaw_rate * y_left) / x_forward
     wx_rate, wy_rate = wy * wz - dot(y, z_acc), dot(x, z_acc) - wx * wz
-    heading_terms = z_ahead * (wx_rate + wy * wz) + 2 * yaw_rate * (wx * z_left - wz * x_left) + yaw_acc * y_left
-    wz_rate = wx * wy + heading_terms / x_ahead
+    heading_terms = z_forward * (wx_rate + wy * wz) + 2 * yaw_rate * (wx * z_left - wz * x_left) + yaw_acc * y_left
+    wz_rate = wx * wy + heading_terms / x_forward
     ang_vel = jnp.concatenate([wx, wy, wz], axis=-1)
     ang_acc = jnp.concatenate([wx_rate, wy_rate, wz_rate], axis=-1)
     return Attitude(jnp.stack([x, y, z], axis=-1), ang_vel, ang_acc)

@@ -24,9 +24,9 @@ def require_gains(airframe: Airframe, paths: Iterable[str], controller: str) -> 
     for path in missing:
         table, _, key = path.rpartition(".")
         tables.setdefault(table, []).append(key)
-    listed = "; ".join(f"[{table}] {', '.join(keys)}" for table, keys in tables.items())
-    why = next(filter(None, map(airframe.why_missing, missing)), "")
+    missing_text = "; ".join(f"[{table}] {', '.join(keys)}" for table, keys in tables.items())
+    reason = next(filter(None, map(airframe.why_missing, missing)), "")
     raise ConfigError(
-        f"airframe {airframe.name!r} lacks {listed}, which controller {controller!r} needs. {why}Use "
+        f"airframe {airframe.name!r} lacks {missing_text}, which controller {controller!r} needs. {reason}Use "
         f"controller='auto', which needs no gains, or add them to the airframe; {GUIDE} lists all keys."
     )

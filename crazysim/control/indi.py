@@ -47,7 +47,7 @@ class INDIParams(PyTree):
     """Factor on the difference between commanded and current rotor speeds, 1. (1,)"""
     reaction: Array = leaf("parameter", 1, (1,))
     """Ratio of the changes of a rotor's angular momentum and drag torque around hover, s. (1,)"""
-    share: Array = leaf("parameter", 1, (1,))
+    drag_torque_share: Array = leaf("parameter", 1, (1,))
     """Fraction of the missing yaw torque demanded from rotor drag, 1; the reaction to spin-up gives the rest. (1,)"""
     filter: Array = leaf("parameter", 1)
     """Coefficients b0, a1, a2 of the low-pass filter. (3,)"""
@@ -67,15 +67,15 @@ class INDIParams(PyTree):
         if not 0 < cutoff < math.inf:
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
         params = GeometricParams.create(airframe, freq)
-        lag, reaction = rotor_rate(airframe), reaction_time(airframe)
+        rotor_lag_rate, reaction = rotor_rate(airframe), reaction_time(airframe)
         lead = max(min(ROTOR_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
-        gains = bandwidth_gains(airframe, bandwidth(airframe, freq, lead * lag, limits_reaction=False))
+        gains = bandwidth_gains(airframe, bandwidth(airframe, freq, lead * rotor_lag_rate, limits_reaction=False))
         return INDIParams(
             geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),
             mixing_matrix=as_parameter(wrench_matrix(airframe)),
             lead=as_parameter(lead),
             reaction=as_parameter(reaction),
-            share=as_parameter(1 / (1 + lead * lag * reaction)),
+            drag_torque_share=as_parameter(1 / (1 + lead * rotor_lag_rate * reaction)),
             filter=as_parameter(butterworth(min(cutoff, 0.45 * freq), freq)),
         )
 
@@ -93,7 +93,7 @@ class INDIMemory(PyTree):
     """One after the first tick, zero before. (n_worlds, n_drones, 1)"""
 
     @staticmethod
-    def at_rest() -> INDIMemory:
+    def create() -> INDIMemory:
         """Return the memory of one drone before the first tick."""
         return INDIMemory(*(as_parameter(np.zeros(n)) for n in (3, 3, 24, 1)))
 
@@ -108,9 +108,9 @@ def apply_filter(x: Array, state: Array, coefficients: Array) -> tuple[Array, Ar
     """
     b0, a1, a2 = (coefficients[..., i : i + 1] for i in range(3))
     n = x.shape[-1]
-    first, second = state[..., :n], state[..., n:]
-    y = b0 * x + first
-    return y, jnp.concatenate([2 * b0 * x - a1 * y + second, b0 * x - a2 * y], axis=-1)
+    state_1, state_2 = state[..., :n], state[..., n:]
+    y = b0 * x + state_1
+    return y, jnp.concatenate([2 * b0 * x - a1 * y + state_2, b0 * x - a2 * y], axis=-1)
 
 
 def steady_filter_states(x: Array, coefficients: Array) -> Array:
@@ -189,7 +189,7 @@ def indi_control(
     torque = torque_des - rotation.safe_clip(momentum_rate - torque, -limit, limit)
 
     thrust = p.mass * dot(specific_thrust, matrix[..., 2])
-    yaw_drag_torque = yaw_torque + params.share * (torque[..., 2:] - yaw_torque)
+    yaw_drag_torque = yaw_torque + params.drag_torque_share * (torque[..., 2:] - yaw_torque)
     wrench_cmd = prioritized_wrench(
         jnp.concatenate([thrust, torque[..., :2], yaw_drag_torque], axis=-1), params=allocation
     )
@@ -214,7 +214,7 @@ class INDI(Controller):
         return INDIParams.create(airframe, self.freq, self.cutoff)
 
     def memory(self, airframe: Airframe) -> INDIMemory:
-        return INDIMemory.at_rest()
+        return INDIMemory.create()
 
     def take_over(
         self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array

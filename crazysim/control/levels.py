@@ -47,9 +47,9 @@ def count_rotors(rotors: Array | None, n: int) -> Array | int:
     return n if rotors is None else jnp.sum(jnp.where(rotors, 1.0, 0.0), axis=-1, keepdims=True)
 
 
-def mask_rotors(rotors: Array | None, x: Array, missing: float) -> Array:
-    """Return values of rotors, with ``missing`` for rotors that a drone lacks. (..., n_rotors)"""
-    return x if rotors is None else jnp.where(rotors, x, missing)
+def mask_rotors(rotors: Array | None, x: Array, fill_value: float) -> Array:
+    """Return values of rotors, with ``fill_value`` for rotors that a drone lacks. (..., n_rotors)"""
+    return x if rotors is None else jnp.where(rotors, x, fill_value)
 
 
 def allocation_matrix(airframe: Airframe) -> np.ndarray:

@@ -140,8 +140,8 @@ def _z_axis(rpy: Array) -> Array:
 def _rotational_derivatives(rpy: Array, ang_vel: Array, torque: Array, J: Array) -> tuple[Array, Array]:
     """Return the derivatives of roll, pitch, yaw and of the body rates."""
     roll, pitch = rpy[0], rpy[1]
-    turning = jnp.sin(roll) * ang_vel[1] + jnp.cos(roll) * ang_vel[2]
-    yaw_rate = turning / jnp.cos(pitch)
+    heading_rate = jnp.sin(roll) * ang_vel[1] + jnp.cos(roll) * ang_vel[2]
+    yaw_rate = heading_rate / jnp.cos(pitch)
     pitch_rate = jnp.cos(roll) * ang_vel[1] - jnp.sin(roll) * ang_vel[2]
     rpy_rate = jnp.stack([ang_vel[0] + jnp.sin(pitch) * yaw_rate, pitch_rate, yaw_rate])
     return rpy_rate, jnp.linalg.solve(J, torque - cross(ang_vel, matvec(J, ang_vel)))

@@ -188,16 +188,20 @@ def _joint_motion(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, 
     return matvec(matrix, attach), matvec(matrix, cross(ang_vel, attach))
 
 
-def _reference(pos: Array, vel: Array, force: Array, force_rate: Array, sp: Setpoint, p: LoadLQRParams) -> Reference:
+def _reference(
+    pos: Array, vel: Array, force: Array, force_rate: Array, setpoint: Setpoint, p: LoadLQRParams
+) -> Reference:
     """Return the reference of a drone whose thrust vector is ``force``, N, with the derivative ``force_rate``, N/s.
 
     The torque includes compensation for the pull at the joint of a load that accelerates like the setpoint.
     """
     total_mass = p.mass + p.load_mass
-    attitude = attitude_of_thrust(force / total_mass, force_rate / total_mass, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
+    attitude = attitude_of_thrust(
+        force / total_mass, force_rate / total_mass, setpoint.snap, setpoint.yaw, setpoint.yaw_rate, setpoint.yaw_acc
+    )
     torque = matvec(p.J, attitude.ang_acc) + cross(attitude.ang_vel, matvec(p.J, attitude.ang_vel))
     if p.attach is not None:
-        pull = matvec(jnp.swapaxes(attitude.matrix, -1, -2), p.load_mass * (p.gravity_vec - sp.acc))
+        pull = matvec(jnp.swapaxes(attitude.matrix, -1, -2), p.load_mass * (p.gravity_vec - setpoint.acc))
         torque = torque - cross(jnp.broadcast_to(p.attach, pull.shape), pull)
     wrench = jnp.concatenate([rotation.safe_norm(force), torque], axis=-1)
     return Reference(pos, vel, attitude.matrix, attitude.ang_vel, wrench)
@@ -250,7 +254,7 @@ def load_lqr_control(
 
 
 class LoadLQRMemory(PyTree):
-    """Memory of the LQR with load: a derivative at the last tick, of which a difference gives the next derivative."""
+    """Memory of the LQR with load: a derivative at the last tick, to compute the next derivative by differences."""
 
     rod_acc: Array = leaf("drone", 1)
     """Second derivative of the direction of the rod at the last tick, 1/s^2. (n_worlds, n_drones, 3)"""

@@ -90,7 +90,7 @@ class MellingerMemory(PyTree):
     """Desired body rates at the last tick, rad/s. (n_worlds, n_drones, 3)"""
 
     @staticmethod
-    def at_rest() -> MellingerMemory:
+    def create() -> MellingerMemory:
         """Return the memory of one drone before the first tick."""
         return MellingerMemory(*(np.zeros(3) for _ in range(4)))  # type: ignore[arg-type]
 
@@ -169,7 +169,7 @@ class Mellinger(Controller):
         return MellingerParams.create(airframe)
 
     def memory(self, airframe: Airframe) -> MellingerMemory:
-        return MellingerMemory.at_rest()
+        return MellingerMemory.create()
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams

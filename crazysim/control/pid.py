@@ -59,7 +59,7 @@ class PID(Controller):
         return PIDParams.create(airframe, self.outer_freq, self.freq)
 
     def memory(self, airframe: Airframe) -> PIDMemory:
-        return PIDMemory.at_rest(self.params(airframe))
+        return PIDMemory.create(self.params(airframe))
 
     def outer(self, data: DroneData, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
         s, heading = data.states, heading_vector(data.states.quat)
@@ -140,11 +140,11 @@ class PID(Controller):
 
 def _reset_at_zero_thrust(memory: PIDMemory, rpy: Array, pos: Array) -> PIDMemory:
     """Return the memory with all loops reset, where the thrust is zero or less, as ``controllerPidReinitialize``."""
-    m, off = memory, memory.thrust <= 0
+    m, is_off = memory, memory.thrust <= 0
     return m.replace(
-        position=m.position.reset_where(off, pos),
-        velocity=m.velocity.reset_where(off, jnp.zeros_like(pos)),
-        attitude=m.attitude.reset_where(off, rpy, filters=False),
-        rate=m.rate.reset_where(off, jnp.zeros_like(rpy), filters=False),
-        rpy_des=jnp.where(off, rpy, m.rpy_des),
+        position=m.position.reset_where(is_off, pos),
+        velocity=m.velocity.reset_where(is_off, jnp.zeros_like(pos)),
+        attitude=m.attitude.reset_where(is_off, rpy, filters=False),
+        rate=m.rate.reset_where(is_off, jnp.zeros_like(rpy), filters=False),
+        rpy_des=jnp.where(is_off, rpy, m.rpy_des),
     )

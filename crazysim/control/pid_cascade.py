@@ -86,11 +86,11 @@ class PIDMemory(PyTree):
     """True from the first tick on. (n_worlds, n_drones, 1)"""
 
     @staticmethod
-    def at_rest(params: PIDParams) -> PIDMemory:
+    def create(params: PIDParams) -> PIDMemory:
         """Return the memory of one drone before the first tick."""
-        p, memory_at_rest = params, PIDLoopMemory.at_rest
+        p, create_memory = params, PIDLoopMemory.create
         zeros: Any = np.zeros(3)
-        loops = {name: memory_at_rest(getattr(p, name)) for name in _LOOPS}
+        loops = {name: create_memory(getattr(p, name)) for name in _LOOPS}
         return PIDMemory(**loops, rpy_des=zeros, thrust=zeros[:1], started=zeros[:1] > 0)
 
 
@@ -149,7 +149,7 @@ def desired_rates(
         freq: Rate of this loop, Hz.
         loop: Gains and limits.
     """
-    return pid_step(rpy_des - rpy, rpy, memory, freq, loop=loop, wrapped=(False, False, True))
+    return pid_step(rpy_des - rpy, rpy, memory, freq, loop=loop, is_angle=(False, False, True))
 
 
 def desired_torque(

@@ -15,7 +15,7 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import safe_clip
 
 DEFAULT_INTEGRAL_MAX = 5000.0
-"""Limit of the integral of a loop without a limit of its own (``DEFAULT_PID_INTEGRATION_LIMIT``)."""
+"""Limit of the integral of a loop that sets no limit (``DEFAULT_PID_INTEGRATION_LIMIT``)."""
 
 
 class PIDLoop(PyTree):
@@ -69,7 +69,7 @@ class PIDLoopMemory(PyTree):
     """Last two internal values of the filter of the derivative, latest first. (n_worlds, n_drones, 2, 3)"""
 
     @staticmethod
-    def at_rest(loop: PIDLoop) -> PIDLoopMemory:
+    def create(loop: PIDLoop) -> PIDLoopMemory:
         """Return the memory of one drone before the first tick."""
         return PIDLoopMemory(
             integral=None if loop.ki is None else np.zeros(3),  # type: ignore[arg-type]
@@ -105,7 +105,7 @@ def pid_step(
     freq: float,
     *,
     loop: PIDLoop,
-    wrapped: Sequence[bool] = (False, False, False),
+    is_angle: Sequence[bool] = (False, False, False),
 ) -> tuple[Array, PIDLoopMemory]:
     """Return the outputs of three PID loops, and their memory after a tick.
 
@@ -119,15 +119,15 @@ def pid_step(
         memory: Memory of the loops.
         freq: Rate, Hz.
         loop: Gains and limits, shared or with the leading axes of the error.
-        wrapped: True for loops of angles in degrees that wrap around.
+        is_angle: True for loops of angles in degrees that wrap around.
 
     Returns:
         Outputs (..., 3); the memory.
     """
-    error = _wrap_angle(error, wrapped)
+    error = _wrap_angle(error, is_angle)
     output = loop.kp * error
     if loop.kd is not None:
-        derivative = _wrap_angle(memory.measured - measured, wrapped) * freq
+        derivative = _wrap_angle(memory.measured - measured, is_angle) * freq
         memory = memory.replace(measured=measured)
         if loop.low_pass is not None:
             derivative, delays = _low_pass(derivative, memory.delays, loop.low_pass)
@@ -165,10 +165,10 @@ def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array,
     return b0 * (latest + 2 * first + second), jnp.stack([latest, first], axis=-2)
 
 
-def _wrap_angle(angle: Array, wrapped: Sequence[bool]) -> Array:
-    """Return angles, where ``wrapped``, less one turn above 180 degrees and plus one turn below -180 degrees."""
-    if not any(wrapped):
+def _wrap_angle(angle: Array, is_angle: Sequence[bool]) -> Array:
+    """Return angles, where ``is_angle``, less one turn above 180 degrees and plus one turn below -180 degrees."""
+    if not any(is_angle):
         return angle
-    mask = jnp.asarray(wrapped)
-    turns = jnp.where(angle > 180, 360.0, jnp.where(angle < -180, -360.0, 0.0))
-    return jnp.where(mask, angle - turns, angle)
+    mask = jnp.asarray(is_angle)
+    correction = jnp.where(angle > 180, 360.0, jnp.where(angle < -180, -360.0, 0.0))
+    return jnp.where(mask, angle - correction, angle)

@@ -67,7 +67,7 @@ class PositionParams(PyTree):
         """
         g = -GRAVITY[2]
         max_specific_force = MAX_THRUST_SHARE * level_thrust(airframe) / float(airframe.value("rigid_body.mass", ()))
-        up, down = max(max_specific_force - g, MIN_FEEDBACK_RATIO * g), MAX_FALL_RATIO * g
+        max_up_acc, max_down_acc = max(max_specific_force - g, MIN_FEEDBACK_RATIO * g), MAX_FALL_RATIO * g
         sideways_acc = min(
             MAX_HORIZONTAL_RATIO * g, np.sqrt(max(max_specific_force**2 - g**2, (MIN_FEEDBACK_RATIO * g) ** 2))
         )
@@ -76,8 +76,8 @@ class PositionParams(PyTree):
             gravity_vec=as_parameter(GRAVITY),
             stiffness=as_parameter(frequency**2),
             damping=as_parameter(2 * frequency),
-            reach=as_parameter(2 * np.array([sideways_acc, min(up, down)]) / frequency**2),
-            acc_max=as_parameter([sideways_acc, up, down]),
+            reach=as_parameter(2 * np.array([sideways_acc, min(max_up_acc, max_down_acc)]) / frequency**2),
+            acc_max=as_parameter([sideways_acc, max_up_acc, max_down_acc]),
             observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO / delay / freq)),
         )
 
@@ -91,7 +91,7 @@ class PositionMemory(PyTree):
     """Estimated acceleration by unknown forces, world frame, m/s^2. (n_worlds, n_drones, 3)"""
 
     @staticmethod
-    def at_rest() -> PositionMemory:
+    def create() -> PositionMemory:
         """Return the memory of one drone before the first tick."""
         return PositionMemory(as_parameter(np.zeros(3)), as_parameter(np.zeros(3)))
 

@@ -164,7 +164,7 @@ class Controller:
         """
         return memory
 
-    def adapted(self, control: Control, fitted: str | None) -> Controller | None:
+    def adapt(self, control: Control, fitted: str | None) -> Controller | None:
         """Return the controller to use for a command level and dynamics; None if commands need none.
 
         Args:

@@ -66,14 +66,14 @@ def solve_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
     """
     eye, G = jnp.eye(A.shape[0], dtype=A.dtype), B @ jnp.linalg.solve(R, B.T)
     shift = jnp.sqrt(jnp.sqrt(jnp.linalg.norm(G) * jnp.linalg.norm(Q))) + jnp.linalg.norm(A) / A.shape[0]
-    shifted = A - shift * eye
-    inverse = jnp.linalg.inv(shifted)
-    W = jnp.linalg.inv(shifted.T + Q @ inverse @ G)
-    V = jnp.linalg.inv(shifted + G @ inverse.T @ Q)
+    shifted_A = A - shift * eye
+    inverse = jnp.linalg.inv(shifted_A)
+    W = jnp.linalg.inv(shifted_A.T + Q @ inverse @ G)
+    V = jnp.linalg.inv(shifted_A + G @ inverse.T @ Q)
     P = _solve_by_doubling(eye + 2 * shift * V, 2 * shift * inverse @ G @ W, 2 * shift * W @ Q @ inverse)
     for _ in range(N_REFINEMENTS):
-        closed = A - G @ P
-        P = solve_lyapunov(closed, Q + P @ G @ P)
+        closed_loop = A - G @ P
+        P = solve_lyapunov(closed_loop, Q + P @ G @ P)
     return P
 
 
@@ -81,14 +81,14 @@ def _solve_by_doubling(A: Array, G: Array, H: Array) -> Array:
     """Return the limit of H under doubling, or NaN where A does not converge to zero. (n, n)"""
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
 
-    def double(carry: tuple[Array, Array, Array], _: Any) -> tuple[tuple[Array, Array, Array], None]:
+    def double_step(carry: tuple[Array, Array, Array], _: Any) -> tuple[tuple[Array, Array, Array], None]:
         A, G, H = carry
         W = jnp.linalg.solve(eye + G @ H, jnp.concatenate([A, G], axis=1))
         WA, WG = W[:, : A.shape[1]], W[:, A.shape[1] :]
         G, H = G + A @ WG @ A.T, H + A.T @ H @ WA
         return (A @ WA, (G + G.T) / 2, (H + H.T) / 2), None
 
-    (A, G, H), _ = jax.lax.scan(double, (A, G, H), length=N_DOUBLINGS)
+    (A, G, H), _ = jax.lax.scan(double_step, (A, G, H), length=N_DOUBLINGS)
     converged = jnp.all(jnp.isfinite(H)) & (jnp.max(jnp.abs(A)) < 1e-3)
     return jnp.where(converged, H, jnp.nan)
 
@@ -104,11 +104,11 @@ def solve_lyapunov(A: Array, Q: Array) -> Array:
 def _solve_smith(A: Array, Q: Array) -> Array:
     """Return X with ``X = A^T X A + Q`` for a stable A, by doubling (Smith 1968). (n, n)"""
 
-    def double(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
+    def double_step(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
         X, power = carry
         return (X + power.T @ X @ power, power @ power), None
 
-    (X, _), _ = jax.lax.scan(double, (Q, A), length=N_DOUBLINGS)
+    (X, _), _ = jax.lax.scan(double_step, (Q, A), length=N_DOUBLINGS)
     return (X + X.T) / 2
 
 

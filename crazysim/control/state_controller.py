@@ -90,8 +90,8 @@ def state2attitude(
     pos_err_i = rotation.safe_clip(pos_err_i + pos_err / ctrl_freq, -p.int_err_max, p.int_err_max)
     force = p.mass * (cmd[..., 6:9] - p.gravity_vec) + p.kp * pos_err + p.kd * vel_err + p.ki * pos_err_i
 
-    ahead, left = rotation.heading(cmd[..., 9:13])
-    rpy = rotation.from_axes(*rotation.axes_along(force, ahead, left))
+    forward, left = rotation.heading(cmd[..., 9:13])
+    rpy = rotation.from_axes(*rotation.axes_along(force, forward, left))
 
     thrust = p.thrust_scale * rotation.dot(force, rotation.z_axis(quat))
     return jnp.concatenate([rpy, thrust], axis=-1), pos_err_i

@@ -42,7 +42,7 @@ class SwitchMemory(PyTree):
 
 
 class Switch(Controller):
-    """Several controllers, one of which commands a drone at a time. ``Sim(controller=[...], switch=...)`` creates it.
+    """Several controllers that take turns in commanding a drone. ``Sim(controller=[...], switch=...)`` creates it.
 
     Only the active controller's memory changes. When a controller becomes active, its ``take_over`` sets its memory, so
     that its first command can continue the last one. Wrenches are allocated to the rotors here.
@@ -79,18 +79,18 @@ class Switch(Controller):
         self, data: DroneData, command: Setpoint | Array, memory: SwitchMemory, params: SwitchParams
     ) -> tuple[Array, SwitchMemory]:
         index = self._index(data, command, params)
-        switched = (memory.active[0] >= 0) & (memory.active[0] != index)
+        is_switch = (memory.active[0] >= 0) & (memory.active[0] != index)
         rotor_vel, new_memories = memory.rotor_vel, []
         for k, (controller, state, p) in enumerate(
             zip(self.controllers, memory.controllers, params.controllers, strict=True)
         ):
-            is_chosen = index == k
-            takes_over = is_chosen & switched
+            is_selected = index == k
+            takes_over = is_selected & is_switch
             state = _select_tree(takes_over, controller.take_over(data, command, state, p, memory.rotor_vel), state)
             if isinstance(command, Setpoint) and controller.has_outer:
-                is_due = is_chosen & (takes_over | _is_due(data, controller.outer_freq))
+                is_due = is_selected & (takes_over | _is_due(data, controller.outer_freq))
                 state = _select_tree(is_due, controller.outer(data, command, state, p), state)
-            is_due = is_chosen & (takes_over | _is_due(data, controller.freq))
+            is_due = is_selected & (takes_over | _is_due(data, controller.freq))
             output, new_state = controller.update(data, command, state, p)
             if controller.output == Control.force_torque:
                 output = force_torque2rotor_vel(output, params=params.allocation)

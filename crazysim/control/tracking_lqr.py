@@ -68,8 +68,8 @@ def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc:
     w_d = reference.ang_vel
     w = w_d + rate_error - cross(rot_error, w_d)
     z = reference.matrix[..., 2]
-    tilted = z + matvec(reference.matrix, cross(rot_error, jnp.asarray([0.0, 0.0, 1.0], rot_error.dtype)))
-    acc = ((reference.wrench[:1] + wrench[:1]) * tilted - reference.wrench[:1] * z) / mass
+    thrust_axis = z + matvec(reference.matrix, cross(rot_error, jnp.asarray([0.0, 0.0, 1.0], rot_error.dtype)))
+    acc = ((reference.wrench[:1] + wrench[:1]) * thrust_axis - reference.wrench[:1] * z) / mass
     w_rate = jnp.linalg.solve(J, reference.wrench[1:] + wrench[1:] - cross(w, matvec(J, w)))
     return jnp.concatenate(
         [vel_error, acc, rate_error, w_rate - ang_acc + cross(rate_error, w_d) + cross(rot_error, ang_acc)]
@@ -125,8 +125,8 @@ def tracking_gains(
         def riccati_step(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
             P, _ = carry
             K = jnp.linalg.solve(h * R + G.T @ P @ G, G.T @ P @ F)
-            closed = F - G @ K
-            P = closed.T @ P @ closed + h * (Q + K.T @ R @ K)
+            closed_loop = F - G @ K
+            P = closed_loop.T @ P @ closed_loop + h * (Q + K.T @ R @ K)
             return ((P + P.T) / 2, K), None
 
         (P, K), _ = jax.lax.scan(riccati_step, (P, end), length=substeps)
@@ -140,9 +140,9 @@ def gain_at(time: Array, gains: Array, dt: Array) -> Array:
     """Return the gain at a time, s, interpolated linearly between knots ``dt`` apart and held at the ends. (4, 12)"""
     last = gains.shape[-3] - 1
     knot = rotation.safe_clip(time / dt, 0.0, float(last))
-    gains, below = jnp.asarray(gains), jnp.minimum(jnp.floor(knot).astype(jnp.int32), last - 1)
-    share = knot - below
-    return (1 - share) * gains[below] + share * gains[below + 1]
+    gains, index = jnp.asarray(gains), jnp.minimum(jnp.floor(knot).astype(jnp.int32), last - 1)
+    weight = knot - index
+    return (1 - weight) * gains[index] + weight * gains[index + 1]
 
 
 def tracking_lqr_control(
@@ -201,10 +201,10 @@ class TrackingLQR(Controller):
                 f"expected setpoints of one drone with a leading axis of 2 to {MAX_KNOTS}, and a positive dt, got "
                 f"positions of shape {shape} and {self.dt}. Use jax.vmap(trajectory.evaluate)(times) with a larger dt."
             )
-        bad = [name for name, x in vars(self.setpoints).items() if not np.all(np.isfinite(x))]
-        if bad:
+        invalid = [name for name, x in vars(self.setpoints).items() if not np.all(np.isfinite(x))]
+        if invalid:
             raise ConfigError(
-                f"expected finite setpoints, got NaN or infinity in {', '.join(bad)}. Evaluate the trajectory at "
+                f"expected finite setpoints, got NaN or infinity in {', '.join(invalid)}. Evaluate the trajectory at "
                 f"times that it covers, and check its limits."
             )
         Q, R = lqr_weights(airframe, self.freq, self.Q, self.R)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazysim.drones.airframe import Airframe
 
 LED_MATERIALS = ("led_top", "led_bot")
-"""Materials of which each drone has its own copy, so that its LEDs can have their own colours."""
+"""Materials that are copied for each drone, so that each drone can have other colours of its LEDs."""
 
 MATERIALS = {
     "drone_carbon": (0.10, 0.10, 0.11, 1.0),
@@ -142,11 +142,11 @@ def body_cameras(airframe: Airframe) -> list[BodyCamera]:
     shape = outline(airframe)
     camera_pos = shape["track_camera"]
     # Looking ahead from behind: right is body -y, and up is tilted forward by as much as the camera looks down.
-    up = np.array([-camera_pos[2] * np.sign(camera_pos[0]), 0, abs(camera_pos[0])]) / np.hypot(
+    camera_up = np.array([-camera_pos[2] * np.sign(camera_pos[0]), 0, abs(camera_pos[0])]) / np.hypot(
         camera_pos[0], camera_pos[2]
     )
-    right = np.array([0.0, -1.0, 0.0])
+    camera_right = np.array([0.0, -1.0, 0.0])
     return [
-        BodyCamera("track_cam", camera_pos, np.concatenate([right, up]), tracks=True),
-        BodyCamera("fpv_cam", shape["fpv_camera"], np.concatenate([right, [0, 0, 1]]), fovy=70.0),
+        BodyCamera("track_cam", camera_pos, np.concatenate([camera_right, camera_up]), tracks=True),
+        BodyCamera("fpv_cam", shape["fpv_camera"], np.concatenate([camera_right, [0, 0, 1]]), fovy=70.0),
     ]

@@ -23,9 +23,9 @@ _MATRIX: Shapes = ((3,), (3, 3))
 _SIGN = Range("1 or -1 for each rotor", -1.0, 1.0)
 _GAIN, _GAINS = Key(_NUMBER, NOT_NEGATIVE), Key(_VECTOR, NOT_NEGATIVE)
 _POSITIVE = Key(_NUMBER, POSITIVE)
-_FAR = 3 * (COORDINATE.low,)
+_MIN_COORDINATES = 3 * (COORDINATE.low,)
 _SIZE, _SIZES = Key(_NUMBER, LENGTH), Key(_VECTOR, LENGTH)
-_RESPONSE = {
+_FITTED_KEYS = {
     "acc_coef": Key(_NUMBER),
     "cmd_f_coef": _POSITIVE,
     "rpy_coef": Key(_VECTOR, NEGATIVE),
@@ -53,9 +53,9 @@ TABLES: dict[str, dict[str, Key]] = {
         "output": Key(((6, "any"),)),
     },
     "fitted": {},
-    "fitted.so_rpy": _RESPONSE,
-    "fitted.so_rpy_rotor": _RESPONSE | {"thrust_dyn_coef": _POSITIVE},
-    "fitted.so_rpy_rotor_drag": _RESPONSE | {"thrust_dyn_coef": _POSITIVE, "drag_coefficients": Key(_MATRIX)},
+    "fitted.so_rpy": _FITTED_KEYS,
+    "fitted.so_rpy_rotor": _FITTED_KEYS | {"thrust_dyn_coef": _POSITIVE},
+    "fitted.so_rpy_rotor_drag": _FITTED_KEYS | {"thrust_dyn_coef": _POSITIVE, "drag_coefficients": Key(_MATRIX)},
     "battery": {
         "thrust_over_voltage": Key(((4,),)),
         "cells": Key(_NUMBER, Range("a whole number from 1 to 100", 1, 100)),
@@ -96,9 +96,12 @@ TABLES: dict[str, dict[str, Key]] = {
         "propeller_height": Key(_NUMBER, COORDINATE),
         "led_radius": _SIZE,
         "led_heights": Key(((2,),), COORDINATE),
-        "collision_sphere": Key(((4,),), Range("three coordinates and a positive radius, m", (*_FAR, LENGTH.low), 1e3)),
+        "collision_sphere": Key(
+            ((4,),), Range("three coordinates and a positive radius, m", (*_MIN_COORDINATES, LENGTH.low), 1e3)
+        ),
         "collision_box": Key(
-            ((6,),), Range("three coordinates and three positive half sizes, m", (*_FAR, *3 * (LENGTH.low,)), 1e3)
+            ((6,),),
+            Range("three coordinates and three positive half sizes, m", (*_MIN_COORDINATES, *3 * (LENGTH.low,)), 1e3),
         ),
         "fpv_camera": Key(_VECTOR, COORDINATE),
         "track_camera": Key(_VECTOR, COORDINATE),

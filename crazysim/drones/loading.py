@@ -56,11 +56,11 @@ def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
     bases = extend_bases(bases, source)
     stem, origin, tables = read_source(source, "drone", "an Airframe", AIRFRAME_FOLDER, airframe_names(), LAYOUT.guide)
     name = str(tables.get("name", stem))
-    numbers, why = dict(LAYOUT.numbers(f"airframe {name!r}{origin}", tables)), ""
+    numbers, reason = dict(LAYOUT.numbers(f"airframe {name!r}{origin}", tables)), ""
     if tables.get("base") is not None:
-        inherited, why = _inherit(_load(tables["base"], bases), numbers)
-        numbers = inherited | numbers
-    airframe = Airframe(name, numbers, why)
+        inherited_numbers, reason = _inherit(_load(tables["base"], bases), numbers)
+        numbers = inherited_numbers | numbers
+    airframe = Airframe(name, numbers, reason)
     check_airframe(airframe)
     return airframe
 
@@ -73,19 +73,21 @@ def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, 
         changes: The airframe's own numbers, by dotted path.
     """
     old = base.values
-    changed = [
+    changed_counts = [
         path for path in BODY_KEYS if path in changes and not np.array_equal(changes[path], old.get(path, np.nan))
     ]
-    lost = [table for table in TUNED_TABLES if table in base.tables]
-    if not changed or not lost:
+    lost_tables = [table for table in TUNED_TABLES if table in base.tables]
+    if not changed_counts or not lost_tables:
         return dict(old), base.not_inherited
     numbers = {path: x for path, x in old.items() if path.partition(".")[0] not in TUNED_TABLES}
     ratio = "controller.thrust2torque"
     if ratio in old and not {"rotors.thrust_curve", "rotors.torque_curve"} & set(changes):
         numbers[ratio] = old[ratio]  # of the propellers alone
-    names = _join_names(f"[{table}]" for table in lost)
-    why = f"Its base {base.name!r} has {names}, which fit another {_join_names(changed)} and are not inherited."
-    return numbers, why
+    names = _join_names(f"[{table}]" for table in lost_tables)
+    reason = (
+        f"Its base {base.name!r} has {names}, which fit another {_join_names(changed_counts)} and are not inherited."
+    )
+    return numbers, reason
 
 
 def _join_names(names: Iterable[str]) -> str:

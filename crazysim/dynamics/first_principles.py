@@ -155,10 +155,10 @@ def hover_rotor_vel(params: Params) -> Array:
     if params.rotor_vel_max.shape[-1] == 1:
         thrusts = jnp.broadcast_to(weight / n_rotors, (*weight.shape[:-1], n_rotors))
         return rotor_vel_of_thrust(thrusts, params.rpm2thrust)
-    exists = params.rotor_vel_max > 0
-    thrusts = jnp.broadcast_to(weight / jnp.sum(exists, axis=-1, keepdims=True), exists.shape)
-    curves = jnp.where(exists[..., None], params.rpm2thrust, jnp.ones(3, params.rpm2thrust.dtype))
-    return jnp.where(exists, rotor_vel_of_thrust(thrusts, curves), 0.0)
+    has_rotor = params.rotor_vel_max > 0
+    thrusts = jnp.broadcast_to(weight / jnp.sum(has_rotor, axis=-1, keepdims=True), has_rotor.shape)
+    curves = jnp.where(has_rotor[..., None], params.rpm2thrust, jnp.ones(3, params.rpm2thrust.dtype))
+    return jnp.where(has_rotor, rotor_vel_of_thrust(thrusts, curves), 0.0)
 
 
 def pad_rotors(params: Params, n_rotors: int) -> Params:
@@ -169,12 +169,12 @@ def pad_rotors(params: Params, n_rotors: int) -> Params:
 
     def extend(x: Array, axis: int) -> np.ndarray:
         array = np.asarray(x)
-        full = (
+        padded_params = (
             np.broadcast_to(array, [*array.shape[:axis], n_present, *array.shape[axis + 1 :]])
             if array.shape[axis] == 1
             else array
         )
-        return np.pad(full, [(0, n_rotors - n_present if k == axis else 0) for k in range(array.ndim)])
+        return np.pad(padded_params, [(0, n_rotors - n_present if k == axis else 0) for k in range(array.ndim)])
 
     curves = {name: extend(getattr(params, name), 0) for name in ("rpm2thrust", "rpm2torque")}
     limits = {name: extend(getattr(params, name), 0) for name in ("rotor_vel_min", "rotor_vel_max")}

@@ -69,7 +69,7 @@ class Params(PyTree):
         """Return the shared parameters of an airframe for one of the fitted models."""
         require_support(airframe, dynamics)
 
-        def fitted(key: str) -> Array:
+        def fitted_value(key: str) -> Array:
             return as_parameter(airframe.value(f"fitted.{dynamics.value}.{key}"))
 
         has_lag = dynamics in (Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
@@ -81,12 +81,12 @@ class Params(PyTree):
             gravity_vec=as_parameter(GRAVITY),
             J=as_parameter(airframe.inertia),
             J_inv=as_parameter(np.linalg.inv(airframe.inertia)),
-            acc_coef=fitted("acc_coef"),
-            cmd_f_coef=fitted("cmd_f_coef"),
-            rpy_coef=fitted("rpy_coef"),
-            rpy_rates_coef=fitted("rpy_rates_coef"),
-            cmd_rpy_coef=fitted("cmd_rpy_coef"),
-            thrust_dyn_coef=fitted("thrust_dyn_coef") if has_lag else None,
+            acc_coef=fitted_value("acc_coef"),
+            cmd_f_coef=fitted_value("cmd_f_coef"),
+            rpy_coef=fitted_value("rpy_coef"),
+            rpy_rates_coef=fitted_value("rpy_rates_coef"),
+            cmd_rpy_coef=fitted_value("cmd_rpy_coef"),
+            thrust_dyn_coef=fitted_value("thrust_dyn_coef") if has_lag else None,
             drag_matrix=drag_matrix,
             thrust_min=as_parameter(airframe.n_rotors * airframe.value("rotors.thrust_min", ())),
             thrust_max=as_parameter(airframe.n_rotors * airframe.value("rotors.thrust_max", ())),
@@ -143,8 +143,8 @@ def dynamics(
 def saturate(cmd: Array, params: Params) -> Array:
     """Return the attitude command with its thrust within the limits of the rotors; zero or less is off. (..., 4)"""
     thrust = cmd[..., 3:4]
-    within = jnp.where(thrust <= 0, 0.0, rotation.safe_clip(thrust, params.thrust_min, params.thrust_max))
-    return jnp.concatenate([cmd[..., :3], within], axis=-1)
+    clipped_thrust = jnp.where(thrust <= 0, 0.0, rotation.safe_clip(thrust, params.thrust_min, params.thrust_max))
+    return jnp.concatenate([cmd[..., :3], clipped_thrust], axis=-1)
 
 
 def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Array:

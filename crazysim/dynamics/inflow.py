@@ -94,14 +94,14 @@ def thrust_in_flight(
     lift = (static + loss * safe_sqrt(static / disc)) * (1 + 1.5 * advance)
 
     disc = disc * ceiling * ceiling
-    across = in_plane_square + MIN_AIR_SPEED**2
+    in_plane = in_plane_square + MIN_AIR_SPEED**2
     linear = loss - disc * axial
     inflow = (safe_sqrt(linear * linear + 4 * disc * lift) - linear) / (2 * disc)
     for _ in range(N_ITERATIONS):
-        speed = jnp.sqrt(across + inflow * inflow)
-        excess = disc * (inflow - axial) * speed + loss * inflow - lift
+        speed = jnp.sqrt(in_plane + inflow * inflow)
+        residual = disc * (inflow - axial) * speed + loss * inflow - lift
         slope = disc * (speed + (inflow - axial) * inflow / speed) + loss
-        inflow = inflow - excess / slope
+        inflow = inflow - residual / slope
         inflow = jnp.where(inflow > 0, inflow, 0.0)
     return lift - loss * inflow
 
@@ -121,6 +121,6 @@ def ceiling_factor(gap: Array, radius: Array) -> Array:
         gap: Height of the ceiling over the rotor, m. (...)
         radius: Radius of the propeller, m. (...)
     """
-    least = radius / 20
-    ratio = radius / jnp.where(gap > least, gap, least)
+    min_distance = radius / 20
+    ratio = radius / jnp.where(gap > min_distance, gap, min_distance)
     return jnp.where(gap < 0, 1.0, 0.5 + 0.5 * jnp.sqrt(1 + ratio * ratio / 8))

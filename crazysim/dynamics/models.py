@@ -34,9 +34,9 @@ class Dynamics(StrEnum):
 def supported_dynamics(drone: AirframeSource) -> tuple[Dynamics, ...]:
     """Return the models for which an airframe, or a source of one as in ``load_airframe``, has parameters."""
     airframe = load_airframe(drone)
-    fitted = airframe.tables.get("fitted", {})
-    full = "thrust_curve" in airframe.table("rotors")
-    return tuple(d for d in Dynamics if (full if d == Dynamics.first_principles else d.value in fitted))
+    fits = airframe.tables.get("fitted", {})
+    has_curves = "thrust_curve" in airframe.table("rotors")
+    return tuple(d for d in Dynamics if (has_curves if d == Dynamics.first_principles else d.value in fits))
 
 
 def supported_drones(dynamics: Dynamics | str) -> tuple[Drone, ...]:

@@ -26,9 +26,9 @@ def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> A
     Returns:
         Rotor accelerations, rpm/s. (..., n_rotors)
     """
-    up = cmd > rotor_vel
-    a = jnp.where(up, rotor_dyn_coef[..., 0], rotor_dyn_coef[..., 2])
-    b = jnp.where(up, rotor_dyn_coef[..., 1], rotor_dyn_coef[..., 3])
+    is_spin_up = cmd > rotor_vel
+    a = jnp.where(is_spin_up, rotor_dyn_coef[..., 0], rotor_dyn_coef[..., 2])
+    b = jnp.where(is_spin_up, rotor_dyn_coef[..., 1], rotor_dyn_coef[..., 3])
     return (cmd - rotor_vel) * (a + b * (cmd + rotor_vel))
 
 

@@ -73,10 +73,10 @@ class ShapePair:
         return larger_gap((self.gap(n), n), best)
 
 
-def larger_gap(new: BestDirection, old: BestDirection) -> BestDirection:
+def larger_gap(candidate: BestDirection, best: BestDirection) -> BestDirection:
     """Return the direction with the larger gap; on a tie, the old one."""
-    larger = new[0] > old[0] + rounding_margin(old[0].dtype) * jnp.abs(old[0])
-    return jnp.where(larger, new[0], old[0]), select_vector(larger, new[1], old[1])
+    is_larger = candidate[0] > best[0] + rounding_margin(best[0].dtype) * jnp.abs(best[0])
+    return jnp.where(is_larger, candidate[0], best[0]), select_vector(is_larger, candidate[1], best[1])
 
 
 def find_separation(pair: ShapePair, n: Vector, steps: int) -> tuple[BestDirection, list[Array]]:
@@ -95,25 +95,25 @@ def find_separation(pair: ShapePair, n: Vector, steps: int) -> tuple[BestDirecti
     def step(_: int, carry: Any) -> Any:
         triangle, nearest, best = carry
         n = normalize(nearest, fallback)
-        new = pair.support_point(n)
-        size = nearest.dot(nearest)
+        new_point = pair.support_point(n)
+        squared_distance = nearest.dot(nearest)
         simplex = (triangle, nearest)
         p, q, r = (point for point, _ in triangle)
         b, c = stack_vectors([p, q, r]), stack_vectors([q, r, p])
-        points = from_barycentric(closest_point_off_bc(new[0], b, c), new[0], b, c)
+        points = from_barycentric(closest_point_off_bc(new_point[0], b, c), new_point[0], b, c)
         squares = points.dot(points)
         for k in range(3):
-            closer = squares[k] < size * (1 - rounding_margin(size.dtype))
-            candidate = ((new, triangle[k], triangle[(k + 1) % 3]), points[k])
-            simplex = jax.tree.map(partial(jnp.where, closer), candidate, simplex)
-            size = jnp.where(closer, squares[k], size)
+            is_closer = squares[k] < squared_distance * (1 - rounding_margin(squared_distance.dtype))
+            candidate = ((new_point, triangle[k], triangle[(k + 1) % 3]), points[k])
+            simplex = jax.tree.map(partial(jnp.where, is_closer), candidate, simplex)
+            squared_distance = jnp.where(is_closer, squares[k], squared_distance)
         return (*simplex, pair.with_candidate(n, best))
 
     first = pair.support_point(n)
     triangle, nearest, best = lax.fori_loop(0, steps, step, ((first,) * 3, first[0], (pair.gap(n), n)))
-    shares = closest_point(*(point for point, _ in triangle))
+    weights = closest_point(*(point for point, _ in triangle))
     coordinates = [
-        jnp.asarray(sum(w * x for w, x in zip(shares, xs, strict=True)))
+        jnp.asarray(sum(w * x for w, x in zip(weights, xs, strict=True)))
         for xs in zip(*(e for _, e in triangle), strict=True)
     ]
     return pair.with_candidate(normalize(nearest, fallback), best), coordinates

@@ -64,8 +64,8 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     if b.kind == "sphere":
         return point_distance(a, _inverse_position(pos, rot)) - b.size[0]
     if a.kind == "capsule" and b.kind == "capsule":
-        between = segment_to_segment(components(pos), components(rot[..., 2]), a.size[1], b.size[1])
-        return between - a.size[0] - b.size[0]
+        axis_distance = segment_to_segment(components(pos), components(rot[..., 2]), a.size[1], b.size[1])
+        return axis_distance - a.size[0] - b.size[0]
     if a.kind == "capsule" and b.kind == "box":
         return segment_to_box(components(pos), components(rot[..., 2]), a.size[1], b.size) - a.size[0]
     if a.kind == "box" and b.kind == "capsule":

@@ -33,16 +33,16 @@ def field_ray(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Arr
     """
     o, d = to_vector(lax.stop_gradient(origin)), to_vector(lax.stop_gradient(direction))
     t, n = _nearer_hit(_nearer_hit(_base_hit(shape, o, d), _wall_hits(shape, o, d)), _surface_hit(shape, o, d))
-    hit = jnp.isfinite(t)
+    is_hit = jnp.isfinite(t)
     # The surface is locally flat, so the derivative is taken of the distance to the plane of the hit.
-    reached = o + d * jnp.where(hit, t, 0.0)
+    hit_point = o + d * jnp.where(is_hit, t, 0.0)
     o, d = to_vector(origin), to_vector(direction)
-    across = n.dot(d)
-    safe = hit & (jnp.abs(across) > MIN_COMPONENT)
-    moving = n.dot(reached - o) / jnp.where(safe, across, 1.0)
-    exact = jnp.where(safe, moving + lax.stop_gradient(t - moving), t)
+    approach_rate = n.dot(d)
+    is_safe = is_hit & (jnp.abs(approach_rate) > MIN_COMPONENT)
+    plane_distance = n.dot(hit_point - o) / jnp.where(is_safe, approach_rate, 1.0)
+    hit_distance = jnp.where(is_safe, plane_distance + lax.stop_gradient(t - plane_distance), t)
     normal = jnp.stack([n.x, n.y, n.z], axis=-1)
-    return jnp.where(hit, exact, jnp.inf), jnp.where(hit[..., None], normal, 0.0)
+    return jnp.where(is_hit, hit_distance, jnp.inf), jnp.where(is_hit[..., None], normal, 0.0)
 
 
 def _nearer_hit(a: Hit, b: Hit) -> Hit:
@@ -54,16 +54,16 @@ def _face_hits(
 ) -> list[tuple[Array, Vector, Array, Array]]:
     """Return the distance, outward normal, and x and y of the hit, for each of the four walls."""
     zero = jnp.zeros_like(origin.x)
-    out = []
+    hits = []
     for side in (-1.0, 1.0):
         for k, (p, v, h) in enumerate(((origin.x, direction.x, half[0]), (origin.y, direction.y, half[1]))):
-            crosses = jnp.abs(v) > MIN_COMPONENT
-            t = (side * h - p) / jnp.where(crosses, v, 1.0)
+            is_crossing = jnp.abs(v) > MIN_COMPONENT
+            t = (side * h - p) / jnp.where(is_crossing, v, 1.0)
             n = Vector(zero + side, zero, zero) if k == 0 else Vector(zero, zero + side, zero)
-            along = origin.y + t * direction.y if k == 0 else origin.x + t * direction.x
-            within = crosses & (t >= 0) & (jnp.abs(along) <= half[1 - k])
-            out.append((jnp.where(within, t, jnp.inf), n, origin.x + t * direction.x, origin.y + t * direction.y))
-    return out
+            coordinate = origin.y + t * direction.y if k == 0 else origin.x + t * direction.x
+            is_within = is_crossing & (t >= 0) & (jnp.abs(coordinate) <= half[1 - k])
+            hits.append((jnp.where(is_within, t, jnp.inf), n, origin.x + t * direction.x, origin.y + t * direction.y))
+    return hits
 
 
 def _base_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
@@ -74,16 +74,16 @@ def _base_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     for t, n, _, _ in _face_hits((x_half, y_half), origin, direction):
         z = origin.z + jnp.where(jnp.isfinite(t), t, 0.0) * direction.z
         hit = _nearer_hit((jnp.where((z <= 0) & (z >= -base), t, jnp.inf), n), hit)
-    crosses = jnp.abs(direction.z) > MIN_COMPONENT
-    for level, up in ((0.0, 1.0), (-base, -1.0)):
-        t = (level - origin.z) / jnp.where(crosses, direction.z, 1.0)
-        within = (
-            crosses
+    is_crossing = jnp.abs(direction.z) > MIN_COMPONENT
+    for height, normal_z in ((0.0, 1.0), (-base, -1.0)):
+        t = (height - origin.z) / jnp.where(is_crossing, direction.z, 1.0)
+        is_within = (
+            is_crossing
             & (t >= 0)
             & (jnp.abs(origin.x + t * direction.x) <= x_half)
             & (jnp.abs(origin.y + t * direction.y) <= y_half)
         )
-        hit = _nearer_hit((jnp.where(within, t, jnp.inf), Vector(zero, zero, zero + up)), hit)
+        hit = _nearer_hit((jnp.where(is_within, t, jnp.inf), Vector(zero, zero, zero + normal_z)), hit)
     return hit
 
 
@@ -109,41 +109,46 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     du, dv = direction.x / side_x, direction.y / side_y
     start = jnp.zeros_like(origin.x)
     for p, step, n in ((u, du, n_columns - 1), (v, dv, n_rows - 1)):
-        moves = jnp.abs(step) > MIN_COMPONENT
-        enters = (jnp.where(step > 0, 0.0, float(n)) - p) / jnp.where(moves, step, 1.0)
-        start = jnp.where(moves & (enters > start), enters, start)
+        is_moving = jnp.abs(step) > MIN_COMPONENT
+        entry_distance = (jnp.where(step > 0, 0.0, float(n)) - p) / jnp.where(is_moving, step, 1.0)
+        start = jnp.where(is_moving & (entry_distance > start), entry_distance, start)
     column = jnp.clip(jnp.floor(u + start * du), 0, n_columns - 2).astype(jnp.int32)
     row = jnp.clip(jnp.floor(v + start * dv), 0, n_rows - 2).astype(jnp.int32)
     slack = 1e-5 if origin.x.dtype == jnp.float32 else 1e-10
 
-    def cell(carry: tuple[Array, Array, Hit], _: None) -> tuple[tuple[Array, Array, Hit], None]:
+    def visit_cell(carry: tuple[Array, Array, Hit], _: None) -> tuple[tuple[Array, Array, Hit], None]:
         column, row, hit = carry
-        inside = (column >= 0) & (column <= n_columns - 2) & (row >= 0) & (row <= n_rows - 2)
+        is_inside = (column >= 0) & (column <= n_columns - 2) & (row >= 0) & (row <= n_rows - 2)
         i, j = jnp.clip(row, 0, n_rows - 2), jnp.clip(column, 0, n_columns - 2)
         a, b, c, e = heights[i, j], heights[i, j + 1], heights[i + 1, j + 1], heights[i + 1, j]
         x, y = u - j.astype(u.dtype), v - i.astype(v.dtype)
-        for rise_x, rise_y, right in ((b - a, c - b, 1.0), (c - e, e - a, -1.0)):
+        for rise_x, rise_y, goes_right in ((b - a, c - b, 1.0), (c - e, e - a, -1.0)):
             # Height of the ray's origin above the plane of the triangle, and its rate of descent towards it.
-            above, sinks = origin.z - a - rise_x * x - rise_y * y, rise_x * du + rise_y * dv - direction.z
-            meets = jnp.abs(sinks) > MIN_COMPONENT
-            t = above / jnp.where(meets, sinks, 1.0)
-            at_x, at_y = x + t * du, y + t * dv
-            on = (at_x >= -slack) & (at_x <= 1 + slack) & (at_y >= -slack) & (at_y <= 1 + slack)
-            on = on & (right * (at_x - at_y) >= -slack) & meets & inside & (t >= 0)
+            origin_height, descent_rate = (
+                origin.z - a - rise_x * x - rise_y * y,
+                rise_x * du + rise_y * dv - direction.z,
+            )
+            is_crossing = jnp.abs(descent_rate) > MIN_COMPONENT
+            t = origin_height / jnp.where(is_crossing, descent_rate, 1.0)
+            hit_x, hit_y = x + t * du, y + t * dv
+            is_on_triangle = (hit_x >= -slack) & (hit_x <= 1 + slack) & (hit_y >= -slack) & (hit_y <= 1 + slack)
+            is_on_triangle = (
+                is_on_triangle & (goes_right * (hit_x - hit_y) >= -slack) & is_crossing & is_inside & (t >= 0)
+            )
             n = Vector(-rise_x / side_x, -rise_y / side_y, jnp.ones_like(t))
-            hit = _nearer_hit((jnp.where(on, t, jnp.inf), n), hit)
+            hit = _nearer_hit((jnp.where(is_on_triangle, t, jnp.inf), n), hit)
         step = jnp.int32(1)
         # Continue with the neighbour whose border is nearer.
-        right, up = du > 0, dv > 0
-        moves_x, moves_y = jnp.abs(du) > MIN_COMPONENT, jnp.abs(dv) > MIN_COMPONENT
-        t_x = jnp.where(moves_x, (jnp.where(right, 1.0, 0.0) - x) / jnp.where(moves_x, du, 1.0), jnp.inf)
-        t_y = jnp.where(moves_y, (jnp.where(up, 1.0, 0.0) - y) / jnp.where(moves_y, dv, 1.0), jnp.inf)
-        by_x = t_x <= t_y
-        column = jnp.where(inside & by_x, column + jnp.where(right, step, -step), column)
-        row = jnp.where(inside & ~by_x, row + jnp.where(up, step, -step), row)
+        goes_right, goes_up = du > 0, dv > 0
+        is_moving_x, is_moving_y = jnp.abs(du) > MIN_COMPONENT, jnp.abs(dv) > MIN_COMPONENT
+        t_x = jnp.where(is_moving_x, (jnp.where(goes_right, 1.0, 0.0) - x) / jnp.where(is_moving_x, du, 1.0), jnp.inf)
+        t_y = jnp.where(is_moving_y, (jnp.where(goes_up, 1.0, 0.0) - y) / jnp.where(is_moving_y, dv, 1.0), jnp.inf)
+        x_is_first = t_x <= t_y
+        column = jnp.where(is_inside & x_is_first, column + jnp.where(goes_right, step, -step), column)
+        row = jnp.where(is_inside & ~x_is_first, row + jnp.where(goes_up, step, -step), row)
         return (column, row, hit), None
 
     zero = jnp.zeros_like(origin.x)
-    none = (zero + jnp.inf, Vector(zero, zero, zero + 1))
-    (_, _, (t, n)), _ = lax.scan(cell, (column, row, none), length=n_rows + n_columns - 2)
+    no_hit = (zero + jnp.inf, Vector(zero, zero, zero + 1))
+    (_, _, (t, n)), _ = lax.scan(visit_cell, (column, row, no_hit), length=n_rows + n_columns - 2)
     return t, normalize(n, n)

@@ -45,15 +45,15 @@ def field_distance(shape: Shape, point: Array, radius: float = 0.0) -> Array:
     surface = triangles_distance(position, *triangles(grid))
     # The walls and the bottom can be nearer than the surface.
     qx, qy = safe_clip(position.x, -x_half, x_half), safe_clip(position.y, -y_half, y_half)
-    below = position.z < height_at(shape, lax.stop_gradient(qx), lax.stop_gradient(qy), position)
+    is_below = position.z < height_at(shape, lax.stop_gradient(qx), lax.stop_gradient(qy), position)
     dx, dy, dz = position.x - qx, position.y - qy, maximum(-base - position.z, 0.0)
-    beside = safe_sqrt(dx * dx + dy * dy + dz * dz)
+    border_distance = safe_sqrt(dx * dx + dy * dy + dz * dz)
     wall = maximum(
         maximum(position.x - x_half, -x_half - position.x), maximum(position.y - y_half, -y_half - position.y)
     )
     wall = maximum(wall, -base - position.z)
-    inside = maximum(-surface, wall)
-    return jnp.where(below, jnp.where(wall < 0, inside, beside), surface)
+    inner_distance = maximum(-surface, wall)
+    return jnp.where(is_below, jnp.where(wall < 0, inner_distance, border_distance), surface)
 
 
 def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array) -> Array:
@@ -72,23 +72,23 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
     """
     size = math.sqrt(sum(h * h for h in half))
     signs = np.stack(np.meshgrid(*[[-1.0, 1.0] if h else [0.0] for h in half], indexing="ij"), axis=-1).reshape(-1, 3)
-    ends = jnp.asarray(signs * np.asarray(half), pos.dtype)
-    tips = pos[..., None, :] + sum(rot[..., None, :, k] * ends[:, k, None] for k in range(3))
-    out = jnp.min(field_distance(shape, tips, size), axis=-1)
+    local_corners = jnp.asarray(signs * np.asarray(half), pos.dtype)
+    corners = pos[..., None, :] + sum(rot[..., None, :, k] * local_corners[:, k, None] for k in range(3))
+    corner_distance = jnp.min(field_distance(shape, corners, size), axis=-1)
     grid = nearby_corners(shape, to_vector(lax.stop_gradient(pos)), 2 * size)
     axes = [to_vector(rot[..., k]) for k in range(3)]
     position = to_vector(pos)
     a, b = edges(grid)
-    middle, along = (a + b) * 0.5, b - a
-    length = jnp.sqrt(along.dot(along))
-    away = Vector(
+    middle, edge_vectors = (a + b) * 0.5, b - a
+    length = jnp.sqrt(edge_vectors.dot(edge_vectors))
+    offsets = Vector(
         *(m - p[..., None] for m, p in ((middle.x, position.x), (middle.y, position.y), (middle.z, position.z)))
     )
-    wide = [Vector(axis.x[..., None], axis.y[..., None], axis.z[..., None]) for axis in axes]
-    x, y, z = (away.dot(axis) for axis in wide)
-    u, v, w = (along.dot(axis) / length for axis in wide)
-    of_edges = jnp.min(segment_to_box((x, y, z), (u, v, w), 0.5 * length, half), axis=-1)
-    return jnp.where(of_edges < out, of_edges, out)
+    batched_axes = [Vector(axis.x[..., None], axis.y[..., None], axis.z[..., None]) for axis in axes]
+    x, y, z = (offsets.dot(axis) for axis in batched_axes)
+    u, v, w = (edge_vectors.dot(axis) / length for axis in batched_axes)
+    edge_distance = jnp.min(segment_to_box((x, y, z), (u, v, w), 0.5 * length, half), axis=-1)
+    return jnp.where(edge_distance < corner_distance, edge_distance, corner_distance)
 
 
 def nearby_corners(shape: Shape, position: Vector, radius: float) -> Vector:
@@ -99,10 +99,10 @@ def nearby_corners(shape: Shape, position: Vector, radius: float) -> Vector:
         (position.y, shape.size[1], cell_sides(shape)[1], heights.shape[0] - 1),
         (position.x, shape.size[0], cell_sides(shape)[0], heights.shape[1] - 1),
     ):
-        around = max(1, math.ceil(radius / side))
-        count = min(n, 2 * around + 1)
+        n_neighbours = max(1, math.ceil(radius / side))
+        count = min(n, 2 * n_neighbours + 1)
         cell = jnp.floor((lax.stop_gradient(coordinate) + half) / side).astype(jnp.int32)
-        starts.append(jnp.clip(cell - around, 0, n - count))
+        starts.append(jnp.clip(cell - n_neighbours, 0, n - count))
         counts.append(count + 1)
     rows = starts[0][..., None, None] + jnp.arange(counts[0])[:, None]
     columns = starts[1][..., None, None] + jnp.arange(counts[1])
@@ -116,27 +116,29 @@ def nearby_corners(shape: Shape, position: Vector, radius: float) -> Vector:
 def triangles(grid: Vector) -> tuple[Vector, Vector, Vector]:
     """Return the three corners of both triangles of every cell, concatenated. 3 of (..., n_triangles)"""
 
-    def part(rows: slice, columns: slice) -> list[Array]:
+    def take_corners(rows: slice, columns: slice) -> list[Array]:
         return [v[..., rows, columns].reshape(*v.shape[:-2], -1) for v in (grid.x, grid.y, grid.z)]
 
     low, high = slice(None, -1), slice(1, None)
-    a, b, c, d = part(low, low), part(low, high), part(high, high), part(high, low)
+    a, b, c, d = take_corners(low, low), take_corners(low, high), take_corners(high, high), take_corners(high, low)
 
-    def join(p: list[Array], q: list[Array]) -> Vector:
+    def concatenate(p: list[Array], q: list[Array]) -> Vector:
         return Vector(*(jnp.concatenate(pair, axis=-1) for pair in zip(p, q, strict=True)))
 
-    return join(a, a), join(b, c), join(c, d)
+    return concatenate(a, a), concatenate(b, c), concatenate(c, d)
 
 
 def edges(grid: Vector) -> tuple[Vector, Vector]:
     """Return the ends of all edges along x, y and the diagonals of cells, concatenated. 2 of (..., n_edges)"""
-    full, low, high = slice(None), slice(None, -1), slice(1, None)
+    all_nodes, but_last, but_first = slice(None), slice(None, -1), slice(1, None)
 
-    def join(*parts: tuple[slice, slice]) -> Vector:
+    def concatenate(*parts: tuple[slice, slice]) -> Vector:
         columns = ([v[..., i, j].reshape(*v.shape[:-2], -1) for i, j in parts] for v in (grid.x, grid.y, grid.z))
         return Vector(*(jnp.concatenate(column, axis=-1) for column in columns))
 
-    return join((full, low), (low, full), (low, low)), join((full, high), (high, full), (high, high))
+    return concatenate((all_nodes, but_last), (but_last, all_nodes), (but_last, but_last)), concatenate(
+        (all_nodes, but_first), (but_first, all_nodes), (but_first, but_first)
+    )
 
 
 def height_at(shape: Shape, x: Array, y: Array, vector: Vector) -> Array:
@@ -167,14 +169,18 @@ def surface_at(heights: Array, half: Array, point: Array) -> tuple[Array, Array,
     """
     n_rows, n_columns = heights.shape
     x, y = point[..., 0], point[..., 1]
-    inside = (jnp.abs(x) <= half[0]) & (jnp.abs(y) <= half[1])
+    is_inside = (jnp.abs(x) <= half[0]) & (jnp.abs(y) <= half[1])
     side_x, side_y = 2 * half[0] / (n_columns - 1), 2 * half[1] / (n_rows - 1)
-    place_u = safe_clip((x + half[0]) / side_x, 0.0, float(n_columns - 1))
-    place_v = safe_clip((y + half[1]) / side_y, 0.0, float(n_rows - 1))
-    u, v, rise_x, rise_y, origin = triangle_at(heights, place_u, place_v)
+    cell_x = safe_clip((x + half[0]) / side_x, 0.0, float(n_columns - 1))
+    cell_y = safe_clip((y + half[1]) / side_y, 0.0, float(n_rows - 1))
+    u, v, rise_x, rise_y, origin = triangle_at(heights, cell_x, cell_y)
     slope_x, slope_y = rise_x / side_x, rise_y / side_y
-    up = 1 / jnp.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
-    return origin + rise_x * u + rise_y * v, jnp.stack([-slope_x * up, -slope_y * up, up], axis=-1), inside
+    normal_z = 1 / jnp.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
+    return (
+        origin + rise_x * u + rise_y * v,
+        jnp.stack([-slope_x * normal_z, -slope_y * normal_z, normal_z], axis=-1),
+        is_inside,
+    )
 
 
 def field_gap(shape: Shape, point: Array) -> tuple[Array, Array]:
@@ -184,9 +190,9 @@ def field_gap(shape: Shape, point: Array) -> tuple[Array, Array]:
     ``field_distance``. Beyond the border and below the bottom of the ground, it is ``OUTSIDE_DISTANCE``.
     """
     half = jnp.asarray(shape.size[:2], point.dtype)
-    height, normal, inside = surface_at(jnp.asarray(shape.array("heights"), point.dtype), half, point)
-    inside = inside & (point[..., 2] > -shape.size[3])
-    return jnp.where(inside, (point[..., 2] - height) * normal[..., 2], OUTSIDE_DISTANCE), normal
+    height, normal, is_inside = surface_at(jnp.asarray(shape.array("heights"), point.dtype), half, point)
+    is_inside = is_inside & (point[..., 2] > -shape.size[3])
+    return jnp.where(is_inside, (point[..., 2] - height) * normal[..., 2], OUTSIDE_DISTANCE), normal
 
 
 def triangle_at(heights: Array, u: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
@@ -207,5 +213,5 @@ def triangle_at(heights: Array, u: Array, v: Array) -> tuple[Array, Array, Array
     row = jnp.clip(jnp.floor(v), 0, heights.shape[0] - 2).astype(jnp.int32)
     u, v = u - column.astype(u.dtype), v - row.astype(v.dtype)
     a, b, c, d = (heights[row + i, column + j] for i, j in ((0, 0), (0, 1), (1, 1), (1, 0)))
-    right = u > v
-    return u, v, jnp.where(right, b - a, c - d), jnp.where(right, c - b, d - a), a
+    is_right = u > v
+    return u, v, jnp.where(is_right, b - a, c - d), jnp.where(is_right, c - b, d - a), a

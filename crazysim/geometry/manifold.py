@@ -63,15 +63,15 @@ def ball_box_contacts(radius: Array, pos: Array, size: Array, pos_box: Array, ro
     """
     centre = matvec(rot_box.T, pos - pos_box)
     nearest = rotation.safe_clip(centre, -size, size)
-    out = centre - nearest
-    distance = rotation.safe_norm(out)
+    offset = centre - nearest
+    distance = rotation.safe_norm(offset)
     # A centre inside the box leaves through the nearest face.
     depth = size - jnp.abs(centre)
-    leaves = jnp.arange(3) == jnp.argmin(depth)
-    face = jnp.where(leaves, jnp.where(centre < 0, -1.0, 1.0), 0.0)
-    is_out = distance > 0
-    normal = jnp.where(is_out, out / jnp.where(is_out, distance, 1.0), face)
-    gap = jnp.where(is_out, distance, -jnp.min(depth)) - radius
+    is_nearest_face = jnp.arange(3) == jnp.argmin(depth)
+    face = jnp.where(is_nearest_face, jnp.where(centre < 0, -1.0, 1.0), 0.0)
+    is_outside = distance > 0
+    normal = jnp.where(is_outside, offset / jnp.where(is_outside, distance, 1.0), face)
+    gap = jnp.where(is_outside, distance, -jnp.min(depth)) - radius
     normal = matvec(rot_box, normal)
     return Manifold(gap, normal[None], (pos - normal * (radius + 0.5 * gap))[None])
 
@@ -92,33 +92,35 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
         rot_b: Rotation matrix from its frame to the world. (3, 3)
     """
     offset = pos_a - pos_b
-    turn = matmul(rot_b.T, rot_a)
-    size = jnp.abs(turn)
+    relative_rot = matmul(rot_b.T, rot_a)
+    abs_rot = jnp.abs(relative_rot)
     along_a, along_b = matvec(rot_a.T, offset), matvec(rot_b.T, offset)
     faces = jnp.concatenate([
-        jnp.abs(along_a) - half_a - matvec(size.T, half_b),
-        jnp.abs(along_b) - half_b - matvec(size, half_a),
+        jnp.abs(along_a) - half_a - matvec(abs_rot.T, half_b),
+        jnp.abs(along_b) - half_b - matvec(abs_rot, half_a),
     ])  # fmt: skip
-    smaller = jnp.minimum(jnp.min(half_a), jnp.min(half_b))
-    best = jnp.argmax(lax.stop_gradient(faces + FACE_BIAS * smaller * jnp.asarray([1, 1, 1, 0, 0, 0], faces.dtype)))
+    min_half = jnp.minimum(jnp.min(half_a), jnp.min(half_b))
+    best_face = jnp.argmax(
+        lax.stop_gradient(faces + FACE_BIAS * min_half * jnp.asarray([1, 1, 1, 0, 0, 0], faces.dtype))
+    )
     axes = rotation.cross(rot_b.T[:, None], rot_a.T[None])  # (3 of b, 3 of a, 3)
     length = rotation.safe_norm(axes)
-    spans = length[..., 0] > MIN_EDGE_SINE
+    is_defined = length[..., 0] > MIN_EDGE_SINE
     axes = axes / jnp.where(length > MIN_EDGE_SINE, length, 1.0)
     reach = jnp.sum(half_a * jnp.abs(jnp.sum(axes[..., None] * rot_a, axis=-2)), axis=-1)
     reach = reach + jnp.sum(half_b * jnp.abs(jnp.sum(axes[..., None] * rot_b, axis=-2)), axis=-1)
-    edges = jnp.where(spans, jnp.abs(jnp.sum(axes * offset, axis=-1)) - reach, -OUTSIDE_DISTANCE).reshape(-1)
+    edges = jnp.where(is_defined, jnp.abs(jnp.sum(axes * offset, axis=-1)) - reach, -OUTSIDE_DISTANCE).reshape(-1)
     pair = jnp.argmax(lax.stop_gradient(edges))
-    by_edge = edges[pair] > EDGE_SHARE * faces[best] + EDGE_BIAS * smaller
+    by_edge = edges[pair] > EDGE_SHARE * faces[best_face] + EDGE_BIAS * min_half
     # If the boxes are apart, the axis with the largest distance counts, face or edge. Without the bias, rounding would
     # choose between level faces that touch.
-    by_edge = jnp.where(faces[best] > 0, edges[pair] > faces[best] + FACE_BIAS * smaller, by_edge)
+    by_edge = jnp.where(faces[best_face] > 0, edges[pair] > faces[best_face] + FACE_BIAS * min_half, by_edge)
 
-    is_a = best < 3
+    is_a = best_face < 3
     boxes = (half_a, pos_a, rot_a), (half_b, pos_b, rot_b)
     face = tuple(jnp.where(is_a, x, y) for x, y in zip(*boxes, strict=True))
     other = tuple(jnp.where(is_a, y, x) for x, y in zip(*boxes, strict=True))
-    gap, normal, point = _clip_face(face, best % 3, other)
+    gap, normal, point = _clip_face(face, best_face % 3, other)
     gap_edge, normal_edge, point_edge = _edge_contact(boxes, pair, axes.reshape(-1, 3)[pair], offset)
     gap = jnp.concatenate(
         [jnp.where(by_edge, OUTSIDE_DISTANCE, gap), jnp.where(by_edge, gap_edge, OUTSIDE_DISTANCE)[None]]
@@ -140,40 +142,40 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     offset = other[1] - pos
     side = jnp.where(jnp.sum(offset * rot[:, 0]) < 0, -1.0, 1.0)
     normal = side * rot[:, 0]
-    against = matvec(other[2].T, normal)
-    turned = jnp.argmax(lax.stop_gradient(jnp.abs(against)))
-    half_o, _, rot_o = _renumber_axes(other, turned)
+    other_normal = matvec(other[2].T, normal)
+    other_axis = jnp.argmax(lax.stop_gradient(jnp.abs(other_normal)))
+    half_o, _, rot_o = _renumber_axes(other, other_axis)
     # The other's nearest face: its middle and its half edges, in the plane of the face (u, v) and along its normal (s).
-    sign = jnp.where(against[turned] > 0, -1.0, 1.0)
+    sign = jnp.where(other_normal[other_axis] > 0, -1.0, 1.0)
     frame = jnp.stack([rot[:, 1], rot[:, 2], normal])
     middle = matvec(frame, offset + sign * half_o[0] * rot_o[:, 0]) - jnp.stack([0 * side, 0 * side, half[0]])
     edge_1, edge_2 = half_o[1] * matvec(frame, rot_o[:, 1]), half_o[2] * matvec(frame, rot_o[:, 2])
     ring = jnp.stack([middle + x * edge_1 + y * edge_2 for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
-    along = jnp.roll(ring, -1, axis=0) - ring
+    edges = jnp.roll(ring, -1, axis=0) - ring
     limit = half[1:] * (2 - FACE_SHARE)
     first, last = jnp.zeros(4, pos.dtype), jnp.ones(4, pos.dtype)
     for k in range(2):
-        speed = along[:, k]
-        moves = jnp.abs(speed) > 1e-9
-        inverse = 1 / jnp.where(moves, speed, 1.0)
+        speed = edges[:, k]
+        is_crossing = jnp.abs(speed) > 1e-9
+        inverse = 1 / jnp.where(is_crossing, speed, 1.0)
         ends = (-limit[k] - ring[:, k]) * inverse, (limit[k] - ring[:, k]) * inverse
-        within = jnp.abs(ring[:, k]) <= limit[k]
-        first = jnp.maximum(first, jnp.where(moves, jnp.minimum(*ends), jnp.where(within, 0.0, 2.0)))
-        last = jnp.minimum(last, jnp.where(moves, jnp.maximum(*ends), 1.0))
-    exists = first <= last
-    valid = [exists, exists & (last < 1)]  # the end of an edge is the beginning of the next
+        is_within = jnp.abs(ring[:, k]) <= limit[k]
+        first = jnp.maximum(first, jnp.where(is_crossing, jnp.minimum(*ends), jnp.where(is_within, 0.0, 2.0)))
+        last = jnp.minimum(last, jnp.where(is_crossing, jnp.maximum(*ends), 1.0))
+    is_clipped = first <= last
+    valid = [is_clipped, is_clipped & (last < 1)]  # the end of an edge is the beginning of the next
     # Clip to the edge: for an edge parallel to the border up to rounding, the computed ends can be kilometres away.
-    candidates = [ring + jnp.clip(x, 0.0, 1.0)[:, None] * along for x in (first, last)]
+    candidates = [ring + jnp.clip(x, 0.0, 1.0)[:, None] * edges for x in (first, last)]
     # Corners of the face, projected along its normal onto the other's nearest face.
-    at = jnp.stack([jnp.stack([x * limit[0], y * limit[1]]) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+    face_corners = jnp.stack([jnp.stack([x * limit[0], y * limit[1]]) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     det = edge_1[0] * edge_2[1] - edge_1[1] * edge_2[0]
     det = jnp.where(jnp.abs(det) > 1e-12, det, 1e-12)
-    away = at - middle[:2]
-    p = (away[:, 0] * edge_2[1] - away[:, 1] * edge_2[0]) / det
-    q = (edge_1[0] * away[:, 1] - edge_1[1] * away[:, 0]) / det
+    face_offsets = face_corners - middle[:2]
+    p = (face_offsets[:, 0] * edge_2[1] - face_offsets[:, 1] * edge_2[0]) / det
+    q = (edge_1[0] * face_offsets[:, 1] - edge_1[1] * face_offsets[:, 0]) / det
     valid.append((jnp.abs(p) < FACE_SHARE) & (jnp.abs(q) < FACE_SHARE))
     height = middle[2] + p * edge_1[2] + q * edge_2[2]
-    candidates.append(jnp.concatenate([at, height[:, None]], axis=-1))
+    candidates.append(jnp.concatenate([face_corners, height[:, None]], axis=-1))
     points = jnp.concatenate(candidates)
     gap = jnp.where(jnp.concatenate(valid), points[:, 2], OUTSIDE_DISTANCE)
     local = jnp.concatenate([points[:, :2], half[0] + 0.5 * points[:, 2:]], axis=-1)
@@ -187,14 +189,14 @@ def _edge_contact(
     normal = jnp.where(jnp.sum(axis * offset) < 0, -1.0, 1.0) * axis
     ends = []
     for (half, pos, rot), number, side in zip(boxes, (pair % 3, pair // 3), (-1.0, 1.0), strict=True):
-        toward = matvec(rot.T, normal)
+        local_normal = matvec(rot.T, normal)
         is_edge = jnp.arange(3) == number
-        local = jnp.where(is_edge, 0.0, side * jnp.where(toward < 0, -1.0, 1.0) * half)
-        along = jnp.sum(jnp.where(is_edge, rot, 0.0), axis=-1)
-        ends.append((pos + matvec(rot, local), along, jnp.sum(jnp.where(is_edge, half, 0.0))))
+        local = jnp.where(is_edge, 0.0, side * jnp.where(local_normal < 0, -1.0, 1.0) * half)
+        direction = jnp.sum(jnp.where(is_edge, rot, 0.0), axis=-1)
+        ends.append((pos + matvec(rot, local), direction, jnp.sum(jnp.where(is_edge, half, 0.0))))
     (p, u, reach_p), (q, v, reach_q) = ends
-    between = p - q
-    c, d, e = (jnp.sum(x * y) for x, y in ((u, v), (u, between), (v, between)))
+    offset_pq = p - q
+    c, d, e = (jnp.sum(x * y) for x, y in ((u, v), (u, offset_pq), (v, offset_pq)))
     det = jnp.maximum(1 - c * c, MIN_EDGE_SINE**2)
     s = rotation.safe_clip((c * e - d) / det, -reach_p, reach_p)
     t = rotation.safe_clip((e - c * d) / det, -reach_q, reach_q)
@@ -206,11 +208,11 @@ def _renumber_axes(box: tuple[Array, ...], axis: Array) -> tuple[Array, ...]:
     """Return half lengths, position and attitude of a box with its axes renumbered so that one comes first."""
     half, pos, rot = box
 
-    def pick(options: list[Array]) -> Array:
+    def select_axis(options: list[Array]) -> Array:
         return jnp.where(axis == 0, options[0], jnp.where(axis == 1, options[1], options[2]))
 
     return (
-        pick([jnp.roll(half, -k) for k in range(3)]),
+        select_axis([jnp.roll(half, -k) for k in range(3)]),
         pos,
-        pick([jnp.roll(rot, -k, axis=1) for k in range(3)]),
+        select_axis([jnp.roll(rot, -k, axis=1) for k in range(3)]),
     )

@@ -51,19 +51,21 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     """
     half = (a.size[1],) if a.kind == "capsule" else a.size
     centre, edges = to_vector(pos), [to_vector(rot[..., k]) for k in range(3)][-len(half) :]
-    fixed = ShapePair(b, half, *lax.stop_gradient((edges, centre)))
+    fixed_pair = ShapePair(b, half, *lax.stop_gradient((edges, centre)))
     fallback = axis_vector(2, centre.x)
-    best, _ = find_separation(fixed, normalize(fixed.centre, fallback), SEPARATION_STEPS)
-    gap, n = find_overlap(fixed, a.kind == "box", best)
+    best, _ = find_separation(fixed_pair, normalize(fixed_pair.centre, fallback), SEPARATION_STEPS)
+    gap, n = find_overlap(fixed_pair, a.kind == "box", best)
     # Once moved apart along the direction found, the shapes have nearest points, at which they would touch first.
-    aside = SEPARATION_SHARE * max(half)
-    parted = dataclasses.replace(fixed, centre=fixed.centre + n * jnp.where(gap < aside, aside - gap, 0.0))
-    (_, m), coordinates = find_separation(parted, n, TOUCH_STEPS)
-    n = fixed.with_candidate(m, (gap, n))[1]
+    clearance = SEPARATION_SHARE * max(half)
+    separated_pair = dataclasses.replace(
+        fixed_pair, centre=fixed_pair.centre + n * jnp.where(gap < clearance, clearance - gap, 0.0)
+    )
+    (_, m), coordinates = find_separation(separated_pair, n, TOUCH_STEPS)
+    n = fixed_pair.with_candidate(m, (gap, n))[1]
     n = normalize(n, fallback)
     # The derivative of the distance is taken at the nearest point of the moving shape.
-    moving = ShapePair(b, half, edges, centre).point_at(coordinates).dot(n)
-    return moving + lax.stop_gradient(fixed.gap(n) - moving)
+    moving_distance = ShapePair(b, half, edges, centre).point_at(coordinates).dot(n)
+    return moving_distance + lax.stop_gradient(fixed_pair.gap(n) - moving_distance)
 
 
 def find_overlap(pair: ShapePair, is_box: bool, best: BestDirection) -> BestDirection:
@@ -85,10 +87,10 @@ def find_overlap(pair: ShapePair, is_box: bool, best: BestDirection) -> BestDire
     return _best_end_normal(pair, best) if b.kind == "ellipsoid" else best
 
 
-def _select_best(tried: BestDirection, best: BestDirection) -> BestDirection:
+def _select_best(candidates: BestDirection, best: BestDirection) -> BestDirection:
     """Return the best of the directions along the first axis and the best so far."""
-    for k in range(tried[0].shape[0]):
-        best = larger_gap((tried[0][k], tried[1][k]), best)
+    for k in range(candidates[0].shape[0]):
+        best = larger_gap((candidates[0][k], candidates[1][k]), best)
     return best
 
 
@@ -112,7 +114,7 @@ def _best_end_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
     """Return the best of a direction and the normals of an ellipsoid at its points nearest to corners of the other."""
     shortest = min(range(3), key=lambda k: pair.other.size[k])
 
-    def at_end(k: Array, best: BestDirection) -> BestDirection:
+    def try_end(k: Array, best: BestDirection) -> BestDirection:
         point = pair.centre
         for bit, (edge, half) in enumerate(zip(pair.edges, pair.half, strict=True)):
             point = point + edge * jnp.where((k >> bit) & 1 == 1, -half, half)
@@ -121,7 +123,7 @@ def _best_end_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
         sign = [-1.0 if k == shortest else 1.0 for k in range(3)]
         return pair.with_candidate(Vector(n.x * sign[0], n.y * sign[1], n.z * sign[2]), pair.with_candidate(n, best))
 
-    return lax.fori_loop(0, 2 ** len(pair.edges), at_end, best)
+    return lax.fori_loop(0, 2 ** len(pair.edges), try_end, best)
 
 
 def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
@@ -147,46 +149,49 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
         point, _ = pair.support_point(direction(n))
         return point.dot(e), point.dot(f)
 
-    def between(n: PlaneVector, p: PlaneVector, m: PlaneVector, q: PlaneVector) -> PlaneVector:
+    def bisect(n: PlaneVector, p: PlaneVector, m: PlaneVector, q: PlaneVector) -> PlaneVector:
         """Return the unit direction between two directions along which their support points are equally far."""
         u, v, middle = q[1] - p[1], p[0] - q[0], (n[0] + m[0], n[1] + m[1])
         sign = jnp.where(u * middle[0] + v * middle[1] < 0, -1.0, 1.0)
-        same = u * u + v * v <= 1e-10 * (p[0] * p[0] + p[1] * p[1])
-        u, v = jnp.where(same, middle[0], sign * u), jnp.where(same, middle[1], sign * v)
+        coincide = u * u + v * v <= 1e-10 * (p[0] * p[0] + p[1] * p[1])
+        u, v = jnp.where(coincide, middle[0], sign * u), jnp.where(coincide, middle[1], sign * v)
         scale = lax.rsqrt(u * u + v * v)
         return u * scale, v * scale
 
-    def arc(
+    def try_arc(
         k: Array, carry: tuple[PlaneVector, PlaneVector, Array, tuple[PlaneVector, ...]]
     ) -> tuple[PlaneVector, PlaneVector, Array, tuple[PlaneVector, ...]]:
         n, p, gap, best_arc = carry
         angle = (k + 1).astype(x.dtype) * (2 * math.pi / N_ARCS)
         m = (jnp.cos(angle) + 0 * x, jnp.sin(angle) + 0 * x)
         q = support_point(m)
-        top = between(n, p, m, q)
-        top_gap = pair.gap(direction(top))
-        larger = top_gap > gap
-        best_arc = tuple(_choose(larger, new, old) for new, old in zip((n, p, m, q, top), best_arc, strict=True))
-        return m, q, jnp.where(larger, top_gap, gap), best_arc
+        peak = bisect(n, p, m, q)
+        peak_gap = pair.gap(direction(peak))
+        is_larger = peak_gap > gap
+        best_arc = tuple(
+            _choose(is_larger, candidate, current)
+            for candidate, current in zip((n, p, m, q, peak), best_arc, strict=True)
+        )
+        return m, q, jnp.where(is_larger, peak_gap, gap), best_arc
 
     start = (jnp.ones_like(x), jnp.zeros_like(x))
     first = support_point(start)
     _, _, gap, widest_arc = lax.fori_loop(
-        0, N_ARCS, arc, (start, first, jnp.full_like(x, -jnp.inf), (start, first, start, first, start))
+        0, N_ARCS, try_arc, (start, first, jnp.full_like(x, -jnp.inf), (start, first, start, first, start))
     )
 
-    def narrow(_: int, carry: tuple[Array, tuple[PlaneVector, ...]]) -> tuple[Array, tuple[PlaneVector, ...]]:
-        gap, (n, p, m, q, top) = carry
-        middle = between(n, p, m, q)
+    def narrow_arc(_: int, carry: tuple[Array, tuple[PlaneVector, ...]]) -> tuple[Array, tuple[PlaneVector, ...]]:
+        gap, (n, p, m, q, peak) = carry
+        middle = bisect(n, p, m, q)
         r, middle_gap = support_point(middle), pair.gap(direction(middle))
         # The derivative of the gap with the angle is the component of the support point along the circle.
-        rises = middle[0] * r[1] - middle[1] * r[0] > 0
-        n, p = _choose(rises, middle, n), _choose(rises, r, p)
-        m, q = _choose(rises, m, middle), _choose(rises, q, r)
-        return jnp.where(middle_gap > gap, middle_gap, gap), (n, p, m, q, _choose(middle_gap > gap, middle, top))
+        is_rising = middle[0] * r[1] - middle[1] * r[0] > 0
+        n, p = _choose(is_rising, middle, n), _choose(is_rising, r, p)
+        m, q = _choose(is_rising, m, middle), _choose(is_rising, q, r)
+        return jnp.where(middle_gap > gap, middle_gap, gap), (n, p, m, q, _choose(middle_gap > gap, middle, peak))
 
-    _, (*_, top) = lax.fori_loop(0, N_ARC_STEPS, narrow, (gap, widest_arc))
-    n = direction(top)
+    _, (*_, peak) = lax.fori_loop(0, N_ARC_STEPS, narrow_arc, (gap, widest_arc))
+    n = direction(peak)
     n = normalize(n, e)
     return pair.gap(n), n
 

@@ -51,8 +51,8 @@ def _sphere(shape: Shape, point: Array) -> Array:
 def _capsule(shape: Shape, point: Array) -> Array:
     radius, half = shape.size
     x, y, z = components(point)
-    off = z - safe_clip(z, -half, half)
-    return safe_sqrt(x * x + y * y + off * off) - radius
+    outside_z = z - safe_clip(z, -half, half)
+    return safe_sqrt(x * x + y * y + outside_z * outside_z) - radius
 
 
 def _box(shape: Shape, point: Array) -> Array:
@@ -62,18 +62,18 @@ def _box(shape: Shape, point: Array) -> Array:
 def box_distance(half: tuple[float, ...], point: tuple[Array, Array, Array]) -> Array:
     """Return the signed distance from a point, 3 components of (...), to a box of given half lengths, m. (...)"""
     x, y, z = (magnitude(p) - h for p, h in zip(point, half, strict=True))
-    inside = maximum(maximum(x, y), z)
+    face_distance = maximum(maximum(x, y), z)
     x, y, z = maximum(x, 0.0), maximum(y, 0.0), maximum(z, 0.0)
-    return jnp.where(inside > 0, safe_sqrt(x * x + y * y + z * z), inside)
+    return jnp.where(face_distance > 0, safe_sqrt(x * x + y * y + z * z), face_distance)
 
 
 def _cylinder(shape: Shape, point: Array) -> Array:
     radius, half = shape.size
     x, y, z = components(point)
     side, cap = safe_sqrt(x * x + y * y) - radius, magnitude(z) - half
-    inside = maximum(side, cap)
+    surface_distance = maximum(side, cap)
     side, cap = maximum(side, 0.0), maximum(cap, 0.0)
-    return jnp.where(inside > 0, safe_sqrt(side * side + cap * cap), inside)
+    return jnp.where(surface_distance > 0, safe_sqrt(side * side + cap * cap), surface_distance)
 
 
 def _ellipsoid(shape: Shape, point: Array) -> Array:
@@ -82,9 +82,9 @@ def _ellipsoid(shape: Shape, point: Array) -> Array:
     An error e of the normal n gives an error e^2 of the distance ``(n.p - |a n|) / |n|``.
     """
     normal = ellipsoid_normal(shape, components(point))
-    along = sum(n * p for n, p in zip(normal, components(point), strict=True))
+    projection = sum(n * p for n, p in zip(normal, components(point), strict=True))
     support = jnp.sqrt(sum((a * n) ** 2 for a, n in zip(shape.size, normal, strict=True)))
-    return (along - support) / jnp.sqrt(sum(n * n for n in normal))
+    return (projection - support) / jnp.sqrt(sum(n * n for n in normal))
 
 
 def ellipsoid_normal(shape: Shape, point: Components) -> Components:
@@ -99,9 +99,9 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
     axes = np.asarray(shape.size)
     gaps = (axes**2 - axes.min() ** 2).tolist()
     # A point of the symmetry plane has two nearest points: it is displaced by less than a rounding error.
-    aside = (2 * float(jnp.finfo(point[0].dtype).eps) * axes).tolist()
-    moved = [p + jnp.where(p < 0, -e, e) for p, e in zip(point, aside, strict=True)]
-    scaled = [a * p for a, p in zip(shape.size, moved, strict=True)]
+    displacements = (2 * float(jnp.finfo(point[0].dtype).eps) * axes).tolist()
+    displaced = [p + jnp.where(p < 0, -e, e) for p, e in zip(point, displacements, strict=True)]
+    scaled = [a * p for a, p in zip(shape.size, displaced, strict=True)]
 
     def newton(s: Array, scaled: list[Array]) -> Array:
         inverse = [1 / (s + gap) for gap in gaps]
@@ -110,23 +110,23 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
         slope = sum(term * i for term, i in zip(terms, inverse, strict=True))
         return s + square * (jnp.sqrt(square) - 1) / slope
 
-    fixed = [lax.stop_gradient(x) for x in scaled]
-    start = fixed[0] * 0
-    for x, gap in zip(fixed, gaps, strict=True):
+    constants = [lax.stop_gradient(x) for x in scaled]
+    start = constants[0] * 0
+    for x, gap in zip(constants, gaps, strict=True):
         start = maximum(start, jnp.abs(x) - gap)
-    s = lax.fori_loop(0, ELLIPSOID_STEPS - 1, lambda _, s: newton(s, fixed), start)
+    s = lax.fori_loop(0, ELLIPSOID_STEPS - 1, lambda _, s: newton(s, constants), start)
     s = newton(s, scaled)  # the last step carries the derivative of the root
-    x, y, z = (p / (s + gap) for p, gap in zip(moved, gaps, strict=True))
+    x, y, z = (p / (s + gap) for p, gap in zip(displaced, gaps, strict=True))
     return x, y, z
 
 
 def _mesh(shape: Shape, point: Array) -> Array:
     """Return the distance to the nearest triangle for points outside, and to the nearest plane inside, m. (...)"""
-    at = to_vector(point)
-    inside = plane_distance(shape.array("normals"), shape.array("offsets"), at)
+    position = to_vector(point)
+    signed_distance = plane_distance(shape.array("normals"), shape.array("offsets"), position)
     triangles = shape.array("vertices")[shape.array("faces")]
     corners = [Vector(*jnp.asarray(triangles[:, k].T, point.dtype)) for k in range(3)]
-    return jnp.where(inside > 0, triangles_distance(at, *corners), inside)
+    return jnp.where(signed_distance > 0, triangles_distance(position, *corners), signed_distance)
 
 
 def plane_distance(normals: np.ndarray, offsets: np.ndarray, point: Vector) -> Array:
@@ -135,11 +135,13 @@ def plane_distance(normals: np.ndarray, offsets: np.ndarray, point: Vector) -> A
     The plane is selected first and its distance computed afterwards, because the gradient of the maximum, in a step
     under ``vmap``, lacked a component with XLA for CPUs in JAX 0.10.1.
     """
-    fixed = lax.stop_gradient(point)
+    constant_point = lax.stop_gradient(point)
     columns = [jnp.asarray(column, point.x.dtype) for column in (*normals.T, offsets)]
     x, y, z, offset = columns
-    above = x * fixed.x[..., None] + y * fixed.y[..., None] + z * fixed.z[..., None] - offset
-    is_highest = jnp.arange(len(offsets)) == jnp.argmax(above, axis=-1)[..., None]
+    heights = (
+        x * constant_point.x[..., None] + y * constant_point.y[..., None] + z * constant_point.z[..., None] - offset
+    )
+    is_highest = jnp.arange(len(offsets)) == jnp.argmax(heights, axis=-1)[..., None]
     x, y, z, offset = (jnp.sum(jnp.where(is_highest, column, 0.0), axis=-1) for column in columns)
     return x * point.x + y * point.y + z * point.z - offset
 
@@ -153,15 +155,20 @@ def triangles_distance(point: Vector, a: Vector, b: Vector, c: Vector) -> Array:
         b: Second corners.
         c: Third corners.
     """
-    fixed = lax.stop_gradient(point)
-    fixed = Vector(fixed.x[..., None], fixed.y[..., None], fixed.z[..., None])
-    a, b, c = a - fixed, b - fixed, c - fixed
-    to = from_barycentric(closest_point(a, b, c), a, b, c)
-    nearest = jnp.argmin(to.dot(to), axis=-1)
-    is_nearest = jnp.arange(to.x.shape[-1]) == nearest[..., None]
-    to = Vector(*(jnp.sum(jnp.where(is_nearest, v, 0.0), axis=-1) for v in (to.x, to.y, to.z)))
-    away = point - lax.stop_gradient(point) - to
-    return safe_sqrt(away.dot(away))
+    constant_point = lax.stop_gradient(point)
+    constant_point = Vector(constant_point.x[..., None], constant_point.y[..., None], constant_point.z[..., None])
+    a, b, c = a - constant_point, b - constant_point, c - constant_point
+    nearest_points = from_barycentric(closest_point(a, b, c), a, b, c)
+    nearest = jnp.argmin(nearest_points.dot(nearest_points), axis=-1)
+    is_nearest = jnp.arange(nearest_points.x.shape[-1]) == nearest[..., None]
+    nearest_points = Vector(
+        *(
+            jnp.sum(jnp.where(is_nearest, v, 0.0), axis=-1)
+            for v in (nearest_points.x, nearest_points.y, nearest_points.z)
+        )
+    )
+    offset = point - lax.stop_gradient(point) - nearest_points
+    return safe_sqrt(offset.dot(offset))
 
 
 POINT_DISTANCE = {

@@ -63,8 +63,8 @@ def hit_distance(shape: Shape | SizedShapes, origin: Components, direction: Comp
     """
     if shape.kind != "plane":
         return first_distance(LINE_INTERVAL[shape.kind](shape, origin, direction))
-    t, hit = _plane(origin, direction)
-    return first_distance((t, t, hit))
+    t, is_hit = _plane(origin, direction)
+    return first_distance((t, t, is_hit))
 
 
 def hit_normal(shape: Shape | SizedShapes, origin: Array, direction: Array, distance: Array) -> Array:
@@ -76,24 +76,24 @@ def hit_normal(shape: Shape | SizedShapes, origin: Array, direction: Array, dist
         direction: Unit direction of each ray, in the frame of the shape. (..., 3)
         distance: Distance along each ray, m, infinite where it misses. (...)
     """
-    hit = jnp.isfinite(distance)
-    t = jnp.where(hit, distance, 0.0)
+    is_hit = jnp.isfinite(distance)
+    t = jnp.where(is_hit, distance, 0.0)
     normal = SURFACE_NORMAL[shape.kind](shape, origin + t[..., None] * direction)
-    return jnp.where(hit[..., None], normal, 0.0)
+    return jnp.where(is_hit[..., None], normal, 0.0)
 
 
 def _plane(origin: Components, direction: Components) -> tuple[Array, Array]:
-    height, down = origin[2], -direction[2]
-    hit = (down > MIN_COMPONENT) & (height >= 0)
-    return height / jnp.where(hit, down, 1.0), hit
+    height, descent_rate = origin[2], -direction[2]
+    is_hit = (descent_rate > MIN_COMPONENT) & (height >= 0)
+    return height / jnp.where(is_hit, descent_rate, 1.0), is_hit
 
 
 def slab_line(origin: Array, direction: Array, half: Array | float) -> Interval:
     """Return the interval of a line between the planes at ``-half`` and ``half``, from its normal components."""
-    parallel = jnp.abs(direction) < MIN_COMPONENT
-    inverse = 1 / jnp.where(parallel, MIN_COMPONENT, direction)
+    is_parallel = jnp.abs(direction) < MIN_COMPONENT
+    inverse = 1 / jnp.where(is_parallel, MIN_COMPONENT, direction)
     a, b = (-half - origin) * inverse, (half - origin) * inverse
-    return jnp.where(a < b, a, b), jnp.where(a < b, b, a), ~parallel | (jnp.abs(origin) <= half)
+    return jnp.where(a < b, a, b), jnp.where(a < b, b, a), ~is_parallel | (jnp.abs(origin) <= half)
 
 
 def intersection(p: Interval, q: Interval) -> Interval:
@@ -115,15 +115,15 @@ def _ball_line(origin: Sequence[Array], direction: Sequence[Array], radius: Arra
     It uses the point of the line nearest to the centre, because the usual discriminant cancels far from the ball.
     """
     square = sum(d * d for d in direction)
-    parallel = square < MIN_COMPONENT
-    inverse = 1 / jnp.where(parallel, 1.0, square)
+    is_parallel = square < MIN_COMPONENT
+    inverse = 1 / jnp.where(is_parallel, 1.0, square)
     middle = -sum(o * d for o, d in zip(origin, direction, strict=True)) * inverse
-    closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
-    rest = radius * radius - sum(c * c for c in closest)
-    half = safe_sqrt(rest * inverse)
-    outside = sum(o * o for o in origin) > radius * radius
-    half = jnp.where(parallel, 1 / MIN_COMPONENT, half)
-    return middle - half, middle + half, jnp.where(parallel, ~outside, rest >= 0)
+    closest_point = [o + middle * d for o, d in zip(origin, direction, strict=True)]
+    squared_half_chord = radius * radius - sum(c * c for c in closest_point)
+    half_chord = safe_sqrt(squared_half_chord * inverse)
+    is_outside = sum(o * o for o in origin) > radius * radius
+    half_chord = jnp.where(is_parallel, 1 / MIN_COMPONENT, half_chord)
+    return middle - half_chord, middle + half_chord, jnp.where(is_parallel, ~is_outside, squared_half_chord >= 0)
 
 
 def _sphere_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
@@ -151,8 +151,8 @@ def _cylinder_line(shape: Shape | SizedShapes, origin: Components, direction: Co
 
 
 def _ellipsoid_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
-    start, way = ([x / a for x, a in zip(v, shape.size, strict=True)] for v in (origin, direction))
-    return _ball_line(start, way, 1.0)
+    scaled_origin, scaled_direction = ([x / a for x, a in zip(v, shape.size, strict=True)] for v in (origin, direction))
+    return _ball_line(scaled_origin, scaled_direction, 1.0)
 
 
 def _plane_products(shape: Shape, v: Components) -> Array:
@@ -166,13 +166,13 @@ def _plane_products(shape: Shape, v: Components) -> Array:
 
 def _mesh_line(shape: Shape, origin: Components, direction: Components) -> Interval:
     """Return the interval of a line below all planes of a mesh (Kay and Kajiya 1986)."""
-    below = jnp.asarray(shape.offsets, origin[0].dtype) - _plane_products(shape, origin)
-    rises = _plane_products(shape, direction)
-    parallel = jnp.abs(rises) < MIN_COMPONENT
-    t = below / jnp.where(parallel, 1.0, rises)
-    near = jnp.max(jnp.where(~parallel & (rises < 0), t, -jnp.inf), axis=-1)
-    far = jnp.min(jnp.where(~parallel & (rises > 0), t, jnp.inf), axis=-1)
-    return near, far, (near <= far) & ~jnp.any(parallel & (below < 0), axis=-1)
+    depths = jnp.asarray(shape.offsets, origin[0].dtype) - _plane_products(shape, origin)
+    rates = _plane_products(shape, direction)
+    is_parallel = jnp.abs(rates) < MIN_COMPONENT
+    t = depths / jnp.where(is_parallel, 1.0, rates)
+    near = jnp.max(jnp.where(~is_parallel & (rates < 0), t, -jnp.inf), axis=-1)
+    far = jnp.min(jnp.where(~is_parallel & (rates > 0), t, jnp.inf), axis=-1)
+    return near, far, (near <= far) & ~jnp.any(is_parallel & (depths < 0), axis=-1)
 
 
 def first_distance(interval: Interval) -> Array:
@@ -180,10 +180,10 @@ def first_distance(interval: Interval) -> Array:
 
     It is infinite where the ray misses. A ray from inside meets the surface where it leaves.
     """
-    near, far, meets = interval
-    hit = meets & (far >= 0)
+    near, far, is_crossing = interval
+    is_hit = is_crossing & (far >= 0)
     # A miss must not contribute NaN, in gradients either.
-    return jnp.where(hit, jnp.where(hit, jnp.where(near >= 0, near, far), 0.0), jnp.inf)
+    return jnp.where(is_hit, jnp.where(is_hit, jnp.where(near >= 0, near, far), 0.0), jnp.inf)
 
 
 LINE_INTERVAL = {
@@ -222,9 +222,9 @@ def _capsule_normal(shape: Shape | SizedShapes, point: Array) -> Array:
 def _box_normal(shape: Shape | SizedShapes, point: Array) -> Array:
     """Return the normal of the side nearest to a point. (..., 3)"""
     x, y, z = (jnp.abs(p) - h for p, h in zip(components(point), shape.size, strict=True))
-    of_x = (x >= y) & (x >= z)
-    of_y = ~of_x & (y >= z)
-    sides = jnp.stack([of_x, of_y, ~of_x & ~of_y], axis=-1)
+    is_x_side = (x >= y) & (x >= z)
+    is_y_side = ~is_x_side & (y >= z)
+    sides = jnp.stack([is_x_side, is_y_side, ~is_x_side & ~is_y_side], axis=-1)
     return jnp.where(sides, jnp.where(point < 0, -1.0, 1.0), 0.0)
 
 
@@ -233,11 +233,11 @@ def _cylinder_normal(shape: Shape | SizedShapes, point: Array) -> Array:
     x, y, z = components(point)
     zero = jnp.zeros_like(z)
     rho = safe_sqrt(x * x + y * y)
-    of_side = rho - radius > jnp.abs(z) - half
-    safe = jnp.where(of_side, rho, 1.0)
-    side = jnp.stack([x / safe, y / safe, zero], axis=-1)
+    is_side = rho - radius > jnp.abs(z) - half
+    safe_rho = jnp.where(is_side, rho, 1.0)
+    side = jnp.stack([x / safe_rho, y / safe_rho, zero], axis=-1)
     cap = jnp.stack([zero, zero, jnp.where(z < 0, -1.0, 1.0)], axis=-1)
-    return jnp.where(of_side[..., None], side, cap)
+    return jnp.where(is_side[..., None], side, cap)
 
 
 def _ellipsoid_normal(shape: Shape | SizedShapes, point: Array) -> Array:
@@ -246,8 +246,8 @@ def _ellipsoid_normal(shape: Shape | SizedShapes, point: Array) -> Array:
 
 
 def _mesh_normal(shape: Shape, point: Array) -> Array:
-    above = _plane_products(shape, components(point)) - jnp.asarray(shape.offsets, point.dtype)
-    return jnp.take(jnp.asarray(shape.array("normals"), point.dtype), jnp.argmax(above, axis=-1), axis=0)
+    heights = _plane_products(shape, components(point)) - jnp.asarray(shape.offsets, point.dtype)
+    return jnp.take(jnp.asarray(shape.array("normals"), point.dtype), jnp.argmax(heights, axis=-1), axis=0)
 
 
 SURFACE_NORMAL = {

@@ -15,7 +15,7 @@ MIN_SQUARED_SINE = 1e-12
 def segment_to_segment(middle: Components, axis: Components, half: float, other_half: float) -> Array:
     """Return the distance from a segment to a segment along z centred at the origin, m. (...)
 
-    The method is that of Ericson (2005, section 5.1.9). For parallel or nearly parallel segments, the choice of the
+    The method follows Ericson (2005, section 5.1.9). For parallel or nearly parallel segments, the choice of the
     nearest points does not change the distance.
 
     Args:
@@ -25,9 +25,9 @@ def segment_to_segment(middle: Components, axis: Components, half: float, other_
         other_half: Half length of the other segment, m.
     """
     (cx, cy, cz), (x, y, z) = map(_stop_gradient, (middle, axis))
-    across = x * x + y * y
-    s = -(cx * x + cy * y) / jnp.where(across > MIN_SQUARED_SINE, across, 1.0)
-    s = safe_clip(jnp.where(across > MIN_SQUARED_SINE, s, 0.0), -half, half)
+    squared_sine = x * x + y * y
+    s = -(cx * x + cy * y) / jnp.where(squared_sine > MIN_SQUARED_SINE, squared_sine, 1.0)
+    s = safe_clip(jnp.where(squared_sine > MIN_SQUARED_SINE, s, 0.0), -half, half)
     t = safe_clip(cz + s * z, -other_half, other_half)
     s = safe_clip(t * z - (cx * x + cy * y + cz * z), -half, half)
     # Moving the nearest points along the segments does not change the distance to first order, so they are held fixed.
@@ -52,40 +52,40 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
     c, u = _stop_gradient(middle), _stop_gradient(axis)
 
     def slope(t: Array) -> Array:
-        at = [p + t * d for p, d in zip(c, u, strict=True)]
-        return sum(d * (p - jnp.clip(p, -h, h)) for d, p, h in zip(u, at, box, strict=True))  # type: ignore[return-value]
+        point = [p + t * d for p, d in zip(c, u, strict=True)]
+        return sum(d * (p - jnp.clip(p, -h, h)) for d, p, h in zip(u, point, box, strict=True))  # type: ignore[return-value]
 
     low, high = 0 * c[0] - half, 0 * c[0] + half
     low_slope, high_slope = slope(low), slope(high)
     for p, d, h in zip(c, u, box, strict=True):
-        crosses = d * d > MIN_SQUARED_SINE
-        inverse = 1 / jnp.where(crosses, d, 1.0)
+        is_crossing = d * d > MIN_SQUARED_SINE
+        inverse = 1 / jnp.where(is_crossing, d, 1.0)
         for side in (-h, h):
-            t = jnp.where(crosses, jnp.clip((side - p) * inverse, -half, half), 0.0)
-            slopes = slope(t)
-            falls, rises = (slopes <= 0) & (t > low), (slopes >= 0) & (t < high)
-            low, low_slope = jnp.where(falls, t, low), jnp.where(falls, slopes, low_slope)
-            high, high_slope = jnp.where(rises, t, high), jnp.where(rises, slopes, high_slope)
+            t = jnp.where(is_crossing, jnp.clip((side - p) * inverse, -half, half), 0.0)
+            slope_at_side = slope(t)
+            is_before_root, is_after_root = (slope_at_side <= 0) & (t > low), (slope_at_side >= 0) & (t < high)
+            low, low_slope = jnp.where(is_before_root, t, low), jnp.where(is_before_root, slope_at_side, low_slope)
+            high, high_slope = jnp.where(is_after_root, t, high), jnp.where(is_after_root, slope_at_side, high_slope)
     rise = high_slope - low_slope
-    between = (low_slope < 0) & (high_slope > 0)
-    t = low + (high - low) * jnp.where(between, -low_slope / jnp.where(between, rise, 1.0), 0.0)
+    is_between = (low_slope < 0) & (high_slope > 0)
+    t = low + (high - low) * jnp.where(is_between, -low_slope / jnp.where(is_between, rise, 1.0), 0.0)
     t = jnp.where(high_slope < 0, high, t)
     x, y, z = (maximum(magnitude(p + t * d) - h, 0.0) for p, d, h in zip(middle, axis, box, strict=True))
-    return jnp.where((inside := _largest_gap(middle, axis, half, box)) > 0, safe_sqrt(x * x + y * y + z * z), inside)
+    return jnp.where((overlap := _largest_gap(middle, axis, half, box)) > 0, safe_sqrt(x * x + y * y + z * z), overlap)
 
 
 def _largest_gap(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
     """Return the largest gap between a segment and a box along the normals of their Minkowski difference, m. (...)"""
     c, u = [magnitude(p) for p in middle], [magnitude(d) for d in axis]
     faces = [p - h - half * d for p, h, d in zip(c, box, u, strict=True)]
-    out = maximum(maximum(faces[0], faces[1]), faces[2])
+    largest_gap = maximum(maximum(faces[0], faces[1]), faces[2])
     for i, j in ((1, 2), (2, 0), (0, 1)):
         square = axis[i] * axis[i] + axis[j] * axis[j]
-        crosses = square > MIN_SQUARED_SINE
+        is_defined = square > MIN_SQUARED_SINE
         gap = magnitude(middle[j] * axis[i] - middle[i] * axis[j]) - box[i] * u[j] - box[j] * u[i]
-        gap = gap / safe_sqrt(jnp.where(crosses, square, 1.0))
-        out = jnp.where(crosses & (gap > out), gap, out)
-    return out
+        gap = gap / safe_sqrt(jnp.where(is_defined, square, 1.0))
+        largest_gap = jnp.where(is_defined & (gap > largest_gap), gap, largest_gap)
+    return largest_gap
 
 
 def _stop_gradient(vector: Components) -> Components:

@@ -107,16 +107,16 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     normals = np.cross(b - a, c - a)
     area = np.linalg.norm(normals, axis=1)
     # A sliver has no normal; its neighbours close the hull.
-    keep = area > 1e-12 * scale * scale
-    triangles, normals = triangles[keep], normals[keep] / area[keep, None]
+    is_valid = area > 1e-12 * scale * scale
+    triangles, normals = triangles[is_valid], normals[is_valid] / area[is_valid, None]
     outward = np.sum(normals * (v[triangles[:, 0]] - v.mean(axis=0)), axis=1) > 0
     normals = np.where(outward[:, None], normals, -normals)
     triangles = np.where(outward[:, None], triangles, triangles[:, ::-1])
     offsets = np.sum(normals * v[triangles[:, 0]], axis=1)
-    out = float(np.max(v @ normals.T - offsets)) if len(offsets) else np.inf
-    if out > 1e-4 * scale or (keep.all() and not _is_closed(triangles)):
+    gap = float(np.max(v @ normals.T - offsets)) if len(offsets) else np.inf
+    if gap > 1e-4 * scale or (is_valid.all() and not _is_closed(triangles)):
         raise ConfigError(
-            f"expected the triangles of the convex hull, got faces that are not closed or leave a vertex {out:.3g} m "
+            f"expected the triangles of the convex hull, got faces that are not closed or leave a vertex {gap:.3g} m "
             f"outside; omit faces for up to {MAX_HULL_VERTICES} vertices, and they are computed"
         )
     # Coplanar triangles share a plane through the outermost vertex, so that all vertices are inside.
@@ -192,15 +192,18 @@ def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
     i, j, k = np.array([(i, j, k) for i in range(len(v)) for j in range(i) for k in range(j)]).T
     normals = np.cross(v[j] - v[i], v[k] - v[i])
     length = np.linalg.norm(normals, axis=1)
-    flat = length <= tolerance * np.max(np.ptp(v, axis=0))
-    normals = normals / np.where(flat, 1.0, length)[:, None]
-    above = v @ normals.T - np.sum(normals * v[i], axis=1)
-    low, high = above.min(axis=0) >= -tolerance, above.max(axis=0) <= tolerance
-    out = normals[(low | high) & ~flat] * np.where(low[(low | high) & ~flat], -1.0, 1.0)[:, None]
+    is_flat = length <= tolerance * np.max(np.ptp(v, axis=0))
+    normals = normals / np.where(is_flat, 1.0, length)[:, None]
+    heights = v @ normals.T - np.sum(normals * v[i], axis=1)
+    all_above, all_below = heights.min(axis=0) >= -tolerance, heights.max(axis=0) <= tolerance
+    outward = (
+        normals[(all_above | all_below) & ~is_flat]
+        * np.where(all_above[(all_above | all_below) & ~is_flat], -1.0, 1.0)[:, None]
+    )
     triangles: list[tuple[int, int, int]] = []
-    for normal in _unique_normals(out):
-        along = v @ normal
-        side = np.flatnonzero(along >= along.max() - 2 * tolerance)
+    for normal in _unique_normals(outward):
+        heights_along = v @ normal
+        side = np.flatnonzero(heights_along >= heights_along.max() - 2 * tolerance)
         axis = np.eye(3)[np.argmin(np.abs(normal))]
         x = np.cross(normal, axis)
         middle = v[side] - v[side].mean(axis=0)

@@ -21,9 +21,9 @@ def sharpness(dtype: jnp.dtype) -> float:
     return 1e3 if dtype == jnp.float32 else 1e7
 
 
-def segment_support_point(half: float, along: Array) -> Array:
+def segment_support_point(half: float, direction: Array) -> Array:
     """Return the support point of a segment, m along it, from the component of the direction along it. (...)"""
-    return half * jnp.clip(along * sharpness(along.dtype), -1.0, 1.0)
+    return half * jnp.clip(direction * sharpness(direction.dtype), -1.0, 1.0)
 
 
 def support_function(shape: Shape, n: Vector) -> Array:
@@ -83,8 +83,8 @@ def _mesh_function(shape: Shape, n: Vector) -> Array:
 def _mesh_point(shape: Shape, n: Vector) -> Vector:
     """Return the support point of a mesh, a weighted mean near a tie, without indexing."""
     products, columns = _mesh_products(shape, n)
-    behind = jnp.max(products, axis=-1, keepdims=True) - products
-    weight = jnp.clip(1 - behind * (sharpness(behind.dtype) / float(abs(shape.array("vertices")).max())), 0.0, 1.0)
+    gaps = jnp.max(products, axis=-1, keepdims=True) - products
+    weight = jnp.clip(1 - gaps * (sharpness(gaps.dtype) / float(abs(shape.array("vertices")).max())), 0.0, 1.0)
     share = 1 / jnp.sum(weight, axis=-1)
     return Vector(*(jnp.sum(weight * v, axis=-1) * share for v in columns))
 

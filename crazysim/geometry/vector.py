@@ -71,11 +71,11 @@ def select_vector(condition: Array, a: Vector, b: Vector) -> Vector:
     return Vector(*(jnp.where(condition, p, q) for p, q in ((a.x, b.x), (a.y, b.y), (a.z, b.z))))
 
 
-def normalize(v: Vector, otherwise: Vector, least: float = 0.0) -> Vector:
-    """Return a vector scaled to unit length, or ``otherwise`` where its squared length is at most ``least``."""
+def normalize(v: Vector, fallback: Vector, min_square: float = 0.0) -> Vector:
+    """Return a vector scaled to unit length, or ``fallback`` where its squared length is at most ``min_square``."""
     square = v.dot(v)
-    long = square > least
-    return select_vector(long, v * lax.rsqrt(jnp.where(long, square, 1.0)), otherwise)
+    is_long = square > min_square
+    return select_vector(is_long, v * lax.rsqrt(jnp.where(is_long, square, 1.0)), fallback)
 
 
 def rounding_margin(dtype: jnp.dtype) -> float:

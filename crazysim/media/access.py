@@ -40,7 +40,7 @@ class Access:
         """
         self.host, self.port = host, port
         self._token = secrets.token_urlsafe(16)
-        self._reported: set[str] = set()
+        self._reported_messages: set[str] = set()
 
     @property
     def url(self) -> str:
@@ -70,8 +70,8 @@ class Access:
         if not reason:
             request.path = request.path.removeprefix(f"/{self._token}") or "/"
             return None
-        if "Upgrade" in request.headers and reason not in self._reported:
-            self._reported.add(reason)
+        if "Upgrade" in request.headers and reason not in self._reported_messages:
+            self._reported_messages.add(reason)
             log.warning("refused a connection: %s", reason)
         return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
 

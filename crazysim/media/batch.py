@@ -54,6 +54,6 @@ def render_worlds(
     can_warp = camera != -1 and not len(sim.overlays) and sim.device.platform == "gpu" and batch_render.is_installed()
     if renderer == "warp" or (renderer == "auto" and can_warp):
         return np.asarray(sim.scene.render_worlds(sim.data, indices, camera, width, height))
-    whole = positive_integer("height", height) * len(indices)
-    column = View(indices.tolist(), width, whole, camera, cam_config, columns=1, border=0)
+    total_height = positive_integer("height", height) * len(indices)
+    column = View(indices.tolist(), width, total_height, camera, cam_config, columns=1, border=0)
     return column.render(sim).reshape(-1, height, width, 3)

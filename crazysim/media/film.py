@@ -77,10 +77,10 @@ class Film:
                 raise ConfigError(f"expected a positive {name}, got {value!r}")
         size = self.view.width, self.view.height
         if self.path.suffix.lower() == ".mp4" and any(n % 2 for n in size):
-            even = [n + n % 2 for n in size]
+            even_size = [n + n % 2 for n in size]
             raise ConfigError(
                 f"expected an even width and height for .mp4, got {size[0]} x {size[1]} pixels. Use "
-                f"{even[0]} x {even[1]}."
+                f"{even_size[0]} x {even_size[1]}."
             )
         self.fps, self.speed, self.n_frames = float(fps), float(speed), 0
         self._command = self._encode(*size)
@@ -186,11 +186,22 @@ class Film:
             from imageio_ffmpeg import get_ffmpeg_exe
         except ImportError as error:
             raise ImportError(not_installed("films need", "imageio-ffmpeg", "demo")) from error
-        raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps:g}", "-i", "-"]
+        input_options = [
+            "-f",
+            "rawvideo",
+            "-pix_fmt",
+            "rgb24",
+            "-s",
+            f"{width}x{height}",
+            "-r",
+            f"{self.fps:g}",
+            "-i",
+            "-",
+        ]
         encoder = [*ENCODERS[self.path.suffix.lower()], "-g", f"{math.ceil(self.fps)}"]  # a key frame every second
         target = str(unfinished_path(self._file))
         kind = ["-f", self.path.suffix[1:].lower()]
-        return [get_ffmpeg_exe(), "-loglevel", "error", *raw, *encoder, *kind, "-y", target]
+        return [get_ffmpeg_exe(), "-loglevel", "error", *input_options, *encoder, *kind, "-y", target]
 
     def __enter__(self) -> Film:
         return self

@@ -73,8 +73,8 @@ class Flight:
         def spherical(quat: NDArray) -> NDArray:
             # q and -q are the same attitude: interpolate along the shorter arc.
             sign = np.where((quat[before] * quat[after]).sum(-1, keepdims=True) < 0, -1, 1)
-            mixed = (1 - weight) * quat[before] + weight * sign * quat[after]
-            return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
+            blended = (1 - weight) * quat[before] + weight * sign * quat[after]
+            return blended / np.linalg.norm(blended, axis=-1, keepdims=True)
 
         return {
             "pos": linear(self.pos),

@@ -193,15 +193,15 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
         columns = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
         old |= {"body_pos": objects.pos, "body_quat": objects.quat}
         new |= {name: now[name][:, None, columns] for name in ("body_pos", "body_quat")}
-    changed = _with_worlds(old, worlds, new)
-    states = data.states.replace(pos=changed["pos"], quat=changed["quat"])
-    core = data.core.replace(steps=changed["steps"])
+    shown_record = _with_worlds(old, worlds, new)
+    states = data.states.replace(pos=shown_record["pos"], quat=shown_record["quat"])
+    core = data.core.replace(steps=shown_record["steps"])
     if objects is not None:
         recorded = any(plugin.moves_objects for plugin in sim.plugins.values())
-        objects = objects.replace(pos=changed["body_pos"], quat=changed["body_quat"], recorded=recorded)
+        objects = objects.replace(pos=shown_record["body_pos"], quat=shown_record["body_quat"], recorded=recorded)
     data = data.replace(states=states, core=core, objects=objects)
-    if "setpoint" in changed:
-        command, (_, *before) = changed["setpoint"], staged_leaves(data)
+    if "setpoint" in shown_record:
+        command, (_, *before) = shown_record["setpoint"], staged_leaves(data)
         feedforward = [
             x.at[worlds].set(default_feedforward(command)[worlds]) for x in before
         ]  # other worlds keep theirs

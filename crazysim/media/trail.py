@@ -17,7 +17,7 @@ MIN_ALPHA = 0.15
 """Opacity of a trail's beginning, 0 to 1."""
 
 
-def colors_of(n_drones: int, rgba: ArrayLike | None) -> NDArray:
+def choose_drone_colors(n_drones: int, rgba: ArrayLike | None) -> NDArray:
     """Return a colour for each drone: the given one, or one of ``COLORS`` if it is None. (n_drones, 4)"""
     if rgba is None:
         return COLORS[np.arange(n_drones) % len(COLORS)]
@@ -66,8 +66,8 @@ class Trail:
         while all(self._has_expired(self._samples[0][0], now)):
             self._samples.popleft()
 
-    def _has_expired(self, then: NDArray, now: NDArray) -> NDArray:
-        return (then < now - self.seconds - 1e-6) | (then > now)
+    def _has_expired(self, point_time: NDArray, time: NDArray) -> NDArray:
+        return (point_time < time - self.seconds - 1e-6) | (point_time > time)
 
     def path(self, world: int) -> NDArray:
         """Return the positions of the drones of a world since its last reset, oldest first, m. (n, n_drones, 3)
@@ -98,6 +98,6 @@ class Trail:
             return
         fade = np.linspace(MIN_ALPHA, 1.0, len(path) - 1)[:, None] ** [0, 0, 0, 1]
         is_moving = (np.ptp(path, axis=0) > 0).any(-1)
-        colors = colors_of(path.shape[1], rgba)
+        colors = choose_drone_colors(path.shape[1], rgba)
         for drone in np.flatnonzero(is_moving):
             overlays.line(path[:, drone], colors[drone] * fade, 1.0, width)

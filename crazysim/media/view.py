@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import check_settings, color, positive_integer, setting
 from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError, short_repr
-from crazysim.media.trail import Trail, colors_of
+from crazysim.media.trail import Trail, choose_drone_colors
 from crazysim.media.worlds import world_indices
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_setpoints, draw_text
@@ -171,7 +171,7 @@ class View:
         if self._trail is not None:
             self._trail.draw(sim.overlays, k, self.rgba)
         if self.setpoints:
-            draw_setpoints(sim, self.worlds[k], colors_of(sim.n_drones, self.rgba))
+            draw_setpoints(sim, self.worlds[k], choose_drone_colors(sim.n_drones, self.rgba))
         if self.draw is not None:
             self.draw(sim, self.worlds[k])
         if self.text is not None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError, RenderError, not_installed
 from crazysim.media.access import LOOPBACK_ADDRESSES, Access, guarded_server, is_own_name, wrong_name_message
 from crazysim.media.flight import Flight
-from crazysim.media.trail import colors_of
+from crazysim.media.trail import choose_drone_colors
 from crazysim.scene.visual_geoms import VisualGeom
 from crazysim.storage import check_writable, write_file
 
@@ -54,7 +54,7 @@ def page(flight: Flight, world: int | None = None, lights: NDArray | None = None
     ):  # viser prints the address of its server, which runs for this call only
         server = guarded_server(viser, Access("127.0.0.1", free_port()))
         try:
-            return _record(server, flight, k, lights).as_html()
+            return _record_scene(server, flight, k, lights).as_html()
         finally:
             server.stop()
 
@@ -71,7 +71,7 @@ def export(flight: Flight, path: str | Path, world: int | None = None) -> None:
     write_file(path, page(flight, world))
 
 
-def server_of(html: str, port: int, host: str = "127.0.0.1") -> http.server.ThreadingHTTPServer:
+def create_server(html: str, port: int, host: str = "127.0.0.1") -> http.server.ThreadingHTTPServer:
     """Return a server of one page; ``serve_forever`` starts it.
 
     Args:
@@ -105,7 +105,7 @@ def server_of(html: str, port: int, host: str = "127.0.0.1") -> http.server.Thre
         raise RenderError(f"expected a free address, got {host}:{port}: {error}. Choose another --port.") from error
 
 
-def camera_of(flight: Flight, k: int) -> tuple[NDArray, NDArray]:
+def initial_camera_pose(flight: Flight, k: int) -> tuple[NDArray, NDArray]:
     """Return the initial position of a page's camera and the point it looks at, for a whole flight, m. (3,), (3,)"""
     points = flight.pos[:, k].reshape(-1, 3)
     points = points[np.isfinite(points).all(-1)]
@@ -130,7 +130,7 @@ def serve_page(html: str, port: int = 8080, host: str = "127.0.0.1") -> None:
     Raises:
         RenderError: If it cannot listen there.
     """
-    with server_of(html, port, host) as server:
+    with create_server(html, port, host) as server:
         print(f"serving the flight at http://{host}:{server.server_port}; stop with Ctrl-C", flush=True)
         if host not in LOOPBACK_ADDRESSES:
             print("every machine of that network can watch", flush=True)
@@ -138,12 +138,12 @@ def serve_page(html: str, port: int = 8080, host: str = "127.0.0.1") -> None:
             server.serve_forever()
 
 
-def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
+def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
     """Return viser's recording of the k-th world of a flight."""
     scene = server.scene
     scene.set_up_direction("+z")
     camera = server.initial_camera
-    camera.fov, (camera.position, camera.look_at) = np.deg2rad(FOV), camera_of(flight, k)
+    camera.fov, (camera.position, camera.look_at) = np.deg2rad(FOV), initial_camera_pose(flight, k)
 
     frames = {
         int(mocap): scene.add_frame(f"/bodies/{mocap}", show_axes=False)
@@ -156,7 +156,7 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
         parent = f"/bodies/{mocap}" if mocap in frames else "/scene"
         add_static(scene, f"{parent}/{i}", shapes, rgba)
 
-    colors = colors_of(flight.n_drones, None)
+    colors = choose_drone_colors(flight.n_drones, None)
     for drone in range(flight.n_drones):
         path = flight.pos[:, k, drone]
         path = path[np.isfinite(path).all(-1)]
@@ -179,7 +179,7 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
     end = float(flight.time[-1])
     times = np.linspace(0, end, int(np.ceil(FPS * end)) + 1)  # viser does not interpolate
     last_values: dict[Any, NDArray] = {}
-    lit: dict[str, tuple[int, int, int]] = {}
+    light_colors: dict[str, tuple[int, int, int]] = {}
 
     def move(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
         pose = np.concatenate([pos, [] if quat is None else np.roll(quat, 1)])
@@ -205,8 +205,8 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
         if lights is not None:
             colors = lights[min(int(np.searchsorted(flight.time, time)), len(lights) - 1)]
             for bulb, color in zip(bulbs, colors, strict=True):
-                if (value := rgb(color)) != lit.get(bulb.name):
-                    lit[bulb.name] = bulb.color = value
+                if (value := rgb(color)) != light_colors.get(bulb.name):
+                    light_colors[bulb.name] = bulb.color = value
     return recording
 
 
@@ -222,7 +222,7 @@ def add_static(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> 
             position=shape.pos, wxyz=np.roll(shape.quat, 1),
         )  # fmt: skip
     if solid:
-        mesh = mesh_of(solid)
+        mesh = create_mesh(solid)
         scene.add_mesh_simple(
             name,
             np.asarray(mesh.vertices, np.float32),
@@ -234,7 +234,7 @@ def add_static(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> 
         )
 
 
-def mesh_of(shapes: list[VisualGeom]) -> Any:
+def create_mesh(shapes: list[VisualGeom]) -> Any:
     """Return the geoms of one body, except planes, as one trimesh mesh in the body's frame."""
     import trimesh
 

@@ -236,11 +236,11 @@ def _check_slot_value(sim: Simulation, name: str, value: ArrayLike, n_slots: int
     return check_parameter(sim, name, value, positive=name == "rate")
 
 
-def _check_count(name: str, value: object, least: int) -> int:
-    """Return a setting, checked to be an integer of at least ``least``."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+def _check_count(name: str, value: object, minimum: int) -> int:
+    """Return a setting, checked to be an integer of at least ``minimum``."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < minimum:
         raise ConfigError(
-            f"expected {name} as an integer of at least {least}, which the trajectories need, got {value!r}"
+            f"expected {name} as an integer of at least {minimum}, which the trajectories need, got {value!r}"
         )
     return int(value)
 
@@ -251,11 +251,11 @@ def _replace_slot(old: list[Array], new: list[Array], slot: Array) -> list[Array
 
 
 @jax.jit
-def _future_paths(record: FollowData, of_drones: list[Array], times: Array) -> Array:
+def _future_paths(record: FollowData, slots: list[Array], times: Array) -> Array:
     """Return the positions of all drones of a world at several times. (n_drones, n_times, 3)"""
 
-    def of_one(index: Array, start: Array, rate: Array) -> Array:
+    def drone_path(index: Array, start: Array, rate: Array) -> Array:
         vehicle = record.replace(index=index, start=start, rate=rate)
         return jax.vmap(lambda t: vehicle.setpoint(t).pos)(times)
 
-    return jax.vmap(of_one)(*of_drones)
+    return jax.vmap(drone_path)(*slots)

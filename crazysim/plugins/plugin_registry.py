@@ -126,9 +126,9 @@ class PluginRegistry(Mapping[str, Plugin]):
         sim, name = self._sim, plugin.name
         self._require_names(plugin, [other for other in sim.names if other not in self.members_of(before)])
         self._require_terms(plugin, [other for other in self.values() if other is not before])
-        present, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
-        if _have_same_code(before, plugin) and jax.tree.structure(present) == jax.tree.structure(record):
-            self._put_records(name, _continue_states(record, present), default)
+        old_record, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
+        if _have_same_code(before, plugin) and jax.tree.structure(old_record) == jax.tree.structure(record):
+            self._put_records(name, _continue_states(record, old_record), default)
             self._installed[name] = self._installed[name]._replace(plugin=plugin)
             self._checked = False
             return plugin
@@ -141,7 +141,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             resets[name] = Stage(plugin.reset_episode, "drone")
         elif _in_reset_pipeline(before):
             resets.pop(name, None)
-        self._put_records(name, _continue_states(record, present), default)
+        self._put_records(name, _continue_states(record, old_record), default)
         self._installed[name] = installed
         self._build(pipeline, resets)
         return plugin
@@ -176,13 +176,13 @@ class PluginRegistry(Mapping[str, Plugin]):
         """Names of the members of all populations."""
         return tuple([name for plugin in self.values() for name in self.members_of(plugin)])
 
-    def _require_names(self, plugin: Plugin, taken: Collection[str]) -> None:
+    def _require_names(self, plugin: Plugin, used_names: Collection[str]) -> None:
         """Check that the names of a population's members are not in use."""
-        taken = set(taken)
-        twice = [name for name in self.members_of(plugin) if name in taken]
-        if twice:
+        used_names = set(used_names)
+        duplicates = [name for name in self.members_of(plugin) if name in used_names]
+        if duplicates:
             raise ConfigError(
-                f"expected names that are not in use, got {twice[0]!r} again. Use "
+                f"expected names that are not in use, got {duplicates[0]!r} again. Use "
                 f"{type(plugin).__name__}([...]) with other names."
             )
 
@@ -190,9 +190,9 @@ class PluginRegistry(Mapping[str, Plugin]):
     def _require_terms(plugin: Plugin, others: Iterable[Plugin]) -> None:
         """Check that no other plugin replaces the same term of the model."""
         for other in others:
-            if shared := set(plugin.replaced_terms) & set(other.replaced_terms):
+            if shared_terms := set(plugin.replaced_terms) & set(other.replaced_terms):
                 raise ConfigError(
-                    f"expected one plugin for {' and '.join(sorted(shared))}, got {type(other).__name__} "
+                    f"expected one plugin for {' and '.join(sorted(shared_terms))}, got {type(other).__name__} "
                     f"{other.name!r} and {type(plugin).__name__} {plugin.name!r}, which would both provide it. "
                     f"Use one of the two: sim.remove({other.name!r}) removes the first."
                 )
@@ -280,11 +280,11 @@ def _placements(plugin: Plugin, sim: Simulation) -> object:
     placements = plugin.stages(sim)
     if not plugin.resets_episode or not isinstance(placements, (list, tuple)):
         return placements
-    begins = Stage(plugin.reset_episode, "drone", is_first_step)
+    episode_stage = Stage(plugin.reset_episode, "drone", is_first_step)
     before = plugin.reset_before
     if before is None:  # in front of all stages that do not begin an episode
         before = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not is_first_step)
-    return [StagePlacement(begins, before=before, name=_reset_stage_name(plugin)), *placements]
+    return [StagePlacement(episode_stage, before=before, name=_reset_stage_name(plugin)), *placements]
 
 
 def _in_reset_pipeline(plugin: Plugin) -> bool:
@@ -357,8 +357,8 @@ def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | 
 
 def _have_same_code(before: Plugin, after: Plugin) -> bool:
     """Return True if two plugins of one class differ at most in numbers of their records."""
-    fixed = [name for name, setting in collect_settings(type(before)).items() if not setting.is_parameter]
-    return all(_are_equal(getattr(before, name), getattr(after, name)) for name in fixed)
+    static_settings = [name for name, setting in collect_settings(type(before)).items() if not setting.is_parameter]
+    return all(_are_equal(getattr(before, name), getattr(after, name)) for name in static_settings)
 
 
 def _are_equal(a: Any, b: Any) -> bool:
@@ -395,13 +395,13 @@ def _no_observations(_data: SimData, **_: Any) -> dict[str, Array]:
 
 
 def _observations(plugins: Sequence[Plugin], data: SimData, measured: bool) -> dict[str, Array]:
-    def of_one(drone: SimData) -> dict[str, Array]:
+    def observe_drone(drone: SimData) -> dict[str, Array]:
         measured_drone = with_measured_states(plugins, drone) if measured else drone
         sources = [(p, drone if isinstance(p, Sensor) else measured_drone) for p in plugins]
         return {f"{p.name}.{key}": x for p, values in sources for key, x in p.observations(values).items()}
 
     leaves, axes = jax.tree.leaves(data), Axes(data)
     worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]
-    of_drones = vmap_drones(of_one)
-    of_world = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
-    return jax.vmap(lambda values: of_drones(axes.treedef.unflatten(values)), (worlds,))(of_world)
+    observe_drones = vmap_drones(observe_drone)
+    world_leaves = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
+    return jax.vmap(lambda values: observe_drones(axes.treedef.unflatten(values)), (worlds,))(world_leaves)

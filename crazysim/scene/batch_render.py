@@ -80,14 +80,14 @@ class BatchRenderer:
         """
         wp, mjw, d = self._wp, self._mjw, self._data
         with wp.ScopedDevice(self._device):
-            for into, x, kind in (
+            for target, x, kind in (
                 (d.mocap_pos, mocap_pos, wp.vec3),
                 (d.mocap_quat, mocap_quat, wp.quat),
                 (d.qpos, qpos, wp.float32),
             ):
                 if x.size:
                     x = jax.block_until_ready(jnp.asarray(x, jnp.float32))
-                    wp.copy(into, wp.from_jax(x, dtype=kind))
+                    wp.copy(target, wp.from_jax(x, dtype=kind))
             for stage in (mjw.kinematics, mjw.com_pos, mjw.camlight):
                 stage(self._model, d)
             mjw.refit_bvh(self._model, d, self._context)

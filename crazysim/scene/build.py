@@ -40,10 +40,10 @@ def build_spec(
     spec = xml_path if isinstance(xml_path, mujoco.MjSpec) else read_spec(xml_path)
     spec.option.timestep = 1 / freq
     spec.add_numeric(name="max_geom_pairs", data=[max_geom_pairs])
-    reserved = [body.name for body in spec.bodies if body.name.startswith("drone:")]
-    if reserved:
+    reserved_names = [body.name for body in spec.bodies if body.name.startswith("drone:")]
+    if reserved_names:
         raise ConfigError(
-            f"expected no bodies named 'drone:...', which are reserved for the drones, got {reserved} in "
+            f"expected no bodies named 'drone:...', which are reserved for the drones, got {reserved_names} in "
             f"{str(xml_path)!r}"
         )
     _add_drones(spec, airframes)
@@ -115,23 +115,28 @@ def _add_bodies(spec: mujoco.MjSpec, airframes: Sequence[Airframe], drones: rang
             _add_geom(body, geom, i)
         for camera in cameras:
             mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK if camera.tracks else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
-            added = body.add_camera(name=f"{camera.name}:{i}", pos=camera.pos, fovy=camera.fovy, mode=mode)
-            added.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
-            added.alt.xyaxes = camera.xyaxes
+            spec_camera = body.add_camera(name=f"{camera.name}:{i}", pos=camera.pos, fovy=camera.fovy, mode=mode)
+            spec_camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
+            spec_camera.alt.xyaxes = camera.xyaxes
 
 
 def _add_geom(body: mujoco.MjsBody, geom: BodyGeom, i: int) -> None:
-    added = body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{geom.kind.upper()}"), size=geom.size, mass=0)
+    spec_geom = body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{geom.kind.upper()}"), size=geom.size, mass=0)
     if geom.end is None:
-        added.pos = geom.pos
+        spec_geom.pos = geom.pos
     else:
-        added.fromto = [*geom.pos, *geom.end]
+        spec_geom.fromto = [*geom.pos, *geom.end]
     if geom.collides:
-        added.name, added.group, added.condim, added.rgba = f"{geom.name}:{i}", 3, 1, (0.5, 0.5, 0.5, 0.3)
-        _set_touching(added, geom.name == "col_sphere")
+        spec_geom.name, spec_geom.group, spec_geom.condim, spec_geom.rgba = (
+            f"{geom.name}:{i}",
+            3,
+            1,
+            (0.5, 0.5, 0.5, 0.3),
+        )
+        _set_touching(spec_geom, geom.name == "col_sphere")
     else:
-        added.group, added.contype, added.conaffinity = 2, 0, 0
-        added.material = f"{geom.material}:{i}" if geom.material in LED_MATERIALS else geom.material
+        spec_geom.group, spec_geom.contype, spec_geom.conaffinity = 2, 0, 0
+        spec_geom.material = f"{geom.material}:{i}" if geom.material in LED_MATERIALS else geom.material
 
 
 def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
@@ -142,9 +147,9 @@ def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
             _set_touching(geom, (kind == "col_box") == enable)
 
 
-def _set_touching(geom: mujoco.MjsGeom, touches: bool) -> None:
+def _set_touching(geom: mujoco.MjsGeom, is_touching: bool) -> None:
     """Make a geom of a drone touch the scene, other drones, and geoms that only drones touch (bit 2), or no geom."""
-    geom.contype, geom.conaffinity = (3, 1) if touches else (0, 0)
+    geom.contype, geom.conaffinity = (3, 1) if is_touching else (0, 0)
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:

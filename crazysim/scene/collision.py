@@ -114,13 +114,13 @@ def collision_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds 
         kinds: Drones of each airframe.
     """
 
-    def touches(geom: int) -> bool:
+    def can_touch(geom: int) -> bool:
         return bool(DRONE_BITS[0] & model.geom_conaffinity[geom] or DRONE_BITS[1] & model.geom_contype[geom])
 
-    def touches_of_drone(geom: int) -> bool:
+    def touches_drones(geom: int) -> bool:
         return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
 
-    return _model(model, handles, kinds, touches, touches_of_drone)
+    return _model(model, handles, kinds, can_touch, touches_drones)
 
 
 def visual_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds = (None,)) -> CollisionModel:

@@ -114,9 +114,9 @@ def build_contact_fn(
         all_geoms = [geom for kind in model.drones for geom in kind.geoms]
         drone_rot = rotation.matrix(quat) if any(geom.shape.kind != "sphere" for geom in all_geoms) else None
         parts = [
-            (geom, pos + rotation.rotate(quat, jnp.asarray(geom.pos, pos.dtype)), present)
+            (geom, pos + rotation.rotate(quat, jnp.asarray(geom.pos, pos.dtype)), is_present)
             for kind in model.drones
-            for present in (kind.drone_mask(data.core.drone_id),)
+            for is_present in (kind.drone_mask(data.core.drone_id),)
             for geom in kind.geoms
         ]
         fields: dict[str, Array | None] = dict.fromkeys(
@@ -125,8 +125,8 @@ def build_contact_fn(
         )  # fmt: skip
         if floor:
             gaps = [
-                _mask_absent(present, _geom_distance(part, part_pos, drone_rot, geom))
-                for part, part_pos, present in parts
+                _mask_absent(is_present, _geom_distance(part, part_pos, drone_rot, geom))
+                for part, part_pos, is_present in parts
                 for geom in model.floor
             ]
             gap = _minimum(gaps, pos)
@@ -135,10 +135,10 @@ def build_contact_fn(
             gap = jnp.concatenate([_group_distances(parts, drone_rot, group, data) for group in groups], axis=-1)
             fields |= {"objects": gap < 0, "object_distance": gap, "nearest_object": _argmin(gap)}
         if drones:
-            gap, nearest = (
+            gap, nearest_index = (
                 (_nearest_other(parts, drone_rot), None) if pos.ndim == 1 else _nearest_drones(parts, drone_rot)
             )
-            fields |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest}
+            fields |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest_index}
         return ContactReport(**fields, object_names=names)
 
     return contacts
@@ -192,9 +192,9 @@ DroneParts = Sequence[tuple[CollisionGeom, Array, Array | None]]
 """Geoms of the drone, their positions, world frame, m (..., 3), and True for drones that have them (...) or None."""
 
 
-def _mask_absent(present: Array | None, gap: Array) -> Array:
+def _mask_absent(is_present: Array | None, gap: Array) -> Array:
     """Return distances, infinite for geoms that a drone does not have. (...)"""
-    return gap if present is None else jnp.where(present, gap, jnp.inf)
+    return gap if is_present is None else jnp.where(is_present, gap, jnp.inf)
 
 
 def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
@@ -202,9 +202,12 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
     geoms = group[0].geoms
     if group[0].row is None:
         if len(group) > MAX_UNROLLED_GEOMS:
-            stacked = StackedGeoms.of([body.geoms[0] for body in group])
+            stacked_geoms = StackedGeoms.of([body.geoms[0] for body in group])
             return _minimum(
-                [_stacked_distances(part, part_pos, drone_rot, stacked, present) for part, part_pos, present in parts],
+                [
+                    _stacked_distances(part, part_pos, drone_rot, stacked_geoms, is_present)
+                    for part, part_pos, is_present in parts
+                ],
                 parts[0][1],
             )
         return jnp.stack([_fixed_distance(parts, drone_rot, body.geoms) for body in group], axis=-1)
@@ -216,10 +219,10 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
     if drone_rot is not None:
         rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), drone_rot[..., None, :, :])
     gaps = []
-    for part, part_pos, present in parts:
-        inside = rotation.rotate_inverse(quat, part_pos[..., None, :] - pos)
-        presence = None if present is None else present[..., None]
-        gaps += [_mask_absent(presence, _geom_distance(part, inside, rot, geom)) for geom in geoms]
+    for part, part_pos, is_present in parts:
+        local_pos = rotation.rotate_inverse(quat, part_pos[..., None, :] - pos)
+        presence = None if is_present is None else is_present[..., None]
+        gaps += [_mask_absent(presence, _geom_distance(part, local_pos, rot, geom)) for geom in geoms]
     return _minimum(gaps, parts[0][1])
 
 
@@ -233,15 +236,17 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
         kinds.setdefault((geom.shape, geom.rot is None), []).append(geom)
     gaps = []
     for equal_geoms in kinds.values():
-        for part, part_pos, present in parts:
+        for part, part_pos, is_present in parts:
             if len(equal_geoms) > MAX_UNROLLED_GEOMS:
                 gaps.append(
                     jnp.min(
-                        _stacked_distances(part, part_pos, drone_rot, StackedGeoms.of(equal_geoms), present), axis=-1
+                        _stacked_distances(part, part_pos, drone_rot, StackedGeoms.of(equal_geoms), is_present), axis=-1
                     )
                 )
             else:
-                gaps += [_mask_absent(present, _geom_distance(part, part_pos, drone_rot, geom)) for geom in equal_geoms]
+                gaps += [
+                    _mask_absent(is_present, _geom_distance(part, part_pos, drone_rot, geom)) for geom in equal_geoms
+                ]
     return _minimum(gaps, parts[0][1])
 
 
@@ -263,12 +268,12 @@ class StackedGeoms(NamedTuple):
 
 
 def _stacked_distances(
-    part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms, present: Array | None
+    part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms, is_present: Array | None
 ) -> Array:
     """Return the distances of a drone's geom to stacked geoms, infinite if the drone has no such geom, m. (..., n)"""
     rot = None if drone_rot is None else drone_rot[..., None, :, :]
     gap = _geom_distance(part, part_pos[..., None, :], rot, geoms)
-    return _mask_absent(None if present is None else present[..., None], gap)
+    return _mask_absent(None if is_present is None else is_present[..., None], gap)
 
 
 def _geom_distance(
@@ -282,16 +287,16 @@ def _geom_distance(
         drone_rot: Attitude of the drone in that frame; None if all its geoms are spheres. (..., 3, 3)
         geom: The other geom, or several along the last batch axis.
     """
-    inside = part_pos - jnp.asarray(geom.pos, part_pos.dtype)
+    local_pos = part_pos - jnp.asarray(geom.pos, part_pos.dtype)
     rot = drone_rot
     if geom.rot is not None:
         columns = jnp.asarray(geom.rot, part_pos.dtype)
-        x, y, z = (inside[..., k, None] * columns[..., k, :] for k in range(3))
-        inside = x + y + z
+        x, y, z = (local_pos[..., k, None] * columns[..., k, :] for k in range(3))
+        local_pos = x + y + z
         rot = None if drone_rot is None else _product(jnp.swapaxes(columns, -1, -2), drone_rot)
     if rot is not None and part.rot is not None:
         rot = _product(rot, jnp.asarray(part.rot, part_pos.dtype))
-    return distance(part.shape, geom.shape, inside, jnp.eye(3) if rot is None else rot)
+    return distance(part.shape, geom.shape, local_pos, jnp.eye(3) if rot is None else rot)
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -309,20 +314,22 @@ def _minimum(gaps: list[Array], pos: Array) -> Array:
 def _nearest_other(parts: DroneParts, drone_rot: Array | None) -> Array:
     """Return the distance of one drone to the nearest other of its world, m. ()"""
 
-    def between(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
+    def pair_distance(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
         positions, presences, rot = other
         inverse = None if rot is None else rot.T
         relative_rot = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
         gaps = []
-        for part, part_pos, present in parts:
+        for part, part_pos, is_present in parts:
             for (geom, *_), other_pos, other_present in zip(parts, positions, presences, strict=True):
-                inside = part_pos - other_pos if inverse is None else rotation.matvec(inverse, part_pos - other_pos)
-                are_present = None if present is None or other_present is None else present & other_present
-                gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, inside, relative_rot)))
+                local_pos = part_pos - other_pos if inverse is None else rotation.matvec(inverse, part_pos - other_pos)
+                are_present = None if is_present is None or other_present is None else is_present & other_present
+                gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, local_pos, relative_rot)))
         return jnp.where(is_self, jnp.inf, _minimum(gaps, parts[0][1]))
 
     return reduce_over_others(
-        between, ([part_pos for _, part_pos, _ in parts], [present for *_, present in parts], drone_rot), "min"
+        pair_distance,
+        ([part_pos for _, part_pos, _ in parts], [is_present for *_, is_present in parts], drone_rot),
+        "min",
     )
 
 
@@ -337,31 +344,31 @@ def _nearest_drones(parts: DroneParts, drone_rot: Array | None) -> tuple[Array, 
 
     def nearest_of_chunk(chunk: Array) -> tuple[Array, Array]:
         gaps = []
-        for part, part_pos, present in parts:
+        for part, part_pos, is_present in parts:
             chunk_pos = jnp.take(part_pos, chunk, axis=-2)[..., :, None, :]
             for geom, other, other_present in parts:
                 are_present = None
-                if present is not None and other_present is not None:
-                    are_present = jnp.take(present, chunk, axis=-1)[..., :, None] & other_present[..., None, :]
+                if is_present is not None and other_present is not None:
+                    are_present = jnp.take(is_present, chunk, axis=-1)[..., :, None] & other_present[..., None, :]
                 offset = chunk_pos - other[..., None, :, :]
                 if drone_rot is None:
                     gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, offset, jnp.eye(3))))
                     continue
                 inverse = jnp.swapaxes(drone_rot, -1, -2)[..., None, :, :, :]
-                inside = rotation.matvec(inverse, offset)
+                local_pos = rotation.matvec(inverse, offset)
                 rot = _product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
-                gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, inside, rot)))
+                gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, local_pos, rot)))
         gap = jnp.where(chunk[:, None] == indices, jnp.inf, _minimum(gaps, parts[0][1]))
         return jnp.min(gap, axis=-1), _argmin(gap)
 
     if n <= DRONES_PER_CHUNK:
         return nearest_of_chunk(indices)
     n_chunks = -(-n // DRONES_PER_CHUNK)
-    padded = jnp.minimum(jnp.arange(n_chunks * DRONES_PER_CHUNK, dtype=np.int32), n - 1).reshape(
+    chunk_indices = jnp.minimum(jnp.arange(n_chunks * DRONES_PER_CHUNK, dtype=np.int32), n - 1).reshape(
         n_chunks, DRONES_PER_CHUNK
     )
-    gap, nearest = jax.lax.map(nearest_of_chunk, padded)
-    return tuple(jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :n] for x in (gap, nearest))  # type: ignore[return-value]
+    gap, nearest_drones = jax.lax.map(nearest_of_chunk, chunk_indices)
+    return tuple(jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :n] for x in (gap, nearest_drones))  # type: ignore[return-value]
 
 
 def _argmin(gaps: Array) -> Array:

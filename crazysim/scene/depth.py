@@ -50,7 +50,7 @@ class Camera:
     """Position in the frame of that body, m. (3,)"""
     rot: tuple[tuple[float, ...], ...]
     """Rotation matrix whose columns are the camera's right, up and back in that frame. (3, 3)"""
-    turns: bool
+    follows_rotation: bool
     """True if it turns with that body; false if it follows its position only."""
     fovy: float
     """Vertical field of view, degrees."""
@@ -110,9 +110,9 @@ def pixel_directions(fovy: float, width: int, height: int) -> np.ndarray:
         width: Pixels.
         height: Pixels.
     """
-    half = np.tan(np.deg2rad(fovy) / 2)
-    y = half * (1 - (2 * np.arange(height) + 1) / height)
-    x = half * width / height * ((2 * np.arange(width) + 1) / width - 1)
+    half_height = np.tan(np.deg2rad(fovy) / 2)
+    y = half_height * (1 - (2 * np.arange(height) + 1) / height)
+    x = half_height * width / height * ((2 * np.arange(width) + 1) / width - 1)
     d = np.stack(np.broadcast_arrays(x[None, :], y[:, None], -1.0), axis=-1)
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
@@ -143,26 +143,28 @@ def build_depth_fn(
             raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")
     h, w = (math.gcd(n, TILE_SIDE) for n in (height, width))
     order = np.arange(height * width).reshape(height // h, h, width // w, w).swapaxes(1, 2).reshape(-1)
-    looks = np.zeros((len(cameras), height * width, 4))
-    for camera, rays in zip(cameras, looks, strict=True):
+    directions = np.zeros((len(cameras), height * width, 4))
+    for camera, rays in zip(cameras, directions, strict=True):
         rays[:, :3] = pixel_directions(camera.fovy, width, height).reshape(-1, 3)[order]
         rays[:, 3] = camera.row if camera.carrier == "drone" and hide_own else IGNORES_NONE
     n_rays = len(cameras) * width * height
 
-    ignored = looks[..., 3].reshape(-1).astype(int)
+    ignored = directions[..., 3].reshape(-1).astype(int)
 
     def cast_in_worlds(data: SimData) -> Hits:
         poses = [_camera_pose(camera, data) for camera in cameras]
         if data.states.pos.ndim == 2:
             origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
-            direction = jnp.concatenate([_directions(rot, rays) for (_, rot), rays in zip(poses, looks, strict=True)])
+            direction = jnp.concatenate(
+                [_directions(rot, rays) for (_, rot), rays in zip(poses, directions, strict=True)]
+            )
             return pictures(cast_rays(in_data, data, origin, direction, ignored, drones))
         eyes = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
-        return pictures(cast_rays_in_worlds(in_data, data, eyes, looks, drones, kernels))
+        return pictures(cast_rays_in_worlds(in_data, data, eyes, directions, drones, kernels))
 
     def pictures(hits: Hits) -> Hits:
         """Return the results of rays, which follow each other by tiles, as pictures, row by row."""
-        cosine = jnp.asarray(-looks[..., 2].reshape(-1), hits.distance.dtype) if along == "axis" else 1.0
+        cosine = jnp.asarray(-directions[..., 2].reshape(-1), hits.distance.dtype) if along == "axis" else 1.0
 
         def picture(x: Array, n_last: int) -> Array:
             leading, last = x.shape[: x.ndim - n_last - 1], x.shape[x.ndim - n_last :]
@@ -227,7 +229,7 @@ def _camera_pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
         if leading:
             poses = poses[0][:, 0], poses[1][:, 0]
     camera_pos, quat = (x[..., camera.row, :] for x in poses)
-    if not camera.turns:
+    if not camera.follows_rotation:
         return camera_pos + pos, jnp.broadcast_to(rot, (*leading, 3, 3))
     # By components: a GPU may round matrix products to 10 bits.
     return camera_pos + rotation.rotate(quat, pos), jnp.stack(

@@ -223,15 +223,16 @@ class Targets:
             eyes: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
             pixels: Directions in the frame of the camera, and ``Ray.ignored_drone``. (n_cameras, n_pixels, 4)
         """
-        fixed = self.hierarchy(eyes.dtype)
-        n_nodes = len(fixed.boxes) // hierarchy.N_ORDERS
+        fixed_tables = self.hierarchy(eyes.dtype)
+        n_nodes = len(fixed_tables.boxes) // hierarchy.N_ORDERS
         counts = np.array([[n_nodes, len(self.fixed), len(self.movable), links.shape[1]]], np.int32)
         tables = (
-            jnp.asarray(counts), jnp.asarray(self.codes), *fixed[1:], boxes, jnp.asarray(links), geoms, eyes, pixels
+            jnp.asarray(counts), jnp.asarray(self.codes), *fixed_tables[1:], boxes, jnp.asarray(links), geoms, eyes,
+            pixels,
         )  # fmt: skip
         # Empty tables get a row of zeros, since an array without rows has no memory.
-        flat = [x.reshape(-1, x.shape[-1]) for x in tables]
-        return Tables(*(x if x.shape[0] else jnp.zeros((1, x.shape[1]), x.dtype) for x in flat))
+        flat_tables = [x.reshape(-1, x.shape[-1]) for x in tables]
+        return Tables(*(x if x.shape[0] else jnp.zeros((1, x.shape[1]), x.dtype) for x in flat_tables))
 
 
 def _leaf_set(links: np.ndarray, node: int) -> frozenset[int]:
@@ -301,11 +302,11 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
         after, geom, first_order = table_rows(t.movable_links, k)
         return table_rows(t.movable_boxes, world * n_movable_nodes + first_order), after, geom
 
-    def hit(k: Array, meets: Array, best: BestHit) -> BestHit:
+    def hit(k: Array, is_near: Array, best: BestHit) -> BestHit:
         code, owner = table_rows(t.codes, n_fixed + k)
-        meets = meets & (owner != ray.ignored_drone)
+        is_near = is_near & (owner != ray.ignored_drone)
         row = table_rows(t.movable, world * n_movable + k)
-        return _nearer_hit(surfaces, code, n_fixed + k, row, ray, meets, best)
+        return _nearer_hit(surfaces, code, n_fixed + k, row, ray, is_near, best)
 
     return _walk_hierarchy(node, hit, ray, best, n_movable_nodes)
 
@@ -409,9 +410,9 @@ def first_fixed_hit(
         after, geom = table_rows(tables.links, k)
         return table_rows(tables.boxes, k), after, geom
 
-    def hit(geom: Array, meets: Array, best: BestHit) -> BestHit:
+    def hit(geom: Array, is_crossing: Array, best: BestHit) -> BestHit:
         code, _ = table_rows(tables.codes, geom)
-        return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, meets, best)
+        return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, is_crossing, best)
 
     return _walk_hierarchy(node, hit, ray, best, n_nodes)
 
@@ -460,18 +461,22 @@ def _minimum(a: Array, b: Array) -> Array:
 
 
 def _meets_box(
-    low: Sequence[Array], high: Sequence[Array], scaled: Sequence[Array], inverse: Sequence[Array], best: Array
+    low: Sequence[Array],
+    high: Sequence[Array],
+    scaled_origin: Sequence[Array],
+    inverse_direction: Sequence[Array],
+    best: Array,
 ) -> Array:
     """Return True where a ray meets a box before its best hit.
 
     Args:
         low: Lower corner of the box, m.
         high: Upper corner, m.
-        scaled: Origin of the ray times ``inverse``.
-        inverse: Inverses of the components of its direction.
+        scaled_origin: Origin of the ray times ``inverse_direction``.
+        inverse_direction: Inverses of the components of its direction.
         best: Distance to its best hit, m.
     """
-    ends = [(a * i - s, b * i - s) for a, b, s, i in zip(low, high, scaled, inverse, strict=True)]
+    ends = [(a * i - s, b * i - s) for a, b, s, i in zip(low, high, scaled_origin, inverse_direction, strict=True)]
     x, y, z = (_minimum(*pair) for pair in ends)
     near = _maximum(_maximum(x, y), z)
     x, y, z = (_maximum(*pair) for pair in ends)
@@ -480,16 +485,16 @@ def _meets_box(
 
 
 def _nearer_hit(
-    surfaces: Sequence[Surface], code: Array, k: Array, row: Sequence[Array], ray: Ray, meets: Array, best: BestHit
+    surfaces: Sequence[Surface], code: Array, k: Array, row: Sequence[Array], ray: Ray, is_near: Array, best: BestHit
 ) -> BestHit:
     """Return the best hit, or a nearer hit of geom ``k`` where a ray may meet it."""
-    start, along = ray_in_frame(row, ray.origin, ray.direction)
+    start, direction = ray_in_frame(row, ray.origin, ray.direction)
     for index, surface in enumerate(surfaces):
 
         def hit_surface(best: BestHit, surface: Surface = surface) -> BestHit:
-            far = _ray_length(surface, row, start, along)
-            closer = meets & ((far < best[0]) | ((far == best[0]) & (k < best[1])))
-            return jnp.where(closer, far, best[0]), jnp.where(closer, k, best[1])
+            distance = _ray_length(surface, row, start, direction)
+            is_closer = is_near & ((distance < best[0]) | ((distance == best[0]) & (k < best[1])))
+            return jnp.where(is_closer, distance, best[0]), jnp.where(is_closer, k, best[1])
 
         best = compute_where(code == index, hit_surface, best) if len(surfaces) > 1 else hit_surface(best)
     return best
@@ -497,11 +502,11 @@ def _nearer_hit(
 
 def ray_in_frame(row: Sequence[Array], origin: Components, direction: Components) -> tuple[Components, Components]:
     """Return a ray in the frame of the geom with the given row; see ``Target.table_row``."""
-    away = [o - p for o, p in zip(origin, row, strict=False)]
-    start, along = (
-        tuple(sum(row[4 + 3 * i + k] * v[i] for i in range(3)) for k in range(3)) for v in (away, direction)
+    offset = [o - p for o, p in zip(origin, row, strict=False)]
+    local_origin, local_direction = (
+        tuple(sum(row[4 + 3 * i + k] * v[i] for i in range(3)) for k in range(3)) for v in (offset, direction)
     )
-    return start, along  # type: ignore[return-value]
+    return local_origin, local_direction  # type: ignore[return-value]
 
 
 def geom_shape(surface: Surface, row: Sequence[Array]) -> Shape | SizedShapes:
@@ -509,13 +514,13 @@ def geom_shape(surface: Surface, row: Sequence[Array]) -> Shape | SizedShapes:
     return SizedShapes(surface, row[13 : 13 + N_SIZES[surface]]) if isinstance(surface, str) else surface
 
 
-def _ray_length(surface: Surface, row: Sequence[Array], start: Components, along: Components) -> Array:
+def _ray_length(surface: Surface, row: Sequence[Array], origin: Components, direction: Components) -> Array:
     """Return the distance along one ray in the frame of a geom, m. ()"""
     if isinstance(surface, str):
-        return hit_distance(geom_shape(surface, row), start, along)
+        return hit_distance(geom_shape(surface, row), origin, direction)
     if surface.kind == "hfield":
-        return field_ray(surface, jnp.stack(start), jnp.stack(along))[0]
-    return _mesh_ray_length(surface, start, along)
+        return field_ray(surface, jnp.stack(origin), jnp.stack(direction))[0]
+    return _mesh_ray_length(surface, origin, direction)
 
 
 def _mesh_ray_length(shape: Shape, origin: Components, direction: Components) -> Array:
@@ -523,17 +528,17 @@ def _mesh_ray_length(shape: Shape, origin: Components, direction: Components) ->
     planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), origin[0].dtype)
 
     def cut_by_plane(carry: tuple[Array, Interval], _: None) -> tuple[tuple[Array, Interval], None]:
-        k, (near, far, meets) = carry
+        k, (near, far, is_crossing) = carry
         x, y, z, offset = table_rows(planes, k)
-        below = offset - (x * origin[0] + y * origin[1] + z * origin[2])
-        rises = x * direction[0] + y * direction[1] + z * direction[2]
-        parallel = jnp.abs(rises) < MIN_COMPONENT
-        t = below / jnp.where(parallel, 1.0, rises)
-        near = jnp.where(~parallel & (rises < 0) & (t > near), t, near)
-        far = jnp.where(~parallel & (rises > 0) & (t < far), t, far)
-        return (k + 1, (near, far, meets & ~(parallel & (below < 0)))), None
+        depth = offset - (x * origin[0] + y * origin[1] + z * origin[2])
+        rate = x * direction[0] + y * direction[1] + z * direction[2]
+        is_parallel = jnp.abs(rate) < MIN_COMPONENT
+        t = depth / jnp.where(is_parallel, 1.0, rate)
+        near = jnp.where(~is_parallel & (rate < 0) & (t > near), t, near)
+        far = jnp.where(~is_parallel & (rate > 0) & (t < far), t, far)
+        return (k + 1, (near, far, is_crossing & ~(is_parallel & (depth < 0)))), None
 
     infinite = jnp.full_like(origin[0], jnp.inf)
     initial = jnp.int32(0), (-infinite, infinite, infinite > 0)
-    (_, (near, far, meets)), _ = lax.scan(cut_by_plane, initial, length=len(planes))
-    return first_distance((near, far, meets & (near <= far)))
+    (_, (near, far, is_crossing)), _ = lax.scan(cut_by_plane, initial, length=len(planes))
+    return first_distance((near, far, is_crossing & (near <= far)))

@@ -1,7 +1,7 @@
 """Bounding volume hierarchy of geoms, as a table that a ray walks without a stack.
 
 Nodes are in depth-first order, each with the index of the node after its subtree, where a ray that misses its box
-continues. Each of the eight octants of directions has an order of its own, in which nearer boxes come first.
+continues. Each of the eight octants of directions has a separate order, in which nearer boxes come first.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
         Index of the node after its subtree, and index of the geom of a leaf or -1. (8, n_nodes, 2)
     """
     low, high = low - BOX_PADDING, high + BOX_PADDING
-    bounded = np.all(high - low < UNBOUNDED_LENGTH, axis=1)
-    roots = [_Node(low[k], high[k], geom=int(k)) for k in np.flatnonzero(~bounded)]
-    if bounded.any():
-        roots.append(_build_tree(low, high, np.flatnonzero(bounded)))
+    is_bounded = np.all(high - low < UNBOUNDED_LENGTH, axis=1)
+    roots = [_Node(low[k], high[k], geom=int(k)) for k in np.flatnonzero(~is_bounded)]
+    if is_bounded.any():
+        roots.append(_build_tree(low, high, np.flatnonzero(is_bounded)))
     rows = np.array([_node_rows(roots, order) for order in range(N_ORDERS)]).reshape(N_ORDERS, -1, 8)
     return rows[..., :6], rows[..., 6:].astype(np.int32)
 

@@ -41,10 +41,10 @@ def update_kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     rot = rotation.matrix(quat)
     body_of_row = np.concatenate([np.arange(model.nbody), model.geom_bodyid, model.site_bodyid])
     offsets = jnp.concatenate([model.body_ipos, model.geom_pos, model.site_pos])
-    turns = _to_xyzw(jnp.concatenate([model.body_iquat, model.geom_quat, model.site_quat]))
+    local_quats = _to_xyzw(jnp.concatenate([model.body_iquat, model.geom_quat, model.site_quat]))
     ends = np.cumsum([model.nbody, model.ngeom])
     positions = jnp.split(rotation.matvec(rot[:, body_of_row], offsets, pos[:, body_of_row]), ends, axis=1)
-    frames = jnp.split(rotation.matrix(rotation.multiply(quat[:, body_of_row], turns)), ends, axis=1)
+    frames = jnp.split(rotation.matrix(rotation.multiply(quat[:, body_of_row], local_quats)), ends, axis=1)
     data = data.replace(xpos=pos, xquat=jnp.roll(quat, 1, axis=-1), xmat=rot, xipos=positions[0], ximat=frames[0])
     return data.replace(geom_xpos=positions[1], geom_xmat=frames[1], site_xpos=positions[2], site_xmat=frames[2])
 

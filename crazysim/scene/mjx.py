@@ -39,7 +39,7 @@ class _Deferred(ModuleType):
 
 @contextlib.contextmanager
 def _light_imports() -> Iterator[None]:
-    """Make imports of Warp fail, and defer those of trimesh and SciPy's geometry, unless they have been imported."""
+    """Make imports of Warp fail, and defer imports of trimesh and SciPy's geometry, unless they have been imported."""
     light = {"warp": None, **{name: _Deferred(name) for name in ("trimesh", "scipy.spatial")}}
     light = {} if "mujoco.mjx" in sys.modules else {k: x for k, x in light.items() if k not in sys.modules}
     sys.modules.update(light)  # type: ignore[arg-type]

@@ -35,7 +35,7 @@ class MjxScene:
         self._mj_model, self._n_worlds, self._device, self._mesh = mj_model, n_worlds, device, mesh
         self._model: mjx.Model | None = None
         self._data: mjx.Data | None = None
-        self._rest: tuple[NDArray, ...] | None = None
+        self._default_fields: tuple[NDArray, ...] | None = None
         self._is_synced = False
 
     @property
@@ -90,12 +90,12 @@ class MjxScene:
             if worlds is None:
                 return pos, quat, qpos
             return fetch_rows(pos, worlds), fetch_rows(quat, worlds), fetch_rows(qpos, worlds)
-        if self._rest is None:
+        if self._default_fields is None:
             initial_data = mujoco.MjData(self._mj_model)
             defaults = (initial_data.mocap_pos, initial_data.mocap_quat, self._mj_model.qpos0)
-            self._rest = tuple(np.array(x) for x in defaults)
+            self._default_fields = tuple(np.array(x) for x in defaults)
         rows = slice(None) if worlds is None else worlds
-        pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[rows] for x in self._rest)
+        pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[rows] for x in self._default_fields)
         return pos, quat, qpos
 
     def contacts(self, body: str | None) -> Array:

@@ -103,9 +103,9 @@ class Handle:
             )
         return data.objects  # type: ignore[return-value]
 
-    def _with_rows(self, old: Array, what: str, value: ArrayLike, mask: Array | None) -> Array:
-        value = require_pose_array(value, what, len(self), old.shape[-1], old.shape[0] if old.ndim == 4 else None)
-        return _replace_rows(old, value, mask, self.rows, what == "quat")
+    def _with_rows(self, old: Array, field: str, value: ArrayLike, mask: Array | None) -> Array:
+        value = require_pose_array(value, field, len(self), old.shape[-1], old.shape[0] if old.ndim == 4 else None)
+        return _replace_rows(old, value, mask, self.rows, field == "quat")
 
 
 @jit_unless_traced("numbers", "is_quat")
@@ -135,19 +135,19 @@ def _select_rows(old: Array, numbers: tuple[int, ...]) -> Array:
     return (old if old.ndim == 2 else old[:, 0])[..., np.array(numbers), :]
 
 
-def require_pose_array(value: ArrayLike, what: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
+def require_pose_array(value: ArrayLike, field: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
     """Return positions, attitudes or velocities of ``n`` objects, checked. (size,), (n, size) or (n_worlds, n, size)"""
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value, np.float64)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"expected numbers for {what}, got {value!r}") from error
+        raise ConfigError(f"expected numbers for {field}, got {value!r}") from error
     shapes = [(size,), (n, size)] + ([] if n_worlds is None else [(n_worlds, n, size)])
     if array.shape not in shapes:
-        raise ConfigError(f"expected {what} of shape {' or '.join(map(str, shapes))}, got {array.shape}")
+        raise ConfigError(f"expected {field} of shape {' or '.join(map(str, shapes))}, got {array.shape}")
     on_host = isinstance(array, np.ndarray)
-    if on_host and (not np.isfinite(array).all() or (what == "quat" and not array.any(axis=-1).all())):
+    if on_host and (not np.isfinite(array).all() or (field == "quat" and not array.any(axis=-1).all())):
         raise ConfigError(
-            f"expected finite numbers for {what}, not all zero in a quaternion, got "
+            f"expected finite numbers for {field}, not all zero in a quaternion, got "
             f"{np.array2string(array, threshold=8)}"
         )
     return array
@@ -180,7 +180,7 @@ class SceneObjects:
     def add(
         self,
         spec: mujoco.MjSpec,
-        what: Source,
+        source: Source,
         name: str | None,
         count: int,
         pos: ArrayLike,
@@ -189,7 +189,7 @@ class SceneObjects:
         options: dict[str, Any],
     ) -> Handle:
         """Add bodies to a spec, and return their handle; see ``Scene.add``."""
-        name = _default_name(what) if name is None else name
+        name = _default_name(source) if name is None else name
         numbers = tuple(range(positive_integer("count", count, MAX_OBJECTS)))
         names = [f"{name}:{k}" for k in numbers]
         used_names = sorted({body.name for body in spec.bodies} & {name, *names})
@@ -200,12 +200,12 @@ class SceneObjects:
         n_worlds = self._n_worlds if check_flag("mocap", mocap) else None
         poses = [
             np.broadcast_to(
-                np.asarray(require_pose_array(x, what, count, size, n_worlds)), (n_worlds or 1, count, size)
+                np.asarray(require_pose_array(x, field, count, size, n_worlds)), (n_worlds or 1, count, size)
             )
-            for x, what, size in ((pos, "pos", 3), (quat, "quat", 4))
+            for x, field, size in ((pos, "pos", 3), (quat, "quat", 4))
         ]
         poses[1] = poses[1] / np.linalg.norm(poses[1], axis=-1, keepdims=True)
-        add_bodies(spec, what, names, poses[0][0], poses[1][0], mocap, options)
+        add_bodies(spec, source, names, poses[0][0], poses[1][0], mocap, options)
         first = len(self.movable)
         handle = Handle(name, numbers, tuple(first + k for k in numbers) if mocap else ())
         self._handles.append(handle)
@@ -213,7 +213,7 @@ class SceneObjects:
             self._initial.append((poses[0], poses[1]))
         return handle
 
-    def number_of(self, name: str) -> int:
+    def count_objects(self, name: str) -> int:
         """Return the number of added objects of a kind, by its name as in ``Handle.name``; 0 if there are none."""
         return sum(len(handle) for handle in self._handles if handle.name == name)
 
@@ -256,13 +256,13 @@ def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:
 
 
 def add_bodies(
-    spec: mujoco.MjSpec, what: Source, names: list[str], pos: np.ndarray, quat: np.ndarray, mocap: bool, options: dict
+    spec: mujoco.MjSpec, source: Source, names: list[str], pos: np.ndarray, quat: np.ndarray, mocap: bool, options: dict
 ) -> None:
     """Add bodies to a spec.
 
     Args:
         spec: Scene.
-        what: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list of
+        source: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list of
             these, but no primitives, with one for each body.
         names: Names of the bodies.
         pos: Positions, m. (n, 3)
@@ -271,8 +271,8 @@ def add_bodies(
         options: Settings of the primitive.
     """
     poses = [{"pos": p, "quat": np.roll(q, 1)} for p, q in zip(pos, quat, strict=True)]
-    if isinstance(what, str) and what in PRIMITIVES:
-        geoms = primitive_geoms(what, options)
+    if isinstance(source, str) and source in PRIMITIVES:
+        geoms = primitive_geoms(source, options)
         for name, pose in zip(names, poses, strict=True):
             body = spec.worldbody.add_body(name=name, mocap=mocap, **pose)
             for geom in geoms:
@@ -281,31 +281,31 @@ def add_bodies(
     if options:
         raise ConfigError(f"expected no settings, which only {', '.join(PRIMITIVES)} have, got {', '.join(options)}")
     for k, (name, pose) in enumerate(zip(names, poses, strict=True)):
-        source = _source(what[k] if isinstance(what, list) else what)
+        body_source = _source(source[k] if isinstance(source, list) else source)
         body = spec.worldbody.add_body(name=name, mocap=mocap, **pose)
         frame, prefix = body.add_frame(), f"{name}/"
-        if isinstance(source, mujoco.MjSpec):
-            spec.attach(source, prefix=prefix, frame=frame)
+        if isinstance(body_source, mujoco.MjSpec):
+            spec.attach(body_source, prefix=prefix, frame=frame)
         else:
-            frame.attach_body(source, prefix, "")
+            frame.attach_body(body_source, prefix, "")
 
 
-def _source(what: Source) -> mujoco.MjSpec | mujoco.MjsBody:
+def _source(source: Source) -> mujoco.MjSpec | mujoco.MjsBody:
     """Return a spec or body to attach; it is read for every body, because attaching may consume it."""
-    if isinstance(what, mujoco.MjsBody):
-        return what
+    if isinstance(source, mujoco.MjsBody):
+        return source
     kinds = f"{', '.join(PRIMITIVES)}, an MJCF file, MJCF text, an MjSpec or a body of one"
     try:
-        if isinstance(what, mujoco.MjSpec):
-            spec = what.copy()
-        elif isinstance(what, str) and what.lstrip().startswith("<"):
-            spec = mujoco.MjSpec.from_string(what)
-        elif isinstance(what, (str, Path)) and Path(what).is_file():
-            spec = mujoco.MjSpec.from_file(str(what))
-        elif isinstance(what, (str, Path)):
-            raise UnknownNameError(f"expected {kinds}, got {str(what)!r}")
+        if isinstance(source, mujoco.MjSpec):
+            spec = source.copy()
+        elif isinstance(source, str) and source.lstrip().startswith("<"):
+            spec = mujoco.MjSpec.from_string(source)
+        elif isinstance(source, (str, Path)) and Path(source).is_file():
+            spec = mujoco.MjSpec.from_file(str(source))
+        elif isinstance(source, (str, Path)):
+            raise UnknownNameError(f"expected {kinds}, got {str(source)!r}")
         else:
-            raise ConfigError(f"expected {kinds}, got {what!r}")
+            raise ConfigError(f"expected {kinds}, got {source!r}")
         spec.copy().compile()
     except (ValueError, mujoco.FatalError) as error:
         if isinstance(error, ConfigError):
@@ -314,10 +314,12 @@ def _source(what: Source) -> mujoco.MjSpec | mujoco.MjsBody:
     return spec
 
 
-def _default_name(what: Source) -> str:
+def _default_name(source: Source) -> str:
     """Return the name of objects that are added without one."""
-    if isinstance(what, mujoco.MjsBody):
-        return what.name or "object"
-    if isinstance(what, mujoco.MjSpec):
-        return what.modelname or "object"
-    return Path(what).stem if isinstance(what, Path) or (isinstance(what, str) and "<" not in what) else "object"
+    if isinstance(source, mujoco.MjsBody):
+        return source.name or "object"
+    if isinstance(source, mujoco.MjSpec):
+        return source.modelname or "object"
+    return (
+        Path(source).stem if isinstance(source, Path) or (isinstance(source, str) and "<" not in source) else "object"
+    )

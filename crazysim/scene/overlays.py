@@ -68,8 +68,10 @@ class Overlays:
         """Add text to a corner of the image, below earlier text."""
         if corner not in IMAGE_CORNERS:
             raise UnknownNameError(f"expected corner {' or '.join(map(repr, IMAGE_CORNERS))}, got {corner!r}")
-        above = self._texts.get(corner)
-        self._texts[corner] = _printable_text(text) if above is None else f"{above}\n{_printable_text(text)}"
+        texts_above = self._texts.get(corner)
+        self._texts[corner] = (
+            _printable_text(text) if texts_above is None else f"{texts_above}\n{_printable_text(text)}"
+        )
 
     def _add(self, geoms: list[tuple], rgba: ArrayLike, emission: float = 0.0) -> None:
         if len(self) + len(geoms) > self.limit:
@@ -124,7 +126,7 @@ def _printable_text(text: str, longest: int | None = None) -> str:
     """Return text that MuJoCo's font can show."""
     if not isinstance(text, str) or not text:
         raise ConfigError(f"expected a string that is not empty as text, got {text!r}")
-    missing = sorted({letter for letter in text if letter != "\n" and not 32 <= ord(letter) < 127})
+    missing = sorted({character for character in text if character != "\n" and not 32 <= ord(character) < 127})
     if missing:
         raise ConfigError(f"expected ASCII text, got {text!r} with {''.join(missing)!r}")
     if longest is not None and (len(text) > longest or "\n" in text):

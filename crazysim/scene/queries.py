@@ -33,7 +33,7 @@ class SceneQueries:
 
     def __init__(self, scene: Scene):
         self._scene = scene
-        self._reported: set[str] = set()
+        self._reported_messages: set[str] = set()
         self._compiled: tuple[mujoco.MjModel | None, dict[tuple[Any, ...], Callable[..., Any]]] = None, {}
 
     def contact_report(self, data: SimData, objects: ObjectSelection, floor: bool, drones: bool) -> ContactReport:
@@ -63,7 +63,7 @@ class SceneQueries:
             _, compiled = self._compiled = self._scene.mj_model, {}
         is_new = (name, *settings) not in compiled
         if is_new:
-            compiled[name, *settings] = jax.jit(_as_function_of_poses(build(), data))
+            compiled[name, *settings] = jax.jit(_close_over_data(build(), data))
         states, objects = data.states, data.objects
         # Only the arrays that the query needs, since a compiled call costs by their number.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
@@ -95,13 +95,13 @@ class SceneQueries:
                 if not isinstance(error, LimitError):
                     problem = f"the contact report has no kernel: {error.reason}"
                     remedy = "Leave out the geoms that need it with objects="
-                    report_unsupported([problem], kernels.strict, self._reported, remedy)
+                    report_unsupported([problem], kernels.strict, self._reported_messages, remedy)
                 return by_xla(data, mocap)
 
         return contacts
 
 
-def _as_function_of_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
+def _close_over_data(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
     """Return a function of data and mocap poses as one of poses alone; the rest of the data is left out."""
     poses_only = jax.tree.map(lambda _: None, data)
 

@@ -165,11 +165,11 @@ def _hit_bodies(
 
     def nearer_hits_of_body(best: Hits, row: Array, body_index: Array) -> Hits:
         p, q = (jnp.take(x, row, axis=-2)[..., None, :] for x in (pos, quat))
-        start, along = rotation.rotate_inverse(q, origin - p), rotation.rotate_inverse(q, direction)
+        local_origin, local_direction = rotation.rotate_inverse(q, origin - p), rotation.rotate_inverse(q, direction)
         for geom in geoms:
-            far, normal = _hit_geom(geom, start, along)
-            far = far if ignored_rows is None else jnp.where(ignored_rows == row, jnp.inf, far)
-            best = _nearer_hits(best, far, rotation.rotate(q, normal), body_index)
+            distance, normal = _hit_geom(geom, local_origin, local_direction)
+            distance = distance if ignored_rows is None else jnp.where(ignored_rows == row, jnp.inf, distance)
+            best = _nearer_hits(best, distance, rotation.rotate(q, normal), body_index)
         return best
 
     for row, body_index in group:
@@ -183,8 +183,8 @@ def _hit_geom(geom: CollisionGeom, origin: Array, direction: Array) -> tuple[Arr
     if geom.rot is None:
         return ray_distance(geom.shape, start, direction)
     rows = np.array(geom.rot)
-    far, normal = ray_distance(geom.shape, _constant_product(rows.T, start), _constant_product(rows.T, direction))
-    return far, _constant_product(rows, normal)
+    distance, normal = ray_distance(geom.shape, _constant_product(rows.T, start), _constant_product(rows.T, direction))
+    return distance, _constant_product(rows, normal)
 
 
 def _constant_product(matrix: np.ndarray, vectors: Array) -> Array:
@@ -194,12 +194,12 @@ def _constant_product(matrix: np.ndarray, vectors: Array) -> Array:
     return jnp.stack([functools.reduce(jnp.add, row) for row in terms], axis=-1)
 
 
-def _nearer_hits(best: Hits, far: Array, normal: Array, body_index: Array | int) -> Hits:
-    closer = far < best.distance
+def _nearer_hits(best: Hits, distance: Array, normal: Array, body_index: Array | int) -> Hits:
+    is_closer = distance < best.distance
     return best.replace(
-        distance=jnp.where(closer, far, best.distance),
-        normal=jnp.where(closer[..., None], normal, best.normal),
-        body_index=jnp.where(closer, jnp.asarray(body_index, jnp.int32), best.body_index),
+        distance=jnp.where(is_closer, distance, best.distance),
+        normal=jnp.where(is_closer[..., None], normal, best.normal),
+        body_index=jnp.where(is_closer, jnp.asarray(body_index, jnp.int32), best.body_index),
     )
 
 
@@ -224,64 +224,64 @@ def _hit_fixed_geoms(
     """
     tables = targets.hierarchy(origin.dtype)
     surfaces = targets.surfaces[: 1 + targets.codes[: len(targets.fixed), 0].max()]
-    starts, ways = jax.lax.stop_gradient((origin, direction))
+    origins, directions = jax.lax.stop_gradient((origin, direction))
     initial = jax.lax.stop_gradient(jnp.asarray(limit, origin.dtype)), jnp.int32(-1)
 
-    def first_geoms(starts: Array, ways: Array) -> Array:
+    def first_geoms(origins: Array, directions: Array) -> Array:
         def cast_next(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-            k, which = carry
-            ray = Ray(components(starts[k]), components(ways[k]), jnp.int32(IGNORES_NONE))
-            return (k + 1, which.at[k].set(first_fixed_hit(surfaces, tables, ray, initial)[1])), None
+            k, geom_index = carry
+            ray = Ray(components(origins[k]), components(directions[k]), jnp.int32(IGNORES_NONE))
+            return (k + 1, geom_index.at[k].set(first_fixed_hit(surfaces, tables, ray, initial)[1])), None
 
-        initial_carry = jnp.int32(0), jnp.full(len(starts), -1, jnp.int32)
-        return jax.lax.scan(cast_next, initial_carry, length=len(starts))[0][1]
+        initial_carry = jnp.int32(0), jnp.full(len(origins), -1, jnp.int32)
+        return jax.lax.scan(cast_next, initial_carry, length=len(origins))[0][1]
 
-    chunks = [slice(k, k + MAX_LOOP_RAYS) for k in range(0, len(starts), MAX_LOOP_RAYS)]
-    which = jnp.concatenate([first_geoms(starts[chunk], ways[chunk]) for chunk in chunks])
-    rows = jnp.take(tables.geoms, jnp.maximum(which, 0), axis=0)
-    distance, normal_at = _hit_rows(surfaces, targets.codes, which, rows, origin, direction)
+    chunks = [slice(k, k + MAX_LOOP_RAYS) for k in range(0, len(origins), MAX_LOOP_RAYS)]
+    geom_index = jnp.concatenate([first_geoms(origins[chunk], directions[chunk]) for chunk in chunks])
+    rows = jnp.take(tables.geoms, jnp.maximum(geom_index, 0), axis=0)
+    distance, normal_at = _hit_rows(surfaces, targets.codes, geom_index, rows, origin, direction)
     body_indices = jnp.asarray([target.body_index for target in targets.fixed], jnp.int32)
-    return distance, normal_at(distance), jnp.take(body_indices, jnp.maximum(which, 0))
+    return distance, normal_at(distance), jnp.take(body_indices, jnp.maximum(geom_index, 0))
 
 
 def _hit_rows(
-    surfaces: Sequence[Surface], codes: np.ndarray, which: Array, rows: Array, origin: Array, direction: Array
+    surfaces: Sequence[Surface], codes: np.ndarray, geom_index: Array, rows: Array, origin: Array, direction: Array
 ) -> tuple[Array, Callable[[Array], Array]]:
     """Return the distance along each ray to its geom, and a function from distances to unit normals, world frame.
 
     Args:
         surfaces: ``Targets.surfaces``, or the first of them.
         codes: Index of the surface of each geom in the first column. (n, 2)
-        which: Index of the geom of each ray, -1 for none. (...)
+        geom_index: Index of the geom of each ray, -1 for none. (...)
         rows: Rows of these geoms; see ``Target.table_row``. (..., 16)
         origin: Origins of the rays, world frame, m. (..., 3)
         direction: Unit directions, world frame. (..., 3)
     """
     row = [rows[..., k] for k in range(16)]
-    start, along = ray_in_frame(row, components(origin), components(direction))
-    ray_start, ray_direction = jnp.stack(start, axis=-1), jnp.stack(along, axis=-1)
-    code = jnp.take(jnp.asarray(codes[:, 0]), jnp.maximum(which, 0))
+    local_origin, local_direction = ray_in_frame(row, components(origin), components(direction))
+    ray_start, ray_direction = jnp.stack(local_origin, axis=-1), jnp.stack(local_direction, axis=-1)
+    code = jnp.take(jnp.asarray(codes[:, 0]), jnp.maximum(geom_index, 0))
     hits = []
-    exact = jnp.full_like(start[0], jnp.inf)
+    distance = jnp.full_like(local_origin[0], jnp.inf)
     for index, surface in enumerate(surfaces):
-        selected = (which >= 0) & (code == index)
+        is_selected = (geom_index >= 0) & (code == index)
         # Geoms of other kinds get sizes of 1, so that derivatives are finite.
-        shape = geom_shape(surface, [*row[:13], *(jnp.where(selected, x, 1.0) for x in row[13:])])
+        shape = geom_shape(surface, [*row[:13], *(jnp.where(is_selected, x, 1.0) for x in row[13:])])
         if isinstance(shape, Shape) and shape.kind == "hfield":
-            far, normal = ray_distance(shape, ray_start, ray_direction)
+            ray_length, normal = ray_distance(shape, ray_start, ray_direction)
         else:
-            far, normal = hit_distance(shape, start, along), None
-        exact = jnp.where(selected, far, exact)
-        hits.append((selected, shape, normal))
+            ray_length, normal = hit_distance(shape, local_origin, local_direction), None
+        distance = jnp.where(is_selected, ray_length, distance)
+        hits.append((is_selected, shape, normal))
 
     def normal_at(distance: Array) -> Array:
-        across = jnp.zeros_like(origin)
-        for selected, shape, normal in hits:
+        normals = jnp.zeros_like(origin)
+        for is_selected, shape, normal in hits:
             normal = hit_normal(shape, ray_start, ray_direction, distance) if normal is None else normal
-            across = jnp.where(selected[..., None], normal, across)
-        return jnp.stack([sum(row[4 + 3 * i + k] * across[..., k] for k in range(3)) for i in range(3)], axis=-1)
+            normals = jnp.where(is_selected[..., None], normal, normals)
+        return jnp.stack([sum(row[4 + 3 * i + k] * normals[..., k] for k in range(3)) for i in range(3)], axis=-1)
 
-    return exact, normal_at
+    return distance, normal_at
 
 
 # Rays of all worlds -------------------------------------------------------------------------------------------------
@@ -313,20 +313,20 @@ def cast_rays_in_worlds(
     tables = targets.tables(boxes, links, movable, eyes, jnp.asarray(pixels, eyes.dtype))
     n, tables = n_worlds * n_cameras * n_pixels, jax.lax.stop_gradient(tables)
     fn = functools.partial(first_hit, targets.surfaces, n_pixels, n_cameras)
-    (far, which), platform = kernels.run(fn, n, tables, targets)
-    hit_table = far[:, None], which[:, None]
-    distance, which = far.reshape(n_worlds, -1), which.reshape(n_worlds, -1)
+    (ray_length, geom_index), platform = kernels.run(fn, n, tables, targets)
+    hit_table = ray_length[:, None], geom_index[:, None]
+    distance, geom_index = ray_length.reshape(n_worlds, -1), geom_index.reshape(n_worlds, -1)
 
     look, axes = jnp.asarray(pixels[..., :3], eyes.dtype), eyes[..., 3:].reshape(n_worlds, n_cameras, 1, 3, 3)
     direction = sum(axes[..., k] * look[..., k, None] for k in range(3)).reshape(n_worlds, -1, 3)
     origin = jnp.repeat(eyes[..., :3], n_pixels, axis=1)
     names = body_names(model, data.core.n_drones if drones else 0)
     if not targets.all:
-        return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), which, names)
-    fixed = jnp.broadcast_to(tables.fixed[: len(targets.fixed)], (n_worlds, len(targets.fixed), 16))
-    rows = jnp.concatenate([fixed, movable], axis=1)
-    rows = jnp.take_along_axis(rows, jnp.maximum(which, 0)[..., None], axis=1)
-    exact, normal_at = _hit_rows(targets.surfaces, targets.codes, which, rows, origin, direction)
+        return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), geom_index, names)
+    fixed_rows = jnp.broadcast_to(tables.fixed[: len(targets.fixed)], (n_worlds, len(targets.fixed), 16))
+    rows = jnp.concatenate([fixed_rows, movable], axis=1)
+    rows = jnp.take_along_axis(rows, jnp.maximum(geom_index, 0)[..., None], axis=1)
+    exact, normal_at = _hit_rows(targets.surfaces, targets.codes, geom_index, rows, origin, direction)
     distance = _replace_derivative(distance, exact)
     normal = normal_at(distance)
     if platform is not None:
@@ -334,7 +334,7 @@ def cast_rays_in_worlds(
         by_kernel = map_indices(fn, n, [*tables, *hit_table], platform, compile_now=False)
         normal = _replace_derivative(jnp.stack(by_kernel, axis=-1).reshape(normal.shape), normal)
     body_indices = jnp.asarray([*(target.body_index for target in targets.all), -1], jnp.int32)
-    return Hits(distance, normal, _hit_points(origin, direction, distance), body_indices[which], names)
+    return Hits(distance, normal, _hit_points(origin, direction, distance), body_indices[geom_index], names)
 
 
 @dataclasses.dataclass

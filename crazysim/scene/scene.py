@@ -93,7 +93,7 @@ class Scene:
 
     def add(
         self,
-        what: Source,
+        source: Source,
         name: str | None = None,
         *,
         count: int = 1,
@@ -107,7 +107,7 @@ class Scene:
         The scene is compiled at its next use, once for all objects that were added since the last compilation.
 
         Args:
-            what: ``"gate"``, ``"box"``, ``"pole"``, ``"sphere"``, ``"wall"`` or ``"landing_pad"``; or the path of an
+            source: ``"gate"``, ``"box"``, ``"pole"``, ``"sphere"``, ``"wall"`` or ``"landing_pad"``; or the path of an
                 MJCF file, MJCF text, an ``MjSpec``, or a body of one.
             name: Prefix of the bodies' names ``name:0``, ``name:1``, ...; None for the name of the primitive or file.
             count: Number of objects.
@@ -117,20 +117,20 @@ class Scene:
             **options: Settings of a primitive: lengths in m, ``rgba``. ``crazysim.scene.primitives`` lists them.
         """
         with self.unchanged_on_error():
-            handle = self.added.add(self.spec, what, name, count, pos, quat, mocap, options)
+            handle = self.added.add(self.spec, source, name, count, pos, quat, mocap, options)
         self.revision += 1
         return handle
 
-    def add_once(self, what: Source, name: str, count: int) -> None:
+    def add_once(self, source: Source, name: str, count: int) -> None:
         """Add ``count`` objects unless they exist: objects of a plugin stay when it is removed or replaced."""
-        n_existing = self.added.number_of(name)
+        n_existing = self.added.count_objects(name)
         if n_existing not in (0, count):
             raise ConfigError(
                 f"expected {n_existing} objects {name!r}, which are in the scene already, got {count}: objects stay "
                 f"there when a plugin is removed. Use another name=, or a new simulation."
             )
         if not n_existing:
-            self.add(what, name, count=count)
+            self.add(source, name, count=count)
 
     @contextlib.contextmanager
     def unchanged_on_error(self) -> Iterator[None]:
@@ -200,9 +200,11 @@ class Scene:
     def _ids(self, names: Sequence[str]) -> list[int]:
         """Return mocap ids in the spec, which equal the ids in the compiled model; nothing is compiled."""
         ids = build.spec_mocap_ids(self.spec)
-        lost = [name for name in names if name not in ids]
-        if lost:
-            raise ConfigError(f"expected mocap body {lost[0]!r} in the spec, got none. Leave drones and objects in it.")
+        missing_names = [name for name in names if name not in ids]
+        if missing_names:
+            raise ConfigError(
+                f"expected mocap body {missing_names[0]!r} in the spec, got none. Leave drones and objects in it."
+            )
         return [ids[name] for name in names]
 
     # Pure queries -----------------------------------------------------------------------------------------------------

@@ -137,15 +137,15 @@ class SceneWindow:
         size = self._glfw.get_framebuffer_size(self._window)
         x, y = self.cursor[0] * size[0], (1 - self.cursor[1]) * size[1]
         for k, r in enumerate(self._tiles(n)):
-            inside = (x - r.left) / max(r.width, 1), (y - r.bottom) / max(r.height, 1)
-            if not all(0 <= part < 1 for part in inside):
+            position = (x - r.left) / max(r.width, 1), (y - r.bottom) / max(r.height, 1)
+            if not all(0 <= part < 1 for part in position):
                 continue
             data, _ = tile(k)
             self._update_scene(data)
             point, geom = np.zeros(3), np.full((1, 1), -1, np.int32)
             ids = np.full((1, 1), -1, np.int32)
             mujoco.mjv_select(
-                self._model, data, self._option, r.width / max(r.height, 1), *inside, self._scene, point, geom, ids,
+                self._model, data, self._option, r.width / max(r.height, 1), *position, self._scene, point, geom, ids,
                 ids.copy(),
             )  # fmt: skip
             return None if geom[0, 0] < 0 else (k, int(geom[0, 0]), point)
@@ -216,8 +216,8 @@ def _glfw() -> Any:
     import glfw  # comes with mujoco; images in memory do not need it
 
     with warnings.catch_warnings(action="ignore"):
-        works = glfw.init()
-    if not works:
+        is_initialized = glfw.init()
+    if not is_initialized:
         raise RenderError("expected a screen, got one that GLFW cannot reach. Use mode='rgb_array' without a screen.")
     return glfw
 

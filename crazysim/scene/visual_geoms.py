@@ -63,9 +63,9 @@ def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
     pos, quat = np.zeros(3), np.zeros(4)
     geom_quat = np.zeros(4)
     mujoco.mju_mat2Quat(geom_quat, data.geom_xmat[geom])
-    inverse, back = np.zeros(4), np.zeros(3)
-    mujoco.mju_negPose(back, inverse, data.xpos[body], data.xquat[body])
-    mujoco.mju_mulPose(pos, quat, back, inverse, data.geom_xpos[geom], geom_quat)
+    inverse, inverse_pos = np.zeros(4), np.zeros(3)
+    mujoco.mju_negPose(inverse_pos, inverse, data.xpos[body], data.xquat[body])
+    mujoco.mju_mulPose(pos, quat, inverse_pos, inverse, data.geom_xpos[geom], geom_quat)
     vertices, faces = _mesh(model, geom)
     return VisualGeom(
         kind=_kind(model, geom),

@@ -107,9 +107,9 @@ def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list
             )
         vehicles.append((body, Vehicle(body.name, kinds[prefix], np.array(body.pos), np.roll(body.quat, -1))))
     names = [vehicle.name for _, vehicle in vehicles]
-    repeated = [name for name in names if names.count(name) > 1]
-    if repeated:
-        raise ConfigError(f"expected bodies with different names, got {repeated[0]!r} twice. Rename one.")
+    duplicates = [name for name in names if names.count(name) > 1]
+    if duplicates:
+        raise ConfigError(f"expected bodies with different names, got {duplicates[0]!r} twice. Rename one.")
     for body, _ in vehicles:
         spec.delete(body)
     return [vehicle for _, vehicle in vehicles]

@@ -127,7 +127,7 @@ class Configuration:
         controller = find_controller(controllers, switch)
         for member in controller.members:
             check_settings(member)
-        controller = controller.adapted(control, None if dynamics == Dynamics.first_principles else dynamics)
+        controller = controller.adapt(control, None if dynamics == Dynamics.first_principles else dynamics)
         require_controller(dynamics, control, controller)
         check_rates(control, freq, rates)
         controller = controller and controller_at_rates(controller, control, freq, rates)

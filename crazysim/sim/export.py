@@ -135,7 +135,8 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     while memory := [
         leaf
         for leaf, symbol in symbols.items()
-        if leaf not in (*state, *inputs) and any(casadi.depends_on(next_values[known], symbol) for known in state)
+        if leaf not in (*state, *inputs)
+        and any(casadi.depends_on(next_values[state_leaf], symbol) for state_leaf in state)
     ]:
         state += memory
     state = state[: len(STATES)] + sorted(state[len(STATES) :])
@@ -173,8 +174,8 @@ def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
     return after
 
 
-def _refusal(stage: str, why: str) -> ConfigError:
-    return ConfigError(f"the step cannot be exported because of its stage {stage!r}: {why}")
+def _refusal(stage: str, reason: str) -> ConfigError:
+    return ConfigError(f"the step cannot be exported because of its stage {stage!r}: {reason}")
 
 
 def _with_feedforward(data: SimData) -> SimData:
@@ -192,7 +193,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
     names = [leaf.name for leaf in program.leaves]
     if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
         raise ConfigError(f"expected parameters as a list of distinct names, got {parameters!r}")
-    free = [
+    choices = [
         name
         for leaf, name in enumerate(names)
         if name not in (*STATES, command)
@@ -201,8 +202,8 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
         and jax.numpy.issubdtype(program.leaves[leaf].dtype, jax.numpy.floating)
     ]
     for name in parameters:
-        if name not in free:
-            raise UnknownNameError(f"expected a parameter of this step, got {name!r}; use one of {', '.join(free)}")
+        if name not in choices:
+            raise UnknownNameError(f"expected a parameter of this step, got {name!r}; use one of {', '.join(choices)}")
     return [names.index(name) for name in parameters]
 
 

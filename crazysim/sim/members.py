@@ -110,16 +110,16 @@ class Member:
             return command
         return np.pad(np.asarray(command), [(0, 0)] * (np.ndim(command) - 1) + [(0, n_rotors - n_own_rotors)])
 
-    def _replace_checked_row(self, what: str, x: Array, value: ArrayLike) -> Array | NDArray:
+    def _replace_checked_row(self, label: str, x: Array, value: ArrayLike) -> Array | NDArray:
         shape = x.shape[:1] + x.shape[2:]
         if np.shape(value) not in (shape[1:], shape):
             raise ValueError(
-                f"expected the {what} of shape {shape[1:]}, or {shape} with one for each world, got {np.shape(value)}"
+                f"expected the {label} of shape {shape[1:]}, or {shape} with one for each world, got {np.shape(value)}"
             )
         if not isinstance(value, jax.Array):
             value = np.asarray(value, x.dtype)
             if not np.all(np.isfinite(value)):
-                raise ValueError(f"expected finite numbers as {what}, got NaN or infinity. Check its computation.")
+                raise ValueError(f"expected finite numbers as {label}, got NaN or infinity. Check its computation.")
         return _replace_row(x, self.index, value)
 
     def _record(self) -> PyTree:
@@ -127,8 +127,8 @@ class Member:
 
     def _fields(self) -> list[str]:
         record = self._record()
-        shared = ("population", "n_members", "member_id")
-        names = [field.name for field in dataclasses.fields(record) if field.name not in shared]  # type: ignore[arg-type]
+        excluded = ("population", "n_members", "member_id")
+        names = [field.name for field in dataclasses.fields(record) if field.name not in excluded]  # type: ignore[arg-type]
         return [name for name in names if getattr(getattr(record, name), "ndim", 0) >= 2]
 
     def __repr__(self) -> str:

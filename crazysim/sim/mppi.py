@@ -217,26 +217,26 @@ class MPPI:
         noise = noise.at[:, 0].set(0.0)  # the plan itself is a sample
         knots = rotation.safe_clip(plan[:, None] + noise, jnp.asarray(self.low), jnp.asarray(self.high))
 
-        repeated = jax.tree.map(lambda x: jnp.broadcast_to(x, (n_worlds, n_drones, x.shape[-1])), setpoint)
+        setpoints = jax.tree.map(lambda x: jnp.broadcast_to(x, (n_worlds, n_drones, x.shape[-1])), setpoint)
         record = RolloutRecord(
             knots=knots.reshape(n_worlds * self.samples, *plan.shape[1:]),
-            setpoint=jax.tree.map(self._repeat, repeated),
+            setpoint=jax.tree.map(self._repeat, setpoints),
             cost=jnp.zeros((n_worlds * self.samples, n_drones, 1), plan.dtype),
         )
         final = self._step(self._rollouts(data, record), self.horizon * self.substeps)
         costs = final.plugins[RECORD_NAME].cost.reshape(n_worlds, self.samples, n_drones)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-        excess = costs - jnp.min(costs, axis=1, keepdims=True)
-        finite = jnp.isfinite(excess)  # a drone whose rollouts all failed keeps its plan
-        mean_excess = jnp.sum(jnp.where(finite, excess, 0.0), axis=1, keepdims=True) / jnp.maximum(
+        excess_cost = costs - jnp.min(costs, axis=1, keepdims=True)
+        finite = jnp.isfinite(excess_cost)  # a drone whose rollouts all failed keeps its plan
+        mean_excess = jnp.sum(jnp.where(finite, excess_cost, 0.0), axis=1, keepdims=True) / jnp.maximum(
             jnp.sum(finite, axis=1, keepdims=True), 1
         )
         weights = jnp.where(
-            finite, jnp.exp(-jnp.where(finite, excess, 0.0) / (self.temperature * mean_excess + 1e-9)), 0.0
+            finite, jnp.exp(-jnp.where(finite, excess_cost, 0.0) / (self.temperature * mean_excess + 1e-9)), 0.0
         )
         weights = weights / jnp.maximum(jnp.sum(weights, axis=1, keepdims=True), 1e-9)
-        moved = plan + jnp.einsum("wsd,wsdkc->wdkc", weights, knots - plan[:, None])
-        return moved[:, :, 0], MPPIMemory(self._shift_plan(moved), memory.count + 1)
+        new_plan = plan + jnp.einsum("wsd,wsdkc->wdkc", weights, knots - plan[:, None])
+        return new_plan[:, :, 0], MPPIMemory(self._shift_plan(new_plan), memory.count + 1)
 
     # Rollouts -------------------------------------------------------------------------------------------------------
 
@@ -261,13 +261,13 @@ class MPPI:
                 jax.tree.leaves(scopes(data)), jax.tree.leaves(template), jax.tree.leaves(data), strict=True
             )
         ]
-        started = jax.tree.unflatten(jax.tree.structure(template), leaves)
-        core = started.core.replace(
+        initial_record = jax.tree.unflatten(jax.tree.structure(template), leaves)
+        core = initial_record.core.replace(
             steps=jnp.zeros_like(template.core.steps),
             world_id=template.core.world_id,
             drone_mocap_ids=template.core.drone_mocap_ids,
         )
-        return started.replace(core=core, plugins=started.plugins | {RECORD_NAME: record})
+        return initial_record.replace(core=core, plugins=initial_record.plugins | {RECORD_NAME: record})
 
     def _control_tick(self, data: SimData) -> Array:
         return data.core.steps % self.substeps == 0
@@ -289,15 +289,15 @@ class MPPI:
         """Return the command of one drone's plan at a step. (k,)"""
         knots = data.plugins[RECORD_NAME].knots
         knot = step.astype(knots.dtype) * ((self.knots - 1) / ((self.horizon - 1) * self.substeps))
-        below = jnp.clip(jnp.floor(knot).astype(jnp.int32), 0, self.knots - 2)
-        return knots[below] + (knot - below) * (knots[below + 1] - knots[below])
+        index = jnp.clip(jnp.floor(knot).astype(jnp.int32), 0, self.knots - 2)
+        return knots[index] + (knot - index) * (knots[index + 1] - knots[index])
 
     def _shift_plan(self, plan: Array) -> Array:
         """Return the plan one control step later; its end is held."""
         knot = np.arange(self.knots) + (self.knots - 1) / (self.horizon - 1)
-        below = np.minimum(np.floor(knot).astype(int), self.knots - 2)
-        share = np.minimum(knot - below, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
-        return plan[:, :, below] + share * (plan[:, :, below + 1] - plan[:, :, below])
+        index = np.minimum(np.floor(knot).astype(int), self.knots - 2)
+        share = np.minimum(knot - index, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
+        return plan[:, :, index] + share * (plan[:, :, index + 1] - plan[:, :, index])
 
 
 def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -309,10 +309,10 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     weight = -GRAVITY[2] * mass
     thrust, thrust_deviation = (weight, low, high), 0.2 * (high - low)
     if level == Control.rotor_vel:
-        least, most = rotor_vel_limits(sim.dynamics, airframe)
-        hover = least + (most - least) * np.sqrt(max(weight - low, 0.0) / (high - low))
+        min_rotor_vel, max_rotor_vel = rotor_vel_limits(sim.dynamics, airframe)
+        hover = min_rotor_vel + (max_rotor_vel - min_rotor_vel) * np.sqrt(max(weight - low, 0.0) / (high - low))
         n = airframe.n_rotors
-        rows = [[hover] * n, [least] * n, [most] * n, [0.05 * most] * n]
+        rows = [[hover] * n, [min_rotor_vel] * n, [max_rotor_vel] * n, [0.05 * max_rotor_vel] * n]
     elif level == Control.force_torque:
         arm = 0.5 * airframe.arm * (high - low)
         torque = np.array([arm, arm, 0.1 * arm])

@@ -50,7 +50,7 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
     first, second = np.triu_indices(n, 1)
     if not len(first):
         return []
-    best, best_time = np.full(len(first), np.inf), np.zeros(len(first))
+    min_distance, best_time = np.full(len(first), np.inf), np.zeros(len(first))
     n_cells = int(np.ceil(pieces.duration / CELL_DURATION))
     dt, motion = pieces.duration / n_cells, _Motion(pieces)
     pair, cell = np.repeat(np.arange(len(first)), n_cells), np.tile(np.arange(n_cells), len(first))
@@ -61,13 +61,15 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
         for k in range(0, len(pair), CELLS_PER_BATCH):
             part = slice(k, k + CELLS_PER_BATCH)
             i, j = first[pair[part]], second[pair[part]]
-            motion_i, motion_j = (motion.in_cells(drone, cell[part], dt, table) for drone in (i, j))
-            lower = _lower_bounds(pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, best, best_time)
-            keep[part] = lower < best[pair[part]] - tolerance
+            motion_i, motion_j = (motion.motion_in_cells(drone, cell[part], dt, table) for drone in (i, j))
+            lower = _lower_bounds(
+                pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, min_distance, best_time
+            )
+            keep[part] = lower < min_distance[pair[part]] - tolerance
         pair, cell = np.repeat(pair[keep], N_SPLITS), (cell[keep][:, None] * N_SPLITS + np.arange(N_SPLITS)).ravel()
         dt, n_cells = dt / N_SPLITS, n_cells * N_SPLITS
-    order = np.argsort(best, kind="stable")
-    return [Approach((int(first[k]), int(second[k])), float(best[k]), float(best_time[k])) for k in order]
+    order = np.argsort(min_distance, kind="stable")
+    return [Approach((int(first[k]), int(second[k])), float(min_distance[k]), float(best_time[k])) for k in order]
 
 
 class _Motion:
@@ -75,7 +77,7 @@ class _Motion:
 
     def __init__(self, pieces: PieceTable) -> None:
         self.pieces = pieces
-        snap = pieces.coefficients_of(4)[:, :3]
+        snap = pieces.derivative_coefficients(4)[:, :3]
         control_points = snap @ bernstein_matrix(snap.shape[-1] - 1).T  # a polynomial lies in their convex hull
         self.snaps = np.cumsum(np.max(np.linalg.norm(control_points, axis=1), axis=-1))
         jumps = np.zeros((4, len(pieces.drone)))
@@ -88,9 +90,11 @@ class _Motion:
 
     def table(self, n_cells: int, dt: float) -> tuple[Floats, ...]:
         """Return the motion of every drone in every cell. (n_drones, n_cells, ...)"""
-        return self.in_cells(np.arange(self.pieces.n_drones)[:, None], np.arange(n_cells), dt, None)
+        return self.motion_in_cells(np.arange(self.pieces.n_drones)[:, None], np.arange(n_cells), dt, None)
 
-    def in_cells(self, drone: Ints, cell: Ints, dt: float, table: tuple[Floats, ...] | None) -> tuple[Floats, ...]:
+    def motion_in_cells(
+        self, drone: Ints, cell: Ints, dt: float, table: tuple[Floats, ...] | None
+    ) -> tuple[Floats, ...]:
         """Return positions at start and end, acceleration and jerk in the middle (..., 3) and bound (...) of each cell.
 
         The bound is for the deviation from the chord beyond the part due to the derivatives in the middle.
@@ -116,7 +120,7 @@ def _lower_bounds(
     pair: Ints,
     cell: Ints,
     dt: float,
-    best: Floats,
+    upper_bound: Floats,
     best_time: Floats,
 ) -> Floats:
     """Return a lower bound of the distance in each cell; update the smallest distance of each pair in place."""
@@ -131,8 +135,8 @@ def _lower_bounds(
     k = order[np.unique(pair[order], return_index=True)[1]]
     t = (cell[k] + u[k]) * dt
     distance = _norm((pieces.evaluate(drones[0][k], t) - pieces.evaluate(drones[1][k], t))[:, :3])
-    is_closer = distance < best[pair[k]]
-    best[pair[k[is_closer]]], best_time[pair[k[is_closer]]] = distance[is_closer], t[is_closer]
+    is_closer = distance < upper_bound[pair[k]]
+    upper_bound[pair[k[is_closer]]], best_time[pair[k[is_closer]]] = distance[is_closer], t[is_closer]
     return to_chord - deviation
 
 

@@ -52,9 +52,9 @@ def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
         (degree + 1, k)
     """
     n = coefficients.shape[1]
-    raised = n - 1 if degree is None else degree
-    padded = np.pad(coefficients, ((0, 0), (0, raised + 1 - n)))
-    return bernstein_matrix(raised) @ padded.T
+    new_degree = n - 1 if degree is None else degree
+    padded = np.pad(coefficients, ((0, 0), (0, new_degree + 1 - n)))
+    return bernstein_matrix(new_degree) @ padded.T
 
 
 def restrict_interval(coefficients: NDArray, start: float, end: float) -> NDArray:
@@ -83,6 +83,6 @@ def significant_degree(coefficients: NDArray, tolerance: float) -> int:
         coefficients: Constant term first. (k, n)
         tolerance: Largest sum of the omitted coefficients.
     """
-    tails = np.cumsum(np.abs(coefficients)[:, ::-1], axis=1)[:, ::-1].max(axis=0)
-    above = np.flatnonzero(tails[1:] > tolerance)
-    return int(above[-1]) + 1 if len(above) else 0
+    tail_sums = np.cumsum(np.abs(coefficients)[:, ::-1], axis=1)[:, ::-1].max(axis=0)
+    significant = np.flatnonzero(tail_sums[1:] > tolerance)
+    return int(significant[-1]) + 1 if len(significant) else 0

@@ -51,27 +51,27 @@ def fill_in_corridors(
     """
     unit = float(np.mean(durations))
     powers = unit ** np.arange(nodes.shape[1])[:, None]
-    scaled, lengths = nodes * powers, durations / unit
-    filled = interpolation.fill_derivatives(scaled, lengths)
-    program = _Program(scaled, filled, lengths)
-    inner, limit = radii * (1 - RADIUS_MARGIN), radii * (1 - RADIUS_MARGIN / 2)
+    scaled_nodes, lengths = nodes * powers, durations / unit
+    filled_nodes = interpolation.fill_derivatives(scaled_nodes, lengths)
+    program = _Program(scaled_nodes, filled_nodes, lengths)
+    inner_radii, max_radii = radii * (1 - RADIUS_MARGIN), radii * (1 - RADIUS_MARGIN / 2)
     for _ in range(MAX_ITERATIONS):
-        paths = interpolation.unit_coefficients(filled, lengths)
+        paths = interpolation.unit_coefficients(filled_nodes, lengths)
 
         def deviation(piece: np.ndarray, u: Floats, paths: Floats = paths) -> Vectors:
             return _deviation(paths[piece], nodes[piece, 0], nodes[piece + 1, 0], u)
 
-        piece, u = _maxima(lambda piece, u: deviation(piece, u)[2], 0.5 * radii)
-        outside, nearest, distance = deviation(piece, u)
-        is_outside = distance > limit[piece]
-        piece, normal = piece[is_outside], outside[is_outside] / distance[is_outside, None]
-        cuts = [(piece, u[is_outside], normal, np.sum(normal * nearest[is_outside], axis=-1) + inner[piece])]
+        piece, u = _find_maxima(lambda piece, u: deviation(piece, u)[2], 0.5 * radii)
+        offset, nearest, distance = deviation(piece, u)
+        is_outside = distance > max_radii[piece]
+        piece, normal = piece[is_outside], offset[is_outside] / distance[is_outside, None]
+        cuts = [(piece, u[is_outside], normal, np.sum(normal * nearest[is_outside], axis=-1) + inner_radii[piece])]
         cuts += [_height_half_spaces(paths[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)]
         piece, u, normal, reach = (np.concatenate(parts) for parts in zip(*cuts, strict=True))
         if not len(piece):
-            return filled / powers
+            return filled_nodes / powers
         program.add(piece, u, normal, reach)
-        filled = program.solve()
+        filled_nodes = program.solve()
     raise OutsideError(
         f"expected a curve inside its corridors and heights after {MAX_ITERATIONS} iterations, got one whose piece "
         f"{piece[0]} is not. Make the corridor wider, or add a waypoint."
@@ -90,13 +90,13 @@ def _height_half_spaces(heights: Floats, limit: float, sign: int) -> tuple[np.nd
         Pieces, times within them, normals and ``normal . pos`` of the limit. (n,), (n,), (n, 3), (n,)
     """
 
-    def excess(piece: np.ndarray, u: Floats) -> Floats:
+    def height_excess(piece: np.ndarray, u: Floats) -> Floats:
         return sign * (
             np.einsum("n...k,nk->n...", u[..., None] ** np.arange(heights.shape[-1]), heights[piece]) - limit
         )
 
-    piece, u = _maxima(excess, np.full(len(heights), -np.inf if np.isfinite(limit) else np.inf))
-    is_beyond = excess(piece, u) > HEIGHT_TOLERANCE
+    piece, u = _find_maxima(height_excess, np.full(len(heights), -np.inf if np.isfinite(limit) else np.inf))
+    is_beyond = height_excess(piece, u) > HEIGHT_TOLERANCE
     n = int(np.sum(is_beyond))
     return piece[is_beyond], u[is_beyond], np.tile([0.0, 0.0, float(sign)], (n, 1)), np.full(n, sign * limit)
 
@@ -119,11 +119,11 @@ def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Vectors:
     pos = np.einsum("n...k,nak->n...a", u[..., None] ** np.arange(paths.shape[-1]), paths)
     square = np.sum(segment**2, axis=-1)
     segment_fraction = np.sum((pos - start) * segment, axis=-1) / np.where(square > 0, square, 1.0)
-    nearest = start + np.clip(segment_fraction, 0.0, 1.0)[..., None] * segment
-    return pos - nearest, nearest, np.linalg.norm(pos - nearest, axis=-1)
+    nearest_point = start + np.clip(segment_fraction, 0.0, 1.0)[..., None] * segment
+    return pos - nearest_point, nearest_point, np.linalg.norm(pos - nearest_point, axis=-1)
 
 
-def _maxima(value: Callable[[np.ndarray, Floats], Floats], thresholds: Floats) -> tuple[np.ndarray, Floats]:
+def _find_maxima(value: Callable[[np.ndarray, Floats], Floats], thresholds: Floats) -> tuple[np.ndarray, Floats]:
     """Return pieces, and times within them, of the local maxima of a quantity along curves. (n,) each
 
     Args:
@@ -144,8 +144,8 @@ def _maxima(value: Callable[[np.ndarray, Floats], Floats], thresholds: Floats) -
 class _Program:
     """Quadratic program of least distance to the unconstrained minimum, in the metric of the cost."""
 
-    def __init__(self, nodes: Floats, filled: Floats, durations: Floats) -> None:
-        self.filled, self.is_free = filled, np.isnan(nodes)
+    def __init__(self, nodes: Floats, filled_nodes: Floats, durations: Floats) -> None:
+        self.filled_nodes, self.is_free = filled_nodes, np.isnan(nodes)
         self.order = nodes.shape[1]
         self.powers = durations[:, None] ** np.tile(np.arange(self.order), 2)
         size = nodes.shape[0] * self.order
@@ -153,9 +153,9 @@ class _Program:
         for p, block in enumerate(interpolation.cost_matrices(durations, self.order)):
             part = slice(p * self.order, (p + 2) * self.order)
             matrix[part, part] += block
-        free = [self.is_free[..., axis].ravel() for axis in range(3)]
-        self.factors = [np.linalg.cholesky(matrix[np.ix_(f, f)]) for f in free]
-        self.rows, self.slack = np.zeros((0, sum(map(np.sum, free)))), np.zeros(0)
+        free_nodes = [self.is_free[..., axis].ravel() for axis in range(3)]
+        self.factors = [np.linalg.cholesky(matrix[np.ix_(f, f)]) for f in free_nodes]
+        self.rows, self.slack = np.zeros((0, sum(map(np.sum, free_nodes)))), np.zeros(0)
 
     def add(self, piece: np.ndarray, u: Floats, normal: Floats, reach: Floats) -> None:
         """Add half-spaces: ``normal . pos <= reach`` at one time ``u`` within each piece. (n,), (n,), (n, 3), (n,)"""
@@ -164,7 +164,7 @@ class _Program:
         rows = np.zeros((n, self.is_free.shape[0], self.order, 3))
         values = ((weights * self.powers[piece])[..., None] * normal[:, None]).reshape(n, 2, self.order, 3)
         rows[np.arange(n), piece], rows[np.arange(n), piece + 1] = values[:, 0], values[:, 1]
-        slack = reach - np.einsum("nika,ika->n", rows, self.filled)
+        slack = reach - np.einsum("nika,ika->n", rows, self.filled_nodes)
         columns = [
             np.linalg.solve(factor, rows[..., axis].reshape(n, -1)[:, self.is_free[..., axis].ravel()].T)
             for axis, factor in enumerate(self.factors)
@@ -183,18 +183,18 @@ class _Program:
 
         scale = float(np.max(np.abs(self.slack)))
         system = np.concatenate([-self.rows.T, -self.slack[None] / scale])
-        right = np.append(np.zeros(len(system) - 1), 1.0)
-        residual = system @ nnls(system, right, maxiter=30 * system.shape[1])[0] - right
+        rhs = np.append(np.zeros(len(system) - 1), 1.0)
+        residual = system @ nnls(system, rhs, maxiter=30 * system.shape[1])[0] - rhs
         if -residual[-1] < 1e-12:
             raise _infeasible_error()
         step = -residual[:-1] / residual[-1] * scale
-        filled, first = self.filled.copy(), 0
+        filled_nodes, index = self.filled_nodes.copy(), 0
         for axis, factor in enumerate(self.factors):
-            part = step[first : first + len(factor)]
-            values = filled[..., axis]
+            part = step[index : index + len(factor)]
+            values = filled_nodes[..., axis]
             values[self.is_free[..., axis]] += np.linalg.solve(factor.T, part)
-            first += len(factor)
-        return filled
+            index += len(factor)
+        return filled_nodes
 
 
 def _infeasible_error() -> OutsideError:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.errors import ConfigError
 from crazysim.trajectories.trajectory import Trajectory
 
-TOLERANCE = 5e-6
+FIT_TOLERANCE = 5e-6
 """Largest error of the position of a fitted curve, m; float32 adds its rounding, 6e-8 of a coordinate."""
 MAX_PIECES = 20_000
 """Largest number of pieces of a fitted curve."""
@@ -172,7 +172,7 @@ def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 
 
 
 def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repeats: bool = False) -> Trajectory:
-    """Return a smooth curve as a trajectory of pieces of equal length, each within ``TOLERANCE``.
+    """Return a smooth curve as a trajectory of pieces of equal length, each within ``FIT_TOLERANCE``.
 
     Args:
         curve: The curve with its derivatives up to the third.
@@ -181,13 +181,13 @@ def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repea
         repeats: True to start again after the end.
     """
     max_piece_duration = (
-        2 * (TOLERANCE * math.factorial(8) / max_eighth_derivative) ** (1 / 8)
+        2 * (FIT_TOLERANCE * math.factorial(8) / max_eighth_derivative) ** (1 / 8)
         if max_eighth_derivative > 0
         else math.inf
     )
     if duration / max_piece_duration > MAX_PIECES:
         raise ConfigError(
-            f"expected a curve of at most {MAX_PIECES} polynomials within {TOLERANCE * 1e6:g} um, got one of "
+            f"expected a curve of at most {MAX_PIECES} polynomials within {FIT_TOLERANCE * 1e6:g} um, got one of "
             f"{duration / max_piece_duration:.3g}. Use fewer turns or lower frequencies, or a smaller size."
         )
     n = max(1, math.ceil(duration / max_piece_duration))

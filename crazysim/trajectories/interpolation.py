@@ -97,9 +97,9 @@ def fill_derivatives(nodes: Floats, durations: Floats) -> Floats:
     order = nodes.shape[1]
     unit = float(np.mean(durations))
     powers = unit ** np.arange(order)[:, None]
-    scaled = nodes * powers
+    scaled_nodes = nodes * powers
     blocks = cost_matrices(durations / unit, order)
-    return np.stack([_fill_axis(scaled[..., axis], blocks) for axis in range(nodes.shape[2])], axis=-1) / powers
+    return np.stack([_fill_axis(scaled_nodes[..., axis], blocks) for axis in range(nodes.shape[2])], axis=-1) / powers
 
 
 def _fill_axis(nodes: Floats, blocks: Floats) -> Floats:

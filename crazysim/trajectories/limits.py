@@ -148,8 +148,8 @@ class Report:
             )
         if self.closest:
             pair = self.closest[0]
-            who = " and ".join(self.names[k] for k in pair.drones)
-            lines.append(f"separation: {pair.distance:.4g} m ({who} at {pair.time:.2f} s)")
+            drone_names = " and ".join(self.names[k] for k in pair.drones)
+            lines.append(f"separation: {pair.distance:.4g} m ({drone_names} at {pair.time:.2f} s)")
         lines += [f"{len(self.violations) or 'no'} violation{'s' * (len(self.violations) != 1)}"]
         return "\n".join([*lines, *map(str, self.violations)])
 

@@ -52,10 +52,10 @@ def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:
     rows = np.concatenate(columns, axis=-1).reshape(-1, 8)
     small_batch, large_batch = BATCH_SIZES
     chunk = small_batch if len(rows) <= small_batch else large_batch
-    padded = np.zeros((-(-len(rows) // chunk) * chunk, 8))
-    padded[: len(rows)] = rows
+    padded_rows = np.zeros((-(-len(rows) // chunk) * chunk, 8))
+    padded_rows[: len(rows)] = rows
     with jax.enable_x64(True):
-        rates = [np.asarray(_compiled_body_rate(padded[k : k + chunk])) for k in range(0, len(padded), chunk)]
+        rates = [np.asarray(_compiled_body_rate(padded_rows[k : k + chunk])) for k in range(0, len(padded_rows), chunk)]
     return np.concatenate(rates)[: len(rows)].reshape(acc.shape[:-1])
 
 
@@ -113,7 +113,7 @@ def _peak(table: PieceTable, quantity: Quantity) -> Peak:
     powers = u ** np.arange(table.coefficients.shape[-1])[:, None]
 
     def sample_pieces(part: slice) -> Floats:
-        derivatives = [table.coefficients_of(k)[part] for k in quantity.orders]
+        derivatives = [table.derivative_coefficients(k)[part] for k in quantity.orders]
         values = [np.swapaxes(c @ powers[: c.shape[-1]], 1, 2) for c in derivatives]
         return quantity.sign * quantity.compute(*values)
 
@@ -138,8 +138,8 @@ def _peak(table: PieceTable, quantity: Quantity) -> Peak:
 
 def _candidates(samples: Floats, threshold: Floats) -> tuple[Ints, Ints]:
     """Return piece and sample of the local maxima of pieces above their thresholds; a plateau by its first sample."""
-    padded = np.pad(samples, ((0, 0), (1, 1)), constant_values=-np.inf)
-    is_maximum = (samples > padded[:, :-2]) & (samples >= padded[:, 2:])
+    padded_samples = np.pad(samples, ((0, 0), (1, 1)), constant_values=-np.inf)
+    is_maximum = (samples > padded_samples[:, :-2]) & (samples >= padded_samples[:, 2:])
     return np.nonzero(is_maximum & (samples >= threshold[:, None]))  # type: ignore[return-value]
 
 
@@ -147,12 +147,15 @@ def _golden_sections(function: Callable[[Floats], Floats], low: Floats, high: Fl
     """Return the maxima of a function in intervals with one maximum each, and their arguments. (n,) each"""
     ratio = (np.sqrt(5) - 1) / 2
     left, right = high - ratio * (high - low), low + ratio * (high - low)
-    at_left, at_right = function(left), function(right)
+    left_value, right_value = function(left), function(right)
     for _ in range(N_SECTIONS):
-        goes_left = at_left > at_right
+        goes_left = left_value > right_value
         low, high = np.where(goes_left, low, left), np.where(goes_left, right, high)
         probe = np.where(goes_left, high - ratio * (high - low), low + ratio * (high - low))
-        at_probe = function(probe)
+        probe_value = function(probe)
         left, right = np.where(goes_left, probe, right), np.where(goes_left, left, probe)
-        at_left, at_right = np.where(goes_left, at_probe, at_right), np.where(goes_left, at_left, at_probe)
-    return np.where(at_left > at_right, at_left, at_right), np.where(at_left > at_right, left, right)
+        left_value, right_value = (
+            np.where(goes_left, probe_value, right_value),
+            np.where(goes_left, left_value, probe_value),
+        )
+    return np.where(left_value > right_value, left_value, right_value), np.where(left_value > right_value, left, right)

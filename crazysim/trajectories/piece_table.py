@@ -59,7 +59,7 @@ class PieceTable:
             got = f"{duration!r}" if duration is not None else f"trajectories that end at {end:g} s"
             raise ConfigError(f"expected a positive, finite duration, s, got {got}. Use for example duration=10.0.")
         size = max(t.coefficients.shape[-1] for t in host)
-        parts = [_pieces(t, start, end, size) for t, start in zip(host, starts, strict=True)]
+        parts = [_collect_pieces(t, start, end, size) for t, start in zip(host, starts, strict=True)]
         drone = np.repeat(np.arange(n_drones), [len(part[0]) for part in parts])
         return PieceTable(end, drone, *(np.concatenate(x) for x in zip(*parts, strict=True)))
 
@@ -88,7 +88,7 @@ class PieceTable:
             derivatives.append(c)
         return derivatives
 
-    def coefficients_of(self, order: int) -> Floats:
+    def derivative_coefficients(self, order: int) -> Floats:
         """Return the coefficients of a derivative, up to snap. (n_pieces, 4, degree + 1 - order)"""
         return self._derivatives[order]
 
@@ -121,7 +121,7 @@ class PieceTable:
         return self.evaluate_pieces(piece, (t - self.start[piece]) / self.length[piece], order)
 
 
-def _pieces(t: Trajectory, start: float, duration: float, size: int) -> tuple[Floats, Floats, Floats]:
+def _collect_pieces(t: Trajectory, start: float, duration: float, size: int) -> tuple[Floats, Floats, Floats]:
     """Return starts, lengths and coefficients of the pieces of one trajectory up to a duration."""
     ends = np.asarray(t.ends, float)
     starts = np.concatenate([[0.0], ends[:-1]])
@@ -143,18 +143,18 @@ def _pieces(t: Trajectory, start: float, duration: float, size: int) -> tuple[Fl
     if end < duration:
         parts.append(_resting_piece(end, duration - end, last, size))
     starts, lengths, c = (np.concatenate(x) for x in zip(*parts, strict=True))
-    inside = starts < duration
-    return starts[inside], lengths[inside], c[inside]
+    is_before_end = starts < duration
+    return starts[is_before_end], lengths[is_before_end], c[is_before_end]
 
 
-def _cut_at_zero(starts: Floats, lengths: Floats, c: Floats) -> tuple[Floats, Floats, Floats]:
+def _cut_at_zero(starts: Floats, lengths: Floats, coefficients: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the pieces that end after time zero; the first one is cut there."""
     ends_after_zero = starts + lengths > 0
-    starts, lengths, c = starts[ends_after_zero], lengths[ends_after_zero], c[ends_after_zero]
+    starts, lengths, coefficients = starts[ends_after_zero], lengths[ends_after_zero], coefficients[ends_after_zero]
     if len(starts) and starts[0] < 0:
-        c[0] = restrict_interval(c[0], -starts[0] / lengths[0], 1.0)
+        coefficients[0] = restrict_interval(coefficients[0], -starts[0] / lengths[0], 1.0)
         lengths[0], starts[0] = lengths[0] + starts[0], 0.0
-    return starts, lengths, c
+    return starts, lengths, coefficients
 
 
 def _resting_piece(start: float, length: float, pose: Floats, size: int) -> tuple[Floats, Floats, Floats]:

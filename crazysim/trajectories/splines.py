@@ -55,8 +55,8 @@ def spline(
     nodes[:, 0] = np.concatenate([require_finite(x, "points"), unwrap_yaw(yaw, len(knots))[:, None]], axis=1)
     if at_rest:
         nodes[[0, -1], 1:] = 0.0
-    filled = interpolation.fill_derivatives(nodes, durations)
-    return trajectory_of_unit_pieces(durations, interpolation.unit_coefficients(filled, durations))
+    filled_nodes = interpolation.fill_derivatives(nodes, durations)
+    return trajectory_from_unit_pieces(durations, interpolation.unit_coefficients(filled_nodes, durations))
 
 
 def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: bool = False) -> Trajectory:
@@ -94,10 +94,10 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
         interpolation.pad_degree(power_coefficients(require_finite(curve, "control points")), degree)
         for curve in curves
     ]
-    return trajectory_of_unit_pieces(durations, np.stack(pieces), repeats)
+    return trajectory_from_unit_pieces(durations, np.stack(pieces), repeats)
 
 
-def trajectory_of_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
+def trajectory_from_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
     """Return the trajectory of polynomials in each piece's time divided by its length.
 
     Args:
@@ -133,6 +133,6 @@ def require_finite(values: NDArray[np.float64], name: str) -> NDArray[np.float64
         name: Name for the message.
     """
     if not np.all(np.isfinite(values)):
-        where = np.argwhere(~np.isfinite(values))[0].tolist()
-        raise ConfigError(f"expected finite {name}, got {values[tuple(where)]} at index {where}. Remove or replace it.")
+        index = np.argwhere(~np.isfinite(values))[0].tolist()
+        raise ConfigError(f"expected finite {name}, got {values[tuple(index)]} at index {index}. Remove or replace it.")
     return values

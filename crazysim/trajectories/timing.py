@@ -17,7 +17,7 @@ from crazysim.trajectories.piece_table import PieceTable
 LIMIT_MARGIN = 1e-4
 """Fraction of a limit that is left unused, for the rounding of trajectories in float32. Height limits may instead be
 exceeded by half of this fraction, since waypoints may lie on them."""
-PRECISION = 1e-5
+DURATION_TOLERANCE = 1e-5
 """Relative precision of the factor by which durations are scaled."""
 DURATION_FACTOR = 1.25
 """Factor by which the durations are changed until the limits are met, then until they are not."""
@@ -57,9 +57,9 @@ def best_ratios(nodes: Floats, durations: Floats) -> Floats:
 
     def logarithm_of_cost(ratios: Floats) -> tuple[float, Floats]:
         lengths = durations_of(ratios)
-        filled = interpolation.fill_derivatives(nodes, lengths)
-        cost = interpolation.derivative_cost(filled, lengths)
-        slope = interpolation.cost_gradient(filled, lengths) * lengths
+        filled_nodes = interpolation.fill_derivatives(nodes, lengths)
+        cost = interpolation.derivative_cost(filled_nodes, lengths)
+        slope = interpolation.cost_gradient(filled_nodes, lengths) * lengths
         return float(np.log(cost)), (slope - lengths / total * np.sum(slope)) / cost
 
     if len(durations) == 1:
@@ -81,9 +81,9 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
     ends = np.cumsum(durations)
     table = PieceTable(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
     extremes = peaks(table, tuple(checked))
-    excess = {name: QUANTITIES[name].sign * (extremes[name].value[0] - limit) for name, limit in checked.items()}
+    excesses = {name: QUANTITIES[name].sign * (extremes[name].value[0] - limit) for name, limit in checked.items()}
     margins = {name: -LIMIT_MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * LIMIT_MARGIN for name in checked}
-    return [name for name, limit in checked.items() if excess[name] > margins[name] * limit_size(name, limit)]
+    return [name for name, limit in checked.items() if excesses[name] > margins[name] * limit_size(name, limit)]
 
 
 def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:
@@ -129,7 +129,7 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
             f"expected limits that bound the speed of the flight, got {limits}. Set a limit of speed or acceleration, "
             f"or pass durations."
         )
-    while high > low * (1 + PRECISION):
+    while high > low * (1 + DURATION_TOLERANCE):
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if exceeded_limits(middle) else (low, middle)
     return durations * high

@@ -28,8 +28,8 @@ N_DERIVATIVES = 4
 class Trajectory(PyTree):
     """Position and yaw of one vehicle as piecewise polynomials of time; leading axes hold several trajectories.
 
-    Each piece is a polynomial of its own time scaled to ``u`` in [0, 1], which suits float32. Before its start a
-    trajectory is at rest at its first point; after its end it is at rest at its last point, or starts again.
+    Each piece is a polynomial of the time since its start, scaled to ``u`` in [0, 1], which suits float32. Before its
+    start a trajectory is at rest at its first point; after its end it is at rest at its last point, or starts again.
     """
 
     ends: Array = leaf("shared", 1)
@@ -128,19 +128,19 @@ class Trajectory(PyTree):
         """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
         end, repeats = _entry_at(ends, index, ends.shape[1] - 1), _entry_at(jnp.asarray(self.repeats), index)
-        local, inside = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
+        local, is_active = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
         piece = _piece(ends, index, local)
         start = jnp.where(piece > 0, _entry_at(ends, index, piece - 1), 0.0)
         inverse = _inverse(jnp, _entry_at(ends, index, piece) - start)
-        u, of_piece = (local - start) * inverse, _entry_at(coefficients, index, piece)
+        u, piece_coefficients = (local - start) * inverse, _entry_at(coefficients, index, piece)
         degrees = [self.degree] * 4 if degrees is None else degrees
         rows: dict[int, list[Array]] = {}
         for degree in sorted(set(degrees)):
             axes = [k for k, d in enumerate(degrees) if d == degree]
-            derivatives = _derivatives(of_piece[np.array(axes), : degree + 1], u, N_DERIVATIVES)
+            derivatives = _derivatives(piece_coefficients[np.array(axes), : degree + 1], u, N_DERIVATIVES)
             rows.update((axis, [x[k] for x in derivatives]) for k, axis in enumerate(axes))
         values = [jnp.stack([rows[axis][k] for axis in range(4)]) for k in range(N_DERIVATIVES + 1)]
-        return _setpoint(_per_second(values, jnp.where(inside, inverse * rate, 0.0)))
+        return _setpoint(_per_second(values, jnp.where(is_active, inverse * rate, 0.0)))
 
     def derivatives(self, t: ArrayLike, order: int) -> list[Array]:
         """Return x, y, z, m, and yaw, rad, of one trajectory at one time, and their derivatives up to an order.
@@ -157,11 +157,11 @@ class Trajectory(PyTree):
         # One row of a table for each piece, so that a single lookup suffices; its parts begin at multiples of four.
         numbers = [starts, _inverse(xp, self.ends - starts), xp.zeros((2, n), self.ends.dtype)]
         table = xp.concatenate([xp.vstack(numbers).T, self.coefficients.reshape(n, -1)], axis=1)
-        local, inside = _local_time(jnp.asarray(t, self.ends.dtype), self.ends[-1], self.repeats)
+        local, is_active = _local_time(jnp.asarray(t, self.ends.dtype), self.ends[-1], self.repeats)
         piece = _piece(jnp.asarray(self.ends)[None], 0, local)
         row = jnp.asarray(table).at[piece].get(mode="promise_in_bounds")
         derivatives = _derivatives(row[4:].reshape(4, -1), (local - row[0]) * row[1], order)
-        return _per_second(derivatives, jnp.where(inside, row[1], 0.0))
+        return _per_second(derivatives, jnp.where(is_active, row[1], 0.0))
 
     def degrees(self) -> tuple[int, ...]:
         """Return the largest degree with a nonzero coefficient of x, y, z and yaw, or -1 for none, on the host.
@@ -171,8 +171,8 @@ class Trajectory(PyTree):
         if isinstance(self.coefficients, jax.core.Tracer):
             return (self.degree,) * 4
         c = np.asarray(self.coefficients)
-        used = np.any(c.reshape(-1, *c.shape[-2:]) != 0, axis=0)
-        return tuple([int(np.max(np.flatnonzero(row), initial=-1)) for row in used])
+        is_used = np.any(c.reshape(-1, *c.shape[-2:]) != 0, axis=0)
+        return tuple([int(np.max(np.flatnonzero(row), initial=-1)) for row in is_used])
 
     @staticmethod
     def stack(trajectories: Sequence[Trajectory]) -> Trajectory:
@@ -200,13 +200,13 @@ class Trajectory(PyTree):
         Added pieces have no length and stay at the last point.
         """
         xp = _array_module(self)
-        more, higher = max(0, n_pieces - self.n_pieces), max(0, degree - self.degree)
-        ends = xp.concatenate([self.ends, xp.broadcast_to(self.ends[-1:], (more,))])
-        coefficients = xp.pad(self.coefficients, ((0, 0), (0, 0), (0, higher)))
-        last = xp.sum(coefficients[-1:], axis=-1, keepdims=True)
-        rest = xp.pad(last, ((0, 0), (0, 0), (0, self.degree + higher)))
-        rest = xp.broadcast_to(rest, (more, *rest.shape[1:]))
-        return self.replace(ends=ends, coefficients=xp.concatenate([coefficients, rest]))
+        n_added_pieces, n_added_degrees = max(0, n_pieces - self.n_pieces), max(0, degree - self.degree)
+        ends = xp.concatenate([self.ends, xp.broadcast_to(self.ends[-1:], (n_added_pieces,))])
+        coefficients = xp.pad(self.coefficients, ((0, 0), (0, 0), (0, n_added_degrees)))
+        end_pose = xp.sum(coefficients[-1:], axis=-1, keepdims=True)
+        rest_piece = xp.pad(end_pose, ((0, 0), (0, 0), (0, self.degree + n_added_degrees)))
+        rest_piece = xp.broadcast_to(rest_piece, (n_added_pieces, *rest_piece.shape[1:]))
+        return self.replace(ends=ends, coefficients=xp.concatenate([coefficients, rest_piece]))
 
     def repeat(self, n: int | None = None) -> Trajectory:
         """Return this trajectory flown several times, one after the other; for one vehicle.
@@ -241,24 +241,24 @@ class Trajectory(PyTree):
                 continuous velocity, acceleration and jerk, and yaw turned the shorter way; 0 for none.
         """
         if self.repeats or other.repeats:
-            which = "first" if self.repeats else "second"
+            order = "first" if self.repeats else "second"
             raise ConfigError(
-                f"expected trajectories that end, got a {which} one that repeats without end. Use its repeat(n), such "
+                f"expected trajectories that end, got a {order} one that repeats without end. Use its repeat(n), such "
                 f"as repeat(1) for one round."
             )
         is_number = isinstance(transition, (int, float, np.number)) and not isinstance(transition, bool)
         if not is_number or not 0 <= transition < np.inf:
             raise ConfigError(f"expected a transition of 0 s or more, got {transition!r}. Use for example 1.0.")
         if transition > 0:
-            before, after = self._edge(last=True), other._edge(last=False)
-            turns = 2 * np.pi * np.round((before[0, 3] - after[0, 3]) / (2 * np.pi))
-            after[0, 3] += turns
+            before, after = self._edge(at_end=True), other._edge(at_end=False)
+            yaw_shift = 2 * np.pi * np.round((before[0, 3] - after[0, 3]) / (2 * np.pi))
+            after[0, 3] += yaw_shift
             lengths = np.array([transition], float)
-            between = unit_coefficients(np.stack([before, after]), lengths).astype(self.coefficients.dtype)
+            coefficients = unit_coefficients(np.stack([before, after]), lengths).astype(self.coefficients.dtype)
             ends = lengths.astype(self.ends.dtype)
-            piece = Trajectory(ends, between, np.bool_(False))  # type: ignore[arg-type]
-            turned = other.coefficients + np.pad([[turns]], ((3, 0), (0, other.degree))).astype(between.dtype)
-            return self.then(piece).then(other.replace(coefficients=turned))
+            piece = Trajectory(ends, coefficients, np.bool_(False))  # type: ignore[arg-type]
+            shifted = other.coefficients + np.pad([[yaw_shift]], ((3, 0), (0, other.degree))).astype(coefficients.dtype)
+            return self.then(piece).then(other.replace(coefficients=shifted))
         degree = max(self.degree, other.degree)
         first, second = self.padded(0, degree), other.padded(0, degree)
         xp = _array_module([first, second])
@@ -267,11 +267,11 @@ class Trajectory(PyTree):
             coefficients=xp.concatenate([first.coefficients, second.coefficients]),
         )
 
-    def _edge(self, last: bool) -> np.ndarray:
+    def _edge(self, at_end: bool) -> np.ndarray:
         """Return x, y, z and yaw at the start or the end, with derivatives up to jerk, on the host. (4, 4)"""
         lengths = np.diff(np.asarray(self.ends, float), prepend=0.0)
-        real = np.flatnonzero(lengths > 0)
-        k, u = (real[-1], 1.0) if last else (real[0], 0.0)
+        nonempty = np.flatnonzero(lengths > 0)
+        k, u = (nonempty[-1], 1.0) if at_end else (nonempty[0], 0.0)
         c = np.polynomial.polynomial.Polynomial
         polynomials = [c(x) for x in np.asarray(self.coefficients[k], float)]
         return np.array([[p.deriv(m)(u) / lengths[k] ** m for p in polynomials] for m in range(4)])
@@ -293,9 +293,9 @@ class Trajectory(PyTree):
         c, offset = self.coefficients, xp.asarray(offset, self.coefficients.dtype)
         cos, sin = xp.cos(yaw).astype(c.dtype), xp.sin(yaw).astype(c.dtype)
         x, y = cos * c[..., 0, :] - sin * c[..., 1, :], sin * c[..., 0, :] + cos * c[..., 1, :]
-        turned = xp.stack([x, y, c[..., 2, :], c[..., 3, :]], axis=-2)
-        constant = turned[..., :1] + xp.append(offset, xp.asarray(yaw, c.dtype))[:, None]
-        return self.replace(coefficients=xp.concatenate([constant, turned[..., 1:]], axis=-1))
+        rotated = xp.stack([x, y, c[..., 2, :], c[..., 3, :]], axis=-2)
+        constant = rotated[..., :1] + xp.append(offset, xp.asarray(yaw, c.dtype))[:, None]
+        return self.replace(coefficients=xp.concatenate([constant, rotated[..., 1:]], axis=-1))
 
 
 def _array_module(tree: object) -> Any:
@@ -369,8 +369,8 @@ def _derivatives(coefficients: Array, u: Array, order: int) -> list[Array]:
         return [jnp.zeros(coefficients.shape[:-1], coefficients.dtype)] * (order + 1)
     taylor = columns[:1]
     for column in columns[1:]:
-        raised = [taylor[0] * u + column]
-        raised += [taylor[k] * u + taylor[k - 1] for k in range(1, len(taylor))]
-        taylor = [*raised, taylor[-1]][: order + 1]
+        products = [taylor[0] * u + column]
+        products += [taylor[k] * u + taylor[k - 1] for k in range(1, len(taylor))]
+        taylor = [*products, taylor[-1]][: order + 1]
     taylor += [jnp.zeros_like(columns[0])] * (order + 1 - len(taylor))
     return [math.factorial(k) * value for k, value in enumerate(taylor)]

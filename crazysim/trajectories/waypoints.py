@@ -14,7 +14,7 @@ from crazysim.trajectories import interpolation, timing
 from crazysim.trajectories.corridors import HEIGHT_TOLERANCE, fill_in_corridors
 from crazysim.trajectories.interpolation import Floats
 from crazysim.trajectories.limits import Limits
-from crazysim.trajectories.splines import require_finite, trajectory_of_unit_pieces, unwrap_yaw
+from crazysim.trajectories.splines import require_finite, trajectory_from_unit_pieces, unwrap_yaw
 from crazysim.trajectories.trajectory import Trajectory
 
 YAW_ORDER = 2
@@ -57,7 +57,7 @@ def minimum_snap(
     Raises:
         ConfigError: If the waypoints cannot be flown within the limits or corridors.
     """
-    return _plan(waypoints, durations, (velocities, accelerations, jerks), limits, yaw, corridors)
+    return _plan_trajectory(waypoints, durations, (velocities, accelerations, jerks), limits, yaw, corridors)
 
 
 def minimum_jerk(
@@ -87,7 +87,7 @@ def minimum_jerk(
     Raises:
         ConfigError: As for ``minimum_snap``.
     """
-    return _plan(waypoints, durations, (velocities, accelerations), limits, yaw, corridors)
+    return _plan_trajectory(waypoints, durations, (velocities, accelerations), limits, yaw, corridors)
 
 
 def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Trajectory, Array]:
@@ -112,7 +112,7 @@ def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Traje
     unit = jnp.mean(durations)
     lengths = (durations / unit)[:, None]
     powers = jnp.concatenate([lengths**j for j in range(k)] * 2, axis=-1)  # (n_pieces, 2k)
-    scaled = (
+    scaled_nodes = (
         jnp.asarray(interpolation.unit_cost(k), dtype)
         * powers[:, :, None]
         * powers[:, None]
@@ -120,31 +120,31 @@ def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Traje
     )
     entries = k * np.arange(n_pieces)[:, None] + np.arange(2 * k)
     size = k * (n_pieces + 1)
-    matrix = jnp.zeros((size, size), dtype).at[entries[:, :, None], entries[:, None, :]].add(scaled)
+    matrix = jnp.zeros((size, size), dtype).at[entries[:, :, None], entries[:, None, :]].add(scaled_nodes)
 
-    position, inner = np.arange(0, size, k), np.setdiff1d(np.arange(k, size - k), np.arange(0, size, k))
+    position, inner_indices = np.arange(0, size, k), np.setdiff1d(np.arange(k, size - k), np.arange(0, size, k))
     values = jnp.zeros((size, 3), dtype).at[position].set(waypoints)
-    block = matrix[inner[:, None], inner]
+    block = matrix[inner_indices[:, None], inner_indices]
     weight = 1 / jnp.sqrt(jnp.diagonal(block))[:, None]  # to a diagonal of ones
-    right_side = -matrix[inner[:, None], position] @ waypoints
-    values = values.at[inner].set(weight * jnp.linalg.solve(weight * block * weight.T, weight * right_side))
+    right_side = -matrix[inner_indices[:, None], position] @ waypoints
+    values = values.at[inner_indices].set(weight * jnp.linalg.solve(weight * block * weight.T, weight * right_side))
 
     ends = values[entries]  # (n_pieces, 2k, 3)
-    cost = jnp.sum(ends * jnp.einsum("pij,pja->pia", scaled, ends)) * unit ** (1 - 2 * k)
+    cost = jnp.sum(ends * jnp.einsum("pij,pja->pia", scaled_nodes, ends)) * unit ** (1 - 2 * k)
     paths = jnp.einsum("cj,pj,pja->pac", jnp.asarray(interpolation.hermite_basis(k), dtype), powers, ends)
     coefficients = jnp.concatenate([paths, jnp.zeros_like(paths[:, :1])], axis=1)
     return Trajectory(jnp.cumsum(durations), coefficients, jnp.zeros((), bool)), cost
 
 
-def _plan(
+def _plan_trajectory(
     waypoints: ArrayLike,
     durations: ArrayLike | None,
-    fixed: Sequence[ArrayLike | None],
+    fixed_derivatives: Sequence[ArrayLike | None],
     limits: Limits | None,
     yaw: ArrayLike,
     corridors: ArrayLike | None,
 ) -> Trajectory:
-    nodes = _nodes(waypoints, fixed)
+    nodes = _nodes(waypoints, fixed_derivatives)
     n_pieces = len(nodes) - 1
     angles = np.full((n_pieces + 1, YAW_ORDER, 1), np.nan)
     angles[:, 0, 0], angles[[0, -1], 1:] = unwrap_yaw(yaw, n_pieces + 1), 0.0
@@ -152,15 +152,15 @@ def _plan(
 
     def solve(lengths: Floats) -> Floats:
         try:
-            filled = interpolation.fill_derivatives(nodes, lengths)
+            filled_nodes = interpolation.fill_derivatives(nodes, lengths)
             if np.any(np.isfinite([*radii, *heights])):
-                filled = fill_in_corridors(nodes, lengths, radii, heights)
+                filled_nodes = fill_in_corridors(nodes, lengths, radii, heights)
         except np.linalg.LinAlgError as error:
             raise ConfigError(
                 f"expected a unique trajectory, got {n_pieces + 1} waypoints with too few fixed derivatives. Add "
                 f"waypoints, or fix the derivatives at the ends."
             ) from error
-        paths = interpolation.unit_coefficients(filled, lengths)
+        paths = interpolation.unit_coefficients(filled_nodes, lengths)
         yaw_paths = interpolation.unit_coefficients(interpolation.fill_derivatives(angles, lengths), lengths)
         return np.concatenate([paths, interpolation.pad_degree(yaw_paths, paths.shape[-1] - 1)], axis=1)
 
@@ -173,7 +173,7 @@ def _plan(
                 f"expected durations that meet the limits, got a trajectory that exceeds {' and '.join(names)}. "
                 f"Multiply the durations by {factor * 1.001:.4g}, or omit them."
             )
-        return trajectory_of_unit_pieces(lengths, coefficients)
+        return trajectory_from_unit_pieces(lengths, coefficients)
     if limits is None:
         raise ConfigError("expected durations or limits, got neither. Pass limits=Limits(speed=..., acceleration=...).")
     distances = np.linalg.norm(np.diff(nodes[:, 0], axis=0), axis=-1)
@@ -187,12 +187,14 @@ def _plan(
     is_scalable = np.all(np.nan_to_num(nodes[:, 1:]) == 0)  # then the path is the same at any speed
     if is_scalable:
         coefficients = solve(guess)
-        return trajectory_of_unit_pieces(timing.shortest_durations(lambda _: coefficients, guess, limits), coefficients)
+        return trajectory_from_unit_pieces(
+            timing.shortest_durations(lambda _: coefficients, guess, limits), coefficients
+        )
     lengths = timing.shortest_durations(solve, guess, limits)
-    return trajectory_of_unit_pieces(lengths, solve(lengths))
+    return trajectory_from_unit_pieces(lengths, solve(lengths))
 
 
-def _nodes(waypoints: ArrayLike, fixed: Sequence[ArrayLike | None]) -> Floats:
+def _nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike | None]) -> Floats:
     """Return the derivatives at each waypoint, NaN where free. (n, k, 3)"""
     positions = np.asarray(waypoints, float)
     if positions.ndim != 2 or positions.shape[1] != 3 or len(positions) < 2:
@@ -200,9 +202,11 @@ def _nodes(waypoints: ArrayLike, fixed: Sequence[ArrayLike | None]) -> Floats:
             f"expected waypoints (n, 3), at least two, got shape {positions.shape}. Pass an array with a row for each "
             f"point."
         )
-    nodes = np.full((len(positions), len(fixed) + 1, 3), np.nan)
+    nodes = np.full((len(positions), len(fixed_derivatives) + 1, 3), np.nan)
     nodes[:, 0] = require_finite(positions, "waypoints")
-    for k, (name, values) in enumerate(zip(("velocities", "accelerations", "jerks"), fixed, strict=False), start=1):
+    for k, (name, values) in enumerate(
+        zip(("velocities", "accelerations", "jerks"), fixed_derivatives, strict=False), start=1
+    ):
         if values is None:
             nodes[[0, -1], k] = 0.0
             continue

@@ -48,7 +48,7 @@ def law(drone):
 
 
 def memory():
-    return jax.tree.map(jnp.asarray, INDIMemory.at_rest())
+    return jax.tree.map(jnp.asarray, INDIMemory.create())
 
 
 def test_a_return_to_the_controller_starts_its_filter_anew():

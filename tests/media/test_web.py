@@ -19,7 +19,7 @@ from waiting import wait_for
 from crazysim.__main__ import main
 from crazysim.errors import RenderError
 from crazysim.media import Recorder, web
-from crazysim.media.web import FOV, camera_of, page
+from crazysim.media.web import FOV, initial_camera_pose, page
 from crazysim.sim import Sim
 
 START, END = np.array([-0.5, 0.0, 0.8]), np.array([0.5, 0.0, 1.2])
@@ -84,7 +84,7 @@ def scrub(browser, part):
 
 def pixel(browser, flight, point, world):
     """Return column and row at which a page's camera sees a point at first."""
-    position, target = camera_of(flight, world)
+    position, target = initial_camera_pose(flight, world)
     ahead = (target - position) / np.linalg.norm(target - position)
     right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
     left, top, width, height = browser.box("canvas")
@@ -174,7 +174,7 @@ class Served:
 
 
 def test_a_served_page_says_who_can_watch(monkeypatch, capsys):
-    monkeypatch.setattr(web, "server_of", lambda html, port, host: Served())
+    monkeypatch.setattr(web, "create_server", lambda html, port, host: Served())
     web.serve_page("", 0)
     assert capsys.readouterr().out == "serving the flight at http://127.0.0.1:8123; stop with Ctrl-C\n"
     web.serve_page("", 0, "0.0.0.0")
@@ -182,7 +182,7 @@ def test_a_served_page_says_who_can_watch(monkeypatch, capsys):
 
 
 def test_a_served_page_answers_to_names_of_this_machine():
-    with web.server_of("<p>flight</p>", 0) as server:
+    with web.create_server("<p>flight</p>", 0) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         address = f"http://127.0.0.1:{server.server_port}"
@@ -197,7 +197,7 @@ def test_a_served_page_answers_to_names_of_this_machine():
 
 
 def test_a_port_in_use_is_named():
-    with web.server_of("", 0) as server:
+    with web.create_server("", 0) as server:
         assert server.server_address[0] == "127.0.0.1"
         with pytest.raises(RenderError, match=f"expected a free address, got 127.0.0.1:{server.server_port}"):
-            web.server_of("", server.server_port)
+            web.create_server("", server.server_port)

@@ -34,22 +34,22 @@ def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
     Raises:
         ConfigError: If a column is missing or the time does not increase.
     """
-    needed = ("time", "pos", "quat", "cmd_rpy", "cmd_f")
-    if missing := [key for key in needed if key not in data]:
-        raise ConfigError(f"expected {', '.join(needed)}, got no {', '.join(missing)}. Add them to the log.")
+    keys = ("time", "pos", "quat", "cmd_rpy", "cmd_f")
+    if missing := [key for key in keys if key not in data]:
+        raise ConfigError(f"expected {', '.join(keys)}, got no {', '.join(missing)}. Add them to the log.")
     log = {key: np.array(x, np.float64) for key, x in data.items()}
     time, pos, quat = log["time"] - log["time"][0], log["pos"], log["quat"]
     if not np.all(np.diff(time) > 0):
         raise ConfigError("expected a time that increases, got repeated or earlier samples. Drop them first.")
     dt = np.diff(time)
-    half = max(1, round(MEDIAN_DURATION / 2 / float(np.mean(dt))))
-    middle = np.stack([np.median(pos[max(0, k - half) : k + half + 1], axis=0) for k in range(len(time))])
-    good = ~np.any(np.abs(pos - middle) > OUTLIER_DISTANCE, axis=-1)
-    if np.sum(good) < 2:
+    half_window = max(1, round(MEDIAN_DURATION / 2 / float(np.mean(dt))))
+    middle = np.stack([np.median(pos[max(0, k - half_window) : k + half_window + 1], axis=0) for k in range(len(time))])
+    is_valid = ~np.any(np.abs(pos - middle) > OUTLIER_DISTANCE, axis=-1)
+    if np.sum(is_valid) < 2:
         raise ConfigError("expected positions along a path, got jumps at nearly every sample. Check their unit.")
     sign = np.cumprod(np.r_[1.0, np.where(np.sum(quat[1:] * quat[:-1], axis=-1) < 0, -1.0, 1.0)])
     quat = sign[:, None] * quat
-    pos, quat = (np.stack([np.interp(time, time[good], c[good]) for c in x.T], axis=-1) for x in (pos, quat))
+    pos, quat = (np.stack([np.interp(time, time[is_valid], c[is_valid]) for c in x.T], axis=-1) for x in (pos, quat))
     first = np.mean(quat[: max(1, round(LEVEL_DURATION / float(np.mean(dt))))], axis=0)
     inverse = first / np.linalg.norm(first) * [-1, -1, -1, 1]
     quat = np.asarray(rotation.multiply(jnp.asarray(inverse), jnp.asarray(quat)), np.float64)
@@ -75,8 +75,8 @@ def derivatives_svf(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
     log = {key: np.asarray(x, np.float64) for key, x in data.items()}
     time = log["time"]
 
-    def filter_signal(key: str, cutoff: str, held: bool = False) -> NDArray:
-        return state_variable_filter(log[key].T, time, CUTOFFS[cutoff], 3, held=held)
+    def filter_signal(key: str, cutoff: str, zero_order_hold: bool = False) -> NDArray:
+        return state_variable_filter(log[key].T, time, CUTOFFS[cutoff], 3, zero_order_hold=zero_order_hold)
 
     def columns(x: NDArray, k: int) -> NDArray:
         return x[:, k].T
@@ -85,13 +85,13 @@ def derivatives_svf(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
     log |= {f"SVF_{key}": columns(pos, k) for k, key in enumerate(("pos", "vel", "acc", "jerk"))}
     log |= {f"SVF_{key}": columns(rpy, k) for k, key in enumerate(("rpy", "drpy", "ddrpy", "dddrpy"))}
     log["SVF_quat"] = np.asarray(rotation.from_rpy(jnp.asarray(log["SVF_rpy"])), np.float64)
-    log["SVF_cmd_f"] = filter_signal("cmd_f", "translation", held=True)[0]
-    log["SVF_cmd_rpy"] = columns(filter_signal("cmd_rpy", "rotation", held=True), 0)
+    log["SVF_cmd_f"] = filter_signal("cmd_f", "translation", zero_order_hold=True)[0]
+    log["SVF_cmd_rpy"] = columns(filter_signal("cmd_rpy", "rotation", zero_order_hold=True), 0)
     return log
 
 
 def state_variable_filter(
-    y: ArrayLike, t: ArrayLike, f_c: float = 1.0, N_deriv: int = 2, *, held: bool = False
+    y: ArrayLike, t: ArrayLike, f_c: float = 1.0, N_deriv: int = 2, *, zero_order_hold: bool = False
 ) -> NDArray:
     """Filter a signal by a Butterworth low-pass backward and forward in time; return it and its derivatives.
 
@@ -103,7 +103,7 @@ def state_variable_filter(
         t: Times, s. (n,)
         f_c: Cutoff, Hz.
         N_deriv: Number of derivatives.
-        held: True for signals that stay constant until the next sample.
+        zero_order_hold: True for signals that stay constant until the next sample.
 
     Returns:
         Filtered signals and derivatives, (n_signals, N_deriv + 1, n), without axes of length one.
@@ -111,11 +111,11 @@ def state_variable_filter(
     from scipy.linalg import expm  # a fifth of a second to import
 
     y, t = np.atleast_2d(np.asarray(y, np.float64)), np.asarray(t, np.float64)
-    even = np.linspace(t[0], t[-1], len(t))
-    if held:
-        u = y[:, np.clip(np.searchsorted(t, even + 1e-9, side="right") - 1, 0, len(t) - 1)]
+    grid = np.linspace(t[0], t[-1], len(t))
+    if zero_order_hold:
+        u = y[:, np.clip(np.searchsorted(t, grid + 1e-9, side="right") - 1, 0, len(t) - 1)]
     else:
-        u = np.stack([np.interp(even, t, x) for x in y])
+        u = np.stack([np.interp(grid, t, x) for x in y])
     order, omega = N_deriv + 2, 2 * np.pi * f_c
     poles = np.exp(1j * np.pi * (2 * np.arange(1, order + 1) + order - 1) / (2 * order))
     a = np.zeros((order + 2, order + 2))  # filter states in time times omega, input, and the input's change
@@ -138,10 +138,10 @@ def state_variable_filter(
         return states
 
     zero = np.zeros((len(u), 1))
-    if held:  # backward in time, the value before a sample holds after it
-        back = low_pass(np.concatenate([u[:, -2::-1], u[:, :1]], axis=1), np.zeros_like(u))[:, ::-1, 0]
+    if zero_order_hold:  # backward in time, the value before a sample holds after it
+        backward_pass = low_pass(np.concatenate([u[:, -2::-1], u[:, :1]], axis=1), np.zeros_like(u))[:, ::-1, 0]
     else:
-        back = low_pass(u[:, ::-1], np.concatenate([np.diff(u[:, ::-1], axis=1), zero], axis=1))[:, ::-1, 0]
-    states = low_pass(back, np.concatenate([np.diff(back, axis=1), zero], axis=1))
-    interpolated = [[np.interp(t, even, omega**k * x[:, k]) for k in range(N_deriv + 1)] for x in states]
+        backward_pass = low_pass(u[:, ::-1], np.concatenate([np.diff(u[:, ::-1], axis=1), zero], axis=1))[:, ::-1, 0]
+    states = low_pass(backward_pass, np.concatenate([np.diff(backward_pass, axis=1), zero], axis=1))
+    interpolated = [[np.interp(t, grid, omega**k * x[:, k]) for k in range(N_deriv + 1)] for x in states]
     return np.squeeze(np.array(interpolated))

@@ -90,8 +90,10 @@ def sys_id_rotation(
     values, _ = fit_rotation([data])
     for name, log in (("data", data), ("validation", data_validation)):
         if log is not None:
-            rest = [_rotation_error(np.array([x[k] for x in values.values()]), *_angles(log, [k])) for k in range(3)]
-            logger.info("rotation, %s: RMSE of roll, pitch, yaw %s rad", name, [f"{_rms(x):.4g}" for x in rest])
+            rest_errors = [
+                _rotation_error(np.array([x[k] for x in values.values()]), *_angles(log, [k])) for k in range(3)
+            ]
+            logger.info("rotation, %s: RMSE of roll, pitch, yaw %s rad", name, [f"{_rms(x):.4g}" for x in rest_errors])
     return values
 
 
@@ -182,9 +184,9 @@ def _terms(
     if kind == Dynamics.so_rpy_rotor_drag:
         axial_vel = matrix[..., 2] * np.sum(matrix[..., 2] * vel, axis=-1, keepdims=True)
         terms += [vel - axial_vel, axial_vel]
-    inner = (time >= time[0] + EDGE_DURATION) & (time <= time[-1] - EDGE_DURATION)
-    inner = inner if np.any(inner) else np.ones(len(time), bool)
-    return (np.stack(terms, axis=-1) / mass)[inner], (acc - np.asarray(gravity, np.float64))[inner]
+    is_inner = (time >= time[0] + EDGE_DURATION) & (time <= time[-1] - EDGE_DURATION)
+    is_inner = is_inner if np.any(is_inner) else np.ones(len(time), bool)
+    return (np.stack(terms, axis=-1) / mass)[is_inner], (acc - np.asarray(gravity, np.float64))[is_inner]
 
 
 def lag_signal(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:

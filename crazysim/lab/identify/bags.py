@@ -22,7 +22,7 @@ from crazysim.lab.identify.readers import Stream, resample
 from crazysim.storage import read_text
 
 XYZ, XYZW = "xyz", "xyzw"
-POSES = {
+POSE_FIELDS = {
     "nav_msgs/msg/Odometry": ("pose/pose/position", "pose/pose/orientation"),
     "geometry_msgs/msg/PoseStamped": ("pose/position", "pose/orientation"),
     "geometry_msgs/msg/PoseWithCovarianceStamped": ("pose/pose/position", "pose/pose/orientation"),
@@ -30,7 +30,7 @@ POSES = {
     "geometry_msgs/msg/Pose": ("position", "orientation"),
 }
 """Fields of position and attitude by message type, most informative first."""
-ROTORS = {"actuator_msgs/msg/Actuators": "velocity", "mav_msgs/msg/Actuators": "angular_velocities"}
+ROTOR_FIELDS = {"actuator_msgs/msg/Actuators": "velocity", "mav_msgs/msg/Actuators": "angular_velocities"}
 """Fields of rotor speeds, rad/s, by message type."""
 
 MAX_METADATA = 2**24
@@ -72,9 +72,9 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
     A name such as ``/drone/odom/pose/pose/position/x`` or ``/motors/data[0]`` is a topic and a field of its messages.
     Without such names, topics are chosen by message type, and the columns are named as in crazysim's logs:
 
-    - Position and attitude come from the topic of the first type in ``POSES`` that the bag has. Odometry also gives
-      velocity and angular velocity. They are in the body frame (nav_msgs/Odometry), and the velocity is rotated to the
-      world frame.
+    - Position and attitude come from the topic of the first type in ``POSE_FIELDS`` that the bag has. Odometry also
+      gives velocity and angular velocity. They are in the body frame (nav_msgs/Odometry), and the velocity is rotated
+      to the world frame.
     - The angular velocity of an Imu replaces the angular velocity of Odometry.
     - Rotor speeds come from Actuators, rad/s (actuator_msgs, mav_msgs), and are converted to rpm.
 
@@ -142,14 +142,18 @@ def _default_columns(name: str, topics: dict[str, str]) -> dict[str, tuple[str, 
 
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
     columns = {}
-    pose, imu, rotors = find_topic(list(POSES)), find_topic(["sensor_msgs/msg/Imu"]), find_topic(list(ROTORS))
+    pose, imu, rotors = (
+        find_topic(list(POSE_FIELDS)),
+        find_topic(["sensor_msgs/msg/Imu"]),
+        find_topic(list(ROTOR_FIELDS)),
+    )
     if pose is None:
         raise ConfigError(
-            f"{name}: expected a topic of {', '.join(POSES)}, got {listed}. Name the columns, such as "
+            f"{name}: expected a topic of {', '.join(POSE_FIELDS)}, got {listed}. Name the columns, such as "
             "pos=/topic/x,/topic/y,/topic/z."
         )
     topic, kind = pose
-    position, attitude = POSES[kind]
+    position, attitude = POSE_FIELDS[kind]
     columns |= {axis: (topic, f"{position}/{axis}") for axis in XYZ}
     columns |= {f"q{axis}": (topic, f"{attitude}/{axis}") for axis in XYZW}
     if kind == "nav_msgs/msg/Odometry":
@@ -158,7 +162,7 @@ def _default_columns(name: str, topics: dict[str, str]) -> dict[str, tuple[str, 
     if imu is not None:
         columns |= {f"w{axis}": (imu[0], f"angular_velocity/{axis}") for axis in XYZ}
     if rotors is not None:
-        columns["rpm"] = (rotors[0], ROTORS[rotors[1]])
+        columns["rpm"] = (rotors[0], ROTOR_FIELDS[rotors[1]])
     return columns
 
 
@@ -166,8 +170,8 @@ def _read_stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, s
     """Return the messages of a topic as a stream."""
     get = {column: _getter(field) for column, field in fields.items()}
     times, rows = [], []
-    for connection, stamp, raw in bag.messages([c for c in bag.connections if c.topic == topic]):
-        message = bag.deserialize(raw, connection.msgtype)
+    for connection, stamp, packed_message in bag.messages([c for c in bag.connections if c.topic == topic]):
+        message = bag.deserialize(packed_message, connection.msgtype)
         header = getattr(message, "header", None)
         seconds = 0.0 if header is None else header.stamp.sec + 1e-9 * header.stamp.nanosec
         times.append(seconds or 1e-9 * stamp)

@@ -13,7 +13,7 @@ from crazysim.lab.identify.columns import without_huge_numbers
 from crazysim.lab.identify.delimited import parse_number, split_rows
 from crazysim.lab.identify.readers import decimate
 
-POLES = 14
+MOTOR_POLES = 14
 """Magnetic poles of the motors where the file does not state ``motor_poles``: Betaflight's default."""
 HEADER_WITHIN = 1000
 """Number of lines in which the column names are sought; the Blackbox Explorer writes settings before them."""
@@ -59,8 +59,8 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     start, names, settings = header
     unit = {}
     for name in names:
-        key, _, rest = name.partition(" (")
-        unit[key] = rest.rstrip(")")
+        key, _, unit_text = name.partition(" (")
+        unit[key] = unit_text.rstrip(")")
     keys = list(unit)
     if len(keys) != len(names):
         raise ConfigError(f"{path.name}: expected columns of different names, got some twice. Export the log again.")
@@ -68,10 +68,10 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         key for key in keys if key in ("time", "vbatLatest") or key.startswith(("gyroADC", "motor[", "eRPM[", "imuQua"))
     ]
     n_rotors = sum(key.startswith("motor[") for key in keys)
-    required = ["time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(n_rotors))]
+    required_names = ["time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(n_rotors))]
     if "imuQuaternion[0]" in keys:
-        required += ["imuQuaternion[1]", "imuQuaternion[2]"]
-    missing = [key for key in required if key not in keys]
+        required_names += ["imuQuaternion[1]", "imuQuaternion[2]"]
+    missing = [key for key in required_names if key not in keys]
     if missing:
         raise ConfigError(
             f"{path.name}: expected columns {', '.join(missing)}, got {', '.join(keys)[:300]}. "
@@ -86,7 +86,7 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
 
     high = 10.0 if parse_number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
     per_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(unit["gyroADC[0]"], math.pi / 180 / high)
-    poles = parse_number(settings.get("motor_poles", str(POLES)))
+    poles = parse_number(settings.get("motor_poles", str(MOTOR_POLES)))
     if not 2 <= poles < math.inf:
         raise ConfigError(f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.")
     table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(unit["time"], 1e-6)}

@@ -20,7 +20,7 @@ from crazysim.lab.identify.motion import body_rates, integral
 if TYPE_CHECKING:
     from crazysim.lab.identify.logs import Log
 
-RATIOS = (0.5, 2.0)
+PLAUSIBLE_RATIOS = (0.5, 2.0)
 """Ratios of measured to expected motion that count as agreement, on each axis that moves. In the logs of two
 public benchmarks, delays between streams, drag and noise give 0.6 to 1.3."""
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
@@ -71,11 +71,16 @@ class Pair(NamedTuple):
         """Return True if measured and expected motion agree on every axis that moves, within half of the floor."""
         measured_size, size = self.sizes().T
         slack = self.floor / 2
-        return bool(np.all((measured_size >= RATIOS[0] * size - slack) & (measured_size <= RATIOS[1] * size + slack)))
+        return bool(
+            np.all(
+                (measured_size >= PLAUSIBLE_RATIOS[0] * size - slack)
+                & (measured_size <= PLAUSIBLE_RATIOS[1] * size + slack)
+            )
+        )
 
 
 def check_motion(
-    name: str, t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...], repairs: list[str]
+    name: str, t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...], repairs: list[str]
 ) -> NDArray:
     """Return True for the samples whose columns describe one motion. (n,)
 
@@ -87,20 +92,20 @@ def check_motion(
         name: Name of the log, for messages.
         t: Time, s. (n,)
         data: Columns by field of ``Columns``, in the units of a log.
-        derived: Fields that were differentiated, not measured; also ``quat`` if the attitude was given as angles.
+        derived_keys: Fields that were differentiated, not measured; also ``quat`` if the attitude was given as angles.
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
         ConfigError: If the columns contradict each other; the message names a change that would help, if any.
     """
     keep = np.ones(len(t), bool)
-    for pair, width in _rates(t, data, derived):
+    for pair, width in _rates(t, data, derived_keys):
         is_diverged = _diverged_windows(pair, round(PIECE_DURATION / float(np.median(np.diff(t)))))
         if 0 < np.sum(is_diverged) <= len(is_diverged) / 2:
             keep[np.flatnonzero(is_diverged)[:, None] + np.arange(width + 1)] = False
             repairs.append(f"dropped {np.sum(~keep)} samples without {pair.requirement}, which the others have")
     t, data = t[keep], {key: x[keep] for key, x in data.items()}
-    laws = _laws(t, data, derived)
+    laws = _check_laws(t, data, derived_keys)
     broken = [k for k, law in enumerate(laws) if law.fault]
     if not broken:
         return keep
@@ -112,8 +117,8 @@ def check_motion(
             f"{MIN_SPAN:g} m or more, or give metres_per_unit."
         )
     remedy, n_faults = "", len(broken)
-    for remedy_text, changed in _alternatives(data, derived):
-        new_laws = _laws(t, changed, derived)
+    for remedy_text, changed_data in _propose_remedies(data, derived_keys):
+        new_laws = _check_laws(t, changed_data, derived_keys)
         # Another law may be broken by another mistake. A factor that makes a motion vanish explains nothing.
         breaks_another = any(
             (y.fault and not x.fault) or (x.has_motion and not y.has_motion)
@@ -151,11 +156,14 @@ class Law(NamedTuple):
     """True if the log contains the motion that the law describes."""
 
 
-def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> list[Law]:
+def _check_laws(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> list[Law]:
     """Check the laws that the columns must obey."""
-    up, problem = float(np.median(_thrust_axis(data["quat"])[:, 2])), "a thrust that points up in most samples, got"
-    laws = [Law("" if up > 0 else f"{problem} {up:.2f} as the median of its z component", True)]
-    for pair in (*(pair for pair, _ in _rates(t, data, derived)), _thrust(t, data)):
+    upward_share, problem = (
+        float(np.median(_thrust_axis(data["quat"])[:, 2])),
+        "a thrust that points up in most samples, got",
+    )
+    laws = [Law("" if upward_share > 0 else f"{problem} {upward_share:.2f} as the median of its z component", True)]
+    for pair in (*(pair for pair, _ in _rates(t, data, derived_keys)), _thrust(t, data)):
         ratios = pair.ratios()
         listed = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in ratios)
         text = (
@@ -165,12 +173,12 @@ def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> 
     return laws
 
 
-def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
+def _rates(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
     """Yield a pair of changes for each measured rate, and the samples per window."""
-    if "vel" not in derived:
+    if "vel" not in derived_keys:
         width, (change, expected) = _changes(t, 0.2, data["pos"], integral(data["vel"], t))
         yield Pair("a velocity that moves the position", change, expected, 0.01), width
-    if "ang_vel" not in derived:
+    if "ang_vel" not in derived_keys:
         angles = np.cumsum(body_rates(t, data["quat"]) * np.diff(t)[:, None], axis=0)
         angles = np.concatenate([np.zeros((1, 3)), angles])
         width, (change, expected) = _changes(t, 0.1, angles, integral(data["ang_vel"], t))
@@ -215,10 +223,12 @@ def _changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[N
 def _diverged_windows(pair: Pair, size: int) -> NDArray:
     """Return True for the windows of pieces in which the error exceeds ten times the motion. (n,)"""
     motion, error = (np.linalg.norm(x, axis=-1) for x in (pair.measured, pair.expected - pair.measured))
-    typical, is_diverged = max(float(np.median(motion)), pair.floor / 2), np.zeros(len(motion), bool)
+    typical_motion, is_diverged = max(float(np.median(motion)), pair.floor / 2), np.zeros(len(motion), bool)
     for k in range(0, len(motion), size):
         part = slice(k, k + size)
-        is_diverged[part] = np.median(error[part]) > DIVERGED_ERROR * max(typical, float(np.median(motion[part])))
+        is_diverged[part] = np.median(error[part]) > DIVERGED_ERROR * max(
+            typical_motion, float(np.median(motion[part]))
+        )
     return is_diverged
 
 
@@ -228,16 +238,18 @@ def _thrust_axis(quat: NDArray) -> NDArray:
     return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
 
 
-def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, NDArray]]]:
+def _propose_remedies(
+    data: Mapping[str, NDArray], derived_keys: tuple[str, ...]
+) -> Iterator[tuple[str, Mapping[str, NDArray]]]:
     """Yield the remedy for each common mistake as text, and the columns after it."""
 
-    def scaled(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
+    def scale_columns(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
         return {**data, **{key: data[key] * np.asarray(x) for key, x in factors.items()}}
 
     for (unit, x), (speed_unit, y) in product(LENGTH_UNITS.items(), repeat=2):
-        if "vel" in derived and x != y:
+        if "vel" in derived_keys and x != y:
             continue
-        if y == 1 or "vel" in derived:
+        if y == 1 or "vel" in derived_keys:
             remedy_text = f"The position seems to be in {unit}: give metres_per_unit={x:g}"
         elif x == 1:
             remedy_text = f"The velocity seems to be in {speed_unit}/s: give speed_per_unit={y:g}"
@@ -245,54 +257,60 @@ def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iter
             factors = f"metres_per_unit={x:g} and speed_per_unit={y:g}"
             remedy_text = f"Position and velocity seem to be in {unit} and {speed_unit}/s: give {factors}"
         if (x, y) != (1, 1):
-            yield remedy_text, scaled(pos=x, vel=y)
+            yield remedy_text, scale_columns(pos=x, vel=y)
     degrees = math.pi / 180
     yield (
         f"The angular velocity seems to be in degrees per second: give rad_per_unit={degrees:.6g}",
-        scaled(ang_vel=degrees),
+        scale_columns(ang_vel=degrees),
     )
-    if "quat" in derived:
+    if "quat" in derived_keys:
         angles = np.asarray(rotation.to_rpy(jnp.asarray(data["quat"])))
         for signs, x in product(product((1, -1), repeat=3), (1.0, degrees)):
             names = ",".join(
                 ("-" if s < 0 else "") + key for s, key in zip(signs, ("roll", "pitch", "yaw"), strict=True)
             )
             turned_quat = np.asarray(rotation.from_rpy(jnp.asarray(angles * np.array(signs))), np.float64)
-            also = "" if x == 1 else f", and the angular velocity in degrees per second: give rad_per_unit={x:.6g}"
+            remark = "" if x == 1 else f", and the angular velocity in degrees per second: give rad_per_unit={x:.6g}"
             yield (
-                f"The angles seem to be rpy={names}, with names of your columns{also}",
-                {**scaled(ang_vel=x), "quat": turned_quat},
+                f"The angles seem to be rpy={names}, with names of your columns{remark}",
+                {**scale_columns(ang_vel=x), "quat": turned_quat},
             )
     else:
-        reordered, inverse = data["quat"][:, [1, 2, 3, 0]], (-1, -1, -1, 1)
+        xyzw_quat, inverse = data["quat"][:, [1, 2, 3, 0]], (-1, -1, -1, 1)
         yield (
             "The quaternions seem to be in the order w, x, y, z: name them in the order x, y, z, w",
-            {**data, "quat": reordered},
+            {**data, "quat": xyzw_quat},
         )
-        yield "The quaternions seem to be world to body: give the signs quat=-qx,-qy,-qz,qw", scaled(quat=inverse)
+        yield (
+            "The quaternions seem to be world to body: give the signs quat=-qx,-qy,-qz,qw",
+            scale_columns(quat=inverse),
+        )
         yield (
             "The quaternions seem to be in the order w, x, y, z and world to body: give quat=-qx,-qy,-qz,qw",
-            {**data, "quat": reordered * np.array(inverse)},
+            {**data, "quat": xyzw_quat * np.array(inverse)},
         )
-    down = (1, -1, -1)
+    down_axes = (1, -1, -1)
     yield (
         "z seems to point down, in world and body: give the signs pos=x,-y,-z vel=vx,-vy,-vz quat=qx,-qy,-qz,qw "
         "ang_vel=wx,-wy,-wz",
-        scaled(pos=down, vel=down, quat=(*down, 1), ang_vel=down),
+        scale_columns(pos=down_axes, vel=down_axes, quat=(*down_axes, 1), ang_vel=down_axes),
     )
-    yield "z seems to point down: give the signs pos=x,y,-z vel=vx,vy,-vz", scaled(pos=(1, 1, -1), vel=(1, 1, -1))
-    for key, word, unit, factor in (
+    yield (
+        "z seems to point down: give the signs pos=x,y,-z vel=vx,vy,-vz",
+        scale_columns(pos=(1, 1, -1), vel=(1, 1, -1)),
+    )
+    for key, noun, unit, factor in (
         ("vel", "velocity", 1.0, ""),
         ("ang_vel", "angular velocity", 1.0, ""),
         ("ang_vel", "angular velocity", degrees, f" and rad_per_unit={degrees:.6g}"),
         ("pos", "position", 1.0, ""),
     ):
-        if key in derived:
+        if key in derived_keys:
             continue
         for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
             fields = getattr(Columns(), key)
             names = ",".join(("-" if sign < 0 else "") + fields[k] for k, sign in zip(order, signs, strict=True))
             yield (
-                f"The {word} fits as {key}={names}{factor}, with names of your columns",
+                f"The {noun} fits as {key}={names}{factor}, with names of your columns",
                 {**data, key: data[key][:, order] * signs * unit},
             )

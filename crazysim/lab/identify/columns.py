@@ -125,9 +125,9 @@ def unsigned_name(name: str) -> str:
 
 def stack_columns(name: str, table: Mapping[str, NDArray], names: Sequence[str], factor: float = 1.0) -> NDArray:
     """Return columns side by side, with their signs, times a factor. (n, len(names))"""
-    if absent := [unsigned_name(x) for x in names if unsigned_name(x) not in table]:
+    if missing := [unsigned_name(x) for x in names if unsigned_name(x) not in table]:
         raise ConfigError(
-            f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}. Name them in a Columns."
+            f"{name}: expected columns {', '.join(missing)}, got {', '.join(sorted(table))}. Name them in a Columns."
         )
     columns = [_numbers(name, unsigned_name(x), table[unsigned_name(x)]) for x in names]
     lengths = {unsigned_name(x): len(c) for x, c in zip(names, columns, strict=True)}

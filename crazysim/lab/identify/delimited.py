@@ -35,7 +35,7 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         raise ConfigError(f"{path.name}: expected at most {MAX_COLUMNS} columns, got {width}. Export fewer of them.")
     names = [x.strip().strip('"') for x in header.split(",")]
     if len(names) < 2:
-        other = next((word for mark, word in ((";", "semicolons"), ("\t", "tabs")) if mark in header), None)
+        other = next((separator for mark, separator in ((";", "semicolons"), ("\t", "tabs")) if mark in header), None)
         got = f"{other} between them" if other else repr(header.strip()[:40])
         raise ConfigError(
             f"{path.name}: expected names of columns in the first line, with commas between them, got {got}. "
@@ -46,8 +46,10 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             f"{path.name}: expected names of columns in the first line, got numbers: {header.strip()[:40]}. "
             "Add a first line such as t,x,y,z,qx,qy,qz,qw."
         )
-    if twice := sorted(x for x, n in Counter(names).items() if n > 1):
-        raise ConfigError(f"{path.name}: expected columns of different names, got {twice[0][:60]!r} twice. Rename one.")
+    if duplicates := sorted(x for x, n in Counter(names).items() if n > 1):
+        raise ConfigError(
+            f"{path.name}: expected columns of different names, got {duplicates[0][:60]!r} twice. Rename one."
+        )
     rows = split_rows(path.name, lines, len(names), 2, repairs, "Export the log again.")
     return {key: _column(cells) for key, cells in zip(names, zip(*rows, strict=True), strict=True)}
 

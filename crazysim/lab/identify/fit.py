@@ -47,18 +47,22 @@ MIN_FACTORS = {"rotor inertia": 0.0}
 rotors."""
 
 
-FACTORS = ("thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia")
+FACTOR_NAMES = ("thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia")
 """Factors of the airframe's curves and moments."""
-FORCES = (
+FORCE_TERMS = (
     "thrust factor", "drag x", "drag y", "drag z", "quadratic drag x", "quadratic drag y", "quadratic drag z",
 )  # fmt: skip
 """Parameters of the force: a factor, and coefficients in N s/m and N s^2/m^2."""
-TORQUES = (
+TORQUE_TERMS = (
     "centre of mass x", "centre of mass y", "torque z", *(f"torque {a} per velocity {b}" for a in "xyz" for b in "xyz"),
 )  # fmt: skip
 """Parameters of the torque, m, N m and N s."""
 PARAMETER_UNITS = dict(
-    zip((*FORCES, *TORQUES), ("", *["N s/m"] * 3, *["N s^2/m^2"] * 3, "m", "m", "N m", *["N s"] * 9), strict=True)
+    zip(
+        (*FORCE_TERMS, *TORQUE_TERMS),
+        ("", *["N s/m"] * 3, *["N s^2/m^2"] * 3, "m", "m", "N m", *["N s"] * 9),
+        strict=True,
+    )
 )
 """Units of these parameters; empty for factors."""
 
@@ -74,8 +78,8 @@ class Identification:
     model: Model
     """Model of that airframe, with its residual."""
     values: dict[str, float]
-    """Identified parameters by name, see ``FACTORS``, ``FORCES`` and ``TORQUES``, and ``motor lag``, 1/s, for logs with
-    commands and measured speeds."""
+    """Identified parameters by name, see ``FACTOR_NAMES``, ``FORCE_TERMS`` and ``TORQUE_TERMS``, and ``motor lag``,
+    1/s, for logs with commands and measured speeds."""
     deviations: dict[str, float]
     """Standard deviations of the parameters, from the scatter between blocks of 10 s, enlarged if there are few blocks
     so that three of them are as likely to contain the truth as with many; NaN for fewer than three blocks. In simulated
@@ -103,7 +107,7 @@ class Identification:
     @property
     def doubtful(self) -> list[str]:
         """Names of factors below 1/3 or above 3: the fit predicts with them, but they are hardly physical."""
-        return [name for name in FACTORS if not 1 / 3 < self.values[name] < 3]
+        return [name for name in FACTOR_NAMES if not 1 / 3 < self.values[name] < 3]
 
     def toml(self, source: str) -> str:
         """Return the airframe as a TOML file that names its base.
@@ -151,55 +155,57 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     if mass is not None and not 0 < mass < np.inf:
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
     logs = [with_speeds(log, base) for log in logs]
-    _check(logs, base)
+    _check_logs(logs, base)
     windows(logs, WINDOW_DURATION, WINDOW_DURATION)
     check_turning(logs)
     if base.n_rotors <= 4:
         _check_order(logs, base)
     weight = float(base.value("rigid_body.mass")) if mass is None else float(mass)
     params = Model.create(base, weight).params
-    fast = fast_rotation(logs, params, float(_forces(logs, params)[0][0]))
+    fast = fast_rotation(logs, params, float(_fit_forces(logs, params)[0][0]))
     logs = [aligned(log, delay) for log, delay in zip(logs, fast.delays, strict=True)]
-    force, force_spread = _forces(logs, params)
+    force, force_spread = _fit_forces(logs, params)
     force_spread[0] = math.hypot(force_spread[0], SAMPLING_ERROR * force[0])
-    torque, torque_spread = _torques(logs, params, float(force[0]), fast.values)
+    torque, torque_spread = _fit_torques(logs, params, float(force[0]), fast.values)
     delayed_logs = [aligned(log, SLOW_TORQUE_DELAY_STD * log.dt) for log in logs]
-    torque_spread = np.hypot(torque_spread, _torques(delayed_logs, params, float(force[0]), fast.values)[0] - torque)
+    torque_spread = np.hypot(
+        torque_spread, _fit_torques(delayed_logs, params, float(force[0]), fast.values)[0] - torque
+    )
     for k, step in enumerate(fast.deviations):
         if math.isfinite(step):
-            shifted_torque = _torques(logs, params, float(force[0]), fast.values + step * (np.arange(5) == k))[0]
+            shifted_torque = _fit_torques(logs, params, float(force[0]), fast.values + step * (np.arange(5) == k))[0]
             torque_spread = np.hypot(torque_spread, shifted_torque - torque)
 
     def named(force: NDArray, torque: NDArray, fast: NDArray) -> dict[str, float]:
         numbers = [*force, *torque, *fast]
-        return dict(zip((*FORCES, *TORQUES, *FACTORS[1:]), map(float, numbers), strict=True))
+        return dict(zip((*FORCE_TERMS, *TORQUE_TERMS, *FACTOR_NAMES[1:]), map(float, numbers), strict=True))
 
     values = named(force, torque, fast.values)
     deviations = named(force_spread, torque_spread, fast.deviations)
-    if wrong := [
+    if unphysical := [
         f"{name} {values[name]:.3g}"
-        for name in FACTORS
+        for name in FACTOR_NAMES
         if not MIN_FACTORS.get(name, 1 / MAX_FACTOR) <= values[name] <= MAX_FACTOR
     ]:
         raise ConfigError(
-            f"expected factors from {1 / MAX_FACTOR:g} to {MAX_FACTOR:g}, got {', '.join(wrong)}, which no body "
+            f"expected factors from {1 / MAX_FACTOR:g} to {MAX_FACTOR:g}, got {', '.join(unphysical)}, which no body "
             f"that flies like {base.name!r} explains. Check its mass and the logs, add flights that turn and climb "
             "more, or start from an airframe file nearer to the drone (--airframe)."
         )
-    changes = _changes(base, weight, values)
+    changes = _airframe_changes(base, weight, values)
     rates = motor_lag(logs)
     if 2 * np.sum(np.isfinite(rates)) > rates.size:
         rates = rates[np.isfinite(rates)]
         values["motor lag"], deviations["motor lag"] = weighted_median(rates, np.ones(len(rates)))
         changes["rotors.lag"] = np.array([values["motor lag"], 0.0, values["motor lag"], 0.0])
     try:
-        identified = load_airframe(_nested_tables(str(airframe), base.name, changes))
+        new_airframe = load_airframe(_nested_tables(str(airframe), base.name, changes))
     except ConfigError as error:
         raise ConfigError(f"the fitted numbers are not valid: {error} Add flights that turn and climb more.") from error
     return Identification(
         base=str(airframe),
-        airframe=identified,
-        model=Model.create(identified),
+        airframe=new_airframe,
+        model=Model.create(new_airframe),
         values=values,
         deviations=deviations,
         delays=dict(zip([log.name for log in logs], fast.delays.tolist(), strict=True)),
@@ -207,26 +213,26 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     )
 
 
-def _forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[NDArray, NDArray]:
-    """Return the parameters of the force, see ``FORCES``, and their deviations."""
+def _fit_forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[NDArray, NDArray]:
+    """Return the parameters of the force, see ``FORCE_TERMS``, and their deviations."""
     mass, gravity = float(params.mass[0]), np.asarray(params.gravity_vec, np.float64)
 
     def terms(log: Log) -> tuple[NDArray, NDArray]:
         thrust = np.asarray(quadratic_curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64)
-        vel, speed = _body(log, log.vel), np.linalg.norm(log.vel, axis=-1, keepdims=True)
+        vel, speed = _to_body_frame(log, log.vel), np.linalg.norm(log.vel, axis=-1, keepdims=True)
         axes = np.eye(3)
         body = [thrust.sum(-1, keepdims=True) * axes[2]]
         body += [(x[:, k : k + 1] * axes[k]) for x in (vel, vel * speed) for k in range(3)]
         world = np.stack([np.asarray(rotate(jnp.asarray(log.quat), jnp.asarray(x))) for x in body], axis=-1)
         return world, mass * (log.vel - gravity * log.t[:, None])
 
-    return _regression(logs, terms, np.arange(7) > 0)
+    return _fit_regression(logs, terms, np.arange(7) > 0)
 
 
-def _torques(
+def _fit_torques(
     logs: Sequence[Log], params: first_principles.Params, thrust_factor: float, fast: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Return the parameters of the torque, see ``TORQUES``, and their deviations."""
+    """Return the parameters of the torque, see ``TORQUE_TERMS``, and their deviations."""
     mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
     root = np.sqrt(fast[:3])
     inertia = np.asarray(params.J, np.float64) * np.outer(root, root)
@@ -242,20 +248,20 @@ def _torques(
         rotors = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
         # Integrals of the known terms move to the left side.
         impulse = integral(rotors - np.cross(log.ang_vel, momentum), log.t)
-        vel, total, axes = _body(log, log.vel), thrust.sum(-1, keepdims=True), np.eye(3)
+        vel, total, axes = _to_body_frame(log, log.vel), thrust.sum(-1, keepdims=True), np.eye(3)
         columns = [total * axes[1], -total * axes[0], np.broadcast_to(axes[2], vel.shape)]
         columns += [vel[:, b : b + 1] * axes[a] for a in range(3) for b in range(3)]
         return np.stack(columns, axis=-1), momentum - impulse
 
-    return _regression(logs, terms, np.zeros(len(TORQUES), bool))
+    return _fit_regression(logs, terms, np.zeros(len(TORQUE_TERMS), bool))
 
 
-def _body(log: Log, vector: NDArray) -> NDArray:
+def _to_body_frame(log: Log, vector: NDArray) -> NDArray:
     """Return vectors of the world frame in the body frame. (n, 3)"""
     return np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(vector)), np.float64)
 
 
-def _regression(
+def _fit_regression(
     logs: Sequence[Log], terms: Callable[[Log], tuple[NDArray, NDArray]], not_positive: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Return coefficients by robust linear least squares, and their deviations from the scatter between blocks.
@@ -277,18 +283,18 @@ def _regression(
     x, y, block = np.concatenate(rates), np.concatenate(changes), np.concatenate(blocks)
     k = x.shape[-1]
     weights = np.ones(y.shape)
-    coefficients, free = np.zeros(k), np.ones(k, bool)
+    coefficients, is_free = np.zeros(k), np.ones(k, bool)
     for _ in range(10):
         normal = np.einsum("wri,wr,wrj->ij", x, weights, x)
         vector = np.einsum("wri,wr,wr->i", x, weights, y)
-        free = np.ones(k, bool)
+        is_free = np.ones(k, bool)
         while True:
             coefficients = np.zeros(k)
-            coefficients[free] = np.linalg.lstsq(normal[np.ix_(free, free)], vector[free], rcond=None)[0]
-            wrong = not_positive & (coefficients > 0)
-            if not np.any(wrong):
+            coefficients[is_free] = np.linalg.lstsq(normal[np.ix_(is_free, is_free)], vector[is_free], rcond=None)[0]
+            is_wrong_sign = not_positive & (coefficients > 0)
+            if not np.any(is_wrong_sign):
                 break
-            free &= ~wrong
+            is_free &= ~is_wrong_sign
         residual = y - x @ coefficients
         scale = 1.4826 * np.median(np.abs(residual), axis=0)  # standard deviation, if residuals are normal
         weights = 1 / np.maximum(scale, np.abs(residual) / 2) / np.maximum(scale, 1e-30)
@@ -296,33 +302,33 @@ def _regression(
     numbers = np.unique(block)
     if len(numbers) < MIN_BLOCKS:
         return coefficients, np.full(k, np.nan)
-    without = []
+    held_out_fits = []
     for b in numbers:
-        keep = block != b
-        normal = np.einsum("wri,wr,wrj->ij", x[keep], weights[keep], x[keep])
-        vector = np.einsum("wri,wr,wr->i", x[keep], weights[keep], y[keep])
-        without.append(np.linalg.lstsq(normal, vector, rcond=None)[0])
-    deviations = np.array(without) - np.mean(without, axis=0)
+        is_training = block != b
+        normal = np.einsum("wri,wr,wrj->ij", x[is_training], weights[is_training], x[is_training])
+        vector = np.einsum("wri,wr,wr->i", x[is_training], weights[is_training], y[is_training])
+        held_out_fits.append(np.linalg.lstsq(normal, vector, rcond=None)[0])
+    deviations = np.array(held_out_fits) - np.mean(held_out_fits, axis=0)
     n = len(numbers)
     return coefficients, deviation_factor(n) * np.sqrt((n - 1) / n * np.sum(deviations**2, axis=0))
 
 
-def _smooth(x: NDArray, size: int = 9) -> NDArray:
+def _smooth_columns(x: NDArray, size: int = 9) -> NDArray:
     kernel = np.hanning(size + 2)[1:-1]
     return np.stack([np.convolve(c, kernel / kernel.sum(), "same") for c in x.T], axis=-1)
 
 
-def _regressors(log: Log, params: first_principles.Params) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+def _create_regressors(log: Log, params: first_principles.Params) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return smoothed accelerations without gravity, angular accelerations, body velocities, and thrusts."""
     sl = slice(10, -10)
-    acc = np.gradient(_smooth(log.vel), log.t, axis=0) - np.asarray(params.gravity_vec)
-    ang_acc = np.gradient(_smooth(log.ang_vel), log.t, axis=0)
-    body = np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(np.stack([acc, _smooth(log.vel)]))))
-    thrust = _smooth(np.asarray(quadratic_curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64))
+    acc = np.gradient(_smooth_columns(log.vel), log.t, axis=0) - np.asarray(params.gravity_vec)
+    ang_acc = np.gradient(_smooth_columns(log.ang_vel), log.t, axis=0)
+    body = np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(np.stack([acc, _smooth_columns(log.vel)]))))
+    thrust = _smooth_columns(np.asarray(quadratic_curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64))
     return body[0][sl], ang_acc[sl], body[1][sl], thrust[sl]
 
 
-def _check(logs: Sequence[Log], airframe: Airframe) -> None:
+def _check_logs(logs: Sequence[Log], airframe: Airframe) -> None:
     """Check that logs and airframe fit: sample times, number and unit of rotors."""
     if not logs:
         raise ConfigError("expected at least one log, got none")
@@ -351,7 +357,7 @@ def _check(logs: Sequence[Log], airframe: Airframe) -> None:
 def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
     """Check that no other order of the rotors explains the angular accelerations much better."""
     params = first_principles.Params.create(airframe)
-    pieces = [_regressors(log, params) for log in logs]
+    pieces = [_create_regressors(log, params) for log in logs]
     _, ang_acc, vel, thrust = [np.concatenate(x) for x in zip(*pieces, strict=True)]
     mixing = airframe.mixing_matrix
 
@@ -369,23 +375,23 @@ def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
         return total
 
     index_order = tuple(range(airframe.n_rotors))
-    best = max(itertools.permutations(index_order), key=explained)
-    if explained(best) > explained(index_order) + 0.2:
+    best_order = max(itertools.permutations(index_order), key=explained)
+    if explained(best_order) > explained(index_order) + 0.2:
         raise ConfigError(
             f"expected rotors in the order of airframe {airframe.name!r}; the angular accelerations fit "
-            f"the order {[k + 1 for k in best]} much better "
-            f"({explained(best):.2f} against {explained(index_order):.2f}, of at most 2). Name the columns of "
+            f"the order {[k + 1 for k in best_order]} much better "
+            f"({explained(best_order):.2f} against {explained(index_order):.2f}, of at most 2). Name the columns of "
             "rotor_vel, and of command, in that order."
         )
 
 
-def _changes(base: Airframe, mass: float, values: dict[str, float]) -> dict[str, NDArray]:
+def _airframe_changes(base: Airframe, mass: float, values: dict[str, float]) -> dict[str, NDArray]:
     """Return the numbers of the identified airframe that differ from its base."""
-    thrust, *moments, torque, rotor = [values[name] for name in FACTORS]
+    thrust, *moments, torque, rotor = [values[name] for name in FACTOR_NAMES]
     root = np.sqrt(moments)
     inertia = base.inertia * np.outer(root, root)
     inertia = np.diag(inertia) if np.allclose(inertia, np.diag(np.diag(inertia)), atol=0) else inertia
-    x = np.array([values[name] for name in (*FORCES, *TORQUES)])
+    x = np.array([values[name] for name in (*FORCE_TERMS, *TORQUE_TERMS)])
     linear = np.zeros((6, N_INPUTS))
     linear[range(3), range(4, 7)] = x[4:7]
     linear[5, 0], linear[3:, 1:4] = x[9], x[10:].reshape(3, 3)

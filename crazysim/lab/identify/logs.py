@@ -110,10 +110,10 @@ def read_log(
             (c for c in reversed(KNOWN_COLUMNS.values()) if not missing_columns(table, c)), KNOWN_COLUMNS["crazysim"]
         )
     columns = with_rotor_count(table, columns)
-    if absent := missing_columns(table, columns):
+    if missing := missing_columns(table, columns):
         slow = "".join(f", and {x}" for x in repairs if x.startswith("left out a slow stream"))
         raise ConfigError(
-            f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}{slow}. Name them, as in "
+            f"{name}: expected columns {', '.join(missing)}, got {', '.join(sorted(table))}{slow}. Name them, as in "
             "--columns time=seconds pos=px,py,pz or a Columns, or give the motion capture of the flight (--motion)."
         )
     factors = {
@@ -133,12 +133,12 @@ def read_log(
         data["attitude_command"] *= [*[columns.rad_per_command] * 3, columns.newton_per_command]
     t = stack_columns(name, table, [columns.time])[:, 0]
     keep = increasing_samples(name, t, repairs)
-    since = t - t[keep][0]
-    keep &= (since >= between[0]) & (since <= between[1])
+    elapsed = t - t[keep][0]
+    keep &= (elapsed >= between[0]) & (elapsed <= between[1])
     if np.sum(keep) < MIN_SAMPLES:
         raise ConfigError(
             f"{name}: expected at least {MIN_SAMPLES} samples between {between[0]:g} and {between[1]:g} s, got "
-            f"{np.sum(keep)} of a log of {since[np.isfinite(since)].max():.3g} s. Give other times."
+            f"{np.sum(keep)} of a log of {elapsed[np.isfinite(elapsed)].max():.3g} s. Give other times."
         )
     t, data = interpolate_missing(name, t[keep], {key: x[keep] for key, x in data.items()}, repairs)
     thrust = np.sum(data["rotor_vel"] ** 2, axis=1) if "rotor_vel" in data else None
@@ -151,14 +151,14 @@ def read_log(
         data["rotor_vel"] = remove_spikes(name, data["rotor_vel"], repairs)
     else:
         data["rotor_vel"] = np.zeros((len(t), 0))
-    derived = tuple(key for key in ("vel", "ang_vel") if key not in data)
-    if "vel" in derived:
-        data["vel"] = capture.velocity_of(t, data["pos"])
+    derived_keys = tuple(key for key in ("vel", "ang_vel") if key not in data)
+    if "vel" in derived_keys:
+        data["vel"] = capture.fit_velocity(t, data["pos"])
         repairs.append("differentiated the position, since the log has no velocity")
-    if "ang_vel" in derived:
-        data["ang_vel"] = capture.ang_vel_of(t, data["quat"])
+    if "ang_vel" in derived_keys:
+        data["ang_vel"] = capture.fit_ang_vel(t, data["quat"])
         repairs.append("differentiated the attitude, since the log has no angular velocity")
-    keep = check_motion(name, t, data, (*derived, *(["quat"] if columns.rpy else [])), repairs)
+    keep = check_motion(name, t, data, (*derived_keys, *(["quat"] if columns.rpy else [])), repairs)
     t, data = t[keep], {key: x[keep] for key, x in data.items()}
     if "voltage" in data:
         data["voltage"] = data["voltage"][:, 0]

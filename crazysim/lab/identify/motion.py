@@ -65,7 +65,7 @@ def join_motion_capture(
         speed = np.interp(grid, times[is_valid][order], np.linalg.norm(rates[is_valid][order], axis=-1))
         series.append((grid[0], np.convolve(speed, np.ones(size) / size, "same")))
     (first, a), (second, b) = series
-    lag, agreement = _lag(a, b)
+    lag, agreement = _find_lag(a, b)
     if agreement < 0.7:
         raise ConfigError(
             f"{name}: expected motion capture of the same flight, got angular velocities that agree by "
@@ -74,20 +74,20 @@ def join_motion_capture(
     shift = first - second + lag * LAG_STEP
     repairs.append(f"moved the clock of the motion capture by {shift:.3f} s (agreement {agreement:.2f} of 1)")
     streams = {
-        "the log": Stream(t, _numbers(table, len(t), (time,))),
-        "motion capture": Stream(motion_time + shift, _numbers(motion, len(motion_time), (time, *table))),
+        "the log": Stream(t, _number_columns(table, len(t), (time,))),
+        "motion capture": Stream(motion_time + shift, _number_columns(motion, len(motion_time), (time, *table))),
     }
-    merged = resample(name, streams, repairs, columns)
-    return merged | {time: merged.pop("t")}
+    merged_table = resample(name, streams, repairs, columns)
+    return merged_table | {time: merged_table.pop("t")}
 
 
-def _numbers(table: Mapping[str, NDArray], n: int, without: Sequence[str]) -> dict[str, NDArray]:
-    """Return the columns with n numbers, other than ``without``."""
-    columns = {key: np.asarray(x) for key, x in table.items() if key not in without}
+def _number_columns(table: Mapping[str, NDArray], n: int, excluded: Sequence[str]) -> dict[str, NDArray]:
+    """Return the columns with n numbers, other than ``excluded``."""
+    columns = {key: np.asarray(x) for key, x in table.items() if key not in excluded}
     return {key: x.astype(np.float64) for key, x in columns.items() if x.shape == (n,) and x.dtype.kind in "fiub"}
 
 
-def _lag(a: NDArray, b: NDArray) -> tuple[float, float]:
+def _find_lag(a: NDArray, b: NDArray) -> tuple[float, float]:
     """Return the number of samples by which b is shifted to agree best with a, and the correlation there, 0 to 1."""
     n = len(a) + len(b)
 
@@ -116,24 +116,26 @@ def body_rates(t: NDArray, quat: NDArray) -> NDArray:
     return 2 * vector * np.sign(scalar) / np.diff(t)[:, None]
 
 
-def velocity_of(t: NDArray, pos: NDArray) -> NDArray:
+def fit_velocity(t: NDArray, pos: NDArray) -> NDArray:
     """Return velocities as slopes of lines fitted to positions over ``DERIVATIVE_DURATION``, m/s. (n, 3)"""
-    half = max(1, round(DERIVATIVE_DURATION / float(np.median(np.diff(t))) / 2))
-    padded = np.concatenate([2 * pos[:1] - pos[half:0:-1], pos, 2 * pos[-1:] - pos[-2 : -half - 2 : -1]])
-    times = np.concatenate([2 * t[:1] - t[half:0:-1], t, 2 * t[-1:] - t[-2 : -half - 2 : -1]])
-    weights = np.arange(-half, half + 1)[::-1].astype(float)
-    rate = np.stack([np.convolve(x, weights, "valid") for x in padded.T], axis=-1)
+    half_window = max(1, round(DERIVATIVE_DURATION / float(np.median(np.diff(t))) / 2))
+    padded_pos = np.concatenate(
+        [2 * pos[:1] - pos[half_window:0:-1], pos, 2 * pos[-1:] - pos[-2 : -half_window - 2 : -1]]
+    )
+    times = np.concatenate([2 * t[:1] - t[half_window:0:-1], t, 2 * t[-1:] - t[-2 : -half_window - 2 : -1]])
+    weights = np.arange(-half_window, half_window + 1)[::-1].astype(float)
+    rate = np.stack([np.convolve(x, weights, "valid") for x in padded_pos.T], axis=-1)
     return rate / np.convolve(times, weights, "valid")[:, None]
 
 
-def ang_vel_of(t: NDArray, quat: NDArray) -> NDArray:
+def fit_ang_vel(t: NDArray, quat: NDArray) -> NDArray:
     """Return angular velocities from attitudes, averaged over about half of ``DERIVATIVE_DURATION``, rad/s. (n, 3)"""
     rates = body_rates(t, quat)
     rates = np.concatenate([rates[:1], (rates[1:] + rates[:-1]) / 2, rates[-1:]])
-    half = max(1, round(DERIVATIVE_DURATION / float(np.median(np.diff(t))) / 4))
-    kernel = np.ones(2 * half + 1) / (2 * half + 1)
-    padded = np.pad(rates, ((half, half), (0, 0)), mode="edge")
-    return np.stack([np.convolve(x, kernel, "valid") for x in padded.T], axis=-1)
+    half_window = max(1, round(DERIVATIVE_DURATION / float(np.median(np.diff(t))) / 4))
+    kernel = np.ones(2 * half_window + 1) / (2 * half_window + 1)
+    padded_rates = np.pad(rates, ((half_window, half_window), (0, 0)), mode="edge")
+    return np.stack([np.convolve(x, kernel, "valid") for x in padded_rates.T], axis=-1)
 
 
 def integral(x: NDArray, t: NDArray) -> NDArray:

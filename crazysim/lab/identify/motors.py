@@ -52,9 +52,9 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
             f"{command.max():.4g}. Give share_per_command, such as 1.5259e-05 for 0 to 65535."
         )
     command = np.stack([np.interp(log.t, log.t[g], c[g]) for c, g in zip(command.T, is_valid.T, strict=True)], axis=-1)
-    half = max(1, round(VOLTAGE_WINDOW / log.dt / 2))
-    window = np.hanning(2 * half + 3)[1:-1]
-    volts = np.convolve(np.pad(voltage, half, mode="edge"), window / window.sum(), "valid")[:, None] * command
+    half_window = max(1, round(VOLTAGE_WINDOW / log.dt / 2))
+    window = np.hanning(2 * half_window + 3)[1:-1]
+    volts = np.convolve(np.pad(voltage, half_window, mode="edge"), window / window.sum(), "valid")[:, None] * command
     thrust = np.maximum(np.polynomial.polynomial.polyval(volts, airframe.value("battery.thrust_over_voltage")), 0.0)
     total = thrust.sum(axis=1)
     means = thrust[total > np.median(total) / 2].mean(axis=0)
@@ -107,27 +107,27 @@ def motor_lag(logs: Sequence[Log]) -> NDArray:
             continue
         t = np.arange(log.t[0], log.t[-1], log.dt)
         series = [[np.interp(t, log.t, c) for c in x.T] for x in (log.command, log.rotor_vel)]
-        lags.append([_rate(u, r, log.dt) for u, r in zip(*series, strict=True)])
+        lags.append([_fit_rate(u, r, log.dt) for u, r in zip(*series, strict=True)])
     return np.array(lags)
 
 
-def _rate(command: NDArray, speed: NDArray, dt: float) -> float:
+def _fit_rate(command: NDArray, speed: NDArray, dt: float) -> float:
     """Return the rate of one rotor: a grid over rates and delays that is refined about its best point."""
     terms = np.c_[command, command**2] / max(np.max(np.abs(command)), 1e-30) ** [1, 2]
     rates, delays = np.geomspace(MIN_RATE, MAX_RATE, 15), np.linspace(-MAX_DELAY, MAX_DELAY, 9)
-    index, inner = np.arange(len(speed), dtype=float), slice(round(0.5 / dt), None)
+    index, inner_samples = np.arange(len(speed), dtype=float), slice(round(0.5 / dt), None)
     rate = delay = 0.0
     for _ in range(5):
         responses = lag_signal(terms[:, None], dt, rates[:, None])
-        best = np.inf
+        best_cost = np.inf
         for d in delays:
             for k, r in enumerate(rates):
                 # Shift the response, not the speed: interpolation would reduce the noise of the speed.
-                shifted = [np.interp(index - d / dt, index, c)[inner] for c in responses[:, k].T]
-                x = np.c_[shifted[0], shifted[1], np.ones(len(shifted[0]))]
-                residual = speed[inner] - x @ np.linalg.lstsq(x, speed[inner], rcond=None)[0]
-                if (cost := float(residual @ residual)) < best:
-                    best, rate, delay = cost, float(r), float(d)
+                shifted_responses = [np.interp(index - d / dt, index, c)[inner_samples] for c in responses[:, k].T]
+                x = np.c_[shifted_responses[0], shifted_responses[1], np.ones(len(shifted_responses[0]))]
+                residual = speed[inner_samples] - x @ np.linalg.lstsq(x, speed[inner_samples], rcond=None)[0]
+                if (cost := float(residual @ residual)) < best_cost:
+                    best_cost, rate, delay = cost, float(r), float(d)
         ratio, width = rates[1] / rates[0], delays[1] - delays[0]
         rates, delays = np.geomspace(rate / ratio, rate * ratio, 9), np.linspace(delay - width, delay + width, 7)
     return rate if 1.05 * MIN_RATE < rate < MAX_RATE / 1.05 else np.nan

@@ -15,11 +15,11 @@ from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.prediction import Model, Windows, attitude_error, predict, windows
 from crazysim.plugins.effects.residual import ResidualData, residual_inputs
 
-SCALES = {"pos": 0.02, "attitude": 0.05, "vel": 0.1, "ang_vel": 0.5}
+ERROR_SCALES = {"pos": 0.02, "attitude": 0.05, "vel": 0.1, "ang_vel": 0.5}
 """Scales of errors: m, rad, m/s, rad/s. Larger errors count linearly (Huber)."""
-DURATION = 0.5
+WINDOW_DURATION = 0.5
 """Duration of the predictions, s."""
-STRIDE = 0.05
+WINDOW_STRIDE = 0.05
 """Time between the starts of training windows, s."""
 FORCE, TORQUE = 0.1, 0.03
 """Scales of force and torque, which make the weights of order one: shares of the weight, and of weight times arm."""
@@ -66,29 +66,29 @@ def fit_residual(
             f"expected n_hidden of at least 0, iterations and batch_size of at least 1, got {n_hidden}, {iterations} "
             f"and {batch_size}. Leave them out for the defaults."
         )
-    data, dt, params = windows(logs, DURATION, STRIDE), logs[0].dt, model.params
-    held_out = windows(validation, DURATION, 4 * STRIDE) if validation else None
+    data, dt, params = windows(logs, WINDOW_DURATION, WINDOW_STRIDE), logs[0].dt, model.params
+    held_out = windows(validation, WINDOW_DURATION, 4 * WINDOW_STRIDE) if validation else None
     inputs = jax.vmap(lambda q, v, w, r: residual_inputs(q, v, w, r, params))(
         data.quat[:, 0], data.vel[:, 0], data.ang_vel[:, 0], data.rotor_vel[:, 1]
     )
-    spread = jnp.std(inputs, axis=0).at[0].set(1.0)
+    input_std = jnp.std(inputs, axis=0).at[0].set(1.0)
     weight = float(params.mass[0]) * float(jnp.linalg.norm(params.gravity_vec))
     scale = weight * jnp.repeat(jnp.array([FORCE, TORQUE * float(params.L[0])]), 3)
 
     def residual(weights: dict[str, Array]) -> ResidualData:
         """Return the residual from weights of order one."""
-        linear = model.residual.linear + scale[:, None] * weights["linear"] / spread
+        linear = model.residual.linear + scale[:, None] * weights["linear"] / input_std
         if not n_hidden:
             return ResidualData(linear, None, None)
         return ResidualData(
             linear=linear,
-            hidden=weights["hidden"] / spread,
+            hidden=weights["hidden"] / input_std,
             output=scale[:, None] * weights["output"],
         )
 
     def loss(weights: dict[str, Array], batch: Windows) -> Array:
-        trained = Model(params=params, residual=residual(weights))
-        return jnp.mean(huber(jax.vmap(lambda w: scaled_errors(trained, w, dt))(batch)))
+        candidate = Model(params=params, residual=residual(weights))
+        return jnp.mean(huber(jax.vmap(lambda w: scaled_errors(candidate, w, dt))(batch)))
 
     optimizer: Any = optax.chain(
         optax.clip_by_global_norm(1.0),
@@ -110,27 +110,27 @@ def fit_residual(
         "hidden": jax.random.normal(key, (n_hidden, n_inputs)) / np.sqrt(n_inputs),
         "output": jnp.zeros((6, n_hidden)),
     }
-    state, judge = optimizer.init(weights), jax.jit(loss)
-    best, least_loss = weights, np.inf
+    state, held_out_loss_fn = optimizer.init(weights), jax.jit(loss)
+    best_weights, least_loss = weights, np.inf
     for k in range(iterations):
         weights, state = update(weights, state, jax.random.fold_in(key, k))
         if held_out is not None and (k % 100 == 99 or k == iterations - 1):
-            held_out_loss = float(judge(weights, held_out))
+            held_out_loss = float(held_out_loss_fn(weights, held_out))
             if held_out_loss < least_loss:
-                best, least_loss = weights, held_out_loss
-    return Model(params=params, residual=residual(weights if held_out is None else best))
+                best_weights, least_loss = weights, held_out_loss
+    return Model(params=params, residual=residual(weights if held_out is None else best_weights))
 
 
 def scaled_errors(model: Model, window: Windows, dt: float) -> Array:
-    """Return the errors of the prediction of one window at ten times, divided by ``SCALES``. (120,)"""
+    """Return the errors of the prediction of one window at ten times, divided by ``ERROR_SCALES``. (120,)"""
     pos, quat, vel, ang_vel = predict(model, window, dt)
     n = window.pos.shape[0]
     samples = np.unique(np.linspace(0, n - 1, 11).round().astype(int))[1:]
     parts = [
-        (pos - window.pos)[samples] / SCALES["pos"],
-        attitude_error(quat[samples], window.quat[samples]) / SCALES["attitude"],
-        (vel - window.vel)[samples] / SCALES["vel"],
-        (ang_vel - window.ang_vel)[samples] / SCALES["ang_vel"],
+        (pos - window.pos)[samples] / ERROR_SCALES["pos"],
+        attitude_error(quat[samples], window.quat[samples]) / ERROR_SCALES["attitude"],
+        (vel - window.vel)[samples] / ERROR_SCALES["vel"],
+        (ang_vel - window.ang_vel)[samples] / ERROR_SCALES["ang_vel"],
     ]
     return jnp.concatenate([x.ravel() for x in parts])
 

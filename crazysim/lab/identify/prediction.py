@@ -147,8 +147,8 @@ def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
             if np.any((log.gaps > start - PADDING) & (log.gaps < start + n + PADDING)):
                 continue
             for key, values in pieces.items():
-                extra = PADDING if key == "rotor_vel" else 0
-                values.append(getattr(log, key)[start - extra : start + n + extra])
+                padding = PADDING if key == "rotor_vel" else 0
+                values.append(getattr(log, key)[start - padding : start + n + padding])
     if not pieces["pos"]:
         raise ConfigError(
             f"expected a log without gaps for longer than {duration:g} s and {2 * PADDING + 1} samples, got none. "

@@ -55,7 +55,7 @@ def resample(
     """
     columns = columns or Columns()
     quat, angles = ([unsigned_name(x) for x in names] for names in (columns.quat, columns.rpy))
-    required, slow_columns = (
+    required_columns, slow_columns = (
         {*map(unsigned_name, columns.pos), *quat, *angles},
         set(map(unsigned_name, columns.voltage)),
     )
@@ -71,7 +71,7 @@ def resample(
         step = float(np.median(np.diff(stream.t[order])))
         if step > PERIOD_RANGE[1] and not set(values) <= slow_columns:
             interval = f"{key} every {PERIOD_RANGE[1]:g} s or more often, got every {step:.2g} s"
-            if required & set(values):
+            if required_columns & set(values):
                 raise ConfigError(f"{name}: expected {interval}. Log it faster.")
             repairs.append(f"left out a slow stream: expected {interval}")
             continue
@@ -93,11 +93,11 @@ def resample(
     if end - start > 100 * dt * max(len(s.t) for s in sorted_streams.values()):
         raise ConfigError(f"{name}: expected one flight, got {end - start:.3g} s of pauses. Cut the log into flights.")
     t = start + dt * np.arange(int((end - start) / dt) + 1)
-    keep = np.ones(len(t), bool)
+    is_covered = np.ones(len(t), bool)
     for key, s in sorted_streams.items():
         before = np.clip(np.searchsorted(s.t, t, side="right") - 1, 0, len(s.t) - 2)
-        keep &= s.t[before + 1] - s.t[before] <= MAX_HOLD * steps[key]
-    t = t[keep]
+        is_covered &= s.t[before + 1] - s.t[before] <= MAX_HOLD * steps[key]
+    t = t[is_covered]
     columns_at = {c: np.interp(t, s.t, x) for s in sorted_streams.values() for c, x in s.columns.items()}
     return {"t": t - start} | columns_at
 
@@ -149,7 +149,7 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
         repairs.append("the checksum does not match: read up to the last whole record")
         end = len(data)
     try:
-        kinds, offset = _kinds(data, n_kinds)
+        kinds, offset = _read_kinds(data, n_kinds)
     except (struct.error, ValueError) as error:
         raise ConfigError(
             f"{path.name}: expected names of log variables in the header, got {error}. Copy the file again."
@@ -200,12 +200,12 @@ def decompress_quat(packed: NDArray) -> NDArray:
         size = (packed & 511) / 511 * np.sqrt(0.5)
         quat[:, k] = np.where(is_small, np.where(packed & 512, -size, size), 0.0)
         packed = np.where(is_small, packed >> 10, packed)
-    rest = np.sqrt(np.clip(1 - np.sum(quat**2, axis=1), 0, 1))
-    quat[np.arange(len(quat)), largest] = rest
+    largest_value = np.sqrt(np.clip(1 - np.sum(quat**2, axis=1), 0, 1))
+    quat[np.arange(len(quat)), largest] = largest_value
     return quat
 
 
-def _kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
+def _read_kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
     """Return name, variables and layout of each kind of record, and the offset of the first record, bytes."""
     kinds, offset = {}, 5
 

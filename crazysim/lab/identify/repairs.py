@@ -32,7 +32,7 @@ N_NEIGHBOURS = 10
 
 
 def check_period(name: str, t: NDArray) -> None:
-    """Check that the interval between samples is that of a log of a flight.
+    """Check that the interval between samples is plausible for a log of a flight.
 
     Args:
         name: Name of the log, for messages.
@@ -66,19 +66,19 @@ def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
         keep[[indices[k] for k, step in ((0, 0), (-1, -2)) if t[indices[step + 1]] - t[indices[step]] > 100 * dt]] = (
             False
         )
-    lost = int(np.sum(~keep))
+    n_bad = int(np.sum(~keep))
     if len(t) >= MIN_SAMPLES and 2 * (n_different := len(np.unique(t))) < len(t):
         raise ConfigError(
             f"{name}: expected a different time for each sample, got {n_different} times of {len(t)} samples. "
             "Export the time with more digits, or name another column as time."
         )
-    if len(t) < MIN_SAMPLES or lost > MAX_REPAIRED_SHARE * len(t):
+    if len(t) < MIN_SAMPLES or n_bad > MAX_REPAIRED_SHARE * len(t):
         raise ConfigError(
-            f"{name}: expected at least {MIN_SAMPLES} samples whose time increases, got {len(t)} of which {lost} do "
+            f"{name}: expected at least {MIN_SAMPLES} samples whose time increases, got {len(t)} of which {n_bad} do "
             "not. Cut the log into flights."
         )
-    if lost:
-        repairs.append(f"dropped {lost} samples whose time is not between those of their neighbours")
+    if n_bad:
+        repairs.append(f"dropped {n_bad} samples whose time is not between those of their neighbours")
     return keep
 
 
@@ -110,8 +110,8 @@ def find_gaps(name: str, t: NDArray, repairs: list[str]) -> NDArray:
     n_intervals = min(5 * N_NEIGHBOURS, len(t) - 1)
     lateness = t - t[0] - np.median(t[n_intervals:] - t[:-n_intervals]) / n_intervals * np.arange(len(t))
     sides = [(lateness[max(k - N_NEIGHBOURS, 0) : k], lateness[k : k + N_NEIGHBOURS]) for k in late_samples]
-    lost = [np.median(b) - np.median(a) > dt / 2 and np.min(b) > np.max(a) for a, b in sides]
-    gaps = late_samples[np.array(lost, bool)]
+    is_lost = [np.median(b) - np.median(a) > dt / 2 and np.min(b) > np.max(a) for a, b in sides]
+    gaps = late_samples[np.array(is_lost, bool)]
     if len(late_samples) > len(gaps):
         longest = float(np.max(steps[late_samples - 1]))
         repairs.append(
@@ -136,7 +136,7 @@ def interpolate_missing(
     A value is missing where it is not finite, an attitude also where its quaternion is zero, as motion capture gives
     for a lost body.
     """
-    keep, lost, repaired = np.ones(len(t), bool), [], {}
+    keep, lost, columns = np.ones(len(t), bool), [], {}
     for key, x in data.items():
         is_valid = np.all(np.isfinite(x), axis=-1)
         if key == "quat":
@@ -173,12 +173,12 @@ def interpolate_missing(
         if not np.all(is_valid):
             x = np.stack([np.interp(t, t[is_valid], c[is_valid]) for c in x.T], axis=-1)
             x = x / np.linalg.norm(x, axis=-1, keepdims=True) if key == "quat" else x
-        repaired[key] = x
+        columns[key] = x
     if lost:
         repairs.append(
             f"dropped {np.sum(~keep)} samples, in which {', '.join(lost)} were missing for over {MAX_INTERPOLATION:g} s"
         )
-    return t[keep], {key: x[keep] for key, x in repaired.items()}
+    return t[keep], {key: x[keep] for key, x in columns.items()}
 
 
 def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str]) -> NDArray:
@@ -192,23 +192,23 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
     """
     from scipy.ndimage import median_filter  # a fifth of a second to import
 
-    smooth = median_filter(
+    smoothed = median_filter(
         np.maximum(thrust, 0.0), size=2 * max(1, round(0.1 / float(np.median(np.diff(t))))) + 1, mode="nearest"
     )
-    order = np.argsort(smooth)
-    weight = np.cumsum(smooth[order] ** 2)  # Idling rotors have little weight, however long they idle.
-    typical = smooth[order[np.searchsorted(weight, weight[-1] / 2)]]
-    if not typical > 0:
+    order = np.argsort(smoothed)
+    weight = np.cumsum(smoothed[order] ** 2)  # Idling rotors have little weight, however long they idle.
+    median_thrust = smoothed[order[np.searchsorted(weight, weight[-1] / 2)]]
+    if not median_thrust > 0:
         raise ConfigError(
             f"{name}: expected a flight, got rotors at rest. Check rotor_vel or attitude_command, or take another log."
         )
-    low = np.r_[False, smooth < CARRIED_SHARE * typical, False]
+    low = np.r_[False, smoothed < CARRIED_SHARE * median_thrust, False]
     starts, ends = np.flatnonzero(np.diff(low.astype(int)) == 1), np.flatnonzero(np.diff(low.astype(int)) == -1)
     keep = np.ones(len(t), bool)
     for start, end in zip(starts, ends, strict=True):
-        inside = start > 0 and end < len(t)
-        if np.min(smooth[start:end]) < IDLE_SHARE * typical and not (
-            inside and t[end - 1] - t[start] < GROUND_DURATION
+        is_inner = start > 0 and end < len(t)
+        if np.min(smoothed[start:end]) < IDLE_SHARE * median_thrust and not (
+            is_inner and t[end - 1] - t[start] < GROUND_DURATION
         ):
             keep &= (t < t[start] - GROUND_DURATION) | (t > t[end - 1] + GROUND_DURATION)
     if np.all(keep):

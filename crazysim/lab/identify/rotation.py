@@ -75,7 +75,7 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     moments = np.diag(np.asarray(params.J, np.float64))
     values, blocks = np.ones(5), []
     for _ in range(N_ITERATIONS):
-        blocks = [_blocks(_LogTerms.create(log, params, thrust_factor, values)) for log in logs]
+        blocks = [_solve_blocks(_LogTerms.create(log, params, thrust_factor, values)) for log in logs]
         estimates = np.concatenate(blocks)
         if not len(estimates):
             raise ConfigError(
@@ -91,20 +91,20 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
         x, y = 1 / roll / moments[0], 1 / pitch / moments[1]
         z = (x * moments[0] + y * moments[1]) / (moments[0] + moments[1])
         values = np.array([x, y, z, *(max(c, 0.0) * moments[2] * z for c in (drag, reaction))])
-    delayed = np.concatenate(
-        [_blocks(_LogTerms.create(log, params, thrust_factor, values), DELAY_DEVIATION) for log in logs]
+    delayed_columns = np.concatenate(
+        [_solve_blocks(_LogTerms.create(log, params, thrust_factor, values), DELAY_DEVIATION) for log in logs]
     )
-    yaw_changes = [weighted_median(delayed[:, k], delayed[:, k + 5])[0] - medians[k][0] for k in (2, 3)]
+    yaw_changes = [weighted_median(delayed_columns[:, k], delayed_columns[:, k + 5])[0] - medians[k][0] for k in (2, 3)]
     inertia = moments * values[:3]
     tilt = np.array(deviations[:2]) / [roll, pitch]
     mean_tilt_deviation = np.hypot(*(tilt * inertia[:2])) / np.sum(inertia[:2])
-    spread = np.hypot(
+    deviation = np.hypot(
         [*tilt * [x, y], mean_tilt_deviation * z, *inertia[2] * np.hypot(deviations[2:], yaw_changes)],
         SAMPLING_ERROR * values,
     )
     overall_delay = weighted_median(estimates[:, 4], np.ones(len(estimates)))[0]
     delays = [weighted_median(b[:, 4], b[:, 5])[0] if len(b) else overall_delay for b in blocks]
-    return FastRotation(values, spread, np.array(delays))
+    return FastRotation(values, deviation, np.array(delays))
 
 
 def aligned(log: Log, delay: float) -> Log:
@@ -125,8 +125,8 @@ def weighted_median(x: NDArray, variance: NDArray) -> tuple[float, float]:
     if len(x) < MIN_BLOCKS:
         return center, math.nan
     count = np.sum(weight) ** 2 / np.sum(weight**2)
-    spread = math.sqrt(np.sum(weight * (x - center) ** 2) / np.sum(weight) / (count - 1))
-    return center, 1.2533 * deviation_factor(len(x)) * spread  # ratio of deviations of median and mean (Gauss)
+    deviation = math.sqrt(np.sum(weight * (x - center) ** 2) / np.sum(weight) / (count - 1))
+    return center, 1.2533 * deviation_factor(len(x)) * deviation  # ratio of deviations of median and mean (Gauss)
 
 
 def deviation_factor(n: int) -> float:
@@ -167,10 +167,10 @@ class _LogTerms(NamedTuple):
             thrust = thrust_factor * thrust
             torque = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
             # The drag of the air on rotors and their acceleration turn the body the same way.
-            reaction = _change((rotor_inertia * speed) @ mixing[2])
+            reaction = _centred_change((rotor_inertia * speed) @ mixing[2])
             return _Rotors(
                 _integral_over_two(torque, log.dt),
-                _change(torque),
+                _centred_change(torque),
                 reaction,
                 _integral_over_two(thrust.sum(axis=1), log.dt),
             )
@@ -183,7 +183,7 @@ class _LogTerms(NamedTuple):
         return _LogTerms(
             dt,
             log.gaps,
-            _change(w) + _integral_over_two(gyro, dt),
+            _centred_change(w) + _integral_over_two(gyro, dt),
             _integral_over_two(w, dt),
             rotors(log.rotor_vel),
             rotors(speeds),
@@ -214,7 +214,7 @@ def _speeds_of_commands(log: Log) -> NDArray:
     return np.stack(speeds, axis=-1)
 
 
-def _change(x: NDArray) -> NDArray:
+def _centred_change(x: NDArray) -> NDArray:
     """Return the change over the two intervals around each sample, zero at the ends."""
     change = np.zeros_like(x)
     change[1:-1] = x[2:] - x[:-2]
@@ -228,45 +228,45 @@ def _integral_over_two(x: NDArray, dt: float) -> NDArray:
     return total
 
 
-def _band(x: NDArray, dt: float, slow: float) -> NDArray:
+def _band_pass(x: NDArray, dt: float, slow: float) -> NDArray:
     """Return the band-passed signal. (n, k)"""
 
-    def smooth(width: float) -> NDArray:
+    def smooth_columns(width: float) -> NDArray:
         size = 2 * max(1, round(width / dt / 2)) + 1
         kernel = np.hanning(size + 2)[1:-1]
         return np.stack([np.convolve(c, kernel / kernel.sum(), "same") for c in x.T], axis=-1)
 
-    return smooth(FAST_WIDTH) - smooth(slow)
+    return smooth_columns(FAST_WIDTH) - smooth_columns(slow)
 
 
-def _blocks(d: _LogTerms, extra_delay: float = 0.0) -> NDArray:
+def _solve_blocks(data: _LogTerms, extra_delay: float = 0.0) -> NDArray:
     """Return the solution of each block, about z with a delay that is longer by ``extra_delay`` samples.
 
     The columns are the coefficients of torque about x and y, of drag torque and of reaction; the delay, s; and the
     variances of the four coefficients.
     (n_blocks, 9)
     """
-    n, margin = len(d.ang_vel_change), round(YAW_SLOW_WIDTH / d.dt / 2)
+    n, margin = len(data.ang_vel_change), round(YAW_SLOW_WIDTH / data.dt / 2)
     keep = np.ones(n, bool)
-    for gap in (0, *d.gaps, n):
+    for gap in (0, *data.gaps, n):
         keep[max(0, gap - margin) : gap + margin] = False
-    size, blocks = max(1, round(BLOCK_DURATION / d.dt)), []
+    size, blocks = max(1, round(BLOCK_DURATION / data.dt)), []
     for k in range(0, n, size):
         indices = np.flatnonzero(keep[k : k + size]) + k
-        if len(indices) * d.dt < 1:
+        if len(indices) * data.dt < 1:
             continue
         delay = 0.0
         for _ in range(6):
-            tilt = [_solve(d, axis, delay, indices) for axis in (0, 1)]
+            tilt = [_solve_samples(data, axis, delay, indices) for axis in (0, 1)]
             # Torque and its rate over time: torque(t - e) = torque - e rate.
             delay -= float(np.mean([x[1] / x[0] for x, _ in tilt]))
             delay = float(np.clip(delay, -MAX_DELAY, MAX_DELAY))
-        yaw, variance = _solve(d, 2, delay + extra_delay * d.dt, indices)
+        yaw, variance = _solve_samples(data, 2, delay + extra_delay * data.dt, indices)
         blocks.append([*(x[0] for x, _ in tilt), *yaw[:2], delay, *(v[0] for _, v in tilt), *variance[:2]])
     return np.reshape(blocks, (-1, 9))
 
 
-def _solve(d: _LogTerms, axis: int, delay: float, samples: NDArray) -> tuple[NDArray, NDArray]:
+def _solve_samples(data: _LogTerms, axis: int, delay: float, samples: NDArray) -> tuple[NDArray, NDArray]:
     """Return the coefficients of the regressors and their variances, fitted at ``samples``.
 
     Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
@@ -278,12 +278,12 @@ def _solve(d: _LogTerms, axis: int, delay: float, samples: NDArray) -> tuple[NDA
             columns = rotors.impulse[:, 2], rotors.reaction
         else:
             columns = rotors.impulse[:, axis], rotors.swing[:, axis], rotors.lift
-        return np.c_[shift_series(np.stack(columns, axis=-1), delay / d.dt), d.angle[:, axis]]
+        return np.c_[shift_series(np.stack(columns, axis=-1), delay / data.dt), data.angle[:, axis]]
 
     slow = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH
     regressors, instruments, ang_vel_change = (
-        _band(x, d.dt, slow)[samples]
-        for x in (terms(d.rotors), terms(d.instruments), d.ang_vel_change[:, axis : axis + 1])
+        _band_pass(x, data.dt, slow)[samples]
+        for x in (terms(data.rotors), terms(data.instruments), data.ang_vel_change[:, axis : axis + 1])
     )
     inverse = np.linalg.pinv(instruments.T @ regressors)
     x = inverse @ instruments.T @ ang_vel_change[:, 0]
@@ -298,9 +298,9 @@ def shift_series(x: NDArray, samples: float) -> NDArray:
     """
     whole_samples = math.floor(samples)
     fraction, taps = samples - whole_samples, np.arange(-2, 4)
-    delayed, n = np.zeros_like(x), len(x)
+    shifted, n = np.zeros_like(x), len(x)
     for k in taps:
         other_taps = taps[taps != k]
         weight = np.prod((fraction - other_taps) / (k - other_taps))
-        delayed += weight * x[np.clip(np.arange(n) - whole_samples - k, 0, n - 1)]
-    return delayed
+        shifted += weight * x[np.clip(np.arange(n) - whole_samples - k, 0, n - 1)]
+    return shifted

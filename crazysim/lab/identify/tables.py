@@ -37,7 +37,7 @@ def read_table(
     Raises:
         ConfigError: If the file cannot be read, or its samples are too close or too far apart for a flight.
     """
-    name, table = _read(source, repairs, columns)
+    name, table = _read_source(source, repairs, columns)
     if columns is None or not columns.rpy or any(unsigned_name(x) not in table for x in columns.rpy):
         return name, table
     angles = stack_columns(name, table, columns.rpy, columns.rad_per_angle)
@@ -50,12 +50,12 @@ def read_table(
     return name, {**table, **dict(zip(columns.quat, quat.T.astype(np.float64), strict=True))}
 
 
-def _read(
+def _read_source(
     source: str | Path | Mapping[str, NDArray], repairs: list[str], columns: Columns | None
 ) -> tuple[str, Mapping[str, NDArray]]:
     """Return the name of a log and its columns, with the time in s and the attitude as the source has it."""
     if isinstance(source, Mapping):
-        return "log", _in_seconds("log", source, columns)
+        return "log", _convert_time("log", source, columns)
     path = Path(source)
     if is_bag(path) and path.exists():
         with reading(path.name, "a ROS bag", "Record it again, or run ros2 bag reindex."):
@@ -76,10 +76,10 @@ def _read(
             return path.stem, read_blackbox(path, repairs)
         else:
             table = read_delimited(path, repairs)
-    return path.stem, _in_seconds(path.stem, table, columns)
+    return path.stem, _convert_time(path.stem, table, columns)
 
 
-def _in_seconds(name: str, table: Mapping[str, NDArray], columns: Columns | None) -> Mapping[str, NDArray]:
+def _convert_time(name: str, table: Mapping[str, NDArray], columns: Columns | None) -> Mapping[str, NDArray]:
     """Return the table with its time in s."""
     names = columns or KNOWN_COLUMNS["crazysim"]
     if names.time not in table:

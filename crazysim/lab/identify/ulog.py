@@ -28,13 +28,13 @@ TOPICS = (
 """Topics that are read; the first two are needed."""
 MAGIC = b"ULog\x01\x12\x35"
 """First bytes of a file."""
-SYNC = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
+SYNC_BYTES = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
 """Content of a message ``S``, after which reading of a damaged file resumes."""
 HEADER_SIZE = 16
 """Bytes before the first message."""
-KINDS = b"ABCDFILMOPQRS"
+MESSAGE_LETTERS = b"ABCDFILMOPQRS"
 """Letters of the messages."""
-SCALARS = {
+SCALAR_TYPES = {
     "int8_t": "<i1", "uint8_t": "<u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
     "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8", "bool": "<i1", "char": "<i1",
 }  # fmt: skip
@@ -43,16 +43,16 @@ MAX_MESSAGE = 2**16 - 1
 """Largest message, bytes, which its 16 bits of length can state."""
 MAX_DEPTH = 8
 """Largest depth of nested formats; PX4 has two."""
-FIELD = re.compile(r"([\w/-]+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
+FIELD_PATTERN = re.compile(r"([\w/-]+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
 
 
 def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     """Return the columns of a PX4 ULog by the names of crazysim's logs.
 
     World axes are north, west, up, and body axes forward, left, up: PX4's, rotated by 180 degrees about the first axis.
-    Rotor speeds are those of ``esc_status`` and commands those of ``actuator_motors``, or else of ``actuator_outputs``,
-    in PX4's order. Commanded attitudes are those of ``vehicle_attitude_setpoint``, with its thrust from 0 to 1.
-    Logs before PX4 1.10 have the angular velocity in ``vehicle_attitude``.
+    Rotor speeds come from ``esc_status`` and commands from ``actuator_motors``, or else from ``actuator_outputs``, in
+    PX4's order. Commanded attitudes come from ``vehicle_attitude_setpoint``, with its thrust from 0 to 1. Logs
+    before PX4 1.10 have the angular velocity in ``vehicle_attitude``.
 
     Args:
         path: File.
@@ -61,7 +61,7 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     Raises:
         ConfigError: If the log lacks position or attitude, or is damaged.
     """
-    topics = _topics(path, TOPICS, repairs)
+    topics = _read_topics(path, TOPICS, repairs)
     if missing := [key for key in TOPICS[:2] if key not in topics]:
         others = ", ".join(topics) or "none"
         raise ConfigError(
@@ -120,7 +120,7 @@ class Topic(dict[str, NDArray]):
         )
 
 
-def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str, Topic]:
+def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str, Topic]:
     """Return the first instances of topics, their fields by name, such as ``q[0]`` or ``esc[2].esc_rpm``.
 
     Where a file is damaged, the messages up to the next synchronisation message are left out.
@@ -143,12 +143,12 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
     while offset + head.size <= len(data):
         size, kind = head.unpack_from(data, offset)
         start, end = offset + head.size, offset + head.size + size
-        if kind not in KINDS or end > len(data):
-            sync = data.find(SYNC, offset + 1)
+        if kind not in MESSAGE_LETTERS or end > len(data):
+            sync = data.find(SYNC_BYTES, offset + 1)
             skipped += (len(data) if sync < 0 else sync) - offset
             if sync < 0:
                 break
-            offset = sync + len(SYNC)
+            offset = sync + len(SYNC_BYTES)
             continue
         offset = end
         if kind == ord("D") and size > 2:
@@ -171,18 +171,18 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
         repairs.append(f"{dropouts} dropouts of the logger")
     tables: dict[str, Topic] = {}
     for name, key in ids.items():
-        layout = np.dtype(_layout(path.name, formats, name))
-        whole = [part[: layout.itemsize] for part in parts[key] if len(part) >= layout.itemsize]
-        if len(whole) < len(parts[key]):
-            repairs.append(f"left out {len(parts[key]) - len(whole)} messages {name}, which are too short")
-        if whole:
-            table = np.frombuffer(b"".join(whole), layout)
+        layout = np.dtype(_read_layout(path.name, formats, name))
+        whole_records = [part[: layout.itemsize] for part in parts[key] if len(part) >= layout.itemsize]
+        if len(whole_records) < len(parts[key]):
+            repairs.append(f"left out {len(parts[key]) - len(whole_records)} messages {name}, which are too short")
+        if whole_records:
+            table = np.frombuffer(b"".join(whole_records), layout)
             columns = {field: without_huge_numbers(table[field]) for field in layout.names or ()}
             tables[name] = Topic(f"{path.name}: {name}", columns)
     return tables
 
 
-def _layout(
+def _read_layout(
     file: str, formats: Mapping[str, str], name: str, prefix: str = "", depth: int = 0
 ) -> list[tuple[str, str]]:
     """Return names and types of the fields of a format, with nested formats unrolled.
@@ -195,14 +195,16 @@ def _layout(
         raise DamagedFileError(f"{file}: expected a format of {quoted}, got {got}. {remedy}")
     fields = []
     for text in filter(None, formats[name].split(";")):
-        match = FIELD.fullmatch(text)
+        match = FIELD_PATTERN.fullmatch(text)
         if match is None:
             raise DamagedFileError(f"{file}: expected a field such as 'float[4] q', got {text[:60]!r}. {remedy}")
         kind, count, field = match.groups()
         for index in [""] if count is None else [f"[{k}]" for k in range(int(count))]:
             path = f"{prefix}{field}{index}"
             field_layout = (
-                [(path, SCALARS[kind])] if kind in SCALARS else _layout(file, formats, kind, f"{path}.", depth + 1)
+                [(path, SCALAR_TYPES[kind])]
+                if kind in SCALAR_TYPES
+                else _read_layout(file, formats, kind, f"{path}.", depth + 1)
             )
             fields += field_layout
             if not field_layout or len(fields) > MAX_MESSAGE:

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 def rotate(quat: NDArray, vec: NDArray) -> NDArray:
     """Return vectors turned by unit quaternions, xyzw. (..., 3)"""
     axis, w = quat[..., :3], quat[..., 3:]
-    twice = 2 * _cross(axis, vec)
-    return vec + w * twice + _cross(axis, twice)
+    double_cross = 2 * _cross(axis, vec)
+    return vec + w * double_cross + _cross(axis, double_cross)
 
 
 def _cross(a: NDArray, b: NDArray) -> NDArray:
@@ -34,8 +34,8 @@ def multiply(p: NDArray, q: NDArray) -> NDArray:
 
 def from_rpy(rpy: ArrayLike) -> NDArray:
     """Return quaternions, xyzw, of roll, pitch and yaw, rad. (..., 4)"""
-    half = np.asarray(rpy, float) / 2
-    (sr, sp, sy), (cr, cp, cy) = (np.moveaxis(f(half), -1, 0) for f in (np.sin, np.cos))
+    half_angles = np.asarray(rpy, float) / 2
+    (sr, sp, sy), (cr, cp, cy) = (np.moveaxis(f(half_angles), -1, 0) for f in (np.sin, np.cos))
     return np.stack(
         [
             sr * cp * cy - cr * sp * sy,
@@ -65,7 +65,7 @@ def from_yaw(yaw: float) -> NDArray:
     return np.array([0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)])
 
 
-def yaw_of(quat: NDArray) -> float:
+def yaw_from_quat(quat: NDArray) -> float:
     """Return the yaw of a unit quaternion, xyzw, rad."""
     x, y, z, w = quat
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -139,15 +139,15 @@ class BrowserPanel:
         }  # fmt: skip
         buttons = gui.add_button_group("", tuple(calls))
         buttons.on_click(lambda _: live.post(calls[buttons.value]))
-        speed = gui.add_dropdown("speed", SPEEDS, initial_value=_nearest(live.speed))
+        speed = gui.add_dropdown("speed", SPEEDS, initial_value=_nearest_speed(live.speed))
 
         @speed.on_update
         def _(_: Any) -> None:
             value = speed.value
             live.post(lambda live: setattr(live, "speed", "max" if value == "max" else float(value)))
 
-        to = gui.add_number("go to, s", 0.0, min=0.0, step=0.1)
-        _post(gui.add_button("Go"), live, lambda live: live.go_to(float(to.value)))
+        target_time = gui.add_number("go to, s", 0.0, min=0.0, step=0.1)
+        _post_on_click(gui.add_button("Go"), live, lambda live: live.go_to(float(target_time.value)))
 
     def _add_drone(self, gui: Any, live: Live, bodies: SceneBodies) -> None:
         sim = live.sim
@@ -161,8 +161,8 @@ class BrowserPanel:
             @number.on_update
             def _(event: Any) -> None:
                 if event.client is not None:  # a change by a user
-                    chosen = int(worlds.value), int(self._drone.value)
-                    live.post(lambda live: live.select(*chosen))
+                    selection = int(worlds.value), int(self._drone.value)
+                    live.post(lambda live: live.select(*selection))
 
         self._body = None
         if any(body.kind != DRONE for body in bodies.items):
@@ -203,7 +203,7 @@ class BrowserPanel:
     @staticmethod
     def _add_control(gui: Any, live: Live, control: Control) -> None:
         if not isinstance(control, Slider):
-            _post(gui.add_button(control.name), live, lambda _: control.call())
+            _post_on_click(gui.add_button(control.name), live, lambda _: control.call())
             return
         step = (control.high - control.low) / 200
         slider = gui.add_slider(control.name, control.low, control.high, step, control.value)
@@ -214,12 +214,12 @@ class BrowserPanel:
             live.post(lambda live: live.set_value(control.name, value))
 
 
-def _post(button: Any, live: Live, call: Callable[[Live], object]) -> None:
+def _post_on_click(button: Any, live: Live, call: Callable[[Live], object]) -> None:
     """Make a button post a function to the loop."""
     button.on_click(lambda _: live.post(call))
 
 
-def _nearest(speed: Speed) -> str:
+def _nearest_speed(speed: Speed) -> str:
     """Return the choice that is nearest to a speed."""
     if speed == "max":
         return "max"

@@ -12,8 +12,8 @@ from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.browser_trails import Trails, finite_rows
 from crazysim.lab.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
 from crazysim.lab.live.scene_bodies import DRONE, MARK_RADIUS, SceneBodies, SceneBody
-from crazysim.media.trail import colors_of
-from crazysim.media.web import add_static, mesh_of, rgb
+from crazysim.media.trail import choose_drone_colors
+from crazysim.media.web import add_static, create_mesh, rgb
 from crazysim.scene.visual_geoms import VisualGeom
 
 SETPOINT_RADIUS = 0.025
@@ -60,9 +60,9 @@ class BrowserScene:
                 by_color[tuple(np.round(shape.rgba, 3))].append(shape)
             elif shape.kind != "plane":
                 by_body[shape.mocap].append(shape)
-        for k, (rgba, fixed) in enumerate(by_color.items()):
-            infinite = [s for s in fixed if s.kind == "plane" and not s.size[:2].any()]
-            others = [s for s in fixed if not any(s is plane for plane in infinite)]
+        for k, (rgba, fixed_shapes) in enumerate(by_color.items()):
+            infinite = [s for s in fixed_shapes if s.kind == "plane" and not s.size[:2].any()]
+            others = [s for s in fixed_shapes if not any(s is plane for plane in infinite)]
             if infinite:
                 add_static(scene, f"/world/floor/{k}", infinite, rgba)
             for w, offset in enumerate(self.offsets if others else []):
@@ -72,22 +72,22 @@ class BrowserScene:
         for equal_bodies in _group_equal_bodies(by_body):
             self._add_bodies(np.array(equal_bodies), by_body[equal_bodies[0]], picture)
 
-        colors = np.tile(colors_of(n_drones, None)[:, :3], (n_worlds, 1))
+        colors = np.tile(choose_drone_colors(n_drones, None)[:, :3], (n_worlds, 1))
         drones = self._to_grid(picture.drone_pos).reshape(-1, 3)
-        self._setpoints = self._add_balls("setpoints", SETPOINT_RADIUS, picture.setpoint, rgb_of(colors), 0.8)
+        self._setpoints = self._add_balls("setpoints", SETPOINT_RADIUS, picture.setpoint, to_rgb_bytes(colors), 0.8)
         self._contacts = self._add_balls("contacts", MARK_RADIUS, picture.drone_pos, CONTACT_COLOR, 0.45)
         self._contacts.batched_scales = np.full(len(drones), HIDDEN_SCALE, np.float32)
-        self._lights = self._add_balls("lights", LIGHT_RADIUS, picture.drone_pos, rgb_of(0 * colors), 0.7)
+        self._lights = self._add_balls("lights", LIGHT_RADIUS, picture.drone_pos, to_rgb_bytes(0 * colors), 0.7)
         self._lights.batched_scales = np.full(len(drones), HIDDEN_SCALE, np.float32)
-        self._lit = np.zeros_like(colors)
-        self._followed = scene.add_icosphere(
+        self._led_colors = np.zeros_like(colors)
+        self._followed_mark = scene.add_icosphere(
             "/world/followed", radius=MARK_RADIUS, color=FOLLOWED_COLOR, opacity=0.25, visible=False
         )
         self._label = scene.add_label("/world/followed/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
         self._wind = None
         self._tracked = bodies.tracked
         tracked = self._to_grid(picture.pos[:, self._tracked]).reshape(-1, 3)
-        trail_colors = np.tile(colors_of(len(self._tracked), None)[:, :3], (n_worlds, 1))
+        trail_colors = np.tile(choose_drone_colors(len(self._tracked), None)[:, :3], (n_worlds, 1))
         self._trail = Trails(scene, tracked, trail_colors, trail) if trail > 0 else None
         self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind", "lights"), True)
 
@@ -98,7 +98,7 @@ class BrowserScene:
             picture: Picture.
             follow: True to keep the followed body in the middle: the worlds move, and the camera stays.
         """
-        pos, show = self._to_grid(picture.pos), self.visible
+        pos, visible = self._to_grid(picture.pos), self.visible
         for handle, bodies in self._batches:
             handle.batched_positions = finite_rows(pos[:, bodies].reshape(-1, 3))
             handle.batched_wxyzs = finite_rows(
@@ -106,16 +106,16 @@ class BrowserScene:
             )
         drones = self._to_grid(picture.drone_pos)
         if self._setpoints is not None:
-            self._setpoints.visible = show["setpoints"]
+            self._setpoints.visible = visible["setpoints"]
             self._setpoints.batched_positions = finite_rows(self._to_grid(picture.setpoint).reshape(-1, 3))
-        has_contact = picture.has_contact.ravel() & show["contacts"]
+        has_contact = picture.has_contact.ravel() & visible["contacts"]
         self._contacts.batched_scales = np.where(has_contact, 1.0, HIDDEN_SCALE).astype(np.float32)
         if has_contact.any():
             self._contacts.batched_positions = finite_rows(drones.reshape(-1, 3))
-        self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * show["lights"])
+        self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * visible["lights"])
         self._show_wind(drones, picture)
         if self._trail is not None:
-            self._trail.update(picture.time, finite_rows(pos[:, self._tracked].reshape(-1, 3)), show["trails"])
+            self._trail.update(picture.time, finite_rows(pos[:, self._tracked].reshape(-1, 3)), visible["trails"])
         self._show_followed(pos, picture, follow)
 
     def pick(
@@ -133,9 +133,9 @@ class BrowserScene:
         """
         origin = np.asarray(origin, float) - np.asarray(self._root.position, float)
         direction = np.asarray(direction, float) / np.linalg.norm(direction)
-        beside = self._hits(picture, origin, direction)
-        if np.isfinite(beside).any():
-            world, mocap = np.unravel_index(beside.argmin(), beside.shape)
+        distances = self._ray_distances(picture, origin, direction)
+        if np.isfinite(distances).any():
+            world, mocap = np.unravel_index(distances.argmin(), distances.shape)
             return int(world), self._bodies.items[self._bodies.owner[mocap]], None
         if direction[2] > -1e-6:
             return 0, None, None
@@ -143,7 +143,7 @@ class BrowserScene:
         world = int(np.linalg.norm(self.offsets - point, axis=-1).argmin())
         return world, None, point - self.offsets[world]
 
-    def _hits(self, picture: Picture, origin: NDArray, direction: NDArray) -> NDArray:
+    def _ray_distances(self, picture: Picture, origin: NDArray, direction: NDArray) -> NDArray:
         """Return the distance between a ray and the origin of each body whose box it enters, m. (n, n_mocap)
 
         The distance is infinite for other bodies. Boxes of small and distant bodies are enlarged, so that they are easy
@@ -155,18 +155,21 @@ class BrowserScene:
             direction: Unit vector. (3,)
         """
         start = origin - self._to_grid(picture.pos)
-        away = np.linalg.norm(start, axis=-1, keepdims=True)
+        distance = np.linalg.norm(start, axis=-1, keepdims=True)
         low, high = self._bodies.low, self._bodies.high
         drones = np.array([self._bodies.items[k].kind == DRONE for k in self._bodies.owner])
-        least = np.maximum(np.where(drones, MARK_RADIUS, 0.0)[:, None], CLICK_SIZE * away)
+        min_radius = np.maximum(np.where(drones, MARK_RADIUS, 0.0)[:, None], CLICK_SIZE * distance)
         to_body = picture.quat * (-1, -1, -1, 1)
-        begin, ray = rotate(to_body, start), rotate(to_body, np.broadcast_to(direction, start.shape))
+        local_start, ray = rotate(to_body, start), rotate(to_body, np.broadcast_to(direction, start.shape))
         with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (np.minimum(low, -least) - begin) / ray, (np.maximum(high, least) - begin) / ray
-        enter, leave = np.fmin(a, b).max(-1), np.fmax(a, b).min(-1)
-        hit = (enter > 0) & (enter <= leave) & (high > low).any(-1)
-        beside = np.linalg.norm(start - (start @ direction)[..., None] * direction, axis=-1)
-        return np.where(hit, beside, np.inf)
+            a, b = (
+                (np.minimum(low, -min_radius) - local_start) / ray,
+                (np.maximum(high, min_radius) - local_start) / ray,
+            )
+        entry_distance, exit_distance = np.fmin(a, b).max(-1), np.fmax(a, b).min(-1)
+        is_hit = (entry_distance > 0) & (entry_distance <= exit_distance) & (high > low).any(-1)
+        ray_distance = np.linalg.norm(start - (start @ direction)[..., None] * direction, axis=-1)
+        return np.where(is_hit, ray_distance, np.inf)
 
     def _add_bodies(self, bodies: NDArray, shapes: list[VisualGeom], picture: Picture) -> None:
         """Add bodies that have the same geoms, as one batch for each colour."""
@@ -175,8 +178,8 @@ class BrowserScene:
             by_color[tuple(np.round(shape.rgba, 3))].append(shape)
         pos = self._to_grid(picture.pos)[:, bodies].reshape(-1, 3)
         quat = np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4)
-        for k, (rgba, same) in enumerate(by_color.items()):
-            mesh = mesh_of(same)
+        for k, (rgba, same_color) in enumerate(by_color.items()):
+            mesh = create_mesh(same_color)
             handle = self._scene.add_batched_meshes_simple(
                 f"/world/bodies/{bodies[0]}/{k}", np.asarray(mesh.vertices, np.float32),
                 np.asarray(mesh.faces, np.uint32), finite_rows(quat, (1, 0, 0, 0)), finite_rows(pos),
@@ -218,9 +221,9 @@ class BrowserScene:
             drones: Positions, m. (n, 3)
             colors: Colours, 0 to 1; zero for off. (n, 3)
         """
-        if not np.array_equal(colors, self._lit):
-            self._lit = colors
-            self._lights.batched_colors = rgb_of(colors)
+        if not np.array_equal(colors, self._led_colors):
+            self._led_colors = colors
+            self._lights.batched_colors = to_rgb_bytes(colors)
             self._lights.batched_scales = np.where(colors.any(-1), 1.0, HIDDEN_SCALE).astype(np.float32)
         if colors.any():
             self._lights.batched_positions = finite_rows(drones)
@@ -229,15 +232,15 @@ class BrowserScene:
         k = None
         if picture.followed is not None:
             k = next((i for i, world in enumerate(picture.worlds) if world == picture.followed[0]), None)
-        self._followed.visible = k is not None
+        self._followed_mark.visible = k is not None
         if k is None or picture.followed is None:
             self._root.position = (0.0, 0.0, 0.0)
             return
         pos = finite_rows(bodies[k, picture.followed[1]])
         radius = self._bodies.radius(picture.followed[1])
-        self._followed.position = pos
-        if radius != self._followed.radius:  # only on a change, because browsers rebuild the sphere
-            self._followed.radius, self._label.position = radius, (0.0, 0.0, radius)
+        self._followed_mark.position = pos
+        if radius != self._followed_mark.radius:  # only on a change, because browsers rebuild the sphere
+            self._followed_mark.radius, self._label.position = radius, (0.0, 0.0, radius)
         self._label.text = picture.followed_name
         self._root.position = -pos if follow else (0.0, 0.0, 0.0)
 
@@ -254,7 +257,7 @@ def grid_offsets(n: int, spacing: float) -> NDArray:
     return spacing * np.stack([column - (columns - 1) / 2, (rows - 1) / 2 - row, np.zeros(n)], axis=-1)
 
 
-def rgb_of(colors: NDArray) -> NDArray:
+def to_rgb_bytes(colors: NDArray) -> NDArray:
     """Return colours, 0 to 1, as whole numbers from 0 to 255. (n, 3)"""
     return np.round(255 * colors[:, :3]).astype(np.uint8)
 

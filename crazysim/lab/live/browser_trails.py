@@ -60,7 +60,7 @@ class Trails:
         return np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
 
 
-def finite_rows(values: NDArray, rest: ArrayLike = 0.0) -> NDArray:
-    """Return rows of numbers, (..., k), with rows that are not finite replaced by ``rest``, () or (k,)."""
-    bad = ~np.isfinite(values).all(-1, keepdims=True)
-    return np.where(bad, np.asarray(rest, float), values)
+def finite_rows(values: NDArray, fill_value: ArrayLike = 0.0) -> NDArray:
+    """Return rows of numbers, (..., k), with rows that are not finite replaced by ``fill_value``, () or (k,)."""
+    is_invalid = ~np.isfinite(values).all(-1, keepdims=True)
+    return np.where(is_invalid, np.asarray(fill_value, float), values)

@@ -25,7 +25,7 @@ class Chart:
         Args:
             name: Title; empty for no plot.
         """
-        self._name, self._selected = name, None
+        self._name, self._selected_drone = name, None
         self._times: list[float] = []
         self._values: list[np.ndarray] = []
         self._figure = figure = mujoco.MjvFigure()
@@ -39,10 +39,10 @@ class Chart:
         """Add the values of a picture; the chart restarts for another drone or after a jump back in time."""
         values = picture.plot[:MAX_LINES]
         restarts = self._times and (picture.time < self._times[-1] or len(values) != len(self._values[-1]))
-        if restarts or picture.selected != self._selected:
+        if restarts or picture.selected != self._selected_drone:
             self._times.clear()
             self._values.clear()
-        self._selected = picture.selected
+        self._selected_drone = picture.selected
         if len(values) and np.isfinite(values).all() and (not self._times or picture.time > self._times[-1]):
             self._times.append(picture.time)
             self._values.append(values)

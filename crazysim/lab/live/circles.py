@@ -11,9 +11,9 @@ HEIGHT = 1.0
 """Height of the circles above the initial positions, m."""
 RADIUS = 0.3
 """Radius of the circles, m."""
-PERIOD = 4.0
+CIRCLE_DURATION = 4.0
 """Duration of one circle, s."""
-CLIMB = 2.0
+CLIMB_DURATION = 2.0
 """Time in which the drones rise to their circles, s."""
 
 
@@ -28,13 +28,13 @@ class Circles:
             piloted: True to leave the first drone of the first world to a pilot once it has risen.
         """
         self._places = np.asarray(live.sim.data.states.pos, float).copy()
-        self._piloted = piloted
+        self._is_piloted = piloted
 
     def __call__(self, live: Live) -> None:
         """Write the setpoints of this control step."""
         command = circle_commands(self._places, live.time)
-        if self._piloted:
-            if live.time > CLIMB:
+        if self._is_piloted:
+            if live.time > CLIMB_DURATION:
                 command[0, 0] = live.command[0, 0]
             else:
                 command[0, 0, :2], command[0, 0, 3:9] = self._places[0, 0, :2], 0.0
@@ -48,9 +48,9 @@ def circle_commands(places: NDArray, time: float) -> NDArray:
         places: Positions, m. (n_worlds, n_drones, 3)
         time: Time since the start, s.
     """
-    rise = np.clip(time / CLIMB, 0.0, 1.0)
+    rise = np.clip(time / CLIMB_DURATION, 0.0, 1.0)
     part = rise**2 * (3 - 2 * rise)
-    omega = 2 * np.pi / PERIOD
+    omega = 2 * np.pi / CIRCLE_DURATION
     c, s = np.cos(omega * time), np.sin(omega * time)
     command = np.zeros((*places.shape[:2], 16))
     command[..., :3] = places + part * np.array([RADIUS * (c - 1), RADIUS * s, HEIGHT])

@@ -91,7 +91,7 @@ class LoadShow:
 Command = TakeOff | Land | Hover | Upload | Start | SetParameter | StartShow | LoadShow
 
 
-def command_of(frame: Message | ShowFile, drone: int | None = None) -> Command:
+def parse_command(frame: Message | ShowFile, drone: int | None = None) -> Command:
     """Return the command in a message.
 
     Args:
@@ -123,9 +123,9 @@ def command_of(frame: Message | ShowFile, drone: int | None = None) -> Command:
         if not equals or not parameter:
             raise ConfigError(f"expected param_NAME=VALUE, got {argument!r}")
         return SetParameter(drone, parameter, _number(value, -math.inf, math.inf))
-    plain = {"land": Land, "hover": Hover}
-    if name in plain:
-        return plain[name](drone)
+    motionless = {"land": Land, "hover": Hover}
+    if name in motionless:
+        return motionless[name](drone)
     if name == "show":
         return StartShow()
     raise ConfigError(f"expected takeoff, land, hover, upload, start, param or show, got {name!r}")

@@ -21,13 +21,13 @@ from crazysim.plugins.follow import Follow
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Trajectory, hover, line
 
-SPEED = 0.5
+VERTICAL_SPEED = 0.5
 """Mean speed of take-off and landing, m/s."""
 MIN_TIME = 1.0
 """Shortest duration of take-off and landing, s."""
 MAX_PIECES = 256
 """Default largest number of pieces of a trajectory."""
-DEGREE = 7
+MAX_DEGREE = 7
 """Highest degree of a trajectory."""
 
 log = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ class Fleet:
         if len(set(self.ids.values())) < len(self.ids) or not all(0 <= i < sim.n_drones for i in self.ids.values()):
             raise ConfigError(f"expected one drone of {sim.n_drones} for each ID, got {self.ids}")
         pos = np.asarray(sim.data.states.pos[0], float)
-        self._active = [_hover(np.append(p, 0.0)) for p in pos]
+        self._active = [_hover_trajectory(np.append(p, 0.0)) for p in pos]
         self._starts = np.zeros(sim.n_drones)
         self._uploaded: dict[int, Trajectory] = {}
         self._untouched = [True] * sim.n_drones
@@ -97,7 +97,7 @@ class Fleet:
         n = 0
         for command in commands:
             try:
-                self._apply(command)
+                self._apply_command(command)
                 n += 1
             except ConfigError as error:
                 log.warning("%s refused: %s", type(command).__name__, error)
@@ -108,44 +108,44 @@ class Fleet:
         self._untouched = [True] * self.sim.n_drones
         self._show_start = None
         for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
-            self._fly(drone, _hover(np.append(pos, 0.0)))
+            self._assign_trajectory(drone, _hover_trajectory(np.append(pos, 0.0)))
             self._untouched[drone] = drone not in self._uploaded
 
     def colors(self) -> NDArray:
         """Return the present colours of the LEDs, from the received show once it has started. (n_drones, 3)"""
         colors = np.zeros((self.sim.n_drones, 3))
         if self._lights is not None and self._show_start is not None:
-            show_colors = self._lights.colors([self._now() - self._show_start])[0]
+            show_colors = self._lights.colors([self._current_time() - self._show_start])[0]
             colors[: len(show_colors)] = show_colors
         return colors
 
     def setpoint(self, drone: int) -> NDArray:
         """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
-        return HostTrajectory.of(self._active[drone]).at(self._now() - self._starts[drone])
+        return HostTrajectory.of(self._active[drone]).at(self._current_time() - self._starts[drone])
 
-    def _now(self) -> float:
+    def _current_time(self) -> float:
         return float(self.sim.time[0, 0])
 
-    def _apply(self, command: Command) -> None:
+    def _apply_command(self, command: Command) -> None:
         if isinstance(command, LoadShow):
             show = command.show
             if show.n_drones > self.sim.n_drones:
                 raise ConfigError(f"expected a show of at most {self.sim.n_drones} drones, got {show.n_drones}")
             received = [_without_padding(show.trajectory(i)) for i in range(show.n_drones)]
             for trajectory in received:
-                self._check(trajectory)
+                self._check_trajectory(trajectory)
             for drone, trajectory in enumerate(received):
-                self._receive(drone, trajectory)
+                self._receive_trajectory(drone, trajectory)
             self._lights, self._show_start = show.lights, None
         elif isinstance(command, StartShow):
             if not self._uploaded:
                 raise ConfigError("expected trajectories to start, got none. Upload some first.")
             for drone in self._uploaded:
-                self._start(drone, relative=False)
-            self._show_start = self._now()
+                self._start_trajectory(drone, relative=False)
+            self._show_start = self._current_time()
         else:
             if isinstance(command, Upload):
-                self._check(command.trajectory)
+                self._check_trajectory(command.trajectory)
             drones = self._drones(command.drone)
             if isinstance(command, Start) and any(drone not in self._uploaded for drone in drones):
                 raise ConfigError("expected a trajectory to start, got none. Upload one first.")
@@ -155,7 +155,7 @@ class Fleet:
     def _apply_to(self, command: Command, drone: int) -> None:
         """Carry out a command to one drone."""
         if isinstance(command, Upload):
-            self._receive(drone, command.trajectory)
+            self._receive_trajectory(drone, command.trajectory)
             return
         if isinstance(command, SetParameter):
             self.parameters[drone][command.name] = command.value
@@ -163,35 +163,35 @@ class Fleet:
             return
         setpoint = self.setpoint(drone)
         if isinstance(command, Start):
-            self._start(drone, command.relative)
+            self._start_trajectory(drone, command.relative)
         elif isinstance(command, Hover):
-            self._fly(drone, _hover(setpoint))
+            self._assign_trajectory(drone, _hover_trajectory(setpoint))
         elif isinstance(command, TakeOff):
-            self._fly(drone, _move(setpoint, command.height))
+            self._assign_trajectory(drone, _vertical_trajectory(setpoint, command.height))
         elif isinstance(command, Land):
-            self._fly(drone, _move(setpoint, 0.0))
+            self._assign_trajectory(drone, _vertical_trajectory(setpoint, 0.0))
 
     def _drones(self, identity: int | None) -> list[int]:
         """Return the drones of an ID; a new one gets the next free drone."""
         if identity is None:
             return list(range(self.sim.n_drones))
         if identity not in self.ids:
-            free = sorted(set(range(self.sim.n_drones)) - set(self.ids.values()))
-            if not free:
+            free_drones = sorted(set(range(self.sim.n_drones)) - set(self.ids.values()))
+            if not free_drones:
                 raise ConfigError(f"expected one of the IDs {sorted(self.ids)}, got {identity}: no drone is free")
-            self.ids[identity] = free[0]
-            log.info("ID %d is drone %d", identity, free[0])
+            self.ids[identity] = free_drones[0]
+            log.info("ID %d is drone %d", identity, free_drones[0])
         return [self.ids[identity]]
 
-    def _check(self, trajectory: Trajectory) -> None:
+    def _check_trajectory(self, trajectory: Trajectory) -> None:
         n_pieces = self.follow.read(self.sim.data).ends.shape[1]
-        if np.ndim(trajectory.ends) != 1 or trajectory.n_pieces > n_pieces or trajectory.degree > DEGREE:
+        if np.ndim(trajectory.ends) != 1 or trajectory.n_pieces > n_pieces or trajectory.degree > MAX_DEGREE:
             raise ConfigError(
-                f"expected a trajectory of one vehicle with at most {n_pieces} pieces of degree {DEGREE}, got ends of "
-                f"shape {np.shape(trajectory.ends)} and degree {trajectory.degree}. Use Fleet(..., max_pieces=...)."
+                f"expected a trajectory of one vehicle with at most {n_pieces} pieces of degree {MAX_DEGREE}, got ends "
+                f"of shape {np.shape(trajectory.ends)} and degree {trajectory.degree}. Use Fleet(..., max_pieces=...)."
             )
 
-    def _receive(self, drone: int, trajectory: Trajectory) -> None:
+    def _receive_trajectory(self, drone: int, trajectory: Trajectory) -> None:
         self._uploaded[drone] = trajectory
         if self.teleport and self._untouched[drone]:
             start_point = HostTrajectory.of(trajectory).at(0.0)
@@ -199,32 +199,32 @@ class Fleet:
             pos = states.pos.at[0, drone].set(jnp.asarray(start_point[:3], states.pos.dtype))
             quat = states.quat.at[0, drone].set(jnp.asarray(from_yaw(start_point[3]), states.quat.dtype))
             self.sim.data = self.sim.data.replace(states=states.replace(pos=pos, quat=quat))
-            self._fly(drone, _hover(start_point))
+            self._assign_trajectory(drone, _hover_trajectory(start_point))
         self._untouched[drone] = False
 
-    def _start(self, drone: int, relative: bool) -> None:
+    def _start_trajectory(self, drone: int, relative: bool) -> None:
         trajectory = self._uploaded[drone]
         if relative:
             trajectory = trajectory.moved((self.setpoint(drone) - HostTrajectory.of(trajectory).at(0.0))[:3])
-        self._fly(drone, trajectory)
+        self._assign_trajectory(drone, trajectory)
 
-    def _fly(self, drone: int, trajectory: Trajectory) -> None:
+    def _assign_trajectory(self, drone: int, trajectory: Trajectory) -> None:
         """Make a drone follow a trajectory from now on."""
         data = self.follow.uploaded(self.sim.data, drone, trajectory)
-        record, now = self.follow.read(data), self._now()
+        record, now = self.follow.read(data), self._current_time()
         start = record.start.at[0, drone, 0].set(jnp.asarray(now, record.start.dtype))
         self.sim.data = self.follow.write(data, record.replace(start=start))
         self._active[drone], self._starts[drone], self._untouched[drone] = trajectory, now, False
 
 
-def _hover(point: NDArray) -> Trajectory:
+def _hover_trajectory(point: NDArray) -> Trajectory:
     """Return the trajectory that stays at a position, m, and yaw, rad. (4,)"""
     return hover(point[:3], float(point[3]))
 
 
-def _move(point: NDArray, height: float) -> Trajectory:
+def _vertical_trajectory(point: NDArray, height: float) -> Trajectory:
     """Return the vertical move from a position, m, and yaw, rad, to a height, m, at rest at both ends."""
-    seconds = max(abs(height - float(point[2])) / SPEED, MIN_TIME)
+    seconds = max(abs(height - float(point[2])) / VERTICAL_SPEED, MIN_TIME)
     return line(point[:3], [point[0], point[1], height], seconds, yaw=float(point[3]))
 
 
@@ -232,8 +232,8 @@ def _without_padding(trajectory: Trajectory) -> Trajectory:
     """Return one trajectory of a stacked record without the zero-length pieces that pad its end."""
     ends = np.asarray(trajectory.ends, float)
     n = max(int(np.searchsorted(ends, ends[-1])) + 1, 1)
-    cut = jax.tree.map(np.asarray, trajectory)
-    return cut.replace(ends=cut.ends[:n], coefficients=cut.coefficients[:n])
+    host_trajectory = jax.tree.map(np.asarray, trajectory)
+    return host_trajectory.replace(ends=host_trajectory.ends[:n], coefficients=host_trajectory.coefficients[:n])
 
 
 class RemoteCommands:

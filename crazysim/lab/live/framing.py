@@ -92,10 +92,10 @@ class Frames:
                 stream cannot be read.
         """
         self._buffer += received
-        while (message := self._next()) is not None:
+        while (message := self._take_message()) is not None:
             yield message
 
-    def _next(self) -> Message | Request | ShowFile | None:
+    def _take_message(self) -> Message | Request | ShowFile | None:
         """Return the message at the front of the buffer and remove it; None if it is incomplete."""
         if not self._scan_position and self._buffer[:1] and self._buffer[0] in SPACE_BYTES:
             del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(SPACE_BYTES))]
@@ -105,12 +105,12 @@ class Frames:
         if buffer.startswith(ZIP):
             return self._read_show()
         if buffer.startswith(b"START"):
-            self._discard(5)
+            self._discard_bytes(5)
             return Message(None, "show", "")
         if buffer.startswith(b"REQ_"):
             digits = bytes(buffer[4:6])
             if len(digits) == 2 and digits.isdigit():
-                self._discard(6)
+                self._discard_bytes(6)
                 return Request(int(digits))
             if digits and not digits.isdigit():
                 raise FramingError(f"expected REQ_ and an ID of two digits, got {_excerpt(buffer)}")
@@ -125,8 +125,10 @@ class Frames:
     def _may_begin(self, front: bytes) -> bool:
         """Return True if these bytes may be the start of a message."""
         if any(start.startswith(front[: len(start)]) for start in MESSAGE_STARTS) and len(front) <= MAX_TEXT:
-            rest = front[len(b"CMDSTART_") :]
-            return not front.startswith(b"CMDSTART_") or bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", rest))
+            command_text = front[len(b"CMDSTART_") :]
+            return not front.startswith(b"CMDSTART_") or bool(
+                re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", command_text)
+            )
         after = re.sub(rb"^\d{1,4}", b"", front)
         if after == front or not b"_CMDSTART_".startswith(after[:10]):
             return False
@@ -144,7 +146,7 @@ class Frames:
                 raise FramingError(f"expected _EOF or JSON within {MAX_TEXT} bytes, got {_excerpt(buffer)}")
             return None
         message = _make_message(head, bytes(buffer[head.end() : end]))
-        self._discard(end + 4)
+        self._discard_bytes(end + 4)
         return message
 
     def _json_message(self, head: re.Match[bytes], brace: int) -> Message | None:
@@ -155,13 +157,13 @@ class Frames:
             if len(buffer) > MAX_JSON:
                 raise FramingError(f"expected JSON of at most {MAX_JSON} bytes, got more")
             return None
-        rest = bytes(buffer[end : end + 16]).lstrip(SPACE_BYTES)
-        if not rest.startswith(b"_EOF"):
-            if len(rest) >= 4 or not b"_EOF".startswith(rest) or len(buffer) - end >= 16:
+        following = bytes(buffer[end : end + 16]).lstrip(SPACE_BYTES)
+        if not following.startswith(b"_EOF"):
+            if len(following) >= 4 or not b"_EOF".startswith(following) or len(buffer) - end >= 16:
                 raise FramingError(f"expected _EOF after the JSON, got {_excerpt(buffer[end:])}")
             return None
         message = _make_message(head, bytes(buffer[head.end() : brace]).rstrip(b"_"), bytes(buffer[brace:end]))
-        self._discard(buffer.index(b"_EOF", end) + 4)
+        self._discard_bytes(buffer.index(b"_EOF", end) + 4)
         return message
 
     def _end_of_json(self, brace: int) -> int | None:
@@ -201,7 +203,7 @@ class Frames:
             end = zip_end + 22 + struct.unpack_from("<H", buffer, zip_end + 20)[0]
             if buffer[end : end + 4] == b"SKYC":
                 content = bytes(buffer[:end])
-                self._discard(end + 4)
+                self._discard_bytes(end + 4)
                 return ShowFile(content)
             if end + 4 > len(buffer):
                 self._scan_position = zip_end
@@ -213,7 +215,7 @@ class Frames:
             raise FramingError(f"expected a show of at most {MAX_SHOW} bytes, got more")
         return None
 
-    def _discard(self, n: int) -> None:
+    def _discard_bytes(self, n: int) -> None:
         del self._buffer[:n]
         self._reset_scan()
 

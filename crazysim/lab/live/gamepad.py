@@ -43,7 +43,7 @@ class Gamepad:
             raise ConfigError("expected a gamepad, got none. Connect it before the program starts.")
         self._number = gamepads[0]
         self._calls: dict[int, Callable[[Live], object]] = {}
-        self._before: list[int] = []
+        self._last_buttons: list[int] = []
 
     @property
     def name(self) -> str:
@@ -69,13 +69,13 @@ class Gamepad:
         glfw = self._glfw
         state = glfw.get_gamepad_state(self._number)
         if not state:
-            self._before = []
+            self._last_buttons = []
             return np.zeros(4)
         buttons, axes = list(state.buttons), state.axes
         for index, call in self._calls.items():
-            if buttons[index] and not (self._before and self._before[index]):
+            if buttons[index] and not (self._last_buttons and self._last_buttons[index]):
                 live.post(call)
-        self._before = buttons
+        self._last_buttons = buttons
         right_y, right_x = axes[glfw.GAMEPAD_AXIS_RIGHT_Y], axes[glfw.GAMEPAD_AXIS_RIGHT_X]
         left_y, left_x = axes[glfw.GAMEPAD_AXIS_LEFT_Y], axes[glfw.GAMEPAD_AXIS_LEFT_X]
         return remove_deadband(-np.array([right_y, right_x, left_y, left_x]))  # GLFW: down and right are positive
@@ -91,7 +91,7 @@ def _glfw() -> Any:
     import glfw  # comes with mujoco
 
     with warnings.catch_warnings(action="ignore"):
-        works = glfw.init()
-    if not works:
+        is_initialized = glfw.init()
+    if not is_initialized:
         raise ConfigError("expected a screen, without which GLFW has no gamepads, got none")
     return glfw

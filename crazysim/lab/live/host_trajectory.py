@@ -42,15 +42,15 @@ class HostTrajectory(NamedTuple):
 
     def derivatives(self, t: float, n: int) -> NDArray:
         """Return position and yaw and their first n derivatives at a time since the start, s. (n + 1, 4)"""
-        last = float(self.ends[-1])
-        inside = t >= 0 and (self.repeats or t <= last)
-        t = t % last if self.repeats and t > 0 else min(max(t, 0.0), last)
+        end = float(self.ends[-1])
+        is_inside = t >= 0 and (self.repeats or t <= end)
+        t = t % end if self.repeats and t > 0 else min(max(t, 0.0), end)
         k = min(bisect_right(self.ends, t), len(self.ends) - 1)  # type: ignore[arg-type]
         start = float(self.ends[k - 1]) if k else 0.0
         length = float(self.ends[k]) - start
         u, rate = ((t - start) / length, 1 / length) if length > 0 else (1.0, 0.0)
         factors, exponents, orders = _powers(n, self.coefficients.shape[2])
-        scale = (rate if inside else 0.0) ** orders
+        scale = (rate if is_inside else 0.0) ** orders
         return (factors * u**exponents * scale[:, None]) @ self.coefficients[k].T
 
 

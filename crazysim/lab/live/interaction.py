@@ -46,9 +46,9 @@ class Interaction:
         self.keyboard, self.controls, self.values, self.quantities = Keyboard(), [], {}, {}
         self.selected, self.on_click, self.goals = (0, 0), None, None
         self.lights = np.zeros((sim.n_worlds, sim.n_drones, 3))
-        self._followed: tuple[int, str, int] | None = None
+        self._followed_body: tuple[int, str, int] | None = None
         self._slider = 0
-        self._posted: deque[Callable[[Self], object]] = deque()
+        self._posted_calls: deque[Callable[[Self], object]] = deque()
 
     def button(self, name: str, call: Callable[[Self], object], key: str | None = None) -> None:
         """Add a button to viewers that are shown from now on, and optionally a key that calls the same function."""
@@ -105,7 +105,7 @@ class Interaction:
                 f"expected a world below {self.sim.n_worlds} and a drone below {self.sim.n_drones}, got "
                 f"{world!r} and {drone!r}"
             )
-        self.selected, self._followed = (int(world), int(drone)), None
+        self.selected, self._followed_body = (int(world), int(drone)), None
 
     def select_next(self) -> None:
         """Select the next drone of the selected world."""
@@ -115,8 +115,8 @@ class Interaction:
     @property
     def followed(self) -> tuple[int, str, int] | None:
         """World, kind and index of the body that viewers mark and follow: the selected drone or ``follow``'s body."""
-        if self._followed is not None or self.selected is None:
-            return self._followed
+        if self._followed_body is not None or self.selected is None:
+            return self._followed_body
         return self.selected[0], DRONE, self.selected[1]
 
     def follow(self, world: int, kind: str, index: int) -> None:
@@ -134,7 +134,7 @@ class Interaction:
             raise ConfigError(f"expected a world below {self.sim.n_worlds}, got {world!r}")
         self.sim.scene.compile_if_edited()
         SceneBodies(self.sim).find(kind, index)
-        self._followed = int(world), kind, int(index)
+        self._followed_body = int(world), kind, int(index)
 
     def click(self, world: int, point: NDArray) -> None:
         """Call ``on_click``, if it is set, as viewers do for a click on the ground.
@@ -148,4 +148,4 @@ class Interaction:
 
     def post(self, call: Callable[[Self], object]) -> None:
         """Make the loop call a function between two steps; may be called from any thread."""
-        self._posted.append(call)
+        self._posted_calls.append(call)

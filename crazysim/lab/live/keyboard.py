@@ -23,30 +23,30 @@ class Keyboard(Generic[L]):
     """
 
     def __init__(self) -> None:
-        self._held: dict[str, float] = {}
-        self._pressed: deque[str] = deque(maxlen=100)
+        self._hold_times: dict[str, float] = {}
+        self._pressed_keys: deque[str] = deque(maxlen=100)
         self._calls: dict[str, Callable[[L], object]] = {}
 
     def press(self, key: str) -> None:
         """Press a key."""
-        self._held[key] = math.inf
-        self._pressed.append(key)
+        self._hold_times[key] = math.inf
+        self._pressed_keys.append(key)
 
     def hold(self, key: str, seconds: float) -> None:
         """Hold a key for a while, s, for viewers that do not report its release; the key's function is not called."""
-        self._held[key] = time.monotonic() + seconds
+        self._hold_times[key] = time.monotonic() + seconds
 
     def release(self, key: str) -> None:
         """Release a key."""
-        self._held.pop(key, None)
+        self._hold_times.pop(key, None)
 
     def release_all(self) -> None:
         """Release all keys, as when a viewer closes or loses the focus."""
-        self._held.clear()
+        self._hold_times.clear()
 
     def is_held(self, key: str) -> bool:
         """Return True while a key is held."""
-        return self._held.get(key, 0.0) > time.monotonic()
+        return self._hold_times.get(key, 0.0) > time.monotonic()
 
     def axis(self, positive: str, negative: str) -> float:
         """Return 1, -1 or 0 for two opposite keys."""
@@ -60,7 +60,7 @@ class Keyboard(Generic[L]):
 
     def run(self, live: L) -> None:
         """Call the functions of the keys that were pressed since the last call."""
-        while self._pressed:
-            call = self._calls.get(self._pressed.popleft())
+        while self._pressed_keys:
+            call = self._calls.get(self._pressed_keys.popleft())
             if call is not None:
                 call(live)

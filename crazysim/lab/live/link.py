@@ -87,11 +87,11 @@ def fly_policy(
     states = []
     try:
         for _ in range(round(seconds * freq)):
-            began = time.perf_counter()
+            start_time = time.perf_counter()
             states.append(link.state())
             link.command(level, policy(states[-1]))
-            passed = 0.0 if isinstance(link, SimLink) else time.perf_counter() - began
-            link.sleep(max(1 / freq - passed, 0.0))
+            elapsed = 0.0 if isinstance(link, SimLink) else time.perf_counter() - start_time
+            link.sleep(max(1 / freq - elapsed, 0.0))
     except BaseException:
         link.stop()
         raise
@@ -119,10 +119,10 @@ class TrainedPolicy:
         self.reset()
         self._names = list(meta["observations"])
         self._centre, self._scale = (np.asarray(meta["actions"][key], float) for key in ("centre", "scale"))
-        unknown = sorted(set(self._names) - set(self._observations(_at_rest())))
-        if unknown:
+        unknown_names = sorted(set(self._names) - set(self._observations(_rest_state())))
+        if unknown_names:
             raise ConfigError(
-                f"expected observations of a drone's state, got {', '.join(unknown)}. Use a policy without them."
+                f"expected observations of a drone's state, got {', '.join(unknown_names)}. Use a policy without them."
             )
 
     def reset(self) -> None:
@@ -132,8 +132,8 @@ class TrainedPolicy:
 
     def __call__(self, state: DroneState) -> NDArray:
         """Return the command for a state. (k,)"""
-        known = self._observations(state)
-        obs = {name: known[name].astype(np.float32) for name in self._names}
+        observations = self._observations(state)
+        obs = {name: observations[name].astype(np.float32) for name in self._names}
         if self._memory is None:
             action = self.policy(obs)
         else:
@@ -152,5 +152,5 @@ class TrainedPolicy:
         }
 
 
-def _at_rest() -> DroneState:
+def _rest_state() -> DroneState:
     return DroneState(0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), np.zeros(3))

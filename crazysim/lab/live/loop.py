@@ -20,7 +20,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.live.history import History, Snapshot
 from crazysim.lab.live.interaction import Interaction
 from crazysim.lab.live.pace import LiveReport, Pace, Speed, protect_loop
-from crazysim.lab.live.process import Event, OnError, Process, RateLimit, period_of
+from crazysim.lab.live.process import Event, OnError, Process, RateLimit, steps_per_call
 from crazysim.lab.live.recordings import Recordings
 from crazysim.lab.live.staging import StagedCommands, compile_step
 from crazysim.lab.live.viewer import Viewer
@@ -95,7 +95,7 @@ class Live(Interaction, Closing):
         self._events: dict[int, list[Event]] = defaultdict(list)
         self._viewers = Viewers[Live](fps, self.stop)
         self._recordings = Recordings(sim, control_freq)
-        self._paused = self._stopped = self._in_step = False
+        self._paused = self._is_stopped = self._in_step = False
         self._refused = 0
         self._factor = (perf_counter(), 0, 0.0)
         self._may_warn = RateLimit(WARNING_PERIOD)
@@ -152,7 +152,7 @@ class Live(Interaction, Closing):
 
     def stop(self) -> None:
         """End ``run`` before the next control step."""
-        self._stopped = True
+        self._is_stopped = True
 
     # Parts ----------------------------------------------------------------------------------------------------------
 
@@ -183,7 +183,7 @@ class Live(Interaction, Closing):
         if on_error not in ("raise", "report"):
             raise ConfigError(f"expected on_error 'raise' or 'report', got {on_error!r}")
         label = str(name or getattr(process, "__name__", type(process).__name__))
-        period = period_of(freq, self.control_freq, label)
+        period = steps_per_call(freq, self.control_freq, label)
         reset = getattr(process, "reset", lambda _: None)
         self._processes.append(Process(label, partial(process, self), partial(reset, self), period, on_error))
         return self._processes[-1]
@@ -219,7 +219,7 @@ class Live(Interaction, Closing):
         Raises:
             ConfigError: If the file cannot be created, or the rate is invalid.
         """
-        return self._recordings.start(path, period_of(freq, self.control_freq, "recording"))
+        return self._recordings.start(path, steps_per_call(freq, self.control_freq, "recording"))
 
     @property
     def is_recording(self) -> bool:
@@ -248,12 +248,12 @@ class Live(Interaction, Closing):
         if seconds is not None and (not np.isfinite(seconds) or seconds <= 0):
             raise ConfigError(f"expected a positive duration, s, got {seconds!r}")
         end = None if seconds is None else self.n_steps_run + round(seconds * self.control_freq)
-        self._stopped = False
+        self._is_stopped = False
         self._warm_up()
         self._pace = Pace(self._dt, self._pace.speed)
         first_step, pictures, paused_s, start_time = self.n_steps_run, self._viewers.n_pictures, 0.0, perf_counter()
         with protect_loop(), contextlib.suppress(KeyboardInterrupt):
-            while not self._stopped and (end is None or self.n_steps_run < end):
+            while not self._is_stopped and (end is None or self.n_steps_run < end):
                 paused_s += self._run_once()
         jax.block_until_ready(self.sim.data.states.pos)
         wall_s = perf_counter() - start_time - paused_s
@@ -281,7 +281,7 @@ class Live(Interaction, Closing):
         """Run the tasks that are due, or sleep; return the time spent in a pause, s."""
         viewers = self._viewers
         self._run_posted()
-        if self._stopped:
+        if self._is_stopped:
             return 0.0
         if self._paused:
             start_time = perf_counter()
@@ -324,8 +324,8 @@ class Live(Interaction, Closing):
     def _run_posted(self) -> None:
         try:
             self.keyboard.run(self)
-            while self._posted:
-                self._posted.popleft()(self)
+            while self._posted_calls:
+                self._posted_calls.popleft()(self)
         except ConfigError as error:
             self._refused += 1
             log.warning("refused at %.2f s: %s", self.time, error)

@@ -17,7 +17,7 @@ from crazysim.lab.live.process import Process
 
 Speed = float | Literal["max"]
 """Simulated seconds per second, or ``"max"`` for as fast as possible."""
-TOLERANCE = 2e-3
+LATE_TOLERANCE = 2e-3
 """Delay above which a control step counts as late, s."""
 MAX_LAG = 0.25
 """Lag above which the loop drops the lost time instead of catching up, s."""
@@ -55,7 +55,7 @@ class LiveReport:
     steps: int
     """Number of control steps."""
     late: int
-    """Number of control steps that began more than ``TOLERANCE`` late."""
+    """Number of control steps that began more than ``LATE_TOLERANCE`` late."""
     lateness_999: float
     """Lateness that 99.9% of the control steps did not exceed, s; 0 at ``speed="max"``."""
     worst: float
@@ -81,7 +81,7 @@ class LiveReport:
         lines = [f"{self.simulated_s:.2f} s in {self.wall_s:.2f} s: {self.factor:.2f} times real time"]
         if self.worst > 0:
             lines.append(
-                f"control steps     {self.steps}, {self.late} more than {1e3 * TOLERANCE:g} ms late; 99.9% within "
+                f"control steps     {self.steps}, {self.late} more than {1e3 * LATE_TOLERANCE:g} ms late; 99.9% within "
                 f"{1e3 * self.lateness_999:.1f} ms, worst {1e3 * self.worst:.1f} ms at {self.worst_at:.2f} s"
             )
         if self.lost_s > 0:
@@ -101,7 +101,7 @@ class Pace:
     steps: int
     """Number of control steps so far."""
     late: int
-    """Number of control steps that began more than ``TOLERANCE`` late."""
+    """Number of control steps that began more than ``LATE_TOLERANCE`` late."""
     worst: float
     """Greatest lateness, s."""
     worst_at: float
@@ -153,7 +153,7 @@ class Pace:
             return 0.0
         lateness = max(self._clock() - self._due, 0.0)
         self._counts[min(int(lateness / BIN_WIDTH), N_BINS - 1)] += 1
-        self.late += lateness > TOLERANCE
+        self.late += lateness > LATE_TOLERANCE
         if lateness > self.worst:
             self.worst, self.worst_at = lateness, time
         if lateness > MAX_LAG:
@@ -180,7 +180,7 @@ class Pace:
             simulated_s: Simulated time, s.
             wall_s: Wall-clock time without pauses, s.
             pictures: Number of pictures.
-            failures: Number of logged errors of requests, viewers and recordings; those of the processes are added.
+            failures: Number of logged errors of requests, viewers and recordings; errors of the processes are added.
         """
         longest = sorted(processes, key=lambda process: -process.longest)[:N_LISTED]
         slowest = ", ".join(f"{p.name} {1e3 * p.longest:.1f} ms at {p.longest_at:.2f} s" for p in longest)

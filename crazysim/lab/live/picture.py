@@ -79,7 +79,7 @@ class PictureSource:
         self._sim, self._worlds = sim, np.asarray(worlds)
         self._bodies = {(body.kind, body.index): body for body in bodies.items}
         self._contacts, self._wind = contacts, wind
-        self._wind_fn = jax.jit(vmap_worlds(vmap_drones(_air)))
+        self._wind_fn = jax.jit(vmap_worlds(vmap_drones(_air_velocity)))
 
     def take(self, live: Live, plot: str = "") -> Picture:
         """Return a picture of the simulation as it is now.
@@ -98,7 +98,7 @@ class PictureSource:
             setpoint = live.goals[worlds]
         elif state is not None:
             setpoint = np.asarray(state.staged_cmd, float)[worlds, :, :3]
-        if self._wind and _winds(data):
+        if self._wind and _find_winds(data):
             wind = np.asarray(self._wind_fn(data), float)[worlds]
         has_contact = (
             np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drone_pos.shape[:2], bool)
@@ -132,14 +132,14 @@ class PictureSource:
         )
 
 
-def _winds(data: SimData) -> list[WindData | WindFieldData]:
+def _find_winds(data: SimData) -> list[WindData | WindFieldData]:
     """Return the records of all wind plugins."""
     return [record for record in data.plugins.values() if isinstance(record, (WindData, WindFieldData))]
 
 
-def _air(data: SimData) -> jax.Array:
+def _air_velocity(data: SimData) -> jax.Array:
     """Return the velocity of the air at one drone, world frame, m/s. (3,)"""
-    return sum((record.velocity_at(data.states.pos) for record in _winds(data)), jnp.zeros_like(data.states.pos))
+    return sum((record.velocity_at(data.states.pos) for record in _find_winds(data)), jnp.zeros_like(data.states.pos))
 
 
 def quantities(sim: Sim) -> list[str]:

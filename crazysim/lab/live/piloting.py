@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control
 from crazysim.errors import ConfigError
-from crazysim.lab.live.attitude import from_yaw, yaw_of
+from crazysim.lab.live.attitude import from_yaw, yaw_from_quat
 from crazysim.lab.live.loop import Live
 
 Sticks = Callable[[Live], NDArray]
@@ -86,7 +86,7 @@ class Pilot:
         if live.selected is None or not np.any(sticks):
             return
         command = live.command[live.selected]
-        point = move_setpoint(setpoint_of(command), sticks, 1.0 / live.control_freq, self._speed, self._yaw_rate)
+        point = move_setpoint(command_setpoint(command), sticks, 1.0 / live.control_freq, self._speed, self._yaw_rate)
         pos = np.asarray(live.sim.data.states.pos, float)[live.selected]
         reach = MAX_LEAD * self._speed
         point[:3] = np.clip(np.clip(point[:3], pos - reach, pos + reach), self._low, self._high)
@@ -108,7 +108,7 @@ class Pilot:
             return
         command = live.command[live.selected]
         x, y, _ = np.clip(point, self._low, self._high)
-        _, _, z, yaw = setpoint_of(command)
+        _, _, z, yaw = command_setpoint(command)
         hold_setpoint(command, [x, y, max(z, self._low[2], 0.5), yaw])
 
 
@@ -120,9 +120,9 @@ def require_state_control(live: Live) -> None:
         )
 
 
-def setpoint_of(command: NDArray) -> NDArray:
+def command_setpoint(command: NDArray) -> NDArray:
     """Return position, m, and yaw, rad, of a state command. (4,)"""
-    return np.append(command[:3], yaw_of(command[9:13]))
+    return np.append(command[:3], yaw_from_quat(command[9:13]))
 
 
 def hold_setpoint(command: NDArray, point: NDArray | Sequence[float]) -> None:

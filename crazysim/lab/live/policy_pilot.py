@@ -26,7 +26,7 @@ from crazysim.lab.live.loop import Live
 from crazysim.storage import reading
 from crazysim.train.evaluation import act, initial_memory
 
-CLOSE = 0.15
+ARRIVAL_DISTANCE = 0.15
 """Distance from a listed goal at which a drone gets the next one, m."""
 MIN_HEIGHT = 0.5
 """Least height of a clicked goal, m."""
@@ -62,7 +62,7 @@ class PolicyPilot:
         if self._points is not None and not len(self._points):
             raise ConfigError("expected at least one point, got none. Use points=None for the goal of the task.")
         self._set_goal = jax.jit(lambda data, pos: env.set_goal(state_of_data(data), pos).data)
-        self._command = jax.jit(partial(_command, env, policy))
+        self._command = jax.jit(partial(_compute_command, env, policy))
         self._memory = self._initial_memory = initial_memory(policy, env)
         self._target = jax.jit(vectorize_over_worlds(env.task.target, env.task.batched))
         self._start = jax.jit(env.reset)(jax.random.key(seed)).data
@@ -76,7 +76,7 @@ class PolicyPilot:
             self.goals[:] = self._target(self._start)
         if self._points is not None:
             for i, point in enumerate(self._points):
-                self._check(point, f"point {i + 1}: ")
+                self._check_goal(point, f"point {i + 1}: ")
             self.goals[:] = self._points[0]
             self._start = self._set_goal(self._start, self.goals)
         env.sim.data = self._start
@@ -121,7 +121,7 @@ class PolicyPilot:
         if live.selected is None:
             raise ConfigError("expected a selected drone, got none. Click on one, or press tab.")
         pos = np.asarray(pos, float)
-        self._check(pos)
+        self._check_goal(pos)
         self._follows[live.selected] = False
         self.goals[live.selected] = pos
         live.sim.data = self._set_goal(live.sim.data, self.goals)
@@ -156,9 +156,9 @@ class PolicyPilot:
         return f"x and y from {-task.half_width:g} to {task.half_width:g} m, z from {FLOOR:g} to {task.height:g} m"
 
     def _go_to_text(self, live: Live, text: str) -> None:
-        self.go_to(live, as_point(text))
+        self.go_to(live, parse_point(text))
 
-    def _check(self, pos: NDArray, place: str = "") -> None:
+    def _check_goal(self, pos: NDArray, place: str = "") -> None:
         """Check that a point can be a goal."""
         task = self.env.task
         if type(task).set_goal is Task.set_goal:
@@ -168,17 +168,17 @@ class PolicyPilot:
         limits = np.array([task.half_width] * 2 + [task.height]) if isinstance(task, GoalTask) else np.full(3, np.inf)
         low = np.append(-limits[:2], FLOOR if self.arena else -np.inf)
         if pos.shape != (3,) or not np.isfinite(pos).all() or not ((low <= pos) & (pos <= limits)).all():
-            inside = f" within the arena of {task.name!r}, {self.arena}" if self.arena else ""
-            raise ConfigError(f"{place}expected x y z, m,{inside}, got {' '.join(f'{x:g}' for x in pos.ravel())}")
+            arena_text = f" within the arena of {task.name!r}, {self.arena}" if self.arena else ""
+            raise ConfigError(f"{place}expected x y z, m,{arena_text}, got {' '.join(f'{x:g}' for x in pos.ravel())}")
 
     def _pass_points(self, live: Live) -> None:
         """Give drones that are close to their listed goal the next one."""
         points: Any = self._points
         distance = np.linalg.norm(self.goals - np.asarray(live.sim.data.states.pos), axis=-1)
-        near = self._follows & (distance < CLOSE) & (self.passed < len(points))
-        if near.any():
-            self.passed += near
-            goes_on = near & (self.passed < len(points))
+        is_near = self._follows & (distance < ARRIVAL_DISTANCE) & (self.passed < len(points))
+        if is_near.any():
+            self.passed += is_near
+            goes_on = is_near & (self.passed < len(points))
             self.goals[goes_on] = points[self.passed[goes_on]]
             live.sim.data = self._set_goal(live.sim.data, self.goals)
 
@@ -190,7 +190,7 @@ def typed_lines() -> Iterator[str]:
         yield from lines
 
 
-def as_point(text: str, place: str = "") -> NDArray:
+def parse_point(text: str, place: str = "") -> NDArray:
     """Return a point that is written as three numbers, m, separated by spaces or commas. (3,)
 
     Args:
@@ -217,17 +217,17 @@ def read_points(path: str | Path) -> NDArray:
     points = []
     for number, line in enumerate(lines, 1):
         if text := line.partition("#")[0].strip():
-            points.append(as_point(text, f"{path}, line {number}: "))
+            points.append(parse_point(text, f"{path}, line {number}: "))
     if not points:
         raise ConfigError(f"expected points in {path}, got none. Write x,y,z in each line, m.")
     return np.array(points)
 
 
-def _command(env: Env, policy: Callable[[Obs], Array], data: SimData, memory: Any) -> tuple[Array, Any]:
+def _compute_command(env: Env, policy: Callable[[Obs], Array], data: SimData, memory: Any) -> tuple[Array, Any]:
     """Return the command of the policy's action for every drone, (n_worlds, n_drones, k), and the policy's memory."""
     measure = env.base.measure_states
-    seen = data if measure is None else vectorize_over_worlds(measure, env.task.batched)(data)
-    obs = vectorize_over_worlds(env.task.observe, env.task.batched)(seen)
+    measured_data = data if measure is None else vectorize_over_worlds(measure, env.task.batched)(data)
+    obs = vectorize_over_worlds(env.task.observe, env.task.batched)(measured_data)
     for wrapper in env.wrappers:
         obs |= wrapper.look(state_of_data(data))
     action, memory = act(policy, obs, memory)

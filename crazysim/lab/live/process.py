@@ -72,9 +72,9 @@ class Process:
             self.failures += 1
             if self._may_warn():
                 log.warning("%s failed at %.3f s (%d in all): %s", self.name, now, self.failures, error)
-        took = time.perf_counter() - start_time
-        if took > self.longest:
-            self.longest, self.longest_at = took, now
+        duration = time.perf_counter() - start_time
+        if duration > self.longest:
+            self.longest, self.longest_at = duration, now
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Event:
     """Name in messages."""
 
 
-def period_of(freq: float | None, control_freq: int, name: str) -> int:
+def steps_per_call(freq: float | None, control_freq: int, name: str) -> int:
     """Return the number of control steps from one call to the next.
 
     Args:

@@ -32,7 +32,7 @@ LOG = {
 }
 """Log variables of each part of the state."""
 UNIT_FACTORS = {"ang_vel": math.pi / 180, "acc": GRAVITY_MAGNITUDE}
-"""Factors to the units of ``DroneState`` from those of log variables: degrees/s and multiples of standard gravity."""
+"""Factors from the units of log variables (degrees/s, multiples of standard gravity) to the units of ``DroneState``."""
 
 log = logging.getLogger(__name__)
 
@@ -73,10 +73,10 @@ class Radio(Closing):
         """
         self.name, self.armed, self.max_height = uri, bool(arm), max_height
         frame = load_airframe(airframe)
-        self._most = frame.n_rotors * float(np.max(frame.value("rotors.thrust_max")))
+        self._max_thrust = frame.n_rotors * float(np.max(frame.value("rotors.thrust_max")))
         self._lock, self._arrived = threading.Lock(), threading.Event()
         self._values = {part: np.zeros(len(names)) for part, names in LOG.items()}
-        self._seen: set[str] = set()
+        self._received_names: set[str] = set()
         self._stamp, self._mode = 0.0, None
         self._sync: Any = None
         self._configs: list[Any] = []
@@ -106,7 +106,7 @@ class Radio(Closing):
             config = LogConfig("-".join(parts), period_ms)
             for name in (name for part in parts for name in LOG[part]):
                 config.add_variable(name, "float")
-            config.data_received_cb.add_callback(self._take)
+            config.data_received_cb.add_callback(self._receive_block)
             self._cf.log.add_config(config)
             config.start()
             self._configs.append(config)
@@ -148,7 +148,7 @@ class Radio(Closing):
             commander.send_full_state_setpoint(x[0:3], x[3:6], x[6:9], x[9:13], *np.clip(x[13:16], -32, 32))
             return
         self._set_mode(level)
-        thrust = round(65535 * min(max(x[3] / self._most, 0.0), 1.0))
+        thrust = round(65535 * min(max(x[3] / self._max_thrust, 0.0), 1.0))
         roll, pitch, yaw = np.degrees(x[:3])
         # In this packet, positive yaw rates turn right, but positive absolute yaw turns left.
         commander.send_setpoint(roll, pitch, yaw if level == Control.attitude else -yaw, thrust)
@@ -194,13 +194,13 @@ class Radio(Closing):
                 self._cf.param.set_value(f"flightmode.stabMode{axis}", value)
             self._mode = level
 
-    def _take(self, stamp: int, data: dict[str, float], config: Any) -> None:
+    def _receive_block(self, stamp: int, data: dict[str, float], config: Any) -> None:
         with self._lock:
             for part, names in LOG.items():
                 if names[0] in data:
                     x = np.array([data[name] for name in names])
                     if np.isfinite(x).all():
                         self._values[part], self._stamp = x, stamp / 1000
-                        self._seen.add(part)
-        if len(self._seen) == len(LOG):
+                        self._received_names.add(part)
+        if len(self._received_names) == len(LOG):
             self._arrived.set()

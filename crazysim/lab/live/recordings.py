@@ -47,10 +47,10 @@ class Recordings:
             ConfigError: If it cannot be created.
         """
         self.close()
-        self.last_path, free = Path(path), free_path(Path(path))
-        self._recorder, self._period, self._steps = Recorder(self._sim, path=free), period, 0
+        self.last_path, unused_path = Path(path), free_path(Path(path))
+        self._recorder, self._period, self._steps = Recorder(self._sim, path=unused_path), period, 0
         self.add()
-        return free
+        return unused_path
 
     def add(self) -> None:
         """Write a sample if one is due, at the start and after every control step.

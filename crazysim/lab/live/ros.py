@@ -1,7 +1,7 @@
 """ROS 2 bridge: publishes the clock, states of drones and poses of objects, and receives commands.
 
 The package does not depend on ROS. ``RosBridge`` takes a node and the message classes that it uses; without classes it
-imports those of the ROS installation in which it runs.
+imports them from the ROS installation in which it runs.
 
 | Topic | Message | |
 | --- | --- | --- |
@@ -43,7 +43,7 @@ MESSAGES = {
     "Float64": "std_msgs.msg",
 }
 """ROS modules that contain the message classes, by the name of the class."""
-DEPTH = 10
+QUEUE_LENGTH = 10
 """Length of the queues of publishers and subscriptions."""
 
 
@@ -103,24 +103,25 @@ class RosBridge:
                 raise ConfigError(f"expected one of the movable objects {list(names)}, got {name!r}")
         self._rows = {name: names.index(name) for name in objects}
         self._period, self._due = 1 / freq, 0.0
-        self._clock = node.create_publisher(m.Clock, "/clock", DEPTH)
+        self._clock = node.create_publisher(m.Clock, "/clock", QUEUE_LENGTH)
         kinds = {"pose": m.PoseStamped, "odom": m.Odometry, "imu": m.Imu}
         self._publishers = [
-            {topic: node.create_publisher(kind, f"/{name}/{topic}", DEPTH) for topic, kind in kinds.items()}
+            {topic: node.create_publisher(kind, f"/{name}/{topic}", QUEUE_LENGTH) for topic, kind in kinds.items()}
             for name in swarm.names
         ]
-        self._of_objects = {
-            name: node.create_publisher(m.PoseStamped, f"/{name.replace(':', '_')}/pose", DEPTH) for name in objects
+        self._object_publishers = {
+            name: node.create_publisher(m.PoseStamped, f"/{name.replace(':', '_')}/pose", QUEUE_LENGTH)
+            for name in objects
         }
         self._thrust = np.zeros(len(swarm.names))
         for k, name in enumerate(swarm.names):
-            for topic, kind, take in (
+            for topic, kind, callback in (
                 ("cmd_vel", m.Twist, self._velocity),
                 ("cmd_pose", m.PoseStamped, self._pose),
                 ("cmd_thrust", m.Float64, self._set_thrust),
                 ("cmd_attitude", m.QuaternionStamped, self._attitude),
             ):
-                node.create_subscription(kind, f"/{name}/{topic}", self._guarded(k, take), DEPTH)
+                node.create_subscription(kind, f"/{name}/{topic}", self._guard_callback(k, callback), QUEUE_LENGTH)
 
     def __call__(self, live: Live) -> None:
         """Publish messages that are due; for a bridge that is added to a live loop as a process."""
@@ -146,7 +147,7 @@ class RosBridge:
             objects = self.swarm.sim.data.objects
             pos, quat = (np.asarray(x[0, 0], float) for x in (objects.pos, objects.quat))
             for name, row in self._rows.items():
-                self._of_objects[name].publish(self._pose_message(stamp, pos[row], quat[row]))
+                self._object_publishers[name].publish(self._pose_message(stamp, pos[row], quat[row]))
 
     # Messages -------------------------------------------------------------------------------------------------------
 
@@ -182,13 +183,13 @@ class RosBridge:
 
     # Commands -------------------------------------------------------------------------------------------------------
 
-    def _guarded(self, drone: int, take: Callable[[int, Any], None]) -> Callable[[Any], None]:
+    def _guard_callback(self, drone: int, receive: Callable[[int, Any], None]) -> Callable[[Any], None]:
         """Return the callback of a subscription, which reports refused commands."""
 
         def callback(message: Any) -> None:
             with self.swarm.lock:
                 try:
-                    take(drone, message)
+                    receive(drone, message)
                 except ConfigError as error:
                     self.swarm.reports.add("refused", self.swarm.names[drone], self.swarm.time, str(error))
 

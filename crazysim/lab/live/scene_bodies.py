@@ -63,8 +63,8 @@ class SceneBodies:
         mocap_ids = {body.mocap for body in items}
         for mocap, (kind, k) in enumerate(names):
             if mocap not in mocap_ids and kind not in parts:
-                called = members.get(kind, ())
-                name = called[k] if k < len(called) else kind if counts[kind] == 1 else f"{kind} {k}"
+                member_names = members.get(kind, ())
+                name = member_names[k] if k < len(member_names) else kind if counts[kind] == 1 else f"{kind} {k}"
                 items.append(SceneBody(kind, k, name, mocap))
         self.items = tuple(items)
         places = {(body.kind, body.index): i for i, body in enumerate(items)}
@@ -140,8 +140,8 @@ def _boxes(n: int, shapes: Sequence[VisualGeom]) -> tuple[NDArray, NDArray]:
             points = shape.pos + rotate(shape.quat, _corners(shape))
             low[shape.mocap] = np.minimum(low[shape.mocap], points.min(0))
             high[shape.mocap] = np.maximum(high[shape.mocap], points.max(0))
-    empty = ~np.isfinite(low).all(-1)
-    low[empty] = high[empty] = 0.0
+    is_empty = ~np.isfinite(low).all(-1)
+    low[is_empty] = high[is_empty] = 0.0
     return low, high
 
 

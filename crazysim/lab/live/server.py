@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 
 from crazysim.errors import ConfigError
-from crazysim.lab.live.commands import Command, command_of
+from crazysim.lab.live.commands import Command, parse_command
 from crazysim.lab.live.framing import Frames, FramingError, Message, Request, ShowFile
 from crazysim.storage import Closing
 
@@ -27,7 +27,7 @@ MAX_PEERS = 64
 """Largest number of simultaneous connections to a port."""
 TIMEOUT = 10.0
 """Time in which a message that has begun must be complete, s."""
-POLL = 0.2
+POLL_INTERVAL = 0.2
 """Interval at which a thread that waits for bytes checks if it must stop, s."""
 
 log = logging.getLogger(__name__)
@@ -93,9 +93,9 @@ class CommandServer(CommandQueue):
         """
         super().__init__()
         self.drones, self.timeout = frozenset(drones), timeout
-        self._taken: set[int] = set()
+        self._flown_drones: set[int] = set()
         self._lock = threading.Lock()
-        self._stopped = threading.Event()
+        self._stop_event = threading.Event()
         self._listeners = []
         if host not in ("127.0.0.1", "localhost", "::1"):
             log.warning("listening at %s: every machine of that network can command the drones", host)
@@ -106,7 +106,7 @@ class CommandServer(CommandQueue):
                 self.close()
                 raise ConfigError(f"expected a free address, got {host}:{port}: {error}. Use another port.") from error
             self._listeners.append(listener)
-            threading.Thread(target=listener.serve_forever, args=(POLL,), daemon=True).start()
+            threading.Thread(target=listener.serve_forever, args=(POLL_INTERVAL,), daemon=True).start()
 
     @property
     def drone_port(self) -> int:
@@ -119,7 +119,7 @@ class CommandServer(CommandQueue):
         return self._listeners[1].server_address[1]
 
     def close(self) -> None:
-        self._stopped.set()
+        self._stop_event.set()
         for listener in self._listeners:
             listener.shutdown()
             listener.server_close()
@@ -127,9 +127,9 @@ class CommandServer(CommandQueue):
     def _serve_drone(self, peer: socket.socket, name: str) -> None:
         drone = None
         try:
-            for frame in _frames(peer, self._stopped, self.timeout):
+            for frame in _frames(peer, self._stop_event, self.timeout):
                 if drone is None:
-                    if not isinstance(frame, Request) or not self._take(frame.drone):
+                    if not isinstance(frame, Request) or not self._claim_drone(frame.drone):
                         log.warning("%s refused: drone %s is not free", name, getattr(frame, "drone", None))
                         peer.sendall(b"ACK_00")
                         return
@@ -141,17 +141,17 @@ class CommandServer(CommandQueue):
                     raise FramingError("expected commands after the request, got another request or a show")
         finally:
             with self._lock:
-                self._taken.discard(drone)  # type: ignore[arg-type]
+                self._flown_drones.discard(drone)  # type: ignore[arg-type]
 
-    def _take(self, drone: int) -> bool:
+    def _claim_drone(self, drone: int) -> bool:
         with self._lock:
-            if drone not in self.drones or drone in self._taken:
+            if drone not in self.drones or drone in self._flown_drones:
                 return False
-            self._taken.add(drone)
+            self._flown_drones.add(drone)
             return True
 
     def _serve_stream(self, peer: socket.socket, name: str) -> None:
-        for frame in _frames(peer, self._stopped, self.timeout):
+        for frame in _frames(peer, self._stop_event, self.timeout):
             if isinstance(frame, Request):
                 raise FramingError("expected messages with the ID of a drone, got a request")
             self._answer(peer, name, frame, None)
@@ -161,7 +161,7 @@ class CommandServer(CommandQueue):
         try:
             if drone is not None and isinstance(frame, Message) and frame.drone not in (None, drone):
                 raise ConfigError(f"expected commands to drone {drone}, got one to drone {frame.drone}")
-            self._enqueue(command_of(frame, drone))
+            self._enqueue(parse_command(frame, drone))
         except ConfigError as error:
             log.warning("%s: command refused: %s", name, error)
             peer.sendall(b"ERR")
@@ -189,7 +189,7 @@ class StreamListener(CommandQueue):
             ConfigError: If there is no server.
         """
         super().__init__()
-        self._stopped = threading.Event()
+        self._stop_event = threading.Event()
         self._peer = connect(host, port, timeout)
         self._timeout = timeout
         self._thread = threading.Thread(target=self._listen, args=(f"{host}:{port}",), daemon=True)
@@ -201,17 +201,17 @@ class StreamListener(CommandQueue):
         return self._thread.is_alive()
 
     def close(self) -> None:
-        self._stopped.set()
-        self._thread.join(5 * POLL)
+        self._stop_event.set()
+        self._thread.join(5 * POLL_INTERVAL)
         self._peer.close()
 
     def _listen(self, name: str) -> None:
-        with _logged(name), contextlib.closing(self._peer):
-            for frame in _frames(self._peer, self._stopped, self._timeout):
+        with _log_errors(name), contextlib.closing(self._peer):
+            for frame in _frames(self._peer, self._stop_event, self._timeout):
                 if isinstance(frame, Request):
                     raise FramingError("expected commands, got a request")
                 try:
-                    self._enqueue(command_of(frame))
+                    self._enqueue(parse_command(frame))
                     self._peer.sendall(b"ACK")
                 except ConfigError as error:
                     log.warning("%s: command refused: %s", name, error)
@@ -244,14 +244,14 @@ class _Listener(socketserver.ThreadingTCPServer):
             log.warning("%s refused: %d clients are connected already", name, MAX_PEERS)
             return
         try:
-            with _logged(name):
+            with _log_errors(name):
                 self._serve(request, name)
         finally:
             self._n_peers.release()
 
 
 @contextlib.contextmanager
-def _logged(name: str) -> Iterator[None]:
+def _log_errors(name: str) -> Iterator[None]:
     """Log the reason why a connection ends instead of raising an error."""
     try:
         yield
@@ -270,7 +270,7 @@ def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> It
         TimeoutError: If the client does not finish a message.
     """
     frames, deadline = Frames(), None
-    peer.settimeout(POLL)
+    peer.settimeout(POLL_INTERVAL)
     while not stopped.is_set():
         if deadline is not None and time.monotonic() > deadline:
             raise TimeoutError(f"expected a complete message within {timeout:g} s")
@@ -286,7 +286,7 @@ def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> It
             deadline = None
             peer.settimeout(timeout)  # for the answer
             yield frame
-            peer.settimeout(POLL)
+            peer.settimeout(POLL_INTERVAL)
         if not frames.pending:
             deadline = None
         elif deadline is None:

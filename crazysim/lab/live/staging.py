@@ -21,7 +21,7 @@ class StagedCommands:
         """Start from the commands of the simulation; a drone without a state command hovers at its position."""
         self._sim = sim
         self._array: NDArray | None = None
-        self._staged: NDArray | None = None
+        self._staged_copy: NDArray | None = None
 
     @property
     def array(self) -> NDArray:
@@ -32,10 +32,10 @@ class StagedCommands:
 
     def stage(self) -> None:
         """Stage the commands if they have changed since the last call."""
-        if self._array is None or (self._staged is not None and np.array_equal(self._array, self._staged)):
+        if self._array is None or (self._staged_copy is not None and np.array_equal(self._array, self._staged_copy)):
             return
-        self._staged = self._array.copy()
-        getattr(self._sim, f"{self._sim.control.value}_control")(self._staged)
+        self._staged_copy = self._array.copy()
+        getattr(self._sim, f"{self._sim.control.value}_control")(self._staged_copy)
 
     def copy(self) -> NDArray | None:
         """Return the commands for ``restore``."""
@@ -43,7 +43,7 @@ class StagedCommands:
 
     def restore(self, array: NDArray | None) -> None:
         """Return to commands that ``copy`` returned, or to those staged in the data if None."""
-        self._staged = None
+        self._staged_copy = None
         if array is not None:
             self.array[:] = array
         elif self._array is not None:

@@ -48,7 +48,7 @@ class Window(Viewer[Live]):
     makes viewers follow it, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses,
     a full stop makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [
     and ] move the chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window draws
-    in a process of its own, at the highest rate possible, and never delays the simulation.
+    in a separate process, at the highest rate possible, and never delays the simulation.
     """
 
     worlds: Sequence[int] = (0,)
@@ -80,8 +80,8 @@ class Window(Viewer[Live]):
         if not np.isfinite(self.trail) or self.trail < 0:
             raise ConfigError(f"expected a trail of 0 s or more, got {self.trail!r}")
         self._process: subprocess.Popen[bytes] | None = None
-        self._next: Picture | None = None
-        self._changed = threading.Condition()
+        self._next_picture: Picture | None = None
+        self._picture_changed = threading.Condition()
 
     @property
     def is_open(self) -> bool:
@@ -114,14 +114,14 @@ class Window(Viewer[Live]):
 
     def update(self, live: Live) -> None:
         picture = self._source.take(live, self.plot)
-        with self._changed:
-            self._next = picture
-            self._changed.notify()
+        with self._picture_changed:
+            self._next_picture = picture
+            self._picture_changed.notify()
 
     def close(self) -> None:
         process, self._process = self._process, None
-        with self._changed:
-            self._changed.notify()
+        with self._picture_changed:
+            self._picture_changed.notify()
         if process is None:
             return
         with contextlib.suppress(OSError):
@@ -135,9 +135,9 @@ class Window(Viewer[Live]):
     def _write(self, process: subprocess.Popen[bytes]) -> None:
         """Write the latest picture to the process whenever it has read the previous one."""
         while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._next is not None or self._process is not process)
-                picture, self._next = self._next, None
+            with self._picture_changed:
+                self._picture_changed.wait_for(lambda: self._next_picture is not None or self._process is not process)
+                picture, self._next_picture = self._next_picture, None
             if self._process is not process or picture is None:
                 return
             try:
@@ -156,9 +156,9 @@ class Window(Viewer[Live]):
             elif kind == "release":
                 live.keyboard.release(*values)
             elif kind == "follow":
-                live.post(lambda live, chosen=values: live.follow(*chosen))
+                live.post(lambda live, body=values: live.follow(*body))
             elif kind == "click":
-                live.post(lambda live, where=values: live.click(where[0], np.array(where[1])))
+                live.post(lambda live, place=values: live.click(place[0], np.array(place[1])))
         process.stdout.close()
         process.wait()
         live.keyboard.release_all()

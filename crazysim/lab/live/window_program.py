@@ -19,7 +19,7 @@ from crazysim.lab.live.chart import Chart
 from crazysim.lab.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
 from crazysim.lab.live.scene_bodies import MARK_RADIUS, SceneBodies
 from crazysim.lab.live.window import LENGTH_PREFIX
-from crazysim.media.trail import Trail, colors_of
+from crazysim.media.trail import Trail, choose_drone_colors
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.render import camera_id
 from crazysim.scene.scene_window import SceneWindow
@@ -73,15 +73,15 @@ class Leds:
             (k, int(drone)) for k, (kind, _, drone) in enumerate(names) if kind in LED_MATERIALS and drone.isdigit()
         ]
         self._materials, self._drones = np.array(leds, int).reshape(-1, 2).T
-        self._off = model.mat_rgba[self._materials].copy(), model.mat_emission[self._materials].copy()
+        self._unlit_colors = model.mat_rgba[self._materials].copy(), model.mat_emission[self._materials].copy()
 
     def color(self, colors: np.ndarray) -> None:
         """Set the colours of the drones of one world, 0 to 1; zero for off. (n_drones, 3)"""
         drone_colors = colors[self._drones]
         brightest = drone_colors.max(-1, initial=0.0)
-        lit, (rgba, emission) = brightest > 0, self._off
-        self._model.mat_rgba[self._materials] = np.where(lit[:, None], np.insert(drone_colors, 3, 1.0, axis=1), rgba)
-        self._model.mat_emission[self._materials] = np.where(lit, brightest, emission)
+        is_lit, (rgba, emission) = brightest > 0, self._unlit_colors
+        self._model.mat_rgba[self._materials] = np.where(is_lit[:, None], np.insert(drone_colors, 3, 1.0, axis=1), rgba)
+        self._model.mat_emission[self._materials] = np.where(is_lit, brightest, emission)
 
 
 class Program:
@@ -113,7 +113,7 @@ class Program:
             for key, value in (settings["cam_config"] or {}).items():
                 setattr(self._camera, key, value if np.ndim(value) == 0 else np.asarray(value, float))
         self.window = SceneWindow(model, 100_000 + model.ngeom, settings["width"], settings["height"])
-        self.window.on_key = lambda key, down: self._say("press" if down else "release", key)
+        self.window.on_key = lambda key, down: self._send("press" if down else "release", key)
         self._chart = Chart(settings["plot"])
         self.window.on_drawn = self._chart.draw
         self._was_down, self._click = False, (-np.inf, (0.0, 0.0))
@@ -121,7 +121,7 @@ class Program:
     def run(self, inbox: Inbox) -> None:
         """Draw until the input ends or the user closes the window."""
         last_picture, drawn_at = None, -np.inf
-        self._say("ready")
+        self._send("ready")
         while self.window.is_open and not inbox.ended:
             picture, now = inbox.picture, time.perf_counter()
             if picture is None or (picture is last_picture and now - drawn_at < REDRAW_TIME):
@@ -156,7 +156,7 @@ class Program:
         mujoco.mj_camlight(self._model, data)
         overlays.clear()
         drones = picture.drone_pos[k]
-        colors = colors_of(len(drones), None)
+        colors = choose_drone_colors(len(drones), None)
         if self._trail is not None:
             self._trail.draw(overlays, k)
         if settings["setpoints"] and len(picture.setpoint[k]):
@@ -185,17 +185,17 @@ class Program:
 
     def _double_clicked(self) -> bool:
         """Return True if the left button has just been pressed for the second time."""
-        down, was_down = self.window.is_pressed("left"), self._was_down
-        self._was_down = down
-        if not down or was_down:
+        is_down, was_down = self.window.is_pressed("left"), self._was_down
+        self._was_down = is_down
+        if not is_down or was_down:
             return False
         (last_time, last_cursor), cursor, now = self._click, self.window.cursor, time.perf_counter()
-        double = (
+        is_double = (
             now - last_time < DOUBLE_CLICK_TIME
             and max(abs(a - b) for a, b in zip(last_cursor, cursor, strict=True)) < MAX_CLICK_MOVE
         )
-        self._click = (-np.inf if double else now, cursor)
-        return double
+        self._click = (-np.inf if is_double else now, cursor)
+        return is_double
 
     def _report(self, picture: Picture, hit: tuple[int, int, np.ndarray] | None) -> None:
         """Write which body, or which point, was clicked."""
@@ -208,11 +208,11 @@ class Program:
         mocap, world = int(self._model.body_mocapid[body]), int(picture.worlds[k])
         if mocap >= 0:
             followed = self._bodies.items[self._bodies.owner[mocap]]
-            self._say("follow", world, followed.kind, followed.index)
+            self._send("follow", world, followed.kind, followed.index)
         else:
-            self._say("click", world, point.tolist())
+            self._send("click", world, point.tolist())
 
-    def _say(self, *message: object) -> None:
+    def _send(self, *message: object) -> None:
         try:
             self._out.write(json.dumps(message) + "\n")
             self._out.flush()

@@ -74,10 +74,10 @@ class Archive:
             reference = checks.require_text(value["$ref"], f"{location}, $ref", 1000)
             name, _, fragment = reference.partition("#")
             if fragment.strip("/"):
-                checks.refuse("a reference to a whole file, such as ./cues.json#", short_repr(reference), location)
+                checks.raise_error("a reference to a whole file, such as ./cues.json#", short_repr(reference), location)
             name = str(PurePosixPath(name))
             value, location = self.json(name), f"{self.location}: {name}"
-        return checks.refuse(f"a chain of at most {MAX_CHAIN} references", "a longer one", location)
+        return checks.raise_error(f"a chain of at most {MAX_CHAIN} references", "a longer one", location)
 
 
 def write_archive(path: str | Path, files: Mapping[str, str]) -> None:

@@ -75,12 +75,12 @@ class _Machine:
         self.loops: list[tuple[int, int]] = []  # address of the body, iterations left; 0 for endless
         self.pieces: list[tuple[int, tuple, tuple]] = [(0, BLACK, BLACK)]
 
-    def refuse(self, expected: str, got: str) -> None:
+    def raise_error(self, expected: str, got: str) -> None:
         raise ConfigError(f"expected {expected}, got {got} in {self.location}, byte {self.address}")
 
     def read_byte(self) -> int:
         if self.address >= len(self.code):
-            self.refuse("an argument", "the end of the program")
+            self.raise_error("an argument", "the end of the program")
         self.address += 1
         return self.code[self.address - 1]
 
@@ -91,7 +91,7 @@ class _Machine:
             value |= (byte & 0x7F) << shift
             shift += 7
             if value > MAX_VARINT or shift > 35:
-                self.refuse(f"a number of at most {MAX_VARINT}", "a larger one")
+                self.raise_error(f"a number of at most {MAX_VARINT}", "a larger one")
             if byte < 0x80:
                 return value
 
@@ -100,7 +100,7 @@ class _Machine:
         for _ in range(max_commands):
             if self.address >= len(self.code) or self.now > end or not self.run_command(self.read_byte()):
                 return
-        self.refuse(f"a program that runs at most {max_commands} commands in {end * TICK_DURATION:g} s", "more")
+        self.raise_error(f"a program that runs at most {max_commands} commands in {end * TICK_DURATION:g} s", "more")
 
     def run_command(self, code: int) -> bool:
         """Run one command; return False at the end of the program."""
@@ -118,7 +118,7 @@ class _Machine:
             self.set_color(code)
         elif code == LOOP_BEGIN:
             if len(self.loops) == MAX_LOOPS:
-                self.refuse(f"loops nested at most {MAX_LOOPS} deep", "a further one")
+                self.raise_error(f"loops nested at most {MAX_LOOPS} deep", "a further one")
             iterations = self.read_byte()
             self.loops.append((self.address, iterations))
         elif code == LOOP_END:
@@ -130,7 +130,7 @@ class _Machine:
                 self.read_varint()
         else:
             self.address -= 1
-            self.refuse("a command of Skybrush's light programs, 0x00 to 0x15", f"0x{code:02x}")
+            self.raise_error("a command of Skybrush's light programs, 0x00 to 0x15", f"0x{code:02x}")
         return True
 
     def set_color(self, code: int) -> None:
@@ -158,7 +158,7 @@ class _Machine:
 
     def end_loop(self) -> None:
         if not self.loops:
-            self.refuse("the start of a loop in front of its end", "none")
+            self.raise_error("the start of a loop in front of its end", "none")
         start, iterations_left = self.loops.pop()
         if iterations_left != 1:
             self.loops.append((start, max(iterations_left - 1, 0)))
@@ -166,7 +166,7 @@ class _Machine:
 
     def jump(self, address: int) -> None:
         if address >= len(self.code):
-            self.refuse(f"a jump to one of {len(self.code)} bytes", f"one to byte {address}")
+            self.raise_error(f"a jump to one of {len(self.code)} bytes", f"one to byte {address}")
         self.address = address
         self.loops.clear()
 

@@ -67,10 +67,10 @@ class Lights(PyTree):
             raise ConfigError("expected the lights of at least one drone, got none. Pass a list with one per drone.")
         n = max(x.times.shape[-1] for x in lights)
 
-        def padded(x: Array) -> np.ndarray:
+        def pad(x: Array) -> np.ndarray:
             return np.concatenate([x, np.repeat(x[-1:], n - len(x), axis=0)])
 
-        return jax.tree.map(lambda *leaves: np.stack([padded(x) for x in leaves]), *lights)
+        return jax.tree.map(lambda *leaves: np.stack([pad(x) for x in leaves]), *lights)
 
     def evaluate(self, t: ArrayLike) -> Array:
         """Return the colour of one drone at one time, 0 to 1; where two pieces meet, the later one counts.

@@ -11,12 +11,12 @@ from crazysim.errors import ConfigError, short_repr
 from crazysim.trajectories.bezier import control_points, power_coefficients, significant_degree
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.pieces import require_no_jumps, split_pieces, trajectory_pieces
-from crazysim.trajectories.splines import trajectory_of_unit_pieces
+from crazysim.trajectories.splines import trajectory_from_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 ENCODINGS = ("COMPRESSED", "POLY4D")
 MAX_DEGREE = 7
-TOLERANCE = 1e-6
+COEFFICIENT_TOLERANCE = 1e-6
 """Size of coefficients that a file omits, m or rad."""
 
 
@@ -40,10 +40,10 @@ def parse_trajectory(value: object, location: str, yaw_control: object = None) -
     checks.require_version_one(value, location)
     encoding = value.get("type", ENCODINGS[0])
     if encoding not in ENCODINGS:
-        checks.refuse(f"type {' or '.join(ENCODINGS)}", short_repr(encoding), location)
+        checks.raise_error(f"type {' or '.join(ENCODINGS)}", short_repr(encoding), location)
     points = checks.require_array(value.get("points"), checks.MAX_POINTS, f"{location}, points")
     if not points:
-        checks.refuse("at least one point", "none", location)
+        checks.raise_error("at least one point", "none", location)
     for key in ("takeoffTime", "landingTime"):
         if value.get(key) is not None:
             checks.require_number(value[key], f"{location}, {key}", 0.0, checks.MAX_TIME)
@@ -52,34 +52,40 @@ def parse_trajectory(value: object, location: str, yaw_control: object = None) -
     times, curves, last = [], [], None
     n_axes = len(points[0][1]) if _is_point(points[0]) else 3
     for i, point in enumerate(points):
-        where = f"{location}, point {i}"
+        point_location = f"{location}, point {i}"
         if not _is_point(point):
-            checks.refuse("[time, [x, y, z], [control points]]", short_repr(point), where)
-        times.append(checks.require_number(point[0], where, 0.0, checks.MAX_TIME))
-        end = checks.require_numbers(point[1], [n_axes] if i else [3, 4], checks.MAX_COORDINATE, where)
-        inner = checks.require_array(point[2], MAX_DEGREE - 1, f"{where}, control points") if len(point) > 2 else []
-        if last is None and inner:
-            checks.refuse("no control points of the first point", f"{len(inner)}", where)
+            checks.raise_error("[time, [x, y, z], [control points]]", short_repr(point), point_location)
+        times.append(checks.require_number(point[0], point_location, 0.0, checks.MAX_TIME))
+        end = checks.require_numbers(point[1], [n_axes] if i else [3, 4], checks.MAX_COORDINATE, point_location)
+        handles = (
+            checks.require_array(point[2], MAX_DEGREE - 1, f"{point_location}, control points")
+            if len(point) > 2
+            else []
+        )
+        if last is None and handles:
+            checks.raise_error("no control points of the first point", f"{len(handles)}", point_location)
         if last is not None:
-            via = [checks.require_numbers(x, [n_axes], checks.MAX_COORDINATE, where) for x in inner]
-            curves.append(np.stack([last, *via, end]))
+            handle_points = [
+                checks.require_numbers(x, [n_axes], checks.MAX_COORDINATE, point_location) for x in handles
+            ]
+            curves.append(np.stack([last, *handle_points, end]))
         last = end
     checks.require_ascending(np.array(times), checks.MIN_LENGTH, location)
     start = takeoff + times[0]
     if times[-1] + takeoff > checks.MAX_TIME:
-        checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1] + takeoff:g} s", location)
+        checks.raise_error(f"at most {checks.MAX_TIME:g} s", f"{times[-1] + takeoff:g} s", location)
     first = curves[0][:1] if curves else np.asarray(last)[None]
     ends = [takeoff + t for t in times[1:]]
     if start >= checks.MIN_LENGTH or not curves:  # a shorter rest belongs to the first curve
         ends, curves = [max(start, checks.MIN_LENGTH), *ends], [first, *curves]
-    return _of_curves(np.array(ends), curves, yaw_control, location), encoding
+    return _trajectory_of_curves(np.array(ends), curves, yaw_control, location), encoding
 
 
 def _is_point(point: object) -> TypeGuard[list[Any]]:
     return isinstance(point, list) and 2 <= len(point) <= 3 and isinstance(point[1], list)
 
 
-def _of_curves(ends: NDArray, curves: list, yaw_control: object, location: str) -> Trajectory:
+def _trajectory_of_curves(ends: NDArray, curves: list, yaw_control: object, location: str) -> Trajectory:
     """Return the trajectory of Bezier curves."""
     degree = max(len(curve) for curve in curves) - 1
     c = np.zeros((len(curves), 4, max(degree, 1) + 1))
@@ -88,16 +94,16 @@ def _of_curves(ends: NDArray, curves: list, yaw_control: object, location: str) 
     c[:, 3] = np.deg2rad(c[:, 3])
     if yaw_control is not None:
         ends, c = _with_yaw(ends, c, yaw_control, f"{location}, yawControl")
-    return trajectory_of_unit_pieces(np.diff(ends, prepend=0.0), c)
+    return trajectory_from_unit_pieces(np.diff(ends, prepend=0.0), c)
 
 
-def _with_yaw(ends: NDArray, c: NDArray, yaw_control: object, location: str) -> tuple[NDArray, NDArray]:
+def _with_yaw(ends: NDArray, coefficients: NDArray, yaw_control: object, location: str) -> tuple[NDArray, NDArray]:
     """Return the pieces with the yaw of setpoints that are connected linearly, in the time of the show."""
     value = checks.require_object(yaw_control, location)
     checks.require_version_one(value, location)
     setpoints = checks.require_array(value.get("setpoints"), checks.MAX_POINTS, location)
     if not setpoints:
-        return ends, c
+        return ends, coefficients
     pairs = np.array(
         [
             checks.require_numbers(x, [2], checks.MAX_COORDINATE, f"{location}, entry {i}")
@@ -106,12 +112,12 @@ def _with_yaw(ends: NDArray, c: NDArray, yaw_control: object, location: str) -> 
     )
     times, yaw = pairs[:, 0], np.deg2rad(pairs[:, 1])
     checks.require_ascending(times, checks.MIN_LENGTH, location)
-    ends, c = split_pieces(ends, c, times)
+    ends, coefficients = split_pieces(ends, coefficients, times)
     starts = np.concatenate([[0.0], ends[:-1]])
-    c[:, 3] = 0.0
-    c[:, 3, 0] = np.interp(starts, times, yaw)
-    c[:, 3, 1] = np.interp(ends, times, yaw) - c[:, 3, 0]
-    return ends, c
+    coefficients[:, 3] = 0.0
+    coefficients[:, 3, 0] = np.interp(starts, times, yaw)
+    coefficients[:, 3, 1] = np.interp(ends, times, yaw) - coefficients[:, 3, 0]
+    return ends, coefficients
 
 
 def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw: bool = True) -> dict[str, Any]:
@@ -132,19 +138,19 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
     require_no_jumps(ends, c)
     digits = np.asarray(trajectory.coefficients).dtype
 
-    def written(point: NDArray) -> list[float]:
+    def format_point(point: NDArray) -> list[float]:
         point = np.array(point)
         point[3:] = np.rad2deg(point[3:])
         return [float(str(x)) for x in point.astype(digits)]
 
-    points: list[Any] = [[0.0, written(c[0, :, 0]), []]]
+    points: list[Any] = [[0.0, format_point(c[0, :, 0]), []]]
     for end, axes in zip(ends, c, strict=True):
-        n_degree = significant_degree(axes, TOLERANCE)
+        n_degree = significant_degree(axes, COEFFICIENT_TOLERANCE)
         if n_degree > MAX_DEGREE:
             raise ConfigError(f"expected polynomials of degree {MAX_DEGREE} at most, got degree {n_degree}")
         degree = min(d for d in degrees if d >= n_degree)
         curve = control_points(axes[:, : degree + 1], degree)
-        points.append([float(end), written(curve[-1]), [written(x) for x in curve[1:-1]]])
+        points.append([float(end), format_point(curve[-1]), [format_point(x) for x in curve[1:-1]]])
     return {
         "version": 1,
         "points": points,

@@ -58,66 +58,66 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
         ConfigError: If the file is not a valid show; the message names the location.
     """
     archive = Archive(content, location)
-    where = f"{location}: show.json"
-    show = checks.require_object(archive.json("show.json"), where)
-    checks.require_version_one(show, where)
-    settings, _ = archive.resolve(show.get("settings", {}), where)
-    settings = checks.require_object(settings, f"{where}, settings")
-    swarm, swarm_at = archive.resolve(show.get("swarm"), f"{where}, swarm")
+    file_location = f"{location}: show.json"
+    show = checks.require_object(archive.json("show.json"), file_location)
+    checks.require_version_one(show, file_location)
+    settings, _ = archive.resolve(show.get("settings", {}), file_location)
+    settings = checks.require_object(settings, f"{file_location}, settings")
+    swarm, swarm_at = archive.resolve(show.get("swarm"), f"{file_location}, swarm")
     drones = checks.require_array(
         checks.require_object(swarm, swarm_at).get("drones"), MAX_DRONES, f"{swarm_at}, drones"
     )
     if not drones:
-        checks.refuse("at least one drone", "none", swarm_at)
+        checks.raise_error("at least one drone", "none", swarm_at)
     parsed = []
     for i, drone in enumerate(drones):
-        parsed.append(_drone(archive, drone, f"{swarm_at}, drone {i}", i))
+        parsed.append(_parse_drone(archive, drone, f"{swarm_at}, drone {i}", i))
         _bound(len(drones) * parsed[-1]["trajectory"].n_pieces, parsed[-1]["at"])
     trajectories = [drone["trajectory"] for drone in parsed]
     duration = max(float(x.duration) for x in trajectories)
     lights, decoded = [], {}
     for drone in parsed:
-        lights.append(_lights(archive, drone, duration, MAX_LOOPED // len(parsed), decoded))
+        lights.append(_decode_lights(archive, drone, duration, MAX_LOOPED // len(parsed), decoded))
         _bound(len(parsed) * len(lights[-1].times), f"{drone['at']}, lights")
     names = [drone["name"] for drone in parsed]
     if len(set(names)) < len(names):
-        checks.refuse("different names of the drones", f"{short_repr(sorted(names))}", swarm_at)
+        checks.raise_error("different names of the drones", f"{short_repr(sorted(names))}", swarm_at)
     environment = show.get("environment") or {}
-    kind = checks.require_object(environment, f"{where}, environment").get("type", "outdoor")
+    kind = checks.require_object(environment, f"{file_location}, environment").get("type", "outdoor")
     if kind not in ("indoor", "outdoor"):
-        checks.refuse("environment indoor or outdoor", short_repr(kind), where)
+        checks.raise_error("environment indoor or outdoor", short_repr(kind), file_location)
     return Show(
         names=tuple(names),
         trajectories=Trajectory.stack(trajectories),
         lights=Lights.stack(lights),
-        cues=_cues(archive, settings.get("cues"), f"{where}, cues"),
+        cues=_parse_cues(archive, settings.get("cues"), f"{file_location}, cues"),
         settings={name: value for name, value in settings.items() if name != "cues"},
         homes=np.stack([drone["home"] for drone in parsed]),
         landings=np.stack([drone["landing"] for drone in parsed]),
         parameters=tuple(drone["parameters"] for drone in parsed),
         encodings=tuple(drone["encoding"] for drone in parsed),
         environment=kind,
-        meta=checks.require_object(show.get("meta") or {}, f"{where}, meta"),
+        meta=checks.require_object(show.get("meta") or {}, f"{file_location}, meta"),
     )
 
 
 def _bound(n_pieces: int, location: str) -> None:
     if n_pieces > MAX_PIECES:
-        checks.refuse(f"at most {MAX_PIECES} pieces, padded to the longest", str(n_pieces), location)
+        checks.raise_error(f"at most {MAX_PIECES} pieces, padded to the longest", str(n_pieces), location)
 
 
-def _drone(archive: Archive, value: object, location: str, index: int) -> dict[str, Any]:
+def _parse_drone(archive: Archive, value: object, location: str, index: int) -> dict[str, Any]:
     """Return the entry of one drone in the show; its lights are not decoded yet."""
     value, location = archive.resolve(value, location)
     settings, location = archive.resolve(
         checks.require_object(value, location).get("settings"), f"{location}, settings"
     )
     settings = checks.require_object(settings, location)
-    data, where = archive.resolve(settings.get("trajectory"), f"{location}, trajectory")
+    data, file_location = archive.resolve(settings.get("trajectory"), f"{location}, trajectory")
     yaw_control, _ = archive.resolve(settings.get("yawControl"), f"{location}, yawControl")
     if isinstance(yaw_control, dict) and yaw_control.get("autoYaw"):
         log.warning("%s: autoYaw is ignored; the drone keeps the yaw of the setpoints", location)
-    trajectory, encoding = parse_trajectory(data, where, yaw_control)
+    trajectory, encoding = parse_trajectory(data, file_location, yaw_control)
     c = np.asarray(trajectory.coefficients, float)
     start, end = c[0, :, 0], c[-1].sum(-1)
     if settings.get("startYaw") is not None:
@@ -130,31 +130,33 @@ def _drone(archive: Archive, value: object, location: str, index: int) -> dict[s
         "name": f"drone_{index}" if name is None else checks.require_text(name, f"{location}, name"),
         "trajectory": trajectory,
         "encoding": encoding,
-        "home": _position(settings.get("home"), start[:3], f"{location}, home"),
-        "landing": _position(settings.get("landAt"), end[:3], f"{location}, landAt"),
-        "parameters": _parameters(settings.get("parameters"), f"{location}, parameters"),
+        "home": _parse_position(settings.get("home"), start[:3], f"{location}, home"),
+        "landing": _parse_position(settings.get("landAt"), end[:3], f"{location}, landAt"),
+        "parameters": _parse_parameters(settings.get("parameters"), f"{location}, parameters"),
         "lights": settings.get("lights"),
     }
 
 
-def _position(value: object, default: NDArray, location: str) -> NDArray:
+def _parse_position(value: object, default: NDArray, location: str) -> NDArray:
     return default if value is None else checks.require_numbers(value, [3], checks.MAX_COORDINATE, location)
 
 
-def _parameters(value: object, location: str) -> tuple[ParameterChange, ...]:
+def _parse_parameters(value: object, location: str) -> tuple[ParameterChange, ...]:
     changes = []
     for i, entry in enumerate(checks.require_array(value, checks.MAX_POINTS, location) if value is not None else []):
         if not isinstance(entry, list) or len(entry) != 3:
-            checks.refuse("[time, name, value]", short_repr(entry), f"{location}, entry {i}")
-        where = f"{location}, entry {i}"
-        time = checks.require_number(entry[0], where, 0.0, checks.MAX_TIME)
+            checks.raise_error("[time, name, value]", short_repr(entry), f"{location}, entry {i}")
+        entry_location = f"{location}, entry {i}"
+        time = checks.require_number(entry[0], entry_location, 0.0, checks.MAX_TIME)
         changes.append(
-            ParameterChange(time, checks.require_text(entry[1], where), checks.require_number(entry[2], where))
+            ParameterChange(
+                time, checks.require_text(entry[1], entry_location), checks.require_number(entry[2], entry_location)
+            )
         )
     return tuple(changes)
 
 
-def _cues(archive: Archive, value: object, location: str) -> tuple[Cue, ...]:
+def _parse_cues(archive: Archive, value: object, location: str) -> tuple[Cue, ...]:
     if value is None:
         return ()
     value, location = archive.resolve(value, location)
@@ -162,14 +164,14 @@ def _cues(archive: Archive, value: object, location: str) -> tuple[Cue, ...]:
     checks.require_version_one(value, location)
     cues = []
     for i, item in enumerate(checks.require_array(value.get("items", []), checks.MAX_POINTS, location)):
-        where = f"{location}, item {i}"
-        item = checks.require_object(item, where)
-        time = checks.require_number(item.get("time"), where, 0.0, checks.MAX_TIME)
-        cues.append(Cue(time, checks.require_text(item.get("name", ""), where)))
+        item_location = f"{location}, item {i}"
+        item = checks.require_object(item, item_location)
+        time = checks.require_number(item.get("time"), item_location, 0.0, checks.MAX_TIME)
+        cues.append(Cue(time, checks.require_text(item.get("name", ""), item_location)))
     return tuple(sorted(cues, key=lambda cue: cue.time))
 
 
-def _lights(
+def _decode_lights(
     archive: Archive, drone: dict[str, Any], until: float, max_looped: int, decoded: dict[str, Lights]
 ) -> Lights:
     """Return the lights of one drone; equal programs are decoded once."""
@@ -201,20 +203,22 @@ def parse_colors(value: object, location: str) -> Lights:
     entries = checks.require_array(value, MAX_REPEATED, location)
     times, colors, now = [], [], 0.0
     for i, entry in enumerate(entries):
-        where = f"{location}, entry {i}"
+        entry_location = f"{location}, entry {i}"
         if not isinstance(entry, list) or len(entry) != 2:
-            checks.refuse("[time, [red, green, blue]] or ['red, green, blue', duration]", short_repr(entry), where)
+            checks.raise_error(
+                "[time, [red, green, blue]] or ['red, green, blue', duration]", short_repr(entry), entry_location
+            )
         first, second = entry
         if isinstance(first, str):
-            channels: Any = [_integer(x, where) for x in first.split(",")[:4]]
+            channels: Any = [_parse_integer(x, entry_location) for x in first.split(",")[:4]]
             times.append(now)
-            now += checks.require_number(second, where, 0.0, checks.MAX_TIME)
+            now += checks.require_number(second, entry_location, 0.0, checks.MAX_TIME)
         else:
             channels = second
-            times.append(checks.require_number(first, where, 0.0, checks.MAX_TIME))
-        colors.append(checks.require_numbers(channels, [3], 255.0, where) / 255)
+            times.append(checks.require_number(first, entry_location, 0.0, checks.MAX_TIME))
+        colors.append(checks.require_numbers(channels, [3], 255.0, entry_location) / 255)
         if colors[-1].min() < 0:
-            checks.refuse("colours from 0 to 255", short_repr(channels), where)
+            checks.raise_error("colours from 0 to 255", short_repr(channels), entry_location)
     if not entries:
         return Lights.constant((0.0, 0.0, 0.0))
     checks.require_ascending(np.array(times), 0.0, location)
@@ -223,10 +227,10 @@ def parse_colors(value: object, location: str) -> Lights:
     return Lights.of_pieces(times, colors)
 
 
-def _integer(text: str, location: str) -> int:
+def _parse_integer(text: str, location: str) -> int:
     text = text.strip()
     if not (text.isascii() and text.isdigit() and len(text) <= 3):
-        checks.refuse("colours as 'red, green, blue', 0 to 255", short_repr(text), location)
+        checks.raise_error("colours as 'red, green, blue', 0 to 255", short_repr(text), location)
     return int(text)
 
 

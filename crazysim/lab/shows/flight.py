@@ -21,7 +21,7 @@ from crazysim.plugins.follow import Follow
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Trajectory
 
-RATES = (50, 25, 10, 5)
+RECORDING_RATES = (50, 25, 10, 5)
 """Rates at which a flight may be recorded, Hz; the first that divides the physics' rate and fits is used."""
 MAX_RECORDED = 20_000_000
 """Most poses of a recording, which take 28 bytes each."""
@@ -99,9 +99,9 @@ def start_simulation(show: Show, settings: dict[str, Any]) -> Sim:
     start = _start(show.trajectories)
     states = sim.data.states
     pos = jnp.asarray(start[None, :, :3], states.pos.dtype)
-    half = start[None, :, 3:] / 2
+    half_yaw = start[None, :, 3:] / 2
     zeros = np.zeros((1, show.n_drones, 2))
-    quat = jnp.asarray(np.concatenate([zeros, np.sin(half), np.cos(half)], axis=-1), states.quat.dtype)
+    quat = jnp.asarray(np.concatenate([zeros, np.sin(half_yaw), np.cos(half_yaw)], axis=-1), states.quat.dtype)
     states = states.replace(pos=pos, quat=quat)
     if isinstance(sim.data.params, first_principles.Params):
         hover = first_principles.hover_rotor_vel(sim.data.params)
@@ -118,12 +118,12 @@ def _start(trajectories: Trajectory) -> NDArray:
 
 def _rate(freq: int, seconds: float, n_drones: int) -> int:
     """Return the rate of the recording, Hz."""
-    for rate in RATES:
+    for rate in RECORDING_RATES:
         if freq % rate == 0 and seconds * rate * n_drones <= MAX_RECORDED:
             return rate
     raise ConfigError(
-        f"expected at most {MAX_RECORDED} recorded poses and freq a multiple of {RATES[-1]} Hz, got {seconds:g} s of "
-        f"{n_drones} drones at {freq} Hz. Fly a part of the show with seconds=..."
+        f"expected at most {MAX_RECORDED} recorded poses and freq a multiple of {RECORDING_RATES[-1]} Hz, got "
+        f"{seconds:g} s of {n_drones} drones at {freq} Hz. Fly a part of the show with seconds=..."
     )
 
 

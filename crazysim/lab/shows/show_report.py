@@ -124,12 +124,12 @@ def summary(flight: ShowFlight, figures: dict[str, Any]) -> str:
         figures: Result of ``report``.
     """
     rms = figures["flown"]["tracking_rms"]
-    worst = max(rms, key=rms.__getitem__)
+    worst_drone = max(rms, key=rms.__getitem__)
     lines = [
         f"{flight.show.n_drones} drones, {flight.duration:.1f} s, computed in {flight.wall_s:.2f} s, "
         f"{flight.duration / flight.wall_s:.0f} times real time",
         f"tracking error    {100 * float(np.sqrt(np.mean(np.square(list(rms.values()))))):.1f} cm RMS, largest "
-        f"{100 * rms[worst]:.1f} cm ({worst})",
+        f"{100 * rms[worst_drone]:.1f} cm ({worst_drone})",
     ]
     limit = flight.show.settings.get("validation", {})
     limit = limit.get("minDistance") if isinstance(limit, dict) else None
@@ -143,6 +143,8 @@ def summary(flight: ShowFlight, figures: dict[str, Any]) -> str:
             n = sum(pair["distance"] < limit for pair in pairs)
             lines.append(f"                  {n} of {len(pairs)} pairs closer than the show's {limit:g} m")
     collided_pairs = collisions(flight)
-    shown = ", ".join(f"{' and '.join(pair['drones'])} at {pair['time']:.1f} s" for pair in collided_pairs[:N_LISTED])
-    lines.append(f"collisions        {len(collided_pairs)}{': ' + shown if collided_pairs else ''}")
+    collision_text = ", ".join(
+        f"{' and '.join(pair['drones'])} at {pair['time']:.1f} s" for pair in collided_pairs[:N_LISTED]
+    )
+    lines.append(f"collisions        {len(collided_pairs)}{': ' + collision_text if collided_pairs else ''}")
     return "\n".join(lines)

@@ -55,7 +55,7 @@ def film(
         fps: Frames per second.
         progress: True to show a progress bar, which needs tqdm, where stderr is a terminal.
         night: True to darken the scene, which makes the lights stand out.
-        view: Settings of ``crazysim.media.View`` that replace the defaults of ``view_of``.
+        view: Settings of ``crazysim.media.View`` that replace the defaults of ``create_view``.
 
     Raises:
         ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
@@ -63,7 +63,7 @@ def film(
     """
     if check_flag("night", night):
         darken(flight.sim)
-    with Film(path, view_of(flight, **view), fps=fps, progress=progress) as recording:
+    with Film(path, create_view(flight, **view), fps=fps, progress=progress) as recording:
         return recording.play(flight.sim, media_flight(flight))
 
 
@@ -73,24 +73,24 @@ def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
     Args:
         flight: Flight.
         speed: Seconds of the show per second.
-        view: Settings of ``crazysim.media.View`` that replace the defaults of ``view_of``.
+        view: Settings of ``crazysim.media.View`` that replace the defaults of ``create_view``.
 
     Raises:
         RenderError: If there is no screen.
     """
     if not np.isfinite(speed) or speed <= 0:
         raise ConfigError(f"expected a positive speed, got {speed!r}")
-    sim, recorded, camera = flight.sim, media_flight(flight), view_of(flight, **view)
+    sim, recorded, camera = flight.sim, media_flight(flight), create_view(flight, **view)
     data = sim.data
     try:
         show_flight_at(sim, recorded, 0.0)
         camera.show(sim)
         start = time.perf_counter()  # opening the window can take longer than a short show
         while sim.viewer.has_window and (now := speed * (time.perf_counter() - start)) < flight.duration:
-            shown = time.perf_counter()
+            shown_time = time.perf_counter()
             show_flight_at(sim, recorded, now)
             camera.show(sim)
-            time.sleep(max(shown + 1 / MAX_FPS - time.perf_counter(), 0.0))
+            time.sleep(max(shown_time + 1 / MAX_FPS - time.perf_counter(), 0.0))
     finally:
         sim.data = data
 
@@ -110,7 +110,7 @@ def media_flight(flight: ShowFlight) -> Flight:
     return flight_of(flight.sim, states, float(flight.times[1] - flight.times[0]))
 
 
-def view_of(flight: ShowFlight, **settings: Any) -> View:
+def create_view(flight: ShowFlight, **settings: Any) -> View:
     """Return a view of the whole show with lights, time, and marks of collisions.
 
     Args:
@@ -120,12 +120,12 @@ def view_of(flight: ShowFlight, **settings: Any) -> View:
     camera = camera_around(flight.planned)
     size = camera["distance"] / CAMERA_DISTANCE
     marks = collisions(flight)
-    lit = _led_materials(flight.sim)
+    led_materials = _led_materials(flight.sim)
 
     def draw(sim: Sim, world: int) -> None:
         now = float(sim.time[world, 0])
         k = int(np.argmin(np.abs(flight.times - now)))
-        color_leds(sim, lit, flight.colors[k])
+        color_leds(sim, led_materials, flight.colors[k])
         glow = np.concatenate([flight.colors[k], np.full((flight.show.n_drones, 1), 0.6)], axis=1)
         pos = np.asarray(sim.data.states.pos[world], float)
         sim.overlays.points(pos, glow, max(GLOW_RADIUS_SHARE * size, MIN_GLOW_RADIUS), emission=1.0)

@@ -23,8 +23,8 @@ def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> lis
             for none.
         only: Names of sections.
     """
-    if unknown := [name for name in only if name not in NAMES]:
-        raise ConfigError(f"expected sections of {', '.join(NAMES)}, got {unknown[0]!r}")
+    if unknown_names := [name for name in only if name not in NAMES]:
+        raise ConfigError(f"expected sections of {', '.join(NAMES)}, got {unknown_names[0]!r}")
     folder = None if data is None else Path(data)
     if folder is not None and not folder.is_dir():
         raise ConfigError(

@@ -72,7 +72,7 @@ def quat_from_rotvec(vector: NDArray) -> Array:
     return jnp.asarray([*(vector / angle * math.sin(angle / 2)), math.cos(angle / 2)])
 
 
-def state_of(sim: Sim) -> dict[str, NDArray]:
+def read_state(sim: Sim) -> dict[str, NDArray]:
     """Return the states of the first drone of the first world."""
     s = sim.data.states
     return {k: np.asarray(getattr(s, k))[0, 0] for k in ("pos", "vel", "quat", "ang_vel", "rotor_vel")}
@@ -99,7 +99,7 @@ def free_fall_error(integrator: str) -> float:
         "rk4": 0.0,
     }[integrator]
     expected = np.array([1.0, -2.0, 103.0 - 0.5 * GRAVITY_MAGNITUDE * t**2 + scheme_term])
-    return float(np.linalg.norm(state_of(sim)["pos"] - expected))
+    return float(np.linalg.norm(read_state(sim)["pos"] - expected))
 
 
 def free_fall() -> Iterable[Row]:
@@ -120,12 +120,12 @@ def precession() -> Iterable[Row]:
     with jax.enable_x64(True):
         sim = free_body("rk4", 500, w, np.diag([a, a, c]))
         sim.step(250)
-        quat = state_of(sim)["quat"]
-        exact = rotation.multiply(
+        quat = read_state(sim)["quat"]
+        exact_quat = rotation.multiply(
             quat_from_rotvec(np.array([a, a, c]) * w / a * t),
             quat_from_rotvec(np.array([0, 0, w[2] * (1 - c / a) * t])),
         )
-        angle = angle_between(exact, quat)
+        angle = angle_between(exact_quat, quat)
     # One step turns by 0.019 rad. The bound is ten times 250 * 0.019^5 / 120, which is the error for a linear system,
     # because Euler's equations are not linear.
     yield Row("precession of a top at 9.4 rad/s, 0.5 s, RK4: attitude", "closed form", angle, "rad", (0, 5e-8))
@@ -141,7 +141,7 @@ def terminal_velocity() -> Iterable[Row]:
         sim.data = with_states(sim.data, pos=[0, 0, 2000.0], rotor_vel=np.zeros(4))
         sim.rotor_vel_control(np.zeros((1, 1, 4)))
         sim.step(20_000)
-        speed = -state_of(sim)["vel"][2]
+        speed = -read_state(sim)["vel"][2]
     rate = GRAVITY_MAGNITUDE / terminal_speed
     # bound: what remains of the transient after 40 s, twice to allow for rounding
     bound = (0, 2 * math.exp(-40 * rate))
@@ -162,7 +162,7 @@ def motor_step() -> Iterable[Row]:
         sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=np.full(4, low))
         sim.rotor_vel_control(np.full((1, 1, 4), high))
         sim.step(25)
-        speed = state_of(sim)["rotor_vel"][0]
+        speed = read_state(sim)["rotor_vel"][0]
     # with e = c - r: e' = -e (a + 2 b c - b e), Bernoulli's equation
     rate, initial_error = a + 2 * b * high, high - low
     e = rate / (b + (rate / initial_error - b) * math.exp(rate * t))
@@ -218,7 +218,7 @@ def dzhanibekov() -> Iterable[Row]:
     with jax.enable_x64(True):
         sim = free_body("rk4", 500, ang_vel)
         sim.step(500)
-        growth = math.log(abs(state_of(sim)["ang_vel"][0]) / wobble) / t
+        growth = math.log(abs(read_state(sim)["ang_vel"][0]) / wobble) / t
     # per step of 2 ms the wobble grows by exp(0.0089), which RK4 matches up to 0.0089^5 / 120: 500 times that over 4.5
     yield Row("Dzhanibekov effect: growth rate", f"{rate:.4f} 1/s", abs(growth / rate - 1), "", (0, 1e-8))
 
@@ -239,7 +239,7 @@ def order_errors() -> dict[str, NDArray]:
         drag = np.diag([-0.02, -0.05, -0.2])
         sim.data = sim.data.replace(params=sim.data.params.replace(drag_matrix=drag))
         sim.step(freq // 2)
-        state = state_of(sim)
+        state = read_state(sim)
         return state["pos"], state["quat"]
 
     with jax.enable_x64(True):

@@ -46,8 +46,8 @@ class Flight:
     def compared_samples(self) -> slice:
         """Samples that are compared."""
         height = self.setpoint[:, 2]
-        up = np.flatnonzero(height > AIRBORNE_SHARE * np.median(height[height > 0.5 * height.max()]))
-        return slice(up[0] + round(SETTLING_TIME * FREQ), up[-1] - round(LANDING_TIME * FREQ))
+        airborne = np.flatnonzero(height > AIRBORNE_SHARE * np.median(height[height > 0.5 * height.max()]))
+        return slice(airborne[0] + round(SETTLING_TIME * FREQ), airborne[-1] - round(LANDING_TIME * FREQ))
 
     def rmse(self, pos: NDArray) -> float:
         """Return the root mean square distance of positions, (n, 3), from the setpoint, m."""
@@ -70,9 +70,9 @@ class Comparison:
 
     name: str
     """Name of the log."""
-    logged: float
+    logged_error: float
     """Root mean square distance from the setpoint in the log, m."""
-    simulated: float
+    simulated_error: float
     """The same in the simulation, m."""
     logged_lag: float
     """Lag behind the setpoint in the log, s."""
@@ -84,7 +84,7 @@ class Comparison:
     @property
     def ratio(self) -> float:
         """Simulated error over the logged one."""
-        return self.simulated / self.logged
+        return self.simulated_error / self.logged_error
 
 
 def read_flight(path: str | Path) -> Flight:
@@ -94,18 +94,18 @@ def read_flight(path: str | Path) -> Flight:
         ConfigError: If a column is missing, or there is no setpoint.
     """
     path = Path(path)
-    columns = columns_of(path, COLUMNS)
-    t, logged, setpoints = columns[0], columns[1:4], columns[4:]
-    height_at_rest, commanded = logged[2, 0], commanded_samples(path.name, setpoints[2])
+    columns = read_columns(path, COLUMNS)
+    t, logged_pos, setpoints = columns[0], columns[1:4], columns[4:]
+    height_at_rest, commanded = logged_pos[2, 0], commanded_samples(path.name, setpoints[2])
     grid = np.arange(float(t[commanded[0]]), float(t[commanded[-1]]), 1 / FREQ)
-    pos = np.stack([np.interp(grid, t, x) for x in logged], axis=-1)
-    nearest = np.searchsorted((t[1:] + t[:-1]) / 2, grid)
-    setpoint = setpoints[:, nearest].T * [1, 1, 1, np.pi / 180]
+    pos = np.stack([np.interp(grid, t, x) for x in logged_pos], axis=-1)
+    nearest_index = np.searchsorted((t[1:] + t[:-1]) / 2, grid)
+    setpoint = setpoints[:, nearest_index].T * [1, 1, 1, np.pi / 180]
     pos[:, 2], setpoint[:, 2] = pos[:, 2] - height_at_rest, setpoint[:, 2] - height_at_rest
     return Flight(path.stem, setpoint, pos)
 
 
-def columns_of(path: Path, names: Sequence[str]) -> NDArray:
+def read_columns(path: Path, names: Sequence[str]) -> NDArray:
     """Return columns of a log of NanoBench. (len(names), n)"""
     _, table = read_table(path, [], None)
     if missing := [name for name in names if name not in table]:

@@ -54,7 +54,7 @@ def crazysim_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParam
     Steering angle and acceleration follow the commands within CommonRoad's limits.
     """
     x, p = jnp.asarray(state), params
-    limited = commonroad_rates(state, command, params)
+    limited_rates = commonroad_rates(state, command, params)
     zero, speed, slip = jnp.zeros(1), x[3:4], x[6:7]
     loads = p.mass * GRAVITY_MAGNITUDE * p.arms[..., ::-1] / jnp.sum(p.arms)
     car = CarParams(
@@ -65,10 +65,10 @@ def crazysim_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParam
         slip_speed=jnp.full(1, SLIP_SPEED), trailer=None,
     )  # fmt: skip
     vel = speed * jnp.concatenate([jnp.cos(slip), jnp.sin(slip)])
-    rates = single_track(CarState(jnp.zeros(3), x[4:5], vel, x[5:6], x[2:3], zero), limited[3:4], car)
+    rates = single_track(CarState(jnp.zeros(3), x[4:5], vel, x[5:6], x[2:3], zero), limited_rates[3:4], car)
     acc, slip_rate = rates.body_vel, (vel[:1] * rates.body_vel[1:] - vel[1:] * rates.body_vel[:1]) / speed**2
-    along = (vel @ acc)[None] / speed
-    return jnp.concatenate([rates.pos[:2], limited[2:3], along, rates.yaw, rates.yaw_rate, slip_rate])
+    tangential_acc = (vel @ acc)[None] / speed
+    return jnp.concatenate([rates.pos[:2], limited_rates[2:3], tangential_acc, rates.yaw, rates.yaw_rate, slip_rate])
 
 
 def lane_change(t: float, rate: float) -> list[float]:

@@ -68,10 +68,10 @@ def pwm_differences(name: str, whole_numbers: bool = False) -> NDArray:
 def compare_controllers() -> Iterable[Row]:
     """Yield the largest differences of the motors from the compiled firmware's."""
     for name, (controller, mode, drone) in CASES.items():
-        flown = f"`{drone}`" if isinstance(drone, str) else "`cf2x_L250` with derivative gains"
+        airframe_text = f"`{drone}`" if isinstance(drone, str) else "`cf2x_L250` with derivative gains"
         for whole_numbers, bound in ((False, MAX_TRUNCATION + MAX_ROUNDING), (True, 1.0 + MAX_ROUNDING)):
             arithmetic = "integers as the firmware" if whole_numbers else "real numbers"
-            quantity = f"{type(controller).__name__} on {mode} commands, {flown}, {arithmetic}: motors"
+            quantity = f"{type(controller).__name__} on {mode} commands, {airframe_text}, {arithmetic}: motors"
             yield Row(
                 quantity, "compiled C, 240 ticks", float(pwm_differences(name, whole_numbers).max()), "PWM", (0, bound)
             )

@@ -28,7 +28,9 @@ DIODE_OFFSET = np.array([0.015, 0.0075, 0.0], np.float32)
 PROCESS_VARIANCE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4], np.float32))
 
 
-def update_with_measurements(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, stations: Any) -> Any:
+def update_with_measurements(
+    kind: str, k: Any, measurement: Any, gyro: Array, estimate: Any, rot: Array, stations: Any
+) -> Any:
     """Return the estimate after the measurements of one loop of the Kalman filter.
 
     The loops in which measurements are used, and their deviations, are as in
@@ -37,34 +39,38 @@ def update_with_measurements(kind: str, k: Any, m: Any, gyro: Array, estimate: A
     Args:
         kind: One of ``MEASUREMENT_KINDS``.
         k: Number of the loop, from 1. ()
-        m: Measurements of the loop. (9,)
+        measurement: Measurements of the loop. (9,)
         gyro: Angular velocity, body frame, rad/s. (3,)
         estimate: The estimate before.
         rot: Attitude at the end of the previous loop, as a matrix. (3, 3)
         stations: Positions, m, (2, 3), and attitudes, station to world, (2, 3, 3), of the two Lighthouse stations.
     """
     if kind in ("position", "ground"):
-        return error_state.select_estimate(k % 10 == 5, updates.update_pos(estimate, m[:3], 0.01), estimate)
+        return error_state.select_estimate(k % 10 == 5, updates.update_pos(estimate, measurement[:3], 0.01), estimate)
     if kind == "pose":
-        updated = updates.update_quat(updates.update_pos(estimate, m[:3], 0.01), m[3:7], 0.05)
+        updated = updates.update_quat(updates.update_pos(estimate, measurement[:3], 0.01), measurement[3:7], 0.05)
         return error_state.select_estimate(k % 10 == 0, updated, estimate)
     if kind in ("flow", "range"):
-        updated = updates.update_flow(estimate, rot, 0.1 * m[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
+        updated = updates.update_flow(estimate, rot, 0.1 * measurement[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
         estimate = error_state.select_estimate(k % 10 == 0, updated, estimate)
         has_range = (k % 25 == 10) & (kind == "range")
-        return error_state.select_estimate(has_range, updates.update_range(estimate, rot, m[2], 0.02), estimate)
+        return error_state.select_estimate(
+            has_range, updates.update_range(estimate, rot, measurement[2], 0.02), estimate
+        )
     if kind == "sweep":
-        estimate = error_state.select_estimate(k == 2, updates.update_pos(estimate, m[:3], 0.01), estimate)
+        estimate = error_state.select_estimate(k == 2, updates.update_pos(estimate, measurement[:3], 0.01), estimate)
         station = stations[0][k // 8 % 2], stations[1][k // 8 % 2]
         for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
-            updated = updates.update_sweep(estimate, rot, jnp.asarray(DIODE_OFFSET), station, tilt, m[0], 0.001)
+            updated = updates.update_sweep(
+                estimate, rot, jnp.asarray(DIODE_OFFSET), station, tilt, measurement[0], 0.001
+            )
             estimate = error_state.select_estimate(k % 8 == first, updated, estimate)
         return estimate
     anchors, a = jnp.asarray(ANCHORS), k // 5 % 4
     if kind == "distance":
-        updated = updates.update_distance(estimate, anchors[a], m[0], 0.25)
+        updated = updates.update_distance(estimate, anchors[a], measurement[0], 0.25)
     else:
-        updated = updates.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], m[0], 0.15)
+        updated = updates.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], measurement[0], 0.15)
     return error_state.select_estimate(k % 5 == 0, updated, estimate)
 
 
@@ -85,13 +91,15 @@ def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
         stations = jnp.asarray(file["sweep/places"]), jnp.asarray(file["sweep/frames"])
 
     def loop(carry: Any, x: Any) -> tuple[Any, Array]:
-        (estimate, rot), (k, inert, m) = carry, x
-        accel, gyro = inert[:3], inert[3:]
+        (estimate, rot), (loop_index, inertial_row, measurement) = carry, x
+        accel, gyro = inertial_row[:3], inertial_row[3:]
         predicted = error_state.predict(estimate, accel, gyro, 0.01, level if kind == "ground" else None)
         estimate = error_state.add_noise(
-            error_state.select_estimate(k % 10 == 0, predicted, estimate), jnp.asarray(PROCESS_VARIANCE)
+            error_state.select_estimate(loop_index % 10 == 0, predicted, estimate), jnp.asarray(PROCESS_VARIANCE)
         )
-        estimate = error_state.finalize(update_with_measurements(kind, k, m, gyro, estimate, rot, stations))
+        estimate = error_state.finalize(
+            update_with_measurements(kind, loop_index, measurement, gyro, estimate, rot, stations)
+        )
         state = estimate.pos, estimate.vel, estimate.att_error, jnp.roll(estimate.quat, 1), estimate.cov
         return (estimate, rotation.matrix(estimate.quat)), jnp.concatenate(state)
 
@@ -116,19 +124,22 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
         inputs, recorded = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"]
 
     def tick(carry: Any, x: Any) -> tuple[Any, Array]:
-        (quat, integral, climb, height, rate, over), (k, row) = carry, x
+        (quat, integral, climb, height, climb_rate, over_surface), (k, row) = carry, x
         gyro, accel = jnp.radians(row[:3]), GRAVITY_MAGNITUDE * row[3:6]
-        turned = law.update_mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
-        turned = *turned, law.inertial_climb(climb, turned[0], accel, 0.004)
-        quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(turned, carry[:3], strict=True))
+        attitude_update = law.update_mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
+        attitude_update = *attitude_update, law.inertial_climb(climb, attitude_update[0], accel, 0.004)
+        quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(attitude_update, carry[:3], strict=True))
         shift = 0.01 * climb
         by_pressure = law.filtered_height(height, row[6:7], shift)
-        useful = row[8:] <= 1000 * law.MAX_RANGE_AGE
-        risen, above = law.height_over_surface(height, by_pressure, row[7:8], useful, over, shift)
-        rises = k % 10 == 0
-        rate, over = jnp.where(rises, (risen - height) / 0.01, rate), jnp.where(rises, above, over)
-        height = jnp.where(rises, risen, height)
-        return (quat, integral, climb, height, rate, over), jnp.concatenate([quat, height, rate])
+        is_useful = row[8:] <= 1000 * law.MAX_RANGE_AGE
+        new_height, new_over = law.height_over_surface(height, by_pressure, row[7:8], is_useful, over_surface, shift)
+        is_height_tick = k % 10 == 0
+        climb_rate, over_surface = (
+            jnp.where(is_height_tick, (new_height - height) / 0.01, climb_rate),
+            jnp.where(is_height_tick, new_over, over_surface),
+        )
+        height = jnp.where(is_height_tick, new_height, height)
+        return (quat, integral, climb, height, climb_rate, over_surface), jnp.concatenate([quat, height, climb_rate])
 
     zero = jnp.zeros(1)
     start = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3), zero, inputs[0, 6:7], zero, zero

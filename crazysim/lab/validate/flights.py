@@ -69,7 +69,7 @@ def closed_loop(folder: Path) -> Iterable[Row]:
     """Yield the ratio of simulated to logged tracking error of each flight."""
     paths = [path for name in ("circle", "figure8", "trefoil") for path in find_logs(folder, f"*{name}*")]
     for row in compare_tracking([read_flight(path) for path in paths], estimator=laboratory_estimator()):
-        remark = f"real {row.logged:.3f} m, simulated {row.simulated:.3f} m"
+        remark = f"real {row.logged_error:.3f} m, simulated {row.simulated_error:.3f} m"
         if row.failed:
             yield Row(f"{row.name} (the real drone crashed)", "its log", row.ratio, remark=remark)
             continue

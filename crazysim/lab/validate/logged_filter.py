@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from crazysim import rotation
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
-from crazysim.lab.validate.closed_loop import MAX_DISTANCE, columns_of, commanded_samples
+from crazysim.lab.validate.closed_loop import MAX_DISTANCE, commanded_samples, read_columns
 from crazysim.lab.validate.flights import find_logs
 from crazysim.lab.validate.rows import Row
 from crazysim.plugins.estimators import error_state, updates
@@ -47,8 +47,8 @@ def read_filter_log(path: Path) -> dict[str, NDArray]:
         "est_quat": [f"att_stateEstimate_q{k}" for k in "xyzw"],
         "goal": [f"sp_ctrltarget_{k}" for k in "xyz"],
     }
-    flat = [name for columns in names.values() for name in columns]
-    table = dict(zip(flat, columns_of(path, flat).astype(np.float32), strict=True))
+    column_names = [name for columns in names.values() for name in columns]
+    table = dict(zip(column_names, read_columns(path, column_names).astype(np.float32), strict=True))
     log = {key: np.stack([table[name] for name in columns], axis=-1) for key, columns in names.items()}
     commanded = commanded_samples(path.name, log["goal"][:, 2])
     log = {k: x[commanded[0] : commanded[-1]] for k, x in log.items()}
@@ -123,8 +123,8 @@ def compare_filter(folder: Path) -> Iterable[Row]:
         if np.max(np.linalg.norm(log["pos"] - log["goal"], axis=-1)) > MAX_DISTANCE:
             continue
         size = len(log["pos"])  # all logs are padded to one length, so that the filter compiles once
-        padded = (log[k][np.minimum(np.arange(n), size - 1)] for k in ("accel", "gyro", "pos", "quat"))
-        ours = estimate_errors(log, *(np.asarray(x)[:size] for x in replay_filter(*padded)))
+        padded_columns = (log[k][np.minimum(np.arange(n), size - 1)] for k in ("accel", "gyro", "pos", "quat"))
+        ours = estimate_errors(log, *(np.asarray(x)[:size] for x in replay_filter(*padded_columns)))
         board = estimate_errors(log, log["est_pos"], log["est_quat"])
         for quantity, unit, our_error, board_error in zip(
             ("position", "attitude"), ("m", "degrees"), ours, board, strict=True

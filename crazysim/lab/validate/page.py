@@ -44,7 +44,7 @@ sim*:
 A figure passes if it is within the range in its row; rows without a range only report.
 """
 """Introduction at the top of the page, in which ``packages`` is filled in."""
-COLUMNS: Mapping[str, Callable[[Row], str]] = {
+TABLE_COLUMNS: Mapping[str, Callable[[Row], str]] = {
     "Quantity": lambda row: row.quantity,
     "Reference": lambda row: row.reference,
     "Figure": lambda row: f"**{row.text}**" if row.failed else row.text,
@@ -63,19 +63,23 @@ def format_page(sections: Sequence[Section], rows: Sequence[Row], provenance: st
         provenance: Sentence with the date, commit, machine and versions with which the rows were measured.
         pictures: Paths of pictures, relative to the page, by the name of their section.
     """
-    bounded = [row for row in rows if row.bound is not None or row.problem]
-    failed = [row for row in bounded if row.failed]
-    summary = f" {len(bounded) - len(failed)} of {len(bounded)} figures with a range are within it." if bounded else ""
-    if failed:
-        summary += " Outside: " + "; ".join(row.quantity for row in failed) + "."
+    bounded_rows = [row for row in rows if row.bound is not None or row.problem]
+    failed_rows = [row for row in bounded_rows if row.failed]
+    summary = (
+        f" {len(bounded_rows) - len(failed_rows)} of {len(bounded_rows)} figures with a range are within it."
+        if bounded_rows
+        else ""
+    )
+    if failed_rows:
+        summary += " Outside: " + "; ".join(row.quantity for row in failed_rows) + "."
     packages = dict.fromkeys(
         name for section in sections for name in (*section.packages.values(), *section.peers.values())
     )
     parts = [INTRODUCTION.format(packages=f'".[demo]" {shlex.join(packages)}'.rstrip()).strip(), provenance + summary]
     for section in sections:
         command = f"`crazysim validate --only {section.name}{' --data FOLDER' * section.needs_logs}`"
-        if needed := [*section.packages.values(), *section.peers.values()]:
-            command = f"`pip install {shlex.join(needed)}` and {command}"
+        if package_names := [*section.packages.values(), *section.peers.values()]:
+            command = f"`pip install {shlex.join(package_names)}` and {command}"
         parts += [f"## {section.title}", section.text, f"Repeat: {command}."]
         if section.problem:
             parts.append(f"Not measured: {section.problem}.")
@@ -83,7 +87,7 @@ def format_page(sections: Sequence[Section], rows: Sequence[Row], provenance: st
         if section.name in pictures:
             parts.append(f"![{section.axes[1]}]({pictures[section.name]})")
         section_rows = [row for row in rows if row.section == section.name]
-        cells = {name: [cell(row) for row in section_rows] for name, cell in COLUMNS.items()}
+        cells = {name: [cell(row) for row in section_rows] for name, cell in TABLE_COLUMNS.items()}
         cells = {name: column for name, column in cells.items() if any(column)}
         lines = [list(cells), ["---"] * len(cells), *zip(*cells.values(), strict=True)]
         parts.append("\n".join(f"| {' | '.join(line)} |".replace("  ", " ") for line in lines))

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.lab.validate.closed_forms import TUMBLE_ANG_VEL, free_body, state_of, with_states
+from crazysim.lab.validate.closed_forms import TUMBLE_ANG_VEL, free_body, read_state, with_states
 from crazysim.lab.validate.rows import Row
 
 
@@ -36,7 +36,7 @@ def mujoco_differences() -> dict[str, float]:
         sim = free_body("rk4", 1000, TUMBLE_ANG_VEL)
         sim.data = with_states(sim.data, force=force, torque=torque)
         sim.step(500)
-        s = state_of(sim)
+        s = read_state(sim)
     quat = np.roll(s["quat"], 1)
     ours = {"pos": s["pos"], "vel": s["vel"], "quat": quat * np.sign(quat @ data.qpos[3:]), "ang_vel": s["ang_vel"]}
     reference = {"pos": data.qpos[:3], "vel": data.qvel[:3], "quat": data.qpos[3:], "ang_vel": data.qvel[3:]}
@@ -62,8 +62,8 @@ def compare_with_crazyflow() -> Iterable[Row]:
     commands = {"attitude": np.asarray([[[0.1, -0.15, 0.2, 1.02 * weight]]], np.float32), "state": state}
     for level, command in commands.items():
         ends = []
-        for package, extra in (("crazysim", {"controller": "crazyflow"}), ("crazyflow", {})):
-            sim: Any = importlib.import_module(f"{package}.sim").Sim(n_worlds=1, control=level, freq=500, **extra)
+        for package, settings in (("crazysim", {"controller": "crazyflow"}), ("crazyflow", {})):
+            sim: Any = importlib.import_module(f"{package}.sim").Sim(n_worlds=1, control=level, freq=500, **settings)
             sim.data = with_states(sim.data, pos=[0, 0, 5.0])
             getattr(sim, f"{level}_control")(command)
             sim.step(1000)

@@ -136,8 +136,8 @@ def compare_airframes() -> Iterable[Row]:
         for period in PERIODS:
             sim = Sim(N_STARTS * len(DELAYS), drone=drone, control="rotor_vel", integrator="rk4")
             delay = np.repeat(np.array(DELAYS) // STEP_MS, N_STARTS)[:, None]
-            held = hold_in_simulation(sim, max_rotor_vel, np.zeros((sim.n_worlds, 4)), delay, period)
-            shares = 100 * np.mean(held.reshape(-1, N_STARTS), axis=-1)
+            is_held = hold_in_simulation(sim, max_rotor_vel, np.zeros((sim.n_worlds, 4)), delay, period)
+            shares = 100 * np.mean(is_held.reshape(-1, N_STARTS), axis=-1)
             n_delays_held = int(np.argmin(np.append(shares == 100, False)))
             share_list = ", ".join(f"{share:.0f}" for share in shares)
             yield Row(f"`{drone}`, called every {period} ms: longest latency with all drones held",
@@ -244,7 +244,7 @@ def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
         drone.position, drone.orientation, drone.rpm = start[i].tolist(), [1, 0, 0, 0], ((q.hover[i] + 1) / 2).tolist()
         drone.linear_velocity = drone.angular_velocity = [0, 0, 0]
     observed = np.zeros((n, world.OBSERVATION_DIM), np.float32)
-    sent = [q.hover] * delay
+    actions = [q.hover] * delay
 
     def observe() -> np.ndarray:
         batch.observe(device, world, parameters, state, observed, rng)
@@ -252,8 +252,8 @@ def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
 
     def apply_action(action: np.ndarray) -> None:
         for _ in range(period // STEP_MS):
-            sent.append(action)
-            batch.step(device, world, parameters, state, sent.pop(0).astype(np.float32), next_state, rng)
+            actions.append(action)
+            batch.step(device, world, parameters, state, actions.pop(0).astype(np.float32), next_state, rng)
             state.assign(next_state)
 
     return hold_goal(RaptorPolicy(period, q.hover), period, observe, apply_action)

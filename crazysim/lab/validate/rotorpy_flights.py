@@ -15,7 +15,7 @@ from crazysim.core.plugin import Plugin
 from crazysim.core.stage import stage
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
-from crazysim.lab.validate.closed_forms import angle_between, state_of, with_states
+from crazysim.lab.validate.closed_forms import angle_between, read_state, with_states
 from crazysim.lab.validate.rows import Row
 from crazysim.plugins.effects import RotorAerodynamics, Wind
 from crazysim.sim.sim import Sim
@@ -92,7 +92,7 @@ def crazysim_flight(
     for command in commands:
         sim.rotor_vel_control(command[None, None] / RPM_TO_RAD_S)
         sim.step(round(PERIOD * FREQ))
-        states.append(state_of(sim))
+        states.append(read_state(sim))
     return states
 
 
@@ -138,14 +138,16 @@ def wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArra
     speeds = hover_speed(params) * rng.uniform(0.9, 1.1, (n, 4))
     sim = simulation(params, n)
     plugin = sim.add(rotor_aerodynamics(params))
-    moving = with_states(sim.data, vel=vel[:, None], ang_vel=rate[:, None], rotor_vel=speeds[:, None] / RPM_TO_RAD_S)
-    s = stage("drone")(plugin.influence)(moving).states
+    moving_data = with_states(
+        sim.data, vel=vel[:, None], ang_vel=rate[:, None], rotor_vel=speeds[:, None] / RPM_TO_RAD_S
+    )
+    s = stage("drone")(plugin.influence)(moving_data).states
     drag = vel @ np.asarray(sim.data.params.drag_matrix).reshape(3, 3)
     ours = np.concatenate([np.asarray(s.force)[:, 0] + drag, np.asarray(s.torque)[:, 0]], axis=-1)
     multirotor = importlib.import_module("rotorpy.vehicles.multirotor").Multirotor
-    with_air, without = multirotor(params), multirotor(params, aero=False)
+    rotorpy, rotorpy_without_drag = multirotor(params), multirotor(params, aero=False)
     theirs = [
-        np.concatenate(with_air.compute_body_wrench(*x)) - np.concatenate(without.compute_body_wrench(*x))
+        np.concatenate(rotorpy.compute_body_wrench(*x)) - np.concatenate(rotorpy_without_drag.compute_body_wrench(*x))
         for x in zip(rate, speeds, vel, strict=True)
     ]
     return ours, np.stack(theirs)

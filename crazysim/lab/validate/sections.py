@@ -139,7 +139,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             (raptor.compare_training_airframes,), packages=RAPTOR | {"l2f": "l2f==2.0.18"},
         ),
         Section(
-            "sim2sim", "Sim to sim", sim_to_sim.TEXT, sim_to_sim.checks(data),
+            "sim2sim", "Sim to sim", sim_to_sim.SECTION_TEXT, sim_to_sim.checks(data),
             packages={"onnx": "onnx", "onnxruntime": "onnxruntime", "optax": "optax"}, peers=sim_to_sim.PEERS,
         ),
     )  # fmt: skip

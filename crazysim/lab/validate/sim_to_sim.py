@@ -26,9 +26,9 @@ from crazysim.envs.registry import make
 from crazysim.envs.state import flatten
 from crazysim.errors import ConfigError
 from crazysim.lab.validate.rows import Row
-from crazysim.lab.validate.simulators import PERIOD, SIMULATORS, Simulator, States
+from crazysim.lab.validate.simulators import COMMAND_PERIOD, SIMULATORS, Simulator, States
 
-STARTS = 200
+N_STARTS = 200
 """Number of starts of each policy in each simulator."""
 POLICIES = {
     f"{task}{'_crazyflie' * randomized}": (task, {"randomize": "crazyflie"} if randomized else {})
@@ -42,10 +42,10 @@ PEERS = {
     "gym_pybullet_drones": "gym-pybullet-drones@git+https://github.com/learnsyslab/gym-pybullet-drones@90b178a",
 }
 """Modules of simulators that may be missing, with the requirement for pip of each."""
-TEXT = f"""
+SECTION_TEXT = f"""
 Policies of `crazysim train`, with seed 0 and the recipes of their tasks, are exported and flown unchanged: the C
 header commands attitudes and thrust at 50 Hz, and the ONNX file gives the same actions on the same observations.
-The figure is the share of {STARTS} held-out starts from which the error stays below the tolerance of the task for
+The figure is the share of {N_STARTS} held-out starts from which the error stays below the tolerance of the task for
 its last second, 5 s for `track`. Observations, errors and ends of episodes are those of our task on the states of
 the other simulator.
 
@@ -104,7 +104,7 @@ class Result:
 
 
 @functools.cache
-def exported(name: str, folder: Path | None = None) -> Exported:
+def export_policy(name: str, folder: Path | None = None) -> Exported:
     """Return a policy of ``POLICIES``, trained with seed 0 on its recipe, and exported.
 
     Args:
@@ -125,11 +125,11 @@ def exported(name: str, folder: Path | None = None) -> Exported:
         policy, _, meta = load_policy(place)
         actions, n_obs = meta["actions"], sum(meta["observations"].values())
         centre, scale = (np.asarray(actions[key], float) for key in ("centre", "scale"))
-        c = compiled(to_c(policy, Path(temporary) / "policy.h", meta), n_obs, len(centre))
-        return Exported(c, _onnx(to_onnx(policy, Path(temporary) / "policy.onnx", meta)), centre, scale)
+        c = compile_header(to_c(policy, Path(temporary) / "policy.h", meta), n_obs, len(centre))
+        return Exported(c, _load_onnx(to_onnx(policy, Path(temporary) / "policy.onnx", meta)), centre, scale)
 
 
-def compiled(header: Path, n_obs: int, n_actions: int) -> Act:
+def compile_header(header: Path, n_obs: int, n_actions: int) -> Act:
     """Return the function of an exported C header, compiled next to it.
 
     Raises:
@@ -143,8 +143,8 @@ def compiled(header: Path, n_obs: int, n_actions: int) -> Act:
         f'extern "C" void act(int n, const float *obs, float *action) {{\n'
         f"    for (int i = 0; i < n; ++i) policy(obs + {n_obs} * i, action + {n_actions} * i);\n}}\n"
     )
-    words = [*compiler.split(), "-O2", "-shared", "-fPIC", str(source), "-o", str(library)]
-    subprocess.run(words, check=True, capture_output=True)
+    command = [*compiler.split(), "-O2", "-shared", "-fPIC", str(source), "-o", str(library)]
+    subprocess.run(command, check=True, capture_output=True)
     act: Any = ctypes.CDLL(str(library)).act
 
     def actions(obs: NDArray) -> NDArray:
@@ -155,13 +155,15 @@ def compiled(header: Path, n_obs: int, n_actions: int) -> Act:
     return actions
 
 
-def _onnx(path: Path) -> Act:
+def _load_onnx(path: Path) -> Act:
     runtime: Any = importlib.import_module("onnxruntime")
     session = runtime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
     return lambda obs: session.run(None, {"observation": obs})[0]
 
 
-def fly(task: str, command: Callable[[NDArray], NDArray], simulator: type[Simulator], starts: int = STARTS) -> Result:
+def fly_task(
+    task: str, command: Callable[[NDArray], NDArray], simulator: type[Simulator], starts: int = N_STARTS
+) -> Result:
     """Fly a task from its held-out starts in another simulator.
 
     The task provides starts, goals, observations, errors and ends of episodes. It reads the states of the other
@@ -175,7 +177,7 @@ def fly(task: str, command: Callable[[NDArray], NDArray], simulator: type[Simula
     """
     from crazysim.train.evaluation import EVALUATION_SEED
 
-    env = make(task, n_worlds=starts, freq=round(1 / PERIOD))
+    env = make(task, n_worlds=starts, freq=round(1 / COMMAND_PERIOD))
     data = env.reset(jax.random.key(EVALUATION_SEED)).data
 
     def assess(world: SimData) -> tuple[Array, Array, Array]:
@@ -186,23 +188,23 @@ def fly(task: str, command: Callable[[NDArray], NDArray], simulator: type[Simula
         name: np.asarray(getattr(data.states, name), np.float64)[:, 0] for name in ("pos", "quat", "vel", "ang_vel")
     }
     flights = simulator(states)
-    over, errors, observed = np.zeros(starts, bool), [], []
+    is_done, errors, observed = np.zeros(starts, bool), [], []
     for _ in range(env.max_steps):
         obs = np.asarray(assess_all(data)[0])[:, 0]
-        states = flights.fly(command(obs))
+        states = flights.fly_period(command(obs))
         fields = {name: x[:, None].astype(np.float32) for name, x in states.items()}
         core = data.core.replace(steps=data.core.steps + env.n_substeps)
         data = data.replace(states=data.states.replace(**fields), core=core)
         _, error, terminated = assess_all(data)
-        over |= np.asarray(terminated) | ~np.all([np.isfinite(x).all(axis=-1) for x in states.values()], axis=0)
+        is_done |= np.asarray(terminated) | ~np.all([np.isfinite(x).all(axis=-1) for x in states.values()], axis=0)
         errors.append(np.asarray(error)[:, 0])
         observed.append(obs)
-        if over.all():
+        if is_done.all():
             break
-    last = np.stack(errors[-round(env.task.hold / PERIOD) :])
-    settled, landed = np.all(last < env.task.tolerance, axis=0) & ~over, last[:, ~over]
+    last = np.stack(errors[-round(env.task.hold / COMMAND_PERIOD) :])
+    settled, landed = np.all(last < env.task.tolerance, axis=0) & ~is_done, last[:, ~is_done]
     mean = float(landed.mean()) if landed.size else float("nan")
-    return Result(float(settled.mean()), float(over.mean()), mean, np.stack(observed))
+    return Result(float(settled.mean()), float(is_done.mean()), mean, np.stack(observed))
 
 
 def checks(data: Path | None) -> Sequence[Callable[[], Iterable[Row]]]:
@@ -224,14 +226,14 @@ def compare(name: str, simulator: str, folder: Path | None = None) -> Iterable[R
     module = SIMULATORS[simulator].module
     if module and importlib.util.find_spec(module) is None:
         return
-    policy, (task, options) = exported(name, folder), POLICIES[name]
-    result = fly(task, policy.command, SIMULATORS[simulator])
-    what = f"`{task}`{', trained with `randomize=crazyflie`' * bool(options)}"
+    policy, (task, options) = export_policy(name, folder), POLICIES[name]
+    result = fly_task(task, policy.command, SIMULATORS[simulator])
+    quantity = f"`{task}`{', trained with `randomize=crazyflie`' * bool(options)}"
     remark = f"crashed {100 * result.crashed:.3g} %"
     remark = remark if np.isnan(result.error) else f"mean error {result.error:.2g} m, {remark}"
-    yield Row(f"{what}: success", simulator, 100 * result.success, "%", None, remark)
+    yield Row(f"{quantity}: success", simulator, 100 * result.success, "%", None, remark)
     if simulator == "crazysim":
         obs = result.observed.reshape(-1, result.observed.shape[-1])
         difference = float(np.abs(policy.c(obs) - policy.onnx(obs)).max())
         # actions are in [-1, 1], and sums of 64 products are rounded in another order
-        yield Row(f"{what}: actions of the C header", "ONNX file", difference, "", (0, 1e-5))
+        yield Row(f"{quantity}: actions of the C header", "ONNX file", difference, "", (0, 1e-5))

@@ -29,11 +29,11 @@ from crazysim.lab.validate.closed_forms import with_states
 from crazysim.sim.functional import attitude_control
 from crazysim.sim.sim import Sim
 
-DRONE = "cf21B_500"
+AIRFRAME = "cf21B_500"
 """Airframe of all simulators."""
-PERIOD = 0.02
+COMMAND_PERIOD = 0.02
 """Time between two commands, s."""
-STEP = 0.004
+CONTROL_PERIOD = 0.004
 """Period of the controller in simulators that do not use our controller, s."""
 
 States = dict[str, NDArray]
@@ -50,7 +50,7 @@ class Simulator(Protocol):
         """Put the drones at their starts, with rotors that turn as in hover."""
         ...
 
-    def fly(self, commands: NDArray) -> States:
+    def fly_period(self, commands: NDArray) -> States:
         """Return the states after one period under attitude commands: roll, pitch, yaw, rad, and thrust, N. (n, 4)"""
         ...
 
@@ -59,12 +59,12 @@ class Crazysim(Simulator):
     """crazysim itself, with its default controller."""
 
     def __init__(self, start: States) -> None:
-        self._sim = Sim(len(start["pos"]), drone=DRONE, control="attitude")
+        self._sim = Sim(len(start["pos"]), drone=AIRFRAME, control="attitude")
         self._sim.data = with_states(self._sim.data, **_rows(start), rotor_vel=_hover_speed(self._sim))
 
-    def fly(self, commands: NDArray) -> States:
+    def fly_period(self, commands: NDArray) -> States:
         self._sim.attitude_control(commands[:, None])
-        self._sim.step(round(PERIOD * self._sim.freq))
+        self._sim.step(round(COMMAND_PERIOD * self._sim.freq))
         return _states(self._sim.data)
 
 
@@ -75,13 +75,13 @@ class Crazyflow(Simulator):
 
     def __init__(self, start: States) -> None:
         package: Any = importlib.import_module("crazyflow.sim")
-        self._sim = package.Sim(n_worlds=len(start["pos"]), drone=DRONE, control="attitude", freq=500)
-        ours = Sim(drone=DRONE, control="attitude")
+        self._sim = package.Sim(n_worlds=len(start["pos"]), drone=AIRFRAME, control="attitude", freq=500)
+        ours = Sim(drone=AIRFRAME, control="attitude")
         self._sim.data = with_states(self._sim.data, **_rows(start), rotor_vel=_hover_speed(ours))
 
-    def fly(self, commands: NDArray) -> States:
+    def fly_period(self, commands: NDArray) -> States:
         self._sim.attitude_control(np.asarray(commands[:, None], np.float32))
-        self._sim.step(round(PERIOD * self._sim.freq))
+        self._sim.step(round(COMMAND_PERIOD * self._sim.freq))
         return _states(self._sim.data)
 
 
@@ -90,7 +90,7 @@ class AttitudeController:
 
     def __init__(self, n: int) -> None:
         """Create the controllers of ``n`` drones at rest."""
-        self._sim = Sim(n, drone=DRONE, control="attitude")
+        self._sim = Sim(n, drone=AIRFRAME, control="attitude")
         self._data, self.dt = self._sim.data, 1 / self._sim.freq
         params = self._data.params
         self._curve, speed = params.rpm2thrust, float(_hover_speed(self._sim)[0])
@@ -134,7 +134,7 @@ class Mujoco(Simulator):
 
     def __init__(self, start: States) -> None:
         self._controller = AttitudeController(len(start["pos"]))
-        model = _mjcf(load_airframe(DRONE), self._controller.lag, self._controller.dt)
+        model = _mjcf(load_airframe(AIRFRAME), self._controller.lag, self._controller.dt)
         self._model = mujoco.MjModel.from_xml_string(model)
         self._bodies = [mujoco.MjData(self._model) for _ in start["pos"]]
         for k, body in enumerate(self._bodies):
@@ -142,9 +142,9 @@ class Mujoco(Simulator):
             body.qvel[:3], body.qvel[3:] = start["vel"][k], start["ang_vel"][k]
             body.act[:] = self._controller.hover
 
-    def fly(self, commands: NDArray) -> States:
+    def fly_period(self, commands: NDArray) -> States:
         self._controller.command(commands)
-        for _ in range(round(PERIOD / self._controller.dt)):
+        for _ in range(round(COMMAND_PERIOD / self._controller.dt)):
             thrusts = self._controller.thrusts(self._states(), np.stack([body.act for body in self._bodies]))
             for body, thrust in zip(self._bodies, thrusts, strict=True):
                 body.ctrl[:] = thrust
@@ -169,21 +169,21 @@ class RotorPy(Simulator):
         module: Any = importlib.import_module("rotorpy.vehicles.multirotor")
         self._torch.set_num_threads(1)  # synchronising threads would take longer than the work on arrays of this size
         n, device = len(start["pos"]), self._torch.device("cpu")
-        params = rotorpy_params(load_airframe(DRONE))
+        params = rotorpy_params(load_airframe(AIRFRAME))
         hover = np.sqrt(params["mass"] * GRAVITY_MAGNITUDE / (4 * params["k_eta"]))
         state = {"x": start["pos"], "v": start["vel"], "q": start["quat"], "w": start["ang_vel"],
                  "wind": np.zeros((n, 3)), "rotor_speeds": np.full((n, 4), hover)}  # fmt: skip
         self._state = {name: self._tensor(x) for name, x in state.items()}
-        shared = module.BatchedMultirotorParams([params] * n, n, device)
-        self._drones = module.BatchedMultirotor(shared, n, self._state, device, self.level, integrator="rk4")
+        batch_params = module.BatchedMultirotorParams([params] * n, n, device)
+        self._drones = module.BatchedMultirotor(batch_params, n, self._state, device, self.level, integrator="rk4")
         self._k_eta = params["k_eta"]
-        self._all = self._torch.arange(n)
+        self._indices = self._torch.arange(n)
 
-    def fly(self, commands: NDArray) -> States:
+    def fly_period(self, commands: NDArray) -> States:
         quat = np.asarray(rotation.from_rpy(jnp.asarray(commands[:, :3])))
         control = {"cmd_thrust": self._tensor(commands[:, 3:]), "cmd_q": self._tensor(quat)}
-        for _ in range(round(PERIOD / STEP)):
-            self._state = self._drones.step(self._state, control, STEP, self._all)
+        for _ in range(round(COMMAND_PERIOD / CONTROL_PERIOD)):
+            self._state = self._drones.step(self._state, control, CONTROL_PERIOD, self._indices)
         return self._states()
 
     def _states(self) -> States:
@@ -203,12 +203,12 @@ class RotorPyRotors(RotorPy):
         super().__init__(start)
         self._controller = AttitudeController(len(start["pos"]))
 
-    def fly(self, commands: NDArray) -> States:
+    def fly_period(self, commands: NDArray) -> States:
         self._controller.command(commands)
-        for _ in range(round(PERIOD / self._controller.dt)):
-            present = self._k_eta * self._state["rotor_speeds"].numpy() ** 2
-            control = {"cmd_motor_thrusts": self._tensor(self._controller.thrusts(self._states(), present))}
-            self._state = self._drones.step(self._state, control, self._controller.dt, self._all)
+        for _ in range(round(COMMAND_PERIOD / self._controller.dt)):
+            current_thrust = self._k_eta * self._state["rotor_speeds"].numpy() ** 2
+            control = {"cmd_motor_thrusts": self._tensor(self._controller.thrusts(self._states(), current_thrust))}
+            self._state = self._drones.step(self._state, control, self._controller.dt, self._indices)
         return self._states()
 
 
@@ -227,10 +227,10 @@ class PyBullet(Simulator):
             envs: Any = importlib.import_module("gym_pybullet_drones.envs.CtrlAviary")
             control: Any = importlib.import_module("gym_pybullet_drones.control.DSLPIDControl")
             enums: Any = importlib.import_module("gym_pybullet_drones.utils.enums")
-            freq, model = round(1 / STEP), enums.DroneModel.CF2X
+            freq, model = round(1 / CONTROL_PERIOD), enums.DroneModel.CF2X
             self._env = envs.CtrlAviary(model, physics=enums.Physics.PYB, pyb_freq=freq, ctrl_freq=freq)
             self._controllers = [control.DSLPIDControl(model) for _ in start["pos"]]
-        airframe, pid = load_airframe(DRONE), self._controllers[0]
+        airframe, pid = load_airframe(AIRFRAME), self._controllers[0]
         top = pid.PWM2RPM_SCALE * pid.MAX_PWM + pid.PWM2RPM_CONST
         self._env.KF = _thrust_max(airframe) / top**2
         self._env.KM, self._env.MAX_RPM = self._env.KF * _torque_per_thrust(airframe), top
@@ -242,7 +242,7 @@ class PyBullet(Simulator):
         for controller, quat in zip(self._controllers, self._now["quat"], strict=True):
             controller.last_rpy = np.array(self._p.getEulerFromQuaternion(quat))
 
-    def fly(self, commands: NDArray) -> States:
+    def fly_period(self, commands: NDArray) -> States:
         s = self._now
         ang_vel = np.array(
             rotation.rotate(jnp.asarray(s["quat"]), jnp.asarray(s["ang_vel"])), np.float64
@@ -253,8 +253,8 @@ class PyBullet(Simulator):
             self._p.resetBaseVelocity(self._body, s["vel"][k], ang_vel[k], physicsClientId=self._client)
             speed = np.sqrt(max(command[3], 0) / (4 * self._env.KF))
             pwm, quat = (speed - controller.PWM2RPM_CONST) / controller.PWM2RPM_SCALE, s["quat"][k]
-            for _ in range(round(PERIOD / STEP)):
-                rpm = controller._dslPIDAttitudeControl(STEP, pwm, quat, angles[k], np.zeros(3))
+            for _ in range(round(COMMAND_PERIOD / CONTROL_PERIOD)):
+                rpm = controller._dslPIDAttitudeControl(CONTROL_PERIOD, pwm, quat, angles[k], np.zeros(3))
                 observed = self._env.step(rpm[None])[0][0]
                 quat = observed[3:7]
             s["pos"][k], s["quat"][k], s["vel"][k] = observed[:3], quat, observed[10:13]

@@ -186,17 +186,17 @@ class FreeBodies(Population):
         """Return the scheme of the simulation, in which bodies turn by ``free_rotation`` if it is an Euler scheme."""
         scheme = super().scheme(integrator)
 
-        def moved(body: FreeBodiesData, rates: Rates, dt: float) -> FreeBodiesData:
+        def integrate_motion(body: FreeBodiesData, rates: Rates, dt: float) -> FreeBodiesData:
             if integrator == Integrator.rk4:
                 after = scheme(body, rates, dt)
                 return after.replace(ang_vel=limit_ang_vel(after.ang_vel, 1 / dt))
-            after = scheme(body, lambda at: {name: rates(at)[name] for name in ("pos", "vel")}, dt)
+            after = scheme(body, lambda state: {name: rates(state)[name] for name in ("pos", "vel")}, dt)
             torque = rotation.rotate_inverse(body.quat, body.torque)
             ang_vel = limit_ang_vel(body.ang_vel + dt * torque / body.inertia, 1 / dt)
             quat, ang_vel = free_rotation(body.quat, ang_vel, body.inertia, dt)
             return after.replace(quat=quat, ang_vel=ang_vel)
 
-        return moved
+        return integrate_motion
 
     def finish(self, record: FreeBodiesData) -> FreeBodiesData:
         identity = jnp.asarray([0.0, 0.0, 0.0, 1.0], record.quat.dtype)

@@ -76,8 +76,8 @@ class ContactLog(Plugin):
             drone_stage = self._stage(sim.scene.contact_fn(others, self.floor, self.drones), "drone")
             placements.append(StagePlacement(drone_stage, before="increment_steps"))
         if movers:
-            together = self._stage(sim.scene.contact_fn(list(movers), floor=False, drones=False), "world")
-            placements.append(StagePlacement(together, before="increment_steps", name=f"{self.name}_of_moved"))
+            object_stage = self._stage(sim.scene.contact_fn(list(movers), floor=False, drones=False), "world")
+            placements.append(StagePlacement(object_stage, before="increment_steps", name=f"{self.name}_of_moved"))
         return placements
 
     def _names(self, sim: Simulation) -> tuple[str, ...]:

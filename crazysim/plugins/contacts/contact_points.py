@@ -30,7 +30,7 @@ FLAT_KINDS = ("plane", "box", "cylinder")
 """Kinds of geoms with flat faces, which the corners of a drone's box touch."""
 PLATE_SHARE = 0.05
 """Height of the upper and lower plate of a drone's box, as a share of the box's height; both plates touch an object
-beside the drone."""
+next to the drone."""
 
 
 class Carrier(NamedTuple):
@@ -55,7 +55,7 @@ class Surface(NamedTuple):
     """Name of the carrier's population; None for the static scene and objects."""
 
 
-def find_carriers(sim: Simulation, objects: ObjectSelection, without: Collection[str] = ()) -> list[Carrier]:
+def find_carriers(sim: Simulation, objects: ObjectSelection, excluded: Collection[str] = ()) -> list[Carrier]:
     """Return the static scene, the chosen objects, and the chosen members of populations with an angular velocity.
 
     Objects that other plugins move, such as loads, are left out.
@@ -63,7 +63,7 @@ def find_carriers(sim: Simulation, objects: ObjectSelection, without: Collection
     Args:
         sim: Simulation.
         objects: Handles, or names of objects; None for all.
-        without: Names of populations that are left out.
+        excluded: Names of populations that are left out.
     """
     model = sim.scene.collision_model
     carriers = [Carrier(None, None, tuple(model.floor))] if model.floor else []
@@ -71,7 +71,7 @@ def find_carriers(sim: Simulation, objects: ObjectSelection, without: Collection
     members = populations(sim.data)
     for body in select_bodies(model, objects):
         kind, _, number = body.name.rpartition(":")
-        if kind in without:
+        if kind in excluded:
             continue
         if kind in members and hasattr(members[kind], "ang_vel"):
             carriers.append(Carrier(kind, int(number), body.geoms))

@@ -78,7 +78,7 @@ class DroneCollisions(Plugin):
         boxes, n = drone_box_extents(sim), sim.n_drones
         pairs = np.array(list(combinations(range(n), 2)))
 
-        def of_world(data: SimData) -> SimData:
+        def solve_world(data: SimData) -> SimData:
             record = self.read(data)
             pos, rot = drones_as_boxes(data, boxes)
             solids = Solids(np.arange(n), np.zeros(n, bool), boxes[:, 3:], pos, rot)
@@ -94,5 +94,5 @@ class DroneCollisions(Plugin):
             states = states_after_contact(data.states, solved, slice(n))
             return self.write(data.replace(states=states), record.replace(**changes))
 
-        solve = Stage(vmap_worlds(of_world), "batch", unfused_reason="it solves the contacts of all worlds at once")
+        solve = Stage(vmap_worlds(solve_world), "batch", unfused_reason="it solves the contacts of all worlds at once")
         return [StagePlacement(solve, before="increment_steps")]

@@ -89,8 +89,8 @@ def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Dro
 
     gap, normal = select_airframe([(kind, to_box(box)) for kind, box in boxes], data.core.drone_id)
     gap = gap[..., 0]
-    touches = (gap < 0) & ~collider.joined_mask(data)
-    touches = touches if body.exists is None else touches & body.exists[:, None]
+    is_touching = (gap < 0) & ~collider.joined_mask(data)
+    is_touching = is_touching if body.exists is None else is_touching & body.exists[:, None]
 
     def response(change: Array) -> Array:
         """Return the change of the relative velocity at the lever for a change of the load's velocity, m/s."""
@@ -99,8 +99,8 @@ def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Dro
 
     vel = rotation.rotate_inverse(quat, body.vel[:, None] - s.vel) - rotation.cross(s.ang_vel[None], lever)
     change = velocity_change(gap, normal, vel, material, response)
-    n_load, n_drone = (jnp.sum(touches, axis=axis, keepdims=True, dtype=gap.dtype) for axis in (1, 0))
-    share = jnp.where(touches, 1 / jnp.maximum(jnp.maximum(n_load, n_drone), 1.0), 0.0)[..., None]
+    n_load, n_drone = (jnp.sum(is_touching, axis=axis, keepdims=True, dtype=gap.dtype) for axis in (1, 0))
+    share = jnp.where(is_touching, 1 / jnp.maximum(jnp.maximum(n_load, n_drone), 1.0), 0.0)[..., None]
     change = share * change
 
     turn_rate = rotation.matvec(p.J_inv, rotation.cross(lever, change))
@@ -142,7 +142,7 @@ def velocity_change(
 class _PairContacts(NamedTuple):
     """Changes of velocity by the contacts of two groups of bodies with each other."""
 
-    touches: Array
+    is_touching: Array
     """True where two touch. (n, m)"""
     first: Array
     """Change of each body of the first group, m/s. (n, m, 3)"""
@@ -165,16 +165,18 @@ def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Mater
     """
     groups = list(combinations_with_replacement(range(len(colliders)), 2))
     material = Material(*(x.reshape(-1)[:1] for x in material))
-    contacts = {(a, b): _pair_contacts(data, colliders[a], colliders[b], material, same=a == b) for a, b in groups}
+    contacts = {
+        (a, b): _pair_contacts(data, colliders[a], colliders[b], material, is_same_kind=a == b) for a, b in groups
+    }
     n_touches: list[Any] = [
-        sum(pairs.touches.sum(axis=1) for (a, _), pairs in contacts.items() if a == k)
-        + sum(pairs.touches.sum(axis=0) for (_, b), pairs in contacts.items() if b == k)
+        sum(pairs.is_touching.sum(axis=1) for (a, _), pairs in contacts.items() if a == k)
+        + sum(pairs.is_touching.sum(axis=0) for (_, b), pairs in contacts.items() if b == k)
         for k in range(len(colliders))
     ]
     changes: list[Array | float] = [0.0] * len(colliders)
     for (a, b), pairs in contacts.items():
         n = jnp.maximum(n_touches[a][:, None], n_touches[b][None])
-        share = jnp.where(pairs.touches, 1 / jnp.maximum(n, 1), 0.0)[..., None].astype(pairs.first.dtype)
+        share = jnp.where(pairs.is_touching, 1 / jnp.maximum(n, 1), 0.0)[..., None].astype(pairs.first.dtype)
         changes[a] = changes[a] + jnp.sum(share * pairs.first, axis=1)
         changes[b] = changes[b] + jnp.sum(share * pairs.second, axis=0)
     vels = [collider.body(data).vel + change for collider, change in zip(colliders, changes, strict=True)]
@@ -183,26 +185,28 @@ def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Mater
     return data
 
 
-def _pair_contacts(data: SimData, first: Collider, second: Collider, material: Material, same: bool) -> _PairContacts:
+def _pair_contacts(
+    data: SimData, first: Collider, second: Collider, material: Material, is_same_kind: bool
+) -> _PairContacts:
     """Return the contacts of two groups of bodies, or of one group, in which each pair counts once."""
     a, b = first.body(data), second.body(data)
     second_quat = b.quat[None]
     offset = rotation.rotate_inverse(second_quat, a.pos[:, None] - b.pos[None])
-    if same:
+    if is_same_kind:
         offset = offset + SELF_GAP * np.eye(len(offset), dtype=offset.dtype)[..., None]
     eye = jnp.eye(3, dtype=offset.dtype)
     axes = [rotation.rotate_inverse(second_quat, rotation.rotate(a.quat[:, None], eye[k])) for k in range(3)]
     rot = jnp.stack(axes, axis=-1)
     gap, pull_back = jax.vjp(lambda x: distance(first.shape, second.shape, x, rot), offset)
     normal = rotation.rotate(second_quat, pull_back(jnp.ones_like(gap))[0])
-    touches = gap < 0
-    if same:
-        touches = touches & np.triu(np.ones(gap.shape, bool), 1)
-    for exists in (None if a.exists is None else a.exists[:, None], b.exists):
-        touches = touches if exists is None else touches & exists
+    is_touching = gap < 0
+    if is_same_kind:
+        is_touching = is_touching & np.triu(np.ones(gap.shape, bool), 1)
+    for is_present in (None if a.exists is None else a.exists[:, None], b.exists):
+        is_touching = is_touching if is_present is None else is_touching & is_present
 
     vel = a.vel[:, None] - b.vel[None]
     change = velocity_change(gap, normal, vel, material, lambda change: change)
     total = a.mass[:, None] + b.mass[None]
     weight = 1 / jnp.where(total > 0, total, 1.0)
-    return _PairContacts(touches, b.mass[None] * weight * change, -a.mass[:, None] * weight * change)
+    return _PairContacts(is_touching, b.mass[None] * weight * change, -a.mass[:, None] * weight * change)

@@ -54,12 +54,12 @@ def contacts_between(solids: Solids, pairs: np.ndarray) -> list[PairContacts]:
     contacts = []
     kinds = solids.is_ball[pairs]
     for first, second in ((True, True), (True, False), (False, True), (False, False)):
-        of_kind = pairs[(kinds[:, 0] == first) & (kinds[:, 1] == second)]
-        if not len(of_kind):
+        pairs_of_kind = pairs[(kinds[:, 0] == first) & (kinds[:, 1] == second)]
+        if not len(pairs_of_kind):
             continue
         if second and not first:
-            of_kind = of_kind[:, ::-1]
-        a, b = of_kind.T
+            pairs_of_kind = pairs_of_kind[:, ::-1]
+        a, b = pairs_of_kind.T
         size = jnp.asarray(solids.size, solids.pos.dtype)
         if first and second:
             points = jax.vmap(ball_contacts)(size[a, 0], solids.pos[a], size[b, 0], solids.pos[b])
@@ -95,8 +95,10 @@ def contacts_on_surface(
     if solids.is_ball[number] or shape.kind == "plane":
         return contacts
     box = Shape("box", tuple(map(float, solids.size[number])))
-    nearest = _nearest_point(box, solids.pos[number], solids.rot[number], shape, surface_pos, surface_rot)
-    return contacts._replace(points=Manifold(*(jnp.concatenate(x) for x in zip(contacts.points, nearest, strict=True))))
+    nearest_point = _nearest_point(box, solids.pos[number], solids.rot[number], shape, surface_pos, surface_rot)
+    return contacts._replace(
+        points=Manifold(*(jnp.concatenate(x) for x in zip(contacts.points, nearest_point, strict=True)))
+    )
 
 
 def contacts_on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> PairContacts:
@@ -125,10 +127,10 @@ def join_contacts(pairs: list[PairContacts], friction: Array, restitution: Array
     first, second = (np.concatenate([pair[k] for pair in pairs]) for k in range(2))
     n_points = np.concatenate([np.full(len(pair.first), _n_points(pair)) for pair in pairs])
     gap, normal, point = (jnp.concatenate([pair.points[k] for pair in pairs]) for k in range(3))
-    mixed = (
+    mixed_materials = (
         jnp.maximum(x[first], x[second])[np.repeat(np.arange(len(first)), n_points)] for x in (friction, restitution)
     )
-    return Contacts(first, second, n_points, gap, normal, point, *mixed)
+    return Contacts(first, second, n_points, gap, normal, point, *mixed_materials)
 
 
 def _n_points(contacts: PairContacts) -> int:

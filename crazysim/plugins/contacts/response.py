@@ -85,7 +85,10 @@ class ContactResponse(Plugin):
         surfaces = find_surfaces(sim, self.objects)
 
         def respond(data: SimData) -> SimData:
-            results = [(kind, _respond(data, self.read(data), surfaces, box, self.iterations)) for kind, box in boxes]
+            results = [
+                (kind, _respond_to_contacts(data, self.read(data), surfaces, box, self.iterations))
+                for kind, box in boxes
+            ]
             states, record = select_airframe(results, data.core.drone_id)
             return self.write(data.replace(states=states), record)
 
@@ -117,7 +120,7 @@ class ContactResponse(Plugin):
                 data = stop_loads(data, collider, obstacles, self.read(data).material, self.iterations)
             return data
 
-        def hit(data: SimData) -> SimData:
+        def bounce_loads(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
                 return data
             record = self.read(data)
@@ -136,13 +139,13 @@ class ContactResponse(Plugin):
         if obstacles:
             stages.append((Stage(stop, plugin.coupling), f"{self.name}_of_{plugin.name}"))
         if boxes:
-            stages.append((Stage(hit, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
+            stages.append((Stage(bounce_loads, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
             if touch_each_other:
                 stages.append((Stage(hit_others, "world"), f"{self.name}_between_{plugin.name}"))
         return [StagePlacement(stage, before="increment_steps", name=name) for stage, name in stages]
 
 
-def _respond(
+def _respond_to_contacts(
     data: SimData, record: ContactResponseData, surfaces: list[Surface], box: np.ndarray, iterations: int
 ) -> tuple[SimState, ContactResponseData]:
     """Return the states with the velocity after contact, and the record with the impulse."""

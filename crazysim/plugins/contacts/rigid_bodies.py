@@ -123,8 +123,8 @@ class BodyContacts:
             owners += range(n_free, n_free + self.n_drones)
             balls += [False] * self.n_drones
             sizes += list(self.boxes[:, 3:])
-            for whole, part in zip((pos, rot), drones_as_boxes(data, self.boxes), strict=True):
-                whole.append(part)
+            for batch, part in zip((pos, rot), drones_as_boxes(data, self.boxes), strict=True):
+                batch.append(part)
         for k, carrier in enumerate(self.carriers):
             for geom in carrier.geoms:
                 if geom.shape.kind in EXACT_KINDS:
@@ -158,17 +158,17 @@ class BodyContacts:
         return contacts
 
 
-def require_few_contacts(n_contacts: int, among: str) -> int:
+def require_few_contacts(n_contacts: int, bodies: str) -> int:
     """Return the number of contact points, or raise an error if it is too large.
 
     Args:
         n_contacts: Number of contact points in a world.
-        among: Bodies to which they belong, for the message.
+        bodies: Bodies to which they belong, for the message.
     """
     if n_contacts > MAX_CONTACTS:
         raise ConfigError(
-            f"expected at most {MAX_CONTACTS} contact points in a world, got {n_contacts} of {among}. Use fewer bodies "
-            f"or fewer objects: every pair has up to {N_BOX_POINTS}."
+            f"expected at most {MAX_CONTACTS} contact points in a world, got {n_contacts} of {bodies}. Use fewer "
+            f"bodies or fewer objects: every pair has up to {N_BOX_POINTS}."
         )
     return n_contacts
 
@@ -181,7 +181,7 @@ def states_after_contact(states: Any, solved: SolvedBodies, rows: slice) -> Any:
         solved: Bodies after contact.
         rows: Rows of these states among the solved bodies.
     """
-    ang_vel, angle = (rotation.rotate_inverse(states.quat, x[rows]) for x in (solved.bodies.ang_vel, solved.turned))
+    ang_vel, angle = (rotation.rotate_inverse(states.quat, x[rows]) for x in (solved.bodies.ang_vel, solved.rotvec))
     quat = rotation.integrate_attitude(states.quat, angle, 1.0)
     return states.replace(pos=solved.bodies.pos[rows], quat=quat, vel=solved.bodies.vel[rows], ang_vel=ang_vel)
 

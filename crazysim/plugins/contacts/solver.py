@@ -81,7 +81,7 @@ class SolvedBodies(NamedTuple):
 
     bodies: Bodies
     """The bodies with their new velocities and positions."""
-    turned: Array
+    rotvec: Array
     """Rotations that remove overlaps, world frame, rad. (n, 3)"""
     contact_impulses: Impulses
     """Impulses at the contacts, with which the next step begins."""
@@ -120,12 +120,12 @@ def solve_contacts(
     offset = bodies.pos[a] - bodies.pos[b]
     arm = contacts.point - bodies.pos[a][pair]
 
-    def slip(vel: Array, ang_vel: Array) -> Array:
+    def contact_velocity(vel: Array, ang_vel: Array) -> Array:
         """Return the velocities of the first bodies relative to the second at the contacts, m/s. (k, 3)"""
-        between = vel[a] - vel[b] - rotation.cross(ang_vel[b], offset)
-        return between[pair] + rotation.cross((ang_vel[a] - ang_vel[b])[pair], arm)
+        relative_vel = vel[a] - vel[b] - rotation.cross(ang_vel[b], offset)
+        return relative_vel[pair] + rotation.cross((ang_vel[a] - ang_vel[b])[pair], arm)
 
-    def change(impulse: Array) -> tuple[Array, Array]:
+    def velocity_change(impulse: Array) -> tuple[Array, Array]:
         """Return the changes of the velocities by impulses on the first bodies and opposite ones on the second."""
         force, torque = contacts.sum_pairs(impulse), contacts.sum_pairs(rotation.cross(arm, impulse))
         second_torque = torque + rotation.cross(offset, force)
@@ -135,26 +135,35 @@ def solve_contacts(
         )
         return bodies.inv_mass[:, None] * force, matvec(bodies.inv_inertia, torque)
 
-    initial_vel = slip(bodies.vel, bodies.ang_vel)
+    initial_vel = contact_velocity(bodies.vel, bodies.ang_vel)
     separation_speed = rotation.dot(initial_vel, normal)[:, 0]
     is_near = contacts.gap < MAX_ACTING_GAP + dt * jnp.abs(separation_speed)
-    closes = jnp.minimum(-contacts.gap / dt, 0.0)
-    bounces = (separation_speed < -BOUNCE_SPEED) & (contacts.gap + dt * separation_speed < 0)
-    target_speed = jnp.where(bounces, -contacts.restitution * separation_speed, closes)
+    closing_speed = jnp.minimum(-contacts.gap / dt, 0.0)
+    is_bouncing = (separation_speed < -BOUNCE_SPEED) & (contacts.gap + dt * separation_speed < 0)
+    target_speed = jnp.where(is_bouncing, -contacts.restitution * separation_speed, closing_speed)
 
     normal_response, slip_response = jnp.zeros(k, dtype), jnp.zeros(k, dtype)
-    for body_indices, sum_of, lever in ((a, sums[0], arm), (b, sums[1], arm + offset[pair])):
+    for body_indices, sum_matrix, lever in ((a, sums[0], arm), (b, sums[1], arm + offset[pair])):
         lever_matrix = rotation.cross_matrix(lever)
         inverse, inv_mass = bodies.inv_inertia[body_indices][pair], bodies.inv_mass[body_indices][pair]
-        spun = matmul(inverse, lever_matrix)
-        of_normal = inv_mass + rotation.dot(rotation.cross(lever, normal), matvec(spun, normal))[:, 0]
-        of_slip = 0.5 * (3 * inv_mass + jnp.sum(lever_matrix * spun, axis=(-2, -1)) - of_normal)
-        acts = is_near & (of_normal > 0)
-        n_weight, s_weight = (jnp.where(acts, 1 / jnp.where(acts, x, 1.0), 0.0) for x in (of_normal, of_slip))
-        together = _shared_response(bodies, sum_of, contacts, normal, lever_matrix, n_weight, s_weight)[body_indices][
-            pair
-        ]
-        normal_response, slip_response = normal_response + together * of_normal, slip_response + together * of_slip
+        angular_response = matmul(inverse, lever_matrix)
+        normal_compliance = (
+            inv_mass + rotation.dot(rotation.cross(lever, normal), matvec(angular_response, normal))[:, 0]
+        )
+        slip_compliance = 0.5 * (
+            3 * inv_mass + jnp.sum(lever_matrix * angular_response, axis=(-2, -1)) - normal_compliance
+        )
+        is_active = is_near & (normal_compliance > 0)
+        n_weight, s_weight = (
+            jnp.where(is_active, 1 / jnp.where(is_active, x, 1.0), 0.0) for x in (normal_compliance, slip_compliance)
+        )
+        shared_response = _shared_response(bodies, sum_matrix, contacts, normal, lever_matrix, n_weight, s_weight)[
+            body_indices
+        ][pair]
+        normal_response, slip_response = (
+            normal_response + shared_response * normal_compliance,
+            slip_response + shared_response * slip_compliance,
+        )
     normal_response, slip_response = (jnp.where(x > 0, x, 1.0) for x in (normal_response, slip_response))
 
     def iterate(_: int, carry: tuple[Impulses, Impulses, Array]) -> tuple[Impulses, Impulses, Array]:
@@ -162,7 +171,7 @@ def solve_contacts(
         momentum = n_accelerated / (n_accelerated + 3)
         y = current.normal + momentum * (current.normal - previous.normal)
         z = current.friction + momentum * (current.friction - previous.friction)
-        contact_vel = initial_vel + slip(*change(y[:, None] * normal + z))
+        contact_vel = initial_vel + contact_velocity(*velocity_change(y[:, None] * normal + z))
         speed = rotation.dot(contact_vel, normal)[:, 0]
         normal_impulse = jnp.where(is_near, jnp.maximum(y + (target_speed - speed) / normal_response, 0.0), 0.0)
         friction_impulse = z - (contact_vel - speed[:, None] * normal) / slip_response[:, None]
@@ -180,28 +189,32 @@ def solve_contacts(
     friction_start = jnp.where(
         is_near[:, None], initial_impulses.friction - rotation.dot(initial_impulses.friction, normal) * normal, 0.0
     )
-    first = Impulses(normal_start, friction_start)
-    impulses, *_ = jax.lax.fori_loop(0, iterations, iterate, (first, first, jnp.zeros((), dtype)))
+    initial = Impulses(normal_start, friction_start)
+    impulses, *_ = jax.lax.fori_loop(0, iterations, iterate, (initial, initial, jnp.zeros((), dtype)))
     total = impulses.normal[:, None] * normal + impulses.friction
-    vel, ang_vel = change(total)
-    share = _energy_share(total, initial_vel, slip(vel, ang_vel))
-    impulses, total, vel, ang_vel = jax.tree.map(lambda x: share * x, (impulses, total, vel, ang_vel))
+    vel, ang_vel = velocity_change(total)
+    energy_share = _energy_share(total, initial_vel, contact_velocity(vel, ang_vel))
+    impulses, total, vel, ang_vel = jax.tree.map(lambda x: energy_share * x, (impulses, total, vel, ang_vel))
 
     # One gradient step with exact line search reduces the overlaps; the next time step continues.
-    leaves = separation_speed + rotation.dot(slip(vel, ang_vel), normal)[:, 0]
-    push = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, MAX_PUSH_SPEED) - jnp.maximum(leaves, 0.0)
+    separation_rate = separation_speed + rotation.dot(contact_velocity(vel, ang_vel), normal)[:, 0]
+    push = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, MAX_PUSH_SPEED) - jnp.maximum(separation_rate, 0.0)
     push = jnp.maximum(push, 0.0)
-    vel_change, ang_vel_change = change((push / normal_response)[:, None] * normal)
-    slip_change = jnp.sum(push / normal_response * rotation.dot(slip(vel_change, ang_vel_change), normal)[:, 0])
+    vel_change, ang_vel_change = velocity_change((push / normal_response)[:, None] * normal)
+    slip_change = jnp.sum(
+        push / normal_response * rotation.dot(contact_velocity(vel_change, ang_vel_change), normal)[:, 0]
+    )
     size = dt * jnp.sum(push / normal_response * push) / jnp.where(slip_change > 0, slip_change, 1.0)
-    after = bodies._replace(pos=bodies.pos + size * vel_change, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel)
+    moved_bodies = bodies._replace(
+        pos=bodies.pos + size * vel_change, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel
+    )
     impulse = _sum_for_bodies(sums[0] - sums[1], contacts.sum_pairs(total))
-    return SolvedBodies(after, size * ang_vel_change, impulses, impulse)
+    return SolvedBodies(moved_bodies, size * ang_vel_change, impulses, impulse)
 
 
 def _shared_response(
     bodies: Bodies,
-    sum_of: Array,
+    sum_matrix: Array,
     contacts: Contacts,
     normal: Array,
     lever_matrix: Array,
@@ -216,7 +229,7 @@ def _shared_response(
 
     Args:
         bodies: The bodies.
-        sum_of: 1 where a pair contains the body, and else 0. (n, n_pairs)
+        sum_matrix: 1 where a pair contains the body, and else 0. (n, n_pairs)
         contacts: The contacts.
         normal: Normals. (k, 3)
         lever_matrix: Torque of impulses about the body. (k, 3, 3)
@@ -232,7 +245,7 @@ def _shared_response(
     upper = jnp.concatenate([weight, jnp.swapaxes(angular, -1, -2)], axis=-1)
     lower = jnp.concatenate([angular, matmul(angular, jnp.swapaxes(lever_matrix, -1, -2))], axis=-1)
     blocks = jnp.concatenate([upper, lower], axis=-2).reshape(-1, 36)
-    total = _sum_for_bodies(sum_of, contacts.sum_pairs(blocks)).reshape(-1, 6, 6)
+    total = _sum_for_bodies(sum_matrix, contacts.sum_pairs(blocks)).reshape(-1, 6, 6)
     response = jnp.concatenate(
         [bodies.inv_mass[:, None, None] * total[:, :3], matmul(bodies.inv_inertia, total[:, 3:])], axis=-2
     )

@@ -63,11 +63,11 @@ class Terrain(Plugin):
             heights=device_array(heights, dtype),
             middle=device_array(pos, dtype),
             half=device_array(size / 2, dtype),
-            below=drone_array(sim, 0.0, 1),
+            height_below=drone_array(sim, 0.0, 1),
             floor=self.floor,
         )
         _set_height_field(sim.scene, self, heights, size, pos)
-        return record.replace(below=record.surface_at(sim.data.states.pos)[0])
+        return record.replace(height_below=record.surface_at(sim.data.states.pos)[0])
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         scope = "drone" if self._check_heights(sim)[0].size <= MAX_FUSED_VALUES else "batch"
@@ -78,7 +78,7 @@ class Terrain(Plugin):
         """Stop drones at the ground: one that is below it, or on it and not rising, is set on it, at rest."""
         ground = ground_height(data, data.states.pos)
         states = stop_below(data.states, ground + FLOOR_HEIGHT)
-        return self.write(data.replace(states=states), self.read(data).replace(below=ground))
+        return self.write(data.replace(states=states), self.read(data).replace(height_below=ground))
 
     def _check_heights(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return heights, full lengths along x and y, and the middle, m."""

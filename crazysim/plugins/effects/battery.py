@@ -164,10 +164,10 @@ class Battery(Plugin):
         charge_used = current / (3600.0 * data.core.freq * battery.capacity) + battery.rounding
         charge = battery.charge - charge_used
         rounding = charge_used - (battery.charge - charge)
-        empty = charge <= 0
+        is_empty = charge <= 0
         battery = battery.replace(
-            charge=jnp.where(empty, 0.0, charge),
-            rounding=jnp.where(empty, 0.0, rounding),
+            charge=jnp.where(is_empty, 0.0, charge),
+            rounding=jnp.where(is_empty, 0.0, rounding),
             voltage=voltage,
             current=current,
         )
@@ -200,9 +200,9 @@ def voltage_under_load(power: Array, open_circuit: Array, resistance: Array) -> 
         open_circuit: Voltage without load, V. (..., 1)
         resistance: Internal resistance, ohm. (..., 1)
     """
-    spare = open_circuit * open_circuit - 4 * resistance * power
-    enough = spare > 0
-    root = jnp.where(enough, jnp.sqrt(jnp.where(enough, spare, 1.0)), 0.0)
+    discriminant = open_circuit * open_circuit - 4 * resistance * power
+    is_feasible = discriminant > 0
+    root = jnp.where(is_feasible, jnp.sqrt(jnp.where(is_feasible, discriminant, 1.0)), 0.0)
     voltage = 0.5 * (open_circuit + root)
     max_power = open_circuit * open_circuit / (4 * resistance)
-    return voltage, jnp.where(enough, power, max_power) / voltage
+    return voltage, jnp.where(is_feasible, power, max_power) / voltage

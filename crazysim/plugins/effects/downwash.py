@@ -75,7 +75,7 @@ class Downwash(Plugin):
     def sum_jets(self, data: SimData) -> SimData:
         """Add up the jets of all drones of the world at one drone; a jet does not act on its own drone.
 
-        Jets are also added up at the drone's load, on which the jet of its own drone does act.
+        Jets are also added up at the drone's load. The jet of its own drone acts on the load, too.
         """
         record, s = self.read(data), data.states
         bodies = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.air_vel is not None}
@@ -83,14 +83,14 @@ class Downwash(Plugin):
         axis = rotation.z_axis(s.quat)
         sources = jet_source(collective_thrust(data), record.diameter, record.air_density)
 
-        def at_places(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
+        def velocities_of_jet(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
             origin, axis, source = other
             return {name: jet_speed(pos - origin, axis, source) * axis for name, pos in positions.items()}
 
-        against = reduce_over_others(at_places, (s.pos, axis, sources))
-        in_jet = {name: x.replace(air_vel=-against[name]) for name, x in bodies.items()}
-        data = data.replace(plugins=data.plugins | in_jet)
-        return self.write(data, record.replace(air_vel=-against[self.name]))
+        air_velocity = reduce_over_others(velocities_of_jet, (s.pos, axis, sources))
+        bodies_in_jets = {name: x.replace(air_vel=-air_velocity[name]) for name, x in bodies.items()}
+        data = data.replace(plugins=data.plugins | bodies_in_jets)
+        return self.write(data, record.replace(air_vel=-air_velocity[self.name]))
 
 
 def stream_diameter(sim: Simulation, radius: Array) -> Array:
@@ -151,16 +151,16 @@ def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
     The formula of ``hover_jet_speed`` with one division: for ``q = s + B d`` and
     ``w = q / (q^2 + (sqrt(2) - 1) (r / S)^2)`` the speed is ``u_0 B d q w^2``.
     """
-    below = -rotation.dot(offset, axis)
-    off_axis = offset + below * axis
+    depth = -rotation.dot(offset, axis)
+    off_axis = offset + depth * axis
     # Clamped to zero above the rotors, where the distance to the virtual origin would pass through zero.
-    down = jnp.where(below < 0, 0.0, below)
-    q = down + source.origin
+    positive_depth = jnp.where(depth < 0, 0.0, depth)
+    q = positive_depth + source.origin
     w = q / (q * q + (math.sqrt(2) - 1) / SPREAD**2 * rotation.dot(off_axis, off_axis))
-    x = down * source.per_diameter
+    x = positive_depth * source.per_diameter
     x = jnp.where(x > 1, 1.0, x)
-    begins = x * x * (3 - 2 * x)
-    return begins * source.strength * q * w * w
+    fade_in = x * x * (3 - 2 * x)
+    return fade_in * source.strength * q * w * w
 
 
 def mean_rotor_vel(data: SimData) -> Array:

@@ -46,15 +46,15 @@ class Grid(NamedTuple):
             k: Length of the vector at each node; None for a grid of scalars.
         """
         values, origin, spacing = (
-            read_numbers(f"{what} of {name}", getattr(self, what), POSITIVE if what == "spacing" else ANY_NUMBER)
-            for what in ("values", "origin", "spacing")
+            read_numbers(f"{key} of {name}", getattr(self, key), POSITIVE if key == "spacing" else ANY_NUMBER)
+            for key in ("values", "origin", "spacing")
         )
         core = () if k is None else (k,)
         if values.ndim != 3 + len(core) or values.shape[3:] != core or min(values.shape) < 1:
-            what = "one number" if k is None else f"{k} numbers"
+            key = "one number" if k is None else f"{k} numbers"
             shape = f"(n_x, n_y, n_z{', ' if core else ''}{', '.join(map(str, core))})"
             raise ConfigError(
-                f"expected {name} as values of shape {shape}, got {values.shape}. Give each node of the grid {what}."
+                f"expected {name} as values of shape {shape}, got {values.shape}. Give each node of the grid {key}."
             )
         if origin.shape != (3,) or spacing.shape not in ((), (3,)):
             raise ConfigError(

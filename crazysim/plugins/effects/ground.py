@@ -20,7 +20,7 @@ class TerrainData(PyTree):
     """Position of the middle of the terrain, world frame, m. (3,)"""
     half: Array = leaf("shared", 1)
     """Half extents along x and y, m. (2,)"""
-    below: Array = leaf("drone", 1)
+    height_below: Array = leaf("drone", 1)
     """Height of the ground below the drone after the last step, world frame, m. (n_worlds, n_drones, 1)"""
     floor: bool = static()
     """True if a flat floor at z = 0 surrounds the terrain; False if its border extends outwards without end."""
@@ -38,10 +38,10 @@ class TerrainData(PyTree):
         Returns:
             Height, world frame, m (..., 1), and unit normal, upwards (..., 3).
         """
-        height, normal, inside = surface_at(self.heights, self.half, pos - self.middle)
+        height, normal, is_inside = surface_at(self.heights, self.half, pos - self.middle)
         if self.floor:
-            normal = jnp.where(inside[..., None], normal, jnp.asarray([0.0, 0.0, 1.0], normal.dtype))
-            return jnp.where(inside, height + self.middle[2], 0.0)[..., None], normal
+            normal = jnp.where(is_inside[..., None], normal, jnp.asarray([0.0, 0.0, 1.0], normal.dtype))
+            return jnp.where(is_inside, height + self.middle[2], 0.0)[..., None], normal
         return (height + self.middle[2])[..., None], normal
 
     def gap_at(self, point: Array) -> tuple[Array, Array]:
@@ -54,9 +54,9 @@ class TerrainData(PyTree):
             Distance, m, ``OUTSIDE_DISTANCE`` beyond the border of a terrain that a flat floor surrounds (...), and unit
             normal (..., 3).
         """
-        height, normal, inside = surface_at(self.heights, self.half, point - self.middle)
+        height, normal, is_inside = surface_at(self.heights, self.half, point - self.middle)
         gap = (point[..., 2] - self.middle[2] - height) * normal[..., 2]
-        return jnp.where(inside, gap, OUTSIDE_DISTANCE) if self.floor else gap, normal
+        return jnp.where(is_inside, gap, OUTSIDE_DISTANCE) if self.floor else gap, normal
 
 
 @jit_unless_traced()
@@ -75,9 +75,9 @@ def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
     height = jnp.zeros_like(pos[..., :1])
     normal = jnp.zeros_like(pos).at[..., 2].set(1.0)
     for k, terrain in enumerate(x for x in data.plugins.values() if isinstance(x, TerrainData)):
-        here, up = terrain.surface_at(pos)
-        higher = here > height if k else jnp.ones_like(here, bool)
-        height, normal = jnp.where(higher, here, height), jnp.where(higher, up, normal)
+        terrain_height, terrain_normal = terrain.surface_at(pos)
+        is_higher = terrain_height > height if k else jnp.ones_like(terrain_height, bool)
+        height, normal = jnp.where(is_higher, terrain_height, height), jnp.where(is_higher, terrain_normal, normal)
     return height, normal
 
 
@@ -88,8 +88,8 @@ def ground_height(data: SimData, pos: Array) -> Array:
 
 def ground_below(data: SimData) -> Array | float:
     """Return the height of the ground below a drone, m, after the last step; zero without terrain. (..., 1)"""
-    below = [x.below for x in data.plugins.values() if isinstance(x, TerrainData)]
-    height: Array | float = below[0] if below else 0.0
-    for other in below[1:]:
+    heights = [x.height_below for x in data.plugins.values() if isinstance(x, TerrainData)]
+    height: Array | float = heights[0] if heights else 0.0
+    for other in heights[1:]:
         height = jnp.maximum(height, other)
     return height

@@ -53,11 +53,11 @@ def rotor_positions(sim: Simulation) -> Array:
     """Return the positions of the rotors, body frame, m; zero for rotors that a drone lacks. (..., n_rotors, 3)"""
     n_rotors = sim.data.states.rotor_vel.shape[-1]
 
-    def of_one(airframe: Airframe) -> np.ndarray:
+    def read_airframe(airframe: Airframe) -> np.ndarray:
         positions = airframe.value("rotors.position")
         return np.pad(positions, [(0, n_rotors - len(positions)), (0, 0)])  # missing rotors have no thrust
 
-    return device_array(airframe_numbers(sim, of_one), sim.data.states.pos.dtype)
+    return device_array(airframe_numbers(sim, read_airframe), sim.data.states.pos.dtype)
 
 
 def thrust_gain(height: Array, upright: Array, radius: Array) -> Array:

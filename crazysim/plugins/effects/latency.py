@@ -81,10 +81,10 @@ class Latency(Plugin):
         """Return a controller that uses the command that has arrived, and does not change the staged command."""
         scope: Any = controller.scope
 
-        def late(data: SimData) -> SimData:
+        def run_on_delayed_state(data: SimData) -> SimData:
             return _with_command(controller.fn(_with_command(data, self.read(data).arrived)), _staged_command(data))
 
-        return Stage(late, scope, controller.when, controller.batched, controller.__name__)
+        return Stage(run_on_delayed_state, scope, controller.when, controller.batched, controller.__name__)
 
     def _filled_queue(self, sim: Simulation, data: SimData) -> LatencyData:
         delay, longest = np.asarray(self.delay), self.max_delay

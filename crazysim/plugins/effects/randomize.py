@@ -22,9 +22,9 @@ from crazysim.plugins.effects.moving_air import MovingAir, has_drag, require_dra
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamicsData
 from crazysim.pytree import leaf
 
-FACTORS = ("mass", "inertia", "torque", "lag", "drag")
+FACTOR_SETTINGS = ("mass", "inertia", "torque", "lag", "drag")
 """Settings that give one factor per drone, in the order of ``RandomizeData.factors``."""
-RANGES = (*FACTORS, "thrust", "rotor_thrust", "wind", "charge", "delay")
+RANGE_SETTINGS = (*FACTOR_SETTINGS, "thrust", "rotor_thrust", "wind", "charge", "delay")
 """Settings that are ranges (low, high)."""
 
 
@@ -63,7 +63,7 @@ class RandomizeData(MovingAir):
 
     @property
     def drag_factor(self) -> Array | float:
-        return 1.0 if self.drag is None else self.factors[..., FACTORS.index("drag") :]
+        return 1.0 if self.drag is None else self.factors[..., FACTOR_SETTINGS.index("drag") :]
 
 
 class Randomize(Plugin):
@@ -105,9 +105,9 @@ class Randomize(Plugin):
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""
         super().__post_init__()
-        if not isinstance(self.optional, (list, tuple)) or not all(name in RANGES for name in self.optional):
+        if not isinstance(self.optional, (list, tuple)) or not all(name in RANGE_SETTINGS for name in self.optional):
             raise ConfigError(
-                f"expected optional as a list of {', '.join(RANGES)}, got {short_repr(self.optional)}. Use "
+                f"expected optional as a list of {', '.join(RANGE_SETTINGS)}, got {short_repr(self.optional)}. Use "
                 f"optional=('wind',), say."
             )
 
@@ -139,7 +139,7 @@ class Randomize(Plugin):
         Args:
             changes: Other settings, by name.
         """
-        ranges: dict[str, Any] = dict.fromkeys((*FACTORS, "thrust"), (0.7, 1.3))
+        ranges: dict[str, Any] = dict.fromkeys((*FACTOR_SETTINGS, "thrust"), (0.7, 1.3))
         return cls._preset(ranges | {"rotor_thrust": (0.95, 1.05), "charge": (0.1, 1.0)}, changes)
 
     @classmethod
@@ -159,11 +159,11 @@ class Randomize(Plugin):
         record = settings.fill_record(
             sim,
             RandomizeData,
-            factors=drone_array(sim, 1.0, len(FACTORS)),
+            factors=drone_array(sim, 1.0, len(FACTOR_SETTINGS)),
             thrust_factors=drone_array(sim, 1.0, sim.data.states.rotor_vel.shape[-1]),
             air_vel=drone_array(sim, 0.0, 3) if blows else None,
         )
-        for name in RANGES:
+        for name in RANGE_SETTINGS:
             limits, values = getattr(record, name), getattr(self, name)
             if limits is not None and np.ndim(values) == 0:
                 raise ConfigError(
@@ -178,13 +178,13 @@ class Randomize(Plugin):
         latencies = {name: x for name, x in sim.data.plugins.items() if isinstance(x, LatencyData)}
         has_battery = any(isinstance(x, BatteryData) for x in records)
         drags = has_drag(sim) or any(isinstance(x, RotorAerodynamicsData) for x in records)
-        lacking = {
+        unmet = {
             "charge": (has_battery, "a battery", "sim.add(Battery())"),
             "drag": (drags, "an airframe with drag", "sim.add(RotorAerodynamics(...))"),
             "delay": (bool(latencies), "late commands", f"sim.add({self._latency(sim)})"),
         }
-        for setting, (exists, needs, remedy) in lacking.items():
-            if getattr(self, setting) is not None and not exists and setting not in self.optional:
+        for setting, (is_met, needs, remedy) in unmet.items():
+            if getattr(self, setting) is not None and not is_met and setting not in self.optional:
                 raise ConfigError(
                     f"expected {needs} for Randomize({setting}=...), got a simulation without. Use {remedy} too, or "
                     f"{setting}=None."
@@ -209,7 +209,7 @@ class Randomize(Plugin):
 
     def influence(self, data: SimData) -> SimData:
         record, p = self.read(data), data.params
-        mass, inertia, torque, lag, drag = (record.factors[k : k + 1] for k in range(len(FACTORS)))
+        mass, inertia, torque, lag, drag = (record.factors[k : k + 1] for k in range(len(FACTOR_SETTINGS)))
         changes = {}
         if record.mass is not None:
             changes["mass"] = mass * p.mass
@@ -234,26 +234,26 @@ class Randomize(Plugin):
     def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
         n_rotors, dtype = record.thrust_factors.shape[-1], record.factors.dtype
-        u = uniform(drone_key(data, self.name), (len(FACTORS) + 5 + n_rotors,), dtype)
+        u = uniform(drone_key(data, self.name), (len(FACTOR_SETTINGS) + 5 + n_rotors,), dtype)
 
-        def drawn(limits: Array | None, share: Array) -> Array:
+        def draw_factor(limits: Array | None, share: Array) -> Array:
             return jnp.ones_like(share) if limits is None else limits[0] + share * (limits[1] - limits[0])
 
-        single = [drawn(getattr(record, name), u[k : k + 1]) for k, name in enumerate(FACTORS)]
-        other_draws = u[len(FACTORS) :]
-        thrust = drawn(record.thrust, other_draws[:1]) * drawn(record.rotor_thrust, other_draws[5:])
-        changes = {"factors": jnp.concatenate(single), "thrust_factors": thrust}
+        single_factors = [draw_factor(getattr(record, name), u[k : k + 1]) for k, name in enumerate(FACTOR_SETTINGS)]
+        other_draws = u[len(FACTOR_SETTINGS) :]
+        thrust = draw_factor(record.thrust, other_draws[:1]) * draw_factor(record.rotor_thrust, other_draws[5:])
+        changes = {"factors": jnp.concatenate(single_factors), "thrust_factors": thrust}
         if record.wind is not None:
-            speed, angle = drawn(record.wind, other_draws[1:2]), 2 * math.pi * other_draws[2:3]
+            speed, angle = draw_factor(record.wind, other_draws[1:2]), 2 * math.pi * other_draws[2:3]
             changes["air_vel"] = jnp.concatenate([speed * jnp.cos(angle), speed * jnp.sin(angle), 0 * speed])
         data = self.write(data, record.replace(**changes))
 
         others = dict(data.plugins)
         for name, other in data.plugins.items():
             if isinstance(other, BatteryData) and record.charge is not None:
-                charge = drawn(record.charge, other_draws[3:4])
+                charge = draw_factor(record.charge, other_draws[3:4])
                 others[name] = other.replace(charge=charge, voltage=open_circuit_voltage(charge, other.n_cells))
             if isinstance(other, LatencyData) and record.delay is not None:
-                steps = jnp.floor(drawn(record.delay, other_draws[4:5])).astype(other.delay.dtype)
+                steps = jnp.floor(draw_factor(record.delay, other_draws[4:5])).astype(other.delay.dtype)
                 others[name] = other.replace(delay=steps)
         return data.replace(plugins=others)

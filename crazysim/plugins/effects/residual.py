@@ -152,11 +152,11 @@ def residual_wrench(inputs: Array, residual: ResidualData) -> tuple[Array, Array
 
 def _airframe_coefficients(sim: Simulation) -> dict[str, Any]:
     """Return the coefficients of the airframes. Either all airframes or none have a network, of the same size."""
-    lacking = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
-    if lacking is not None:
+    drone = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
+    if drone is not None:
         raise ConfigError(
-            f"expected a table [residual] of drone {lacking.name!r}, got none. {lacking.why_missing('residual.linear')}"
-            f"Use 'crazysim identify LOG --airframe {lacking.name} --out mine.toml' on flights of it, or "
+            f"expected a table [residual] of drone {drone.name!r}, got none. {drone.why_missing('residual.linear')}"
+            f"Use 'crazysim identify LOG --airframe {drone.name} --out mine.toml' on flights of it, or "
             f"drone='cf21B_500_idsia'."
         )
     sizes = {len(airframe.values.get("residual.hidden", ())) for airframe in sim.airframes}

@@ -110,12 +110,12 @@ class RotorAerodynamics(Plugin):
             hub_pos=self._hub_positions(sim),
         )
 
-    def _own_or_drag_value(self, sim: Simulation, name: str, of_drag: Callable[[np.ndarray], float]) -> Array:
+    def _own_or_drag_value(self, sim: Simulation, name: str, drag_value: Callable[[np.ndarray], float]) -> Array:
         """Return a coefficient from the setting, or else from the airframes' linear drag in hover."""
         value = getattr(self, name)
         if value is None:
             drag = airframe_numbers(
-                sim, lambda a: of_drag(a.matrix("drag.coefficients")) / (a.n_rotors * hover_speed(a))
+                sim, lambda a: drag_value(a.matrix("drag.coefficients")) / (a.n_rotors * hover_speed(a))
             )
             value = drag[..., None] if drag.ndim else drag
             if not np.all(value > 0):
@@ -131,9 +131,9 @@ class RotorAerodynamics(Plugin):
         height = self.hub_height
         if height is None:
             height = airframe_numbers(sim, lambda airframe: airframe.value("shape.propeller_height", ()))
-        up = np.asarray(check_parameter(sim, "hub_height", height))[..., None]
+        hub_z = np.asarray(check_parameter(sim, "hub_height", height))[..., None]
         pos = np.asarray(rotor_positions(sim))
-        return device_array(pos + up * np.array([0.0, 0.0, 1.0]), sim.data.states.pos.dtype)
+        return device_array(pos + hub_z * np.array([0.0, 0.0, 1.0]), sim.data.states.pos.dtype)
 
     def influence(self, data: SimData) -> SimData:
         record, s, p = self.read(data), data.states, data.params

@@ -103,7 +103,7 @@ class Complementary(Estimator):
         period = freq // dividing_rate("freq", self.freq, freq)
         height_period = freq // dividing_rate("rate of the height", HEIGHT_FREQ, freq)
 
-        def turns(data: SimData) -> SimData:
+        def update_attitude(data: SimData) -> SimData:
             """Update the attitude and the inertial velocity of one drone."""
             record, dt = self.read(data), period / data.core.freq
             gyro, accel = self.inertial(data)
@@ -111,46 +111,48 @@ class Complementary(Estimator):
             climb = inertial_climb(record.inertial_climb, quat, accel, dt)
             return self.write(data, record.replace(quat=quat, integral=integral, inertial_climb=climb))
 
-        def rises(data: SimData) -> SimData:
+        def update_height(data: SimData) -> SimData:
             """Update the height of one drone."""
             record, dt = self.read(data), height_period / data.core.freq
             height, over_surface = self._height(data, record, dt)
             climb = (height - record.height) / dt
             return self.write(data, record.replace(height=height, climb=climb, over_surface=over_surface))
 
-        def every(steps: int) -> Any:
+        def fires_every(steps: int) -> Any:
             return lambda data: (data.core.steps + 1) % steps == 0
 
         return [
-            ("attitude", Stage(turns, "drone", every(period))),
-            ("", Stage(rises, "drone", every(height_period))),
+            ("attitude", Stage(update_attitude, "drone", fires_every(period))),
+            ("", Stage(update_height, "drone", fires_every(height_period))),
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
         """Return the estimated attitude, position and velocity of one drone; x and y of the last two are zero."""
         record, s = self.read(data), data.states
         zero = jnp.zeros_like(s.pos[..., :2])
-        pos, vel = (jnp.concatenate([zero, up], axis=-1) for up in (record.height, record.climb))
+        pos, vel = (jnp.concatenate([zero, z], axis=-1) for z in (record.height, record.climb))
         return {"pos": pos, "vel": vel, "quat": rotation.safe_normalize(record.quat, s.quat)}
 
     def reset_episode(self, data: SimData) -> SimData:
         s, record = data.states, self.read(data)
-        up = s.vel[2:]
-        return self.write(data, record.replace(quat=s.quat, height=s.pos[2:], climb=up, inertial_climb=up))
+        climb = s.vel[2:]
+        return self.write(data, record.replace(quat=s.quat, height=s.pos[2:], climb=climb, inertial_climb=climb))
 
     def _height(self, data: SimData, record: ComplementaryData, dt: float) -> tuple[Array, Array]:
         """Return the height of one drone, m, and its new ``over_surface``. (1,) each"""
         height, over_surface, shift = record.height, record.over_surface, dt * record.inertial_climb
-        after = height
+        new_height = height
         for sensor in self.aids:
             if isinstance(sensor, Barometer):
-                after = filtered_height(height, sensor.part(data, "height"), shift)
+                new_height = filtered_height(height, sensor.part(data, "height"), shift)
         for sensor in self.aids:
             if isinstance(sensor, TimeOfFlight):
                 distance = sensor.latest(data)
-                useful = (sensor.age(data) <= MAX_RANGE_AGE) & (distance < sensor.read(data).max_range)
-                after, over_surface = height_over_surface(height, after, distance, useful, over_surface, shift)
-        return after, over_surface
+                is_useful = (sensor.age(data) <= MAX_RANGE_AGE) & (distance < sensor.read(data).max_range)
+                new_height, over_surface = height_over_surface(
+                    height, new_height, distance, is_useful, over_surface, shift
+                )
+        return new_height, over_surface
 
 
 def filtered_height(height: Array, measured: Array, shift: Array) -> Array:
@@ -165,21 +167,21 @@ def filtered_height(height: Array, measured: Array, shift: Array) -> Array:
 
 
 def height_over_surface(
-    height: Array, by_pressure: Array, distance: Array, useful: Array, over_surface: Array, shift: Array
+    height: Array, pressure_height: Array, distance: Array, is_useful: Array, over_surface: Array, shift: Array
 ) -> tuple[Array, Array]:
     """Return the height after an update, m, and the new ``over_surface`` (``positionEstimateInternal``). (1,) each
 
     Args:
         height: Height before, m. (1,)
-        by_pressure: Height to use if the distance to the ground was never measured, m. (1,)
+        pressure_height: Height to use if the distance to the ground was never measured, m. (1,)
         distance: Distance to the ground, m. (1,)
-        useful: True where the distance is recent and within the sensor's range. (1,)
+        is_useful: True where the distance is recent and within the sensor's range. (1,)
         over_surface: 1 if the distance to the ground has been measured before, else 0. (1,)
         shift: Change of the height in the interval by the inertial velocity, m. (1,)
     """
-    over_surface = jnp.where(useful, 1.0, over_surface)
-    height_estimate = jnp.where(over_surface > 0, height, by_pressure)
-    return jnp.where(useful, filtered_height(height, distance, shift), height_estimate), over_surface
+    over_surface = jnp.where(is_useful, 1.0, over_surface)
+    height_estimate = jnp.where(over_surface > 0, height, pressure_height)
+    return jnp.where(is_useful, filtered_height(height, distance, shift), height_estimate), over_surface
 
 
 def update_mahony(
@@ -200,8 +202,8 @@ def update_mahony(
     """
     error = rotation.cross(rotation.safe_normalize(accel, jnp.zeros_like(accel)), rotation.matrix(quat)[2])
     integral = integral + ki * dt * error
-    falls = jnp.any(accel != 0)
-    rate = gyro + jnp.where(falls, integral + kp * error, 0.0)
+    has_force = jnp.any(accel != 0)
+    rate = gyro + jnp.where(has_force, integral + kp * error, 0.0)
     step = jnp.concatenate([0.5 * dt * rate, jnp.ones_like(rate[:1])])
     return rotation.safe_normalize(rotation.multiply(quat, step), quat), integral
 
@@ -216,5 +218,5 @@ def inertial_climb(climb: Array, quat: Array, accel: Array, dt: float) -> Array:
         dt: Length of the interval, s.
     """
     acc = rotation.matrix(quat)[2:] @ accel / GRAVITY_MAGNITUDE - 1.0
-    beyond = jnp.sign(acc) * jnp.maximum(jnp.abs(acc) - CLIMB_DEADBAND, 0.0)
-    return KEEP_VELOCITY * (climb + GRAVITY_MAGNITUDE * dt * beyond)
+    excess_acc = jnp.sign(acc) * jnp.maximum(jnp.abs(acc) - CLIMB_DEADBAND, 0.0)
+    return KEEP_VELOCITY * (climb + GRAVITY_MAGNITUDE * dt * excess_acc)

@@ -1,7 +1,7 @@
 """Extended Kalman filters with error states, as functions of one drone.
 
-The equations, constants and guards are those of the Crazyflie's firmware (kalman_core.c and the mm_*.c of
-bitcraze/crazyflie-firmware, commit 2a18fc29), whose sources are M. W. Mueller, M. Hamer and R. D'Andrea, Fusing
+The equations, constants and guards follow the Crazyflie's firmware (kalman_core.c and the mm_*.c of
+bitcraze/crazyflie-firmware, commit 2a18fc29), which is based on M. W. Mueller, M. Hamer and R. D'Andrea, Fusing
 ultra-wideband range measurements with accelerometers and rate gyroscopes for quadrocopter state estimation, ICRA 2015,
 and M. W. Mueller, M. Hehn and R. D'Andrea, Covariance correction step for Kalman filtering with an attitude, Journal of
 Guidance, Control, and Dynamics 40 (2017). The drag that the firmware can model is zero on Crazyflies, and is left out.
@@ -168,7 +168,7 @@ def predict_biased(
     """Return the estimate with biases after an interval, with the noise of the inertial sensors.
 
     Position and velocity move with the mean specific force, turned by half of the rotation in the interval; the errors
-    are those of Solà (2017), section 5.4.3, with the velocity turned into the body frame. R and v are attitude and
+    follow Solà (2017), section 5.4.3, with the velocity turned into the body frame. R and v are attitude and
     velocity before the interval, R' and v' after it, M is the rotation in its first half, E = R'^T R, g gravity in the
     world frame, a and w are the errors of accelerometer and gyroscope, and [ ]x is the matrix of a cross product:
 
@@ -299,8 +299,8 @@ def turn_attitude(quat: Array, angle: Array, resting: Array | None = None) -> Ar
     If ``resting`` is given, a share of it is mixed in (``REVERSION_SHARE``).
     """
     size = rotation.safe_norm(angle) + EPS
-    half = 0.5 * size
-    step = jnp.concatenate([jnp.sin(half) / size * angle, jnp.cos(half)])
+    half_angle = 0.5 * size
+    step = jnp.concatenate([jnp.sin(half_angle) / size * angle, jnp.cos(half_angle)])
     quat = rotation.multiply(quat, step)
     if resting is not None:
         quat = (1 - REVERSION_SHARE) * quat + REVERSION_SHARE * resting

@@ -19,7 +19,7 @@ from crazysim.plugins.estimators import error_state, inertial_path, updates
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.inertial_path import InertialPath
-from crazysim.plugins.estimators.kalman import UPDATE_FNS as FIRMWARE
+from crazysim.plugins.estimators.kalman import UPDATE_FNS as KALMAN_UPDATE_FNS
 from crazysim.plugins.sensors.barometer import LAPSE, PRESSURE_EXPONENT, SEA_LEVEL_TEMPERATURE, Barometer, pressure_at
 from crazysim.plugins.sensors.beacons import UWB, Lighthouse
 from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight, range_deviation
@@ -155,8 +155,8 @@ class ESKF(ErrorStateFilter):
         def predict(data: SimData) -> SimData:
             """Predict the state of one drone; angular velocities are integrated by the trapezoidal rule."""
             record, imu, dt = self.read(data), self.imu.read(data), period / data.core.freq
-            half = 0.5 * self.inertial(data)[0]
-            accel, gyro = record.accel / period, (record.gyro - half) / period
+            half_rate = 0.5 * self.inertial(data)[0]
+            accel, gyro = record.accel / period, (record.gyro - half_rate) / period
             noise_variances = [0.5 / dt * triad.noise**2 for triad in (imu.accel, imu.gyro)]
             estimate = error_state.predict_biased(
                 record.estimate, accel, gyro, dt, data.params.gravity_vec, noise_variances[0], noise_variances[1]
@@ -166,7 +166,7 @@ class ESKF(ErrorStateFilter):
             if record.paths is not None:
                 paths = [InertialPath.from_row(row, jnp.zeros_like(dt)).extend(accel, gyro, dt) for row in record.paths]
                 record = record.replace(paths=jnp.stack([path.to_row() for path in paths]))
-            return self.write(data, record.replace(estimate=estimate, accel=jnp.zeros_like(accel), gyro=half))
+            return self.write(data, record.replace(estimate=estimate, accel=jnp.zeros_like(accel), gyro=half_rate))
 
         return predict
 
@@ -314,7 +314,7 @@ def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate)
         rotation.matrix(estimate.quat),
         {"sweep": _combined_std(sensor.read(data).noise[0], min_std=0.1 * MIN_STD)},
     )
-    return FIRMWARE[Lighthouse](sensor, imu, data, estimate, rot, std)
+    return KALMAN_UPDATE_FNS[Lighthouse](sensor, imu, data, estimate, rot, std)
 
 
 UPDATE_FNS: dict[type, Callable[..., Estimate]] = {

@@ -97,8 +97,8 @@ class Estimator(Plugin):
     def measured_states(self, data: SimData) -> dict[str, Array]:
         """Return the estimated state of one drone, the true one in a world's first step."""
         s, estimate = data.states, self.estimated_states(data)
-        first = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
-        states = {name: jnp.where(first, getattr(s, name), value) for name, value in estimate.items()}
+        is_first_step = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
+        states = {name: jnp.where(is_first_step, getattr(s, name), value) for name, value in estimate.items()}
         return self.imu.measured_states(data) | states
 
     def observations(self, data: SimData) -> dict[str, Array]:
@@ -128,7 +128,7 @@ class Estimator(Plugin):
     def _estimate_controller(self, controller: Stage) -> Stage:
         """Return a controller that reads the estimate in place of the state."""
 
-        def blind(data: SimData) -> SimData:
+        def run_on_estimate(data: SimData) -> SimData:
             return controller.fn(with_measured_states([self], data)).replace(states=data.states)
 
-        return Stage(blind, controller.scope, controller.when, controller.batched, controller.__name__)
+        return Stage(run_on_estimate, controller.scope, controller.when, controller.batched, controller.__name__)

@@ -65,8 +65,8 @@ class InertialPath(NamedTuple):
 
     def without_biases(self, estimate: Estimate) -> InertialPath:
         """Return the path for measurements without the biases of an estimate, to first order in them."""
-        half, t = _half_rotation(self.quat), self.duration
-        rate, force = (rotation.rotate(half, x) for x in (estimate.gyro_bias, estimate.accel_bias))  # type: ignore[arg-type]
+        half_quat, t = _half_rotation(self.quat), self.duration
+        rate, force = (rotation.rotate(half_quat, x) for x in (estimate.gyro_bias, estimate.accel_bias))  # type: ignore[arg-type]
         vel, pos = self.vel - t * force, self.pos - 0.5 * t**2 * force
         vel, pos = vel - rotation.cross(rate, t * vel - pos), pos - t / 3 * rotation.cross(rate, pos)
         return InertialPath(
@@ -105,14 +105,14 @@ def propagate_along(estimate: Estimate, path: InertialPath, gravity: Array) -> E
     )
     accel_to_vel, accel_to_pos, vel_cross = -t * half_rot, -0.5 * t**2 * rot @ half_rot, cross_matrix(vel)
 
-    def rows(p: Array) -> Array:
+    def transform_errors(p: Array) -> Array:
         """Return the derivatives of the errors at the end times a matrix."""
         att = inverse_rot @ (p[6:9] + gyro_to_att @ p[12:])
         vel_error = p[3:6] + att_to_vel @ p[6:9] + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
         pos_rows = p[:3] + t * rot @ p[3:6] + att_to_pos @ p[6:9] + accel_to_pos @ p[9:12] + gyro_to_pos @ p[12:]
         return jnp.concatenate([pos_rows, inverse_rot @ vel_error + vel_cross @ att, att, p[9:]])
 
-    cov = bound_covariance(rows(rows(covariance(estimate.cov)).T))
+    cov = bound_covariance(transform_errors(transform_errors(covariance(estimate.cov)).T))
     return estimate.replace(pos=pos, vel=vel, quat=quat, cov=cov)
 
 

@@ -97,18 +97,18 @@ class Kalman(ErrorStateFilter):
 
     def record(self, sim: Simulation) -> KalmanData:
         self.check_sensors(sim)
-        if unknown := self.deviations.keys() - MEASUREMENT_STD.keys():
+        if unknown_names := self.deviations.keys() - MEASUREMENT_STD.keys():
             raise ConfigError(
-                f"expected deviations of {', '.join(MEASUREMENT_STD)}, got {', '.join(map(repr, unknown))}"
+                f"expected deviations of {', '.join(MEASUREMENT_STD)}, got {', '.join(map(repr, unknown_names))}"
             )
         deviations = MEASUREMENT_STD | dict(self.deviations)
         level = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4)
-        still = drone_array(sim, 0.0, 3)
+        zeros = drone_array(sim, 0.0, 3)
         cov = np.diag(np.square(INITIAL_STD))[np.triu_indices(error_state.N)]
         return self.initial_record(
             sim,
             KalmanData,
-            Estimate(still, still, level, still, drone_array(sim, cov, *cov.shape), None, None),
+            Estimate(zeros, zeros, level, zeros, drone_array(sim, cov, *cov.shape), None, None),
             previous=level,
             deviations=device_array(np.array([deviations[name] for name in MEASUREMENT_STD]), level.dtype),
         )
@@ -190,8 +190,8 @@ def _use_flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate, 
 def _use_range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     distance = sensor.latest(data)
     deviation = range_deviation(distance, std["range"])[0]
-    after = updates.update_range(estimate, rot, distance[0], deviation)
-    return error_state.select_estimate(distance[0] < sensor.read(data).max_range[0], after, estimate)
+    updated = updates.update_range(estimate, rot, distance[0], deviation)
+    return error_state.select_estimate(distance[0] < sensor.read(data).max_range[0], updated, estimate)
 
 
 def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
@@ -206,13 +206,13 @@ def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: 
 
 def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     system = sensor.read(data)
-    angle, visible, k = sensor.part(data, "angle"), sensor.part(data, "visible"), 0
+    angle, visibility, k = sensor.part(data, "angle"), sensor.part(data, "visible"), 0
     for pos, quat in zip(system.stations, system.quat, strict=True):
         for diode in system.diodes:
             for plane, tilt in enumerate(SWEEP_TILTS):
                 station = pos, rotation.matrix(quat)
-                after = updates.update_sweep(estimate, rot, diode, station, tilt, angle[2 * k + plane], std["sweep"])
-                estimate = error_state.select_estimate(visible[k] > 0, after, estimate)
+                updated = updates.update_sweep(estimate, rot, diode, station, tilt, angle[2 * k + plane], std["sweep"])
+                estimate = error_state.select_estimate(visibility[k] > 0, updated, estimate)
             k += 1
     return estimate
 

@@ -159,11 +159,11 @@ def update_difference(
         difference: Distance to the second minus distance to the first. ()
         deviation: Standard deviation of the difference, m.
     """
-    to_first, to_second = estimate.pos - first, estimate.pos - second
-    d_first, d_second = rotation.safe_norm(to_first), rotation.safe_norm(to_second)
-    is_apart = (d_first > 0) & (d_second > 0)
-    h = to_second / jnp.where(is_apart, d_second, 1.0) - to_first / jnp.where(is_apart, d_first, 1.0)
-    updated = update(estimate, POS, h, difference - (d_second - d_first)[0], deviation)
+    offset_1, offset_2 = estimate.pos - first, estimate.pos - second
+    distance_1, distance_2 = rotation.safe_norm(offset_1), rotation.safe_norm(offset_2)
+    is_apart = (distance_1 > 0) & (distance_2 > 0)
+    h = offset_2 / jnp.where(is_apart, distance_2, 1.0) - offset_1 / jnp.where(is_apart, distance_1, 1.0)
+    updated = update(estimate, POS, h, difference - (distance_2 - distance_1)[0], deviation)
     return select_estimate(is_apart[0], updated, estimate)
 
 

@@ -118,9 +118,9 @@ class Hook(CollidingPlugin, Plugin):
         pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
         no_clearance = device_array(np.zeros(load.clearance.shape))
         tip_pos, tip_vel = hanging_state(sim.data.states, load.attach, load.length, no_clearance, False)
-        free = {name: device_array(np.zeros(load.attached.shape), bool) for name in ("attached", "grip")}
+        masks = {name: device_array(np.zeros(load.attached.shape), bool) for name in ("attached", "grip")}
         return load.replace(
-            pos=device_array(pos), vel=device_array(np.zeros_like(pos)), tip_pos=tip_pos, tip_vel=tip_vel, **free
+            pos=device_array(pos), vel=device_array(np.zeros_like(pos)), tip_pos=tip_pos, tip_vel=tip_vel, **masks
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
@@ -138,17 +138,17 @@ class Hook(CollidingPlugin, Plugin):
             p.gravity_vec + load.mass / (link.mass + MIN_MASS) * (fall_acc - p.gravity_vec),
             p.gravity_vec,
         )
-        linked = couple_bodies(
+        motion = couple_bodies(
             data.states, deriv, p.mass, p.J_inv, link, load.tip_pos, load.tip_vel, tip_free_acc, dt, data.core.freq
         )
         free_rate = load.vel if dt is None else load.vel + dt * fall_acc
         rates = {
-            "tip_pos": linked.rate,
-            "tip_vel": linked.acc,
-            "pos": jnp.where(load.attached, linked.rate, free_rate),
-            "vel": jnp.where(load.attached, linked.acc, fall_acc),
+            "tip_pos": motion.rate,
+            "tip_vel": motion.acc,
+            "pos": jnp.where(load.attached, motion.rate, free_rate),
+            "vel": jnp.where(load.attached, motion.acc, fall_acc),
         }
-        return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
+        return motion.deriv.replace(plugins=deriv.plugins | {self.name: rates})
 
     def pick_up_and_release(self, data: SimData) -> SimData:
         """Pick up one drone's load if it is near and slow, or let it go, as commanded by ``grip`` of the record.
@@ -169,8 +169,8 @@ class Hook(CollidingPlugin, Plugin):
         joint_vel = load.tip_vel + load.mass / (link.mass + MIN_MASS) * relative_vel
         new_state, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, joint_vel)
 
-        def where_picked(picked: Array, unchanged: Array) -> Array:
-            return jnp.where(picks, picked, unchanged)
+        def where_picked(is_picked: Array, unchanged: Array) -> Array:
+            return jnp.where(picks, is_picked, unchanged)
 
         tip_vel = where_picked(tip_vel, load.tip_vel)
         new_load = new_load.replace(

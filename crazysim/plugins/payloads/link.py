@@ -77,13 +77,13 @@ class LinkGeometry(NamedTuple):
     """Velocity of the tip relative to the attachment, m/s. (3,)"""
 
 
-def link_geometry(s: SimState, pos: Array, vel: Array, attach: Array | None) -> LinkGeometry:
+def link_geometry(state: SimState, pos: Array, vel: Array, attach: Array | None) -> LinkGeometry:
     """Return the geometry of the link from a body to a tip."""
-    rot, arm = rotation.matrix(s.quat), None
-    offset, rel_vel = pos - s.pos, vel - s.vel
+    rot, arm = rotation.matrix(state.quat), None
+    offset, rel_vel = pos - state.pos, vel - state.vel
     if attach is not None:
         arm = matvec(rot, attach)
-        offset, rel_vel = offset - arm, matvec(rot, -cross(s.ang_vel, attach), rel_vel)
+        offset, rel_vel = offset - arm, matvec(rot, -cross(state.ang_vel, attach), rel_vel)
     square = dot(offset, offset)
     inverse = lax.rsqrt(square + MIN_SQUARED_LENGTH)
     return LinkGeometry(rot, arm, offset, square * inverse, offset * inverse, rel_vel)
@@ -127,7 +127,7 @@ class UnitPull(NamedTuple):
 
 
 def couple_bodies(
-    s: SimState, deriv: SimStateDeriv, mass: Array, J_inv: Array, link: LinkParams, pos: Array, vel: Array,
+    state: SimState, deriv: SimStateDeriv, mass: Array, J_inv: Array, link: LinkParams, pos: Array, vel: Array,
     free_acc: Array, dt: float | None, freq: int,
 ) -> LinkedMotion:  # fmt: skip
     """Return the derivative of a body and a tip that a link joins.
@@ -139,7 +139,7 @@ def couple_bodies(
     relative to the attachment. Errors in length are removed from positions only.
 
     Args:
-        s: State of the body. Leaves (k,)
+        state: State of the body. Leaves (k,)
         deriv: Derivative of the free body.
         mass: Mass of the body, kg. (1,)
         J_inv: Inverse of its inertia, 1/(kg m^2). (3, 3)
@@ -150,22 +150,22 @@ def couple_bodies(
         dt: Duration of the step, s; None for the derivative at an instant.
         freq: Steps per second, Hz.
     """
-    r, m = link_geometry(s, pos, vel, link.attach), link.mass
-    radial_speed = dot(r.direction, r.vel)
-    attach_acc = acceleration_at(s, deriv, r.rot, link.attach, 1.0 if dt is None else 0.5)
+    geometry, m = link_geometry(state, pos, vel, link.attach), link.mass
+    radial_speed = dot(geometry.direction, geometry.vel)
+    attach_acc = acceleration_at(state, deriv, geometry.rot, link.attach, 1.0 if dt is None else 0.5)
     rel_acc = free_acc - attach_acc
 
-    link_pull = UnitPull.create(r.direction, r.rot, J_inv, link.attach)
+    link_pull = UnitPull.create(geometry.direction, geometry.rot, J_inv, link.attach)
     # Of equal directions: their product is 1 but for rounding.
     mass_ratio = m / mass
     if link_pull.lever is not None and link_pull.ang_acc is not None:
         mass_ratio = m / mass + m * dot(link_pull.lever, link_pull.ang_acc)
-    swing_square = dot(r.vel, r.vel) - radial_speed * radial_speed
-    rhs = dot(r.direction, rel_acc) + (1.0 if dt is None else 0.5) / link.length * swing_square
-    rhs = rhs + _radial_term(r, radial_speed, rhs, link, dt, freq)
+    swing_square = dot(geometry.vel, geometry.vel) - radial_speed * radial_speed
+    rhs = dot(geometry.direction, rel_acc) + (1.0 if dt is None else 0.5) / link.length * swing_square
+    rhs = rhs + _radial_term(geometry, radial_speed, rhs, link, dt, freq)
     pulls = [link_pull]
     if link.is_hinge:
-        hinge_pull, hinge_rhs = _hinge_pull(s, deriv, r, rel_acc, J_inv, link, dt, freq)
+        hinge_pull, hinge_rhs = _hinge_pull(state, deriv, geometry, rel_acc, J_inv, link, dt, freq)
         cross_ratio = dot(link_pull.direction, hinge_pull.direction) + m * link_pull.response(hinge_pull, mass)
         hinge_ratio = m * hinge_pull.response(hinge_pull, mass)
         inverse = 1 / ((1 + mass_ratio) * (1 + hinge_ratio) - cross_ratio * cross_ratio)
@@ -179,25 +179,25 @@ def couple_bodies(
         tensions = [jnp.where(link.is_attached, t, 0.0) for t in tensions]
     damping = None
     if link.damping is not None:  # it pulls against the swing across the link
-        rate, swing = _damping_rate(link, dt, freq), _swing_velocities(s, r)[1]
+        rate, swing = _damping_rate(link, dt, freq), _swing_velocities(state, geometry)[1]
         damping = rate * swing
         tensions[0] = tensions[0] - rate * radial_speed
     parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
     pull = sum(parts[1:], parts[0])
     # Constants are multiplied first, which is then done once, and the rest are multiply-adds.
-    mass_ratio, coupled = m / mass, deriv
+    mass_ratio, rates = m / mass, deriv
     if damping is not None:
         pull = pull + damping
         # All that pulls at the tip turns the body as if it were part of it: along the link no force has another lever.
-        torque = to_body_frame(r.rot, cross(pos - s.pos, pull))
-        coupled = _with_torque(deriv, m * J_inv, torque, dt)
+        torque = to_body_frame(geometry.rot, cross(pos - state.pos, pull))
+        rates = _with_torque(deriv, m * J_inv, torque, dt)
     elif any(p.ang_acc is not None for p in pulls):
-        turns = [m * t * p.ang_acc for t, p in zip(tensions, pulls, strict=True) if p.ang_acc is not None]
-        coupled = _with_torque(deriv, None, sum(turns[1:], turns[0]), dt)
+        angular_terms = [m * t * p.ang_acc for t, p in zip(tensions, pulls, strict=True) if p.ang_acc is not None]
+        rates = _with_torque(deriv, None, sum(angular_terms[1:], angular_terms[0]), dt)
     tip_acc = free_acc - pull
-    new_deriv = coupled.replace(acc=deriv.acc + mass_ratio * pull)
+    new_deriv = rates.replace(acc=deriv.acc + mass_ratio * pull)
     new_deriv = new_deriv if dt is None else new_deriv.replace(vel=deriv.vel + dt * mass_ratio * pull)
-    rate = _tip_rate(s, deriv, r, link, vel, tip_acc, attach_acc, dt, freq)
+    rate = _tip_rate(state, deriv, geometry, link, vel, tip_acc, attach_acc, dt, freq)
     return LinkedMotion(new_deriv, rate, tip_acc)
 
 
@@ -215,18 +215,18 @@ def to_body_frame(rot: Array, vector: Array) -> Array:
     return matvec(jnp.swapaxes(rot, -1, -2), vector)
 
 
-def acceleration_at(s: SimState, deriv: SimStateDeriv, rot: Array, point: Array | None, share: float) -> Array:
+def acceleration_at(state: SimState, deriv: SimStateDeriv, rot: Array, point: Array | None, share: float) -> Array:
     """Return the acceleration of a point of the body, with a share of its centripetal part, m/s^2. (3,)"""
     if point is None:
         return deriv.acc
-    centripetal = cross(s.ang_vel, share * cross(s.ang_vel, point))
+    centripetal = cross(state.ang_vel, share * cross(state.ang_vel, point))
     return matvec(rot, add_cross(centripetal, deriv.ang_acc, point), deriv.acc)
 
 
-def _swing_velocities(s: SimState, r: LinkGeometry) -> tuple[Array, Array]:
+def _swing_velocities(state: SimState, geometry: LinkGeometry) -> tuple[Array, Array]:
     """Return the body's angular velocity, world frame, and the velocity of the tip relative to the turning body."""
-    ang_vel = matvec(r.rot, s.ang_vel)
-    return ang_vel, add_cross(r.vel, r.offset, ang_vel)
+    ang_vel = matvec(geometry.rot, state.ang_vel)
+    return ang_vel, add_cross(geometry.vel, geometry.offset, ang_vel)
 
 
 def correction_rate(freq: int) -> float:
@@ -257,74 +257,74 @@ def _damping_rate(link: LinkParams, dt: float | None, freq: int) -> Array:
 
 
 def _radial_term(
-    r: LinkGeometry, radial_speed: Array, free_acc: Array, link: LinkParams, dt: float | None, freq: int
+    geometry: LinkGeometry, radial_speed: Array, free_acc: Array, link: LinkParams, dt: float | None, freq: int
 ) -> Array:
     """Return the term of the tension, before it is shared, that ends relative motion along the link."""
     if dt is None:
         if not link.is_cable:
             return 2 * correction_rate(freq) * radial_speed
         # A faster tip gets the impulse of ``end_relative_motion`` in front of the next step.
-        is_taut = (r.distance > (1 - TAUT_BAND) * link.length) & (radial_speed < BOUNCE_SPEED)
+        is_taut = (geometry.distance > (1 - TAUT_BAND) * link.length) & (radial_speed < BOUNCE_SPEED)
         return jnp.where(is_taut, 2 * correction_rate(freq) * radial_speed, -SLACK_ACCELERATION)
     if not link.is_cable:
         return freq * radial_speed
     # Within the band a cable is taut, and smooth in its parameters like a rod.
-    slack = link.length - r.distance
+    slack = link.length - geometry.distance
     gap = jnp.where(slack > TAUT_BAND * link.length, freq * slack, 0.0)
     if link.restitution is None:
         return freq * (radial_speed - gap)
     # It bounces in the step at whose end it would be taut, with the speed that it had when it became taut.
-    overshoot = jnp.maximum(r.distance - link.length, 0.0)
+    overshoot = jnp.maximum(geometry.distance - link.length, 0.0)
     rebound_speed = link.restitution * rotation.safe_sqrt(
         radial_speed * radial_speed - 2 * overshoot * jnp.maximum(free_acc, 0.0)
     )
-    bounces = (link.restitution > 0) & (radial_speed > BOUNCE_SPEED) & (radial_speed + dt * free_acc > gap)
-    return freq * (radial_speed - jnp.where(bounces, -rebound_speed, gap))
+    is_bouncing = (link.restitution > 0) & (radial_speed > BOUNCE_SPEED) & (radial_speed + dt * free_acc > gap)
+    return freq * (radial_speed - jnp.where(is_bouncing, -rebound_speed, gap))
 
 
 def _hinge_pull(
-    s: SimState, deriv: SimStateDeriv, r: LinkGeometry, rel_acc: Array, J_inv: Array, link: LinkParams,
+    state: SimState, deriv: SimStateDeriv, geometry: LinkGeometry, rel_acc: Array, J_inv: Array, link: LinkParams,
     dt: float | None, freq: int,
 ) -> tuple[UnitPull, Array]:  # fmt: skip
     """Return the pull that keeps the tip in the body's x-z plane, and the relative acceleration that it prevents."""
-    y = r.rot[..., 1]
-    ang_vel, swing = _swing_velocities(s, r)
-    offset = to_body_frame(r.rot, r.offset)
-    pull = UnitPull.create(y, r.rot, J_inv, offset if link.attach is None else offset + link.attach)
-    turning_acc = matvec(r.rot, cross(deriv.ang_acc, offset))
-    coriolis = cross(ang_vel, cross(ang_vel, r.offset) - 2 * r.vel)
+    y = geometry.rot[..., 1]
+    ang_vel, swing = _swing_velocities(state, geometry)
+    offset = to_body_frame(geometry.rot, geometry.offset)
+    pull = UnitPull.create(y, geometry.rot, J_inv, offset if link.attach is None else offset + link.attach)
+    turning_acc = matvec(geometry.rot, cross(deriv.ang_acc, offset))
+    coriolis = cross(ang_vel, cross(ang_vel, geometry.offset) - 2 * geometry.vel)
     hinge_speed = dot(y, swing)
     correction = freq * hinge_speed if dt is not None else 2 * correction_rate(freq) * hinge_speed
     return pull, dot(y, rel_acc - turning_acc + (1.0 if dt is None else 0.5) * coriolis) + correction
 
 
 def _tip_rate(
-    s: SimState, deriv: SimStateDeriv, r: LinkGeometry, link: LinkParams, vel: Array, tip_acc: Array, attach_acc: Array,
-    dt: float | None, freq: int,
+    state: SimState, deriv: SimStateDeriv, geometry: LinkGeometry, link: LinkParams, vel: Array, tip_acc: Array,
+    attach_acc: Array, dt: float | None, freq: int,
 ) -> Array:  # fmt: skip
     """Return the rate of the tip's position, which removes errors in length, m/s. (3,)"""
-    is_attached, stretch = link.is_attached, r.distance - link.length
+    is_attached, stretch = link.is_attached, geometry.distance - link.length
     if link.is_cable:
         stretch = jnp.where(stretch > -TAUT_BAND * link.length, stretch, 0.0)
     share = freq if dt is not None else correction_rate(freq)
     share = share if is_attached is None else jnp.where(is_attached, share, 0.0)
     rate = vel if dt is None else vel + dt * tip_acc  # as the integrator has it: computed once
-    rate = rate - share * stretch * r.direction
+    rate = rate - share * stretch * geometry.direction
     if link.is_hinge:
-        rate = rate - share * dot(r.rot[..., 1], r.offset) * r.rot[..., 1]
+        rate = rate - share * dot(geometry.rot[..., 1], geometry.offset) * geometry.rot[..., 1]
     if dt is None:
         return rate
     # ``deriv.vel`` moves the body; the tip moves with its new velocity relative to that.
     attach_motion = attach_acc
-    if deriv.vel is not s.vel:  # it is the new velocity of the body
+    if deriv.vel is not state.vel:  # it is the new velocity of the body
         attach_motion = attach_motion - deriv.acc
         if link.attach is not None:
-            attach_motion = attach_motion - matvec(r.rot, cross(deriv.ang_acc, link.attach))
+            attach_motion = attach_motion - matvec(geometry.rot, cross(deriv.ang_acc, link.attach))
     return rate - (dt if is_attached is None else jnp.where(is_attached, dt, 0.0)) * attach_motion
 
 
 def end_relative_motion(
-    s: SimState, mass: Array, J_inv: Array, link: LinkParams, pos: Array, vel: Array
+    state: SimState, mass: Array, J_inv: Array, link: LinkParams, pos: Array, vel: Array
 ) -> tuple[SimState, Array]:
     """Return the body and the tip's velocity after the impulse that ends relative motion along the link.
 
@@ -332,23 +332,23 @@ def end_relative_motion(
     restitution. Momentum is conserved, and no energy is gained.
 
     Args:
-        s: State of the body. Leaves (k,)
+        state: State of the body. Leaves (k,)
         mass: Mass of the body, kg. (1,)
         J_inv: Inverse of its inertia, 1/(kg m^2). (3, 3)
         link: Parameters.
         pos: Position of the tip, world frame, m. (3,)
         vel: Velocity of the tip, world frame, m/s. (3,)
     """
-    r = link_geometry(s, pos, vel, link.attach)
-    radial_speed = dot(r.direction, r.vel)
-    pull = UnitPull.create(r.direction, r.rot, J_inv, link.attach)
+    geometry = link_geometry(state, pos, vel, link.attach)
+    radial_speed = dot(geometry.direction, geometry.vel)
+    pull = UnitPull.create(geometry.direction, geometry.rot, J_inv, link.attach)
     change = radial_speed / (1 + link.mass * pull.response(pull, mass))
     if link.is_cable:
         bounce_factor = 1.0 if link.restitution is None else 1 + link.restitution
-        is_taut = (r.distance > (1 - TAUT_BAND) * link.length) & (radial_speed > 0)
+        is_taut = (geometry.distance > (1 - TAUT_BAND) * link.length) & (radial_speed > 0)
         change = jnp.where(is_taut, jnp.where(radial_speed > BOUNCE_SPEED, bounce_factor, 1.0) * change, 0.0)
     change = change if link.is_attached is None else jnp.where(link.is_attached, change, 0.0)
-    s = s.replace(vel=s.vel + link.mass / mass * change * pull.direction)
+    state = state.replace(vel=state.vel + link.mass / mass * change * pull.direction)
     if pull.ang_acc is not None:
-        s = s.replace(ang_vel=s.ang_vel + link.mass * change * pull.ang_acc)
-    return s, vel - change * pull.direction
+        state = state.replace(ang_vel=state.ang_vel + link.mass * change * pull.ang_acc)
+    return state, vel - change * pull.direction

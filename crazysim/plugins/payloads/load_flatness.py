@@ -18,7 +18,7 @@ from crazysim import rotation
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.eager import jit_unless_traced
 
-ORDER = 6
+MAX_ORDER = 6
 """Highest derivative of the load's path that is needed."""
 
 
@@ -70,8 +70,8 @@ def load_flat_state(
     """
     falling = [gravity_vec, 0.0, 0.0, 0.0, 0.0]
     pull = [load_mass * (path[..., 2 + k, :] - g) for k, g in enumerate(falling)]
-    tension, up = _norm_and_direction(pull)
-    pos = [path[..., k, :] + length * up[k] for k in range(ORDER - 1)]
+    tension, rod_axis = _norm_and_direction(pull)
+    pos = [path[..., k, :] + length * rod_axis[k] for k in range(MAX_ORDER - 1)]
     force = [mass * (pos[2 + k] - g) + pull[k] for k, g in enumerate(falling[:3])]
     thrust, rate, acc = (f / mass for f in force)
     now = attitude_of_thrust(thrust, rate, acc, yaw[..., :1], yaw[..., 1:2], yaw[..., 2:])
@@ -80,8 +80,8 @@ def load_flat_state(
         pos=pos[0],
         vel=pos[1],
         acc=pos[2],
-        direction=-up[0],
-        direction_rate=-up[1],
+        direction=-rod_axis[0],
+        direction_rate=-rod_axis[1],
         quat=rotation.quat_from_axes(*(now.matrix[..., k] for k in range(3))),
         ang_vel=now.ang_vel,
         ang_acc=now.ang_acc,

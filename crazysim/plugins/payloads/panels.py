@@ -24,7 +24,7 @@ class Panels(NamedTuple):
     """Areas, m^2. (n, 1)"""
 
 
-def shape_panels(shape: Shape, largest: float) -> Panels:
+def shape_panels(shape: Shape, max_edge: float) -> Panels:
     """Return the surface of a ball or a box as panels.
 
     The panels of a box are equal rectangles on each side. The panels of a ball have equal areas and lie on a Fibonacci
@@ -32,31 +32,31 @@ def shape_panels(shape: Shape, largest: float) -> Panels:
 
     Args:
         shape: Sphere or box.
-        largest: Largest edge of a panel, m; on a ball, the square root of its largest area.
+        max_edge: Largest edge of a panel, m; on a ball, the square root of its largest area.
     """
     if shape.kind == "sphere":
-        return _ball_panels(shape.size[0], largest)
+        return _ball_panels(shape.size[0], max_edge)
     half = np.array(shape.size)
     pos, normal, area = [], [], []
     for axis in range(3):
-        across = [k for k in range(3) if k != axis]
-        counts = [max(1, math.ceil(2 * half[k] / largest - 1e-9)) for k in across]
-        lines = [half[k] * (2 * (np.arange(n) + 0.5) / n - 1) for k, n in zip(across, counts, strict=True)]
+        side_axes = [k for k in range(3) if k != axis]
+        counts = [max(1, math.ceil(2 * half[k] / max_edge - 1e-9)) for k in side_axes]
+        lines = [half[k] * (2 * (np.arange(n) + 0.5) / n - 1) for k, n in zip(side_axes, counts, strict=True)]
         grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
         for side in (-1.0, 1.0):
             points = np.zeros((len(grid), 3))
-            points[:, across], points[:, axis] = grid, side * half[axis]
+            points[:, side_axes], points[:, axis] = grid, side * half[axis]
             pos.append(points)
             normal.append(np.tile(side * np.eye(3)[axis], (len(grid), 1)))
-            area.append(np.full((len(grid), 1), 4 * half[across[0]] * half[across[1]] / len(grid)))
+            area.append(np.full((len(grid), 1), 4 * half[side_axes[0]] * half[side_axes[1]] / len(grid)))
     return Panels(*(np.concatenate(x) for x in (pos, normal, area)))
 
 
-def _ball_panels(radius: float, largest: float) -> Panels:
+def _ball_panels(radius: float, max_edge: float) -> Panels:
     surface = 4 * math.pi * radius**2
-    n = max(MIN_BALL_PANELS, math.ceil(surface / largest**2))
+    n = max(MIN_BALL_PANELS, math.ceil(surface / max_edge**2))
     z = 1 - 2 * (np.arange(n) + 0.5) / n
     angle = np.arange(n) * math.pi * (3 - math.sqrt(5))
-    level = np.sqrt(1 - z**2)
-    normal = np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=-1)
+    horizontal = np.sqrt(1 - z**2)
+    normal = np.stack([horizontal * np.cos(angle), horizontal * np.sin(angle), z], axis=-1)
     return Panels(radius * normal, normal, np.full((n, 1), surface / n))

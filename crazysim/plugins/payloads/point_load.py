@@ -136,37 +136,37 @@ def clip_to_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> 
         clearance: Height of the body above the floor where it rests, m. (..., 1)
         friction: Coulomb's coefficient, 1. (..., 1)
     """
-    height, climb, level = pos[..., 2:], vel[..., 2:], vel[..., :2]
-    lands = height <= clearance
-    brake = jnp.where(lands, friction * jnp.maximum(-climb, 0.0), 0.0)
-    level = level - jnp.maximum(jnp.minimum(level, brake), -brake)
-    vel = jnp.concatenate([level, jnp.where(lands, jnp.maximum(climb, 0.0), climb)], axis=-1)
+    height, climb, horizontal_vel = pos[..., 2:], vel[..., 2:], vel[..., :2]
+    is_landed = height <= clearance
+    brake = jnp.where(is_landed, friction * jnp.maximum(-climb, 0.0), 0.0)
+    horizontal_vel = horizontal_vel - jnp.maximum(jnp.minimum(horizontal_vel, brake), -brake)
+    vel = jnp.concatenate([horizontal_vel, jnp.where(is_landed, jnp.maximum(climb, 0.0), climb)], axis=-1)
     return jnp.concatenate([pos[..., :2], jnp.maximum(height, clearance)], axis=-1), vel
 
 
 @jit_unless_traced("is_cable")
 def hanging_state(
-    s: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool
+    state: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool
 ) -> tuple[Array, Array]:
     """Return position and velocity of a load that hangs at rest below its drone, or rests on the floor.
 
     Args:
-        s: State of the drones. Leaves (..., k)
+        state: State of the drones. Leaves (..., k)
         attach: Attachment point, body frame, m; None for the centre of mass. (..., 3)
         length: Length of the link, m. (..., 1)
         clearance: Height of the load above the floor where it rests, m. (..., 1)
         is_cable: True for a cable, which is slack where the load rests; a rod then lies behind the drone.
     """
-    rot = rotation.matrix(s.quat)
-    arm = jnp.zeros(3, s.pos.dtype) if attach is None else attach
-    attach_pos = s.pos + rotation.matvec(rot, arm)
+    rot = rotation.matrix(state.quat)
+    arm = jnp.zeros(3, state.pos.dtype) if attach is None else attach
+    attach_pos = state.pos + rotation.matvec(rot, arm)
     drop = jnp.clip(attach_pos[..., 2:] - clearance, -length, length)
     horizontal_offset = jnp.zeros_like(drop) if is_cable else rotation.safe_sqrt((length - drop) * (length + drop))
-    heading = rotation.yaw(s.quat)[..., None]
+    heading = rotation.yaw(state.quat)[..., None]
     offset = jnp.concatenate(
         [-horizontal_offset * jnp.cos(heading), -horizontal_offset * jnp.sin(heading), -drop], axis=-1
     )
-    vel = s.vel + rotation.matvec(rot, rotation.cross(s.ang_vel, jnp.broadcast_to(arm, s.ang_vel.shape)))
+    vel = state.vel + rotation.matvec(rot, rotation.cross(state.ang_vel, jnp.broadcast_to(arm, state.ang_vel.shape)))
     return attach_pos + offset, vel
 
 

@@ -86,15 +86,17 @@ class RotorJet(Plugin):
         radius = checked_propeller_radius(sim, self.propeller_radius)
         names = ("speeds", "pressure", "velocity", "origin", "spacing")
         values = {name: getattr(table, name, None) for name in names}
-        shared = {name: None if x is None else device_array(x, radius.dtype) for name, x in values.items()}
-        return self.fill_record(sim, RotorJetData, diameter=stream_diameter(sim, radius), load=self.load, **shared)
+        shared_values = {name: None if x is None else device_array(x, radius.dtype) for name, x in values.items()}
+        return self.fill_record(
+            sim, RotorJetData, diameter=stream_diameter(sim, radius), load=self.load, **shared_values
+        )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         loads, shape = self._loads(sim), self._loads(sim).shape()
         edge = 2 * max(shape.size) / PANELS_PER_LENGTH if self.panel is None else self.panel
         panels = shape_panels(shape, edge)
 
-        def press(data: SimData) -> SimData:
+        def apply_jets(data: SimData) -> SimData:
             if self.load not in data.plugins:
                 return self.write(data, without_wrench(self.read(data)))
             record, body, s = self.read(data), loads.body(data), data.states
@@ -109,7 +111,7 @@ class RotorJet(Plugin):
 
         numbers = 0 if self.table is None else sum(np.size(x) for x in (self.table.pressure, self.table.velocity))
         scope = "world" if self.all_drones else "drone" if numbers <= MAX_FUSED_VALUES else "batch"
-        return [StagePlacement(Stage(press, scope, batched=not self.all_drones, unfused_reason=WHY_UNFUSED))]  # type: ignore[arg-type]
+        return [StagePlacement(Stage(apply_jets, scope, batched=not self.all_drones, unfused_reason=WHY_UNFUSED))]  # type: ignore[arg-type]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the force of the jet on the load, world frame, N."""
@@ -165,11 +167,11 @@ def jet_pressure(
     offset = pos - drone_pos
 
     def momentum(air: Array) -> Array:
-        relative = air - vel[..., None, :]
-        closing_speed = -rotation.dot(relative, normal)
+        relative_vel = air - vel[..., None, :]
+        closing_speed = -rotation.dot(relative_vel, normal)
         # Only air in the jet transfers momentum: still air outside it exerts no force on a load that moves.
         is_in_jet = rotation.dot(air, air) > 0
-        return jnp.where(is_in_jet & (closing_speed > 0), density * closing_speed, 0.0) * relative
+        return jnp.where(is_in_jet & (closing_speed > 0), density * closing_speed, 0.0) * relative_vel
 
     if record.speeds is None:
         axis = rotation.z_axis(quat)

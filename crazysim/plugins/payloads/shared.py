@@ -154,10 +154,10 @@ class SharedLoad(PointLoad, Plugin):
         share = 1.0 if dt is None else 0.5
         rel_acc = gravity - acceleration_at(s, deriv, r.rot, load.attach, share)
         rhs = rotation.dot(q, rel_acc) + share / load.length * (rotation.dot(r.vel, r.vel) - out * out)
-        acts = load.attached
+        is_active = load.attached
         if dt is None:
             rhs = rhs + 2 * correction_rate(freq) * out
-            acts = acts & (r.distance > (1 - TAUT_BAND) * load.length)[..., 0] if self.cable else acts
+            is_active = is_active & (r.distance > (1 - TAUT_BAND) * load.length)[..., 0] if self.cable else is_active
         else:
             gap = jnp.maximum(load.length - r.distance, 0.0) if self.cable else 0.0
             rhs = rhs + freq * (out - freq * gap)
@@ -166,7 +166,7 @@ class SharedLoad(PointLoad, Plugin):
             ratio if pull.lever is None or pull.ang_acc is None else ratio + m * rotation.dot(pull.lever, pull.ang_acc)
         )
         gram = jnp.sum(q[:, None] * q[None], axis=-1) + jnp.eye(n, dtype=q.dtype) * (ratio + TENSION_REGULARIZATION)
-        tension = _tensions(gram, rhs[:, 0], acts, self.cable)[:, None]
+        tension = _tensions(gram, rhs[:, 0], is_active, self.cable)[:, None]
 
         force = tension * q
         acc = m / p.mass * force
@@ -194,8 +194,8 @@ class SharedLoad(PointLoad, Plugin):
         offset = jnp.where(load.attached[:, None], r.offset, -load.length * r.rot[..., 2])
         top = data.states.pos if r.arm is None else data.states.pos + r.arm
         links = link_pieces(top, offset, load.length, CABLE_SEGMENTS if self.cable else 1)
-        up = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
-        rows = {self.name: (load.pos[None], rotation_from_z(up)), f"{self.name}_link": links}
+        z_axis = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
+        rows = {self.name: (load.pos[None], rotation_from_z(z_axis)), f"{self.name}_link": links}
         return data.objects.with_poses(rows)  # type: ignore[union-attr]
 
     def body(self, data: SimData) -> LoadBody:
@@ -210,19 +210,19 @@ class SharedLoad(PointLoad, Plugin):
         return self.read(data).attached[None] & (not self.cable)
 
 
-def _tensions(matrix: Array, rhs: Array, acts: Array, one_sided: bool) -> Array:
+def _tensions(matrix: Array, rhs: Array, is_active: Array, one_sided: bool) -> Array:
     """Return the tensions per mass of the load, m/s^2; cables that would push are slack. (n,)
 
     Args:
         matrix: Accelerations along each link under a unit tension in each, symmetric, positive definite. (n, n)
         rhs: Relative accelerations that the tensions prevent, m/s^2. (n,)
-        acts: True for links that can pull. (n,)
+        is_active: True for links that can pull. (n,)
         one_sided: True for cables.
     """
     eye = jnp.eye(rhs.shape[0], dtype=rhs.dtype)
     tension = jnp.zeros_like(rhs)
     for _ in range(N_ITERATIONS if one_sided else 1):
-        active_pairs = acts[:, None] & acts[None]
-        tension = solve_symmetric(jnp.where(active_pairs, matrix, eye), jnp.where(acts, rhs, 0.0))
-        acts = acts & (tension > 0) if one_sided else acts
+        active_pairs = is_active[:, None] & is_active[None]
+        tension = solve_symmetric(jnp.where(active_pairs, matrix, eye), jnp.where(is_active, rhs, 0.0))
+        is_active = is_active & (tension > 0) if one_sided else is_active
     return jnp.maximum(tension, 0.0) if one_sided else tension

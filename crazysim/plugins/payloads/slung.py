@@ -81,12 +81,21 @@ class SlungLoad(PointLoad, Plugin):
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
         load, p = self.read(data), data.params
-        free = free_acceleration(data, load, self.name, dt)
-        linked = couple_bodies(
-            data.states, deriv, p.mass, p.J_inv, self._link_params(load), load.pos, load.vel, free, dt, data.core.freq
+        free_acc = free_acceleration(data, load, self.name, dt)
+        motion = couple_bodies(
+            data.states,
+            deriv,
+            p.mass,
+            p.J_inv,
+            self._link_params(load),
+            load.pos,
+            load.vel,
+            free_acc,
+            dt,
+            data.core.freq,
         )
-        rates = {"pos": linked.rate, "vel": linked.acc}
-        return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
+        rates = {"pos": motion.rate, "vel": motion.acc}
+        return motion.deriv.replace(plugins=deriv.plugins | {self.name: rates})
 
     def become_taut(self, data: SimData) -> SimData:
         """Apply the impulse of one drone's cable if it is taut while the load moves outwards."""
@@ -161,8 +170,8 @@ def load_record(
     fields |= {} if is_cable else {"restitution": None}
     load = plugin.fill_record(sim, kind, clearance=height_at_rest, attached=attached, **fields)
     # A setting that is zero everywhere becomes None and is not computed.
-    optional = [name for name in ("attach", "damping", "restitution", "drag") if getattr(load, name) is not None]
-    load = load.replace(**{name: None for name in optional if not np.any(np.asarray(getattr(load, name)))})
+    optional_names = [name for name in ("attach", "damping", "restitution", "drag") if getattr(load, name) is not None]
+    load = load.replace(**{name: None for name in optional_names if not np.any(np.asarray(getattr(load, name)))})
     if load.drag is None:
         load = load.replace(air_vel=None, wind_vel=None)
     if plugin.in_scene:
@@ -179,7 +188,7 @@ def move_loads(
     name: str,
     load: LoadData,
     tip: Array,
-    holds: Array,
+    is_held: Array,
     n_pieces: int,
     ring: float = 0.0,
     show_free_links: bool = False,
@@ -193,18 +202,18 @@ def move_loads(
         name: Name of the plugin.
         load: Its record.
         tip: Ends of the links, world frame, m. (n_drones, 3)
-        holds: True where something is attached to the end; other links hang along the body's z axis. (n_drones,)
+        is_held: True where something is attached to the end; other links hang along the body's z axis. (n_drones,)
         n_pieces: Number of straight pieces of a link.
         ring: Height of the point by which a load hangs above its middle, m.
         show_free_links: True to show links of loads that do not exist.
     """
     hidden_offset = jnp.where(load.mass > 0, 0.0, ABSENT_LOAD_DEPTH) * np.array([0.0, 0.0, 1.0], tip.dtype)
     r = link_geometry(data.states, tip, load.vel, load.attach)
-    offset = jnp.where(holds[..., None], r.offset, -load.length * r.rot[..., 2])
-    up = shape_axis(data, load, tip)
+    offset = jnp.where(is_held[..., None], r.offset, -load.length * r.rot[..., 2])
+    load_axis = shape_axis(data, load, tip)
     top = data.states.pos if r.arm is None else data.states.pos + r.arm
     links = link_pieces(top if show_free_links else top - hidden_offset, offset, load.length, n_pieces)
-    rows = {name: (load.pos - hidden_offset - ring * up, rotation_from_z(up)), f"{name}_link": links}
+    rows = {name: (load.pos - hidden_offset - ring * load_axis, rotation_from_z(load_axis)), f"{name}_link": links}
     return data.objects.with_poses(rows)  # type: ignore[union-attr]
 
 

@@ -86,7 +86,7 @@ class Barometer(Sensor):
         wander = gauss_markov_step(record.wander, record.drift, record.drift_time, self.interval(data), noise[:1])
         pressure = self.ideal(data)[:1] + record.offset + wander + record.noise * noise[1:]
         pressure = quantise(pressure, record.resolution)
-        height = altitude_of(pressure) - record.altitude
+        height = pressure_altitude(pressure) - record.altitude
         return jnp.concatenate([pressure, height]), record.replace(wander=wander)
 
 
@@ -99,7 +99,7 @@ def pressure_at(altitude: Array) -> Array:
     return SEA_LEVEL_PRESSURE * jnp.exp(PRESSURE_EXPONENT * jnp.log1p(-LAPSE / SEA_LEVEL_TEMPERATURE * altitude))
 
 
-def altitude_of(pressure: Array) -> Array:
+def pressure_altitude(pressure: Array) -> Array:
     """Return the altitude at which the standard atmosphere has a pressure, m; the inverse of ``pressure_at``. (...)"""
     log = jnp.log1p((pressure - SEA_LEVEL_PRESSURE) / SEA_LEVEL_PRESSURE)
     return -SEA_LEVEL_TEMPERATURE / LAPSE * jnp.expm1(log / PRESSURE_EXPONENT)

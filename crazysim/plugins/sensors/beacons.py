@@ -165,16 +165,16 @@ class Lighthouse(Sensor):
         offset = diodes - record.stations[:, None]
         local = rotation.rotate_inverse(record.quat[:, None], offset)
         angle = jnp.stack([sweep_angle(local, tilt) for tilt in SWEEP_TILTS], axis=-1)
-        above = -rotation.dot(offset, rotation.z_axis(s.quat))[..., 0] > 0
-        visible = (local[..., 0] > 0) & above
-        angle = jnp.where(visible[..., None], angle, 0.0)
-        return jnp.concatenate([angle.reshape(-1), visible.astype(angle.dtype).reshape(-1)])
+        is_above = -rotation.dot(offset, rotation.z_axis(s.quat))[..., 0] > 0
+        is_visible = (local[..., 0] > 0) & is_above
+        angle = jnp.where(is_visible[..., None], angle, 0.0)
+        return jnp.concatenate([angle.reshape(-1), is_visible.astype(angle.dtype).reshape(-1)])
 
     def measure(self, data: SimData, record: LighthouseData, key: Array) -> tuple[Array, LighthouseData]:
         truth = self.ideal(data)
         n = truth.shape[0] // 3
-        visible = jnp.repeat(truth[2 * n :], 2)
-        angle = truth[: 2 * n] + visible * record.noise * normal(key, (2 * n,), truth.dtype)
+        visibility = jnp.repeat(truth[2 * n :], 2)
+        angle = truth[: 2 * n] + visibility * record.noise * normal(key, (2 * n,), truth.dtype)
         return jnp.concatenate([angle, truth[2 * n :]]), record
 
 
@@ -185,15 +185,15 @@ def sweep_angle(pos: Array, tilt: float) -> Array:
         pos: The point in the frame of the base station, x forwards, z upwards, m. (..., 3)
         tilt: Tilt of the plane, rad.
     """
-    across = rotation.safe_norm(pos[..., :2])[..., 0]
-    sine = pos[..., 2] * math.tan(tilt) / jnp.where(across > 1e-6, across, 1e-6)
+    horizontal_distance = rotation.safe_norm(pos[..., :2])[..., 0]
+    sine = pos[..., 2] * math.tan(tilt) / jnp.where(horizontal_distance > 1e-6, horizontal_distance, 1e-6)
     sine = rotation.safe_clip(sine, -MAX_SINE, MAX_SINE)
     return rotation.safe_arctan2(pos[..., 1], pos[..., 0]) + jnp.arcsin(sine)
 
 
-def _point_array(name: str, value: ArrayLike, least: int) -> np.ndarray:
+def _point_array(name: str, value: ArrayLike, min_points: int) -> np.ndarray:
     """Return vectors as an array. (n, 3)"""
     points = np.asarray(value, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < least or not np.isfinite(points).all():
-        raise ConfigError(f"expected {name} as at least {least} finite vectors (n, 3), got {points.tolist()}")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < min_points or not np.isfinite(points).all():
+        raise ConfigError(f"expected {name} as at least {min_points} finite vectors (n, 3), got {points.tolist()}")
     return points

@@ -188,9 +188,9 @@ class IMU(Sensor):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         stages = super().stages(sim)
-        when = next(p.stage for p in stages if p.name is None).when  # type: ignore[attr-defined]
-        before = StagePlacement(Stage(self._store_velocities, "drone", when), name=f"{self.name}_before")
-        return [before, *stages]
+        condition = next(p.stage for p in stages if p.name is None).when  # type: ignore[attr-defined]
+        velocity_stage = StagePlacement(Stage(self._store_velocities, "drone", condition), name=f"{self.name}_before")
+        return [velocity_stage, *stages]
 
     def ideal(self, data: SimData) -> Array:
         """Return the measurement of a perfect unit of a drone that does not accelerate. (6,)"""

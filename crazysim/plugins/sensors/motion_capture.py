@@ -83,8 +83,8 @@ class MotionCapture(Sensor):
         truth, dt = self.ideal(data), self.interval(data)
         noise = normal(key, (6,), truth.dtype)
         pos = truth[:3] + record.noise * noise[:3]
-        half = 0.5 * record.angle_noise * noise[3:]
-        quat = rotation.multiply(truth[3:7], jnp.concatenate([half, jnp.ones_like(half[:1])]))
+        half_rotvec = 0.5 * record.angle_noise * noise[3:]
+        quat = rotation.multiply(truth[3:7], jnp.concatenate([half_rotvec, jnp.ones_like(half_rotvec[:1])]))
         quat = quat / jnp.sqrt(rotation.dot(quat, quat))
         vel = (pos - record.last) / dt
         vel = record.vel + (1 - jnp.exp(-2 * math.pi * dt * record.bandwidth)) * (vel - record.vel)

@@ -49,7 +49,7 @@ class RadarData(PyTree):
 
 
 class Radar(Plugin):
-    """Radars, each of which detects the drones within its lobe; objects do not block it.
+    """Radars that detect the drones within their lobes; objects do not block them.
 
     The lobe is a teardrop in the vertical plane, turned about the vertical axis of the radar: the range is the same in
     all directions. Each setting is one number for all radars, or one number per radar.
@@ -130,15 +130,15 @@ def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: 
         height_scale: Factor h of the thickness, 1. (...)
         tilt: Elevation of the lobe, rad. (...)
     """
-    level_distance, up = safe_norm(offset[..., :2])[..., 0], offset[..., 2]
+    level_distance, height = safe_norm(offset[..., :2])[..., 0], offset[..., 2]
     size, c, s = 0.5 * max_range, jnp.cos(tilt), jnp.sin(tilt)
 
     def margin(level_distance: Array) -> Array:
-        axial, lateral = c * level_distance + s * up, c * up - s * level_distance
+        axial, lateral = c * level_distance + s * height, c * height - s * level_distance
         u = axial / size
-        inside = safe_clip(u, 1e-6, 2.0)
-        root = rotation.safe_sqrt(2 - inside)
-        limit = height_scale * size * jnp.exp(0.5 * ((1 + exponent) * jnp.log(inside) - exponent * math.log(2))) * root
+        clipped = safe_clip(u, 1e-6, 2.0)
+        root = rotation.safe_sqrt(2 - clipped)
+        limit = height_scale * size * jnp.exp(0.5 * ((1 + exponent) * jnp.log(clipped) - exponent * math.log(2))) * root
         overshoot = jnp.maximum(u - 2, 0.0) + jnp.maximum(-u, 0.0)
         return limit - jnp.abs(lateral) - size * overshoot
 
@@ -152,14 +152,17 @@ def lobe_curves(max_range: float, exponent: float, height_scale: float, tilt: fl
     axial, lateral = size * (1 - np.cos(t)), height_scale * size * np.sin(t) * np.sin(t / 2) ** exponent
     axial, lateral = np.concatenate([axial, axial[::-1]]), np.concatenate([lateral, -lateral[::-1]])
     level_distance = axial * math.cos(tilt) - lateral * math.sin(tilt)
-    up = axial * math.sin(tilt) + lateral * math.cos(tilt)
+    height = axial * math.sin(tilt) + lateral * math.cos(tilt)
     meridians = np.linspace(0.0, 2 * math.pi, N_MERIDIANS, endpoint=False)
-    curves = [np.stack([level_distance * math.cos(a), level_distance * math.sin(a), up], axis=-1) for a in meridians]
+    curves = [
+        np.stack([level_distance * math.cos(a), level_distance * math.sin(a), height], axis=-1) for a in meridians
+    ]
     angles = np.linspace(0.0, 2 * math.pi, 2 * N_POINTS)
-    for k in (int(np.argmax(level_distance)), int(np.argmax(up)), int(np.argmin(up))):
+    for k in (int(np.argmax(level_distance)), int(np.argmax(height)), int(np.argmin(height))):
         curves.append(
             np.stack(
-                [level_distance[k] * np.cos(angles), level_distance[k] * np.sin(angles), 0 * angles + up[k]], axis=-1
+                [level_distance[k] * np.cos(angles), level_distance[k] * np.sin(angles), 0 * angles + height[k]],
+                axis=-1,
             )
         )
     return curves

@@ -75,9 +75,9 @@ class RangeFinder(Plugin):
             raise ConfigError(f"expected directions as vectors (n_rays, 3), none of them zero, got {rays.tolist()}")
         steps_between(self, sim)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        far = float(self.max_range)
-        distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), far)
-        return RangeFinderData(device_array(distance), device_array(rays), device_array(far))
+        max_range = float(self.max_range)
+        distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), max_range)
+        return RangeFinderData(device_array(distance), device_array(rays), device_array(max_range))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stage that measures: for one drone; for one world if distances to drones or loads are measured; or
@@ -85,11 +85,11 @@ class RangeFinder(Plugin):
         """
         visual, solid = sim.scene.visual_model, sim.scene.collision_model
         movers = moving_plugins(sim.scene.plugins(), [body.name for body in visual.objects])
-        touched = {body.name for body in solid.objects}
-        objects = tuple(body for body in visual.objects if body.name in touched or body.name not in movers)
+        moved_objects = {body.name for body in solid.objects}
+        objects = tuple(body for body in visual.objects if body.name in moved_objects or body.name not in movers)
         # The collision shape of a drone is enough for a few rays.
         model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
-        movers = {name: plugin for name, plugin in movers.items() if name in touched}
+        movers = {name: plugin for name, plugin in movers.items() if name in moved_objects}
         n_movable = sum(len(body.geoms) for body in objects if body.row is not None)
         if self.drones:
             n_movable += sum(len(kind.geoms) * len(kind.drones or range(sim.n_drones)) for kind in model.drones)
@@ -102,8 +102,8 @@ class RangeFinder(Plugin):
 
         def measure(data: SimData) -> SimData:
             """Measure distances, with loads at their current positions."""
-            present = {name: plugin for name, plugin in movers.items() if plugin.name in data.plugins}
-            current = with_moved_objects(data, present)
+            movers_present = {name: plugin for name, plugin in movers.items() if plugin.name in data.plugins}
+            current = with_moved_objects(data, movers_present)
             return self.write(data, self._measure(model, current, scope == "drone", scene.ray_kernels))
 
         def measure_at_times(data: SimData) -> SimData:
@@ -111,9 +111,9 @@ class RangeFinder(Plugin):
             return jax.lax.cond(jnp.any(is_due(data)), measure, lambda data: data, data)
 
         fn = measure_at_times if scope == "batch" and period > 1 else measure
-        when = None if period == 1 else is_due
+        condition = None if period == 1 else is_due
         reason = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED_GEOMS}, are cast by a separate kernel"
-        measuring = Stage(fn, scope, when, name="range_finder", unfused_reason=reason)
+        measuring = Stage(fn, scope, condition, name="range_finder", unfused_reason=reason)
         return [StagePlacement(measuring, before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:

@@ -135,8 +135,8 @@ class Sensor(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         end, placements = "increment_steps", []
-        when = None if steps_between(self, sim) == 1 else lambda data: acts_now(data, self.freq or data.core.freq)
-        placements.append(StagePlacement(Stage(self._take_measurement, "drone", when), before=end))
+        condition = None if steps_between(self, sim) == 1 else lambda data: acts_now(data, self.freq or data.core.freq)
+        placements.append(StagePlacement(Stage(self._take_measurement, "drone", condition), before=end))
         if self.is_late:
             placements.append(
                 StagePlacement(Stage(self._deliver_measurement, "drone"), before=end, name=f"{self.name}_arrival")

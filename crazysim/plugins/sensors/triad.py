@@ -64,8 +64,8 @@ class TriadData(PyTree):
 
     def without_noise(self, truth: Array) -> Array:
         """Return the measurement of one sensor before noise, low-pass, saturation and rounding, u. (3,)"""
-        rotated = truth - rotation.cross(self.misalignment, truth)
-        return rotated + self.scale * rotated + self.bias + self.wander
+        misaligned = truth - rotation.cross(self.misalignment, truth)
+        return misaligned + self.scale * misaligned + self.bias + self.wander
 
     def measure(self, truth: Array, noise: Array, dt: float) -> tuple[Array, TriadData]:
         """Return the measurement of one sensor, u, (3,), an interval after the last one, and the errors after it.

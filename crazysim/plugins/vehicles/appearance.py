@@ -59,8 +59,8 @@ def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
 def wheel_positions(vehicle: VehicleModel) -> np.ndarray:
     """Return the positions of the wheels, body frame: front left, front right, rear left, rear right, m. (n, 2)"""
     front, rear = vehicle.number("axles.front"), -vehicle.number("axles.rear")
-    half = vehicle.number("axles.track") / 2
-    sides = (half, -half) if vehicle.number("wheels.number") == 4 else (0.0,)
+    half_track = vehicle.number("axles.track") / 2
+    sides = (half_track, -half_track) if vehicle.number("wheels.number") == 4 else (0.0,)
     return np.array([(x, y) for x in (front, rear) for y in sides])
 
 
@@ -95,13 +95,13 @@ def _wheels(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
 def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]:
     """Return positions, m, and attitudes of drawbars, decks and wheels of trailers, on the plane below their cars."""
     number = vehicle.number
-    radius, half = number("trailer.wheel_radius"), number("trailer.track") / 2
+    radius, half_track = number("trailer.wheel_radius"), number("trailer.track") / 2
     bar, deck = (tilted_quat(car.joints[:, k : k + 1], car.normal) for k in range(2))
     front, rear = (_above_plane(x, car, radius - number("wheels.radius")) for x in trailer_axles(car.state, car.params))
     roll_quat = _rolling_quat(car.distance / radius)
     wheels = []
     for origin, attitude in ((front, bar), (rear, deck)):
-        for side in (half, -half):
+        for side in (half_track, -half_track):
             offset = rotation.rotate(attitude, jnp.asarray([0.0, side, 0.0], origin.dtype))
             wheels.append((origin + offset, rotation.multiply(attitude, roll_quat)))
     pos, quat = (jnp.stack(x, axis=1) for x in zip(*wheels, strict=True))
@@ -136,16 +136,20 @@ def _body(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
     front, floor = vehicle.number("axles.front"), 0.02
     if vehicle.number("wheels.number") != 4:
         return _geom("box", (length, width / 2, height * 2), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
-    inner = min(width, vehicle.number("axles.track") / 2 - vehicle.number("wheels.width") / 2 - 0.005)
+    inner_width = min(width, vehicle.number("axles.track") / 2 - vehicle.number("wheels.width") / 2 - 0.005)
     roof = (height - floor / 2, 0.12 * length, floor + height)
     return (
-        _geom("box", (length * 0.92, inner, floor), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
+        _geom("box", (length * 0.92, inner_width, floor), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
         + _geom(
-            "box", (length * 0.45, inner * 0.8, roof[0]), (-roof[1], 0, 2 * height - roof[0]), rgba, CONTACT_ATTRIBUTES
+            "box",
+            (length * 0.45, inner_width * 0.8, roof[0]),
+            (-roof[1], 0, 2 * height - roof[0]),
+            rgba,
+            CONTACT_ATTRIBUTES,
         )
         + _geom(
             "box",
-            (length * 0.2, inner * 0.7, floor / 2),
+            (length * 0.2, inner_width * 0.7, floor / 2),
             (front - length * 0.12, 0, 1.5 * floor),
             rgba,
             NO_CONTACT_ATTRIBUTES,

@@ -37,7 +37,7 @@ class CarData(Members):
     command: Array = leaf("member", 1)
     """Motor reference, 1, or speed, m/s, depending on the command level, followed by the steering angle, rad.
     (n_worlds, n_members, 2)"""
-    applied: Array | None = leaf("member", 1)
+    applied_command: Array | None = leaf("member", 1)
     """Motor reference and steering angle, rad, of the last tick of the controller; None at the level ``drive``, where
     they are the command. (n_worlds, n_members, 2)"""
     force: Array = leaf("member", 1)

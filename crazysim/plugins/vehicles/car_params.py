@@ -120,6 +120,6 @@ def drive_constants(vehicle: VehicleModel) -> tuple[list[float], float]:
     if "drive.force" in vehicle.numbers:
         factor, kind = 2.0, "force"
     else:
-        driven = vehicle.number("wheels.number") / (2 if share in (0, 1) else 1)
-        factor, kind = driven / vehicle.number("wheels.radius"), "torque"
+        n_driven_wheels = vehicle.number("wheels.number") / (2 if share in (0, 1) else 1)
+        factor, kind = n_driven_wheels / vehicle.number("wheels.radius"), "torque"
     return (factor * vehicle.value(f"drive.{kind}")).tolist(), factor * vehicle.number(f"drive.{kind}_max")

@@ -77,5 +77,11 @@ def ackermann(steer: Array, wheelbase: float, track: float) -> Array:
         Steering angles of the left and the right wheel, rad. (..., 2)
     """
     tan = jnp.tan(steer)
-    top, half = wheelbase * tan, track / 2 * tan
-    return jnp.concatenate([jnp.arctan2(top, wheelbase - half), jnp.arctan2(top, wheelbase + half)], axis=-1)
+    wheelbase_rise, half_track_rise = wheelbase * tan, track / 2 * tan
+    return jnp.concatenate(
+        [
+            jnp.arctan2(wheelbase_rise, wheelbase - half_track_rise),
+            jnp.arctan2(wheelbase_rise, wheelbase + half_track_rise),
+        ],
+        axis=-1,
+    )

@@ -45,8 +45,8 @@ class Cars(Population):
     """Cars, driven by commands, or along paths by a controller, on level ground or on terrain.
 
     Commands are held until they change: at the level ``drive`` the motor reference and the steering angle, at ``speed``
-    the speed and the steering angle. With a path the cars need no commands. On terrain the dynamics are those of level
-    ground with the pull of the slope; height and tilt follow the ground. Wheels do not leave it.
+    the speed and the steering angle. With a path the cars need no commands. On terrain the dynamics are the same as on
+    level ground, plus the pull of the slope; height and tilt follow the ground. Wheels do not leave it.
     """
 
     members: int | Sequence[str] = 1
@@ -137,23 +137,23 @@ class Cars(Population):
         height, normal = ground_at(sim.data, device_array(np.concatenate([pos, pos[..., :1]], axis=-1)))
         z = np.asarray(height) + vehicle.number("wheels.radius")
         zero = np.zeros((*counts, 1))
-        two, three = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)
+        zeros_2, zeros_3 = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)
         is_held = self.level == "drive" and follows is None
         record = self.create(
             sim,
             CarData,
             pos=np.concatenate([pos, z], axis=-1),
             yaw=yaw,
-            body_vel=two,
+            body_vel=zeros_2,
             yaw_rate=zero,
             normal=np.asarray(normal),
             steer=zero,
             distance=zero,
             joints=np.concatenate([yaw, yaw], axis=-1) if self.trailer else None,
-            command=two,
-            applied=None if is_held else two,
-            force=three,
-            torque=three,
+            command=zeros_2,
+            applied_command=None if is_held else zeros_2,
+            force=zeros_3,
+            torque=zeros_3,
             params=params,
             path=paths,
             index=index,
@@ -168,11 +168,11 @@ class Cars(Population):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of controller and integration; commands of the level ``drive`` need no controller."""
-        inherited = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
+        placements = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
         if self.follows is None and self.level == "drive":
-            return inherited
-        name, when = f"{self.name}_control", functools.partial(acts_now, freq=self.rate_in(sim.data.core.freq))
-        return [StagePlacement(Stage(self._run_controller, self.name, when, name=name), name=name), *inherited]
+            return placements
+        name, condition = f"{self.name}_control", functools.partial(acts_now, freq=self.rate_in(sim.data.core.freq))
+        return [StagePlacement(Stage(self._run_controller, self.name, condition, name=name), name=name), *placements]
 
     def control(self, data: SimData) -> CarData:
         car = self.read(data)
@@ -180,16 +180,16 @@ class Cars(Population):
         if follows is None:
             acc = SPEED_GAIN * (car.command[:1] - car.body_vel[:1])
             drive = motor_reference(car.command[:1], acc, car.params)
-            return car.replace(applied=jnp.concatenate([drive, car.command[1:]]))
+            return car.replace(applied_command=jnp.concatenate([drive, car.command[1:]]))
         time = data.core.steps / data.core.freq - car.start_time[0] if self.reference == "time" else None
         path_point = path_state(car.state, car.path, car.index[0], car.arc, follows.ahead(car.params), time)
-        applied, memory = follows.update(car.state, path_point, car.memory, car.gains, car.params)
-        return car.replace(applied=applied, arc=path_point.arc, memory=memory)
+        applied_command, memory = follows.update(car.state, path_point, car.memory, car.gains, car.params)
+        return car.replace(applied_command=applied_command, arc=path_point.arc, memory=memory)
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
         car = self.read(data)
         model = kinematic if self.model.dynamics == "kinematic" else single_track
-        command = car.command if car.applied is None else car.applied
+        command = car.command if car.applied_command is None else car.applied_command
         force, settling = car.force[:2], {}
         if any(isinstance(record, TerrainData) for record in data.plugins.values()):
             force = force - GRAVITY[2] * car.params.mass * car.normal[2:] * car.normal[:2]
@@ -219,9 +219,9 @@ class Cars(Population):
 
     def _check_settings(self, vehicle: VehicleModel) -> None:
         """Check settings that are not numbers."""
-        for name, allowed in (("level", ("drive", "speed")), ("reference", ("time", "arc"))):
-            if getattr(self, name) not in allowed:
-                raise ConfigError(f"expected {name} of {self.name!r} as one of {allowed}, got {getattr(self, name)!r}")
+        for name, choices in (("level", ("drive", "speed")), ("reference", ("time", "arc"))):
+            if getattr(self, name) not in choices:
+                raise ConfigError(f"expected {name} of {self.name!r} as one of {choices}, got {getattr(self, name)!r}")
         for name in ("controller", "index", "start"):
             if getattr(self, name) is not None and self.path is None:
                 raise ConfigError(f"expected a path for {name} of {self.name!r}, got none. Use Cars(path=...).")

@@ -118,8 +118,8 @@ def commonroad_single_track(state: CommonRoadState, command: Array, params: Comm
 def limited_steer_rate(steer: Array, rate: Array, params: CommonRoadParams) -> Array:
     """Return the rate of the steering angle within its limits, zero at a stop of the angle, rad/s. (..., 1)"""
     p = params
-    stops = ((steer <= p.steer[..., :1]) & (rate <= 0)) | ((steer >= p.steer[..., 1:]) & (rate >= 0))
-    return jnp.where(stops, 0.0, jnp.clip(rate, p.steer_rate[..., :1], p.steer_rate[..., 1:]))
+    is_at_limit = ((steer <= p.steer[..., :1]) & (rate <= 0)) | ((steer >= p.steer[..., 1:]) & (rate >= 0))
+    return jnp.where(is_at_limit, 0.0, jnp.clip(rate, p.steer_rate[..., :1], p.steer_rate[..., 1:]))
 
 
 def limited_acceleration(speed: Array, acc: Array, params: CommonRoadParams) -> Array:
@@ -127,5 +127,5 @@ def limited_acceleration(speed: Array, acc: Array, params: CommonRoadParams) -> 
     p = params
     fast = speed > p.switch_speed
     high = jnp.where(fast, p.acc_max * p.switch_speed / jnp.where(fast, speed, 1.0), p.acc_max)
-    stops = ((speed <= p.speed[..., :1]) & (acc <= 0)) | ((speed >= p.speed[..., 1:]) & (acc >= 0))
-    return jnp.where(stops, 0.0, jnp.clip(acc, -p.acc_max, high))
+    is_at_limit = ((speed <= p.speed[..., :1]) & (acc <= 0)) | ((speed >= p.speed[..., 1:]) & (acc >= 0))
+    return jnp.where(is_at_limit, 0.0, jnp.clip(acc, -p.acc_max, high))

@@ -155,27 +155,31 @@ class PathController:
         """Return the distance from the centre of mass to the point of the vehicle that follows the path, m. (1,)"""
         return jnp.zeros_like(car.front)
 
-    def steering(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
+    def steering(
+        self, state: CarState, tracking: PathState, memory: Any, gains: Any, car: CarParams
+    ) -> tuple[Array, Any]:
         """Return the steering angle, rad (1,), and the memory.
 
         Args:
             state: State of the vehicle.
-            at: The vehicle relative to its path.
+            tracking: The vehicle relative to its path.
             memory: Memory.
             gains: Gains.
             car: Parameters of the vehicle.
         """
         raise NotImplementedError(f"{type(self).__name__} does not define steering")
 
-    def driving(self, state: CarState, at: PathState, gains: Any, car: CarParams) -> Array:
+    def driving(self, state: CarState, tracking: PathState, gains: Any, car: CarParams) -> Array:
         """Return the motor reference that follows the reference speed, and the position of a reference by time. (1,)"""
-        acc = self.position_gain * at.lag + self.speed_gain * (at.speed - state.body_vel[:1])
-        return motor_reference(at.speed, acc, car)
+        acc = self.position_gain * tracking.lag + self.speed_gain * (tracking.speed - state.body_vel[:1])
+        return motor_reference(tracking.speed, acc, car)
 
-    def update(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
+    def update(
+        self, state: CarState, tracking: PathState, memory: Any, gains: Any, car: CarParams
+    ) -> tuple[Array, Any]:
         """Return motor reference and steering angle, rad (2,), and the memory."""
-        steer, memory = self.steering(state, at, memory, gains, car)
-        drive = safe_clip(self.driving(state, at, gains, car), -self.reference_max, self.reference_max)
+        steer, memory = self.steering(state, tracking, memory, gains, car)
+        drive = safe_clip(self.driving(state, tracking, gains, car), -self.reference_max, self.reference_max)
         return jnp.concatenate([drive, safe_clip(steer, -car.steer_max, car.steer_max)]), memory
 
 
@@ -195,9 +199,11 @@ class PurePursuit(PathController):
     def ahead(self, car: CarParams) -> Array:
         return -car.rear
 
-    def steering(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
+    def steering(
+        self, state: CarState, tracking: PathState, memory: Any, gains: Any, car: CarParams
+    ) -> tuple[Array, Any]:
         distance = self.lookahead + self.lookahead_time * jnp.abs(state.body_vel[0])
-        goal = at.path.at(at.index, at.arc[0] + distance).pos
+        goal = tracking.path.at(tracking.index, tracking.arc[0] + distance).pos
         axle = state.pos[:2] - car.rear * jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
         offset = to_world_frame(-state.yaw, goal - axle)
         square = offset[:1] * offset[:1] + offset[1:] * offset[1:]
@@ -222,6 +228,8 @@ class Stanley(PathController):
     def ahead(self, car: CarParams) -> Array:
         return car.front
 
-    def steering(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
+    def steering(
+        self, state: CarState, tracking: PathState, memory: Any, gains: Any, car: CarParams
+    ) -> tuple[Array, Any]:
         speed = self.soft_speed + jnp.abs(state.body_vel[:1])
-        return -at.heading_error - jnp.arctan(self.gain * at.offset / speed), memory
+        return -tracking.heading_error - jnp.arctan(self.gain * tracking.offset / speed), memory

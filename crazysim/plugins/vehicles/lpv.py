@@ -92,27 +92,27 @@ class LPV(PathController):
         return LPVMemory(*[as_parameter(0.0) for _ in range(4)])
 
     def steering(
-        self, state: CarState, at: PathState, memory: LPVMemory, gains: LPVGains, car: CarParams
+        self, state: CarState, tracking: PathState, memory: LPVMemory, gains: LPVGains, car: CarParams
     ) -> tuple[Array, LPVMemory]:
-        right, speed = -at.offset, state.body_vel[:1]
-        integral = safe_clip(memory.integral + RATE * gains.period * right, -INTEGRAL_MAX, INTEGRAL_MAX)
-        raw_rate = (right - memory.offset) / gains.period
+        right_offset, speed = -tracking.offset, state.body_vel[:1]
+        integral = safe_clip(memory.integral + RATE * gains.period * right_offset, -INTEGRAL_MAX, INTEGRAL_MAX)
+        raw_rate = (right_offset - memory.offset) / gains.period
         rate = memory.started * (memory.rate + SMOOTHING * (raw_rate - memory.rate))
-        terms = (integral, right, rate)
+        terms = (integral, right_offset, rate)
         feedback = sum(polynomial(c, speed) * x for c, x in zip(self.lateral, terms, strict=True))
-        steer = -at.heading_error + feedback + gains.feedforward * at.curvature
-        return steer, LPVMemory(integral, right, rate, jnp.ones_like(memory.started))
+        steer = -tracking.heading_error + feedback + gains.feedforward * tracking.curvature
+        return steer, LPVMemory(integral, right_offset, rate, jnp.ones_like(memory.started))
 
-    def driving(self, state: CarState, at: PathState, gains: LPVGains, car: CarParams) -> Array:
+    def driving(self, state: CarState, tracking: PathState, gains: LPVGains, car: CarParams) -> Array:
         vx, vy = state.body_vel[:1], state.body_vel[1:]
         slip = safe_arctan2(vy, jnp.abs(vx))
-        curvature_factor = jnp.maximum(1 - at.curvature * at.offset, 0.2)
-        p = jnp.maximum(jnp.abs(jnp.cos(at.heading_error + slip)) / (jnp.cos(slip) * curvature_factor), 0.2)
-        speed = at.speed / p
+        curvature_factor = jnp.maximum(1 - tracking.curvature * tracking.offset, 0.2)
+        p = jnp.maximum(jnp.abs(jnp.cos(tracking.heading_error + slip)) / (jnp.cos(slip) * curvature_factor), 0.2)
+        speed = tracking.speed / p
         sign = speed / jnp.sqrt(speed * speed + car.slip_speed * car.slip_speed)
         hold = (car.drive[1:2] * speed + car.drive[2:] * sign) / car.drive[:1]
         by_lag, by_speed = (polynomial(c, p) for c in self.longitudinal)
-        return hold + by_lag * at.lag + by_speed * (speed - vx)
+        return hold + by_lag * tracking.lag + by_speed * (speed - vx)
 
 
 def polynomial(coefficients: Sequence[float], x: Array) -> Array:

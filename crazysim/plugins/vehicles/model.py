@@ -173,8 +173,8 @@ def _check_model(vehicle: VehicleModel) -> None:
         )
     tyres = ("tyres.front", "tyres.rear") if vehicle.dynamics == "single_track" else ()
     trailer = tuple(key for key in KEYS if key.startswith("trailer.")) if vehicle.has_trailer else ()
-    required = [key for key in KEYS if not key.startswith(OPTIONAL_KEYS)]
-    missing = [key for key in (*required, *tyres, *trailer) if key not in numbers]
+    required_keys = [key for key in KEYS if not key.startswith(OPTIONAL_KEYS)]
+    missing = [key for key in (*required_keys, *tyres, *trailer) if key not in numbers]
     if missing:
         raise ConfigError(
             f"vehicle {name!r}: expected {', '.join(missing)}, which it lacks. Add them, or start from another vehicle "

@@ -140,14 +140,14 @@ class Path(PyTree):
         if not paths:
             raise ConfigError("expected at least one path, got none. Use Path.stack([Path.of_points(points)]).")
         n = max(path.n_pieces for path in paths)
-        padded = []
+        padded_paths = []
         for path in paths:
             n_missing = n - path.n_pieces
             last = np.repeat(path.coefficients[:, -1:], n_missing, axis=1)
             coefficients = np.concatenate([path.coefficients, last], axis=1)
             speeds = np.concatenate([path.speeds, np.repeat(path.speeds[:, -1:], n_missing, axis=1)], axis=1)
-            padded.append(path.replace(coefficients=coefficients, speeds=speeds))
-        return jax.tree.map(lambda *arrays: np.concatenate(arrays), *padded)
+            padded_paths.append(path.replace(coefficients=coefficients, speeds=speeds))
+        return jax.tree.map(lambda *arrays: np.concatenate(arrays), *padded_paths)
 
     @property
     def n_paths(self) -> int:
@@ -193,8 +193,8 @@ class Path(PyTree):
         Returns:
             (1,) each
         """
-        duration, closed = _entry_at(self.duration, index), _entry_at(self.closed, index)
-        laps = jnp.where(closed, lax.floor(t / duration), 0.0)
+        duration, is_closed = _entry_at(self.duration, index), _entry_at(self.closed, index)
+        laps = jnp.where(is_closed, lax.floor(t / duration), 0.0)
         local = safe_clip(t - laps * duration, 0.0, duration)
         step = duration / (N_TIMES - 1)
         node = jnp.minimum(lax.floor(local / step), N_TIMES - 2.0)
@@ -203,7 +203,7 @@ class Path(PyTree):
         rise, v0, v1 = s1 - s0, v0 * step, v1 * step
         c2, c3 = 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise  # cubic of Hermite
         s = s0 + u * (v0 + u * (c2 + u * c3))
-        is_moving = (t >= 0) & (closed | (t <= duration))
+        is_moving = (t >= 0) & (is_closed | (t <= duration))
         v = jnp.where(is_moving, (v0 + u * (2 * c2 + 3 * u * c3)) / step, 0.0)
         sign = jnp.where(_entry_at(self.speeds, index, 0) < 0, -1.0, 1.0)
         return (s + laps * _entry_at(self.length, index))[None], (sign * v)[None]
@@ -222,7 +222,7 @@ class Path(PyTree):
         Returns:
             m. ()
         """
-        s, length, closed = guess, _entry_at(self.length, index), _entry_at(self.closed, index)
+        s, length, is_closed = guess, _entry_at(self.length, index), _entry_at(self.closed, index)
         for _ in range(NEWTON_STEPS):
             point = self.at(index, s)
             offset = pos - point.pos
@@ -231,7 +231,7 @@ class Path(PyTree):
             s = s + safe_clip(
                 along_error / jnp.maximum(1 - point.curvature[0] * lateral, 0.2), -MAX_NEWTON_STEP, MAX_NEWTON_STEP
             )
-            s = jnp.where(closed, s, safe_clip(s, 0.0, length))
+            s = jnp.where(is_closed, s, safe_clip(s, 0.0, length))
         return s
 
     def nearest(self, index: int, pos: ArrayLike) -> float:
@@ -262,8 +262,8 @@ class Path(PyTree):
     def _locate(self, index: Array | int, s: Array) -> tuple[Array, Array]:
         """Return the piece at an arc length, and the position in it as a share of its length."""
         length, spacing = _entry_at(self.length, index), _entry_at(self.spacing, index)
-        wrapped = s - length * lax.floor(s / length)
-        local = jnp.where(_entry_at(self.closed, index), wrapped, safe_clip(s, 0.0, length)) / spacing
+        local_s = s - length * lax.floor(s / length)
+        local = jnp.where(_entry_at(self.closed, index), local_s, safe_clip(s, 0.0, length)) / spacing
         piece = safe_clip(lax.floor(local), 0.0, lax.floor(length / spacing - 0.5))
         return piece.astype(jnp.int32), local - piece
 
@@ -319,8 +319,10 @@ def _path_of_curve(
         )
     n = max(4, int(np.ceil(arc[-1] / MAX_PIECE_LENGTH)))
     nodes = np.interp(np.linspace(0.0, arc[-1], n + 1), arc, times)
-    inner = np.clip(nodes, times[moving_samples[0]], times[moving_samples[-1]])  # at rest the tangent is undefined
-    pos, vel, acc = curve(nodes, 0), curve(inner, 1), curve(inner, 2)
+    inner_times = np.clip(
+        nodes, times[moving_samples[0]], times[moving_samples[-1]]
+    )  # at rest the tangent is undefined
+    pos, vel, acc = curve(nodes, 0), curve(inner_times, 1), curve(inner_times, 2)
     if closed and not np.allclose(pos[0], pos[-1], atol=1e-3):
         raise ConfigError(
             f"expected a closed path that ends at its start, got a gap of {np.hypot(*(pos[0] - pos[-1])):.3g} m. Let "

@@ -64,16 +64,16 @@ class PathLQR(PathController):
         return PathLQRGains(as_parameter(table.reshape(2, N_SPEEDS, 5)))
 
     def steering(
-        self, state: CarState, at: PathState, memory: Any, gains: PathLQRGains, car: CarParams
+        self, state: CarState, tracking: PathState, memory: Any, gains: PathLQRGains, car: CarParams
     ) -> tuple[Array, Any]:
         cell = safe_clip(jnp.abs(state.body_vel[0]) / SPEED_STEP - 1, 0.0, N_SPEEDS - 1.001)
         k = lax.floor(cell)
-        side, node = (at.speed[0] < 0).astype(jnp.int32), k.astype(jnp.int32)
+        side, node = (tracking.speed[0] < 0).astype(jnp.int32), k.astype(jnp.int32)
         table = jnp.asarray(gains.table)
         low, high = (table.at[side, node + i].get(mode="clip") for i in range(2))
         row = low + (cell - k) * (high - low)
-        x = jnp.concatenate([at.offset, state.body_vel[1:], at.heading_error, state.yaw_rate])
-        return row[4:] * at.curvature - jnp.sum(row[:4] * x, keepdims=True), memory
+        x = jnp.concatenate([tracking.offset, state.body_vel[1:], tracking.heading_error, state.yaw_rate])
+        return row[4:] * tracking.curvature - jnp.sum(row[:4] * x, keepdims=True), memory
 
 
 def lateral_model(model: Callable[..., CarState], car: CarParams, speed: Array) -> tuple[Array, Array]:
@@ -104,8 +104,8 @@ def lateral_gains(
     rows = jnp.array([1, 3])
     balance = jnp.stack([A[rows, 1], B[rows, 0]], axis=1)
     side, steer = jnp.linalg.solve(balance, -A[rows, 3] * speed)
-    steady = jnp.stack([jnp.zeros_like(speed), side, -side / speed, speed])
-    return jnp.concatenate([K, (steer + K @ steady)[None]])
+    row = jnp.stack([jnp.zeros_like(speed), side, -side / speed, speed])
+    return jnp.concatenate([K, (steer + K @ row)[None]])
 
 
 def _gain_rows(

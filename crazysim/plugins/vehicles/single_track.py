@@ -46,8 +46,8 @@ def tyre_force(drive: Array, vel: Array, stiffness: Array, grip: Array, slip_spe
         grip: Largest force, N. (..., 1)
         slip_speed: Speed below which slip forces decrease, m/s. (..., 1)
     """
-    along, across = vel[..., :1], vel[..., 1:]
-    lateral = -stiffness * across * lax.rsqrt(along * along + slip_speed * slip_speed)
+    longitudinal_vel, lateral_vel = vel[..., :1], vel[..., 1:]
+    lateral = -stiffness * lateral_vel * lax.rsqrt(longitudinal_vel * longitudinal_vel + slip_speed * slip_speed)
     share = (drive * drive + lateral * lateral) / (grip * grip)
     scale = lax.rsqrt(1 + share)
     return drive * scale, lateral * scale

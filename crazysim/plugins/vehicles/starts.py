@@ -50,11 +50,11 @@ def member_numbers(name: str, value: ArrayLike, counts: tuple[int, int], n: int 
         n: Number of paths, for indices of paths; None for real numbers.
     """
     array = np.asarray(value)
-    whole = n is None or (array.dtype.kind in "iu" and np.all((array >= 0) & (array < n)))
-    if array.shape not in ((), counts[1:], counts) or array.dtype.kind not in "iuf" or not whole:
-        what = "a number" if n is None else f"a whole number from 0 to {n - 1}"
+    is_index = n is None or (array.dtype.kind in "iu" and np.all((array >= 0) & (array < n)))
+    if array.shape not in ((), counts[1:], counts) or array.dtype.kind not in "iuf" or not is_index:
+        kind = "a number" if n is None else f"a whole number from 0 to {n - 1}"
         raise ConfigError(
-            f"expected {name} as {what} for all cars, or for each, {counts[1:]} or {counts} = (n_worlds, n_members), "
+            f"expected {name} as {kind} for all cars, or for each, {counts[1:]} or {counts} = (n_worlds, n_members), "
             f"got {value!r}. Use one number, or an array of one of these shapes."
         )
     if not np.all(np.isfinite(array)):
@@ -101,9 +101,9 @@ def project_arcs(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
     index, projections = np.broadcast_to(index, arc.shape), np.empty_like(arc)
     for member in np.ndindex(arc.shape[:2]):
         k = int(index[member][0])
-        nearest, length = paths.nearest(k, pos[member]), float(paths.length[k])
-        rounds = round((float(arc[member][0]) - nearest) / length) if paths.closed[k] else 0
-        projections[member] = nearest + rounds * length
+        nearest_arc, length = paths.nearest(k, pos[member]), float(paths.length[k])
+        rounds = round((float(arc[member][0]) - nearest_arc) / length) if paths.closed[k] else 0
+        projections[member] = nearest_arc + rounds * length
     return projections
 
 

@@ -24,9 +24,9 @@ def trailer_rates(state: CarState, params: CarParams) -> Array:
     vx, vy = state.body_vel[..., :1], state.body_vel[..., 1:] - hitch * state.yaw_rate
     to_bar = state.yaw - state.joints[..., :1]
     cos, sin = jnp.cos(to_bar), jnp.sin(to_bar)
-    along, across = cos * vx - sin * vy, sin * vx + cos * vy
+    longitudinal, lateral = cos * vx - sin * vy, sin * vx + cos * vy
     to_deck = state.joints[..., :1] - state.joints[..., 1:]
-    return jnp.concatenate([across / drawbar, along * jnp.sin(to_deck) / axles], axis=-1)
+    return jnp.concatenate([lateral / drawbar, longitudinal * jnp.sin(to_deck) / axles], axis=-1)
 
 
 def trailer_axles(state: CarState, params: CarParams) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ MAX_COORDINATE = 1e5
 """Largest coordinate, m, and largest yaw, degrees."""
 
 
-def refuse(expected: str, got: str, location: str) -> NoReturn:
+def raise_error(expected: str, got: str, location: str) -> NoReturn:
     """Raise the error for a value that is not accepted.
 
     Args:
@@ -49,16 +49,16 @@ def parse_json(content: bytes | str, location: str) -> Any:
 def require_object(value: object, location: str) -> dict[str, Any]:
     """Return a value that must be a JSON object."""
     if not isinstance(value, dict):
-        refuse("an object {...}", short_repr(value), location)
+        raise_error("an object {...}", short_repr(value), location)
     return value
 
 
 def require_array(value: object, n_max: int, location: str) -> list[Any]:
     """Return a value that must be a JSON array of at most ``n_max`` entries."""
     if not isinstance(value, list):
-        refuse("an array [...]", short_repr(value), location)
+        raise_error("an array [...]", short_repr(value), location)
     if len(value) > n_max:
-        refuse(f"at most {n_max} entries", str(len(value)), location)
+        raise_error(f"at most {n_max} entries", str(len(value)), location)
     return value
 
 
@@ -66,13 +66,13 @@ def require_version_one(value: dict[str, Any], location: str) -> None:
     """Check that an object has version 1."""
     version = value.get("version")
     if version != 1 or isinstance(version, bool):
-        refuse("version 1", short_repr(version), location)
+        raise_error("version 1", short_repr(version), location)
 
 
 def require_number(value: object, location: str, low: float = -np.inf, high: float = np.inf) -> float:
     """Return a value that must be a finite number in a range."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or value != value:
-        refuse(
+        raise_error(
             "a number" if np.isinf([low, high]).any() else f"a number from {low:g} to {high:g}",
             short_repr(value),
             location,
@@ -83,7 +83,7 @@ def require_number(value: object, location: str, low: float = -np.inf, high: flo
 def require_text(value: object, location: str, n_max: int = 200) -> str:
     """Return a value that must be a string of at most ``n_max`` characters."""
     if not isinstance(value, str) or len(value) > n_max:
-        refuse(f"a text of at most {n_max} characters", short_repr(value), location)
+        raise_error(f"a text of at most {n_max} characters", short_repr(value), location)
     return value
 
 
@@ -92,17 +92,17 @@ def require_numbers(value: object, lengths: Sequence[int], bound: float, locatio
     if isinstance(value, tuple):
         value = list(value)
     if not isinstance(value, list) or len(value) not in lengths:
-        refuse(f"an array of {' or '.join(map(str, lengths))} numbers", short_repr(value), location)
+        raise_error(f"an array of {' or '.join(map(str, lengths))} numbers", short_repr(value), location)
     return np.array([require_number(x, location, -bound, bound) for x in value])
 
 
-def require_ascending(times: NDArray, least: float, location: str) -> None:
-    """Check that times ascend by at least ``least``, so that no pieces overlap or have zero length."""
+def require_ascending(times: NDArray, min_step: float, location: str) -> None:
+    """Check that times ascend by at least ``min_step``, so that no pieces overlap or have zero length."""
     steps = np.diff(times)
-    if len(steps) and steps.min() < least * (1 - 1e-6):
+    if len(steps) and steps.min() < min_step * (1 - 1e-6):
         k = int(np.argmin(steps))
-        refuse(
-            f"times that ascend by at least {least:g} s",
+        raise_error(
+            f"times that ascend by at least {min_step:g} s",
             f"{times[k]:g} s followed by {times[k + 1]:g} s at entry {k + 1}",
             location,
         )

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.errors import ConfigError, short_repr
 from crazysim.storage import read_text, write_file
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.polynomials import trajectory_of_rows, trajectory_rows
-from crazysim.trajectories.splines import trajectory_of_unit_pieces
+from crazysim.trajectories.files.polynomials import trajectory_from_rows, trajectory_rows
+from crazysim.trajectories.splines import trajectory_from_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 POLYNOMIAL_HEADER = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y", "z", "yaw") for k in range(8))])
@@ -32,7 +32,7 @@ def load_csv(path: str | Path) -> Trajectory:
         ConfigError: If the file does not exist, or a row is invalid.
     """
     rows = _parse_table(read_text(path, checks.MAX_FILE_BYTES).splitlines(), str(path))
-    return trajectory_of_rows(rows, str(path)) if rows.shape[1] > 5 else _fit_samples(rows, str(path))
+    return trajectory_from_rows(rows, str(path)) if rows.shape[1] > 5 else _fit_samples(rows, str(path))
 
 
 def _parse_table(lines: list[str], location: str) -> NDArray:
@@ -43,32 +43,32 @@ def _parse_table(lines: list[str], location: str) -> NDArray:
         if cells == [""] or cells[0].startswith("#"):
             continue
         if len(rows) >= checks.MAX_POINTS:
-            checks.refuse(f"at most {checks.MAX_POINTS} rows", "more", f"{location}, line {i}")
+            checks.raise_error(f"at most {checks.MAX_POINTS} rows", "more", f"{location}, line {i}")
         try:
             row = [float(cell) for cell in cells]
         except ValueError:
             if not rows and any(cell[:1].isalpha() for cell in cells):
                 continue  # the header
-            checks.refuse("numbers", short_repr(line), f"{location}, line {i}")
+            checks.raise_error("numbers", short_repr(line), f"{location}, line {i}")
         if len(row) not in (4, 5, 25, 33) or (rows and len(row) != len(rows[0])):
             expected = f"{len(rows[0])} columns, as before" if rows else "4, 5, 25 or 33 columns"
-            checks.refuse(expected, str(len(row)), f"{location}, line {i}")
+            checks.raise_error(expected, str(len(row)), f"{location}, line {i}")
         rows.append(row)
     if not rows:
-        checks.refuse("at least one row of numbers", "none", location)
+        checks.raise_error("at least one row of numbers", "none", location)
     return np.array(rows)
 
 
 def _fit_samples(rows: NDArray, location: str) -> Trajectory:
     """Return the cubic trajectory through samples of time, position and, optionally, yaw."""
     if not np.all(np.isfinite(rows)) or np.abs(rows[:, 1:]).max() > checks.MAX_COORDINATE:
-        checks.refuse(f"finite numbers up to {checks.MAX_COORDINATE:g}", "others", location)
+        checks.raise_error(f"finite numbers up to {checks.MAX_COORDINATE:g}", "others", location)
     if len(rows) < 2:
-        checks.refuse("at least two samples", "one", location)
+        checks.raise_error("at least two samples", "one", location)
     times = rows[:, 0] - rows[0, 0]
     checks.require_ascending(times, checks.MIN_LENGTH, location)
     if times[-1] > checks.MAX_TIME:
-        checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1]:g} s", location)
+        checks.raise_error(f"at most {checks.MAX_TIME:g} s", f"{times[-1]:g} s", location)
     values = np.zeros((len(rows), 4))
     values[:, : rows.shape[1] - 1] = rows[:, 1:]
     values[:, 3] = np.unwrap(values[:, 3])
@@ -78,7 +78,7 @@ def _fit_samples(rows: NDArray, location: str) -> Trajectory:
     start, end, first, last = values[:-1], values[1:], rates[:-1] * lengths, rates[1:] * lengths
     # Cubic Hermite polynomial of u in [0, 1].
     c = [start, first, 3 * (end - start) - 2 * first - last, 2 * (start - end) + first + last]
-    return trajectory_of_unit_pieces(np.diff(times), np.stack(c, axis=-1))
+    return trajectory_from_unit_pieces(np.diff(times), np.stack(c, axis=-1))
 
 
 def save_csv(trajectory: Trajectory, path: str | Path) -> None:

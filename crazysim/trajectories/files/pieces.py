@@ -19,7 +19,7 @@ ROUNDING = 1e-5
 def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     """Return the ends of a trajectory's pieces and their coefficients, in float64.
 
-    Times are the shortest decimals that represent those of the trajectory, so that 0.1 s is written as 0.1.
+    Times are the shortest decimals that represent the times of the trajectory, so that 0.1 s is written as 0.1.
 
     Args:
         trajectory: Trajectory of one vehicle.
@@ -52,13 +52,13 @@ def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
     """
     ends_at = coefficients[:-1].sum(axis=-1)
     jumps = np.abs(coefficients[1:, :, 0] - ends_at)
-    too_far = np.argwhere(jumps > MAX_JUMPS[: jumps.shape[1]] + ROUNDING * np.abs(ends_at))
-    if len(too_far):
-        piece, axis = too_far[0]
+    is_jump = np.argwhere(jumps > MAX_JUMPS[: jumps.shape[1]] + ROUNDING * np.abs(ends_at))
+    if len(is_jump):
+        piece, axis = is_jump[0]
         size = jumps[piece, axis]
-        what = f"yaw of {np.rad2deg(size):.3g} degrees" if axis == 3 else f"{'xyz'[axis]} of {size:.3g} m"
+        text = f"yaw of {np.rad2deg(size):.3g} degrees" if axis == 3 else f"{'xyz'[axis]} of {size:.3g} m"
         raise ConfigError(
-            f"expected pieces that begin where the one before ends, which this format requires, got a jump in {what} "
+            f"expected pieces that begin where the one before ends, which this format requires, got a jump in {text} "
             f"at {ends[piece]:g} s. Use moved() to align the parts, or join them by a line."
         )
 
@@ -71,8 +71,8 @@ def split_pieces(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[
         coefficients: Coefficients in the pieces' times scaled to [0, 1]. (n_pieces, k, degree + 1)
         times: Times, s. (n,)
     """
-    inside = times[(times > 0) & (times < ends[-1])]
-    cuts = np.union1d(ends, inside)
+    inner_times = times[(times > 0) & (times < ends[-1])]
+    cuts = np.union1d(ends, inner_times)
     cuts = cuts[np.diff(cuts, append=np.inf) > 1e-6]  # cuts within a microsecond are one cut
     cuts[-1] = ends[-1]
     from_cuts = np.concatenate([[0.0], cuts[:-1]])

@@ -17,7 +17,7 @@ from crazysim.storage import read_bytes, write_file
 from crazysim.trajectories.bezier import control_points, power_coefficients, significant_degree
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.pieces import require_no_jumps, split_pieces, trajectory_pieces
-from crazysim.trajectories.splines import trajectory_of_unit_pieces
+from crazysim.trajectories.splines import trajectory_from_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 POLY4D_FLOATS = 33
@@ -59,12 +59,12 @@ def unpack_poly4d(content: bytes, location: str = "a trajectory memory") -> Traj
     """
     size = 4 * POLY4D_FLOATS
     if not content or len(content) % size or len(content) // size > checks.MAX_POINTS:
-        checks.refuse(f"1 to {checks.MAX_POINTS} pieces of {size} bytes", f"{len(content)} bytes", location)
+        checks.raise_error(f"1 to {checks.MAX_POINTS} pieces of {size} bytes", f"{len(content)} bytes", location)
     rows = np.frombuffer(content, "<f4").reshape(-1, POLY4D_FLOATS).astype(float)
-    return trajectory_of_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], location)
+    return trajectory_from_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], location)
 
 
-def trajectory_of_rows(rows: NDArray, location: str) -> Trajectory:
+def trajectory_from_rows(rows: NDArray, location: str) -> Trajectory:
     """Return the trajectory of rows as ``trajectory_rows`` returns them.
 
     Args:
@@ -74,18 +74,20 @@ def trajectory_of_rows(rows: NDArray, location: str) -> Trajectory:
     """
     lengths, c = rows[:, 0], rows[:, 1:].reshape(len(rows), -1, 8)
     if not np.all(np.isfinite(rows)):
-        checks.refuse("finite numbers", "others", f"{location}, piece {int(np.argmin(np.isfinite(rows).all(1)))}")
+        checks.raise_error("finite numbers", "others", f"{location}, piece {int(np.argmin(np.isfinite(rows).all(1)))}")
     if not np.all(lengths >= checks.MIN_LENGTH * (1 - 1e-6)) or lengths.sum() > checks.MAX_TIME:
         k = int(np.argmin(lengths))
-        checks.refuse(
+        checks.raise_error(
             f"durations of at least {checks.MIN_LENGTH:g} s and at most {checks.MAX_TIME:g} s in all",
             f"{lengths[k]:g} s and {lengths.sum():g} s",
             f"{location}, piece {k}",
         )
-    scaled = np.abs(c) * lengths[:, None, None] ** np.arange(8)
-    if not np.all(scaled < checks.MAX_COORDINATE):
-        k = int(np.argmax(scaled.max((1, 2))))
-        checks.refuse(f"coordinates up to {checks.MAX_COORDINATE:g}", f"{scaled[k].max():g}", f"{location}, piece {k}")
+    magnitudes = np.abs(c) * lengths[:, None, None] ** np.arange(8)
+    if not np.all(magnitudes < checks.MAX_COORDINATE):
+        k = int(np.argmax(magnitudes.max((1, 2))))
+        checks.raise_error(
+            f"coordinates up to {checks.MAX_COORDINATE:g}", f"{magnitudes[k].max():g}", f"{location}, piece {k}"
+        )
     return Trajectory.of_pieces(lengths, c)
 
 
@@ -169,24 +171,24 @@ def unpack_compressed(content: bytes, location: str = "a trajectory memory") -> 
             piece, last = np.zeros((4, 8)), points.copy()
             for axis in range(4):
                 degree = STORED_DEGREES[header >> 2 * axis & 3]
-                stored = struct.unpack_from(f"<{degree}h", content, offset)
+                later_points = struct.unpack_from(f"<{degree}h", content, offset)
                 offset += 2 * degree
-                curve = np.array([points[axis], *stored], float)
+                curve = np.array([points[axis], *later_points], float)
                 piece[axis, : degree + 1] = power_coefficients(curve[:, None])[0]
                 last[axis] = curve[-1]
             points = last
             durations.append(duration)
             pieces.append(piece)
             if len(pieces) > checks.MAX_POINTS:
-                checks.refuse(f"at most {checks.MAX_POINTS} pieces", "more", location)
+                checks.raise_error(f"at most {checks.MAX_POINTS} pieces", "more", location)
     except struct.error:
-        checks.refuse("complete pieces", f"{len(content)} bytes that end within one", location)
+        checks.raise_error("complete pieces", f"{len(content)} bytes that end within one", location)
     ends = DURATION_UNIT * np.cumsum(durations)
     if not pieces or ends[-1] > checks.MAX_TIME:
-        checks.refuse(
+        checks.raise_error(
             f"pieces of up to {checks.MAX_TIME:g} s in all", "none" if not pieces else "longer ones", location
         )
-    return trajectory_of_unit_pieces(np.diff(ends, prepend=0.0), np.stack(pieces) * AXIS_UNITS[:, None])
+    return trajectory_from_unit_pieces(np.diff(ends, prepend=0.0), np.stack(pieces) * AXIS_UNITS[:, None])
 
 
 def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = False) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crazysim import rotation
-from crazysim.lab.live.attitude import from_rpy, from_yaw, multiply, rotate, to_rpy, yaw_of
+from crazysim.lab.live.attitude import from_rpy, from_yaw, multiply, rotate, to_rpy, yaw_from_quat
 
 
 def test_rotations_on_the_host_equal_those_of_the_step():
@@ -21,4 +21,4 @@ def test_rotations_on_the_host_equal_those_of_the_step():
 @pytest.mark.parametrize("yaw", [-3.0, -0.4, 0.0, 2.0])
 def test_yaw_is_that_of_roll_pitch_and_yaw(yaw):
     np.testing.assert_allclose(from_yaw(yaw), from_rpy([0.0, 0.0, yaw]), atol=1e-15)
-    assert yaw_of(from_rpy([0.3, -0.7, yaw])) == pytest.approx(yaw, abs=1e-12)
+    assert yaw_from_quat(from_rpy([0.3, -0.7, yaw])) == pytest.approx(yaw, abs=1e-12)

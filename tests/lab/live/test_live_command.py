@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim.__main__ import main
-from crazysim.lab.live.circles import CLIMB, HEIGHT, PERIOD, RADIUS, circle_commands
+from crazysim.lab.live.circles import CIRCLE_DURATION, CLIMB_DURATION, HEIGHT, RADIUS, circle_commands
 from crazysim.media import Flight
 
 
@@ -27,7 +27,7 @@ def test_headless_it_flies_and_prints_the_factor(tmp_path, capsys):
 def test_circles_are_consistent():
     """Velocity and acceleration are derivatives of position once the drones have risen, and the start is at rest."""
     places = np.array([[[1.0, 2.0, 0.0]]])
-    t, h = CLIMB + 0.3 * PERIOD, 1e-4
+    t, h = CLIMB_DURATION + 0.3 * CIRCLE_DURATION, 1e-4
     before, now, after = (circle_commands(places, t + k * h)[0, 0] for k in (-1, 0, 1))
     np.testing.assert_allclose(now[3:6], (after[:3] - before[:3]) / (2 * h), atol=1e-6)
     np.testing.assert_allclose(now[6:9], (after[:3] - 2 * now[:3] + before[:3]) / h**2, atol=1e-5)

@@ -142,7 +142,7 @@ def test_a_double_click_reports_the_body_below_it():
     sim.scene.compile_if_edited()
     program, said = Program.__new__(Program), []
     program._model, program._bodies = sim.mj_model, SceneBodies(sim)
-    program._say = lambda *message: said.append(message)
+    program._send = lambda *message: said.append(message)
     picture = SimpleNamespace(worlds=np.array([3, 5]))
 
     def geom_of(body):

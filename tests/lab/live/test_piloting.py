@@ -9,7 +9,7 @@ import pytest
 from crazysim.errors import ConfigError
 from crazysim.lab.live import Gamepad, Keyboard, Live, Pilot, keyboard_sticks
 from crazysim.lab.live.gamepad import DEADBAND, remove_deadband
-from crazysim.lab.live.piloting import hold_setpoint, move_setpoint, setpoint_of
+from crazysim.lab.live.piloting import command_setpoint, hold_setpoint, move_setpoint
 from crazysim.sim import Sim
 
 
@@ -28,7 +28,7 @@ def test_sticks_move_in_the_axes_of_the_drone():
 def test_a_setpoint_is_written_and_read():
     command = np.ones(16)
     hold_setpoint(command, [1.0, 2.0, 3.0, -2.5])
-    np.testing.assert_allclose(setpoint_of(command), [1, 2, 3, -2.5])
+    np.testing.assert_allclose(command_setpoint(command), [1, 2, 3, -2.5])
     np.testing.assert_allclose(np.linalg.norm(command[9:13]), 1.0)
     assert not command[3:9].any()
 

@@ -13,7 +13,7 @@ from crazysim.envs import make
 from crazysim.errors import ConfigError
 from crazysim.lab.live import Live, PolicyPilot
 from crazysim.lab.live.picture import PictureSource
-from crazysim.lab.live.policy_pilot import CLOSE, as_point, read_points
+from crazysim.lab.live.policy_pilot import ARRIVAL_DISTANCE, parse_point, read_points
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.media import Flight
 
@@ -96,7 +96,7 @@ def test_listed_points_are_passed_in_order(env):
         live.run(6.0)
         assert pilot.passed.tolist() == [[2], [2]]
         np.testing.assert_array_equal(pilot.goals[:, 0], [POINTS[1]] * 2)
-        assert np.linalg.norm(positions(live) - POINTS[1], axis=-1).max() < CLOSE
+        assert np.linalg.norm(positions(live) - POINTS[1], axis=-1).max() < ARRIVAL_DISTANCE
         live.go_to(0.1)
         assert pilot.passed.tolist() == [[0], [0]]
         live.go_to(6.0)
@@ -118,7 +118,7 @@ def test_points_outside_of_the_arena_and_tasks_without_goals_are_refused(env):
 
 
 def test_points_are_read_from_text(tmp_path):
-    np.testing.assert_array_equal(as_point(" 1, -2.5 3e-1\n"), [1.0, -2.5, 0.3])
+    np.testing.assert_array_equal(parse_point(" 1, -2.5 3e-1\n"), [1.0, -2.5, 0.3])
     path = tmp_path / "points.csv"
     path.write_text("# x, y, z\n0.5,0,1\n\n0.5;0.5;1.4  # the last\n")
     np.testing.assert_array_equal(read_points(path), POINTS)

@@ -15,7 +15,7 @@ from waiting import wait_for
 from crazysim import IMU, ConfigError, Sim
 from crazysim.drones import load_airframe
 from crazysim.lab.live.sitl import ArduPilot, Betaflight, Measurements, Origin, Px4, SoftwareInTheLoop
-from crazysim.lab.live.sitl.loop import FIELD, motor_order
+from crazysim.lab.live.sitl.loop import MAGNETIC_FIELD, motor_order
 from crazysim.lab.live.sitl.measured import quat_ned
 from crazysim.plugins.sensors import GPS, Barometer, Magnetometer, Triad
 
@@ -206,7 +206,7 @@ def test_px4_starts_slowly_and_flies_on_mounted_sensors_with_rates_of_their_own(
     sim = disturbed(freq=250)
     sim.add(IMU(gyro=Triad(bias=[0.03, 0.0, 0.03]), rpy=(np.pi, 0.0, 0.3), freq=125))
     sim.add(Barometer(altitude=100.0, freq=50))
-    sim.add(Magnetometer(FIELD, rpy=(0.0, 0.0, np.pi / 2), freq=25))
+    sim.add(Magnetometer(MAGNETIC_FIELD, rpy=(0.0, 0.0, np.pi / 2), freq=25))
     sim.add(GPS(freq=10))
     loop = SoftwareInTheLoop(sim, link)
     with loop:
@@ -419,7 +419,7 @@ def test_measurements_are_those_of_the_plugins_in_the_axes_of_the_body():
     sim.data = with_states(sim.data, pos=[0.0, 0.0, 50.0], quat=quat, ang_vel=[0.5, -1.0, 2.0])
     sim.add(IMU(rpy=(0.4, -0.2, 1.0), pos=(0.0, 0.0, 0.02)))
     aligned = sim.add(IMU(pos=(0.0, 0.0, 0.02), name="aligned"))
-    sim.add(Magnetometer(FIELD, rpy=(np.pi / 2, 0.0, np.pi), freq=None))
+    sim.add(Magnetometer(MAGNETIC_FIELD, rpy=(np.pi / 2, 0.0, np.pi), freq=None))
     sim.add(GPS(pos=(0.1, 0.0, -0.2), freq=None))
     with SoftwareInTheLoop(sim, [ArduPilot(port=free_port(socket.SOCK_DGRAM)) for _ in range(2)]) as loop:
         for has_measured in (False, True):
@@ -433,7 +433,7 @@ def test_measurements_are_those_of_the_plugins_in_the_axes_of_the_body():
                 assert measured.height == pytest.approx(pos[2])
                 # In float32, with positions of 50 m.
                 np.testing.assert_allclose(measured.gps_pos, pos + rotation @ [0.1, 0, -0.2], atol=1e-5)
-                np.testing.assert_allclose(measured.field, rotation.T @ FIELD, atol=1e-10)
+                np.testing.assert_allclose(measured.field, rotation.T @ MAGNETIC_FIELD, atol=1e-10)
                 np.testing.assert_allclose(measured.ang_vel, states.ang_vel[k, 0])
                 if has_measured:
                     found = np.concatenate([measured.gyro, measured.accel])

@@ -193,10 +193,10 @@ def test_part_of_a_show_and_wrong_settings():
 
 
 def test_film_has_the_colours_of_the_lights(flight, tmp_path, opengl):
-    from crazysim.lab.shows.view import media_flight, view_of
+    from crazysim.lab.shows.view import create_view, media_flight
     from crazysim.media.flight_recorder import show_flight_at
 
-    view = view_of(flight, width=320, height=240, text=None)
+    view = create_view(flight, width=320, height=240, text=None)
     data = flight.sim.data
     images = []
     for now in (0.3, 1.95):  # not while a collision is marked

@@ -8,7 +8,7 @@ import pytest
 from crazysim.__main__ import main
 from crazysim.lab.validate import sim_to_sim
 from crazysim.lab.validate.sections import sections
-from crazysim.lab.validate.simulators import PERIOD, SIMULATORS, Crazysim, Mujoco, Simulator
+from crazysim.lab.validate.simulators import COMMAND_PERIOD, SIMULATORS, Crazysim, Mujoco, Simulator
 
 WEIGHT = 0.0434 * 9.81
 """Weight of cf21B_500, N."""
@@ -23,7 +23,7 @@ def pilot(obs):
 
 @pytest.fixture(scope="module")
 def results():
-    return [sim_to_sim.fly("hover", pilot, simulator, 3) for simulator in (Crazysim, Mujoco)]
+    return [sim_to_sim.fly_task("hover", pilot, simulator, 3) for simulator in (Crazysim, Mujoco)]
 
 
 @pytest.mark.long("compiles the step, the controller in the loop, and the task")
@@ -47,21 +47,21 @@ class Falling(Simulator):
     def __init__(self, start):
         self.states = start
 
-    def fly(self, commands):
-        vel = self.states["vel"] - [0, 0, 9.81 * PERIOD]
-        self.states = self.states | {"vel": vel, "pos": self.states["pos"] + PERIOD * vel}
+    def fly_period(self, commands):
+        vel = self.states["vel"] - [0, 0, 9.81 * COMMAND_PERIOD]
+        self.states = self.states | {"vel": vel, "pos": self.states["pos"] + COMMAND_PERIOD * vel}
         return self.states
 
 
 def test_drones_that_fall_have_crashed():
-    result = sim_to_sim.fly("hover", lambda obs: np.zeros((len(obs), 4)), Falling, 3)
+    result = sim_to_sim.fly_task("hover", lambda obs: np.zeros((len(obs), 4)), Falling, 3)
     assert (result.success, result.crashed) == (0, 1)
     assert np.isnan(result.error)
     assert len(result.observed) < 50  # 1.9 m of free fall, from at most 0.5 m/s upwards, take less than 0.7 s
 
 
 def test_simulators_that_are_not_installed_are_left_out(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sim_to_sim, "exported", lambda *_: pytest.fail("a training"))
+    monkeypatch.setattr(sim_to_sim, "export_policy", lambda *_: pytest.fail("a training"))
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in sim_to_sim.PEERS else find_spec(name))
     installed = [name for name in SIMULATORS if not SIMULATORS[name].module]
@@ -79,9 +79,9 @@ def test_simulators_that_are_not_installed_are_left_out(tmp_path, monkeypatch, c
 def test_a_row_has_success_error_and_the_difference_of_both_exports(monkeypatch):
     shift = np.float32(2e-6)
     policy = sim_to_sim.Exported(lambda obs: obs[:, :4], lambda obs: obs[:, :4] + shift, np.zeros(4), np.ones(4))
-    monkeypatch.setattr(sim_to_sim, "exported", lambda *_: policy)
+    monkeypatch.setattr(sim_to_sim, "export_policy", lambda *_: policy)
     result = sim_to_sim.Result(0.5, 0.25, 0.0123, np.linspace(-1, 1, 60).reshape(5, 3, 4))
-    monkeypatch.setattr(sim_to_sim, "fly", lambda *_: result)
+    monkeypatch.setattr(sim_to_sim, "fly_task", lambda *_: result)
     flown, same = sim_to_sim.compare("hover_crazyflie", "crazysim")
     assert (flown.quantity, flown.figure) == ("`hover`, trained with `randomize=crazyflie`: success", 50)
     assert flown.remark == "mean error 0.012 m, crashed 25 %"

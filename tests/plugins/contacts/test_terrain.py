@@ -79,7 +79,7 @@ def test_drones_land_on_it_and_take_off():
     np.testing.assert_allclose(np.asarray(sim.data.states.pos)[..., 2:], ground + FLOOR_HEIGHT, atol=1e-6)
     assert float(ground.min()) > 0.4
     np.testing.assert_array_equal(sim.data.states.vel, 0)
-    np.testing.assert_allclose(plugin.read(sim.data).below, ground)
+    np.testing.assert_allclose(plugin.read(sim.data).height_below, ground)
     np.testing.assert_allclose(
         sim.contact_report(drones=False).floor_distance, -0.086, atol=0.02
     )  # sunk by its sphere's radius
@@ -87,7 +87,9 @@ def test_drones_land_on_it_and_take_off():
     sim.step(300)
     assert float(np.asarray(sim.data.states.pos)[..., 2].min()) > 0.7
     sim.reset()
-    np.testing.assert_allclose(plugin.read(sim.data).below, ground_height(sim.data, sim.data.states.pos), rtol=1e-6)
+    np.testing.assert_allclose(
+        plugin.read(sim.data).height_below, ground_height(sim.data, sim.data.states.pos), rtol=1e-6
+    )
 
 
 def test_law_07_nothing_breaks_at_the_border_of_the_terrain():

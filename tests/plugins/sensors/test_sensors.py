@@ -8,7 +8,7 @@ from cases import hover_rotor_state, with_states
 from crazysim import Battery, ConfigError, Plugin, RangeFinder, Sim, rotation
 from crazysim.envs import DroneEnv, make
 from crazysim.plugins import sensors
-from crazysim.plugins.sensors.barometer import altitude_of, pressure_at
+from crazysim.plugins.sensors.barometer import pressure_altitude, pressure_at
 from crazysim.plugins.sensors.beacons import SWEEP_TILTS, sweep_angle
 
 N = 2000
@@ -131,7 +131,7 @@ def test_the_standard_atmosphere():
     with jax.enable_x64(True):
         pressure = pressure_at(np.array([0.0, 1000.0, 5000.0]))
         np.testing.assert_allclose(pressure, [101325, 89874.6, 54019.9], atol=0.1)
-        np.testing.assert_allclose(altitude_of(pressure), [0, 1000, 5000], atol=1e-9)
+        np.testing.assert_allclose(pressure_altitude(pressure), [0, 1000, 5000], atol=1e-9)
 
 
 def test_barometer_has_its_errors():

@@ -13,7 +13,7 @@ from crazysim.lab.live.attitude import from_yaw
 from crazysim.lab.live.crazyflie_py.uav_trajectory import Trajectory
 from crazysim.lab.live.swarm import Commander, Swarm
 from crazysim.lab.live.swarm.parameters import LED_SOLID
-from crazysim.lab.live.swarm.sensors import battery_of
+from crazysim.lab.live.swarm.sensors import read_battery
 
 
 class TimeHelper:
@@ -151,7 +151,7 @@ class Crazyflie:
         """
         now, c = self._swarm.time, self._commander
         supervisor = (0 if c.locked else 1) | c.armed << 1 | c.armed << 3 | c.motors_on << 4 | c.locked << 6
-        seconds, battery = int(now), battery_of(self._swarm.sim, self._index)
+        seconds, battery = int(now), read_battery(self._swarm.sim, self._index)
         return {
             "id": self.prefix[1:],
             "timestamp_sec": seconds,
@@ -192,19 +192,19 @@ class CrazyflieServer:
 
     def emergency(self) -> None:
         """Stop all motors, and refuse all commands."""
-        self._all(lambda cf: cf.emergency())
+        self._call_all(lambda cf: cf.emergency())
 
     def takeoff(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
         """Make all rise to a height, m, within a time, s."""
-        self._all(lambda cf: cf.takeoff(targetHeight, duration, groupMask))
+        self._call_all(lambda cf: cf.takeoff(targetHeight, duration, groupMask))
 
     def land(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
         """Make all descend to a height, m, within a time, s, and stop their motors."""
-        self._all(lambda cf: cf.land(targetHeight, duration, groupMask))
+        self._call_all(lambda cf: cf.land(targetHeight, duration, groupMask))
 
     def goTo(self, goal: ArrayLike, yaw: float, duration: float, groupMask: int = 0) -> None:
         """Move all by an offset, m, and turn them by an angle, rad, within a time, s."""
-        self._all(lambda cf: cf.goTo(goal, yaw, duration, True, groupMask))
+        self._call_all(lambda cf: cf.goTo(goal, yaw, duration, True, groupMask))
 
     def startTrajectory(
         self,
@@ -215,21 +215,21 @@ class CrazyflieServer:
         groupMask: int = 0,
     ) -> None:
         """Start the trajectory that each drone has stored under a number."""
-        self._all(lambda cf: cf.startTrajectory(trajectoryId, timescale, reverse, relative, groupMask))
+        self._call_all(lambda cf: cf.startTrajectory(trajectoryId, timescale, reverse, relative, groupMask))
 
     def arm(self, arm: bool = True) -> None:
         """Arm or disarm all."""
-        self._all(lambda cf: cf.arm(arm))
+        self._call_all(lambda cf: cf.arm(arm))
 
     def setParam(self, name: str, value: float) -> None:
         """Set a parameter of all."""
-        self._all(lambda cf: cf.setParam(name, value))
+        self._call_all(lambda cf: cf.setParam(name, value))
 
     def cmdFullState(self, pos: ArrayLike, vel: ArrayLike, acc: ArrayLike, yaw: float, omega: ArrayLike) -> None:
         """Stream one state to all."""
-        self._all(lambda cf: cf.cmdFullState(pos, vel, acc, yaw, omega))
+        self._call_all(lambda cf: cf.cmdFullState(pos, vel, acc, yaw, omega))
 
-    def _all(self, call: Callable[[Crazyflie], object]) -> None:
+    def _call_all(self, call: Callable[[Crazyflie], object]) -> None:
         with self._swarm.lock:
             for cf in self.crazyflies:
                 call(cf)

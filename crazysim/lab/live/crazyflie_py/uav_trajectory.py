@@ -110,5 +110,5 @@ class Trajectory:
             or not np.isfinite(durations).all()
         ):
             raise ConfigError(f"expected pieces of finite coefficients and positive durations, got {len(axes)} pieces")
-        scaled = coefficients * durations[:, None, None] ** np.arange(n)
-        return HostTrajectory(np.cumsum(durations), scaled, False)
+        scaled_coefficients = coefficients * durations[:, None, None] ** np.arange(n)
+        return HostTrajectory(np.cumsum(durations), scaled_coefficients, False)

@@ -24,7 +24,7 @@ from crazysim.lab.live.crtp.tables import (
     Reading,
     Table,
     Variable,
-    log_of,
+    create_log_table,
     pack,
     supervisor_bits,
 )
@@ -86,7 +86,7 @@ class CrtpDevice:
         self.swarm = swarm
         self.drone = swarm.index(drone) if isinstance(drone, str) else drone
         self.name, self.commander = swarm.names[self.drone], swarm.commanders[self.drone]
-        self.readings = log_of(swarm, self.drone) | (log or {})
+        self.readings = create_log_table(swarm, self.drone) | (log or {})
         self.log = Table([Variable(name, kind) for name, (kind, _) in self.readings.items()], LOG_TYPES)
         self.values = swarm.parameters[self.drone]
         kinds = self.values.kinds.items()
@@ -96,9 +96,10 @@ class CrtpDevice:
         self._console: deque[bytes] = deque(maxlen=MAX_LINES)
         self.blocks: dict[int, LogBlock] = {}
         self._ports: dict[int, Callable[[int, bytes], list[Packet]]] = {
-            PARAM: self._param, COMMANDER: self._setpoint, MEM: self._mem, LOGGING: self._logging,
-            LOCALIZATION: self._localization, GENERIC: self._generic, HIGH_LEVEL: self._high_level,
-            SUPERVISOR: self._supervisor, PLATFORM: self._platform, LINK: self._link,
+            PARAM: self._handle_param, COMMANDER: self._handle_setpoint, MEM: self._handle_memory,
+            LOGGING: self._handle_logging, LOCALIZATION: self._handle_localization, GENERIC: self._handle_generic,
+            HIGH_LEVEL: self._high_level, SUPERVISOR: self._handle_supervisor, PLATFORM: self._handle_platform,
+            LINK: self._handle_link,
         }  # fmt: skip
 
     # Packets --------------------------------------------------------------------------------------------------------
@@ -158,12 +159,12 @@ class CrtpDevice:
 
     # Connection -----------------------------------------------------------------------------------------------------
 
-    def _link(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_link(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 0:
             return [(LINK, 0, data)]
         return [(LINK, 1, b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0"))] if channel == 1 else []
 
-    def _platform(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_platform(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 1 and data[0] == 0:
             return [(PLATFORM, 1, bytes([0, PROTOCOL]))]
         if channel == 1 and data[0] == 1:
@@ -173,7 +174,7 @@ class CrtpDevice:
             return [(PLATFORM, 0, bytes([1, 1, self.commander.armed]))]
         return []
 
-    def _supervisor(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_supervisor(self, channel: int, data: bytes) -> list[Packet]:
         command = data[0]
         if channel == 0 and command == 0x0C:
             return [(SUPERVISOR, 0, bytes([0x8C]) + struct.pack("<H", supervisor_bits(self.commander)))]
@@ -186,14 +187,14 @@ class CrtpDevice:
             self.commander.emergency()
         return []
 
-    def _localization(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_localization(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 1 and data[0] == 3:
             self.commander.emergency()
         return []  # positions from outside are not needed: the simulation has its own
 
     # Setpoints ------------------------------------------------------------------------------------------------------
 
-    def _setpoint(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_setpoint(self, channel: int, data: bytes) -> list[Packet]:
         """Apply roll, pitch, yaw and thrust in the modes of ``flightmode``; zero thrust stops the motors.
 
         crtp_commander_rpyt.c reads pitch and yaw rate with the opposite sign, and yaw with the sign of the world frame.
@@ -202,28 +203,28 @@ class CrtpDevice:
         if thrust == 0:
             self.commander.stop()
         elif any(self.values[f"flightmode.stabMode{axis}"] == 0 for axis in ("Roll", "Pitch")):
-            self.commander.command(Control.body_rate, [*_radians(roll, -pitch, -yaw), self._force(thrust)])
+            self.commander.command(Control.body_rate, [*_radians(roll, -pitch, -yaw), self._thrust_force(thrust)])
         elif self.values["flightmode.stabModeYaw"]:
-            self.commander.command(Control.attitude, [*_radians(roll, -pitch, yaw), self._force(thrust)])
+            self.commander.command(Control.attitude, [*_radians(roll, -pitch, yaw), self._thrust_force(thrust)])
         else:
-            self.commander.attitude(*_radians(roll, -pitch, -yaw), self._force(thrust))
+            self.commander.attitude(*_radians(roll, -pitch, -yaw), self._thrust_force(thrust))
         return []
 
-    def _force(self, thrust: int) -> float:
+    def _thrust_force(self, thrust: int) -> float:
         """Return the collective thrust, N, of a 16-bit value; full scale is all rotors at their largest thrust."""
         airframe = self.swarm.sim.airframes[self.drone]
         return thrust / 65535 * airframe.n_rotors * float(np.max(airframe.value("rotors.thrust_max")))
 
-    def _generic(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_generic(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 1 and data[0] == 0:
             self.commander.notify_setpoints_stop(struct.unpack("<I", data[1:5])[0] / 1000)
         elif channel == 0 and data[0] == 11:
             roll, pitch, yaw_rate, thrust, rates = struct.unpack("<fffHB", data[1:])
             angles = _radians(roll, -pitch, yaw_rate)
             if rates:
-                self.commander.command(Control.body_rate, [*angles, self._force(thrust)])
+                self.commander.command(Control.body_rate, [*angles, self._thrust_force(thrust)])
             else:
-                self.commander.attitude(*angles, self._force(thrust))
+                self.commander.attitude(*angles, self._thrust_force(thrust))
         elif channel == 0:
             handle_generic(self.commander, data)
         return []
@@ -239,7 +240,7 @@ class CrtpDevice:
 
     # Tables ---------------------------------------------------------------------------------------------------------
 
-    def _contents(self, port: int, table: Table, data: bytes) -> list[Packet]:
+    def _answer_contents(self, port: int, table: Table, data: bytes) -> list[Packet]:
         """Answer a request to a table of contents, version 2 of its protocol."""
         if data[0] == 3:
             head = struct.pack("<BHI", 3, len(table.variables), table.checksum)
@@ -247,9 +248,9 @@ class CrtpDevice:
         (k,) = struct.unpack("<H", data[1:3])
         return [(port, 0, data[:3] + table.item(k))] if data[0] == 2 and k < len(table.variables) else []
 
-    def _logging(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_logging(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 0:
-            return self._contents(LOGGING, self.log, data)
+            return self._answer_contents(LOGGING, self.log, data)
         if channel != 1:
             return []
         command, identity = data[0], data[1] if len(data) > 1 else 0
@@ -257,7 +258,7 @@ class CrtpDevice:
             self.blocks.clear()
             return [(LOGGING, 1, bytes([5, 0, 0]))]
         if command in (6, 7):
-            code = self._define(command, identity, data[2:])
+            code = self._define_block(command, identity, data[2:])
         elif identity not in self.blocks:
             code = errno.ENOENT
         elif command == 2:
@@ -275,7 +276,7 @@ class CrtpDevice:
             code = errno.ENOEXEC
         return [(LOGGING, 1, bytes([command, identity, code]))]
 
-    def _define(self, command: int, identity: int, data: bytes) -> int:
+    def _define_block(self, command: int, identity: int, data: bytes) -> int:
         """Create a log block or append to it, and return an error code, or 0 for success."""
         if command == 6 and identity in self.blocks:
             return errno.EEXIST
@@ -298,9 +299,9 @@ class CrtpDevice:
         self.blocks[identity] = block
         return 0
 
-    def _param(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_param(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 0:
-            return self._contents(PARAM, self.params, data)
+            return self._answer_contents(PARAM, self.params, data)
         if channel == 3:
             return self._param_misc(data)
         (k,) = struct.unpack("<H", data[:2])
@@ -309,34 +310,34 @@ class CrtpDevice:
         name, layout = self.params.variables[k].name, self.params.format(k)
         if channel == 1:
             return [(PARAM, 1, data[:2] + b"\0" + pack(layout, self.values[name]))]
-        self._set(name, struct.unpack(layout, data[2:])[0])
+        self._set_parameter(name, struct.unpack(layout, data[2:])[0])
         return [(PARAM, 2, data[:2] + pack(layout, self.values[name]))]
 
     def _param_misc(self, data: bytes) -> list[Packet]:
         command = data[0]
         if command == 0:
-            group, name, rest = data[1:].split(b"\0", 2)
+            group, name, payload = data[1:].split(b"\0", 2)
             full_name = f"{group.decode()}.{name.decode()}"
             code = errno.ENOENT
             formats = {number: layout for number, layout in PARAM_TYPES.values()}
-            if full_name in self.values and rest[0] in formats:
-                self._set(full_name, struct.unpack(formats[rest[0]], rest[1:])[0])
+            if full_name in self.values and payload[0] in formats:
+                self._set_parameter(full_name, struct.unpack(formats[payload[0]], payload[1:])[0])
                 code = 0
-            return [(PARAM, 3, data[: len(data) - len(rest)] + bytes([code]))]
+            return [(PARAM, 3, data[: len(data) - len(payload)] + bytes([code]))]
         (k,) = struct.unpack("<H", data[1:3])
         if command == 8 and k < len(self.params.variables):
             value = self.values.kinds[self.params.variables[k].name].value
             return [(PARAM, 3, data[:3] + b"\0" + pack(self.params.format(k), value))]
         return [(PARAM, 3, data[:3] + bytes([errno.ENOENT]))]
 
-    def _set(self, name: str, value: float) -> None:
+    def _set_parameter(self, name: str, value: float) -> None:
         """Set a parameter; if that is refused, it is reported and the parameter keeps its value."""
         try:
             self.swarm.set_parameter(self.drone, name, value)
         except ConfigError as error:
             self._report(str(error))
 
-    def _mem(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_memory(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 0:
             if data[0] == 1:
                 return [(MEM, 0, bytes([1, len(self.memories)]))]

@@ -18,7 +18,7 @@ from crazysim.storage import Closing
 
 PORT = 19850
 """First port; cflib scans ten from here on."""
-POLL = 0.1
+POLL_INTERVAL = 0.1
 """Longest time until the thread ends after ``close``, s."""
 
 log = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ class CrtpServer(Closing):
         self._clients: list[tuple[str, int] | None] = [None] * len(self.devices)
         self._sockets: list[socket.socket] = []
         self._selector = selectors.DefaultSelector()
-        self._stopped = threading.Event()
+        self._stop_event = threading.Event()
         for k in range(len(self.devices)):
             peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self._sockets.append(peer)
@@ -70,7 +70,7 @@ class CrtpServer(Closing):
         return [f"udp://{host if host != '0.0.0.0' else '127.0.0.1'}:{port}" for host, port in addresses]
 
     def close(self) -> None:
-        self._stopped.set()
+        self._stop_event.set()
         self._thread.join()
         self.swarm.listeners.remove(self._send_due)
         self._close_sockets()
@@ -81,8 +81,8 @@ class CrtpServer(Closing):
         self._selector.close()
 
     def _serve(self) -> None:
-        while not self._stopped.is_set():
-            for key, _ in self._selector.select(POLL):
+        while not self._stop_event.is_set():
+            for key, _ in self._selector.select(POLL_INTERVAL):
                 k = key.data
                 try:
                     packet, address = self._sockets[k].recvfrom(2048)

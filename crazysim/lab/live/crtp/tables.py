@@ -13,7 +13,7 @@ import numpy as np
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
 from crazysim.lab.live.swarm import Commander, DroneState, Swarm
-from crazysim.lab.live.swarm.sensors import battery_of, ranges_of
+from crazysim.lab.live.swarm.sensors import read_battery, read_ranges
 
 LOG_TYPES = {
     "uint8_t": (1, "<B"), "uint16_t": (2, "<H"), "uint32_t": (3, "<I"), "int8_t": (4, "<b"), "int16_t": (5, "<h"),
@@ -100,7 +100,7 @@ def _angles(group: str) -> dict[str, tuple[str, Reading]]:
     def reading(k: int, sign: int) -> Reading:
         return lambda state, _c: sign * math.degrees(float(state.rpy[k]))
 
-    return {f"{group}.{name}": ("float", reading(*which)) for name, which in signs.items()}
+    return {f"{group}.{name}": ("float", reading(*indices)) for name, indices in signs.items()}
 
 
 def _goal(row: int, k: int) -> Reading:
@@ -132,31 +132,40 @@ LOG: dict[str, tuple[str, Reading]] = {
 """Log variables that every simulated drone has, with their types and readings."""
 
 
-def log_of(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]:
+def create_log_table(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]:
     """Return the log variables of a drone, including its battery and its range finder."""
     sim = swarm.sim
 
     def distance(name: str) -> Reading:
         def millimetres(_state: DroneState, _commander: Commander) -> float:
-            value = 1000 * ranges_of(sim, drone)[name]
+            value = 1000 * read_ranges(sim, drone)[name]
             return value if math.isfinite(value) else OUT_OF_RANGE_DISTANCE
 
         return millimetres
 
     ranges = {
-        f"range.{RANGE_VARIABLES.get(name, name)}": ("uint16_t", distance(name)) for name in ranges_of(sim, drone)
+        f"range.{RANGE_VARIABLES.get(name, name)}": ("uint16_t", distance(name)) for name in read_ranges(sim, drone)
     }
     battery: dict[str, tuple[str, Reading]] = {
-        "pm.vbat": ("float", lambda _s, _c: battery_of(sim, drone).voltage),
-        "pm.state": ("uint8_t", lambda _s, _c: battery_of(sim, drone).state),
-        "pm.batteryLevel": ("uint8_t", lambda _s, _c: 100 * battery_of(sim, drone).charge),
+        "pm.vbat": ("float", lambda _s, _c: read_battery(sim, drone).voltage),
+        "pm.state": ("uint8_t", lambda _s, _c: read_battery(sim, drone).state),
+        "pm.batteryLevel": ("uint8_t", lambda _s, _c: 100 * read_battery(sim, drone).charge),
     }
     return LOG | battery | ranges
 
 
 def supervisor_bits(commander: Commander) -> int:
     """Return the state of the supervisor: bits as in ``Supervisor.STATES`` of cflib."""
-    free, flies = not commander.locked, commander.motors_on
-    bits = [free, commander.armed, True, commander.armed and free, flies, False, commander.locked, False]
-    bits += [flies, commander.finished, False]
+    is_unlocked, is_flying = not commander.locked, commander.motors_on
+    bits = [
+        is_unlocked,
+        commander.armed,
+        True,
+        commander.armed and is_unlocked,
+        is_flying,
+        False,
+        commander.locked,
+        False,
+    ]
+    bits += [is_flying, commander.finished, False]
     return sum(int(bit) << k for k, bit in enumerate(bits))

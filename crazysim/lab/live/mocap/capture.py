@@ -75,7 +75,7 @@ class MotionCaptureSource(ThreadSource):
             yield parse(message)
 
     def close(self) -> None:
-        self._stopped.set()
+        self._stop_event.set()
         self._worker.kill()
         super().close()
         self._worker.wait()

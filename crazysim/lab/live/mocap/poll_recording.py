@@ -108,7 +108,7 @@ class ReplaySource(MocapSource):
         self.simulated = by == "time"
         self._polls = list(read_polls(path))
         self._frames = [frame for poll in self._polls for frame in poll.frames]
-        self._next, self._step = 0, -1
+        self._next_index, self._step = 0, -1
         self._offset = self._frames[0].received if self._frames else 0.0
 
     @property
@@ -129,19 +129,19 @@ class ReplaySource(MocapSource):
     @property
     def ended(self) -> str | None:
         n = len(self._polls) if self.by == "poll" else len(self._frames)
-        return "the recording ended" if self._next >= n else None
+        return "the recording ended" if self._next_index >= n else None
 
     def poll(self, step: int, freq: int) -> Poll:
         """Return the frames of the next recorded poll, or those up to the present simulated time."""
         if self.by == "poll":
-            if self._next < len(self._polls):
-                self._next += 1
-                return self._polls[self._next - 1]
+            if self._next_index < len(self._polls):
+                self._next_index += 1
+                return self._polls[self._next_index - 1]
             return Poll(self._polls[-1].now if self._polls else 0.0, [])
         if step < self._step:
-            self._next = 0
+            self._next_index = 0
         self._step, now = step, step / freq + self._offset
-        first = self._next
-        while self._next < len(self._frames) and self._frames[self._next].received <= now + 1e-9:
-            self._next += 1
-        return Poll(now, self._frames[first : self._next])
+        first = self._next_index
+        while self._next_index < len(self._frames) and self._frames[self._next_index].received <= now + 1e-9:
+            self._next_index += 1
+        return Poll(now, self._frames[first : self._next_index])

@@ -21,7 +21,7 @@ from crazysim.trajectories import Trajectory
 
 log = logging.getLogger(__name__)
 
-CAPACITY = 4096
+MAX_QUEUED_FRAMES = 4096
 """Largest number of frames that wait for the reader, 17 s at 240 Hz; beyond it, the oldest are lost."""
 
 
@@ -85,15 +85,15 @@ class FunctionSource(MocapSource):
         if not 0 < freq < np.inf:
             raise ConfigError(f"expected a positive number of frames per second, got {freq!r}. Use freq=120.")
         self.name, self.freq = name, float(freq)
-        self._function, self._convention, self._next = function, convention or Convention(), 0
+        self._function, self._convention, self._next_sample = function, convention or Convention(), 0
 
     def poll(self, step: int, freq: int) -> Poll:
         """Return the frames up to the present simulated time; after a reset, they begin again with the first."""
         now = step / freq
         last = int(np.floor(now * self.freq + 1e-9))
-        if last < self._next - 1:
-            self._next = 0
-        first, self._next = max(self._next, last + 1 - CAPACITY), last + 1
+        if last < self._next_sample - 1:
+            self._next_sample = 0
+        first, self._next_sample = max(self._next_sample, last + 1 - MAX_QUEUED_FRAMES), last + 1
         return Poll(now, [self.frame(k / self.freq) for k in range(first, last + 1)])
 
     def frame(self, stamp: float) -> Frame:
@@ -141,10 +141,10 @@ class ThreadSource(MocapSource):
             convention: Convention of the frames; None for crazysim's.
         """
         self.name, self._convention = name, convention or Convention()
-        self._frames: deque[Frame] = deque(maxlen=CAPACITY)
+        self._frames: deque[Frame] = deque(maxlen=MAX_QUEUED_FRAMES)
         self._n_put = self._n_got = 0
-        self._ended: str | None = None
-        self._stopped = threading.Event()
+        self._end_reason: str | None = None
+        self._stop_event = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"mocap-{name}", daemon=True)
 
     def start(self) -> ThreadSource:
@@ -167,26 +167,26 @@ class ThreadSource(MocapSource):
 
     @property
     def ended(self) -> str | None:
-        return self._ended
+        return self._end_reason
 
     def close(self) -> None:
         """Stop the thread; a thread that does not end within a second is abandoned."""
-        self._stopped.set()
+        self._stop_event.set()
         if self._thread.is_alive():
             self._thread.join(1.0)
 
     def _run(self) -> None:
         try:
-            for frame in self.stream(self._stopped):
+            for frame in self.stream(self._stop_event):
                 self._frames.append(self._convention.convert(frame))
                 self._n_put += 1
-                if self._stopped.is_set():
+                if self._stop_event.is_set():
                     return
-            self._ended = "the stream ended"
+            self._end_reason = "the stream ended"
         except Exception as error:
-            self._ended = f"{type(error).__name__}: {error}"
-            if not self._stopped.is_set():
-                log.warning("%s ended: %s", self.name, self._ended)
+            self._end_reason = f"{type(error).__name__}: {error}"
+            if not self._stop_event.is_set():
+                log.warning("%s ended: %s", self.name, self._end_reason)
 
 
 class RealTimeSource(ThreadSource):

@@ -86,13 +86,13 @@ class Tracker:
         self.n_frames = 0
         self._rows_of = {name: k for k, name in enumerate(names)}
         self._maps: dict[tuple[str, ...], tuple[NDArray, NDArray, list[str]]] = {}
-        self._unknown: set[str] = set()
+        self._unknown_names: set[str] = set()
         self._stamps = np.full(n, -np.inf)
-        self._lost = np.zeros(n, bool)
+        self._is_lost = np.zeros(n, bool)
         self._suspect, self._n_suspect = np.zeros((n, 3)), np.zeros(n, int)
         self._stamp: float | None = None
         self._received: float | None = None
-        self._stalled = self._ended = False
+        self._is_stalled = self._has_ended = False
         self._intervals: list[float] = []
         self._period: float | None = None
         self._least_delay, self._least_at = np.inf, -np.inf
@@ -100,7 +100,7 @@ class Tracker:
     @property
     def stalled(self) -> bool:
         """True if the source has sent no frame for longer than ``Rules.stalled``."""
-        return self._stalled
+        return self._is_stalled
 
     def accept(self, frame: Frame) -> bool:
         """Process a frame, and return True unless it was refused."""
@@ -109,8 +109,8 @@ class Tracker:
             self._report("invalid", self.source, frame.received, f"time {now}")
             return False
         self._received = frame.received
-        if self._stalled:
-            self._stalled = False
+        if self._is_stalled:
+            self._is_stalled = False
             self._report("resumed", self.source, now, "frames arrive again")
         last_stamp = self._stamp
         if last_stamp is not None and now <= last_stamp:
@@ -132,9 +132,9 @@ class Tracker:
         self.n_frames += 1
         with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused below
             self._take_bodies(frame, now)
-        missing = self.seen & ~self._lost & (now - self._stamps > rules.lost) & np.isfinite(self._stamps)
+        missing = self.seen & ~self._is_lost & (now - self._stamps > rules.lost) & np.isfinite(self._stamps)
         for k in np.flatnonzero(missing):
-            self._lost[k], self.vel[k] = True, 0.0
+            self._is_lost[k], self.vel[k] = True, 0.0
             self._report("lost", self.names[k], now, f"no valid pose for {now - self._stamps[k]:.3f} s; it stays there")
         return True
 
@@ -153,14 +153,14 @@ class Tracker:
         """
         if lost:
             self._report("overrun", self.source, now, f"{lost} frames lost: the reader was too slow")
-        if ended is not None and not self._ended:
-            self._ended = True
+        if ended is not None and not self._has_ended:
+            self._has_ended = True
             self._report("ended", self.source, now, ended)
         if self._received is None:
             self._received = now
         silence = now - self._received
-        if silence > self.rules.stalled and not self._stalled:
-            self._stalled = True
+        if silence > self.rules.stalled and not self._is_stalled:
+            self._is_stalled = True
             self.vel[:] = 0.0
             self._report("stalled", self.source, now, f"no frame for {silence:.3f} s; all bodies stay where they are")
 
@@ -184,7 +184,7 @@ class Tracker:
         elif delay - self._least_delay > self.rules.late:
             self._report("late", self.source, now, f"{delay - self._least_delay:.3f} s after the quickest frame")
 
-    def _rows(self, names: tuple[str, ...], now: float) -> tuple[NDArray, NDArray]:
+    def _find_rows(self, names: tuple[str, ...], now: float) -> tuple[NDArray, NDArray]:
         """Return the indices of the frame's entries that are used, and the rows of their bodies in the tracker."""
         mapping = self._maps.get(names)
         if mapping is None:
@@ -195,9 +195,9 @@ class Tracker:
             if len(self._maps) > 1000:
                 self._maps.clear()
             self._maps[names] = mapping
-            for name in set(names) - set(self._rows_of) - self._unknown:
-                if len(self._unknown) < 1000:
-                    self._unknown.add(name)
+            for name in set(names) - set(self._rows_of) - self._unknown_names:
+                if len(self._unknown_names) < 1000:
+                    self._unknown_names.add(name)
                     self._report("unknown", name, now, "no object of the scene has this name; it is ignored")
         entries, rows, duplicates = mapping
         for name in duplicates:
@@ -205,7 +205,7 @@ class Tracker:
         return entries, rows
 
     def _take_bodies(self, frame: Frame, now: float) -> None:
-        entries, rows = self._rows(frame.names, now)
+        entries, rows = self._find_rows(frame.names, now)
         pos, quat = frame.pos[entries], frame.quat[entries]
         norm = np.sqrt((quat * quat).sum(-1))
         is_valid = (np.abs(pos) < MAX_COORDINATE).all(-1) & (norm > 1e-3) & np.isfinite(norm)
@@ -223,7 +223,7 @@ class Tracker:
             relocated = self._confirm_jumps(rows, pos, distance, is_plausible, now)
             is_plausible |= relocated
         self._n_suspect[rows[is_plausible]] = 0
-        for k in rows[is_plausible & self._lost[rows]]:
+        for k in rows[is_plausible & self._is_lost[rows]]:
             self._report("found", self.names[k], now, "valid pose again")
         rows, pos, quat, norm, dt, displacement = (
             rows[is_plausible],
@@ -233,11 +233,11 @@ class Tracker:
             dt[is_plausible],
             displacement[is_plausible],
         )
-        has_no_speed = ~was_seen[is_plausible] | relocated[is_plausible] | self._lost[rows]
+        has_no_speed = ~was_seen[is_plausible] | relocated[is_plausible] | self._is_lost[rows]
         dt = np.where(has_no_speed, np.inf, np.maximum(dt, distance[is_plausible] / self.rules.max_speed))
         self.vel[rows] = displacement / np.where(dt > 0, dt, np.inf)[:, None]
         self.pos[rows], self.quat[rows] = pos, quat / norm[:, None]
-        self._stamps[rows], self.seen[rows], self._lost[rows] = now, True, False
+        self._stamps[rows], self.seen[rows], self._is_lost[rows] = now, True, False
 
     def _confirm_jumps(
         self, rows: NDArray, pos: NDArray, distance: NDArray, is_plausible: NDArray, now: float

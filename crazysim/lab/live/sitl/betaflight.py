@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
-from crazysim.lab.live.sitl.measured import COS_45_DEGREES, ZURICH, Measurements, Origin, as_origin, frd
+from crazysim.lab.live.sitl.measured import COS_45_DEGREES, ZURICH, Measurements, Origin, check_origin, frd
 from crazysim.tables import range_between, read_numbers
 
 PORTS = (9002, 9003, 9004)
@@ -61,7 +61,7 @@ class Betaflight(FirmwareLink):
         """
         self.gazebo, self.origin, self._rc_rate = (
             check_flag("gazebo", gazebo),
-            as_origin(origin),
+            check_origin(origin),
             Rate("rc_freq", rc_freq),
         )
         self._start: tuple[float, float] | None = None
@@ -71,7 +71,7 @@ class Betaflight(FirmwareLink):
             )
         motors, self._state, self._rc = ports
         for port in (self._state, self._rc):
-            check_address(host, port, least=1)
+            check_address(host, port, min_port=1)
         self._channels = np.array([1500.0, 1500.0, 1000.0, 1500.0, *[1000.0] * (N_CHANNELS - 4)])
         self._link = Datagrams(host, motors)
 

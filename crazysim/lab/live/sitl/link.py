@@ -65,27 +65,27 @@ class Rate:
             name: Name of the rate, for messages.
             freq: Rate, Hz.
         """
-        self._period, self._next = 1 / read_number(name, freq, POSITIVE), 0.0
+        self._period, self._next_time = 1 / read_number(name, freq, POSITIVE), 0.0
 
     def is_due(self, time: float) -> bool:
         """Return True if the action is due at a simulated time, s, and then schedule the next one."""
-        if time < self._next - ROUNDING:
+        if time < self._next_time - ROUNDING:
             return False
-        self._next = max(self._next + self._period, time)
+        self._next_time = max(self._next_time + self._period, time)
         return True
 
 
-def check_address(host: str, port: int, least: int = 0) -> None:
+def check_address(host: str, port: int, min_port: int = 0) -> None:
     """Check an address.
 
     Args:
         host: Name or address of a host.
         port: Port.
-        least: Smallest valid port; 0 allows any free one.
+        min_port: Smallest valid port; 0 allows any free one.
     """
     if not isinstance(host, str):
         raise ConfigError(f"expected host as text, got {short_repr(host)}. Use '127.0.0.1'.")
-    read_numbers("port", port, range_between(least, LAST_PORT), ((),), whole=True)
+    read_numbers("port", port, range_between(min_port, LAST_PORT), ((),), whole=True)
 
 
 class Datagrams(Closing):

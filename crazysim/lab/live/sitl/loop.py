@@ -26,7 +26,7 @@ from crazysim.sim import Sim
 from crazysim.storage import Closing
 from crazysim.tables import NOT_NEGATIVE, read_number
 
-FIELD = np.array([0.0, 2e-5, -4.5e-5])
+MAGNETIC_FIELD = np.array([0.0, 2e-5, -4.5e-5])
 """Magnetic field without a ``Magnetometer``, world frame, T: roughly the field in central Europe."""
 SILENCE_LIMIT = 1.0
 """Time of a run within which a firmware must send motor commands, s."""
@@ -68,7 +68,7 @@ class SoftwareInTheLoop(Closing):
             timeout: Time to wait for the motor commands of a firmware in lockstep, s.
         """
         self.sim, self.timeout, self.motors = sim, read_number("timeout", timeout, TIMEOUT), motors
-        self.links = _as_links(links)
+        self.links = _check_links(links)
         freq = sim.freq if freq is None else dividing_rate("freq", freq, sim.freq)
         if sim.control != Control.rotor_vel:
             raise ConfigError(
@@ -93,7 +93,7 @@ class SoftwareInTheLoop(Closing):
         if self._sensors[IMU] is None:
             self._sensors[IMU] = sim.add(IMU())
         self._rotor_vel = np.zeros((len(self.links), 4), np.float32)
-        self._taken: NDArray | None = None
+        self._sample_numbers: NDArray | None = None
         self._heard = [0.0] * len(self.links)
         self._exchanges = 0
         self._compiled = False
@@ -115,8 +115,8 @@ class SoftwareInTheLoop(Closing):
         if not self._compiled:  # without lockstep, a firmware does not wait for compilation
             compile_step(self.sim, self._n_steps)
             self._compiled = True
-        dt, began = self._n_steps / self.sim.freq, time.monotonic()
-        self._heard = [began] * len(self.links)
+        dt, start_time = self._n_steps / self.sim.freq, time.monotonic()
+        self._heard = [start_time] * len(self.links)
         pace = Pace(dt, speed)
         for k in range(round(seconds / dt)):
             if (due := pace.due_in()) > 0:
@@ -125,12 +125,12 @@ class SoftwareInTheLoop(Closing):
             self.exchange()
             self._check_heard(time.monotonic() - self.timeout, self.timeout)
             self.sim.step(self._n_steps)
-        if seconds > SILENCE_LIMIT and (passed := time.monotonic() - began) > SILENCE_LIMIT:
-            self._check_heard(began, passed)
+        if seconds > SILENCE_LIMIT and (elapsed := time.monotonic() - start_time) > SILENCE_LIMIT:
+            self._check_heard(start_time, elapsed)
 
     def exchange(self) -> None:
         """Send measurements, and apply the motor commands that come back."""
-        measured, self._taken = self._measurements()
+        measured, self._sample_numbers = self._measurements()
         for link, measurements in zip(self.links, measured, strict=True):
             link.send(measurements)
         for k, link in enumerate(self.links):
@@ -152,16 +152,20 @@ class SoftwareInTheLoop(Closing):
         """Return the measurements of every drone, and counts of when they were taken. (n_links, n_kinds)"""
         states, time_now = self.sim.data.states, self._exchanges * self._n_steps / self.sim.freq
         pos, quat, vel, ang_vel = (_rows(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
-        values, taken = zip(*map(self._latest, SENSOR_KINDS), strict=True)
+        values, steps_taken = zip(*map(self._latest, SENSOR_KINDS), strict=True)
         imu, height, field, gps = values
         if field is None:
-            field = rotate(quat * [-1, -1, -1, 1], FIELD)
+            field = rotate(quat * [-1, -1, -1, 1], MAGNETIC_FIELD)
         gps = np.concatenate([pos, vel], axis=-1) if gps is None else gps
         counts: dict[type[Sensor], int] = {GPS: math.floor(time_now * GPS_FREQ + ROUNDING)}
-        when = np.empty((len(self.links), len(SENSOR_KINDS)), np.int64)
+        sample_numbers = np.empty((len(self.links), len(SENSOR_KINDS)), np.int64)
         for k, kind in enumerate(SENSOR_KINDS):
-            when[:, k] = counts.get(kind, self._exchanges) if taken[k] is None else taken[k]
-        is_new = np.ones_like(when, bool) if self._taken is None else when != self._taken
+            sample_numbers[:, k] = counts.get(kind, self._exchanges) if steps_taken[k] is None else steps_taken[k]
+        is_new = (
+            np.ones_like(sample_numbers, bool)
+            if self._sample_numbers is None
+            else sample_numbers != self._sample_numbers
+        )
         measurements = []
         for k in range(len(self.links)):
             measurements.append(
@@ -177,10 +181,10 @@ class SoftwareInTheLoop(Closing):
                     gps_vel=gps[k, 3:],
                     height=float(pos[k, 2] if height is None else height[k, 1]),
                     field=field[k],
-                    new=frozenset(kind for kind, changed in zip(SENSOR_KINDS, is_new[k], strict=True) if changed),
+                    new=frozenset(kind for kind, is_changed in zip(SENSOR_KINDS, is_new[k], strict=True) if is_changed),
                 )
             )
-        return measurements, when
+        return measurements, sample_numbers
 
     def _latest(self, kind: type[Sensor]) -> tuple[Any, NDArray | None]:
         """Return the latest measurements of a sensor, vectors in the body frame, and the steps that took them.
@@ -200,10 +204,10 @@ class SoftwareInTheLoop(Closing):
             value = rotate(np.asarray(record.quat, float)[..., None, :], vectors).reshape(value.shape)
         return _rows(value), taken
 
-    def _check_heard(self, since: float, seconds: float) -> None:
+    def _check_heard(self, start_time: float, seconds: float) -> None:
         """Check that every firmware has sent commands since a time (``time.monotonic``), ``seconds`` ago."""
         for link, heard in zip(self.links, self._heard, strict=True):
-            if heard <= since:
+            if heard <= start_time:
                 raise _silence_error(link, seconds)
 
     def close(self) -> None:
@@ -220,7 +224,7 @@ class SoftwareInTheLoop(Closing):
         return np.where(of_rotors > 0, speeds, 0.0)
 
 
-def _as_links(links: object) -> tuple[FirmwareLink, ...]:
+def _check_links(links: object) -> tuple[FirmwareLink, ...]:
     """Check links to firmware, and return them as a tuple."""
     sequence = (links,) if isinstance(links, FirmwareLink) else links
     if not isinstance(sequence, Sequence) or not all(isinstance(link, FirmwareLink) for link in sequence):
@@ -257,14 +261,14 @@ def motor_order(airframe: Airframe, link: FirmwareLink, reversed: bool = False) 
             f"expected a rotor in each quadrant of the body, got signs of x and y {signs}. Turn the frame."
         )
     order = np.array([signs.index(position) for position in link.positions])
-    turns = tuple(map(int, airframe.value("rotors.yaw_torque_sign")[order]))
+    torque_signs = tuple(map(int, airframe.value("rotors.yaw_torque_sign")[order]))
     expected = tuple(-sign if reversed else sign for sign in link.yaw_torque_signs)
-    if turns != expected:
+    if torque_signs != expected:
         change = (
             "reversed=False, with the firmware's default senses" if reversed else f"reversed=True, and {link.remedy}"
         )
         raise ConfigError(
             f"expected rotors of {airframe.name!r} whose drag turns the body by {expected} about z, for motors 1 "
-            f"to 4 of {type(link).__name__}, got {turns}. Pass {change}."
+            f"to 4 of {type(link).__name__}, got {torque_signs}. Pass {change}."
         )
     return order

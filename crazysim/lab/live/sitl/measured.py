@@ -91,7 +91,7 @@ class Origin:
         return SEA_LEVEL_PRESSURE * base**PRESSURE_EXPONENT
 
 
-def as_origin(origin: object) -> Origin:
+def check_origin(origin: object) -> Origin:
     """Check an origin, and return it."""
     if not isinstance(origin, Origin):
         raise ConfigError(f"expected an Origin, got {short_repr(origin)}. Use Origin(latitude, longitude, altitude).")

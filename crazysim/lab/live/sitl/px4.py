@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, not_installed
 from crazysim.lab.live.sitl.link import MAX_DRAIN_TIME, TIMEOUT, FirmwareLink, check_address
-from crazysim.lab.live.sitl.measured import ZURICH, Measurements, Origin, as_origin, frd, ned, quat_ned
+from crazysim.lab.live.sitl.measured import ZURICH, Measurements, Origin, check_origin, frd, ned, quat_ned
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.tables import read_number
 
 PORT = 4560
 """Port at which the first instance of PX4 looks for a simulation."""
-FIELDS: dict[type[Sensor], int] = {IMU: 0x003F, Magnetometer: 0x01C0, Barometer: 0x1A00}
+UPDATED_BITS: dict[type[Sensor], int] = {IMU: 0x003F, Magnetometer: 0x01C0, Barometer: 0x1A00}
 """Bits of ``HIL_SENSOR.fields_updated`` for the fields of each sensor, without which PX4 ignores them: ``ACCEL`` with
 ``GYRO``, ``MAG`` and ``BARO`` of ``SensorSource`` in SimulatorMavlink.hpp of PX4/PX4-Autopilot."""
 STARTUP_LAG = 0.02
@@ -27,7 +27,7 @@ TEMPERATURE = 25.0
 """Temperature that is reported, degrees Celsius."""
 GAUSS, HECTOPASCAL = 1e-4, 100.0
 """One gauss in T, and one hectopascal in Pa."""
-CHUNK = 65536
+CHUNK_BYTES = 65536
 """Largest number of bytes that are read at once."""
 
 
@@ -69,7 +69,7 @@ class Px4(FirmwareLink):
             raise ConfigError(not_installed("links to PX4 need", "pymavlink", "mavlink")) from error
         self._mavlink: Any = common
         check_address(host, port)
-        self.origin = as_origin(origin)
+        self.origin = check_origin(origin)
         self.connect_timeout = read_number("connect_timeout", connect_timeout, TIMEOUT)
         self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -82,9 +82,9 @@ class Px4(FirmwareLink):
         self._client: socket.socket | None = None
         self._mav: Any = common.MAVLink(None, srcSystem=1, srcComponent=1)
         self._mav.robust_parsing = True  # bytes that are not a message are skipped
-        self._began: tuple[float, float] | None = None
+        self._start_times: tuple[float, float] | None = None
         self._time = 0.0
-        self._asked = self._answers = False
+        self._is_asked = self._answers = False
         self._motors = np.zeros(4)
         self.armed = False
         """True while PX4 is armed."""
@@ -100,14 +100,14 @@ class Px4(FirmwareLink):
         field = frd(measured.field) / GAUSS
         altitude = origin.altitude + measured.height
         pressure = origin.pressure(measured.height) / HECTOPASCAL
-        updated = sum(FIELDS.get(kind, 0) for kind in measured.new)
+        updated = sum(UPDATED_BITS.get(kind, 0) for kind in measured.new)
         self._send(
             mav.MAVLink_hil_sensor_message(
                 micros, *frd(measured.accel), *frd(measured.gyro), *field, pressure, 0.0, altitude, TEMPERATURE,
                 updated,
             )
         )  # fmt: skip
-        self._time, self._asked = measured.time, IMU in measured.new
+        self._time, self._is_asked = measured.time, IMU in measured.new
         if GPS in measured.new:
             north, east, down = (round(100 * v) for v in ned(measured.gps_vel))
             speed = round(float(np.hypot(north, east)))
@@ -122,13 +122,13 @@ class Px4(FirmwareLink):
 
     def receive(self, timeout: float) -> NDArray | None:
         now = time.monotonic()
-        if self._began is None:
-            self._began = now, self._time
-        passed, simulated = now - self._began[0], self._time - self._began[1]
+        if self._start_times is None:
+            self._start_times = now, self._time
+        elapsed, simulated_elapsed = now - self._start_times[0], self._time - self._start_times[1]
         if self._answers:
-            must_answer, patience = self._asked, timeout * self._asked
+            must_answer, patience = self._is_asked, timeout * self._is_asked
         else:
-            must_answer, patience = passed > timeout, min(max(simulated + STARTUP_LAG - passed, 0.0), timeout)
+            must_answer, patience = elapsed > timeout, min(max(simulated_elapsed + STARTUP_LAG - elapsed, 0.0), timeout)
         motors = self._newest(now + patience)
         if motors is not None:
             self._answers, self._motors = True, motors
@@ -176,7 +176,7 @@ class Px4(FirmwareLink):
         try:
             client.sendall(message.pack(self._mav))
         except (ConnectionError, TimeoutError):
-            raise _closed() from None
+            raise _closed_error() from None
 
     def _readable(self, timeout: float) -> bool:
         client = self._connected()
@@ -184,7 +184,7 @@ class Px4(FirmwareLink):
         try:
             return bool(client.recv(1, socket.MSG_PEEK))
         except ConnectionError:
-            raise _closed() from None
+            raise _closed_error() from None
         except (TimeoutError, BlockingIOError):
             return False
 
@@ -192,10 +192,10 @@ class Px4(FirmwareLink):
         client = self._connected()
         client.settimeout(0)
         try:
-            return self._mav.parse_buffer(client.recv(CHUNK)) or []
+            return self._mav.parse_buffer(client.recv(CHUNK_BYTES)) or []
         except BlockingIOError:
             return []
 
 
-def _closed() -> ConfigError:
+def _closed_error() -> ConfigError:
     return ConfigError("expected PX4 to stay connected, got a closed connection. Start it again.")

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control
 from crazysim.errors import ConfigError
-from crazysim.lab.live.attitude import yaw_of
+from crazysim.lab.live.attitude import yaw_from_quat
 from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.lab.live.swarm.motion import PlannedMotion, move, nearest_yaw
 from crazysim.lab.live.swarm.state import DroneState, EstimateFrame
@@ -61,10 +61,10 @@ class Commander:
         self.pos, self.vel, self.yaw = np.zeros(3), np.zeros(3), 0.0
         self.armed, self.locked = True, False
         self._plan: PlannedMotion | None = None
-        self._held: tuple[PlannedMotion, NDArray] | None = None
+        self._held_plan: tuple[PlannedMotion, NDArray] | None = None
         self.estimate_frame: EstimateFrame | None = None
         self._stream: tuple[str, NDArray] | None = None
-        self._stream_time, self._released = 0.0, math.inf
+        self._stream_time, self._release_time = 0.0, math.inf
         self._reference = np.zeros(4)  # position and yaw that velocity setpoints move
         self._last = np.zeros((3, 4))
 
@@ -99,7 +99,7 @@ class Commander:
 
     def take_off(self, height: float, duration: float, yaw: float | None = None) -> None:
         """Rise to a height, m, within a duration, s; a yaw of None keeps the present one."""
-        self._vertical(height, duration, yaw, lands=False)
+        self._move_vertically(height, duration, yaw, is_landing=False)
 
     def land(self, height: float, duration: float, yaw: float | None = None) -> None:
         """Descend to a height, m, and stop the motors there, or where the drone comes to rest; a yaw of None
@@ -107,7 +107,7 @@ class Commander:
 
         A drone that is still higher at the end, because its controller lags or has an offset, descends further.
         """
-        self._vertical(height, duration, yaw, lands=True)
+        self._move_vertically(height, duration, yaw, is_landing=True)
 
     def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:
         """Move to a position, m (3,), and yaw, rad; relative ones are added to the present setpoint."""
@@ -177,7 +177,7 @@ class Commander:
     def command(self, level: Control | str, values: ArrayLike) -> None:
         """Stream a command for this drone: the numbers that ``sim.state_control``, ... take. (k,)"""
         level = Control(level)
-        self._require(level)
+        self._require_level(level)
         size = {Control.state: 16, Control.rotor_vel: np.size(values)}.get(level, 4)
         self._stream_setpoint("command", _numbers(f"{level.value} command", values, size, limit=math.inf))
 
@@ -188,32 +188,32 @@ class Commander:
         if norm < 1e-3:
             raise ConfigError(f"expected a unit quaternion, xyzw, got {list(parts[3])}")
         parts[3] = parts[3] / norm
-        self._require(Control.state)
+        self._require_level(Control.state)
         self._stream_setpoint("command", np.concatenate(parts))
 
     def position(self, pos: ArrayLike, yaw: float) -> None:
         """Stream a position, m (3,), and yaw, rad."""
-        self._require(Control.state)
+        self._require_level(Control.state)
         self._stream_setpoint("position", np.append(_numbers("position", pos, 3), _numbers("yaw", [yaw], 1)))
 
     def velocity(self, vel: ArrayLike, yaw_rate: float) -> None:
         """Stream a velocity, world frame, m/s (3,), and yaw rate, rad/s; a reference position moves with it."""
-        self._require(Control.state)
+        self._require_level(Control.state)
         self._stream_setpoint("velocity", np.append(_numbers("velocity", vel, 3), _numbers("yaw rate", [yaw_rate], 1)))
 
     def hover(self, vx: float, vy: float, yaw_rate: float, height: float) -> None:
         """Stream a horizontal velocity in the axes of the drone's yaw, m/s, yaw rate, rad/s, and height, m."""
-        self._require(Control.state)
+        self._require_level(Control.state)
         self._stream_setpoint("hover", _numbers("hover setpoint", [vx, vy, yaw_rate, height], 4))
 
     def attitude(self, roll: float, pitch: float, yaw_rate: float, thrust: float) -> None:
         """Stream roll, pitch, rad, yaw rate, rad/s, and collective thrust, N."""
-        self._require(Control.attitude)
+        self._require_level(Control.attitude)
         self._stream_setpoint("attitude", _numbers("attitude setpoint", [roll, pitch, yaw_rate, thrust], 4))
 
     def notify_setpoints_stop(self, remain_valid: float = 0.0) -> None:
         """Return to high-level commands after a time, s, in which the last setpoint stays active."""
-        self._released = self.now + max(float(remain_valid), 0.0)
+        self._release_time = self.now + max(float(remain_valid), 0.0)
 
     # Safety ---------------------------------------------------------------------------------------------------------
 
@@ -267,7 +267,7 @@ class Commander:
         self.pos, self.vel, self.yaw = pos, vel, yaw
         if self._stream is not None:
             age = now - self._stream_time
-            if now >= self._released and self._plan is not None:
+            if now >= self._release_time and self._plan is not None:
                 self._stream = None
             elif age > SHUTDOWN:
                 self.stop()
@@ -279,24 +279,24 @@ class Commander:
         if not self.motors_on:
             return None
         if self._stream is not None:
-            return self._streamed(dt)
+            return self._streamed_command(dt)
         if plan is None or not plan.finished(now) or plan.lands:
             return _state_command(*self.goal())
-        if self._held is None or self._held[0] is not plan:  # evaluated only once while the drone hovers
-            self._held = plan, _state_command(plan.at(now)[0], np.zeros(4), np.zeros(4))
-        return self._held[1]
+        if self._held_plan is None or self._held_plan[0] is not plan:  # evaluated only once while the drone hovers
+            self._held_plan = plan, _state_command(plan.at(now)[0], np.zeros(4), np.zeros(4))
+        return self._held_plan[1]
 
     def _has_landed(self, plan: PlannedMotion) -> bool:
         """Return True if the drone has reached the height of its landing, or stands on a surface."""
-        stands = self.now > plan.end + REST_TIME and abs(self.vel[2]) < RESTING_SPEED
-        return stands or self.pos[2] <= plan.at(self.now)[0, 2] + LANDED_HEIGHT
+        is_standing = self.now > plan.end + REST_TIME and abs(self.vel[2]) < RESTING_SPEED
+        return is_standing or self.pos[2] <= plan.at(self.now)[0, 2] + LANDED_HEIGHT
 
-    def _streamed(self, dt: float) -> NDArray:
+    def _streamed_command(self, dt: float) -> NDArray:
         kind, x = self._stream  # type: ignore[misc]
         if self.control != Control.state:
             return self._streamed_attitude(kind, x, dt)
         if kind == "command":
-            self._last = np.array([[*x[:3], yaw_of(x[9:13])], [*x[3:6], x[15]], [*x[6:9], 0.0]])
+            self._last = np.array([[*x[:3], yaw_from_quat(x[9:13])], [*x[3:6], x[15]], [*x[6:9], 0.0]])
             self._reference = self._last[0].copy()
             return x
         rate = np.zeros(4)
@@ -323,18 +323,18 @@ class Commander:
         if self._stream is None:
             self._last = self.goal()
             self._reference = self._last[0].copy()
-        self._stream, self._stream_time, self._released, self._plan = (kind, values), self.now, math.inf, None
+        self._stream, self._stream_time, self._release_time, self._plan = (kind, values), self.now, math.inf, None
         self._thrust = float(values[3]) if kind in ("command", "attitude") else 0.0
 
-    def _vertical(self, height: float, duration: float, yaw: float | None, lands: bool) -> None:
+    def _move_vertically(self, height: float, duration: float, yaw: float | None, is_landing: bool) -> None:
         (height,) = _numbers("height", [height], 1)
-        start_pos = self._motion_start("land" if lands else "take_off")[0]
+        start_pos = self._motion_start("land" if is_landing else "take_off")[0]
         goal = start_pos.copy()
         goal[2] = height
         if yaw is not None:
             goal[3] = nearest_yaw(start_pos[3], _numbers("yaw", [yaw], 1)[0])
         start = np.array([start_pos, np.zeros(4), np.zeros(4)])
-        self._plan = PlannedMotion(move(start, goal, _duration(duration)), self.now, lands=lands)
+        self._plan = PlannedMotion(move(start, goal, _duration(duration)), self.now, lands=is_landing)
 
     def _motion(self) -> NDArray:
         """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""
@@ -345,17 +345,17 @@ class Commander:
 
         A command that has no effect because of the stream is reported.
         """
-        self._require(Control.state)
+        self._require_level(Control.state)
         if self._stream is None:
             return self.goal()
-        if math.isinf(self._released) and self._report is not None:
+        if math.isinf(self._release_time) and self._report is not None:
             self._report(
                 f"expected no streamed setpoints in force before {command}, got some: it begins after "
                 f"notify_setpoints_stop, and the next streamed setpoint discards it. Call notify_setpoints_stop first."
             )
         return self._motion()
 
-    def _require(self, level: Control) -> None:
+    def _require_level(self, level: Control) -> None:
         if self.locked or not self.armed:
             raise ConfigError(
                 f"expected a drone that is armed, got one that is {'locked' if self.locked else 'disarmed'}"
@@ -387,5 +387,7 @@ def _duration(value: float) -> float:
 
 def _state_command(point: NDArray, rate: NDArray, second: NDArray) -> NDArray:
     """Return the state command of position and yaw, their rates and second derivatives. (16,)"""
-    half = point[3] / 2
-    return np.array([*point[:3], *rate[:3], *second[:3], 0.0, 0.0, math.sin(half), math.cos(half), 0.0, 0.0, rate[3]])
+    half_yaw = point[3] / 2
+    return np.array(
+        [*point[:3], *rate[:3], *second[:3], 0.0, 0.0, math.sin(half_yaw), math.cos(half_yaw), 0.0, 0.0, rate[3]]
+    )

@@ -42,9 +42,9 @@ class PlannedMotion(NamedTuple):
 
     def at(self, t: float) -> NDArray:
         """Return position and yaw, their rates and second derivatives at a time, s. (3, 4)"""
-        since = (t - self.start) / self.timescale
+        elapsed = (t - self.start) / self.timescale
         rate = (-1.0 if self.reversed else 1.0) / self.timescale
-        derivatives = self.path.derivatives(self.path.duration - since if self.reversed else since, 2)
+        derivatives = self.path.derivatives(self.path.duration - elapsed if self.reversed else elapsed, 2)
         derivatives = derivatives * np.array([1.0, rate, rate * rate])[:, None]
         derivatives[0] += self.shift
         return derivatives

@@ -63,7 +63,7 @@ PARAMETERS: dict[str, Parameter] = {
 """Parameters that every simulated drone has."""
 
 
-def parameters_of(airframe: Airframe, multi_ranger: bool) -> dict[str, Parameter]:
+def create_parameters(airframe: Airframe, multi_ranger: bool) -> dict[str, Parameter]:
     """Return the parameters of a drone, including its multi-ranger deck and its attitude gains.
 
     Args:
@@ -107,16 +107,16 @@ class Parameters(Mapping[str, float]):
 
     def get_value(self, name: str) -> float:
         """Return a value."""
-        self._require(name)
+        self._require_parameter(name)
         return self._values[name]
 
-    def _require(self, name: str) -> None:
+    def _require_parameter(self, name: str) -> None:
         if name not in self.kinds:
-            raise ConfigError(f"expected a parameter that the simulation has, got {name!r}. {PAGE}")
+            raise ConfigError(f"expected a parameter that the simulation has, got {name!r}. {GUIDE_REMARK}")
 
     def set(self, name: str, value: float, now: float) -> None:
         """Set a value."""
-        self._require(name)
+        self._require_parameter(name)
         kind = self.kinds[name]
         if kind.read_only or not math.isfinite(value):
             raise ConfigError(f"expected a finite value of a parameter that can be written, got {name} = {value:g}")
@@ -126,7 +126,7 @@ class Parameters(Mapping[str, float]):
         if not (is_effect and (kind.simulated or is_same)):
             raise ConfigError(
                 f"expected a value whose effect is simulated, got {name} = {value:g}; it stays {self._values[name]:g}. "
-                f"{PAGE}"
+                f"{GUIDE_REMARK}"
             )
         self._values[name] = value
         self.has_initial_pose |= name in INITIAL_POSE
@@ -134,7 +134,7 @@ class Parameters(Mapping[str, float]):
             self.light.changed(self._values, name, now)
 
 
-PAGE = 'The guide "Real drones and their scripts" lists the parameters.'
+GUIDE_REMARK = 'The guide "Real drones and their scripts" lists the parameters.'
 
 
 class Light:

@@ -33,7 +33,7 @@ class BatteryState(NamedTuple):
     """State of the power management."""
 
 
-def battery_of(sim: Sim, drone: int) -> BatteryState:
+def read_battery(sim: Sim, drone: int) -> BatteryState:
     """Return the state of a drone's ``Battery``; without the plugin, of a battery that is never empty."""
     plugin = _plugin(sim, Battery)
     if plugin is None:
@@ -43,7 +43,7 @@ def battery_of(sim: Sim, drone: int) -> BatteryState:
     return BatteryState(voltage, charge, LOW_POWER if voltage < LOW_VOLTAGE * record.n_cells else ON_BATTERY)
 
 
-def ranges_of(sim: Sim, drone: int) -> dict[str, float]:
+def read_ranges(sim: Sim, drone: int) -> dict[str, float]:
     """Return the distances that a ``MultiRanger``, or a ``RangeFinder``, measures along ``MULTI_RANGER_DIRECTIONS``, m.
 
     They are infinite if no object is within range. Other directions, and drones without the sensor, are missing.
@@ -54,7 +54,7 @@ def ranges_of(sim: Sim, drone: int) -> dict[str, float]:
     if plugin is None:
         return {}
     record = plugin.read(sim.data)
-    far, distances = float(record.max_range), np.asarray(record.distance)[0, drone].tolist()
+    max_range, distances = float(record.max_range), np.asarray(record.distance)[0, drone].tolist()
     if ranger is not None:
         samples = ranger.read(sim.data).samples
         if samples.taken[0, drone, 0] >= 0:
@@ -65,7 +65,7 @@ def ranges_of(sim: Sim, drone: int) -> dict[str, float]:
             (name for name, axis in MULTI_RANGER_DIRECTIONS.items() if np.allclose(axis, direction, atol=1e-6)), None
         )
         if name is not None:
-            ranges[name] = distance if distance < far else math.inf
+            ranges[name] = distance if distance < max_range else math.inf
     return ranges
 
 

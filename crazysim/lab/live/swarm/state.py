@@ -69,6 +69,6 @@ class EstimateFrame(NamedTuple):
             return command - [0.0, 0.0, self.turn, 0.0]
         if level != Control.state:
             return command
-        back = from_yaw(-self.turn)
-        pos, vel, acc = (rotate(back, x) for x in (command[:3] - self.shift, command[3:6], command[6:9]))
-        return np.concatenate([pos, vel, acc, multiply(back, command[9:13]), command[13:]])
+        inverse_turn = from_yaw(-self.turn)
+        pos, vel, acc = (rotate(inverse_turn, x) for x in (command[:3] - self.shift, command[3:6], command[6:9]))
+        return np.concatenate([pos, vel, acc, multiply(inverse_turn, command[9:13]), command[13:]])

@@ -24,8 +24,8 @@ from crazysim.lab.live.loop import Live
 from crazysim.lab.live.mocap.source_events import Reports
 from crazysim.lab.live.staging import compile_step
 from crazysim.lab.live.swarm.commander import Commander
-from crazysim.lab.live.swarm.parameters import LIGHT_GROUPS, Parameters, parameters_of
-from crazysim.lab.live.swarm.sensors import ranges_of
+from crazysim.lab.live.swarm.parameters import LIGHT_GROUPS, Parameters, create_parameters
+from crazysim.lab.live.swarm.sensors import read_ranges
 from crazysim.lab.live.swarm.state import DroneState
 from crazysim.plugins.effects import MotorFailure
 from crazysim.plugins.estimators import Estimator
@@ -67,9 +67,9 @@ class Swarm(Closing):
         if len(names) != sim.n_drones or len(set(names)) < len(names):
             raise ConfigError(f"expected {sim.n_drones} different names, got {names}")
         self.sim, self.names, self.lock = sim, tuple(names), threading.RLock()
-        self.commanders = [Commander(sim.control, functools.partial(self._refused, name)) for name in names]
-        ranged = "front" in ranges_of(sim, 0)
-        self.parameters = [Parameters(parameters_of(airframe, ranged)) for airframe in sim.airframes]
+        self.commanders = [Commander(sim.control, functools.partial(self._report_refusal, name)) for name in names]
+        ranged = "front" in read_ranges(sim, 0)
+        self.parameters = [Parameters(create_parameters(airframe, ranged)) for airframe in sim.airframes]
         self.colors, self.reports = np.zeros((len(names), 3)), Reports()
         self.listeners: list[Callable[[], object]] = []
         self._period = sim.freq // sim.control_freq
@@ -78,12 +78,12 @@ class Swarm(Closing):
         estimators = [plugin for plugin in sim.plugins.values() if isinstance(plugin, Estimator)]
         self._estimator = next((estimator for estimator in estimators if estimator.control), None)
         self._estimate = jax.jit(vmap_worlds(vmap_drones(self._estimated)))
-        self._on = np.ones(len(names), bool)
+        self._motors_on = np.ones(len(names), bool)
         self._states: list[DroneState] = []
         self._yaws: list[float] = []
         self._home = np.asarray(sim.data.states.pos[0], float)
         self._thread: threading.Thread | None = None
-        self._stopped = threading.Event()
+        self._stop_event = threading.Event()
         self._live: Live | None = None
         self._read()
         self._write()
@@ -205,14 +205,14 @@ class Swarm(Closing):
         if self._live is not None:
             raise ConfigError("expected a swarm without a live loop, got one after run_in. Use advance or sleep.")
         self.compile_step()
-        self._stopped.clear()
+        self._stop_event.clear()
         self._thread = threading.Thread(target=self._run, args=(speed,), name="swarm", daemon=True)
         self._thread.start()
         return self
 
     def close(self) -> None:
         """Stop the thread, if there is one."""
-        self._stopped.set()
+        self._stop_event.set()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
@@ -220,14 +220,14 @@ class Swarm(Closing):
     def _run(self, speed: float) -> None:
         dt = self._period / self.sim.freq / speed
         due = time.perf_counter()
-        while not self._stopped.is_set():
+        while not self._stop_event.is_set():
             with self.lock:
                 self.update()
                 self.sim.step(self._period)
             due = max(due + dt, time.perf_counter() - 0.1)
-            self._stopped.wait(max(due - time.perf_counter(), 0.0))
+            self._stop_event.wait(max(due - time.perf_counter(), 0.0))
 
-    def _refused(self, name: str, text: str) -> None:
+    def _report_refusal(self, name: str, text: str) -> None:
         """Report that a command to a drone has no effect."""
         self.reports.add("refused", name, self.time, text)
 
@@ -250,7 +250,7 @@ class Swarm(Closing):
         if before and now < before[0].time:
             for commander in self.commanders:
                 commander.reset()
-            before, self._on = [], np.ones(len(self.names), bool)
+            before, self._motors_on = [], np.ones(len(self.names), bool)
         dt = now - before[0].time if before else 0.0
         vel_before = np.stack([state.vel for state in before]) if before else vel
         force = (vel - vel_before) / dt if dt > 0 else np.zeros_like(vel)
@@ -270,19 +270,19 @@ class Swarm(Closing):
     def _write(self) -> None:
         sim = self.sim
         command = np.zeros((1, len(self.names), self._size))
-        on = np.ones(len(self.names), bool)
+        motors_on = np.ones(len(self.names), bool)
         drones = zip(self.commanders, self._states, self._yaws, strict=True)
         for k, (commander, state, yaw) in enumerate(drones):
             new_command = commander.tick(state.time, state.pos, state.vel, yaw)
-            on[k] = new_command is not None
+            motors_on[k] = new_command is not None
             if new_command is not None:
                 command[0, k] = new_command
             elif sim.control == Control.state:
                 command[0, k, :3], command[0, k, 9:13] = state.pos, from_yaw(yaw)
         getattr(sim, f"{sim.control.value}_control")(command)
-        if self._motors is not None and (on != self._on).any():
-            self._on = on
+        if self._motors is not None and (motors_on != self._motors_on).any():
+            self._motors_on = motors_on
             record = self._motors.read(sim.data)
             shape = record.effectiveness.shape
-            switched = jnp.asarray(np.broadcast_to(on[None, :, None], shape), record.effectiveness.dtype)
+            switched = jnp.asarray(np.broadcast_to(motors_on[None, :, None], shape), record.effectiveness.dtype)
             sim.data = self._motors.write(sim.data, record.replace(effectiveness=switched))

@@ -87,7 +87,7 @@ class Quick(ThreadSource):
     """A source that sends more frames than are kept."""
 
     def stream(self, stopped):
-        for k in range(source_module.CAPACITY + 100):
+        for k in range(source_module.MAX_QUEUED_FRAMES + 100):
             yield Frame.of(k, moving(0.0))
 
 
@@ -102,8 +102,8 @@ def test_lost_frames_are_counted():
     with Quick("quick").start() as source:
         wait_for(lambda: source.ended)
         poll = source.poll(0, 500)
-    assert (len(poll.frames), poll.lost) == (source_module.CAPACITY, 100)
-    assert poll.frames[-1].stamp == source_module.CAPACITY + 99
+    assert (len(poll.frames), poll.lost) == (source_module.MAX_QUEUED_FRAMES, 100)
+    assert poll.frames[-1].stamp == source_module.MAX_QUEUED_FRAMES + 99
 
 
 WORKER = """
