@@ -186,7 +186,7 @@ def keep(records: list[Line]) -> None:
 
 def write_pages() -> None:
     """Write the tables of all stored records into the pages."""
-    for path in sorted({figure.page for figure in FIGURES.values()}):
+    for path in sorted({"README.md", *(figure.page for figure in FIGURES.values())}):
         page = ROOT / path
         text = page.read_text()
         if (written := with_tables(text, load())) != text:
@@ -289,7 +289,7 @@ def training_commits() -> dict[str, str]:
 
 def validation_commits() -> dict[str, str]:
     """Return the commit that ``crazysim validate`` wrote into its page."""
-    found = re.search(r"commit ([0-9a-f]{7,})", (ROOT / "docs/validation.md").read_text())
+    found = re.search(r"crazysim [\d.]+, commit ([0-9a-f]{7,})", (ROOT / "docs/validation.md").read_text())
     return {"all": found[1]} if found else {}
 
 
@@ -352,8 +352,14 @@ FIGURES: dict[str, Figure] = {
     "queries": Figure(
         PAGE,
         (*ENVS, *SCENE, VERSUS[1]),
-        cpu="versus_crazyflow.py --only contacts depth swarm_build gym memory --repeats 3",
+        cpu="versus_crazyflow.py --only contacts depth swarm_build gym --repeats 3",
         gpu="versus_crazyflow.py --only contacts depth gym --repeats 3",
+        table=tables.queries,
+    ),
+    "memory": Figure(
+        PAGE,
+        ("crazysim/core", "crazysim/scene", VERSUS[1]),
+        cpu="versus_crazyflow.py --only memory",
         table=tables.queries,
     ),
     "depth": Figure(
@@ -403,6 +409,7 @@ FIGURES: dict[str, Figure] = {
     "controllers-rates": Figure(
         "docs/concepts/control-results.md",
         STEP,
+        cpu="controllers.py --drones cf21B_500 --attitudes 1 --repeats 5",
         gpu="controllers.py --worlds 1048576 --drones cf21B_500 --attitudes 1",
         table=tables.control_rates,
     ),

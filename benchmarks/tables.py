@@ -50,12 +50,12 @@ def worlds_of(line: Line) -> str:
     return f"{line['n_worlds']:,}"
 
 
-def si(value: float, unit: str = "") -> str:
+def si(value: float) -> str:
     """Return a number with three digits and a prefix, such as ``46.2 G``."""
     value, k = digits(value), 0
     while value >= 1000 and k < 3:
         value, k = digits(value / 1000), k + 1
-    return f"{value:g} {' kMG'[k]}{unit}".replace("  ", " ").strip()
+    return f"{value:g} {' kMG'[k]}".strip()
 
 
 def duration(seconds: float) -> str:
@@ -69,7 +69,7 @@ def loops(lines: list[Line]) -> str:
 
     def time_of(line: Line) -> str:
         if "ratio" in line:
-            return f"{duration(line['crazysim_call_s'])}, {line['ratio']:.2g}"
+            return f"{duration(line['crazysim_call_s'])}, {digits(line['ratio'], 2):g}"
         return duration(line["iteration_s"])
 
     names = {"loop/jax": "a compiled sum, read", "loop/mj_step": "C MuJoCo, one box"}
@@ -87,7 +87,7 @@ def versus(lines: list[Line]) -> str:
         Worlds=worlds_of,
         crazysim=lambda x: si(x["crazysim_steps_per_s"]),
         Crazyflow=lambda x: si(x["crazyflow_steps_per_s"]),
-        Ratio=lambda x: f"{x['ratio']:.2g}",
+        Ratio=lambda x: f"{digits(x['ratio'], 2):g}",
         Compilation=lambda x: f"{x['crazysim_compile_s']:.2g} s, Crazyflow {x['crazyflow_compile_s']:.2g} s",
     )(lines)
 
@@ -102,7 +102,7 @@ def gradients(lines: list[Line]) -> str:
     return columns(
         Commands=lambda x: LEVELS[x["control"]],
         Worlds=worlds_of,
-        Gradient=lambda x: si(x["n_worlds"] * x["n_steps"] / x["gradient_s"], "steps/s"),
+        Steps_per_second=lambda x: si(x["n_worlds"] * x["n_steps"] / x["gradient_s"]),
         Over_steps_alone=lambda x: f"{x['forward_passes']:.2g}",
         Forward_mode_over_steps_alone=lambda x: f"{x['jvp_passes']:.2g}",
         First_gradient_compiles_in=lambda x: f"{x['compile_s']:.2g} s",
@@ -134,10 +134,15 @@ def queries(lines: list[Line]) -> str:
     def row_of(line: Line) -> list[str]:
         name = line["benchmark"].partition("/")[2]
         if name == "memory":
-            key, label = "bytes_per_world", f"memory of a world after a contact query, {line['n_drones']} drones"
+            key, label = "bytes_per_world", f"memory of a world, drones: {line['n_drones']}"
             ours, theirs = (f"{digits(line[f'{x}_{key}'] / 1000):g} kB" for x in ("crazysim", "crazyflow"))
-            return [label, ours, theirs, f"{1 / line['ratio']:.2g}"]
-        return [names[name], duration(line["crazysim_s"]), duration(line["crazyflow_s"]), f"{line['ratio']:.2g}"]
+            return [label, ours, theirs, f"{digits(1 / line['ratio'], 2):g}"]
+        return [
+            names[name],
+            duration(line["crazysim_s"]),
+            duration(line["crazyflow_s"]),
+            f"{digits(line['ratio'], 2):g}",
+        ]
 
     return table_of(["", "crazysim", "Crazyflow", "Crazyflow over crazysim"], [row_of(line) for line in lines])
 
@@ -151,14 +156,12 @@ depths = columns(
     Poles=poles_of,
     Image=lambda x: f"{x['width']} x {x['height']}, {x['n_worlds']:,} worlds",
     Rays_per_second=lambda x: si(x["rays_per_s"]),
-    per_second_of_processor_time=lambda x: si(x["rays_per_processor_s"]),
     First_image=lambda x: duration(x["first_s"]),
 )
 range_finders = columns(
     Poles=poles_of,
     Worlds=worlds_of,
     One_step=lambda x: duration(1e-6 * x["step_us"]),
-    Processor_time_per_drone=lambda x: duration(1e-9 * x["processor_ns_per_drone"]),
     First_step=lambda x: duration(x["first_s"]),
 )
 
@@ -185,7 +188,7 @@ fleets = columns(
         "airframes": "two airframes, over one with parameters per drone",
     }[x["case"]],
     Worlds=worlds_of,
-    Rate_of_the_drones=lambda x: f"{x['ratio']:.2g}",
+    Rate_of_the_drones=lambda x: f"{digits(x['ratio'], 2):g}",
 )
 vehicles = columns(Case=lambda x: f"`{x['case']}`", Steps_per_second=lambda x: si(x["steps_per_s"]))
 commands = columns(
@@ -196,7 +199,7 @@ commands = columns(
 live = columns(
     Case=lambda x: f"`{x['case']}`, {x['n_drones']} drones",
     Times_real_time=lambda x: f"{x['factor']:g}",
-    Late_in_99_9_percent_at_most=lambda x: f"{x['lateness_999_ms']:g} ms",
+    Late_by_at_most_in_999_of_1000_steps=lambda x: f"{x['lateness_999_ms']:g} ms",
     worst=lambda x: f"{x['worst_ms']:g} ms",
 )
 mocap = columns(
@@ -299,6 +302,7 @@ def readme(records: list[Line]) -> str:
 
     auto, same = {"control": "attitude", "controller": "auto"}, {"control": "attitude", "controller": "crazyflow"}
     euler = {"integrator": "euler"}
+    most_envs = {"cpu": 16384, "gpu": 1048576}
     most = {"cpu": ("versus", "crazysim_steps_per_s", 16384), "gpu": ("step", "steps_per_s", 4194304)}
 
     def steps(device: str, case: Line) -> str:
@@ -313,7 +317,10 @@ def readme(records: list[Line]) -> str:
 
     rows = {
         "one iteration of a script (attitude command, 5 steps, read), 64 and 1,024 worlds": lambda device: joined(
-            duration(x["crazysim_call_s"]) for n in (64, 1024) for x in lines_of("loop", device, n_worlds=n, **auto)
+            duration(x.get("crazysim_call_s") or x["iteration_s"])
+            for n in (64, 1024)
+            for x in lines_of("loop", device, n_worlds=n, control="attitude")
+            if x.get("controller", "auto") == "auto"
         ),
         "the same, 1 to 16,384 worlds: Crazyflow 0.4.0's time over ours, same control": lambda device: span(
             x["ratio"] for x in lines_of("loop", device, **same)
@@ -328,7 +335,7 @@ def readme(records: list[Line]) -> str:
         ).partition(" to ")[0],
         "environment steps per second through Gymnasium, 4,096 worlds": gym,
         "environment steps per second in compiled rollouts": lambda device: joined(
-            si(x["env_steps_per_s"]) for x in lines_of("envs", device, actions="random", n_worlds=1048576)
+            si(x["env_steps_per_s"]) for x in lines_of("envs", device, actions="random", n_worlds=most_envs[device])
         ),
     }
     return table_of(head, [[name, cells("cpu"), cells("gpu")] for name, cells in rows.items()])

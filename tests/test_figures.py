@@ -39,6 +39,7 @@ def repository(figures, monkeypatch, tmp_path):
     (tmp_path / "benchmarks" / "speed.py").write_text("print(1)\n")
     (tmp_path / "thrust.py").write_text(MEASURED)
     (tmp_path / "page.md").write_text("Before.\n\n<!-- figure speed -->\n\n<!-- end of speed -->\n\nAfter.\n")
+    (tmp_path / "README.md").write_text("Nothing.\n")
     (tmp_path / "figures.json").write_text("[]\n")
     table = figures.tables.columns(Case=lambda x: x["case"], Rate=lambda x: figures.tables.si(x["rate"]))
     figure = figures.Figure("page.md", ("thrust.py",), cpu="speed.py --fast", table=table)
@@ -69,7 +70,7 @@ def test_each_figure_has_a_script_and_a_place_on_its_page(figures):
             assert (ROOT / path.removeprefix(":(exclude)")).exists(), f"{name}: {path} does not exist"
     places = [(name, str(page.relative_to(ROOT))) for page in PAGES for name in figures.blocks(page.read_text())]
     wanted = [(name, figure.page) for name, figure in figures.FIGURES.items() if figure.table]
-    assert set(places) <= {*wanted, ("readme", "README.md")}
+    assert sorted(places) == sorted([*wanted, ("readme", "README.md")])
 
 
 def test_pages_show_the_records(figures):
