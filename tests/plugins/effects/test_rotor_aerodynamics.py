@@ -28,13 +28,25 @@ def hover(n_worlds=1, drone="cf21B_500", **settings):
 
 def wrench(sim, plugin, **states):
     """Return force, N, and torque, N m, that the plugin adds in each world, world frame. (n_worlds, 3) each"""
-    found = stage("drone")(plugin.influence)(with_states(sim.data, **states)).states
+    return wrench_of(stage("drone")(plugin.influence)(with_states(sim.data, **states)).states)
+
+
+def wrench_of(found):
+    """Return the external force and torque of states. (n_worlds, 3) each"""
     return np.asarray(found.force, float)[:, 0], np.asarray(found.torque, float)[:, 0]
 
 
 @pytest.fixture(scope="module")
 def quad():
     return hover(3)
+
+
+@pytest.fixture(scope="module")
+def compiled_wrench(quad):
+    """Return the wrench of that plugin as a compiled function of states."""
+    sim, plugin = quad
+    influence = jax.jit(stage("drone")(plugin.influence))
+    return lambda **states: wrench_of(influence(with_states(sim.data, **states)).states)
 
 
 @functools.cache
@@ -124,14 +136,13 @@ def test_rotor_drag_grows_with_the_speed_of_the_rotors(quad):
 
 
 @given(vel=vectors(2, 8.0), rate=vectors(3, 3.0))
-def test_law_08_drag_in_still_air_does_no_positive_work(quad, vel, rate):
+def test_law_08_drag_in_still_air_does_no_positive_work(compiled_wrench, vel, rate):
     """Across the axes of the rotors, and on rotation: the whole wrench with the linear drag of the dynamics."""
-    sim, plugin = quad
-    force, _ = wrench(sim, plugin, vel=[*vel, 0.0])
+    force, _ = compiled_wrench(vel=[*vel, 0.0])
     drag = force[0, :2] - DRAG_XY * vel
     assert drag @ vel <= 1e-7
     np.testing.assert_allclose(drag, -DRAG_XY * vel, rtol=1e-3, atol=1e-6)
-    _, torque = wrench(sim, plugin, ang_vel=rate)
+    _, torque = compiled_wrench(ang_vel=rate)
     assert torque[0] @ rate <= 1e-9
 
 

@@ -65,8 +65,8 @@ def test_the_covariance_moves_with_the_derivatives_of_the_step(estimate):
     def step(at):
         return error_state.predict_biased(at, accel, gyro, dt, gravity, *noise)
 
-    after = step(estimate)
-    f = jax.jacfwd(lambda error: difference(step(moved(estimate, error)), after))(jnp.zeros(15))
+    after = jax.jit(step)(estimate)
+    f = jax.jit(jax.jacfwd(lambda error: difference(step(moved(estimate, error)), after)))(jnp.zeros(15))
     g = f[:, 9:] * (np.arange(15) < 9)[:, None]  # noise acts as a bias of one interval, and leaves the biases
     expected = f @ error_state.covariance(estimate.cov) @ f.T + g @ jnp.diag(jnp.concatenate(noise)) @ g.T
     np.testing.assert_allclose(error_state.covariance(after.cov), expected, rtol=0, atol=5e-6)
@@ -113,8 +113,8 @@ def test_updates_move_by_the_derivatives_of_the_measurement(estimate, kind):
     error = 1e-7 * jnp.array([1.0, -2.0, 1.5])[: len(prediction)]
     std = jnp.array([0.1, 0.2, 0.3]) if kind in ("vel", "direction") else 0.1
     variance = jnp.diag(jnp.full(len(error), std**2)) + (std**2 if kind == "differences" else 0.0)
-    after = UPDATES[kind](estimate, prediction + error, rot, std)
-    h = jax.jacfwd(lambda e: MEASURED[kind](moved(estimate, e), rot))(jnp.zeros(15))
+    after = jax.jit(lambda z: UPDATES[kind](estimate, z, rot, std))(prediction + error)
+    h = jax.jit(jax.jacfwd(lambda e: MEASURED[kind](moved(estimate, e), rot)))(jnp.zeros(15))
     p = error_state.covariance(estimate.cov)
     gain = p @ h.T @ jnp.linalg.inv(h @ p @ h.T + variance)
     found = difference(error_state.finalize(after, min_angle=0.0), estimate)

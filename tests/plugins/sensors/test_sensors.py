@@ -295,7 +295,7 @@ class Relative(Plugin):
 def test_a_task_observes_measurements_by_one_argument():
     """Positions are off by the tracked body's offset, rates by the bias of the gyroscope; the reward is not."""
     on = [sensors.MotionCapture(pos=(0, 0, 0.3)), sensors.IMU(gyro=sensors.Triad(bias=0.2))]
-    envs = [make("hover", n_worlds=3, sensors=s) for s in ((), on)]
+    envs = [make("hover", n_worlds=3, sensors=s, engine="interpret") for s in ((), on)]
     states = [env.reset(jax.random.key(1)) for env in envs]
     action = np.zeros(envs[0].sim.data.states.pos.shape[:2] + (4,), np.float32)
     for _ in range(2):
