@@ -11,13 +11,14 @@ the repository, ``--records FILE --commit COMMIT`` writes the records to a file,
 repository puts them into the pages.
 
 ``--stale`` lists each record that is older than a change of what it measures, and ends with status 1 if there is one.
-Changes of comments, docstrings, annotations, local names and error messages do not count.
+Changes of comments, docstrings, annotations and error messages do not count, nor do new names for the same.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import functools
 import json
 import os
 import re
@@ -242,42 +243,102 @@ def stale() -> list[str]:
 
 
 def changed(commit: str, spec: Iterable[str]) -> list[str]:
-    """Return the files whose code differs between a commit and the working tree."""
+    """Return the files whose code differs between a commit and the working tree, apart from new names for the same."""
     if commit.endswith("+"):
         raise RuntimeError(f"measured with changes beyond commit {commit[:-1]}")
     paths = git("diff", "--name-only", "--no-renames", commit, "--", *spec).split()
-    return [path for path in paths if not is_same_code(commit, path)]
+    pairs = {path: pair for path in paths if (pair := versions(commit, path)) is not None}
+    defined = [{name for pair in pairs.values() for name in pair[k].defined} for k in (0, 1)]
+    old_names, new_names, renamed = defined[0] - defined[1], defined[1] - defined[0], {}
+
+    def is_same(old: Iterable[str], new: Iterable[str]) -> bool:
+        """Return True if two sequences differ only in names that were defined before or after, each always by one."""
+        return all(x == y or (x in old_names and y in new_names and renamed.setdefault(x, y) == y)
+                   for x, y in zip(old, new, strict=True))  # fmt: skip
+
+    def is_unchanged(path: str) -> bool:
+        if path not in pairs:
+            return False
+        old, new = pairs[path]
+        return (
+            len(old.atoms) == len(new.atoms)
+            and is_same(old.atoms, new.atoms)
+            and {tuple(renamed.get(x, x) for x in names) for names in old.imports} == new.imports
+        )
+
+    found = [path for path in paths if not is_unchanged(path)]
+    return found if len(set(renamed.values())) == len(renamed) else paths
 
 
-def is_same_code(commit: str, path: str) -> bool:
-    """Return True if a Python file that differs from a commit's compiles to the same code."""
+class Code(NamedTuple):
+    """What matters of a Python source."""
+
+    atoms: list[str]
+    """Instructions, names and constants, without docstrings, annotations of functions, error messages and imports."""
+    imports: set[tuple[str, ...]]
+    """Modules and names that it imports."""
+    defined: set[str]
+    """Names that it defines."""
+
+
+def versions(commit: str, path: str) -> tuple[Code, Code] | None:
+    """Return the code of a Python file at a commit and in the working tree; None if one of them has no such file."""
     if not path.endswith(".py") or not (ROOT / path).exists():
-        return False
+        return None
     try:
-        before = git("show", f"{commit}:{path}")
+        return code_at(commit, path), code_of((ROOT / path).read_text())
     except RuntimeError:
-        return False
-    return code_of(before) == code_of((ROOT / path).read_text())
+        return None
 
 
-def code_of(source: str) -> Any:
-    """Return what a Python source compiles to, without docstrings, annotations of functions and error messages."""
-    tree = ast.parse(source)
+@functools.cache
+def code_at(commit: str, path: str) -> Code:
+    """Return the code of a file at a commit."""
+    return code_of(git("show", f"{commit}:{path}"))
+
+
+@functools.cache
+def code_of(source: str) -> Code:
+    """Return the code of a Python source."""
+    tree, imports, defined = ast.parse(source), set(), set()
     for node in ast.walk(tree):
         if isinstance(node, ast.arg):
             node.annotation = None
-        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            node.returns = None
+            defined.add(node.arg)
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            defined.add(node.name)
+            if not isinstance(node, ast.ClassDef):
+                node.returns = None
+        elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
+            defined.add(node.id if isinstance(node, ast.Name) else node.attr)
         elif isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             node.exc.args, node.exc.keywords = [], []
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            module = getattr(node, "module", None) or ""
+            imports |= {(*module.split("."), name.name, name.asname or "") for name in node.names}
 
-    def comparable(value: Any) -> Any:
-        """Return a constant, or of code all but the names of local variables and the numbers of lines."""
+    for node in ast.walk(tree):
+        for statements in (
+            getattr(node, "body", None),
+            getattr(node, "orelse", None),
+            getattr(node, "finalbody", None),
+        ):
+            if isinstance(statements, list):
+                statements[:] = [
+                    ast.copy_location(ast.Pass(), x) if isinstance(x, ast.Import | ast.ImportFrom) else x
+                    for x in statements
+                ]
+
+    def atoms_of(value: Any) -> list[str]:
+        """Return the atoms of a constant, or of code all but the names of local variables and the numbers of lines."""
         if isinstance(value, types.CodeType):
-            return value.co_code, value.co_exceptiontable, value.co_names, [comparable(x) for x in value.co_consts]
-        return repr(value)
+            parts = [repr(value.co_code), repr(value.co_exceptiontable), *value.co_names]
+            return [*parts, *(atom for x in value.co_consts for atom in atoms_of(x))]
+        if isinstance(value, tuple):
+            return ["(", *(atom for x in value for atom in atoms_of(x)), ")"]
+        return value.split(".") if isinstance(value, str) else [repr(value)]
 
-    return comparable(compile(tree, "source", "exec", dont_inherit=True, optimize=2))
+    return Code(atoms_of(compile(tree, "source", "exec", dont_inherit=True, optimize=2)), imports, defined)
 
 
 def training_commits() -> dict[str, str]:

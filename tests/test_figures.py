@@ -10,12 +10,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MEASURED = '''
+from math import sin
+
 def thrust(speed: float) -> float:
     """Return the thrust."""
     if speed < 0:
         raise ValueError(f"expected a speed, got {speed}")
     squared = speed * speed
-    return 2.0 * squared
+    return 2.0 * squared + sin(squared)
 '''
 SCRIPT = f"""
 import json, sys
@@ -92,6 +94,14 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(repository
     source.write_text("# A comment.\n" + text.replace("expected a speed", "expected m/s"))
     commit_all(repository)
     assert repository.stale() == []
+    source.write_text(
+        MEASURED.replace("thrust(", "lift(").replace("import sin", "import sin as sine").replace("sin(", "sine(")
+    )
+    assert "thrust.py changed after" in repository.stale()[0]
+    source.write_text(MEASURED.replace("thrust(", "lift("))
+    assert repository.stale() == []
+    source.write_text(MEASURED.replace("sin", "cos"))
+    assert "thrust.py changed after" in repository.stale()[0]
     source.write_text(MEASURED.replace("2.0", "3.0"))
     (found,) = repository.stale()
     assert found == f"speed, 2 cores of EPYC (AVX2): thrust.py changed after {commit}"
