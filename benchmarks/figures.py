@@ -490,6 +490,12 @@ FIGURES: dict[str, Figure] = {
         cpu="first_results.py --repeat 1",
         table=tables.first_results,
     ),
+    "devices": Figure(
+        "docs/guides/devices.md",
+        (*ENVS, *SCENE, "crazysim/train"),
+        gpu="devices.py --devices 1 2 --processes 12",
+        table=tables.devices,
+    ),
     "training": Figure("docs/concepts/training-results.md", (*ENVS, "crazysim/train"), commits=training_commits),
     "validation": Figure(
         "docs/validation.md",

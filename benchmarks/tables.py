@@ -339,3 +339,30 @@ def readme(records: list[Line]) -> str:
         ),
     }
     return table_of(head, [[name, cells("cpu"), cells("gpu")] for name, cells in rows.items()])
+
+
+def devices(lines: list[Line]) -> str:
+    """Return rates on numbers of devices, their ratios, and bytes, memory and compile time of the last number."""
+    cases: dict[str, dict[int, Line]] = {}
+    for line in lines:
+        if "rate" in line:
+            cases.setdefault(line["case"], {})[line["n_devices"]] = line
+    numbers = sorted({n for case in cases.values() for n in case})
+    head = ["", "Worlds", *(f"{n} device{'s' * (n > 1)}" for n in numbers), "Ratio", "Bytes", "Memory", "Compile time"]
+    rows = []
+    for name, case in cases.items():
+        last = case[max(case)]
+        rates = [si(case[n]["rate"]) if n in case else "" for n in numbers]
+        sizes = sum(last["exchanged"].values()), last["memory_bytes"]
+        exchanged, memory = (f"{x} B" if x < 1000 else f"{si(x)}B" for x in sizes)
+        worlds = f"{worlds_of(last)} a {'seed' if name.startswith('seeds') else 'device'}"
+        facts = [f"{last['ratio']:.3g}", exchanged, memory, duration(last["compile_s"])]
+        rows.append([f"{name}, {last['unit']} a second", worlds, *rates, *facts])
+    text = table_of(head, rows)
+    for line in lines:
+        if "difference" in line:
+            text += (
+                f"\n\nThree iterations of PPO moved the weights by {line['moved']:.3g} (Euclidean norm); those on "
+                f"{line['n_devices']} devices differ from those on {line['compared_with']} by {line['difference']:.2g}."
+            )
+    return text

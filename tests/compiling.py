@@ -13,7 +13,7 @@ MIN_KEPT_COMPILE_S = 0.05
 
 
 def environment(variables: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment of the tests: two host devices, persistent caches, and quick compilers.
+    """Return the environment of the tests: four host devices, persistent caches, and quick compilers.
 
     ``XLA_FLAGS`` that set ``xla_backend_optimization_level`` keep all optimisations; CI runs laws and engines so.
     """
@@ -31,7 +31,7 @@ def environment(variables: Mapping[str, str]) -> dict[str, str]:
         ):  # emitters of fused loops take three times as long; later jaxlibs have no option
             flags += " --xla_cpu_use_fusion_emitters=false"
         settings["CXXFLAGS"] = f"{variables.get('CXXFLAGS', '')} {_quick_cxxflags(variables)}"
-    return settings | {"XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=2"}
+    return settings | {"XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=4"}
 
 
 def _quick_cxxflags(variables: Mapping[str, str]) -> str:

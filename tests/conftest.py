@@ -1,4 +1,4 @@
-"""Shared by all tests: two host devices, a persistent compilation cache, and simulations built once."""
+"""Shared by all tests: four host devices, a persistent compilation cache, and simulations built once."""
 
 import gc
 import os

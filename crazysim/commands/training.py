@@ -38,7 +38,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--resume", action="store_true", help=resume)
     checkpoint_every = "write a checkpoint every so many seconds, besides those of the evaluations"
     add("--checkpoint-every", type=float, metavar="SECONDS", help=checkpoint_every)
-    add("--device", help="device: cpu, gpu; by default cpu")
+    add("--device", help="device: cpu, gpu; by default cpu, or JAX's default platform with --devices")
+    devices = "devices to distribute the worlds over: all, their number, or their indices such as 0,2,3"
+    add("--devices", metavar="all|N|I,J", help=devices)
     add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation")
     add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm")
     add("--no-film", action="store_true", help="write no film")
@@ -137,6 +139,7 @@ def train(options: argparse.Namespace) -> None:
         "checkpoint_every": options.checkpoint_every,
         "algorithm": options.algorithm or (options.teacher and "dagger"),
         "n_worlds": options.worlds,
+        "devices": options.devices,
         "options": _parse_pairs(options.set) | given_options(options, "device"),
         "config": _parse_pairs(options.config) | given_options(options, "iterations", "teacher"),
     }

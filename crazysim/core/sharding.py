@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.errors import ConfigError
 from crazysim.pytree import n_batch_axes, replace_leaves, scopes
 
-T = TypeVar("T")
+T, R = TypeVar("T"), TypeVar("R")
 
 WORLD_AXIS = "worlds"
 """Name of the mesh axis over which worlds are distributed."""
@@ -99,7 +99,7 @@ def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
 def shardings_of(data: SimData, mesh: Mesh) -> SimData:
     """Return the sharding of every leaf: leaves of members and worlds are split, shared leaves are replicated."""
     if not isinstance(mesh, Mesh):
-        raise ConfigError(f"expected a mesh, got {mesh!r}; use world_mesh(jax.devices())")
+        raise ConfigError(f"expected a mesh, got {mesh!r}; use world_mesh(jax.devices()), or --devices of a training")
     n_devices = mesh.shape.get(WORLD_AXIS)
     if n_devices is None:
         raise ConfigError(
@@ -119,6 +119,19 @@ def shard(data: SimData, mesh: Mesh) -> SimData:
     """Return the data distributed over a mesh; under a trace, constrain the compiled function to distribute it."""
     distribute = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else jax.device_put
     return distribute(data, shardings_of(data, mesh))
+
+
+def map_devices(fn: Callable[[SimData], R], data: SimData, mesh: Mesh) -> R:
+    """Return the results of a function of data, which each device of a mesh computes for its own worlds.
+
+    Args:
+        fn: Function whose results have a leading axis over worlds.
+        data: Data of all worlds.
+        mesh: The devices.
+    """
+    split, shared = PartitionSpec(WORLD_AXIS), PartitionSpec()
+    specs = jax.tree.map(lambda scope: split if n_batch_axes(scope) else shared, scopes(data))
+    return jax.shard_map(fn, mesh=mesh, in_specs=(specs,), out_specs=split, check_vma=False)(data)
 
 
 def shard_scene(mjx_data: T, mesh: Mesh) -> T:

@@ -32,7 +32,7 @@ from crazysim.core.stages import watched_records
 from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.host_call import HostCall, is_possible
-from crazysim.engine.ir.program import Program, Zeros
+from crazysim.engine.ir.program import Leaf, Program, Zeros
 from crazysim.engine.lowering.groups import Group, independent_groups
 from crazysim.engine.lowering.relative import on_data_leaves
 from crazysim.engine.lowering.stages import lower_stages
@@ -167,9 +167,7 @@ class Planner(NamedTuple):
             lower_stages(g.stages, data, shared_zeros, _watched_leaves, population=g.population, tracer=tracer)
             for g in groups
         ]
-        one_kernel = (
-            self._has_kernels and not self.location.is_distributed and [x.fused for x in lowered_programs] == [True]
-        )
+        one_kernel = self._has_kernels and [x.fused for x in lowered_programs] == [True]
         select = None
         if separate is not None and one_kernel:
             separate_leaves = {*separate, leaf_indices(data).core.mjx_synced}
@@ -256,7 +254,7 @@ class Planner(NamedTuple):
             return [*outputs, flagged] if flags else list(outputs)
 
         if programs and self.location.mesh is not None:
-            advance = self._over_mesh(advance, data, inputs, written_leaves)
+            advance = self._over_mesh(advance, data, programs[0].leaves, inputs, written_leaves)
         plan = Plan(
             engine, reason, programs, self.location, inputs, packed, rows, written_leaves, indices, *_jit_step(advance)
         )
@@ -264,12 +262,18 @@ class Planner(NamedTuple):
         return dataclasses.replace(plan, numpy_step=_results_on_device(advance)) if in_numpy else plan
 
     def _over_mesh(
-        self, advance: Callable[..., Any], data: SimData, inputs: Sequence[int], outputs: Sequence[int]
+        self,
+        advance: Callable[..., Any],
+        data: SimData,
+        program_leaves: Sequence[Leaf],
+        inputs: Sequence[int],
+        outputs: Sequence[int],
     ) -> Callable[..., Any]:
         """Return a step in which every device advances its own worlds."""
         split, shared = PartitionSpec(self.location.axis), PartitionSpec()
         specs = [split if n_batch_axes(scope) == 2 else shared for scope in jax.tree.leaves(scopes(data))]
-        specs.append(shared)  # the packed array
+        added = program_leaves[len(specs) :]  # the packed array, and rows, in which worlds are the last axis
+        specs += [PartitionSpec(None, self.location.axis) if leaf.row_leaves else shared for leaf in added]
 
         def sharded_step(values: list[Any], n_steps: int | Array) -> list[Any]:
             count = [] if isinstance(n_steps, int) else [n_steps]

@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import NamedSharding, PartitionSpec
 from numpy.typing import ArrayLike
 
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
+from crazysim.core.sharding import WORLD_AXIS
 from crazysim.engine.step import FlatData
 from crazysim.envs.env import Env
 from crazysim.envs.state import NAME, OUTPUTS, EnvState
@@ -68,6 +70,8 @@ class EnvStepper:
         flat = self._flat
         if flat is None:
             raise ConfigError("expected a state before the first step, got none. Assign stepper.state.")
+        if self._env.sim.mesh is not None:  # actions of a policy on one device
+            actions = jax.device_put(actions, NamedSharding(self._env.sim.mesh, PartitionSpec(WORLD_AXIS)))
         carry, fixed_leaves = (
             [flat.leaves[i] for i in indices] for indices in (self._carried_indices, self._fixed_indices)
         )

@@ -151,7 +151,7 @@ def build_depth_fn(
 
     ignored = directions[..., 3].reshape(-1).astype(int)
 
-    def cast_in_worlds(data: SimData) -> Hits:
+    def cast_in_worlds(data: SimData, kernels: RayKernels) -> Hits:
         poses = [_camera_pose(camera, data) for camera in cameras]
         if data.states.pos.ndim == 2:
             origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
@@ -187,16 +187,23 @@ def build_depth_fn(
         bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]
         require_poses(model, bodies, mocap)
         data = with_mocap_bodies(model, with_moved_objects(data, moving_plugins(plugins(), bodies)), mocap)
+        if data.states.pos.ndim == 2:
+            return cast_in_worlds(data, kernels)
+        return kernels.run_on_each_device(cast_in_parts, data)
+
+    def cast_in_parts(data: SimData, kernels: RayKernels) -> Hits:
+        """Cast the rays of as many worlds at a time as fit into memory."""
         max_rays = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
-        n_worlds, at_a_time = data.core.n_worlds, max(1, max_rays // n_rays)
-        if data.states.pos.ndim == 2 or n_worlds <= at_a_time:
-            return cast_in_worlds(data)
+        n_worlds, at_a_time = data.states.pos.shape[0], max(1, max_rays // n_rays)
+        if n_worlds <= at_a_time:
+            return cast_in_worlds(data, kernels)
         objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
 
         def cast_in_world(poses: MocapPoses) -> Hits:
             pos, quat, objects = jax.tree.map(lambda x: x[None], poses)
             states = data.states.replace(pos=pos, quat=quat)
-            return jax.tree.map(lambda x: x[0], cast_in_worlds(data.replace(states=states, objects=objects)))
+            of_world = data.replace(states=states, objects=objects)
+            return jax.tree.map(lambda x: x[0], cast_in_worlds(of_world, kernels))
 
         return jax.lax.map(cast_in_world, (data.states.pos, data.states.quat, objects), batch_size=at_a_time)
 

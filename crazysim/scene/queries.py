@@ -75,7 +75,7 @@ class SceneQueries:
         """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""
         # The data come with the objects of plugins at their poses.
         model, kernels = self._scene.collision_model, self._scene.ray_kernels
-        platform = kernels.platform
+        platform = kernels.platform if kernels.mesh is None else None
         by_xla = contact_report.build_contact_fn(model, objects, floor, drones)
         if platform is None or contact_report.kernel_size(model, objects) > MAX_SIZE:
             return by_xla

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jax.sharding import Mesh
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.sharding import map_devices
 from crazysim.engine.backends import fused
 from crazysim.engine.errors import report_unsupported
 from crazysim.engine.index_map import map_indices
@@ -38,6 +39,7 @@ from crazysim.scene.first_hit import (
 )
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
+T = TypeVar("T")
 MAX_UNROLLED_GEOMS = 16
 """Largest number of movable geoms of a world with which a stage should cast rays: its program is unrolled."""
 MAX_PAIRS = 36
@@ -345,6 +347,8 @@ class RayKernels:
     """Platform of the kernels, ``"cpu"`` or ``"gpu"``; None for XLA."""
     strict: bool = False
     """True to raise an error where XLA would be used with an ``EngineWarning``."""
+    mesh: Mesh | None = None
+    """Devices over which the worlds are distributed; None for one, or where the kernels serve the worlds of one."""
     used: str = ""
     """Description of the kernels that cast rays last, for ``Sim.explain``."""
     reported: set[str] = dataclasses.field(default_factory=set)
@@ -352,16 +356,30 @@ class RayKernels:
 
     @classmethod
     def choose(cls, engine: str, device: jax.Device, mesh: Mesh | None, strict: bool) -> RayKernels:
-        """Return the choice for a simulation: kernels where its engine may use them, on one device that has them.
+        """Return the choice for a simulation: kernels where its engine may use them, on devices that have them.
 
         Args:
             engine: Engine of its steps, one of ``crazysim.engine.ENGINES``.
             device: Device of its data.
-            mesh: Devices over which its worlds are spread instead; None for one.
+            mesh: Devices over which its worlds are distributed instead; None for one.
             strict: True to raise an error where XLA would be used with an ``EngineWarning``.
         """
-        has_kernels = mesh is None and engine in ("auto", "fused") and not fused.unavailable_reason(device.platform)
-        return cls(device.platform if has_kernels else None, strict)
+        has_kernels = engine in ("auto", "fused") and not fused.unavailable_reason(device.platform)
+        return cls(device.platform if has_kernels else None, strict, mesh)
+
+    def run_on_each_device(self, fn: Callable[[SimData, RayKernels], T], data: SimData) -> T:
+        """Return the results of a function of data and kernels, which each device computes for its own worlds.
+
+        Args:
+            fn: Function whose results have a leading axis over worlds.
+            data: Data of all worlds.
+        """
+        if self.mesh is None:
+            return fn(data, self)
+        kernels = dataclasses.replace(self, mesh=None)
+        results = map_devices(lambda data: fn(data, kernels), data, self.mesh)
+        self.used = kernels.used
+        return results
 
     def node_boxes(self, targets: Targets, leaf_boxes: Array) -> tuple[Array, np.ndarray]:
         """Return the boxes of the nodes of the movable geoms in every world, (n_worlds, n_nodes, 6), and their links.
@@ -396,7 +414,7 @@ class RayKernels:
             The results. (n,) each
             Platform of the kernel that computed them; None for XLA.
         """
-        if self.platform is not None:
+        if self.platform is not None and self.mesh is None:
             try:
                 return map_indices(fn, n, tables, self.platform), self.platform
             except UnsupportedError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -315,8 +316,8 @@ class Scene:
         return self._mjx.poses()[:2]
 
     def shard(self, mesh: Mesh) -> None:
-        """Spread the scene of all worlds over devices; from then on XLA, without kernels, answers queries."""
-        self.mesh, self.ray_kernels = mesh, RayKernels()
+        """Spread the scene of all worlds over devices."""
+        self.mesh, self.ray_kernels = mesh, dataclasses.replace(self.ray_kernels, mesh=mesh)
         self._mjx.shard(mesh)
 
     def sync(self, data: SimData) -> SimData:

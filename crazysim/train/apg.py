@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jax.sharding import NamedSharding, PartitionSpec
 
+from crazysim.core.sharding import WORLD_AXIS
 from crazysim.envs.env import Env
 from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import EnvState, Obs, flatten
@@ -21,6 +23,7 @@ from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Layers, Policies, Policy, all_finite, init_mlp
 from crazysim.train.seeds import Rates, for_each_seed, split_blocks, stack_rates
 
+T = TypeVar("T")
 STATS_ITERATIONS = 20
 """Iterations during which the observation statistics are updated."""
 
@@ -107,10 +110,11 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     initial_state = env.restart(learner.env, learner.env.done)
     agents, rates, config = learner.agents, stack_rates(configs), configs[0]
     split_seeds = partial(split_blocks, n_seeds=len(configs))
+    n_copies = _copies_of_policy(env, len(configs))
 
     def loss(policies: Layers) -> tuple[Array, Any]:
-        """Return the sum of the losses of all seeds. Its gradient is the stack of the gradients of all seeds."""
-        seed_policies = Policies(Policy(agents.stats, policies))
+        """Return the sum of the losses of all seeds. Its gradient is the stack of the gradients of all copies."""
+        seed_policies = Policies(Policy(_copy(agents.stats, n_copies, env), policies))
 
         def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
             del key
@@ -120,13 +124,14 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
             reward, raw_obs, terminated = split_seeds(
                 (transition.reward, flatten(transition.obs), transition.terminated)
             )
-            return reward.mean(axis=(1, 2)), raw_obs, terminated.mean(axis=1)
+            return reward, raw_obs, terminated
 
         state, _, (rewards, raw_obs, crashed) = rollout(
             env, initial_state, act, agents.key, config.n_steps, record_transition
         )
         discounts = rates["discount"] ** jnp.arange(config.n_steps, dtype=rewards.dtype)[:, None]
         error = jnp.nanmean(split_seeds(state.info["error"]), axis=(1, 2))
+        rewards, crashed = rewards.mean(axis=(2, 3)), crashed.mean(axis=2)
         metrics = {"reward": rewards.mean(axis=0), "crashed": crashed.mean(axis=0), "error": error}
         losses = -(discounts * rewards).mean(axis=0)
         return losses.sum(), (losses, state, raw_obs, metrics)
@@ -147,9 +152,30 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
         finite = all_finite((policy, optimizer, stats, loss))
         return Agent(policy, optimizer, stats, agent.key), {"gradient": grad_norm, "finite": finite}
 
-    (_, (losses, state, raw_obs, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(agents.policy)
+    policies = _copy(agents.policy, n_copies, env)
+    (_, (losses, state, raw_obs, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(policies)
+    if n_copies > 1:
+        grads = jax.tree.map(lambda x: x.reshape(-1, n_copies, *x.shape[1:]).sum(axis=1), grads)
     agents, update_metrics = for_each_seed(update, agents, losses, grads, raw_obs, rates, axes=(0, 0, 0, 1, 0))
     return Learner(agents, state, learner.iteration + 1), metrics | update_metrics
+
+
+def _copies_of_policy(env: Env, n_seeds: int) -> int:
+    """Return the number of copies of the policy of a seed, each of which controls worlds of one device.
+
+    Devices sum the gradients of the copies once, after all steps, but those of a single policy in every step.
+    """
+    mesh = env.sim.mesh
+    return 1 if mesh is None or n_seeds % mesh.size == 0 else mesh.size
+
+
+def _copy(tree: T, n_copies: int, env: Env) -> T:
+    """Return copies of the arrays of each seed, on the devices that use them. (n_seeds * n_copies, ...) each"""
+    mesh = env.sim.mesh
+    if mesh is None or n_copies == 1:
+        return tree
+    split = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
+    return jax.lax.with_sharding_constraint(jax.tree.map(lambda x: jnp.repeat(x, n_copies, axis=0), tree), split)
 
 
 def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:

@@ -18,8 +18,9 @@ from crazysim.envs.env import Env
 from crazysim.envs.references import absolute_reference, is_reference, reference_of, split_reference
 from crazysim.envs.registry import TASKS, entry_of, make
 from crazysim.envs.task import Task
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.train import apg, dagger, ppo
+from crazysim.train.devices import Devices, evaluation_device, place_worlds
 from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.networks import Network, choose_network
 
@@ -108,7 +109,7 @@ ALTERABLE_HYPERPARAMETERS = ("iterations", *SWEEPABLE)
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Complete configuration of a run. A resumed run may only change ``ALTERABLE_HYPERPARAMETERS`` and the device."""
+    """Complete configuration of a run. A resumed run may only change ``ALTERABLE_HYPERPARAMETERS`` and devices."""
 
     task: str
     """Name of a registered task, or the absolute reference of its class, ``FILE.py:NAME`` or ``MODULE:NAME``."""
@@ -126,6 +127,9 @@ class TrainConfig:
     """True if the policy has a network of your own instead of the built-in one."""
     network: Network | None = field(default=None, compare=False)
     """Network of your own; None for the built-in one. The files of a run hold its weights, but not its functions."""
+    devices: Devices | None = field(default=None, compare=False)
+    """Devices that the worlds of the training are distributed over; None for the device of the options alone. The files
+    of a run do not hold them: a resumed run may have others."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -137,6 +141,11 @@ class TrainConfig:
         if unknown := [name for name in self.config if name not in names]:
             raise ConfigError(
                 f"expected hyperparameters of {self.algorithm}, got {', '.join(unknown)}; use {', '.join(names)}"
+            )
+        if "mesh" in self.options:
+            raise ConfigError(
+                f"expected no option 'mesh' of a training, got {short_repr(self.options['mesh'])}. Use --devices all, "
+                f"or devices='all' in Python: the worlds are then distributed over a mesh of these devices."
             )
         if self.network is not None:
             if self.algorithm != "ppo":
@@ -165,6 +174,7 @@ class TrainConfig:
         config: dict[str, Any] | None = None,
         resumed: TrainConfig | None = None,
         network: Network | None = None,
+        devices: Devices | None = None,
     ) -> TrainConfig:
         """Return the configuration of a run; omitted values come from the recipe of the task.
 
@@ -177,6 +187,8 @@ class TrainConfig:
             config: Hyperparameters of the algorithm.
             resumed: Configuration of the run to continue, which then provides omitted values; None for a new run.
             network: Network of your own; None for the built-in one.
+            devices: Devices that the worlds are distributed over: ``"all"``, their number, or their indices; of the
+                platform ``options["device"]``, or else of JAX's default platform. None for one device.
         """
         entry = entry_of(task)
         stored_options = {} if resumed is None else resumed.options
@@ -199,8 +211,10 @@ class TrainConfig:
         options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
         if is_airframe_file(options.get("drone")):  # so that the run can be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())
+        if devices is not None:
+            options["device"] = evaluation_device(options.get("device"), devices)
         seed = 0 if seed is None else seed
-        return TrainConfig(task, recipe.algorithm, seed, n_worlds, options, config, network=network)
+        return TrainConfig(task, recipe.algorithm, seed, n_worlds, options, config, network=network, devices=devices)
 
     @property
     def title(self) -> str:
@@ -208,8 +222,22 @@ class TrainConfig:
         name = split_reference(self.task)[1] if is_reference(self.task) else self.task
         return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(".")[2]).lower()
 
+    def make_training_env(self, n_seeds: int = 1) -> Env:
+        """Return the training environment of some seeds, with its worlds on the devices of the training.
+
+        Args:
+            n_seeds: Number of seeds, each with the worlds of the run.
+
+        Raises:
+            ConfigError: As ``make_env``; if a device does not exist, or if the worlds cannot be distributed evenly.
+        """
+        entry_of(self.task, named=False)
+        n_worlds = n_seeds * self.n_worlds
+        devices = {} if self.devices is None else place_worlds(self.options["device"], self.devices, n_worlds)
+        return make(self.task, n_worlds, **self.practice_options() | self.options | devices)
+
     def make_env(self, n_worlds: int | None = None, **defaults: Any) -> Env:
-        """Return an environment of the run.
+        """Return an environment of the run, on one device.
 
         Args:
             n_worlds: Number of worlds; None for the run's.

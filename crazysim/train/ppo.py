@@ -246,7 +246,7 @@ def _collect_samples(
             reward + discount * jnp.where(truncated, final_values, 0.0),
             jnp.broadcast_to(done, reward.shape),
         )
-        return sample, raw_obs, (reward.mean(axis=(1, 2)), terminated, error.mean(axis=(1, 2)))
+        return sample, raw_obs, (reward, terminated, error)  # means of every step would be exchanges of every step
 
     initial_memory = _initial_memories(agents.network, learner.env)
     state, memory, (samples, raw_obs, (reward, terminated_counts, error)) = rollout(
@@ -254,9 +254,9 @@ def _collect_samples(
     )
     done = samples.done.any(axis=-1)
     metrics = {
-        "reward": reward.mean(axis=0),
+        "reward": reward.mean(axis=(0, 2, 3)),
         "crashed": terminated_counts.sum(axis=(0, 2)) / jnp.maximum(done.sum(axis=(0, 2)), 1),
-        "error": error.mean(axis=0),
+        "error": error.mean(axis=(0, 2, 3)),
     }
     return state, memory, samples, raw_obs, metrics
 

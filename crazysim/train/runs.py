@@ -15,7 +15,7 @@ from crazysim.train.show import film as film_policy
 from crazysim.train.show import plot_curve, plot_episode, plot_spread, read_curve
 from crazysim.train.training import CHECKPOINT, CURVE, POLICY, TABLE, TrainResult, stored_configs, train, train_many
 
-SETTINGS = ("algorithm", "seed", "n_worlds", "options", "config", "network")
+SETTINGS = ("algorithm", "seed", "n_worlds", "options", "config", "network", "devices")
 """Settings of ``TrainConfig.create`` that ``run`` takes."""
 
 
@@ -51,7 +51,7 @@ def run(
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
             names of metrics of an evaluation after it begin with ``"evaluation "``. Each call waits for the device.
             None for none.
-        settings: ``algorithm``, ``seed``, ``n_worlds``, ``options``, ``config`` and ``network`` of
+        settings: ``algorithm``, ``seed``, ``n_worlds``, ``options``, ``config``, ``network`` and ``devices`` of
             ``TrainConfig.create``.
 
     Raises:
@@ -111,7 +111,7 @@ def run_many(
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         on_iteration: As in ``run``, but each metric is an array with a number for each training.
-        settings: ``algorithm``, ``n_worlds`` of each training, ``options``, ``config`` and ``network`` of
+        settings: ``algorithm``, ``n_worlds`` of each training, ``options``, ``config``, ``network`` and ``devices`` of
             ``TrainConfig.create``.
 
     Returns:

@@ -32,10 +32,12 @@ from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
 from crazysim.errors import ConfigError, DivergedError
 from crazysim.progress import progress_bar
+from crazysim.sim.sim import Sim
 from crazysim.storage import replacing
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
+from crazysim.train.devices import exchanged_bytes, learner_shardings, replicated_sharding
 from crazysim.train.evaluation import describe_outcome, evaluate_blocks
 from crazysim.train.export import describe
 from crazysim.train.hyperparameters import SWEEPABLE
@@ -111,7 +113,7 @@ def train_many(
         configs: Configuration of each training, by the name of its folder. Only the seed and the ``SWEEPABLE``
             hyperparameters may differ. The name may be empty if there is only one.
         folder: Folder of the run.
-        resume: True to continue from the checkpoint in the folder.
+        resume: True to continue from the checkpoint in the folder, also with another number of devices.
         evaluation_worlds: Number of initial states of the held-out set, and of the check set.
         log: Function that is called with each line of output.
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
@@ -151,7 +153,7 @@ def train_many(
     algorithm = ALGORITHMS[config.algorithm]
     hyperparameters = tuple([training.config.algorithm_config() for training in trainings])
     n_iterations, n_steps = hyperparameters[0].iterations, hyperparameters[0].n_steps
-    base_env = config.make_env(n_trainings * config.n_worlds, **config.practice_options())
+    base_env = config.make_training_env(n_trainings)
     wrapped_env = dagger.wrap_with_teacher(base_env, hyperparameters[0]) if algorithm is dagger else base_env
     wrapped_env = PrivilegedObservation(base_env) if config.config.get("critic") == "privileged" else wrapped_env
     env = base_env if algorithm is apg else AutoReset(wrapped_env)
@@ -159,8 +161,12 @@ def train_many(
     check_key = jax.random.key(CHECK_SEED)
     keys = jnp.stack([jax.random.fold_in(jax.random.key(training.config.seed), 1) for training in trainings])
     init_fn = algorithm.init if config.network is None else partial(algorithm.init, network=config.network)
-    init = jax.jit(init_fn, static_argnums=(0, 1))
+    init, iterate_fn = jax.jit(init_fn, static_argnums=(0, 1)), algorithm.iterate
     shapes = init.eval_shape(env, hyperparameters, keys)
+    shardings, replicated = learner_shardings(shapes, base_env.sim, n_trainings), replicated_sharding(base_env.sim)
+    if base_env.sim.mesh is not None:
+        init = jax.jit(init_fn, static_argnums=(0, 1), out_shardings=shardings)
+        iterate_fn = jax.jit(iterate_fn, static_argnums=(1, 2), out_shardings=(shardings, replicated))
     policy_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
     kept_shapes = [jax.eval_shape(lambda policies: take_seed(policies, 0), policy_shapes)] * n_trainings
     for training in trainings:
@@ -170,9 +176,8 @@ def train_many(
     def load_or_init() -> tuple[Learner, list[Policy]]:
         if resume:
             files = checkpoint.restore(path, stored_arrays, {"learner": shapes, "kept": kept_shapes})
-            files = jax.device_put(files, base_env.sim.device)
-            return files["learner"], files["kept"]
-        learner = init(env, hyperparameters, jax.device_put(keys, base_env.sim.device))
+            return jax.device_put(files["learner"], shardings), jax.device_put(files["kept"], eval_env.sim.device)
+        learner = init(env, hyperparameters, jax.device_put(keys, replicated))
         require_finite_start(base_env.task, learner.env)
         policies = jax.device_get(learner.as_policy())
         return learner, [take_seed(policies, i) for i in range(n_trainings)]
@@ -180,7 +185,7 @@ def train_many(
     def evaluate_policies(policies: Policy, key: Array | None) -> list[dict[str, float]]:
         """Return the metrics of each training's policy. The policies are host arrays, so slices need no compilation."""
         policy = take_seed(policies, 0) if n_trainings == 1 else Policies(policies)
-        return evaluate_blocks(eval_env, jax.device_put(policy, base_env.sim.device), key, n_trainings)
+        return evaluate_blocks(eval_env, jax.device_put(policy, eval_env.sim.device), key, n_trainings)
 
     @keep_programs()
     def compile_evaluation() -> dict[str, Any]:
@@ -191,7 +196,7 @@ def train_many(
     @keep_programs()
     def compile_iteration() -> tuple[Any, float]:
         compile_start = time.perf_counter()
-        compiled = algorithm.iterate.lower(_attach_device(shapes, base_env.sim.device), env, hyperparameters).compile()
+        compiled = iterate_fn.lower(_attach_shardings(shapes, shardings), env, hyperparameters).compile()
         return compiled, time.perf_counter() - compile_start
 
     # Each compilation takes seconds, mostly on one core, so they run in parallel.
@@ -209,6 +214,7 @@ def train_many(
     log(
         f"{config.title} by {config.algorithm}, {f'seed {config.seed}' if n_trainings == 1 else ', '.join(configs)}: "
         f"{n_iterations} iterations of {times}{steps_per_iteration:,} steps in {times}{config.n_worlds:,} worlds, "
+        f"{_describe_devices(base_env.sim, iterate)}"
         f"{base_env.sim.control.value} commands, "
         f"{base_env.sim.explain().splitlines()[0]}" + (f"; continues after iteration {n_done}" if n_done else "")
     )
@@ -307,7 +313,7 @@ def train_many(
             f"{describe_outcome(point, base_env.task.unit)}; "
             f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
         )
-        policy = jax.device_put(training.kept_policy, base_env.sim.device)
+        policy = jax.device_put(training.kept_policy, eval_env.sim.device)
         results[training.name] = TrainResult(training.folder, point, policy, eval_env)
     return results
 
@@ -406,10 +412,17 @@ def kept_point(curve: list[dict[str, Any]]) -> dict[str, Any]:
     return next(point for point in reversed(curve) if point["kept"])
 
 
-def _attach_device(shapes: Learner, device: jax.Device) -> Learner:
-    """Return the shapes with a device attached."""
-    sharding = jax.sharding.SingleDeviceSharding(device)
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
+def _describe_devices(sim: Sim, iterate: Any) -> str:
+    """Return the worlds of each device and the bytes that they exchange, for the log; nothing for one device."""
+    if sim.mesh is None:
+        return ""
+    n, n_bytes = sim.mesh.size, sum(exchanged_bytes(iterate.as_text()).values())
+    return f"{sim.n_worlds // n:,} on each of {n} devices, which exchange {n_bytes:,} bytes an iteration, "
+
+
+def _attach_shardings(shapes: Learner, shardings: Learner) -> Learner:
+    """Return the shapes with shardings attached."""
+    return jax.tree.map(lambda x, to: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=to), shapes, shardings)
 
 
 def load_policy(
@@ -452,7 +465,8 @@ def load_policy(
 
 def _run_metadata(config: TrainConfig) -> dict[str, Any]:
     """Return the metadata of the files of a run."""
-    settings = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name != "network"}
+    stored = [f.name for f in dataclasses.fields(config) if f.name not in ("network", "devices")]
+    settings = {name: getattr(config, name) for name in stored}
     meta = {"crazysim": crazysim.__version__, "settings": settings, "code": code_digest(config.task)}
     try:
         return json.loads(json.dumps(meta))
@@ -528,7 +542,7 @@ def _require_same_settings(path: Path, settings: dict[str, Any], config: TrainCo
             raise ConfigError(
                 f"expected {name} = {stored_settings.get(name, 'its default')!r} as in {path}, got "
                 f"{requested_settings.get(name, 'its default')!r}; resume with the same value, or start a new run in "
-                f"another folder with --out. A resumed run may change {', '.join(alterable)} and device."
+                f"another folder with --out. A resumed run may change {', '.join(alterable)}, device and devices."
             )
 
 

@@ -23,7 +23,7 @@ COLLECTIVES = ("all-reduce(", "all-gather(", "all-to-all(", "collective-permute(
 @pytest.fixture(scope="module")
 def mesh():
     devices = jax.devices("cpu")
-    assert len(devices) >= 2, "tests/conftest.py requests two host devices"
+    assert len(devices) >= 2, "tests/conftest.py requests four host devices"
     return world_mesh(devices[:2])
 
 

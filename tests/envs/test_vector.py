@@ -63,7 +63,7 @@ def test_an_episode_takes_its_time_in_every_mode(env):
 @pytest.mark.long("compiles an environment for two devices")
 def test_episodes_stay_on_the_device_that_was_asked_for():
     """Compiled or not, where the key and the actions are on JAX's default device; a moved state stays there."""
-    default, device = jax.devices()
+    default, device = jax.devices()[:2]
     env = make("hover", 3, device="cpu:1")
     state = jax.jit(env.reset)(jax.random.key(0))
     action, both = np.zeros(state.action.shape, np.float32), np.array([True, False, True])

@@ -128,7 +128,7 @@ def test_keys_do_not_depend_on_where_another_world_is_in_its_time(four):
 
 
 def test_two_devices_give_the_same_numbers_as_one(four):
-    assert len(jax.devices()) >= 2, "conftest forces two host devices"
+    assert len(jax.devices()) >= 2, "conftest forces four host devices"
     split = randomised(4, mesh=world_mesh(jax.devices()[:2]))
     for masks in ([None], [None, [True, False, True, False]]):
         np.testing.assert_array_equal(after_resets(split, *masks), after_resets(four, *masks))

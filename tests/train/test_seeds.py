@@ -195,7 +195,7 @@ def test_wrong_seeds_and_sweeps_are_refused(capsys, tmp_path):
         error = " ".join(capsys.readouterr().err.split())
         assert re.search(message, error), error
     with pytest.raises(
-        ConfigError, match="expected settings among algorithm, n_worlds, options, config, network, got seed"
+        ConfigError, match="expected settings among algorithm, n_worlds, options, config, network, devices, got seed"
     ):
         run_many("hover", tmp_path / "out", seed=1)
     with pytest.raises(ConfigError, match="expected at least one value of seeds, and each once, got none"):

@@ -1,0 +1,292 @@
+"""Rates on several devices beside those on one: physics, environments, training, gradients and depth images.
+
+    python benchmarks/devices.py [--device gpu] [--devices 1 2] [--cases physics PPO] [--processes 12] [--small]
+
+The worlds of each device are the same for any number of devices (weak scaling), except for ``seeds``: sixteen seeds are
+divided among the devices. One JSON line for each case and number of devices: the rate, its ratio to that on the
+first number of devices, the bytes that the devices exchange in a call and the memory of its program on a device, both
+from the compiled program, and the compile time. With ``--processes`` several cases are compiled at the same time, in
+processes of their own, and then timed one after another. The line ``weights`` compares the weights of PPO after three
+iterations. ``--small`` is for a try on CPUs, with
+``XLA_FLAGS=--xla_force_host_platform_device_count=4``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import multiprocessing
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from measure import digits, hovering, medians, report
+
+import crazysim.envs as envs
+from crazysim import Sim, __version__
+from crazysim.core import functional, world_mesh
+from crazysim.envs.state import flatten
+from crazysim.envs.statistics import RunningStats
+from crazysim.train import apg, ppo
+from crazysim.train.config import TrainConfig
+from crazysim.train.devices import exchanged_bytes, learner_shardings, replicated_sharding
+from crazysim.train.networks import Policy, init_mlp
+
+WEIGHTS = "weights"
+"""Name of the case that compares weights."""
+N_SEEDS = 16
+"""Seeds of the case that divides them among the devices."""
+N_CALLS = 5
+"""Calls that are timed together."""
+IMAGE = (64, 64)
+"""Width and height of a depth image, pixels."""
+
+
+class Case(NamedTuple):
+    """A compiled program with its first arguments."""
+
+    call: Any
+    """Compiled program."""
+    arguments: tuple[Any, ...]
+    """Its arguments; results that come first and have their structure are the arguments of the next call."""
+    carries: bool
+    """True if the first result is the argument of the next call."""
+    work: int
+    """What one call computes, in units of the case."""
+    compile_s: float
+    """Compile time, s."""
+
+
+class Size(NamedTuple):
+    """Size of a case."""
+
+    n_worlds: int
+    """Worlds of each device; for seeds those of each seed."""
+    small: int
+    """The same with ``--small``."""
+    unit: str
+    """What is counted."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", help="platform of the devices")
+    parser.add_argument("--devices", type=int, nargs="+", default=[1, 2], help="numbers of devices")
+    parser.add_argument("--cases", nargs="+", default=[*CASES, WEIGHTS], choices=[*CASES, WEIGHTS])
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--small", action="store_true", help="few worlds and steps, for a try")
+    parser.add_argument("--processes", type=int, default=1, help="cases that are compiled at the same time")
+    args = parser.parse_args()
+    if args.processes == 1:
+        for name in args.cases:
+            run(name, args)
+        return
+    context = multiprocessing.get_context("spawn")
+    failed = []
+    for k in range(0, len(args.cases), args.processes):
+        names = args.cases[k : k + args.processes]
+        turns = context.Barrier(len(names)), context.Lock()
+        running = {name: context.Process(target=run, args=(name, args, *turns)) for name in names}
+        for process in running.values():
+            process.start()
+        for name, process in running.items():
+            process.join()
+            failed += [name] if process.exitcode else []
+    if failed:
+        raise SystemExit(f"{', '.join(failed)} failed; the errors are above")
+
+
+def run(name: str, args: argparse.Namespace, ready: Any = None, turn: Any = None) -> None:
+    """Compile a case for each number of devices, time it in turn once all are ``ready``, and print its lines."""
+    devices = jax.devices(args.device)
+    if len(devices) < max(args.devices):
+        raise SystemExit(f"expected {max(args.devices)} devices, got {len(devices)}. See --help for CPUs.")
+    if name == WEIGHTS:
+        make, show = trained_weights, compare
+    else:
+        make, show = partial(build, name), partial(measure, name)
+    try:
+        built: dict[int, Any] = {n: make(devices[:n], args.small) for n in args.devices}
+    finally:
+        if ready is not None:
+            ready.wait()
+    with nullcontext() if turn is None else turn:
+        show(built, args)
+
+
+def compare(weights: dict[int, tuple[np.ndarray, np.ndarray]], args: argparse.Namespace) -> None:
+    """Print the lines that compare weights before and after a training."""
+    first_start, first_end = weights[args.devices[0]]
+    for n in args.devices[1:]:
+        start, end = weights[n]
+        report(
+            args.device, benchmark="devices", case=WEIGHTS, n_devices=n, compared_with=args.devices[0],
+            same_start=bool(np.array_equal(start, first_start)),
+            difference=digits(float(np.linalg.norm(end - first_end))),
+            moved=digits(float(np.linalg.norm(first_end - first_start))), crazysim=__version__,
+        )  # fmt: skip
+
+
+def build(name: str, devices: list[jax.Device], small: bool) -> Case:
+    """Return a case on some devices."""
+    (make, size), n = CASES[name], len(devices)
+    n_worlds = size.small if small else size.n_worlds
+    place = {"device": devices[0], "mesh": world_mesh(devices) if n > 1 else None}
+    return make(n_worlds if name.startswith("seeds") else n * n_worlds, place, 4 if small else None)
+
+
+def measure(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None:
+    """Print the lines of a case."""
+    size = CASES[name][1]
+    states: dict[int, list[Any]] = {n: list(case.arguments) for n, case in cases.items()}
+
+    def seconds(n: int) -> float:
+        case, state = cases[n], states[n]
+        jax.block_until_ready(state)
+        begin = time.perf_counter()
+        for _ in range(N_CALLS):  # queued, as in a training
+            out = case.call(*state)
+            if case.carries:
+                state[0] = out[0]
+        jax.block_until_ready((state, out))
+        return (time.perf_counter() - begin) / N_CALLS
+
+    for n in cases:
+        seconds(n)
+        seconds(n)
+    taken = medians({n: partial(seconds, n) for n in cases}, args.repeats)
+    rates = {n: cases[n].work / taken[n] for n in cases}
+    for n, case in cases.items():
+        text, memory = case.call.as_text(), case.call.memory_analysis()
+        n_bytes = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
+        report(
+            args.device, benchmark="devices", case=name, n_devices=n, unit=size.unit,
+            n_worlds=size.small if args.small else size.n_worlds, call_s=digits(taken[n]), rate=digits(rates[n]),
+            ratio=digits(rates[n] / rates[args.devices[0]]),
+            exchanged=exchanged_bytes(text), memory_bytes=n_bytes - memory.alias_size_in_bytes,
+            compile_s=round(case.compile_s, 1), crazysim=__version__,
+        )  # fmt: skip
+
+
+def compiled(fn: Any, *arguments: Any, work: int, carries: bool = False, static: tuple[Any, ...] = ()) -> Case:
+    """Return the case of a jitted function."""
+    lowered = fn.lower(*arguments, *static)
+    begin = time.perf_counter()
+    call = lowered.compile()
+    return Case(call, arguments, carries, work, time.perf_counter() - begin)
+
+
+def physics(n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+    """Return steps of attitude commands."""
+    n_steps = few or 100
+    sim = Sim(n_worlds, control="attitude", **place)
+    hovering(sim, "attitude")
+    step = sim.build_step_fn()
+    return compiled(jax.jit(lambda data: (step(data, n_steps), ())), sim.data, work=n_worlds * n_steps, carries=True)
+
+
+def rollouts(task: str, flies: bool, n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+    """Return rollouts with automatic resets, with random actions or with a policy of two layers of 64."""
+    n_steps = few or 50
+    env = envs.AutoReset(envs.make(task, n_worlds, **place))
+    everywhere = replicated_sharding(env.sim)
+    state = jax.jit(env.reset)(jax.device_put(jax.random.key(0), everywhere))
+    shape, n_obs = state.action.shape, flatten(state.obs).shape[-1]
+    policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, env.actions.size), 0.01))
+    policy = jax.device_put(policy, everywhere)
+
+    def run(carry: Any, policy: Any) -> Any:
+        def act(obs: Any, memory: Any, key: Any) -> Any:
+            if flies:
+                return policy(obs) + 0.1 * jax.random.normal(key, shape), memory, ()
+            return jax.random.uniform(key, shape, minval=-0.3, maxval=0.3), memory, ()
+
+        state, key = carry
+        key, now = jax.random.split(key)
+        state, _, kept = envs.rollout(env, state, act, now, n_steps)
+        return (state, key), kept
+
+    carry = state, jax.device_put(jax.random.key(2), everywhere)
+    return compiled(jax.jit(run), carry, policy, work=n_worlds * n_steps, carries=True)
+
+
+def training(algorithm: Any, n_seeds: int, n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+    """Return iterations of a training of ``hover``, all of its seeds."""
+    recipe = TrainConfig.create("hover", "ppo" if algorithm is ppo else "apg", n_worlds=n_worlds).algorithm_config()
+    recipe = recipe if few is None else dataclasses.replace(recipe, n_steps=few)
+    base = envs.make("hover", n_seeds * n_worlds, **place)
+    env, recipes = envs.AutoReset(base) if algorithm is ppo else base, (recipe,) * n_seeds
+    everywhere = replicated_sharding(base.sim)
+    keys = jax.device_put(jax.random.split(jax.random.key(0), n_seeds), everywhere)
+    shapes = jax.eval_shape(partial(algorithm.init, env, recipes), keys)
+    shardings = learner_shardings(shapes, base.sim, n_seeds)
+    learner = jax.jit(algorithm.init, static_argnums=(0, 1), out_shardings=shardings)(env, recipes, keys)
+    iterate = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(shardings, everywhere))
+    work = n_seeds * n_worlds * recipe.n_steps
+    return compiled(iterate, learner, work=work, carries=True, static=(env, recipes))
+
+
+def gradient(n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+    """Return gradients of distances after some steps with respect to attitude commands."""
+    n_steps = few or 100
+    sim = Sim(n_worlds, control="attitude", **place)
+    hovering(sim, "attitude")
+    step, zeros = sim.build_step_fn(), sim.step_fn.zeros(sim.data)
+
+    def distance(cmd: Any, start: Any) -> Any:
+        end = step(functional.attitude_control(start, cmd), n_steps, zeros)
+        return jnp.sum((end.states.pos - start.states.pos) ** 2)
+
+    cmd = 1.01 * sim.data.controls.attitude.staged_cmd
+    return compiled(jax.jit(jax.grad(distance)), cmd, sim.data, work=n_worlds * n_steps)
+
+
+def depth(n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+    """Return depth images of a drone amid 30 movable poles, rays."""
+    size = (few, few) if few else IMAGE
+    sim = Sim(n_worlds, control="attitude", **place)
+    pos = np.zeros((30, 3))
+    pos[:, :2] = np.random.default_rng(0).uniform(-10, 10, (30, 2))
+    sim.scene.add("pole", count=30, pos=pos, mocap=True)
+    hovering(sim, "attitude")
+    look = sim.scene.depth_fn("fpv_cam", *size)
+    return compiled(jax.jit(lambda data: look(data).distance), sim.data, work=n_worlds * size[0] * size[1])
+
+
+def trained_weights(devices: list[jax.Device], small: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of a policy before and after three iterations of PPO."""
+    place = {"device": devices[0], "mesh": world_mesh(devices) if len(devices) > 1 else None}
+    with jax.default_matmul_precision("highest"):  # a GPU would round the products of each order of sums to 10 bits
+        case = training(ppo, 1, 256 if small else 16384, place, 4 if small else None)
+    learner = case.arguments[0]
+    weights = [learner.agents.policy]
+    for _ in range(3):
+        learner, _ = case.call(learner)
+    weights.append(learner.agents.policy)
+    first, last = (np.concatenate([np.ravel(x) for x in jax.tree.leaves(jax.device_get(x))]) for x in weights)
+    return first, last
+
+
+CASES: dict[str, tuple[Callable[..., Case], Size]] = {
+    "physics": (physics, Size(4194304, 64, "steps")),
+    "hover, random actions": (partial(rollouts, "hover", False), Size(1048576, 64, "environment steps")),
+    "hover, policy": (partial(rollouts, "hover", True), Size(1048576, 64, "environment steps")),
+    "race, random actions": (partial(rollouts, "race", False), Size(1048576, 64, "environment steps")),
+    "race, policy": (partial(rollouts, "race", True), Size(1048576, 64, "environment steps")),
+    "PPO": (partial(training, ppo, 1), Size(262144, 64, "environment steps")),
+    "analytic policy gradients": (partial(training, apg, 1), Size(16384, 64, "environment steps")),
+    "gradient": (gradient, Size(131072, 64, "steps")),
+    "depth": (depth, Size(16384, 8, "rays")),
+    "seeds": (partial(training, ppo, N_SEEDS), Size(16384, 16, "environment steps")),
+    "seeds, recipe": (partial(training, ppo, N_SEEDS), Size(1024, 16, "environment steps")),
+}
+"""Cases by name: function that builds one, and its size."""
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,179 @@
+"""Devices of a training, and the distribution of its arrays over them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import jax
+from jax.sharding import NamedSharding, PartitionSpec, SingleDeviceSharding
+
+from crazysim.core.settings import find_device
+from crazysim.core.sharding import WORLD_AXIS, shardings_of, world_mesh
+from crazysim.errors import ConfigError
+from crazysim.sim.sim import Sim
+
+Learner = TypeVar("Learner", bound=Any)
+Devices = str | int | Sequence[int]
+"""Devices of a training: ``"all"``, their number, or their indices among the devices of the platform; as text also
+``"2"`` and ``"0,2,3"``."""
+
+
+_COLLECTIVE = re.compile(
+    r" = (.*?) (all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast)(-start)?\("
+)
+_ARRAY, _CALLED = re.compile(r"(pred|[a-z]+(\d+))\[([\d,]*)\]"), re.compile(r"=\{?(%[\w.-]+(?:, %[\w.-]+)*)")
+_COMPUTATION, _TRIPS = re.compile(r"^(?:ENTRY )?(%[\w.-]+) .*\{$"), re.compile(r'"known_trip_count":\{"n":"(\d+)"')
+
+
+def evaluation_device(device: str | None, devices: Devices) -> str:
+    """Return the name of the device that evaluates the policies of a training on several devices.
+
+    Args:
+        device: Platform of the devices, or one of them, such as ``"gpu:1"``; None for JAX's default platform.
+        devices: Devices of the training.
+    """
+    device = jax.default_backend() if device is None else device
+    indices = _read_devices(devices)
+    is_platform = isinstance(device, str) and ":" not in device
+    return f"{device}:{indices[0]}" if is_platform and isinstance(indices, tuple) and indices[0] else device
+
+
+def find_devices(device: str, devices: Devices) -> list[jax.Device]:
+    """Return the devices of a training.
+
+    Args:
+        device: Platform of the devices, or one of them.
+        devices: The devices.
+
+    Raises:
+        ConfigError: If a device does not exist, or if ``devices`` is not one of the forms of ``Devices``.
+    """
+    chosen, platform = _read_devices(devices), find_device(device).platform
+    available = jax.devices(platform)
+    indices = list(chosen) if isinstance(chosen, tuple) else list(range(len(available) if chosen is None else chosen))
+    if missing := [i for i in indices if i >= len(available)]:
+        hint = "" if platform != "cpu" else (
+            " A CPU is one device, or N with XLA_FLAGS=--xla_force_host_platform_device_count=N in the environment."
+        )  # fmt: skip
+        raise ConfigError(
+            f"expected devices among the {len(available)} of {platform!r}, got {platform}:{missing[-1]}. Use "
+            f"--devices all, and --device for another platform.{hint}"
+        )
+    return [available[i] for i in indices]
+
+
+def place_worlds(device: str, devices: Devices, n_worlds: int) -> dict[str, Any]:
+    """Return the options of ``Sim`` with which its worlds are distributed over the devices of a training.
+
+    Args:
+        device: Platform of the devices, or one of them.
+        devices: The devices.
+        n_worlds: Number of worlds of all seeds.
+
+    Raises:
+        ConfigError: If a device does not exist, or if the worlds cannot be distributed evenly.
+    """
+    found = find_devices(device, devices)
+    n = len(found)
+    if n_worlds % n:
+        raise ConfigError(
+            f"expected a number of worlds that {n} devices divide, got {n_worlds}. Use for example --worlds "
+            f"{-(-n_worlds // n) * n}, or another number of --devices."
+        )
+    return {"device": found[0]} | ({"mesh": world_mesh(found)} if n > 1 else {})
+
+
+def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
+    """Return the sharding of every array of a learner, as a learner.
+
+    Arrays over worlds are split. Networks, optimisers and statistics are replicated, or split over the seeds where
+    their number is a multiple of the number of devices: then each device trains its own seeds.
+
+    Args:
+        shapes: Shapes of the learner.
+        sim: Simulation of the training environment.
+        n_seeds: Number of seeds.
+    """
+    mesh = sim.mesh
+    if mesh is None:
+        whole = SingleDeviceSharding(sim.device)
+        return jax.tree.map(lambda _: whole, shapes)
+    copied, split = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
+    agents = copied if n_seeds % mesh.size else split
+
+    def sharding(name: str, tree: Any) -> Any:
+        if name == "env":
+            return jax.tree.unflatten(jax.tree.structure(tree), jax.tree.leaves(shardings_of(tree.full_data, mesh)))
+        of_field = {"agents": agents, "memory": split}.get(name, copied)
+        return jax.tree.map(lambda _: of_field, tree)
+
+    return shapes.replace(**{f.name: sharding(f.name, getattr(shapes, f.name)) for f in dataclasses.fields(shapes)})
+
+
+def replicated_sharding(sim: Sim) -> jax.sharding.Sharding:
+    """Return the sharding of arrays of which every device of a simulation has a copy."""
+    return SingleDeviceSharding(sim.device) if sim.mesh is None else NamedSharding(sim.mesh, PartitionSpec())
+
+
+def exchanged_bytes(program: str) -> dict[str, int]:
+    """Return the bytes of the arrays that the devices exchange in one call of a compiled program, by operation.
+
+    The bodies of loops count as often as they run, where their number of rounds is known.
+
+    Args:
+        program: Text of the program, ``compiled.as_text()``.
+    """
+    computations: dict[str, list[str]] = {}
+    entry = name = ""
+    for line in program.splitlines():
+        if begin := _COMPUTATION.match(line):
+            name = begin[1]
+            entry = name if line.startswith("ENTRY") else entry
+        elif name:
+            computations.setdefault(name, []).append(line)
+
+    found: dict[str, int] = {}
+
+    def count(name: str, times: int) -> None:
+        for line in computations.get(name, ()):
+            if collective := _COLLECTIVE.search(line):
+                arrays, operation, started = collective.groups()
+                sizes = [
+                    math.prod(map(int, filter(None, shape.split(",")))) * max(int(bits or 8) // 8, 1)
+                    for _, bits, shape in _ARRAY.findall(arrays)
+                ]
+                # The beginning of a gather also lists its operands, which are smaller than its result.
+                n_bytes = max(sizes) if started and operation != "all-reduce" else sum(sizes)
+                found[operation] = found.get(operation, 0) + times * n_bytes
+            trips = _TRIPS.search(line) if " while(" in line else None
+            for names in [] if "-done(" in line or "-update(" in line else _CALLED.findall(line):
+                for called in names.split(", "):
+                    count(called, times * (int(trips[1]) if trips else 1))
+
+    count(entry, 1)
+    return found
+
+
+def _read_devices(devices: Devices) -> int | tuple[int, ...] | None:
+    """Return a number of devices, or their indices; None for all."""
+    if devices == "all":
+        return None
+    try:
+        if isinstance(devices, str):
+            numbers = [int(x) for x in devices.split(",")]
+            chosen = tuple(numbers) if len(numbers) > 1 else numbers[0]
+        else:
+            chosen = devices if isinstance(devices, int) else tuple([int(x) for x in devices])
+    except (TypeError, ValueError):
+        chosen = 0
+    indices = chosen if isinstance(chosen, tuple) else (chosen - 1,)
+    if isinstance(devices, bool) or not indices or min(indices) < 0 or len(set(indices)) < len(indices):
+        raise ConfigError(
+            f"expected 'all', a number of devices, or their indices, each once, got {devices!r}. Use for example "
+            f"--devices 2, or --devices 0,2,3."
+        )
+    return chosen
