@@ -17,7 +17,7 @@ DEEP = {("capsule", "ellipsoid"): 1e-2}
 
 @pytest.mark.parametrize("a, b", PAIRS)
 def test_convex_pairs(x64, rng, a, b):
-    check_pair(DRONES[a], SHAPES[b], rng, N, apart=1e-6, shallow=1e-3, deep=DEEP.get((a, b), 1e-3))
+    check_pair(DRONES[a], SHAPES[b], rng, N, apart_tolerance=1e-6, shallow=1e-3, deep=DEEP.get((a, b), 1e-3))
 
 
 @pytest.mark.parametrize("a, b", PAIRS)
