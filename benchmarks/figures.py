@@ -496,6 +496,12 @@ FIGURES: dict[str, Figure] = {
         gpu="devices.py --devices 1 2 --processes 12",
         table=tables.devices,
     ),
+    "trainers": Figure(
+        "docs/concepts/training-results.md",
+        (*ENVS, "crazysim/train"),
+        gpu="trainers.py --worlds 1024 65536 --seeds 3",
+        table=tables.trainers,
+    ),
     "training": Figure("docs/concepts/training-results.md", (*ENVS, "crazysim/train"), commits=training_commits),
     "validation": Figure(
         "docs/validation.md",

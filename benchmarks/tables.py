@@ -277,6 +277,18 @@ def limits(lines: list[Line]) -> str:
     return pivot(lines, case_of, worlds_of, lambda x: f"{1 / x['ratio']:.0%}", "Commands, worlds")
 
 
+def trainers(lines: list[Line]) -> str:
+    """Return the table of ``trainers.py``."""
+    names = {"crazysim": "crazysim", "brax": "Brax", "rsl_rl": "RSL-RL"}
+    return columns(
+        Worlds=worlds_of,
+        Trainer=lambda x: f"{names[x['trainer']]} {x['version']}" + (f", torch {x['torch']}" if "torch" in x else ""),
+        Environment_steps_a_second=lambda x: si(x["env_steps_per_s"]),
+        Training_without_compilation=lambda x: f"{si(x['env_steps'])} steps in {duration(x['seconds'])}",
+        Success_of_each_seed=lambda x: ", ".join(f"{success:.1%}" for success in x["success"]),
+    )(lines)
+
+
 def readme(records: list[Line]) -> str:
     """Return the table of README.md: two cores without AVX-512, and one H100."""
     kinds = {"cpu": "AVX2", "gpu": "H100"}

@@ -7,7 +7,8 @@
 
 All seeds of a task are trained by one process, ``crazysim train TASK --seeds ...``, so its time includes imports,
 building, compilation and evaluation of all of them; ``--together`` limits the seeds of a process. A JSON line for each
-seed, as its process ends, and one for each task, with medians over its seeds.
+seed, as its process ends, and one for each task, with medians over its seeds. A seed that diverges counts
+as no success, and is named.
 
 Finished seeds are kept in one file, ``results.jsonl`` of the folder ``--out``, and are not trained again while the
 sources of the package are the same: an interrupted command continues where it was, also on another machine that is
@@ -45,6 +46,7 @@ from crazysim.envs.registry import TASKS, entry_of
 from crazysim.train.config import find_recipe
 from crazysim.train.show import read_curve
 from crazysim.train.training import CHECKPOINT, kept_point, least_kept_success, stored_configs
+from crazysim.train.training import TABLE as SEEDS_TABLE
 
 PACKAGE = Path(crazysim.__file__).parent
 TABLE = Path(__file__).parents[1] / "docs" / "concepts" / "training-results.json"
@@ -54,7 +56,7 @@ PAGE = TABLE.with_suffix(".md")
 TABLE_START, TABLE_END = "<!-- table of benchmarks/train.py -->", "<!-- end of the table -->"
 STARTS = 1000
 """Held-out starts of an evaluation of ``crazysim train``."""
-TABLE_COLUMNS = ("task", "seed", "success", "crashed", "error", "seconds")
+TABLE_COLUMNS = ("task", "seed", "success", "diverged", "crashed", "error", "seconds")
 """Entries of a result that are printed."""
 
 
@@ -227,18 +229,26 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
         last_line = (log.read_text().strip().splitlines() or ["no output"])[-1]
         raise RuntimeError(f"status {process.returncode}, {last_line} (see {log})")
     algorithm = next(iter(stored_configs(folder).values())).algorithm
-    results = [read_result(folder / f"seed-{key[1]}") for key in group]
+    diverged = {row["seed"]: row["diverged"] for row in json.loads((folder / SEEDS_TABLE).read_text())}
+    results = [read_result(folder / f"seed-{key[1]}", diverged[key[1]]) for key in group]
     shared = {"algorithm": algorithm, "wall_s": digits(wall_s), "together": len(group)}
     return [result | shared for result in results]
 
 
-def read_result(folder: Path) -> dict[str, Any]:
-    """Return the results of one seed from its learning curve; the seconds are the time of all seeds of its process."""
+def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
+    """Return the results of one seed from its learning curve; seconds are those of all seeds of its process.
+
+    Args:
+        folder: Folder of the seed.
+        diverged: Iteration in which its numbers became NaN or infinite, which counts as no success; None if they did
+            not.
+    """
     curve = read_curve(folder)
     point, last_point = kept_point(curve), curve[-1]
     solved = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
     return {
-        "success": round(point["success"], 4),
+        "success": round(point["success"], 4) if diverged is None else 0.0,
+        "diverged": diverged,
         "crashed": round(point["crashed"], 4),
         "error": digits(point["error"]) if point["error"] == point["error"] else None,
         "kept_iteration": point["iteration"],
@@ -254,7 +264,9 @@ def make_row(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the row of a task: quantiles of the success over its seeds, and medians of error and time."""
     success = [run["success"] for run in runs]
     errors = [run["error"] for run in runs if run["error"] is not None]
-    row: dict[str, Any] = {name: runs[-1][name] for name in ("task", "algorithm", "env_steps")}
+    row: dict[str, Any] = {name: runs[-1][name] for name in ("task", "algorithm")}
+    diverged = sorted(run["seed"] for run in runs if run.get("diverged") is not None)
+    row |= {"env_steps": max(run["env_steps"] for run in runs)} | ({"diverged": diverged} if diverged else {})
     row |= {
         "seeds": sorted(run["seed"] for run in runs),
         "least": min(success),
@@ -288,10 +300,11 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         seeds = row["seeds"]
         is_range = seeds == list(range(seeds[0], seeds[-1] + 1)) and len(seeds) > 2
+        diverged = f"; diverged: {', '.join(map(str, row['diverged']))}" if "diverged" in row else ""
         cells = (
             f"`{row['task']}`",
             f"{names[row['algorithm']]}, {digits(row['env_steps'] / 1e6, 2):g} M",
-            f"{seeds[0]} to {seeds[-1]}" if is_range else ", ".join(map(str, seeds)),
+            (f"{seeds[0]} to {seeds[-1]}" if is_range else ", ".join(map(str, seeds))) + diverged,
             f"{row['least']:.1%}",
             f"{row['median']:.1%}",
             "" if row["error"] is None else f"{digits(row['error'], 2):g} {row['unit']}",

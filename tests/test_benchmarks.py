@@ -315,6 +315,19 @@ def test_the_page_shows_the_committed_table(benchmarks):
     assert shown.strip() == train.markdown(json.loads(train.TABLE.read_text()))
 
 
+def test_a_seed_that_diverged_is_named_and_counts_as_no_success(run, train, tmp_path):
+    """Its last kept policy may succeed, but its training did not end; before, it was a row like any other."""
+    curve = [{"iteration": 20, "success": 0.97, "crashed": 0.0, "error": 0.01, "env_steps": 10, "seconds": 1.0,
+              "compile_seconds": 0.5, "kept": True}]  # fmt: skip
+    (tmp_path / "curve.json").write_text(json.dumps(curve))
+    lost = train.read_result(tmp_path, 33)
+    assert (train.read_result(tmp_path, None)["success"], lost["success"], lost["diverged"]) == (0.97, 0.0, 33)
+    about = {"task": "hover", "algorithm": "ppo", "commit": "0", "date": "0", "machine": "0", "jax": "0", "parallel": 1}
+    row = train.make_row([train.read_result(tmp_path, x) | about | {"seed": i} for i, x in enumerate((None, 33))])
+    assert (row["least"], row["diverged"]) == (0.0, [1])
+    assert "| 0, 1; diverged: 1 | 0.0% |" in train.markdown([row])
+
+
 @pytest.mark.long("trains in a process of its own")
 def test_a_training_that_fails_leaves_the_others_which_are_not_trained_again(run, train, tmp_path, capsys):
     options = ("--seeds", "0:2", "--parallel", "2", "--out", tmp_path, "--")

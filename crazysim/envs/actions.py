@@ -106,7 +106,7 @@ def _drone_actions(airframe: Airframe, params: SimParams, control: Control, tilt
     params = jax.tree.map(lambda scope, x: fetch_rows(x, (0, drone)) if scope == "drone" else x, scopes(params), params)
     n_rotors = airframe.n_rotors
     max_thrust = float(airframe.value("rotors.thrust_max", ()))
-    hover = float(hover_thrust(params)[0])
+    hover = float(jax.jit(hover_thrust)(params)[0])  # one program, where each operation would be one
     thrust_range = n_rotors * max_thrust - hover
     if control == Control.attitude:
         return Actions(np.array([0, 0, 0, hover]), np.array([tilt, tilt, MAX_YAW, thrust_range]), control)

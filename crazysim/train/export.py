@@ -22,7 +22,7 @@ from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
 from crazysim.errors import ConfigError, not_installed
 from crazysim.storage import write_file
-from crazysim.train.networks import MEMORYLESS, Gru, Policy
+from crazysim.train.networks import Gru, Policy
 
 OBSERVATIONS = {
     "pos": "position, world frame, m",
@@ -233,7 +233,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
 
 def _check_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     """Return the numbers of a policy, after checking them."""
-    if policy.network is not MEMORYLESS and not isinstance(policy.body, Gru):
+    if not policy.network.is_built_in:
         raise ConfigError(
             "expected a policy with the built-in network, got one with a network of your own. Export it with its "
             "library, or with jax.export."

@@ -24,7 +24,7 @@ LIMITS = ("max_grad_norm",)
 
 COUNTS = ("memory",)
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
-CHOICES = {"critic": ("observations", "privileged", "all_drones")}
+CHOICES = {"critic": ("observations", "privileged", "all_drones", "all_drones_privileged")}
 """Hyperparameters that are one of some words."""
 
 

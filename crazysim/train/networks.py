@@ -89,6 +89,11 @@ class Network:
         """True if the network keeps a memory between steps."""
         return bool(jax.tree.leaves(self.initial_memory))
 
+    @property
+    def is_built_in(self) -> bool:
+        """True if it is a built-in network, without memory or with that of a ``Gru``."""
+        return self.apply in (MEMORYLESS.apply, _apply_gru)
+
     def make_memory(self, *batch: int) -> Any:
         """Return the memory at the start of an episode. (*batch, ...) each"""
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *jnp.shape(x))), self.initial_memory)
@@ -135,11 +140,12 @@ def _gru_network(size: int, dtype: np.dtype) -> Network:
         ((recurrent, _),) = init_mlp(k_recurrent, (size, 3 * size), 1.0)
         return Gru(inputs, recurrent, bias)
 
-    def apply(gru: Gru, obs: Array, memory: Array) -> tuple[Array, Array]:
-        memory = gru(obs, memory)
-        return jnp.concatenate([obs, memory]), memory
+    return Network(init, _apply_gru, np.zeros(size, dtype))
 
-    return Network(init, apply, np.zeros(size, dtype))
+
+def _apply_gru(gru: Gru, obs: Array, memory: Array) -> tuple[Array, Array]:
+    memory = gru(obs, memory)
+    return jnp.concatenate([obs, memory]), memory
 
 
 def choose_network(memory: int, network: Network | None) -> Network:

@@ -32,6 +32,8 @@ from crazysim.train.networks import (
 )
 from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates
 
+PRIVILEGED_CRITICS = ("privileged", "all_drones_privileged")
+"""Critics that see the observation of ``PrivilegedObservation``."""
 MAX_GROUPS = 64
 """Largest number of groups of neighbouring worlds. A minibatch takes the same number of worlds from every group. A
 device holds whole groups, so it needs no samples of others, and minibatches do not depend on the number of devices."""
@@ -55,7 +57,8 @@ class Config:
     """Size of the memory of policy and value function, a gated recurrent unit before the hidden layers; 0 for none."""
     critic: str = "observations"
     """Inputs of the value function: ``observations``, the observations of the policy; ``privileged``, the same and the
-    true state and parameters of the drone; ``all_drones``, the observations of all drones of the world."""
+    true state and parameters of the drone; ``all_drones``, the observations of all drones of the world;
+    ``all_drones_privileged``, those and the true states and parameters of all of them."""
     learning_rate: float = 1e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     discount: float = 0.98
@@ -147,7 +150,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
 
     Args:
         env: Environment that resets automatically within the step that ends an episode, with a block of worlds for
-            each seed; with the wrapper ``PrivilegedObservation`` for ``critic="privileged"``.
+            each seed; with the wrapper ``PrivilegedObservation`` for a privileged critic. Statistics of a
+            ``Normalize`` wrapper are those of the worlds of all seeds.
         configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
         network: Network of your own, for policy and value function; None for the built-in one.
@@ -162,7 +166,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     hidden_sizes = config.hidden if network is None else ()
     network = choose_network(config.memory, network)
     state = env.reset(k_env)
-    n_obs = flatten({name: x for name, x in state.obs.items() if name != PRIVILEGED}).shape[-1]
+    n_obs = flatten(_policy_obs(state.obs, config)).shape[-1]
 
     def init_agent(k_policy: Array, k_value: Array, key: Array, obs: Array) -> Agent:
         n_actions = env.actions.size
@@ -377,25 +381,30 @@ def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.
 
 def _critic_obs(obs: Obs, config: Config) -> Array:
     """Return the observations of the policy, followed by observations that only the critic may use. (..., k)"""
-    if config.critic != "privileged":
+    if config.critic not in PRIVILEGED_CRITICS:
         return flatten(obs)
     if PRIVILEGED not in obs:
         raise ConfigError(
-            f"expected the observation {PRIVILEGED!r} for critic='privileged', got {', '.join(obs)}. Use "
+            f"expected the observation {PRIVILEGED!r} for critic={config.critic!r}, got {', '.join(obs)}. Use "
             f"AutoReset(PrivilegedObservation(env))."
         )
-    policy_obs = {name: x for name, x in obs.items() if name != PRIVILEGED}
-    return jnp.concatenate([flatten(policy_obs), obs[PRIVILEGED]], axis=-1)
+    return jnp.concatenate([flatten(_policy_obs(obs, config)), obs[PRIVILEGED]], axis=-1)
+
+
+def _policy_obs(obs: Obs, config: Config) -> Obs:
+    """Return the observations of the policy: all of them, except for a privileged critic's."""
+    is_hidden = config.critic in PRIVILEGED_CRITICS
+    return {name: x for name, x in obs.items() if not (is_hidden and name == PRIVILEGED)}
 
 
 def _critic_input(obs: Array, config: Config) -> Array:
-    """Return the inputs of the value function for each drone; ``all_drones`` appends the observations of the others.
+    """Return the inputs of the value function for each drone, to which a critic of all drones appends the others'.
 
     Args:
         obs: Result of ``_critic_obs``, normalised or not. (..., n_drones, k)
         config: Hyperparameters.
     """
-    if config.critic != "all_drones":
+    if config.critic not in ("all_drones", "all_drones_privileged"):
         return obs
     return jnp.concatenate([jnp.roll(obs, -i, axis=-2) for i in range(obs.shape[-2])], axis=-1)
 

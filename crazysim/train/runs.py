@@ -71,11 +71,14 @@ def run(
         plot_curve({config.title: read_curve(folder)}, folder / "curve.png")
         plot_episode(result.env, result.policy, folder / "episode.png")
         log(f"wrote {folder / 'curve.png'}, {folder / 'episode.png'}")
+    except ImportError as error:
+        log(f"no plots: {error}")
+    try:
         if film:
             film_policy(config.make_env(4), result.policy, folder / "policy.mp4", progress=progress)
             log(f"wrote {folder / 'policy.mp4'}")
     except (ImportError, RenderError) as error:
-        log(f"no curve or film: {error}")
+        log(f"no film: {error}")
     return result
 
 
@@ -139,7 +142,7 @@ def run_many(
         plot_spread(curves, folder / "curve.png")
         log(f"wrote {folder / 'curve.png'}")
     except ImportError as error:
-        log(f"no curve: {error}")
+        log(f"no plot: {error}")
     return results
 
 

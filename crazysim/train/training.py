@@ -155,11 +155,13 @@ def train_many(
     n_iterations, n_steps = hyperparameters[0].iterations, hyperparameters[0].n_steps
     base_env = config.make_training_env(n_trainings)
     wrapped_env = dagger.wrap_with_teacher(base_env, hyperparameters[0]) if algorithm is dagger else base_env
-    wrapped_env = PrivilegedObservation(base_env) if config.config.get("critic") == "privileged" else wrapped_env
+    is_privileged = config.config.get("critic") in ppo.PRIVILEGED_CRITICS
+    wrapped_env = PrivilegedObservation(base_env) if is_privileged else wrapped_env
     env = base_env if algorithm is apg else AutoReset(wrapped_env)
     eval_env = config.make_env(n_trainings * evaluation_worlds)
     check_key = jax.random.key(CHECK_SEED)
-    keys = jnp.stack([jax.random.fold_in(jax.random.key(training.config.seed), 1) for training in trainings])
+    seed_keys = [jax.random.key(training.config.seed) for training in trainings]
+    keys = jax.jit(lambda keys: jnp.stack([jax.random.fold_in(key, 1) for key in keys]))(seed_keys)
     init_fn = algorithm.init if config.network is None else partial(algorithm.init, network=config.network)
     init, iterate_fn = jax.jit(init_fn, static_argnums=(0, 1)), algorithm.iterate
     shapes = init.eval_shape(env, hyperparameters, keys)
@@ -188,10 +190,10 @@ def train_many(
         return evaluate_blocks(eval_env, jax.device_put(policy, eval_env.sim.device), key, n_trainings)
 
     @keep_programs()
-    def compile_evaluation() -> dict[str, Any]:
+    def compile_evaluation() -> tuple[dict[str, Any], str]:
         zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy_shapes)
         evaluate_policies(zeros, None)
-        return describe(base_env)
+        return describe(base_env), base_env.sim.explain().splitlines()[0]
 
     @keep_programs()
     def compile_iteration() -> tuple[Any, float]:
@@ -203,7 +205,7 @@ def train_many(
     with announce_if_slow("compiling the training", "5 to 20 s"), compiling_threads(3) as executor:
         iteration_future, init_future = executor.submit(compile_iteration), executor.submit(load_or_init)
         evaluation_future = executor.submit(compile_evaluation)
-        (learner, kept_policies), description = init_future.result(), evaluation_future.result()
+        (learner, kept_policies), (description, engine) = init_future.result(), evaluation_future.result()
         iterate, compile_s = iteration_future.result()
     for training, policy in zip(trainings, kept_policies, strict=True):
         training.kept_policy = policy
@@ -215,8 +217,7 @@ def train_many(
         f"{config.title} by {config.algorithm}, {f'seed {config.seed}' if n_trainings == 1 else ', '.join(configs)}: "
         f"{n_iterations} iterations of {times}{steps_per_iteration:,} steps in {times}{config.n_worlds:,} worlds, "
         f"{_describe_devices(base_env.sim, iterate)}"
-        f"{base_env.sim.control.value} commands, "
-        f"{base_env.sim.explain().splitlines()[0]}" + (f"; continues after iteration {n_done}" if n_done else "")
+        f"{base_env.sim.control.value} commands, {engine}" + (f"; continues after iteration {n_done}" if n_done else "")
     )
     if stored_code != code:
         log("the file of the task has changed since the checkpoint was written; it is used as it is now")
@@ -234,68 +235,78 @@ def train_many(
         checkpoint.save(path, {"learner": learner, "kept": [training.kept_policy for training in trainings]}, meta)
         saved_iteration, save_time = int(learner.iteration), time.perf_counter()
 
-    def evaluate_and_save(learner: Learner, interrupted: bool = False) -> list[dict[str, Any]]:
+    def evaluate_and_save(learner: Learner, metrics: dict[str, Array]) -> list[dict[str, Any]]:
         """Evaluate the policies, keep each if none was clearly better, write all files, and return the points."""
         iteration, policies = int(learner.iteration), jax.device_get(learner.as_policy())
-        stop_diverged(finite, iteration)
-        metrics, checks = evaluate_policies(policies, None), evaluate_policies(policies, check_key)
+        stop_diverged(metrics, iteration)
+        is_planned = iteration % evaluation_period == 0 or iteration == n_iterations
+        results, checks = evaluate_policies(policies, None), evaluate_policies(policies, check_key)
         counters = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds()}
         for i, training in enumerate(trainings):
             if training.divergence_iteration is None:
-                point = counters | metrics[i] | {"compile_seconds": compile_s, "check": checks[i]["success"]}
-                training.add_evaluation(point, take_seed(policies, i), evaluation_worlds, description, interrupted)
-        if n_trainings > 1:
+                point = counters | results[i] | {"compile_seconds": compile_s, "check": checks[i]["success"]}
+                training.add_evaluation(point, take_seed(policies, i), evaluation_worlds, description, is_planned)
+        if "" not in configs:
             write_table(folder, [training.row for training in trainings])
         save_checkpoint(learner)
         return [training.curve[-1] for training in trainings]
 
-    def stop_diverged(finite: Any, iteration: int) -> None:
-        """Mark the trainings that have diverged; raise an error if all have."""
-        for training, is_finite in zip(trainings, np.asarray(finite), strict=True):
+    def stop_diverged(metrics: dict[str, Array], iteration: int) -> None:
+        """Mark the trainings that have diverged according to the metrics of an iteration; raise an error if all have.
+
+        Args:
+            metrics: Metrics of the iteration; none before the first one.
+            iteration: Number of the iteration.
+        """
+        finite = np.asarray(metrics.get("finite", np.full(n_trainings, True)))
+        for training, is_finite in zip(trainings, finite, strict=True):
             if is_finite or training.divergence_iteration is not None:
                 continue
             training.divergence_iteration = iteration
             if n_trainings > 1:
                 log(f"{training.name} diverged: NaN or infinity in iteration {iteration}; the others go on")
         if all(training.divergence_iteration is not None for training in trainings):
+            names = [f" ({training.name})" * (n_trainings > 1) for training in trainings]
+            diverged = [f"{x.divergence_iteration}{name}" for x, name in zip(trainings, names, strict=True)]
+            kept = [f"{kept_point(x.curve)['iteration']}{name}" for x, name in zip(trainings, names, strict=True)]
             raise DivergedError(
-                f"expected finite weights and losses, got NaN or infinity in iteration {iteration} of {config.title} "
-                f"by {config.algorithm}; {path} is of iteration {saved_iteration}, {POLICY} of "
-                f"iteration {kept_point(trainings[0].curve)['iteration']}. Use a smaller learning_rate or "
-                f"max_grad_norm, with another --out."
+                f"expected finite weights and losses, got NaN or infinity in iteration {', '.join(diverged)} of "
+                f"{config.title} by {config.algorithm}; {path} is of iteration {saved_iteration}, {POLICY} of "
+                f"iteration {', '.join(kept)}. Use a smaller learning_rate or max_grad_norm, with another --out."
             )
 
-    finite: Any = np.full(n_trainings, True)
-    metrics: dict[str, Array] = {}
-    if not resume:
-        evaluate_and_save(learner)
     evaluation_period = find_recipe(config.task, config.algorithm).evaluate_every
+    # Learner and metrics are replaced together, so an interrupt never leaves a learner with the metrics of another.
+    learner_and_metrics: tuple[Learner, dict[str, Array]] = learner, {}
     try:
+        if not resume:
+            evaluate_and_save(*learner_and_metrics)
         with _iteration_bar(n_iterations, n_done, progress) as show_progress:
             for i in range(n_done, n_iterations):
-                learner, metrics = iterate(learner)
-                stop_diverged(finite, i)  # checks the previous iteration while this one runs
-                finite = metrics["finite"]
-                show_progress(metrics if i % 5 == 0 else None)
+                metrics_before = learner_and_metrics[1]
+                learner_and_metrics = iterate(learner_and_metrics[0])
+                stop_diverged(metrics_before, i)  # waits for the previous iteration while this one runs
+                show_progress(learner_and_metrics[1] if i % 5 == 0 else None)
                 points = None
                 if (i + 1) % evaluation_period == 0 and i + 1 < n_iterations:
-                    points = evaluate_and_save(learner)
+                    points = evaluate_and_save(*learner_and_metrics)
                     show_progress(
                         {name: [point[name] for point in points] for name in ("success", "error", "reward")}, 0
                     )
                 elif checkpoint_every is not None and time.perf_counter() - save_time > checkpoint_every:
-                    stop_diverged(finite, i + 1)
-                    save_checkpoint(learner)
+                    stop_diverged(learner_and_metrics[1], i + 1)
+                    save_checkpoint(learner_and_metrics[0])
                 if on_iteration is not None and i + 1 < n_iterations:
-                    on_iteration(i + 1, _host_metrics(metrics, points))
+                    on_iteration(i + 1, _host_metrics(learner_and_metrics[1], points))
+        final_points = evaluate_and_save(*learner_and_metrics)
     except (KeyboardInterrupt, SystemExit):
-        jax.block_until_ready(learner)
-        evaluate_and_save(learner, interrupted=True)
-        log(f"interrupted after iteration {int(learner.iteration)}; wrote {path}; continue with --resume")
+        evaluate_and_save(*learner_and_metrics)
+        log(
+            f"interrupted after iteration {int(learner_and_metrics[0].iteration)}; wrote {path}; continue with --resume"
+        )
         raise
-    final_points = evaluate_and_save(learner)
-    if on_iteration is not None and metrics:
-        on_iteration(n_iterations, _host_metrics(metrics, final_points))
+    if on_iteration is not None and learner_and_metrics[1]:
+        on_iteration(n_iterations, _host_metrics(learner_and_metrics[1], final_points))
     criterion = f"error below {base_env.task.tolerance:g} {base_env.task.unit} for the last {base_env.task.hold:g} s"
     if type(base_env.task).succeeded is not Task.succeeded:
         criterion = "as the task judges it"
@@ -338,9 +349,17 @@ class _Training:
     """Iteration in which it became non-finite; None if it did not."""
 
     def add_evaluation(
-        self, point: dict[str, Any], policy: Policy, n_starts: int, description: dict[str, Any], interrupted: bool
+        self, point: dict[str, Any], policy: Policy, n_starts: int, description: dict[str, Any], is_planned: bool
     ) -> None:
-        """Add an evaluation to the curve, keep the policy if no earlier one was clearly better, and write both."""
+        """Add an evaluation to the curve, keep the policy if no earlier one was clearly better, and write both.
+
+        Args:
+            point: Counters and metrics of the evaluation.
+            policy: The evaluated policy.
+            n_starts: Number of starts of the check set.
+            description: Description of the policy's inputs and outputs.
+            is_planned: True if an uninterrupted run makes this evaluation too. Others must not influence a resumed run.
+        """
         self.curve[:] = [earlier for earlier in self.curve if earlier["iteration"] < point["iteration"]]
         best_check = max((earlier["check"] for earlier in self.curve if earlier["kept"]), default=0.0)
         point["kept"] = point["check"] >= least_kept_success(best_check, n_starts)
@@ -348,8 +367,7 @@ class _Training:
         checkpoint.save(self.folder / POLICY, best, self.meta | description)
         with replacing(self.folder / CURVE) as file:
             file.write(json.dumps([*self.curve, point], indent=1).encode())
-        # An uninterrupted run makes no evaluation here, so this one must not influence the resumed run.
-        self.kept_policy, point["kept"] = (self.kept_policy, False) if interrupted else (best, point["kept"])
+        self.kept_policy, point["kept"] = (best, point["kept"]) if is_planned else (self.kept_policy, False)
         self.curve.append(point)
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.envs import AutoReset, DroneEnv, PrivilegedObservation, RandomizeWith, make, state_of, uniform
+from crazysim.envs import AutoReset, DroneEnv, Observe, PrivilegedObservation, RandomizeWith, make, state_of, uniform
 from crazysim.envs.state import flatten
 from crazysim.envs.tasks.hover import Hover
 from crazysim.lab.live.link import TrainedPolicy
@@ -234,11 +234,35 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
         PrivilegedObservation(PrivilegedObservation(base)).reset(jax.random.key(0))
 
 
+def test_an_observation_of_the_task_may_be_named_privileged(rng):
+    """Without a privileged critic it is an observation like the others: before, the policy got its first columns and
+    was trained without the last ones."""
+    base = make("hover", 2, seconds=0.06, engine="interpret")
+    add = lambda obs, data: obs | {"privileged": data.states.rotor_vel, "zeros": 0 * obs["pos"]}  # noqa: E731
+    env = AutoReset(Observe(base, add))
+    learner, _ = started(env, minibatches=1)
+    n_obs = flatten(learner.env.obs).shape[-1]
+    assert learner.agents.n_obs == n_obs == take_seed(learner.as_policy(), 0).stats.mean.shape[0]
+    assert learner.agents.policy.layers[0][0].shape[1] == n_obs
+
+
 def test_a_critic_of_all_drones_gets_the_observations_of_each_its_own_first():
     obs = jnp.arange(2 * 3 * 2).reshape(2, 3, 2)
     seen = np.asarray(ppo._critic_input(obs, ppo.Config(critic="all_drones")))
     np.testing.assert_array_equal(seen[0], [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5, 0, 1], [4, 5, 0, 1, 2, 3]])
     np.testing.assert_array_equal(seen[1, 2], [10, 11, 6, 7, 8, 9])
+
+
+def test_a_critic_may_see_all_drones_and_their_true_states():
+    """Its inputs are the observations and privileged observations of each drone; the policy has its own alone."""
+    base = make("swarm", 2, seconds=0.1, engine="interpret")
+    env = AutoReset(PrivilegedObservation(base))
+    learner, _ = started(env, minibatches=1, critic="all_drones_privileged")
+    sizes = {name: x.shape[-1] for name, x in learner.env.obs.items()}
+    n_obs = sum(sizes.values()) - sizes["privileged"]
+    agent = take_seed(learner.agents, 0)
+    assert agent.value.layers[0][0].shape[0] == base.sim.n_drones * (n_obs + sizes["privileged"])
+    assert agent.policy.layers[0][0].shape[0] == agent.n_obs == n_obs
 
 
 @pytest.mark.long("compiles a training")

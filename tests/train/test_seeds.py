@@ -13,6 +13,7 @@ from crazysim import ConfigError
 from crazysim.__main__ import main
 from crazysim.core.random import drone_keys, world_keys
 from crazysim.envs import AutoReset, make
+from crazysim.errors import DivergedError
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import config as configs
 from crazysim.train import training as trainings
@@ -172,6 +173,29 @@ def test_a_seed_of_a_run_is_that_of_a_run_alone_and_resumes(tmp_path, monkeypatc
     for mine, other in zip(read_curve(whole / "seed-1"), read_curve(alone / "seed-1"), strict=True):
         for name in ("success", "error", "reward", "check"):
             np.testing.assert_allclose(mine[name], other[name], rtol=1e-3, err_msg=name)
+
+
+@pytest.mark.long("compiles a training of two seeds")
+def test_seeds_that_are_interrupted_before_the_first_iteration_have_files_and_all_that_diverged_are_named(
+    tmp_path, monkeypatch
+):
+    """Before, the interrupt ended in StopIteration, and the error named one iteration of one seed."""
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    sweep = {"learning_rate": [1e38, 2e38]}
+    with monkeypatch.context() as patch:
+        patch.setattr(trainings, "_iteration_bar", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            trained(tmp_path, sweep=sweep)
+    first, second = "learning_rate-1e+38-seed-0", "learning_rate-2e+38-seed-0"
+    assert [row["iteration"] for row in json.loads((tmp_path / "seeds.json").read_text())] == [0, 0]
+    assert [point["kept"] for point in read_curve(tmp_path / first)] == [True]
+    where = rf"2 \({re.escape(first)}\), 2 \({re.escape(second)}\)"
+    expected = rf"NaN or infinity in iteration {where} of hover .*policy\.npz of iteration 0 \("
+    with pytest.raises(DivergedError, match=expected):
+        trained(tmp_path, sweep=sweep, resume=True)
 
 
 def test_wrong_seeds_and_sweeps_are_refused(capsys, tmp_path):

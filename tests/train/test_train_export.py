@@ -15,7 +15,7 @@ from crazysim import ConfigError
 from crazysim.envs import make
 from crazysim.envs.statistics import RunningStats
 from crazysim.train.export import describe, to_c, to_onnx
-from crazysim.train.networks import Policy, gru_network, init_mlp, init_weights
+from crazysim.train.networks import Network, Policy, gru_network, init_mlp, init_weights
 
 FLAGS = ("-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 
@@ -210,6 +210,15 @@ def test_a_policy_of_other_sizes_or_with_nan_is_refused(tmp_path, policy, meta, 
     with pytest.raises(ConfigError, match="expected finite weights, got NaN or infinity"):
         write(policy.replace(layers=broken), path, meta)
     assert not path.exists()
+
+
+def test_a_network_of_your_own_with_the_weights_of_a_gru_is_refused(tmp_path, policy, meta):
+    """Before, only the type of the weights was checked, and the file computed another function."""
+    remembers = remembering(policy, 3)
+    network = Network(remembers.network.init, lambda gru, obs, memory: (obs, -gru(obs, memory)), np.zeros(3))
+    with pytest.raises(ConfigError, match="expected a policy with the built-in network, got one with a network of y"):
+        to_c(remembers.replace(network=network), tmp_path / "policy.h", meta)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["", "2fast", "fly away", "a-b", "é"])

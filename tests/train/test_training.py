@@ -357,7 +357,7 @@ INVALID = {
     "memory of a fraction": ({"memory": 0.5}, "expected memory as a whole number of at least 0, got 0.5"),
     "critic": (
         {"critic": "all"},
-        "expected critic as one of observations, privileged, all_drones, got 'all'. Use for example observations",
+        "expected critic as one of observations, privileged, all_drones, all_drones_privileged, got 'all'",
     ),
     "discount": ({"discount": 1.01}, "expected discount as a number from 0 to 1, got 1.01"),
     "value_weight": ({"value_weight": -1}, "expected value_weight as a finite number of at least 0, got -1"),
@@ -409,6 +409,58 @@ def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(tmp_path):
     policy, _, _ = load_policy(tmp_path)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(policy))
     assert all(np.isfinite(x).all() for name, x in arrays(tmp_path).items() if ".policy" in name)
+
+
+def interrupting(name, count):
+    """Return a function for ``sys.settrace`` that presses Ctrl-C where a function of that name is called again."""
+    calls = [0]
+
+    def trace(frame, event, _):
+        if event == "call" and frame.f_code.co_name == name:
+            calls[0] += 1
+            if calls[0] == count:
+                raise KeyboardInterrupt
+
+    return trace
+
+
+@pytest.fixture
+def traced():
+    """Return ``sys.settrace``, and remove what it set."""
+    before = sys.gettrace()
+    yield sys.settrace
+    sys.settrace(before)
+
+
+def test_an_interrupt_before_nan_is_found_keeps_the_last_checkpoint(tmp_path, traced):
+    """The first iteration diverges, which is only looked at while the second one runs. Before, Ctrl-C in between wrote
+    the weights that are not finite."""
+    config = small_config(config=SMALL | {"iterations": 4, "learning_rate": 1e38})
+    traced(interrupting("stop_diverged", 2))  # the first call is that of the evaluation before the training
+    with pytest.raises(DivergedError, match=r"NaN or infinity in iteration 1 of hover .*iteration 0\. Use a sm"):
+        trained(tmp_path, config)
+    assert [point["iteration"] for point in read_curve(tmp_path)] == [0]
+    assert all(np.isfinite(x).all() for name, x in arrays(tmp_path).items() if ".policy" in name)
+
+
+def test_an_interrupt_during_a_planned_evaluation_leaves_the_curve_of_an_uninterrupted_run(
+    tmp_path, monkeypatch, traced
+):
+    """Before, its point was marked as not kept, so that the resumed run could end with another policy."""
+    recipe = dataclasses.replace(configs.RECIPES["hover"], evaluate_every=2)
+    monkeypatch.setattr(runs, "find_recipe", lambda *_: recipe)
+    trained(tmp_path / "whole", small_config())
+    traced(interrupting("add_evaluation", 2))
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "cut", small_config())
+    sys.settrace(None)
+    trained(tmp_path / "cut", small_config(), resume=True)
+    mine, others = (
+        [{k: x for k, x in point.items() if "seconds" not in k} for point in read_curve(tmp_path / name)]
+        for name in ("cut", "whole")
+    )
+    assert [point["iteration"] for point in mine] == [0, 2, 4]
+    np.testing.assert_equal(mine, others)  # NaN equals NaN
 
 
 def test_a_full_disk_leaves_the_last_checkpoint_and_nothing_else(tmp_path):

@@ -108,7 +108,8 @@ class Normalize(Wrapper):
     """Normalise observations to mean zero and variance one over all worlds and drones so far, clipped to [-10, 10].
 
     ``state.memory["Normalize"]`` holds the statistics, by name of the observation. To fly a policy with the
-    statistics of its training, pass them: ``Normalize(env, stats)`` does not update them.
+    statistics of its training, pass them: ``Normalize(env, stats)`` does not update them. Blocks of worlds with keys of
+    their own, such as those of several seeds in one training, share the statistics.
     """
 
     batched = True
