@@ -26,6 +26,8 @@ from crazysim.train.seeds import for_each_seed, join_blocks, split_blocks
 
 Layers = list[tuple[Array, Array]]
 """Weights (n_in, n_out) and biases (n_out,), first layer first."""
+ApplyLayers = Callable[[Layers, Array], Array]
+"""Function from layers and inputs, (..., n_in), to outputs, (..., n_out), such as ``mlp``."""
 
 
 def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
@@ -208,7 +210,9 @@ def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int],
     return Weights(init_mlp(key, (features.shape[-1], *sizes), last_scale), network_weights)
 
 
-def forward(network: Network, weights: Weights, obs: Array, memory: Any) -> tuple[Array, Any]:
+def forward(
+    network: Network, weights: Weights, obs: Array, memory: Any, apply_layers: ApplyLayers = mlp
+) -> tuple[Array, Any]:
     """Return the outputs of one step, and the memory after it.
 
     Args:
@@ -216,12 +220,15 @@ def forward(network: Network, weights: Weights, obs: Array, memory: Any) -> tupl
         weights: Weights of the network and of the layers after it.
         obs: Normalised observations. (..., n_obs)
         memory: Memory before the step. (..., ...) each
+        apply_layers: Function of layers and features that returns the outputs.
     """
     features, memory = _batch_apply(network, weights, obs.ndim - 1)(obs, memory)
-    return mlp(weights.layers, features), memory
+    return apply_layers(weights.layers, features), memory
 
 
-def unroll(network: Network, weights: Weights, obs: Array, memory: Any, done: Array) -> Array:
+def unroll(
+    network: Network, weights: Weights, obs: Array, memory: Any, done: Array, apply_layers: ApplyLayers = mlp
+) -> Array:
     """Return the outputs of consecutive steps, through which gradients flow back in time.
 
     Args:
@@ -230,9 +237,10 @@ def unroll(network: Network, weights: Weights, obs: Array, memory: Any, done: Ar
         obs: Normalised observations. (n_steps, ..., n_obs)
         memory: Memory before the first step. (..., ...) each
         done: True where an episode ended with the step; the next step begins with the initial memory. (n_steps, ...)
+        apply_layers: Function of layers and features that returns the outputs.
     """
     if not network.has_memory:
-        return forward(network, weights, obs, memory)[0]
+        return forward(network, weights, obs, memory, apply_layers)[0]
     apply, initial_memory = _batch_apply(network, weights, obs.ndim - 2), network.make_memory(*done.shape[1:])
 
     def step(memory: Any, inputs: tuple[Array, Array]) -> tuple[Any, Array]:
@@ -241,7 +249,7 @@ def unroll(network: Network, weights: Weights, obs: Array, memory: Any, done: Ar
         return jax.tree.map(lambda initial, x: select_worlds(step_done, initial, x), initial_memory, memory), features
 
     _, features = jax.lax.scan(step, memory, (obs, done))
-    return mlp(weights.layers, features)
+    return apply_layers(weights.layers, features)
 
 
 def _batch_apply(network: Network, weights: Weights, n_axes: int) -> Callable[[Array, Any], tuple[Array, Any]]:

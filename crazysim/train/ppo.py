@@ -20,7 +20,9 @@ from crazysim.envs.statistics import EPSILON, RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, static
 from crazysim.train.hyperparameters import check_hyperparameters
+from crazysim.train.mlp_kernel import choose_mlp
 from crazysim.train.networks import (
+    ApplyLayers,
     Network,
     Policy,
     Weights,
@@ -28,6 +30,7 @@ from crazysim.train.networks import (
     choose_network,
     forward,
     init_weights,
+    mlp,
     unroll,
 )
 from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates
@@ -102,6 +105,8 @@ class Agent(PyTree):
     """Number of observations of the policy."""
     network: Network = static()
     """Network of policy and value function."""
+    apply_layers: ApplyLayers = static(default=mlp)
+    """Function that computes the layers after the network."""
 
     def as_policy(self) -> Policy:
         """Return the deterministic policy."""
@@ -165,6 +170,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     k_policy, k_value, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 4), keys), 1, 0)
     hidden_sizes = config.hidden if network is None else ()
     network = choose_network(config.memory, network)
+    apply_layers = choose_mlp(network, env.sim.device, 1 if env.sim.mesh is None else env.sim.mesh.size)
     state = env.reset(k_env)
     n_obs = flatten(_policy_obs(state.obs, config)).shape[-1]
 
@@ -176,7 +182,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
         parameters: Any = (policy, log_std, value)
         optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(parameters)
         stats = RunningStats.create(obs.shape[-1]).update(obs)
-        return Agent(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, n_obs, network)
+        returns = RunningStats.create(1)
+        return Agent(policy, log_std, value, optimizer, stats, returns, key, n_obs, network, apply_layers)
 
     obs = split_blocks(_critic_obs(state.obs, config), len(configs))
     agents = for_each_seed(init_agent, k_policy, k_value, k_agent, obs)
@@ -211,7 +218,8 @@ def _collect_samples(
 
     def act(agent: Agent, raw_obs: Array, memory: Any, key: Array) -> tuple[Array, Any, Any]:
         normalized_obs = agent.stats.normalize(raw_obs)
-        output, policy_memory = forward(agent.network, agent.policy, normalized_obs[..., : agent.n_obs], memory[0])
+        policy_obs = normalized_obs[..., : agent.n_obs]
+        output, policy_memory = forward(agent.network, agent.policy, policy_obs, memory[0], agent.apply_layers)
         value, value_memory = _value(agent, normalized_obs, memory[1], config)
         mean = jnp.tanh(output)
         action = mean + jnp.exp(agent.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
@@ -299,7 +307,9 @@ def _update_agent(
     policy, log_std, value = parameters
     stats = agent.stats.update(raw_obs)
     finite = all_finite((parameters, optimizer, stats, returns, losses))
-    agent = Agent(policy, log_std, value, optimizer, stats, returns, agent.key, agent.n_obs, agent.network)
+    agent = agent.replace(
+        policy=policy, log_std=log_std, value=value, optimizer=optimizer, stats=stats, returns=returns
+    )
     return agent, losses | {"std": jnp.exp(log_std).mean(), "finite": finite}
 
 
@@ -324,7 +334,7 @@ def _run_epochs(
     agent: Agent, parameters: Any, data: Any, memory: Any, rates: Rates, key: Array, config: Config
 ) -> tuple[Any, Any, dict[str, Array]]:
     """Return parameters, optimiser state and mean losses after all epochs on the samples of one seed."""
-    n_worlds, network, n_obs = data[1].shape[1], agent.network, agent.n_obs
+    n_worlds, network, n_obs, apply_layers = data[1].shape[1], agent.network, agent.n_obs, agent.apply_layers
     n_groups = math.gcd(n_worlds // config.minibatches, MAX_GROUPS)
     transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
 
@@ -347,8 +357,9 @@ def _run_epochs(
     def loss(parameters: Any, batch: Any) -> tuple[Array, dict[str, Array]]:
         policy, log_std, value = parameters
         sample, advantage, target, (policy_memory, value_memory) = batch
-        mean = jnp.tanh(unroll(network, policy, sample.obs[..., :n_obs], policy_memory, sample.done))
-        values = unroll(network, value, _critic_input(sample.obs, config), value_memory, sample.done)[..., 0]
+        mean = jnp.tanh(unroll(network, policy, sample.obs[..., :n_obs], policy_memory, sample.done, apply_layers))
+        critic_input = _critic_input(sample.obs, config)
+        values = unroll(network, value, critic_input, value_memory, sample.done, apply_layers)[..., 0]
         ratio = jnp.exp(_log_prob(mean, log_std, sample.action) - sample.log_prob)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
         clipped_ratio = jnp.clip(ratio, 1 - rates["clip"], 1 + rates["clip"])
@@ -417,7 +428,7 @@ def _initial_memories(network: Network, state: EnvState) -> tuple[Any, Any]:
 
 def _value(agent: Agent, obs: Array, memory: Any, config: Config) -> tuple[Array, Any]:
     """Return the expected return for normalised observations, and the memory after the step. (..., k) -> (...)"""
-    output, memory = forward(agent.network, agent.value, _critic_input(obs, config), memory)
+    output, memory = forward(agent.network, agent.value, _critic_input(obs, config), memory, agent.apply_layers)
     return output[..., 0] * _return_std(agent.returns) + agent.returns.mean, memory
 
 

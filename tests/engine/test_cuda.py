@@ -64,14 +64,14 @@ def test_each_architecture_has_its_own_code(source):
 def test_without_nvrtc_the_kernel_is_unsupported(source, monkeypatch):
     monkeypatch.setattr(cuda, "nvrtc", lambda: None)
     with pytest.raises(KernelError, match="NVRTC was not found"):
-        cuda._compile(source.text, cuda.DEFAULT_ARCHITECTURE, "PTX")
+        cuda.compile_source(source.text, cuda.DEFAULT_ARCHITECTURE, "PTX")
 
 
 def test_what_nvrtc_refuses_is_unsupported(source):
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here")
     with pytest.raises(KernelError, match="NVRTC refused the kernel"):
-        cuda._compile("not CUDA", cuda.DEFAULT_ARCHITECTURE, "PTX")
+        cuda.compile_source("not CUDA", cuda.DEFAULT_ARCHITECTURE, "PTX")
 
 
 @pytest.mark.parametrize(

@@ -195,7 +195,7 @@ def test_the_source_for_gpus_is_well_formed():
     assert "lookup_four(p" in text
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here")
-    assert cuda._compile(text, cuda.DEFAULT_ARCHITECTURE, "PTX")
+    assert cuda.compile_source(text, cuda.DEFAULT_ARCHITECTURE, "PTX")
 
 
 def test_gradients_by_states_and_entries_are_those_of_the_stage():

@@ -191,13 +191,13 @@ def ptx(kernel: Kernel, arch: str) -> str:
     """Return a kernel's PTX."""
     if dump.is_enabled():
         dump.write(f"kernel.{arch}.cu", f"// NVRTC --gpu-architecture={arch} {' '.join(NVRTC_OPTIONS)}\n{kernel.text}")
-    return _compile(kernel.text, arch, "PTX").decode()
+    return compile_source(kernel.text, arch, "PTX").decode()
 
 
 @functools.cache
 def resources(kernel: Kernel, device: jax.Device) -> Resources:
     """Return the registers and memory that a kernel takes on a GPU, as its driver reports them."""
-    image = _compile(kernel.text, architecture(device).replace("compute", "sm"), "CUBIN")
+    image = compile_source(kernel.text, architecture(device).replace("compute", "sm"), "CUBIN")
     try:
         driver, ordinal = ctypes.CDLL("libcuda.so.1"), device.local_hardware_id
     except OSError as error:
@@ -244,7 +244,7 @@ def nvrtc() -> ctypes.CDLL | None:
     return None
 
 
-def _compile(source: str, arch: str, kind: str) -> bytes:
+def compile_source(source: str, arch: str, kind: str) -> bytes:
     """Return the compiled image of a source, from the cache of kernels or from NVRTC.
 
     Args:
