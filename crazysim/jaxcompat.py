@@ -18,6 +18,8 @@ newest JAX that are supported. How each use would be replaced if a release remov
 - **Threefry's primitive** (``threefry2x32_p``): its rounds written out, as in ``engine/backends/interpret.py``.
 - **The compilation cache of one thread** (``compilation_cache``): without it, programs are only kept in the folder that
   JAX is configured with. It is used where these names are missing.
+- **The coordinator of several hosts** (``connected_hosts``, ``detect_hosts``): exchanges of arrays instead of its store
+  of texts, and the variables of SLURM. ``jax.experimental.multihost_utils``: programs with replicated results.
 - **_cache_size** (``n_compilations``): only tests need it.
 
 ``CRAZYSIM_JAX_FALLBACKS=1`` selects all fallbacks, to try them.
@@ -32,13 +34,14 @@ import math
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jaxlib
 import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
+from jax.experimental import multihost_utils
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
 from jax.extend.random import threefry2x32_p, threefry_prng_impl
 from jax.interpreters import ad, batching, mlir
@@ -55,6 +58,7 @@ __all__ = [
     "FALLBACKS",
     "ClosedJaxpr",
     "Equation",
+    "Hosts",
     "Jaxpr",
     "JaxprEqn",
     "Literal",
@@ -64,16 +68,21 @@ __all__ = [
     "batched_rule",
     "bind",
     "bits_generator",
+    "broadcast_from_first",
     "cache_folder",
     "close_jaxpr",
     "compilation_cache",
     "compute_capability",
+    "connected_hosts",
     "constants_to_inputs",
     "custom_vmap",
+    "detect_hosts",
     "equations",
     "expand_primitive",
     "ffi_include_folder",
+    "gather_from_hosts",
     "is_key",
+    "is_stop_requested",
     "is_symbolic_zero",
     "jaxpr_as_fun",
     "jit_donating",
@@ -498,3 +507,54 @@ DIGAMMA_AT_ZERO = -math.inf if jax.__version_info__ >= (0, 11) else math.nan
 def versions() -> str:
     """Return the versions of JAX and jaxlib, which compiled code depends on."""
     return f"jax {jax.__version__} jaxlib {jaxlib.__version__}"
+
+
+# Several hosts --------------------------------------------------------------------------------------------------
+
+
+class Hosts(NamedTuple):
+    """The hosts of ``jax.distributed.initialize``: processes that run the same program."""
+
+    client: Any
+    """Client of the coordinator: its store of texts and its barriers."""
+    host_id: int
+    """Number of this host, from 0."""
+    n_hosts: int
+    """Number of hosts."""
+
+
+def connected_hosts() -> Hosts | None:
+    """Return the hosts that this process is connected with, without starting a backend; None if there are none."""
+    from jax._src.distributed import global_state
+
+    client = global_state.client
+    return None if client is None else Hosts(client, global_state.process_id, global_state.num_processes)
+
+
+def detect_hosts(timeout: int) -> tuple[str | None, int | None, int | None, Sequence[int] | None]:
+    """Return what SLURM or Open MPI say of the hosts, as ``jax.distributed.initialize`` finds it; None where none is.
+
+    Args:
+        timeout: Time for finding them, s.
+
+    Returns:
+        Address of the coordinator, number of hosts, number of this host, and indices of its devices.
+    """
+    from jax._src.clusters import ClusterEnv
+
+    return ClusterEnv.auto_detect_unset_distributed_params(None, None, None, None, None, timeout)
+
+
+def gather_from_hosts(arrays: Sequence[jax.Array]) -> list[np.ndarray]:
+    """Return arrays that are distributed over several hosts as host arrays on each of them; all hosts must call it."""
+    return multihost_utils.process_allgather(list(arrays), tiled=True)
+
+
+def broadcast_from_first(flag: bool) -> bool:
+    """Return the flag of host 0 on all hosts, which must all call it."""
+    return bool(multihost_utils.broadcast_one_to_all(np.bool_(flag)))
+
+
+def is_stop_requested(step: int) -> bool:
+    """Return True on all hosts at the same step, after one of them has received SIGTERM; all call it at each step."""
+    return multihost_utils.reached_preemption_sync_point(step)

@@ -366,3 +366,11 @@ def test_the_engine_runs_without_what_jax_may_take_away():
 
 def test_digamma_at_zero_is_that_of_this_version():
     np.testing.assert_array_equal(jax.lax.digamma(np.float32(0)), np.float32(jaxcompat.DIGAMMA_AT_ZERO))
+
+
+def test_a_process_alone_is_its_only_host():
+    """Several hosts are those of ``tests/train/test_hosts.py``."""
+    assert jaxcompat.connected_hosts() is None
+    assert not jaxcompat.is_stop_requested(1)
+    assert [jaxcompat.broadcast_from_first(flag) for flag in (True, False)] == [True, False]
+    np.testing.assert_array_equal(jaxcompat.gather_from_hosts([jax.numpy.arange(3)])[0], np.arange(3))

@@ -6,9 +6,11 @@ import argparse
 import json
 import signal
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
+from crazysim.commands import hosts
 from crazysim.commands.options import DefaultsFormatter, given_options
 from crazysim.errors import ConfigError
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
@@ -41,6 +43,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--device", help="device: cpu, gpu; by default cpu, or JAX's default platform with --devices")
     devices = "devices to distribute the worlds over: all, their number, or their indices such as 0,2,3"
     add("--devices", metavar="all|N|I,J", help=devices)
+    hosts.add_options(add)
     add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation")
     add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm")
     add("--no-film", action="store_true", help="write no film")
@@ -124,14 +127,25 @@ def _parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
     return pairs
 
 
-def train(options: argparse.Namespace) -> None:
-    """Train a policy, or print the names of all tasks."""
+def train(options: argparse.Namespace) -> int | None:
+    """Train a policy, on this host or on several, or print the names of all tasks."""
     from crazysim.envs.registry import TASKS
 
     if options.task == "list":
         for name, entry in TASKS.items():
             print(f"{name:12} {(entry.task.__doc__ or '').splitlines()[0]}")
-        return
+        return None
+    if hosts.are_several(options):
+        return hosts.run_on_hosts(partial(_train, devices="all"), options)
+    before = signal.signal(signal.SIGTERM, _exit)
+    try:
+        return _train(options)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _train(options: argparse.Namespace, devices: str | None = None) -> None:
+    """Train a policy in this process, on these devices if the options name none."""
     from crazysim.train.runs import run, run_many
 
     settings: dict[str, Any] = {
@@ -139,21 +153,17 @@ def train(options: argparse.Namespace) -> None:
         "checkpoint_every": options.checkpoint_every,
         "algorithm": options.algorithm or (options.teacher and "dagger"),
         "n_worlds": options.worlds,
-        "devices": options.devices,
+        "devices": options.devices or devices,
         "options": _parse_pairs(options.set) | given_options(options, "device"),
         "config": _parse_pairs(options.config) | given_options(options, "iterations", "teacher"),
     }
-    handler = signal.signal(signal.SIGTERM, _exit)
-    try:
-        if options.seeds is None and not options.sweep:
-            run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)
-            return
-        if options.seeds is not None and options.seed is not None:
-            raise ConfigError("expected --seed or --seeds, got both. Use --seeds alone.")
-        seeds = options.seeds or [options.seed or 0]
-        run_many(options.task, options.out, seeds=seeds, sweep=_parse_sweep(options.sweep), **settings)
-    finally:
-        signal.signal(signal.SIGTERM, handler)
+    if options.seeds is None and not options.sweep:
+        run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)
+        return
+    if options.seeds is not None and options.seed is not None:
+        raise ConfigError("expected --seed or --seeds, got both. Use --seeds alone.")
+    seeds = options.seeds or [options.seed or 0]
+    run_many(options.task, options.out, seeds=seeds, sweep=_parse_sweep(options.sweep), **settings)
 
 
 def _exit(*_: object) -> NoReturn:

@@ -261,10 +261,10 @@ def find_device(device: str | jax.Device) -> jax.Device:
             f"device='cpu'"
         )
     try:
-        devices = jax.devices("gpu" if platform == "cuda" else platform)
+        devices = jax.local_devices(backend="gpu" if platform == "cuda" else platform)
         return devices[int(index or 0)]
     except (RuntimeError, ValueError, IndexError) as error:
-        available = ", ".join(str(d) for d in jax.devices())
+        available = ", ".join(str(d) for d in jax.local_devices())
         raise ConfigError(
             f"device {device!r} does not exist ({error}); there is {available}. Use a platform such as 'cpu' or 'gpu', "
             f"or 'gpu:1' for its second device. GPUs need the CUDA packages of JAX: pip install 'crazysim[gpu]'."

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import numpy as np
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
 from crazysim.core.data import SimData
 from crazysim.errors import ConfigError
+from crazysim.jaxcompat import gather_from_hosts, is_key
 from crazysim.pytree import n_batch_axes, replace_leaves, scopes
 
 T, R = TypeVar("T"), TypeVar("R")
@@ -117,8 +118,8 @@ def shardings_of(data: SimData, mesh: Mesh) -> SimData:
 
 def shard(data: SimData, mesh: Mesh) -> SimData:
     """Return the data distributed over a mesh; under a trace, constrain the compiled function to distribute it."""
-    distribute = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else jax.device_put
-    return distribute(data, shardings_of(data, mesh))
+    put = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else distribute
+    return put(data, shardings_of(data, mesh))
 
 
 def map_devices(fn: Callable[[SimData], R], data: SimData, mesh: Mesh) -> R:
@@ -134,6 +135,48 @@ def map_devices(fn: Callable[[SimData], R], data: SimData, mesh: Mesh) -> R:
     return jax.shard_map(fn, mesh=mesh, in_specs=(specs,), out_specs=split, check_vma=False)(data)
 
 
+def distribute(tree: T, shardings: Any) -> T:
+    """Return arrays distributed over devices: ``jax.device_put``, also onto the devices of several hosts.
+
+    Args:
+        tree: Pytree of arrays. Those of one host are the same on all hosts, each of which takes the parts of its own
+            devices.
+        shardings: Sharding of every array, as a pytree of the same structure, or one for all.
+    """
+    shardings = jax.tree.broadcast(shardings, tree)
+    if all(sharding.is_fully_addressable for sharding in jax.tree.leaves(shardings)):
+        return jax.device_put(tree, shardings)
+    return jax.tree.map(_distribute_over_hosts, tree, shardings)
+
+
+def _distribute_over_hosts(x: Any, sharding: Sharding) -> jax.Array:
+    if isinstance(x, jax.Array) and not x.is_fully_addressable:
+        return jax.device_put(x, sharding)
+    if isinstance(x, jax.Array) and is_key(x):
+        return jax.random.wrap_key_data(
+            _distribute_over_hosts(jax.random.key_data(x), sharding), impl=jax.random.key_impl(x)
+        )
+    value = np.asarray(x)
+    return jax.make_array_from_callback(value.shape, sharding, lambda part: value[part])
+
+
+def fetch(tree: T) -> T:
+    """Return arrays as host arrays, random keys as their data.
+
+    Arrays that are distributed over several hosts are sent to all of them, which must all call this.
+    """
+    leaves, treedef = jax.tree.flatten(tree)
+    leaves = [jax.random.key_data(x) if isinstance(x, jax.Array) and is_key(x) else x for x in leaves]
+    far = [i for i, x in enumerate(leaves) if isinstance(x, jax.Array) and not _is_readable(x)]
+    if far:
+        leaves = replace_leaves(leaves, far, gather_from_hosts([leaves[i] for i in far]))
+    return treedef.unflatten([np.asarray(x) for x in leaves])
+
+
+def _is_readable(x: jax.Array) -> bool:
+    return x.is_fully_addressable or x.is_fully_replicated
+
+
 def shard_scene(mjx_data: T, mesh: Mesh) -> T:
     """Return the MJX data of all worlds distributed over a mesh."""
-    return jax.device_put(mjx_data, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))
+    return distribute(mjx_data, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))

@@ -38,7 +38,7 @@ def evaluation_device(device: str | None, devices: Devices) -> str:
     """
     device = jax.default_backend() if device is None else device
     indices = _read_devices(devices)
-    is_platform = isinstance(device, str) and ":" not in device
+    is_platform = isinstance(device, str) and ":" not in device and jax.process_count() == 1
     return f"{device}:{indices[0]}" if is_platform and isinstance(indices, tuple) and indices[0] else device
 
 
@@ -84,7 +84,10 @@ def place_worlds(device: str, devices: Devices, n_worlds: int) -> dict[str, Any]
             f"expected a number of worlds that {n} devices divide, got {n_worlds}. Use for example --worlds "
             f"{-(-n_worlds // n) * n}, or another number of --devices."
         )
-    return {"device": found[0]} | ({"mesh": world_mesh(found)} if n > 1 else {})
+    n_hosts, own = jax.process_count(), [x for x in found if x.process_index == jax.process_index()]
+    if len({x.process_index for x in found}) < n_hosts:
+        raise ConfigError(f"expected devices of all {n_hosts} hosts, got {devices!r}. Use --devices all.")
+    return {"device": own[0]} | ({"mesh": world_mesh(found)} if n > 1 else {})
 
 
 def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:

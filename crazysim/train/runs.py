@@ -10,6 +10,7 @@ from typing import Any
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, RenderError
 from crazysim.train.config import TrainConfig
+from crazysim.train.hosts import is_first_host
 from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.show import film as film_policy
 from crazysim.train.show import plot_curve, plot_episode, plot_spread, read_curve
@@ -66,6 +67,8 @@ def run(
     if resume:
         config = TrainConfig.create(task, **settings, resumed=_stored_config(folder))
     result = train(config, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
+    if not is_first_host():
+        return result
     log(f"wrote {folder / CHECKPOINT}, {folder / POLICY}")
     try:
         plot_curve({config.title: read_curve(folder)}, folder / "curve.png")
@@ -134,6 +137,8 @@ def run_many(
         seed_settings = settings | {"seed": seed, "config": {**(settings.get("config") or {}), **changes}}
         configs[name] = TrainConfig.create(task, **seed_settings, resumed=stored_by_name.get(name))
     results = train_many(configs, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
+    if not is_first_host():
+        return results
     log(f"wrote {folder / CHECKPOINT}, {folder / TABLE}, and {POLICY} and {CURVE} in {', '.join(configs)}")
     curves: dict[str, list[Any]] = {}
     for name in configs:

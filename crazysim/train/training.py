@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import math
+import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from jax import Array
 import crazysim
 from crazysim.cache import announce_if_slow, keep_programs
 from crazysim.core.settings import positive_integer
+from crazysim.core.sharding import distribute, fetch
 from crazysim.engine.backends.native import compiling_threads
 from crazysim.envs.env import Env
 from crazysim.envs.references import code_digest, is_reference, split_reference
@@ -33,13 +35,14 @@ from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
 from crazysim.errors import ConfigError, DivergedError
 from crazysim.progress import progress_bar
 from crazysim.sim.sim import Sim
-from crazysim.storage import replacing
+from crazysim.storage import replacing, write_file
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
 from crazysim.train.devices import exchanged_bytes, learner_shardings, replicated_sharding
 from crazysim.train.evaluation import describe_outcome, evaluate_blocks
 from crazysim.train.export import describe
+from crazysim.train.hosts import decided_by_first, is_first_host, must_stop, require_same_settings
 from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.networks import Network, Policies, Policy, choose_network, init_weights
 from crazysim.train.seeds import take_seed
@@ -133,6 +136,7 @@ def train_many(
     path = folder / CHECKPOINT
     start_time = time.perf_counter()
     evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
+    log = log if is_first_host() else lambda _: None
     if checkpoint_every is not None:
         checkpoint_every = read_number("checkpoint_every", checkpoint_every, POSITIVE)
     metadata = {name: _run_metadata(config) for name, config in configs.items()}
@@ -145,6 +149,14 @@ def train_many(
             runs[training.name]["diverged"],
         )
     config, n_trainings = trainings[0].config, len(trainings)
+    _require_same_on_hosts(
+        metadata,
+        devices=config.devices,
+        evaluation_worlds=evaluation_worlds,
+        checkpoint_every=checkpoint_every,
+        resume=resume,
+        seconds_of_checkpoint=seconds_before,
+    )
     if path.exists() and not resume:
         raise ConfigError(
             f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
@@ -171,17 +183,17 @@ def train_many(
         iterate_fn = jax.jit(iterate_fn, static_argnums=(1, 2), out_shardings=(shardings, replicated))
     policy_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
     kept_shapes = [jax.eval_shape(lambda policies: take_seed(policies, 0), policy_shapes)] * n_trainings
-    for training in trainings:
+    for training in trainings if is_first_host() else ():
         _make_folder(training.folder)
 
     @keep_programs()
     def load_or_init() -> tuple[Learner, list[Policy]]:
         if resume:
             files = checkpoint.restore(path, stored_arrays, {"learner": shapes, "kept": kept_shapes})
-            return jax.device_put(files["learner"], shardings), jax.device_put(files["kept"], eval_env.sim.device)
-        learner = init(env, hyperparameters, jax.device_put(keys, replicated))
+            return distribute(files["learner"], shardings), jax.device_put(files["kept"], eval_env.sim.device)
+        learner = init(env, hyperparameters, distribute(keys, replicated))
         require_finite_start(base_env.task, learner.env)
-        policies = jax.device_get(learner.as_policy())
+        policies = fetch(learner.as_policy())
         return learner, [take_seed(policies, i) for i in range(n_trainings)]
 
     def evaluate_policies(policies: Policy, key: Array | None) -> list[dict[str, float]]:
@@ -232,12 +244,14 @@ def train_many(
         nonlocal saved_iteration, save_time
         runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.divergence_iteration} for x in trainings}
         meta = {"crazysim": crazysim.__version__, "code": code, "runs": runs, "seconds": seconds()}
-        checkpoint.save(path, {"learner": learner, "kept": [training.kept_policy for training in trainings]}, meta)
+        files = fetch({"learner": learner, "kept": [training.kept_policy for training in trainings]})
+        if is_first_host():
+            checkpoint.save(path, files, meta)
         saved_iteration, save_time = int(learner.iteration), time.perf_counter()
 
     def evaluate_and_save(learner: Learner, metrics: dict[str, Array]) -> list[dict[str, Any]]:
         """Evaluate the policies, keep each if none was clearly better, write all files, and return the points."""
-        iteration, policies = int(learner.iteration), jax.device_get(learner.as_policy())
+        iteration, policies = int(learner.iteration), fetch(learner.as_policy())
         stop_diverged(metrics, iteration)
         is_planned = iteration % evaluation_period == 0 or iteration == n_iterations
         results, checks = evaluate_policies(policies, None), evaluate_policies(policies, check_key)
@@ -246,7 +260,7 @@ def train_many(
             if training.divergence_iteration is None:
                 point = counters | results[i] | {"compile_seconds": compile_s, "check": checks[i]["success"]}
                 training.add_evaluation(point, take_seed(policies, i), evaluation_worlds, description, is_planned)
-        if "" not in configs:
+        if "" not in configs and is_first_host():
             write_table(folder, [training.row for training in trainings])
         save_checkpoint(learner)
         return [training.curve[-1] for training in trainings]
@@ -293,13 +307,19 @@ def train_many(
                     show_progress(
                         {name: [point[name] for point in points] for name in ("success", "error", "reward")}, 0
                     )
-                elif checkpoint_every is not None and time.perf_counter() - save_time > checkpoint_every:
+                elif checkpoint_every is not None and decided_by_first(
+                    time.perf_counter() - save_time > checkpoint_every
+                ):
                     stop_diverged(learner_and_metrics[1], i + 1)
                     save_checkpoint(learner_and_metrics[0])
                 if on_iteration is not None and i + 1 < n_iterations:
                     on_iteration(i + 1, _host_metrics(learner_and_metrics[1], points))
+                if must_stop(i + 1):
+                    raise SystemExit(128 + signal.SIGTERM)
         final_points = evaluate_and_save(*learner_and_metrics)
-    except (KeyboardInterrupt, SystemExit):
+    except (KeyboardInterrupt, SystemExit) as error:
+        if jax.process_count() > 1 and not isinstance(error, SystemExit):
+            raise  # the other hosts go on, and would not take part
         evaluate_and_save(*learner_and_metrics)
         log(
             f"interrupted after iteration {int(learner_and_metrics[0].iteration)}; wrote {path}; continue with --resume"
@@ -364,9 +384,9 @@ class _Training:
         best_check = max((earlier["check"] for earlier in self.curve if earlier["kept"]), default=0.0)
         point["kept"] = point["check"] >= least_kept_success(best_check, n_starts)
         best = policy if point["kept"] else self.kept_policy
-        checkpoint.save(self.folder / POLICY, best, self.meta | description)
-        with replacing(self.folder / CURVE) as file:
-            file.write(json.dumps([*self.curve, point], indent=1).encode())
+        if is_first_host():
+            checkpoint.save(self.folder / POLICY, best, self.meta | description)
+            write_file(self.folder / CURVE, json.dumps([*self.curve, point], indent=1))
         self.kept_policy, point["kept"] = (best, point["kept"]) if is_planned else (self.kept_policy, False)
         self.curve.append(point)
 
@@ -571,6 +591,16 @@ def _fixed_settings(settings: dict[str, Any]) -> dict[str, Any]:
     hyperparameters = {k: x for k, x in settings["config"].items() if k not in ALTERABLE_HYPERPARAMETERS}
     options = {k: x for k, x in settings["options"].items() if k != "device"}
     return run_settings | {"task": f"{Path(location).name}:{name}" if location else name} | options | hyperparameters
+
+
+def _require_same_on_hosts(metadata: Mapping[str, dict[str, Any]], **others: Any) -> None:
+    """Check that all hosts train with the same metadata of each training, by name, and the same other settings."""
+    runs = {
+        name: _fixed_settings(x["settings"]) | x["settings"]["config"] | {"code": x["code"]}
+        for name, x in metadata.items()
+    }
+    named = {f"{name} {key}".strip(): x for name, run in runs.items() for key, x in run.items()}
+    require_same_settings({"trainings": list(metadata)} | others | named)
 
 
 @contextmanager

@@ -1,0 +1,291 @@
+"""Commands that run on several hosts: a process for each host, and the process that starts it and explains its end.
+
+JAX's runtime aborts a process when another host is lost, so only the process that started it can say what happened.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from crazysim.errors import ConfigError, DivergedError
+
+VARIABLE = "CRAZYSIM_HOST"
+"""Environment variable of the process of a host: its ``Host`` as JSON."""
+STOP_KEY = "crazysim/stop"
+"""Folder of the coordinator's store in which a host writes why it stops."""
+STOP_SECONDS = 10
+"""Time that a host that stops waits for the others to stop, s."""
+POLL_SECONDS = 0.5
+"""Time between two looks for a host that stops, s."""
+END_SECONDS = 24 * 3600
+"""Time that hosts wait for the last one to end, s: host 0 draws and films when the others have finished."""
+EXPLAINED = "crazysim: the end of this host is explained"
+"""Line by which the process of a host tells the one that started it to print nothing more."""
+
+
+@dataclass(frozen=True)
+class Host:
+    """One of the hosts of a command."""
+
+    coordinator: str
+    """Address at which host 0 coordinates them, HOST:PORT."""
+    host_id: int
+    """Number of this host, from 0."""
+    n_hosts: int
+    """Number of hosts."""
+    devices: list[int] | None
+    """Indices of its devices; None for all."""
+    heartbeat: int
+    """Time without a heartbeat after which a host counts as lost, s."""
+    connect: int
+    """Time within which all hosts must have connected, s."""
+
+
+def add_options(add: Callable[..., Any]) -> None:
+    """Add the options of a command that can run on several hosts."""
+    coordinator = "address of host 0, at which hosts that train together meet; auto: as SLURM or Open MPI say"
+    add("--coordinator", metavar="HOST:PORT|auto", help=coordinator)
+    add("--host-id", type=int, metavar="I", help="number of this host, from 0")
+    add("--hosts", type=int, metavar="N", help="number of hosts")
+    heartbeat = "time without a sign of life after which a host counts as lost, s"
+    add("--heartbeat-timeout", type=int, default=100, metavar="SECONDS", help=heartbeat)
+    connect = "time within which all hosts must have connected, s"
+    add("--connect-timeout", type=int, default=300, metavar="SECONDS", help=connect)
+
+
+def are_several(options: argparse.Namespace) -> bool:
+    """Return True if a command runs on several hosts.
+
+    Raises:
+        ConfigError: If some options of ``add_options`` lack others.
+    """
+    if options.coordinator is None and (options.host_id is not None or options.hosts is not None):
+        raise ConfigError(
+            "expected --coordinator with --host-id and --hosts, got none. Use the address of host 0, such as "
+            "--coordinator 10.0.0.1:1234."
+        )
+    return options.coordinator is not None
+
+
+def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: argparse.Namespace) -> int:
+    """Run a command on this host together with others, and return the exit status.
+
+    Args:
+        command: The command. It runs in a process of its own, which is connected with the other hosts.
+        options: Its options, with those of ``add_options``, and ``arguments``, from which they were parsed.
+
+    Raises:
+        ConfigError: If the options are invalid, or no hosts are found.
+    """
+    if VARIABLE in os.environ:
+        return _run_host(Host(**json.loads(os.environ.pop(VARIABLE))), command, options)
+    host = _find_host(options) if options.coordinator == "auto" else _given_host(options)
+    return _start_host(host, options.arguments)
+
+
+def _given_host(options: argparse.Namespace) -> Host:
+    """Return the host of the options."""
+    if not re.fullmatch(r".+:\d+", options.coordinator):
+        raise ConfigError(
+            f"expected HOST:PORT or auto as --coordinator, got {options.coordinator!r}. Use for example 10.0.0.1:1234."
+        )
+    n, i = options.hosts, options.host_id
+    if n is None or i is None or not 0 <= i < n:
+        raise ConfigError(
+            f"expected --hosts N, and --host-id from 0 to N - 1, got --hosts {n} --host-id {i}. Use for example "
+            f"--hosts 2 --host-id 0 on the host of the coordinator, and --hosts 2 --host-id 1 on the other."
+        )
+    return Host(options.coordinator, i, n, None, options.heartbeat_timeout, options.connect_timeout)
+
+
+def _find_host(options: argparse.Namespace) -> Host:
+    """Return the host that SLURM or Open MPI say."""
+    from crazysim.jaxcompat import detect_hosts
+
+    coordinator, n_hosts, host_id, devices = detect_hosts(options.connect_timeout)
+    if coordinator is None or n_hosts is None or host_id is None:
+        raise ConfigError(
+            "expected the variables of SLURM or Open MPI for --coordinator auto, got none. Start the command with "
+            "srun or mpirun, or use --coordinator HOST:PORT, --hosts and --host-id."
+        )
+    devices = None if devices is None else list(devices)
+    return Host(coordinator, host_id, n_hosts, devices, options.heartbeat_timeout, options.connect_timeout)
+
+
+def _start_host(host: Host, arguments: Sequence[str]) -> int:
+    """Run the process of a host, pass signals on to it, explain its end, and return its exit status."""
+    received: list[int] = []
+
+    def pass_on(number: int, frame: object) -> None:
+        del frame
+        received.append(number)
+        child.send_signal(signal.SIGTERM if len(received) == 1 else signal.SIGKILL)
+
+    with tempfile.TemporaryFile() as log:
+        environment = os.environ | {VARIABLE: json.dumps(asdict(host)), "CRAZYSIM_HOST_LOG": str(log.fileno())}
+        child = subprocess.Popen(
+            [sys.executable, "-m", "crazysim", *arguments],
+            env=environment,
+            pass_fds=[log.fileno()],
+            start_new_session=True,  # Ctrl-C goes to this process, which passes it on as SIGTERM
+        )
+        before = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            status = child.wait()
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        log.seek(0)
+        text = log.read().decode(errors="replace")
+    if status != 0 and not received and EXPLAINED not in text:
+        print(f"crazysim: {_explain(text, status, host, arguments)}", file=sys.stderr)
+    return 128 + received[0] if received and status else status if status >= 0 else 128 - status
+
+
+def _explain(log: str, status: int, host: Host, arguments: Sequence[str]) -> str:
+    """Return why the process of a host has ended.
+
+    Args:
+        log: Messages of JAX's runtime and other libraries.
+        status: Its exit status; -n for signal n.
+        host: The host.
+        arguments: Arguments of its command.
+    """
+    if "RegisterTask" in log:
+        others = "the other hosts" if host.host_id == 0 else f"host 0 at {host.coordinator}"
+        return (
+            f"host {host.host_id}: expected {host.n_hosts} hosts to connect with {host.coordinator} within "
+            f"{host.connect} s, got no connection with {others}. Start a process on every host, and check the address "
+            f"and the firewall; --connect-timeout is the time."
+        )
+    resume = shlex.join(["crazysim", *arguments, *(["--resume"] if "--resume" not in arguments else [])])
+    remedy = f"The last checkpoint continues the training: start all hosts again, this one with\n  {resume}"
+    unhealthy = re.search(r"stopped sending heartbeats\)?:?\s*\n((?:[^\n]*\d+\n)+)", log)
+    lost = sorted({int(line.rpartition(":")[2]) for line in unhealthy[1].split()} - {host.host_id}) if unhealthy else []
+    if lost:
+        names = f"host{'s' if len(lost) > 1 else ''} {', '.join(map(str, lost))}"
+        return f"host {host.host_id}: {names} lost: no heartbeat for {host.heartbeat} s. {remedy}"
+    if "coordination" in log and host.host_id != 0:
+        return f"host {host.host_id}: host 0 lost: {host.coordinator} does not answer. {remedy}"
+    last = "\n".join(log.strip().splitlines()[-20:])
+    return f"host {host.host_id} ended with status {status}. {remedy}" + (f"\nIts last messages:\n{last}" * bool(last))
+
+
+def _run_host(host: Host, command: Callable[[argparse.Namespace], int | None], options: argparse.Namespace) -> int:
+    """Connect with the other hosts, run the command, and end with them; return the exit status."""
+    log = int(os.environ.pop("CRAZYSIM_HOST_LOG"))
+    sys.stdout, sys.stderr = (os.fdopen(os.dup(n), "w", buffering=1) for n in (1, 2))
+    for n in (1, 2):  # what libraries write below Python
+        os.dup2(log, n)
+    os.close(log)
+    parent = os.getppid()
+
+    import jax
+
+    from crazysim.train.hosts import require_same_versions
+
+    try:
+        jax.distributed.initialize(
+            host.coordinator,
+            host.n_hosts,
+            host.host_id,
+            host.devices,
+            cluster_detection_method="deactivate",
+            initialization_timeout=host.connect,
+            heartbeat_timeout_seconds=host.heartbeat,
+            shutdown_timeout_seconds=END_SECONDS,
+        )
+    except RuntimeError as error:
+        _tell_parent()
+        print(f"crazysim: expected an address to listen at as {host.coordinator}, got: {error}", file=sys.stderr)
+        return 2
+    threading.Thread(target=_stop_with_others, args=(host, parent), daemon=True).start()
+    try:
+        require_same_versions()
+        devices = jax.local_devices()
+        print(f"host {host.host_id} of {host.n_hosts}: {len(devices)} {devices[0].device_kind}", flush=True)
+        status = command(options) or 0
+    except SystemExit as end:  # all hosts have agreed on it
+        _tell_parent()
+        status = int(end.code or 0)
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):  # probably a host is lost: JAX's runtime then ends this process
+            time.sleep(host.heartbeat + STOP_SECONDS)
+        _stop_others(host, error)
+    except BaseException as error:
+        _stop_others(host, error)
+    sys.stdout.flush()
+    jax.distributed.shutdown()
+    return status
+
+
+def _stop_others(host: Host, error: BaseException) -> None:
+    """Print an error, tell it the other hosts, and end the process when they have ended."""
+    expected = isinstance(error, (ValueError, ImportError, OSError, DivergedError))
+    text = str(error) if expected else f"{type(error).__name__}: {error}"
+    if not expected:
+        import traceback
+
+        traceback.print_exception(error)
+    _end(host, f"crazysim: {text}" if host.host_id == 0 else f"crazysim: host {host.host_id}: {text}", text)
+
+
+_ending = threading.Lock()
+"""Held by the thread that ends the process."""
+
+
+def _end(host: Host, line: str, reason: str | None) -> None:
+    """Print a line, write the reason for the other hosts if there is one, wait until they end, and end the process."""
+    from crazysim.jaxcompat import connected_hosts
+
+    if not _ending.acquire(blocking=False):
+        time.sleep(2 * STOP_SECONDS)
+    print(line, file=sys.stderr)
+    _tell_parent()
+    hosts = connected_hosts()
+    with suppress(Exception):  # the process ends in any case
+        if hosts is not None:
+            if reason is not None:
+                hosts.client.key_value_set(f"{STOP_KEY}/{host.host_id}", reason)
+            hosts.client.wait_at_barrier(STOP_KEY, 1000 * STOP_SECONDS)
+            if host.host_id == 0:  # the coordinator ends last
+                time.sleep(2 * POLL_SECONDS)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(2)
+
+
+def _stop_with_others(host: Host, parent: int) -> None:
+    """End this process as soon as another host stops with an error, or the process that started this one has ended."""
+    from crazysim.jaxcompat import connected_hosts
+
+    while True:
+        time.sleep(POLL_SECONDS)
+        if os.getppid() != parent:
+            os._exit(2)
+        hosts = connected_hosts()
+        with suppress(Exception):  # the coordinator has gone: JAX's runtime ends this process
+            others = [] if hosts is None else hosts.client.key_value_dir_get(STOP_KEY)
+            for name, reason in others:
+                other = int(name.rpartition("/")[2])
+                if other != host.host_id:
+                    _end(host, f"crazysim: host {host.host_id} stops: host {other} ended: {reason}", None)
+
+
+def _tell_parent() -> None:
+    """Tell the process that started this one that the reason of its end has been printed."""
+    os.write(2, f"{EXPLAINED}\n".encode())

@@ -1,0 +1,80 @@
+"""Agreement of the hosts of a training: they run the same program, step by step."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+
+import crazysim
+from crazysim import jaxcompat
+from crazysim.errors import ConfigError
+
+AGREEMENT_SECONDS = 300
+"""Time that hosts wait for the settings of the others, s: as JAX waits for their connection."""
+_exchanges = itertools.count()
+"""Numbers of the exchanges of texts, which all hosts make in the same order."""
+
+
+def is_first_host() -> bool:
+    """Return True on the host that writes files and lines of output: host 0, or the only one."""
+    return jax.process_index() == 0
+
+
+def require_same_versions() -> None:
+    """Check that all hosts have the same versions of crazysim and JAX; before a backend starts.
+
+    Raises:
+        ConfigError: On all hosts, if one of them has another version.
+    """
+    versions = {"crazysim": crazysim.__version__, "JAX": jaxcompat.versions()}
+    _require_same("versions", versions, "Install the same versions on all hosts.")
+
+
+def require_same_settings(settings: Mapping[str, Any]) -> None:
+    """Check that all hosts have the same settings of a training, which JSON can represent.
+
+    Raises:
+        ConfigError: On all hosts, if one of them has another setting.
+    """
+    _require_same("settings", settings, "Start all hosts with the same settings, files and checkpoint.")
+
+
+def _require_same(what: str, values: Mapping[str, Any], remedy: str) -> None:
+    """Check that all hosts have the same values by name."""
+    hosts = jaxcompat.connected_hosts()
+    if hosts is None:
+        return
+    first, *others = (json.loads(text) for text in _exchange(json.dumps(dict(values)), hosts))
+    for host, other in enumerate(others, 1):
+        for name in {**first, **other}:
+            if first.get(name) != other.get(name):
+                raise ConfigError(
+                    f"expected the same {what} on all hosts, got {name} = {first.get(name)!r} on host 0 and "
+                    f"{other.get(name)!r} on host {host}. {remedy}"
+                )
+
+
+def _exchange(text: str, hosts: jaxcompat.Hosts) -> list[str]:
+    """Return the texts of all hosts, in their order; they go through the coordinator, not through devices."""
+    client, host_id, n_hosts = hosts
+    folder = f"crazysim/exchange-{next(_exchanges)}"
+    client.key_value_set(f"{folder}/{host_id}", text)
+    return [client.blocking_key_value_get(f"{folder}/{i}", 1000 * AGREEMENT_SECONDS) for i in range(n_hosts)]
+
+
+def must_stop(iteration: int) -> bool:
+    """Return True on all hosts after the same iteration, if a host has received SIGTERM; False without other hosts.
+
+    Args:
+        iteration: Number of the iteration that has ended.
+    """
+    return jax.process_count() > 1 and jaxcompat.is_stop_requested(iteration)
+
+
+def decided_by_first(decision: bool) -> bool:
+    """Return the decision of host 0, on all hosts: clocks of hosts differ. Waits for the devices of all hosts."""
+    return decision if jax.process_count() == 1 else jaxcompat.broadcast_from_first(decision)

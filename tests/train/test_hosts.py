@@ -1,0 +1,183 @@
+"""Trainings of two processes with two devices each, which act as two hosts: one policy, and one end."""
+
+import argparse
+import json
+import os
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from waiting import wait_for
+
+from crazysim.__main__ import main
+from crazysim.commands import hosts
+from crazysim.train import checkpoint
+from crazysim.train.training import CHECKPOINT, CURVE, POLICY
+
+SMALL = "--worlds 64 --no-film --set seconds=0.2 --config n_steps=4 minibatches=2 epochs=1 hidden=[8]".split()
+HEARTBEAT = 20
+"""Time without a heartbeat after which a host is lost, s: others use the processor, too."""
+
+
+def free_address():
+    """Return an address at which nothing listens."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{s.getsockname()[1]}"
+
+
+def environment(**others):
+    flags = re.sub(r"device_count=\d+", "device_count=2", os.environ["XLA_FLAGS"])
+    return os.environ | {"XLA_FLAGS": flags} | others
+
+
+class Process:
+    """A command in a process of its own, whose output goes into a file."""
+
+    def __init__(self, folder, name, *command, **variables):
+        self._path = folder / f"{name}.txt"
+        with self._path.open("wb") as file:
+            self._process = subprocess.Popen(command, env=environment(**variables), stdout=file, stderr=file)
+
+    def end(self):
+        """Wait for the end, and return the exit status and the output."""
+        status = self._process.wait(timeout=300)
+        return status, self._path.read_text()
+
+    def signal(self, number):
+        self._process.send_signal(number)
+
+    @property
+    def has_ended(self):
+        return self._process.poll() is not None
+
+
+def start(folder, arguments, others=((), ())):
+    """Return the processes of two hosts that run a command, each with other arguments besides."""
+    address = free_address()
+    common = f"--coordinator {address} --hosts 2 --heartbeat-timeout {HEARTBEAT}".split()
+    return [
+        Process(folder, f"host{i}", sys.executable, "-m", "crazysim", *arguments, *common, "--host-id", str(i), *own)
+        for i, own in enumerate(others)
+    ]
+
+
+def training(out, *further):
+    return ["train", "hover", *SMALL, "--out", str(out), *further]
+
+
+def iteration(out):
+    """Return the last iteration in the checkpoint of a run; -1 without one."""
+    path = out / CHECKPOINT
+    return int(checkpoint.read(path)[0]["['learner'].iteration"]) if path.exists() else -1
+
+
+def assert_same_files(mine, others):
+    """Assert that the checkpoints and policies of two runs agree to rounding."""
+    for name in (CHECKPOINT, POLICY):
+        (x, _), (y, _) = (checkpoint.read(out / name) for out in (mine, others))
+        assert x.keys() == y.keys()
+        for key in x:
+            np.testing.assert_allclose(x[key], y[key], rtol=1e-4, atol=1e-5, err_msg=key)
+
+
+@pytest.mark.long("six processes import JAX, and compile or load a training")
+def test_two_hosts_train_as_one_stop_together_and_survive_the_loss_of_one(tmp_path):
+    """One training: complete; continued, and interrupted by Ctrl-C on one host; continued, until a host is killed;
+    continued by one process with all devices."""
+    out, alone = tmp_path / "two", tmp_path / "one"
+    ended = [process.end() for process in start(tmp_path, training(out, "--iterations", "3"))]
+    assert [status for status, _ in ended] == [0, 0], ended
+    assert "16 on each of 4 devices" in ended[0][1]
+    assert "host 1 of 2: 2 cpu" in ended[1][1]
+    assert "success" not in ended[1][1], "only host 0 reports"
+    assert main(training(alone, "--iterations", "3", "--devices", "4")) == 0
+    assert_same_files(out, alone)
+    assert len(json.loads((out / CURVE).read_text())) == 2
+
+    endless = training(out, "--resume", "--iterations", "100000", "--checkpoint-every", "0.01")
+    first, second = start(tmp_path, endless)
+    wait_for(lambda: iteration(out) > 3 or first.has_ended)
+    second.signal(signal.SIGINT)
+    (status, text), (other_status, _) = first.end(), second.end()
+    assert (status, other_status) == (128 + signal.SIGTERM, 128 + signal.SIGINT), text
+    assert f"interrupted after iteration {iteration(out)}" in text
+    assert "start all hosts again" not in text, "nothing was lost"
+
+    stopped = iteration(out)
+    first, second = start(tmp_path, endless)
+    wait_for(lambda: iteration(out) > stopped or first.has_ended)
+    second.signal(signal.SIGKILL)
+    (status, text), (other_status, _) = first.end(), second.end()
+    assert (status, other_status) == (128 + signal.SIGABRT, -signal.SIGKILL)
+    assert f"host 1 lost: no heartbeat for {HEARTBEAT} s. The last checkpoint continues the training" in text
+    assert f"crazysim train hover {shlex.join(SMALL)}" in text
+
+    last = iteration(out)
+    assert main(training(out, "--resume", "--iterations", str(last + 1), "--devices", "4")) == 0
+    assert iteration(out) == last + 1
+
+
+@pytest.mark.long("two processes import JAX")
+def test_hosts_with_other_settings_stop_together(tmp_path):
+    others = ((), ("--seed", "1"))
+    for i, process in enumerate(start(tmp_path, training(tmp_path / "out", "--iterations", "1"), others)):
+        status, text = process.end()
+        assert status == 2
+        assert "expected the same settings on all hosts, got seed = 0 on host 0 and 1 on host 1" in text, i
+    assert not (tmp_path / "out" / CHECKPOINT).exists()
+
+
+VERSION = """
+import sys, jax, crazysim
+from crazysim.train.hosts import require_same_versions
+crazysim.__version__ = f"0.{sys.argv[2]}"
+jax.distributed.initialize(sys.argv[1], 2, int(sys.argv[2]), cluster_detection_method="deactivate")
+require_same_versions()
+"""
+
+
+def test_hosts_with_other_versions_are_an_error(tmp_path):
+    address = free_address()
+    command = (sys.executable, "-c", VERSION, address)
+    for process in [Process(tmp_path, str(i), *command, str(i)) for i in range(2)]:
+        status, text = process.end()
+        assert status == 1
+        assert "expected the same versions on all hosts, got crazysim = '0.0' on host 0 and '0.1' on host 1" in text
+
+
+def test_a_coordinator_that_does_not_answer_is_an_error_with_its_address(tmp_path):
+    address = free_address()
+    arguments = training(tmp_path, "--coordinator", address, "--hosts", "2", "--host-id", "1", "--connect-timeout", "1")
+    status, text = Process(tmp_path, "alone", sys.executable, "-m", "crazysim", *arguments).end()
+    assert status == 128 + signal.SIGABRT
+    assert f"expected 2 hosts to connect with {address} within 1 s, got no connection with host 0" in text
+    assert "stack trace" not in text
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--hosts 2 --host-id 0", "expected --coordinator with --host-id and --hosts"),
+        ("--coordinator here --hosts 2 --host-id 0", "expected HOST:PORT or auto as --coordinator, got 'here'"),
+        ("--coordinator here:1 --hosts 2 --host-id 2", "got --hosts 2 --host-id 2"),
+        ("--coordinator here:1 --hosts 2", "got --hosts 2 --host-id None"),
+        ("--coordinator auto", "expected the variables of SLURM or Open MPI"),
+    ],
+)
+def test_options_of_hosts_are_checked(options, message, capsys):
+    assert main(["train", "hover", *options.split()]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_slurm_says_which_host_this_is(monkeypatch):
+    variables = {"JOB_ID": "4097", "STEP_NODELIST": "gpu[07-08]", "NTASKS": "8", "PROCID": "5", "LOCALID": "1"}
+    for name, value in variables.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    options = argparse.Namespace(heartbeat_timeout=7, connect_timeout=30)
+    assert hosts._find_host(options) == hosts.Host("gpu07:61441", 5, 8, [1], 7, 30)
