@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.custom_batching import custom_vmap
 
 from crazysim import jaxcompat
 from crazysim.engine.backends import cuda
@@ -316,7 +315,7 @@ def apply_mlp(layers: Layers, x: Array) -> Array:
 def _batchable(gradient: bool) -> Callable[..., Array]:
     """Return ``_launch`` for the network of one seed; ``jax.vmap`` over seeds launches one kernel for all of them."""
 
-    @custom_vmap
+    @jaxcompat.custom_vmap
     def run(*args: Any) -> Array:
         return _launch(gradient, *_stack(1, None, *args))[0]
 
