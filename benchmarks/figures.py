@@ -7,11 +7,11 @@
 ``FIGURES`` has a command for each figure. ``--write`` runs the commands for a device, stores what they print in
 ``docs/concepts/figures.json`` with machine, versions, date and commit, and writes their tables into the pages, between
 the comments ``<!-- figure NAME -->`` and ``<!-- end of NAME -->``. Records of other machines stay. On a machine without
-the repository, ``--records FILE --commit COMMIT`` writes the records to a file, and ``--write --take FILE`` in the
-repository puts them into the pages.
+the repository, ``--write --records FILE --commit COMMIT`` writes the records to a file, and ``--write --take FILE`` in
+the repository puts them into the pages.
 
 ``--stale`` lists each record that is older than a change of what it measures, and ends with status 1 if there is one.
-Changes of comments, docstrings, annotations and error messages do not count, nor do new names for the same.
+Changes of comments, docstrings, annotations of functions, names and error messages do not count.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ MACHINE_KEYS = ("device", "processor", "vectors", "cores", "jax", "python", "dat
 """Keys of lines that a record has once."""
 
 ENGINE = ("crazysim/engine", ":(exclude)crazysim/engine/tools")
-STEP = (*ENGINE, "crazysim/core", "crazysim/dynamics", "crazysim/control", "crazysim/sim/sim.py")
+BASE = ("crazysim/rotation.py", "crazysim/pytree.py", "crazysim/jaxcompat.py", "crazysim/drones")
+STEP = (*BASE, *ENGINE, "crazysim/core", "crazysim/dynamics", "crazysim/control", "crazysim/sim/sim.py")
 """Sources of a step, as Git's path specifications."""
 SCENE = ("crazysim/geometry", "crazysim/scene")
 ENVS = (*STEP, "crazysim/envs")
@@ -48,7 +49,7 @@ VERSUS = ("benchmarks/versus_crazyflow.py", "benchmarks/contestant.py")
 
 
 class Figure(NamedTuple):
-    """What one command measures and one page shows."""
+    """A table on a page, and the command that measures it."""
 
     page: str
     """Page with the figure."""
@@ -78,7 +79,9 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="list figures, pages, commands and records")
     parser.add_argument("--stale", action="store_true", help="list records that are older than what they measure")
     parser.add_argument("--write", action="store_true", help="measure, and write records and pages")
-    parser.add_argument("--only", nargs="*", choices=list(FIGURES), default=list(FIGURES), help="figures to measure")
+    parser.add_argument(
+        "--only", nargs="*", choices=list(FIGURES), default=list(FIGURES), help="figures that --write measures"
+    )
     parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu")
     parser.add_argument("--peer-python", help="interpreter with Crazyflow 0.4.0, for comparisons with it")
     parser.add_argument("--records", type=Path, help="file for the new records, instead of the pages")
@@ -156,8 +159,9 @@ def record(name: str, command: str, commit: str, lines: list[Line]) -> Line:
 
 
 def checked_out() -> str:
-    """Return the commit that is checked out."""
-    return git("rev-parse", "--short=9", "HEAD").strip()
+    """Return the commit that is checked out, with ``+`` if the sources have been changed since."""
+    changed = git("status", "--porcelain", "--", "crazysim", "benchmarks").strip()
+    return git("rev-parse", "--short=9", "HEAD").strip() + "+" * bool(changed)
 
 
 def git(*words: str) -> str:
@@ -350,7 +354,7 @@ def training_commits() -> dict[str, str]:
 
 def validation_commits() -> dict[str, str]:
     """Return the commit that ``crazysim validate`` wrote into its page."""
-    found = re.search(r"crazysim [\d.]+, commit ([0-9a-f]{7,})", (ROOT / "docs/validation.md").read_text())
+    found = re.search(r"crazysim [\d.]+, commit ([0-9a-f]{7,}\+?)", (ROOT / "docs/validation.md").read_text())
     return {"all": found[1]} if found else {}
 
 
@@ -502,10 +506,14 @@ FIGURES: dict[str, Figure] = {
         gpu="trainers.py --worlds 1024 65536 --seeds 3",
         table=tables.trainers,
     ),
-    "training": Figure("docs/concepts/training-results.md", (*ENVS, "crazysim/train"), commits=training_commits),
+    "training": Figure(
+        "docs/concepts/training-results.md",
+        (*ENVS, *SCENE, "crazysim/plugins", "crazysim/train"),
+        commits=training_commits,
+    ),
     "validation": Figure(
         "docs/validation.md",
-        ("crazysim/dynamics", "crazysim/control", "crazysim/lab/validate"),
+        (*PLUGINS, "crazysim/lab/validate"),
         commits=validation_commits,
     ),
 }

@@ -19,11 +19,11 @@ from crazysim import startup
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "gymnasium")
 """Packages that crazysim needs."""
 OPTIONAL = ("optax", "viser", "websockets", "matplotlib", "imageio-ffmpeg", "casadi", "onnx", "pettingzoo", "warp-lang",
-            "cflib", "motioncapture")  # fmt: skip
+            "cflib", "motioncapture", "pymavlink", "rosbags", "ziglang", "tqdm", "trimesh")  # fmt: skip
 """Packages of the extras."""
 VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XLA_FLAGS", "CUDA_VISIBLE_DEVICES",
-             "CXX", "CXXFLAGS", "CRAZYSIM_CACHE", "CRAZYSIM_COMPILE_TIMEOUT", "CRAZYSIM_RENDERING",
-             "XDG_CACHE_HOME", "MUJOCO_GL")  # fmt: skip
+             "CXX", "CXXFLAGS", "CRAZYSIM_CACHE", "CRAZYSIM_COMPILE_TIMEOUT", "CRAZYSIM_JAX_FALLBACKS",
+             "CRAZYSIM_RENDERING", "XDG_CACHE_HOME", "MUJOCO_GL")  # fmt: skip
 """Environment variables that change the behaviour of crazysim."""
 
 

@@ -15,8 +15,9 @@ from crazysim.core.stage import Stage, acts_now
 def controller_stages(controller: Controller, control: Control) -> Pipeline:
     """Return the stages of a controller that follows a command level, in order.
 
-    One stage puts the staged command in force and commands the rotors or the allocation. With an outer loop there are
-    two: the first puts the setpoint in force at the rate of the outer loop, the second commands at the controller's.
+    One stage puts the staged command in force, and stages the command of the level below or sets the rotor speeds. With
+    an outer loop there are two: the first puts the setpoint in force at the rate of the outer loop, the second commands
+    at the controller's.
     """
     level = control.value
 

@@ -1,4 +1,4 @@
-"""Calls of plugins within the integration, with checks of their results."""
+"""Calls of plugins within the integration: influences, derivatives of their records, and constraints."""
 
 from __future__ import annotations
 

@@ -210,7 +210,9 @@ class Env(ABC):
         state = self.phases.reset_episode(
             state, self.base.episode_reset.make_default(state.data), vectorize_over_worlds
         )
-        state = self.phases.look(state) if self.phases.takes_images else state
+        if self.phases.takes_images:
+            state = self.phases.look(state)
+            state = state.replace(info={name: x for name, x in state.info.items() if name != "final_obs"})
         core = state.full_data.core.replace(mjx_synced=jnp.asarray(False))
         full_data = state.full_data.replace(core=core)
         return EnvState(full_data if self.sim.mesh is None else shard(full_data, self.sim.mesh))

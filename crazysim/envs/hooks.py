@@ -1,4 +1,4 @@
-"""Hooks: functions of one world that add to the phases of an environment step."""
+"""Hooks: functions, most of them of one world, that add to the phases of an environment step."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Hooks:
     | ``after_step(state)`` | after observations and reward; the innermost wrapper is called first |
     | ``look(state)`` | at the end of ``reset`` and ``step``, with the state of all worlds |
 
-    A hook receives the state without the axis of worlds: (n_drones, k). The memory of a wrapper is
-    ``state.memory[self.name]``; see ``remember`` and ``recall``. It is stored per world, except fields that a record
-    declares with ``leaf("drone")``, which a fused step divides among the drones.
+    All hooks but ``prepare`` and ``look`` receive one world, without the axis of worlds: (n_drones, k). The memory of a
+    wrapper is ``state.memory[self.name]``; see ``remember`` and ``recall``. It is stored per world, except fields that
+    a record declares with ``leaf("drone")``, which a fused step divides among the drones.
     """
 
     name: str = ""

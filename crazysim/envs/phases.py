@@ -1,8 +1,8 @@
-"""Phases of an environment step: act, (physics), observe, reset episode.
+"""Phases of an environment step: act, (physics), observe, reset episode, look.
 
-Each is written for one world, and becomes a stage of the step: ``act`` before the physics, ``observe`` after it, and
-``reset_episode`` where an episode is over. ``Env.reset`` and ``Env.restart`` also call ``reset_episode``, for all
-worlds. Methods of tasks and hooks of wrappers are called here and nowhere else.
+Each but the last is written for one world, and becomes a stage of the step: ``act`` before the physics, ``observe``
+after it, and ``reset_episode`` where an episode is over. ``look`` takes the images of all worlds. ``Env.reset`` and
+``Env.restart`` also call ``reset_episode`` and ``look``, for all worlds.
 """
 
 from __future__ import annotations
@@ -123,22 +123,21 @@ class Phases:
         return any(type(wrapper).look is not Hooks.look for wrapper in self.wrappers)
 
     def _look(self, data: SimData) -> SimData:
-        return _restore_types(data, self.look(EnvState(data)))
+        before, state = EnvState(data), self.look(EnvState(data))
+        if "final_obs" in state.info:
+            over = before.done[:, None, None]
+            images = {name: jnp.where(over, before.obs[name], x) for name, x in state.record.images.items()}
+            state = state.replace(info=state.info | {"final_obs": state.info["final_obs"] | images})
+        return _restore_types(data, state)
 
     def look(self, state: EnvState) -> EnvState:
-        """Return the state of all worlds with new images; those before become the images of the final observations."""
-        before = state.record.images
+        """Return the state of all worlds with new images."""
         images = {name: x for wrapper in self.wrappers for name, x in wrapper.look(state).items()}
         if both := images.keys() & state.record.obs.keys():
             raise ConfigError(f"expected other names of images than those of observations, got {min(both)!r} as both")
         invalid = state.full_data.core.nonfinite[..., None]
         images = {name: jnp.where(invalid, jnp.zeros((), x.dtype), x) for name, x in images.items()}
-        state = EnvState(
-            state.full_data.replace(plugins=state.full_data.plugins | {NAME: state.record.replace(images=images)})
-        )
-        if "final_obs" not in state.info:
-            return state
-        return state.replace(info=state.info | {"final_obs": state.info["final_obs"] | (before or images)})
+        return state.replace(images=images)
 
     def _act(self, data: SimData, vectorize: Vectorize) -> SimData:
         state = EnvState(data)

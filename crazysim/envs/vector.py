@@ -120,7 +120,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         if "final_obs" in entries:
             entries["final_obs"] = {k: v.reshape(*n, -1) for k, v in info["final_obs"].items()}
         obs = {k: v.reshape(*n, -1) for k, v in obs.items()}
-        return state.replace(obs=obs, reward=jnp.broadcast_to(reward[:, None], n), info=entries)
+        images = {name: obs.pop(name) for name in state.record.images}
+        return state.replace(obs=obs, images=images, reward=jnp.broadcast_to(reward[:, None], n), info=entries)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Advance all worlds.

@@ -192,7 +192,7 @@ def build_depth_fn(
         return kernels.run_on_each_device(cast_in_parts, data)
 
     def cast_in_parts(data: SimData, kernels: RayKernels) -> Hits:
-        """Cast the rays of as many worlds at a time as fit into memory."""
+        """Cast the rays of all worlds, in parts of at most ``MAX_RAYS`` or ``MAX_RAYS_OF_KERNEL``."""
         max_rays = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
         n_worlds, at_a_time = data.states.pos.shape[0], max(1, max_rays // n_rays)
         if n_worlds <= at_a_time:

@@ -30,8 +30,8 @@ IGNORES_NONE, NOT_A_DRONE = -1, -2
 """Drone index of rays that ignore no drone, and drone index of geoms that belong to no drone."""
 
 FAR_FROM_OBJECTS = 1e4
-"""Distance of the drones from the objects where the hierarchy of movable geoms is planned, m: drones get a branch of
-their own."""
+"""Offset between drones and objects while the hierarchy of movable geoms is built, so that drones form a branch of
+their own, m."""
 
 Surface = Shape | str
 """A mesh or height field, or the kind of shapes that their sizes describe."""
@@ -206,7 +206,7 @@ class Targets:
             axes = jnp.stack([rotation.rotate(quat, jnp.asarray(rot[:, :, k], dtype)) for k in range(3)], axis=-1)
             middle, half = (jnp.asarray(x, dtype)[:, None] for x in (middle, half))
             centre, reach = geom_pos + jnp.sum(axes * middle, axis=-1), jnp.sum(jnp.abs(axes) * half, axis=-1)
-            reach = reach + hierarchy.BOX_PADDING
+            reach = reach + hierarchy.BOX_PADDING + 4 * jnp.finfo(dtype).eps * jnp.abs(centre)
             boxes.append(jnp.concatenate([centre - reach, centre + reach], axis=-1))
             size = jnp.broadcast_to(jnp.asarray(rows[:, 13:], dtype), (*geom_pos.shape[:2], 3))
             zero = jnp.zeros_like(geom_pos[..., :1])

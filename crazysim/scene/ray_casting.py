@@ -296,7 +296,7 @@ def cast_rays_in_worlds(
 
     A function of one ray finds the distance and the nearest geom, without a derivative, in a kernel of the engine where
     that is possible; a second one finds the normal there. Derivatives depend on that geom alone; XLA computes them.
-    Within ``jit``, what is not used is neither computed nor compiled.
+    ``jit`` removes what is not used.
 
     Args:
         model: Model, without bodies whose poses are not part of the data.

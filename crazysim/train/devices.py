@@ -46,15 +46,21 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
     """Return the devices of a training.
 
     Args:
-        device: Platform of the devices, or one of them.
+        device: Platform of the devices, or the first of a number of them.
         devices: The devices.
 
     Raises:
         ConfigError: If a device does not exist, or if ``devices`` is not one of the forms of ``Devices``.
     """
-    chosen, platform = _read_devices(devices), find_device(device).platform
-    available = jax.devices(platform)
-    indices = list(chosen) if isinstance(chosen, tuple) else list(range(len(available) if chosen is None else chosen))
+    chosen, first_device = _read_devices(devices), find_device(device)
+    platform, available = first_device.platform, jax.devices(first_device.platform)
+    if isinstance(chosen, tuple):
+        indices = list(chosen)
+    elif chosen is None:
+        indices = list(range(len(available)))
+    else:
+        first = available.index(first_device) if isinstance(device, str) and ":" in device else 0
+        indices = list(range(first, first + chosen))
     if missing := [i for i in indices if i >= len(available)]:
         hint = "" if platform != "cpu" else (
             " A CPU is one device, or N with XLA_FLAGS=--xla_force_host_platform_device_count=N in the environment."

@@ -1,4 +1,4 @@
-"""Outputs and gradients of tanh networks by one CUDA kernel each, for PPO on an NVIDIA GPU.
+"""Outputs and gradients of tanh networks by one CUDA kernel each, for PPO on one NVIDIA GPU of the Hopper architecture.
 
 XLA writes the activations of every layer to memory and reads them again, which takes most of the time of an update.
 Here a warp computes all layers of 16 samples in its registers. For gradients it computes the activations again; each
@@ -6,7 +6,7 @@ block adds up the gradients of the weights over its samples, and XLA adds the su
 
 Products are those of tensor cores, with operands of 16 bits and sums of 32 bits. The operands have 11 bits of
 precision, like those of TF32, which XLA uses on the same GPUs, but a smaller range: weights, normalised observations
-and activations are within it, and gradients of the outputs are scaled such that the largest is between 64 and 128.
+and activations are within it, and gradients of the outputs are scaled such that the largest is between 1 and 2.
 
 Lanes of a warp hold operands as in the PTX manual, "Matrix Fragments for mma.m16n8k16": of a sum of 16 x 8 numbers,
 lane 4 g + t has columns 2 t and 2 t + 1 of rows g and g + 8. Two sums, rounded, are a left operand of the next product.
@@ -31,13 +31,13 @@ MAX_WIDTH, MAX_UNITS, MAX_LAYERS = 128, 64, 4
 """Largest number of inputs or outputs, of units of a hidden layer, and of layers."""
 WARPS_AND_BLOCKS = {(False, False): (4, 4), (False, True): (4, 3), (True, False): (4, 2), (True, True): (8, 1)}
 """Warps of a block, and blocks on a multiprocessor, by whether there are more than 64 inputs and whether the kernel is
-for gradients: about the fastest of three to six pairs on an H100, with 21 inputs, or 40 and 128 units."""
+for gradients: about the fastest of three to six pairs on an H100, with 21 inputs for the first two."""
 KERNEL_NAMES = ("mlp_outputs", "mlp_gradients")
 CAPABILITY, MAX_SHARED_BYTES, MULTIPROCESSORS = 90, 227 * 2**10, 132
 """Compute capability of the GPUs that use the kernels, those of the Hopper architecture, times ten; the largest shared
 memory of a block there (CUDA C++ Programming Guide), bytes; and the number of multiprocessors of an H100 SXM."""
 
-PTX = r"""
+INTRINSICS = r"""
 typedef unsigned u32; typedef unsigned short u16;
 #define METHOD __device__ __forceinline__
 #define DEVICE static METHOD
@@ -224,7 +224,7 @@ warp of a block has 16 samples."""
 
 
 def cuda_source(sizes: tuple[int, ...], gradient: bool) -> tuple[str, int]:
-    """Return the CUDA source of a kernel without ``PTX``, and the shared memory of a block, bytes.
+    """Return the CUDA source of a kernel without ``INTRINSICS``, and the shared memory of a block, bytes.
 
     Args:
         sizes: Number of inputs, sizes of the hidden layers, number of outputs.
@@ -283,7 +283,8 @@ def choose_mlp(network: Network, device: jax.Device, n_devices: int = 1) -> Call
     """Return ``apply_mlp`` where its kernels run and its inputs are constants, otherwise ``mlp``.
 
     Args:
-        network: Network before the layers; one with weights needs the gradients of its features.
+        network: Network before the layers; one with weights needs gradients with respect to its features, which kernels
+            do not give.
         device: Device of the training.
         n_devices: Number of devices of the training; XLA does not distribute kernels over several.
     """
@@ -293,7 +294,7 @@ def choose_mlp(network: Network, device: jax.Device, n_devices: int = 1) -> Call
 
 
 def apply_mlp(layers: Layers, x: Array) -> Array:
-    """Return ``mlp(layers, x)`` to the precision of TF32, for inputs that are constants of a gradient.
+    """Return ``mlp(layers, x)`` to about 11 bits, within the range of float16; gradients are those of the layers.
 
     Networks that are larger than the kernels allow, or of another dtype, are computed by ``mlp``.
 
@@ -342,7 +343,7 @@ def _forward(layers: Layers, x: Array) -> tuple[Array, Any]:
 def _backward(residuals: Any, cotangent: Array) -> Any:
     layers, x = residuals
     largest = jnp.max(jnp.abs(cotangent))
-    exponent = jnp.where((largest > 0) & jnp.isfinite(largest), 6 - jnp.floor(jnp.log2(largest)), 0.0)
+    exponent = jnp.where((largest > 0) & jnp.isfinite(largest), -jnp.floor(jnp.log2(largest)), 0.0)
     scale = jnp.exp2(jnp.clip(exponent, -100, 100))  # an infinite one would make zeros NaN
     sums = _gradients(layers, x, scale, cotangent).sum(axis=0) / scale
     ends = np.cumsum([array.size for layer in layers for array in layer])
@@ -389,7 +390,7 @@ def _run_kernel(source: str, name: str, grid: tuple[int, ...], arrays: list[Any]
     """Return the result of a kernel; ``grid`` is blocks along x and y, threads of a block and its shared memory."""
     names = ("grid_x", "grid_y", "block_x", "shared_mem_bytes", "grid_z", "block_y", "block_z")
     integers: dict[str, Any] = {name: np.int32(x) for name, x in zip(names, (*grid, 1, 1, 1), strict=True)}
-    code = cuda.compile_source(PTX + source, f"compute_{CAPABILITY}", "PTX").decode()
+    code = cuda.compile_source(INTRINSICS + source, f"compute_{CAPABILITY}", "PTX").decode()
     run = jax.ffi.ffi_call(cuda.PTX_TARGET, result)
     return run(*arrays, name=name, kernel_type="ptx", kernel_data=code, **integers)
 

@@ -380,6 +380,8 @@ class _Training:
             description: Description of the policy's inputs and outputs.
             is_planned: True if an uninterrupted run makes this evaluation too. Others must not influence a resumed run.
         """
+        # A planned evaluation that is repeated, after a run was resumed at its end, stays a planned one.
+        is_planned |= any(known["iteration"] == point["iteration"] and known["kept"] for known in self.curve)
         self.curve[:] = [earlier for earlier in self.curve if earlier["iteration"] < point["iteration"]]
         best_check = max((earlier["check"] for earlier in self.curve if earlier["kept"]), default=0.0)
         point["kept"] = point["check"] >= least_kept_success(best_check, n_starts)

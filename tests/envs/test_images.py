@@ -7,7 +7,16 @@ import pytest
 from env_cases import random_action
 
 from crazysim import ConfigError
-from crazysim.envs import AutoReset, DepthImages, DroneVectorEnv, Observe, make
+from crazysim.envs import (
+    AutoReset,
+    DepthImages,
+    DroneVectorEnv,
+    FrameStack,
+    Normalize,
+    ObservationNoise,
+    Observe,
+    make,
+)
 from crazysim.envs.state import EnvState
 
 SIZE = {"width": 8, "height": 6}
@@ -40,10 +49,20 @@ def test_images_are_those_of_the_state_after_the_step_and_after_new_episodes(pai
     assert np.asarray(flown[0][2].obs["depth"]).std() > 0.1, "nothing is in view"
 
 
-def test_final_observations_have_the_images_of_the_step_before(flown):
+def test_final_observations_of_episodes_have_the_images_of_the_step_before(flown):
     for before, after in zip(flown[0], flown[0][1:], strict=False):
-        np.testing.assert_array_equal(after.final_obs["depth"], before.obs["depth"])
+        expected = (before if after.done.all() else after).obs["depth"]
+        np.testing.assert_array_equal(after.final_obs["depth"], expected)
         assert after.final_obs.keys() == after.obs.keys()
+
+
+def test_restarted_worlds_have_images_of_their_new_episodes(pair, flown):
+    restarted = pair[0].restart(flown[0][1], np.array([True, False, False]))
+    assert jax.tree.structure(restarted) == jax.tree.structure(flown[0][1])
+    for obs in (restarted.obs, restarted.final_obs):
+        np.testing.assert_array_equal(obs["depth"][1:], flown[0][1].obs["depth"][1:])
+    np.testing.assert_array_equal(restarted.final_obs["depth"], restarted.obs["depth"])
+    assert not np.array_equal(restarted.obs["depth"][0], flown[0][1].obs["depth"][0])
 
 
 def test_nothing_else_depends_on_images(flown):
@@ -68,6 +87,17 @@ def test_adapters_have_the_images_in_their_spaces():
     obs, *_ = env.step(env.action_space.sample())
     assert obs["depth"].shape == (2, 12)
     assert env.observation_space.contains(jax.device_get(obs))
+    again, _ = env.reset(options={"reset_mask": np.array([True, False])})
+    np.testing.assert_array_equal(again["depth"][1], obs["depth"][1])
+    env.reset()
+
+
+def test_wrappers_around_images_leave_them_as_they_are():
+    env = DepthImages(make("hover", 2, engine="interpret"), **SIZE)
+    for around in (lambda env: FrameStack(env, 2), Normalize, lambda env: ObservationNoise(env, {"pos": 0.1})):
+        state = around(env).reset(jax.random.key(0))
+        state = around(env).step(state, jnp.zeros((2, 1, 4)))
+        assert state.obs["depth"].shape == (2, 1, 48)
 
 
 def test_law_09_wrong_images_are_refused():

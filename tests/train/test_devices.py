@@ -174,3 +174,4 @@ def test_a_training_on_several_devices_is_evaluated_on_the_first_of_them():
     env = TrainConfig.create("hover", devices=[3], n_worlds=2).make_training_env()
     assert (env.sim.device, env.sim.mesh) == (jax.devices()[3], None)
     assert find_devices("cpu", "2,0") == [jax.devices()[2], jax.devices()[0]]
+    assert find_devices("cpu:1", 2) == jax.devices()[1:3]

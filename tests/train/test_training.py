@@ -159,6 +159,14 @@ def test_a_later_policy_within_two_standard_errors_is_kept():
     assert runs.least_kept_success(0.0, 1000) < 0.0
 
 
+def test_the_last_evaluation_of_a_resumed_run_stays_kept_where_it_is_repeated(tmp_path):
+    training = runs._Training("", runs.TrainConfig.create("hover"), tmp_path, {})
+    for iteration, is_planned in ((120, True), (130, True), (130, False)):
+        point = {"iteration": iteration, "check": 1.0}
+        training.add_evaluation(point, np.int32(iteration), 1000, {}, is_planned)
+        assert runs.kept_point(training.curve)["iteration"] == training.kept_policy == iteration
+
+
 def test_the_policy_that_did_best_on_the_check_set_is_kept(tmp_path, monkeypatch):
     """A learning rate that ruins the policy leaves a better one. An interrupt writes the best until then, but does not
     change what an uninterrupted run keeps, which evaluates less often."""

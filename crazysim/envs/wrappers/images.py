@@ -16,8 +16,9 @@ class DepthImages(Wrapper):
     """Add ``obs["depth"]``: a depth image of the camera of each drone, row by row, in m. (n_worlds, n_drones, k)
 
     An image is taken of all worlds at the end of every environment step, by the kernel of ``Sim.depth``; it does not
-    change rewards or the ends of episodes. Reshape it for a convolution: ``depth.reshape(-1, height, width)``.
-    Worlds on a mesh of devices have no images.
+    change rewards or the ends of episodes. Where an episode ends and another one begins in the same step, ``final_obs``
+    has the image of the step before. Reshape it for a convolution: ``depth.reshape(-1, height, width)``. Worlds on a
+    mesh of devices have no images.
     """
 
     def __init__(

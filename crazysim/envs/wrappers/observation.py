@@ -84,10 +84,10 @@ class ObservationNoise(Wrapper):
         self.std = {name: read_number(f"std of {name!r}", value, NOT_NEGATIVE) for name, value in std.items()}
 
     def after_reset(self, state: EnvState) -> EnvState:
-        return state.replace(obs=self._add_noise(state.obs, state.data))
+        return state.replace(obs=self._add_noise(state.record.obs, state.data))
 
     def after_step(self, state: EnvState) -> EnvState:
-        return state.replace(obs=self._add_noise(state.obs, state.data))
+        return state.replace(obs=self._add_noise(state.record.obs, state.data))
 
     def _add_noise(self, obs: Obs, data: SimData) -> Obs:
         if missing := set(self.std) - set(obs):
@@ -107,6 +107,8 @@ def _draw_normal(key: Array, number: int, template: Array) -> Array:
 class Normalize(Wrapper):
     """Normalise observations to mean zero and variance one over all worlds and drones so far, clipped to [-10, 10].
 
+    Images are not normalised.
+
     ``state.memory["Normalize"]`` holds the statistics, by name of the observation. To fly a policy with the
     statistics of its training, pass them: ``Normalize(env, stats)`` does not update them. Blocks of worlds with keys of
     their own, such as those of several seeds in one training, share the statistics.
@@ -121,10 +123,11 @@ class Normalize(Wrapper):
     def after_reset(self, state: EnvState) -> EnvState:
         if self.name in state.memory:
             return self._normalize(state, self.recall(state))
-        stats = self.stats or {name: RunningStats.create(x.shape[-1]) for name, x in state.obs.items()}
-        if missing := set(state.obs) ^ set(stats):
+        obs = state.record.obs  # without images
+        stats = self.stats or {name: RunningStats.create(x.shape[-1]) for name, x in obs.items()}
+        if missing := set(obs) ^ set(stats):
             raise ConfigError(
-                f"expected statistics of the observations {', '.join(sorted(state.obs))}, got "
+                f"expected statistics of the observations {', '.join(sorted(obs))}, got "
                 f"{', '.join(sorted(stats))}: {', '.join(sorted(missing))} is in one of them only"
             )
         return self._update(state, stats)
@@ -134,11 +137,11 @@ class Normalize(Wrapper):
 
     def _update(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
         if self.stats is None:
-            stats = {name: stats[name].update(x) for name, x in state.obs.items()}
+            stats = {name: stats[name].update(x) for name, x in state.record.obs.items()}
         return self._normalize(state, stats)
 
     def _normalize(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
-        return self.remember(state, stats, obs={name: stats[name].normalize(x) for name, x in state.obs.items()})
+        return self.remember(state, stats, obs={name: stats[name].normalize(x) for name, x in state.record.obs.items()})
 
 
 class Frames(PyTree):
@@ -149,19 +152,20 @@ class Frames(PyTree):
 
 
 class FrameStack(Wrapper):
-    """Observe the last ``n`` observations, the oldest first, concatenated along the last axis."""
+    """Observe the last ``n`` observations, the oldest first, concatenated along the last axis; images stay single."""
 
     def __init__(self, env: Env, n: int):
         super().__init__(env)
         self.n = positive_integer("n", n)
 
     def after_reset(self, state: EnvState) -> EnvState:
-        return self._stack(state, jax.tree.map(lambda x: jnp.repeat(x[..., None, :], self.n, axis=-2), state.obs))
+        frames = jax.tree.map(lambda x: jnp.repeat(x[..., None, :], self.n, axis=-2), state.record.obs)
+        return self._stack(state, frames)
 
     def after_step(self, state: EnvState) -> EnvState:
         old_frames = self.recall(state).obs
         frames = jax.tree.map(
-            lambda x, y: jnp.concatenate([y[..., 1:, :], x[..., None, :]], axis=-2), state.obs, old_frames
+            lambda x, y: jnp.concatenate([y[..., 1:, :], x[..., None, :]], axis=-2), state.record.obs, old_frames
         )
         return self._stack(state, frames)
 

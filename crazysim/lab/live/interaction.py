@@ -59,7 +59,10 @@ class Interaction:
     def slider(self, name: str, low: float, high: float, value: float, call: Callable[[Self, float], object]) -> None:
         """Add a slider to viewers that are shown from now on; the function is called with the loop and the value."""
         if not (np.isfinite([low, high]).all() and low < high and low <= value <= high):
-            raise ConfigError(f"expected low <= value <= high of slider {name!r}, got {low!r}, {value!r}, {high!r}")
+            raise ConfigError(
+                f"expected low < high, and a value between them, of slider {name!r}, got low {low!r}, value {value!r} "
+                f"and high {high!r}"
+            )
         if name in self.values:
             raise ConfigError(f"expected a new name of a slider, got {name!r} twice. Use another name.")
         self.controls.append(Slider(name, low, high, value, partial(call, self)))

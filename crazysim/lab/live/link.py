@@ -74,6 +74,8 @@ def fly_policy(
 ) -> list[DroneState]:
     """Fly a policy over a link, and return the states that it acted on.
 
+    Any exception, Ctrl-C too, stops the motors; after the last command they keep running.
+
     Args:
         link: Link to a simulated or a real drone.
         policy: Function of the state that returns a command of the level. (k,)
@@ -82,7 +84,7 @@ def fly_policy(
         level: Command level.
 
     Raises:
-        ConfigError: If the link refuses a command, after which the motors are stopped.
+        ConfigError: If the link refuses a command.
     """
     states = []
     try:

@@ -1,6 +1,7 @@
 """Simulated Crazyflies at the other end of CRTP: scripts of cflib, and packets of any content."""
 
 import errno
+import math
 import socket
 import struct
 
@@ -15,8 +16,8 @@ from crazysim.core.pipeline import append_fn
 from crazysim.errors import ConfigError
 from crazysim.lab.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_cflib_driver
 from crazysim.lab.live.crtp.setpoints import unpack_quat
-from crazysim.lab.live.crtp.tables import LOG_TYPES, Table, Variable, pack
-from crazysim.lab.live.swarm import Swarm
+from crazysim.lab.live.crtp.tables import LOG, LOG_TYPES, Table, Variable, pack
+from crazysim.lab.live.swarm import DroneState, Swarm
 from crazysim.plugins.estimators import Kalman
 from crazysim.plugins.sensors import IMU, MotionCapture, MultiRanger, Triad
 from crazysim.plugins.sensors.range_finder import RangeFinder
@@ -65,6 +66,15 @@ def test_the_high_level_commander(running, uri):
         running.sleep(2.5)
         assert running.state(0).pos[2] < 0.02
         assert not scf.cf.supervisor.is_flying
+
+
+def test_accelerations_are_logged_in_the_frames_of_the_firmware():
+    """A drone that pitches by 90 degrees, with its thrust along x of the world, falls: -1 g along z."""
+    half = math.sqrt(0.5)
+    state = DroneState(0.0, np.zeros(3), np.array([0, half, 0, half]), np.zeros(3), np.zeros(3), np.array([0, 0, 9.81]))
+    logged = {name: LOG[name][1](state, None) for name in LOG if name.startswith(("stateEstimate.a", "acc."))}
+    assert list(logged.values()) == pytest.approx([1, 0, -1, 0, 0, 1], abs=1e-3)
+    assert list(logged) == [f"stateEstimate.a{axis}" for axis in "xyz"] + [f"acc.{axis}" for axis in "xyz"]
 
 
 def test_log_configurations_and_the_synchronous_logger(running, uri):

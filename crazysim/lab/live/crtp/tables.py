@@ -103,6 +103,17 @@ def _angles(group: str) -> dict[str, tuple[str, Reading]]:
     return {f"{group}.{name}": ("float", reading(*indices)) for name, indices in signs.items()}
 
 
+def _acceleration(k: int) -> Reading:
+    """Return a component of the acceleration, world frame, without gravity, g (``kalmanCoreExternalizeState``)."""
+
+    def reading(state: DroneState, _: Commander) -> float:
+        axis, w = state.quat[:3], state.quat[3]
+        turned = state.acc + 2 * np.cross(axis, np.cross(axis, state.acc) + w * state.acc)
+        return float(turned[k]) / GRAVITY_MAGNITUDE - (k == 2)
+
+    return reading
+
+
 def _goal(row: int, k: int) -> Reading:
     return lambda _s, commander: float(commander.goal()[row, k])
 
@@ -110,7 +121,7 @@ def _goal(row: int, k: int) -> Reading:
 LOG: dict[str, tuple[str, Reading]] = {
     **_axes("stateEstimate", "x y z", "pos"),
     **_axes("stateEstimate", "vx vy vz", "vel"),
-    **_axes("stateEstimate", "ax ay az", "acc", 1 / GRAVITY_MAGNITUDE),
+    **{f"stateEstimate.a{axis}": ("float", _acceleration(k)) for k, axis in enumerate("xyz")},
     **_axes("stateEstimate", "qx qy qz qw", "quat"),
     **_angles("stateEstimate"),
     **_angles("stabilizer"),
