@@ -217,7 +217,7 @@ class Geometric(Controller):
         if self.integral:
             limit = -MAX_INTEGRAL_RATIO * GRAVITY[2]
             acc = params.kr * (command.pos - s.pos) / params.mass
-            acc = jnp.where(jnp.abs(acc) < limit, acc, 0.0)  # Farther away, the drone approaches: no disturbance.
+            acc = jnp.where(jnp.abs(acc) < limit, acc, 0.0)  # Larger errors are transients, not disturbances.
             memory = GeometricMemory(safe_clip(memory.acc + self.integral / self.freq * acc, -limit, limit))
         state = (s.pos, s.quat, s.vel, s.ang_vel)
         acc = memory.acc if self.integral else None

@@ -30,8 +30,8 @@ MAX_RAYS_OF_KERNEL = 1 << 28
 """Largest number of rays in a kernel; numbers of rays and indices of tables are int32."""
 
 TILE_SIDE = 4
-"""Height and width of the tiles of pixels, whose rays follow each other: rays side by side in a kernel meet much the
-same geoms."""
+"""Height and width of the tiles of pixels whose rays follow each other, so that neighbouring lanes of a kernel meet
+similar geoms, pixels."""
 
 Along = Literal["axis", "ray"]
 
@@ -158,28 +158,28 @@ def build_depth_fn(
             direction = jnp.concatenate(
                 [_directions(rot, rays) for (_, rot), rays in zip(poses, directions, strict=True)]
             )
-            return pictures(cast_rays(in_data, data, origin, direction, ignored, drones))
+            return untile_results(cast_rays(model_without_mocap, data, origin, direction, ignored, drones))
         eyes = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
-        return pictures(cast_rays_in_worlds(in_data, data, eyes, directions, drones, kernels))
+        return untile_results(cast_rays_in_worlds(model_without_mocap, data, eyes, directions, drones, kernels))
 
-    def pictures(hits: Hits) -> Hits:
-        """Return the results of rays, which follow each other by tiles, as pictures, row by row."""
+    def untile_results(hits: Hits) -> Hits:
+        """Return the results of rays, tile by tile, as images, row by row."""
         cosine = jnp.asarray(-directions[..., 2].reshape(-1), hits.distance.dtype) if along == "axis" else 1.0
 
-        def picture(x: Array, n_last: int) -> Array:
+        def untile(x: Array, n_last: int) -> Array:
             leading, last = x.shape[: x.ndim - n_last - 1], x.shape[x.ndim - n_last :]
             x = x.reshape(*leading, len(cameras), height // h, width // w, h, w, *last)
             return jnp.swapaxes(x, -3 - n_last, -2 - n_last).reshape(*leading, len(cameras), height, width, *last)
 
         return hits.replace(
-            distance=picture(hits.distance * cosine, 0),
-            normal=picture(hits.normal, 1),
-            point=picture(hits.point, 1),
-            body_index=picture(hits.body_index, 0),
+            distance=untile(hits.distance * cosine, 0),
+            normal=untile(hits.normal, 1),
+            point=untile(hits.point, 1),
+            body_index=untile(hits.body_index, 0),
         )
 
     # Poses of mocap bodies become part of the data before the rays are cast.
-    in_data = model.without_mocap_bodies()
+    model_without_mocap = model.without_mocap_bodies()
 
     def depth(data: SimData, mocap: MocapPoses = None) -> Hits:
         if data.states.pos.ndim == 1:
@@ -202,8 +202,8 @@ def build_depth_fn(
         def cast_in_world(poses: MocapPoses) -> Hits:
             pos, quat, objects = jax.tree.map(lambda x: x[None], poses)
             states = data.states.replace(pos=pos, quat=quat)
-            of_world = data.replace(states=states, objects=objects)
-            return jax.tree.map(lambda x: x[0], cast_in_worlds(of_world, kernels))
+            world_data = data.replace(states=states, objects=objects)
+            return jax.tree.map(lambda x: x[0], cast_in_worlds(world_data, kernels))
 
         return jax.lax.map(cast_in_world, (data.states.pos, data.states.quat, objects), batch_size=at_a_time)
 

@@ -131,7 +131,7 @@ def replicated_sharding(sim: Sim) -> jax.sharding.Sharding:
 def exchanged_bytes(program: str) -> dict[str, int]:
     """Return the bytes of the arrays that the devices exchange in one call of a compiled program, by operation.
 
-    The bodies of loops count as often as they run, where their number of rounds is known.
+    The body of a loop counts once for each round if their number is known, otherwise once.
 
     Args:
         program: Text of the program, ``compiled.as_text()``.

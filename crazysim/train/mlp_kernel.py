@@ -9,7 +9,8 @@ precision, like those of TF32, which XLA uses on the same GPUs, but a smaller ra
 and activations are within it, and gradients of the outputs are scaled such that the largest is between 1 and 2.
 
 Lanes of a warp hold operands as in the PTX manual, "Matrix Fragments for mma.m16n8k16": of a sum of 16 x 8 numbers,
-lane 4 g + t has columns 2 t and 2 t + 1 of rows g and g + 8. Two sums, rounded, are a left operand of the next product.
+lane 4 g + t has columns 2 t and 2 t + 1 of rows g and g + 8. Two sums, rounded to 16 bits, form a left operand of the
+next product.
 """
 
 from __future__ import annotations
