@@ -26,9 +26,8 @@ def environment(variables: Mapping[str, str]) -> dict[str, str]:
     if "xla_backend_optimization_level" not in flags:
         flags += " --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
         flags += " --xla_llvm_disable_expensive_passes=true"
-        if version("jaxlib").startswith(
-            "0.10."
-        ):  # emitters of fused loops take three times as long; later jaxlibs have no option
+        if version("jaxlib").startswith("0.10."):
+            # Emitters of fused loops take three times as long; later jaxlibs have no option.
             flags += " --xla_cpu_use_fusion_emitters=false"
         settings["CXXFLAGS"] = f"{variables.get('CXXFLAGS', '')} {_quick_cxxflags(variables)}"
     return settings | {"XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=4"}
