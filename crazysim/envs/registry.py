@@ -91,7 +91,7 @@ def make(
     sensors: Sequence[Plugin] = (),
     effects: Sequence[Plugin] = (),
     randomize: str | None = None,
-    depth: Sequence[int] | None = None,
+    depth_image: Sequence[int] | None = None,
     **options: Any,
 ) -> Env:
     """Return an environment of many worlds of a task, with a simulation of its own.
@@ -107,8 +107,8 @@ def make(
             by ``env.sim.add``, ``reset`` raises an error.
         randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
             ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
-        depth: Width and height in pixels of images that the drones observe in addition; see ``DepthImages``. None for
-            no images.
+        depth_image: Width and height in pixels of images that the drones observe in addition; see ``DepthImages``. None
+            for no images.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
     """
@@ -145,13 +145,13 @@ def make(
     for plugin in plugins:
         sim.add(plugin)
     env = DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
-    if depth is None:
+    if depth_image is None:
         return env
-    if not isinstance(depth, (tuple, list)) or len(depth) != 2:
+    if not isinstance(depth_image, (tuple, list)) or len(depth_image) != 2:
         raise ConfigError(
-            f"expected depth as width and height of images in pixels, got {short_repr(depth)}. Try (16, 12)."
+            f"expected depth_image as width and height in pixels, got {short_repr(depth_image)}. Try (16, 12)."
         )
-    return DepthImages(env, width=depth[0], height=depth[1])
+    return DepthImages(env, width=depth_image[0], height=depth_image[1])
 
 
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:

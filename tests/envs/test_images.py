@@ -81,7 +81,7 @@ def _as_numbers(x):
 
 
 def test_adapters_have_the_images_in_their_spaces():
-    env = DroneVectorEnv(make("hover", 2, depth=(4, 3), engine="interpret"))
+    env = DroneVectorEnv(make("hover", 2, depth_image=(4, 3), engine="interpret"))
     obs, _ = env.reset(seed=0)
     assert env.single_observation_space["depth"].shape == (12,)
     obs, *_ = env.step(env.action_space.sample())
@@ -102,8 +102,8 @@ def test_wrappers_around_images_leave_them_as_they_are():
 
 def test_law_09_wrong_images_are_refused():
     base = make("hover", 2, engine="interpret")
-    with pytest.raises(ConfigError, match=r"expected depth as width and height of images in pixels, got '16x12'"):
-        make("hover", 2, depth="16x12")
+    with pytest.raises(ConfigError, match=r"expected depth_image as width and height in pixels, got '16x12'"):
+        make("hover", 2, depth_image="16x12")
     with pytest.raises(ConfigError, match="expected an image of positive integer width, got 0 x 12 pixels"):
         DepthImages(base, width=0)
     for around, message in [
