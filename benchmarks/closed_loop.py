@@ -35,8 +35,8 @@ def main() -> None:
             "logged_m": round(row.logged_error, 3),
             "simulated_m": round(row.simulated_error, 3),
             "ratio": round(row.ratio, 2),
-            "logged_lag_s": row.logged_error_lag,
-            "simulated_lag_s": row.simulated_error_lag,
+            "logged_lag_s": row.logged_lag,
+            "simulated_lag_s": row.simulated_lag,
             "failed": row.failed,
         }
         print(json.dumps({"benchmark": "closed_loop", "log": row.name, **numbers}), flush=True)

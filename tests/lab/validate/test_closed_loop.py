@@ -44,7 +44,7 @@ def test_a_flight_of_the_simulation_is_matched(circling, tmp_path):
     (row,) = compare_tracking([flight])
     assert row.logged_error > 0.1
     assert abs(row.ratio - 1) < 0.01
-    assert row.logged_error_lag == row.simulated_error_lag == pytest.approx(0.5, abs=0.1)  # 1 / kp of the position loop
+    assert row.logged_lag == row.simulated_lag == pytest.approx(0.5, abs=0.1)  # 1 / kp of the position loop
     assert not row.failed
     (row,) = compare_tracking([flight], estimator=laboratory_estimator())
     assert 1.0 < row.ratio < 1.3
