@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -166,20 +165,6 @@ def bounding_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         case _:
             half = list(size)
     return np.zeros(3), np.array(half)
-
-
-def bounding_radius(shape: Shape) -> float:
-    """Return the radius of a ball around a shape, centred at its bounding box, m."""
-    match shape.kind:
-        case "plane":
-            return UNBOUNDED_LENGTH
-        case "sphere" | "ellipsoid":
-            return max(shape.size)
-        case "capsule":
-            return sum(shape.size)
-        case "cylinder":
-            return math.hypot(*shape.size)
-    return float(np.linalg.norm(bounding_box(shape)[1]))
 
 
 def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
