@@ -382,7 +382,7 @@ def test_memory_stays_where_it_is(live):
         (lambda live: live.go_to(float("inf")), "time of 0 s or more"),
         (lambda live: live.advance(0), "n_steps"),
         (lambda live: live.select(0, 2), "drone below 2"),
-        (lambda live: live.slider("wind", 0, 1, 2, print), "low <= value <= high"),
+        (lambda live: live.slider("wind", 0, 1, 2, print), "expected low < high, and a value between them"),
         (lambda live: live.button("b", print, key="F13"), "lower-case character"),
         (lambda live: live.record("nowhere/a.journal"), "file that can be created"),
         (lambda live: live.record("a.journal", freq=30), "divides 100 Hz"),
