@@ -13,7 +13,7 @@ from crazysim.lab.live.loop import Live
 from crazysim.lab.live.pace import Speed
 from crazysim.lab.live.picture import Picture, quantities
 from crazysim.lab.live.scene_bodies import DRONE, SceneBodies
-from crazysim.lab.live.viewer import Control, Slider
+from crazysim.lab.live.viewer import Slider, Widget
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "max")
 """Speeds to choose from."""
@@ -70,10 +70,10 @@ class BrowserPanel:
             self._add_time(gui, live)
         with gui.add_folder("Drone"):
             self._add_drone(gui, live, bodies)
-        if live.controls:
+        if live.widgets:
             with gui.add_folder("Controls"):
-                for control in live.controls:
-                    self._add_control(gui, live, control)
+                for widget in live.widgets:
+                    self._add_widget(gui, live, widget)
         with gui.add_folder("Layers", expand_by_default=False):
             for layer in scene.visible:
                 self._add_layer(gui, layer)
@@ -201,17 +201,17 @@ class BrowserPanel:
             self._scene.visible[layer] = box.value
 
     @staticmethod
-    def _add_control(gui: Any, live: Live, control: Control) -> None:
-        if not isinstance(control, Slider):
-            _post_on_click(gui.add_button(control.name), live, lambda _: control.call())
+    def _add_widget(gui: Any, live: Live, widget: Widget) -> None:
+        if not isinstance(widget, Slider):
+            _post_on_click(gui.add_button(widget.name), live, lambda _: widget.callback())
             return
-        step = (control.high - control.low) / 200
-        slider = gui.add_slider(control.name, control.low, control.high, step, control.value)
+        step = (widget.high - widget.low) / 200
+        slider = gui.add_slider(widget.name, widget.low, widget.high, step, widget.value)
 
         @slider.on_update
         def _(_: Any) -> None:
             value = float(slider.value)
-            live.post(lambda live: live.set_value(control.name, value))
+            live.post(lambda live: live.set_value(widget.name, value))
 
 
 def _post_on_click(button: Any, live: Live, call: Callable[[Live], object]) -> None:

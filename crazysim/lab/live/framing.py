@@ -60,11 +60,11 @@ class ShowFile:
     """Contents."""
 
 
-class Frames:
-    """Buffer of a stream.
+class MessageBuffer:
+    """Buffer of a stream, which returns the complete messages.
 
-        frames = Frames()
-        for message in frames.feed(received):
+        buffer = MessageBuffer()
+        for message in buffer.feed(received):
             ...
 
     The bytes may be split anywhere between the calls of ``feed``.

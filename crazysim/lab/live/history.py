@@ -41,8 +41,8 @@ class History:
         elif snapshot.step > (self._latest[-1] if self._latest else self._first).step:
             self._latest.append(snapshot)
 
-    def before(self, step: int) -> Snapshot | None:
-        """Return the latest snapshot at or before a control step, or None, and remove the later ones."""
+    def rewind(self, step: int) -> Snapshot | None:
+        """Remove the snapshots after a control step, and return the latest of the others; None if there is none."""
         while self._latest and self._latest[-1].step > step:
             self._latest.pop()
         if self._latest:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.errors import ConfigError
 from crazysim.lab.live.keyboard import Keyboard
 from crazysim.lab.live.scene_bodies import DRONE, SceneBodies
-from crazysim.lab.live.viewer import Button, Control, Slider
+from crazysim.lab.live.viewer import Button, Slider, Widget
 from crazysim.sim.sim import Sim
 
 
@@ -24,9 +24,9 @@ class Interaction:
     """The simulation."""
     keyboard: Keyboard[Self]
     """Keys that are held in a viewer."""
-    controls: list[Control]
+    widgets: list[Widget]
     """Buttons and sliders that viewers show."""
-    values: dict[str, float]
+    slider_values: dict[str, float]
     """Present values of the sliders, by name."""
     selected: tuple[int, int] | None
     """World and drone that are plotted, piloted and, unless ``follow`` chose another body, followed; None for none."""
@@ -43,7 +43,7 @@ class Interaction:
 
     def __init__(self, sim: Sim):
         self.sim = sim
-        self.keyboard, self.controls, self.values, self.quantities = Keyboard(), [], {}, {}
+        self.keyboard, self.widgets, self.slider_values, self.quantities = Keyboard(), [], {}, {}
         self.selected, self.on_click, self.goals = (0, 0), None, None
         self.lights = np.zeros((sim.n_worlds, sim.n_drones, 3))
         self._followed_body: tuple[int, str, int] | None = None
@@ -52,7 +52,7 @@ class Interaction:
 
     def button(self, name: str, call: Callable[[Self], object], key: str | None = None) -> None:
         """Add a button to viewers that are shown from now on, and optionally a key that calls the same function."""
-        self.controls.append(Button(name, partial(call, self), key))
+        self.widgets.append(Button(name, partial(call, self), key))
         if key is not None:
             self.keyboard.bind(key, call)
 
@@ -63,42 +63,44 @@ class Interaction:
                 f"expected low < high, and a value between them, of slider {name!r}, got low {low!r}, value {value!r} "
                 f"and high {high!r}"
             )
-        if name in self.values:
+        if name in self.slider_values:
             raise ConfigError(f"expected a new name of a slider, got {name!r} twice. Use another name.")
-        self.controls.append(Slider(name, low, high, value, partial(call, self)))
-        self.values[name] = float(value)
+        self.widgets.append(Slider(name, low, high, value, partial(call, self)))
+        self.slider_values[name] = float(value)
 
     def set_value(self, name: str, value: float) -> None:
         """Move a slider, clipped to its limits, and call its function."""
-        control = next((slider for slider in self._sliders if slider.name == name), None)
-        if control is None or not np.isfinite(value):
-            raise ConfigError(f"expected a slider of {list(self.values)} and a finite value, got {name!r}, {value!r}")
-        self.values[name] = float(np.clip(value, control.low, control.high))
-        control.call(self.values[name])
+        slider = next((slider for slider in self._sliders if slider.name == name), None)
+        if slider is None or not np.isfinite(value):
+            raise ConfigError(
+                f"expected a slider of {list(self.slider_values)} and a finite value, got {name!r}, {value!r}"
+            )
+        self.slider_values[name] = float(np.clip(value, slider.low, slider.high))
+        slider.callback(self.slider_values[name])
 
     @property
-    def control_lines(self) -> tuple[str, ...]:
+    def widget_lines(self) -> tuple[str, ...]:
         """Buttons with their keys, and sliders with their values, for viewers without a panel."""
         selected_name = self._sliders[self._slider].name if self._sliders else None
         return tuple(
-            f"{c.name}: {self.values[c.name]:.3g}" + ("  [ ]" if c.name == selected_name else "")
-            if isinstance(c, Slider)
-            else f"{c.name}  {c.key or ''}".rstrip()
-            for c in self.controls
+            f"{w.name}: {self.slider_values[w.name]:.3g}" + ("  [ ]" if w.name == selected_name else "")
+            if isinstance(w, Slider)
+            else f"{w.name}  {w.key or ''}".rstrip()
+            for w in self.widgets
         )
 
     @property
     def _sliders(self) -> list[Slider]:
-        return [control for control in self.controls if isinstance(control, Slider)]
+        return [widget for widget in self.widgets if isinstance(widget, Slider)]
 
-    def turn(self, parts: float) -> None:
+    def move_slider(self, fraction: float) -> None:
         """Move the chosen slider by a fraction of its range, as the keys do."""
         if self._sliders:
             slider = self._sliders[self._slider]
-            self.set_value(slider.name, self.values[slider.name] + parts * (slider.high - slider.low))
+            self.set_value(slider.name, self.slider_values[slider.name] + fraction * (slider.high - slider.low))
 
     def choose_next_slider(self) -> None:
-        """Choose the next slider for ``turn``."""
+        """Choose the next slider for ``move_slider``."""
         self._slider = (self._slider + 1) % max(len(self._sliders), 1)
 
     def select(self, world: int, drone: int) -> None:

@@ -351,7 +351,7 @@ class Live(Interaction, Closing):
 
     def _go_to(self, step: int) -> None:
         if step < self.step:
-            snapshot = self._history.before(step)
+            snapshot = self._history.rewind(step)
             if snapshot is None:
                 raise ConfigError(
                     f"expected a time that was flown in this loop, got {step / self.control_freq:g} s. Use reset() to "
@@ -375,7 +375,7 @@ class Live(Interaction, Closing):
         self._viewers.next_at = perf_counter()
 
 
-KEY_TURN = 0.05
+KEY_FRACTION = 0.05
 """Fraction of a slider's range by which a key moves it."""
 
 
@@ -394,8 +394,8 @@ KEYS: dict[str, Callable[[Live], object]] = {
     "+": _scale(2.0),
     "-": _scale(0.5),
     "r": Live.toggle_recording,
-    "[": lambda live: live.turn(-KEY_TURN),
-    "]": lambda live: live.turn(KEY_TURN),
+    "[": lambda live: live.move_slider(-KEY_FRACTION),
+    "]": lambda live: live.move_slider(KEY_FRACTION),
     "'": Live.choose_next_slider,
     "escape": Live.stop,
 }

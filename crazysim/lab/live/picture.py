@@ -57,7 +57,7 @@ class Picture:
     """World and mocap id of the body that the camera follows; None if it follows none."""
     followed_name: str
     """Name of the followed body; empty if there is none."""
-    controls: tuple[str, ...]
+    widget_lines: tuple[str, ...]
     """Lines of text that list the buttons and sliders of the loop, for viewers without a panel."""
     plot: NDArray
     """Values of the plotted quantity; empty if nothing is plotted. (k,)"""
@@ -127,7 +127,7 @@ class PictureSource:
             selected=live.selected,
             followed=None if body is None or followed is None else (followed[0], body.mocap),
             followed_name="" if body is None else body.name,
-            controls=live.control_lines,
+            widget_lines=live.widget_lines,
             plot=plotted,
         )
 

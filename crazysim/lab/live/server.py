@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from crazysim.errors import ConfigError
 from crazysim.lab.live.commands import Command, parse_command
-from crazysim.lab.live.framing import Frames, FramingError, Message, Request, ShowFile
+from crazysim.lab.live.framing import FramingError, Message, MessageBuffer, Request, ShowFile
 from crazysim.storage import Closing
 
 DRONE_PORT, STREAM_PORT = 7000, 7002
@@ -127,7 +127,7 @@ class CommandServer(CommandQueue):
     def _serve_drone(self, peer: socket.socket, name: str) -> None:
         drone = None
         try:
-            for frame in _frames(peer, self._stop_event, self.timeout):
+            for frame in _read_messages(peer, self._stop_event, self.timeout):
                 if drone is None:
                     if not isinstance(frame, Request) or not self._claim_drone(frame.drone):
                         log.warning("%s refused: drone %s is not free", name, getattr(frame, "drone", None))
@@ -151,7 +151,7 @@ class CommandServer(CommandQueue):
             return True
 
     def _serve_stream(self, peer: socket.socket, name: str) -> None:
-        for frame in _frames(peer, self._stop_event, self.timeout):
+        for frame in _read_messages(peer, self._stop_event, self.timeout):
             if isinstance(frame, Request):
                 raise FramingError("expected messages with the ID of a drone, got a request")
             self._answer(peer, name, frame, None)
@@ -207,7 +207,7 @@ class StreamListener(CommandQueue):
 
     def _listen(self, name: str) -> None:
         with _log_errors(name), contextlib.closing(self._peer):
-            for frame in _frames(self._peer, self._stop_event, self._timeout):
+            for frame in _read_messages(self._peer, self._stop_event, self._timeout):
                 if isinstance(frame, Request):
                     raise FramingError("expected commands, got a request")
                 try:
@@ -262,14 +262,16 @@ def _log_errors(name: str) -> Iterator[None]:
         log.warning("%s lost: %s", name, error)
 
 
-def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> Iterator[Message | Request | ShowFile]:
+def _read_messages(
+    peer: socket.socket, stopped: threading.Event, timeout: float
+) -> Iterator[Message | Request | ShowFile]:
     """Yield the messages of a connection until it ends, or the server stops.
 
     Raises:
         FramingError: If the client sends something else.
         TimeoutError: If the client does not finish a message.
     """
-    frames, deadline = Frames(), None
+    buffer, deadline = MessageBuffer(), None
     peer.settimeout(POLL_INTERVAL)
     while not stopped.is_set():
         if deadline is not None and time.monotonic() > deadline:
@@ -279,15 +281,15 @@ def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> It
         except TimeoutError:
             continue
         if not received:
-            if frames.pending:
+            if buffer.pending:
                 raise FramingError("expected a complete message, got the end of the connection")
             return
-        for frame in frames.feed(received):
+        for message in buffer.feed(received):
             deadline = None
             peer.settimeout(timeout)  # for the answer
-            yield frame
+            yield message
             peer.settimeout(POLL_INTERVAL)
-        if not frames.pending:
+        if not buffer.pending:
             deadline = None
         elif deadline is None:
             deadline = time.monotonic() + timeout

@@ -1,4 +1,4 @@
-"""Base class of viewers, and the controls that viewers show."""
+"""Base class of viewers, and the widgets that viewers show."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Button:
 
     name: str
     """Text on the button."""
-    call: Callable[[], object]
+    callback: Callable[[], object]
     """Function to call."""
     key: str | None = None
     """Key that calls the same function; None if no key does."""
@@ -33,18 +33,18 @@ class Slider:
     """Greatest value."""
     value: float
     """Initial value."""
-    call: Callable[[float], object]
+    callback: Callable[[float], object]
     """Function to call with the value."""
 
 
-Control = Button | Slider
+Widget = Button | Slider
 
 
 class Viewer(Generic[L]):
     """Base class of viewers. A loop of type ``L`` calls their methods in its own thread, so they must not block."""
 
     def open(self, live: L) -> None:
-        """Show the simulation of a loop from now on, with the controls that it has.
+        """Show the simulation of a loop from now on, with the widgets that it has.
 
         Raises:
             CrazysimError: If this machine cannot show it.

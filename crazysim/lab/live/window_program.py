@@ -179,8 +179,8 @@ class Program:
             text = f"world {picture.worlds[k]}\n{text}".strip()
         if text:
             overlays.text(text, "top left")
-        if k == 0 and picture.controls:
-            overlays.text(_ascii("\n".join(picture.controls)), "bottom left")
+        if k == 0 and picture.widget_lines:
+            overlays.text(_ascii("\n".join(picture.widget_lines)), "bottom left")
         return data, overlays
 
     def _double_clicked(self) -> bool:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazysim.lab.live import framing
-from crazysim.lab.live.framing import Frames, FramingError, Message, Request, ShowFile
+from crazysim.lab.live.framing import FramingError, Message, MessageBuffer, Request, ShowFile
 
 TRICKY = {"name": '_EOF "quoted\\" {', "odd": '" {', "a_b": {"points": [[0.0, [1, 2, 3], []]]}, "SKYC": "START"}
 JSON = json.dumps(TRICKY).encode()
@@ -36,29 +36,29 @@ EXPECTED = [expected for _, expected in STREAM]
 
 @pytest.mark.parametrize(("message", "expected"), STREAM, ids=[repr(m[:24]) for m, _ in STREAM])
 def test_every_message(message, expected):
-    frames = Frames()
-    assert list(frames.feed(message)) == [expected]
-    assert not frames.pending or message.endswith(b"\n")
+    buffer = MessageBuffer()
+    assert list(buffer.feed(message)) == [expected]
+    assert not buffer.pending or message.endswith(b"\n")
 
 
 def test_joined_and_byte_by_byte():
-    assert list(Frames().feed(BYTES)) == EXPECTED
-    frames = Frames()
-    assert [frame for k in range(len(BYTES)) for frame in frames.feed(BYTES[k : k + 1])] == EXPECTED
+    assert list(MessageBuffer().feed(BYTES)) == EXPECTED
+    buffer = MessageBuffer()
+    assert [frame for k in range(len(BYTES)) for frame in buffer.feed(BYTES[k : k + 1])] == EXPECTED
 
 
 @given(st.lists(st.integers(0, len(BYTES)), max_size=12), st.permutations(range(len(STREAM))))
 def test_any_split_and_order(cuts, order):
     stream = b"".join(STREAM[k][0] for k in order)
-    frames, found, begin = Frames(), [], 0
+    buffer, found, begin = MessageBuffer(), [], 0
     for end in [*sorted(cuts), len(stream)]:
-        found += frames.feed(stream[begin:end])
+        found += buffer.feed(stream[begin:end])
         begin = end
     assert found == [EXPECTED[k] for k in order]
 
 
-def feed_all(frames, parts):
-    return [frame for part in parts for frame in frames.feed(part)]
+def feed_all(buffer, parts):
+    return [frame for part in parts for frame in buffer.feed(part)]
 
 
 GARBAGE = {
@@ -78,17 +78,17 @@ GARBAGE = {
 @pytest.mark.parametrize("garbage", GARBAGE.values(), ids=GARBAGE)
 def test_garbage_is_refused(garbage):
     with pytest.raises(FramingError):
-        list(Frames().feed(garbage))
-    frames = Frames()
+        list(MessageBuffer().feed(garbage))
+    buffer = MessageBuffer()
     with pytest.raises(FramingError):
-        feed_all(frames, [garbage[k : k + 1] for k in range(len(garbage))])
+        feed_all(buffer, [garbage[k : k + 1] for k in range(len(garbage))])
 
 
 def test_messages_in_front_of_garbage_count():
-    frames = Frames().feed(b"07_CMDSTART_land_EOFhello")
-    assert next(frames) == Message(7, "land", "")
+    buffer = MessageBuffer().feed(b"07_CMDSTART_land_EOFhello")
+    assert next(buffer) == Message(7, "land", "")
     with pytest.raises(FramingError):
-        next(frames)
+        next(buffer)
 
 
 def test_sizes_are_bounded(monkeypatch):
@@ -96,14 +96,14 @@ def test_sizes_are_bounded(monkeypatch):
     monkeypatch.setattr(framing, "MAX_SHOW", 1000)
     for begin in (b"07_CMDSTART_upload_{", b"PK\x03\x04"):
         with pytest.raises(FramingError, match="at most 1000"):
-            feed_all(Frames(), [begin, *[b"a" * 50] * 30])
+            feed_all(MessageBuffer(), [begin, *[b"a" * 50] * 30])
 
 
 def test_long_messages_in_small_parts():
     """A megabyte of brackets, quotes and false ends."""
     body = b'{"a": "' + b'_EOF\\"PK\x05\x06' * 100_000 + b'"}'
-    message, frames = b"07_CMDSTART_upload_" + body + b"_EOF", Frames()
-    found = [frame for k in range(0, len(message), 1000) for frame in frames.feed(message[k : k + 1000])]
+    message, buffer = b"07_CMDSTART_upload_" + body + b"_EOF", MessageBuffer()
+    found = [frame for k in range(0, len(message), 1000) for frame in buffer.feed(message[k : k + 1000])]
     assert found == [Message(7, "upload", "", body)]
 
 
@@ -133,11 +133,11 @@ def test_any_bytes_are_messages_or_refused_however_they_are_split(pieces, seed):
     stream, pick = b"".join(pieces), random.Random(seed)
 
     def read(size):
-        frames, found, begin = Frames(), [], 0
+        buffer, found, begin = MessageBuffer(), [], 0
         try:
             while begin < len(stream):
                 n = size()
-                for frame in frames.feed(stream[begin : begin + n]):
+                for frame in buffer.feed(stream[begin : begin + n]):
                     found.append(frame)
                 begin += n
         except FramingError:

@@ -117,13 +117,13 @@ def test_sliders_and_buttons_by_key(live):
     live.slider("wind", 0.0, 10.0, 5.0, lambda live, value: moved.append(value))
     live.slider("mass", -1.0, 1.0, 0.98, lambda live, value: moved.append(-value))
     live.button("shoot", pressed.append, key="f")
-    assert live.control_lines == ("wind: 5  [ ]", "mass: 0.98", "shoot  f")
+    assert live.widget_lines == ("wind: 5  [ ]", "mass: 0.98", "shoot  f")
     for key in "]]['" + "]]f":
         live.keyboard.press(key)
     live.run(0.01)
     np.testing.assert_allclose(moved, [5.5, 6.0, 5.5, -1.0, -1.0])
     assert pressed == [live]
-    assert live.values == {"wind": 5.5, "mass": 1.0}
+    assert live.slider_values == {"wind": 5.5, "mass": 1.0}
     with pytest.raises(ConfigError, match="a slider of \\['wind', 'mass'\\]"):
         live.set_value("speed", 1.0)
     with pytest.raises(ConfigError, match="'wind' twice"):

@@ -65,8 +65,8 @@ class Table:
         """Return the description of a variable: type, group and name."""
         variable = self.variables[k]
         group, name = variable.name.split(".")
-        kind = self.types[variable.ctype][0] | (READ_ONLY_BIT if variable.read_only else 0)
-        return bytes([kind]) + group.encode() + b"\0" + name.encode() + b"\0"
+        type_number = self.types[variable.ctype][0] | (READ_ONLY_BIT if variable.read_only else 0)
+        return bytes([type_number]) + group.encode() + b"\0" + name.encode() + b"\0"
 
     def format(self, k: int) -> str:
         """Return the format of a variable for ``struct``."""
@@ -108,8 +108,8 @@ def _acceleration(k: int) -> Reading:
 
     def reading(state: DroneState, _: Commander) -> float:
         axis, w = state.quat[:3], state.quat[3]
-        turned = state.acc + 2 * np.cross(axis, np.cross(axis, state.acc) + w * state.acc)
-        return float(turned[k]) / GRAVITY_MAGNITUDE - (k == 2)
+        world_acc = state.acc + 2 * np.cross(axis, np.cross(axis, state.acc) + w * state.acc)
+        return float(world_acc[k]) / GRAVITY_MAGNITUDE - (k == 2)
 
     return reading
 
@@ -168,15 +168,17 @@ def create_log_table(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]
 def supervisor_bits(commander: Commander) -> int:
     """Return the state of the supervisor: bits as in ``Supervisor.STATES`` of cflib."""
     is_unlocked, is_flying = not commander.locked, commander.motors_on
-    bits = [
-        is_unlocked,
-        commander.armed,
-        True,
-        commander.armed and is_unlocked,
-        is_flying,
-        False,
-        commander.locked,
-        False,
-    ]
-    bits += [is_flying, commander.finished, False]
-    return sum(int(bit) << k for k, bit in enumerate(bits))
+    flags = {
+        "can be armed": is_unlocked,
+        "is armed": commander.armed,
+        "is auto armed": True,
+        "can fly": commander.armed and is_unlocked,
+        "is flying": is_flying,
+        "is tumbled": False,
+        "is locked": commander.locked,
+        "is crashed": False,
+        "high-level control is active": is_flying,
+        "high-level trajectory is finished": commander.finished,
+        "high-level control is disabled": False,
+    }
+    return sum(int(flag) << k for k, flag in enumerate(flags.values()))
