@@ -92,24 +92,24 @@ def main() -> None:
     args = parser.parse_args()
     failures: list[str] = []
     if args.list:
-        print("\n".join(listing()))
+        print("\n".join(list_figures()))
     if args.write:
         if args.take:
             records = [record for path in args.take for record in json.loads(path.read_text())]
         else:
             records, failures = measure(args)
         if args.records is None:
-            keep(records)
+            store_records(records)
             write_pages()
     if args.stale:
-        failures += stale()
+        failures += stale_records()
     if failures:
         raise SystemExit("\n".join(failures))
 
 
-def listing() -> list[str]:
+def list_figures() -> list[str]:
     """Return a line for each figure."""
-    machines = {name: [record["machine"] for record in load() if record["figure"] == name] for name in FIGURES}
+    machines = {name: [record["machine"] for record in load_records() if record["figure"] == name] for name in FIGURES}
     return [
         f"{name}: {figure.page}; {figure.cpu or '-'}; {figure.gpu or '-'}; {', '.join(machines[name]) or 'no record'}"
         for name, figure in FIGURES.items()
@@ -118,7 +118,7 @@ def listing() -> list[str]:
 
 def measure(args: argparse.Namespace) -> tuple[list[Line], list[str]]:
     """Run the commands of figures on a device, and return their records and what failed."""
-    commit, records, failures = args.commit or checked_out(), [], []
+    commit, records, failures = args.commit or current_commit(), [], []
     for name in args.only:
         command = FIGURES[name].command(args.device)
         if not command:
@@ -129,16 +129,16 @@ def measure(args: argparse.Namespace) -> tuple[list[Line], list[str]]:
         words += ["--peer-python", args.peer_python] if args.peer_python and words[0] == Path(VERSUS[0]).name else []
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
         print(f"{name}: {shown}", file=sys.stderr, flush=True)
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, *words], cwd=ROOT / "benchmarks", env=environment, stdout=subprocess.PIPE, text=True
         )
-        lines = [json.loads(text) for text in done.stdout.splitlines() if text.startswith("{")]
-        if done.returncode or not lines:
-            failures.append(f"{name}: {shown} failed with status {done.returncode}; its error is above.")
+        lines = [json.loads(text) for text in process.stdout.splitlines() if text.startswith("{")]
+        if process.returncode or not lines:
+            failures.append(f"{name}: {shown} failed with status {process.returncode}; its error is above.")
             continue
         records.append(record(name, shown, commit, lines))
         if args.records is not None:
-            args.records.write_text(as_text(records))
+            args.records.write_text(records_text(records))
     return records, failures
 
 
@@ -158,35 +158,35 @@ def record(name: str, command: str, commit: str, lines: list[Line]) -> Line:
     }
 
 
-def checked_out() -> str:
+def current_commit() -> str:
     """Return the commit that is checked out, with ``+`` if the sources have been changed since."""
-    changed = git("status", "--porcelain", "--", "crazysim", "benchmarks").strip()
-    return git("rev-parse", "--short=9", "HEAD").strip() + "+" * bool(changed)
+    changes = git("status", "--porcelain", "--", "crazysim", "benchmarks").strip()
+    return git("rev-parse", "--short=9", "HEAD").strip() + "+" * bool(changes)
 
 
 def git(*words: str) -> str:
     """Return what Git prints about this repository."""
-    done = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(done.stderr.strip())
-    return done.stdout
+    process = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True)
+    if process.returncode:
+        raise RuntimeError(process.stderr.strip())
+    return process.stdout
 
 
-def load() -> list[Line]:
+def load_records() -> list[Line]:
     """Return the stored records."""
     return json.loads(STORE.read_text())
 
 
-def as_text(records: Iterable[Line]) -> str:
+def records_text(records: Iterable[Line]) -> str:
     """Return records as the store holds them."""
     return "[\n" + ",\n".join(json.dumps(record) for record in records) + "\n]\n"
 
 
-def keep(records: list[Line]) -> None:
+def store_records(records: list[Line]) -> None:
     """Store records instead of earlier ones of the same figures and machines."""
-    known = {(record["figure"], record["machine"]): record for record in [*load(), *records]}
+    by_figure = {(record["figure"], record["machine"]): record for record in [*load_records(), *records]}
     order = list(FIGURES)
-    STORE.write_text(as_text(sorted(known.values(), key=lambda x: (order.index(x["figure"]), x["machine"]))))
+    STORE.write_text(records_text(sorted(by_figure.values(), key=lambda x: (order.index(x["figure"]), x["machine"]))))
 
 
 def write_pages() -> None:
@@ -194,26 +194,26 @@ def write_pages() -> None:
     for path in sorted({"README.md", *(figure.page for figure in FIGURES.values())}):
         page = ROOT / path
         text = page.read_text()
-        if (written := with_tables(text, load())) != text:
+        if (written := insert_tables(text, load_records())) != text:
             page.write_text(written)
 
 
-def blocks(text: str) -> list[str]:
+def figure_names(text: str) -> list[str]:
     """Return the names of the figures that a page has places for."""
     return re.findall(r"^<!-- figure (\S+) -->$", text, re.MULTILINE)
 
 
-def with_tables(text: str, records: list[Line]) -> str:
+def insert_tables(text: str, records: list[Line]) -> str:
     """Return a page with the tables of records between its comments."""
-    for name in blocks(text):
+    for name in figure_names(text):
         begin, end = f"<!-- figure {name} -->", f"<!-- end of {name} -->"
         before, _, rest = text.partition(begin)
         _, _, after = rest.partition(end)
-        text = f"{before}{begin}\n\n{markdown(name, records)}\n\n{end}{after}"
+        text = f"{before}{begin}\n\n{figure_tables(name, records)}\n\n{end}{after}"
     return text
 
 
-def markdown(name: str, records: list[Line]) -> str:
+def figure_tables(name: str, records: list[Line]) -> str:
     """Return the tables of a figure, each with its machine, versions, date, commit and command."""
     if name == "readme":
         return tables.readme(records)
@@ -226,27 +226,27 @@ def markdown(name: str, records: list[Line]) -> str:
     return "\n\n".join(parts)
 
 
-def stale() -> list[str]:
+def stale_records() -> list[str]:
     """Return a line for each record that is older than a change of what it measures."""
-    found = []
+    reports = []
     for name, figure in FIGURES.items():
-        measured = [(record["machine"], record["commit"]) for record in load() if record["figure"] == name]
+        measured = [(record["machine"], record["commit"]) for record in load_records() if record["figure"] == name]
         measured += list(figure.commits().items()) if figure.commits else []
         if not measured:
-            found.append(f"{name}: no record")
+            reports.append(f"{name}: no record")
         for machine, commit in measured:
             try:
-                paths = changed(commit, figure.spec())
+                paths = changed_files(commit, figure.spec())
             except RuntimeError as error:
-                found.append(f"{name}, {machine}: {error}")
+                reports.append(f"{name}, {machine}: {error}")
                 continue
             if paths:
                 others = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
-                found.append(f"{name}, {machine}: {', '.join(paths[:3])}{others} changed after {commit}")
-    return found
+                reports.append(f"{name}, {machine}: {', '.join(paths[:3])}{others} changed after {commit}")
+    return reports
 
 
-def changed(commit: str, spec: Iterable[str]) -> list[str]:
+def changed_files(commit: str, spec: Iterable[str]) -> list[str]:
     """Return the files whose code differs between a commit and the working tree, apart from new names for the same."""
     if commit.endswith("+"):
         raise RuntimeError(f"measured with changes beyond commit {commit[:-1]}")
@@ -270,8 +270,8 @@ def changed(commit: str, spec: Iterable[str]) -> list[str]:
             and {tuple(renamed.get(x, x) for x in names) for names in old.imports} == new.imports
         )
 
-    found = [path for path in paths if not is_unchanged(path)]
-    return found if len(set(renamed.values())) == len(renamed) else paths
+    changed_paths = [path for path in paths if not is_unchanged(path)]
+    return changed_paths if len(set(renamed.values())) == len(renamed) else paths
 
 
 class Code(NamedTuple):
@@ -354,8 +354,8 @@ def training_commits() -> dict[str, str]:
 
 def validation_commits() -> dict[str, str]:
     """Return the commit that ``crazysim validate`` wrote into its page."""
-    found = re.search(r"crazysim [\d.]+, commit ([0-9a-f]{7,}\+?)", (ROOT / "docs/validation.md").read_text())
-    return {"all": found[1]} if found else {}
+    commit = re.search(r"crazysim [\d.]+, commit ([0-9a-f]{7,}\+?)", (ROOT / "docs/validation.md").read_text())
+    return {"all": commit[1]} if commit else {}
 
 
 PAGE = "docs/concepts/figures.md"

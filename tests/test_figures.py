@@ -56,7 +56,7 @@ def repository(figures, monkeypatch, tmp_path):
 def commit_all(figures):
     figures.git("add", "-A")
     figures.git("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false", "commit", "-qm", "x")
-    return figures.checked_out()
+    return figures.current_commit()
 
 
 def record(figures, commit, processor="EPYC", rate=2e9):
@@ -70,53 +70,53 @@ def test_each_figure_has_a_script_and_a_place_on_its_page(figures):
         assert figure.cpu or figure.gpu or figure.commits, name
         for path in figure.spec():
             assert (ROOT / path.removeprefix(":(exclude)")).exists(), f"{name}: {path} does not exist"
-    places = [(name, str(page.relative_to(ROOT))) for page in PAGES for name in figures.blocks(page.read_text())]
+    places = [(name, str(page.relative_to(ROOT))) for page in PAGES for name in figures.figure_names(page.read_text())]
     wanted = [(name, figure.page) for name, figure in figures.FIGURES.items() if figure.table]
     assert sorted(places) == sorted([*wanted, ("readme", "README.md")])
 
 
 def test_pages_show_the_records(figures):
-    records = figures.load()
+    records = figures.load_records()
     for page in PAGES:
         text = page.read_text()
-        assert figures.with_tables(text, records) == text, (
+        assert figures.insert_tables(text, records) == text, (
             f"run benchmarks/figures.py --write --only; {page.name} differs"
         )
 
 
 def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(repository):
-    assert repository.stale() == ["speed: no record"]
-    commit = repository.checked_out()
-    repository.keep([record(repository, commit)])
-    assert repository.stale() == []
+    assert repository.stale_records() == ["speed: no record"]
+    commit = repository.current_commit()
+    repository.store_records([record(repository, commit)])
+    assert repository.stale_records() == []
     source = repository.ROOT / "thrust.py"
     text = MEASURED.replace("squared", "square").replace("Return the", "Give back the").replace(": float)", ")")
     source.write_text("# A comment.\n" + text.replace("expected a speed", "expected m/s"))
     commit_all(repository)
-    assert repository.stale() == []
+    assert repository.stale_records() == []
     source.write_text(
         MEASURED.replace("thrust(", "lift(").replace("import sin", "import sin as sine").replace("sin(", "sine(")
     )
-    assert "thrust.py changed after" in repository.stale()[0]
+    assert "thrust.py changed after" in repository.stale_records()[0]
     source.write_text(MEASURED.replace("thrust(", "lift("))
-    assert repository.stale() == []
+    assert repository.stale_records() == []
     source.write_text(MEASURED.replace("sin", "cos"))
-    assert "thrust.py changed after" in repository.stale()[0]
+    assert "thrust.py changed after" in repository.stale_records()[0]
     source.write_text(MEASURED.replace("2.0", "3.0"))
-    (found,) = repository.stale()
+    (found,) = repository.stale_records()
     assert found == f"speed, 2 cores of EPYC (AVX2): thrust.py changed after {commit}"
-    repository.keep([record(repository, commit_all(repository))])
-    assert repository.stale() == []
+    repository.store_records([record(repository, commit_all(repository))])
+    assert repository.stale_records() == []
     (repository.ROOT / "benchmarks" / "speed.py").write_text("print(2)\n")
-    assert "benchmarks/speed.py changed after" in repository.stale()[0]
-    repository.keep([record(repository, "0123abc")])
-    assert "0123abc" in repository.stale()[0]
+    assert "benchmarks/speed.py changed after" in repository.stale_records()[0]
+    repository.store_records([record(repository, "0123abc")])
+    assert "0123abc" in repository.stale_records()[0]
 
 
 def test_a_written_table_keeps_the_rows_of_other_machines(repository):
-    commit = repository.checked_out()
-    repository.keep([record(repository, commit), record(repository, commit, "Xeon", 3e9)])
-    repository.keep([record(repository, commit, rate=4e6)])
+    commit = repository.current_commit()
+    repository.store_records([record(repository, commit), record(repository, commit, "Xeon", 3e9)])
+    repository.store_records([record(repository, commit, rate=4e6)])
     repository.write_pages()
     text = (repository.ROOT / "page.md").read_text()
     assert text.startswith(
@@ -138,7 +138,7 @@ def test_figures_are_measured_and_written_by_one_command(repository, monkeypatch
         repository.main()
     assert json.loads((repository.ROOT / "figures.json").read_text()) == [row]
     other = tmp_path / "other.json"
-    other.write_text(repository.as_text([row | {"machine": "another", "lines": [{"case": "there", "rate": 7.0}]}]))
+    other.write_text(repository.records_text([row | {"machine": "another", "lines": [{"case": "there", "rate": 7.0}]}]))
     monkeypatch.setattr(sys, "argv", ["figures.py", "--write", "--take", str(other)])
     repository.main()
     assert "| there | 7 |" in (repository.ROOT / "page.md").read_text()
