@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command")
     for module in (demo, replay, show, live, training, airframe, identify, validate, info):
-        module.add(commands)
+        module.add_parsers(commands)
     options = parser.parse_args(arguments)
     options.arguments = list(sys.argv[1:] if arguments is None else arguments)
     if options.command is None:

@@ -17,7 +17,7 @@ SPINS = {"ccw": 1, "cw": -1}
 """Sign of each sense of rotation, seen from above."""
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_parsers(commands: argparse._SubParsersAction) -> None:
     """Add the commands that make and check airframes."""
     airframe = commands.add_parser("airframe", help="make an airframe from a few numbers, or check one")
     actions = airframe.add_subparsers(title="actions", metavar="ACTION", dest="action", required=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from crazysim.control import AllocationParams, AttitudeParams, StateParams
-from crazysim.control.allocation import hover_rotor_vel, level_thrust, yaw_arm
+from crazysim.control.allocation import hover_rotor_vel, max_thrust_without_torque, yaw_arm
 from crazysim.control.auto import Auto
 from crazysim.control.bandwidth import max_ang_acc, precession_rate, rotor_rate
 from crazysim.control.controllers import find_controller
@@ -84,7 +84,7 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
 
 def _ratio(airframe: Airframe) -> float:
     """Return the ratio of the largest thrust at zero torque to the weight, 1."""
-    return level_thrust(airframe) / float(airframe.value("rigid_body.mass") * GRAVITY_MAGNITUDE)
+    return max_thrust_without_torque(airframe) / float(airframe.value("rigid_body.mass") * GRAVITY_MAGNITUDE)
 
 
 def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:

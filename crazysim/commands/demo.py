@@ -8,7 +8,7 @@ from pathlib import Path
 from crazysim.commands.options import DefaultsFormatter, given_options
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_parsers(commands: argparse._SubParsersAction) -> None:
     """Add the command that runs the demonstration."""
     parser = commands.add_parser(
         "demo",

@@ -34,7 +34,7 @@ from crazysim.lab.identify import (
 from crazysim.storage import PICTURE_SUFFIXES, check_writable, write_file
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_parsers(commands: argparse._SubParsersAction) -> None:
     """Add the command that fits airframes to flights."""
     text = "fit an airframe to logs of real flights"
     parser = commands.add_parser("identify", help=text, formatter_class=DefaultsFormatter)

@@ -27,7 +27,7 @@ VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XL
 """Environment variables that change the behaviour of crazysim."""
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_parsers(commands: argparse._SubParsersAction) -> None:
     """Add the command that describes the installation."""
     parser = commands.add_parser("info", help="print versions, devices, compiler and cache, for reports of bugs")
     parser.set_defaults(run=run)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from crazysim.lab.live.policy_pilot import PolicyPilot
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_parsers(commands: argparse._SubParsersAction) -> None:
     """Add the command that flies live."""
     text = "fly in real time: watch, pilot, command and record; print the factor of real time"
     parser = commands.add_parser("live", help=text, formatter_class=DefaultsFormatter)

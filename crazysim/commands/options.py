@@ -11,8 +11,8 @@ class DefaultsFormatter(argparse.HelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         text, default = action.help, action.default
-        states_none = default == [] or any(default is x for x in (None, False, argparse.SUPPRESS))
-        if text is None or states_none or "by default" in text:
+        has_no_default = default == [] or any(default is x for x in (None, False, argparse.SUPPRESS))
+        if text is None or has_no_default or "by default" in text:
             return text
         return f"{text} (default: %(default)s)"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from crazysim.commands.options import DefaultsFormatter, add_page
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_parsers(commands: argparse._SubParsersAction) -> None:
     """Add the command that plays recorded flights."""
     text = "play a recorded flight in a browser"
     parser = commands.add_parser("replay", help=text, formatter_class=DefaultsFormatter)

@@ -16,7 +16,7 @@ from crazysim.errors import ConfigError
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_parsers(commands: argparse._SubParsersAction) -> None:
     """Add the commands that train, evaluate, export and film policies."""
     text = "train a policy; write checkpoint, learning curve, policy and film"
     parser = commands.add_parser("train", help=text, formatter_class=DefaultsFormatter)

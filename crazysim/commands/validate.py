@@ -25,7 +25,7 @@ PICTURES = "pictures"
 """Name of the folder of the pictures, in the folder of the page."""
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_parsers(commands: argparse._SubParsersAction) -> None:
     """Add the command that measures the page."""
     text = "compare with closed forms, other simulators and logs"
     parser = commands.add_parser("validate", help=text, formatter_class=DefaultsFormatter)

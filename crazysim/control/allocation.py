@@ -59,7 +59,7 @@ def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
     return airframe.rotor_vel([thrust])
 
 
-def level_thrust(airframe: Airframe) -> float:
+def max_thrust_without_torque(airframe: Airframe) -> float:
     """Return the collective thrust without torque, N, at which the most loaded rotor is at its maximum thrust."""
     return float(airframe.value("rotors.thrust_max", ()) / np.max(allocation_matrix(airframe)[:, 0]))
 

@@ -25,7 +25,7 @@ class FittedParams(PyTree):
 
     model: Params
     """Parameters of the fitted model that the controller assumes."""
-    angles: Array = leaf("parameter", 1)
+    angle_ratio: Array = leaf("parameter", 1)
     """Ratio of commanded roll, pitch and yaw to the angles at which the model settles, 1. (3,)"""
     lead: Array = leaf("parameter", 1)
     """Factors on jerk, s, and snap, s^2, that advance the attitude command to compensate the response's delay. (2,)"""
@@ -45,14 +45,14 @@ class FittedParams(PyTree):
             freq: Rate of the controller, Hz.
         """
         model = Params.create(airframe, dynamics)
-        attitude = float(np.max(np.asarray(model.rpy_rates_coef / model.rpy_coef)[:2]))
-        delays = [attitude]
+        attitude_delay = float(np.max(np.asarray(model.rpy_rates_coef / model.rpy_coef)[:2]))
+        delays = [attitude_delay]
         if model.thrust_dyn_coef is not None:
             delays.append(1 / float(np.max(model.thrust_dyn_coef)))
         return FittedParams(
             model=model,
-            angles=as_parameter(-model.rpy_coef / model.cmd_rpy_coef),
-            lead=as_parameter([attitude + 0.5 / freq, float(np.max(-1 / np.asarray(model.rpy_coef)[:2]))]),
+            angle_ratio=as_parameter(-model.rpy_coef / model.cmd_rpy_coef),
+            lead=as_parameter([attitude_delay + 0.5 / freq, float(np.max(-1 / np.asarray(model.rpy_coef)[:2]))]),
             position=PositionParams.create(airframe, max(delays) + 1.5 / freq, freq),
         )
 
@@ -90,6 +90,6 @@ class FittedAuto(Controller):
 
         forward, left = rotation.heading(data.controls.state.cmd[..., 9:13])
         advanced_thrust = specific_thrust + p.lead[..., :1] * command.jerk + p.lead[..., 1:] * command.snap
-        angles = p.angles * rotation.from_axes(*rotation.axes_along(advanced_thrust, forward, left))
+        angles = p.angle_ratio * rotation.from_axes(*rotation.axes_along(advanced_thrust, forward, left))
         thrust = (model.mass * dot(specific_thrust, matrix[..., 2]) - model.acc_coef) / model.cmd_f_coef
         return jnp.concatenate([angles, jnp.maximum(thrust, model.thrust_min)], axis=-1), memory

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.control.allocation import level_thrust
+from crazysim.control.allocation import max_thrust_without_torque
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
@@ -66,7 +66,9 @@ class PositionParams(PyTree):
             freq: Rate of the controller, Hz.
         """
         g = -GRAVITY[2]
-        max_specific_force = MAX_THRUST_SHARE * level_thrust(airframe) / float(airframe.value("rigid_body.mass", ()))
+        max_specific_force = (
+            MAX_THRUST_SHARE * max_thrust_without_torque(airframe) / float(airframe.value("rigid_body.mass", ()))
+        )
         max_up_acc, max_down_acc = max(max_specific_force - g, MIN_FEEDBACK_RATIO * g), MAX_FALL_RATIO * g
         sideways_acc = min(
             MAX_HORIZONTAL_RATIO * g, np.sqrt(max(max_specific_force**2 - g**2, (MIN_FEEDBACK_RATIO * g) ** 2))

@@ -81,21 +81,21 @@ class Switch(Controller):
         index = self._index(data, command, params)
         is_switch = (memory.active[0] >= 0) & (memory.active[0] != index)
         rotor_vel, new_memories = memory.rotor_vel, []
-        for k, (controller, state, p) in enumerate(
+        for k, (controller, m, p) in enumerate(
             zip(self.controllers, memory.controllers, params.controllers, strict=True)
         ):
             is_selected = index == k
             takes_over = is_selected & is_switch
-            state = _select_tree(takes_over, controller.take_over(data, command, state, p, memory.rotor_vel), state)
+            m = _select_tree(takes_over, controller.take_over(data, command, m, p, memory.rotor_vel), m)
             if isinstance(command, Setpoint) and controller.has_outer:
                 is_due = is_selected & (takes_over | _is_due(data, controller.outer_freq))
-                state = _select_tree(is_due, controller.outer(data, command, state, p), state)
+                m = _select_tree(is_due, controller.outer(data, command, m, p), m)
             is_due = is_selected & (takes_over | _is_due(data, controller.freq))
-            output, new_state = controller.update(data, command, state, p)
+            output, new_memory = controller.update(data, command, m, p)
             if controller.output == Control.force_torque:
                 output = force_torque2rotor_vel(output, params=params.allocation)
             rotor_vel = jnp.where(is_due, output, rotor_vel)
-            new_memories.append(_select_tree(is_due, new_state, state))
+            new_memories.append(_select_tree(is_due, new_memory, m))
         active = jnp.full_like(memory.active, index)
         return rotor_vel, SwitchMemory(tuple(new_memories), active, rotor_vel)
 

@@ -20,7 +20,7 @@ from crazysim.envs.registry import TASKS, entry_of, make
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.train import apg, dagger, ppo
-from crazysim.train.devices import Devices, evaluation_device, place_worlds
+from crazysim.train.devices import Devices, device_options, evaluation_device
 from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.networks import Network, choose_network
 
@@ -233,7 +233,7 @@ class TrainConfig:
         """
         entry_of(self.task, named=False)
         n_worlds = n_seeds * self.n_worlds
-        devices = {} if self.devices is None else place_worlds(self.options["device"], self.devices, n_worlds)
+        devices = {} if self.devices is None else device_options(self.options["device"], self.devices, n_worlds)
         return make(self.task, n_worlds, **self.practice_options() | self.options | devices)
 
     def make_env(self, n_worlds: int | None = None, **defaults: Any) -> Env:

@@ -25,8 +25,10 @@ Devices = str | int | Sequence[int]
 _COLLECTIVE = re.compile(
     r" = (.*?) (all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast)(-start)?\("
 )
-_ARRAY, _CALLED = re.compile(r"(pred|[a-z]+(\d+))\[([\d,]*)\]"), re.compile(r"=\{?(%[\w.-]+(?:, %[\w.-]+)*)")
-_COMPUTATION, _TRIPS = re.compile(r"^(?:ENTRY )?(%[\w.-]+) .*\{$"), re.compile(r'"known_trip_count":\{"n":"(\d+)"')
+_ARRAY_TYPE = re.compile(r"(pred|[a-z]+(\d+))\[([\d,]*)\]")
+_CALLED_COMPUTATIONS = re.compile(r"=\{?(%[\w.-]+(?:, %[\w.-]+)*)")
+_COMPUTATION = re.compile(r"^(?:ENTRY )?(%[\w.-]+) .*\{$")
+_TRIP_COUNT = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
 
 
 def evaluation_device(device: str | None, devices: Devices) -> str:
@@ -72,7 +74,7 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
     return [available[i] for i in indices]
 
 
-def place_worlds(device: str, devices: Devices, n_worlds: int) -> dict[str, Any]:
+def device_options(device: str, devices: Devices, n_worlds: int) -> dict[str, Any]:
     """Return the options of ``Sim`` with which its worlds are distributed over the devices of a training.
 
     Args:
@@ -83,17 +85,18 @@ def place_worlds(device: str, devices: Devices, n_worlds: int) -> dict[str, Any]
     Raises:
         ConfigError: If a device does not exist, or if the worlds cannot be distributed evenly.
     """
-    found = find_devices(device, devices)
-    n = len(found)
+    training_devices = find_devices(device, devices)
+    n = len(training_devices)
     if n_worlds % n:
         raise ConfigError(
             f"expected a number of worlds that {n} devices divide, got {n_worlds}. Use for example --worlds "
             f"{-(-n_worlds // n) * n}, or another number of --devices."
         )
-    n_hosts, own = jax.process_count(), [x for x in found if x.process_index == jax.process_index()]
-    if len({x.process_index for x in found}) < n_hosts:
+    n_hosts = jax.process_count()
+    local_devices = [x for x in training_devices if x.process_index == jax.process_index()]
+    if len({x.process_index for x in training_devices}) < n_hosts:
         raise ConfigError(f"expected devices of all {n_hosts} hosts, got {devices!r}. Use --devices all.")
-    return {"device": own[0]} | ({"mesh": world_mesh(found)} if n > 1 else {})
+    return {"device": local_devices[0]} | ({"mesh": world_mesh(training_devices)} if n > 1 else {})
 
 
 def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
@@ -109,16 +112,16 @@ def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
     """
     mesh = sim.mesh
     if mesh is None:
-        whole = SingleDeviceSharding(sim.device)
-        return jax.tree.map(lambda _: whole, shapes)
-    copied, split = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
-    agents = copied if n_seeds % mesh.size else split
+        on_one_device = SingleDeviceSharding(sim.device)
+        return jax.tree.map(lambda _: on_one_device, shapes)
+    replicated, over_worlds = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
+    agents = replicated if n_seeds % mesh.size else over_worlds
 
     def sharding(name: str, tree: Any) -> Any:
         if name == "env":
             return jax.tree.unflatten(jax.tree.structure(tree), jax.tree.leaves(shardings_of(tree.full_data, mesh)))
-        of_field = {"agents": agents, "memory": split}.get(name, copied)
-        return jax.tree.map(lambda _: of_field, tree)
+        field_sharding = {"agents": agents, "memory": over_worlds}.get(name, replicated)
+        return jax.tree.map(lambda _: field_sharding, tree)
 
     return shapes.replace(**{f.name: sharding(f.name, getattr(shapes, f.name)) for f in dataclasses.fields(shapes)})
 
@@ -131,7 +134,7 @@ def replicated_sharding(sim: Sim) -> jax.sharding.Sharding:
 def exchanged_bytes(program: str) -> dict[str, int]:
     """Return the bytes of the arrays that the devices exchange in one call of a compiled program, by operation.
 
-    The body of a loop counts once for each round if their number is known, otherwise once.
+    The body of a loop counts once for each iteration if their number is known, otherwise once.
 
     Args:
         program: Text of the program, ``compiled.as_text()``.
@@ -139,13 +142,13 @@ def exchanged_bytes(program: str) -> dict[str, int]:
     computations: dict[str, list[str]] = {}
     entry = name = ""
     for line in program.splitlines():
-        if begin := _COMPUTATION.match(line):
-            name = begin[1]
+        if heading := _COMPUTATION.match(line):
+            name = heading[1]
             entry = name if line.startswith("ENTRY") else entry
         elif name:
             computations.setdefault(name, []).append(line)
 
-    found: dict[str, int] = {}
+    bytes_by_operation: dict[str, int] = {}
 
     def count(name: str, times: int) -> None:
         for line in computations.get(name, ()):
@@ -153,18 +156,18 @@ def exchanged_bytes(program: str) -> dict[str, int]:
                 arrays, operation, started = collective.groups()
                 sizes = [
                     math.prod(map(int, filter(None, shape.split(",")))) * max(int(bits or 8) // 8, 1)
-                    for _, bits, shape in _ARRAY.findall(arrays)
+                    for _, bits, shape in _ARRAY_TYPE.findall(arrays)
                 ]
-                # The beginning of a gather also lists its operands, which are smaller than its result.
+                # The start of a gather also lists its operands, which are smaller than its result.
                 n_bytes = max(sizes) if started and operation != "all-reduce" else sum(sizes)
-                found[operation] = found.get(operation, 0) + times * n_bytes
-            trips = _TRIPS.search(line) if " while(" in line else None
-            for names in [] if "-done(" in line or "-update(" in line else _CALLED.findall(line):
+                bytes_by_operation[operation] = bytes_by_operation.get(operation, 0) + times * n_bytes
+            trips = _TRIP_COUNT.search(line) if " while(" in line else None
+            for names in [] if "-done(" in line or "-update(" in line else _CALLED_COMPUTATIONS.findall(line):
                 for called in names.split(", "):
                     count(called, times * (int(trips[1]) if trips else 1))
 
     count(entry, 1)
-    return found
+    return bytes_by_operation
 
 
 def _read_devices(devices: Devices) -> int | tuple[int, ...] | None:

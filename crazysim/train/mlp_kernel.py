@@ -172,10 +172,10 @@ template <int N> DEVICE void write_rows(float* out, const float (&c)[N / 8][4], 
     }
 }
 
-constexpr int common(int a, int b) { return b ? common(b, a % b) : a; }
+constexpr int common_divisor(int a, int b) { return b ? common_divisor(b, a % b) : a; }
 // Sums of a warp for the gradients of a layer: some tiles of 16 rows and 16 columns.
 template <int K, int N> struct Sums {
-  static constexpr int across = common(WARPS, N / 16), down = WARPS / across;
+  static constexpr int across = common_divisor(WARPS, N / 16), down = WARPS / across;
   static constexpr int columns = N / 16 / across, rows = (K / 16 + down - 1) / down;
   float weight[columns][rows][2][4], bias[columns][2];
 
@@ -314,21 +314,21 @@ def apply_mlp(layers: Layers, x: Array) -> Array:
     return _apply(layers, x.reshape(-1, sizes[0])).reshape(*x.shape[:-1], sizes[-1])
 
 
-def _batchable(gradient: bool) -> Callable[..., Array]:
+def _make_launcher(gradient: bool) -> Callable[..., Array]:
     """Return ``_launch`` for the network of one seed; ``jax.vmap`` over seeds launches one kernel for all of them."""
 
     @jaxcompat.custom_vmap
     def run(*args: Any) -> Array:
-        return _launch(gradient, *_stack(1, None, *args))[0]
+        return _launch(gradient, *_add_seed_axis(1, None, *args))[0]
 
     @run.def_vmap
     def _run_seeds(n_seeds: int, batched: Any, *args: Any) -> tuple[Array, bool]:
-        return _launch(gradient, *_stack(n_seeds, batched, *args)), True
+        return _launch(gradient, *_add_seed_axis(n_seeds, batched, *args)), True
 
     return run
 
 
-_outputs, _gradients = _batchable(False), _batchable(True)
+_outputs, _gradients = _make_launcher(False), _make_launcher(True)
 
 
 @jax.custom_vjp
@@ -355,7 +355,7 @@ def _backward(residuals: Any, cotangent: Array) -> Any:
 _apply.defvjp(_forward, _backward)
 
 
-def _stack(n_seeds: int, batched: Any, *args: Any) -> Any:
+def _add_seed_axis(n_seeds: int, batched: Any, *args: Any) -> Any:
     """Return the arguments with a first axis of seeds; those that ``batched`` marks, a tree like them, have it."""
 
     def stack(x: Array, is_stacked: bool = False) -> Array:

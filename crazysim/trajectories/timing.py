@@ -37,7 +37,7 @@ def trapezoid_durations(distances: Floats, limits: Limits) -> Floats:
     return np.where(is_short, 2 * np.sqrt(distances / acceleration), distances / speed + speed / acceleration)
 
 
-def best_ratios(nodes: Floats, durations: Floats) -> Floats:
+def optimal_durations(nodes: Floats, durations: Floats) -> Floats:
     """Return the durations with the same sum that minimise the cost.
 
     A quasi-Newton method over the logarithms of the ratios, with the exact gradient (``interpolation.cost_gradient``),
@@ -56,11 +56,11 @@ def best_ratios(nodes: Floats, durations: Floats) -> Floats:
         return total * weights / np.sum(weights)
 
     def logarithm_of_cost(ratios: Floats) -> tuple[float, Floats]:
-        lengths = durations_of(ratios)
-        filled_nodes = interpolation.fill_derivatives(nodes, lengths)
-        cost = interpolation.derivative_cost(filled_nodes, lengths)
-        slope = interpolation.cost_gradient(filled_nodes, lengths) * lengths
-        return float(np.log(cost)), (slope - lengths / total * np.sum(slope)) / cost
+        trial_durations = durations_of(ratios)
+        filled_nodes = interpolation.fill_derivatives(nodes, trial_durations)
+        cost = interpolation.derivative_cost(filled_nodes, trial_durations)
+        slope = interpolation.cost_gradient(filled_nodes, trial_durations) * trial_durations
+        return float(np.log(cost)), (slope - trial_durations / total * np.sum(slope)) / cost
 
     if len(durations) == 1:
         return durations

@@ -183,7 +183,7 @@ def _plan_trajectory(
             f"expected waypoints that differ from their neighbours, got {nodes[k, 0].tolist()} as number {k} and "
             f"{k + 1}. Remove one, or pass durations."
         )
-    guess = timing.best_ratios(nodes, timing.trapezoid_durations(distances, limits))
+    guess = timing.optimal_durations(nodes, timing.trapezoid_durations(distances, limits))
     is_scalable = np.all(np.nan_to_num(nodes[:, 1:]) == 0)  # then the path is the same at any speed
     if is_scalable:
         coefficients = solve(guess)

@@ -109,6 +109,6 @@ def test_rates_near_the_default_and_rates_that_are_set_stay(settings):
 
 def test_a_default_rate_of_cars_is_checked_like_those_of_controllers():
     cars, path = Cars(1), circle(radius=1.0)
-    with pytest.raises(ConfigError, match=r"near 50 Hz, the default of rate of 'cars', got 499 Hz.*1 Hz.*freq=500"):
+    with pytest.raises(ConfigError, match=r"near 50 Hz, the default of freq of 'cars', got 499 Hz.*1 Hz.*freq=500"):
         Sim(freq=499, control="rotor_vel").add(dataclasses.replace(cars, path=path))
-    Sim(freq=499, control="rotor_vel").add(dataclasses.replace(cars, path=path, rate=1))
+    Sim(freq=499, control="rotor_vel").add(dataclasses.replace(cars, path=path, freq=1))

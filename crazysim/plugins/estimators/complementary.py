@@ -87,8 +87,8 @@ class Complementary(Estimator):
 
     def record(self, sim: Simulation) -> ComplementaryData:
         self.check_sensors(sim)
-        if not self.aids or len({type(sensor) for sensor in self.aids}) < len(self.aids):
-            got = [type(sensor).__name__ for sensor in self.aids]
+        if not self.aiding_sensors or len({type(sensor) for sensor in self.aiding_sensors}) < len(self.aiding_sensors):
+            got = [type(sensor).__name__ for sensor in self.aiding_sensors]
             raise ConfigError(
                 f"expected a Barometer, a TimeOfFlight or one of each among the sensors of {self.name!r}, got {got}"
             )
@@ -142,10 +142,10 @@ class Complementary(Estimator):
         """Return the height of one drone, m, and its new ``over_surface``. (1,) each"""
         height, over_surface, shift = record.height, record.over_surface, dt * record.inertial_climb
         new_height = height
-        for sensor in self.aids:
+        for sensor in self.aiding_sensors:
             if isinstance(sensor, Barometer):
                 new_height = filtered_height(height, sensor.part(data, "height"), shift)
-        for sensor in self.aids:
+        for sensor in self.aiding_sensors:
             if isinstance(sensor, TimeOfFlight):
                 distance = sensor.latest(data)
                 is_useful = (sensor.age(data) <= MAX_RANGE_AGE) & (distance < sensor.read(data).max_range)

@@ -29,8 +29,8 @@ class ErrorStateFilter(Estimator):
     """Base class of filters with error states.
 
     A subclass also defines ``update_estimate`` and ``restarted_estimate``. Its record has the fields ``estimate``,
-    ``accel`` and ``gyro``, sums of the inertial measurements since the last prediction, ``used`` and ``failures``,
-    which ``initial_record`` describes.
+    ``accel`` and ``gyro``, sums of the inertial measurements since the last prediction, and the fields ``used_steps``
+    and ``failures``, which ``initial_record`` describes.
     """
 
     _: dataclasses.KW_ONLY
@@ -59,22 +59,22 @@ class ErrorStateFilter(Estimator):
         """
         raise NotImplementedError
 
-    def initial_record(self, sim: Simulation, kind: type[R], estimate: Estimate, **fields: Any) -> R:
+    def initial_record(self, sim: Simulation, record_type: type[R], estimate: Estimate, **fields: Any) -> R:
         """Return the record before the first step.
 
-        In ``used``, the step in which the latest used measurement of each sensor was taken, all values are -1.
+        In ``used_steps``, the step in which the latest used measurement of each sensor was taken, all values are -1.
         ``failures``, the number of times that the estimate left its bounds and the filter restarted, is zero.
 
         Args:
             sim: The simulation.
-            kind: Class of the record.
+            record_type: Class of the record.
             estimate: Estimate of all drones.
             fields: Other fields, see ``fill_record``.
         """
         shape = sim.data.states.pos.shape[:2]
-        used = device_array(np.full((*shape, len(self.aids)), -1), np.int32)
+        used_steps = device_array(np.full((*shape, len(self.aiding_sensors)), -1), np.int32)
         failures = device_array(np.zeros((*shape, 1)), np.int32)
-        return self.fill_record(sim, kind, estimate=estimate, used=used, failures=failures, **fields)
+        return self.fill_record(sim, record_type, estimate=estimate, used_steps=used_steps, failures=failures, **fields)
 
     def prediction_schedule(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
         """Return the steps between predictions at ``freq`` steps per second, and the predicate for when one is due."""
@@ -83,11 +83,14 @@ class ErrorStateFilter(Estimator):
 
     def fusion_stages(self) -> list[tuple[str, Stage]]:
         """Return the stages that use the measurements of the sensors, by their names."""
-        return [(s.name, Stage(self._fusion_stage(k, s), "drone", self._is_new(k, s))) for k, s in enumerate(self.aids)]
+        return [
+            (s.name, Stage(self._fusion_stage(k, s), "drone", self._is_new(k, s)))
+            for k, s in enumerate(self.aiding_sensors)
+        ]
 
     def restart_stage(self) -> Stage:
         """Return the stage that restarts the filter where its estimate has left its bounds."""
-        return Stage(self._begin_again, "drone", lambda data: ~self.is_valid(self.read(data).estimate))
+        return Stage(self._restart, "drone", lambda data: ~self.is_valid(self.read(data).estimate))
 
     def add_sample(self, data: SimData) -> SimData:
         """Add the latest inertial measurement of one drone to the sums."""
@@ -96,18 +99,20 @@ class ErrorStateFilter(Estimator):
         return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
 
     def _is_new(self, k: int, sensor: Sensor) -> Callable[[SimData], Array]:
-        return lambda data: sensor.read(data).samples.taken[0] != self.read(data).used[k]
+        return lambda data: sensor.read(data).samples.taken[0] != self.read(data).used_steps[k]
 
     def _fusion_stage(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
         def fuse(data: SimData) -> SimData:
             """Use a new measurement of one sensor."""
             record, taken = self.read(data), sensor.read(data).samples.taken
-            used = record.used.at[k].set(taken[0])
-            return self.write(data, record.replace(estimate=self.update_estimate(sensor, data, record), used=used))
+            used_steps = record.used_steps.at[k].set(taken[0])
+            return self.write(
+                data, record.replace(estimate=self.update_estimate(sensor, data, record), used_steps=used_steps)
+            )
 
         return fuse
 
-    def _begin_again(self, data: SimData) -> SimData:
+    def _restart(self, data: SimData) -> SimData:
         """Restart the filter of one drone at the origin, level."""
         record = self.read(data)
         pos, quat = jnp.zeros_like(record.estimate.pos), jnp.zeros_like(record.estimate.quat).at[3].set(1.0)

@@ -53,7 +53,7 @@ class ESKFData(PyTree):
     gyro: Array = leaf("drone", 1, (3,))
     """Sum of half the angular velocity at the last prediction and the angular velocities since then, for the
     trapezoidal rule, body frame, rad/s. (n_worlds, n_drones, 3)"""
-    used: Array = leaf("drone", 1)
+    used_steps: Array = leaf("drone", 1)
     """Step in which the latest used measurement of each sensor was taken; -1 before the first.
     (n_worlds, n_drones, n_sensors)"""
     failures: Array = leaf("drone", 1)
@@ -94,7 +94,7 @@ class ESKF(ErrorStateFilter):
         n = error_state.N_BIASED
         level, zero = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
         cov = drone_array(sim, 0.0, n * (n + 1) // 2)
-        rows = sum(_rows_in_transit(sensor, sim.data) for sensor in self.aids)
+        rows = sum(_rows_in_transit(sensor, sim.data) for sensor in self.aiding_sensors)
         paths = (
             drone_array(sim, inertial_path.EMPTY_PATH_ROW, rows, len(inertial_path.EMPTY_PATH_ROW)) if rows else None
         )
@@ -110,7 +110,7 @@ class ESKF(ErrorStateFilter):
                     f"{sensor.name}_path",
                     Stage(self._path_start_stage(sensor, period), "drone", _sampling_predicate(sensor)),
                 )
-                for sensor in self.aids
+                for sensor in self.aiding_sensors
                 if sensor.is_late
             ),
             *self.fusion_stages(),
@@ -193,9 +193,9 @@ class ESKF(ErrorStateFilter):
 
     def _path_rows(self, sensor: Sensor, data: SimData) -> tuple[int, int]:
         """Return the first row of the paths of one sensor, and the row after its last one."""
-        counts = [_rows_in_transit(aid, data) for aid in self.aids]
-        first = sum(counts[: self.aids.index(sensor)])
-        return first, first + counts[self.aids.index(sensor)]
+        counts = [_rows_in_transit(other, data) for other in self.aiding_sensors]
+        first = sum(counts[: self.aiding_sensors.index(sensor)])
+        return first, first + counts[self.aiding_sensors.index(sensor)]
 
     def update_estimate(self, sensor: Sensor, data: SimData, record: ESKFData) -> Estimate:
         """Return the estimate of one drone after the latest measurement of a sensor.

@@ -78,7 +78,7 @@ class Estimator(Plugin):
         return next(sensor for sensor in self.sensors if isinstance(sensor, IMU))
 
     @property
-    def aids(self) -> list[Sensor]:
+    def aiding_sensors(self) -> list[Sensor]:
         """Sensors besides the inertial measurement unit."""
         return [sensor for sensor in self.sensors if not isinstance(sensor, IMU)]
 
@@ -116,7 +116,7 @@ class Estimator(Plugin):
         if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
             got = [type(sensor).__name__ for sensor in self.sensors]
             raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}, got {got}")
-        for sensor in self.aids:
+        for sensor in self.aiding_sensors:
             if type(sensor) not in self.kinds:
                 raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")
         for sensor in self.sensors:

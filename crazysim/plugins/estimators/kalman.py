@@ -58,7 +58,7 @@ class KalmanData(PyTree):
     """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
     gyro: Array = leaf("drone", 1, (3,))
     """Sum of the angular velocities since the last prediction, body frame, rad/s. (n_worlds, n_drones, 3)"""
-    used: Array = leaf("drone", 1)
+    used_steps: Array = leaf("drone", 1)
     """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
     failures: Array = leaf("drone", 1)
     """Number of times that the estimate left its bounds and the filter restarted. (n_worlds, n_drones, 1)"""

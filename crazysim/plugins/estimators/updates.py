@@ -1,4 +1,4 @@
-"""Measurements that correct a filter with error states, as functions of one drone: the models of its aids.
+"""Measurements that correct a filter with error states, as functions of one drone: the models of its aiding sensors.
 
 The models of the Crazyflie's firmware use the attitude ``rot`` at the end of the previous loop (the mm_*.c of
 bitcraze/crazyflie-firmware, commit 2a18fc29).

@@ -27,16 +27,16 @@ class BarometerData(PyTree):
 
     samples: Samples
     """Measurements."""
-    wander: Array = leaf("drone", 1, (1,))
-    """Wandering error, Pa. (n_worlds, n_drones, 1)"""
+    drift_error: Array = leaf("drone", 1, (1,))
+    """Drift error, Pa. (n_worlds, n_drones, 1)"""
     offset: Array = leaf("drone", 1, (1,))
     """Constant error in this episode, Pa. (n_worlds, n_drones, 1)"""
     noise: Array = leaf("parameter", 1, (1,), sparse=True)
     """Standard deviation of a measurement, Pa. (1,)"""
     drift: Array = leaf("parameter", 1, (1,), sparse=True)
-    """Standard deviation of the error that wanders, Pa. (1,)"""
+    """Standard deviation of the drift error, Pa. (1,)"""
     drift_time: Array = leaf("parameter", 1, (1,))
-    """Correlation time of the wandering error, s. (1,)"""
+    """Correlation time of the drift error, s. (1,)"""
     offset_spread: Array = leaf("parameter", 1, (1,), sparse=True)
     """Standard deviation of the offset between episodes, Pa. (1,)"""
     altitude: Array = leaf("parameter", 1, (1,), sparse=True)
@@ -52,7 +52,7 @@ class Barometer(Sensor):
     noise: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of a measurement, Pa; 12 Pa correspond to one metre. () or (n_worlds, n_drones)"""
     drift: ArrayLike = parameter(default=0.0, low=0.0)
-    """Standard deviation of a wandering error, as from weather and temperature, Pa. () or (n_worlds, n_drones)"""
+    """Standard deviation of the drift error, as from weather and temperature, Pa. () or (n_worlds, n_drones)"""
     drift_time: ArrayLike = parameter(default=60.0, positive=True)
     """Correlation time of that error, s. () or (n_worlds, n_drones)"""
     offset_spread: ArrayLike = parameter(default=0.0, low=0.0)
@@ -78,16 +78,18 @@ class Barometer(Sensor):
     def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
         noise = normal(self.episode_key(data), (2,), record.offset.dtype)
-        new_record = record.replace(offset=record.offset_spread * noise[:1], wander=record.drift * noise[1:])
+        new_record = record.replace(offset=record.offset_spread * noise[:1], drift_error=record.drift * noise[1:])
         return self.write(data, new_record)
 
     def measure(self, data: SimData, record: BarometerData, key: Array) -> tuple[Array, BarometerData]:
         noise = normal(key, (2,), record.offset.dtype)
-        wander = gauss_markov_step(record.wander, record.drift, record.drift_time, self.interval(data), noise[:1])
-        pressure = self.ideal(data)[:1] + record.offset + wander + record.noise * noise[1:]
+        drift_error = gauss_markov_step(
+            record.drift_error, record.drift, record.drift_time, self.interval(data), noise[:1]
+        )
+        pressure = self.ideal(data)[:1] + record.offset + drift_error + record.noise * noise[1:]
         pressure = quantise(pressure, record.resolution)
         height = pressure_altitude(pressure) - record.altitude
-        return jnp.concatenate([pressure, height]), record.replace(wander=wander)
+        return jnp.concatenate([pressure, height]), record.replace(drift_error=drift_error)
 
 
 def pressure_at(altitude: Array) -> Array:

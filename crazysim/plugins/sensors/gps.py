@@ -1,4 +1,4 @@
-"""Satellite navigation: position with wandering errors, and velocity."""
+"""Satellite navigation: position with drifting errors, and velocity."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class GPSData(PyTree):
 
     samples: Samples
     """Measurements."""
-    wander: Array = leaf("drone", 1, (3,))
-    """Wandering error of the position, world frame, m. (n_worlds, n_drones, 3)"""
+    drift_error: Array = leaf("drone", 1, (3,))
+    """Drift error of the position, world frame, m. (n_worlds, n_drones, 3)"""
     noise: Array = leaf("parameter", 1, (3,), sparse=True)
     """Standard deviation of a position, m. (3,)"""
     drift: Array = leaf("parameter", 1, (3,), sparse=True)
-    """Standard deviation of the wandering error, m. (3,)"""
+    """Standard deviation of the drift error, m. (3,)"""
     drift_time: Array = leaf("parameter", 1, (1,))
-    """Correlation time of the wandering error, s. (1,)"""
+    """Correlation time of the drift error, s. (1,)"""
     vel_noise: Array = leaf("parameter", 1, (3,), sparse=True)
     """Standard deviation of a velocity, m/s. (3,)"""
     pos: Array = leaf("parameter", 1, (3,), sparse=True)
@@ -44,7 +44,7 @@ class GPS(Sensor):
     noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
     """Standard deviation of a position, world frame, m. (), (3,) or (n_worlds, n_drones, 3)"""
     drift: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
-    """Standard deviation of a wandering error of the position, world frame, m. (), (3,) or (n_worlds, n_drones, 3)"""
+    """Standard deviation of the drift error of the position, world frame, m. (), (3,) or (n_worlds, n_drones, 3)"""
     drift_time: ArrayLike = parameter(default=60.0, positive=True)
     """Correlation time of that error, s. () or (n_worlds, n_drones)"""
     vel_noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
@@ -68,14 +68,16 @@ class GPS(Sensor):
 
     def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
-        wander = record.drift * normal(self.episode_key(data), (3,), record.wander.dtype)
-        return self.write(data, record.replace(wander=wander))
+        drift_error = record.drift * normal(self.episode_key(data), (3,), record.drift_error.dtype)
+        return self.write(data, record.replace(drift_error=drift_error))
 
     def measure(self, data: SimData, record: GPSData, key: Array) -> tuple[Array, GPSData]:
-        noise = normal(key, (9,), record.wander.dtype)
-        wander = gauss_markov_step(record.wander, record.drift, record.drift_time, self.interval(data), noise[:3])
-        error = jnp.concatenate([wander + record.noise * noise[3:6], record.vel_noise * noise[6:]])
-        return self.ideal(data) + error, record.replace(wander=wander)
+        noise = normal(key, (9,), record.drift_error.dtype)
+        drift_error = gauss_markov_step(
+            record.drift_error, record.drift, record.drift_time, self.interval(data), noise[:3]
+        )
+        error = jnp.concatenate([drift_error + record.noise * noise[3:6], record.vel_noise * noise[6:]])
+        return self.ideal(data) + error, record.replace(drift_error=drift_error)
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
         return self.split(self.latest(data))

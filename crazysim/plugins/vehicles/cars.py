@@ -74,7 +74,7 @@ class Cars(Population):
     path. (), (n_members,) or (n_worlds, n_members)"""
     trailer: bool = False
     """True for cars that tow a trailer."""
-    rate: int | None = None
+    freq: int | None = None
     """Rate of the controller, Hz, a divisor of the simulation's rate; None for the largest one up to 50 Hz."""
     rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
@@ -92,7 +92,7 @@ class Cars(Population):
 
     @property
     def control_freq(self) -> int | None:
-        return self.rate
+        return self.freq
 
     @property
     def model(self) -> VehicleModel:
@@ -106,11 +106,11 @@ class Cars(Population):
             return None
         return PurePursuit() if self.controller is None else self.controller
 
-    def rate_in(self, freq: int) -> int:
+    def control_freq_in(self, freq: int) -> int:
         """Return the rate of the controller, Hz, in a simulation at ``freq``, Hz."""
-        if self.rate is not None:
-            return self.rate
-        return default_rates(freq, {"rate": CONTROL_FREQ}, f" of {self.name!r}")["rate"]
+        if self.freq is not None:
+            return self.freq
+        return default_rates(freq, {"freq": CONTROL_FREQ}, f" of {self.name!r}")["freq"]
 
     def record(self, sim: Simulation) -> CarData:
         self.check(sim)
@@ -126,7 +126,7 @@ class Cars(Population):
             start_times = starts.spread_start_times(paths, index, self.n_members) if self.start is None else self.start
             start = starts.member_numbers("start", start_times, counts)
             pos, yaw, arc = starts.path_poses(paths, index, start, counts)
-            gains, memory = follows.gains(vehicle, params, self.rate_in(freq)), follows.memory()
+            gains, memory = follows.gains(vehicle, params, self.control_freq_in(freq)), follows.memory()
         if self.pos is not None:
             pos = starts.member_array("pos", self.pos, counts, (2,))
         if self.yaw is not None:
@@ -171,7 +171,10 @@ class Cars(Population):
         placements = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
         if self.follows is None and self.level == "drive":
             return placements
-        name, condition = f"{self.name}_control", functools.partial(acts_now, freq=self.rate_in(sim.data.core.freq))
+        name, condition = (
+            f"{self.name}_control",
+            functools.partial(acts_now, freq=self.control_freq_in(sim.data.core.freq)),
+        )
         return [StagePlacement(Stage(self._run_controller, self.name, condition, name=name), name=name), *placements]
 
     def control(self, data: SimData) -> CarData:

@@ -203,7 +203,7 @@ def test_biases_are_found(indoors):
 def test_innovations_are_as_the_filter_expects(indoors):
     """NIS: poses that the filter does not use yet, minus predictions, normalised by ``H P H' + R``."""
     record, step = indoors.data.plugins["eskf"], indoors.data.core.steps[0, 0]
-    data = ESKF(()).write(indoors.data, record.replace(used=jnp.full_like(record.used, step)))
+    data = ESKF(()).write(indoors.data, record.replace(used_steps=jnp.full_like(record.used_steps, step)))
     data = indoors.step_fn(data, jnp.int32(1))
     estimate, pose = data.plugins["eskf"].estimate, data.plugins["motion_capture"].samples.value[:, 0]
     turn = rotation.multiply(rotation.conjugate(estimate.quat[:, 0]), pose[:, 3:7])
@@ -254,7 +254,9 @@ def test_flow_range_and_differences_are_used_as_they_err():
     assert not np.asarray(sim.data.plugins["eskf"].failures).any()
 
     record, steps = sim.data.plugins["eskf"], sim.data.core.steps[0, 0]
-    data = ESKF(()).write(sim.data, record.replace(used=jnp.full_like(record.used, steps)))  # nothing is new
+    data = ESKF(()).write(
+        sim.data, record.replace(used_steps=jnp.full_like(record.used_steps, steps))
+    )  # nothing is new
     plugins = sim.step_fn(data, jnp.int32(1)).plugins
     values = jnp.concatenate([plugins[name].samples.value[:, 0] for name in ("uwb", "time_of_flight")], axis=-1)
 

@@ -102,7 +102,7 @@ def test_the_covariance_is_that_of_the_errors(captured):
 def test_innovations_are_as_the_filter_expects(captured):
     """NIS: measurements minus predictions, normalised by ``H P H' + R``, of a pose that the filter does not use yet."""
     record, step = captured.data.plugins["kalman"], captured.data.core.steps[0, 0]
-    data = Kalman(()).write(captured.data, record.replace(used=jnp.full_like(record.used, step)))
+    data = Kalman(()).write(captured.data, record.replace(used_steps=jnp.full_like(record.used_steps, step)))
     data = captured.step_fn(data, jnp.int32(1))
     estimate, (pose,) = data.plugins["kalman"].estimate, (data.plugins["motion_capture"].samples.value[:, 0],)
     turn = rotation.multiply(rotation.conjugate(estimate.quat[:, 0]), pose[:, 3:7])
