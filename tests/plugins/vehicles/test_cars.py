@@ -267,7 +267,7 @@ def test_a_negative_weight_is_an_error():
         ({"path": Path.of_points([(0, 0), (1, 0), (2, 0)], -1.0), "controller": LPV()}, "can drive forwards"),
         ({"members": 2, "pos": [(0, 0, 0)]}, "expected pos as finite numbers of shape"),
         ({"yaw": [0.0, 1.0]}, "expected yaw as finite numbers"),
-        ({"rate": 40}, "to divide freq = 500 Hz"),
+        ({"freq": 40}, "to divide freq = 500 Hz"),
         ({"members": ["a", "a"]}, "got 'a' twice"),
     ],
 )
