@@ -76,6 +76,10 @@ class Env(ABC):
         """Environment steps in one episode."""
         return self.base.max_steps
 
+    def image_formats(self) -> dict[str, dict[str, Any]]:
+        """Return the formats of observations that are images, by name; see ``Hooks.describe_images``."""
+        return {name: format for wrapper in self.wrappers for name, format in wrapper.describe_images().items()}
+
     @property
     def reset_policy(self) -> ResetPolicy | None:
         """Rule by which new episodes begin within a step; None if none do."""

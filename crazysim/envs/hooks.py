@@ -62,6 +62,14 @@ class Hooks:
         del state
         return {}
 
+    def describe_images(self) -> dict[str, dict[str, Any]]:
+        """Return the format of each image that ``look`` takes, by name, for networks and exports.
+
+        Each is a dict that JSON can hold: ``height`` and ``width`` in pixels, ``unit`` of a pixel, ``"m"`` for depths,
+        and the model of the camera.
+        """
+        return {}
+
     def recall(self, state: EnvState) -> Any:
         """Return the memory of this wrapper."""
         return state.memory[self.name]

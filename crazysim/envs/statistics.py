@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, static
 
 CLIP, EPSILON = 10.0, 1e-6
 """Largest magnitude of a normalised observation, and the addend that keeps the root of a variance above zero."""
@@ -20,11 +21,20 @@ class RunningStats(PyTree):
     """Variance. (k,)"""
     count: Array = leaf("shared", 0)
     """Number of observations. ()"""
+    unscaled: tuple[range, ...] = static(default=())
+    """Indices of observations that are not normalised, such as the pixels of images."""
 
     @staticmethod
-    def create(size: int) -> RunningStats:
+    def create(size: int, unscaled: tuple[range, ...] = ()) -> RunningStats:
         """Return the statistics before any observation: mean zero, variance one."""
-        return RunningStats(jnp.zeros(size), jnp.ones(size), jnp.full((), 1e-4, jnp.result_type(float)))
+        return RunningStats(jnp.zeros(size), jnp.ones(size), jnp.full((), 1e-4, jnp.result_type(float)), unscaled)
+
+    def is_scaled(self) -> np.ndarray:
+        """Return True for observations that are normalised. (k,)"""
+        mask = np.ones(self.mean.shape[-1], bool)
+        for indices in self.unscaled:
+            mask[indices.start : indices.stop] = False
+        return mask
 
     def update(self, x: Array) -> RunningStats:
         """Return the statistics with one more batch. (..., k)"""
@@ -33,8 +43,12 @@ class RunningStats(PyTree):
         total = self.count + n
         delta = mean - self.mean
         sum_of_squares = self.var * self.count + var * n + delta * delta * self.count * n / total
-        return RunningStats(self.mean + delta * n / total, sum_of_squares / total, total)
+        mean, var = self.mean + delta * n / total, sum_of_squares / total
+        if self.unscaled:
+            mean, var = (jnp.where(self.is_scaled(), x, y) for x, y in ((mean, self.mean), (var, self.var)))
+        return self.replace(mean=mean, var=var, count=total)
 
     def normalize(self, x: Array) -> Array:
-        """Return observations with mean zero and variance one, clipped to [-10, 10]. (..., k)"""
-        return jnp.clip((x - self.mean) / jnp.sqrt(self.var + EPSILON), -CLIP, CLIP)
+        """Return observations with mean zero and variance one, clipped to [-10, 10], or unscaled. (..., k)"""
+        scaled = jnp.clip((x - self.mean) / jnp.sqrt(self.var + EPSILON), -CLIP, CLIP)
+        return jnp.where(self.is_scaled(), scaled, x) if self.unscaled else scaled

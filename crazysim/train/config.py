@@ -152,13 +152,13 @@ class TrainConfig:
                 raise ConfigError(
                     f"expected no network of your own for {self.algorithm}, got one. Use algorithm='ppo'."
                 )
-            choose_network(self.config.get("memory", 0), self.network)
+            choose_network(self.config.get("memory", 0), self.network, self.config.get("convolution", ()))
             object.__setattr__(self, "own_network", True)
         config = dataclasses.asdict(self.algorithm_config())
         values = {
             "seed": int(self.seed),
             "n_worlds": positive_integer("n_worlds", self.n_worlds),
-            "config": config | {"hidden": list(config["hidden"])},
+            "config": {name: list(x) if isinstance(x, tuple) else x for name, x in config.items()},
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)

@@ -30,10 +30,11 @@ from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import ConfigError, DivergedError
-from crazysim.pytree import PyTree
+from crazysim.pytree import PyTree, static
+from crazysim.train.convolution import find_images
 from crazysim.train.evaluation import as_tree
 from crazysim.train.hyperparameters import check_hyperparameters
-from crazysim.train.networks import Layers, Policy, all_finite, init_mlp, mlp
+from crazysim.train.networks import Network, Policy, Weights, all_finite, choose_network, forward, init_weights
 from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates, take_seed
 
 TEACHER_PREFIX = "teacher "
@@ -56,6 +57,8 @@ class Config:
     """Minibatches, and hence updates, per epoch; each contains all samples of a subset of the worlds."""
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers of the student."""
+    convolution: tuple[int, ...] = ()
+    """Channels of the layers of a convolution over each image, as in PPO; none to observe the pixels as they are."""
     learning_rate: float = 3e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     teacher_decay: float = 0.8
@@ -73,14 +76,20 @@ class Config:
 class Agent(PyTree):
     """Network, optimiser and statistics of one student; in a ``Learner`` stacked, with a leading axis over seeds."""
 
-    student: Layers
-    """Network from normalised observations to the action before tanh."""
+    student: Weights
+    """Weights from normalised observations to the action before tanh."""
     optimizer: optax.OptState
     """State of the optimiser."""
     stats: RunningStats
     """Mean and variance with which observations are normalised."""
     key: Array
     """Random key. ()"""
+    network: Network = static()
+    """Network of the student, without memory."""
+
+    def act(self, obs: Array) -> Array:
+        """Return the student's action for normalised observations. (..., n_obs) -> (..., n_actions)"""
+        return jnp.tanh(forward(self.network, self.student, obs, ())[0])
 
 
 class Learner(PyTree):
@@ -97,7 +106,8 @@ class Learner(PyTree):
 
     def as_policy(self) -> Policy:
         """Return the students' policies. (n_seeds, ...) each"""
-        return Policy(self.agents.stats, self.agents.student)
+        agents = self.agents
+        return Policy(agents.stats, agents.student.layers, agents.student.body, agents.network)
 
 
 class TeacherObservation(Wrapper):
@@ -169,10 +179,15 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
     if isinstance(teacher, Policy) and teacher.has_memory:
         raise ConfigError("expected a teacher without memory, got one with a memory. Train the teacher with memory=0.")
 
+    sizes, convolution = {name: x.shape[-1] for name, x in obs.items()}, config.convolution
+    images = find_images(sizes, env.image_formats()) if convolution else ()
+    network = choose_network(0, None, convolution, images)
+
     def init_agent(k_student: Array, key: Array, obs: Array) -> Agent:
-        student = init_mlp(k_student, (obs.shape[-1], *config.hidden, env.actions.size), 0.01)
+        student: Any = init_weights(network, k_student, obs.shape[-1], (*config.hidden, env.actions.size), 0.01)
         optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(student)
-        return Agent(student, optimizer, RunningStats.create(obs.shape[-1]).update(obs), key)
+        stats = RunningStats.create(obs.shape[-1], network.pixels).update(obs)
+        return Agent(student, optimizer, stats, key, network)
 
     agents = for_each_seed(init_agent, k_student, k_agent, split_blocks(flatten(obs), len(configs)))
     return Learner(agents, as_tree(teacher), state, jnp.int32(0))
@@ -191,7 +206,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     teacher_share = config.teacher_decay**learner.iteration
 
     def act(agent: Agent, raw_obs: Array, label: Array, key: Array) -> tuple[Array, Any]:
-        action = jnp.tanh(mlp(agent.student, agent.stats.normalize(raw_obs)))
+        action = agent.act(agent.stats.normalize(raw_obs))
         teacher_acts = jax.random.bernoulli(key, teacher_share, (len(action), 1, 1))
         return jnp.where(teacher_acts, label, action), (raw_obs, label, jnp.square(action - label).mean())
 
@@ -308,9 +323,9 @@ def _update_agent(
     transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
     samples = agent.stats.normalize(raw_obs), labels
 
-    def loss(student: Layers, batch: tuple[Array, Array]) -> Array:
+    def loss(student: Weights, batch: tuple[Array, Array]) -> Array:
         obs, label = batch
-        return jnp.square(jnp.tanh(mlp(student, obs)) - label).mean()
+        return jnp.square(agent.replace(student=student).act(obs) - label).mean()
 
     def update(carry: Any, worlds: Array) -> tuple[Any, Array]:
         student, optimizer = carry
@@ -325,7 +340,8 @@ def _update_agent(
     keys = jax.random.split(key, config.epochs)
     (student, optimizer), losses = jax.lax.scan(epoch, (agent.student, agent.optimizer), keys)
     stats = agent.stats.update(raw_obs)
-    return Agent(student, optimizer, stats, agent.key), all_finite((student, optimizer, stats, losses))
+    finite = all_finite((student, optimizer, stats, losses))
+    return agent.replace(student=student, optimizer=optimizer, stats=stats), finite
 
 
 def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:

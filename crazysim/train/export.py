@@ -1,15 +1,17 @@
 """Export of policies: an ONNX file, and a C header that includes only ``math.h``.
 
 Both take the observations of one drone, concatenated in the order of their names, and return its action in [-1, 1].
-Both contain a description of their inputs and outputs. A policy with memory also takes and returns its memory, which is
-zero at the start of an episode.
+Both contain a description of their inputs and outputs, with the camera of each image. A policy with memory also takes
+and returns its memory, which is zero at the start of an episode.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +24,8 @@ from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
 from crazysim.errors import ConfigError, not_installed
 from crazysim.storage import write_file
-from crazysim.train.networks import Gru, Policy
+from crazysim.train.convolution import KERNEL, STRIDE, Image
+from crazysim.train.networks import Encoder, Gru, Policy
 
 OBSERVATIONS = {
     "pos": "position, world frame, m",
@@ -53,8 +56,12 @@ class PolicyNumbers(NamedTuple):
     """Mean of the observations. (n_obs,)"""
     std: np.ndarray
     """Standard deviation of the observations. (n_obs,)"""
+    images: tuple[Image, ...]
+    """Images that convolutions replace by features."""
+    convolutions: Sequence[Sequence[tuple[Any, Any]]]
+    """Weights (9 n_in, n_out) and biases of the layers of each image."""
     gru: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
-    """Weights of the observations, (n_obs, n_memory), and of the memory, (n_memory, n_memory), and bias of each gate;
+    """Weights of the inputs, (n_inputs, n_memory), and of the memory, (n_memory, n_memory), and bias of each gate;
     empty without memory."""
     layers: list[tuple[np.ndarray, np.ndarray]]
     """Weights and biases of the layers."""
@@ -63,6 +70,17 @@ class PolicyNumbers(NamedTuple):
     def n_memory(self) -> int:
         """Size of the memory; 0 for none."""
         return len(self.gru[0][2]) if self.gru else 0
+
+    @property
+    def others(self) -> list[range]:
+        """Indices of the observations before, between and after the images."""
+        starts, ends = [0, *(x.pixels.stop for x in self.images)], [x.start for x in self.images] + [len(self.mean)]
+        return [range(start, end) for start, end in zip(starts, ends, strict=True) if start < end]
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs of memory and layers: observations that are not pixels, and features of images."""
+        return len(self.layers[0][0]) - self.n_memory
 
 
 def describe(env: Env) -> dict[str, Any]:
@@ -76,6 +94,7 @@ def describe(env: Env) -> dict[str, Any]:
     return {
         "crazysim": crazysim.__version__,
         "observations": {name: shapes[name].shape[-1] for name in sorted(shapes)},
+        "images": env.image_formats(),
         "actions": {
             "level": env.actions.control.value,
             "centre": env.actions.centre.tolist(),
@@ -89,8 +108,8 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
 
     A policy with memory also has the input ``memory`` (batch, n_memory), zero at the start of an episode, and the
     output ``next_memory``, which is the input of the next step. The description of inputs and outputs is stored in the
-    model's ``metadata_props`` as JSON: ``observations`` (names and sizes, in order), and ``level``, ``centre``,
-    ``scale`` and ``units`` of the actions.
+    model's ``metadata_props`` as JSON: ``observations`` (names and sizes, in order), ``images`` (size and camera of
+    those that are images, row by row), and ``level``, ``centre``, ``scale`` and ``units`` of the actions.
 
     Args:
         policy: The policy.
@@ -121,6 +140,8 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         [add_node("Div", [add_node("Sub", ["observation", "mean"], "centred"), "std"], "scaled"), "low", "high"],
         "x",
     )
+    if numbers.images:
+        x = _add_convolutions(add_node, constants, numbers, x)
     if numbers.n_memory:
         constants["one"] = np.float32(1.0)
         for gate, (inputs, recurrent, bias) in zip(GATES, numbers.gru, strict=True):
@@ -166,12 +187,42 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     )
     actions = meta["actions"]
     properties = {"observations": meta["observations"], "units": _action_units(actions)} | actions
-    properties |= {name: meta[name] for name in ("settings",) if name in meta}
+    properties |= {name: meta[name] for name in ("settings", "images") if name in meta}
     helper.set_model_props(model, {k: v if isinstance(v, str) else json.dumps(v) for k, v in properties.items()})
     onnx.checker.check_model(model)
     path = Path(path)
     write_file(path, model.SerializeToString())
     return path
+
+
+def _add_convolutions(
+    add_node: Callable[..., str], constants: dict[str, Any], numbers: PolicyNumbers, normalized: str
+) -> str:
+    """Add the nodes that replace images by features, and return the name of their output."""
+    constants |= {"axis": np.array([1]), "one_metre": np.float32(1.0), "flat": np.array([0, -1])}
+
+    def add_slice(source: str, indices: range) -> str:
+        name = f"observation{indices.start}"
+        constants.update({f"{name}_start": np.array([indices.start]), f"{name}_end": np.array([indices.stop])})
+        return add_node("Slice", [source, f"{name}_start", f"{name}_end", "axis"], name)
+
+    parts = [add_slice(normalized, indices) for indices in numbers.others]
+    for i, (image, layers) in enumerate(zip(numbers.images, numbers.convolutions, strict=True)):
+        constants[f"shape{i}"] = np.array([0, *image.shape])
+        x = add_slice("observation", image.pixels)
+        if image.is_depth:
+            x = add_node("Reciprocal", [add_node("Add", [x, "one_metre"], f"distance{i}")], f"nearness{i}")
+        x = add_node("Reshape", [x, f"shape{i}"], f"pixels{i}")
+        x = add_node("Transpose", [x], f"image{i}", perm=[0, 3, 1, 2])
+        for k, (weight, bias) in enumerate(layers):
+            kernel = weight.reshape(KERNEL, KERNEL, -1, len(bias)).transpose(3, 2, 0, 1)
+            constants |= {f"kernel{i}_{k}": np.ascontiguousarray(kernel), f"kernel_bias{i}_{k}": bias}
+            inputs = [x, f"kernel{i}_{k}", f"kernel_bias{i}_{k}"]
+            x = add_node("Conv", inputs, f"sum{i}_{k}", pads=[1] * 4, strides=[STRIDE] * 2)
+            x = add_node("Relu", [x], f"layer{i}_{k}")
+        x = add_node("Transpose", [x], f"channels{i}", perm=[0, 2, 3, 1])
+        parts.append(add_node("Reshape", [x, "flat"], f"features{i}"))
+    return add_node("Concat", parts, "inputs", axis=1)
 
 
 def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = "policy") -> Path:
@@ -206,6 +257,9 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
         "",
     ]
     constants = {"mean": numbers.mean, "std": numbers.std}
+    for i, layers in enumerate(numbers.convolutions):
+        for k, (weight, bias) in enumerate(layers):
+            constants |= {f"kernel{i}_{k}": weight, f"kernel_bias{i}_{k}": bias}
     for gate, arrays in zip(GATES, numbers.gru, strict=False):
         constants |= {f"{gate}_{kind}": x for kind, x in zip(("inputs", "recurrent", "bias"), arrays, strict=True)}
     for i, (weight, bias) in enumerate(numbers.layers):
@@ -240,6 +294,9 @@ def _check_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
         )
     host_policy = jax.tree.map(lambda x: np.asarray(x, np.float32), policy)
     mean, var, layers = host_policy.stats.mean, host_policy.stats.var, host_policy.layers
+    body, convolutions = host_policy.body, ()
+    if isinstance(body, Encoder):
+        body, convolutions = body.memory, body.convolutions
     n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
     if (len(mean), len(layers[-1][1])) != (n_obs, n_actions):
         raise ConfigError(
@@ -250,10 +307,10 @@ def _check_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     if not all(np.isfinite(x).all() for x in jax.tree.leaves(host_policy)):
         raise ConfigError("expected finite weights, got NaN or infinity; the training diverged, so train again")
     gru = []
-    if isinstance(host_policy.body, Gru):
-        arrays = (host_policy.body.inputs, host_policy.body.recurrent, host_policy.body.bias)
+    if isinstance(body, Gru):
+        arrays = (body.inputs, body.recurrent, body.bias)
         gru = list(zip(*(np.split(x, len(GATES), axis=-1) for x in arrays), strict=True))
-    return PolicyNumbers(mean, np.sqrt(var + np.float32(EPSILON)), gru, layers)
+    return PolicyNumbers(mean, np.sqrt(var + np.float32(EPSILON)), policy.network.images, convolutions, gru, layers)
 
 
 def _action_units(actions: Mapping[str, Any]) -> list[str]:
@@ -268,6 +325,8 @@ def _description_lines(meta: Mapping[str, Any]) -> Iterator[str]:
     offset = 0
     for name, size in meta["observations"].items():
         description = f": {OBSERVATIONS[name]}" if name in OBSERVATIONS else ""
+        if name in meta.get("images", {}):
+            description = ": image, row by row: " + json.dumps(meta["images"][name])
         yield f"  [{offset}..{offset + size - 1}] {name}{description}"
         offset += size
     actions = meta["actions"]
@@ -280,25 +339,32 @@ def _description_lines(meta: Mapping[str, Any]) -> Iterator[str]:
 
 def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
     """Yield the lines of the function's body."""
-    n_obs, n_memory, limit = len(numbers.mean), numbers.n_memory, float_literal(CLIP)
-    yield f"float x0[{n_obs + n_memory}];"
-    yield f"for (int i = 0; i < {n_obs}; ++i) {{"
-    yield f"    const float x = (observation[i] - {name}_mean[i]) / {name}_std[i];"
-    yield f"    x0[i] = x < -{limit} ? -{limit} : (x > {limit} ? {limit} : x);"
-    yield "}"
+    n_inputs, n_memory, limit = numbers.n_inputs, numbers.n_memory, float_literal(CLIP)
+    yield f"float x0[{n_inputs + n_memory}];"
+    offset = 0
+    for indices in numbers.others:
+        yield f"for (int i = {indices.start}; i < {indices.stop}; ++i) {{"
+        yield f"    const float x = (observation[i] - {name}_mean[i]) / {name}_std[i];"
+        target = "i" if indices.start == offset else f"i - {indices.start - offset}"
+        yield f"    x0[{target}] = x < -{limit} ? -{limit} : (x > {limit} ? {limit} : x);"
+        yield "}"
+        offset += len(indices)
+    for i, (image, layers) in enumerate(zip(numbers.images, numbers.convolutions, strict=True)):
+        yield from _convolution_lines(name, i, image, layers, offset)
+        offset += math.prod(list(image.shapes([len(bias) for _, bias in layers]))[-1])
     if n_memory:
         yield f"for (int j = 0; j < {n_memory}; ++j) {{"
         for gate in GATES:
             yield f"    float {gate} = {name}_{gate}_bias[j], {gate}_memory = 0.0f;"
-            yield f"    for (int i = 0; i < {n_obs}; ++i) {gate} += x0[i] * {name}_{gate}_inputs[i][j];"
+            yield f"    for (int i = 0; i < {n_inputs}; ++i) {gate} += x0[i] * {name}_{gate}_inputs[i][j];"
             yield f"    for (int i = 0; i < {n_memory}; ++i)"
             yield f"        {gate}_memory += state->memory[i] * {name}_{gate}_recurrent[i][j];"
         yield "    reset = 1.0f / (1.0f + expf(-(reset + reset_memory)));"
         yield "    update = 1.0f / (1.0f + expf(-(update + update_memory)));"
         yield "    candidate = tanhf(candidate + reset * candidate_memory);"
-        yield f"    x0[{n_obs} + j] = update * state->memory[j] + (1.0f - update) * candidate;"
+        yield f"    x0[{n_inputs} + j] = update * state->memory[j] + (1.0f - update) * candidate;"
         yield "}"
-        yield f"for (int j = 0; j < {n_memory}; ++j) state->memory[j] = x0[{n_obs} + j];"
+        yield f"for (int j = 0; j < {n_memory}; ++j) state->memory[j] = x0[{n_inputs} + j];"
     for k, (weight, _) in enumerate(numbers.layers):
         n_in, n_out = weight.shape
         output = "action" if k == len(numbers.layers) - 1 else f"x{k + 1}"
@@ -308,6 +374,33 @@ def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
         yield f"    float sum = {name}_bias{k}[j];"
         yield f"    for (int i = 0; i < {n_in}; ++i) sum += x{k}[i] * {name}_weight{k}[i][j];"
         yield f"    {output}[j] = tanhf(sum);"
+        yield "}"
+
+
+def _convolution_lines(name: str, i: int, image: Image, layers: Sequence[Any], offset: int) -> Iterator[str]:
+    """Yield the lines that write the features of an image into the inputs, from an index on."""
+    shapes = list(image.shapes([len(bias) for _, bias in layers]))
+    yield f"float image{i}_0[{len(image.pixels)}];"
+    yield f"for (int p = 0; p < {len(image.pixels)}; ++p)"
+    pixel = f"observation[{image.start} + p]"
+    yield f"    image{i}_0[p] = {f'1.0f / (1.0f + {pixel})' if image.is_depth else pixel};"
+    for k, ((height, width, n_in), (rows, columns, n_out)) in enumerate(itertools.pairwise(shapes)):
+        target, start = f"image{i}_{k + 1}", 0
+        if k == len(layers) - 1:
+            target, start = "x0", offset
+        else:
+            yield f"float {target}[{rows * columns * n_out}];"
+        yield f"for (int r = 0; r < {rows}; ++r) for (int c = 0; c < {columns}; ++c)"
+        yield f"for (int j = 0; j < {n_out}; ++j) {{"
+        yield f"    float sum = {name}_kernel_bias{i}_{k}[j];"
+        yield f"    for (int a = 0; a < {KERNEL}; ++a) for (int b = 0; b < {KERNEL}; ++b) {{"
+        yield f"        const int y = {STRIDE} * r + a - 1, x = {STRIDE} * c + b - 1;"
+        yield f"        if (y < 0 || y >= {height} || x < 0 || x >= {width}) continue;"
+        yield f"        for (int m = 0; m < {n_in}; ++m)"
+        yield f"            sum += image{i}_{k}[(y * {width} + x) * {n_in} + m]"
+        yield f"                * {name}_kernel{i}_{k}[(a * {KERNEL} + b) * {n_in} + m][j];"
+        yield "    }"
+        yield f"    {target}[{start} + (r * {columns} + c) * {n_out} + j] = sum > 0.0f ? sum : 0.0f;"
         yield "}"
 
 

@@ -1,8 +1,9 @@
 """Networks as pure functions of weights, observations and memory.
 
 A policy and a value function are a ``Network``, which turns the normalised observations of a drone into features and
-may keep a memory between steps, and a multilayer perceptron from the features to the outputs. Without a network the
-features are the observations themselves.
+may keep a memory between steps, and a multilayer perceptron from the features to the outputs. The built-in network
+replaces images by the features of a convolution, then appends a memory; without both, the features are the observations
+themselves.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, float_dtype, select_worlds, static
+from crazysim.train.convolution import KERNEL, Image, convolve, scale_depth
 from crazysim.train.seeds import for_each_seed, join_blocks, split_blocks
 
 Layers = list[tuple[Array, Array]]
@@ -85,6 +87,8 @@ class Network:
     memory after the step, of the structure and shapes of ``initial_memory``."""
     initial_memory: Any = ()
     """Memory at the start of an episode, any pytree of arrays; ``()`` for none."""
+    images: tuple[Image, ...] = ()
+    """Images among the observations, which are passed without normalisation."""
 
     @property
     def has_memory(self) -> bool:
@@ -93,8 +97,14 @@ class Network:
 
     @property
     def is_built_in(self) -> bool:
-        """True if it is a built-in network, without memory or with that of a ``Gru``."""
-        return self.apply in (MEMORYLESS.apply, _apply_gru)
+        """True if it is a built-in network, with or without convolution and memory."""
+        apply = self.apply.func if isinstance(self.apply, functools.partial) else self.apply
+        return apply in (MEMORYLESS.apply, _apply_gru, _apply_convolution)
+
+    @property
+    def pixels(self) -> tuple[range, ...]:
+        """Indices of the pixels of its images among the observations."""
+        return tuple(image.pixels for image in self.images)
 
     def make_memory(self, *batch: int) -> Any:
         """Return the memory at the start of an episode. (*batch, ...) each"""
@@ -150,20 +160,72 @@ def _apply_gru(gru: Gru, obs: Array, memory: Array) -> tuple[Array, Array]:
     return jnp.concatenate([obs, memory]), memory
 
 
-def choose_network(memory: int, network: Network | None) -> Network:
+class Encoder(PyTree):
+    """Weights of the convolutions, and of the memory after them."""
+
+    convolutions: tuple[Layers, ...]
+    """Layers of each image, see ``crazysim.train.convolution.convolve``."""
+    memory: Gru | tuple[()] = ()
+    """Weights of the memory; ``()`` for none."""
+
+
+@functools.cache
+def _convolution_network(channels: tuple[int, ...], images: tuple[Image, ...], base: Network) -> Network:
+    """Return a network whose features are those of ``base`` for observations with features in place of images."""
+
+    def init(key: Array, n_obs: int) -> Encoder:
+        keys = jax.random.split(jax.random.fold_in(key, 2), (len(images), len(channels)))
+        convolutions = tuple(
+            [
+                init_mlp(keys[i, k], (KERNEL**2 * n_in, n_out), np.sqrt(2.0))[0]
+                for k, (n_in, n_out) in enumerate(itertools.pairwise((image.channels, *channels)))
+            ]
+            for i, image in enumerate(images)
+        )
+        n_features = sum(int(np.prod(list(image.shapes(channels))[-1])) for image in images)
+        n_pixels = sum(len(image.pixels) for image in images)
+        return Encoder(convolutions, base.init(key, n_obs - n_pixels + n_features))
+
+    apply = functools.partial(_apply_convolution, images, base.apply)
+    return Network(init, apply, base.initial_memory, images)
+
+
+def _apply_convolution(
+    images: tuple[Image, ...], apply: Callable[..., Any], encoder: Encoder, obs: Array, memory: Any
+) -> tuple[Array, Any]:
+    ends = [end for pixels in (image.pixels for image in images) for end in (pixels.start, pixels.stop)]
+    others = jnp.split(obs, ends)[::2]
+    features = []
+    for image, layers in zip(images, encoder.convolutions, strict=True):
+        pixels = obs[image.pixels.start : image.pixels.stop]
+        features.append(convolve(layers, (scale_depth(pixels) if image.is_depth else pixels).reshape(image.shape)))
+    return apply(encoder.memory, jnp.concatenate([*others, *features]), memory)
+
+
+def choose_network(
+    memory: int, network: Network | None, convolution: Sequence[int] = (), images: tuple[Image, ...] = ()
+) -> Network:
     """Return ``network``, or the built-in network if it is None.
 
     Args:
         memory: Size of the memory of the built-in network; 0 for none.
         network: Network of your own; None for the built-in one.
+        convolution: Channels of the layers of the convolution of the built-in network; none without.
+        images: Images among the observations, for the convolution.
 
     Raises:
-        ConfigError: If ``network`` is not a ``Network``, or is given together with a size of the memory.
+        ConfigError: If ``network`` is not a ``Network``, or is given together with a convolution or a size of the
+            memory.
     """
     if network is None:
-        return gru_network(memory) if memory else MEMORYLESS
+        base = gru_network(memory) if memory else MEMORYLESS
+        return _convolution_network(tuple(convolution), images, base) if convolution else base
     if not isinstance(network, Network):
         raise ConfigError(f"expected a Network, got {network!r}. Use crazysim.train.Network(init, apply).")
+    if convolution:
+        raise ConfigError(
+            f"expected no convolution with a network of your own, got {list(convolution)}. Put it into the network."
+        )
     if memory:
         raise ConfigError(
             f"expected memory=0 with a network of your own, got {memory}. Give the network an initial_memory instead."

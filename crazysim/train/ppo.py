@@ -19,6 +19,7 @@ from crazysim.envs.state import PRIVILEGED, EnvState, Obs, flatten
 from crazysim.envs.statistics import EPSILON, RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, static
+from crazysim.train.convolution import Image, find_images
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.mlp_kernel import choose_mlp
 from crazysim.train.networks import (
@@ -58,6 +59,9 @@ class Config:
     """Sizes of the hidden layers of policy and value function; not used with a network of your own."""
     memory: int = 0
     """Size of the memory of policy and value function, a gated recurrent unit before the hidden layers; 0 for none."""
+    convolution: tuple[int, ...] = ()
+    """Channels of the layers of a convolution over each image, with patches of 3 x 3 pixels and stride 2, before the
+    memory and the hidden layers; none to observe the pixels as they are."""
     critic: str = "observations"
     """Inputs of the value function: ``observations``, the observations of the policy; ``privileged``, the same and the
     true state and parameters of the drone; ``all_drones``, the observations of all drones of the world;
@@ -169,10 +173,11 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
         )
     k_policy, k_value, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 4), keys), 1, 0)
     hidden_sizes = config.hidden if network is None else ()
-    network = choose_network(config.memory, network)
-    apply_layers = choose_mlp(network, env.sim.device, 1 if env.sim.mesh is None else env.sim.mesh.size)
     state = env.reset(k_env)
-    n_obs = flatten(_policy_obs(state.obs, config)).shape[-1]
+    policy_obs = _policy_obs(state.obs, config)
+    network = choose_network(config.memory, network, config.convolution, _find_images(env, policy_obs, config))
+    apply_layers = choose_mlp(network, env.sim.device, 1 if env.sim.mesh is None else env.sim.mesh.size)
+    n_obs = flatten(policy_obs).shape[-1]
 
     def init_agent(k_policy: Array, k_value: Array, key: Array, obs: Array) -> Agent:
         n_actions = env.actions.size
@@ -181,7 +186,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
         log_std = jnp.full(n_actions, jnp.log(config.init_std), policy.layers[0][0].dtype)
         parameters: Any = (policy, log_std, value)
         optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(parameters)
-        stats = RunningStats.create(obs.shape[-1]).update(obs)
+        stats = RunningStats.create(obs.shape[-1], network.pixels).update(obs)
         returns = RunningStats.create(1)
         return Agent(policy, log_std, value, optimizer, stats, returns, key, n_obs, network, apply_layers)
 
@@ -388,6 +393,17 @@ def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.
     n_updates = config.iterations * config.epochs * config.minibatches
     schedule = optax.linear_schedule(learning_rate, 0.0, n_updates)
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(schedule))
+
+
+def _find_images(env: Env, policy_obs: Obs, config: Config) -> tuple[Image, ...]:
+    """Return the images that a convolution replaces by features; none without one."""
+    if not config.convolution:
+        return ()
+    if config.critic.startswith("all_drones"):
+        raise ConfigError(
+            f"expected a critic of one drone with a convolution, got {config.critic!r}. Use critic='privileged'."
+        )
+    return find_images({name: x.shape[-1] for name, x in policy_obs.items()}, env.image_formats())
 
 
 def _critic_obs(obs: Obs, config: Config) -> Array:

@@ -39,6 +39,7 @@ from crazysim.storage import replacing, write_file
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
+from crazysim.train.convolution import find_images
 from crazysim.train.devices import exchanged_bytes, learner_shardings, replicated_sharding
 from crazysim.train.evaluation import describe_outcome, evaluate_blocks
 from crazysim.train.export import describe
@@ -487,18 +488,20 @@ def load_policy(
         if task is not None:
             config = dataclasses.replace(config, task=TrainConfig.create(task).task)
         n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
+        convolution = config.config["convolution"] if config.algorithm != "apg" else ()
+        images = find_images(meta["observations"], meta["images"]) if convolution else ()
     if config.own_network != (network is not None):
         expected = "the network of your own" if config.own_network else "no network besides the built-in one"
         raise ConfigError(
             f"expected {expected} with which {path} was trained, got {network}. Use crazysim.train.load_policy(folder, "
             f"network={'network' if config.own_network else None})."
         )
-    used_network = choose_network(config.config.get("memory", 0), network)
+    used_network = choose_network(config.config.get("memory", 0), network, convolution, images)
     hidden = () if config.own_network else config.config["hidden"]
 
     def make_policy() -> Policy:
         weights = init_weights(used_network, jax.random.key(0), n_obs, (*hidden, n_actions), 1.0)
-        return Policy(RunningStats.create(n_obs), weights.layers, weights.body, used_network)
+        return Policy(RunningStats.create(n_obs, used_network.pixels), weights.layers, weights.body, used_network)
 
     return checkpoint.restore(path, arrays, jax.eval_shape(make_policy)), config, meta
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.errors import ConfigError
-from crazysim.scene.depth import Along
+from crazysim.scene.depth import Along, find_cameras
 from crazysim.tables import POSITIVE, read_number
 
 
@@ -50,6 +52,22 @@ class DepthImages(Wrapper):
         if env.sim.mesh is not None:
             raise ConfigError("expected worlds on one device for images, got a mesh of devices. Leave out mesh=.")
         self._depth = env.sim.scene.depth_fn(camera, width, height, drones, along=along)
+        mounting = find_cameras(env.sim.scene.mj_model, camera, ())[0]
+        self._format = {
+            "height": height,
+            "width": width,
+            "unit": "m",
+            "far": self.max_depth,
+            "along": along,
+            "camera": camera,
+            "fovy": mounting.fovy,
+            "pos": list(mounting.pos),
+            "rot": [list(row) for row in mounting.rot],
+            "follows_rotation": mounting.follows_rotation,
+        }
+
+    def describe_images(self) -> dict[str, dict[str, Any]]:
+        return {self.key: self._format}
 
     def look(self, state: EnvState) -> Obs:
         distance = self._depth(state.data).distance

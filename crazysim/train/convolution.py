@@ -1,0 +1,113 @@
+"""Convolutions over the images among the observations of a policy.
+
+A layer multiplies patches of 3 by 3 pixels, two pixels apart, by one matrix: the same product as in a layer of a
+perceptron, so it compiles as fast, and several seeds are one batched product. XLA's convolution is slower on CPUs in
+the gradient, and with the weights of several seeds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.errors import ConfigError
+
+KERNEL, STRIDE = 3, 2
+"""Side of a patch and distance between neighbouring patches, pixels. An image has a border of one zero."""
+
+
+class Image(NamedTuple):
+    """Place of an image among the concatenated observations."""
+
+    start: int
+    """Index of its first pixel."""
+    height: int
+    """Pixels."""
+    width: int
+    """Pixels."""
+    channels: int = 1
+    """Numbers of a pixel."""
+    is_depth: bool = True
+    """True if pixels are depths or distances, m."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Height, width and channels."""
+        return self.height, self.width, self.channels
+
+    @property
+    def pixels(self) -> range:
+        """Indices of its pixels, row by row."""
+        return range(self.start, self.start + math.prod(self.shape))
+
+    def shapes(self, channels: Sequence[int]) -> Iterator[tuple[int, int, int]]:
+        """Yield height, width and channels of the image and after each layer."""
+        height, width = self.height, self.width
+        yield self.shape
+        for n in channels:
+            height, width = -(-height // STRIDE), -(-width // STRIDE)
+            yield height, width, n
+
+
+def find_images(sizes: Mapping[str, int], formats: Mapping[str, Mapping[str, Any]]) -> tuple[Image, ...]:
+    """Return the places of images among observations that are concatenated in alphabetical order.
+
+    Args:
+        sizes: Sizes of the observations by name.
+        formats: Formats of those that are images, from ``Env.image_formats``.
+
+    Raises:
+        ConfigError: If there is no image.
+    """
+    images, start = [], 0
+    for name in sorted(sizes):
+        if name in formats:
+            height, width = formats[name]["height"], formats[name]["width"]
+            channels = sizes[name] // (height * width)
+            images.append(Image(start, height, width, channels, formats[name]["unit"] == "m"))
+        start += sizes[name]
+    if not images:
+        raise ConfigError(
+            f"expected an image among the observations for a convolution, got {', '.join(sorted(sizes))}. Use "
+            f"depth_image=(16, 12), or leave out convolution."
+        )
+    return tuple(images)
+
+
+def scale_depth(depth: Array) -> Array:
+    """Return 1 / (1 + d) for a depth of d metres: 1 at the lens, 1/2 at 1 m, and nearly 0 where nothing is near.
+
+    Running statistics would scale every pixel on its own, and the depth itself differs most where it matters least. The
+    inverse resolves what is near; adding 1 m keeps it and its derivative finite.
+    """
+    return 1.0 / (1.0 + depth)
+
+
+def convolve(layers: Sequence[tuple[Array, Array]], image: Array) -> Array:
+    """Return the features of one image, with the larger of zero and the sum after each layer. (n_features,)
+
+    Args:
+        layers: Weights (9 n_in, n_out), with rows in the order row, column and channel of a patch, and biases (n_out,).
+        image: Scaled image. (height, width, channels)
+    """
+    for weight, bias in layers:
+        image = jax.nn.relu(_patches(image) @ weight + bias)
+    return image.reshape(-1)
+
+
+def _patches(x: Array) -> Array:
+    """Return the patches of an image. (height, width, n) -> (height / 2, width / 2, 9 n), rounded up"""
+    height, width = x.shape[:2]
+    padded = jnp.pad(x, ((1, 1), (1, 1), (0, 0)))
+    rows, columns = -(-height // STRIDE), -(-width // STRIDE)
+    parts = [
+        padded[i : i + STRIDE * rows - 1 : STRIDE, j : j + STRIDE * columns - 1 : STRIDE]
+        for i in range(KERNEL)
+        for j in range(KERNEL)
+    ]
+    return jnp.concatenate(parts, axis=-1)

@@ -1,0 +1,233 @@
+"""Convolutions over images: features, statistics, trainings, students, and exports."""
+
+import ctypes
+import functools
+import json
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.envs import AutoReset, make
+from crazysim.envs.statistics import RunningStats
+from crazysim.train import Network, dagger, ppo
+from crazysim.train import config as configs
+from crazysim.train.checkpoint import read
+from crazysim.train.config import TrainConfig
+from crazysim.train.convolution import Image, convolve, find_images, scale_depth
+from crazysim.train.evaluation import evaluate
+from crazysim.train.export import describe, to_c, to_onnx
+from crazysim.train.networks import Policies, Policy, choose_network, init_mlp, init_weights, unroll
+from crazysim.train.seeds import stack_rates, take_seed
+from crazysim.train.training import CHECKPOINT, load_policy, train
+
+SHORT = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,), "convolution": (2, 3)}
+OPTIONS = {"seconds": 0.1, "depth_image": (5, 4)}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_environments():
+    """Let runs with equal options share environments, and with them all that was compiled."""
+
+    def freeze(**options):
+        return {name: tuple(x) if isinstance(x, list) else x for name, x in options.items()}
+
+    shared = functools.cache(make)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(configs, "make", lambda task, n_worlds, **options: shared(task, n_worlds, **freeze(**options)))
+        yield
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make("hover", 4, engine="interpret", **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def meta(env):
+    return describe(env)
+
+
+def make_policy(meta, memory, channels=(2, 3), seed=0):
+    """Return a policy with random weights and statistics for the observations of ``meta``."""
+    rng, n_obs = np.random.default_rng(seed), sum(meta["observations"].values())
+    network = choose_network(memory, None, channels, find_images(meta["observations"], meta["images"]))
+    weights = init_weights(network, jax.random.key(1), n_obs, (16, 4), 1.0)
+    weights = jax.tree.map(lambda x: x + jnp.asarray(rng.normal(scale=0.1, size=x.shape), x.dtype), weights)
+    stats = RunningStats.create(n_obs, network.pixels).update(jnp.asarray(rng.normal(1, 2, size=(9, n_obs))))
+    return Policy(stats, weights.layers, weights.body, network)
+
+
+@pytest.mark.parametrize("shape", [(12, 16), (5, 7), (1, 2)])
+def test_a_convolution_is_that_of_xla(rng, shape):
+    layers = [
+        (jnp.asarray(rng.normal(size=(9 * n, m)), jnp.float32), jnp.asarray(rng.normal(size=m), jnp.float32))
+        for n, m in ((1, 3), (3, 2))
+    ]
+    image = jnp.asarray(rng.uniform(size=(*shape, 1)), jnp.float32)
+    x = image[None]
+    for weight, bias in layers:
+        kernel = weight.reshape(3, 3, -1, weight.shape[-1])
+        dimensions = ("NHWC", "HWIO", "NHWC")
+        sums = jax.lax.conv_general_dilated(x, kernel, (2, 2), ((1, 1), (1, 1)), dimension_numbers=dimensions)
+        x = jnp.maximum(sums + bias, 0)
+    features = convolve(layers, image)
+    np.testing.assert_allclose(features, x.ravel(), atol=1e-5)
+    assert features.shape == (np.prod(list(Image(0, *shape).shapes((3, 2)))[-1]),)
+
+
+def test_pixels_are_inverse_distances_and_not_normalised(rng):
+    images = find_images({"z": 2, "depth": 6, "a": 3}, {"depth": {"height": 2, "width": 3, "unit": "m"}})
+    assert images == (Image(3, 2, 3),)
+    x = jnp.asarray(rng.normal(5, 3, size=(50, 11)), jnp.float32)
+    stats = RunningStats.create(11, (images[0].pixels,)).update(x)
+    expected = RunningStats.create(11).update(x)
+    np.testing.assert_array_equal(stats.mean[3:9], 0)
+    np.testing.assert_array_equal(stats.normalize(x)[:, 3:9], x[:, 3:9])
+    for part in (slice(3), slice(9, 11)):
+        np.testing.assert_array_equal(stats.normalize(x)[:, part], expected.normalize(x)[:, part])
+    np.testing.assert_allclose(scale_depth(jnp.array([0.0, 1.0, 9.0])), [1, 0.5, 0.1])
+
+
+def test_a_pixel_of_each_image_moves_the_outputs_and_gradients_reach_all_weights(rng):
+    images = (Image(0, 4, 5), Image(21, 1, 3, 3, is_depth=False))
+    network = choose_network(2, None, (6,), images)
+    assert choose_network(2, None, (6,), images) is network, "so that compiled functions are found again"
+    weights = init_weights(network, jax.random.key(0), 31, (8, 1), 1.0)
+    obs, done = jnp.asarray(rng.uniform(size=(3, 6, 31)), jnp.float32), jnp.zeros((3, 6), bool)
+
+    def loss(weights, obs):
+        return jnp.sum(unroll(network, weights, obs, network.make_memory(6), done) ** 2)
+
+    grads, slopes = jax.grad(loss, argnums=(0, 1))(weights, obs)
+    assert all(np.any(x) for x in jax.tree.leaves(grads))
+    assert (np.abs(slopes).max(axis=(0, 1)) > 0).all()
+
+
+@pytest.fixture(scope="module")
+def episode(meta):
+    """Return a policy with memory, observations of five steps of three drones, and actions."""
+    policy = make_policy(meta, memory=4)
+    rng = np.random.default_rng(2)
+    obs = {name: np.asarray(rng.normal(size=(5, 3, n)), np.float32) for name, n in meta["observations"].items()}
+    obs["depth"] = np.abs(3 * obs["depth"])
+    memory, actions = policy.initial_memory(3), []
+    for t in range(5):
+        action, memory = jax.jit(policy.act)({name: x[t] for name, x in obs.items()}, memory)
+        actions.append(np.asarray(action))
+    return policy, np.concatenate([obs[name] for name in sorted(obs)], axis=-1), np.stack(actions)
+
+
+def test_onnx_gives_the_actions_of_jax_and_holds_the_model_of_the_camera(tmp_path, meta, episode):
+    runtime = pytest.importorskip("onnxruntime")
+    policy, obs, actions = episode
+    session = runtime.InferenceSession(to_onnx(policy, tmp_path / "policy.onnx", meta))
+    memory = np.zeros((3, 4), np.float32)
+    for t in range(5):
+        action, memory = session.run(None, {"observation": obs[t], "memory": memory})
+        np.testing.assert_allclose(action, actions[t], atol=1e-5)
+    camera = json.loads(session.get_modelmeta().custom_metadata_map["images"])["depth"]
+    assert (camera["width"], camera["height"], camera["unit"], camera["far"]) == (5, 4, "m", 10.0)
+    assert camera["pos"] == [0.03, 0, 0]
+    assert 60 < camera["fovy"] < 90
+    np.testing.assert_allclose(camera["rot"], [[0, 0, -1], [-1, 0, 0], [0, 1, 0]], atol=1e-12)
+
+
+def test_c_gives_the_actions_of_jax(tmp_path, meta, episode):
+    policy, obs, actions = episode
+    path = to_c(policy, tmp_path / "policy.h", meta)
+    text = path.read_text()
+    assert 'depth: image, row by row: {"height": 4, "width": 5, "unit": "m", "far": 10.0' in text
+    source, library = tmp_path / "use.c", tmp_path / "use.so"
+    source.write_text(
+        f'#include "{path}"\nvoid step(policy_state *s, const float *x, float *a);\n'
+        "void step(policy_state *s, const float *x, float *a) { policy(s, x, a); }\n"
+    )
+    cc = shutil.which("cc") or shutil.which("gcc") or "cc"
+    flags = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-shared", "-fPIC")
+    subprocess.run([cc, *flags, source, "-o", library, "-lm"], check=True)
+    step = ctypes.CDLL(str(library)).step
+    state, action = np.zeros((3, 4), np.float32), np.zeros(4, np.float32)
+    for t, drone in np.ndindex(5, 3):
+        step(*(np.ascontiguousarray(x).ctypes.data_as(ctypes.c_void_p) for x in (state[drone], obs[t, drone], action)))
+        np.testing.assert_allclose(action, actions[t, drone], atol=1e-5)
+
+
+def trained(folder, iterations=2, **options):
+    """Train hover with images, a tiny convolution and a privileged critic."""
+    config = SHORT | {"iterations": iterations, "memory": 3, "critic": "privileged"}
+    config = TrainConfig.create("hover", n_worlds=8, options=OPTIONS, config=config)
+    return train(config, folder, evaluation_worlds=8, log=lambda line: None, progress=False, **options)
+
+
+@pytest.mark.long("compiles a training")
+def test_a_run_with_a_convolution_resumes_bit_for_bit_and_its_policy_comes_back(tmp_path):
+    whole = trained(tmp_path / "whole")
+
+    def interrupt(i, _):
+        if i == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "cut", on_iteration=interrupt)
+    trained(tmp_path / "cut", resume=True)
+    mine, others = (read(tmp_path / name / CHECKPOINT)[0] for name in ("cut", "whole"))
+    for name, x in mine.items():
+        np.testing.assert_array_equal(x, others[name], err_msg=name)
+    policy, config, meta = load_policy(tmp_path / "whole")
+    assert config.config["convolution"] == [2, 3]
+    assert meta["images"]["depth"]["width"] == 5
+    assert evaluate(whole.env, policy)["reward"] == evaluate(whole.env, whole.policy)["reward"]
+    start = policy.stats.is_scaled().argmin()
+    np.testing.assert_array_equal(policy.stats.mean[start : start + 20], 0)
+    assert np.all(policy.stats.mean[:start] != 0)
+
+
+def test_policies_of_several_seeds_have_convolutions_of_their_own(rng, meta):
+    each = [make_policy(meta, memory=0, channels=(2,), seed=seed) for seed in (0, 1)]
+    policies = Policies(jax.tree.map(lambda *x: jnp.stack(x), *each))
+    obs = {name: jnp.asarray(rng.uniform(size=(4, 1, n)), jnp.float32) for name, n in meta["observations"].items()}
+    actions = policies(obs)
+    for policy, worlds in zip(each, (slice(2), slice(2, 4)), strict=True):
+        np.testing.assert_allclose(actions[worlds], policy({k: x[worlds] for k, x in obs.items()}), atol=1e-6)
+    assert np.abs(actions[:2] - each[1]({k: x[:2] for k, x in obs.items()})).max() > 0.01
+
+
+def test_a_student_learns_from_images(env, rng):
+    """Its labels are a pixel: observations without images have no part in them."""
+    config = dagger.Config(iterations=30, minibatches=1, epochs=4, hidden=(8,), convolution=(4,), learning_rate=0.01)
+    seen = AutoReset(dagger.TeacherObservation(env, lambda data: {"pos": data.states.pos}))
+    init = jax.jit(functools.partial(dagger.init, seen, (config,), teacher=lambda obs: obs["pos"]))
+    learner = init(jax.random.key(0)[None])
+    agent, obs = take_seed(learner.agents, 0), jnp.asarray(rng.uniform(0, 2, size=(4, 64, 1, 41)), jnp.float32)
+    (image,) = agent.network.images
+    assert image.shape == (4, 5, 1)
+    labels = jnp.broadcast_to(0.5 * jnp.tanh(obs[..., image.start : image.start + 1] - 1), (4, 64, 1, 4))
+    update = jax.jit(functools.partial(dagger._update_agent, rates=take_seed(stack_rates((config,)), 0), config=config))
+    measure = jax.jit(lambda agent: jnp.square(agent.act(agent.stats.normalize(obs)) - labels).mean())
+    before = measure(agent)
+    for i in range(30):
+        agent, finite = update(agent, obs, labels, key=jax.random.key(i))
+        assert finite
+    assert measure(agent) < 0.2 * before
+
+
+def test_law_09_convolutions_that_do_not_fit_are_refused(env):
+    blind, keys = make("hover", 4, engine="interpret"), jax.random.key(0)[None]
+    with pytest.raises(ConfigError, match=r"expected an image among the observations .*, got ang_vel, .*Use depth_im"):
+        ppo.init(AutoReset(blind), (ppo.Config(convolution=(2,), minibatches=1),), keys)
+    with pytest.raises(ConfigError, match=r"expected a critic of one drone with a convolution, got 'all_drones'"):
+        ppo.init(AutoReset(env), (ppo.Config(convolution=(2,), minibatches=1, critic="all_drones"),), keys)
+    with pytest.raises(ConfigError, match=r"expected convolution as the channels of the layers, got 8\. Use for"):
+        ppo.Config(convolution=8)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"convolution\[1\] is 0; it must be a positive"):
+        ppo.Config(convolution=(2, 0))
+    network = Network(lambda key, n: init_mlp(key, (n, 2), 1.0), lambda weights, obs, memory: (obs, memory))
+    with pytest.raises(ConfigError, match=r"expected no convolution with a network of your own, got \[2\]\. Put it"):
+        TrainConfig.create("hover", options=OPTIONS, config={"convolution": (2,)}, network=network)
+    with pytest.raises(ConfigError, match=r"expected hyperparameters of apg, got convolution"):
+        TrainConfig.create("hover", "apg", options=OPTIONS, config={"convolution": (2,)})
