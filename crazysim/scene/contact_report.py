@@ -24,6 +24,7 @@ from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape, distance
+from crazysim.geometry.rays import SizedShapes
 from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionBody, CollisionGeom, CollisionModel
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
@@ -229,11 +230,11 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
 def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
     """Return the distance to the nearest of some geoms in the world frame, m. (...)
 
-    Distances to many geoms of one shape are computed side by side.
+    Distances to many geoms of one shape, or to many boxes, are computed side by side.
     """
     kinds: dict[Any, list[CollisionGeom]] = {}
     for geom in geoms:
-        kinds.setdefault((geom.shape, geom.rot is None), []).append(geom)
+        kinds.setdefault(("box" if geom.shape.kind == "box" else geom.shape, geom.rot is None), []).append(geom)
     gaps = []
     for equal_geoms in kinds.values():
         for part, part_pos, is_present in parts:
@@ -251,7 +252,7 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
 
 
 class StackedGeoms(NamedTuple):
-    """Geoms of one shape at different poses."""
+    """Geoms of one shape, or boxes, at different poses."""
 
     shape: Shape
     """Shape of all, in its own frame."""
@@ -259,19 +260,26 @@ class StackedGeoms(NamedTuple):
     """Origins, m. (n, 3)"""
     rot: NDArray | None
     """Rotation matrices; None for the identity. (n, 3, 3)"""
+    box_sizes: NDArray | None
+    """Half lengths of boxes that differ, m; None for equal shapes. (n, 3)"""
 
     @staticmethod
     def of(geoms: Sequence[CollisionGeom]) -> StackedGeoms:
-        """Return geoms of one shape, either all turned or none."""
+        """Return geoms of one shape, or boxes, either all turned or none."""
         rot = None if geoms[0].rot is None else np.array([geom.rot for geom in geoms])
-        return StackedGeoms(geoms[0].shape, np.array([geom.pos for geom in geoms]), rot)
+        sizes = None
+        if any(geom.shape != geoms[0].shape for geom in geoms):
+            sizes = np.array([geom.shape.size for geom in geoms])
+        return StackedGeoms(geoms[0].shape, np.array([geom.pos for geom in geoms]), rot, sizes)
 
 
 def _stacked_distances(
     part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms, is_present: Array | None
 ) -> Array:
     """Return the distances of a drone's geom to stacked geoms, infinite if the drone has no such geom, m. (..., n)"""
-    rot = None if drone_rot is None else drone_rot[..., None, :, :]
+    rot = None
+    if drone_rot is not None:
+        rot = jnp.broadcast_to(drone_rot[..., None, :, :], (*drone_rot.shape[:-2], len(geoms.pos), 3, 3))
     gap = _geom_distance(part, part_pos[..., None, :], rot, geoms)
     return _mask_absent(None if is_present is None else is_present[..., None], gap)
 
@@ -296,7 +304,10 @@ def _geom_distance(
         rot = None if drone_rot is None else _product(jnp.swapaxes(columns, -1, -2), drone_rot)
     if rot is not None and part.rot is not None:
         rot = _product(rot, jnp.asarray(part.rot, part_pos.dtype))
-    return distance(part.shape, geom.shape, local_pos, jnp.eye(3) if rot is None else rot)
+    shape: Shape | SizedShapes = geom.shape
+    if isinstance(geom, StackedGeoms) and geom.box_sizes is not None:
+        shape = SizedShapes("box", [jnp.asarray(half, part_pos.dtype) for half in geom.box_sizes.T])
+    return distance(part.shape, shape, local_pos, jnp.eye(3) if rot is None else rot)
 
 
 def _product(a: Array, b: Array) -> Array:

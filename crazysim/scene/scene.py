@@ -19,6 +19,7 @@ from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
 from crazysim.scene import build, collision, contact_report, depth, mjx
 from crazysim.scene.collision import CollisionModel
+from crazysim.scene.maps import MAP_RGBA, MapSource, map_spec
 from crazysim.scene.mjx_scene import MjxScene
 from crazysim.scene.object_poses import ListPlugins
 from crazysim.scene.objects import IDENTITY_QUAT, Handle, SceneObjects, Source
@@ -121,6 +122,43 @@ class Scene:
             handle = self.added.add(self.spec, source, name, count, pos, quat, mocap, options)
         self.revision += 1
         return handle
+
+    def add_map(
+        self,
+        source: MapSource,
+        name: str | None = None,
+        *,
+        resolution: float = 0.1,
+        pos: ArrayLike = (0.0, 0.0, 0.0),
+        quat: ArrayLike = IDENTITY_QUAT,
+        scale: float | None = None,
+        min_points: int = 1,
+        rgba: ArrayLike = MAP_RGBA,
+    ) -> Handle:
+        """Add a point cloud or a triangle mesh as boxes that do not move, and return the handle of this one object.
+
+        Voxels that contain points, or that triangles meet, are merged into boxes along the axes of the world. A mesh
+        need not be convex or closed, and what it encloses is empty.
+
+        Args:
+            source: Path of a ``.ply``, ``.pcd``, ``.stl`` or ``.obj`` file; or the points of a cloud, (n_points, 3).
+            name: Prefix of the body's name ``name:0``; None for the name of the file, or ``map``.
+            resolution: Edge of the voxels, m.
+            pos: Origin of the file's frame, world frame, m. (3,)
+            quat: Attitude of the file's frame, file to world, xyzw. (4,)
+            scale: Metres per unit of the file; None for one, if the map is then 1 cm to 10 km large.
+            min_points: Number of points from which on a voxel is occupied, to drop the noise of a scan.
+            rgba: Colour.
+
+        Raises:
+            DamagedFileError: If the file is damaged, cut off, or of another kind.
+            ConfigError: If the file does not exist, has no points or some that are not finite, or has no plausible
+                scale; or if there are too many boxes.
+        """
+        spec = map_spec(source, resolution, pos, quat, scale, min_points, rgba)
+        if name is None:
+            name = Path(source).stem if isinstance(source, (str, Path)) else "map"
+        return self.add(spec, name, mocap=False)
 
     def add_once(self, source: Source, name: str, count: int) -> None:
         """Add ``count`` objects unless they exist: objects of a plugin stay when it is removed or replaced."""

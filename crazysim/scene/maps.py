@@ -1,0 +1,133 @@
+"""Maps: point clouds and triangle meshes as boxes that do not move."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.core.settings import as_rgba, positive_integer
+from crazysim.errors import ConfigError, short_repr
+from crazysim.scene.map_files import MapFile, read_map
+from crazysim.scene.primitives import DRONE_TOUCH_BITS
+from crazysim.scene.voxels import count_candidates, merge_voxels, voxels_of_points, voxels_of_triangles
+from crazysim.tables import LENGTH, range_between, read_number, read_numbers
+
+MapSource = str | Path | ArrayLike
+"""Path of a ``.ply``, ``.pcd``, ``.stl`` or ``.obj`` file, or the points of a cloud, m. (n_points, 3)"""
+MIN_EXTENT, MAX_EXTENT = 0.01, 10_000.0
+"""Smallest and largest extent of a map whose unit is taken to be a metre, m."""
+MAX_COORDINATE = 1e6
+"""Largest coordinate of a map, m."""
+MAX_VOXELS = 20_000_000
+"""Largest number of voxels to test or to merge; more would need several GB."""
+MAX_BOXES = 10_000
+"""Largest number of boxes of a map."""
+MAP_RGBA = (0.62, 0.60, 0.57, 1.0)
+"""Colour of maps."""
+
+
+def map_spec(
+    source: MapSource,
+    resolution: float,
+    pos: ArrayLike,
+    quat: ArrayLike,
+    scale: float | None,
+    min_points: int,
+    rgba: ArrayLike,
+) -> mujoco.MjSpec:
+    """Return a spec whose world body has the boxes of a map; see ``Scene.add_map``."""
+    resolution = read_number("resolution", resolution, LENGTH)
+    min_points = positive_integer("min_points", min_points)
+    points, triangles = _read_source(source)
+    if not np.isfinite(points).all():
+        n = int((~np.isfinite(points)).any(axis=1).sum())
+        raise ConfigError(
+            f"expected finite coordinates, got {n} of {len(points)} points of the map without. Drop them."
+        )
+    points = register(points, pos, quat, scale)
+    if triangles is None:
+        _require_few("points", len(points), resolution)
+        voxels = voxels_of_points(points, resolution, min_points)
+        if not len(voxels):
+            raise ConfigError(f"expected voxels with min_points={min_points} points, got none. Use a smaller number.")
+    else:
+        if min_points > 1:
+            raise ConfigError(f"expected min_points=1 for triangles, got {min_points}. Only clouds have noise to drop.")
+        corners = points[triangles]
+        _require_few("voxels near triangles", count_candidates(corners, resolution), resolution)
+        voxels = voxels_of_triangles(corners, resolution)
+    boxes = merge_voxels(voxels)
+    if len(boxes) > MAX_BOXES:
+        raise ConfigError(
+            f"expected a map of at most {MAX_BOXES} boxes, got {len(boxes)} from {len(voxels)} voxels of {resolution} "
+            f"m. Use a larger resolution=."
+        )
+    spec = mujoco.MjSpec()
+    options = {"type": mujoco.mjtGeom.mjGEOM_BOX, "rgba": as_rgba(rgba), **DRONE_TOUCH_BITS}
+    for first, last in zip(boxes[:, :3], boxes[:, 3:], strict=True):
+        middle, half = (first + last) / 2 * resolution, (last - first + 1) / 2 * resolution
+        spec.worldbody.add_geom(pos=middle, size=half, **options)
+    return spec
+
+
+def register(points: NDArray, pos: ArrayLike, quat: ArrayLike, scale: float | None) -> NDArray[np.float64]:
+    """Return points of a file in the world frame, m. (n, 3)
+
+    Args:
+        points: Finite points in the frame and unit of the file. (n, 3)
+        pos: Origin of the file's frame, world frame, m. (3,)
+        quat: Its attitude, file to world, xyzw. (4,)
+        scale: Metres per unit of the file; None for one, if the extent is one that a map in metres can have.
+    """
+    pos, rot, scale = read_frame(points, pos, quat, scale)
+    points = scale * points @ rot.T + pos
+    if np.abs(points).max() > MAX_COORDINATE:
+        raise ConfigError(
+            f"expected points within {MAX_COORDINATE:g} m of the origin, got one at {np.abs(points).max():.4g} m. Use "
+            f"another pos= or scale=."
+        )
+    return points
+
+
+def read_frame(
+    points: NDArray, pos: ArrayLike, quat: ArrayLike, scale: float | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return position (3,), rotation matrix (3, 3) and scale of a file's frame, checked; see ``register``."""
+    pos = read_numbers("pos", pos, range_between(-MAX_COORDINATE, MAX_COORDINATE), ((3,),))
+    quat = read_numbers("quat", quat, shapes=((4,),))
+    if not np.linalg.norm(quat) > 0:
+        raise ConfigError("expected quat as a rotation, got zeros. Use (0, 0, 0, 1) for none.")
+    rot = np.empty(9)
+    mujoco.mju_quat2Mat(rot, np.roll(quat / np.linalg.norm(quat), 1))
+    if scale is not None:
+        return pos, rot.reshape(3, 3), read_number("scale", scale, range_between(positive=True))
+    extent = float(np.ptp(points, axis=0).max())
+    if not MIN_EXTENT <= extent <= MAX_EXTENT:
+        raise ConfigError(
+            f"expected a map in metres, of an extent of {MIN_EXTENT:g} to {MAX_EXTENT:g} m, got {extent:.4g}. Pass "
+            f"scale=, the number of metres per unit of the file."
+        )
+    return pos, rot.reshape(3, 3), 1.0
+
+
+def _read_source(source: MapSource) -> MapFile:
+    if isinstance(source, (str, Path)):
+        return read_map(source)
+    try:
+        points = np.asarray(source, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"expected a path or points, (n_points, 3), got {short_repr(source)}") from error
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise ConfigError(f"expected points of a map, (n_points, 3), got an array of shape {points.shape}")
+    return MapFile(points, None)
+
+
+def _require_few(what: str, n: int, resolution: float) -> None:
+    if n > MAX_VOXELS:
+        raise ConfigError(
+            f"expected a map of at most {MAX_VOXELS} {what}, got {n} with voxels of {resolution:g} m. Use a larger "
+            f"resolution=, or a part of the map."
+        )

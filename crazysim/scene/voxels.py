@@ -1,0 +1,111 @@
+"""Voxels of point clouds and triangles, merged into boxes.
+
+Voxel (i, j, k) is the cube of one edge length around (i, j, k) times that length, so that a surface at a multiple of it
+lies in the middle of its voxels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_CANDIDATES = 1 << 20
+"""Largest number of pairs of a triangle and a voxel that are tested at a time."""
+TOLERANCE = 1e-6
+"""Length by which voxels are enlarged for triangles, as a fraction of their edge."""
+
+
+def voxels_of_points(points: NDArray, resolution: float, min_points: int = 1) -> NDArray[np.int64]:
+    """Return the voxels that contain points. (n, 3)
+
+    Args:
+        points: Points, m. (n_points, 3)
+        resolution: Edge of a voxel, m.
+        min_points: Number of points that a voxel must contain.
+    """
+    voxels, counts = np.unique(np.floor(points / resolution + 0.5).astype(np.int64), axis=0, return_counts=True)
+    return voxels[counts >= min_points]
+
+
+def count_candidates(corners: NDArray, resolution: float) -> int:
+    """Return the number of voxels that ``voxels_of_triangles`` tests: those of the boxes around the triangles."""
+    return int(np.prod(_voxel_range(corners / resolution)[1].astype(np.float64), axis=1).sum())
+
+
+def _voxel_range(corners: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first voxel of the box around each triangle, and the number of its voxels along each axis. (n, 3)"""
+    first = np.floor(corners.min(axis=1) + 0.5).astype(np.int64)
+    return first, np.floor(corners.max(axis=1) + 0.5).astype(np.int64) - first + 1
+
+
+def voxels_of_triangles(corners: NDArray, resolution: float) -> NDArray[np.int64]:
+    """Return the voxels that triangles meet. (n, 3)
+
+    A triangle meets a cube unless one of 13 axes separates them: the normals of both, and the cross products of their
+    edges (Akenine-Möller 2001, Fast 3D triangle-box overlap testing).
+
+    Args:
+        corners: Corners of the triangles, m. (n_triangles, 3, 3)
+        resolution: Edge of a voxel, m.
+    """
+    corners = corners / resolution
+    first, size = _voxel_range(corners)
+    n_candidates = np.prod(size, axis=1)
+    end, found, start = np.cumsum(n_candidates), [np.zeros((0, 3), np.int64)], 0
+    while start < len(corners):
+        done = end[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(end, done + MAX_CANDIDATES, side="right")))
+        triangle = np.repeat(np.arange(start, stop), n_candidates[start:stop])
+        number = np.arange(len(triangle)) - np.repeat(
+            end[start:stop] - n_candidates[start:stop] - done, n_candidates[start:stop]
+        )
+        ny, nz = size[triangle, 1], size[triangle, 2]
+        voxels = first[triangle] + np.stack([number // (ny * nz), number // nz % ny, number % nz], axis=-1)
+        found.append(np.unique(voxels[_meets_cube(corners[triangle] - voxels[:, None])], axis=0))
+        start = stop
+    return np.unique(np.concatenate(found), axis=0)
+
+
+def _meets_cube(corners: NDArray) -> NDArray[np.bool_]:
+    """Return True for triangles that meet the cube of edge 1 around the origin. (n, 3, 3) -> (n,)"""
+    edges = np.roll(corners, -1, axis=1) - corners
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    axes = [np.cross(np.eye(3)[i], edges[:, k]) for i in range(3) for k in range(3)]
+    meets = np.ones(len(corners), bool)
+    for axis in [*axes, normal]:
+        along = np.einsum("nkc,nc->nk", corners, axis)
+        reach = np.abs(axis).sum(axis=1) * (0.5 + TOLERANCE) + TOLERANCE
+        meets &= (along.min(axis=1) <= reach) & (along.max(axis=1) >= -reach)
+    return meets
+
+
+def merge_voxels(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return boxes that fill the same space as voxels, without overlap: first and last voxel of each. (n, 6)
+
+    Runs of voxels along one axis become bars, bars of equal ends plates, plates of equal outline boxes. Of the six
+    orders of axes, the one with the fewest boxes is chosen.
+
+    Args:
+        voxels: Distinct voxels. (n_voxels, 3)
+    """
+    single = np.concatenate([voxels, voxels], axis=1)
+    orders = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
+    results = []
+    for order in orders:
+        boxes = single
+        for axis in order:
+            boxes = _merge_along(boxes, axis)
+        results.append(boxes)
+    return min(results, key=len)
+
+
+def _merge_along(boxes: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
+    """Return boxes with those joined that continue each other along an axis. (n, 6) -> (m, 6)"""
+    across = [k for k in range(6) if k % 3 != axis]
+    order = np.lexsort((boxes[:, axis], *boxes[:, across].T))
+    boxes = boxes[order]
+    is_next = (boxes[1:, across] == boxes[:-1, across]).all(axis=1) & (boxes[1:, axis] == boxes[:-1, axis + 3] + 1)
+    first = np.concatenate([[True], ~is_next])
+    merged = boxes[first]
+    merged[:, axis + 3] = boxes[np.concatenate([first[1:], [True]]), axis + 3]
+    return merged
