@@ -307,7 +307,7 @@ def _geom_distance(
     shape: Shape | SizedShapes = geom.shape
     if isinstance(geom, StackedGeoms) and geom.box_sizes is not None:
         shape = SizedShapes("box", [jnp.asarray(half, part_pos.dtype) for half in geom.box_sizes.T])
-    return distance(part.shape, shape, local_pos, jnp.eye(3) if rot is None else rot)
+    return distance(part.shape, shape, local_pos, jnp.eye(3) if rot is None else rot)  # type: ignore[arg-type]
 
 
 def _product(a: Array, b: Array) -> Array:

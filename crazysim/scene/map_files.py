@@ -57,7 +57,9 @@ def read_map(path: str | Path) -> MapFile:
         if triangles is not None:
             triangles = np.asarray(triangles, np.int64).reshape(-1, 3)
             if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
-                raise ValueError(f"triangles of vertices {triangles.min()} to {triangles.max()} of {len(points)}")
+                raise ValueError(
+                    f"expected triangles of {len(points)} vertices, got {triangles.min()} to {triangles.max()}"
+                )
     if not len(points):
         raise ConfigError(f"expected points, got {str(path)!r}, which has none. {READ_REMEDY}")
     return MapFile(points, triangles if triangles is not None and len(triangles) else None)
@@ -76,7 +78,7 @@ def read_ply(content: bytes) -> dict[str, Columns]:
     """
     header, body = _split_header(content, b"end_header")
     if not header or header[0] != ["ply"]:
-        raise ValueError("its first line is not 'ply'")
+        raise ValueError("expected 'ply' in the first line")
     layout, elements = "", []
     for line in header[1:]:
         if line[0] == "format":
@@ -90,7 +92,7 @@ def read_ply(content: bytes) -> dict[str, Columns]:
     elif layout in PLY_ORDERS:
         table = _BinaryTable(body, PLY_ORDERS[layout])
     else:
-        raise ValueError(f"unknown format {layout[:30]!r}")
+        raise ValueError(f"expected format ascii or {' or '.join(PLY_ORDERS)}, got {layout[:30]!r}")
     return {name: table.read(count, properties) for name, count, properties in elements}
 
 
@@ -135,7 +137,7 @@ def _read_stl(content: bytes) -> tuple[NDArray, NDArray]:
         lines = [line.split() for line in content.lower().splitlines()]
         corners = np.array([line[1:4] for line in lines if line[:1] == [b"vertex"]], np.float64)
     else:
-        raise ValueError(f"{len(content)} bytes, where {n} triangles need {84 + 50 * n}")
+        raise ValueError(f"expected {84 + 50 * n} bytes for {n} triangles, got {len(content)}")
     return corners, np.arange(len(corners)).reshape(-1, 3)
 
 
@@ -174,14 +176,14 @@ def _split_header(content: bytes, last: bytes) -> tuple[list[list[str]], bytes]:
             lines.append(line.decode("ascii").split())
         if line.startswith(last):
             return lines, content[start:]
-    raise ValueError(f"no line {last.decode()!r} ends a header")
+    raise ValueError(f"expected a header that ends with a line {last.decode()!r}")
 
 
 def _count(number: str | int) -> int:
     """Return a number of entries, which is not negative."""
     n = int(number)
     if n < 0:
-        raise ValueError(f"a number of {n} entries")
+        raise ValueError(f"expected a number of entries, got {n}")
     return n
 
 
@@ -193,7 +195,7 @@ def _distinct(names: list[str]) -> list[str]:
 def _numbers(words: list[bytes], n: int) -> NDArray[np.float64]:
     """Return the first ``n`` words as numbers."""
     if len(words) < n:
-        raise ValueError(f"{len(words)} numbers, where {n} are needed")
+        raise ValueError(f"expected {n} numbers, got {len(words)}")
     return np.array(words[:n], np.float64)
 
 
@@ -233,7 +235,7 @@ class _AsciiTable:
     def _take(self, n: int) -> list[bytes]:
         words = self._words[self._next : self._next + n]
         if len(words) < n:
-            raise ValueError("the text ends early")
+            raise ValueError(f"expected {n} numbers, got {len(words)}")
         self._next += n
         return words
 
