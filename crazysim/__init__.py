@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, RotorJet, SharedLoad, SlungLoad
+    from crazysim.plugins.sensors.camera import Camera
     from crazysim.plugins.sensors.imu import IMU
     from crazysim.plugins.sensors.motion_capture import MotionCapture
     from crazysim.plugins.sensors.radar import Radar
@@ -59,6 +60,7 @@ __all__ = [
     "Airframe",
     "Battery",
     "Bicycles",
+    "Camera",
     "Cars",
     "ConfigError",
     "ContactLog",
@@ -113,6 +115,7 @@ __getattr__ = lazy(
     {
         "Battery": "crazysim.plugins.effects",
         "Bicycles": "crazysim.plugins.vehicles",
+        "Camera": "crazysim.plugins.sensors.camera",
         "Cars": "crazysim.plugins.vehicles",
         "ContactLog": "crazysim.plugins.contacts.contact_log",
         "ContactResponse": "crazysim.plugins.contacts.response",

@@ -374,7 +374,7 @@ def plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
         plugins: The plugins.
     """
     if not isinstance(plugins, (list, tuple)) or not all(isinstance(plugin, Plugin) for plugin in plugins):
-        example = "IMU()" if name == "sensors" else "Wind()"
+        example = {"sensors": "IMU()", "camera": "Camera(16, 12)"}.get(name, "Wind()")
         raise ConfigError(
             f"expected {name} as a list of plugins, got {short_repr(plugins)}. Use {name}=[{example}], say."
         )

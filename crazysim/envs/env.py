@@ -243,7 +243,8 @@ class Env(ABC):
     def explain(self) -> str:
         """Return how a step is executed, as ``Sim.explain`` does for a step of the physics."""
         state = jax.eval_shape(self.reset, jax.random.key(0))
-        return explain(self.step_fn, state.full_data, zeros=())
+        step, rays = explain(self.step_fn, state.full_data, zeros=()), self.sim.scene.ray_kernels.used
+        return f"{step}\nrays: {rays}" if rays else step
 
     def target(self, state: EnvState) -> Array | None:
         """Return the target position of each drone, or several marks per drone, to draw in images, m; None without one.

@@ -7,7 +7,7 @@ from typing import Any
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.envs.state import EnvState, Obs
+from crazysim.envs.state import EnvState
 
 
 class Hooks:
@@ -54,13 +54,13 @@ class Hooks:
         """Return the state after the step."""
         return state
 
-    def look(self, state: EnvState) -> Obs:
-        """Return images of all worlds, which are observations under their names. (n_worlds, n_drones, k) each
+    def look(self, state: EnvState) -> EnvState:
+        """Return the state of all worlds with new images in ``state.record.images``, which are observations.
 
-        They are taken once a step, after new episodes have begun, by kernels of their own.
+        They are taken once a step, after new episodes have begun, by kernels of their own. The wrapper's memory may
+        change, too; before the first episode it is empty.
         """
-        del state
-        return {}
+        return state
 
     def describe_images(self) -> dict[str, dict[str, Any]]:
         """Return the format of each image that ``look`` takes, by name, for networks and exports.

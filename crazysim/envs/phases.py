@@ -132,7 +132,9 @@ class Phases:
 
     def look(self, state: EnvState) -> EnvState:
         """Return the state of all worlds with new images."""
-        images = {name: x for wrapper in self.wrappers for name, x in wrapper.look(state).items()}
+        for wrapper in self.wrappers:
+            state = wrapper.look(state)
+        images = state.record.images
         if both := images.keys() & state.record.obs.keys():
             raise ConfigError(f"expected other names of images than those of observations, got {min(both)!r} as both")
         invalid = state.full_data.core.nonfinite[..., None]

@@ -31,9 +31,11 @@ from crazysim.envs.tasks.recover import Recover
 from crazysim.envs.tasks.swarm import Swarm
 from crazysim.envs.tasks.track import TrackTrajectory
 from crazysim.envs.tasks.transport import Transport
-from crazysim.envs.wrappers.images import DepthImages
+from crazysim.envs.wrappers.images import CameraImages
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.plugins.effects.randomize import Randomize
+from crazysim.plugins.sensors.camera import Camera
+from crazysim.plugins.sensors.image_sensor import ImageSensor
 from crazysim.sim.sim import Sim
 
 
@@ -91,6 +93,7 @@ def make(
     sensors: Sequence[Plugin] = (),
     effects: Sequence[Plugin] = (),
     randomize: str | None = None,
+    camera: ImageSensor | Sequence[ImageSensor] = (),
     depth_image: Sequence[int] | None = None,
     **options: Any,
 ) -> Env:
@@ -107,8 +110,9 @@ def make(
             by ``env.sim.add``, ``reset`` raises an error.
         randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
             ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
-        depth_image: Width and height in pixels of images that the drones observe in addition; see ``DepthImages``. None
-            for no images.
+        camera: Camera or lidar whose images the drones observe in addition, or several; see ``CameraImages``.
+        depth_image: Width and height in pixels of depth images that the drones observe as ``"depth"``, short for a
+            ``Camera`` that takes one in every step. None for no such images.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
     """
@@ -145,13 +149,15 @@ def make(
     for plugin in plugins:
         sim.add(plugin)
     env = DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
+    for source in [camera] if isinstance(camera, ImageSensor) else plugin_list("camera", camera):
+        env = CameraImages(env, source)  # type: ignore[arg-type]  # checked there
     if depth_image is None:
         return env
     if not isinstance(depth_image, (tuple, list)) or len(depth_image) != 2:
         raise ConfigError(
             f"expected depth_image as width and height in pixels, got {short_repr(depth_image)}. Try (16, 12)."
         )
-    return DepthImages(env, width=depth_image[0], height=depth_image[1])
+    return CameraImages(env, Camera(*depth_image), {"depth": "depth"})
 
 
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -35,10 +36,33 @@ similar geoms, pixels."""
 
 Along = Literal["axis", "ray"]
 
+BYTES_PER_RAY = 16
+"""Memory of a ray, at least: distance, index of the geom, and the image of each of them, in four bytes each."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class View:
+    """A camera that every drone carries: the directions of its pixels, and its mounting."""
+
+    rays: np.ndarray
+    """Unit directions of the pixels, frame of the camera (x ahead, y left, z up). (height, width, 3)"""
+    pos: np.ndarray
+    """Position on each drone, body frame, m. (n_drones, 3)"""
+    rpy: np.ndarray
+    """Roll, pitch and yaw of the frame of the camera in the body frame, rad. (3,)"""
+
+    @property
+    def rot(self) -> np.ndarray:
+        """Rotation matrix from the frame of the camera to the body frame. (3, 3)"""
+        quat, rot = np.zeros(4), np.zeros(9)
+        mujoco.mju_euler2Quat(quat, np.array(self.rpy, np.float64), "XYZ")  # about fixed axes
+        mujoco.mju_quat2Mat(rot, quat)
+        return rot.reshape(3, 3)
+
 
 @dataclasses.dataclass(frozen=True)
-class Camera:
-    """A camera of the scene, relative to the body that carries it."""
+class CarriedCamera:
+    """A camera relative to the body that carries it."""
 
     carrier: Literal["world", "drone", "object"]
     """Kind of that body."""
@@ -55,8 +79,15 @@ class Camera:
     fovy: float
     """Vertical field of view, degrees."""
 
+    @classmethod
+    def of_view(cls, view: View, drone: int) -> CarriedCamera:
+        """Return the camera of a view on one drone."""
+        ahead, left, up = view.rot.T
+        columns = tuple(tuple(map(float, line)) for line in np.stack([-left, up, -ahead], axis=-1))
+        return cls("drone", f"drone:{drone}", drone, tuple(map(float, view.pos[drone])), columns, True, 0.0)
 
-def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str]) -> list[Camera]:
+
+def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str]) -> list[CarriedCamera]:
     """Return the camera with a name or id, or every drone's camera for a name without index, such as ``fpv_cam``.
 
     Args:
@@ -77,7 +108,7 @@ def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str])
     return [_read_camera(model, i, objects) for i in ids]
 
 
-def _read_camera(model: mujoco.MjModel, i: int, objects: Sequence[str]) -> Camera:
+def _read_camera(model: mujoco.MjModel, i: int, objects: Sequence[str]) -> CarriedCamera:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -99,7 +130,7 @@ def _read_camera(model: mujoco.MjModel, i: int, objects: Sequence[str]) -> Camer
             to_body = data.xmat[root].reshape(3, 3).T
             pos, rot = to_body @ pos, to_body @ rot
     columns = tuple(tuple(map(float, line)) for line in rot)
-    return Camera(carrier, name, row, tuple(map(float, pos)), columns, mode == fixed, float(model.cam_fovy[i]))  # type: ignore[arg-type]
+    return CarriedCamera(carrier, name, row, tuple(map(float, pos)), columns, mode == fixed, float(model.cam_fovy[i]))  # type: ignore[arg-type]
 
 
 def pixel_directions(fovy: float, width: int, height: int) -> np.ndarray:
@@ -117,15 +148,49 @@ def pixel_directions(fovy: float, width: int, height: int) -> np.ndarray:
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
+def check_image_size(width: object, height: object) -> None:
+    """Check the numbers of pixels of an image."""
+    for name, n in (("width", width), ("height", height)):
+        if type(n) is not int or n < 1:
+            raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")
+
+
+def check_image_memory(n_images: int, width: int, height: int, bytes_per_pixel: float, device: jax.Device) -> None:
+    """Check that images fit into the memory of a device, before anything is allocated.
+
+    Args:
+        n_images: Images of all worlds together.
+        width: Pixels.
+        height: Pixels.
+        bytes_per_pixel: Memory that a pixel needs at least.
+        device: Device of the images.
+    """
+    n_bytes, memory = n_images * width * height * bytes_per_pixel, _memory_size(device)
+    if n_bytes > memory:
+        raise ConfigError(
+            f"expected images that fit into the {memory / 2**30:.1f} GiB of {device}, got {n_images} of {width} x "
+            f"{height} pixels, which need {n_bytes / 2**30:.1f} GiB. Use fewer worlds or pixels."
+        )
+
+
+def _memory_size(device: jax.Device) -> float:
+    """Return the memory of a device in bytes; infinite if it is unknown."""
+    stats = device.memory_stats() or {}
+    if "bytes_limit" in stats:
+        return stats["bytes_limit"]
+    if device.platform != "cpu" or "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
+        return math.inf
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
 DepthFn = Callable[..., Hits]
 """``depth(data, mocap=None) -> Hits``."""
 
 
 def build_depth_fn(
     model: CollisionModel,
-    cameras: Sequence[Camera],
-    width: int,
-    height: int,
+    cameras: Sequence[CarriedCamera],
+    rays: Sequence[np.ndarray],
     drones: bool,
     hide_own: bool,
     along: Along,
@@ -134,19 +199,27 @@ def build_depth_fn(
 ) -> DepthFn:
     """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width), without n_worlds in one world;
     see ``Scene.depth_fn``.
+
+    Args:
+        model: Visual model of the scene.
+        cameras: The cameras.
+        rays: Unit directions of the pixels of each camera, as from ``pixel_directions``. (height, width, 3) each
+        drones: True for drones to be visible.
+        hide_own: True for a drone to be invisible to its own camera.
+        along: ``"axis"`` or ``"ray"``.
+        plugins: Function that returns the plugins of the simulation.
+        kernels: Kernels that may cast the rays.
     """
     if along not in ("axis", "ray"):
         raise ConfigError(f"expected along='axis' of the camera or along='ray', got {along!r}")
     drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
-    for name, n in (("width", width), ("height", height)):
-        if type(n) is not int or n < 1:
-            raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")
+    height, width = rays[0].shape[:2]
     h, w = (math.gcd(n, TILE_SIDE) for n in (height, width))
     order = np.arange(height * width).reshape(height // h, h, width // w, w).swapaxes(1, 2).reshape(-1)
     directions = np.zeros((len(cameras), height * width, 4))
-    for camera, rays in zip(cameras, directions, strict=True):
-        rays[:, :3] = pixel_directions(camera.fovy, width, height).reshape(-1, 3)[order]
-        rays[:, 3] = camera.row if camera.carrier == "drone" and hide_own else IGNORES_NONE
+    for camera, pixels, table in zip(cameras, rays, directions, strict=True):
+        table[:, :3] = pixels.reshape(-1, 3)[order]
+        table[:, 3] = camera.row if camera.carrier == "drone" and hide_own else IGNORES_NONE
     n_rays = len(cameras) * width * height
 
     ignored = directions[..., 3].reshape(-1).astype(int)
@@ -156,7 +229,7 @@ def build_depth_fn(
         if data.states.pos.ndim == 2:
             origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
             direction = jnp.concatenate(
-                [_directions(rot, rays) for (_, rot), rays in zip(poses, directions, strict=True)]
+                [_directions(rot, table) for (_, rot), table in zip(poses, directions, strict=True)]
             )
             return untile_results(cast_rays(model_without_mocap, data, origin, direction, ignored, drones))
         eyes = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
@@ -222,7 +295,7 @@ def _directions(rot: Array, rays: np.ndarray) -> Array:
     return x + y + z
 
 
-def _camera_pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
+def _camera_pose(camera: CarriedCamera, data: SimData) -> tuple[Array, Array]:
     """Return the camera's position, m (..., 3), and its axes as columns (..., 3, 3), in all worlds or in one."""
     states = data.states
     pos, rot = (jnp.asarray(x, states.pos.dtype) for x in (camera.pos, camera.rot))

@@ -402,9 +402,11 @@ class RayKernels:
     ) -> tuple[list[Array], str | None]:
         """Return the results of a function of one ray for ``n`` rays, and the platform of the kernel; see ``_map``."""
         hits, platform = self._map(fn, n, tables)
+        any_objects = any(target.carrier == "object" for target in targets.movable)
         by = "XLA, without a kernel" if platform is None else "one kernel with a lane for each ray"
         counts = f"{len(targets.fixed)} fixed geoms in a hierarchy, {len(targets.movable)} movable geoms in another"
-        self.used = f"{by}; {counts}"
+        advice = ", which cost more: mocap=False makes them fixed" if any_objects else ""
+        self.used = f"{by}; {counts}{advice}"
         return hits, platform
 
     def _map(self, fn: Callable[..., Any], n: int, tables: Sequence[Array]) -> tuple[list[Array], str | None]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import mujoco
+import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
@@ -290,7 +291,7 @@ class Scene:
 
     def depth_fn(
         self,
-        camera: str | int = "fpv_cam",
+        camera: str | int | depth.View = "fpv_cam",
         width: int = 64,
         height: int = 64,
         drones: bool = True,
@@ -307,18 +308,32 @@ class Scene:
 
         Args:
             camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); or the name
-                or id of one camera.
-            width: Pixels.
-            height: Pixels.
+                or id of one camera; or the directions and the mounting of a camera that every drone carries.
+            width: Pixels; ignored if ``camera`` has directions of its own.
+            height: Pixels; ignored if ``camera`` has directions of its own.
             drones: True for drones to be visible.
             hide_own: True for a drone to be invisible to its own camera.
             along: ``"axis"`` for the distance along the camera's axis, as in ``Sim.render``, ``"ray"`` for the
                 distance from the camera.
+
+        Raises:
+            ConfigError: If there is no such camera, or the images do not fit into memory.
         """
-        objects = (*self.added.movable, *self.visual_model.mocap_bodies)
-        cameras = depth.find_cameras(self.mj_model, camera, objects)
+        if isinstance(camera, depth.View):
+            height, width = camera.rays.shape[:2]
+            cameras = [depth.CarriedCamera.of_view(camera, drone) for drone in range(self.n_drones)]
+        else:
+            depth.check_image_size(width, height)
+            objects = (*self.added.movable, *self.visual_model.mocap_bodies)
+            cameras = depth.find_cameras(self.mj_model, camera, objects)
+        depth.check_image_memory(self.n_worlds * len(cameras), width, height, depth.BYTES_PER_RAY, self.device)
+        if isinstance(camera, depth.View):
+            # The frame of MuJoCo's cameras: x right, y up, z back.
+            rays = [np.stack([-camera.rays[..., 1], camera.rays[..., 2], -camera.rays[..., 0]], axis=-1)] * len(cameras)
+        else:
+            rays = [depth.pixel_directions(c.fovy, width, height) for c in cameras]
         return depth.build_depth_fn(
-            self.visual_model, cameras, width, height, drones, hide_own, along, self.plugins, self.ray_kernels
+            self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels
         )
 
     # State of all worlds ----------------------------------------------------------------------------------------------

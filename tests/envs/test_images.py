@@ -1,4 +1,4 @@
-"""Depth images among the observations: of the state after the step, of new episodes, and in Gymnasium."""
+"""Images among the observations: of the state after the step, of new episodes, at a rate, late, and in Gymnasium."""
 
 import jax
 import jax.numpy as jnp
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from env_cases import random_action
 
-from crazysim import ConfigError
+from crazysim import Camera, ConfigError
 from crazysim.envs import (
     AutoReset,
-    DepthImages,
+    CameraImages,
     DroneVectorEnv,
     FrameStack,
     Normalize,
@@ -20,13 +20,14 @@ from crazysim.envs import (
 from crazysim.envs.state import EnvState
 
 SIZE = {"width": 8, "height": 6}
+DEPTH = {"depth": "depth"}
 
 
 @pytest.fixture(scope="module")
 def pair():
     """Return environments with and without images whose episodes end after two steps, automatic resets around them."""
     base = make("avoid", 3, seconds=0.04, n_boxes=1, n_poles=3)
-    return AutoReset(DepthImages(base, **SIZE, max_depth=5.0)), AutoReset(base)
+    return AutoReset(CameraImages(base, Camera(**SIZE, max_depth=5.0), DEPTH)), AutoReset(base)
 
 
 @pytest.fixture(scope="module")
@@ -93,22 +94,62 @@ def test_adapters_have_the_images_in_their_spaces():
 
 
 def test_wrappers_around_images_leave_them_as_they_are():
-    env = DepthImages(make("hover", 2, engine="interpret"), **SIZE)
+    env = CameraImages(make("hover", 2, engine="interpret"), Camera(**SIZE), DEPTH)
     for around in (lambda env: FrameStack(env, 2), Normalize, lambda env: ObservationNoise(env, {"pos": 0.1})):
         state = around(env).reset(jax.random.key(0))
         state = around(env).step(state, jnp.zeros((2, 1, 4)))
         assert state.obs["depth"].shape == (2, 1, 48)
 
 
+def test_a_slow_and_late_camera_shows_old_images_and_a_new_one_in_a_new_episode():
+    """25 images/s in an environment of 50 steps/s, delivered 30 ms later, between two of its steps."""
+    base = make("avoid", 3, seconds=0.2, n_boxes=1, n_poles=3)
+    env = AutoReset(CameraImages(base, Camera(**SIZE, freq=25, latency=0.03, outputs=("depth", "normal"))))
+    look = jax.jit(env.sim.scene.depth_fn("fpv_cam", **SIZE))
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(3))
+    assert {name: x.shape for name, x in state.obs.items() if "camera" in name} == {
+        "camera.depth": (3, 1, 48),
+        "camera.normal": (3, 1, 144),
+    }
+    taken = []
+    for k in range(13):
+        if k:
+            state = step(state, random_action(state, k))
+        if k == 5:  # one world begins an episode on its own
+            state = env.restart(state, np.array([True, False, False]))
+        taken.append(np.minimum(look(state.data).distance, 10.0).reshape(3, 1, -1))
+        steps = np.asarray(state.full_data.core.steps)[:, 0] // env.n_substeps
+        # The images of steps 0, 2, 4 ... of an episode arrive 1.5 steps later, the first one at once.
+        shown = np.maximum((2 * steps - 3) // 4 * 2, 0)
+        expected = np.stack(
+            [taken[k - now + then][world] for world, (now, then) in enumerate(zip(steps, shown, strict=True))]
+        )
+        np.testing.assert_allclose(state.obs["camera.depth"], expected, rtol=1e-6)
+    assert steps.tolist() != [12] * 3
+    assert np.ptp(taken, axis=0).max() > 1e-3
+
+
 def test_law_09_wrong_images_are_refused():
     base = make("hover", 2, engine="interpret")
     with pytest.raises(ConfigError, match=r"expected depth_image as width and height in pixels, got '16x12'"):
         make("hover", 2, depth_image="16x12")
-    with pytest.raises(ConfigError, match="expected an image of positive integer width, got 0 x 12 pixels"):
-        DepthImages(base, width=0)
+    for refused, message in [
+        (
+            lambda: make("hover", 2, depth_image=(0, 12), engine="interpret"),
+            "expected width of Camera to be finite and at least 1",
+        ),
+        (lambda: CameraImages(base, "fpv_cam"), "expected a camera or lidar, got 'fpv_cam'"),
+        (lambda: make("hover", camera=["fpv_cam"], engine="interpret"), "expected camera as a list of plugins"),
+        (lambda: CameraImages(base, Camera(freq=20)), "expected freq of 'camera' to divide freq = 50 Hz, got 20 Hz"),
+        (lambda: CameraImages(CameraImages(base, Camera()), Camera(9, 7)), "got images 'camera.depth' twice"),
+        (lambda: CameraImages(base, Camera(200_000, 200_000)), "got 2 of 200000 x 200000 pixels, which need"),
+    ]:
+        with pytest.raises(ConfigError, match=message):
+            refused()
     for around, message in [
-        (lambda env: DepthImages(env, key="pos"), "expected other names of images than those of obs.*, got 'pos'"),
-        (lambda env: Observe(DepthImages(env, **SIZE), lambda obs, _: {k: 2 * x for k, x in obs.items()}),
+        (lambda env: CameraImages(env, Camera(), {"depth": "pos"}),
+         "expected other names of images than those of obs.*, got 'pos'"),
+        (lambda env: Observe(CameraImages(env, Camera(), DEPTH), lambda obs, _: {k: 2 * x for k, x in obs.items()}),
          "expected images unchanged in functions of one world, got a new 'depth'"),
     ]:  # fmt: skip
         env = around(base)

@@ -4,7 +4,7 @@ from crazysim.envs.reset_policy import AutoresetMode, ResetPolicy
 from crazysim.envs.wrappers.action import ActionDelay
 from crazysim.envs.wrappers.autoreset import AutoReset
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.envs.wrappers.images import DepthImages
+from crazysim.envs.wrappers.images import CameraImages
 from crazysim.envs.wrappers.observation import FrameStack, Normalize, ObservationNoise, Observe, PrivilegedObservation
 from crazysim.envs.wrappers.randomize import RandomizeWith
 from crazysim.envs.wrappers.rewards import EpisodeStatistics, RewardTerms
@@ -13,7 +13,7 @@ __all__ = [
     "ActionDelay",
     "AutoReset",
     "AutoresetMode",
-    "DepthImages",
+    "CameraImages",
     "EpisodeStatistics",
     "FrameStack",
     "Normalize",

@@ -1,80 +1,72 @@
-"""Images among the observations."""
+"""Images of cameras and lidars among the observations."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-import jax.numpy as jnp
-
+from crazysim.core.settings import dividing_rate
 from crazysim.envs.env import Env
-from crazysim.envs.state import EnvState, Obs
+from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.errors import ConfigError
-from crazysim.scene.depth import Along, find_cameras
-from crazysim.tables import POSITIVE, read_number
+from crazysim.plugins.sensors.image_sensor import OUTPUTS, ImageSensor
 
 
-class DepthImages(Wrapper):
-    """Add ``obs["depth"]``: a depth image of the camera of each drone, row by row, in m. (n_worlds, n_drones, k)
+class CameraImages(Wrapper):
+    """Add the images of a camera of each drone to the observations, row by row. (n_worlds, n_drones, k) each
 
-    An image is taken of all worlds at the end of every environment step, by the kernel of ``Sim.depth``; it does not
-    change rewards or the ends of episodes. Where an episode ends and another one begins in the same step, ``final_obs``
-    has the image of the step before. Reshape it for a convolution: ``depth.reshape(-1, height, width)``. Worlds on a
-    mesh of devices have no images.
+    Images are taken of all worlds at the end of environment steps, by one kernel, at the rate of the camera, and become
+    observations after its latency; a new episode begins with a new image. They do not change rewards or the ends of
+    episodes. Where an episode ends and another one begins in the same step, ``final_obs`` has the image of the step
+    before. Reshape an observation to ``shapes[name]`` for a convolution. Worlds on a mesh of devices have no images.
     """
 
-    def __init__(
-        self,
-        env: Env,
-        camera: str = "fpv_cam",
-        width: int = 16,
-        height: int = 12,
-        max_depth: float = 10.0,
-        drones: bool = True,
-        along: Along = "axis",
-        key: str = "depth",
-    ):
+    def __init__(self, env: Env, camera: ImageSensor, names: Mapping[str, str] | None = None):
         """Add images to the observations of an environment.
 
         Args:
             env: The environment.
-            camera: Name of a camera that every drone has: ``fpv_cam`` or ``track_cam``.
-            width: Pixels.
-            height: Pixels.
-            max_depth: Largest depth, m; also the value where nothing is nearer.
-            drones: True for other drones to be visible.
-            along: ``"axis"`` for depth along the axis of the camera, ``"ray"`` for the distance from it.
-            key: Name of the observation.
+            camera: The camera or lidar. It is not added to the simulation.
+            names: Names of the observations by output; None for ``"camera.depth"`` and so on, with the camera's name.
         """
         super().__init__(env)
-        self.max_depth = read_number("max_depth", max_depth, POSITIVE)
-        self.key, self._n_pixels = key, width * height
-        if env.sim.mesh is not None:
-            raise ConfigError("expected worlds on one device for images, got a mesh of devices. Leave out mesh=.")
-        self._depth = env.sim.scene.depth_fn(camera, width, height, drones, along=along)
-        mounting = find_cameras(env.sim.scene.mj_model, camera, ())[0]
-        self._format = {
-            "height": height,
-            "width": width,
-            "unit": "m",
-            "far": self.max_depth,
-            "along": along,
-            "camera": camera,
-            "fovy": mounting.fovy,
-            "pos": list(mounting.pos),
-            "rot": [list(row) for row in mounting.rot],
-            "follows_rotation": mounting.follows_rotation,
-        }
+        self._sim: Any = env.sim
+        sim = self._sim
+        if not isinstance(camera, ImageSensor):
+            raise ConfigError(f"expected a camera or lidar, got {camera!r}. Use Camera(16, 12), say.")
+        self.camera = camera
+        self.names = {output: f"{camera.name}.{output}" for output in camera.outputs} | dict(names or {})
+        """Names of the observations by output."""
+        taken = {name for wrapper in env.wrappers if isinstance(wrapper, CameraImages) for name in wrapper.shapes}
+        if both := taken & self.shapes.keys():
+            raise ConfigError(f"expected cameras of different names, got images {min(both)!r} twice. Use name=.")
+        freq = env.base.freq
+        rate = freq if camera.freq is None else dividing_rate(f"freq of {camera.name!r}", camera.freq, freq)
+        self._period = sim.freq // rate
+        camera.check(sim, self._period)
+        self._is_immediate = self._period == env.n_substeps and camera.latency == 0
+        self._take = camera.image_fn(sim)
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of the image of one drone by the name of its observation: (height, width), for normals with 3 last."""
+        return {name: self.camera.image_size + OUTPUTS[output] for output, name in self.names.items()}
 
     def describe_images(self) -> dict[str, dict[str, Any]]:
-        return {self.key: self._format}
+        formats = self.camera.describe(self._sim)
+        return {name: formats[output] for output, name in self.names.items()}
 
-    def look(self, state: EnvState) -> Obs:
-        distance = self._depth(state.data).distance
-        n_worlds, n_drones = state.full_data.states.pos.shape[:2]
-        if distance.shape[1] != n_drones:
-            raise ConfigError(
-                f"expected a camera of every drone, got {distance.shape[1]} cameras for {n_drones} drones. Use "
-                f"camera='fpv_cam' or camera='track_cam'."
-            )
-        return {self.key: jnp.minimum(distance, self.max_depth).reshape(n_worlds, n_drones, self._n_pixels)}
+    def look(self, state: EnvState) -> EnvState:
+        data, camera = state.data, self.camera
+        if self._is_immediate:
+            images = self._take(data)
+        else:
+            if self.name in state.memory:
+                record = camera.update(self._take, data, self.recall(state), self._period)
+            else:
+                record = camera.begin(self._take, data, self._period)
+            state, images = self.remember(state, record), record.images
+        dtype, shape = data.states.pos.dtype, data.states.pos.shape[:2]
+        flat = {self.names[name]: image.reshape(*shape, -1).astype(dtype) for name, image in images.items()}
+        return state.replace(images=state.record.images | flat)

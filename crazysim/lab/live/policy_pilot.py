@@ -229,6 +229,6 @@ def _compute_command(env: Env, policy: Callable[[Obs], Array], data: SimData, me
     measured_data = data if measure is None else vectorize_over_worlds(measure, env.task.batched)(data)
     obs = vectorize_over_worlds(env.task.observe, env.task.batched)(measured_data)
     for wrapper in env.wrappers:
-        obs |= wrapper.look(state_of_data(data))
+        obs |= wrapper.look(state_of_data(data)).record.images
     action, memory = act(policy, obs, memory)
     return env.actions.command(action), memory

@@ -7,8 +7,10 @@ from crazysim.startup import lazy
 if TYPE_CHECKING:
     from crazysim.plugins.sensors.barometer import Barometer
     from crazysim.plugins.sensors.beacons import UWB, Lighthouse
+    from crazysim.plugins.sensors.camera import Camera
     from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
     from crazysim.plugins.sensors.gps import GPS
+    from crazysim.plugins.sensors.image_sensor import ImageData, ImageSensor
     from crazysim.plugins.sensors.imu import IMU
     from crazysim.plugins.sensors.magnetometer import Magnetometer
     from crazysim.plugins.sensors.motion_capture import MotionCapture
@@ -24,6 +26,9 @@ __all__ = [
     "UWB",
     "Barometer",
     "BatteryVoltage",
+    "Camera",
+    "ImageData",
+    "ImageSensor",
     "Lighthouse",
     "Magnetometer",
     "MotionCapture",
@@ -45,6 +50,9 @@ __getattr__ = lazy(
         "IMU": f"{__name__}.imu",
         "Barometer": f"{__name__}.barometer",
         "BatteryVoltage": f"{__name__}.onboard",
+        "Camera": f"{__name__}.camera",
+        "ImageData": f"{__name__}.image_sensor",
+        "ImageSensor": f"{__name__}.image_sensor",
         "Lighthouse": f"{__name__}.beacons",
         "Magnetometer": f"{__name__}.magnetometer",
         "MotionCapture": f"{__name__}.motion_capture",

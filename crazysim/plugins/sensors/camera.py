@@ -1,0 +1,59 @@
+"""Depth cameras: images of depth, normals and bodies, of all drones, with rate and latency.
+
+The same description serves a simulation and an environment::
+
+    Camera(width=64, height=48, fovy=70.0, *, pos=None, rpy=(0, 0, 0), outputs=("depth",), max_depth=10.0,
+           drones=True, freq=None, latency=0.0, name="camera")
+
+    camera = sim.add(Camera(16, 12, freq=60, latency=0.03))      # in the step of a simulation
+    camera.read(sim.data).images["depth"]                        # (n_worlds, n_drones, 12, 16), m
+
+    env = make("avoid", 4096, camera=Camera(16, 12, freq=25))    # among the observations of an environment
+    state.obs["camera.depth"]                                    # (n_worlds, n_drones, 192), m, row by row
+
+In an environment each output is an observation ``"name.output"``. ``make(..., depth_image=(16, 12))`` is short for a
+camera with the output depth at every step, whose observation is ``"depth"``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from crazysim.core.settings import setting
+from crazysim.plugins.sensors.image_sensor import ImageSensor
+from crazysim.scene.depth import pixel_directions
+
+
+class Camera(ImageSensor):
+    """Depth camera on every drone, with the pinhole model."""
+
+    width: int = setting(default=64, low=1)
+    """Width of the image, pixels."""
+    height: int = setting(default=48, low=1)
+    """Height of the image, pixels."""
+    fovy: float = setting(default=70.0, low=1.0, high=179.0)
+    """Vertical field of view, degrees; pixels are square."""
+    _: dataclasses.KW_ONLY
+    max_depth: float = setting(default=10.0, positive=True)
+    """Largest depth and distance, m; also the value where nothing is nearer."""
+    name: str = "camera"
+
+    @property
+    def rays(self) -> np.ndarray:
+        right, up, back = np.moveaxis(pixel_directions(self.fovy, self.width, self.height), -1, 0)
+        return np.stack([-back, -right, up], axis=-1)
+
+    @property
+    def optics(self) -> dict[str, Any]:
+        return {"fovy": float(self.fovy)}
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        return int(self.height), int(self.width)
+
+    @property
+    def max_range(self) -> float:
+        return float(self.max_depth)

@@ -1,0 +1,281 @@
+"""Base class of sensors that take images by rays: mounting, rate, latency and outputs.
+
+A plugin of the simulation takes images in the step, and keeps the last one in its record. An environment takes them at
+the end of its steps instead, by the wrapper ``crazysim.envs.CameraImages``. Both call ``image_fn`` and ``update``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement
+from crazysim.core.settings import setting
+from crazysim.core.stage import Stage
+from crazysim.errors import ConfigError, short_repr
+from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, steps_between
+from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, View, check_image_memory
+from crazysim.scene.ray_casting import body_names
+
+OUTPUTS: dict[str, tuple[int, ...]] = {"depth": (), "distance": (), "normal": (3,), "segmentation": ()}
+"""Shape of a pixel of each output of an image."""
+UNFUSED_REASON = "images are taken by kernels with a lane for each ray"
+
+Images = dict[str, Array]
+"""Images by output, (n_worlds, n_drones, height, width), and (n_worlds, n_drones, height, width, 3) for normals."""
+TakeImages = Callable[[SimData], Images]
+
+
+class ImageData(PyTree):
+    """Images of a camera or lidar that were delivered last, and the images in transit."""
+
+    images: dict[str, Array] = leaf("drone", None)
+    """Last image of each output. (n_worlds, n_drones, height, width), for normals (n_worlds, n_drones, height, width,
+    3)"""
+    taken: Array = leaf("world")
+    """Step in which these images were taken, negative before the first ones. (n_worlds, 1)"""
+    transit: dict[str, Array] = leaf("drone", None)
+    """Images of each output that were taken last, newest first; empty without latency. (n_worlds, n_drones, n_rows,
+    height, width), for normals (n_worlds, n_drones, n_rows, height, width, 3)"""
+
+
+class ImageSensor(Plugin):
+    """Base class of sensors that take images by rays, on every drone.
+
+    A subclass defines ``rays``, ``optics``, ``image_size`` and ``max_range``, and ``measure`` if its images have errors.
+    Images are of the state after a step, as measurements of other sensors are; the latest image is held. The first
+    image of an episode is delivered at once.
+    """
+
+    _: dataclasses.KW_ONLY
+    pos: ArrayLike | None = setting(default=None, shapes=((3,),))
+    """Position of the sensor in the body frame, m; None for that of ``fpv_cam``. (3,)"""
+    rpy: ArrayLike = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
+    """Roll, pitch and yaw of the sensor's frame (x ahead, y left, z up) in the body frame, rad. (3,)"""
+    outputs: Sequence[str] = ("depth",)
+    """Images to take, some of ``"depth"`` (along the axis of the sensor, m), ``"distance"`` (along the ray, m),
+    ``"normal"`` (of the surface, unit, sensor frame) and ``"segmentation"`` (index in ``segment_names``, -1 for
+    nothing)."""
+    drones: bool = True
+    """True for other drones to be visible; a drone never sees itself."""
+    freq: int | None = None
+    """Images per second, Hz, a divisor of ``sim.freq``, in an environment of ``env.freq``; None for every step."""
+    latency: float = setting(default=0.0, low=0.0, high=MAX_DELAY)
+    """Time from image to delivery, s, rounded to steps."""
+    name: str = "images"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        outputs = self.outputs
+        is_list = isinstance(outputs, (list, tuple)) and len(outputs) > 0
+        if not is_list or len({*outputs}) < len(outputs) or not {*outputs} <= {*OUTPUTS}:
+            raise ConfigError(
+                f"expected outputs of {self.name!r} as a list of {', '.join(map(repr, OUTPUTS))}, got "
+                f"{short_repr(outputs)}. Use outputs=('depth',), say."
+            )
+
+    @property
+    def rays(self) -> np.ndarray:
+        """Unit directions of the pixels, frame of the sensor. (height, width, 3)"""
+        raise NotImplementedError
+
+    @property
+    def max_range(self) -> float:
+        """Largest depth and distance, m; also the value where nothing is nearer."""
+        raise NotImplementedError
+
+    def measure(self, images: Images, key: Array) -> Images:
+        """Return the images of one drone with the errors of the sensor. (height, width, ...) each
+
+        Args:
+            images: Images without errors, with all ``OUTPUTS`` of which the errors depend.
+            key: Random key of the drone at this step.
+        """
+        del key
+        return images
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Height and width of the images, pixels."""
+        raise NotImplementedError
+
+    @property
+    def optics(self) -> dict[str, Any]:
+        """Numbers that determine ``rays``, by name."""
+        raise NotImplementedError
+
+    def describe(self, sim: Simulation) -> dict[str, dict[str, Any]]:
+        """Return the format of the images of each output: size, unit and model of the sensor.
+
+        ``pos`` and ``rot`` are in the body frame of the first drone; the columns of ``rot`` are right, up and back.
+        """
+        (height, width), camera = self.image_size, CarriedCamera.of_view(self._view(sim), 0)
+        sensor = {"sensor": self.name, **self.optics, "pos": list(camera.pos), "rot": [list(x) for x in camera.rot]}
+        sensor |= {"freq": self.freq, "latency": float(self.latency)}
+        formats = {}
+        for name in self.outputs:
+            unit = {"normal": "1", "segmentation": "index"}.get(name, "m")
+            far = {"normal": 0.0, "segmentation": -1}.get(name, self.max_range)
+            formats[name] = {"height": height, "width": width, "unit": unit, "far": far, "output": name} | sensor
+        return formats
+
+    def segment_names(self, sim: Simulation) -> tuple[str, ...]:
+        """Return the names of the floor, the objects and the drones, in the order of the indices in segmentations."""
+        return body_names(sim.scene.visual_model, sim.n_drones if self.drones else 0)
+
+    def check(self, sim: Simulation, period: int | None = None) -> None:
+        """Check the settings that depend on the simulation, before anything is allocated.
+
+        Args:
+            sim: The simulation.
+            period: Steps between images; None for images without a record.
+        """
+        if sim.scene.mesh is not None:
+            raise ConfigError("expected worlds on one device for images, got a mesh of devices. Leave out mesh=.")
+        n_rows, (height, width) = 0 if period is None else self._n_rows(sim.data, period), self.image_size
+        if n_rows > MAX_ROWS:
+            raise ConfigError(
+                f"expected a latency of {self.name!r} of at most {MAX_ROWS - 1} images, got {self.latency} s. Use a "
+                f"shorter latency or a lower freq=."
+            )
+        bytes_per_pixel = 4 * sum(math.prod(OUTPUTS[name]) for name in self.outputs) * (1 + n_rows) + BYTES_PER_RAY
+        check_image_memory(sim.n_worlds * sim.n_drones, width, height, bytes_per_pixel, sim.scene.device)
+
+    def image_fn(self, sim: Simulation) -> TakeImages:
+        """Return ``take(data)``, pure: the images of all worlds, for the present scene, without rate and latency."""
+        self.check(sim)
+        rays, max_range, view = self.rays, self.max_range, self._view(sim)
+        look, rot = sim.scene.depth_fn(view, drones=self.drones, along="ray"), view.rot
+
+        def take(data: SimData) -> Images:
+            hits, quat = look(data), data.states.quat[..., None, None, :]
+            cosine = jnp.asarray(rays[..., 0], hits.distance.dtype)
+            images = {}
+            for name in self.outputs:
+                if name == "depth":
+                    images[name] = jnp.minimum(hits.distance * cosine, max_range)
+                elif name == "distance":
+                    images[name] = jnp.minimum(hits.distance, max_range)
+                elif name == "normal":
+                    normal = rotation.rotate_inverse(quat, hits.normal)
+                    # By components: a GPU may round matrix products to 10 bits.
+                    parts = [sum(float(rot[i, k]) * normal[..., i] for i in range(3)) for k in range(3)]
+                    images[name] = jnp.stack(parts, axis=-1)  # type: ignore[arg-type]
+                else:
+                    images[name] = hits.body_index
+            return images
+
+        return take
+
+    def begin(self, take: TakeImages, data: SimData, period: int) -> ImageData:
+        """Return the record of all worlds with images that are taken and delivered now.
+
+        Args:
+            take: From ``image_fn``.
+            data: Data of all worlds.
+            period: Steps between images.
+        """
+        images, n = take(data), self._n_rows(data, period)
+        transit = {k: jnp.repeat(x[:, :, None], n, axis=2) for k, x in images.items()} if n else {}
+        return ImageData(images=images, taken=data.core.steps, transit=transit)
+
+    def update(self, take: TakeImages, data: SimData, record: ImageData, period: int) -> ImageData:
+        """Return the record of all worlds after a step: images are taken where they are due, and delivered.
+
+        Args:
+            take: From ``image_fn``.
+            data: Data of all worlds.
+            record: The record before.
+            period: Steps between images.
+        """
+        steps, latency = data.core.steps, self._latency_steps(data)
+        is_due = steps % period == 0
+
+        def select(new: Array, old: Array) -> Array:
+            return jnp.where(is_due.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+
+        def capture(record: ImageData) -> ImageData:
+            images = take(data)
+            if not latency:
+                return record.replace(images=jax.tree.map(select, images, record.images))
+            queues = {k: jnp.concatenate([x[:, :, None], record.transit[k][:, :, :-1]], 2) for k, x in images.items()}
+            return record.replace(transit=jax.tree.map(select, queues, record.transit))
+
+        record = (
+            jax.lax.cond(jnp.any(is_due), capture, lambda record: record, record) if period > 1 else capture(record)
+        )
+        # Images are numbered from the beginning of the episode; the first one is delivered at once.
+        delivered = jnp.maximum((steps - latency) // period, 0)
+        if latency:
+            row = steps // period - delivered
+
+            def read_row(queue: Array) -> Array:
+                index = row.reshape(-1, *(1,) * (queue.ndim - 1))
+                return jnp.take_along_axis(queue, index, axis=2)[:, :, 0]
+
+            record = record.replace(images=jax.tree.map(read_row, record.transit))
+        return record.replace(taken=delivered * period)
+
+    def record(self, sim: Simulation) -> ImageData:
+        period = steps_between(self, sim)
+        self.check(sim, period)
+        shape, n = (*sim.data.states.pos.shape[:2], *self.image_size), self._n_rows(sim.data, period)
+        images, transit = {}, {}
+        for name in self.outputs:
+            value, dtype = (-1, np.int32) if name == "segmentation" else (self.max_range, sim.data.states.pos.dtype)
+            value = 0.0 if name == "normal" else value
+            images[name] = device_array(np.full(shape + OUTPUTS[name], value), dtype)
+            if n:
+                transit[name] = device_array(np.full((*shape[:2], n, *shape[2:], *OUTPUTS[name]), value), dtype)
+        return ImageData(images, device_array(np.full((shape[0], 1), -1), np.int32), transit)
+
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        period, latency = steps_between(self, sim), self._latency_steps(sim.data)
+
+        def take_images(data: SimData) -> SimData:
+            """Take and deliver images, in a call that is skipped if no world is due."""
+
+            def update(data: SimData) -> SimData:
+                # The function is made here so that objects are visible that were added after the sensor.
+                take = self.image_fn(sim)
+                return self.write(data, self.update(take, data, self.read(data), period))
+
+            steps = data.core.steps
+            acts = (steps % period == 0) | ((steps - latency) % period == 0)
+            return update(data) if period == 1 else jax.lax.cond(jnp.any(acts), update, lambda data: data, data)
+
+        stage = Stage(take_images, "batch", name=self.name, unfused_reason=UNFUSED_REASON)
+        return [StagePlacement(stage, before="increment_steps")]
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the last images of one drone, row by row. (k,) each"""
+        return {name: image.reshape(-1) for name, image in self.read(data).images.items()}
+
+    def age(self, data: SimData) -> Array:
+        """Return the time since the last images were taken, s; zero before the first ones. (n_worlds, 1)"""
+        taken = self.read(data).taken
+        return jnp.where(taken >= 0, (data.core.steps - 1 - taken) / data.core.freq, 0.0)
+
+    def _view(self, sim: Simulation) -> View:
+        fpv_pos = [airframe.value("shape.fpv_camera") for airframe in sim.airframes]
+        pos = np.asarray(fpv_pos if self.pos is None else [self.pos] * sim.n_drones, np.float64)
+        return View(self.rays, pos, np.asarray(self.rpy, np.float64))
+
+    def _latency_steps(self, data: SimData) -> int:
+        return math.floor(self.latency * data.core.freq + 0.5)
+
+    def _n_rows(self, data: SimData, period: int) -> int:
+        """Return the number of images in transit that the record has room for; zero without latency."""
+        latency = self._latency_steps(data)
+        return -(-latency // period) + 1 if latency else 0

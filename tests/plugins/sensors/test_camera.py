@@ -1,0 +1,104 @@
+"""Cameras as plugins: rate, latency and mounting; their outputs against C MuJoCo's rays."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim import Camera, ConfigError, Sim, rotation
+
+SIZE = {"width": 9, "height": 6}
+
+
+def placed(sim, pos, quat=(0.0, 0, 0, 1)):
+    """Put drones at positions, with attitudes."""
+    states = sim.data.states
+    pos, quat = (
+        jnp.broadcast_to(jnp.asarray(x, jnp.float32), (*states.pos.shape[:2], len(x[0]) if np.ndim(x) > 1 else len(x)))
+        for x in (pos, quat)
+    )
+    sim.data = sim.data.replace(states=states.replace(pos=pos, quat=quat))
+
+
+@pytest.fixture(scope="module")
+def flight():
+    """Return a simulation with a slow, late and tilted camera of all outputs, and what it should see in each step."""
+    sim = Sim(2, 2, control="attitude", freq=200)
+    sim.scene.add("wall", pos=[3, 0, 0], length=20, height=20, mocap=False)
+    outputs = ("depth", "distance", "normal", "segmentation")
+    late = sim.add(
+        Camera(**SIZE, fovy=60.0, rpy=(0.1, 0.4, -0.2), outputs=outputs, freq=50, latency=0.03, drones=False)
+    )
+    sim.scene.add("sphere", pos=[1.4, 0.1, 0.9], radius=0.3, mocap=False)
+    placed(sim, [[0.0, 0, 1], [0.5, -0.4, 1.2]])
+    take, seen, records = jax.jit(late.image_fn(sim)), [], []
+    for _ in range(15):
+        sim.step()
+        seen.append(jax.device_get(take(sim.data)))
+        records.append((jax.device_get(late.read(sim.data)), np.asarray(late.age(sim.data))))
+    return sim, late, seen, records
+
+
+def test_images_are_taken_at_a_rate_and_delivered_late(flight):
+    """50 images/s in 200 steps/s, 6 steps late: images of steps 0, 4, 8; the first one is delivered at once."""
+    _, _, seen, records = flight
+    for step, (record, age) in enumerate(records):
+        shown = max((step - 6) // 4 * 4, 0)
+        assert (record.taken == shown).all()
+        np.testing.assert_allclose(age, (step - shown) / 200, rtol=1e-6)
+        for name, image in record.images.items():
+            np.testing.assert_allclose(image, seen[shown][name], rtol=1e-5, atol=1e-6, err_msg=f"{name} {step}")
+    assert np.ptp([x["depth"] for x in seen], axis=0).max() > 1e-4
+
+
+def test_outputs_are_those_of_c_mujoco_in_the_frame_of_the_camera(flight):
+    sim, camera, seen, _ = flight
+    images, names = seen[-1], camera.segment_names(sim)
+    assert names == ("floor", "wall:0", "sphere:0")
+    sim.scene.sync_one(sim.data, 1)
+    mount = np.asarray(rotation.matrix(rotation.from_rpy(jnp.array([0.1, 0.4, -0.2]))))
+    group, geom, met = np.array([1, 1, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32), set()
+    for drone in range(2):
+        body = np.asarray(rotation.matrix(sim.data.states.quat[1, drone]))
+        eye = np.asarray(sim.data.states.pos[1, drone]) + body @ sim.airframe.value("shape.fpv_camera")
+        for row, column in np.ndindex(6, 9):
+            ray, normal = camera.rays[row, column], np.zeros(3)
+            assert ray[0] == pytest.approx(1 / np.sqrt(1 + (ray[1] / ray[0]) ** 2 + (ray[2] / ray[0]) ** 2))
+            along = body @ mount @ ray
+            far = mujoco.mj_ray(sim.mj_model, sim.mj_data, eye, along, group, 1, -1, geom, normal)
+            far = far if far >= 0 else np.inf
+            assert images["distance"][1, drone, row, column] == pytest.approx(min(far, 10.0), rel=1e-5)
+            assert images["depth"][1, drone, row, column] == pytest.approx(min(far * ray[0], 10.0), rel=1e-5)
+            root = sim.mj_model.body(sim.mj_model.body_rootid[sim.mj_model.geom_bodyid[geom[0]]]).name
+            met.add(name := "nothing" if far == np.inf else root if root != "world" else "floor")
+            index = images["segmentation"][1, drone, row, column]
+            assert (names[index] if index >= 0 else "nothing") == name
+            np.testing.assert_allclose(images["normal"][1, drone, row, column], (body @ mount).T @ normal, atol=1e-4)
+    assert met >= {"floor", "wall:0", "sphere:0"}
+    # A pixel on the left of the image is on the left of the camera, a pixel in the upper row above it.
+    assert camera.rays[0, 0, 1] > 0 > camera.rays[0, -1, 1]
+    assert camera.rays[0, 0, 2] > 0 > camera.rays[-1, 0, 2]
+    assert np.degrees(2 * np.arctan2(camera.rays[0, 4, 2] * 6 / 5, camera.rays[0, 4, 0])) == pytest.approx(60)
+
+
+def test_law_09_wrong_cameras_are_refused():
+    sim = Sim(n_worlds=2, control="attitude")
+    for act, words in (
+        (lambda: Camera(0, 4), "expected width of Camera to be finite and at least 1"),
+        (lambda: Camera(4, 4.5), "height of Camera"),
+        (lambda: Camera(fovy=180.0), "fovy of Camera"),
+        (lambda: Camera(outputs=()), "expected outputs of 'camera' as a list of 'depth', 'distance'"),
+        (lambda: Camera(outputs=("rgb",)), "got ('rgb',)"),
+        (lambda: Camera(outputs="depth"), "got 'depth'"),
+        (lambda: Camera(latency=-1.0), "latency of Camera"),
+        (lambda: sim.add(Camera(freq=333)), "Use the nearest rate below, 250 Hz"),
+        (lambda: sim.add(Camera(latency=1.0)), "expected a latency of 'camera' of at most 63 images"),
+        (lambda: sim.add(Camera(10**6, 10**6)), "got 2 of 1000000 x 1000000 pixels, which need"),
+        (lambda: sim.depth("fpv_cam", 10**6, 10**6), "got 2 of 1000000 x 1000000 pixels, which need 29802.3 GiB"),
+        (lambda: Camera().read(sim.data), "expected data with a record of plugin 'camera', got records of none"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            act()
+        assert words in str(error.value), error.value
+    assert not sim.plugins
