@@ -53,7 +53,7 @@ class ImageData(PyTree):
 class ImageSensor(Plugin):
     """Base class of sensors that take images by rays, on every drone.
 
-    A subclass defines ``rays``, ``optics``, ``image_size`` and ``max_range``, and ``measure`` if its images have errors.
+    A subclass defines ``rays``, ``optics``, ``image_size`` and ``max_range``, and ``measure`` if images have errors.
     Images are of the state after a step, as measurements of other sensors are; the latest image is held. The first
     image of an episode is delivered at once.
     """
