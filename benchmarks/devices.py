@@ -7,8 +7,7 @@ divided among the devices. One JSON line for each case and number of devices: th
 first number of devices, the bytes that the devices exchange in a call and the memory of its program on a device, both
 from the compiled program, and the compile time. With ``--processes`` several cases are compiled at the same time, in
 processes of their own, and then timed one after another. The line ``weights`` compares the weights of PPO after three
-iterations. ``--small`` is for a try on CPUs, with
-``XLA_FLAGS=--xla_force_host_platform_device_count=4``.
+iterations. ``--small`` is for a try on CPUs, with ``XLA_FLAGS=--xla_force_host_platform_device_count=4``.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ class Size(NamedTuple):
     """Size of a case."""
 
     n_worlds: int
-    """Worlds of each device; for seeds those of each seed."""
+    """Worlds of each device, or of each seed in the cases of seeds."""
     small: int
     """The same with ``--small``."""
     unit: str
@@ -107,16 +106,16 @@ def run(name: str, args: argparse.Namespace, ready: Any = None, turn: Any = None
     if len(devices) < max(args.devices):
         raise SystemExit(f"expected {max(args.devices)} devices, got {len(devices)}. See --help for CPUs.")
     if name == WEIGHTS:
-        make, show = trained_weights, compare
+        make_result, print_result = trained_weights, compare
     else:
-        make, show = partial(build, name), partial(measure, name)
+        make_result, print_result = partial(build, name), partial(measure, name)
     try:
-        built: dict[int, Any] = {n: make(devices[:n], args.small) for n in args.devices}
+        results: dict[int, Any] = {n: make_result(devices[:n], args.small) for n in args.devices}
     finally:
         if ready is not None:
             ready.wait()
     with nullcontext() if turn is None else turn:
-        show(built, args)
+        print_result(results, args)
 
 
 def compare(weights: dict[int, tuple[np.ndarray, np.ndarray]], args: argparse.Namespace) -> None:
@@ -134,10 +133,10 @@ def compare(weights: dict[int, tuple[np.ndarray, np.ndarray]], args: argparse.Na
 
 def build(name: str, devices: list[jax.Device], small: bool) -> Case:
     """Return a case on some devices."""
-    (make, size), n = CASES[name], len(devices)
+    (make_case, size), n = CASES[name], len(devices)
     n_worlds = size.small if small else size.n_worlds
-    place = {"device": devices[0], "mesh": world_mesh(devices) if n > 1 else None}
-    return make(n_worlds if name.startswith("seeds") else n * n_worlds, place, 4 if small else None)
+    device_options = {"device": devices[0], "mesh": world_mesh(devices) if n > 1 else None}
+    return make_case(n_worlds if name.startswith("seeds") else n * n_worlds, device_options, 4 if small else None)
 
 
 def measure(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None:
@@ -148,93 +147,99 @@ def measure(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None
     def seconds(n: int) -> float:
         case, state = cases[n], states[n]
         jax.block_until_ready(state)
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         for _ in range(N_CALLS):  # queued, as in a training
-            out = case.call(*state)
+            results = case.call(*state)
             if case.carries:
-                state[0] = out[0]
-        jax.block_until_ready((state, out))
-        return (time.perf_counter() - begin) / N_CALLS
+                state[0] = results[0]
+        jax.block_until_ready((state, results))
+        return (time.perf_counter() - start_time) / N_CALLS
 
     for n in cases:
         seconds(n)
         seconds(n)
-    taken = medians({n: partial(seconds, n) for n in cases}, args.repeats)
-    rates = {n: cases[n].work / taken[n] for n in cases}
+    call_times = medians({n: partial(seconds, n) for n in cases}, args.repeats)
+    rates = {n: cases[n].work / call_times[n] for n in cases}
     for n, case in cases.items():
         text, memory = case.call.as_text(), case.call.memory_analysis()
         n_bytes = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
         report(
             args.device, benchmark="devices", case=name, n_devices=n, unit=size.unit,
-            n_worlds=size.small if args.small else size.n_worlds, call_s=digits(taken[n]), rate=digits(rates[n]),
+            n_worlds=size.small if args.small else size.n_worlds, call_s=digits(call_times[n]), rate=digits(rates[n]),
             ratio=digits(rates[n] / rates[args.devices[0]]),
             exchanged=exchanged_bytes(text), memory_bytes=n_bytes - memory.alias_size_in_bytes,
             compile_s=round(case.compile_s, 1), crazysim=__version__,
         )  # fmt: skip
 
 
-def compiled(fn: Any, *arguments: Any, work: int, carries: bool = False, static: tuple[Any, ...] = ()) -> Case:
+def compile_case(fn: Any, *arguments: Any, work: int, carries: bool = False, static: tuple[Any, ...] = ()) -> Case:
     """Return the case of a jitted function."""
     lowered = fn.lower(*arguments, *static)
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     call = lowered.compile()
-    return Case(call, arguments, carries, work, time.perf_counter() - begin)
+    return Case(call, arguments, carries, work, time.perf_counter() - start_time)
 
 
-def physics(n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+def physics(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
     """Return steps of attitude commands."""
-    n_steps = few or 100
-    sim = Sim(n_worlds, control="attitude", **place)
+    n_steps = small_size or 100
+    sim = Sim(n_worlds, control="attitude", **device_options)
     hovering(sim, "attitude")
     step = sim.build_step_fn()
-    return compiled(jax.jit(lambda data: (step(data, n_steps), ())), sim.data, work=n_worlds * n_steps, carries=True)
+    return compile_case(
+        jax.jit(lambda data: (step(data, n_steps), ())), sim.data, work=n_worlds * n_steps, carries=True
+    )
 
 
-def rollouts(task: str, flies: bool, n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+def rollouts(
+    task: str, with_policy: bool, n_worlds: int, device_options: dict[str, Any], small_size: int | None
+) -> Case:
     """Return rollouts with automatic resets, with random actions or with a policy of two layers of 64."""
-    n_steps = few or 50
-    env = envs.AutoReset(envs.make(task, n_worlds, **place))
-    everywhere = replicated_sharding(env.sim)
-    state = jax.jit(env.reset)(jax.device_put(jax.random.key(0), everywhere))
+    n_steps = small_size or 50
+    env = envs.AutoReset(envs.make(task, n_worlds, **device_options))
+    replicated = replicated_sharding(env.sim)
+    state = jax.jit(env.reset)(jax.device_put(jax.random.key(0), replicated))
     shape, n_obs = state.action.shape, flatten(state.obs).shape[-1]
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, env.actions.size), 0.01))
-    policy = jax.device_put(policy, everywhere)
+    policy = jax.device_put(policy, replicated)
 
     def run(carry: Any, policy: Any) -> Any:
         def act(obs: Any, memory: Any, key: Any) -> Any:
-            if flies:
+            if with_policy:
                 return policy(obs) + 0.1 * jax.random.normal(key, shape), memory, ()
             return jax.random.uniform(key, shape, minval=-0.3, maxval=0.3), memory, ()
 
         state, key = carry
-        key, now = jax.random.split(key)
-        state, _, kept = envs.rollout(env, state, act, now, n_steps)
-        return (state, key), kept
+        key, rollout_key = jax.random.split(key)
+        state, _, transitions = envs.rollout(env, state, act, rollout_key, n_steps)
+        return (state, key), transitions
 
-    carry = state, jax.device_put(jax.random.key(2), everywhere)
-    return compiled(jax.jit(run), carry, policy, work=n_worlds * n_steps, carries=True)
+    carry = state, jax.device_put(jax.random.key(2), replicated)
+    return compile_case(jax.jit(run), carry, policy, work=n_worlds * n_steps, carries=True)
 
 
-def training(algorithm: Any, n_seeds: int, n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+def training(
+    algorithm: Any, n_seeds: int, n_worlds: int, device_options: dict[str, Any], small_size: int | None
+) -> Case:
     """Return iterations of a training of ``hover``, all of its seeds."""
     recipe = TrainConfig.create("hover", "ppo" if algorithm is ppo else "apg", n_worlds=n_worlds).algorithm_config()
-    recipe = recipe if few is None else dataclasses.replace(recipe, n_steps=few)
-    base = envs.make("hover", n_seeds * n_worlds, **place)
+    recipe = recipe if small_size is None else dataclasses.replace(recipe, n_steps=small_size)
+    base = envs.make("hover", n_seeds * n_worlds, **device_options)
     env, recipes = envs.AutoReset(base) if algorithm is ppo else base, (recipe,) * n_seeds
-    everywhere = replicated_sharding(base.sim)
-    keys = jax.device_put(jax.random.split(jax.random.key(0), n_seeds), everywhere)
+    replicated = replicated_sharding(base.sim)
+    keys = jax.device_put(jax.random.split(jax.random.key(0), n_seeds), replicated)
     shapes = jax.eval_shape(partial(algorithm.init, env, recipes), keys)
     shardings = learner_shardings(shapes, base.sim, n_seeds)
     learner = jax.jit(algorithm.init, static_argnums=(0, 1), out_shardings=shardings)(env, recipes, keys)
-    iterate = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(shardings, everywhere))
+    iterate = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(shardings, replicated))
     work = n_seeds * n_worlds * recipe.n_steps
-    return compiled(iterate, learner, work=work, carries=True, static=(env, recipes))
+    return compile_case(iterate, learner, work=work, carries=True, static=(env, recipes))
 
 
-def gradient(n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+def gradient(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
     """Return gradients of distances after some steps with respect to attitude commands."""
-    n_steps = few or 100
-    sim = Sim(n_worlds, control="attitude", **place)
+    n_steps = small_size or 100
+    sim = Sim(n_worlds, control="attitude", **device_options)
     hovering(sim, "attitude")
     step, zeros = sim.build_step_fn(), sim.step_fn.zeros(sim.data)
 
@@ -243,26 +248,26 @@ def gradient(n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
         return jnp.sum((end.states.pos - start.states.pos) ** 2)
 
     cmd = 1.01 * sim.data.controls.attitude.staged_cmd
-    return compiled(jax.jit(jax.grad(distance)), cmd, sim.data, work=n_worlds * n_steps)
+    return compile_case(jax.jit(jax.grad(distance)), cmd, sim.data, work=n_worlds * n_steps)
 
 
-def depth(n_worlds: int, place: dict[str, Any], few: int | None) -> Case:
+def depth(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
     """Return depth images of a drone amid 30 movable poles, rays."""
-    size = (few, few) if few else IMAGE
-    sim = Sim(n_worlds, control="attitude", **place)
+    size = (small_size, small_size) if small_size else IMAGE
+    sim = Sim(n_worlds, control="attitude", **device_options)
     pos = np.zeros((30, 3))
     pos[:, :2] = np.random.default_rng(0).uniform(-10, 10, (30, 2))
     sim.scene.add("pole", count=30, pos=pos, mocap=True)
     hovering(sim, "attitude")
-    look = sim.scene.depth_fn("fpv_cam", *size)
-    return compiled(jax.jit(lambda data: look(data).distance), sim.data, work=n_worlds * size[0] * size[1])
+    take_image = sim.scene.depth_fn("fpv_cam", *size)
+    return compile_case(jax.jit(lambda data: take_image(data).distance), sim.data, work=n_worlds * size[0] * size[1])
 
 
 def trained_weights(devices: list[jax.Device], small: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of a policy before and after three iterations of PPO."""
-    place = {"device": devices[0], "mesh": world_mesh(devices) if len(devices) > 1 else None}
+    device_options = {"device": devices[0], "mesh": world_mesh(devices) if len(devices) > 1 else None}
     with jax.default_matmul_precision("highest"):  # a GPU would round the products of each order of sums to 10 bits
-        case = training(ppo, 1, 256 if small else 16384, place, 4 if small else None)
+        case = training(ppo, 1, 256 if small else 16384, device_options, 4 if small else None)
     learner = case.arguments[0]
     weights = [learner.agents.policy]
     for _ in range(3):

@@ -60,6 +60,17 @@ def test_loop_prints_the_time_of_an_iteration(run):
     assert 0 < box["shortest_s"] <= box["iteration_s"]
 
 
+def test_devices_prints_rates_and_what_devices_exchange(run):
+    """Two of the four host devices: physics exchanges nothing, and a gradient with respect to commands neither."""
+    lines = run("devices.py", "--small", "--cases", "physics", "gradient", "--devices", 1, 2, "--repeats", 1)
+    assert [(line["case"], line["n_devices"]) for line in lines] == [
+        ("physics", 1), ("physics", 2), ("gradient", 1), ("gradient", 2)
+    ]  # fmt: skip
+    assert all(line["rate"] == pytest.approx(line["n_devices"] * 64 * 4 / line["call_s"], rel=0.01) for line in lines)
+    assert [line["ratio"] for line in lines[::2]] == [1.0, 1.0]
+    assert all(line["exchanged"] == {} and line["memory_bytes"] > 0 for line in lines)
+
+
 @pytest.mark.long("compiles a training and evaluations of four airframes")
 def test_memory_prints_the_success_of_each_variant_on_other_airframes(run, tmp_path):
     small = ["--worlds", 16, "--iterations", 1, "--starts", 8, "--seconds", 0.1, "--tasks", "hover", "--out", tmp_path]
@@ -236,7 +247,7 @@ def finished(train, out, successes, **changes):
         result = {
             "task": "hover", "seed": seed, "on": "cpu", "arguments": [], "algorithm": "ppo", "success": success,
             "crashed": 0.0, "error": 0.01 * (1 + seed), "env_steps": 2_600_000, "seconds": 20.0 + seed,
-            "curve": [[5.0, 0.5], [9.0, success]], "sources": train.sources(), "commit": "abc1234", "parallel": 1,
+            "curve": [[5.0, 0.5], [9.0, success]], "sources": train.source_hash(), "commit": "abc1234", "parallel": 1,
             "date": "2026-11-26", "machine": "a machine", "jax": "0.10.1",
         }  # fmt: skip
         with (out / "results.jsonl").open("a") as file:
@@ -312,7 +323,7 @@ def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, tra
 def test_the_page_shows_the_committed_table(benchmarks):
     train = importlib.import_module("train")
     shown = train.PAGE.read_text().partition(train.TABLE_START)[2].partition(train.TABLE_END)[0]
-    assert shown.strip() == train.markdown(json.loads(train.TABLE.read_text()))
+    assert shown.strip() == train.table_markdown(json.loads(train.TABLE.read_text()))
 
 
 def test_a_seed_that_diverged_is_named_and_counts_as_no_success(run, train, tmp_path):
@@ -325,7 +336,7 @@ def test_a_seed_that_diverged_is_named_and_counts_as_no_success(run, train, tmp_
     about = {"task": "hover", "algorithm": "ppo", "commit": "0", "date": "0", "machine": "0", "jax": "0", "parallel": 1}
     row = train.make_row([train.read_result(tmp_path, x) | about | {"seed": i} for i, x in enumerate((None, 33))])
     assert (row["least"], row["diverged"]) == (0.0, [1])
-    assert "| 0, 1; diverged: 1 | 0.0% |" in train.markdown([row])
+    assert "| 0, 1; diverged: 1 | 0.0% |" in train.table_markdown([row])
 
 
 @pytest.mark.long("trains in a process of its own")
