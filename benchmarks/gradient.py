@@ -44,12 +44,12 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
     sim = Sim(n_worlds, control=control, device=args.device, engine=args.engine)
     hovering(sim, control)
     step, initial_data = sim.build_step_fn(), sim.data
-    send, zeros = getattr(functional, f"{control}_control"), sim.step_fn.zeros(sim.data)
+    stage_command, zeros = getattr(functional, f"{control}_control"), sim.step_fn.zeros(sim.data)
     hover = jnp.asarray(COMMANDS[control](0.0434 * 9.81, 15864.0), jnp.float32)
     cmd = jax.device_put(jnp.broadcast_to(1.01 * hover, (n_worlds, 1, hover.size)), sim.device)
 
     def distance(cmd: jax.Array) -> jax.Array:
-        final_data = step(send(initial_data, cmd), n_steps, zeros)
+        final_data = step(stage_command(initial_data, cmd), n_steps, zeros)
         return jnp.sum((final_data.states.pos - initial_data.states.pos) ** 2)
 
     functions = {

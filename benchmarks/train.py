@@ -6,9 +6,9 @@
     python benchmarks/train.py --tasks hover -- --worlds 2048 --config learning_rate=1e-3
 
 All seeds of a task are trained by one process, ``crazysim train TASK --seeds ...``, so its time includes imports,
-building, compilation and evaluation of all of them; ``--together`` limits the seeds of a process. A JSON line for each
-seed, as its process ends, and one for each task, with medians over its seeds. A seed that diverges counts
-as no success, and is named.
+building, compilation and evaluation of all of them; ``--together`` limits the seeds of a process. When a process ends,
+it prints a JSON line for each seed, and at the end one for each task, with medians over its seeds. A seed that diverges
+counts as no success, and is named.
 
 Finished seeds are kept in one file, ``results.jsonl`` of the folder ``--out``, and are not trained again while the
 sources of the package are the same: an interrupted command continues where it was, also on another machine that is
@@ -17,8 +17,8 @@ failed training is reported at the end, and the others go on.
 
 ``--write`` puts the rows of tasks with all seeds finished into the committed table,
 docs/concepts/training-results.json, and into the page next to it. ``--check`` trains one seed of each task, and fails
-where its success is below the table's least by more than two standard errors of 1,000 starts. Arguments after ``--``
-are passed to ``crazysim train``.
+where its success is below the lowest of the table by more than two standard errors of 1,000 starts. Arguments after
+``--`` are passed to ``crazysim train``.
 """
 
 from __future__ import annotations
@@ -72,7 +72,9 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, help="image of the learning curves")
     parser.add_argument("--only-plot", action="store_true", help="plot, summarise and write finished runs; train none")
     parser.add_argument("--keep", action="store_true", help="use finished runs of other sources of the package too")
-    parser.add_argument("--commit", default=commit(), help="name of the sources in the table; by default %(default)s")
+    parser.add_argument(
+        "--commit", default=source_commit(), help="name of the sources in the table; by default %(default)s"
+    )
     mode = parser.add_mutually_exclusive_group()
     mode.add_argument("--write", action="store_true", help="write the committed table and the page")
     mode.add_argument("--check", action="store_true", help="compare with the committed table")
@@ -83,7 +85,7 @@ def main() -> None:
     tasks = args.tasks or (list(TASKS) if args.all or args.check else ["hover", "recover", "track", "race"])
     seeds = args.seeds or ([0] if args.check else [0, 1, 2, 3, 4])
 
-    store, source = args.out / "results.jsonl", sources()
+    store, source = args.out / "results.jsonl", source_hash()
     keys = [(task, seed, args.device, *arguments) for seed in seeds for task in tasks]
     results = {
         key: x for key, x in read_results(store).items() if key in keys and (args.keep or x["sources"] == source)
@@ -107,14 +109,14 @@ def main() -> None:
     if args.plot is not None:
         plot({task: runs for task, runs in finished.items() if runs}, args.plot)
     if args.write:
-        write([row for row in rows if len(row["seeds"]) == len(seeds)])
+        write_table([row for row in rows if len(row["seeds"]) == len(seeds)])
     if args.check:
         failures += check_success([run for runs in finished.values() for run in runs])
     if failures:
         raise SystemExit("\n".join(failures))
 
 
-def sources() -> str:
+def source_hash() -> str:
     """Return a hash of the package's sources, which shows whether a finished run is of the same sources."""
     digest = hashlib.sha256()
     for path in sorted(path for path in PACKAGE.rglob("*") if path.suffix in (".py", ".toml", ".xml")):
@@ -122,7 +124,7 @@ def sources() -> str:
     return digest.hexdigest()[:12]
 
 
-def commit() -> str:
+def source_commit() -> str:
     """Return the commit of the sources, with a + if the package has changed since; without Git, the version."""
     git = ["git", "-C", str(PACKAGE)]
     process = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
@@ -204,12 +206,12 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
     task, _, device, *arguments = group[0]
     seeds = ",".join(str(key[1]) for key in group)
     folder = run_folder(out, task, seeds, device, *arguments)
-    stamp = folder / "sources.txt"
-    is_same = stamp.exists() and stamp.read_text() == about["sources"]
+    sources_file = folder / "sources.txt"
+    is_same = sources_file.exists() and sources_file.read_text() == about["sources"]
     if not is_same:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        stamp.write_text(about["sources"])
+        sources_file.write_text(about["sources"])
     command = [sys.executable, "-P", "-m", "crazysim", "train", task, "--seeds", seeds, "--out", str(folder)]
     command += ["--resume"] if (folder / CHECKPOINT).exists() else []  # of a training that was interrupted
     # By default each process would take three quarters of the memory of a GPU.
@@ -236,7 +238,7 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
 
 
 def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
-    """Return the results of one seed from its learning curve; seconds are those of all seeds of its process.
+    """Return the results of one seed from its learning curve, with the seconds of its process for all its seeds.
 
     Args:
         folder: Folder of the seed.
@@ -245,7 +247,7 @@ def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
     """
     curve = read_curve(folder)
     point, last_point = kept_point(curve), curve[-1]
-    solved = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
+    seconds_to_95_percent = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
     return {
         "success": round(point["success"], 4) if diverged is None else 0.0,
         "diverged": diverged,
@@ -255,7 +257,7 @@ def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
         "env_steps": last_point["env_steps"],
         "seconds": digits(last_point["seconds"]),
         "compile_seconds": digits(last_point["compile_seconds"]),
-        "seconds_to_95_percent": None if solved is None else digits(solved),
+        "seconds_to_95_percent": None if seconds_to_95_percent is None else digits(seconds_to_95_percent),
         "curve": [[digits(p["seconds"]), round(p["success"], 4)] for p in curve],
     }
 
@@ -280,17 +282,17 @@ def make_row(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return row | {name: ", ".join(sorted({run[name] for run in runs})) for name in ("commit", "date", "machine", "jax")}
 
 
-def write(rows: list[dict[str, Any]]) -> None:
+def write_table(rows: list[dict[str, Any]]) -> None:
     """Put rows into the committed table, and the table into the page."""
     rows_by_task = {row["task"]: row for row in [*json.loads(TABLE.read_text()), *rows]}
     rows = [rows_by_task[task] for task in [*TASKS, *sorted(rows_by_task.keys() - TASKS)] if task in rows_by_task]
     TABLE.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
     page = PAGE.read_text()
     page_start, page_end = page[: page.index(TABLE_START)], page[page.index(TABLE_END) :]
-    PAGE.write_text(f"{page_start}{TABLE_START}\n\n{markdown(rows)}\n\n{page_end}")
+    PAGE.write_text(f"{page_start}{TABLE_START}\n\n{table_markdown(rows)}\n\n{page_end}")
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
+def table_markdown(rows: list[dict[str, Any]]) -> str:
     """Return the table as the page shows it."""
     names = {"ppo": "PPO", "apg": "analytic gradients"}
     lines = [
@@ -324,7 +326,7 @@ def time_text(row: dict[str, Any]) -> str:
 
 
 def check_success(runs: list[dict[str, Any]]) -> list[str]:
-    """Return a message for each run whose success is below the table's least by more than two standard errors."""
+    """Return a message for each run whose success is below the lowest of the table by more than two standard errors."""
     required = {row["task"]: row["least"] for row in json.loads(TABLE.read_text())}
     failures = []
     for run in runs:

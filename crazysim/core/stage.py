@@ -139,7 +139,7 @@ def stage(
 
 
 def acts_now(data: SimData, freq: int) -> Array | None:
-    """Return whether a stage with a rate, Hz, acts at this step, for each world; None if it acts at every step.
+    """Return True in worlds in which a stage with a rate, Hz, acts at this step; None if it acts at every step.
 
     Returns:
         (n_worlds, 1), or () for data of one world
@@ -193,7 +193,7 @@ class Axes:
         if treedef != self.treedef:
             raise ConfigError(
                 f"stage {name!r} changed the structure of SimData (a field became None, or a plugin came or went); "
-                f"put everything in place before the step, with sim.data = sim.data.replace(...)"
+                f"make such changes before the step, with sim.data = sim.data.replace(...)"
             )
         written = [i for i, (x, y) in enumerate(zip(before, new_leaves, strict=True)) if x is not y]
         writable_scopes = self.writable_scopes(stage)

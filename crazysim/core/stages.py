@@ -65,19 +65,19 @@ def build_step_pipeline(
 @_built_in_stage("drone", when=_rate_condition("attitude"))
 def commit_attitude(data: SimData) -> SimData:
     """Apply the staged attitude command; fitted dynamics contain the controller that follows it."""
-    ctrl = data.controls.attitude
-    ctrl = ctrl.replace(cmd=ctrl.staged_cmd)
-    return data.replace(controls=data.controls.replace(attitude=ctrl))
+    attitude = data.controls.attitude
+    attitude = attitude.replace(cmd=attitude.staged_cmd)
+    return data.replace(controls=data.controls.replace(attitude=attitude))
 
 
 @_built_in_stage("drone", when=_rate_condition("force_torque"))
 def force_torque_controller(data: SimData) -> SimData:
     """Apply the staged wrench, and command the rotor speeds that produce it."""
     controls = controls_of(data)
-    ctrl = controls.force_torque
-    rotor_vel = force_torque2rotor_vel(ctrl.staged_cmd, params=ctrl.params)
-    force_torque = ctrl.replace(cmd=ctrl.staged_cmd)
-    return data.replace(controls=controls.replace(force_torque=force_torque, rotor_vel=rotor_vel))
+    force_torque = controls.force_torque
+    rotor_vel = force_torque2rotor_vel(force_torque.staged_cmd, params=force_torque.params)
+    new_force_torque = force_torque.replace(cmd=force_torque.staged_cmd)
+    return data.replace(controls=controls.replace(force_torque=new_force_torque, rotor_vel=rotor_vel))
 
 
 @_built_in_stage("drone")
@@ -90,9 +90,9 @@ def clip_rotor_vel_cmd(data: SimData) -> SimData:
 @_built_in_stage("drone")
 def clip_thrust_cmd(data: SimData) -> SimData:
     """Limit the commanded collective thrust to the range of the rotors; zero or less switches them off."""
-    ctrl = data.controls.attitude
-    ctrl = ctrl.replace(cmd=fitted.saturate(ctrl.cmd, data.params))
-    return data.replace(controls=data.controls.replace(attitude=ctrl))
+    attitude = data.controls.attitude
+    attitude = attitude.replace(cmd=fitted.saturate(attitude.cmd, data.params))
+    return data.replace(controls=data.controls.replace(attitude=attitude))
 
 
 def first_principles_derivative(data: SimData) -> SimStateDeriv:
@@ -129,20 +129,27 @@ def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
 
     def held_derivative(data: SimData) -> SimStateDeriv:
         s, deriv = data.states, deriv_fn(data)
-        stands = (s.pos[..., 2:] == FLOOR_HEIGHT) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
-        return deriv.replace(acc=jnp.where(stands, 0.0, deriv.acc), ang_acc=jnp.where(stands, 0.0, deriv.ang_acc))
+        is_standing = (s.pos[..., 2:] == FLOOR_HEIGHT) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
+        return deriv.replace(
+            acc=jnp.where(is_standing, 0.0, deriv.acc), ang_acc=jnp.where(is_standing, 0.0, deriv.ang_acc)
+        )
 
     return held_derivative
 
 
 def stop_below(s: SimState, lowest: Array | float) -> SimState:
-    """Return states with drones that are below a height, or at it and not rising, at rest on it. m, (..., 1)"""
+    """Return the states with drones at rest on a surface if they are below it, or on it and not rising.
+
+    Args:
+        s: States.
+        lowest: Height of the surface, world frame, m. (..., 1)
+    """
     height, climb = s.pos[..., 2:], s.vel[..., 2:]
-    stopped = (height < lowest) | ((height == lowest) & (climb <= 0))
+    is_stopped = (height < lowest) | ((height == lowest) & (climb <= 0))
     return s.replace(
         pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, lowest)], axis=-1),
-        vel=jnp.where(stopped, 0.0, s.vel),
-        ang_vel=jnp.where(stopped, 0.0, s.ang_vel),
+        vel=jnp.where(is_stopped, 0.0, s.vel),
+        ang_vel=jnp.where(is_stopped, 0.0, s.ang_vel),
     )
 
 

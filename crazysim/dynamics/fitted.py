@@ -151,21 +151,23 @@ def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p:
     """Return the fit's angular acceleration, blended into an attitude spring outside of the fitted range."""
     x, y, z, w = quat[..., 0:1], quat[..., 1:2], quat[..., 2:3], quat[..., 3:4]
     cos_pitch = rotation.safe_norm(jnp.concatenate([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1))
-    t = jnp.clip((cos_pitch - MIN_BLENDED_COSINE) / (MIN_FITTED_COSINE - MIN_BLENDED_COSINE), 0.0, 1.0)
-    size = jnp.maximum(rotation.dot(ang_vel, ang_vel), rotation.dot(cmd_rpy, cmd_rpy)) / MAX_FITTED_MAGNITUDE**2
-    t = t * jnp.clip((4 - size) / 3, 0.0, 1.0)
-    weight = t * t * t * (10 - 15 * t + 6 * t * t)
+    blend = jnp.clip((cos_pitch - MIN_BLENDED_COSINE) / (MIN_FITTED_COSINE - MIN_BLENDED_COSINE), 0.0, 1.0)
+    squared_magnitude = (
+        jnp.maximum(rotation.dot(ang_vel, ang_vel), rotation.dot(cmd_rpy, cmd_rpy)) / MAX_FITTED_MAGNITUDE**2
+    )
+    blend = blend * jnp.clip((4 - squared_magnitude) / 3, 0.0, 1.0)
+    weight = blend * blend * blend * (10 - 15 * blend + 6 * blend * blend)
 
     # Where the weight is zero the fit is evaluated at rest: 0 * inf is NaN, in gradients too.
     level = jnp.asarray([0.0, 0.0, 0.0, 1.0], quat.dtype)
-    fits = weight > 0
-    from_angles = _euler_spring(
-        jnp.where(fits, quat, level), jnp.where(fits, ang_vel, 0.0), jnp.where(fits, cmd_rpy, 0.0), p
+    is_fitted = weight > 0
+    fitted_acc = _euler_spring(
+        jnp.where(is_fitted, quat, level), jnp.where(is_fitted, ang_vel, 0.0), jnp.where(is_fitted, cmd_rpy, 0.0), p
     )
 
     error = rotation.multiply(rotation.conjugate(rotation.from_rpy(cmd_rpy)), quat)
-    from_error = p.rpy_coef * 2 * error[..., 3:] * error[..., :3] + p.rpy_rates_coef * ang_vel
-    return weight * from_angles + (1 - weight) * from_error
+    spring_acc = p.rpy_coef * 2 * error[..., 3:] * error[..., :3] + p.rpy_rates_coef * ang_vel
+    return weight * fitted_acc + (1 - weight) * spring_acc
 
 
 def _euler_spring(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Array:

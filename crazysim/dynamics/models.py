@@ -80,9 +80,9 @@ def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
     if drag in numbers:
         rates_by_path[drag] = numbers[drag] / mass
     for path, rates in rates_by_path.items():
-        rate = float(np.max(np.abs(rates)))
-        if rate > MAX_LAG_RATE * freq:
+        max_rate = float(np.max(np.abs(rates)))
+        if max_rate > MAX_LAG_RATE * freq:
             raise ConfigError(
                 f"expected {path} of airframe {airframe.name!r} to be slow for steps of 1/{freq} s, got a rate of "
-                f"{rate:.4g} 1/s. Use freq={math.ceil(rate / MAX_LAG_RATE)} or more, or a smaller number."
+                f"{max_rate:.4g} 1/s. Use freq={math.ceil(max_rate / MAX_LAG_RATE)} or more, or a smaller number."
             )

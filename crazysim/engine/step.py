@@ -142,8 +142,8 @@ class Step:
         self._called: set[tuple[int, int | None]] = set()
         self._zeros = ZerosCache()
         self._pack = PackCache()
-        self._at_home: Any = None
-        self._unsynced: Any = None
+        self._home_sharding: Any = None
+        self._last_false_flag: Any = None
 
     def without_stages(self, names: Collection[str]) -> Step:
         """Return the step without some stages."""
@@ -269,12 +269,12 @@ class Step:
 
     def _false_flag(self, old_flag: Any) -> Any:
         """Return a false flag on the devices of the previous flag; the last such flag is returned again if possible."""
-        if old_flag is self._unsynced:
+        if old_flag is self._last_false_flag:
             return old_flag
         traced = isinstance(old_flag, jax.core.Tracer)
         flag = jnp.asarray(False) if traced else jax.device_put(np.False_, getattr(old_flag, "sharding", None))
         if not isinstance(flag, jax.core.Tracer):
-            self._unsynced = flag
+            self._last_false_flag = flag
         return flag
 
     def _plan(
@@ -309,18 +309,18 @@ class Step:
     def _other_location(self, x: Any) -> Location | None:
         """Return the location of an array; None if it is unknown, or the one that the step was built for."""
         sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
-        if sharding is None or sharding is self._at_home:
+        if sharding is None or sharding is self._home_sharding:
             return None
         location, home = find_location(x), self.location
         if location.is_distributed:
-            at_home = home.mesh is not None and (location.mesh, location.axis) == (home.mesh, home.axis)
+            is_home = home.mesh is not None and (location.mesh, location.axis) == (home.mesh, home.axis)
         elif home.devices is None or home.mesh is not None:
-            at_home = True
+            is_home = True
         else:  # one host kernel serves all devices of the host
-            at_home = location.devices == home.devices or location.platform == home.platform == "cpu"
-        if at_home:
-            self._at_home = sharding
-        return None if at_home else location
+            is_home = location.devices == home.devices or location.platform == home.platform == "cpu"
+        if is_home:
+            self._home_sharding = sharding
+        return None if is_home else location
 
 
 def _check_steps(n_steps: Any) -> None:

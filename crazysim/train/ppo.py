@@ -65,7 +65,7 @@ class Config:
     critic: str = "observations"
     """Inputs of the value function: ``observations``, the observations of the policy; ``privileged``, the same and the
     true state and parameters of the drone; ``all_drones``, the observations of all drones of the world;
-    ``all_drones_privileged``, those and the true states and parameters of all of them."""
+    ``all_drones_privileged``, the same and the true states and parameters of all of them."""
     learning_rate: float = 1e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     discount: float = 0.98
@@ -159,8 +159,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
 
     Args:
         env: Environment that resets automatically within the step that ends an episode, with a block of worlds for
-            each seed; with the wrapper ``PrivilegedObservation`` for a privileged critic. Statistics of a
-            ``Normalize`` wrapper are those of the worlds of all seeds.
+            each seed; with the wrapper ``PrivilegedObservation`` for a privileged critic. The worlds of
+            all seeds share the statistics of a ``Normalize`` wrapper.
         configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
         network: Network of your own, for policy and value function; None for the built-in one.
@@ -263,7 +263,11 @@ def _collect_samples(
             reward + discount * jnp.where(truncated, final_values, 0.0),
             jnp.broadcast_to(done, reward.shape),
         )
-        return sample, raw_obs, (reward, terminated, error)  # means of every step would be exchanges of every step
+        return (
+            sample,
+            raw_obs,
+            (reward, terminated, error),
+        )  # a mean in each step would need an exchange between devices in each
 
     initial_memory = _initial_memories(agents.network, learner.env)
     state, memory, (samples, raw_obs, (reward, terminated_counts, error)) = rollout(

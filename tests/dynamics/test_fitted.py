@@ -28,7 +28,7 @@ def body_rates(rpy, rates):
     return (behind.inv() * ahead).as_rotvec() / (2 * h)
 
 
-def by_the_fit(rpy, rates, cmd, p):
+def fit_ang_acc(rpy, rates, cmd, p):
     """Return the angular acceleration of rpy'' = a rpy + b rpy' + c cmd: how E(rpy) rpy' changes along that motion."""
     acc = np.asarray(p.rpy_coef * rpy + p.rpy_rates_coef * rates + p.cmd_rpy_coef * cmd)
     h = 1e-4
@@ -36,7 +36,7 @@ def by_the_fit(rpy, rates, cmd, p):
     return (ahead - behind) / (2 * h)
 
 
-def by_the_model(rpy, rates, cmd, p):
+def model_ang_acc(rpy, rates, cmd, p):
     quat, still = Rotation.from_euler("ZYX", rpy[::-1]).as_quat(), np.zeros(3)
     command = np.concatenate([cmd, [0.4]])
     return model(still, quat, still, body_rates(rpy, rates), command, np.zeros(4), params=p)[2]
@@ -49,16 +49,16 @@ def by_the_model(rpy, rates, cmd, p):
 )
 def test_below_80_degrees_the_angles_obey_the_fit(rpy, rates, cmd):
     """Up to 1.38 rad, 79 degrees, of pitch. Differences of differences leave 1e-5 of 1e3 rad/s^2."""
-    expected = by_the_fit(rpy, rates, cmd, params())
-    np.testing.assert_allclose(by_the_model(rpy, rates, cmd, params()), expected, rtol=1e-4, atol=0.05)
+    expected = fit_ang_acc(rpy, rates, cmd, params())
+    np.testing.assert_allclose(model_ang_acc(rpy, rates, cmd, params()), expected, rtol=1e-4, atol=0.05)
 
 
 @pytest.mark.parametrize("pitch", [-79.9, -70, 60, 70, 79.9])
 @pytest.mark.parametrize("rates", [(0, 0, 0), (1.0, -2.0, 1.5)])
 def test_up_to_80_degrees_the_fit_is_not_touched_by_what_lies_beyond(pitch, rates):
     rpy, cmd = np.array([0.5, np.deg2rad(pitch), -0.7]), np.array([0.1, 0.2, -0.3])
-    expected = by_the_fit(rpy, np.array(rates), cmd, params())
-    np.testing.assert_allclose(by_the_model(rpy, np.array(rates), cmd, params()), expected, rtol=1e-4, atol=0.05)
+    expected = fit_ang_acc(rpy, np.array(rates), cmd, params())
+    np.testing.assert_allclose(model_ang_acc(rpy, np.array(rates), cmd, params()), expected, rtol=1e-4, atol=0.05)
 
 
 @pytest.mark.parametrize("cmd, rates", [(57.0, 0.0), (0.3, 50.0), (-57.0, -20.0)])
@@ -68,8 +68,8 @@ def test_up_to_100_rad_and_100_rad_a_second_the_fit_holds(cmd, rates):
     Differences are off by 2e-4 of themselves here.
     """
     rpy, cmd, rates = np.array([0.5, -0.2, -0.7]), np.full(3, cmd), np.full(3, rates)
-    expected = by_the_fit(rpy, rates, cmd, params())
-    np.testing.assert_allclose(by_the_model(rpy, rates, cmd, params()), expected, rtol=3e-4, atol=0.05)
+    expected = fit_ang_acc(rpy, rates, cmd, params())
+    np.testing.assert_allclose(model_ang_acc(rpy, rates, cmd, params()), expected, rtol=3e-4, atol=0.05)
 
 
 @pytest.mark.parametrize("what", ["rate", "command"])

@@ -92,7 +92,7 @@ def test_hoisting_takes_work_out_of_the_loop(pipeline):
 def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
     program, numbers = pipeline
     fused = schedule.fuse(program)
-    separated = verify(schedule.separate(fused))
+    separated = verify(schedule.add_barriers(fused))
     (before,), (after,) = fused.segments, separated.segments
     names = [op.name for op in after.block.operations]
     runs = "".join("|" if name == "barrier" else "." for name in names).split("|")

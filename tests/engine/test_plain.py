@@ -71,7 +71,10 @@ def test_what_no_stage_writes_comes_back_as_the_very_arrays_that_went_in(data, s
             lambda d: d.replace(core=d.core.replace(steps=d.core.steps.astype(float))),
             ("'mine'", "type int32 into shape (3, 1) and type float32"),
         ),
-        (lambda d: d.replace(plugins={"new": jnp.zeros(3)}), ("'mine'", "structure", "put everything in place before")),
+        (
+            lambda d: d.replace(plugins={"new": jnp.zeros(3)}),
+            ("'mine'", "structure", "make such changes before the step"),
+        ),
         (lambda d: d.replace(states=d.states.replace(force=None)), ("'mine'", "structure")),
         (lambda d: d.replace(params=d.params.replace(mass=jnp.ones((3, 2, 1)))), ("'mine'", "shape (1,)")),
         (lambda d: None, ("'mine'",)),

@@ -18,8 +18,8 @@ REFUSED = {
     "loop_until": "until a condition fails",
     "walk_together": "until a condition fails",
 }
-OTHER = {"not_finite", "sort_not_finite", "argmin_and_sort", "conversions"}
-"""Cases that are given NaN and infinity, which CasADi's simplifications do not keep, or take float32 apart."""
+UNCOMPARABLE = {"not_finite", "sort_not_finite", "argmin_and_sort", "conversions"}
+"""Cases with NaN or infinity, which CasADi's simplifications do not keep, and cases that need float32."""
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def call(function, *args):
     return np.asarray(function(*(np.asarray(x, float).ravel() for x in args))).ravel()
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if name not in {*REFUSED, *OTHER}])
+@pytest.mark.parametrize("name", [name for name in CASES if name not in {*REFUSED, *UNCOMPARABLE}])
 def test_a_case_gives_what_jax_gives(g, name):
     function, compiled = expressions(CASES[name], drone_shapes(g)), jax.jit(CASES[name])
     for world, drone in ((0, 0), (3, 1), (6, 2)):
@@ -56,7 +56,7 @@ def test_a_case_gives_what_jax_gives(g, name):
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_casadi_has_no_form_for_is_named(g, name):
+def test_unsupported_operations_are_named(g, name):
     with pytest.raises(UnsupportedError, match=REFUSED[name]):
         expressions(CASES[name], drone_shapes(g))
 

@@ -23,7 +23,7 @@ from crazysim.core.stage import Phase
 from crazysim.engine.backends import Run, xla
 from crazysim.engine.ir.blocks import Block
 from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot, UnfusedStage
-from crazysim.engine.passes.schedule import separate
+from crazysim.engine.passes.schedule import add_barriers
 from crazysim.jaxcompat import is_key
 
 Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
@@ -204,7 +204,7 @@ def _run_unfused(stage: UnfusedStage, values: LeafValues) -> None:
 
 def build(program: Program, location: Location) -> Run:
     """Return the function that runs a program in XLA."""
-    return functools.partial(steps, separate(program) if location.platform == "cpu" else program)
+    return functools.partial(steps, add_barriers(program) if location.platform == "cpu" else program)
 
 
 def steps(

@@ -88,8 +88,8 @@ def _trace_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) ->
     The stage must not read ``n_worlds`` and ``n_drones``.
     """
     data = axes.treedef.unflatten(leaves)
-    kind = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))
-    key = (stage.fn, stage.when, kind, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)
+    structure = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))
+    key = (stage.fn, stage.when, structure, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)
     traced = _TRACED_STAGES.get(key)
     if traced is None:
         traced = _TRACED_STAGES[key] = TracedStage(stage, axes, leaves)

@@ -30,8 +30,8 @@ def fuse(program: Program) -> Program:
     A number that one stage writes and the next reads then becomes a value, and common subexpressions are computed once.
     """
     segments: list[Segment | UnfusedStage] = []
-    kinds = itertools.groupby(program.segments, lambda s: (s.scope, s.phase) if isinstance(s, Segment) else id(s))
-    for _, group in kinds:
+    groups = itertools.groupby(program.segments, lambda s: (s.scope, s.phase) if isinstance(s, Segment) else id(s))
+    for _, group in groups:
         segment_group = list(group)
         fusible = [s for s in segment_group if isinstance(s, Segment)]
         segments += [_join_segments(fusible)] if fusible else segment_group
@@ -97,11 +97,11 @@ def _join_two_ticks(first: Operation, second: Operation) -> Operation:
 
 
 BARRIER_INTERVAL = 40
-"""Operations between two barriers of ``separate``. Of 20, 30, 40, 60, 80 and 150, 20 to 40 gave the fastest gradients
-on two cores with jax 0.11.2; smaller numbers take longer to compile."""
+"""Operations between two barriers of ``add_barriers``. Of 20, 30, 40, 60, 80 and 150, 20 to 40 gave the fastest
+gradients on two cores with jax 0.11.2; smaller numbers take longer to compile."""
 
 
-def separate(program: Program) -> Program:
+def add_barriers(program: Program) -> Program:
     """Put a barrier after every ``BARRIER_INTERVAL`` operations, for lanes on a CPU.
 
     XLA's CPU backend recomputes a value in every fusion that uses it, also in the backward pass of a gradient. With a
@@ -110,13 +110,13 @@ def separate(program: Program) -> Program:
     return dataclasses.replace(
         program,
         segments=tuple([
-            dataclasses.replace(s, block=_separate_block(s.block)) if isinstance(s, Segment) else s
+            dataclasses.replace(s, block=_add_barriers_to_block(s.block)) if isinstance(s, Segment) else s
             for s in program.segments
         ]),
     )  # fmt: skip
 
 
-def _separate_block(block: Block) -> Block:
+def _add_barriers_to_block(block: Block) -> Block:
     operations: list[Operation] = []
     for k, op in enumerate(block.operations):
         if k and k % BARRIER_INTERVAL == 0 and op.name != "barrier":
@@ -142,22 +142,24 @@ def hoist(program: Program) -> Program:
 
 def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
     block, slots = segment.block, dict(zip(segment.block.inputs, segment.reads, strict=True))
-    fixed = {x for x, slot in slots.items() if slot not in changing}
-    worth: set[Value] = set()
+    fixed_values = {x for x, slot in slots.items() if slot not in changing}
+    hoistable: set[Value] = set()
     operations: list[Operation] = []
-    for op in _replace_divisions(block, fixed):
+    for op in _replace_divisions(block, fixed_values):
         operations.append(op)
-        if op.results and not op.blocks and all([is_constant(x) or x in fixed for x in op.args]):
-            fixed.update(op.results)
-            if ops.TABLE[op.name].cost >= ops.EXPENSIVE_COST or not worth.isdisjoint(op.args):
-                worth.update(op.results)
-    step_block = Block(block.inputs, tuple([op for op in operations if worth.isdisjoint(op.results)]), block.outputs)
-    used = step_block.uses()
-    hoisted_values = [x for op in operations for x in op.results if x in worth and x in used]
+        if op.results and not op.blocks and all([is_constant(x) or x in fixed_values for x in op.args]):
+            fixed_values.update(op.results)
+            if ops.TABLE[op.name].cost >= ops.EXPENSIVE_COST or not hoistable.isdisjoint(op.args):
+                hoistable.update(op.results)
+    step_block = Block(
+        block.inputs, tuple([op for op in operations if hoistable.isdisjoint(op.results)]), block.outputs
+    )
+    step_uses = step_block.uses()
+    hoisted_values = [x for op in operations for x in op.results if x in hoistable and x in step_uses]
     if not hoisted_values:
         return segment
     # Cheap operations that depend on no hoisted value stay in the step; the hoisted block repeats them if needed.
-    fixed_operations = [op for op in operations if op.results and fixed.issuperset(op.results)]
+    fixed_operations = [op for op in operations if op.results and fixed_values.issuperset(op.results)]
     hoisted_block = prune(Block(block.inputs, tuple(fixed_operations), tuple(hoisted_values)), keep_inputs=False)
     new_inputs = {x: Value(x.dtype) for x in hoisted_values}
     step_block = prune(substitute(step_block, new_inputs), keep_inputs=False)
@@ -170,10 +172,10 @@ def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
     )
 
 
-def _replace_divisions(block: Block, fixed: set[Value]) -> Iterable[Operation]:
+def _replace_divisions(block: Block, fixed_values: set[Value]) -> Iterable[Operation]:
     """Yield the operations of a block, with divisions by fixed numbers replaced by products.
 
-    The caller adds to ``fixed`` while it iterates.
+    The caller adds to ``fixed_values`` while it iterates.
     """
     inverses: dict[Any, Element] = {}
     for op in block.operations:
@@ -181,13 +183,13 @@ def _replace_divisions(block: Block, fixed: set[Value]) -> Iterable[Operation]:
             yield op
             continue
         a, b = op.args
-        if (not is_constant(b) and b not in fixed) or is_constant(a) or a in fixed:
+        if (not is_constant(b) and b not in fixed_values) or is_constant(a) or a in fixed_values:
             yield op
             continue
-        one, key = constant(1, op.dtype), constant_key(b) if is_constant(b) else b
+        unit, key = constant(1, op.dtype), constant_key(b) if is_constant(b) else b
         if key not in inverses and is_constant(b):
-            inverses[key] = fold("div", (one, b), op.dtype, ())
+            inverses[key] = fold("div", (unit, b), op.dtype, ())
         elif key not in inverses:
             inverses[key] = Value(op.dtype)
-            yield Operation("div", (one, b), (inverses[key],), stage=op.stage)
+            yield Operation("div", (unit, b), (inverses[key],), stage=op.stage)
         yield Operation("mul", (a, inverses[key]), op.results, stage=op.stage)

@@ -117,7 +117,7 @@ def decimate(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArray
     return {key: without_huge_numbers(x[:n]).reshape(-1, size).mean(axis=1) for key, x in table.items()}
 
 
-def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None) -> dict[str, NDArray]:
+def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = None) -> dict[str, NDArray]:
     """Return the columns of a log of the Crazyflie's micro-SD card, by the names of its log variables.
 
     The format is defined by tools/usdlog/cfusdlog.py of Bitcraze's crazyflie-firmware at commit 34c90e75: versions 1
@@ -127,7 +127,7 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
     Args:
         path: File.
         repairs: List that descriptions of repairs are appended to.
-        wanted: Names of the columns. Events that have none of them are left out, unless all have none.
+        columns: Names of the columns. Events that have none of them are left out, unless all have none.
 
     Raises:
         ConfigError: If the file is not a log of this format.
@@ -138,7 +138,7 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
             f"{path.name}: expected a log of a Crazyflie's micro-SD card, which begins with 0xBC, got another file. "
             "Tables need the ending .csv or .npz."
         )
-    version, n_kinds = struct.unpack_from("<HH", data, 1)
+    version, n_events = struct.unpack_from("<HH", data, 1)
     if version not in (1, 2):
         raise ConfigError(
             f"{path.name}: expected version 1 or 2 of the format, got {version}. Convert the log to CSV with the "
@@ -149,28 +149,28 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
         repairs.append("the checksum does not match: read up to the last whole record")
         end = len(data)
     try:
-        kinds, offset = _read_kinds(data, n_kinds)
+        events, offset = _read_events(data, n_events)
     except (struct.error, ValueError) as error:
         raise ConfigError(
             f"{path.name}: expected names of log variables in the header, got {error}. Copy the file again."
         ) from error
-    head = struct.Struct("<HI" if version == 1 else "<HQ")
-    unit = 1e-3 if version == 1 else 1e-6
-    rows: dict[int, list[tuple[float, ...]]] = {key: [] for key in kinds}
-    while offset + head.size <= end:
-        kind, time = head.unpack_from(data, offset)
-        if kind not in kinds or offset + head.size + kinds[kind][2].size > end:
+    record_header = struct.Struct("<HI" if version == 1 else "<HQ")
+    seconds_per_tick = 1e-3 if version == 1 else 1e-6
+    rows: dict[int, list[tuple[float, ...]]] = {key: [] for key in events}
+    while offset + record_header.size <= end:
+        event, time = record_header.unpack_from(data, offset)
+        if event not in events or offset + record_header.size + events[event][2].size > end:
             break
-        rows[kind].append((time * unit, *kinds[kind][2].unpack_from(data, offset + head.size)))
-        offset += head.size + kinds[kind][2].size
+        rows[event].append((time * seconds_per_tick, *events[event][2].unpack_from(data, offset + record_header.size)))
+        offset += record_header.size + events[event][2].size
     if offset < end and not repairs:
         repairs.append(f"left out {end - offset} bytes at the end that are not a record")
-    times = Counter(variable for key, (_, variables, _) in kinds.items() if rows[key] for variable in variables)
+    n_streams = Counter(variable for key, (_, variables, _) in events.items() if rows[key] for variable in variables)
     streams = {}
-    for key, (name, variables, _) in kinds.items():
+    for key, (name, variables, _) in events.items():
         if rows[key]:
             table = np.array(rows[key], np.float64)
-            names = [x if times[x] == 1 else f"{name}.{x}" for x in variables]
+            names = [x if n_streams[x] == 1 else f"{name}.{x}" for x in variables]
             values = dict(zip(names, table.T[1:], strict=True))
             for x in [x for x in names if x.endswith(".quat") and _are_uint32(values[x])]:
                 attitude = decompress_quat(values[x].astype(np.uint32))
@@ -178,9 +178,9 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
             streams[name] = Stream(table[:, 0], values)
     if not streams:
         raise ConfigError(f"{path.name}: expected records, got none. Start the log before the flight.")
-    if wanted is not None:
-        streams = {key: x for key, x in streams.items() if set(wanted.names) & set(x.columns)} or streams
-    return resample(path.name, streams, repairs, wanted)
+    if columns is not None:
+        streams = {key: x for key, x in streams.items() if set(columns.names) & set(x.columns)} or streams
+    return resample(path.name, streams, repairs, columns)
 
 
 def _are_uint32(x: NDArray) -> bool:
@@ -205,15 +205,15 @@ def decompress_quat(packed: NDArray) -> NDArray:
     return quat
 
 
-def _read_kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
-    """Return name, variables and layout of each kind of record, and the offset of the first record, bytes."""
-    kinds, offset = {}, 5
+def _read_events(data: bytes, n_events: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
+    """Return name, variables and layout of each event, and the offset of the first record, bytes."""
+    events, offset = {}, 5
 
     def text(offset: int) -> tuple[str, int]:
         stop = data.index(0, offset)
         return data[offset:stop].decode(), stop + 1
 
-    for _ in range(n_kinds):
+    for _ in range(n_events):
         (key,) = struct.unpack_from("<H", data, offset)
         name, offset = text(offset + 2)
         (count,) = struct.unpack_from("<H", data, offset)
@@ -225,5 +225,5 @@ def _read_kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[st
                 raise struct.error(f"{entry[:60]!r} in place of one such as 'gyro.x(f)'")
             variables.append(match[1])
             layout += match[2]
-        kinds[key] = (name, variables, struct.Struct(layout))
-    return kinds, offset
+        events[key] = (name, variables, struct.Struct(layout))
+    return events, offset

@@ -48,7 +48,7 @@ class PolicyPilot:
         """Begin an episode in the simulation of the environment.
 
         Args:
-            env: Environment of the policy, without wrappers but those of images.
+            env: Environment of the policy; its wrappers may only add images.
             policy: Trained policy, or any function from observations to actions.
             points: Goals of every drone, one after another, world frame, m; None for the goal of the task. (n, 3)
             seed: Random seed of the episode.
@@ -96,14 +96,14 @@ class PolicyPilot:
     def reset(self, live: Live) -> None:
         """Begin the episode again after a reset, or take the goals of the time to which the loop went back.
 
-        The memory of a policy that has one begins anew in both cases.
+        The memory of the policy is reset in both cases.
         """
         self._memory = self._initial_memory
         if live.step == 0:
             live.sim.data = self._start
         if np.isfinite(self.goals).all():
             self.goals[:] = self._target(live.sim.data)
-        if self._points is not None:  # the goals of that time tell how many points had been passed
+        if self._points is not None:  # the goals of that time show how many points had been passed
             is_goal = np.isclose(self.goals[..., None, :], self._points, atol=1e-5).all(axis=-1)
             self._follows[:], self.passed[:] = is_goal.any(axis=-1), is_goal.argmax(axis=-1)
 
@@ -135,7 +135,7 @@ class PolicyPilot:
     def listen(self, live: Live, lines: Iterable[str]) -> threading.Thread:
         """Set goals of the selected drone that are typed, such as ``0.5 0 1.2``, and return the thread that reads them.
 
-        Lines that are no goals are logged, and change nothing.
+        Lines that are not goals are logged, and change nothing.
         """
 
         def read() -> None:
@@ -158,18 +158,18 @@ class PolicyPilot:
     def _go_to_text(self, live: Live, text: str) -> None:
         self.go_to(live, parse_point(text))
 
-    def _check_goal(self, pos: NDArray, place: str = "") -> None:
+    def _check_goal(self, pos: NDArray, prefix: str = "") -> None:
         """Check that a point can be a goal."""
         task = self.env.task
         if type(task).set_goal is Task.set_goal:
             raise ConfigError(
-                f"{place}expected a policy whose goals are positions, got one of {task.name!r}. Use a policy of hover."
+                f"{prefix}expected a policy whose goals are positions, got one of {task.name!r}. Use a policy of hover."
             )
         limits = np.array([task.half_width] * 2 + [task.height]) if isinstance(task, GoalTask) else np.full(3, np.inf)
         low = np.append(-limits[:2], FLOOR if self.arena else -np.inf)
         if pos.shape != (3,) or not np.isfinite(pos).all() or not ((low <= pos) & (pos <= limits)).all():
             arena_text = f" within the arena of {task.name!r}, {self.arena}" if self.arena else ""
-            raise ConfigError(f"{place}expected x y z, m,{arena_text}, got {' '.join(f'{x:g}' for x in pos.ravel())}")
+            raise ConfigError(f"{prefix}expected x y z, m,{arena_text}, got {' '.join(f'{x:g}' for x in pos.ravel())}")
 
     def _pass_points(self, live: Live) -> None:
         """Give drones that are close to their listed goal the next one."""
@@ -178,8 +178,8 @@ class PolicyPilot:
         is_near = self._follows & (distance < ARRIVAL_DISTANCE) & (self.passed < len(points))
         if is_near.any():
             self.passed += is_near
-            goes_on = is_near & (self.passed < len(points))
-            self.goals[goes_on] = points[self.passed[goes_on]]
+            has_next = is_near & (self.passed < len(points))
+            self.goals[has_next] = points[self.passed[has_next]]
             live.sim.data = self._set_goal(live.sim.data, self.goals)
 
 
@@ -190,19 +190,19 @@ def typed_lines() -> Iterator[str]:
         yield from lines
 
 
-def parse_point(text: str, place: str = "") -> NDArray:
+def parse_point(text: str, prefix: str = "") -> NDArray:
     """Return a point that is written as three numbers, m, separated by spaces or commas. (3,)
 
     Args:
         text: The numbers.
-        place: Beginning of the error message.
+        prefix: Beginning of the error message.
     """
     try:
         point = np.array([float(x) for x in re.split(r"[,;\s]+", text.strip())])
     except ValueError:
         point = np.zeros(0)
     if point.shape != (3,):
-        raise ConfigError(f"{place}expected x y z, m, got {text.strip()[:60]!r}. Write for example 0.5 0 1.2.")
+        raise ConfigError(f"{prefix}expected x y z, m, got {text.strip()[:60]!r}. Write for example 0.5 0 1.2.")
     return point
 
 

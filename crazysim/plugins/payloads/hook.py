@@ -143,9 +143,9 @@ class Hook(CollidingPlugin, Plugin):
         )
         free_rate = load.vel if dt is None else load.vel + dt * fall_acc
         rates = {
-            "tip_pos": motion.rate,
+            "tip_pos": motion.pos_rate,
             "tip_vel": motion.acc,
-            "pos": jnp.where(load.attached, motion.rate, free_rate),
+            "pos": jnp.where(load.attached, motion.pos_rate, free_rate),
             "vel": jnp.where(load.attached, motion.acc, fall_acc),
         }
         return motion.deriv.replace(plugins=deriv.plugins | {self.name: rates})

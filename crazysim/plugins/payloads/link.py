@@ -94,8 +94,8 @@ class LinkedMotion(NamedTuple):
 
     deriv: SimStateDeriv
     """Derivative of the body under the reaction of the link."""
-    rate: Array
-    """Rate of the tip's position, m/s. (3,)"""
+    pos_rate: Array
+    """Rate of the position of the tip, m/s: its velocity and the correction of its distance. (3,)"""
     acc: Array
     """Acceleration of the tip, m/s^2. (3,)"""
 
@@ -179,26 +179,26 @@ def couple_bodies(
         tensions = [jnp.where(link.is_attached, t, 0.0) for t in tensions]
     damping = None
     if link.damping is not None:  # it pulls against the swing across the link
-        rate, swing = _damping_rate(link, dt, freq), _swing_velocities(state, geometry)[1]
-        damping = rate * swing
-        tensions[0] = tensions[0] - rate * radial_speed
+        damping_rate, swing = _damping_rate(link, dt, freq), _swing_velocities(state, geometry)[1]
+        damping = damping_rate * swing
+        tensions[0] = tensions[0] - damping_rate * radial_speed
     parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
     pull = sum(parts[1:], parts[0])
     # Constants are multiplied first, which is then done once, and the rest are multiply-adds.
-    mass_ratio, rates = m / mass, deriv
+    mass_ratio, new_deriv = m / mass, deriv
     if damping is not None:
         pull = pull + damping
-        # All that pulls at the tip turns the body as if it were part of it: along the link no force has another lever.
+        # A force on the tip turns the body as if the tip were part of it: a force along the link has the same lever.
         torque = to_body_frame(geometry.rot, cross(pos - state.pos, pull))
-        rates = _with_torque(deriv, m * J_inv, torque, dt)
+        new_deriv = _with_torque(deriv, m * J_inv, torque, dt)
     elif any(p.ang_acc is not None for p in pulls):
         angular_terms = [m * t * p.ang_acc for t, p in zip(tensions, pulls, strict=True) if p.ang_acc is not None]
-        rates = _with_torque(deriv, None, sum(angular_terms[1:], angular_terms[0]), dt)
+        new_deriv = _with_torque(deriv, None, sum(angular_terms[1:], angular_terms[0]), dt)
     tip_acc = free_acc - pull
-    new_deriv = rates.replace(acc=deriv.acc + mass_ratio * pull)
+    new_deriv = new_deriv.replace(acc=deriv.acc + mass_ratio * pull)
     new_deriv = new_deriv if dt is None else new_deriv.replace(vel=deriv.vel + dt * mass_ratio * pull)
-    rate = _tip_rate(state, deriv, geometry, link, vel, tip_acc, attach_acc, dt, freq)
-    return LinkedMotion(new_deriv, rate, tip_acc)
+    pos_rate = _tip_pos_rate(state, deriv, geometry, link, vel, tip_acc, attach_acc, dt, freq)
+    return LinkedMotion(new_deriv, pos_rate, tip_acc)
 
 
 def _with_torque(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
@@ -298,7 +298,7 @@ def _hinge_pull(
     return pull, dot(y, rel_acc - turning_acc + (1.0 if dt is None else 0.5) * coriolis) + correction
 
 
-def _tip_rate(
+def _tip_pos_rate(
     state: SimState, deriv: SimStateDeriv, geometry: LinkGeometry, link: LinkParams, vel: Array, tip_acc: Array,
     attach_acc: Array, dt: float | None, freq: int,
 ) -> Array:  # fmt: skip
@@ -306,21 +306,21 @@ def _tip_rate(
     is_attached, stretch = link.is_attached, geometry.distance - link.length
     if link.is_cable:
         stretch = jnp.where(stretch > -TAUT_BAND * link.length, stretch, 0.0)
-    share = freq if dt is not None else correction_rate(freq)
-    share = share if is_attached is None else jnp.where(is_attached, share, 0.0)
-    rate = vel if dt is None else vel + dt * tip_acc  # as the integrator has it: computed once
-    rate = rate - share * stretch * geometry.direction
+    correction = freq if dt is not None else correction_rate(freq)
+    correction = correction if is_attached is None else jnp.where(is_attached, correction, 0.0)
+    pos_rate = vel if dt is None else vel + dt * tip_acc  # as the integrator has it: computed once
+    pos_rate = pos_rate - correction * stretch * geometry.direction
     if link.is_hinge:
-        rate = rate - share * dot(geometry.rot[..., 1], geometry.offset) * geometry.rot[..., 1]
+        pos_rate = pos_rate - correction * dot(geometry.rot[..., 1], geometry.offset) * geometry.rot[..., 1]
     if dt is None:
-        return rate
+        return pos_rate
     # ``deriv.vel`` moves the body; the tip moves with its new velocity relative to that.
     attach_motion = attach_acc
     if deriv.vel is not state.vel:  # it is the new velocity of the body
         attach_motion = attach_motion - deriv.acc
         if link.attach is not None:
             attach_motion = attach_motion - matvec(geometry.rot, cross(deriv.ang_acc, link.attach))
-    return rate - (dt if is_attached is None else jnp.where(is_attached, dt, 0.0)) * attach_motion
+    return pos_rate - (dt if is_attached is None else jnp.where(is_attached, dt, 0.0)) * attach_motion
 
 
 def end_relative_motion(

@@ -222,22 +222,25 @@ def add_to_scene(
         ring: Height of the loads' rings above their middles, m, for links that end in a hook; None for others.
     """
     rgba = as_rgba((0.85, 0.55, 0.2, 1.0) if rgba is None else rgba)
-    half = np.full(3, size, float) if np.ndim(size) == 0 else np.asarray(size, float) / 2
-    kind = "sphere" if np.ndim(size) == 0 else "box"
-    body = f'<geom type="{kind}" size="{_join_numbers(half)}" {DRONE_TOUCH_ATTRIBUTES} rgba="{_join_numbers(rgba)}"/>'
+    half_size = np.full(3, size, float) if np.ndim(size) == 0 else np.asarray(size, float) / 2
+    geom_type = "sphere" if np.ndim(size) == 0 else "box"
+    shape = f'type="{geom_type}" size="{_join_numbers(half_size)}" rgba="{_join_numbers(rgba)}"'
+    load_xml = f"<geom {shape} {DRONE_TOUCH_ATTRIBUTES}/>"
     shank = 0.0 if ring is None else HOOK_OUTLINE[0][1]
-    link = _rod_xml((0, 0, -length / n_pieces / 2), (0, 0, length / n_pieces / 2 + shank), LINK_RADIUS, DARK)
-    kinds = [(body, name, n_loads), (link, f"{name}_link", sim.n_drones * n_pieces)]
+    link_xml = _rod_xml((0, 0, -length / n_pieces / 2), (0, 0, length / n_pieces / 2 + shank), LINK_RADIUS, DARK)
+    objects = [(load_xml, name, n_loads), (link_xml, f"{name}_link", sim.n_drones * n_pieces)]
     if ring is not None:
-        ends = [(side * half[0], 0, 0 if kind == "sphere" else half[2]) for side in (-1, 1)]
-        body += "".join(_rod_xml(end, (0, 0, ring), WIRE_RADIUS, STEEL) for end in ends)
-        head = f'<geom type="sphere" pos="0 0 {HEAD_HEIGHT}" size="{HEAD_RADIUS}" group="3" {DRONE_TOUCH_ATTRIBUTES}/>'
-        head += "".join(
+        wire_ends = [(side * half_size[0], 0, 0 if geom_type == "sphere" else half_size[2]) for side in (-1, 1)]
+        load_xml += "".join(_rod_xml(end, (0, 0, ring), WIRE_RADIUS, STEEL) for end in wire_ends)
+        hook_xml = (
+            f'<geom type="sphere" pos="0 0 {HEAD_HEIGHT}" size="{HEAD_RADIUS}" group="3" {DRONE_TOUCH_ATTRIBUTES}/>'
+        )
+        hook_xml += "".join(
             _rod_xml((x, 0, -z), (x_2, 0, -z_2), HOOK_RADIUS, YELLOW) for (x, z), (x_2, z_2) in pairwise(HOOK_OUTLINE)
         )
-        kinds = [(body, name, n_loads), kinds[1], (head, f"{name}_hook", n_loads)]
-    for text, kind, count in kinds:
-        sim.scene.add_once(f"<mujoco><worldbody>{text}</worldbody></mujoco>", kind, count)
+        objects = [(load_xml, name, n_loads), objects[1], (hook_xml, f"{name}_hook", n_loads)]
+    for xml, object_name, count in objects:
+        sim.scene.add_once(f"<mujoco><worldbody>{xml}</worldbody></mujoco>", object_name, count)
 
 
 def _rod_xml(start: Iterable[float], end: Iterable[float], radius: float, rgba: Iterable[float]) -> str:
@@ -262,14 +265,13 @@ def link_pieces(top: Array, offset: Array, length: Array, n: int) -> tuple[Array
     Returns:
         Positions (k n, 3), attitudes, xyzw (k n, 4).
     """
-    span = rotation.safe_norm(offset)
+    distance = rotation.safe_norm(offset)
     # Length of a flat parabola of sag d over a span b: b + 8 d^2 / (3 b).
-    sag = (
-        rotation.safe_sqrt(0.375 * jnp.maximum(length - span, 0.0) * jnp.maximum(span, 0.1 * length)) if n > 1 else 0.0
-    )
-    share = jnp.linspace(0.0, 1.0, n + 1)[:, None, None]
+    excess = jnp.maximum(length - distance, 0.0)
+    sag = rotation.safe_sqrt(0.375 * excess * jnp.maximum(distance, 0.1 * length)) if n > 1 else 0.0
+    fraction = jnp.linspace(0.0, 1.0, n + 1)[:, None, None]
     downwards = jnp.asarray([0.0, 0.0, -1.0], top.dtype)
-    nodes = top + share * offset + 4 * share * (1 - share) * sag * downwards
+    nodes = top + fraction * offset + 4 * fraction * (1 - fraction) * sag * downwards
     centre, axis = (nodes[1:] + nodes[:-1]) / 2, nodes[1:] - nodes[:-1]
     return tuple(jnp.swapaxes(x, 0, 1).reshape(-1, x.shape[-1]) for x in (centre, rotation_from_z(axis)))  # type: ignore[return-value]
 

@@ -94,7 +94,7 @@ class SlungLoad(PointLoad, Plugin):
             dt,
             data.core.freq,
         )
-        rates = {"pos": motion.rate, "vel": motion.acc}
+        rates = {"pos": motion.pos_rate, "vel": motion.acc}
         return motion.deriv.replace(plugins=deriv.plugins | {self.name: rates})
 
     def become_taut(self, data: SimData) -> SimData:
@@ -114,12 +114,12 @@ class SlungLoad(PointLoad, Plugin):
         """
         load, mask = self.read(data), as_mask(mask, data.core.steps.shape[:1])
         pos, vel = hanging_state(data.states, load.attach, load.length, load.clearance, self.cable)
-        new = load.replace(
+        new_load = load.replace(
             pos=select_worlds(mask, pos, load.pos),
             vel=select_worlds(mask, vel, load.vel),
             attached=select_worlds(mask, jnp.ones_like(load.attached), load.attached),
         )
-        return self.write(data, new)
+        return self.write(data, new_load)
 
     def move_objects(self, data: SimData) -> Objects:
         if not self.in_scene:
@@ -148,7 +148,7 @@ class SlungLoad(PointLoad, Plugin):
 def load_record(
     plugin: Plugin,
     sim: Simulation,
-    kind: type[L],
+    record_type: type[L],
     is_cable: bool,
     clearance: float,
     ring: float | None = None,
@@ -159,7 +159,7 @@ def load_record(
     Args:
         plugin: The plugin.
         sim: Simulation.
-        kind: Class of the record.
+        record_type: Class of the record.
         is_cable: True for cables.
         clearance: Height of a load's position above the floor where it rests, m.
         ring: Height of the ring above the middle of the load, m, by which a hook holds it; None without a hook.
@@ -168,7 +168,7 @@ def load_record(
     height_at_rest, states = check_parameter(sim, "size", clearance, low=0.0), sim.data.states
     attached = device_array(np.ones(states.pos.shape[:2]), bool)
     fields |= {} if is_cable else {"restitution": None}
-    load = plugin.fill_record(sim, kind, clearance=height_at_rest, attached=attached, **fields)
+    load = plugin.fill_record(sim, record_type, clearance=height_at_rest, attached=attached, **fields)
     # A setting that is zero everywhere becomes None and is not computed.
     optional_names = [name for name in ("attach", "damping", "restitution", "drag") if getattr(load, name) is not None]
     load = load.replace(**{name: None for name in optional_names if not np.any(np.asarray(getattr(load, name)))})

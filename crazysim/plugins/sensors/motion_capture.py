@@ -23,7 +23,7 @@ class MotionCaptureData(PyTree):
 
     samples: Samples
     """Measurements."""
-    last: Array = leaf("drone", 1, (3,))
+    last_pos: Array = leaf("drone", 1, (3,))
     """Last measured position, world frame, m. (n_worlds, n_drones, 3)"""
     vel: Array = leaf("drone", 1, (3,))
     """Low-pass filtered difference quotient of the positions, world frame, m/s. (n_worlds, n_drones, 3)"""
@@ -77,7 +77,7 @@ class MotionCapture(Sensor):
 
     def reset_episode(self, data: SimData) -> SimData:
         pos, vel = jnp.split(self.ideal(data), (7,))
-        return self.write(data, self.read(data).replace(last=pos[:3] - self.interval(data) * vel, vel=vel))
+        return self.write(data, self.read(data).replace(last_pos=pos[:3] - self.interval(data) * vel, vel=vel))
 
     def measure(self, data: SimData, record: MotionCaptureData, key: Array) -> tuple[Array, MotionCaptureData]:
         truth, dt = self.ideal(data), self.interval(data)
@@ -86,9 +86,9 @@ class MotionCapture(Sensor):
         half_rotvec = 0.5 * record.angle_noise * noise[3:]
         quat = rotation.multiply(truth[3:7], jnp.concatenate([half_rotvec, jnp.ones_like(half_rotvec[:1])]))
         quat = quat / jnp.sqrt(rotation.dot(quat, quat))
-        vel = (pos - record.last) / dt
+        vel = (pos - record.last_pos) / dt
         vel = record.vel + (1 - jnp.exp(-2 * math.pi * dt * record.bandwidth)) * (vel - record.vel)
-        return jnp.concatenate([pos, quat, vel]), record.replace(last=pos, vel=vel)
+        return jnp.concatenate([pos, quat, vel]), record.replace(last_pos=pos, vel=vel)
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
         """Return position, attitude and velocity, as if the tracked body were the drone's frame."""

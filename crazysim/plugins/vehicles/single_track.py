@@ -95,7 +95,7 @@ def single_track(state: CarState, command: Array, params: CarParams, push: Array
     return state_rates(state, acc, torque / p.yaw_inertia, steer_rate(state, command, p), p)
 
 
-def state_rates(state: CarState, acc: Array, yaw_acc: Array, steer: Array, params: CarParams) -> CarState:
+def state_rates(state: CarState, acc: Array, yaw_acc: Array, steer_vel: Array, params: CarParams) -> CarState:
     """Return the derivative of a state from rates of velocities, (..., 2), yaw rate and steering angle. (..., 1)"""
     vel = to_world_frame(state.yaw, state.body_vel)
     return CarState(
@@ -103,7 +103,7 @@ def state_rates(state: CarState, acc: Array, yaw_acc: Array, steer: Array, param
         yaw=state.yaw_rate,
         body_vel=acc,
         yaw_rate=yaw_acc,
-        steer=steer,
+        steer=steer_vel,
         distance=state.body_vel[..., :1],
         joints=None if state.joints is None else trailer_rates(state, params),
     )
