@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, RotorJet, SharedLoad, SlungLoad
+    from crazysim.plugins.scenery import Forest
     from crazysim.plugins.sensors.camera import Camera
     from crazysim.plugins.sensors.imu import IMU
     from crazysim.plugins.sensors.motion_capture import MotionCapture
@@ -72,6 +73,7 @@ __all__ = [
     "DroneCollisions",
     "Dynamics",
     "Follow",
+    "Forest",
     "FreeBodies",
     "GroundEffect",
     "Hook",
@@ -123,6 +125,7 @@ __getattr__ = lazy(
         "DroneCollisions": "crazysim.plugins.contacts.drone_collisions",
         "ESKF": "crazysim.plugins.estimators.eskf",
         "Follow": "crazysim.plugins.follow",
+        "Forest": "crazysim.plugins.scenery",
         "FreeBodies": "crazysim.plugins.bodies",
         "functional": "crazysim.core",
         "GroundEffect": "crazysim.plugins.effects",

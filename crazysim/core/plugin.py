@@ -213,7 +213,7 @@ class Plugin:
 
     @property
     def scope(self) -> str:
-        """Scope of the plugin's own states, and of the data that ``derivative`` is written for."""
+        """Scope of the plugin's own states, and of the data that ``derivative`` and ``reset_episode`` take."""
         return "drone"
 
     @property
@@ -270,10 +270,10 @@ class Plugin:
         return ()
 
     def reset_episode(self, data: SimData) -> SimData:
-        """Return the data of one drone at the beginning of an episode.
+        """Return the data of one drone, or of ``scope``, at the beginning of an episode.
 
-        It may write leaves of drones, such as what is drawn for an episode. It is called at resets, and in the first
-        step of worlds that were not reset, before all other stages and with the same random numbers; with
+        It may write leaves of that scope, such as what is drawn for an episode. It is called at resets, and in the
+        first step of worlds that were not reset, before all other stages and with the same random numbers; with
         ``reset_before`` in every first step instead, in front of that stage.
         """
         return data

@@ -19,6 +19,9 @@ from jax import Array
 from crazysim.core.data import SimData, as_key
 from crazysim.jaxcompat import bits_generator, threefry2x32_p, threefry_prng_impl
 
+STRIDE = np.uint32(0x9E3779B9)
+"""2^32 divided by the golden ratio: its multiples modulo 2^32 are evenly distributed."""
+
 
 def seed_sim(data: SimData, seed: int | Array, device: jax.Device | None = None) -> SimData:
     """Return the data with another seed or key for all random numbers drawn from now on.
@@ -107,6 +110,30 @@ def uniform(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array
     """Return numbers from zero to below one, (*shape), at half the cost of ``jax.random.uniform``; see ``normal``."""
     fractions = _fractions(key, shape, dtype)
     return jax.random.uniform(key, shape, dtype) if fractions is None else fractions
+
+
+def uniform_at(words: Array, index: Array | np.ndarray, dtype: Any = jnp.float32) -> Array:
+    """Return the random numbers with some indices of a stream, in steps of 2^-24 from zero to below one.
+
+    Any number of the stream follows from its index alone, for functions that read few numbers of a long stream. Two
+    rounds of an integer hash with good avalanche (Wellons 2018, "Prospecting for hash functions", with the later
+    constants 21f0aaad, d35a2d97) make each: a twentieth of the arithmetic of JAX's generator.
+
+    Args:
+        words: Two words of a key, uint32. (..., 2)
+        index: Indices, integers; they broadcast with the leading axes of ``words``. (...)
+        dtype: Type of the numbers.
+    """
+    with np.errstate(over="ignore"):
+        bits = mix_bits(mix_bits(words[..., 0] + index.astype(np.uint32) * STRIDE) ^ words[..., 1])
+    return (bits >> 8).astype(dtype) * 2.0**-24
+
+
+def mix_bits(x: Array) -> Array:
+    """Return a hashed 32-bit number: every bit depends on every bit of the input; see ``uniform_at``."""
+    x = (x ^ (x >> 16)) * np.uint32(0x21F0AAAD)
+    x = (x ^ (x >> 15)) * np.uint32(0xD35A2D97)
+    return x ^ (x >> 15)
 
 
 def _fractions(key: Array, shape: Sequence[int], dtype: Any) -> Array | None:

@@ -16,6 +16,7 @@ from crazysim.core.sharding import fetch
 from crazysim.core.stage import Axes, Stage, world_function
 from crazysim.core.stages import reset
 from crazysim.pytree import has_members, leaf_indices, map_batched, n_batch_axes, n_world_axes, scopes
+from crazysim.scene.object_poses import moving_plugins
 from crazysim.sim.sim import Sim
 
 
@@ -39,7 +40,10 @@ class EpisodeReset:
             self.batched_reason = f"{', '.join(map(repr, names))} of the reset pipeline takes all worlds at once"
         elif any(n_batch_axes(kind) == 2 and x.shape[0] > 1 and i != world_id for kind, x, i in rows):
             self.batched_reason = "episodes begin from different data in different worlds"
-        self.reset_data = _reset_all(sim) if self.takes_all_worlds else _reset_world([fn for _, fn in other_stages])
+        movable = () if sim.data.objects is None else sim.data.objects.names
+        keep_objects = len(moving_plugins(sim.plugins.values(), movable)) == len(movable)
+        stages = [fn for _, fn in other_stages]
+        self.reset_data = _reset_all(sim) if self.takes_all_worlds else _reset_world(stages, keep_objects)
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``takes_all_worlds``."""
 
     def make_default(self, data: SimData) -> SimData:
@@ -71,11 +75,17 @@ def _reset_all(sim: Sim) -> Callable[[SimData, SimData], SimData]:
     return lambda data, default: reset_all(data, default, worlds)
 
 
-def _reset_world(stages: Sequence[Any]) -> Callable[[SimData, SimData], SimData]:
-    """Return a function that resets one world and applies stages of the reset pipeline to it."""
+def _reset_world(stages: Sequence[Any], keep_objects: bool) -> Callable[[SimData, SimData], SimData]:
+    """Return a function that resets one world and applies stages of the reset pipeline to it.
+
+    Args:
+        stages: The stages.
+        keep_objects: True if plugins move all objects. Their poses in the data are not read then, and a kernel that
+            resets hundreds of them would take a minute to compile.
+    """
 
     def reset_one(data: SimData, default: SimData) -> SimData:
-        data = reset_world(data, default)
+        data = reset_world(data, default.replace(objects=data.objects) if keep_objects else default)
         axes = Axes(data)  # a wrapper may have given each drone its own parameters
         for stage in stages:
             data = world_function(stage, axes)(data)

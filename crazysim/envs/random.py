@@ -2,8 +2,7 @@
 
 All worlds draw the numbers of a new episode in every step, although few begin one, and a million worlds with twenty
 numbers each must cost less than the physics. JAX's generator is a cipher of twenty rounds; here two rounds of an
-integer hash with good avalanche (Wellons 2018, "Prospecting for hash functions", with the later constants 21f0aaad,
-d35a2d97) mix seed, world and episode.
+integer hash, ``core.random.mix_bits``, mix seed, world and episode.
 """
 
 from __future__ import annotations
@@ -17,11 +16,8 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.random import seed_key
+from crazysim.core.random import STRIDE, mix_bits, seed_key, uniform_at
 from crazysim.errors import ConfigError, short_repr
-
-STRIDE = np.uint32(0x9E3779B9)
-"""2^32 divided by the golden ratio: its multiples modulo 2^32 are evenly distributed."""
 
 
 def as_seed(seed: object) -> int | None:
@@ -49,10 +45,10 @@ def episode_key(data: SimData, name: str) -> Array:
     core = data.core
     seed = jax.random.key_data(seed_key(data)).astype(jnp.uint32)
     world, episode = core.world_id.astype(jnp.uint32), core.episode.astype(jnp.uint32)
-    hash_1 = _mix(seed[0] ^ np.uint32(zlib.crc32(name.encode())))
-    hash_2 = _mix(seed[1] + hash_1)
-    mixed = _mix(_mix(hash_1 + world * STRIDE) ^ (hash_2 + episode * STRIDE))
-    return jax.random.wrap_key_data(jnp.stack([mixed, _mix(mixed ^ hash_2)], axis=-1), impl="threefry2x32")
+    hash_1 = mix_bits(seed[0] ^ np.uint32(zlib.crc32(name.encode())))
+    hash_2 = mix_bits(seed[1] + hash_1)
+    mixed = mix_bits(mix_bits(hash_1 + world * STRIDE) ^ (hash_2 + episode * STRIDE))
+    return jax.random.wrap_key_data(jnp.stack([mixed, mix_bits(mixed ^ hash_2)], axis=-1), impl="threefry2x32")
 
 
 def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
@@ -71,9 +67,7 @@ def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
     """
     words = jax.random.key_data(key).astype(jnp.uint32)
     count = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
-    with np.errstate(over="ignore"):
-        bits = _mix(_mix(words[0] + count * STRIDE) ^ words[1])
-    x = (bits >> 8).astype(jnp.zeros(()).dtype) * 2.0**-24
+    x = uniform_at(words, count, jnp.zeros(()).dtype)
     return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
 
 
@@ -105,10 +99,3 @@ def scale_to(x: Array, low: Any, high: Any) -> Array:
 def scale_symmetric(x: Array, limit: Any) -> Array:
     """Return numbers in [0, 1) scaled to the range from ``-limit`` to ``limit``. (...)"""
     return scale_to(x, -jnp.asarray(limit, x.dtype), limit)
-
-
-def _mix(x: Array) -> Array:
-    """Return a hashed 32-bit number: every bit depends on every bit of the input."""
-    x = (x ^ (x >> 16)) * np.uint32(0x21F0AAAD)
-    x = (x ^ (x >> 15)) * np.uint32(0xD35A2D97)
-    return x ^ (x >> 15)

@@ -92,7 +92,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
             resets = dict(self._sim.reset_pipeline)
             if _in_reset_pipeline(plugin):
-                append_fn(resets, Stage(plugin.reset_episode, "drone"), name)
+                append_fn(resets, Stage(plugin.reset_episode, plugin.scope), name)
             self._put_records(name, record, default)
             self._installed[name] = installed
             self._build(pipeline, resets)
@@ -138,7 +138,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
         resets = dict(self._sim.reset_pipeline)
         if _in_reset_pipeline(plugin) and (name in resets or not _in_reset_pipeline(before)):
-            resets[name] = Stage(plugin.reset_episode, "drone")
+            resets[name] = Stage(plugin.reset_episode, plugin.scope)
         elif _in_reset_pipeline(before):
             resets.pop(name, None)
         self._put_records(name, _continue_states(record, old_record), default)
@@ -280,7 +280,7 @@ def _placements(plugin: Plugin, sim: Simulation) -> object:
     placements = plugin.stages(sim)
     if not plugin.resets_episode or not isinstance(placements, (list, tuple)):
         return placements
-    episode_stage = Stage(plugin.reset_episode, "drone", is_first_step)
+    episode_stage = Stage(plugin.reset_episode, plugin.scope, is_first_step)
     before = plugin.reset_before
     if before is None:  # in front of all stages that do not begin an episode
         before = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not is_first_step)

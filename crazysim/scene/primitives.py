@@ -1,4 +1,4 @@
-"""Primitive objects: a gate, a box, a sphere, a pole, a wall, a landing pad."""
+"""Primitive objects: a gate, a box, a sphere, a pole, a cylinder, a wall, a landing pad."""
 
 from __future__ import annotations
 
@@ -62,6 +62,11 @@ def pole(height: float = 1.6, radius: float = 0.015) -> Geoms:
     return [{"type": "capsule", "size": (radius, half), "pos": (0, 0, height / 2)}]
 
 
+def cylinder(height: float = 1.6, radius: float = 0.1) -> Geoms:
+    """Return an upright cylinder, with its origin in the middle of its foot."""
+    return [{"type": "cylinder", "size": (radius, height / 2), "pos": (0, 0, height / 2)}]
+
+
 def wall(length: float = 2.0, height: float = 2.0, thickness: float = 0.05) -> Geoms:
     """Return a wall along y, with its origin in the middle of its foot."""
     return [_box((0, 0, height / 2), (thickness / 2, length / 2, height / 2))]
@@ -80,6 +85,7 @@ PRIMITIVES: dict[str, tuple[Callable[..., Geoms], tuple[float, ...]]] = {
     "gate": (gate, (0.85, 0.35, 0.10, 1)),
     "box": (box, (0.75, 0.30, 0.25, 1)),
     "pole": (pole, (0.80, 0.25, 0.30, 1)),
+    "cylinder": (cylinder, (0.45, 0.32, 0.22, 1)),
     "sphere": (sphere, (0.30, 0.45, 0.75, 1)),
     "wall": (wall, (0.70, 0.70, 0.68, 1)),
     "landing_pad": (landing_pad, (0.25, 0.55, 0.40, 1)),

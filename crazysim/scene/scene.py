@@ -110,8 +110,8 @@ class Scene:
         The scene is compiled at its next use, once for all objects that were added since the last compilation.
 
         Args:
-            source: ``"gate"``, ``"box"``, ``"pole"``, ``"sphere"``, ``"wall"`` or ``"landing_pad"``; or the path of an
-                MJCF file, MJCF text, an ``MjSpec``, or a body of one.
+            source: ``"gate"``, ``"box"``, ``"pole"``, ``"cylinder"``, ``"sphere"``, ``"wall"`` or ``"landing_pad"``; or
+                the path of an MJCF file, MJCF text, an ``MjSpec``, or a body of one.
             name: Prefix of the bodies' names ``name:0``, ``name:1``, ...; None for the name of the primitive or file.
             count: Number of objects.
             pos: Initial positions in every world, world frame, m. (3,), (count, 3) or (n_worlds, count, 3)
@@ -161,8 +161,11 @@ class Scene:
             name = Path(source).stem if isinstance(source, (str, Path)) else "map"
         return self.add(spec, name, mocap=False)
 
-    def add_once(self, source: Source, name: str, count: int) -> None:
-        """Add ``count`` objects unless they exist: objects of a plugin stay when it is removed or replaced."""
+    def add_once(self, source: Source, name: str, count: int, **options: Any) -> None:
+        """Add ``count`` objects unless they exist: objects of a plugin stay when it is removed or replaced.
+
+        ``options`` are those of ``add``.
+        """
         n_existing = self.added.count_objects(name)
         if n_existing not in (0, count):
             raise ConfigError(
@@ -170,7 +173,7 @@ class Scene:
                 f"there when a plugin is removed. Use another name=, or a new simulation."
             )
         if not n_existing:
-            self.add(source, name, count=count)
+            self.add(source, name, count=count, **options)
 
     @contextlib.contextmanager
     def unchanged_on_error(self) -> Iterator[None]:

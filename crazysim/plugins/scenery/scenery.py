@@ -1,0 +1,164 @@
+"""Base of layouts of obstacles that differ between worlds and episodes.
+
+A layout is not stored: the pose of every obstacle follows from two random words of the world by ``uniform_at``. So the
+record of a world has three numbers, whatever the number of obstacles, and a drone that looks for the obstacles around
+it computes the poses of those alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.core.data import Objects, SimData
+from crazysim.core.plugin import Plugin, Simulation, parameter
+from crazysim.core.random import uniform_at, world_key
+from crazysim.core.settings import setting
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, device_array, leaf
+
+HIDDEN_DEPTH = 100.0
+"""Depth below their places of obstacles that a layout leaves out, m."""
+MAX_OBSTACLES = 10_000
+"""Largest number of obstacles of a layout."""
+DIFFICULTY_INDEX = np.uint32(2**32 - 1)
+"""Index of the number of a world's stream that draws its difficulty."""
+
+
+class SceneryData(PyTree):
+    """Random words and difficulty of the layout of each world."""
+
+    words: Array = leaf("world", 1, (2,))
+    """Words from which the layout follows, uint32. (n_worlds, 1, 2)"""
+    difficulty: Array = leaf("world", 0)
+    """Difficulty, 0 to 1. (n_worlds, 1)"""
+    difficulty_range: Array = leaf("shared", 1)
+    """Lowest and highest difficulty that is drawn. (2,)"""
+
+    def uniform(self, index: Array | np.ndarray) -> Array:
+        """Return random numbers of the layout, from 0 to below 1, by their indices. (...)"""
+        return uniform_at(self.words, index, self.difficulty.dtype)
+
+
+class Model(NamedTuple):
+    """Obstacles of one shape."""
+
+    source: str
+    """Name of a primitive, or MJCF."""
+    options: Mapping[str, Any]
+    """Settings of the primitive."""
+    pos: np.ndarray
+    """Middles of the regions of the obstacles, m: their positions until a layout is drawn. (n, 3)"""
+
+
+class Scenery(Plugin):
+    """Base class of layouts of obstacles, drawn again in every world at every reset.
+
+    A subclass defines ``models`` and ``poses``. Tasks call ``place`` where an episode starts.
+    """
+
+    difficulty: ArrayLike = parameter(default=1.0, low=0.0, high=1.0, shapes=((), (2,)))
+    """Difficulty, 0 to 1, or its range, lowest and highest, within which every world draws one at its resets. ()
+    or (2,)"""
+    free: ArrayLike = setting(default=((0.0, 0.0, 1.0),), shapes=(("any", 3),))
+    """Discs that stay free of obstacles, x, y and radius, m. (n, 3)"""
+    name: str = "scenery"
+
+    @property
+    def scope(self) -> str:
+        return "world"
+
+    @property
+    def moved_kinds(self) -> tuple[str, ...]:
+        return tuple(f"{self.name}_{k}" for k in range(len(self.models())))
+
+    def models(self) -> Sequence[Model]:
+        """Return the obstacles by shape."""
+        raise NotImplementedError
+
+    def poses(self, data: SimData) -> tuple[Array, Array]:
+        """Return the positions, m, and attitudes, xyzw, of the bodies of all obstacles, in the order of ``models``.
+
+        Args:
+            data: All worlds, or one world.
+
+        Returns:
+            (n_worlds, n, 3) and (n_worlds, n, 4), without n_worlds in one world
+        """
+        raise NotImplementedError
+
+    def clearance(self, data: SimData, pos: Array) -> Array:
+        """Return the distance from points to the surface of the nearest obstacle, m, negative inside. (...)
+
+        Args:
+            data: All worlds, one world, or one drone.
+            pos: Points, world frame, m: (n_worlds, n, 3), without n_worlds in one world, or (3,) for one drone.
+        """
+        raise NotImplementedError
+
+    def place(self, data: SimData, key: Array, difficulty: Array | None = None) -> SimData:
+        """Return the data of one world with another layout. Pure; tasks call it in ``spawn``.
+
+        Args:
+            data: One world.
+            key: Random key. ()
+            difficulty: Difficulty, 0 to 1; None to draw it from the range of the setting. ()
+        """
+        record = self.read(data)
+        record = record.replace(words=jax.random.key_data(key)[:2].astype(jnp.uint32))
+        if difficulty is None:
+            low, high = record.difficulty_range
+            difficulty = low + (high - low) * record.uniform(DIFFICULTY_INDEX)
+        return self.write(data, record.replace(difficulty=jnp.asarray(difficulty, record.difficulty.dtype)))
+
+    def record(self, sim: Simulation) -> SceneryData:
+        models = self.models()
+        n = sum(len(model.pos) for model in models)
+        if n > MAX_OBSTACLES:
+            raise ConfigError(
+                f"expected at most {MAX_OBSTACLES} obstacles in {type(self).__name__}, got {n}. Use a smaller size, or "
+                f"a lower density."
+            )
+        for before in sim.scene.plugins():
+            if before.name == self.name and isinstance(before, Scenery) and repr(before.models()) != repr(models):
+                raise ConfigError(
+                    f"expected the obstacles of {self.name!r} as they are in the scene, where they stay, got others. "
+                    f"sim.replace can change difficulty=; use another name=, or a new simulation, for the rest."
+                )
+        for kind, model in zip(self.moved_kinds, models, strict=True):
+            sim.scene.add_once(model.source, kind, len(model.pos), pos=model.pos, **model.options)
+        low_high = np.broadcast_to(np.asarray(self.difficulty, np.float64), 2)
+        if low_high[0] > low_high[1]:
+            raise ConfigError(f"expected a range of difficulty, lowest first, got {self.difficulty!r}")
+        return SceneryData(
+            words=device_array(np.zeros((sim.n_worlds, 1, 2)), np.uint32),
+            difficulty=device_array(np.full((sim.n_worlds, 1), low_high[1])),
+            difficulty_range=device_array(low_high),
+        )
+
+    def reset_episode(self, data: SimData) -> SimData:
+        return self.place(data, world_key(data, self.name))
+
+    def move_objects(self, data: SimData) -> Objects:
+        objects: Any = data.objects
+        pos, quat = self.poses(data)
+        start = objects.names.index(f"{self.moved_kinds[0]}:0")
+        end = start + pos.shape[0]
+        rows = {
+            name: jnp.concatenate([old[:start], new.astype(old.dtype), old[end:]])
+            for name, old, new in (("pos", objects.pos, pos), ("quat", objects.quat, quat))
+        }
+        return objects.replace(**rows)
+
+    def is_free(self, x: Array, y: Array, radius: Array | float) -> Array:
+        """Return True for circles of a radius around points that do not meet the discs of ``free``. (...)"""
+        free = jnp.ones(jnp.shape(x), bool)
+        for free_x, free_y, free_radius in np.asarray(self.free, np.float64).tolist():
+            free &= (x - free_x) ** 2 + (y - free_y) ** 2 > (free_radius + radius) ** 2
+        return free

@@ -1,0 +1,277 @@
+"""Forests: other layouts in every world and episode, distances, free paths, difficulty, tasks, and wrong input."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from cases import with_states
+from scipy import ndimage
+
+from crazysim import ConfigError, Forest, Sim, StagePlacement, stage
+from crazysim.core.plugin import FunctionPlugin
+from crazysim.core.stage import vmap_drones, vmap_worlds
+from crazysim.envs import AutoReset, Task, flying, make
+from crazysim.pytree import PyTree, leaf
+
+SMALL = {"size": (20.0, 16.0), "center": (4.0, -2.0), "free": [[4.0, -2.0, 2.0]]}
+
+
+def build(n_worlds=3, n_drones=2, **settings):
+    sim = Sim(n_worlds, n_drones, control="rotor_vel", rng_key=5)
+    forest = sim.add(Forest(**SMALL | settings))
+    sim.reset()
+    return sim, forest
+
+
+@pytest.fixture(scope="module")
+def half():
+    """A forest of which half the trees stand."""
+    return build(difficulty=0.5)
+
+
+def places(sim, forest):
+    """Return position and radius of the trees that stand, of each world."""
+    pos = np.asarray(forest.poses(sim.data)[0])
+    radii = np.concatenate([np.full(len(m.pos), m.options["radius"]) for m in forest.models()])
+    return [(p[p[:, 2] == 0], radii[p[:, 2] == 0]) for p in pos]
+
+
+def test_trees_stand_in_their_cells_at_the_density_that_is_asked_for():
+    sim, forest = build(n_worlds=200, free=np.zeros((0, 3)))
+    assert (forest.cell, forest.n_cells) == (4.0, (5, 4))
+    radii = np.concatenate([np.full(len(m.pos), m.options["radius"]) for m in forest.models()])
+    assert len(radii) == 20 * 16 / 16
+    assert radii.min() == 0.1
+    assert radii.max() == pytest.approx(0.3)
+    assert len(np.unique(radii)) == 8
+    middle = np.concatenate([m.pos for m in forest.models()])[:, :2]
+    np.testing.assert_allclose(middle.mean(axis=0), SMALL["center"])
+    offset = np.asarray(forest.poses(sim.data)[0])[..., :2] - middle
+    reach = (4.0 - 0.6) / 2 - radii
+    assert np.all(np.abs(offset[..., 0]) <= reach + 1e-5)
+    assert np.all(np.abs(offset[..., 1]) <= reach + 2 + 1e-5)
+    scaled = offset / reach[:, None]
+    assert np.abs(scaled.mean(axis=(0, 1))).max() < 0.05
+    np.testing.assert_allclose(np.std(scaled[..., 0]), 1 / np.sqrt(3), rtol=0.02)  # of a uniform distribution
+    assert abs(np.corrcoef(scaled[:, 0, 0], scaled[:, 1, 0])[0, 1]) < 0.25
+
+
+def test_law_10_a_layout_is_of_world_and_episode():
+    (sim, forest), (more, forest_of_more) = build(), build(n_worlds=5)
+    first, all_worlds = (np.asarray(f.poses(s.data)[0]) for s, f in ((sim, forest), (more, forest_of_more)))
+    np.testing.assert_array_equal(first, all_worlds[:3])
+    assert len(np.unique(all_worlds[:, 0, 0])) == 5
+    more.step(3)
+    np.testing.assert_array_equal(forest_of_more.poses(more.data)[0], all_worlds)
+    more.reset(np.array([True, False, False, False, False]))
+    after = np.asarray(forest_of_more.poses(more.data)[0])
+    np.testing.assert_array_equal(after[1:], all_worlds[1:])
+    assert not np.any(after[0, :, 0] == all_worlds[0, :, 0])
+
+
+def test_worlds_that_were_not_reset_draw_in_their_first_step():
+    sim = Sim(3, control="rotor_vel", rng_key=5)
+    forest = sim.add(Forest(**SMALL))
+    sim.step(2)
+    assert len(np.unique(forest.read(sim.data).words[..., 0])) == 3
+
+
+def test_clearance_is_the_distance_of_the_contact_report(half):
+    sim, forest = half
+    contacts = jax.jit(sim.scene.contact_fn(floor=False, drones=False))
+    ball = sim.scene.collision_model.drones[0].geoms[0]
+    rng = np.random.default_rng(0)
+    clearance = jax.jit(forest.clearance)
+    of_drones = jax.jit(vmap_worlds(vmap_drones(lambda d: forest.clearance(d, d.states.pos))))
+    found, expected = [], []
+    for _ in range(200):
+        data = with_states(sim.data, pos=rng.uniform([-10, -13, -1], [18, 9, 7], (3, 2, 3)))
+        found.append(clearance(data, data.states.pos + np.float32(ball.pos)))
+        expected.append(contacts(data).object_distance.min(axis=-1) + ball.shape.size[0])
+    np.testing.assert_array_equal(clearance(data, data.states.pos), of_drones(data))
+    found, expected = np.array(found), np.array(expected)
+    assert found.min() < 0
+    assert np.mean(found < 4) > 0.5
+    np.testing.assert_allclose(found, np.minimum(expected, 4.0), atol=2e-6)
+
+
+def test_clearance_points_away_from_the_nearest_tree(half):
+    sim, forest = half
+    trees, radii = places(sim, forest)[1]
+    point = trees[0] + [radii[0] + 0.2, 0, 1.0]
+    value, slope = jax.value_and_grad(lambda pos: forest.clearance(sim.data, pos)[1, 0])(
+        jnp.broadcast_to(jnp.float32(point), (3, 2, 3))
+    )
+    assert value == pytest.approx(0.2, abs=1e-5)
+    np.testing.assert_allclose(slope[1, 0], [1, 0, 0], atol=1e-5)
+
+
+def test_a_path_leads_through_each_of_1000_forests():
+    """On a grid of 0.2 m, from the middle of the near edge to that of the far one, with 0.2 m to all trees."""
+    _, forest = build(1, density=0.25, size=(14.0, 8.0), center=(0.0, 0.0), free=np.zeros((0, 3)))
+    x, y = np.meshgrid(np.arange(-7.0, 7.1, 0.2), np.arange(-4.0, 4.1, 0.2), indexing="ij")
+    points = jnp.float32(np.stack([x, y, np.ones_like(x)], axis=-1).reshape(1, -1, 3))
+    sim = Sim(1000, control="rotor_vel", rng_key=1)
+    sim.add(forest)
+    sim.reset()
+    points = jnp.broadcast_to(points, (1000, *points.shape[1:]))
+    gap = np.asarray(jax.jit(forest.clearance)(sim.data, points)).reshape(1000, *x.shape)
+    assert np.mean(gap < 0) > 0.005
+    in_layer = np.zeros((3, 3, 3))
+    in_layer[1] = ndimage.generate_binary_structure(2, 1)
+    area = np.asarray(ndimage.label(gap >= 0.2, in_layer)[0])
+    joined = [np.intersect1d(a[0][a[0] > 0], a[-1][a[-1] > 0]).size for a in area]
+    assert min(joined) > 0
+    assert np.mean(np.all(gap >= 0.2, axis=1).any(axis=1)) < 0.8  # which is not always straight
+
+
+def test_difficulty_is_the_share_of_trees_that_stand():
+    sim, forest = build(n_worlds=300, difficulty=(0.2, 0.6), free=np.zeros((0, 3)))
+    difficulty = np.asarray(forest.read(sim.data).difficulty)[:, 0]
+    assert difficulty.min() < 0.22
+    assert difficulty.max() > 0.58
+    share = np.mean(np.asarray(forest.poses(sim.data)[0])[..., 2] == 0, axis=1)
+    np.testing.assert_allclose(np.mean(share), 0.4, atol=0.03)
+    assert np.corrcoef(share, difficulty)[0, 1] > 0.6
+    begin = sim.step_pipeline["forest_begin"]
+    sim.replace(Forest(**SMALL | {"difficulty": 0.0, "free": np.zeros((0, 3))}))
+    assert sim.step_pipeline["forest_begin"] is begin  # no stage was built
+    sim.reset()
+    assert not any(len(trees) for trees, _ in places(sim, forest))
+    assert np.all(np.asarray(forest.clearance(sim.data, sim.data.states.pos)) == forest.cell)
+
+
+def test_discs_stay_free(half):
+    sim, forest = half
+    for trees, radii in places(sim, forest):
+        assert np.all(np.linalg.norm(trees[:, :2] - [4, -2], axis=1) > 2 + radii)
+    everywhere, _ = build(n_worlds=50, free=np.zeros((0, 3)), difficulty=1.0)
+    all_trees = np.concatenate([t for t, _ in places(everywhere, everywhere.plugins["forest"])])
+    assert np.any(np.linalg.norm(all_trees[:, :2] - [4, -2], axis=1) < 2)
+
+
+def test_rays_meet_the_trees_of_each_world(half):
+    """Each world has an image of its own, as C MuJoCo's rays see it; hidden trees are in no image."""
+    sim, _ = half
+    sim.data = with_states(sim.data, pos=[[4, -2, 1.5], [4, -2, 50]], quat=[0, 0, 0, 1])
+    hits = jax.jit(sim.scene.depth_fn("fpv_cam:0", 64, 4, drones=False, along="ray"))(sim.data)
+    distance, eye = (
+        np.asarray(hits.distance)[:, 0, 1],
+        np.asarray(sim.airframe.value("shape.fpv_camera")) + [4, -2, 1.5],
+    )
+    assert not np.allclose(distance[0], distance[1], rtol=0.01)
+    points, geom = np.asarray(hits.point)[:, 0, 1], np.zeros(1, np.int32)
+    model, own = sim.scene.mj_model, sim.scene.mj_model.body("drone:0").id
+    n_trees = 0
+    for world in range(3):
+        sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), world)
+        for d, point in zip(distance[world], points[world], strict=True):
+            if np.isfinite(d):
+                ray = (point - eye) / np.linalg.norm(point - eye)
+                expected = mujoco.mj_ray(model, sim.scene.mj_data, eye, ray, None, 1, own, geom, None)
+                n_trees += model.geom_type[geom[0]] == mujoco.mjtGeom.mjGEOM_CYLINDER
+                assert d == pytest.approx(expected, abs=1e-4)
+    assert n_trees > 5
+
+
+class Gap(PyTree):
+    """Distance of each drone to the nearest tree."""
+
+    value: jax.Array = leaf("drone", 0)
+
+
+@pytest.mark.parametrize("engine", ["fused", "interpret"])
+def test_a_stage_of_one_drone_reads_the_clearance(engine):
+    sim = Sim(3, 2, control="rotor_vel", rng_key=5, engine=engine)
+    forest = sim.add(Forest(**SMALL))
+    sim.reset()
+    sim.data = with_states(sim.data, pos=np.random.default_rng(2).uniform([-4, -8, 1], [12, 4, 3], (3, 2, 3)))
+
+    @stage("drone")
+    def look(data):
+        return data.replace(
+            plugins=data.plugins | {"gap": data.plugins["gap"].replace(value=forest.clearance(data, data.states.pos))}
+        )
+
+    sim.add(FunctionPlugin("gap", Gap(jnp.zeros((3, 2))), [StagePlacement(look, before="increment_steps")]))
+    expected = np.asarray(forest.clearance(sim.data, sim.data.states.pos))
+    sim.step()
+    assert engine in sim.explain()
+    assert expected.min() < 3.9
+    np.testing.assert_allclose(sim.data.plugins["gap"].value, expected, atol=0.02)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wander(Task):
+    """Stay away from trees that are placed where an episode starts."""
+
+    name = "wander"
+    forest = Forest(size=(40.0, 40.0))
+
+    def install(self, sim):
+        sim.add(self.forest)
+
+    def spawn(self, data, key):
+        return flying(self.forest.place(data, key, jnp.float32(0.75)), jnp.float32([[0, 0, 1.0]]))
+
+    def observe(self, data):
+        return {"gap": self.forest.clearance(data, data.states.pos)[:, None]}
+
+    def rewards(self, data, action, last_action):
+        return {"gap": self.forest.clearance(data, data.states.pos)}
+
+    def terminated(self, data):
+        return jnp.array(False)
+
+    def error(self, data):
+        return self.forest.clearance(data, data.states.pos)
+
+
+@pytest.mark.long("compiles an environment with a task of its own")
+def test_a_task_places_a_forest_in_its_episodes():
+    env = AutoReset(make(Wander(seconds=0.1), n_worlds=4))
+    state = jax.jit(env.reset)(jax.random.key(2))
+    words = np.asarray(state.full_data.plugins["forest"].words)
+    assert len(np.unique(words[..., 0])) == 4
+    step = jax.jit(env.step)
+    n_changes = 0
+    for _ in range(12):
+        state = step(state, jnp.zeros((4, 1, 4)))
+        record = state.full_data.plugins["forest"]
+        n_changes += np.any(np.asarray(record.words) != words)
+        words = np.asarray(record.words)
+        forest = Wander().forest
+        np.testing.assert_allclose(
+            np.asarray(state.obs["gap"])[..., 0],
+            forest.clearance(state.full_data, state.full_data.states.pos),
+            atol=1e-5,
+        )
+    assert 1 <= n_changes <= 3
+    np.testing.assert_array_equal(record.difficulty, 0.75)
+    assert "unfused" not in env.explain()
+
+
+BAD = {
+    "radii": ({"radii": (0.3, 0.1)}, "expected radii as smallest and largest, got"),
+    "dense": ({"density": 4.0}, "Use a lower density, or a smaller gap"),
+    "many": ({"size": (1000.0, 1000.0)}, "expected at most 10000 obstacles in Forest, got 62500"),
+    "difficulty": ({"difficulty": 1.5}, "difficulty"),
+    "range": ({"difficulty": (0.8, 0.2)}, "expected a range of difficulty, lowest first"),
+    "free": ({"free": (0.0, 0.0, 1.0)}, "free of Forest"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_law_09_wrong_settings_are_errors(what):
+    settings, message = BAD[what]
+    with pytest.raises(ConfigError, match=message):
+        Sim().add(Forest(**settings))
+
+
+def test_the_trees_of_a_scene_stay(half):
+    sim, _ = half
+    with pytest.raises(ConfigError, match="use another name="):
+        sim.replace(Forest(**SMALL | {"radii": (0.2, 0.4)}))
