@@ -98,7 +98,7 @@ def rates(lines: list[Line]) -> str:
 
 
 def gradients(lines: list[Line]) -> str:
-    """Return rates of gradients and their times over those of the steps alone."""
+    """Return rates of gradients, and the ratios of their times to the times of the steps alone."""
     return columns(
         Commands=lambda x: LEVELS[x["control"]],
         Worlds=worlds_of,
@@ -265,7 +265,7 @@ def control(lines: list[Line]) -> str:
 
 
 def control_rates(lines: list[Line]) -> str:
-    """Return rates of the controllers over that of ``crazyflow``."""
+    """Return the ratios of the rates of the controllers to the rate of ``crazyflow``."""
     found = {line["controller"]: line["steps_per_s"] for line in lines if "steps_per_s" in line}
     cells = [f"{rate / found['crazyflow']:.2f} ({si(rate)})" for rate in found.values()]
     return table_of([f'`"{name}"`' for name in found], [cells])

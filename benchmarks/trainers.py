@@ -1,4 +1,4 @@
-"""PPO of crazysim beside that of Brax and of RSL-RL, on the same environment.
+"""PPO of crazysim, of Brax and of RSL-RL on the same environment.
 
     python benchmarks/trainers.py --device gpu --worlds 1024 65536 --seeds 3
     python benchmarks/trainers.py --worlds 64 --iterations 8 --trainers crazysim brax

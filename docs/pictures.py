@@ -1,7 +1,7 @@
 """Draw the pictures that the pages show: ``python docs/pictures.py [NAME ...]`` writes them to ``docs/pictures``.
 
-``flight`` is the moving picture of the README, ``mixed`` that of the page on features, ``allan`` and ``measured`` those
-of the page on sensors. The other plots are those of ``crazysim demo`` (``tracks.png``), ``crazysim train``
+``flight`` is the moving picture of the README. ``mixed`` is for the page on features, and ``allan`` and ``measured``
+are for the page on sensors. The other plots are written by ``crazysim demo`` (``tracks.png``), ``crazysim train``
 (``training.png``) and ``benchmarks/scaling.py``.
 """
 
@@ -76,7 +76,7 @@ def mixed() -> None:
 
 
 def allan() -> None:
-    """Allan deviation of the gyroscope and accelerometer of simulated BMI088 at rest, beside that of their numbers."""
+    """Allan deviation of gyroscope and accelerometer of simulated BMI088 at rest, and as their numbers determine it."""
     n, freq = 32, 100
     sim = Sim(n, control="rotor_vel", freq=freq, rng_key=2)
     gyro = sensors.Triad(noise=0.014 * RAD_PER_DEGREE, instability=5.1e-5, correlation_time=20.0, random_walk=5e-6)

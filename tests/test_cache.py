@@ -203,7 +203,7 @@ def test_without_a_usable_folder_there_is_one_line_and_everything_works(settings
     for _ in range(2):
         with keep_programs():
             jax.jit(_inner)(jnp.ones(3))
-        assert kernel_cache.folder() == kernel_cache.temporary()
+        assert kernel_cache.folder() == kernel_cache.temporary_folder()
         assert enable_cache() is None
     told = capsys.readouterr().err
     assert told.count("\n") == 1

@@ -86,7 +86,7 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
 
     Args:
         command: The command. It runs in a process of its own, which is connected with the other hosts.
-        options: Its options, with those of ``add_options``, and ``arguments``, from which they were parsed.
+        options: Its options, including the options of ``add_options``, and ``arguments``, from which they were parsed.
 
     Raises:
         ConfigError: If the options are invalid, or no hosts are found.

@@ -28,7 +28,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     teacher = "folder of a run whose policy teaches this one, which sees what the task observes (DAgger)"
     add("--teacher", metavar="FOLDER", help=teacher)
     add("--seed", type=int, help="random seed; by default 0")
-    seeds = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in that of the run"
+    seeds = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in the folder of the run"
     add("--seeds", type=parse_seeds, metavar="FIRST:END", help=seeds)
     sweep = "values of hyperparameters, each trained with each seed in one program"
     add("--sweep", nargs="+", default=[], metavar="NAME=VALUE,VALUE", help=sweep)
@@ -38,7 +38,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--out", type=Path, help="folder of the run; by default out/TASK")
     resume = "continue from the checkpoint in that folder, with its settings where none are given"
     add("--resume", action="store_true", help=resume)
-    checkpoint_every = "write a checkpoint every so many seconds, besides those of the evaluations"
+    checkpoint_every = "write a checkpoint every so many seconds, in addition to the one at each evaluation"
     add("--checkpoint-every", type=float, metavar="SECONDS", help=checkpoint_every)
     add("--device", help="device: cpu, gpu; by default cpu, or JAX's default platform with --devices")
     devices = "devices to distribute the worlds over: all, their number, or their indices such as 0,2,3"

@@ -113,13 +113,13 @@ class AutoParams(RigidBodyParams):
             freq: Rate of the controller, Hz.
             outer_freq: Rate of its position loop, Hz, whose command is half a period old on average; None without one.
         """
-        lag, rate_limits = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * turn_rates(airframe)
+        lag_rate, rate_limits = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * turn_rates(airframe)
         needed_rate = 1 / max(1 / np.max(rate_limits[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
-        lead = max(min(needed_rate / lag, MAX_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
-        rate = 1 / (1 / (lead * lag) + 1.5 / freq)
-        rates = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), rate_limits)
-        stiffness, damping = STIFFNESS_RATIO * rates**2, DAMPING_RATIO * rates
-        delay, reaction = DAMPING_RATIO / STIFFNESS_RATIO / np.min(rates[:2]), reaction_time(airframe)
+        lead = max(min(needed_rate / lag_rate, MAX_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
+        loop_rate = 1 / (1 / (lead * lag_rate) + 1.5 / freq)
+        axis_rates = np.minimum(loop_rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), rate_limits)
+        stiffness, damping = STIFFNESS_RATIO * axis_rates**2, DAMPING_RATIO * axis_rates
+        delay, reaction = DAMPING_RATIO / STIFFNESS_RATIO / np.min(axis_rates[:2]), reaction_time(airframe)
         body = rigid_body_params(airframe)
         allocation: AllocationParams = body.pop("allocation")
         position = None
@@ -132,10 +132,10 @@ class AutoParams(RigidBodyParams):
             stiffness=as_parameter(stiffness),
             damping=as_parameter(damping),
             torque_max=as_parameter(TORQUE_MAX * np.diag(airframe.inertia) * stiffness),
-            observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO * np.max(rates) / freq)),
+            observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO * np.max(axis_rates) / freq)),
             lead=as_parameter(lead),
             reaction=as_parameter(reaction),
-            drag_torque_share=as_parameter(1 / (1 + lead * lag * reaction)),
+            drag_torque_share=as_parameter(1 / (1 + lead * lag_rate * reaction)),
             position=position,
         )
 
@@ -274,14 +274,14 @@ class Auto(Controller):
         s, p = data.states, params
         if isinstance(command, Setpoint):
             target = cast(AutoTarget, memory.target)
-            error = rotation.multiply(rotation.conjugate(s.quat), target.quat)
-            z, w = error[..., 2:3], error[..., 3:]
+            rotation_error = rotation.multiply(rotation.conjugate(s.quat), target.quat)
+            z, w = rotation_error[..., 2:3], rotation_error[..., 3:]
             thrust = target.thrust * (2 * (w * w + z * z) - 1)  # its component along the current z axis
-            error, rate = quat_error(error), target.ang_vel
+            rotation_error, ang_vel_des = quat_error(rotation_error), target.ang_vel
             is_on: Any = True
         else:
             thrust = command[..., 3:]
-            error, rate = self._command_errors(s, command, data.controls.mode)
+            rotation_error, ang_vel_des = self._command_errors(s, command, data.controls.mode)
             is_on = thrust > 0
 
         rotor_torque = matvec(p.mixing_matrix, quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust))
@@ -296,9 +296,9 @@ class Auto(Controller):
             is_at_rest, 0.0, p.observer * self.freq
         ) * measured_impulse
         expected_momentum = total_momentum + (rotor_torque - gyroscopic) / self.freq
-        torque = gyroscopic - disturbance_torque - matvec(p.J * p.damping[..., None, :], s.ang_vel - rate)
-        if error is not None:
-            torque = torque + matvec(p.J * p.stiffness[..., None, :], error)
+        torque = gyroscopic - disturbance_torque - matvec(p.J * p.damping[..., None, :], s.ang_vel - ang_vel_des)
+        if rotation_error is not None:
+            torque = torque + matvec(p.J * p.stiffness[..., None, :], rotation_error)
         yaw = rotor_torque[..., 2:] + p.drag_torque_share * (torque[..., 2:] - rotor_torque[..., 2:])
 
         wrench = jnp.concatenate([thrust, torque[..., :2], yaw], axis=-1)
@@ -314,8 +314,8 @@ class Auto(Controller):
         """Return the rotation error, rad, None at the level of body rates, and the desired body rates, rad/s. (3,)"""
         if mode == Control.body_rate:
             return None, command[..., :3]
-        rpy, rate = command[..., :3], jnp.zeros_like(state.ang_vel)
+        rpy, ang_vel_des = command[..., :3], jnp.zeros_like(state.ang_vel)
         if self.yaw_rate:
             rpy = jnp.concatenate([rpy[..., :2], rotation.yaw(state.quat)[..., None]], axis=-1)
-            rate = command[..., 2:3] * rotation.matrix(state.quat)[..., 2, :]
-        return quat_error(rotation.multiply(rotation.conjugate(state.quat), rotation.from_rpy(rpy))), rate
+            ang_vel_des = command[..., 2:3] * rotation.matrix(state.quat)[..., 2, :]
+        return quat_error(rotation.multiply(rotation.conjugate(state.quat), rotation.from_rpy(rpy))), ang_vel_des

@@ -124,11 +124,11 @@ def geometric_control(
     if integral is not None:
         feedback = feedback + integral
 
-    def subtract_drag(motion: Array, rate: Array) -> Array:
+    def subtract_drag(motion: Array, derivative: Array) -> Array:
         """Return the acceleration, or a derivative of it, that the rotors give for a motion under drag."""
         if not feedforward:
-            return rate
-        return rate - matvec(matrix, matvec(p.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), motion))) / p.mass
+            return derivative
+        return derivative - matvec(matrix, matvec(p.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), motion))) / p.mass
 
     specific_thrust = subtract_drag(sp.vel, sp.acc) - p.gravity_vec + feedback
     desired = attitude_of_thrust(
@@ -179,11 +179,11 @@ def attitude_errors(matrix: Array, ang_vel: Array, desired: Attitude) -> tuple[A
     columns = [(matrix[..., i], desired.matrix[..., i]) for i in range(3)]
     # vee(R_d^T R - R^T R_d) is R^T times the sum of x_d cross x over the three axes.
     to_body = jnp.swapaxes(matrix, -1, -2)
-    crossed = [cross(axis_d, axis) for axis, axis_d in columns]
-    rotation_error = 0.5 * matvec(to_body, crossed[0] + crossed[1] + crossed[2])
-    rate = matvec(to_body, matvec(desired.matrix, desired.ang_vel))
-    acc = matvec(to_body, matvec(desired.matrix, desired.ang_acc))
-    return rotation_error, ang_vel - rate, acc - cross(ang_vel, rate)
+    cross_products = [cross(axis_d, axis) for axis, axis_d in columns]
+    rotation_error = 0.5 * matvec(to_body, cross_products[0] + cross_products[1] + cross_products[2])
+    ang_vel_des = matvec(to_body, matvec(desired.matrix, desired.ang_vel))
+    ang_acc_des = matvec(to_body, matvec(desired.matrix, desired.ang_acc))
+    return rotation_error, ang_vel - ang_vel_des, ang_acc_des - cross(ang_vel, ang_vel_des)
 
 
 class Geometric(Controller):

@@ -73,9 +73,9 @@ def load_derivative(
     Returns:
         Derivative, per second. (16,)
     """
-    vel, rpy, ang_vel, angles, rates = x[3:6], x[6:9], x[9:12], x[12:14], x[14:16]
+    vel, rpy, ang_vel, angles, angle_rates = x[3:6], x[6:9], x[9:12], x[12:14], x[14:16]
     force = u[0] * _z_axis(rpy)
-    q, q_rate = jax.jvp(rod_direction, (angles,), (rates,))
+    q, q_rate = jax.jvp(rod_direction, (angles,), (angle_rates,))
     rpy_rate, ang_acc = _rotational_derivatives(rpy, ang_vel, u[1:], J)
     if attach is None:
         q_acc = cross(q, cross(q, force)) / (mass * length) - dot(q_rate, q_rate) * q
@@ -95,10 +95,10 @@ def load_derivative(
         acc, ang_acc = acc + load_mass / mass * pull * q, ang_acc + load_mass * pull * ang_acc_per_pull
         q_acc = (gravity_vec - pull * q - joint_acceleration(acc, ang_acc)) / length
     # q'' = D a'' + D' a' with D = dq/da: its columns are orthogonal, so the angles' accelerations are two projections.
-    slope, slope_rate = jax.jvp(jax.jacfwd(rod_direction), (angles,), (rates,))
-    angle_acc_part = q_acc - slope_rate @ rates
-    angles_acc = slope.T @ angle_acc_part / jnp.sum(slope * slope, axis=0)
-    return jnp.concatenate([vel, acc, rpy_rate, ang_acc, rates, angles_acc])
+    slope, slope_rate = jax.jvp(jax.jacfwd(rod_direction), (angles,), (angle_rates,))
+    angle_part = q_acc - slope_rate @ angle_rates
+    angles_acc = slope.T @ angle_part / jnp.sum(slope * slope, axis=0)
+    return jnp.concatenate([vel, acc, rpy_rate, ang_acc, angle_rates, angles_acc])
 
 
 def rod_direction(angles: Array) -> Array:

@@ -193,9 +193,9 @@ class Mellinger(Controller):
     ) -> MellingerMemory:
         # The integrals are set to continue the current force and torque, as far as their limits allow.
         p, s = params, data.states
-        rates = _desired_rates(data, command)
+        ang_vel_des = _desired_rates(data, command)
         zero = jnp.zeros_like(s.ang_vel)
-        initial_memory = MellingerMemory(zero, zero, s.ang_vel, rates)
+        initial_memory = MellingerMemory(zero, zero, s.ang_vel, ang_vel_des)
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
         _, _, _, force = self._command(data, command, initial_memory, p)
         current_force = thrust / p.mass_thrust * rotation.z_axis(s.quat)
@@ -222,8 +222,8 @@ class Mellinger(Controller):
         else:
             axes_des = rotation.matrix(rotation.from_rpy(command[:3]))
             thrust = pwm_of_thrust(command[3:], params=p.motors)
-        rates = _desired_rates(data, command)
-        torque, memory = torque_of_rotation(axes, axes_des, s.ang_vel, rates, memory, self.freq, params=p)
+        ang_vel_des = _desired_rates(data, command)
+        torque, memory = torque_of_rotation(axes, axes_des, s.ang_vel, ang_vel_des, memory, self.freq, params=p)
         return thrust, torque, memory, force
 
 

@@ -26,12 +26,12 @@ def any_lane(condition: Array) -> Array:
     return any_lane_p.bind(condition)[0]
 
 
-def _batched(args: Sequence[Array], dims: Sequence[int]) -> tuple[list[Array], list[None]]:
-    """Return whether the condition holds for any element of a batch, as a result that all of them share."""
+def _batching_rule(args: Sequence[Array], dims: Sequence[int]) -> tuple[list[Array], list[None]]:
+    """Return True if the condition holds for any element of a batch, as a result that all of them share."""
     return any_lane_p.bind(jnp.any(args[0], axis=dims[0])), [None]
 
 
-any_lane_p = simple_primitive("any_lane", lambda condition: [condition], _batched)
+any_lane_p = simple_primitive("any_lane", lambda condition: [condition], _batching_rule)
 """``any_lane`` as a primitive of one operand."""
 
 

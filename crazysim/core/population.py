@@ -147,8 +147,8 @@ class Population(Plugin):
         """Return the stages of ``control`` and ``derivative``, for each that the class overrides."""
         cls, placements = type(self), []
         if cls.control is not Population.control:
-            rate = self.control_freq
-            condition = None if rate is None else functools.partial(acts_now, freq=rate)
+            control_freq = self.control_freq
+            condition = None if control_freq is None else functools.partial(acts_now, freq=control_freq)
             name = f"{self.name}_control"
             placements.append(StagePlacement(Stage(self._run_controller, self.name, condition, name=name), name=name))
         if cls.derivative is not Population.derivative:

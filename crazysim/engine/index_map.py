@@ -123,11 +123,11 @@ def write_map(block: Block, target: str) -> Kernel:
     require_block_source(block)
     writer, tables = Writer(), block.inputs[1:]
     inputs, outputs = ([type_name(x.dtype) for x in values_of_kind] for values_of_kind in (tables, block.outputs))
-    pointers = [f"const {kind}* __restrict__ p{k}" for k, kind in enumerate(inputs)]
-    pointers += [f"{kind}* __restrict__ q{k}" for k, kind in enumerate(outputs)]
+    pointers = [f"const {ctype}* __restrict__ p{k}" for k, ctype in enumerate(inputs)]
+    pointers += [f"{ctype}* __restrict__ q{k}" for k, ctype in enumerate(outputs)]
     values = writer.block(block, ["LANE", *(f"p{k}" for k in range(len(tables)))], 2)
-    for k, (kind, x) in enumerate(zip(outputs, values, strict=True)):
-        write_results(writer, f"q{k}", kind, 1, [x], 2)
+    for k, (ctype, x) in enumerate(zip(outputs, values, strict=True)):
+        write_results(writer, f"q{k}", ctype, 1, [x], 2)
     input_indices, output_indices = tuple(range(len(inputs))), tuple(range(len(outputs)))
     return make_kernel(
         target, pointers, [], writer.lines, [block], writer.tables, inputs=input_indices, outputs=output_indices

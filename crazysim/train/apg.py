@@ -163,7 +163,8 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
 def _copies_of_policy(env: Env, n_seeds: int) -> int:
     """Return the number of copies of the policy of a seed, each of which controls worlds of one device.
 
-    Devices sum the gradients of the copies once, after all steps, but those of a single policy in every step.
+    Devices sum the gradients of the copies once, after all steps; they would sum the gradients of a single policy in
+    every step.
     """
     mesh = env.sim.mesh
     return 1 if mesh is None or n_seeds % mesh.size == 0 else mesh.size

@@ -111,7 +111,7 @@ class Learner(PyTree):
 
 
 class TeacherObservation(Wrapper):
-    """Add the teacher's observations, ``teacher NAME``, to those of the student."""
+    """Add the teacher's observations, ``teacher NAME``, to the student's."""
 
     def __init__(self, env: Env, observe: Callable[[SimData], Obs]):
         """Wrap the student's environment.

@@ -4,8 +4,8 @@ XLA writes the activations of every layer to memory and reads them again, which 
 Here a warp computes all layers of 16 samples in its registers. For gradients it computes the activations again; each
 block adds up the gradients of the weights over its samples, and XLA adds the sums of the blocks.
 
-Products are those of tensor cores, with operands of 16 bits and sums of 32 bits. The operands have 11 bits of
-precision, like those of TF32, which XLA uses on the same GPUs, but a smaller range: weights, normalised observations
+Tensor cores compute the products, with operands of 16 bits and sums of 32 bits. The operands have 11 bits of
+precision, as in TF32, which XLA uses on the same GPUs, but a smaller range: weights, normalised observations
 and activations are within it, and gradients of the outputs are scaled such that the largest is between 1 and 2.
 
 Lanes of a warp hold operands as in the PTX manual, "Matrix Fragments for mma.m16n8k16": of a sum of 16 x 8 numbers,
@@ -35,7 +35,7 @@ WARPS_AND_BLOCKS = {(False, False): (4, 4), (False, True): (4, 3), (True, False)
 for gradients: about the fastest of three to six pairs on an H100, with 21 inputs for the first two."""
 KERNEL_NAMES = ("mlp_outputs", "mlp_gradients")
 CAPABILITY, MAX_SHARED_BYTES, MULTIPROCESSORS = 90, 227 * 2**10, 132
-"""Compute capability of the GPUs that use the kernels, those of the Hopper architecture, times ten; the largest shared
+"""Compute capability of the GPUs that use the kernels (Hopper architecture), times ten; the largest shared
 memory of a block there (CUDA C++ Programming Guide), bytes; and the number of multiprocessors of an H100 SXM."""
 
 INTRINSICS = r"""
@@ -229,7 +229,7 @@ def cuda_source(sizes: tuple[int, ...], gradient: bool) -> tuple[str, int]:
 
     Args:
         sizes: Number of inputs, sizes of the hidden layers, number of outputs.
-        gradient: True for the kernel of gradients, False for that of outputs.
+        gradient: True for the kernel of gradients, False for the kernel of outputs.
     """
     n_warps, n_blocks = WARPS_AND_BLOCKS[sizes[0] > 64, gradient]
     padded, layers = [-(-size // 16) * 16 for size in sizes], range(len(sizes) - 1)
@@ -295,7 +295,7 @@ def choose_mlp(network: Network, device: jax.Device, n_devices: int = 1) -> Call
 
 
 def apply_mlp(layers: Layers, x: Array) -> Array:
-    """Return ``mlp(layers, x)`` to about 11 bits, within the range of float16; gradients are those of the layers.
+    """Return ``mlp(layers, x)`` to about 11 bits, within the range of float16, with gradients for the layers only.
 
     Networks that are larger than the kernels allow, or of another dtype, are computed by ``mlp``.
 
@@ -368,7 +368,7 @@ def _launch(gradient: bool, layers: Layers, x: Array, *cotangent: Array) -> Arra
     """Return the results of a kernel for the networks of all seeds.
 
     Args:
-        gradient: True for the kernel of gradients, False for that of outputs.
+        gradient: True for the kernel of gradients, False for the kernel of outputs.
         layers: Weights (n_seeds, n_in, n_out) and biases (n_seeds, n_out).
         x: Inputs. (n_seeds, n, n_in)
         cotangent: For gradients, their scale, (n_seeds,), and the gradients of the outputs, (n_seeds, n, n_out).

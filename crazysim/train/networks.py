@@ -171,7 +171,7 @@ class Encoder(PyTree):
 
 @functools.cache
 def _convolution_network(channels: tuple[int, ...], images: tuple[Image, ...], base: Network) -> Network:
-    """Return a network whose features are those of ``base`` for observations with features in place of images."""
+    """Return a network that applies ``base`` to observations with features in place of images."""
 
     def init(key: Array, n_obs: int) -> Encoder:
         keys = jax.random.split(jax.random.fold_in(key, 2), (len(images), len(channels)))

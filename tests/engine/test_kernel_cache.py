@@ -46,7 +46,7 @@ def test_the_folder_is_made_for_this_user_alone(cache):
     finally:
         os.umask(mask)
     assert mode(cache / "crazysim") == 0o700
-    assert mode(kernel_cache.temporary()) == 0o700
+    assert mode(kernel_cache.temporary_folder()) == 0o700
 
 
 @pytest.mark.parametrize("bits", [0o777, 0o775, 0o702])
@@ -55,10 +55,10 @@ def test_a_folder_that_others_can_write_is_refused_once(cache, bits):
     shared.mkdir()
     shared.chmod(bits)
     with pytest.warns(UserWarning, match=r"only this user can write, got .*crazysim'.* Remove it"):
-        assert kernel_cache.folder() == kernel_cache.temporary()
+        assert kernel_cache.folder() == kernel_cache.temporary_folder()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert kernel_cache.folder() == kernel_cache.temporary()
+        assert kernel_cache.folder() == kernel_cache.temporary_folder()
     shared.chmod(0o755)
     assert kernel_cache.folder() == shared
 
@@ -78,7 +78,7 @@ def test_a_folder_of_another_user_is_refused(cache):
     shared.mkdir(mode=0o700)
     os.chown(shared, OTHERS, OTHERS)
     with pytest.warns(UserWarning, match=f"belongs to the user {OTHERS}"):
-        assert kernel_cache.folder() == kernel_cache.temporary()
+        assert kernel_cache.folder() == kernel_cache.temporary_folder()
 
 
 @as_root
@@ -135,7 +135,7 @@ def kept(tmp_path):
 
 
 def test_remains_of_killed_processes_are_removed(tmp_path, kept):
-    here, other, gone = kernel_cache.owner(), "0" * 8, finished_process()
+    here, other, gone = kernel_cache.process_name(), "0" * 8, finished_process()
     machine = here.split("-")[0]
     day = 1.01 * kernel_cache.ABANDONED_AFTER
     remains = [
@@ -159,7 +159,7 @@ def test_remains_of_killed_processes_are_removed(tmp_path, kept):
 
 def test_no_process_is_asked_for_on_windows(monkeypatch):
     """There the call that asks on POSIX systems sends Ctrl+C."""
-    name = f"key.{kernel_cache.owner()}-140.tmp"
+    name = f"key.{kernel_cache.process_name()}-140.tmp"
     with monkeypatch.context() as faked:
         faked.setattr(kernel_cache.os, "kill", None)
         faked.setattr(kernel_cache.os, "name", "nt")
@@ -169,7 +169,7 @@ def test_no_process_is_asked_for_on_windows(monkeypatch):
 
 def test_the_folders_are_swept_at_the_next_start(cache, kept):
     (cache / "crazysim").mkdir(mode=0o700)
-    machine = kernel_cache.owner().split("-")[0]
+    machine = kernel_cache.process_name().split("-")[0]
     remains = kept(f"crazysim/key.{machine}-{finished_process()}-1.tmp")
     assert kernel_cache.folder() == cache / "crazysim"
     assert not remains.exists()
@@ -178,10 +178,10 @@ def test_the_folders_are_swept_at_the_next_start(cache, kept):
 FORK = """
 import os, sys
 from crazysim.engine.backends import kernel_cache
-mine = kernel_cache.temporary()
+mine = kernel_cache.temporary_folder()
 child = os.fork()
 if not child:
-    own = kernel_cache.temporary()
+    own = kernel_cache.temporary_folder()
     sys.exit(0 if own != mine and own.is_dir() else 3)
 print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), mine.is_dir())
 print(mine)

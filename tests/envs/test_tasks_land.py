@@ -93,7 +93,7 @@ def test_starts_are_clear_of_contact_and_pads_on_their_circles(moving):
     assert report.drone_distance.min() > 0.3
     radius = np.linalg.norm(np.asarray(data.objects.pos)[:, 0, :, :2], axis=-1)
     assert np.ptp(radius) > 0.3
-    assert np.all(np.asarray(data.plugins["task"].rate)[..., 0].min(axis=0) < 0)
+    assert np.all(np.asarray(data.plugins["task"].ang_vel)[..., 0].min(axis=0) < 0)
 
 
 def test_a_moving_pad_moves_in_the_data_at_its_speed(moving):

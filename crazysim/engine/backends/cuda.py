@@ -263,7 +263,7 @@ def compile_source(source: str, arch: str, kind: str) -> bytes:
         with contextlib.suppress(OSError):  # another process has removed it
             return path.read_bytes()
     image = _run(library, source, arch, kind)
-    if cache_folder != kernel_cache.temporary():
+    if cache_folder != kernel_cache.temporary_folder():
         with contextlib.suppress(OSError):  # its disk is full
             kernel_cache.store(cache_folder, key, image, f".{kind.lower()}")
     return image

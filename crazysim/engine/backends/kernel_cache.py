@@ -60,7 +60,7 @@ def folder() -> Path:
             elif os.access(shared, os.W_OK | os.R_OK):
                 _sweep_once(shared)
                 return shared
-    return temporary()
+    return temporary_folder()
 
 
 @functools.cache
@@ -78,18 +78,18 @@ def _sweep_once(shared: Path) -> None:
     sweep(shared, "*.tmp")
 
 
-def temporary() -> Path:
+def temporary_folder() -> Path:
     """Return a folder of this process, which is removed when the process ends. A forked process has its own folder."""
-    folder = _temporary(os.getpid())
+    folder = _make_temporary_folder(os.getpid())
     make_private(folder)  # again, in case the system has removed it
     return folder
 
 
 @functools.cache
-def _temporary(pid: int) -> Path:
+def _make_temporary_folder(pid: int) -> Path:
     parent = Path(tempfile.gettempdir())
     sweep(parent, "crazysim-*")
-    folder = Path(tempfile.mkdtemp(prefix=f"crazysim-{owner()}-", dir=parent))
+    folder = Path(tempfile.mkdtemp(prefix=f"crazysim-{process_name()}-", dir=parent))
 
     def remove() -> None:
         if os.getpid() == pid:
@@ -99,7 +99,7 @@ def _temporary(pid: int) -> Path:
     return folder
 
 
-def owner() -> str:
+def process_name() -> str:
     """Return the name of this process for the names of its files: machine and process ID."""
     return f"{_machine()}-{os.getpid()}"
 
@@ -139,10 +139,10 @@ def _is_abandoned(name: str, age: float) -> bool:
         name: Its name, which contains the name of its process.
         age: Time since it was written, s.
     """
-    named = re.search(r"[.-]([0-9a-f]{8})-(\d+)-", name)
-    if named is None:
+    match = re.search(r"[.-]([0-9a-f]{8})-(\d+)-", name)
+    if match is None:
         return name.endswith(".tmp") and age > ABANDONED_AFTER
-    machine, pid = named.groups()
+    machine, pid = match.groups()
     if machine != _machine() or os.name == "nt":  # on Windows the call below would end the process
         return age > ABANDONED_AFTER
     try:
@@ -158,10 +158,10 @@ def find(cache_folder: Path, key: str) -> Iterator[Path]:
         if path.suffix == ".tmp" or untrusted_reason(path):
             continue
         try:
-            intact = path.stem == f"{key}-{digest(path.read_bytes())}"
+            is_intact = path.stem == f"{key}-{digest(path.read_bytes())}"
         except OSError:
             continue
-        if intact:
+        if is_intact:
             yield path
         else:
             with contextlib.suppress(OSError):
@@ -181,11 +181,11 @@ def store(cache_folder: Path, key: str, content: bytes, suffix: str) -> Path:
         OSError: If the folder cannot be written, or its disk is full.
     """
     path = cache_folder / f"{key}-{digest(content)}{suffix}"
-    part = cache_folder / f"{path.stem}.{owner()}-{threading.get_ident()}.tmp"
+    unfinished_path = cache_folder / f"{path.stem}.{process_name()}-{threading.get_ident()}.tmp"
     try:
-        part.touch(mode=0o700)
-        part.write_bytes(content)
-        part.replace(path)
+        unfinished_path.touch(mode=0o700)
+        unfinished_path.write_bytes(content)
+        unfinished_path.replace(path)
     finally:
-        part.unlink(missing_ok=True)
+        unfinished_path.unlink(missing_ok=True)
     return path

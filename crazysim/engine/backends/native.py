@@ -202,7 +202,7 @@ def toolchain(words: tuple[str, ...]) -> str:
     versions of JAX and of this package.
     """
     # With -###, a compiler prints its version and the options that replace -march=native.
-    with tempfile.TemporaryDirectory(dir=kernel_cache.temporary(), ignore_cleanup_errors=True) as work:
+    with tempfile.TemporaryDirectory(dir=kernel_cache.temporary_folder(), ignore_cleanup_errors=True) as work:
         # Clang prints the working directory, too.
         steps = _run([*words, "-E", "-x", "c++", os.devnull, "-###"], Path(work), time_limit(), cwd=os.sep)
     libc = " ".join(platform.libc_ver())
@@ -217,7 +217,9 @@ def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
         if library is not None:
             return library
     content, problem = _compile(words, source), None
-    for folder in dict.fromkeys((cache_folder, kernel_cache.temporary())):  # code in the first may not be executable
+    for folder in dict.fromkeys(
+        (cache_folder, kernel_cache.temporary_folder())
+    ):  # code in the first may not be executable
         try:
             library = _load_library(kernel_cache.store(folder, key, content, ".so"))
         except OSError as error:
@@ -249,7 +251,7 @@ def _compile(words: Sequence[str], source: str) -> bytes:
             f"a kernel of {n_lines:,} lines takes {words[0]} longer than {seconds:g} s; use loops (lax.fori_loop) for "
             f"what is unrolled, or set CRAZYSIM_COMPILE_TIMEOUT to a larger number of seconds"
         )
-    with tempfile.TemporaryDirectory(dir=kernel_cache.temporary(), ignore_cleanup_errors=True) as name:
+    with tempfile.TemporaryDirectory(dir=kernel_cache.temporary_folder(), ignore_cleanup_errors=True) as name:
         work, library = Path(name), Path(name) / "kernel.so"
         try:
             (work / "kernel.cpp").write_text(source)

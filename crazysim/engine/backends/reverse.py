@@ -21,7 +21,7 @@ from crazysim.engine.backends.source import type_name
 from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Builder, Value, constant, inline
 from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
-from crazysim.engine.lowering.activity import changed_slots, without_check
+from crazysim.engine.lowering.activity import changed_slots, remove_check
 from crazysim.engine.lowering.transpose import transpose_block
 
 
@@ -69,7 +69,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     Raises:
         UnsupportedError: If a part of it has no derivative in a kernel.
     """
-    program, perturbed = without_check(program, perturbed)
+    program, perturbed = remove_check(program, perturbed)
     n = len(program.leaves)
     cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number_type) for x in program.leaves]
     step_segments = [s for s in program.fused_segments if s.phase == "each"]

@@ -238,8 +238,8 @@ the numbers that depend on it are recomputed; compilers on the host may still me
 int32 index (a multiple of four if ``aligned``) and a constant offset, which must be in bounds.
 ``any_lane`` is true at least where its operand is; a target may return true in all lanes of a vector if any is true.
 
-Comparisons cost nothing, as they are counted with selections; nor do changes of sign, as part of other operations. The
-cost of a function is that of a hardware approximation and a step that refines it, or of the shortest polynomial that is
+Comparisons cost nothing, as they are counted with selections; nor do changes of sign, as part of other operations. A
+function costs as much as a hardware approximation and a step that refines it, or as the shortest polynomial that is
 exact to float32. A random number takes twenty rounds of add, rotate and xor. An operation that runs a block costs as
 much as the block.
 """

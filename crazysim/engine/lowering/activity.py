@@ -15,7 +15,7 @@ from crazysim.engine.ir.blocks import Block, Value
 from crazysim.engine.ir.program import Program, Segment, Slot
 
 
-def without_check(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
+def remove_check(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
     """Return a program without its check, and the perturbed leaves that are floats and that it uses."""
     if not program.fused:
         raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
@@ -42,8 +42,8 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
             x for x, slot in zip(block.inputs, slots, strict=False) if slot in changed and x.dtype.kind == "f"
         ]
         active_inputs += [block.inputs[len(slots) + k] for k in active_constants]
-        on_path = active_values(block, active_inputs)
-        return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in on_path]
+        active = active_values(block, active_inputs)
+        return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in active]
 
     def propagate(s: Segment) -> None:
         written_slots = program.per_drone(s, s.writes)

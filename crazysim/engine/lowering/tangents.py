@@ -19,7 +19,7 @@ from crazysim.engine.ir import ops
 from crazysim.engine.ir.algebra import known_zero
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
 from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
-from crazysim.engine.lowering.activity import apply_operation, changed_slots, without_check
+from crazysim.engine.lowering.activity import apply_operation, changed_slots, remove_check
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.selections import add_selections
 from crazysim.pytree import replace_leaves
@@ -41,7 +41,7 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     Raises:
         UnsupportedError: If a part of it has no derivative in a kernel.
     """
-    program, perturbed = without_check(program, perturbed)
+    program, perturbed = remove_check(program, perturbed)
     n = len(program.leaves)
     changed, constants = changed_slots(program, perturbed)
     segments = [_add_segment_tangents(program, n, s, changed, constants.get(s, ())) for s in program.fused_segments]

@@ -20,11 +20,11 @@ def pack_shared(program: Program) -> Program:
     leaves that are read as tables, stay separate.
     """
     leaves = program.leaves
-    direct = {leaf for stage in program.unfused_stages for leaf in stage.input_leaves} | program.tables
+    separate_leaves = {leaf for stage in program.unfused_stages for leaf in stage.input_leaves} | program.tables
     shared = [
         i
         for i in program.read_leaves
-        if leaves[i].scope == "shared" and i not in direct and i not in program.written_leaves
+        if leaves[i].scope == "shared" and i not in separate_leaves and i not in program.written_leaves
     ]
     shared = [i for i in shared if leaves[i].dtype == leaves[0].dtype]
     if not shared:
@@ -52,17 +52,17 @@ def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Pro
     leaves = list(program.leaves)
     row_leaves = [i for i in sorted(select(program.written_leaves)) if not is_key(leaves[i])]
     # If a world has one drone, leaves of the world can be stored with the leaves of drones.
-    kinds = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in row_leaves}
+    row_types = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in row_leaves}
     positions: dict[int, tuple[int, int, int]] = {}
-    for kind in dict.fromkeys(kinds.values()):
-        members = tuple([i for i in row_leaves if kinds[i] == kind])
+    for row_type in dict.fromkeys(row_types.values()):
+        members = tuple([i for i in row_leaves if row_types[i] == row_type])
         n_rows = sum(leaves[i].size for i in members)
         first = 0
         for i in members:
             positions[i] = (len(leaves), first, n_rows)
             first += leaves[i].size
         n_lanes = leaves[members[0]].shape[0] * program.n_drones
-        leaves.append(Leaf("rows", kind[0], (n_rows, n_lanes), kind[1], members))
+        leaves.append(Leaf("rows", row_type[0], (n_rows, n_lanes), row_type[1], members))
 
     def move(slot: Slot) -> Slot:
         leaf, k = slot
@@ -114,11 +114,11 @@ def packed_rows(program: Program) -> list[PackedRows]:
 def _move_slots(program: Program, move: Callable[[Slot], Slot]) -> Program:
     """Return a program in which all slots are replaced."""
 
-    def segment(s: Segment) -> Segment:
+    def move_segment(s: Segment) -> Segment:
         reads, writes, hoisted = ([move(slot) for slot in x] for x in (s.reads, s.writes, s.hoisted_reads))
         return dataclasses.replace(s, reads=tuple(reads), writes=tuple(writes), hoisted_reads=tuple(hoisted))
 
-    segments = tuple([segment(s) if isinstance(s, Segment) else s for s in program.segments])
+    segments = tuple([move_segment(s) if isinstance(s, Segment) else s for s in program.segments])
     return dataclasses.replace(
-        program, segments=segments, check_segment=program.check_segment and segment(program.check_segment)
+        program, segments=segments, check_segment=program.check_segment and move_segment(program.check_segment)
     )

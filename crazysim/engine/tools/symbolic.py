@@ -44,11 +44,13 @@ def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, E
 
 def require_casadi(block: Block) -> None:
     """Check that CasADi has a form for all operations of a block."""
-    refused = [(op.stage, why) for op in block.walk() if (why := _refusal(op)) is not None]
+    refused = [(op.stage, reason) for op in block.walk() if (reason := _refusal(op)) is not None]
     if refused:
-        random = [(stage, why) for stage, why in refused if why == RANDOM_REASON]  # the most informative reason
-        stage, why = (random or refused)[0]
-        raise UnsupportedError(why, stage=stage)
+        random_draws = [
+            (stage, reason) for stage, reason in refused if reason == RANDOM_REASON
+        ]  # the most informative reason
+        stage, reason = (random_draws or refused)[0]
+        raise UnsupportedError(reason, stage=stage)
 
 
 def _refusal(op: Operation) -> str | None:
@@ -64,9 +66,9 @@ def _refusal(op: Operation) -> str | None:
     row = ops.TABLE[op.name]
     if row.structured or op.name == "convert_element_type":
         return None
-    shared = next((x.dtype for x, letter in zip(op.args, row.operands, strict=True) if letter == "T"), op.dtype)
-    if row.casadi is None or shared.kind not in row.casadi_kinds:
-        return f"operation {op.name!r} on {shared.name} has no form in CasADi"
+    shared_type = next((x.dtype for x, letter in zip(op.args, row.operands, strict=True) if letter == "T"), op.dtype)
+    if row.casadi is None or shared_type.kind not in row.casadi_kinds:
+        return f"operation {op.name!r} on {shared_type.name} has no form in CasADi"
     return None
 
 

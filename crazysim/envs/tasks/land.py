@@ -39,7 +39,7 @@ class PadLanding(Landing):
 
     circle: Array = leaf("drone", 1)
     """Radius of the circle that the pad moves on, m; zero for one that stands still. (n_worlds, n_drones, 1)"""
-    rate: Array = leaf("drone", 1)
+    ang_vel: Array = leaf("drone", 1)
     """Angular velocity of the pad on the circle, rad/s. (n_worlds, n_drones, 1)"""
     phase: Array = leaf("drone", 1)
     """Angle of the pad on the circle at the start of the episode, rad. (n_worlds, n_drones, 1)"""
@@ -83,7 +83,7 @@ class Land(TouchDown):
             return pads.set_pose(data, pos, vel=vel)
 
         zero = device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)
-        record = PadLanding(circle=zero, rate=zero, phase=zero, pads=pads, **initial_outcome(sim.data))
+        record = PadLanding(circle=zero, ang_vel=zero, phase=zero, pads=pads, **initial_outcome(sim.data))
         placements = [StagePlacement(self.touch(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:
             placements.insert(0, StagePlacement(move_pads, before="increment_steps", name=f"{NAME}_pads"))
@@ -102,10 +102,10 @@ class Land(TouchDown):
         )
         data = flying(data, start_pos, rotation.from_rpy(0.2 * rpy), 0.3 * vel)
         circle = CIRCLE_RADII[0] + (CIRCLE_RADII[1] - CIRCLE_RADII[0]) * x["circle"]
-        rate = jnp.where(x["direction"] < 0.5, -self.speed, self.speed) / circle
+        ang_vel = jnp.where(x["direction"] < 0.5, -self.speed, self.speed) / circle
         is_moving = float(self.speed > 0)
         record = landing_of(data).replace(
-            circle=is_moving * circle, rate=is_moving * rate, phase=2 * jnp.pi * x["phase"]
+            circle=is_moving * circle, ang_vel=is_moving * ang_vel, phase=2 * jnp.pi * x["phase"]
         )
         data = with_record(data, record)
         pos, pad_vel = pad_of(data, data.core.steps)
@@ -148,7 +148,7 @@ def pad_of(data: SimData, steps: Array) -> tuple[Array, Array]:
         (..., 3) each
     """
     record = landing_of(data)
-    angle = record.phase + record.rate * (steps / data.core.freq)
+    angle = record.phase + record.ang_vel * (steps / data.core.freq)
     radial = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
     tangential = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)
-    return path_centre_of(data) + record.circle * radial, record.circle * record.rate * tangential
+    return path_centre_of(data) + record.circle * radial, record.circle * record.ang_vel * tangential

@@ -111,7 +111,7 @@ class Normalize(Wrapper):
 
     ``state.memory["Normalize"]`` holds the statistics, by name of the observation. To fly a policy with the
     statistics of its training, pass them: ``Normalize(env, stats)`` does not update them. Blocks of worlds with keys of
-    their own, such as those of several seeds in one training, share the statistics.
+    their own, such as several seeds in one training, share the statistics.
     """
 
     batched = True

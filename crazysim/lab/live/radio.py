@@ -23,7 +23,7 @@ from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.swarm import DroneState
 from crazysim.storage import Closing
 
-LOG = {
+LOG_VARIABLES = {
     "pos": ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),
     "vel": ("stateEstimate.vx", "stateEstimate.vy", "stateEstimate.vz"),
     "quat": ("stateEstimate.qx", "stateEstimate.qy", "stateEstimate.qz", "stateEstimate.qw"),
@@ -72,10 +72,10 @@ class Radio(Closing):
             ConfigError: If it is to be armed, and cflib is not installed or the drone does not answer.
         """
         self.name, self.armed, self.max_height = uri, bool(arm), max_height
-        frame = load_airframe(airframe)
-        self._max_thrust = frame.n_rotors * float(np.max(frame.value("rotors.thrust_max")))
+        loaded_airframe = load_airframe(airframe)
+        self._max_thrust = loaded_airframe.n_rotors * float(np.max(loaded_airframe.value("rotors.thrust_max")))
         self._lock, self._arrived = threading.Lock(), threading.Event()
-        self._values = {part: np.zeros(len(names)) for part, names in LOG.items()}
+        self._values = {part: np.zeros(len(names)) for part, names in LOG_VARIABLES.items()}
         self._received_names: set[str] = set()
         self._stamp, self._mode = 0.0, None
         self._sync: Any = None
@@ -104,7 +104,7 @@ class Radio(Closing):
         self._cf = self._sync.cf
         for parts in (("pos", "vel"), ("quat",), ("ang_vel", "acc")):
             config = LogConfig("-".join(parts), period_ms)
-            for name in (name for part in parts for name in LOG[part]):
+            for name in (name for part in parts for name in LOG_VARIABLES[part]):
                 config.add_variable(name, "float")
             config.data_received_cb.add_callback(self._receive_block)
             self._cf.log.add_config(config)
@@ -196,11 +196,11 @@ class Radio(Closing):
 
     def _receive_block(self, stamp: int, data: dict[str, float], config: Any) -> None:
         with self._lock:
-            for part, names in LOG.items():
+            for part, names in LOG_VARIABLES.items():
                 if names[0] in data:
                     x = np.array([data[name] for name in names])
                     if np.isfinite(x).all():
                         self._values[part], self._stamp = x, stamp / 1000
                         self._received_names.add(part)
-        if len(self._received_names) == len(LOG):
+        if len(self._received_names) == len(LOG_VARIABLES):
             self._arrived.set()

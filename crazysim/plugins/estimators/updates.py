@@ -90,12 +90,16 @@ def update_flow(
     predicted_from = estimate
     for k, (axis, sign) in enumerate(((1, -1.0), (0, 1.0))):
         height = jnp.maximum(predicted_from.pos[2], MIN_FLOW_HEIGHT)
-        rate = rot[2, 2] / height
-        turn_rate, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-predicted_from.vel[k] * rate / height, rate]
+        flow_per_vel = rot[2, 2] / height
+        turn_rate, rows, slopes = (
+            gyro[axis],
+            [POS[2], VEL[k]],
+            [-predicted_from.vel[k] * flow_per_vel / height, flow_per_vel],
+        )
         if predicted_from.gyro_bias is not None:
             turn_rate = turn_rate - predicted_from.gyro_bias[axis]
-            rows, slopes = [*rows, GYRO[axis]], [*slopes, jnp.full_like(rate, -sign)]
-        predicted = scale * (predicted_from.vel[k] * rate + sign * turn_rate)
+            rows, slopes = [*rows, GYRO[axis]], [*slopes, jnp.full_like(flow_per_vel, -sign)]
+        predicted = scale * (predicted_from.vel[k] * flow_per_vel + sign * turn_rate)
         estimate = update(estimate, rows, scale * jnp.stack(slopes), flow[k] - predicted, deviation)
         predicted_from = predicted_from if estimate.gyro_bias is None else estimate
     return estimate

@@ -68,26 +68,26 @@ def load_flat_state(
         inertia: Inertia of the drone, body frame, kg m^2. (3, 3)
         gravity_vec: Gravitational acceleration, world frame, m/s^2. (3,)
     """
-    falling = [gravity_vec, 0.0, 0.0, 0.0, 0.0]
-    pull = [load_mass * (path[..., 2 + k, :] - g) for k, g in enumerate(falling)]
+    gravity_derivatives = [gravity_vec, 0.0, 0.0, 0.0, 0.0]
+    pull = [load_mass * (path[..., 2 + k, :] - g) for k, g in enumerate(gravity_derivatives)]
     tension, rod_axis = _norm_and_direction(pull)
     pos = [path[..., k, :] + length * rod_axis[k] for k in range(MAX_ORDER - 1)]
-    force = [mass * (pos[2 + k] - g) + pull[k] for k, g in enumerate(falling[:3])]
-    thrust, rate, acc = (f / mass for f in force)
-    now = attitude_of_thrust(thrust, rate, acc, yaw[..., :1], yaw[..., 1:2], yaw[..., 2:])
-    momentum = rotation.matvec(inertia, now.ang_vel)
+    force = [mass * (pos[2 + k] - g) + pull[k] for k, g in enumerate(gravity_derivatives[:3])]
+    thrust, thrust_rate, thrust_acc = (f / mass for f in force)
+    attitude = attitude_of_thrust(thrust, thrust_rate, thrust_acc, yaw[..., :1], yaw[..., 1:2], yaw[..., 2:])
+    momentum = rotation.matvec(inertia, attitude.ang_vel)
     return LoadedState(
         pos=pos[0],
         vel=pos[1],
         acc=pos[2],
         direction=-rod_axis[0],
         direction_rate=-rod_axis[1],
-        quat=rotation.quat_from_axes(*(now.matrix[..., k] for k in range(3))),
-        ang_vel=now.ang_vel,
-        ang_acc=now.ang_acc,
+        quat=rotation.quat_from_axes(*(attitude.matrix[..., k] for k in range(3))),
+        ang_vel=attitude.ang_vel,
+        ang_acc=attitude.ang_acc,
         tension=tension,
         thrust=jnp.linalg.norm(force[0], axis=-1, keepdims=True),
-        torque=rotation.matvec(inertia, now.ang_acc) + rotation.cross(now.ang_vel, momentum),
+        torque=rotation.matvec(inertia, attitude.ang_acc) + rotation.cross(attitude.ang_vel, momentum),
     )
 
 

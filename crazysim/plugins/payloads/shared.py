@@ -182,8 +182,8 @@ class SharedLoad(PointLoad, Plugin):
         stretch = r.distance - load.length
         stretch = jnp.maximum(stretch, 0.0) if self.cable else stretch
         error = jnp.sum(jnp.where(load.attached[:, None], stretch * q, 0.0), axis=0) / n
-        rate = load.vel - correction_rate(freq) * error if dt is None else load.vel + dt * tip_acc - freq * error
-        rates = {"pos": rate, "vel": tip_acc}
+        pos_rate = load.vel - correction_rate(freq) * error if dt is None else load.vel + dt * tip_acc - freq * error
+        rates = {"pos": pos_rate, "vel": tip_acc}
         return deriv.replace(**changes, plugins=deriv.plugins | {self.name: rates})
 
     def move_objects(self, data: SimData) -> Objects:

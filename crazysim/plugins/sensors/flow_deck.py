@@ -77,8 +77,8 @@ class OpticalFlow(Sensor):
         distance, in_view = ground_distance(data, record.pos)
         vel = rotation.rotate_inverse(s.quat, s.vel, rotation.cross(s.ang_vel, record.pos))
         turn_rate = jnp.stack([-s.ang_vel[1], s.ang_vel[0]])
-        rate = vel[:2] / jnp.where(distance > MIN_FLOW_DISTANCE, distance, MIN_FLOW_DISTANCE) + turn_rate
-        return jnp.where(in_view, record.scale * self.interval(data) * rate, 0.0)
+        angular_rate = vel[:2] / jnp.where(distance > MIN_FLOW_DISTANCE, distance, MIN_FLOW_DISTANCE) + turn_rate
+        return jnp.where(in_view, record.scale * self.interval(data) * angular_rate, 0.0)
 
     def measure(self, data: SimData, record: OpticalFlowData, key: Array) -> tuple[Array, OpticalFlowData]:
         truth = self.ideal(data)

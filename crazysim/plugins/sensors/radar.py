@@ -131,16 +131,21 @@ def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: 
         tilt: Elevation of the lobe, rad. (...)
     """
     level_distance, height = safe_norm(offset[..., :2])[..., 0], offset[..., 2]
-    size, c, s = 0.5 * max_range, jnp.cos(tilt), jnp.sin(tilt)
+    half_range, c, s = 0.5 * max_range, jnp.cos(tilt), jnp.sin(tilt)
 
     def margin(level_distance: Array) -> Array:
         axial, lateral = c * level_distance + s * height, c * height - s * level_distance
-        u = axial / size
+        u = axial / half_range
         clipped = safe_clip(u, 1e-6, 2.0)
         root = rotation.safe_sqrt(2 - clipped)
-        limit = height_scale * size * jnp.exp(0.5 * ((1 + exponent) * jnp.log(clipped) - exponent * math.log(2))) * root
+        limit = (
+            height_scale
+            * half_range
+            * jnp.exp(0.5 * ((1 + exponent) * jnp.log(clipped) - exponent * math.log(2)))
+            * root
+        )
         overshoot = jnp.maximum(u - 2, 0.0) + jnp.maximum(-u, 0.0)
-        return limit - jnp.abs(lateral) - size * overshoot
+        return limit - jnp.abs(lateral) - half_range * overshoot
 
     # A steep lobe reaches across the vertical axis, so that the lobe in the opposite direction counts too.
     return jnp.maximum(margin(level_distance), margin(-level_distance))
@@ -148,8 +153,8 @@ def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: 
 
 def lobe_curves(max_range: float, exponent: float, height_scale: float, tilt: float) -> list[np.ndarray]:
     """Return outlines of a lobe relative to its radar, m: teardrops in vertical planes, and circles. (n, 3) each"""
-    size, t = 0.5 * max_range, np.linspace(0.0, math.pi, N_POINTS)
-    axial, lateral = size * (1 - np.cos(t)), height_scale * size * np.sin(t) * np.sin(t / 2) ** exponent
+    half_range, t = 0.5 * max_range, np.linspace(0.0, math.pi, N_POINTS)
+    axial, lateral = half_range * (1 - np.cos(t)), height_scale * half_range * np.sin(t) * np.sin(t / 2) ** exponent
     axial, lateral = np.concatenate([axial, axial[::-1]]), np.concatenate([lateral, -lateral[::-1]])
     level_distance = axial * math.cos(tilt) - lateral * math.sin(tilt)
     height = axial * math.sin(tilt) + lateral * math.cos(tilt)

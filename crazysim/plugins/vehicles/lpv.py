@@ -47,7 +47,7 @@ class LPVMemory(PyTree):
     """Sum of the offsets at the ticks, scaled to ``RATE``, m. (n_worlds, n_members, 1)"""
     offset: Array = leaf("member", 1)
     """Offset at the last tick, m. (n_worlds, n_members, 1)"""
-    rate: Array = leaf("member", 1)
+    offset_rate: Array = leaf("member", 1)
     """Smoothed rate of the offset, m/s. (n_worlds, n_members, 1)"""
     started: Array = leaf("member", 1)
     """One after the first tick, zero before. (n_worlds, n_members, 1)"""
@@ -96,12 +96,12 @@ class LPV(PathController):
     ) -> tuple[Array, LPVMemory]:
         right_offset, speed = -tracking.offset, state.body_vel[:1]
         integral = safe_clip(memory.integral + RATE * gains.period * right_offset, -INTEGRAL_MAX, INTEGRAL_MAX)
-        raw_rate = (right_offset - memory.offset) / gains.period
-        rate = memory.started * (memory.rate + SMOOTHING * (raw_rate - memory.rate))
-        terms = (integral, right_offset, rate)
+        raw_offset_rate = (right_offset - memory.offset) / gains.period
+        offset_rate = memory.started * (memory.offset_rate + SMOOTHING * (raw_offset_rate - memory.offset_rate))
+        terms = (integral, right_offset, offset_rate)
         feedback = sum(polynomial(c, speed) * x for c, x in zip(self.lateral, terms, strict=True))
         steer = -tracking.heading_error + feedback + gains.feedforward * tracking.curvature
-        return steer, LPVMemory(integral, right_offset, rate, jnp.ones_like(memory.started))
+        return steer, LPVMemory(integral, right_offset, offset_rate, jnp.ones_like(memory.started))
 
     def driving(self, state: CarState, tracking: PathState, gains: LPVGains, car: CarParams) -> Array:
         vx, vy = state.body_vel[:1], state.body_vel[1:]

@@ -129,10 +129,10 @@ class Path(PyTree):
         _, curve = _level_curve(trajectory)
 
         times = np.linspace(start, end, N_SAMPLES)
-        rate = np.hypot(*curve(times, 1).T)
-        length = _arc_length(times, rate)[-1]
+        derivative_length = np.hypot(*curve(times, 1).T)
+        length = _arc_length(times, derivative_length)[-1]
         progress = np.stack([np.linspace(0.0, length, N_TIMES), np.full(N_TIMES, abs(speed))], axis=1)
-        return _path_of_curve(curve, times, rate, progress, closed, speed < 0, abs(speed))
+        return _path_of_curve(curve, times, derivative_length, progress, closed, speed < 0, abs(speed))
 
     @staticmethod
     def stack(paths: Sequence[Path]) -> Path:
@@ -284,7 +284,7 @@ def _level_curve(trajectory: Trajectory) -> tuple[PieceTable, Callable[[Floats, 
 def _path_of_curve(
     curve: Callable[[Floats, int], Floats],
     times: Floats,
-    rate: Floats,
+    derivative_length: Floats,
     progress: Floats,
     closed: bool,
     backwards: bool,
@@ -295,13 +295,13 @@ def _path_of_curve(
     Args:
         curve: Function from parameters (n,) and the order of a derivative to x and y. (n, 2)
         times: Parameters, equally spaced. (n,)
-        rate: Length of the derivative there. (n,)
+        derivative_length: Length of the derivative there. (n,)
         progress: Arc length and its rate over time. (n_times, 2)
         closed: True for a path that ends at its start.
         backwards: True to drive backwards.
         speed: Speed, m/s; None for the rate.
     """
-    arc = _arc_length(times, rate)
+    arc = _arc_length(times, derivative_length)
     if not arc[-1] > 1e-3:
         raise ConfigError(
             "expected a path of some length on the ground, got one that stays where it is. Leave path out, and command "
@@ -311,7 +311,7 @@ def _path_of_curve(
         raise ConfigError(
             f"expected a path of at most {MAX_PIECES * MAX_PIECE_LENGTH:g} m, got {arc[-1]:.4g} m. Split it."
         )
-    moving_samples = np.flatnonzero(rate > 1e-3 * rate.max())
+    moving_samples = np.flatnonzero(derivative_length > 1e-3 * derivative_length.max())
     if len(moving_samples) != moving_samples[-1] - moving_samples[0] + 1:
         stop = times[moving_samples[0] + np.argmax(np.diff(moving_samples) > 1)]
         raise ConfigError(
@@ -331,33 +331,40 @@ def _path_of_curve(
     size = np.hypot(*vel.T)[:, None]
     tangent = vel / size
     curvature = (acc - np.sum(acc * tangent, axis=1, keepdims=True) * tangent) / size**2
-    curvature[size[:, 0] < STRAIGHT_RATE * rate.max()] = (
+    curvature[size[:, 0] < STRAIGHT_RATE * derivative_length.max()] = (
         0.0  # near rest the curvature of a polynomial grows without bound
     )
     spacing = arc[-1] / n
     derivatives = np.stack([pos, tangent, curvature], axis=1)
     coefficients = interpolation.unit_coefficients(derivatives, np.full(n, spacing))
-    speeds = np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], MIN_SPEED_SHARE * rate.max())
+    speeds = (
+        np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], MIN_SPEED_SHARE * derivative_length.max())
+    )
     end = progress[-1, 0] / speed if speed is not None else times[-1]
     arrays = (coefficients, arc[-1], spacing, speeds * (-1 if backwards else 1), progress, end)
     coefficients, length, spacing, speeds, progress, duration = (np.asarray(x, float_dtype())[None] for x in arrays)
     return Path(coefficients, length, spacing, np.array([closed]), speeds, progress, duration)  # type: ignore[arg-type]
 
 
-def _arc_length(times: Floats, rate: Floats) -> Floats:
+def _arc_length(times: Floats, derivative_length: Floats) -> Floats:
     """Return the arc length at each parameter, by the trapezoidal rule. (n,)"""
-    return np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(times))])
+    return np.concatenate([[0.0], np.cumsum((derivative_length[1:] + derivative_length[:-1]) / 2 * np.diff(times))])
 
 
 def _evaluate(coefficients: Array, u: Array) -> PathPoint:
     """Return position, tangent and curvature of a piece, (2, 6), at a share of its length. ()"""
     x = [coefficients[:, k] for k in range(6)]
     pos = x[0] + u * (x[1] + u * (x[2] + u * (x[3] + u * (x[4] + u * x[5]))))
-    rate = x[1] + u * (2 * x[2] + u * (3 * x[3] + u * (4 * x[4] + u * 5 * x[5])))
-    second = 2 * x[2] + u * (6 * x[3] + u * (12 * x[4] + u * 20 * x[5]))
-    inverse = lax.rsqrt(rate[0] * rate[0] + rate[1] * rate[1])
-    curvature = (rate[0] * second[1] - rate[1] * second[0]) * inverse * inverse * inverse
-    return PathPoint(pos, rate * inverse, curvature[None])
+    derivative = x[1] + u * (2 * x[2] + u * (3 * x[3] + u * (4 * x[4] + u * 5 * x[5])))
+    second_derivative = 2 * x[2] + u * (6 * x[3] + u * (12 * x[4] + u * 20 * x[5]))
+    inverse_length = lax.rsqrt(derivative[0] * derivative[0] + derivative[1] * derivative[1])
+    curvature = (
+        (derivative[0] * second_derivative[1] - derivative[1] * second_derivative[0])
+        * inverse_length
+        * inverse_length
+        * inverse_length
+    )
+    return PathPoint(pos, derivative * inverse_length, curvature[None])
 
 
 def _entry_at(x: Array, *index: Array | int) -> Array:

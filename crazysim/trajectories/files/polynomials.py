@@ -168,15 +168,15 @@ def unpack_compressed(content: bytes, location: str = "a trajectory memory") -> 
             offset += 3
             if not duration:
                 break
-            piece, last = np.zeros((4, 8)), points.copy()
+            piece, end_points = np.zeros((4, 8)), points.copy()
             for axis in range(4):
                 degree = STORED_DEGREES[header >> 2 * axis & 3]
                 later_points = struct.unpack_from(f"<{degree}h", content, offset)
                 offset += 2 * degree
                 curve = np.array([points[axis], *later_points], float)
                 piece[axis, : degree + 1] = power_coefficients(curve[:, None])[0]
-                last[axis] = curve[-1]
-            points = last
+                end_points[axis] = curve[-1]
+            points = end_points
             durations.append(duration)
             pieces.append(piece)
             if len(pieces) > checks.MAX_POINTS:

@@ -176,10 +176,10 @@ def _any_lane(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
 def _inputs(ctx: Lowering, template: Elements) -> Elements:
     """Return new inputs of a block, with the shape and types of an array of elements."""
 
-    def new(x: Any) -> Any:
-        return tuple(map(new, x)) if isinstance(x, tuple) else ctx.builder.input(x.dtype)
+    def new_input(x: Any) -> Any:
+        return tuple(map(new_input, x)) if isinstance(x, tuple) else ctx.builder.input(x.dtype)
 
-    return as_elements([new(x) for x in template.reshape(-1)], template.shape)
+    return as_elements([new_input(x) for x in template.reshape(-1)], template.shape)
 
 
 def _results(

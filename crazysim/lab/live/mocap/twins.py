@@ -134,10 +134,10 @@ class Twins(Closing):
         self.tracker = Tracker(self.names, rules, source.name)
         self._frozen, self._step = np.zeros(len(self.names), bool), 0
         self._recorder = None if record is None else MocapRecorder(record)
-        of_twins = twin_by_name.values()
-        self._turn = from_rpy([t.turn for t in of_twins]).reshape(-1, 4)
-        self._offset = np.array([t.offset for t in of_twins], float).reshape(-1, 3)
-        fixed = np.array([[np.nan if x is None else x for x in t.fixed] for t in of_twins], float).reshape(-1, 3)
+        twin_list = twin_by_name.values()
+        self._turn = from_rpy([t.turn for t in twin_list]).reshape(-1, 4)
+        self._offset = np.array([t.offset for t in twin_list], float).reshape(-1, 3)
+        fixed = np.array([[np.nan if x is None else x for x in t.fixed] for t in twin_list], float).reshape(-1, 3)
         self._fixed, self._is_fixed = fixed, np.isfinite(fixed).any(-1)
         self._poses = (
             np.tile(HIDDEN_POSITION, (len(twin_by_name), 1)),
@@ -167,7 +167,7 @@ class Twins(Closing):
         for frame in poll.frames:
             self.tracker.accept(frame)
         self.tracker.advance(poll.now, poll.lost, self.source.ended)
-        self._compute()
+        self._compute_poses()
         data = sim.data
         objects = data.objects
         if objects is None:
@@ -175,8 +175,8 @@ class Twins(Closing):
                 "expected the simulation whose scene has the twins, got one without movable objects. Pass the one that "
                 "Twins(sim, ...) was made for."
             )
-        new = _write_poses((objects.pos, objects.quat, objects.vel), self._rows, self._poses)
-        sim.data = data.replace(objects=objects.replace(pos=new[0], quat=new[1], vel=new[2]))
+        new_poses = _write_poses((objects.pos, objects.quat, objects.vel), self._rows, self._poses)
+        sim.data = data.replace(objects=objects.replace(pos=new_poses[0], quat=new_poses[1], vel=new_poses[2]))
 
     def freeze(self, *names: str) -> None:
         """Keep bodies at their present poses and ignore the source; without names, all bodies."""
@@ -214,7 +214,7 @@ class Twins(Closing):
                 poll = source.poll(k, freq)
                 for frame in poll.frames:
                     self.tracker.accept(frame)
-                self._compute()
+                self._compute_poses()
                 samples.append(self._poses[:2])
         finally:
             self.tracker, self._poses = state_before
@@ -232,7 +232,7 @@ class Twins(Closing):
                 raise UnknownNameError(f"expected one of the bodies {list(self.names)}, got {name!r}")
         return [self.names.index(name) for name in names] if names else list(range(len(self.names)))
 
-    def _compute(self) -> None:
+    def _compute_poses(self) -> None:
         """Compute poses and velocities of all objects that are not frozen."""
         tracker = self.tracker
         pos, vel = tracker.pos.copy(), tracker.vel
@@ -241,8 +241,8 @@ class Twins(Closing):
             parent = self.names.index(twin.parent)  # type: ignore[arg-type]
             joint = pos[parent] + rotate(tracker.quat[parent], np.asarray(twin.at, float))
             direction = pos[k] - joint
-            reach = np.linalg.norm(direction)
-            pos[k] = joint + (twin.length / reach * direction if reach > 0 else 0.0)
+            distance = np.linalg.norm(direction)
+            pos[k] = joint + (twin.length / distance * direction if distance > 0 else 0.0)
         quat = multiply(tracker.quat, self._turn)
         if self._is_fixed.any():
             rpy = to_rpy(quat[self._is_fixed])
