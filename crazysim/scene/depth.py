@@ -225,7 +225,7 @@ def build_depth_fn(
     ignored = directions[..., 3].reshape(-1).astype(int)
 
     def cast_in_worlds(data: SimData, kernels: RayKernels) -> Hits:
-        poses = [_camera_pose(camera, data) for camera in cameras]
+        poses = [camera_pose(camera, data) for camera in cameras]
         if data.states.pos.ndim == 2:
             origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
             direction = jnp.concatenate(
@@ -295,7 +295,7 @@ def _directions(rot: Array, rays: np.ndarray) -> Array:
     return x + y + z
 
 
-def _camera_pose(camera: CarriedCamera, data: SimData) -> tuple[Array, Array]:
+def camera_pose(camera: CarriedCamera, data: SimData) -> tuple[Array, Array]:
     """Return the camera's position, m (..., 3), and its axes as columns (..., 3, 3), in all worlds or in one."""
     states = data.states
     pos, rot = (jnp.asarray(x, states.pos.dtype) for x in (camera.pos, camera.rot))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.data import Objects, SimData
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
-from crazysim.scene import build, collision, contact_report, depth, mjx
+from crazysim.scene import build, collision, contact_report, depth, mjx, splat_images
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.maps import MAP_RGBA, MapSource, map_spec
 from crazysim.scene.mjx_scene import MjxScene
@@ -338,6 +338,40 @@ class Scene:
         return depth.build_depth_fn(
             self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels
         )
+
+    def splat_fn(
+        self,
+        camera: str | int | Sequence[str | int] = "fpv_cam",
+        width: int = 64,
+        height: int = 64,
+        background: ArrayLike = (1.0, 1.0, 1.0),
+        min_coverage: float = 0.5,
+        renderer: splat_images.Renderer = "auto",
+    ) -> splat_images.SplatFn:
+        """Return ``look(data, gaussians, mocap=None) -> SplatImage``, pure: images of Gaussian splats in all worlds.
+
+        The Gaussians are ``SplatScene.gaussians``. Images have gradients with respect to them and to the poses in
+        ``data``. Bodies of the scene are not drawn.
+
+        Args:
+            camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones, or names or ids of cameras.
+            width: Pixels.
+            height: Pixels.
+            background: Colour behind the splats, red, green and blue from 0 to 1.
+            min_coverage: Coverage of a pixel below which its depth is infinite.
+            renderer: ``"splax"`` for kernels on NVIDIA GPUs, ``"plain"`` for JAX, in small scenes, or ``"auto"``.
+
+        Raises:
+            ImportError: If ``renderer="splax"`` and splax is not installed.
+            ConfigError: If ``renderer="splax"`` and the simulation is not on a GPU.
+        """
+        objects = (*self.added.movable, *self.visual_model.mocap_bodies)
+        names = [camera] if isinstance(camera, (str, int, np.integer)) else list(camera)
+        cameras = [found for name in names for found in depth.find_cameras(self.mj_model, name, objects)]
+        return splat_images.build_splat_fn(
+            self.visual_model, cameras, width, height, background, min_coverage, renderer, self.device.platform,
+            self.plugins,
+        )  # fmt: skip
 
     # State of all worlds ----------------------------------------------------------------------------------------------
 

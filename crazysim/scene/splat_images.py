@@ -1,0 +1,265 @@
+"""Images of Gaussian splats: by splax on NVIDIA GPUs, or in plain JAX."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.settings import positive_integer
+from crazysim.errors import ConfigError, not_installed
+from crazysim.pytree import PyTree
+from crazysim.scene.collision import CollisionModel
+from crazysim.scene.depth import CarriedCamera, camera_pose
+from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
+from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
+from crazysim.scene.splats import Gaussians, spherical_harmonics
+from crazysim.tables import range_between, read_number, read_numbers
+
+NEAR = 0.01
+"""Distance along the camera's axis below which Gaussians are not drawn, m; splax has the same."""
+BLUR = 0.3
+"""Variance added to projected Gaussians, pixels^2, so that none is smaller than a pixel (Kerbl et al. 2023)."""
+MAX_SLOPE = 1.3
+"""Largest slope of the direction to a Gaussian at which its projection is linearised, as a multiple of the image's."""
+MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.999
+"""Alpha below which a Gaussian is left out of a pixel, and largest alpha; splax has the same."""
+MIN_TRANSMITTANCE = 1e-4
+"""Transmittance below which nothing more is drawn in a pixel (Kerbl et al. 2023)."""
+BLOCK = 32
+"""Gaussians that are drawn at a time."""
+MAX_ALPHAS = 1 << 24
+"""Largest number of pixels times ``BLOCK`` that are drawn at a time, over several images."""
+RENDERERS = ("auto", "splax", "plain")
+"""Renderers of splats."""
+
+Renderer = Literal["auto", "splax", "plain"]
+
+
+class SplatImage(PyTree):
+    """Images of splats; in a function of one world they have no axis ``n_worlds``."""
+
+    color: Array
+    """Red, green and blue, 0 to 1. (n_worlds, n_cameras, height, width, 3)"""
+    depth: Array
+    """Mean distance of the surface along the camera's axis, m; infinite where ``coverage`` is below the smallest
+    coverage. (n_worlds, n_cameras, height, width)"""
+    coverage: Array
+    """Share of light that comes from Gaussians and not from the background. (n_worlds, n_cameras, height, width)"""
+
+
+SplatFn = Callable[..., SplatImage]
+"""``look(data, gaussians, mocap=None) -> SplatImage``."""
+
+
+def build_splat_fn(
+    model: CollisionModel,
+    cameras: Sequence[CarriedCamera],
+    width: int,
+    height: int,
+    background: ArrayLike,
+    min_coverage: float,
+    renderer: Renderer,
+    platform: str,
+    plugins: ListPlugins,
+) -> SplatFn:
+    """Return ``look(data, gaussians, mocap=None) -> SplatImage``, pure; see ``Scene.splat_fn``."""
+    width, height = positive_integer("width", width), positive_integer("height", height)
+    color = read_numbers("background", background, range_between(0.0, 1.0), ((3,),))
+    min_coverage = read_number("min_coverage", min_coverage, range_between(0.0, 1.0))
+    if len({camera.fovy for camera in cameras}) > 1:
+        raise ConfigError("expected cameras of one field of view, got several. Draw them in several functions.")
+    focal = height / 2 / np.tan(np.deg2rad(cameras[0].fovy) / 2)
+    draw = functools.partial(
+        _choose_renderer(renderer, platform), focal=float(focal), width=width, height=height, background=color
+    )
+    at_a_time = max(1, MAX_ALPHAS // (width * height * BLOCK))
+    bodies = [camera.body for camera in cameras]
+
+    def look(data: SimData, gaussians: Gaussians, mocap: MocapPoses = None) -> SplatImage:
+        if data.states.pos.ndim == 1:
+            raise ConfigError("expected data of all worlds or of one world for images, got data of one drone")
+        require_poses(model, bodies, mocap)
+        data = with_mocap_bodies(model, with_moved_objects(data, moving_plugins(plugins(), bodies)), mocap)
+        poses = [camera_pose(camera, data) for camera in cameras]
+        pos, rot = (jnp.stack(x, axis=data.states.pos.ndim - 2) for x in zip(*poses, strict=True))
+        leading = pos.shape[:-1]
+        eyes = pos.reshape(-1, 3), rot.reshape(-1, 3, 3)
+        images = draw(gaussians, eyes, at_a_time=at_a_time)
+        color, depth, coverage = (x.reshape(*leading, *x.shape[1:]) for x in images)
+        return SplatImage(color, jnp.where(coverage < min_coverage, jnp.inf, depth), coverage)
+
+    return look
+
+
+def _choose_renderer(renderer: Renderer, platform: str) -> Callable[..., tuple[Array, Array, Array]]:
+    """Return ``_draw_with_splax`` or ``_draw_plainly``."""
+    if renderer not in RENDERERS:
+        raise ConfigError(f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}")
+    if renderer == "plain" or (renderer == "auto" and (platform != "gpu" or not importlib.util.find_spec("splax"))):
+        return _draw_plainly
+    if platform != "gpu":
+        raise ConfigError(
+            f"expected a simulation on a GPU for renderer='splax', got one on {platform!r}. Pass device='gpu', or use "
+            f"renderer='plain'."
+        )
+    return functools.partial(_draw_with_splax, import_splax())
+
+
+def import_splax() -> ModuleType:
+    """Return the module ``splax``.
+
+    Raises:
+        ImportError: If it is not installed.
+        ConfigError: If SciPy was imported before, without the setting that splax needs.
+    """
+    try:
+        import splax
+    except ImportError as error:
+        raise ImportError(not_installed("splats on a GPU need", "splax", "splats")) from error
+    except RuntimeError as error:  # splax sets an option of SciPy, which counts before SciPy is imported only
+        raise ConfigError(
+            f"expected to import splax, got: {error}. Set SCIPY_ARRAY_API=1 before Python starts."
+        ) from error
+    return splax
+
+
+Eyes = tuple[Array, Array]
+"""Positions of cameras, m (n, 3), and axes as columns, right, up and back (n, 3, 3)."""
+
+
+def _draw_with_splax(
+    splax: ModuleType,
+    gaussians: Gaussians,
+    eyes: Eyes,
+    focal: float,
+    width: int,
+    height: int,
+    background: np.ndarray,
+    at_a_time: int,
+) -> tuple[Array, Array, Array]:
+    """Return colours, depths and coverages of images; ``at_a_time`` is not used, since kernels have no arrays."""
+    del at_a_time
+    parameters = (
+        gaussians.pos, gaussians.log_scale, jnp.roll(gaussians.quat, 1, axis=-1), gaussians.color,
+        gaussians.logit_opacity,
+    )  # fmt: skip
+
+    def draw(view: Array) -> tuple[Array, Array]:
+        return splax.render(
+            *parameters,
+            viewmat=view,
+            background=jnp.asarray(background, jnp.float32),
+            img_shape=(height, width),
+            f=(focal, focal),
+            clip_thresh=NEAR,
+            render_depth=True,
+        )
+
+    image, coverage = jax.vmap(draw)(view_matrices(*eyes))
+    return jnp.clip(image[..., :3], 0.0, 1.0), image[..., 3], coverage
+
+
+def view_matrices(pos: Array, rot: Array) -> Array:
+    """Return the matrices from the world to cameras with axes right, down and ahead. (..., 4, 4)
+
+    Args:
+        pos: Positions of the cameras, m. (..., 3)
+        rot: Axes as columns: right, up and back, as MuJoCo has them. (..., 3, 3)
+    """
+    axes = jnp.swapaxes(rot, -1, -2) * np.array([[1.0], [-1.0], [-1.0]], np.float32)
+    upper = jnp.concatenate([axes, -rotation.matvec(axes, pos)[..., None]], axis=-1)
+    last = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], upper.dtype), (*upper.shape[:-2], 1, 4))
+    return jnp.concatenate([upper, last], axis=-2)
+
+
+def _draw_plainly(
+    gaussians: Gaussians, eyes: Eyes, focal: float, width: int, height: int, background: np.ndarray, at_a_time: int
+) -> tuple[Array, Array, Array]:
+    """Return colours (n, height, width, 3), depths and coverages (n, height, width) of images."""
+    draw = functools.partial(_draw_image, gaussians, focal=focal, width=width, height=height, background=background)
+    return jax.lax.map(draw, eyes, batch_size=min(at_a_time, len(eyes[0])))
+
+
+def _draw_image(
+    gaussians: Gaussians, eye: Eyes, focal: float, width: int, height: int, background: np.ndarray
+) -> tuple[Array, Array, Array]:
+    """Return colour (height, width, 3), depth and coverage (height, width) of an image (Kerbl et al. 2023).
+
+    Gaussians are projected to Gaussians of the image (Zwicker et al. 2001) and blended from near to far.
+    """
+    pos, rot = eye
+    order = jnp.argsort(jnp.sum((gaussians.pos - pos) * -rot[:, 2], axis=-1))
+    order = jnp.pad(order, (0, -len(order) % BLOCK), constant_values=-1).reshape(-1, BLOCK)
+    y, x = (np.arange(n, dtype=np.float32) + 0.5 for n in (height, width))
+    zero = jnp.zeros((height, width), gaussians.pos.dtype)
+
+    def blend(carry: tuple[Array, Array, Array], block: Array) -> tuple[tuple[Array, Array, Array], None]:
+        color, depth, transmittance = carry
+        near = jax.tree.map(lambda leaf: leaf[block], gaussians)
+        center, (a, b, c), z, opacity = _project(near, pos, rot, focal, width, height)
+        dx, dy = (e[:, None, None] - p for e, p in zip(center, (x, y[:, None]), strict=True))
+        a, b, c, opacity = (e[:, None, None] for e in (a, b, c, jnp.where(block < 0, 0.0, opacity)))
+        alpha = jnp.minimum(MAX_ALPHA, opacity * jnp.exp(-(a * dx * dx + c * dy * dy) / 2 - b * dx * dy))
+        alpha = jnp.where(alpha < MIN_ALPHA, 0.0, alpha)
+        after = transmittance * jnp.cumprod(1 - alpha, axis=0)
+        alpha = jnp.where(after > MIN_TRANSMITTANCE, alpha, 0.0)
+        weight = jnp.concatenate([transmittance[None], after[:-1]]) * alpha
+        seen = _colors(near, pos)
+        # A GPU may round products of matrices to 10 bits otherwise.
+        color = color + jnp.einsum("kyx,kc->yxc", weight, seen, precision="highest")
+        depth = depth + jnp.sum(weight * z[:, None, None], axis=0)
+        return (color, depth, transmittance - jnp.sum(weight, axis=0)), None
+
+    start = jnp.zeros((height, width, 3), zero.dtype), zero, zero + 1
+    (color, depth, transmittance), _ = jax.lax.scan(blend, start, order)
+    coverage = 1 - transmittance
+    is_covered = coverage > 0
+    color = jnp.clip(color + transmittance[..., None] * jnp.asarray(background, zero.dtype), 0.0, 1.0)
+    return color, jnp.where(is_covered, depth / jnp.where(is_covered, coverage, 1.0), 0.0), coverage
+
+
+def _project(
+    gaussians: Gaussians, pos: Array, rot: Array, focal: float, width: int, height: int
+) -> tuple[tuple[Array, Array], tuple[Array, Array, Array], Array, Array]:
+    """Return centres in the image, pixels, entries xx, xy and yy of the inverse covariances, depths, and opacities."""
+    right, up, back = (rot[:, k] for k in range(3))
+    offset = gaussians.pos - pos
+    z = -jnp.sum(offset * back, axis=-1)
+    is_near = z > NEAR
+    u, v = (jnp.sum(offset * axis, axis=-1) / jnp.where(is_near, z, 1.0) for axis in (right, -up))
+    scale = focal / jnp.where(is_near, z, 1.0)
+    # Rows of the product of projection and rotation, and standard deviations along the axes of a Gaussian.
+    ahead, slopes = -back, [jnp.clip(t, -s, s) for t, s in zip((u, v), _slopes(focal, width, height), strict=True)]
+    rows = [scale[:, None] * (axis - t[:, None] * ahead) for axis, t in zip((right, -up), slopes, strict=True)]
+    quat = gaussians.quat * jax.lax.rsqrt(jnp.sum(gaussians.quat**2, axis=-1, keepdims=True))
+    deviation = jnp.exp(gaussians.log_scale)
+    axes = rotation.matrix(quat)
+    px, py = (jnp.sum(row[:, :, None] * axes, axis=1) * deviation for row in rows)
+    xx, xy, yy = jnp.sum(px * px, axis=-1) + BLUR, jnp.sum(px * py, axis=-1), jnp.sum(py * py, axis=-1) + BLUR
+    determinant = xx * yy - xy * xy
+    opacity = jnp.where(is_near, jax.nn.sigmoid(gaussians.logit_opacity), 0.0)
+    center = focal * u + width / 2, focal * v + height / 2
+    return center, (yy / determinant, -xy / determinant, xx / determinant), z, opacity
+
+
+def _slopes(focal: float, width: int, height: int) -> tuple[float, float]:
+    return MAX_SLOPE * width / 2 / focal, MAX_SLOPE * height / 2 / focal
+
+
+def _colors(gaussians: Gaussians, pos: Array) -> Array:
+    """Return the colours of Gaussians as seen from a position. (n, 3)"""
+    direction = rotation.safe_normalize(gaussians.pos - pos, jnp.array([1.0, 0.0, 0.0], gaussians.pos.dtype))
+    harmonics = spherical_harmonics(direction, gaussians.color.shape[1])
+    seen = sum(h[:, None] * gaussians.color[:, k] for k, h in enumerate(harmonics))
+    return jnp.maximum(seen + 0.5, 0.0)

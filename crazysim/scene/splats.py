@@ -1,0 +1,175 @@
+"""Gaussian splats: scenes of coloured Gaussians, made from photographs, in the frame of a simulation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree
+from crazysim.scene.map_files import MAX_FILE_BYTES, read_ply
+from crazysim.scene.maps import read_frame
+from crazysim.scene.objects import IDENTITY_QUAT
+from crazysim.storage import read_bytes, reading
+from crazysim.tables import range_between, read_number
+
+N_COLORS = (1, 4, 9, 16)
+"""Numbers of spherical harmonics up to degree 0, 1, 2 and 3."""
+CENTRAL = (5.0, 95.0)
+"""Percentiles of coordinates between which the extent of splats is measured: single ones lie far outside."""
+
+
+class Gaussians(PyTree):
+    """Gaussians in the world frame, as unconstrained parameters, with respect to which images have gradients."""
+
+    pos: Array
+    """Centres, m. (n, 3)"""
+    quat: Array
+    """Attitudes, xyzw, normalised where they are used. (n, 4)"""
+    log_scale: Array
+    """Logarithms of the standard deviations along the axes of a Gaussian, m. (n, 3)"""
+    color: Array
+    """Coefficients of spherical harmonics for red, green and blue. (n, 1 | 4 | 9 | 16, 3)"""
+    logit_opacity: Array
+    """Logits of the opacities. (n,)"""
+
+
+class SplatScene:
+    """A scene of Gaussian splats, at a pose and a scale in the world."""
+
+    gaussians: Gaussians
+    """The Gaussians, in the world frame."""
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        pos: ArrayLike = (0.0, 0.0, 0.0),
+        quat: ArrayLike = IDENTITY_QUAT,
+        scale: float | None = None,
+    ):
+        """Read the scene.
+
+        Args:
+            path: A ``.ply`` file as programs for 3D Gaussian splatting write it (Kerbl et al. 2023).
+            pos: Origin of the file's frame, world frame, m. (3,)
+            quat: Attitude of the file's frame, file to world, xyzw. (4,)
+            scale: Metres per unit of the file; None for one, if the scene is then 1 cm to 10 km large.
+
+        Raises:
+            DamagedFileError: If the file is damaged, cut off, or of another kind.
+            ConfigError: If it does not exist, has no Gaussians or some that are not finite, or no plausible scale.
+        """
+        values = _read_gaussians(path)
+        points = values["pos"]
+        central = np.percentile(points, CENTRAL, axis=0) if len(points) > 100 else points
+        origin, rot, scale = read_frame(central, pos, quat, scale)
+        turn = np.empty(4)
+        mujoco.mju_mat2Quat(turn, rot.reshape(-1))
+        self.gaussians = Gaussians(
+            pos=jnp.asarray(scale * points @ rot.T + origin, np.float32),
+            quat=jnp.asarray(_multiply(np.roll(turn, -1), values["quat"]), np.float32),
+            log_scale=jnp.asarray(values["log_scale"] + np.log(scale), np.float32),
+            color=jnp.asarray(_rotate_colors(values["color"], rot), np.float32),
+            logit_opacity=jnp.asarray(values["logit_opacity"], np.float32),
+        )
+
+    def __len__(self) -> int:
+        return len(self.gaussians.pos)
+
+    def points(self, min_opacity: float = 0.3) -> NDArray[np.float64]:
+        """Return the centres of the Gaussians that are not transparent, as a point cloud for ``Scene.add_map``, m.
+
+        Args:
+            min_opacity: Smallest opacity.
+
+        Returns:
+            (n, 3)
+        """
+        min_opacity = read_number("min_opacity", min_opacity, range_between(0.0, 1.0))
+        opacity = 1 / (1 + np.exp(-np.asarray(self.gaussians.logit_opacity, np.float64)))
+        return np.asarray(self.gaussians.pos, np.float64)[opacity >= min_opacity]
+
+
+def spherical_harmonics(direction: Any, n: int) -> list[Any]:
+    """Return the first ``n`` real spherical harmonics, in the order and with the signs of splat files. (...) each
+
+    Args:
+        direction: Unit vectors. (..., 3)
+        n: One of ``N_COLORS``.
+    """
+    x, y, z = (direction[..., k] for k in range(3))
+    xx, yy, zz = x * x, y * y, z * z
+    bands = [
+        (1 / 4, 1 + 0 * x),
+        (3 / 4, -y), (3 / 4, z), (3 / 4, -x),
+        (15 / 4, x * y), (15 / 4, -y * z), (5 / 16, 2 * zz - xx - yy), (15 / 4, -x * z), (15 / 16, xx - yy),
+        (35 / 32, -y * (3 * xx - yy)), (105 / 4, x * y * z), (21 / 32, -y * (4 * zz - xx - yy)),
+        (7 / 16, z * (2 * zz - 3 * xx - 3 * yy)), (21 / 32, -x * (4 * zz - xx - yy)), (105 / 16, z * (xx - yy)),
+        (35 / 32, -x * (xx - 3 * yy)),
+    ]  # fmt: skip
+    return [float(np.sqrt(square / np.pi)) * polynomial for square, polynomial in bands[:n]]
+
+
+def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
+    """Return the fields of ``Gaussians`` in the frame and unit of the file."""
+    with reading(path, "a scene of Gaussian splats", "Use a .ply file of a program for Gaussian splatting."):
+        vertex = read_ply(read_bytes(path, MAX_FILE_BYTES))["vertex"]
+    names = {
+        "pos": ["x", "y", "z"],
+        "quat": [f"rot_{k}" for k in (1, 2, 3, 0)],
+        "log_scale": [f"scale_{k}" for k in range(3)],
+        "color": [f"f_dc_{k}" for k in range(3)],
+        "logit_opacity": ["opacity"],
+    }
+    missing = [name for columns in names.values() for name in columns if name not in vertex]
+    if missing:
+        raise ConfigError(
+            f"expected Gaussian splats, got {str(path)!r}, which has no property {missing[0]!r}. Add a point cloud or "
+            f"mesh with sim.scene.add_map."
+        )
+    values = {field: np.stack([vertex[name] for name in columns], axis=-1) for field, columns in names.items()}
+    n, n_rest = len(values["pos"]), sum(name.startswith("f_rest_") for name in vertex)
+    if n_rest + 3 not in [3 * k for k in N_COLORS]:
+        raise ConfigError(
+            f"expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ..., got {n_rest} in {str(path)!r}. Save it again."
+        )
+    if not n:
+        raise ConfigError(f"expected Gaussian splats, got {str(path)!r}, which has none. Save it again.")
+    rest = np.array([vertex[f"f_rest_{k}"] for k in range(n_rest)]).reshape(3, n_rest // 3, n)
+    values["color"] = np.concatenate([values["color"][:, None], rest.transpose(2, 1, 0)], axis=1)
+    values["logit_opacity"] = values["logit_opacity"][:, 0]
+    values = {field: np.asarray(x, np.float64) for field, x in values.items()}
+    is_bad = ~np.logical_and.reduce([np.isfinite(x).reshape(n, -1).all(axis=1) for x in values.values()])
+    is_bad |= ~values["quat"].any(axis=1)
+    if is_bad.any():
+        raise ConfigError(
+            f"expected finite Gaussians with rotations, got {int(is_bad.sum())} of {n} without in {str(path)!r}. Drop "
+            f"them."
+        )
+    return values
+
+
+def _multiply(p: NDArray, q: NDArray) -> NDArray:
+    """Return the product of quaternions, xyzw. (4,), (n, 4) -> (n, 4)"""
+    vector = p[3] * q[:, :3] + q[:, 3:] * p[:3] + np.cross(p[:3], q[:, :3])
+    return np.concatenate([vector, p[3] * q[:, 3:] - q[:, :3] @ p[:3, None]], axis=1)
+
+
+def _rotate_colors(color: NDArray, rot: NDArray) -> NDArray:
+    """Return coefficients of spherical harmonics in a frame turned by a rotation matrix. (n, n_colors, 3)
+
+    The colour seen along a direction d in the new frame is the one seen along ``rot.T @ d`` in the old frame. Both are
+    linear in the coefficients of a band, so directions that span the bands determine the new ones.
+    """
+    n = color.shape[1]
+    directions = np.random.default_rng(0).normal(size=(4 * n, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    new, old = (np.stack(spherical_harmonics(d, n), axis=-1) for d in (directions, directions @ rot))
+    return np.einsum("ij,njc->nic", np.linalg.pinv(new) @ old, color)

@@ -1,0 +1,267 @@
+"""Gaussian splats: files, frames, and images in plain JAX; the same with splax is tested on GPUs."""
+
+import sys
+import types
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.scene import splat_images
+from crazysim.scene.splats import Gaussians, SplatScene
+
+SIZE = {"width": 24, "height": 16}
+
+
+def write_splats(path, n=30, n_colors=16, seed=0, **changes):
+    """Write a scene of random splats around (2, 0, 1), and return its columns."""
+    rng = np.random.default_rng(seed)
+    columns = {axis: rng.normal(mean, 0.5, n) for axis, mean in (("x", 2), ("y", 0), ("z", 1))}
+    columns |= {f"f_dc_{k}": rng.normal(0, 1, n) for k in range(3)}
+    columns |= {f"f_rest_{k}": rng.normal(0, 0.2, n) for k in range(3 * (n_colors - 1))}
+    columns |= {"opacity": rng.normal(0.5, 1, n)} | {f"scale_{k}": rng.normal(-1.8, 0.4, n) for k in range(3)}
+    columns |= {f"rot_{k}": rng.normal(0, 1, n) for k in range(4)} | changes
+    columns = {name: x for name, x in columns.items() if x is not None}
+    head = "".join(f"property float {name}\n" for name in columns)
+    body = np.stack(list(columns.values()), axis=1).astype("<f4").tobytes()
+    path.write_bytes(f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{head}end_header\n".encode() + body)
+    return columns
+
+
+@pytest.fixture(scope="module")
+def sim():
+    sim = Sim(n_worlds=2, n_drones=2)
+    states = sim.data.states
+    pos = np.float32([[[0, 0, 1], [0.3, 0.5, 1.2]], [[-0.5, 0.2, 0.8], [0.2, -0.4, 1.1]]])
+    quat = np.float32([[0, 0, 0, 1], [0.05, 0.1, -0.1, 1]])
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    sim.data = sim.data.replace(states=states.replace(pos=pos, quat=np.broadcast_to(quat, (2, 2, 4))))
+    return sim
+
+
+@pytest.fixture(scope="module")
+def look(sim):
+    return jax.jit(sim.scene.splat_fn(**SIZE, background=(0.1, 0.2, 0.3)))
+
+
+def gaussians_of(columns):
+    columns = {name: np.float32(x) for name, x in columns.items()}
+    rest = sum(name.startswith("f_rest") for name in columns) // 3
+    colors = [[columns[f"f_dc_{c}"], *(columns[f"f_rest_{c * rest + k}"] for k in range(rest))] for c in range(3)]
+    stack = lambda names: jnp.asarray(np.stack([columns[name] for name in names], axis=-1))  # noqa: E731
+    return Gaussians(
+        stack("xyz"), stack(["rot_1", "rot_2", "rot_3", "rot_0"]), stack([f"scale_{k}" for k in range(3)]),
+        jnp.asarray(np.array(colors).transpose(2, 1, 0)), jnp.asarray(columns["opacity"]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("n_colors", [1, 4, 9, 16])
+def test_files_are_read(n_colors, tmp_path):
+    columns = write_splats(tmp_path / "a.ply", n_colors=n_colors)
+    splats = SplatScene(tmp_path / "a.ply")
+    assert len(splats) == 30
+    for x, y in zip(jax.tree.leaves(splats.gaussians), jax.tree.leaves(gaussians_of(columns)), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-5)
+    opaque = 1 / (1 + np.exp(-columns["opacity"])) >= 0.6
+    assert len(splats.points(0.6)) == opaque.sum() > 0
+
+
+def test_one_splat_is_its_analytic_projection(sim):
+    """A round Gaussian ahead is a round spot, of the standard deviation f s / z and the low-pass of 0.3 pixels^2."""
+    look = sim.scene.splat_fn("fpv_cam:0", 33, 33, background=(0, 0, 0), min_coverage=0.2)
+    ahead = float(sim.mj_model.cam("fpv_cam:0").pos[0])
+    z, s, opacity, color = 2.0, 0.1, 0.8, np.array([0.9, 0.5, 0.2])
+    eye = np.array([ahead, 0, float(sim.mj_model.cam("fpv_cam:0").pos[2]) + 1.0])
+    spot = Gaussians(
+        jnp.asarray([eye + [z, 0.2, 0.1]], jnp.float32), jnp.array([[0, 0, 0, 1.0]]),
+        jnp.full((1, 3), np.log(s), jnp.float32),
+        jnp.asarray((color - 0.5)[None, None] * 2 * np.sqrt(np.pi), jnp.float32),
+        jnp.asarray([np.log(opacity / (1 - opacity))], jnp.float32),
+    )  # fmt: skip
+    image = look(sim.data, spot)
+    assert image.color.shape == (2, 1, 33, 33, 3)
+    focal = 33 / 2 / np.tan(np.deg2rad(float(sim.mj_model.cam("fpv_cam:0").fovy[0])) / 2)
+    u, v = 16.5 - focal * 0.2 / z, 16.5 - focal * 0.1 / z  # left is +y, up is +z
+    rows = np.arange(33) + 0.5
+    slope = np.array([[-0.2 / z, 0.0], [0.0, -0.1 / z]])  # the depth of the spot spreads along the ray
+    sides = focal * s / z * np.array([[1, 0, -slope[0, 0]], [0, 1, -slope[1, 1]]])
+    inverse = np.linalg.inv(sides @ sides.T + 0.3 * np.eye(2))
+    offset = np.stack(np.broadcast_arrays(rows[None] - u, rows[:, None] - v), axis=-1)
+    alpha = opacity * np.exp(-np.einsum("...i,ij,...j", offset, inverse, offset) / 2)
+    alpha[alpha < 1 / 255] = 0
+    np.testing.assert_allclose(image.coverage[0, 0], alpha, atol=2e-5)
+    np.testing.assert_allclose(image.color[0, 0], alpha[..., None] * color, atol=2e-5)
+    np.testing.assert_allclose(image.depth[0, 0], np.where(alpha < 0.2, np.inf, z), rtol=1e-5)
+
+
+def test_many_splats_are_blended_from_near_to_far(sim, look, tmp_path):
+    """The image is what a loop over pixels and splats paints, in the order of depth; splats behind are left out."""
+    g = gaussians_of(write_splats(tmp_path / "a.ply", n=70, x=np.random.default_rng(1).uniform(-1, 3, 70)))
+    image = look(sim.data, g)
+    pos, rot = sim_camera(sim, 1, 1)
+    color = np.tile([0.1, 0.2, 0.3], (16, 24, 1))
+    eye = jnp.float32(pos), jnp.float32(rot)
+    center, (a, b, c), z, opacity = splat_images._project(g, *eye, focal_of(sim), **SIZE)
+    seen = np.asarray(splat_images._colors(g, eye[0]))
+    y, x = np.mgrid[:16, :24] + 0.5
+    for k in np.argsort(-np.asarray(z)):  # from far to near: each is painted over those behind it
+        dx, dy = float(center[0][k]) - x, float(center[1][k]) - y
+        sigma = (float(a[k]) * dx**2 + float(c[k]) * dy**2) / 2 + float(b[k]) * dx * dy
+        alpha = np.minimum(0.999, float(opacity[k]) * np.exp(-sigma))
+        alpha = np.where(alpha < 1 / 255, 0, alpha)[..., None]
+        color = (1 - alpha) * color + alpha * seen[k]
+    np.testing.assert_allclose(image.color[1, 1], np.clip(color, 0, 1), atol=3e-4)  # it stops at 1e-4
+
+
+def sim_camera(sim, world, drone):
+    """Return position and axes of a drone's camera, by MuJoCo."""
+    sim.scene.sync_one(sim.data, world)
+    mujoco.mj_kinematics(sim.mj_model, sim.mj_data)
+    mujoco.mj_comPos(sim.mj_model, sim.mj_data)
+    mujoco.mj_camlight(sim.mj_model, sim.mj_data)
+    camera = sim.mj_model.cam(f"fpv_cam:{drone}").id
+    return np.array(sim.mj_data.cam_xpos[camera]), sim.mj_data.cam_xmat[camera].reshape(3, 3).copy()
+
+
+def focal_of(sim):
+    return 16 / 2 / np.tan(np.deg2rad(float(sim.mj_model.cam("fpv_cam:0").fovy[0])) / 2)
+
+
+def test_a_scene_looks_the_same_at_any_pose_and_scale(sim, look, tmp_path):
+    """A file of other axes and units, registered with the world, gives the image of the file in the world's frame."""
+    columns = write_splats(tmp_path / "world.ply")
+    quat, pos, scale = np.array([0.3, -0.2, 0.5, 0.7]), np.array([1.0, -2.0, 0.5]), 2.5
+    quat /= np.linalg.norm(quat)
+    rot = np.empty(9)
+    mujoco.mju_quat2Mat(rot, np.roll(quat, 1))
+    rot = rot.reshape(3, 3)
+    points = (np.stack([columns[a] for a in "xyz"], axis=1) - pos) @ rot / scale
+    rotated = SplatScene(tmp_path / "world.ply", quat=np.r_[-quat[:3], quat[3]]).gaussians
+    values = np.concatenate(
+        [np.roll(rotated.quat, 1, axis=1), rotated.color.transpose(0, 2, 1).reshape(30, -1)], axis=1
+    )
+    changes = dict(zip([f"rot_{k}" for k in range(4)], values[:, :4].T, strict=True))
+    changes |= {f"scale_{k}": columns[f"scale_{k}"] - np.log(scale) for k in range(3)} | dict(
+        zip("xyz", points.T, strict=True)
+    )
+    colors = values[:, 4:].reshape(30, 3, 16)
+    changes |= {f"f_dc_{c}": colors[:, c, 0] for c in range(3)}
+    changes |= {f"f_rest_{15 * c + k}": colors[:, c, 1 + k] for c in range(3) for k in range(15)}
+    write_splats(tmp_path / "file.ply", **changes)
+    registered = SplatScene(tmp_path / "file.ply", pos=pos, quat=quat, scale=scale)
+    expected, found = look(sim.data, SplatScene(tmp_path / "world.ply").gaussians), look(sim.data, registered.gaussians)
+    np.testing.assert_allclose(found.color, expected.color, atol=2e-3)
+    np.testing.assert_allclose(found.coverage, expected.coverage, atol=2e-3)
+    assert np.asarray(expected.coverage).std() > 0.1
+
+
+def test_images_have_gradients_to_splats_and_poses(sim, tmp_path):
+    """Splats are large and faint, so that no pixel is where an image jumps: at an alpha of 1/255."""
+    large = {f"scale_{k}": np.full(4, 0.2 * k) for k in range(3)} | {f"f_dc_{k}": np.zeros(4) for k in range(3)}
+    write_splats(tmp_path / "a.ply", n=4, n_colors=4, x=np.linspace(3, 4, 4), opacity=np.linspace(-1, 0, 4), **large)
+    g = SplatScene(tmp_path / "a.ply").gaussians
+    look = sim.scene.splat_fn("fpv_cam:0", 6, 4)
+
+    def loss(g, pos):
+        data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+        image = look(data, g)
+        return jnp.sum(jnp.sin(image.color * 3)) + jnp.sum(image.coverage**2)
+
+    pos = jnp.asarray(sim.data.states.pos)
+    slopes = jax.jit(jax.grad(loss, argnums=(0, 1)))(g, pos)
+    value = jax.jit(loss)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        step = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), (g, pos))
+        along = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slopes), jax.tree.leaves(step), strict=True))
+        plus, minus = (jax.tree.map(lambda x, d, s=s: x + s * 1e-3 * d, (g, pos), step) for s in (1, -1))
+        difference = float(value(*plus) - value(*minus)) / 2e-3
+        assert abs(along - difference) < 0.02 * abs(difference) + 0.02
+        assert abs(along) > 0.1
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))
+
+
+def test_one_world_gets_the_image_of_all(sim, look, tmp_path):
+    write_splats(tmp_path / "a.ply", n=9, n_colors=4)
+    g = SplatScene(tmp_path / "a.ply").gaussians
+    image = look(sim.data, g)
+    assert image.color.shape == (2, 2, 16, 24, 3)
+    assert image.depth.shape == image.coverage.shape == (2, 2, 16, 24)
+    chosen = sim.scene.splat_fn(["fpv_cam:1", "fpv_cam:0"], **SIZE, background=(0.1, 0.2, 0.3))(sim.data, g)
+    np.testing.assert_allclose(chosen.color[:, ::-1], image.color, atol=1e-5)
+
+
+def stand_in_for_splax(record):
+    """Return a module with the signature of splax 0.2.3, which draws with the plain renderer."""
+
+    def render(
+        means, log_scales, quats, colors, logits, *, viewmat, background, img_shape, f, clip_thresh, render_depth
+    ):
+        record.append((img_shape, f, clip_thresh, render_depth))
+        axes = viewmat[:3, :3] * jnp.array([[1.0], [-1.0], [-1.0]])
+        pos = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        g = Gaussians(means, jnp.roll(quats, -1, axis=-1), log_scales, colors, logits)
+        height, width = img_shape
+        color, depth, coverage = splat_images._draw_image(g, (pos, axes.T), f[0], width, height, background)
+        return jnp.concatenate([color, depth[..., None]], axis=-1), coverage
+
+    return types.SimpleNamespace(render=render)
+
+
+def test_splax_gets_the_cameras_that_the_plain_renderer_has(sim, look, tmp_path, monkeypatch):
+    write_splats(tmp_path / "a.ply", n=9, n_colors=4)
+    g, record = SplatScene(tmp_path / "a.ply").gaussians, []
+    monkeypatch.setitem(sys.modules, "splax", stand_in_for_splax(record))
+    choose = splat_images._choose_renderer
+    monkeypatch.setattr(splat_images, "_choose_renderer", lambda renderer, platform: choose(renderer, "gpu"))
+    by_splax = sim.scene.splat_fn(**SIZE, background=(0.1, 0.2, 0.3), renderer="splax")(sim.data, g)
+    (shape, focal, near, depth), expected = record[0], look(sim.data, g)
+    assert (shape, near, depth) == ((16, 24), splat_images.NEAR, True)
+    np.testing.assert_allclose(focal, focal_of(sim), rtol=1e-6)
+    for x, y in zip(jax.tree.leaves(by_splax), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-3)
+
+
+def test_law_09_wrong_splats_are_refused(sim, tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    nan = np.full(30, np.nan)
+    for changes, message in (
+        ({"opacity": None}, "no property 'opacity'"),
+        ({"f_rest_44": None}, "got 44 in"),
+        ({"y": nan}, "got 30 of 30 without"),
+        ({f"rot_{k}": np.zeros(30) for k in range(4)}, "got 30 of 30 without"),
+        ({a: np.zeros(30) for a in "xyz"}, "Pass scale="),
+        ({"x": np.linspace(0, 1e5, 30)}, "Pass scale="),
+    ):
+        write_splats(path, **changes)
+        with pytest.raises(ConfigError, match=message):
+            SplatScene(path)
+    write_splats(path, n=0)
+    with pytest.raises(ConfigError, match="which has none"):
+        SplatScene(path)
+    write_splats(path)
+    content = path.read_bytes()
+    for cut in (0, 3, 90, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:cut])
+        with pytest.raises(ConfigError, match=r"a\.ply"):
+            SplatScene(path)
+    with pytest.raises(ConfigError, match="existing file"):
+        SplatScene(tmp_path / "none.ply")
+    for options, message in (
+        ({"width": 0}, "width"),
+        ({"height": 2.5}, "height"),
+        ({"camera": "no_cam"}, "no_cam"),
+        ({"camera": ["fpv_cam", "track_cam:0"]}, "one field of view"),
+        ({"background": (0, 0, 2)}, "background"),
+        ({"min_coverage": -1}, "min_coverage"),
+        ({"renderer": "mujoco"}, "'splax' or 'plain'"),
+        ({"renderer": "splax"}, "Pass device='gpu'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            sim.scene.splat_fn(**options)
+    monkeypatch.setitem(sys.modules, "splax", None)
+    with pytest.raises(ImportError, match=r"crazysim\[splats\]"):
+        splat_images.import_splax()
