@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.sensors.range_finder import RangeFinder
     from crazysim.plugins.sensors.sensor import Sensor
     from crazysim.plugins.vehicles import Bicycles, Cars
+    from crazysim.scene.splats import SplatScene
     from crazysim.sim.mppi import MPPI
 
 __all__ = [
@@ -97,6 +98,7 @@ __all__ = [
     "Sim",
     "SimData",
     "SlungLoad",
+    "SplatScene",
     "StagePlacement",
     "Terrain",
     "Wind",
@@ -146,6 +148,7 @@ __getattr__ = lazy(
         "Sensor": "crazysim.plugins.sensors.sensor",
         "SharedLoad": "crazysim.plugins.payloads",
         "SlungLoad": "crazysim.plugins.payloads",
+        "SplatScene": "crazysim.scene.splats",
         "Terrain": "crazysim.plugins.contacts.terrain",
         "Wind": "crazysim.plugins.effects",
         "WindField": "crazysim.plugins.effects",

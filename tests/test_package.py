@@ -41,7 +41,9 @@ ALIASES = {
     "sim.integration": ["core.integration"],
     "sim.pipeline": ["core.pipeline"],
     "sim.sensors.depth": ["sim.crazyflow"],
+    "sim.sensors.splat": ["sim.crazyflow_splats"],
     "sim.sharding": ["core.sharding"],
+    "sim.splat": ["sim.crazyflow_splats"],
     "utils": ["cache", "core.data", "pytree", "sim.crazyflow"],
 }
 """Import paths of Crazyflow that only name what other modules define, and these modules."""
@@ -72,7 +74,8 @@ def test_import_paths_of_crazyflow_are_aliases_without_logic():
 @pytest.mark.parametrize(
     "path", ["sim.Sim", "sim.data.SimData", "sim.functional.state_control", "sim.pipeline.append_fn",
              "sim.sim.sync_sim2mjx", "sim.sim.use_box_collision", "sim.visualize.draw_line", "sim.sharding.world_mesh",
-             "sim.integration.rk4", "sim.sensors.depth.render_depth", "sim.dynamics.so_rpy_rotor_drag_dynamics",
+             "sim.integration.rk4", "sim.sensors.depth.render_depth", "sim.sensors.splat.viewmats",
+             "sim.splat.attach_splats", "sim.dynamics.so_rpy_rotor_drag_dynamics",
              "control.Control", "control.parameters.load_params", "dynamics.Dynamics",
              "dynamics.parameters.load_fn_params", "drones.Drone", "utils.leaf_replace", "utils.enable_cache",
              "dynamics.supported_drones", "dynamics.supported_dynamics", "exception.CrazyflowError"],
@@ -92,7 +95,7 @@ def test_gravity_is_written_once():
 
 def test_extras_are_never_imported_at_module_level():
     extras = {"matplotlib", "imageio_ffmpeg", "tqdm", "casadi", "viser", "trimesh", "onnx", "pettingzoo", "brax"}
-    extras |= {"stable_baselines3", "torch"}
+    extras |= {"stable_baselines3", "torch", "splax"}
     for source in SOURCES:
         for node in ast.parse(source.read_text()).body:
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []

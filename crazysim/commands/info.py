@@ -19,7 +19,7 @@ from crazysim import startup
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "gymnasium")
 """Packages that crazysim needs."""
 OPTIONAL = ("optax", "viser", "websockets", "matplotlib", "imageio-ffmpeg", "casadi", "onnx", "pettingzoo", "warp-lang",
-            "cflib", "motioncapture", "pymavlink", "rosbags", "ziglang", "tqdm", "trimesh")  # fmt: skip
+            "cflib", "motioncapture", "pymavlink", "rosbags", "splax", "ziglang", "tqdm", "trimesh")  # fmt: skip
 """Packages of the extras."""
 VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XLA_FLAGS", "CUDA_VISIBLE_DEVICES",
              "CXX", "CXXFLAGS", "CRAZYSIM_CACHE", "CRAZYSIM_COMPILE_TIMEOUT", "CRAZYSIM_JAX_FALLBACKS",

@@ -26,6 +26,7 @@ from crazysim.scene.object_poses import ListPlugins
 from crazysim.scene.objects import IDENTITY_QUAT, Handle, SceneObjects, Source
 from crazysim.scene.ray_casting import RayKernels
 from crazysim.scene.renderer import SceneRenderer
+from crazysim.scene.splats import SplatScene
 from crazysim.scene.sync import sync_one_world, with_data_poses
 
 LARGE_SWARM = 64
@@ -51,6 +52,8 @@ class Scene:
     """Function that returns the plugins of the simulation."""
     ray_kernels: RayKernels
     """Kernels that cast rays and answer contact reports."""
+    splats: SplatScene | None
+    """Scene of splats for the functions that have Crazyflow's names; None if none is attached."""
     revision: int
     """Number of edits of the spec so far. The compiled model, and the objects and mocap ids in the data, each
     correspond to one revision, and are updated when it is no longer the present one."""
@@ -91,6 +94,7 @@ class Scene:
         self.added = SceneObjects(n_worlds)
         self.plugins = plugins
         self.ray_kernels = ray_kernels
+        self.splats = None
         self.revision = self._compiled = 0
         self._compile()
 
@@ -368,6 +372,8 @@ class Scene:
         objects = (*self.added.movable, *self.visual_model.mocap_bodies)
         names = [camera] if isinstance(camera, (str, int, np.integer)) else list(camera)
         cameras = [found for name in names for found in depth.find_cameras(self.mj_model, name, objects)]
+        size = splat_images.check_size(width, height)
+        depth.check_image_memory(self.n_worlds * len(cameras), *size, splat_images.BYTES_PER_PIXEL, self.device)
         return splat_images.build_splat_fn(
             self.visual_model, cameras, width, height, background, min_coverage, renderer, self.device.platform,
             self.plugins,

@@ -40,6 +40,8 @@ BLOCK = 32
 """Gaussians that are drawn at a time."""
 MAX_ALPHAS = 1 << 24
 """Largest number of pixels times ``BLOCK`` that are drawn at a time, over several images."""
+BYTES_PER_PIXEL = 20
+"""Memory of a pixel, at least: colour, depth and coverage, bytes."""
 RENDERERS = ("auto", "splax", "plain")
 """Renderers of splats."""
 
@@ -62,6 +64,11 @@ SplatFn = Callable[..., SplatImage]
 """``look(data, gaussians, mocap=None) -> SplatImage``."""
 
 
+def check_size(width: object, height: object) -> tuple[int, int]:
+    """Return width and height of an image, checked, pixels."""
+    return positive_integer("width", width), positive_integer("height", height)
+
+
 def build_splat_fn(
     model: CollisionModel,
     cameras: Sequence[CarriedCamera],
@@ -74,7 +81,7 @@ def build_splat_fn(
     plugins: ListPlugins,
 ) -> SplatFn:
     """Return ``look(data, gaussians, mocap=None) -> SplatImage``, pure; see ``Scene.splat_fn``."""
-    width, height = positive_integer("width", width), positive_integer("height", height)
+    width, height = check_size(width, height)
     color = read_numbers("background", background, range_between(0.0, 1.0), ((3,),))
     min_coverage = read_number("min_coverage", min_coverage, range_between(0.0, 1.0))
     if len({camera.fovy for camera in cameras}) > 1:

@@ -8,27 +8,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from splat_files import one_splat, spot_alpha, write_splats
 
 from crazysim import ConfigError, Sim
 from crazysim.scene import splat_images
 from crazysim.scene.splats import Gaussians, SplatScene
 
 SIZE = {"width": 24, "height": 16}
-
-
-def write_splats(path, n=30, n_colors=16, seed=0, **changes):
-    """Write a scene of random splats around (2, 0, 1), and return its columns."""
-    rng = np.random.default_rng(seed)
-    columns = {axis: rng.normal(mean, 0.5, n) for axis, mean in (("x", 2), ("y", 0), ("z", 1))}
-    columns |= {f"f_dc_{k}": rng.normal(0, 1, n) for k in range(3)}
-    columns |= {f"f_rest_{k}": rng.normal(0, 0.2, n) for k in range(3 * (n_colors - 1))}
-    columns |= {"opacity": rng.normal(0.5, 1, n)} | {f"scale_{k}": rng.normal(-1.8, 0.4, n) for k in range(3)}
-    columns |= {f"rot_{k}": rng.normal(0, 1, n) for k in range(4)} | changes
-    columns = {name: x for name, x in columns.items() if x is not None}
-    head = "".join(f"property float {name}\n" for name in columns)
-    body = np.stack(list(columns.values()), axis=1).astype("<f4").tobytes()
-    path.write_bytes(f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{head}end_header\n".encode() + body)
-    return columns
 
 
 @pytest.fixture(scope="module")
@@ -75,23 +61,11 @@ def test_one_splat_is_its_analytic_projection(sim):
     ahead = float(sim.mj_model.cam("fpv_cam:0").pos[0])
     z, s, opacity, color = 2.0, 0.1, 0.8, np.array([0.9, 0.5, 0.2])
     eye = np.array([ahead, 0, float(sim.mj_model.cam("fpv_cam:0").pos[2]) + 1.0])
-    spot = Gaussians(
-        jnp.asarray([eye + [z, 0.2, 0.1]], jnp.float32), jnp.array([[0, 0, 0, 1.0]]),
-        jnp.full((1, 3), np.log(s), jnp.float32),
-        jnp.asarray((color - 0.5)[None, None] * 2 * np.sqrt(np.pi), jnp.float32),
-        jnp.asarray([np.log(opacity / (1 - opacity))], jnp.float32),
-    )  # fmt: skip
+    spot = one_splat(eye + [z, 0.2, 0.1], s, opacity, color)
     image = look(sim.data, spot)
     assert image.color.shape == (2, 1, 33, 33, 3)
     focal = 33 / 2 / np.tan(np.deg2rad(float(sim.mj_model.cam("fpv_cam:0").fovy[0])) / 2)
-    u, v = 16.5 - focal * 0.2 / z, 16.5 - focal * 0.1 / z  # left is +y, up is +z
-    rows = np.arange(33) + 0.5
-    slope = np.array([[-0.2 / z, 0.0], [0.0, -0.1 / z]])  # the depth of the spot spreads along the ray
-    sides = focal * s / z * np.array([[1, 0, -slope[0, 0]], [0, 1, -slope[1, 1]]])
-    inverse = np.linalg.inv(sides @ sides.T + 0.3 * np.eye(2))
-    offset = np.stack(np.broadcast_arrays(rows[None] - u, rows[:, None] - v), axis=-1)
-    alpha = opacity * np.exp(-np.einsum("...i,ij,...j", offset, inverse, offset) / 2)
-    alpha[alpha < 1 / 255] = 0
+    alpha = spot_alpha([z, 0.2, 0.1], s, opacity, focal, 33)
     np.testing.assert_allclose(image.coverage[0, 0], alpha, atol=2e-5)
     np.testing.assert_allclose(image.color[0, 0], alpha[..., None] * color, atol=2e-5)
     np.testing.assert_allclose(image.depth[0, 0], np.where(alpha < 0.2, np.inf, z), rtol=1e-5)
