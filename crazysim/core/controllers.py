@@ -29,13 +29,13 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
 
     def run_outer(data: SimData) -> SimData:
         data = _apply_staged_command(data, control)
-        ctrl = getattr(data.controls, level).controller
+        record = getattr(data.controls, level).controller
         setpoint: Any = _command_in_force(data, control)
-        return _replace_memory(data, control, controller.outer(data, setpoint, ctrl.memory, ctrl.params))
+        return _replace_memory(data, control, controller.outer(data, setpoint, record.memory, record.params))
 
     def run_inner(data: SimData) -> SimData:
-        ctrl = getattr(data.controls, level).controller
-        command, memory = controller.update(data, _command_in_force(data, control), ctrl.memory, ctrl.params)
+        record = getattr(data.controls, level).controller
+        command, memory = controller.update(data, _command_in_force(data, control), record.memory, record.params)
         return _replace_memory(_stage_below(data, controller.output, command), control, memory)
 
     def run_both(data: SimData) -> SimData:
@@ -53,17 +53,21 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
 def _apply_staged_command(data: SimData, level: Control) -> SimData:
     """Return the data of one drone with the staged command of a level in force."""
     controls = controls_of(data)
-    ctrl = getattr(controls, level.value)
-    ctrl = ctrl.replace(cmd=ctrl.staged_cmd)
+    level_controls = getattr(controls, level.value)
+    level_controls = level_controls.replace(cmd=level_controls.staged_cmd)
     if level == Control.state:
-        ctrl = ctrl.replace(feedforward=ctrl.staged_feedforward)
-    return data.replace(controls=controls.replace(**{level.value: ctrl}))
+        level_controls = level_controls.replace(feedforward=level_controls.staged_feedforward)
+    return data.replace(controls=controls.replace(**{level.value: level_controls}))
 
 
 def _command_in_force(data: SimData, level: Control) -> Setpoint | Array:
     """Return the command in force of one drone: a setpoint at the level ``state``, otherwise four numbers."""
-    ctrl = getattr(data.controls, level.value)
-    return Setpoint.of_command(ctrl.cmd, ctrl.feedforward) if level == Control.state else ctrl.cmd
+    level_controls = getattr(data.controls, level.value)
+    return (
+        Setpoint.of_command(level_controls.cmd, level_controls.feedforward)
+        if level == Control.state
+        else level_controls.cmd
+    )
 
 
 def _stage_below(data: SimData, level: Control, command: Array) -> SimData:

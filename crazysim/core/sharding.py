@@ -130,9 +130,9 @@ def map_devices(fn: Callable[[SimData], R], data: SimData, mesh: Mesh) -> R:
         data: Data of all worlds.
         mesh: The devices.
     """
-    split, shared = PartitionSpec(WORLD_AXIS), PartitionSpec()
-    specs = jax.tree.map(lambda scope: split if n_batch_axes(scope) else shared, scopes(data))
-    return jax.shard_map(fn, mesh=mesh, in_specs=(specs,), out_specs=split, check_vma=False)(data)
+    over_worlds, shared = PartitionSpec(WORLD_AXIS), PartitionSpec()
+    specs = jax.tree.map(lambda scope: over_worlds if n_batch_axes(scope) else shared, scopes(data))
+    return jax.shard_map(fn, mesh=mesh, in_specs=(specs,), out_specs=over_worlds, check_vma=False)(data)
 
 
 def distribute(tree: T, shardings: Any) -> T:
@@ -167,9 +167,9 @@ def fetch(tree: T) -> T:
     """
     leaves, treedef = jax.tree.flatten(tree)
     leaves = [jax.random.key_data(x) if isinstance(x, jax.Array) and is_key(x) else x for x in leaves]
-    far = [i for i, x in enumerate(leaves) if isinstance(x, jax.Array) and not _is_readable(x)]
-    if far:
-        leaves = replace_leaves(leaves, far, gather_from_hosts([leaves[i] for i in far]))
+    remote_indices = [i for i, x in enumerate(leaves) if isinstance(x, jax.Array) and not _is_readable(x)]
+    if remote_indices:
+        leaves = replace_leaves(leaves, remote_indices, gather_from_hosts([leaves[i] for i in remote_indices]))
     return treedef.unflatten([np.asarray(x) for x in leaves])
 
 

@@ -270,8 +270,8 @@ class Planner(NamedTuple):
         outputs: Sequence[int],
     ) -> Callable[..., Any]:
         """Return a step in which every device advances its own worlds."""
-        split, shared = PartitionSpec(self.location.axis), PartitionSpec()
-        specs = [split if n_batch_axes(scope) == 2 else shared for scope in jax.tree.leaves(scopes(data))]
+        over_worlds, shared = PartitionSpec(self.location.axis), PartitionSpec()
+        specs = [over_worlds if n_batch_axes(scope) == 2 else shared for scope in jax.tree.leaves(scopes(data))]
         added = program_leaves[len(specs) :]  # the packed array, and rows, in which worlds are the last axis
         specs += [PartitionSpec(None, self.location.axis) if leaf.row_leaves else shared for leaf in added]
 

@@ -106,7 +106,7 @@ def rollout(
         return ([flat_after.leaves[i] for i in carried_indices], memory), output
 
     carry = [flat.leaves[i] for i in carried_indices], memory
-    split = partial(jax.random.split, num=n_steps)
-    keys = jax.vmap(split, out_axes=1)(key) if is_key(key) and key.ndim else split(key)
+    split_key = partial(jax.random.split, num=n_steps)
+    keys = jax.vmap(split_key, out_axes=1)(key) if is_key(key) and key.ndim else split_key(key)
     (leaves, memory), outputs = jax.lax.scan(step, carry, keys)
     return EnvState(flat.replace(carried_indices, leaves).data()), memory, outputs

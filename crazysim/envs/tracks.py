@@ -175,8 +175,8 @@ def ranks(x: Array, n: int) -> Array:
     """
     # Equal numbers are ranked by position, so that no two have the same rank.
     earlier = np.arange(x.shape[-1])[None] < np.arange(n)[:, None]
-    mine, others = x[..., :n, None], x[..., None, :]
-    return jnp.sum((others < mine) | ((others == mine) & earlier), axis=-1, dtype=jnp.int32)
+    ranked, all_numbers = x[..., :n, None], x[..., None, :]
+    return jnp.sum((all_numbers < ranked) | ((all_numbers == ranked) & earlier), axis=-1, dtype=jnp.int32)
 
 
 def _add_height(flat: Array, points: Points) -> Array:

@@ -175,8 +175,8 @@ def _copy(tree: T, n_copies: int, env: Env) -> T:
     mesh = env.sim.mesh
     if mesh is None or n_copies == 1:
         return tree
-    split = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
-    return jax.lax.with_sharding_constraint(jax.tree.map(lambda x: jnp.repeat(x, n_copies, axis=0), tree), split)
+    over_devices = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
+    return jax.lax.with_sharding_constraint(jax.tree.map(lambda x: jnp.repeat(x, n_copies, axis=0), tree), over_devices)
 
 
 def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:

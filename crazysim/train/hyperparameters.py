@@ -53,8 +53,8 @@ def _check_text(name: str, value: object) -> str:
 
 def _check_sizes(name: str, value: object) -> tuple[int, ...]:
     if not isinstance(value, (list, tuple)):
-        what = "channels of the layers" if name == "convolution" else "sizes of the hidden layers"
-        raise ConfigError(f"expected {name} as the {what}, got {value!r}. Use for example [64, 64].")
+        meaning = "channels of the layers" if name == "convolution" else "sizes of the hidden layers"
+        raise ConfigError(f"expected {name} as the {meaning}, got {value!r}. Use for example [64, 64].")
     return tuple(positive_integer(f"{name}[{i}]", size) for i, size in enumerate(value))
 
 

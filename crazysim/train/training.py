@@ -382,15 +382,17 @@ class _Training:
             is_planned: True if an uninterrupted run makes this evaluation too. Others must not influence a resumed run.
         """
         # A planned evaluation that is repeated, after a run was resumed at its end, stays a planned one.
-        is_planned |= any(known["iteration"] == point["iteration"] and known["kept"] for known in self.curve)
+        is_planned |= any(
+            earlier_point["iteration"] == point["iteration"] and earlier_point["kept"] for earlier_point in self.curve
+        )
         self.curve[:] = [earlier for earlier in self.curve if earlier["iteration"] < point["iteration"]]
         best_check = max((earlier["check"] for earlier in self.curve if earlier["kept"]), default=0.0)
         point["kept"] = point["check"] >= least_kept_success(best_check, n_starts)
-        best = policy if point["kept"] else self.kept_policy
+        best_policy = policy if point["kept"] else self.kept_policy
         if is_first_host():
-            checkpoint.save(self.folder / POLICY, best, self.meta | description)
+            checkpoint.save(self.folder / POLICY, best_policy, self.meta | description)
             write_file(self.folder / CURVE, json.dumps([*self.curve, point], indent=1))
-        self.kept_policy, point["kept"] = (best, point["kept"]) if is_planned else (self.kept_policy, False)
+        self.kept_policy, point["kept"] = (best_policy, point["kept"]) if is_planned else (self.kept_policy, False)
         self.curve.append(point)
 
     @property

@@ -57,7 +57,7 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
     while len(pair) and dt > MIN_CELL_DURATION:
         uses_table = n_cells * pieces.n_drones <= min(MAX_TABLE_CELLS, len(pair))
         table = motion.table(n_cells, dt) if uses_table else None
-        keep = np.zeros(len(pair), bool)
+        is_kept = np.zeros(len(pair), bool)
         for k in range(0, len(pair), CELLS_PER_BATCH):
             part = slice(k, k + CELLS_PER_BATCH)
             i, j = first[pair[part]], second[pair[part]]
@@ -65,8 +65,11 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
             lower = _lower_bounds(
                 pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, min_distance, best_time
             )
-            keep[part] = lower < min_distance[pair[part]] - tolerance
-        pair, cell = np.repeat(pair[keep], N_SPLITS), (cell[keep][:, None] * N_SPLITS + np.arange(N_SPLITS)).ravel()
+            is_kept[part] = lower < min_distance[pair[part]] - tolerance
+        pair, cell = (
+            np.repeat(pair[is_kept], N_SPLITS),
+            (cell[is_kept][:, None] * N_SPLITS + np.arange(N_SPLITS)).ravel(),
+        )
         dt, n_cells = dt / N_SPLITS, n_cells * N_SPLITS
     order = np.argsort(min_distance, kind="stable")
     return [Approach((int(first[k]), int(second[k])), float(min_distance[k]), float(best_time[k])) for k in order]

@@ -226,15 +226,15 @@ def resources(kernel: Kernel, device: jax.Device) -> Resources:
 @functools.cache
 def nvrtc() -> ctypes.CDLL | None:
     """Return NVIDIA's run-time compiler, from JAX's CUDA packages or the system; None if it is missing."""
-    found: list[str] = []
+    library_paths: list[str] = []
     for package in ("nvidia.cu13", "nvidia.cuda_nvrtc"):
         try:
             spec = importlib.util.find_spec(package)
         except ModuleNotFoundError:
             continue
         for folder in (spec.submodule_search_locations or []) if spec else []:
-            found += sorted(map(str, Path(folder).glob("lib/libnvrtc.so.*")))
-    for name in [*found, "libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so"]:
+            library_paths += sorted(map(str, Path(folder).glob("lib/libnvrtc.so.*")))
+    for name in [*library_paths, "libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so"]:
         if "builtins" in name or ".alt." in name:
             continue
         try:

@@ -32,7 +32,11 @@ def describe_kernel(kernel: Kernel, platform: str, devices: Sequence[jax.Device]
     device = cuda.weakest_device(devices)
     if device is None:
         return f"compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
-    small = cuda.fit_registers(kernel, device)
-    large, used = cuda.widen_blocks(small, device), cuda.resources(small, device)
-    wide = f", {large.threads} from {cuda.RESIDENT_LANES:,} drones on" if large is not small else ""
-    return f"{small.threads} threads a block{wide}, {used.registers} registers, {used.spilled} bytes spilled"
+    fitted_kernel = cuda.fit_registers(kernel, device)
+    widened_kernel, needs = cuda.widen_blocks(fitted_kernel, device), cuda.resources(fitted_kernel, device)
+    is_widened = widened_kernel is not fitted_kernel
+    widened_text = f", {widened_kernel.threads} from {cuda.RESIDENT_LANES:,} drones on" if is_widened else ""
+    return (
+        f"{fitted_kernel.threads} threads a block{widened_text}, {needs.registers} registers, "
+        f"{needs.spilled} bytes spilled"
+    )

@@ -86,8 +86,10 @@ def _move_before_steps(
     """
     if sum(clock in s.written_leaves for s in segments) > 1:
         return list(segments)
-    begins = [stage.when is is_first_step and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)]
-    n = (*begins, False).index(False)
+    runs_first = [
+        stage.when is is_first_step and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)
+    ]
+    n = (*runs_first, False).index(False)
     first = [dataclasses.replace(s, phase="before") for s in segments[:n] if isinstance(s, Segment)]
     return [*first, *segments[n:]]
 

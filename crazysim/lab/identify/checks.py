@@ -98,17 +98,17 @@ def check_motion(
     Raises:
         ConfigError: If the columns contradict each other; the message names a change that would help, if any.
     """
-    keep = np.ones(len(t), bool)
+    is_kept = np.ones(len(t), bool)
     for pair, width in _rates(t, data, derived_keys):
         is_diverged = _diverged_windows(pair, round(PIECE_DURATION / float(np.median(np.diff(t)))))
         if 0 < np.sum(is_diverged) <= len(is_diverged) / 2:
-            keep[np.flatnonzero(is_diverged)[:, None] + np.arange(width + 1)] = False
-            repairs.append(f"dropped {np.sum(~keep)} samples without {pair.requirement}, which the others have")
-    t, data = t[keep], {key: x[keep] for key, x in data.items()}
+            is_kept[np.flatnonzero(is_diverged)[:, None] + np.arange(width + 1)] = False
+            repairs.append(f"dropped {np.sum(~is_kept)} samples without {pair.requirement}, which the others have")
+    t, data = t[is_kept], {key: x[is_kept] for key, x in data.items()}
     laws = _check_laws(t, data, derived_keys)
     broken = [k for k, law in enumerate(laws) if law.fault]
     if not broken:
-        return keep
+        return is_kept
     fault = laws[broken[0]].fault
     span = float(np.max(np.ptp(data["pos"], axis=0)))
     if span < MIN_SPAN:

@@ -132,21 +132,21 @@ def read_log(
     if "attitude_command" in data:
         data["attitude_command"] *= [*[columns.rad_per_command] * 3, columns.newton_per_command]
     t = stack_columns(name, table, [columns.time])[:, 0]
-    keep = increasing_samples(name, t, repairs)
-    elapsed = t - t[keep][0]
-    keep &= (elapsed >= between[0]) & (elapsed <= between[1])
-    if np.sum(keep) < MIN_SAMPLES:
+    is_kept = increasing_samples(name, t, repairs)
+    elapsed = t - t[is_kept][0]
+    is_kept &= (elapsed >= between[0]) & (elapsed <= between[1])
+    if np.sum(is_kept) < MIN_SAMPLES:
         raise ConfigError(
             f"{name}: expected at least {MIN_SAMPLES} samples between {between[0]:g} and {between[1]:g} s, got "
-            f"{np.sum(keep)} of a log of {elapsed[np.isfinite(elapsed)].max():.3g} s. Give other times."
+            f"{np.sum(is_kept)} of a log of {elapsed[np.isfinite(elapsed)].max():.3g} s. Give other times."
         )
-    t, data = interpolate_missing(name, t[keep], {key: x[keep] for key, x in data.items()}, repairs)
+    t, data = interpolate_missing(name, t[is_kept], {key: x[is_kept] for key, x in data.items()}, repairs)
     thrust = np.sum(data["rotor_vel"] ** 2, axis=1) if "rotor_vel" in data else None
     if thrust is None and "attitude_command" in data:
         thrust = data["attitude_command"][:, 3]
     if thrust is not None:
-        keep = airborne_samples(name, t, thrust, repairs)
-        t, data = t[keep], {key: x[keep] for key, x in data.items()}
+        is_kept = airborne_samples(name, t, thrust, repairs)
+        t, data = t[is_kept], {key: x[is_kept] for key, x in data.items()}
     if "rotor_vel" in data:
         data["rotor_vel"] = remove_spikes(name, data["rotor_vel"], repairs)
     else:
@@ -158,8 +158,8 @@ def read_log(
     if "ang_vel" in derived_keys:
         data["ang_vel"] = capture.fit_ang_vel(t, data["quat"])
         repairs.append("differentiated the attitude, since the log has no angular velocity")
-    keep = check_motion(name, t, data, (*derived_keys, *(["quat"] if columns.rpy else [])), repairs)
-    t, data = t[keep], {key: x[keep] for key, x in data.items()}
+    is_kept = check_motion(name, t, data, (*derived_keys, *(["quat"] if columns.rpy else [])), repairs)
+    t, data = t[is_kept], {key: x[is_kept] for key, x in data.items()}
     if "voltage" in data:
         data["voltage"] = data["voltage"][:, 0]
     gaps = find_gaps(name, t, repairs)

@@ -58,15 +58,15 @@ def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
 
     If a single time is too early or too late, only that sample is dropped.
     """
-    keep = np.isfinite(t)
-    if not np.all(np.diff(t[keep]) > 0):
-        keep = _longest_increasing_sequence(t)
-    if np.sum(keep) > 2:  # A clock that is set at the start, or garbage at the end.
-        indices, dt = np.flatnonzero(keep), np.median(np.diff(t[keep]))
-        keep[[indices[k] for k, step in ((0, 0), (-1, -2)) if t[indices[step + 1]] - t[indices[step]] > 100 * dt]] = (
-            False
-        )
-    n_bad = int(np.sum(~keep))
+    is_kept = np.isfinite(t)
+    if not np.all(np.diff(t[is_kept]) > 0):
+        is_kept = _longest_increasing_sequence(t)
+    if np.sum(is_kept) > 2:  # A clock that is set at the start, or garbage at the end.
+        indices, dt = np.flatnonzero(is_kept), np.median(np.diff(t[is_kept]))
+        is_kept[
+            [indices[k] for k, step in ((0, 0), (-1, -2)) if t[indices[step + 1]] - t[indices[step]] > 100 * dt]
+        ] = False
+    n_bad = int(np.sum(~is_kept))
     if len(t) >= MIN_SAMPLES and 2 * (n_different := len(np.unique(t))) < len(t):
         raise ConfigError(
             f"{name}: expected a different time for each sample, got {n_different} times of {len(t)} samples. "
@@ -79,7 +79,7 @@ def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
         )
     if n_bad:
         repairs.append(f"dropped {n_bad} samples whose time is not between those of their neighbours")
-    return keep
+    return is_kept
 
 
 def _longest_increasing_sequence(t: NDArray) -> NDArray:
@@ -92,10 +92,10 @@ def _longest_increasing_sequence(t: NDArray) -> NDArray:
             length = bisect_left(ends, x)
             before[k] = last[length - 1] if length else -1
             ends[length : length + 1], last[length : length + 1] = [float(x)], [k]
-    keep, k = np.zeros(len(t), bool), last[-1] if last else -1
+    is_kept, k = np.zeros(len(t), bool), last[-1] if last else -1
     while k >= 0:
-        keep[k], k = True, int(before[k])
-    return keep
+        is_kept[k], k = True, int(before[k])
+    return is_kept
 
 
 def find_gaps(name: str, t: NDArray, repairs: list[str]) -> NDArray:
@@ -136,7 +136,7 @@ def interpolate_missing(
     A value is missing where it is not finite, an attitude also where its quaternion is zero, as motion capture gives
     for a lost body.
     """
-    keep, lost, columns = np.ones(len(t), bool), [], {}
+    is_kept, lost, columns = np.ones(len(t), bool), [], {}
     for key, x in data.items():
         is_valid = np.all(np.isfinite(x), axis=-1)
         if key == "quat":
@@ -159,7 +159,7 @@ def interpolate_missing(
             is_known[indices[k] + 1 : indices[k + 1]] = False
         if not np.all(is_known):
             lost.append(key)
-            keep &= is_known
+            is_kept &= is_known
         n_filled = int(np.sum(is_known & ~is_valid))
         if n_filled > MAX_REPAIRED_SHARE * len(t):
             raise ConfigError(
@@ -176,9 +176,10 @@ def interpolate_missing(
         columns[key] = x
     if lost:
         repairs.append(
-            f"dropped {np.sum(~keep)} samples, in which {', '.join(lost)} were missing for over {MAX_INTERPOLATION:g} s"
+            f"dropped {np.sum(~is_kept)} samples, in which {', '.join(lost)} were missing for over "
+            f"{MAX_INTERPOLATION:g} s"
         )
-    return t[keep], {key: x[keep] for key, x in columns.items()}
+    return t[is_kept], {key: x[is_kept] for key, x in columns.items()}
 
 
 def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str]) -> NDArray:
@@ -204,24 +205,24 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
         )
     low = np.r_[False, smoothed < CARRIED_SHARE * median_thrust, False]
     starts, ends = np.flatnonzero(np.diff(low.astype(int)) == 1), np.flatnonzero(np.diff(low.astype(int)) == -1)
-    keep = np.ones(len(t), bool)
+    is_kept = np.ones(len(t), bool)
     for start, end in zip(starts, ends, strict=True):
         is_inner = start > 0 and end < len(t)
         if np.min(smoothed[start:end]) < IDLE_SHARE * median_thrust and not (
             is_inner and t[end - 1] - t[start] < GROUND_DURATION
         ):
-            keep &= (t < t[start] - GROUND_DURATION) | (t > t[end - 1] + GROUND_DURATION)
-    if np.all(keep):
-        return keep
-    if np.sum(keep) < MIN_SAMPLES:
+            is_kept &= (t < t[start] - GROUND_DURATION) | (t > t[end - 1] + GROUND_DURATION)
+    if np.all(is_kept):
+        return is_kept
+    if np.sum(is_kept) < MIN_SAMPLES:
         raise ConfigError(
-            f"{name}: expected at least {MIN_SAMPLES} samples in the air, got {np.sum(keep)} of {t[-1] - t[0]:.3g} s. "
-            "Take a longer flight, and check rotor_vel or attitude_command."
+            f"{name}: expected at least {MIN_SAMPLES} samples in the air, got {np.sum(is_kept)} of {t[-1] - t[0]:.3g} "
+            "s. Take a longer flight, and check rotor_vel or attitude_command."
         )
     repairs.append(
-        f"left out {np.sum(~keep)} samples on the ground, or within {GROUND_DURATION:g} s of it, by the thrust"
+        f"left out {np.sum(~is_kept)} samples on the ground, or within {GROUND_DURATION:g} s of it, by the thrust"
     )
-    return keep
+    return is_kept
 
 
 def remove_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:

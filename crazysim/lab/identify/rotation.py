@@ -247,12 +247,12 @@ def _solve_blocks(data: _LogTerms, extra_delay: float = 0.0) -> NDArray:
     (n_blocks, 9)
     """
     n, margin = len(data.ang_vel_change), round(YAW_SLOW_WIDTH / data.dt / 2)
-    keep = np.ones(n, bool)
+    is_kept = np.ones(n, bool)
     for gap in (0, *data.gaps, n):
-        keep[max(0, gap - margin) : gap + margin] = False
+        is_kept[max(0, gap - margin) : gap + margin] = False
     size, blocks = max(1, round(BLOCK_DURATION / data.dt)), []
     for k in range(0, n, size):
-        indices = np.flatnonzero(keep[k : k + size]) + k
+        indices = np.flatnonzero(is_kept[k : k + size]) + k
         if len(indices) * data.dt < 1:
             continue
         delay = 0.0

@@ -67,12 +67,12 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         raise ConfigError(
             f"{path.name}: expected messages {' and '.join(missing)}, got {others}. Add them to PX4's logged topics."
         )
-    place, turn = topics["vehicle_local_position"], topics["vehicle_attitude"]
+    local_position, turn = topics["vehicle_local_position"], topics["vehicle_attitude"]
     # PX4's quaternions are wxyz.
     columns = {
         "vehicle_local_position": {
-            "x": place["x"], "y": -place["y"], "z": -place["z"],
-            "vx": place["vx"], "vy": -place["vy"], "vz": -place["vz"],
+            "x": local_position["x"], "y": -local_position["y"], "z": -local_position["z"],
+            "vx": local_position["vx"], "vy": -local_position["vy"], "vz": -local_position["vz"],
         },
         "vehicle_attitude": {"qw": turn["q[0]"], "qx": turn["q[1]"], "qy": -turn["q[2]"], "qz": -turn["q[3]"]},
     }  # fmt: skip
@@ -109,14 +109,14 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
 class Topic(dict[str, NDArray]):
     """Fields of a topic by name. A missing field is an error that names the file."""
 
-    def __init__(self, place: str, fields: Mapping[str, NDArray]):
+    def __init__(self, location: str, fields: Mapping[str, NDArray]):
         super().__init__(fields)
-        self.place = place
+        self.location = location
 
     def __missing__(self, name: str) -> NDArray:
         """Raise the error of a missing field."""
         raise ConfigError(
-            f"{self.place}: expected a field {name}, got {', '.join(self)[:200]}. Take a log of PX4 1.9 or newer."
+            f"{self.location}: expected a field {name}, got {', '.join(self)[:200]}. Take a log of PX4 1.9 or newer."
         )
 
 

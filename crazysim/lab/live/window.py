@@ -158,7 +158,7 @@ class Window(Viewer[Live]):
             elif kind == "follow":
                 live.post(lambda live, body=values: live.follow(*body))
             elif kind == "click":
-                live.post(lambda live, place=values: live.click(place[0], np.array(place[1])))
+                live.post(lambda live, click=values: live.click(click[0], np.array(click[1])))
         process.stdout.close()
         process.wait()
         live.keyboard.release_all()

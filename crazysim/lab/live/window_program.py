@@ -171,9 +171,9 @@ class Program:
         if lit.any():
             overlays.points(drones[lit], np.insert(picture.lights[k, lit], 3, 0.6, axis=1), LIGHT_RADIUS, emission=1.0)
         if picture.followed is not None and picture.followed[0] == picture.worlds[k]:
-            place, radius = picture.pos[k, picture.followed[1]], self._bodies.radius(picture.followed[1])
-            overlays.points(place[None], FOLLOWED_COLOR, radius)
-            overlays.label(_ascii(picture.followed_name), place + [0.0, 0.0, radius])
+            followed_pos, radius = picture.pos[k, picture.followed[1]], self._bodies.radius(picture.followed[1])
+            overlays.points(followed_pos[None], FOLLOWED_COLOR, radius)
+            overlays.label(_ascii(picture.followed_name), followed_pos + [0.0, 0.0, radius])
         text = picture.status if k == 0 else ""
         if len(picture.worlds) > 1:
             text = f"world {picture.worlds[k]}\n{text}".strip()

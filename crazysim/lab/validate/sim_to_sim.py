@@ -115,14 +115,14 @@ def export_policy(name: str, folder: Path | None = None) -> Exported:
     from crazysim.train.export import to_c, to_onnx
 
     with tempfile.TemporaryDirectory() as temporary:
-        place = Path(temporary if folder is None else folder) / name
-        if not (place / "policy.npz").exists():
+        run_folder = Path(temporary if folder is None else folder) / name
+        if not (run_folder / "policy.npz").exists():
             task, options = POLICIES[name]
-            partial_run = place.with_name(f"{name}.partial")  # an interrupted training is no policy to fly
+            partial_run = run_folder.with_name(f"{name}.partial")  # an interrupted training is no policy to fly
             shutil.rmtree(partial_run, ignore_errors=True)
             run(task, partial_run, film=False, log=lambda _: None, progress=False, options=options)
-            partial_run.rename(place)
-        policy, _, meta = load_policy(place)
+            partial_run.rename(run_folder)
+        policy, _, meta = load_policy(run_folder)
         actions, n_obs = meta["actions"], sum(meta["observations"].values())
         centre, scale = (np.asarray(actions[key], float) for key in ("centre", "scale"))
         c = compile_header(to_c(policy, Path(temporary) / "policy.h", meta), n_obs, len(centre))

@@ -97,8 +97,15 @@ class Betaflight(FirmwareLink):
         else:
             quat = COS_45_DEGREES * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
             gyro = gyro * [1, 1, -1]
-        place = (longitude, latitude, altitude)
-        state = (*gyro, *frd(measured.accel), *quat, *measured.gps_vel, *place, self.origin.pressure(measured.height))
+        geodetic_position = (longitude, latitude, altitude)
+        state = (
+            *gyro,
+            *frd(measured.accel),
+            *quat,
+            *measured.gps_vel,
+            *geodetic_position,
+            self.origin.pressure(measured.height),
+        )
         self._link.send(struct.pack("<18d", measured.time, *state), self._state)
         if self._rc_rate.is_due(measured.time):
             self._link.send(struct.pack(f"<d{N_CHANNELS}H", measured.time, *_pulses(self._channels)), self._rc)

@@ -112,13 +112,17 @@ class Px4(FirmwareLink):
             north, east, down = (round(100 * v) for v in ned(measured.gps_vel))
             speed = round(float(np.hypot(north, east)))
             course = round(100 * np.degrees(np.arctan2(east, north)) % 36000)
-            place = self._geodetic_integers(measured.gps_pos)
-            self._send(mav.MAVLink_hil_gps_message(micros, 3, *place, 30, 40, speed, north, east, down, course, 10))
+            geodetic_position = self._geodetic_integers(measured.gps_pos)
+            self._send(
+                mav.MAVLink_hil_gps_message(micros, 3, *geodetic_position, 30, 40, speed, north, east, down, course, 10)
+            )
         vel = [round(100 * v) for v in ned(measured.vel)]
         accel = [round(1e3 * v / 9.80665) for v in frd(measured.accel)]
         quat, rates = quat_ned(measured.quat).tolist(), frd(measured.ang_vel)
-        place = self._geodetic_integers(measured.pos)
-        self._send(mav.MAVLink_hil_state_quaternion_message(micros, quat, *rates, *place, *vel, 0, 0, *accel))
+        geodetic_position = self._geodetic_integers(measured.pos)
+        self._send(
+            mav.MAVLink_hil_state_quaternion_message(micros, quat, *rates, *geodetic_position, *vel, 0, 0, *accel)
+        )
 
     def receive(self, timeout: float) -> NDArray | None:
         now = time.monotonic()
