@@ -215,18 +215,18 @@ def test_nothing_partial_is_ever_seen(source, place, monkeypatch, tmp_path_facto
     with pytest.raises(KernelError, match="refused the kernel"):
         again(source)
     assert [p.suffix for p in place.iterdir()] == [".so"]
-    assert not any(p.is_dir() for p in kernel_cache.temporary().iterdir())
+    assert not any(p.is_dir() for p in kernel_cache.temporary_folder().iterdir())
 
 
 def test_a_shared_folder_that_cannot_be_written_is_not_used(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path / "file"))
-    assert kernel_cache.folder() == kernel_cache.temporary()
+    assert kernel_cache.folder() == kernel_cache.temporary_folder()
     monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path))
     assert kernel_cache.folder() == tmp_path / "crazysim"
     monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: None)
     monkeypatch.setenv("CRAZYSIM_CACHE", "off")
-    assert kernel_cache.folder() == kernel_cache.temporary()
+    assert kernel_cache.folder() == kernel_cache.temporary_folder()
     monkeypatch.setenv("CRAZYSIM_CACHE", str(tmp_path / "kept"))
     assert kernel_cache.folder() == default_cache() / "crazysim"
 
@@ -317,7 +317,7 @@ def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, place
         monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
         assert again(source) == name
         assert len(list(place.iterdir())) == 1
-        assert not any(p.is_dir() for p in kernel_cache.temporary().iterdir()), "zig keeps nothing"
+        assert not any(p.is_dir() for p in kernel_cache.temporary_folder().iterdir()), "zig keeps nothing"
     finally:
         native.compiler.cache_clear()
 
