@@ -266,9 +266,9 @@ def control(lines: list[Line]) -> str:
 
 def control_rates(lines: list[Line]) -> str:
     """Return the ratios of the rates of the controllers to the rate of ``crazyflow``."""
-    found = {line["controller"]: line["steps_per_s"] for line in lines if "steps_per_s" in line}
-    cells = [f"{rate / found['crazyflow']:.2f} ({si(rate)})" for rate in found.values()]
-    return table_of([f'`"{name}"`' for name in found], [cells])
+    rate_by_controller = {line["controller"]: line["steps_per_s"] for line in lines if "steps_per_s" in line}
+    cells = [f"{rate / rate_by_controller['crazyflow']:.2f} ({si(rate)})" for rate in rate_by_controller.values()]
+    return table_of([f'`"{name}"`' for name in rate_by_controller], [cells])
 
 
 def limits(lines: list[Line]) -> str:
@@ -309,7 +309,7 @@ def readme(records: list[Line]) -> str:
         found = sorted(digits(value, 2) for value in values)
         return f"{found[0]:g} to {found[-1]:g}" if found else ""
 
-    def joined(values: Iterable[str]) -> str:
+    def join_rates(values: Iterable[str]) -> str:
         return " and ".join(values)
 
     auto, same = {"control": "attitude", "controller": "auto"}, {"control": "attitude", "controller": "crazyflow"}
@@ -319,16 +319,16 @@ def readme(records: list[Line]) -> str:
 
     def steps(device: str, case: Line) -> str:
         name, key, n_worlds = most[device]
-        return joined(si(x[key]) for x in lines_of(name, device, n_worlds=n_worlds, **case, **euler))
+        return join_rates(si(x[key]) for x in lines_of(name, device, n_worlds=n_worlds, **case, **euler))
 
     def gym(device: str) -> str:
-        return joined(
+        return join_rates(
             si(x["n_worlds"] * x["n_steps"] / x["crazysim_s"])
             for x in lines_of("queries", device, benchmark="versus_crazyflow/gym")
         )
 
     rows = {
-        "one iteration of a script (attitude command, 5 steps, read), 64 and 1,024 worlds": lambda device: joined(
+        "one iteration of a script (attitude command, 5 steps, read), 64 and 1,024 worlds": lambda device: join_rates(
             duration(x.get("crazysim_call_s") or x["iteration_s"])
             for n in (64, 1024)
             for x in lines_of("loop", device, n_worlds=n, control="attitude")
@@ -346,7 +346,7 @@ def readme(records: list[Line]) -> str:
             x["ratio"] for x in lines_of("gradient-versus", device, **same)
         ).partition(" to ")[0],
         "environment steps per second through Gymnasium, 4,096 worlds": gym,
-        "environment steps per second in compiled rollouts": lambda device: joined(
+        "environment steps per second in compiled rollouts": lambda device: join_rates(
             si(x["env_steps_per_s"]) for x in lines_of("envs", device, actions="random", n_worlds=most_envs[device])
         ),
     }

@@ -78,14 +78,14 @@ def train_crazysim(env: Env, config: ppo.Config, seed: int) -> Training:
     """Train by ``crazysim.train.ppo``."""
     resetting = _resetting(env)
     key = jnp.stack([jax.random.fold_in(jax.random.key(seed), 1)])
-    learner, configs, begin = ppo.init(resetting, (config,), key), (config,), 0.0
+    learner, configs, start_time = ppo.init(resetting, (config,), key), (config,), 0.0
     for i in range(config.iterations):
         if i == config.iterations // QUARTERS:
             jax.block_until_ready(learner)
-            begin = time.perf_counter()
+            start_time = time.perf_counter()
         learner, _ = ppo.iterate(learner, resetting, configs)
     jax.block_until_ready(learner)
-    seconds = time.perf_counter() - begin
+    seconds = time.perf_counter() - start_time
     return seconds, jax.tree.map(lambda x: x[0], learner.as_policy())
 
 
@@ -171,8 +171,8 @@ def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> Training:
 
         def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
             self.state, (obs, *rest) = step(self.state, jax.dlpack.from_dlpack(actions.detach().contiguous()))
-            reward, done, truncated = map(torch.from_dlpack, rest)
-            return self._observations(obs), reward, done, {"time_outs": truncated}
+            reward, is_done, truncated = map(torch.from_dlpack, rest)
+            return self._observations(obs), reward, is_done, {"time_outs": truncated}
 
         def _observations(self, obs: Array) -> TensorDict:
             return TensorDict({"policy": torch.from_dlpack(obs)}, batch_size=[n_worlds], device=self.device)
@@ -211,9 +211,9 @@ def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> Training:
     with redirect_stdout(io.StringIO()):
         runner = OnPolicyRunner(torch_env, settings, device=torch_env.device)
         runner.learn(quarter)
-        begin = synchronise()
+        start_time = synchronise()
         runner.learn(config.iterations - quarter)
-        seconds = synchronise() - begin
+        seconds = synchronise() - start_time
     actor: Any = runner.get_inference_policy()
     numbers = {name: jnp.asarray(x.detach().cpu().numpy()) for name, x in actor.state_dict().items()}
     names = sorted(name.removesuffix(".weight") for name in numbers if name.endswith(".weight"))
@@ -273,12 +273,12 @@ def run(
     n_steps = config.iterations * config.n_steps * n_worlds
     rates, success = [], []
     for seed in range(n_seeds):
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         seconds, policy = TRAINERS[name](env, config, seed)
         rates.append(n_steps * (1 - (config.iterations // QUARTERS) / config.iterations) / seconds)
-        whole = time.perf_counter() - begin
+        total_s = time.perf_counter() - start_time
         success.append(round(evaluate(starts, policy)["success"], 4))
-        print(f"{name}, seed {seed}: {whole:.1f} s, success {success[-1]:.1%}", file=sys.stderr, flush=True)
+        print(f"{name}, seed {seed}: {total_s:.1f} s, success {success[-1]:.1%}", file=sys.stderr, flush=True)
     rate = statistics.median(rates)
     line: dict[str, Any] = {
         "benchmark": "trainers",

@@ -122,12 +122,12 @@ class Versus:
         steps = case["n_worlds"] * case["n_steps"]
         for variant in variants:
             line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{benchmark}", **variant, **case}
-            own = durations[json.dumps(variant)]
-            for name, (seconds, compile_s) in (("crazysim", own), ("crazyflow", durations["crazyflow"])):
+            variant_duration = durations[json.dumps(variant)]
+            for name, (seconds, compile_s) in (("crazysim", variant_duration), ("crazyflow", durations["crazyflow"])):
                 line[f"{name}_call_s"] = digits(seconds)
                 line[f"{name}_steps_per_s"] = digits(steps / seconds)
                 line[f"{name}_compile_s"] = round(compile_s, 2)
-            line["ratio"] = round(durations["crazyflow"][0] / own[0], 2)
+            line["ratio"] = round(durations["crazyflow"][0] / variant_duration[0], 2)
             print(json.dumps(line | self.machine), flush=True)
 
     def question(self, task: str, **case: Any) -> None:

@@ -73,11 +73,11 @@ def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, 
         changes: The airframe's own numbers, by dotted path.
     """
     old = base.values
-    changed_counts = [
+    changed_paths = [
         path for path in BODY_KEYS if path in changes and not np.array_equal(changes[path], old.get(path, np.nan))
     ]
     lost_tables = [table for table in TUNED_TABLES if table in base.tables]
-    if not changed_counts or not lost_tables:
+    if not changed_paths or not lost_tables:
         return dict(old), base.not_inherited
     numbers = {path: x for path, x in old.items() if path.partition(".")[0] not in TUNED_TABLES}
     ratio = "controller.thrust2torque"
@@ -85,7 +85,7 @@ def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, 
         numbers[ratio] = old[ratio]  # of the propellers alone
     names = _join_names(f"[{table}]" for table in lost_tables)
     reason = (
-        f"Its base {base.name!r} has {names}, which fit another {_join_names(changed_counts)} and are not inherited."
+        f"Its base {base.name!r} has {names}, which fit another {_join_names(changed_paths)} and are not inherited."
     )
     return numbers, reason
 

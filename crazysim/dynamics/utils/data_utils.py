@@ -125,13 +125,13 @@ def state_variable_filter(
     step = omega * (t[-1] - t[0]) / (len(t) - 1)
     a *= step
     a[order, order + 1] = 1.0
-    move = expm(a)[:order]
+    step_matrix = expm(a)[:order]
 
     def low_pass(u: NDArray, change: NDArray) -> NDArray:
         x = np.zeros((len(u), order))
         x[:, 0] = u[:, 0]
-        inputs = u[..., None] * move[:, order] + change[..., None] * move[:, order + 1]
-        states, transition = np.empty((*u.shape, order)), move[:, :order].T
+        inputs = u[..., None] * step_matrix[:, order] + change[..., None] * step_matrix[:, order + 1]
+        states, transition = np.empty((*u.shape, order)), step_matrix[:, :order].T
         for k in range(u.shape[1]):
             states[:, k] = x
             x = x @ transition + inputs[:, k]

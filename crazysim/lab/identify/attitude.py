@@ -115,10 +115,10 @@ def identify_attitude(
     """
     base = load_airframe(airframe)
     mass_of_base = float(base.value("rigid_body.mass"))
-    weight = mass_of_base if mass is None else float(mass)
+    flight_mass = mass_of_base if mass is None else float(mass)
     check_turning(logs)
     data = [derivatives_svf(preprocessing(_columns(log))) for log in logs]
-    force, force_spread = fit_translation(dynamics, weight, data)
+    force, force_spread = fit_translation(dynamics, flight_mass, data)
     rotation_params, rotation_spread = fit_rotation(data)
     table: dict[str, float | list[float]] = {"acc_coef": 0.0, "cmd_f_coef": force["cmd_f_coef"]}
     if "thrust_dyn_coef" in force:
@@ -128,9 +128,9 @@ def identify_attitude(
     table |= {name: x.tolist() for name, x in rotation_params.items()}
     tables: dict = {"name": f"{base.name}_identified", "base": str(airframe), "fitted": {dynamics: table}}
     lines = [f"base = {json.dumps(str(airframe))}", "", "[sources]", f"flights = {json.dumps(source)}"]
-    if weight != mass_of_base:
-        tables["rigid_body"] = {"mass": weight}
-        lines += ["", "[rigid_body]", f'mass = {{ value = {weight}, unit = "kg", source = "flights" }}']
+    if flight_mass != mass_of_base:
+        tables["rigid_body"] = {"mass": flight_mass}
+        lines += ["", "[rigid_body]", f'mass = {{ value = {flight_mass}, unit = "kg", source = "flights" }}']
     lines += ["", f"[fitted.{dynamics}]"]
     lines += [f'{k} = {{ value = {x}, unit = "{PARAMETER_UNITS[k]}", source = "flights" }}' for k, x in table.items()]
     lines += ["", "# Standard deviations:"]

@@ -176,12 +176,12 @@ def with_rotor_count(table: Mapping[str, NDArray], columns: Columns) -> Columns:
 
     Logs with fewer than four rotors are left to ``missing_columns``.
     """
-    sized = {}
+    extended_names = {}
     for key in ("rotor_vel", "command"):
         names = getattr(columns, key)
         if names == getattr(KNOWN_COLUMNS["crazysim"], key):
             stem, n = names[0][:-1], len(names)
             while f"{stem}{n + 1}" in table:
                 n += 1
-            sized[key] = tuple(f"{stem}{k + 1}" for k in range(n))
-    return replace(columns, **sized)
+            extended_names[key] = tuple(f"{stem}{k + 1}" for k in range(n))
+    return replace(columns, **extended_names)

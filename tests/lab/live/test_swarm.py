@@ -138,7 +138,7 @@ def test_parameters_have_an_effect_or_are_refused():
         with pytest.raises(ConfigError, match="lists the parameters"):
             values.get_value(name)
     for name, value in kept.items():
-        if not values.kinds[name].read_only:
+        if not values.definitions[name].read_only:
             swarm.set_parameter(0, name, np.float32(value))
     assert dict(values) == pytest.approx(kept)
     assert {"pid_attitude.roll_kp": 6.0, "pid_attitude.yaw_kd": 0.35}.items() <= kept.items()

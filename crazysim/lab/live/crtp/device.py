@@ -89,8 +89,8 @@ class CrtpDevice:
         self.readings = create_log_table(swarm, self.drone) | (log or {})
         self.log = Table([Variable(name, kind) for name, (kind, _) in self.readings.items()], LOG_TYPES)
         self.values = swarm.parameters[self.drone]
-        kinds = self.values.kinds.items()
-        self.params = Table([Variable(name, kind.ctype, kind.read_only) for name, kind in kinds], PARAM_TYPES)
+        definitions = self.values.definitions.items()
+        self.params = Table([Variable(name, x.ctype, x.read_only) for name, x in definitions], PARAM_TYPES)
         self.memory = bytearray(MEMORY_SIZE)
         self.memories = [(TRAJECTORY_MEMORY, self.memory), (LED_MEMORY, bytearray(24)), (DECK_MEMORY, DECKS)]
         self._console: deque[bytes] = deque(maxlen=MAX_LINES)
@@ -326,7 +326,7 @@ class CrtpDevice:
             return [(PARAM, 3, data[: len(data) - len(payload)] + bytes([code]))]
         (k,) = struct.unpack("<H", data[1:3])
         if command == 8 and k < len(self.params.variables):
-            value = self.values.kinds[self.params.variables[k].name].value
+            value = self.values.definitions[self.params.variables[k].name].value
             return [(PARAM, 3, data[:3] + b"\0" + pack(self.params.format(k), value))]
         return [(PARAM, 3, data[:3] + bytes([errno.ENOENT]))]
 

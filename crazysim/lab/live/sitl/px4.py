@@ -118,10 +118,10 @@ class Px4(FirmwareLink):
             )
         vel = [round(100 * v) for v in ned(measured.vel)]
         accel = [round(1e3 * v / 9.80665) for v in frd(measured.accel)]
-        quat, rates = quat_ned(measured.quat).tolist(), frd(measured.ang_vel)
+        quat, ang_vel = quat_ned(measured.quat).tolist(), frd(measured.ang_vel)
         geodetic_position = self._geodetic_integers(measured.pos)
         self._send(
-            mav.MAVLink_hil_state_quaternion_message(micros, quat, *rates, *geodetic_position, *vel, 0, 0, *accel)
+            mav.MAVLink_hil_state_quaternion_message(micros, quat, *ang_vel, *geodetic_position, *vel, 0, 0, *accel)
         )
 
     def receive(self, timeout: float) -> NDArray | None:

@@ -82,9 +82,9 @@ def create_parameters(airframe: Airframe, multi_ranger: bool) -> dict[str, Param
 class Parameters(Mapping[str, float]):
     """Values of the parameters of one drone."""
 
-    def __init__(self, kinds: Mapping[str, Parameter]):
-        self.kinds = dict(kinds)
-        self._values = {name: float(kind.value) for name, kind in kinds.items()}
+    def __init__(self, definitions: Mapping[str, Parameter]):
+        self.definitions = dict(definitions)
+        self._values = {name: float(definition.value) for name, definition in definitions.items()}
         self.light = Light()
         self.has_initial_pose = False
 
@@ -111,19 +111,19 @@ class Parameters(Mapping[str, float]):
         return self._values[name]
 
     def _require_parameter(self, name: str) -> None:
-        if name not in self.kinds:
+        if name not in self.definitions:
             raise ConfigError(f"expected a parameter that the simulation has, got {name!r}. {GUIDE_REMARK}")
 
     def set(self, name: str, value: float, now: float) -> None:
         """Set a value."""
         self._require_parameter(name)
-        kind = self.kinds[name]
-        if kind.read_only or not math.isfinite(value):
+        definition = self.definitions[name]
+        if definition.read_only or not math.isfinite(value):
             raise ConfigError(f"expected a finite value of a parameter that can be written, got {name} = {value:g}")
         # Clients read values in their format, so 0.0045 comes back with the rounding of float32.
         is_same = math.isclose(value, self._values[name], rel_tol=1e-6)
         is_effect = name != "ring.effect" or value in (LED_OFF, LED_SOLID, LED_MEMORY, LED_FADE)
-        if not (is_effect and (kind.simulated or is_same)):
+        if not (is_effect and (definition.simulated or is_same)):
             raise ConfigError(
                 f"expected a value whose effect is simulated, got {name} = {value:g}; it stays {self._values[name]:g}. "
                 f"{GUIDE_REMARK}"
@@ -131,7 +131,7 @@ class Parameters(Mapping[str, float]):
         self._values[name] = value
         self.has_initial_pose |= name in INITIAL_POSE
         if name.startswith(LIGHT_GROUPS):
-            self.light.changed(self._values, name, now)
+            self.light.update_color(self._values, name, now)
 
 
 GUIDE_REMARK = 'The guide "Real drones and their scripts" lists the parameters.'
@@ -147,14 +147,14 @@ class Light:
 
     def color(self, now: float) -> NDArray:
         """Return the colour at a time, s: red, green, blue from 0 to 1. (3,)"""
-        share = (now - self._start) / self._duration if self.fades(now) and self._duration > 0 else 1.0
-        return self._begin + share * (self._target - self._begin)
+        fraction = (now - self._start) / self._duration if self.fades(now) and self._duration > 0 else 1.0
+        return self._begin + fraction * (self._target - self._begin)
 
     def fades(self, now: float) -> bool:
         """Return True until the end of a fade; a reset of the time ends it too."""
         return self._start <= now < self._start + self._duration
 
-    def changed(self, values: Mapping[str, float], name: str, now: float) -> None:
+    def update_color(self, values: Mapping[str, float], name: str, now: float) -> None:
         """Update the colour from new values of parameters.
 
         Args:
@@ -163,14 +163,17 @@ class Light:
             now: Time, s.
         """
         effect, duration = values["ring.effect"], 0.0
-        sets = {LED_SOLID: ("ring.solidRed", "ring.solidGreen", "ring.solidBlue"), LED_FADE: ("ring.fadeColor",)}
+        parameters_by_effect = {
+            LED_SOLID: ("ring.solidRed", "ring.solidGreen", "ring.solidBlue"),
+            LED_FADE: ("ring.fadeColor",),
+        }
         if name.startswith("colorLedBot."):
             white, *color = int(values["colorLedBot.wrgb8888"]).to_bytes(4, "big")
             target = np.minimum(np.array(color) + white, 255) / 255
-        elif name not in ("ring.effect", *sets.get(int(effect), ("memory",))):
+        elif name not in ("ring.effect", *parameters_by_effect.get(int(effect), ("memory",))):
             return
         elif effect == LED_SOLID:
-            target = np.array([values[color] for color in sets[LED_SOLID]]) / 255
+            target = np.array([values[color] for color in parameters_by_effect[LED_SOLID]]) / 255
         elif effect == LED_FADE:
             target = np.array(list((int(values["ring.fadeColor"]) & 0xFFFFFF).to_bytes(3, "big"))) / 255
             duration = max(values["ring.fadeTime"], 0.0)

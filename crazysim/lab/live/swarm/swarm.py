@@ -136,7 +136,7 @@ class Swarm(Closing):
         bits = np.asarray(packed, int)[:, None]
         parameters = self.parameters[drone]
         parameters.light.memory = (bits >> [11, 5, 0] & [31, 63, 31]) / [31, 63, 31]
-        parameters.light.changed(parameters, "memory", self.time)
+        parameters.light.update_color(parameters, "memory", self.time)
         self.colors[drone] = parameters.light.color(self.time)
 
     # Time -----------------------------------------------------------------------------------------------------------
