@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> None:
         settings: dict[str, Any] = {"freq": 500} | given_options(options, "freq", "drone", "controller", "device")
         sim = Sim(n_worlds, n_drones, control="state", state_freq=control_freq, **settings)
     else:
-        sim, control_freq = policy_pilot.env.sim, policy_pilot.env.freq
+        sim, control_freq = policy_pilot.env.sim, policy_pilot.env.base.freq
     with contextlib.ExitStack() as stack:
         live = stack.enter_context(Live(sim, control_freq, speed, options.fps))
         if policy_pilot is not None:

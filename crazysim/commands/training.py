@@ -212,7 +212,7 @@ def export(options: argparse.Namespace) -> None:
         from crazysim.train.out_of_tree import to_out_of_tree
 
         env = config.make_env(1)
-        for path in to_out_of_tree(policy, options.out_of_tree, meta, env.sim.airframes[0], env.freq):
+        for path in to_out_of_tree(policy, options.out_of_tree, meta, env.sim.airframes[0], env.base.freq):
             print(f"wrote {path}")
 
 

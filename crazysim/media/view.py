@@ -63,6 +63,9 @@ class View:
     """ASCII text at the top left of each world, with the fields ``{world}`` and ``{time}``; None for none."""
     draw: Callable[[Sim, int], None] | None = None
     """Function that draws further overlays of a world, ``draw(sim, world)``; None for none."""
+    inset: Callable[[Sim, int], NDArray | None] | None = None
+    """Function that returns a small picture of a world, ``inset(sim, world)``, uint8, (height, width, 3), which is
+    drawn enlarged at the bottom right of that world; None for none."""
     columns: int | None = None
     """Worlds per row; None for about as many as there are rows."""
     border: int = setting(default=2, low=0)
@@ -135,7 +138,10 @@ class View:
                 sim.overlays.restore(before)
                 self._draw(sim, k, time[k])
                 config = self._cam_config(sim, k, time[k], pos[k])
-                image[self.tile(k)] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
+                tile = image[self.tile(k)]
+                tile[:] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
+                if self.inset is not None:
+                    _draw_inset(tile, self.inset(sim, world))
         except Exception:
             sim.overlays.restore(before)  # they are kept for the next image
             raise
@@ -204,6 +210,16 @@ class View:
             value = value + weight * (aim - value)
         self._aim[k] = (time, value)
         return value
+
+
+def _draw_inset(tile: NDArray, picture: NDArray | None) -> None:
+    """Draw a picture with a border at the bottom right of an image, whole pixels enlarged to a third of its width."""
+    if picture is None:
+        return
+    scale = max(min(tile.shape[1] // (3 * picture.shape[1]), tile.shape[0] // (2 * picture.shape[0])), 1)
+    picture = np.pad(picture.repeat(scale, axis=0).repeat(scale, axis=1), ((2, 0), (2, 0), (0, 0)))
+    height, width = (min(n, limit) for n, limit in zip(picture.shape[:2], tile.shape[:2], strict=True))
+    tile[tile.shape[0] - height :, tile.shape[1] - width :] = picture[:height, :width]
 
 
 def _aim_at(points: NDArray, fovy: float) -> NDArray:

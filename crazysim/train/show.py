@@ -25,6 +25,8 @@ from crazysim.train.training import CURVE
 
 TARGET_COLOR, TARGET_SIZE = (0.1, 0.8, 0.3, 0.6), 0.03
 """Colour of the mark of a drone's target, RGBA, and its smallest radius, m."""
+DEPTH_COLORS = ((10, 8, 30), (90, 20, 110), (200, 60, 70), (250, 160, 40), (255, 250, 190))
+"""Colours of depths from far to near, RGB."""
 
 
 def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
@@ -179,8 +181,25 @@ def read_curve(folder: Path) -> list[dict[str, float]]:
         return [{"iteration" if name == "round" else name: x for name, x in point.items()} for point in curve]
 
 
+def color_depth(depth: np.ndarray, far: float) -> np.ndarray:
+    """Return a depth image in colours, from black at the largest depth over red to pale yellow at the lens.
+
+    Args:
+        depth: Depths, m. (height, width)
+        far: Largest depth, m.
+
+    Returns:
+        (height, width, 3), uint8
+    """
+    nearness = np.clip((1 / (1 + depth) - 1 / (1 + far)) / (1 - 1 / (1 + far)), 0, 1)
+    channels = [np.interp(np.sqrt(nearness), np.linspace(0, 1, len(x)), x) for x in zip(*DEPTH_COLORS, strict=True)]
+    return np.stack(channels, axis=-1).astype(np.uint8)
+
+
 def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False) -> int:
     """Film one episode of a policy in several worlds side by side, and return the number of frames.
+
+    The first depth image among the observations of the first drone is drawn into each world, near pixels bright.
 
     Args:
         env: Environment to fly in.
@@ -194,7 +213,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         ImportError: If imageio-ffmpeg is not installed.
         RenderError: If this machine cannot render.
     """
-    sim, freq = env.sim, env.freq
+    sim, freq = env.sim, env.base.freq
     frame_steps = max(freq // 25, 1)
 
     def points_of_world(read_points: Callable[[EnvState], Array | None], world: int) -> np.ndarray:
@@ -209,6 +228,14 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         if len(target_pos):
             distance = np.abs(target_pos[:, None] - np.asarray(sim.data.states.pos[world])).max()
             draw_points(sim, target_pos, TARGET_COLOR, max(TARGET_SIZE, 0.02 * float(distance)))
+
+    depth_formats = {name: x for name, x in env.image_formats().items() if x["unit"] == "m"}
+
+    def draw_depth(_: Sim, world: int) -> np.ndarray | None:
+        for name, image in depth_formats.items():
+            pixels = np.asarray(state.obs[name][world, 0]).reshape(image["height"], image["width"])
+            return color_depth(pixels, image["far"])
+        return None
 
     targets, subjects = jax.jit(env.target), jax.jit(env.subjects)
 
@@ -230,6 +257,8 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         text="{time:.1f} s",
         draw=draw_target,
         cam_config=camera,
+        follow=camera.pop("follow", None),
+        inset=draw_depth,
         hold=None if "distance" in camera else points_in_view,
         lag=0.6,
     )

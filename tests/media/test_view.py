@@ -188,6 +188,21 @@ def test_a_camera_that_follows_lags_behind(sim):
     np.testing.assert_allclose(after_reset, 0, atol=1.5)
 
 
+def test_an_inset_is_drawn_enlarged_at_the_bottom_right_of_each_world(sim):
+    """Each pixel of a picture of 2 x 3 is a block of whole pixels, and the rest of the image stays."""
+    pictures = np.random.default_rng(0).integers(0, 255, (4, 2, 3, 3)).astype(np.uint8)
+    options = {"worlds": [1, 3], "width": 2 * WIDTH, "border": 0}
+    place(sim, PLACES, 0.0)
+    shown = view(**options, inset=lambda sim, world: pictures[world] if world == 3 else None).render(sim)
+    plain, scale = view(**options).render(sim), WIDTH // 9
+    block = slice(HEIGHT - 2 * scale, HEIGHT), slice(2 * WIDTH - 3 * scale, 2 * WIDTH)
+    np.testing.assert_array_equal(shown[block], pictures[3].repeat(scale, axis=0).repeat(scale, axis=1))
+    frame = slice(block[0].start - 2, None), slice(block[1].start - 2, None)
+    assert not shown[frame][:2].any()
+    shown[frame], plain[frame] = 0, 0
+    np.testing.assert_array_equal(shown, plain)
+
+
 def test_a_camera_may_move_with_time(sim):
     """Its settings may be a function of time: here the camera goes east by 0.1 m/s, and the drone west."""
     moving = view(

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pictures import read_frames
 
 from crazysim import ConfigError
 from crazysim.envs import AutoReset, make
@@ -23,6 +24,7 @@ from crazysim.train.evaluation import evaluate
 from crazysim.train.export import describe, to_c, to_onnx
 from crazysim.train.networks import Policies, Policy, choose_network, init_mlp, init_weights, unroll
 from crazysim.train.seeds import stack_rates, take_seed
+from crazysim.train.show import color_depth, film
 from crazysim.train.training import CHECKPOINT, load_policy, train
 
 SHORT = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,), "convolution": (2, 3)}
@@ -155,6 +157,23 @@ def test_c_gives_the_actions_of_jax(tmp_path, meta, episode):
     for t, drone in np.ndindex(5, 3):
         step(*(np.ascontiguousarray(x).ctypes.data_as(ctypes.c_void_p) for x in (state[drone], obs[t, drone], action)))
         np.testing.assert_allclose(action, actions[t, drone], atol=1e-5)
+
+
+@pytest.mark.long("renders a film")
+def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
+    """Each pixel of the depth image is a block of the film, near ones brighter."""
+    options = OPTIONS | {"seconds": 0.04, "engine": "interpret"}
+    short = make("hover", 1, **options)
+    film(short, make_policy(meta, memory=0, channels=(2,)), tmp_path / "film.gif", worlds=1)
+    short.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
+    frame = read_frames(tmp_path / "film.gif", 360, 480, "-vf", "scale=480:360").astype(int)[0]
+    depth = np.asarray(jax.jit(short.reset)(jax.random.key(1)).obs["depth"]).reshape(4, 5)
+    assert np.ptp(depth) > 3
+    expected = color_depth(depth, 10.0)
+    assert expected.sum(axis=-1)[depth.argmin() // 5, depth.argmin() % 5] == expected.sum(axis=-1).max()
+    scale = 480 // 15
+    rows, columns = 360 - scale * (4 - np.arange(4)) + scale // 2, 480 - scale * (5 - np.arange(5)) + scale // 2
+    np.testing.assert_allclose(frame[np.ix_(rows, columns)], expected, atol=40)
 
 
 def trained(folder, iterations=2, **options):

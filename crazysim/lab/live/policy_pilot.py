@@ -37,7 +37,7 @@ class PolicyPilot:
 
         env = config.make_env(1)
         pilot = PolicyPilot(env, policy)
-        live = Live(env.sim, env.freq)
+        live = Live(env.sim, env.base.freq)
         pilot.join(live)
 
     The loop begins with the first episode of the environment, which does not end: a drone that crashes stays down until
