@@ -23,6 +23,7 @@ from crazysim.envs.task import Task
 from crazysim.envs.tasks.avoid import Avoid
 from crazysim.envs.tasks.chase import Chase
 from crazysim.envs.tasks.deliver import Deliver
+from crazysim.envs.tasks.forest import Forest
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
 from crazysim.envs.tasks.race import Race
@@ -69,6 +70,7 @@ TASKS: dict[str, Entry] = {
     "race": Entry(Race, "crazysim/Race-v0"),
     "multi_race": Entry(Race, "crazysim/MultiRace-v0", n_drones=2),
     "avoid": Entry(Avoid, "crazysim/Avoid-v0"),
+    "forest": Entry(Forest, "crazysim/Forest-v0"),
     "transport": Entry(Transport, "crazysim/Transport-v0"),
     "swarm": Entry(Swarm, "crazysim/Swarm-v0", n_drones=4),
 }
@@ -93,7 +95,7 @@ def make(
     sensors: Sequence[Plugin] = (),
     effects: Sequence[Plugin] = (),
     randomize: str | None = None,
-    camera: ImageSensor | Sequence[ImageSensor] = (),
+    camera: ImageSensor | Sequence[ImageSensor] | None = None,
     depth_image: Sequence[int] | None = None,
     **options: Any,
 ) -> Env:
@@ -110,9 +112,10 @@ def make(
             by ``env.sim.add``, ``reset`` raises an error.
         randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
             ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
-        camera: Camera or lidar whose images the drones observe in addition, or several; see ``CameraImages``.
+        camera: Camera or lidar whose images the drones observe in addition, or several; see ``CameraImages``. None for
+            the camera of the task, which few tasks have, and whose depth images are ``"depth"``; ``()`` for no images.
         depth_image: Width and height in pixels of depth images that the drones observe as ``"depth"``, short for a
-            ``Camera`` that takes one in every step. None for no such images.
+            ``Camera`` that takes one in every step, which takes the place of the task's. None for no such images.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
     """
@@ -149,10 +152,12 @@ def make(
     for plugin in plugins:
         sim.add(plugin)
     env = DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
-    for source in [camera] if isinstance(camera, ImageSensor) else plugin_list("camera", camera):
-        env = CameraImages(env, source)  # type: ignore[arg-type]  # checked there
+    if camera is not None:
+        for source in [camera] if isinstance(camera, ImageSensor) else plugin_list("camera", camera):
+            env = CameraImages(env, source)  # type: ignore[arg-type]  # checked there
     if depth_image is None:
-        return env
+        own_camera = task.policy_camera() if camera is None else None
+        return env if own_camera is None else CameraImages(env, own_camera, {"depth": "depth"})
     if not isinstance(depth_image, (tuple, list)) or len(depth_image) != 2:
         raise ConfigError(
             f"expected depth_image as width and height in pixels, got {short_repr(depth_image)}. Try (16, 12)."

@@ -13,6 +13,7 @@ from crazysim.core.plugin import FunctionPlugin, StagePlacement
 from crazysim.core.settings import check_settings, setting
 from crazysim.envs.state import Obs
 from crazysim.errors import ConfigError
+from crazysim.plugins.sensors.image_sensor import ImageSensor
 from crazysim.pytree import PyTree
 from crazysim.sim.sim import Sim
 
@@ -97,6 +98,11 @@ class Task:
         """Return the observations of every drone. (n_drones, k) each"""
         raise NotImplementedError(self._undefined("observe(data)"))
 
+    def privileged(self, data: SimData) -> Obs:
+        """Return what only a critic may see in training, besides the true state. (n_drones, k) each"""
+        del data
+        return {}
+
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return the terms of the reward of an environment step, by name; the reward is their sum. (n_drones,) each
 
@@ -139,8 +145,15 @@ class Task:
         return None
 
     def camera(self, n_drones: int) -> Mapping[str, Any] | None:
-        """Return the camera's lookat, distance, azimuth and elevation in images and films; None to frame all starts."""
+        """Return the camera's lookat, distance, azimuth and elevation in films; None to frame all starts.
+
+        With ``follow``, the index of a drone, it looks at that drone from the distance.
+        """
         del n_drones
+        return None
+
+    def policy_camera(self) -> ImageSensor | None:
+        """Return the camera of every drone whose depth images policies need; None for none. ``make`` adds it."""
         return None
 
     def succeeded(self, data: SimData) -> Array | None:

@@ -69,6 +69,18 @@ RECIPES: dict[str, Recipe] = {
         practice={"practice": True},
     ),
     "avoid": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400, "minibatches": 64, "entropy": 0.003}),
+    "forest": Recipe(
+        n_worlds=4096,
+        config={
+            **_LONG_ROLLOUTS,
+            "iterations": 400,
+            "minibatches": 64,
+            "entropy": 0.003,
+            "convolution": (8, 16),
+            "critic": "privileged",
+        },
+        practice={"difficulty": (0.0, 1.0)},
+    ),
     "transport": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400}),
     "deliver": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 800}),
     "swarm": Recipe(

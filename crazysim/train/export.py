@@ -33,6 +33,13 @@ OBSERVATIONS = {
     "vel": "velocity, world frame, m/s",
     "ang_vel": "angular velocity, body frame, rad/s",
     "difference_to_goal": "goal minus position, world frame, m",
+    "heading": "horizontal unit vector along the yaw, world frame, x and y",
+    "heading_vel": "velocity along the heading: ahead, left, up, m/s",
+    "goal_direction": "unit vector to the goal along the heading: ahead, left, up",
+    "goal_distance": "distance from the goal, m",
+    "height": "height above the ground, m",
+    "offset": "position to the left of the middle of the corridor, m",
+    "up": "upward unit vector, body frame",
     "difference_to_target_vel": "target velocity minus velocity, world frame, m/s",
 }
 """Descriptions of the common observations, with frame and unit."""

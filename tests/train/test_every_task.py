@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from crazysim.envs import TASKS, AutoReset
+from crazysim.envs import TASKS, AutoReset, PrivilegedObservation
 from crazysim.envs.registry import BUILT_IN
 from crazysim.train import apg
 from crazysim.train.config import ALGORITHMS, TrainConfig
@@ -23,6 +23,7 @@ def test_the_reward_rises(task):
     config = TrainConfig.create(task, n_worlds=N_WORLDS[name], config={"iterations": ITERATIONS[name]})
     algorithm, hyperparameters = ALGORITHMS[name], config.algorithm_config()
     env = config.make_env(**config.practice_options())
+    env = PrivilegedObservation(env) if config.config.get("critic") == "privileged" else env
     env = env if algorithm is apg else AutoReset(env)
     first = jax.jit(algorithm.init, static_argnums=(0, 1))(env, (hyperparameters,), jax.random.key(0)[None])
     kept = {x: getattr(first.agents, x) for x in ("policy", "log_std") if hasattr(first.agents, x)}

@@ -47,7 +47,7 @@ class PrivilegedObservation(Observe):
     It contains, for every drone: attitude (rotation matrix), angular velocity, position, velocity and rotor speeds; the
     parameters of which each drone has its own, divided by the largest magnitude in the same parameter of the default
     data; and the observations of plugins that change the dynamics, such as the factors that ``Randomize`` has drawn and
-    the charge of a ``Battery``.
+    the charge of a ``Battery``; and ``task.privileged``.
     """
 
     def __init__(self, env: Env):
@@ -66,6 +66,7 @@ class PrivilegedObservation(Observe):
         drone_params = [(x / scale).reshape(len(x), -1) for x, scope, scale in params if scope == "drone"]
         effects = vmap_drones(lambda drone: [plugin.observations(drone) for plugin in self._plugins])(data)
         parts = [flatten(state_of(data)), data.states.rotor_vel, *drone_params, *jax.tree.leaves(effects)]
+        parts += self.task.privileged(data).values()
         return obs | {PRIVILEGED: jnp.concatenate(parts, axis=-1)}
 
 

@@ -1,0 +1,265 @@
+"""Fly through a forest, seeing the trees by a depth image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.settings import setting
+from crazysim.core.stage import stage
+from crazysim.envs import terms
+from crazysim.envs.random import draw
+from crazysim.envs.spawn import flying
+from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.goals import install_rules, nearest_entries, on_floor, with_record
+from crazysim.plugins.scenery.forest import Forest as Trees
+from crazysim.plugins.sensors.camera import Camera
+from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.sim.sim import Sim
+
+HALF_WIDTH, CEILING = 8.0, 4.0
+"""Half the width of the corridor of one drone, and its height, m: four trees side by side, all of them higher."""
+HEIGHT = 1.5
+"""Height of starts and goals, m."""
+TREE_HEIGHT = 5.0
+"""Height of the trees, m."""
+EDGE = 2.0
+"""Distance from the starts to the first trees, and from the goals beyond the goal line, m."""
+GAP = 0.6
+"""Smallest distance between trees, m: see ``crazysim.plugins.scenery.Forest``."""
+JITTER = np.array([0.3, 1.0, 0.3])
+"""Largest components of the offset of starts and goals from their places, m."""
+SPACING = 1.5
+"""Distance between the starts, and between the goals, of several drones, m: with the offsets they do not touch."""
+CHECK_FREQ = 100
+"""Rate at which drones are checked for contact, Hz. At 8 m/s a drone flies 8 cm between two checks, so a ball of the
+drone's 7 cm around a tree of 10 cm is missed where it enters by less than 0.08^2 / (8 * 0.17) = 5 mm."""
+VIEW_RANGE = 8.0
+"""Distance beyond which trees do not matter, m."""
+PRIVILEGED_TREES = 4
+"""Number of nearest trees that a privileged critic sees."""
+DRONE_RANGE = 3.0
+"""Distance beyond which other drones do not matter, m."""
+
+
+class Passage(PyTree):
+    """Goal of each drone, and the outcome of its flight."""
+
+    goal: Array = leaf("drone", 1)
+    """Point beyond the goal line, m. (n_worlds, n_drones, 3)"""
+    reached: Array = leaf("drone", 0)
+    """True where the drone has crossed the goal line. (n_worlds, n_drones)"""
+    disabled: Array = leaf("drone", 0)
+    """True where it has touched something, or left the corridor. (n_worlds, n_drones)"""
+    flight_over_before: Array = leaf("drone", 0)
+    """True where its flight was over before this environment step. (n_worlds, n_drones)"""
+
+    @property
+    def flight_over(self) -> Array:
+        """True where the drone has arrived or is disabled. (n_worlds, n_drones)"""
+        return self.reached | self.disabled
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forest(Task):
+    """Fly through a forest to a goal line at a set speed; every episode has a forest of its own.
+
+    A drone is disabled when it touches a tree, the ground or another drone, or leaves the corridor, whose ceiling is
+    below the tops of the trees. Contacts with trees are checked at 100 Hz. An episode ends when every drone is disabled
+    or has crossed the goal line. Policies see the trees in the depth image of a camera, which ``make`` adds.
+    """
+
+    name = "forest"
+    Record = Passage
+
+    speed: float = setting(default=5.0, positive=True, high=20.0)
+    """Speed above which flying faster earns nothing, m/s."""
+    length: float = setting(default=30.0, low=5.0, high=200.0)
+    """Distance from the starts to the goal line, m."""
+    density: float = setting(default=1 / 16, positive=True)
+    """Trees per square metre, 1/m^2."""
+    radii: ArrayLike = setting(default=(0.1, 0.3), positive=True, shapes=((2,),))
+    """Smallest and largest radius of the trees, m. (2,)"""
+    difficulty: ArrayLike = setting(default=1.0, low=0.0, high=1.0, shapes=((), (2,)))
+    """Share of the trees that stand, or its range, lowest and highest, from which each episode draws. () or (2,)"""
+    trees_seen: int = setting(default=0, low=0, high=12)
+    """Number of nearest trees among the observations; zero for policies that see them in images."""
+    seconds: float = 12.0
+    """Length of an episode, s."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.trees(1)  # checks that they fit
+
+    def half_width(self, n_drones: int) -> float:
+        """Return half the width of the corridor, m."""
+        return HALF_WIDTH + SPACING * (n_drones - 1) / 2
+
+    def trees(self, n_drones: int) -> Trees:
+        """Return the layout of the trees."""
+        cell = 1 / np.sqrt(self.density)
+        size = np.array([self.length, 2 * self.half_width(n_drones)])
+        size = cell * np.ceil(size / cell - 1e-6)
+        return Trees(
+            density=self.density,
+            radii=self.radii,
+            size=size + [0.0, cell],  # columns are shifted by up to half a cell
+            center=(EDGE + size[0] / 2, 0.0),
+            height=TREE_HEIGHT,
+            gap=GAP,
+            difficulty=self.difficulty,
+            name="trees",
+        )
+
+    def install(self, sim: Sim) -> None:
+        trees, half_width = self.trees(sim.n_drones), self.half_width(sim.n_drones)
+        sim.add(trees)
+        shape, dtype = (sim.n_worlds, sim.n_drones), sim.data.states.pos.dtype
+        zero, no = device_array(np.zeros((*shape, 3)), dtype), device_array(np.zeros(shape), bool)
+        radius = max(float(airframe.value("shape.collision_sphere")[3]) for airframe in sim.airframes)
+        period = max(sim.freq // CHECK_FREQ, 1)
+
+        @stage("drone", when=lambda data: (data.core.steps + 1) % period == 0)
+        def update_record(data: SimData) -> SimData:
+            """Disable a drone that touches something or leaves the corridor, and record where it reaches its goal."""
+            record, pos = passage_of(data), data.states.pos
+            has_left = (jnp.abs(pos[1]) > half_width) | (pos[2] > CEILING) | (pos[0] < -EDGE) | on_floor(data)
+            hit = trees.clearance(data, pos) < radius
+            disabled = record.disabled | (~record.reached & (has_left | hit))
+            reached = record.reached | (~disabled & (pos[0] >= self.length))
+            return with_record(data, record.replace(disabled=disabled, reached=reached))
+
+        install_rules(sim, Passage(zero, no, no, no), update_record, collisions=True)
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return drones in flight before another forest."""
+        n_drones, dtype = data.core.n_drones, data.states.pos.dtype
+        x = draw(key, n_drones, start=3, goal=3, rpy=3, vel=3)
+        start, goal, rpy, vel = (2 * x[name] - 1 for name in ("start", "goal", "rpy", "vel"))
+        row = np.zeros((n_drones, 3))
+        row[:, 1], row[:, 2] = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2), HEIGHT
+        jitter = np.array([JITTER[0], JITTER[1] if n_drones == 1 else 0.2, JITTER[2]])
+        data = self.trees(n_drones).place(data, jax.random.fold_in(key, 1))
+        start_pos = (row + jitter * start).astype(dtype)
+        data = flying(data, start_pos, rotation.from_rpy(0.1 * rpy), 0.3 * vel)
+        goal = (row + jitter * goal + np.array([self.length + EDGE, 0.0, 0.0])).astype(dtype)
+        return with_record(data, passage_of(data).replace(goal=goal))
+
+    def before_step(self, data: SimData) -> SimData:
+        record = passage_of(data)
+        return with_record(data, record.replace(flight_over_before=record.flight_over))
+
+    def nearest_trees(self, data: SimData, n: int) -> Array:
+        """Return the nearest trees of each drone: way to the trunk, ahead and to the left, and its radius, m.
+
+        They are found among those of twelve cells around and before the drone. Trees farther than ``VIEW_RANGE``, and
+        those that do not stand, are at that distance.
+
+        Returns:
+            (n_drones, n, 3)
+        """
+        forest, pos = self.trees(data.core.n_drones), data.states.pos
+        n_cells, cell = forest.n_cells, forest.cell
+        corner = np.asarray(forest.center) - cell * np.asarray(n_cells) / 2
+        index = [
+            jnp.floor(rotation.safe_clip((pos[:, k] - corner[k]) / cell, -4.0, n_cells[k] + 4.0)).astype(jnp.int32)
+            for k in range(2)
+        ]
+        columns, rows = np.repeat(np.arange(-1, 3), 3).astype(np.int32), np.tile(np.arange(-1, 2), 4).astype(np.int32)
+        trees = forest.trees(forest.read(data), index[0][:, None] + columns, index[1][:, None] + rows)
+        offset = jnp.stack([trees.x - pos[:, :1], trees.y - pos[:, 1:2]], axis=-1)
+        distance = rotation.safe_norm(offset)[..., 0]
+        gap = jnp.where(trees.stands, jnp.minimum(distance - trees.radius, VIEW_RANGE), VIEW_RANGE)
+        way = offset * (gap / jnp.maximum(distance, 1e-3))[..., None]
+        ahead, left = rotation.heading(data.states.quat)
+        along = [jnp.sum(way * axis[:, None, :2], axis=-1) for axis in (ahead, left)]
+        entries = jnp.stack([*along, trees.radius], axis=-1)
+        return nearest_entries(gap, entries, n)
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return velocity, attitude, angular velocity, height and the way to the goal, and the nearest trees if asked.
+
+        Horizontal vectors are in the frame of the heading: ahead, left, up.
+        """
+        s, offset = data.states, passage_of(data).goal - data.states.pos
+        distance = rotation.safe_norm(offset)
+        ahead, _ = rotation.heading(s.quat)
+        obs = {
+            "ang_vel": s.ang_vel,
+            "goal_direction": _to_heading(data, offset / jnp.maximum(distance, 1e-3)),
+            "goal_distance": distance,
+            "heading": ahead[..., :2],
+            "heading_vel": _to_heading(data, s.vel),
+            "height": s.pos[..., 2:],
+            "offset": s.pos[..., 1:2],
+            "up": rotation.matrix(s.quat)[..., 2, :],
+        }
+        if self.trees_seen:
+            obs["trees_near"] = self.nearest_trees(data, self.trees_seen).reshape(data.core.n_drones, -1)
+        return obs
+
+    def privileged(self, data: SimData) -> dict[str, Array]:
+        return {"trees_near": self.nearest_trees(data, PRIVILEGED_TREES).reshape(data.core.n_drones, -1)}
+
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        record, s = passage_of(data), data.states
+        offset, (_, left) = record.goal - s.pos, rotation.heading(s.quat)
+        approach = jnp.sum(s.vel * offset, axis=-1) / jnp.maximum(rotation.safe_norm(offset)[..., 0], 1e-3)
+        speed = rotation.safe_norm(s.vel)[..., 0]
+        gap = self.trees(data.core.n_drones).clearance(data, s.pos)
+        paid = {
+            "progress": 0.13 * jnp.minimum(approach / self.speed, 1.0) - 0.03,
+            "haste": -0.1 * jnp.maximum(speed - self.speed, 0),
+            "closeness": -0.3 * jnp.exp(-5 * gap),
+            "sideways": -0.02 * jnp.abs(jnp.sum(s.vel * left, axis=-1)),
+            "height": -0.05 * jnp.abs(s.pos[..., 2] - HEIGHT),
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "reached": 10.0 * record.reached,
+            "disabled": -10.0 * record.disabled,
+        }
+        return terms.only_where(~record.flight_over_before, paid)
+
+    def terminated(self, data: SimData) -> Array:
+        return jnp.all(passage_of(data).flight_over)
+
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the goal line, m."""
+        return jnp.maximum(self.length - data.states.pos[..., 0], 0.0)
+
+    def info(self, data: SimData) -> dict[str, Array]:
+        return {"reached": passage_of(data).reached, "disabled": passage_of(data).disabled}
+
+    def policy_camera(self) -> Camera:
+        return Camera(16, 12)
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        del n_drones
+        return {"follow": 0, "distance": 8.0, "azimuth": 0.0, "elevation": -35.0}
+
+    def target(self, data: SimData) -> Array:
+        return passage_of(data).goal
+
+    def succeeded(self, data: SimData) -> Array:
+        return passage_of(data).reached
+
+
+def passage_of(data: SimData) -> Passage:
+    """Return the task's record."""
+    return data.plugins[NAME]
+
+
+def _to_heading(data: SimData, vector: Array) -> Array:
+    """Return a vector of the world frame along the heading of each drone: ahead, left, up. (..., 3)"""
+    ahead, left = rotation.heading(data.states.quat)
+    parts = [jnp.sum(vector * axis, axis=-1) for axis in (ahead, left)]
+    return jnp.stack([*parts, vector[..., 2]], axis=-1)
