@@ -19,20 +19,26 @@ from jax import Array
 from numpy.typing import NDArray
 
 from crazysim import rotation
+from crazysim.core.branches import table_rows
 from crazysim.core.data import SimData
 from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape, distance
+from crazysim.geometry.points import components
 from crazysim.geometry.rays import SizedShapes
+from crazysim.geometry.shapes import bounding_box
 from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionBody, CollisionGeom, CollisionModel
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
+from crazysim.scene.nearest_geom import nearest_geom
 from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
 from crazysim.scene.objects import Handle
 
 MAX_UNROLLED_GEOMS = 16
 """Largest number of fixed geoms of one shape whose distances are computed one by one."""
+MAX_LISTED_GEOMS = 64
+"""Largest number of such geoms of one body for which code of one drone computes all distances, without a search."""
 DRONES_PER_CHUNK = 64
 """Drones whose distances to all others of their world are computed at a time."""
 
@@ -183,9 +189,16 @@ def _group_key(body: CollisionBody) -> tuple[Any, ...]:
 
 
 def kernel_size(model: CollisionModel, objects: ObjectSelection) -> int:
-    """Return a measure of the length of a contact kernel: the number of geoms, with movable ones counted four times."""
+    """Return a measure of the length of a contact kernel: the number of geoms, with movable ones counted four times.
+
+    Of many fixed geoms of a body ``MAX_LISTED_GEOMS`` count, since a kernel searches for the nearest one.
+    """
+    bodies = select_bodies(model, objects, in_data=False)
     return sum(
-        len(body.geoms) * (1 if body.row is None else 4) for body in select_bodies(model, objects, in_data=False)
+        sum(min(len(geoms), MAX_LISTED_GEOMS) for geoms in _geoms_by_kind(body.geoms))
+        if body.row is None
+        else 4 * len(body.geoms)
+        for body in bodies
     )
 
 
@@ -232,13 +245,13 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
 
     Distances to many geoms of one shape, or to many boxes, are computed side by side.
     """
-    kinds: dict[Any, list[CollisionGeom]] = {}
-    for geom in geoms:
-        kinds.setdefault(("box" if geom.shape.kind == "box" else geom.shape, geom.rot is None), []).append(geom)
     gaps = []
-    for equal_geoms in kinds.values():
+    for equal_geoms in _geoms_by_kind(geoms):
         for part, part_pos, is_present in parts:
-            if len(equal_geoms) > MAX_UNROLLED_GEOMS:
+            if len(equal_geoms) > MAX_LISTED_GEOMS and part_pos.ndim == 1:
+                gap = _nearest_distance(part, part_pos, drone_rot, StackedGeoms.of(equal_geoms))
+                gaps.append(_mask_absent(is_present, gap))
+            elif len(equal_geoms) > MAX_UNROLLED_GEOMS:
                 gaps.append(
                     jnp.min(
                         _stacked_distances(part, part_pos, drone_rot, StackedGeoms.of(equal_geoms), is_present), axis=-1
@@ -251,16 +264,24 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
     return _minimum(gaps, parts[0][1])
 
 
+def _geoms_by_kind(geoms: Sequence[CollisionGeom]) -> list[list[CollisionGeom]]:
+    """Return geoms in groups of one shape, or of boxes, either all turned or none."""
+    kinds: dict[Any, list[CollisionGeom]] = {}
+    for geom in geoms:
+        kinds.setdefault(("box" if geom.shape.kind == "box" else geom.shape, geom.rot is None), []).append(geom)
+    return list(kinds.values())
+
+
 class StackedGeoms(NamedTuple):
     """Geoms of one shape, or boxes, at different poses."""
 
     shape: Shape
     """Shape of all, in its own frame."""
-    pos: NDArray
+    pos: NDArray | Array
     """Origins, m. (n, 3)"""
-    rot: NDArray | None
+    rot: NDArray | Array | None
     """Rotation matrices; None for the identity. (n, 3, 3)"""
-    box_sizes: NDArray | None
+    box_sizes: NDArray | Array | None
     """Half lengths of boxes that differ, m; None for equal shapes. (n, 3)"""
 
     @staticmethod
@@ -282,6 +303,33 @@ def _stacked_distances(
         rot = jnp.broadcast_to(drone_rot[..., None, :, :], (*drone_rot.shape[:-2], len(geoms.pos), 3, 3))
     gap = _geom_distance(part, part_pos[..., None, :], rot, geoms)
     return _mask_absent(None if is_present is None else is_present[..., None], gap)
+
+
+def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms) -> Array:
+    """Return the distance of a geom of one drone to the nearest of stacked geoms, m. ()"""
+    n, dtype = len(geoms.pos), part_pos.dtype
+    offset, half = bounding_box(geoms.shape)
+    halves = np.broadcast_to(half, (n, 3)) if geoms.box_sizes is None else geoms.box_sizes
+    middles = geoms.pos + (offset if geoms.rot is None else geoms.rot @ offset)
+    reaches = halves if geoms.rot is None else np.einsum("nij,nj->ni", np.abs(geoms.rot), halves)
+    columns = [geoms.pos, halves, *([] if geoms.rot is None else [geoms.rot.reshape(n, 9)])]
+    table = jnp.asarray(np.concatenate(columns, axis=1), dtype)
+
+    def distance_of(row: list[Array], part_pos: Array, drone_rot: Array | None) -> Array:
+        pos, rest = jnp.stack(row[:3]), row[6:]
+        rot = jnp.stack(rest).reshape(3, 3) if rest else None
+        sizes = None if geoms.box_sizes is None else jnp.stack(row[3:6])
+        return _geom_distance(part, part_pos, drone_rot, StackedGeoms(geoms.shape, pos, rot, sizes))
+
+    fixed_pos, fixed_rot = jax.lax.stop_gradient((part_pos, drone_rot))
+    index = nearest_geom(
+        np.asarray(middles - reaches),
+        np.asarray(middles + reaches),
+        list(components(part_pos)),
+        float(np.linalg.norm(bounding_box(part.shape)[1])) if part.shape.kind != "sphere" else part.shape.size[0],
+        lambda k: distance_of(table_rows(table, k), fixed_pos, fixed_rot),
+    )
+    return distance_of(list(jnp.take(table, index, axis=0)), part_pos, drone_rot)
 
 
 def _geom_distance(

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim
+from crazysim import ConfigError, ContactLog, Sim
 from crazysim.scene.map_files import read_map
 from crazysim.scene.voxels import merge_voxels, voxels_of_points, voxels_of_triangles
 from crazysim.sim import use_box_collision
@@ -227,3 +227,35 @@ def test_many_boxes_of_different_sizes_are_reported_as_few_are(box, rng):
     outside = np.linalg.norm(np.maximum(gap, 0), axis=-1)
     expected = np.where((gap > 0).any(axis=-1), outside, gap.max(axis=-1)) - radius
     np.testing.assert_allclose(found[:, 0, 0], expected.min(axis=1), atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["upright", "turned", "balls", "balls and a box"])
+def test_code_of_one_drone_finds_the_nearest_of_many_geoms(kind, rng):
+    """A search in a hierarchy, for steps and kernels, has the distance and the slope of the nearest geom of all."""
+    sim, n_worlds = Sim(n_worlds=12), 12
+    if kind == "balls and a box":
+        use_box_collision(sim)
+    shape = "type='sphere' size='0.2'" if "balls" in kind else "type='box' size='{} {} {}'"
+    geoms = [
+        f"<geom {shape} pos='{p[0]} {p[1]} {p[2]}' quat='{q}' conaffinity='2'/>".format(*rng.uniform(0.02, 0.3, 3))
+        for p in rng.uniform([-1.2, -1.2, 0.5], [1.2, 1.2, 2.0], (80, 3))
+        for q in [" ".join(map(str, rng.normal(size=4))) if kind == "turned" else "1 0 0 0"]
+    ]
+    sim.scene.add(f"<mujoco><worldbody>{''.join(geoms)}</worldbody></mujoco>", "many", mocap=False)
+    teleport(sim, rng.uniform([-1.2, -1.2, 0.5], [1.2, 1.2, 2.0], (n_worlds, 1, 3)))
+    contacts, states = sim.scene.contact_fn(floor=False, drones=False), sim.data.states
+
+    def gap_of_drone(pos, quat):
+        return contacts(sim.data.replace(states=states.replace(pos=pos, quat=quat))).object_distance[0]
+
+    expected = np.asarray(jax.jit(contacts)(sim.data).object_distance)[:, 0, 0]
+    found, slope = jax.jit(jax.vmap(jax.value_and_grad(gap_of_drone)))(states.pos[:, 0], states.quat[:, 0])
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(slope, axis=-1), 1.0, atol=1e-3)
+    assert (expected < 0).any()
+    assert (expected > 0).any()
+    if kind == "upright":
+        log = sim.add(ContactLog("many:0", floor=False, drones=False))
+        sim.step()
+        np.testing.assert_array_equal(log.read(sim.data).any[:, 0], expected < 0)
+        assert "not fused" not in str(sim.explain())

@@ -1,0 +1,60 @@
+"""The nearest of many geoms that do not move: a search in their hierarchy, for one drone in a stage of a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from crazysim.core.branches import any_lane, compute_where, table_rows
+from crazysim.rotation import safe_sqrt
+from crazysim.scene.hierarchy import build_hierarchy
+
+
+def nearest_geom(
+    low: np.ndarray, high: np.ndarray, point: Sequence[Array], reach: float, distance: Callable[[Array], Array]
+) -> Array:
+    """Return the index of the geom with the smallest distance, int32, without a derivative. ()
+
+    Nodes are visited in one order. A node whose box is no nearer than the best geom so far is left out with its
+    subtree.
+
+    Args:
+        low: Lower corners of boxes around the geoms, m. (n, 3)
+        high: Upper corners, m. (n, 3)
+        point: Position of a body, m. 3 of ()
+        reach: Radius of the ball around the position that contains the body, m.
+        distance: Returns the signed distance of the body to the geom with an index, m. () -> ()
+    """
+    dtype = point[0].dtype
+    node_boxes, node_links = build_hierarchy(low, high)
+    boxes, links = jnp.asarray(node_boxes[0], dtype), jnp.asarray(node_links[0])
+    point = [lax.stop_gradient(x) for x in point]
+
+    def check_node(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
+        k, best = carry
+        (after, geom), box = table_rows(links, k), table_rows(boxes, k)
+        is_near = _box_distance(box[:3], box[3:], point) - reach < best[0]
+
+        def compare(best: tuple[Array, Array]) -> tuple[Array, Array]:
+            gap = lax.stop_gradient(distance(geom))
+            is_nearer = gap < best[0]
+            return jnp.where(is_nearer, gap, best[0]), jnp.where(is_nearer, geom, best[1])
+
+        def descend(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
+            return k + 1, compute_where(geom >= 0, compare, carry[1])
+
+        return compute_where(any_lane(is_near), descend, (after, best))
+
+    start = jnp.int32(0), (jnp.full_like(point[0], jnp.inf), jnp.int32(0))
+    return lax.while_loop(lambda carry: carry[0] < len(links), check_node, start)[1][1]
+
+
+def _box_distance(low: Sequence[Array], high: Sequence[Array], point: Sequence[Array]) -> Array:
+    """Return the signed distance from a point to a box along the axes, m. ()"""
+    gaps = [jnp.maximum(a - p, p - b) for a, b, p in zip(low, high, point, strict=True)]
+    face = jnp.maximum(jnp.maximum(gaps[0], gaps[1]), gaps[2])
+    outside = safe_sqrt(sum(jnp.maximum(gap, 0.0) ** 2 for gap in gaps))  # type: ignore[arg-type]
+    return jnp.where(face > 0, outside, face)
