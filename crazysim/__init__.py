@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.scenery import Forest
     from crazysim.plugins.sensors.camera import Camera
     from crazysim.plugins.sensors.imu import IMU
+    from crazysim.plugins.sensors.lidar import Lidar
     from crazysim.plugins.sensors.motion_capture import MotionCapture
     from crazysim.plugins.sensors.radar import Radar
     from crazysim.plugins.sensors.range_finder import RangeFinder
@@ -81,6 +82,7 @@ __all__ = [
     "Integrator",
     "Kalman",
     "Latency",
+    "Lidar",
     "Members",
     "MotionCapture",
     "MotorFailure",
@@ -135,6 +137,7 @@ __getattr__ = lazy(
         "IMU": "crazysim.plugins.sensors.imu",
         "Kalman": "crazysim.plugins.estimators.kalman",
         "Latency": "crazysim.plugins.effects",
+        "Lidar": "crazysim.plugins.sensors.lidar",
         "make": "crazysim.envs",
         "MotionCapture": "crazysim.plugins.sensors.motion_capture",
         "MotorFailure": "crazysim.plugins.effects",

@@ -8,10 +8,12 @@ if TYPE_CHECKING:
     from crazysim.plugins.sensors.barometer import Barometer
     from crazysim.plugins.sensors.beacons import UWB, Lighthouse
     from crazysim.plugins.sensors.camera import Camera
+    from crazysim.plugins.sensors.depth_errors import Distortion, StereoNoise
     from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
     from crazysim.plugins.sensors.gps import GPS
     from crazysim.plugins.sensors.image_sensor import ImageData, ImageSensor
     from crazysim.plugins.sensors.imu import IMU
+    from crazysim.plugins.sensors.lidar import Lidar
     from crazysim.plugins.sensors.magnetometer import Magnetometer
     from crazysim.plugins.sensors.motion_capture import MotionCapture
     from crazysim.plugins.sensors.onboard import BatteryVoltage, MultiRanger, RotorSpeeds
@@ -27,8 +29,10 @@ __all__ = [
     "Barometer",
     "BatteryVoltage",
     "Camera",
+    "Distortion",
     "ImageData",
     "ImageSensor",
+    "Lidar",
     "Lighthouse",
     "Magnetometer",
     "MotionCapture",
@@ -39,6 +43,7 @@ __all__ = [
     "RotorSpeeds",
     "Samples",
     "Sensor",
+    "StereoNoise",
     "TimeOfFlight",
     "Triad",
 ]
@@ -51,6 +56,9 @@ __getattr__ = lazy(
         "Barometer": f"{__name__}.barometer",
         "BatteryVoltage": f"{__name__}.onboard",
         "Camera": f"{__name__}.camera",
+        "Distortion": f"{__name__}.depth_errors",
+        "Lidar": f"{__name__}.lidar",
+        "StereoNoise": f"{__name__}.depth_errors",
         "ImageData": f"{__name__}.image_sensor",
         "ImageSensor": f"{__name__}.image_sensor",
         "Lighthouse": f"{__name__}.beacons",

@@ -3,7 +3,7 @@
 The same description serves a simulation and an environment::
 
     Camera(width=64, height=48, fovy=70.0, *, pos=None, rpy=(0, 0, 0), outputs=("depth",), max_depth=10.0,
-           drones=True, freq=None, latency=0.0, name="camera")
+           noise=None, distortion=None, drones=True, freq=None, latency=0.0, name="camera")
 
     camera = sim.add(Camera(16, 12, freq=60, latency=0.03))      # in the step of a simulation
     camera.read(sim.data).images["depth"]                        # (n_worlds, n_drones, 12, 16), m
@@ -18,17 +18,24 @@ camera with the output depth at every step, whose observation is ``"depth"``.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from crazysim.core.settings import setting
+from crazysim.plugins.sensors.depth_errors import Distortion, StereoNoise
 from crazysim.plugins.sensors.image_sensor import ImageSensor
 from crazysim.scene.depth import pixel_directions
 
 
 class Camera(ImageSensor):
-    """Depth camera on every drone, with the pinhole model."""
+    """Depth camera on every drone, with the pinhole model, or with a lens, and with noise.
+
+    A camera within an object sees its inner side: the surface where a ray leaves the object, as with MuJoCo's rays.
+    """
 
     width: int = setting(default=64, low=1)
     """Width of the image, pixels."""
@@ -39,21 +46,51 @@ class Camera(ImageSensor):
     _: dataclasses.KW_ONLY
     max_depth: float = setting(default=10.0, positive=True)
     """Largest depth and distance, m; also the value where nothing is nearer."""
+    noise: StereoNoise | None = None
+    """Errors of depths and distances, such as ``StereoNoise()``, which are those of a RealSense D435; None for none."""
+    distortion: Distortion | None = None
+    """Distortion of the lens; ``fovy`` is the field of view without it. None for none."""
     name: str = "camera"
 
     @property
     def rays(self) -> np.ndarray:
         right, up, back = np.moveaxis(pixel_directions(self.fovy, self.width, self.height), -1, 0)
-        return np.stack([-back, -right, up], axis=-1)
+        if self.distortion is None:
+            return np.stack([-back, -right, up], axis=-1)
+        x, y = self.distortion.undistort(-right / back, up / back)
+        rays = np.stack([np.ones_like(x), -x, -y], axis=-1)
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+    @property
+    def focal(self) -> float:
+        """Focal length, pixels."""
+        return self.height / 2 / math.tan(math.radians(self.fovy) / 2)
+
+    @property
+    def has_errors(self) -> bool:
+        return self.noise is not None
+
+    @property
+    def farthest(self) -> np.ndarray:
+        return 1 / self.rays[..., 0]
+
+    def measure(self, distance: Array, key: Array) -> Array:
+        if self.noise is None:
+            return distance
+        cosine = jnp.asarray(self.rays[..., 0], distance.dtype)
+        depth = distance * cosine
+        measured = self.noise.apply(depth, self.focal, key)
+        return jnp.where(depth < self.far * (1 - 1e-6), measured, self.far) / cosine
 
     @property
     def optics(self) -> dict[str, Any]:
-        return {"fovy": float(self.fovy)}
+        distortion = {} if self.distortion is None else {"distortion": dataclasses.asdict(self.distortion)}
+        return {"fovy": float(self.fovy)} | distortion
 
     @property
     def image_size(self) -> tuple[int, int]:
         return int(self.height), int(self.width)
 
     @property
-    def max_range(self) -> float:
+    def far(self) -> float:
         return float(self.max_depth)

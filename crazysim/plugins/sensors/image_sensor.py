@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
+from crazysim.core.random import drone_keys
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError, short_repr
@@ -53,7 +54,7 @@ class ImageData(PyTree):
 class ImageSensor(Plugin):
     """Base class of sensors that take images by rays, on every drone.
 
-    A subclass defines ``rays``, ``optics``, ``image_size`` and ``max_range``, and ``measure`` if images have errors.
+    A subclass defines ``rays``, ``optics``, ``image_size`` and ``far``, and ``measure`` if images have errors.
     Images are of the state after a step, as measurements of other sensors are; the latest image is held. The first
     image of an episode is delivered at once.
     """
@@ -91,19 +92,29 @@ class ImageSensor(Plugin):
         raise NotImplementedError
 
     @property
-    def max_range(self) -> float:
+    def far(self) -> float:
         """Largest depth and distance, m; also the value where nothing is nearer."""
         raise NotImplementedError
 
-    def measure(self, images: Images, key: Array) -> Images:
-        """Return the images of one drone with the errors of the sensor. (height, width, ...) each
+    @property
+    def farthest(self) -> np.ndarray | float:
+        """Distance of points at ``far``, as a multiple of it. (height, width) or ()"""
+        return 1.0
+
+    @property
+    def has_errors(self) -> bool:
+        """True if ``measure`` must be called."""
+        return False
+
+    def measure(self, distance: Array, key: Array) -> Array:
+        """Return the distances of one drone as the sensor measures them, m. (height, width)
 
         Args:
-            images: Images without errors, with all ``OUTPUTS`` of which the errors depend.
+            distance: True distances, m, at most ``far``. (height, width)
             key: Random key of the drone at this step.
         """
         del key
-        return images
+        return distance
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -126,7 +137,7 @@ class ImageSensor(Plugin):
         formats = {}
         for name in self.outputs:
             unit = {"normal": "1", "segmentation": "index"}.get(name, "m")
-            far = {"normal": 0.0, "segmentation": -1}.get(name, self.max_range)
+            far = {"normal": 0.0, "segmentation": -1}.get(name, self.far)
             formats[name] = {"height": height, "width": width, "unit": unit, "far": far, "output": name} | sensor
         return formats
 
@@ -155,18 +166,23 @@ class ImageSensor(Plugin):
     def image_fn(self, sim: Simulation) -> TakeImages:
         """Return ``take(data)``, pure: the images of all worlds, for the present scene, without rate and latency."""
         self.check(sim)
-        rays, max_range, view = self.rays, self.max_range, self._view(sim)
+        rays, far, view = self.rays, self.far, self._view(sim)
         look, rot = sim.scene.depth_fn(view, drones=self.drones, along="ray"), view.rot
 
         def take(data: SimData) -> Images:
             hits, quat = look(data), data.states.quat[..., None, None, :]
             cosine = jnp.asarray(rays[..., 0], hits.distance.dtype)
+            distance = hits.distance
+            if self.has_errors:
+                keys = drone_keys(data, self.name)
+                distance = jax.vmap(jax.vmap(self.measure))(jnp.minimum(distance, far * self.farthest), keys)
             images = {}
             for name in self.outputs:
                 if name == "depth":
-                    images[name] = jnp.minimum(hits.distance * cosine, max_range)
+                    # Without rounding where nothing is nearer.
+                    images[name] = jnp.where(distance * cosine < far * (1 - 1e-6), distance * cosine, far)
                 elif name == "distance":
-                    images[name] = jnp.minimum(hits.distance, max_range)
+                    images[name] = jnp.minimum(distance, far)
                 elif name == "normal":
                     normal = rotation.rotate_inverse(quat, hits.normal)
                     # By components: a GPU may round matrix products to 10 bits.
@@ -233,7 +249,7 @@ class ImageSensor(Plugin):
         shape, n = (*sim.data.states.pos.shape[:2], *self.image_size), self._n_rows(sim.data, period)
         images, transit = {}, {}
         for name in self.outputs:
-            value, dtype = (-1, np.int32) if name == "segmentation" else (self.max_range, sim.data.states.pos.dtype)
+            value, dtype = (-1, np.int32) if name == "segmentation" else (self.far, sim.data.states.pos.dtype)
             value = 0.0 if name == "normal" else value
             images[name] = device_array(np.full(shape + OUTPUTS[name], value), dtype)
             if n:

@@ -15,12 +15,15 @@ from crazysim.plugins.sensors import IMU
 def test_every_sensor_is_here():
     names = set(sensors.__all__) - {
         "Camera",
+        "Distortion",
         "ImageData",
         "ImageSensor",
+        "Lidar",
         "Radar",
         "RangeFinder",
         "Samples",
         "Sensor",
+        "StereoNoise",
         "Triad",
     }
     assert {type(sensor()).__name__ for sensor in SENSORS.values()} == names

@@ -1,0 +1,188 @@
+"""Errors of cameras and lidars: noise and holes against their formulas, lenses against OpenCV's, lidars' patterns."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim import Camera, ConfigError, Lidar, Sim
+from crazysim.plugins.sensors import Distortion, StereoNoise
+
+LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.006, "k3": 0.01}
+
+
+@pytest.fixture(scope="module")
+def wall():
+    """Return drones at 1 to 6 m from a wall in 6 worlds, cameras and a lidar with errors, and their images."""
+    sim = Sim(6, control="attitude", rng_key=2)
+    sim.scene.add("wall", pos=[6.055, 0, -20], length=80, height=80, mocap=False)
+    pos = np.stack([np.arange(6.0)[::-1], np.zeros(6), np.full(6, 5.0)], axis=-1)[:, None]
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.float32(pos)))
+    sensors = [
+        Camera(32, 24, fovy=40.0, outputs=("distance", "depth"), noise=StereoNoise(resolution=0.0)),
+        Camera(4, 3, fovy=10.0, noise=StereoNoise(disparity_noise=0.0, resolution=0.05, min_depth=1.2), name="coarse"),
+        Lidar(
+            np.arange(-2, 2, 0.2), np.arange(-2, 2, 0.1), max_range=9.0, noise=0.02, relative_noise=0.01, dropout=0.25,
+        ),
+    ]  # fmt: skip
+    return sim, sensors, jax.device_get([jax.jit(sensor.image_fn(sim))(sim.data) for sensor in sensors])
+
+
+def test_stereo_noise_grows_with_the_square_of_the_distance(wall):
+    """The standard deviation z^2 s / (f b) of a D435: 0.4% at 1 m, 2.3% at 6 m, and no bias."""
+    _, (camera, *_), (images, *_) = wall
+    depth = np.arange(1.0, 7.0)
+    expected = depth**2 * 0.08 / (424 * 0.05)
+    errors = images["depth"][:, 0] - depth[:, None, None]
+    n = errors[0].size
+    np.testing.assert_allclose(errors.std(axis=(1, 2)), expected, rtol=4 / np.sqrt(2 * n))
+    assert np.all(np.abs(errors.mean(axis=(1, 2))) < 4 * expected / np.sqrt(n))
+    np.testing.assert_allclose(images["distance"] * camera.rays[..., 0], images["depth"], rtol=1e-5)
+    standard = errors / expected[:, None, None]
+    assert len(np.unique(standard.round(5))) > 0.95 * standard.size, "worlds and pixels have numbers of their own"
+
+
+def test_depth_has_steps_and_a_smallest_value(wall):
+    _, _, (_, images, _) = wall
+    depth = images["depth"][:, 0]
+    assert (depth[0] == 0).all()
+    np.testing.assert_allclose(depth[1:], np.broadcast_to(np.arange(2.0, 7.0)[:, None, None], (5, 3, 4)), atol=0.026)
+    np.testing.assert_allclose(depth / 0.05, np.round(depth / 0.05), atol=1e-3)
+
+
+def test_pixels_behind_an_edge_are_holes_where_the_second_imager_does_not_see_them():
+    """A near strip before a far wall hides f b (1 / near - 1 / far) pixels on its left, and none on its right."""
+    noise = StereoNoise(baseline=0.1, disparity_noise=0.0, resolution=0.0, min_depth=0.0)
+    depth = np.full((2, 60), 5.0, np.float32)
+    depth[:, 30:40] = 1.0
+    measured = np.asarray(noise.apply(jnp.asarray(depth), 100.0, jax.random.key(0)))
+    hidden = 100 * 0.1 * (1 / 1.0 - 1 / 5.0)
+    assert hidden == 8
+    expected = depth.copy()
+    expected[:, 30 - 8 : 30] = 0
+    np.testing.assert_array_equal(measured, expected)
+    assert (np.asarray(StereoNoise(has_holes=False).apply(jnp.asarray(depth), 100.0, jax.random.key(0))) > 0).all()
+
+
+def test_noise_of_a_lidar_and_its_lost_returns(wall):
+    _, (*_, lidar), (*_, images) = wall
+    distance, true = images["distance"][:, 0], np.arange(1.0, 7.0)[:, None, None] / lidar.rays[..., 0]
+    lost = distance == 9.0
+    assert abs(lost.mean() - 0.25) < 4 * np.sqrt(0.25 * 0.75 / lost.size)
+    standard = ((distance - true) / (0.02 + 0.01 * true))[~lost]
+    assert abs(standard.mean()) < 4 / np.sqrt(standard.size)
+    assert standard.std() == pytest.approx(1.0, rel=4 / np.sqrt(2 * standard.size))
+
+
+def test_numbers_of_a_world_do_not_depend_on_the_others_and_change_with_the_step(wall):
+    sim, (camera, *_), (images, *_) = wall
+    steps = sim.data.core.steps + 1
+    take = jax.jit(camera.image_fn(sim))
+    later = take(sim.data.replace(core=sim.data.core.replace(steps=steps)))
+    assert np.mean(later["depth"] == images["depth"]) < 0.01
+    few = Sim(2, control="attitude", rng_key=2)
+    few.scene.add("wall", pos=[6.055, 0, -20], length=80, height=80, mocap=False)
+    pos = sim.data.states.pos[:2]
+    few.data = few.data.replace(states=few.data.states.replace(pos=pos))
+    np.testing.assert_allclose(jax.jit(camera.image_fn(few))(few.data)["depth"], images["depth"][:2], rtol=1e-6)
+
+
+def test_a_lens_has_the_pixels_of_the_formula_of_opencv():
+    """x'' = x' (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x' y' + p2 (r^2 + 2 x'^2), and y'' alike, y down."""
+    camera = Camera(20, 14, fovy=75.0, distortion=Distortion(**LENS))
+    ahead, left, up = np.moveaxis(camera.rays, -1, 0)
+    x, y = -left / ahead, -up / ahead
+    k1, k2, p1, p2, k3 = LENS.values()
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    column = 10 - 0.5 + camera.focal * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x))
+    row = 7 - 0.5 + camera.focal * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+    np.testing.assert_allclose(column, np.broadcast_to(np.arange(20), (14, 20)), atol=1e-8)
+    np.testing.assert_allclose(row, np.broadcast_to(np.arange(14)[:, None], (14, 20)), atol=1e-8)
+    assert np.abs(camera.rays - Camera(20, 14, fovy=75.0).rays).max() > 0.02
+    np.testing.assert_allclose(np.linalg.norm(camera.rays, axis=-1), 1)
+    plain = Camera(20, 14, distortion=Distortion())
+    np.testing.assert_allclose(plain.rays, Camera(20, 14).rays, atol=1e-12)
+
+
+def test_patterns_of_lidars_are_those_of_their_data_sheets():
+    lidar, zones = Lidar.vlp16(90), Lidar.vl53l5cx()
+    assert (lidar.image_size, zones.image_size) == ((16, 90), (8, 8))
+    elevation = np.degrees(np.arcsin(lidar.rays[..., 2]))
+    np.testing.assert_allclose(elevation, np.broadcast_to(np.arange(15, -16, -2.0)[:, None], (16, 90)), atol=1e-9)
+    azimuth = np.degrees(np.arctan2(lidar.rays[0, :, 1], lidar.rays[0, :, 0]))
+    np.testing.assert_allclose(np.diff(azimuth), -4)
+    np.testing.assert_allclose(
+        np.degrees(np.arctan2(zones.rays[0, :, 1], zones.rays[0, :, 0]))[[0, 7]], [19.6875, -19.6875]
+    )
+    assert zones.rays[0, 0, 2] > 0 > zones.rays[7, 7, 2]
+    assert (zones.far, lidar.far, lidar.noise) == (4.0, 100.0, 0.03)
+
+
+def test_gradients_pass_through_noise_and_lens(wall):
+    """The slope of the mean distance to the wall, by position, equals that of central differences."""
+    sim, _, _ = wall
+    camera = Camera(4, 3, fovy=20.0, noise=StereoNoise(), distortion=Distortion(k1=-0.1))
+    take = camera.image_fn(sim)
+
+    def mean_depth(x):
+        states = sim.data.states.replace(pos=sim.data.states.pos + jnp.array([1.0, 0, 0]) * x)
+        return jnp.mean(take(sim.data.replace(states=states))["depth"])
+
+    slope = jax.jit(jax.value_and_grad(mean_depth))
+    ends = [float(slope(h)[0]) for h in (0.05, -0.05)]
+    assert float(slope(0.0)[1]) == pytest.approx((ends[0] - ends[1]) / 0.1, rel=2e-2)
+
+
+def test_engines_agree_on_the_images_of_a_step():
+    found = []
+    for engine in ("auto", "plain"):
+        sim = Sim(2, control="attitude", engine=engine, rng_key=3)
+        sim.scene.add("sphere", pos=[1.4, 0.1, 0.9], radius=0.3, mocap=False)
+        camera = sim.add(Camera(8, 6, freq=250, noise=StereoNoise(), outputs=("depth", "segmentation")))
+        sim.data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + jnp.array([0.0, 0, 1])))
+        sim.step(3)
+        found.append(jax.device_get(camera.read(sim.data).images))
+    np.testing.assert_array_equal(found[0]["segmentation"], found[1]["segmentation"])
+    np.testing.assert_allclose(found[0]["depth"], found[1]["depth"], atol=1e-3)  # a step of the resolution
+    assert np.mean(found[0]["depth"] == found[1]["depth"]) > 0.9
+
+
+def test_a_camera_sees_nothing_in_an_empty_scene_and_the_inner_side_of_what_it_is_in(tmp_path):
+    path = tmp_path / "empty.xml"
+    path.write_text("<mujoco><worldbody/></mujoco>")
+    sim = Sim(xml_path=path, control="attitude")
+    camera = Camera(4, 3, outputs=("depth", "normal", "segmentation"), noise=StereoNoise(), max_depth=7.0)
+    images = jax.jit(camera.image_fn(sim))(sim.data)
+    assert (np.asarray(images["depth"]) == 7).all()
+    assert (np.asarray(images["segmentation"]) == -1).all()
+    assert not np.asarray(images["normal"]).any()
+    sim.scene.add("sphere", pos=[0.03, 0, 0], radius=1.0, mocap=False)  # around the camera
+    inner = Camera(4, 3, outputs=("distance", "normal"))
+    images = jax.device_get(jax.jit(inner.image_fn(sim))(sim.data))
+    np.testing.assert_allclose(images["distance"], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(images["normal"][0, 0], inner.rays, atol=1e-5)  # away from the camera
+    sim.scene.sync_one(sim.data, 0)
+    far = mujoco.mj_ray(
+        sim.mj_model, sim.mj_data, [0.03, 0, 0], inner.rays[0, 0], None, 1, 1, np.zeros(1, np.int32), None
+    )
+    assert far == pytest.approx(1.0, rel=1e-5)
+
+
+def test_law_09_wrong_errors_and_patterns_are_refused():
+    for act, words in (
+        (lambda: Camera(noise=0.1), "expected noise of Camera as StereoNoise"),
+        (lambda: StereoNoise(baseline=0.0), "baseline of StereoNoise"),
+        (lambda: StereoNoise(disparity_noise=np.nan), "disparity_noise of StereoNoise"),
+        (lambda: Distortion(k1="wide"), "k1 of Distortion"),
+        (lambda: Camera(fovy=120.0, distortion=Distortion(k1=-0.5)).rays, "which folds the image at"),
+        (lambda: Lidar(outputs=("depth",)), "expected outputs of a lidar without 'depth'"),
+        (lambda: Lidar(elevation=()), "expected at least one elevation and azimuth"),
+        (lambda: Lidar(elevation=(95.0,)), "elevation of Lidar"),
+        (lambda: Lidar(dropout=1.5), "dropout of Lidar"),
+        (lambda: Sim().add(Lidar(np.zeros(10**5), np.zeros(10**6))), "got 1 of 1000000 x 100000 pixels, which need"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            act()
+        assert words in str(error.value), error.value
