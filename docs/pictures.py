@@ -1,8 +1,8 @@
 """Draw the pictures that the pages show: ``python docs/pictures.py [NAME ...]`` writes them to ``docs/pictures``.
 
-``flight`` is the moving picture of the README. ``mixed`` is for the page on features, and ``allan`` and ``measured``
-are for the page on sensors. The other plots are written by ``crazysim demo`` (``tracks.png``), ``crazysim train``
-(``training.png``) and ``benchmarks/scaling.py``.
+``flight`` is the moving picture of the README. ``mixed`` is for the page on features, ``allan`` and ``measured`` are for
+the page on sensors, and ``cameras`` and ``lidar`` are for the page on cameras. The other plots are written by ``crazysim
+demo`` (``tracks.png``), ``crazysim train`` (``training.png``) and ``benchmarks/scaling.py``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from examples import mixed_fleet
 from PIL import Image
 
-from crazysim import IMU, Follow, MotionCapture, Sim
+from crazysim import IMU, Camera, Follow, Lidar, MotionCapture, Sim
 from crazysim.envs import flying
 from crazysim.media import View
 from crazysim.plugins import sensors
@@ -141,9 +141,78 @@ def measured() -> None:
     plt.close(figure)
 
 
+def camera_scene(n_drones: int = 1) -> Sim:
+    """Return a simulation of a drone before a gate, poles, a ball, boxes and a wall."""
+    sim = Sim(n_drones=n_drones, control="state", rng_key=4)
+    sim.scene.add("gate", pos=[2.0, 0.35, 1.0], width=0.7, height=0.7, stand=1.0, mocap=False)
+    sim.scene.add(
+        "pole", count=3, pos=[[1.3, -0.5, 0], [2.6, -0.9, 0], [3.0, 1.4, 0]], height=2.0, radius=0.06, mocap=False
+    )
+    sim.scene.add("sphere", pos=[1.6, -0.1, 0.55], radius=0.2, mocap=False)
+    sim.scene.add("box", count=2, pos=[[2.2, -0.45, 0.2], [-1.5, 1.5, 0.4]], size=(0.4, 0.4, 0.8), mocap=False)
+    sim.scene.add("wall", count=2, pos=[[4.5, 0, 0], [-3.0, 0, 0]], length=7.0, height=2.6, mocap=False)
+    sim.data = flying(sim.data, np.array([[0.0, 0.0, 0.9]]))
+    return sim
+
+
+def cameras() -> None:
+    """What a camera in one scene sees: in colour, each output, stereo noise, and a lens."""
+    sim, size = camera_scene(), (160, 120)
+    clean = Camera(*size, outputs=("depth", "normal", "segmentation"), max_depth=6.0)
+    images = jax.jit(clean.image_fn(sim))(sim.data)
+    stereo = Camera(*size, max_depth=6.0, noise=sensors.StereoNoise())
+    lens = Camera(*size, max_depth=6.0, distortion=sensors.Distortion(k1=-0.25, k2=0.05))
+    noisy, bent = (jax.jit(camera.image_fn(sim))(sim.data)["depth"][0, 0] for camera in (stereo, lens))
+    figure, axes = plt.subplots(2, 3, figsize=(8.4, 4.4), layout="constrained")
+    depths = {"vmin": 0, "vmax": 6, "cmap": "viridis_r"}
+    segments = np.asarray(images["segmentation"][0, 0])
+    panels = [
+        ("sim.render, in colour", sim.render("rgb_array", camera="fpv_cam:0", width=320, height=240), {}),
+        ('"depth", m', images["depth"][0, 0], depths),
+        ('"normal", as red, green and blue', 0.5 + 0.5 * np.asarray(images["normal"][0, 0]), {}),
+        ('"segmentation"', np.ma.masked_less(segments, 0), {"cmap": "tab10", "interpolation": "nearest"}),
+        ("depth with StereoNoise(), holes white", np.ma.masked_equal(noisy, 0), depths),
+        ("depth through a lens, k1=-0.25", bent, depths),
+    ]
+    for axis, (title, image, options) in zip(axes.ravel(), panels, strict=True):
+        shown = axis.imshow(image, **options)
+        axis.set_title(title, fontsize=9)
+        axis.axis("off")
+        if options is depths:
+            figure.colorbar(shown, ax=axis, shrink=0.7)
+    figure.savefig(FOLDER / "cameras.png", dpi=100)
+    plt.close(figure)
+    sim.close()
+
+
+def lidar() -> None:
+    """The returns of a rotating lidar from above and as an image, and the 64 zones of a solid-state one."""
+    sim = camera_scene()
+    rotating, zones = Lidar.vlp16(360, max_range=6.0), Lidar.vl53l5cx()
+    distance, grid = (
+        np.asarray(jax.jit(sensor.image_fn(sim))(sim.data)["distance"])[0, 0] for sensor in (rotating, zones)
+    )
+    points = (rotating.rays * distance[..., None])[distance < rotating.far]
+    figure = plt.figure(figsize=(8.4, 3.6), layout="constrained")
+    above, image, square = figure.subplot_mosaic([["above", "image"], ["above", "zones"]]).values()
+    shown = above.scatter(points[:, 0], points[:, 1], s=1, c=points[:, 2] + 0.9, cmap="viridis")
+    above.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="returns from above, by height, m")
+    figure.colorbar(shown, ax=above, shrink=0.7)
+    for axis, values, title in (
+        (image, np.ma.masked_equal(distance, rotating.far), "Lidar.vlp16(360): 16 rows, from behind over ahead"),
+        (square, grid, "Lidar.vl53l5cx(): 8 x 8 zones"),
+    ):
+        shown = axis.imshow(values, cmap="viridis_r", aspect="equal" if axis is square else "auto")
+        axis.set_title(title, fontsize=9)
+        axis.axis("off")
+        figure.colorbar(shown, ax=axis, label="m")
+    figure.savefig(FOLDER / "lidar.png", dpi=100)
+    plt.close(figure)
+
+
 def main(names: list[str]) -> None:
     """Draw the named pictures, or all of them."""
-    for draw in (flight, mixed, allan, measured):
+    for draw in (flight, mixed, allan, measured, cameras, lidar):
         if not names or draw.__name__ in names:
             draw()
             print(f"drew {draw.__name__}", flush=True)

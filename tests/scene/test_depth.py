@@ -440,28 +440,35 @@ def test_rays_of_all_worlds_are_those_of_each_world(x64, crowd, rng):
 
 
 def test_rays_meet_geoms_of_every_kind_where_c_mujoco_has_them(crowd, rng):
-    n = 300
-    from crazysim.scene.ray_casting import cast_rays
+    """10,000 rays: distance to 1e-5 of it, normal and body, but for rays that graze a surface or pass by an edge."""
+    from crazysim.scene.ray_casting import RayKernels, cast_rays
 
-    origin, direction = some_rays(rng, n)
-    direction[0, :3] = np.nan * np.eye(3)
-    rays = [x.astype(np.float32) for x in (origin, direction)]
-    hits = jax.jit(lambda data, *rays: cast_rays(crowd.scene.visual_model, data, *rays, drones=False))(
-        crowd.data, *rays
-    )
+    n = 10_000
+    rays = [x.astype(np.float32) for x in some_rays(rng, n)]
+    rays[1][0, :3] = np.nan * np.eye(3)
+    model, kernels = crowd.scene.visual_model, RayKernels("cpu", strict=True)
+    cast = jax.jit(lambda data, *rays: cast_rays(model, data, *rays, drones=False, kernels=kernels))
+    hits = jax.device_get(cast(crowd.data, *rays))
     assert not np.isfinite(hits.distance[0, :3]).any()
     crowd.scene.sync_one(crowd.data, 1)
-    geom, group, met = np.zeros(1, np.int32), np.array([1, 1, 0, 0, 0, 0], np.uint8), set()
+    mj_model, group = crowd.mj_model, np.array([1, 1, 0, 0, 0, 0], np.uint8)
+    origin, direction = (x[1].astype(np.float64) for x in rays)
+    far, normal, geoms = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 1), np.int32)
     for k in range(n):
-        far = mujoco.mj_ray(crowd.mj_model, crowd.mj_data, origin[1, k], direction[1, k], group, 1, -1, geom, None)
-        if far < 0:
-            assert not np.isfinite(hits.distance[1, k])
-        else:
-            met.add(int(crowd.mj_model.geom_type[geom[0]]))
-            body = crowd.mj_model.body_rootid[crowd.mj_model.geom_bodyid[geom[0]]]
-            assert hits.names[hits.body_index[1, k]] == (crowd.mj_model.body(body).name if body else "floor")
-            assert hits.distance[1, k] == pytest.approx(far, rel=1e-4, abs=1e-4)
-    assert len(met) == 8
+        far[k] = mujoco.mj_ray(mj_model, crowd.mj_data, origin[k], direction[k], group, 1, -1, geoms[k], normal[k])
+    far = np.where(far < 0, np.inf, far)
+    bodies = [mj_model.body(mj_model.body_rootid[body]).name for body in mj_model.geom_bodyid]
+    names = np.array([*("floor" if body == "world" else body for body in bodies), "nothing"])[geoms[:, 0]]
+    found = np.array([*hits.names, "nothing"])[hits.body_index[1]]
+    differs = (found != names) | ~np.isclose(hits.distance[1], far, rtol=1e-2, atol=0)
+    assert differs.mean() < 1e-3, "rays that pass by an edge on the other side of it"
+    clear = ~differs & np.isfinite(far) & (np.abs(np.sum(normal * direction, axis=-1)) > 0.05)
+    assert clear.mean() > 0.7
+    np.testing.assert_allclose(hits.distance[1][clear], far[clear], rtol=1e-5)
+    # Rounding moves a ray across the edge between two faces, or between the triangles of a height field.
+    turned = np.abs(hits.normal[1] - normal)[clear].max(axis=-1) > 1e-3
+    assert turned.mean() < 2e-3
+    assert len(np.unique(mj_model.geom_type[geoms[clear]])) == 8
 
 
 @pytest.fixture(scope="module")

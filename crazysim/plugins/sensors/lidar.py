@@ -70,7 +70,7 @@ class Lidar(ImageSensor):
             **settings: Other settings; the sensor rotates at ``freq`` of 5 to 20 Hz.
         """
         azimuth = 180 - 360 * (np.arange(columns) + 0.5) / columns
-        defaults = {"max_range": VLP16_RANGE, "noise": VLP16_NOISE, "resolution": VLP16_RESOLUTION}
+        defaults: dict[str, Any] = {"max_range": VLP16_RANGE, "noise": VLP16_NOISE, "resolution": VLP16_RESOLUTION}
         return cls(VLP16_ELEVATIONS, azimuth, **defaults | settings)
 
     @classmethod
@@ -82,7 +82,8 @@ class Lidar(ImageSensor):
         """
         n, fov = VL53L5CX_ZONES, VL53L5CX_FOV
         angle = fov / 2 - fov * (np.arange(n) + 0.5) / n
-        return cls(angle, angle, **{"max_range": VL53L5CX_RANGE} | settings)
+        defaults: dict[str, Any] = {"max_range": VL53L5CX_RANGE}
+        return cls(angle, angle, **defaults | settings)
 
     @property
     def image_size(self) -> tuple[int, int]:
