@@ -13,7 +13,8 @@ from on_devices import ACCELERATOR, on
 from splat_files import one_splat, spot_alpha, write_splats
 
 from crazysim import Sim, SplatScene
-from crazysim.sim import sensors, splat
+from crazysim.sim.sensors.splat import render_splat_rgbd
+from crazysim.sim.splat import attach_splats
 
 os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before SciPy is imported, by whatever test
 splax = pytest.importorskip("splax")
@@ -83,8 +84,8 @@ def test_gradients_are_those_of_plain_jax(sim, tmp_path):
 
 def test_the_functions_of_crazyflow_draw_with_splax(sim, tmp_path):
     write_splats(tmp_path / "a.ply")
-    splat.attach_splats(sim, scene=tmp_path / "a.ply")
-    image = sensors.splat.render_splat_rgbd(sim, drones=[1], resolution=(32, 24))
+    attach_splats(sim, scene=tmp_path / "a.ply")
+    image = render_splat_rgbd(sim, drones=[1], resolution=(32, 24))
     assert image.shape == (3, 1, 24, 32, 4)
     assert image.device == sim.device
     assert 0 <= float(image[..., :3].min()) <= float(image[..., :3].max()) <= 1
