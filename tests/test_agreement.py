@@ -14,6 +14,7 @@ from cases import COMPILED_ENGINES
 from crazysim import Plugin, plugins
 from crazysim.control.controllers import CONTROLLERS
 from crazysim.engine import Step
+from crazysim.plugins.sensors.image_sensor import ImageSensor
 
 ENGINES = ("interpret", *COMPILED_ENGINES)
 N_STEPS = 20
@@ -51,6 +52,8 @@ def test_every_plugin_and_controller_is_in_the_sweep():
     swept = {type(plugin) for factory in sweep.PLUGINS.values() for plugin in factory()}
     modules = [importlib.import_module(m.name) for m in pkgutil.walk_packages(plugins.__path__, "crazysim.plugins.")]
     classes = {x for module in modules for x in vars(module).values() if isinstance(x, type) and issubclass(x, Plugin)}
+    # Images are taken between kernels of the step: tests/plugins/sensors/test_depth_errors.py compares the engines.
+    classes = {x for x in classes if not issubclass(x, ImageSensor)}
     assert len(swept) > 30
     assert not {x.__name__ for x in classes if not any(issubclass(y, x) for y in swept)}
     assert set(sweep.NAMED_CONTROLLERS) | {"auto", "crazyflow", "load_lqr", "tracking_lqr"} == set(CONTROLLERS)
