@@ -35,8 +35,8 @@ STOPPING_LENGTH = 0.5
 """Length before the end of an open path in which a reference by arc length slows down, m."""
 MIN_SPEED_SHARE = 0.1
 """Smallest speed of a reference by arc length, as a share of the path's largest, so that a vehicle at rest starts."""
-STRAIGHT_RATE = 0.05
-"""Rate of a curve, as a share of its largest rate, below which its path is treated as straight."""
+MIN_CURVED_SPEED_SHARE = 0.05
+"""Parametric speed, as a share of its maximum, below which the curvature is set to zero."""
 N_REPEATED_POINTS = 12
 """Number of points of a closed path that are repeated at both ends, so that its spline is smooth where it closes."""
 
@@ -55,7 +55,7 @@ class PathPoint(NamedTuple):
 
 
 class Path(PyTree):
-    """Curves on the ground by arc length with their timing: one, or several in slots.
+    """One or several paths on the ground, parametrised by arc length, with their timing.
 
     Each piece is a polynomial of degree 5 that has the curve's position, tangent and curvature at both ends, so that
     the curvature is continuous. All pieces of a path have the same length.
@@ -83,22 +83,22 @@ class Path(PyTree):
 
         Args:
             trajectory: Trajectory of one vehicle.
-            backwards: True to drive along it backwards.
+            backwards: True to drive along it in reverse gear.
         """
         pieces, curve = _level_curve(trajectory)
 
         times = np.linspace(0.0, pieces.duration, N_SAMPLES)
         speed = np.hypot(*curve(times, 1).T)
-        table = np.linspace(0.0, pieces.duration, N_TIMES)
+        sample_times = np.linspace(0.0, pieces.duration, N_TIMES)
         arc = _arc_length(times, speed)
-        progress = np.stack([np.interp(table, times, arc), np.hypot(*curve(table, 1).T)], axis=1)
+        progress = np.stack([np.interp(sample_times, times, arc), np.hypot(*curve(sample_times, 1).T)], axis=1)
         return _path_of_curve(curve, times, speed, progress, bool(np.asarray(trajectory.repeats)), backwards)
 
     @staticmethod
     def of_points(points: ArrayLike, speed: float = 1.0, closed: bool = False) -> Path:
         """Return the smoothest path through points, at a constant speed.
 
-        It is the spline of degree 5 over the length of the chords.
+        It is a quintic spline, parametrised by the cumulative chord length.
 
         Args:
             points: Points, x and y, world frame, m; a closed path does not repeat the first one. (n_points, 2)
@@ -128,15 +128,15 @@ class Path(PyTree):
         start, end = (knots[N_REPEATED_POINTS], knots[-1 - N_REPEATED_POINTS]) if closed else (0.0, knots[-1])
         _, curve = _level_curve(trajectory)
 
-        times = np.linspace(start, end, N_SAMPLES)
-        derivative_length = np.hypot(*curve(times, 1).T)
-        length = _arc_length(times, derivative_length)[-1]
+        parameters = np.linspace(start, end, N_SAMPLES)
+        parametric_speed = np.hypot(*curve(parameters, 1).T)
+        length = _arc_length(parameters, parametric_speed)[-1]
         progress = np.stack([np.linspace(0.0, length, N_TIMES), np.full(N_TIMES, abs(speed))], axis=1)
-        return _path_of_curve(curve, times, derivative_length, progress, closed, speed < 0, abs(speed))
+        return _path_of_curve(curve, parameters, parametric_speed, progress, closed, speed < 0, abs(speed))
 
     @staticmethod
     def stack(paths: Sequence[Path]) -> Path:
-        """Return the slots of several records as one record."""
+        """Stack several paths into one record with a slot for each."""
         if not paths:
             raise ConfigError("expected at least one path, got none. Use Path.stack([Path.of_points(points)]).")
         n = max(path.n_pieces for path in paths)
@@ -175,16 +175,20 @@ class Path(PyTree):
         return _evaluate(_entry_at(self.coefficients, index, piece), u)
 
     def speed_at(self, index: Array | int, s: Array) -> Array:
-        """Return the speed at an arc length, m/s; it decreases to zero before the end of an open path. (1,)"""
+        """Return the speed at an arc length, m/s. (1,)
+
+        It decreases linearly to zero over the last ``STOPPING_LENGTH`` of an open path.
+        """
         piece, _ = self._locate(index, s)
         slowdown = safe_clip((_entry_at(self.length, index) - s) / STOPPING_LENGTH, 0.0, 1.0)
         share = jnp.where(_entry_at(self.closed, index), 1.0, slowdown)
         return (share * _entry_at(self.speeds, index, piece))[None]
 
     def time_reference(self, index: Array | int, t: Array) -> tuple[Array, Array]:
-        """Return the arc length, m, and the speed, m/s, at a time; at rest before the start and after the end.
+        """Return the arc length, m, and the speed, m/s, at a time.
 
-        On a closed path the motion continues, and the arc length increases with every lap.
+        On an open path the vehicle rests before the start and after the end. On a closed path the motion continues in
+        both directions, and the arc length increases with every lap.
 
         Args:
             index: Number of the path. ()
@@ -203,16 +207,17 @@ class Path(PyTree):
         rise, v0, v1 = s1 - s0, v0 * step, v1 * step
         c2, c3 = 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise  # cubic of Hermite
         s = s0 + u * (v0 + u * (c2 + u * c3))
-        is_moving = (t >= 0) & (is_closed | (t <= duration))
+        is_moving = is_closed | ((t >= 0) & (t <= duration))
         v = jnp.where(is_moving, (v0 + u * (2 * c2 + 3 * u * c3)) / step, 0.0)
         sign = jnp.where(_entry_at(self.speeds, index, 0) < 0, -1.0, 1.0)
         return (s + laps * _entry_at(self.length, index))[None], (sign * v)[None]
 
     def project(self, index: Array | int, pos: Array, guess: Array) -> Array:
-        """Return the arc length of the point of a path nearest to a position, from a guess nearby; compiled.
+        """Return the arc length of the point of a path nearest to a position, from a guess nearby.
 
-        Newton's method, whose steps ``(p - r) . t / (1 - curvature e)`` are limited to ``MAX_NEWTON_STEP``. On a closed
-        path the arc length increases with every lap.
+        Newton's method, with steps ``along_error / (1 - curvature lateral)`` of at most ``MAX_NEWTON_STEP``, where
+        ``along_error`` and ``lateral`` are the components of the offset along the tangent and to its left. Usable in
+        compiled code. On a closed path the arc length increases with every lap.
 
         Args:
             index: Number of the path. ()
@@ -235,7 +240,7 @@ class Path(PyTree):
         return s
 
     def nearest(self, index: int, pos: ArrayLike) -> float:
-        """Return the arc length of the sampled point of a path nearest to a position, anywhere on it, on the host.
+        """Return the arc length, m, of the sample of a path nearest to a position, anywhere on it, on the host.
 
         Args:
             index: Number of the path.
@@ -283,8 +288,8 @@ def _level_curve(trajectory: Trajectory) -> tuple[PieceTable, Callable[[Floats, 
 
 def _path_of_curve(
     curve: Callable[[Floats, int], Floats],
-    times: Floats,
-    derivative_length: Floats,
+    parameters: Floats,
+    parametric_speed: Floats,
     progress: Floats,
     closed: bool,
     backwards: bool,
@@ -294,35 +299,36 @@ def _path_of_curve(
 
     Args:
         curve: Function from parameters (n,) and the order of a derivative to x and y. (n, 2)
-        times: Parameters, equally spaced. (n,)
-        derivative_length: Length of the derivative there. (n,)
+        parameters: Parameters, equally spaced. (n,)
+        parametric_speed: Length of the derivative there. (n,)
         progress: Arc length and its rate over time. (n_times, 2)
         closed: True for a path that ends at its start.
         backwards: True to drive backwards.
-        speed: Speed, m/s; None for the rate.
+        speed: Speed, m/s; None for the parametric speed.
     """
-    arc = _arc_length(times, derivative_length)
+    arc = _arc_length(parameters, parametric_speed)
     if not arc[-1] > 1e-3:
         raise ConfigError(
-            "expected a path of some length on the ground, got one that stays where it is. Leave path out, and command "
-            "the cars, to let them stand."
+            f"expected a path longer than 1 mm, got {arc[-1]:.3g} m. Omit path to let the cars stand still."
         )
     if not arc[-1] <= MAX_PIECES * MAX_PIECE_LENGTH:
         raise ConfigError(
             f"expected a path of at most {MAX_PIECES * MAX_PIECE_LENGTH:g} m, got {arc[-1]:.4g} m. Split it."
         )
-    moving_samples = np.flatnonzero(derivative_length > 1e-3 * derivative_length.max())
+    moving_samples = np.flatnonzero(parametric_speed > 1e-3 * parametric_speed.max())
     if len(moving_samples) != moving_samples[-1] - moving_samples[0] + 1:
-        stop = times[moving_samples[0] + np.argmax(np.diff(moving_samples) > 1)]
+        stop = parameters[moving_samples[0] + np.argmax(np.diff(moving_samples) > 1)]
+        x, y = curve(np.array([stop]), 0)[0]
         raise ConfigError(
-            f"expected a path that stops only at its ends, got one without a tangent at {stop:.3g} s. Split it there."
+            f"expected a path that stops only at its ends, got one without a tangent at ({x:.3g}, {y:.3g}) m. Split it "
+            f"there."
         )
     n = max(4, int(np.ceil(arc[-1] / MAX_PIECE_LENGTH)))
-    nodes = np.interp(np.linspace(0.0, arc[-1], n + 1), arc, times)
-    inner_times = np.clip(
-        nodes, times[moving_samples[0]], times[moving_samples[-1]]
+    nodes = np.interp(np.linspace(0.0, arc[-1], n + 1), arc, parameters)
+    inner_nodes = np.clip(
+        nodes, parameters[moving_samples[0]], parameters[moving_samples[-1]]
     )  # at rest the tangent is undefined
-    pos, vel, acc = curve(nodes, 0), curve(inner_times, 1), curve(inner_times, 2)
+    pos, vel, acc = curve(nodes, 0), curve(inner_nodes, 1), curve(inner_nodes, 2)
     if closed and not np.allclose(pos[0], pos[-1], atol=1e-3):
         raise ConfigError(
             f"expected a closed path that ends at its start, got a gap of {np.hypot(*(pos[0] - pos[-1])):.3g} m. Let "
@@ -331,24 +337,24 @@ def _path_of_curve(
     size = np.hypot(*vel.T)[:, None]
     tangent = vel / size
     curvature = (acc - np.sum(acc * tangent, axis=1, keepdims=True) * tangent) / size**2
-    curvature[size[:, 0] < STRAIGHT_RATE * derivative_length.max()] = (
+    curvature[size[:, 0] < MIN_CURVED_SPEED_SHARE * parametric_speed.max()] = (
         0.0  # near rest the curvature of a polynomial grows without bound
     )
     spacing = arc[-1] / n
     derivatives = np.stack([pos, tangent, curvature], axis=1)
     coefficients = interpolation.unit_coefficients(derivatives, np.full(n, spacing))
     speeds = (
-        np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], MIN_SPEED_SHARE * derivative_length.max())
+        np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], MIN_SPEED_SHARE * parametric_speed.max())
     )
-    end = progress[-1, 0] / speed if speed is not None else times[-1]
-    arrays = (coefficients, arc[-1], spacing, speeds * (-1 if backwards else 1), progress, end)
+    duration = progress[-1, 0] / speed if speed is not None else parameters[-1]
+    arrays = (coefficients, arc[-1], spacing, speeds * (-1 if backwards else 1), progress, duration)
     coefficients, length, spacing, speeds, progress, duration = (np.asarray(x, float_dtype())[None] for x in arrays)
     return Path(coefficients, length, spacing, np.array([closed]), speeds, progress, duration)  # type: ignore[arg-type]
 
 
-def _arc_length(times: Floats, derivative_length: Floats) -> Floats:
+def _arc_length(parameters: Floats, parametric_speed: Floats) -> Floats:
     """Return the arc length at each parameter, by the trapezoidal rule. (n,)"""
-    return np.concatenate([[0.0], np.cumsum((derivative_length[1:] + derivative_length[:-1]) / 2 * np.diff(times))])
+    return np.concatenate([[0.0], np.cumsum((parametric_speed[1:] + parametric_speed[:-1]) / 2 * np.diff(parameters))])
 
 
 def _evaluate(coefficients: Array, u: Array) -> PathPoint:

@@ -99,8 +99,9 @@ def test_timing_is_that_of_the_trajectory():
         arc, speed = path.time_reference(0, jnp.float32(t))
         np.testing.assert_allclose([arc[0], speed[0]], [s, 0.0], atol=1e-5)
     rounds = Path.of_points(SQUARE, speed=2.0, closed=True)
-    arc, speed = rounds.time_reference(0, 3.25 * rounds.duration[0])
-    np.testing.assert_allclose([arc[0], speed[0]], [3.25 * rounds.length[0], 2.0], rtol=1e-4)
+    for n_laps in (3.25, -1.25):
+        arc, speed = rounds.time_reference(0, n_laps * rounds.duration[0])
+        np.testing.assert_allclose([arc[0], speed[0]], [n_laps * rounds.length[0], 2.0], rtol=1e-4)
 
 
 def test_backwards_paths_have_negative_speeds():
@@ -131,12 +132,12 @@ def test_slots_hold_paths_of_any_length():
         (lambda: Path.of_points([*SQUARE, (0, 0)], closed=True), "does not repeat its first point"),
         (lambda: Path.of_points(SQUARE, speed=0), "a speed other than zero"),
         (lambda: Path.of_points([(0, 0), (np.nan, 1), (1, 1)]), "finite"),
-        (lambda: Path.of_trajectory(hover((0, 0, 1), 2.0)), "of some length"),
+        (lambda: Path.of_trajectory(hover((0, 0, 1), 2.0)), "a path longer than 1 mm, got 0 m"),
         (lambda: Path.of_points([(0, 0), (1e9, 0), (2e9, 1)]), "a path of at most 10000 m, got 2e+09 m"),
         (lambda: Path.stack([]), "at least one path"),
         (
             lambda: Path.of_trajectory(STRAIGHT.then(spline([0, 1], [(1, 0, 0), (0, 1, 0)]))),
-            "without a tangent",
+            "without a tangent at (1, 0) m",
         ),
         (
             lambda: Path.of_trajectory(STRAIGHT.replace(repeats=np.bool_(True))),
