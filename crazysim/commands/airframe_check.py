@@ -28,15 +28,16 @@ STATE_CONTROLLERS = ("auto", "geometric", "indi", "lqr", "pid", "mellinger")
 QUARTER_TURN = np.pi / 2
 """Angle of the turn whose largest rate and duration are stated, rad."""
 MIN_THRUST_TO_WEIGHT = 1.5
-"""Thrust over weight below which a warning is given, 1."""
+"""Thrust over weight below which a warning is given (dimensionless)."""
 MIN_AUTHORITY = {"roll": 4.0, "pitch": 4.0, "yaw": 0.2}
 """Angular acceleration in hover below which a warning is given, rad/s^2: the least of the airframes in the tests."""
 MAX_PRECESSION_RATIO = 2.5
-"""Ratio of the precession rate to the bandwidth of the attitude loop above which ``auto`` may be unstable, 1. Of 1,960
-random airframes with an odd number of rotors, all with ratios up to 2.45 fly, and the one with 4.3 does not."""
+"""Ratio of the precession rate to the bandwidth of the attitude loop above which ``auto`` may be unstable
+(dimensionless). Of 1,960 random airframes with an odd number of rotors, all with ratios up to 2.45 fly, and the one
+with 4.3 does not."""
 MAX_PRECESSION_SHARE = 0.25
-"""Share of the angular acceleration in hover that the net angular momentum of the rotors takes up at 1 rad/s, above
-which a warning is given, 1."""
+"""Share of the roll or pitch authority that the gyroscopic torque of the rotors takes up at 1 rad/s, above which a
+warning is given (dimensionless)."""
 MAX_TIME_CONSTANT = 0.2
 """Time constant of rotors above which a warning is given, s: the longest of the airframes in the tests."""
 FREQ = 500
@@ -82,14 +83,14 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
         sim.close()
 
 
-def _ratio(airframe: Airframe) -> float:
-    """Return the ratio of the largest thrust at zero torque to the weight, 1."""
+def _thrust_to_weight(airframe: Airframe) -> float:
+    """Return the ratio of the largest thrust at zero torque to the weight (dimensionless)."""
     return max_thrust_without_torque(airframe) / float(airframe.value("rigid_body.mass") * GRAVITY_MAGNITUDE)
 
 
 def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
     """Yield mass, thrust, and quantities that follow from them and the rotors' positions."""
-    mass, ratio = float(airframe.value("rigid_body.mass")), _ratio(airframe)
+    mass, ratio = float(airframe.value("rigid_body.mass")), _thrust_to_weight(airframe)
     max_thrust, min_thrust = (float(airframe.value(f"rotors.thrust_{limit}")) for limit in ("max", "min"))
     hover = mass * GRAVITY_MAGNITUDE / airframe.n_rotors
     yield "mass", f"{mass:.4g} kg, {airframe.n_rotors} rotors of {min_thrust:.3g} to {max_thrust:.3g} N"
@@ -115,7 +116,8 @@ def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
         rate, seconds = np.sqrt(acc * QUARTER_TURN), 2 * np.sqrt(QUARTER_TURN / max(acc, 1e-9))
         yield (
             name,
-            f"up to {acc:.3g} rad/s^2 at hover; a turn by 90 degrees takes {seconds:.2g} s, at up to {rate:.3g} rad/s",
+            f"up to {acc:.3g} rad/s^2 at hover thrust; a turn by 90 degrees takes {seconds:.2g} s, at up to "
+            f"{rate:.3g} rad/s",
         )
 
 
@@ -133,9 +135,9 @@ def _rotors(airframe: Airframe) -> Iterator[tuple[str, str]]:
 
 
 def _battery(airframe: Airframe) -> str:
-    keys = [key for key in ("cells", "capacity", "resistance") if f"battery.{key}" not in airframe.values]
-    if keys:
-        return f"lacks {', '.join(keys)} in [battery] for Battery() without arguments"
+    missing = [key for key in ("cells", "capacity", "resistance") if f"battery.{key}" not in airframe.values]
+    if missing:
+        return f"[battery] lacks {', '.join(missing)}, which Battery() needs unless they are passed"
     cells, capacity, resistance = (float(airframe.value(f"battery.{k}")) for k in ("cells", "capacity", "resistance"))
     return f"{cells:.0f} cell{'s' * (cells != 1)}, {capacity:.3g} A h, {resistance:.3g} ohm"
 
@@ -155,9 +157,10 @@ def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tupl
         controller: Any = find_controller(name)
         missing = _missing_parameters(functools.partial(controller.params, airframe))
         yield f"  {name}", _levels({", ".join(level.value for level in controller.levels): missing})
-    stages = {"state": StateParams, "attitude, body_rate": AttitudeParams, "force_torque": AllocationParams}
+    params_by_level = {"state": StateParams, "attitude, body_rate": AttitudeParams, "force_torque": AllocationParams}
     missing_by_level = {
-        levels: _missing_parameters(functools.partial(params.create, airframe)) for levels, params in stages.items()
+        levels: _missing_parameters(functools.partial(params.create, airframe))
+        for levels, params in params_by_level.items()
     }
     yield f"  {Crazyflow.name}", _levels(missing_by_level)
 
@@ -181,13 +184,16 @@ def _missing_parameters(create: Callable[[], Any]) -> str:
 
 def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
     """Yield warnings about allowed settings that are probably mistakes."""
-    positions, ratio = airframe.value("rotors.position"), _ratio(airframe)
+    positions, ratio = airframe.value("rotors.position"), _thrust_to_weight(airframe)
     if ratio < MIN_THRUST_TO_WEIGHT:
         yield f"thrust over weight is {ratio:.2f}; below {MIN_THRUST_TO_WEIGHT:g} little is left for manoeuvres"
     if np.linalg.norm(np.mean(positions[:, :2], axis=0)) > 0.05 * airframe.arm:
         yield "the rotors are not centred on the centre of mass: their speeds differ in hover"
     if np.sum(airframe.value("rotors.yaw_torque_sign")):
-        yield "more rotors turn one way than the other: their drag turns the drone in hover"
+        yield (
+            "more rotors turn one way than the other: equal thrusts do not balance the yaw torque, so the rotor speeds "
+            "differ in hover"
+        )
     if Dynamics.first_principles in dynamics:
         yield from _agility_warnings(airframe)
     if not dynamics:
@@ -199,7 +205,10 @@ def _agility_warnings(airframe: Airframe) -> Iterator[str]:
     for (axis, minimum), acc in zip(MIN_AUTHORITY.items(), max_ang_acc(airframe), strict=True):
         if acc < minimum:
             seconds = 2 * np.sqrt(QUARTER_TURN / acc)
-            yield f"{axis} has {acc:.2g} rad/s^2 in hover: a turn by 90 degrees takes {seconds:.2g} s at least"
+            yield (
+                f"{axis} has at most {acc:.2g} rad/s^2 under controller 'auto': a turn by 90 degrees takes "
+                f"{seconds:.2g} s at least"
+            )
     if precession_rate(airframe) > MAX_PRECESSION_SHARE * np.min(max_ang_acc(airframe)[:2]):
         yield (
             f"rotors turn one way more than the other: at 1 rad/s of roll or pitch their momentum takes "

@@ -15,7 +15,7 @@ from crazysim import rotation
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.columns import Columns
-from crazysim.lab.identify.motion import body_rates, integral
+from crazysim.lab.identify.motion import body_rates, integrate
 
 if TYPE_CHECKING:
     from crazysim.lab.identify.logs import Log
@@ -176,12 +176,12 @@ def _check_laws(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str
 def _rates(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
     """Yield a pair of changes for each measured rate, and the samples per window."""
     if "vel" not in derived_keys:
-        width, (change, expected) = _changes(t, 0.2, data["pos"], integral(data["vel"], t))
+        width, (change, expected) = _changes(t, 0.2, data["pos"], integrate(data["vel"], t))
         yield Pair("a velocity that moves the position", change, expected, 0.01), width
     if "ang_vel" not in derived_keys:
         angles = np.cumsum(body_rates(t, data["quat"]) * np.diff(t)[:, None], axis=0)
         angles = np.concatenate([np.zeros((1, 3)), angles])
-        width, (change, expected) = _changes(t, 0.1, angles, integral(data["ang_vel"], t))
+        width, (change, expected) = _changes(t, 0.1, angles, integrate(data["ang_vel"], t))
         yield Pair("an angular velocity that turns the attitude", change, expected, 0.01), width
 
 
@@ -200,7 +200,7 @@ def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
         flying = squares > np.median(squares) / 2
     else:
         thrust, flying = GRAVITY_MAGNITUDE / np.maximum(axis[:, 2], 0.3), np.ones(len(t), bool)
-    expected = integral(thrust[:, None] * axis - [0, 0, GRAVITY_MAGNITUDE], t)
+    expected = integrate(thrust[:, None] * axis - [0, 0, GRAVITY_MAGNITUDE], t)
     ground = np.cumsum(~flying)[:, None] * np.ones(3)
     width, (measured, expected, ground) = _changes(t, 0.25, data["vel"], expected, ground)
     is_airborne = (ground[width:, 0] == 0) & (ground[:-width, 0] == 0)

@@ -19,7 +19,7 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.checks import check_turning
 from crazysim.lab.identify.logs import Log
-from crazysim.lab.identify.motion import integral
+from crazysim.lab.identify.motion import integrate
 from crazysim.lab.identify.motors import motor_lag, with_speeds
 from crazysim.lab.identify.prediction import Model, windows
 from crazysim.lab.identify.rotation import (
@@ -247,7 +247,7 @@ def _fit_torques(
         momentum = log.ang_vel @ inertia + spin
         rotors = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
         # Integrals of the known terms move to the left side.
-        impulse = integral(rotors - np.cross(log.ang_vel, momentum), log.t)
+        impulse = integrate(rotors - np.cross(log.ang_vel, momentum), log.t)
         vel, total, axes = _to_body_frame(log, log.vel), thrust.sum(-1, keepdims=True), np.eye(3)
         columns = [total * axes[1], -total * axes[0], np.broadcast_to(axes[2], vel.shape)]
         columns += [vel[:, b : b + 1] * axes[a] for a in range(3) for b in range(3)]
@@ -274,7 +274,7 @@ def _fit_regression(
     rates, changes, blocks = [], [], []
     for number, log in enumerate(logs):
         x, momentum = terms(log)
-        total, size = integral(x, log.t), round(WINDOW_DURATION / log.dt)
+        total, size = integrate(x, log.t), round(WINDOW_DURATION / log.dt)
         starts = np.arange(0, len(log.t) - size, max(1, size // 5))
         starts = starts[[not np.any((log.gaps > k) & (log.gaps <= k + size)) for k in starts]]
         rates.append(total[starts + size] - total[starts])

@@ -13,8 +13,8 @@ from crazysim.lab.identify.readers import Stream, resample
 
 LAG_STEP = 0.005
 """Interval at which angular velocities are compared, s."""
-MAX_SPAN = 100
-"""Longest duration of a recording, in ``LAG_STEP`` per sample."""
+MAX_MEAN_INTERVAL = 0.5
+"""Longest mean interval between valid samples, s."""
 DERIVATIVE_DURATION = 0.06
 """Duration over which positions and attitudes are differentiated, s."""
 
@@ -50,26 +50,27 @@ def join_motion_capture(
         )
     t, motion_time = (np.asarray(x[time], np.float64) for x in (table, motion))
     motion_rates = body_rates(motion_time, stack_columns(name, motion, columns.quat))
-    size = round(DERIVATIVE_DURATION / LAG_STEP)
+    n_smoothing = round(DERIVATIVE_DURATION / LAG_STEP)
     series = []
     for times, rates in ((t, ang_vel), ((motion_time[1:] + motion_time[:-1]) / 2, motion_rates)):
         is_valid = np.isfinite(times) & np.all(np.isfinite(rates), axis=-1)
         order = np.unique(times[is_valid], return_index=True)[1]
         span = np.ptp(times[is_valid]) if len(order) > 1 else 0.0
-        if not 0 < span < MAX_SPAN * LAG_STEP * len(order):
+        if not 0 < span < MAX_MEAN_INTERVAL * len(order):
             raise ConfigError(
-                f"{name}: expected samples of one flight, got {len(order)} with times and angular velocities, over "
-                f"{span:.3g} s. Cut the log and its motion capture to the flight."
+                f"{name}: expected samples at least every {MAX_MEAN_INTERVAL:g} s on average, got {len(order)} valid "
+                f"samples over {span:.3g} s. Cut the log and its motion capture to the flight."
             )
         grid = np.arange(times[is_valid].min(), times[is_valid].max(), LAG_STEP)
         speed = np.interp(grid, times[is_valid][order], np.linalg.norm(rates[is_valid][order], axis=-1))
-        series.append((grid[0], np.convolve(speed, np.ones(size) / size, "same")))
+        series.append((grid[0], np.convolve(speed, np.ones(n_smoothing) / n_smoothing, "same")))
     (first, a), (second, b) = series
     lag, agreement = _find_lag(a, b)
     if agreement < 0.7:
         raise ConfigError(
             f"{name}: expected motion capture of the same flight, got angular velocities that agree by "
-            f"{agreement:.2f} of 1 at best. Check that both files are of one flight, that it turns, and quat=."
+            f"{agreement:.2f} of 1 at best. Check that both files are of one flight, that the drone rotates in it, and "
+            "that quat= names the attitude."
         )
     shift = first - second + lag * LAG_STEP
     repairs.append(f"moved the clock of the motion capture by {shift:.3f} s (agreement {agreement:.2f} of 1)")
@@ -88,18 +89,20 @@ def _number_columns(table: Mapping[str, NDArray], n: int, excluded: Sequence[str
 
 
 def _find_lag(a: NDArray, b: NDArray) -> tuple[float, float]:
-    """Return the number of samples by which b is shifted to agree best with a, and the correlation there, 0 to 1."""
+    """Return the number of samples by which b is shifted to agree best with a, and the correlation there, -1 to 1."""
     n = len(a) + len(b)
 
-    def product(x: NDArray, y: NDArray) -> NDArray:
+    def cross_correlate(x: NDArray, y: NDArray) -> NDArray:
         return np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
 
     ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
-    count = np.round(product(ones_a, ones_b))
+    count = np.round(cross_correlate(ones_a, ones_b))
     safe_count = np.maximum(count, 1)
-    mean_a, mean_b = product(a, ones_b) / safe_count, product(ones_a, b) / safe_count
-    covariance = product(a, b) / safe_count - mean_a * mean_b
-    variance = (product(a * a, ones_b) / safe_count - mean_a**2) * (product(ones_a, b * b) / safe_count - mean_b**2)
+    mean_a, mean_b = cross_correlate(a, ones_b) / safe_count, cross_correlate(ones_a, b) / safe_count
+    covariance = cross_correlate(a, b) / safe_count - mean_a * mean_b
+    variance = (cross_correlate(a * a, ones_b) / safe_count - mean_a**2) * (
+        cross_correlate(ones_a, b * b) / safe_count - mean_b**2
+    )
     overlap = count >= 0.5 * min(len(a), len(b))
     agreement = np.where(overlap, covariance / np.sqrt(np.maximum(variance, 1e-12)), -1.0)
     k = int(np.argmax(agreement))
@@ -138,7 +141,7 @@ def fit_ang_vel(t: NDArray, quat: NDArray) -> NDArray:
     return np.stack([np.convolve(x, kernel, "valid") for x in padded_rates.T], axis=-1)
 
 
-def integral(x: NDArray, t: NDArray) -> NDArray:
+def integrate(x: NDArray, t: NDArray) -> NDArray:
     """Return the integral over time from the first sample (trapezoidal rule). (n, ...)"""
     steps = (x[1:] + x[:-1]) / 2 * np.diff(t).reshape(-1, *[1] * (x.ndim - 1))
     return np.concatenate([np.zeros_like(x[:1]), np.cumsum(steps, axis=0)])

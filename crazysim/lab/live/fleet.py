@@ -62,12 +62,14 @@ class Fleet:
             sim: Simulation of one world with state commands.
             ids: Index of the drone of each ID that is in use; None if no ID is in use yet.
             max_pieces: Largest number of pieces of a trajectory.
-            teleport: True to move a drone to the start of the first trajectory that it receives before any other
-                command, as the lab's simulator does.
+            teleport: True to move a drone to the start of the first trajectory that it receives before any command
+                that moves it.
             name: Name of the plugin that follows the trajectories.
         """
         if sim.n_worlds != 1:
-            raise ConfigError(f"expected one world, got {sim.n_worlds}. Use Follow.upload for trajectories of many.")
+            raise ConfigError(
+                f"expected one world, got {sim.n_worlds}. Use Follow.upload for trajectories in several worlds."
+            )
         self.sim, self.teleport = sim, teleport
         self.ids = dict(ids or {})
         if len(set(self.ids.values())) < len(self.ids) or not all(0 <= i < sim.n_drones for i in self.ids.values()):
@@ -76,7 +78,7 @@ class Fleet:
         self._active = [_hover_trajectory(np.append(p, 0.0)) for p in pos]
         self._starts = np.zeros(sim.n_drones)
         self._uploaded: dict[int, Trajectory] = {}
-        self._untouched = [True] * sim.n_drones
+        self._awaits_first_trajectory = [True] * sim.n_drones
         self.parameters = [{} for _ in range(sim.n_drones)]
         self._lights: Lights | None = None
         self._show_start: float | None = None
@@ -104,12 +106,12 @@ class Fleet:
         return n
 
     def reset(self) -> None:
-        """Make every drone hover at its position, as after ``sim.reset()``; received trajectories stay."""
-        self._untouched = [True] * self.sim.n_drones
+        """Make every drone hover at its position; received trajectories stay. Call it after ``sim.reset()``."""
+        self._awaits_first_trajectory = [True] * self.sim.n_drones
         self._show_start = None
         for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
             self._assign_trajectory(drone, _hover_trajectory(np.append(pos, 0.0)))
-            self._untouched[drone] = drone not in self._uploaded
+            self._awaits_first_trajectory[drone] = drone not in self._uploaded
 
     def colors(self) -> NDArray:
         """Return the present colours of the LEDs, from the received show once it has started. (n_drones, 3)"""
@@ -171,36 +173,41 @@ class Fleet:
         elif isinstance(command, Land):
             self._assign_trajectory(drone, _vertical_trajectory(setpoint, 0.0))
 
-    def _drones(self, identity: int | None) -> list[int]:
+    def _drones(self, drone_id: int | None) -> list[int]:
         """Return the drones of an ID; a new one gets the next free drone."""
-        if identity is None:
+        if drone_id is None:
             return list(range(self.sim.n_drones))
-        if identity not in self.ids:
+        if drone_id not in self.ids:
             free_drones = sorted(set(range(self.sim.n_drones)) - set(self.ids.values()))
             if not free_drones:
-                raise ConfigError(f"expected one of the IDs {sorted(self.ids)}, got {identity}: no drone is free")
-            self.ids[identity] = free_drones[0]
-            log.info("ID %d is drone %d", identity, free_drones[0])
-        return [self.ids[identity]]
+                raise ConfigError(f"expected one of the IDs {sorted(self.ids)}, got {drone_id}: no drone is free")
+            self.ids[drone_id] = free_drones[0]
+            log.info("ID %d is drone %d", drone_id, free_drones[0])
+        return [self.ids[drone_id]]
 
     def _check_trajectory(self, trajectory: Trajectory) -> None:
         n_pieces = self.follow.read(self.sim.data).ends.shape[1]
-        if np.ndim(trajectory.ends) != 1 or trajectory.n_pieces > n_pieces or trajectory.degree > MAX_DEGREE:
+        if np.ndim(trajectory.ends) != 1 or trajectory.degree > MAX_DEGREE:
             raise ConfigError(
-                f"expected a trajectory of one vehicle with at most {n_pieces} pieces of degree {MAX_DEGREE}, got ends "
-                f"of shape {np.shape(trajectory.ends)} and degree {trajectory.degree}. Use Fleet(..., max_pieces=...)."
+                f"expected a trajectory of one vehicle of degree {MAX_DEGREE} or less, got ends of shape "
+                f"{np.shape(trajectory.ends)} and degree {trajectory.degree}. Fit shorter pieces."
+            )
+        if trajectory.n_pieces > n_pieces:
+            raise ConfigError(
+                f"expected a trajectory of at most {n_pieces} pieces, got {trajectory.n_pieces}. Use "
+                f"Fleet(..., max_pieces={trajectory.n_pieces})."
             )
 
     def _receive_trajectory(self, drone: int, trajectory: Trajectory) -> None:
         self._uploaded[drone] = trajectory
-        if self.teleport and self._untouched[drone]:
+        if self.teleport and self._awaits_first_trajectory[drone]:
             start_point = HostTrajectory.of(trajectory).at(0.0)
             states = self.sim.data.states
             pos = states.pos.at[0, drone].set(jnp.asarray(start_point[:3], states.pos.dtype))
             quat = states.quat.at[0, drone].set(jnp.asarray(from_yaw(start_point[3]), states.quat.dtype))
             self.sim.data = self.sim.data.replace(states=states.replace(pos=pos, quat=quat))
             self._assign_trajectory(drone, _hover_trajectory(start_point))
-        self._untouched[drone] = False
+        self._awaits_first_trajectory[drone] = False
 
     def _start_trajectory(self, drone: int, relative: bool) -> None:
         trajectory = self._uploaded[drone]
@@ -214,7 +221,7 @@ class Fleet:
         record, now = self.follow.read(data), self._current_time()
         start = record.start.at[0, drone, 0].set(jnp.asarray(now, record.start.dtype))
         self.sim.data = self.follow.write(data, record.replace(start=start))
-        self._active[drone], self._starts[drone], self._untouched[drone] = trajectory, now, False
+        self._active[drone], self._starts[drone], self._awaits_first_trajectory[drone] = trajectory, now, False
 
 
 def _hover_trajectory(point: NDArray) -> Trajectory:

@@ -30,7 +30,7 @@ class Gamepad:
         """Open a gamepad.
 
         Args:
-            number: Number of the gamepad, from 0; None for the first that is connected.
+            number: Number of the GLFW joystick slot, 0 to 15; None for the first slot with a gamepad.
             glfw: Module with the functions of GLFW; None for ``glfw``.
 
         Raises:
@@ -65,7 +65,7 @@ class Gamepad:
         self._calls[index] = call
 
     def __call__(self, live: Live) -> NDArray:
-        """Return forward, left, up and turn left, from -1 to 1, and call the functions of buttons. (4,)"""
+        """Return forward, left, up and turn left, -1 to 1, and post the functions of newly pressed buttons. (4,)"""
         glfw = self._glfw
         state = glfw.get_gamepad_state(self._number)
         if not state:
@@ -93,5 +93,7 @@ def _glfw() -> Any:
     with warnings.catch_warnings(action="ignore"):
         is_initialized = glfw.init()
     if not is_initialized:
-        raise ConfigError("expected a screen, without which GLFW has no gamepads, got none")
+        raise ConfigError(
+            "expected a screen, which GLFW needs for gamepads, got none. Run on a machine with a display."
+        )
     return glfw
