@@ -6,14 +6,15 @@
 - tracking: figure eight of 2 m, ``--speed`` in its middle, from a matching start, RMS distance over 9 s, m
 - pushed: hover under a sideways force of a tenth of the weight from 2 s on, distance 5 s later, and its largest, m
 - heavier: hover with 20% more mass from 0 s on, distance after 5 s, m
-- home: part of random attitudes at 5 rad/s that are within 0.1 m of their setpoint after 15 s
+- home: share of the flights from random attitudes at 5 rad/s that end within 0.1 m of the setpoint, after 15 s
 - lost_178: height lost from rest at a roll of 178 degrees, m
-- overshoot_attitude, overshoot_body_rate: largest overshoot after steps of the command (``STEPS``), over their size
+- overshoot_attitude, overshoot_body_rate: largest overshoot after the steps of ``COMMAND_STEPS``, over their size
 - error_attitude, error_body_rate: largest error 2 s after these steps and later, over their size
-- steps_per_s: physics steps of many worlds that hover, in calls of 100 steps; without, with --worlds 0
+- steps_per_s: physics steps of many worlds that hover, in calls of 100 steps; omitted with --worlds 0
 
-Without --drones these are all built-in airframes with rotors, and three made of plain physics (``OWN``). A controller
-that lacks numbers of an airframe is left out for it. ``tracking_lqr`` is only measured on the figure eight.
+Without --drones these are all built-in airframes with rotors, and three made of plain physics (``own_airframes``). A
+controller that lacks numbers of an airframe is left out for it. Of the flights, ``tracking_lqr`` only flies the figure
+eight.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ from crazysim.errors import ConfigError
 from crazysim.trajectories import figure_eight
 
 CONTROLLERS = ("auto", "crazyflow", "mellinger", "pid", "geometric", "lqr", "tracking_lqr", "indi")
-KNOTS = 0.15
+GAIN_INTERVAL = 0.15
 """Time between gains of tracking_lqr, s; 60 of them last 9 s."""
-STEPS = {
+COMMAND_STEPS = {
     "attitude": ((0, 0.1), (0, 0.5), (1, -0.5), (2, 0.5), (2, 2.5)),
     "body_rate": ((0, 0.5), (0, 3.0), (1, -3.0), (2, 0.5), (2, 2.0)),
 }
@@ -51,7 +52,7 @@ TAKE_OFF_WORLD, TRACKING_WORLD, PUSHED_WORLD, HEAVY_WORLD, INVERTED_WORLD, FIRST
 
 
 def own_airframe(
-    name: str, mass: float, radius: float, n: int, inertia: list[float], thrust_max: float, rpm: float, lag: float
+    name: str, mass: float, radius: float, n: int, inertia: list[float], thrust_max: float, rpm: float, lag_rate: float
 ) -> Airframe:
     """Return an airframe of plain physics: rotors on a circle that hover at a speed, and nothing about controllers."""
     angles = 2 * np.pi * (np.arange(n) + 0.5) / n
@@ -68,7 +69,7 @@ def own_airframe(
                 "inertia": 1e-3 * inertia[2],
                 "thrust_curve": [0.0, 0.0, k2],
                 "torque_curve": [0.0, 0.0, 0.015 * k2],
-                "lag": [lag, 0.0, 0.7 * lag, 0.0],
+                "lag": [lag_rate, 0.0, 0.7 * lag_rate, 0.0],
             },
             "drag": {"coefficients": [-0.15 * mass] * 3},
         }
@@ -88,7 +89,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--drones", nargs="+", help="airframes; by default all with rotors and three of plain physics")
-    parser.add_argument("--dynamics", default="first_principles", help="dynamics model; fitted ones take auto alone")
+    parser.add_argument(
+        "--dynamics", default="first_principles", help="dynamics model; only controller auto flies fitted models"
+    )
     parser.add_argument("--controllers", nargs="+", default=CONTROLLERS)
     parser.add_argument("--speed", type=float, default=2.0, help="largest speed along the figure eight, m/s")
     parser.add_argument("--attitudes", type=int, default=100, help="random attitudes of each airframe")
@@ -96,16 +99,18 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     args = parser.parse_args()
     names = args.drones or supported_drones(args.dynamics)
-    has_rotors = args.dynamics == "first_principles"
-    airframes = [load_airframe(name) for name in names] + (own_airframes() if has_rotors and not args.drones else [])
+    is_first_principles = args.dynamics == "first_principles"
+    airframes = [load_airframe(name) for name in names] + (
+        own_airframes() if is_first_principles and not args.drones else []
+    )
     for name in args.controllers:
         able = [airframe for airframe in airframes if is_able(name, airframe, args.dynamics)]
         if able:
             rows = fly(name, able, args.speed, args.attitudes, args.dynamics, args.device)
-            for level in STEPS:
-                if not has_rotors or not is_able(name, able[0], args.dynamics, level):
+            for level in COMMAND_STEPS:
+                if not is_first_principles or not is_able(name, able[0], args.dynamics, level):
                     continue
-                for drone, row in turn(name, able, level, args.device).items():
+                for drone, row in step_response_figures(name, able, level, args.device).items():
                     rows[drone] |= row
             for drone, row in rows.items():
                 row = {key: digits(value) for key, value in row.items()}
@@ -127,7 +132,7 @@ def make_controller(name: str, speed: float = 2.0) -> Any:
     """Return the argument ``controller`` of a simulation."""
     if name == "tracking_lqr":
         eight = figure_eight(2.0, 1.0, speed=speed, height=1.0)
-        return TrackingLQR(jax.vmap(eight.evaluate)(KNOTS * np.arange(60, dtype=np.float32)), dt=KNOTS)
+        return TrackingLQR(jax.vmap(eight.evaluate)(GAIN_INTERVAL * np.arange(60, dtype=np.float32)), dt=GAIN_INTERVAL)
     return name
 
 
@@ -174,10 +179,13 @@ def fly(
     return {airframe.name: figures(flown_pos[:, :, k], path_pos, name) for k, airframe in enumerate(airframes)}
 
 
-def turn(name: str, airframes: list[Airframe], level: str, device: str = "cpu") -> dict[str, dict[str, float]]:
+def step_response_figures(
+    name: str, airframes: list[Airframe], level: str, device: str = "cpu"
+) -> dict[str, dict[str, float]]:
     """Return overshoot and error of a controller for each airframe after steps of the command."""
-    answers = responses(name, airframes, level, device)
-    overshoot, error = answers.max(axis=(0, 1)) - 1, np.abs(answers[100:] - 1).max(axis=(0, 1))
+    normalized_responses = responses(name, airframes, level, device)
+    overshoot = normalized_responses.max(axis=(0, 1)) - 1
+    error = np.abs(normalized_responses[100:] - 1).max(axis=(0, 1))
     return {
         airframe.name: {f"overshoot_{level}": float(max(overshoot[k], 0)), f"error_{level}": float(error[k])}
         for k, airframe in enumerate(airframes)
@@ -187,9 +195,9 @@ def turn(name: str, airframes: list[Airframe], level: str, device: str = "cpu") 
 def responses(name: str, airframes: list[Airframe], level: str, device: str = "cpu") -> np.ndarray:
     """Return angles or body rates over 3 s after steps of the command, over their sizes.
 
-    One every 0.02 s. (n_times, n_steps, n_airframes)
+    One every 0.02 s. (n_times, n_command_steps, n_airframes)
     """
-    steps = STEPS[level]
+    steps = COMMAND_STEPS[level]
     sim = Sim(len(steps), drone=airframes, control=level, controller=make_controller(name), device=device)
     s, params = sim.data.states, sim.data.params
     start_pos = jnp.broadcast_to(jnp.array([0, 0, START_HEIGHT], s.pos.dtype), s.pos.shape)
@@ -214,15 +222,15 @@ def responses(name: str, airframes: list[Airframe], level: str, device: str = "c
 
 def positions(sim: Sim, eight: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:
     """Return the positions of all drones after each step of 15 s, and of the figure eight, m."""
-    step, feeds = sim.build_step_fn(), sim.data.controls.state.staged_feedforward is not None
+    step, takes_feedforward = sim.build_step_fn(), sim.data.controls.state.staged_feedforward is not None
     zeros, command = step.zeros(sim.data), np.zeros((*target.shape[:2], 16), np.float32)
     command[..., :3], command[..., 12] = target, 1
 
     def fly_step(data: Any, k: jax.Array) -> Any:
         setpoint = eight.evaluate(k / sim.freq)
         feedforward = jnp.zeros((*target.shape[:2], 8)).at[TRACKING_WORLD].set(setpoint.feedforward())
-        everybody = jnp.asarray(command).at[TRACKING_WORLD].set(setpoint.command())
-        data = F.state_control(data, everybody, feedforward=feedforward if feeds else None)
+        commands = jnp.asarray(command).at[TRACKING_WORLD].set(setpoint.command())
+        data = F.state_control(data, commands, feedforward=feedforward if takes_feedforward else None)
         data = data.replace(states=data.states.replace(force=jnp.where(k < 2 * sim.freq, 0.0, force)))
         data = step(data, 1, zeros)
         return data, (data.states.pos, eight.evaluate((k + 1) / sim.freq).pos)
@@ -232,19 +240,23 @@ def positions(sim: Sim, eight: Any, target: np.ndarray, force: jax.Array) -> tup
     return np.asarray(flown_pos), np.asarray(path_pos)
 
 
-def figures(pos: np.ndarray, eight: np.ndarray, name: str) -> dict[str, float]:
+def figures(pos: np.ndarray, path_pos: np.ndarray, name: str) -> dict[str, float]:
     """Return the figures of one airframe from its positions. (n_steps, n_worlds, 3)"""
-    per_s, home = len(pos) // 15, np.array([0, 0, 1.0])
-    distance = np.linalg.norm(pos - home, axis=-1)
-    results = {"tracking": float(np.sqrt(np.mean(np.sum((pos[:, TRACKING_WORLD] - eight)[: 9 * per_s] ** 2, axis=-1))))}
+    steps_per_s, setpoint_pos = len(pos) // 15, np.array([0, 0, 1.0])
+    distance = np.linalg.norm(pos - setpoint_pos, axis=-1)
+    results = {
+        "tracking": float(
+            np.sqrt(np.mean(np.sum((pos[:, TRACKING_WORLD] - path_pos)[: 9 * steps_per_s] ** 2, axis=-1)))
+        )
+    }
     if name == "tracking_lqr":
         return results
     return {
-        "hover": float(distance[5 * per_s, TAKE_OFF_WORLD]),
+        "hover": float(distance[5 * steps_per_s, TAKE_OFF_WORLD]),
         **results,
-        "pushed": float(distance[7 * per_s, PUSHED_WORLD]),
+        "pushed": float(distance[7 * steps_per_s, PUSHED_WORLD]),
         "pushed_largest": float(distance[:, PUSHED_WORLD].max()),
-        "heavier": float(distance[5 * per_s, HEAVY_WORLD]),
+        "heavier": float(distance[5 * steps_per_s, HEAVY_WORLD]),
         "home": float(np.mean(np.linalg.norm(pos[-1, FIRST_TUMBLING_WORLD:] - [0, 0, START_HEIGHT], axis=-1) < 0.1)),
         "lost_178": float(START_HEIGHT - pos[:, INVERTED_WORLD, 2].min()),
     }

@@ -130,7 +130,7 @@ def conjugate(q: Array) -> Array:
 def matrix(q: Array) -> Array:
     """Return the rotation matrix of a unit quaternion, body to world. (..., 3, 3)
 
-    Several vectors of a step are rotated by the same attitude, so the matrix pays off.
+    The matrix is reused for several vectors in a step.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     x2, y2, z2 = 2 * x, 2 * y, 2 * z
@@ -179,10 +179,11 @@ def integrate_attitude(q: Array, ang_vel: Array, dt: float, normalize: bool = Tr
         coefficients = [2**n * math.comb(order, n) / math.perm(2 * order, n) for n in range(order + 1)]
     else:
         coefficients = [1 / math.factorial(n) for n in range(14 if is_float32 else 22)]
-    signed = [(-1) ** (n // 2) * c * (dt / 2) ** n for n, c in enumerate(coefficients)]
+    signed_coefficients = [(-1) ** (n // 2) * c * (dt / 2) ** n for n, c in enumerate(coefficients)]
     square = dot(ang_vel, ang_vel)
-    step = jnp.concatenate([_polynomial(square, signed[1::2]) * ang_vel, _polynomial(square, signed[::2])], axis=-1)
-    product = multiply(q, step)
+    vector = _polynomial(square, signed_coefficients[1::2]) * ang_vel
+    increment = jnp.concatenate([vector, _polynomial(square, signed_coefficients[::2])], axis=-1)
+    product = multiply(q, increment)
     return product * lax.rsqrt(dot(product, product)) if normalize else product
 
 
@@ -227,7 +228,7 @@ def to_rpy(q: Array) -> Array:
 
 
 def _wrap(angle: Array) -> Array:
-    """Return an angle of at most two turns as one in [-pi, pi], rad. (...)"""
+    """Return an angle of at most one turn, in either direction, as one in [-pi, pi], rad. (...)"""
     return angle - 2 * jnp.pi * ((angle > jnp.pi).astype(angle.dtype) - (angle < -jnp.pi).astype(angle.dtype))
 
 
@@ -289,7 +290,8 @@ def quat_from_axes(x: Array, y: Array, z: Array) -> Array:
     """Return the quaternion of the frame with these orthonormal axes in the world frame. (..., 3) -> (..., 4)
 
     The products ``4 q_i q`` are linear in the axes. One with ``q_i^2 >= 1 / 4`` is scaled to length one, so that
-    there is no division by small numbers, and value and gradient are accurate at every attitude. The sign varies.
+    there is no division by small numbers, and value and gradient are accurate at every attitude. The sign of the
+    quaternion is not fixed.
     """
     xx, yy, zz = x[..., 0], y[..., 1], z[..., 2]
     xy, xz, yz = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]

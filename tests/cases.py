@@ -32,7 +32,7 @@ PAIRS = tuple(("first_principles", control) for control in LEVELS) + tuple(
 """Every dynamics and command level that go together: 11."""
 INTEGRATORS = ("euler", "symplectic_euler", "rk4")
 COMPILED_ENGINES = ("lanes", "fused") if native.compiler() else ("lanes",)
-"""Engines that compile, those that run here."""
+"""Compiled engines that this machine can run."""
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
 
 BOX = """
@@ -63,9 +63,9 @@ PLAIN_SCENE = f"""
 """A floor of one colour, without shadows, under a camera that looks straight down, and one 5 m beside it."""
 
 
-def vectors(n=3, size=10.0, **options):
-    """Return a strategy for vectors of ``n`` numbers, each up to a size."""
-    return arrays(np.float64, n, elements=st.floats(-size, size, **options))
+def vectors(n=3, max_abs=10.0, **options):
+    """Return a strategy for vectors of ``n`` numbers, of at most an absolute value."""
+    return arrays(np.float64, n, elements=st.floats(-max_abs, max_abs, **options))
 
 
 def unit_quats(**options):
@@ -86,7 +86,7 @@ def send(data, command, **kwargs):
 
 
 def command_in_force(data):
-    """Return the command that the simulation's own level follows by now."""
+    """Return the command that the simulation's own level currently follows."""
     mode = data.controls.mode.value
     return data.controls.rotor_vel if mode == "rotor_vel" else getattr(data.controls, mode).cmd
 
@@ -105,7 +105,7 @@ def broadcast_like(value, template):
 
 
 def with_params(data, **changes):
-    """Return the data with other parameters of its dynamics, as they are given."""
+    """Return the data with other parameters of its dynamics, without broadcasting."""
     return data.replace(params=data.params.replace(**{k: jnp.asarray(v) for k, v in changes.items()}))
 
 
@@ -113,10 +113,10 @@ def with_airframes(sim, airframes):
     """Return the data with the parameters and gains of one airframe in each world, of as many rotors as the sim's."""
 
     kinds = list(dict.fromkeys(airframes))
-    which = [kinds.index(airframe) for airframe in airframes]
+    kind_indices = [kinds.index(airframe) for airframe in airframes]
 
     def stacked(shared):
-        return jax.tree.map(lambda *x: jax.device_put(np.stack(x)[which][:, None]), *shared)
+        return jax.tree.map(lambda *x: jax.device_put(np.stack(x)[kind_indices][:, None]), *shared)
 
     params = stacked([create_params(sim.dynamics, airframe) for airframe in kinds])
     settings = sim.configuration.control_freqs, sim.configuration.controller
@@ -163,8 +163,7 @@ def hover_command(data, pos=(0.0, 0.0, 1.0)):
 def zero_thrust_command(data):
     """Return the command of one drone for zero thrust. (k,)
 
-    For the state level that is a fall with the gravity that the controller believes in, at the place where the drone
-    is anyway; for all others the thrust itself.
+    At state level: a setpoint at the origin with a downward acceleration of 9.81 m/s^2. At all other levels: zeros.
     """
     command = np.zeros_like(hover_command(data))
     if data.controls.mode.value == "state":
@@ -178,7 +177,7 @@ def repeat_command(data, command):
 
 
 def trees_equal(a, b):
-    """Return whether two trees hold the same bits; NaN equals NaN."""
+    """Return whether two trees hold equal values; NaN equals NaN."""
     leaves_a, leaves_b = (jax.tree.leaves(jax.tree.map(as_numbers, tree)) for tree in (a, b))
     return jax.tree.structure(a) == jax.tree.structure(b) and all(
         np.array_equal(x, y, equal_nan=np.issubdtype(x.dtype, np.floating))
@@ -207,7 +206,10 @@ def repulsion(data):
 
 @stage("drone")
 def gap(data):
-    """Push a drone up by its distance to the nearest other one, and by the first of equal numbers."""
+    """Push a drone up by the squared distance to its nearest neighbour.
+
+    For its gradient, a term of value zero is added whose maximum is tied.
+    """
     pos = data.states.pos
     square_distance = reduce_over_others(
         lambda other_pos, is_self: jnp.where(is_self, jnp.inf, jnp.sum((pos - other_pos) ** 2)), pos, "min"
@@ -240,7 +242,7 @@ def by_stages(sim):
 
 
 def hovering(n_worlds=3, n_drones=2, **kwargs):
-    """Return a simulation of drones that hover side by side, each in a place of its own."""
+    """Return a simulation of drones that hover at different positions."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, rng_key=4, **kwargs)
     grid = 0.1 * np.arange(n_worlds * n_drones * 3).reshape(n_worlds, n_drones, 3) + [0, 0, 1.0]
     sim.data = with_states(sim.data, pos=grid, rotor_vel=hover_rotor_state(sim.data))
@@ -255,9 +257,11 @@ def shared_sim(**settings):
 
 
 def n_documented(record, **sizes):
-    """Return the number of arrays of a record and its parts, all of whose docstrings end with their shapes.
+    """Check that the docstring of every array of a record ends with its shape, and return the number of arrays.
 
-    The sizes are those of the words of these shapes.
+    Args:
+        record: Record; its parts are checked too.
+        sizes: Sizes of the names in these shapes.
     """
     shapes, n_arrays = _documented_shapes(type(record)), 0
     for field in dataclasses.fields(record):

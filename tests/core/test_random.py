@@ -1,4 +1,4 @@
-"""Keys for stages: one per world or drone, the same inside and outside of jit."""
+"""Random keys for stages, one per world or drone, equal inside and outside of jit, and the numbers drawn from them."""
 
 import jax
 import jax.numpy as jnp
@@ -28,23 +28,23 @@ def test_numbers_are_uniform_and_uncorrelated(data):
     """Uniform draws over 3,000 steps: mean 1/2 within 4 standard errors, 4 / sqrt(12 * 18,000) = 0.0086."""
 
     def draw(step):
-        at = data.replace(core=data.core.replace(steps=data.core.steps + step))
-        return jax.vmap(jax.vmap(jax.random.uniform))(drone_keys(at, "wind"))
+        later_data = data.replace(core=data.core.replace(steps=data.core.steps + step))
+        return jax.vmap(jax.vmap(jax.random.uniform))(drone_keys(later_data, "wind"))
 
     numbers = jax.jit(jax.vmap(draw))(np.arange(3000, dtype=np.int32))
     assert abs(float(numbers.mean()) - 0.5) < 0.0086
-    # Neighbouring steps, drones and worlds are uncorrelated, within 4 / sqrt(18,000).
+    # Neighbouring steps, drones and worlds are uncorrelated, within 4 standard errors.
     centred = np.asarray(numbers) - 0.5
     for a, b in ((centred[1:], centred[:-1]), (centred[:, 1:], centred[:, :-1]), (centred[..., 1:], centred[..., :-1])):
         assert abs(np.mean(a * b)) * 12 < 4 / np.sqrt(a.size)
 
 
-def test_both_words_of_a_hash_give_independent_standard_numbers(data):
+def test_both_words_of_a_hash_give_independent_standard_normal_numbers(data):
     """108,000 normal numbers: first four moments, and products of neighbours, within 4 standard errors."""
 
     def draw(step):
-        at = data.replace(core=data.core.replace(steps=data.core.steps + step))
-        return jax.vmap(jax.vmap(lambda key: normal(key, (6,))))(drone_keys(at, "imu"))
+        later_data = data.replace(core=data.core.replace(steps=data.core.steps + step))
+        return jax.vmap(jax.vmap(lambda key: normal(key, (6,))))(drone_keys(later_data, "imu"))
 
     numbers = np.asarray(jax.jit(jax.vmap(draw))(np.arange(3000, dtype=np.int32)), np.float64)
     moments = zip((0, 1, 0, 3), (1, 2, 15, 96), strict=True)  # of z, z^2, z^3, z^4: mean and variance
@@ -54,15 +54,15 @@ def test_both_words_of_a_hash_give_independent_standard_numbers(data):
         assert abs(np.mean(a * b)) < 4 / np.sqrt(a.size)
 
 
-def test_numbers_in_float64_have_52_bits_and_a_kernel(x64):
-    """Moments of 400,000 of them; and no 64-bit integers, which kernels do not have."""
+def test_numbers_in_float64_have_52_bits_and_run_in_kernels(x64):
+    """Moments of 400,000 numbers. The jaxpr contains no 64-bit integers, which kernels do not support."""
     key = jax.random.key(3)
-    share, drawn = (np.asarray(draw(key, (400_000,), jnp.float64)) for draw in (uniform, normal))
-    assert share.dtype == drawn.dtype == np.float64
-    np.testing.assert_array_equal(share * 2**52 % 1, 0)
-    assert np.mean(share * 2**51 % 1 != 0) > 0.49, "the last bit is drawn"
-    assert 0 <= share.min() < 1e-5 < 1 - 1e-5 < share.max() < 1
-    for x, moments in ((share, (1 / 2, 1 / 3, 1 / 4)), (drawn, (0, 1, 0))):
+    uniforms, normals = (np.asarray(draw(key, (400_000,), jnp.float64)) for draw in (uniform, normal))
+    assert uniforms.dtype == normals.dtype == np.float64
+    np.testing.assert_array_equal(uniforms * 2**52 % 1, 0)
+    assert np.mean(uniforms * 2**51 % 1 != 0) > 0.49, "the last bit is never set"
+    assert 0 <= uniforms.min() < 1e-5 < 1 - 1e-5 < uniforms.max() < 1
+    for x, moments in ((uniforms, (1 / 2, 1 / 3, 1 / 4)), (normals, (0, 1, 0))):
         np.testing.assert_allclose([np.mean(x**k) for k in (1, 2, 3)], moments, atol=0.02)
     jaxpr = str(jax.make_jaxpr(lambda key: normal(key, (3,), jnp.float64))(key))
     assert "u64" not in jaxpr
