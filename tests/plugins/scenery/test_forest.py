@@ -255,7 +255,7 @@ def test_a_task_places_a_forest_in_its_episodes():
 
 
 BAD = {
-    "radii": ({"radii": (0.3, 0.1)}, "expected radii as smallest and largest, got"),
+    "radii": ({"radii": (0.3, 0.1)}, "expected the smallest before the largest size of .forest., got"),
     "dense": ({"density": 4.0}, "Use a lower density, or a smaller gap"),
     "many": ({"size": (1000.0, 1000.0)}, "expected at most 10000 obstacles in Forest, got 62500"),
     "difficulty": ({"difficulty": 1.5}, "difficulty"),
