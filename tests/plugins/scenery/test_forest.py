@@ -163,6 +163,8 @@ def test_rays_meet_the_trees_of_each_world(half):
         np.asarray(sim.airframe.value("shape.fpv_camera")) + [4, -2, 1.5],
     )
     assert not np.allclose(distance[0], distance[1], rtol=0.01)
+    image = sim.depth("fpv_cam:0", 64, 4, drones=False, along="ray")
+    np.testing.assert_allclose(image, hits.distance, rtol=1e-6)
     points, geom = np.asarray(hits.point)[:, 0, 1], np.zeros(1, np.int32)
     model, own = sim.scene.mj_model, sim.scene.mj_model.body("drone:0").id
     n_trees = 0
