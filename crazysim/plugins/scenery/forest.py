@@ -138,7 +138,8 @@ class StandingObstacles(Scenery):
         """
         record, (n_x, n_y) = self.read(data), self.n_cells
         cell = column * n_y + row
-        place_x, place_y, share, turn, vel_x, vel_y = (record.uniform(cell + k * n_x * n_y) for k in range(6))
+        place_x, place_y, share = (record.uniform(3 * cell + k) for k in range(3))
+        turn, vel_x, vel_y = (record.uniform(4 * n_x * n_y + 3 * cell + k) for k in range(3))
         size = self._size(self._size_index(cell)).astype(place_x.dtype)
         reach = self.cell - self.gap - 2 * self.radius(size)
         middle_x, middle_y = self._middle(column, row)
@@ -180,7 +181,7 @@ class StandingObstacles(Scenery):
 
     def _shift(self, data: SimData, column: Any) -> Array:
         """Return the shift along y of the cells with an index along x, m. (...)"""
-        return (self.read(data).uniform(6 * math.prod(self.n_cells) + column) - 0.5) * self.cell
+        return (self.read(data).uniform(3 * math.prod(self.n_cells) + column) - 0.5) * self.cell
 
     def _size_index(self, cell: Any) -> Any:
         """Return the number of the size of the obstacles of cells, from 0 to 7. (...)"""
