@@ -1,8 +1,9 @@
 """Draw the pictures that the pages show: ``python docs/pictures.py [NAME ...]`` writes them to ``docs/pictures``.
 
-``flight`` is the moving picture of the README. ``mixed`` is for the page on features, ``allan`` and ``measured`` are
-for the page on sensors, and ``cameras`` and ``lidar`` are for the page on cameras. The other plots are written by
-``crazysim demo`` (``tracks.png``), ``crazysim train`` (``training.png``) and ``benchmarks/scaling.py``.
+``flight`` is the moving picture of the README. ``mixed`` is for the page on features, ``scenery`` for the page on
+scenery, ``allan`` and ``measured`` are for the page on sensors, ``cameras`` and ``lidar`` for the page on cameras. The
+other plots are written by ``crazysim demo`` (``tracks.png``), ``crazysim train`` (``training.png``) and
+``benchmarks/scaling.py``.
 """
 
 from __future__ import annotations

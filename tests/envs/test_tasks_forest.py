@@ -161,7 +161,7 @@ def test_speed_pays_up_to_the_set_one_and_trees_nearby_cost(begun):
     ("options", "message"),
     [
         ({"density": 2.0}, "expected obstacles that fit into their cells of 0.707 m"),
-        ({"radii": (0.3, 0.1)}, "expected radii as smallest and largest"),
+        ({"radii": (0.3, 0.1)}, "expected the smallest before the largest size"),
         ({"speed": 0.0}, "expected speed of Forest to be positive, at most 20, got 0.0"),
         ({"trees_seen": 13}, "expected trees_seen of Forest .*12, got 13"),
     ],
