@@ -1,4 +1,4 @@
-"""Measurements that correct a filter with error states, as functions of one drone: the models of its aiding sensors.
+"""Measurement updates of the error-state Kalman filters, for one drone.
 
 The models of the Crazyflie's firmware use the attitude ``rot`` at the end of the previous loop (the mm_*.c of
 bitcraze/crazyflie-firmware, commit 2a18fc29).
@@ -31,7 +31,10 @@ def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Esti
 
 
 def update_vel(estimate: Estimate, vel: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured velocity, world frame, m/s, (3,), of a standard deviation. () or (3,)"""
+    """Return the estimate after a measured velocity, world frame, m/s, (3,).
+
+    Its standard deviation along each axis is in m/s. () or (3,)
+    """
     rot = rotation.matrix(estimate.quat)
     for k, std in enumerate(_per_axis(deviation)):
         attitude_slope = rotation.cross(estimate.vel, rot[k])  # the derivative with respect to the attitude
@@ -47,7 +50,7 @@ def update_direction(
 
     Args:
         estimate: The estimate.
-        direction: Measured direction, body frame, as long as ``world_direction`` but for errors. (3,)
+        direction: Measured direction, body frame, of about unit length. (3,)
         world_direction: The direction, world frame, unit. (3,)
         deviation: Standard deviation along each axis, rad. () or (3,)
     """
@@ -76,8 +79,8 @@ def update_flow(
 ) -> Estimate:
     """Return the estimate after a measured motion of the image of the ground.
 
-    As in the firmware, both numbers are predicted from the estimate before either was used, so that the second one
-    counts part of the first once more. With biases, the second one is predicted from the estimate after the first.
+    Without biases, both components are predicted from the prior estimate, as in the firmware, although the second one
+    is then correlated with the first. With biases, the second one is predicted after the first update.
 
     Args:
         estimate: The estimate.
@@ -106,7 +109,7 @@ def update_flow(
 
 
 def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured distance to the floor, m; a drone tilted by 84 degrees measures none.
+    """Return the estimate after a measured distance to the floor, m; unchanged if the tilt exceeds 84 degrees.
 
     Args:
         estimate: The estimate.
@@ -114,12 +117,12 @@ def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Arr
         distance: Shortest distance within the cone of the sensor. ()
         deviation: Standard deviation of the distance, m.
     """
-    upright = rot[2, 2] > MIN_TILT_COSINE
-    cosine = jnp.where(upright, rot[2, 2], 1.0)
+    is_upright = rot[2, 2] > MIN_TILT_COSINE
+    cosine = jnp.where(is_upright, rot[2, 2], 1.0)
     tilt = rotation.safe_arctan2(rotation.safe_sqrt(jnp.maximum((1 - cosine) * (1 + cosine), 0.0)), cosine)
     gain = 1 / jnp.cos(jnp.maximum(tilt - HALF_CONE_ANGLE, 0.0))
     updated = update(estimate, [POS[2]], gain[None], distance - gain * estimate.pos[2], deviation)
-    return select_estimate(upright, updated, estimate)
+    return select_estimate(is_upright, updated, estimate)
 
 
 def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) -> Estimate:
@@ -127,16 +130,16 @@ def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) ->
 
     Args:
         estimate: The estimate.
-        distance: The distance, m; a drone tilted by 84 degrees measures none. ()
+        distance: The distance, m; the estimate is unchanged if the tilt exceeds 84 degrees. ()
         deviation: Standard deviation of the distance, m.
     """
     world_z = rotation.matrix(estimate.quat)[2]
-    is_visible = world_z[2] > MIN_TILT_COSINE
-    gain = 1 / jnp.where(is_visible, world_z[2], 1.0)
+    is_upright = world_z[2] > MIN_TILT_COSINE
+    gain = 1 / jnp.where(is_upright, world_z[2], 1.0)
     predicted = gain * estimate.pos[2]
     h = gain * jnp.stack([jnp.ones_like(gain), predicted * world_z[1], -predicted * world_z[0]])
     return select_estimate(
-        is_visible, update(estimate, [POS[2], *ATT[:2]], h, distance - predicted, deviation), estimate
+        is_upright, update(estimate, [POS[2], *ATT[:2]], h, distance - predicted, deviation), estimate
     )
 
 
@@ -152,18 +155,18 @@ def update_distance(estimate: Estimate, anchor: Array, distance: Array, deviatio
 
 
 def update_difference(
-    estimate: Estimate, first: Array, second: Array, difference: Array, deviation: Array | float
+    estimate: Estimate, first_anchor: Array, second_anchor: Array, difference: Array, deviation: Array | float
 ) -> Estimate:
     """Return the estimate after a measured difference of distances to two anchors, m.
 
     Args:
         estimate: The estimate.
-        first: Position of the first anchor, world frame, m. (3,)
-        second: Position of the second anchor. (3,)
+        first_anchor: Position of the first anchor, world frame, m. (3,)
+        second_anchor: Position of the second anchor. (3,)
         difference: Distance to the second minus distance to the first. ()
         deviation: Standard deviation of the difference, m.
     """
-    offset_1, offset_2 = estimate.pos - first, estimate.pos - second
+    offset_1, offset_2 = estimate.pos - first_anchor, estimate.pos - second_anchor
     distance_1, distance_2 = rotation.safe_norm(offset_1), rotation.safe_norm(offset_2)
     is_apart = (distance_1 > 0) & (distance_2 > 0)
     h = offset_2 / jnp.where(is_apart, distance_2, 1.0) - offset_1 / jnp.where(is_apart, distance_1, 1.0)
@@ -172,7 +175,7 @@ def update_difference(
 
 
 def update_differences(estimate: Estimate, anchors: Array, differences: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after simultaneous measured differences of distances to anchors and to the first anchor.
+    """Return the estimate after simultaneous differences between the distances to the others and to the first anchor.
 
     The differences share the error of the first distance. A distance minus the mean of the k distances before it is a
     combination of differences; such combinations have independent errors, with ``1 + 1 / k`` times the variance of one

@@ -1,9 +1,5 @@
 """Scenery: layouts of obstacles, drawn again in every world and episode, each a plugin that ``sim.add`` adds."""
 
-from crazysim.plugins.scenery.clutter import Clutter
-from crazysim.plugins.scenery.forest import Forest, Pillars
-from crazysim.plugins.scenery.gates import Gates
-from crazysim.plugins.scenery.rooms import Rooms
-from crazysim.plugins.scenery.scenery import Scenery
+from crazysim.plugins.scenery.forest import Forest
 
-__all__ = ["Clutter", "Forest", "Gates", "Pillars", "Rooms", "Scenery"]
+__all__ = ["Forest"]

@@ -51,8 +51,8 @@ class RadarData(PyTree):
 class Radar(Plugin):
     """Radars that detect the drones within their lobes; objects do not block them.
 
-    The lobe is a teardrop in the vertical plane, turned about the vertical axis of the radar: the range is the same in
-    all directions. Each setting is one number for all radars, or one number per radar.
+    The lobe is a teardrop in a vertical plane, revolved about the vertical axis: the range is the same in all
+    directions. Each setting is one number for all radars, or one number per radar.
     """
 
     pos: ArrayLike = parameter()
@@ -81,7 +81,9 @@ class Radar(Plugin):
         for name in ("max_range", "exponent", "height_scale", "tilt"):
             value = np.asarray(getattr(self, name), np.float64)
             if value.shape not in ((), (len(pos),)):
-                raise ConfigError(f"expected {name} of shape () or ({len(pos)},) for each radar, got {value.shape}")
+                raise ConfigError(
+                    f"expected {name} as one number, or one per radar ({len(pos)},), got shape {value.shape}"
+                )
             settings[name] = device_array(np.broadcast_to(value, len(pos)), dtype)
         return RadarData(pos=device_array(pos, dtype), **settings, exposure=drone_array(sim, 0.0, len(pos)))
 

@@ -16,7 +16,7 @@ from crazysim.core.pipeline import append_fn
 from crazysim.errors import ConfigError
 from crazysim.lab.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_cflib_driver
 from crazysim.lab.live.crtp.setpoints import unpack_quat
-from crazysim.lab.live.crtp.tables import LOG, LOG_TYPES, Table, Variable, pack
+from crazysim.lab.live.crtp.tables import LOG_TYPES, LOG_VARIABLES, Table, Variable, pack
 from crazysim.lab.live.swarm import DroneState, Swarm
 from crazysim.plugins.estimators import Kalman
 from crazysim.plugins.sensors import IMU, MotionCapture, MultiRanger, Triad
@@ -72,7 +72,11 @@ def test_accelerations_are_logged_in_the_frames_of_the_firmware():
     """A drone that pitches by 90 degrees, with its thrust along x of the world, falls: -1 g along z."""
     half = math.sqrt(0.5)
     state = DroneState(0.0, np.zeros(3), np.array([0, half, 0, half]), np.zeros(3), np.zeros(3), np.array([0, 0, 9.81]))
-    logged = {name: LOG[name][1](state, None) for name in LOG if name.startswith(("stateEstimate.a", "acc."))}
+    logged = {
+        name: LOG_VARIABLES[name][1](state, None)
+        for name in LOG_VARIABLES
+        if name.startswith(("stateEstimate.a", "acc."))
+    }
     assert list(logged.values()) == pytest.approx([1, 0, -1, 0, 0, 1], abs=1e-3)
     assert list(logged) == [f"stateEstimate.a{axis}" for axis in "xyz"] + [f"acc.{axis}" for axis in "xyz"]
 

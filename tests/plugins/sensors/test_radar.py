@@ -79,7 +79,7 @@ def test_the_lobe_is_drawn_in_red_where_it_detects():
     ({"pos": np.zeros((0, 3))}, "expected pos"),
     ({"pos": (0, 0, np.nan)}, "expected pos"),
     ({"pos": (0, 0, 0), "max_range": -1.0}, "max_range of Radar to be positive"),
-    ({"pos": (0, 0, 0), "max_range": (1.0, 2.0)}, "max_range of shape"),
+    ({"pos": (0, 0, 0), "max_range": (1.0, 2.0)}, "max_range as one number, or one per radar"),
     ({"pos": (0, 0, 0), "exponent": -1.0}, "exponent"),
     ({"pos": (0, 0, 0), "tilt": 30.0}, "tilt of Radar to be from -1.5708 to 1.5708"),
 ])  # fmt: skip

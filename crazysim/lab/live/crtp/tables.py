@@ -73,15 +73,15 @@ class Table:
         return self.types[self.variables[k].ctype][1]
 
 
-def pack(layout: str, value: float) -> bytes:
+def pack(struct_format: str, value: float) -> bytes:
     """Return a packed number, clipped to the range of its format; for integers it is rounded, and 0 if not finite."""
-    if layout in ("<f", "<e"):
-        largest = 3.4e38 if layout == "<f" else 65504.0
-        return struct.pack(layout, value if math.isnan(value) else min(max(value, -largest), largest))
-    bits = 8 * struct.calcsize(layout)
-    signed = layout[1].islower()
+    if struct_format in ("<f", "<e"):
+        largest = 3.4e38 if struct_format == "<f" else 65504.0
+        return struct.pack(struct_format, value if math.isnan(value) else min(max(value, -largest), largest))
+    bits = 8 * struct.calcsize(struct_format)
+    signed = struct_format[1].islower()
     low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-    return struct.pack(layout, min(max(round(value) if math.isfinite(value) else 0, low), high))
+    return struct.pack(struct_format, min(max(round(value) if math.isfinite(value) else 0, low), high))
 
 
 def _axes(group: str, names: str, field: str, scale: float = 1.0) -> dict[str, tuple[str, Reading]]:
@@ -95,16 +95,19 @@ def _axes(group: str, names: str, field: str, scale: float = 1.0) -> dict[str, t
 
 def _angles(group: str) -> dict[str, tuple[str, Reading]]:
     """Return log variables of roll, pitch and yaw in degrees; the firmware's pitch has the opposite sign."""
-    signs = {"roll": (0, 1), "pitch": (1, -1), "yaw": (2, 1)}
+    index_and_sign = {"roll": (0, 1), "pitch": (1, -1), "yaw": (2, 1)}
 
     def reading(k: int, sign: int) -> Reading:
         return lambda state, _c: sign * math.degrees(float(state.rpy[k]))
 
-    return {f"{group}.{name}": ("float", reading(*indices)) for name, indices in signs.items()}
+    return {f"{group}.{name}": ("float", reading(*pair)) for name, pair in index_and_sign.items()}
 
 
 def _acceleration(k: int) -> Reading:
-    """Return a component of the acceleration, world frame, without gravity, g (``kalmanCoreExternalizeState``)."""
+    """Return the reading of a component of the acceleration without gravity, world frame, in units of g.
+
+    As in ``kalmanCoreExternalizeState``.
+    """
 
     def reading(state: DroneState, _: Commander) -> float:
         axis, w = state.quat[:3], state.quat[3]
@@ -115,10 +118,11 @@ def _acceleration(k: int) -> Reading:
 
 
 def _goal(row: int, k: int) -> Reading:
+    """Return the reading of an entry of the goal: its row and its index in the row."""
     return lambda _s, commander: float(commander.goal()[row, k])
 
 
-LOG: dict[str, tuple[str, Reading]] = {
+LOG_VARIABLES: dict[str, tuple[str, Reading]] = {
     **_axes("stateEstimate", "x y z", "pos"),
     **_axes("stateEstimate", "vx vy vz", "vel"),
     **{f"stateEstimate.a{axis}": ("float", _acceleration(k)) for k, axis in enumerate("xyz")},
@@ -162,7 +166,7 @@ def create_log_table(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]
         "pm.state": ("uint8_t", lambda _s, _c: read_battery(sim, drone).state),
         "pm.batteryLevel": ("uint8_t", lambda _s, _c: 100 * read_battery(sim, drone).charge),
     }
-    return LOG | battery | ranges
+    return LOG_VARIABLES | battery | ranges
 
 
 def supervisor_bits(commander: Commander) -> int:
