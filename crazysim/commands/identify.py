@@ -44,19 +44,25 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         "logs",
         nargs="+",
         metavar="LOG",
-        help="logs to fit: .csv, .npz, .ulg of PX4, ROS bags, or of a micro-SD card; LOG@10:25 is the part from 10 to "
-        "25 s",
+        help="logs to fit: .csv, .npz, PX4 .ulg, ROS bags, or logs of a micro-SD card; LOG@10:25 is the part from 10 "
+        "to 25 s",
     )
     add("--airframe", default="cf21B_500", help="airframe to start from: a name or a TOML file")
     add("--out", type=Path, required=True, metavar="FILE", help=".toml file to write")
-    add("--test", nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
+    add("--test", nargs="+", default=[], metavar="LOG", help="held-out logs to report prediction errors on")
     add("--motion", type=Path, nargs="+", default=[], metavar="FILE", help="motion capture of each log, also of --test")
     add("--mass", type=float, metavar="KG", help="mass; by default the airframe's")
     add("--dynamics", choices=["first_principles", *FITTED_MODELS], default="first_principles", help="model to fit")
     add("--network", type=int, metavar="N", help="train a residual with N hidden units, 0 for linear terms")
-    add("--iterations", type=int, default=1000, metavar="N", help="iterations of that training")
+    add("--iterations", type=int, default=1000, metavar="N", help="iterations of the training of --network")
     add("--plot", type=Path, metavar="FILE", help="picture of the errors of held-out logs, or else of the fitted ones")
-    add("--columns", nargs="+", default=[], metavar="FIELD=NAMES", help="columns, such as time=s pos=px,py,pz")
+    add(
+        "--columns",
+        nargs="+",
+        default=[],
+        metavar="FIELD=NAMES",
+        help="names of the log's columns, such as time=s pos=px,py,pz",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -74,7 +80,7 @@ def run(options: argparse.Namespace) -> None:
     columns = _read_columns(options.columns) if options.columns else None
     paths = [*options.logs, *options.test]
     if options.motion and len(options.motion) != len(paths):
-        raise ValueError(
+        raise ConfigError(
             f"expected motion capture of each of {len(paths)} logs, got {len(options.motion)} files. "
             "Name them in the order of the logs, then of the logs of --test."
         )
@@ -116,7 +122,7 @@ def run(options: argparse.Namespace) -> None:
     _report_errors(options, logs, held_out, models)
     _write_file(options.out, result.toml(source))
     if result.doubtful:
-        print(f"DOUBTFUL, more than three times from the airframe: {', '.join(result.doubtful)}")
+        print(f"DOUBTFUL, less than 1/3 or more than 3 times the airframe's value: {', '.join(result.doubtful)}")
 
 
 def _report_errors(

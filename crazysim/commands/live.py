@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
     """Add the command that flies live."""
-    text = "fly in real time: watch, pilot, command and record; print the factor of real time"
+    text = "fly in real time: watch, pilot, command and record; print the real-time factor"
     parser = commands.add_parser("live", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     add = parser.add_argument
-    policy = "folder of a run whose policy flies, to goals that are typed, as x y z in m, or clicked"
+    policy = "folder of a training run; its policy flies to goals that you type (x y z, m) or click"
     add("--policy", type=Path, metavar="FOLDER", help=policy)
     goals = "goals of the policy, one after another: x,y,z in each line, m"
     add("--goals", type=Path, metavar="FILE", help=goals)

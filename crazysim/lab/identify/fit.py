@@ -124,7 +124,9 @@ class Identification:
         }  # fmt: skip
         lines = [f"base = {json.dumps(self.base)}", "", "[sources]", f"flights = {json.dumps(source)}"]
         if self.doubtful:
-            lines.insert(0, f"# Doubtful, more than three times from the base: {', '.join(self.doubtful)}.")
+            lines.insert(
+                0, f"# Doubtful, less than 1/3 or more than 3 times the base's value: {', '.join(self.doubtful)}."
+            )
         table = ""
         for path, value in sorted(self.changes.items(), key=lambda x: x[0].rpartition(".")[0]):
             owner, _, key = path.rpartition(".")
