@@ -24,7 +24,7 @@ def benchmarks(monkeypatch):
 
 @pytest.fixture
 def run(benchmarks, monkeypatch, capsys):
-    """Return a function that runs a script in this process, its cases too, and returns the lines that it printed."""
+    """Return a function that runs a script and its cases in this process, and returns the lines that it printed."""
     import measure
 
     monkeypatch.setattr(measure, "run_in_process", lambda function, *args: function(*args))
@@ -89,7 +89,7 @@ def test_compile_prints_its_parts_from_a_process_of_its_own():
     assert line["trace_s"] > 0
 
 
-def test_a_crashed_drone_is_no_figure(benchmarks):
+def test_crashed_drones_are_detected(benchmarks):
     import measure
 
     from crazysim import Sim
@@ -190,7 +190,7 @@ def test_operations_are_counted_in_multiply_adds(benchmarks):
     assert limits.operations(outer.finish(new), 0.2) == pytest.approx(0.2)
 
 
-def test_the_work_of_a_step_is_what_its_data_and_stages_say(benchmarks):
+def test_bytes_and_operations_of_a_step_are_counted(benchmarks):
     import limits
 
     from crazysim import Sim
@@ -202,7 +202,7 @@ def test_the_work_of_a_step_is_what_its_data_and_stages_say(benchmarks):
     assert limits.work(Sim(control="rotor_vel", integrator="rk4", engine="lanes"))[0] > 3 * each_step
 
 
-def test_our_side_of_the_contest_runs_without_the_peer(run):
+def test_versus_crazyflow_runs_swarm_without_crazyflow(run):
     arguments = ["--only", "swarm", "--batch-worlds", "2", "--swarm", "3", "--engine", "lanes", "--repeats", "1"]
     (line,) = run("versus_crazyflow.py", *arguments)
     assert line["ratio"] > 0
@@ -233,14 +233,14 @@ def test_a_loop_of_commands_steps_and_reads_is_timed(benchmarks):
 @pytest.mark.parametrize(
     "script", ["step.py", "compile.py", "scaling.py", "limits.py", "train.py", "versus_crazyflow.py"]
 )
-def test_every_script_explains_itself(script, run, capsys):
+def test_main_scripts_print_their_help(script, run, capsys):
     with pytest.raises(SystemExit) as end:
         run(script, "--help")
     assert end.value.code == 0
     assert "--device" in capsys.readouterr().out
 
 
-def finished(train, out, successes, **changes):
+def write_results(train, out, successes, **changes):
     """Write the results of trainings of hover that ended with these successes."""
     out.mkdir(exist_ok=True)
     for seed, success in enumerate(successes):
@@ -256,7 +256,7 @@ def finished(train, out, successes, **changes):
 
 @pytest.fixture
 def train(benchmarks, monkeypatch, tmp_path):
-    """Return the script of trainings, whose committed table and page are copies here, the table without rows."""
+    """Return the script of trainings with copies of its committed table and page; the table has no rows."""
     train = importlib.import_module("train")
     page = tmp_path / train.PAGE.name
     page.write_text(train.PAGE.read_text())
@@ -268,7 +268,7 @@ def train(benchmarks, monkeypatch, tmp_path):
 
 def test_learning_curves_of_several_seeds_are_drawn_and_summarised(run, train, tmp_path):
     plt = pytest.importorskip("matplotlib.pyplot")
-    finished(train, tmp_path, (0.5, 1.0))
+    write_results(train, tmp_path, (0.5, 1.0))
     picture = tmp_path / "curves.png"
     (line,) = run("train.py", "--only-plot", "--tasks", "hover", "--out", tmp_path, "--plot", picture)
     assert (line["seeds"], line["least"], line["median"], line["seconds"]) == ([0, 1], 0.5, 0.75, 20.5)
@@ -284,7 +284,7 @@ def test_the_table_gets_the_rows_of_which_all_seeds_are_finished(run, train, tmp
              "median": 1.0, "error": None, "unit": "m", "seconds": 5.0, "parallel": 12, "commit": "0000000",
              "date": "2026-11-25", "machine": "another", "jax": "0.11.2"}  # fmt: skip
     train.TABLE.write_text(json.dumps([other]))
-    finished(train, tmp_path, (0.99, 1.0, 0.995), together=3)
+    write_results(train, tmp_path, (0.99, 1.0, 0.995), together=3)
     before = train.PAGE.read_text()
     run("train.py", "--only-plot", "--tasks", "hover", "--seeds", "0:4", "--out", tmp_path, "--write")
     assert json.loads(train.TABLE.read_text()) == [other]
@@ -301,20 +301,20 @@ def test_the_table_gets_the_rows_of_which_all_seeds_are_finished(run, train, tmp
 
 
 def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, train, tmp_path, capsys):
-    """Of 1,000 starts at 99% these are 0.69 percentage points, with two more successes and failures."""
+    """Two standard errors of 1,000 starts at 99% are 0.69 points, with two more successes and failures."""
     table = [{"task": "hover", "least": 0.99}]
     train.TABLE.write_text(json.dumps(table))
     check = ("train.py", "--check", "--tasks", "hover")
-    finished(train, tmp_path / "good", [0.984])
+    write_results(train, tmp_path / "good", [0.984])
     run(*check, "--out", tmp_path / "good")
-    finished(train, tmp_path / "bad", [0.983])
+    write_results(train, tmp_path / "bad", [0.983])
     with pytest.raises(SystemExit, match=r"hover: expected at least 99\.0% .*, got 98\.3% with seed 0"):
         run(*check, "--out", tmp_path / "bad")
     train.TABLE.write_text("[]")
     with pytest.raises(SystemExit, match=r"hover has no row in training-results\.json.*--write"):
         run(*check, "--out", tmp_path / "good")
     capsys.readouterr()
-    finished(train, tmp_path / "old", [1.0], sources="others")
+    write_results(train, tmp_path / "old", [1.0], sources="others")
     assert run("train.py", "--only-plot", "--tasks", "hover", "--seeds", 0, "--out", tmp_path / "old") == []
     (kept,) = run("train.py", "--only-plot", "--keep", "--tasks", "hover", "--seeds", 0, "--out", tmp_path / "old")
     assert kept["least"] == 1.0
@@ -331,10 +331,18 @@ def test_a_seed_that_diverged_is_named_and_counts_as_no_success(run, train, tmp_
     curve = [{"iteration": 20, "success": 0.97, "crashed": 0.0, "error": 0.01, "env_steps": 10, "seconds": 1.0,
               "compile_seconds": 0.5, "kept": True}]  # fmt: skip
     (tmp_path / "curve.json").write_text(json.dumps(curve))
-    lost = train.read_result(tmp_path, 33)
-    assert (train.read_result(tmp_path, None)["success"], lost["success"], lost["diverged"]) == (0.97, 0.0, 33)
-    about = {"task": "hover", "algorithm": "ppo", "commit": "0", "date": "0", "machine": "0", "jax": "0", "parallel": 1}
-    row = train.make_row([train.read_result(tmp_path, x) | about | {"seed": i} for i, x in enumerate((None, 33))])
+    diverged = train.read_result(tmp_path, 33)
+    assert (train.read_result(tmp_path, None)["success"], diverged["success"], diverged["diverged"]) == (0.97, 0.0, 33)
+    run_info = {
+        "task": "hover",
+        "algorithm": "ppo",
+        "commit": "0",
+        "date": "0",
+        "machine": "0",
+        "jax": "0",
+        "parallel": 1,
+    }
+    row = train.make_row([train.read_result(tmp_path, x) | run_info | {"seed": i} for i, x in enumerate((None, 33))])
     assert (row["least"], row["diverged"]) == (0.0, [1])
     assert "| 0, 1; diverged: 1 | 0.0% |" in train.table_markdown([row])
 
@@ -423,10 +431,10 @@ def test_gradients_are_timed_beside_the_steps_that_they_go_through(run):
 
 def test_the_runs_of_any_task_are_below_the_folder_that_was_named(benchmarks, tmp_path):
     train = importlib.import_module("train")
-    places = ["hover", "tasks/mine.py:Mine", "../mine.py:Mine", f"{tmp_path}/mine.py:Mine"]
-    folders = [train.run_folder(tmp_path / "out", place, "0", "cpu") for place in places]
+    tasks = ["hover", "tasks/mine.py:Mine", "../mine.py:Mine", f"{tmp_path}/mine.py:Mine"]
+    folders = [train.run_folder(tmp_path / "out", task, "0", "cpu") for task in tasks]
     others = train.run_folder(tmp_path / "out", "hover", "0", "cpu", "--set", "drone=a/b.toml")
     assert others.parent == folders[0].parent
     assert folders[0] == tmp_path / "out" / "hover-cpu-0"
     assert {folder.resolve().parent for folder in folders} == {tmp_path / "out"}
-    assert len(set(folders)) == len(places)
+    assert len(set(folders)) == len(tasks)

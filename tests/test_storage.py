@@ -62,11 +62,11 @@ def test_damaged_arrays_are_refused_wherever_the_damage_is(save):
     refused = 0
     for k in range(len(content)):
         try:
-            found = read(content[:k] + bytes([content[k] ^ 0x10]) + content[k + 1 :])
+            loaded = read(content[:k] + bytes([content[k] ^ 0x10]) + content[k + 1 :])
         except ConfigError as error:
             refused += "a.npz" in str(error)
-        else:  # of a date, for example, or of the size of the table of contents, which then lacks names
-            assert all(np.array_equal(x, arrays[name]) for name, x in found.items())
+        else:  # The bit is in a date, for example, or in the size of the table of contents, which then lacks names.
+            assert all(np.array_equal(x, arrays[name]) for name, x in loaded.items())
     assert refused > 0.6 * len(content)
 
 
@@ -81,11 +81,11 @@ def test_small_files_do_not_take_all_memory():
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("x0.npy", "w") as member:
         for _ in range(2**8):
             member.write(bytes(2**20))
-    one = file.getvalue()
-    stated = one.replace((2**28).to_bytes(4, "little"), (2**31 - 1).to_bytes(4, "little"))
+    content = file.getvalue()
+    forged = content.replace((2**28).to_bytes(4, "little"), (2**31 - 1).to_bytes(4, "little"))
     tracemalloc.start()
     with pytest.raises(ConfigError, match=r"expected files of at most 1073741824 bytes.*a\.npz: x0"):
-        read(stated)
+        read(forged)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**20
@@ -113,7 +113,7 @@ def test_writers_of_texts_and_figures_leave_nothing_on_a_full_disk(tmp_path):
         write_figure(figure, tmp_path / "a.exe", 50)
 
 
-def test_a_file_is_tried_without_a_change(tmp_path):
+def test_check_writable_changes_no_file(tmp_path):
     check_writable(tmp_path / "a.md")
     assert not list(tmp_path.iterdir())
     (tmp_path / "a.md").write_text("before")
@@ -127,7 +127,7 @@ def test_a_file_is_tried_without_a_change(tmp_path):
 
 
 def test_a_device_or_a_pipe_is_not_replaced(tmp_path):
-    """What may write to the folder of devices would otherwise replace /dev/null by a file."""
+    """A process that may write to /dev would otherwise replace /dev/null by a file."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     with pytest.raises(ConfigError, match="got the device or pipe"):

@@ -144,7 +144,7 @@ static void policy_command(const float pos[3], const float quat[4], const float 
 
 
 def _usage(level: Control, freq: int) -> str:
-    """Return the lines of the comment that explain the use in crazysim; empty without such a use."""
+    """Return the comment's lines on the use in crazysim; empty for levels that ``CFirmware`` cannot fly."""
     if level != Control.rotor_vel:
         return ""
     return f"""
@@ -168,7 +168,7 @@ void crazysim_update(void *memory, enum crazysim_level level, const struct crazy
 }
 
 #else"""
-"""Library for ``CFirmware``."""
+"""C source of the interface of ``CFirmware``."""
 
 OUT_OF_TREE_SOURCE = """
 #include "controller.h"{include}
@@ -219,7 +219,7 @@ def _stop_statements(level: Control) -> str:
 
 def _output_statements(level: Control, airframe: Airframe) -> str:
     """Return the statements that pass on the command."""
-    limit = float(np.max(airframe.value("rotors.thrust_max")))
+    max_thrust = float(np.max(airframe.value("rotors.thrust_max")))
     if level == Control.force_torque:
         return """
     control->controlMode = controlModeForceTorque;
@@ -228,25 +228,25 @@ def _output_statements(level: Control, airframe: Airframe) -> str:
     control->torqueY = command[2];
     control->torqueZ = command[3];"""
     if level == Control.rotor_vel:
-        k0, k1, k2 = (float_literal(x / limit) for x in airframe.value("rotors.thrust_curve", (3,)))
+        k0, k1, k2 = (float_literal(x / max_thrust) for x in airframe.value("rotors.thrust_curve", (3,)))
         return f"""
     control->controlMode = controlModeForce;
     for (int i = 0; i < 4; ++i) {{ /* thrust over its maximum, from the speed, rpm */
         const float speed = command[i];
-        const float part = {k0} + speed * ({k1} + speed * {k2});
-        control->normalizedForces[i] = speed <= 0 || part < 0 ? 0 : (part > 1 ? 1 : part);
+        const float share = {k0} + speed * ({k1} + speed * {k2});
+        control->normalizedForces[i] = speed <= 0 || share < 0 ? 0 : (share > 1 ? 1 : share);
     }}"""
     if level == Control.attitude:
         mode, fields = "modeAbs", "attitude"
     else:
         mode, fields = "modeVelocity", "attitudeRate"
     return f"""
-    setpoint_t below;
-    memset(&below, 0, sizeof below);
-    below.mode.roll = below.mode.pitch = below.mode.yaw = {mode};
-    below.{fields}.roll = degree * command[0];
-    below.{fields}.pitch = -degree * command[1]; /* the firmware's pitch is positive with the nose up */
-    below.{fields}.yaw = degree * command[2];
-    const float thrust = command[3] / {float_literal(airframe.n_rotors * limit)}; /* of the largest of all rotors */
-    below.thrust = 65535 * (thrust < 0 ? 0 : (thrust > 1 ? 1 : thrust));
-    controllerPid(control, &below, sensors, state, stabilizerStep);"""
+    setpoint_t inner_setpoint;
+    memset(&inner_setpoint, 0, sizeof inner_setpoint);
+    inner_setpoint.mode.roll = inner_setpoint.mode.pitch = inner_setpoint.mode.yaw = {mode};
+    inner_setpoint.{fields}.roll = degree * command[0];
+    inner_setpoint.{fields}.pitch = -degree * command[1]; /* the firmware's pitch is positive with the nose up */
+    inner_setpoint.{fields}.yaw = degree * command[2];
+    const float thrust = command[3] / {float_literal(airframe.n_rotors * max_thrust)}; /* share of all rotors */
+    inner_setpoint.thrust = 65535 * (thrust < 0 ? 0 : (thrust > 1 ? 1 : thrust));
+    controllerPid(control, &inner_setpoint, sensors, state, stabilizerStep);"""
