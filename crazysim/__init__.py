@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, RotorJet, SharedLoad, SlungLoad
-    from crazysim.plugins.scenery import Forest
+    from crazysim.plugins.scenery import Clutter, Forest, Gates, Pillars, Rooms
     from crazysim.plugins.sensors.camera import Camera
     from crazysim.plugins.sensors.imu import IMU
     from crazysim.plugins.sensors.lidar import Lidar
@@ -65,6 +65,7 @@ __all__ = [
     "Bicycles",
     "Camera",
     "Cars",
+    "Clutter",
     "ConfigError",
     "ContactLog",
     "ContactResponse",
@@ -77,6 +78,7 @@ __all__ = [
     "Follow",
     "Forest",
     "FreeBodies",
+    "Gates",
     "GroundEffect",
     "Hook",
     "Integrator",
@@ -86,6 +88,7 @@ __all__ = [
     "Members",
     "MotionCapture",
     "MotorFailure",
+    "Pillars",
     "Plugin",
     "Population",
     "PyTree",
@@ -93,6 +96,7 @@ __all__ = [
     "Randomize",
     "RangeFinder",
     "Residual",
+    "Rooms",
     "RotorAerodynamics",
     "RotorJet",
     "Sensor",
@@ -123,6 +127,7 @@ __getattr__ = lazy(
         "Bicycles": "crazysim.plugins.vehicles",
         "Camera": "crazysim.plugins.sensors.camera",
         "Cars": "crazysim.plugins.vehicles",
+        "Clutter": "crazysim.plugins.scenery",
         "ContactLog": "crazysim.plugins.contacts.contact_log",
         "ContactResponse": "crazysim.plugins.contacts.response",
         "Downwash": "crazysim.plugins.effects",
@@ -132,6 +137,7 @@ __getattr__ = lazy(
         "Forest": "crazysim.plugins.scenery",
         "FreeBodies": "crazysim.plugins.bodies",
         "functional": "crazysim.core",
+        "Gates": "crazysim.plugins.scenery",
         "GroundEffect": "crazysim.plugins.effects",
         "Hook": "crazysim.plugins.payloads",
         "IMU": "crazysim.plugins.sensors.imu",
@@ -142,10 +148,12 @@ __getattr__ = lazy(
         "MotionCapture": "crazysim.plugins.sensors.motion_capture",
         "MotorFailure": "crazysim.plugins.effects",
         "MPPI": "crazysim.sim.mppi",
+        "Pillars": "crazysim.plugins.scenery",
         "Radar": "crazysim.plugins.sensors.radar",
         "Randomize": "crazysim.plugins.effects",
         "RangeFinder": "crazysim.plugins.sensors.range_finder",
         "Residual": "crazysim.plugins.effects",
+        "Rooms": "crazysim.plugins.scenery",
         "RotorAerodynamics": "crazysim.plugins.effects",
         "RotorJet": "crazysim.plugins.payloads",
         "Sensor": "crazysim.plugins.sensors.sensor",

@@ -1,8 +1,9 @@
 """Draw the pictures that the pages show: ``python docs/pictures.py [NAME ...]`` writes them to ``docs/pictures``.
 
-``flight`` is the moving picture of the README. ``mixed`` is for the page on features, ``allan`` and ``measured`` are
-for the page on sensors, and ``cameras`` and ``lidar`` are for the page on cameras. The other plots are written by
-``crazysim demo`` (``tracks.png``), ``crazysim train`` (``training.png``) and ``benchmarks/scaling.py``.
+``flight`` is the moving picture of the README. ``mixed`` is for the page on features, ``scenery`` for the page on
+scenery, ``allan`` and ``measured`` are for the page on sensors, ``cameras`` and ``lidar`` for the page on cameras. The
+other plots are written by ``crazysim demo`` (``tracks.png``), ``crazysim train`` (``training.png``) and
+``benchmarks/scaling.py``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from examples import mixed_fleet
 from PIL import Image
 
-from crazysim import IMU, Camera, Follow, Lidar, MotionCapture, Sim
+from crazysim import IMU, Camera, Clutter, Follow, Forest, Gates, Lidar, MotionCapture, Pillars, Rooms, Sim
 from crazysim.envs import flying
 from crazysim.media import View
 from crazysim.plugins import sensors
@@ -32,6 +33,8 @@ COLOURS = np.array(
     [[0.1, 0.45, 0.95, 1], [0.95, 0.4, 0.1, 1], [0.15, 0.65, 0.3, 1], [0.75, 0.2, 0.6, 1], [0.9, 0.7, 0, 1]]
 )
 FPS = 20
+MESH = [[0.0, 0.0, 0.4], [0.4, 0.0, -0.15], [-0.2, 0.35, -0.15], [-0.2, -0.35, -0.15]]
+"""Corners of a tetrahedron, m."""
 
 
 def flight() -> None:
@@ -73,6 +76,28 @@ def mixed() -> None:
     camera = {"lookat": [0, 0, 0.75], "distance": 3.4, "azimuth": 210, "elevation": -22}
     Image.fromarray(View([0], 960, 480, cam_config=camera).render(sim)).save(FOLDER / "mixed.jpg", quality=80)
     sim.close()
+
+
+def scenery() -> None:
+    """One forest in two worlds, pillars, clutter, gates and rooms."""
+    above = {"lookat": [0, 0, 1], "distance": 17, "azimuth": 120, "elevation": -35}
+    layouts = [
+        (Forest(size=(20.0, 16.0)), 0, above | {"distance": 23}),
+        (Forest(size=(20.0, 16.0)), 1, above | {"distance": 23}),
+        (Pillars(size=(16.0, 12.0), density=0.25), 0, above | {"distance": 14}),
+        (Clutter(meshes=[MESH]), 0, above | {"distance": 12, "elevation": -25}),
+        (Gates(spacing=3.0), 0, {"lookat": [9.5, 0, 0.8], "distance": 12, "azimuth": 115, "elevation": -22}),
+        (Rooms(), 0, above | {"distance": 13, "elevation": -50}),
+    ]
+    canvas = Image.new("RGB", (3 * 320, 2 * 220))
+    for k, (layout, world, camera) in enumerate(layouts):
+        sim = Sim(n_worlds=2, rng_key=3)
+        sim.add(layout)
+        sim.reset()
+        image = sim.render("rgb_array", world, cam_config=camera, width=640, height=440)
+        canvas.paste(Image.fromarray(np.asarray(image)).resize((320, 220)), (k % 3 * 320, k // 3 * 220))
+        sim.close()
+    canvas.save(FOLDER / "scenery.jpg", quality=80)
 
 
 def allan() -> None:
@@ -212,7 +237,7 @@ def lidar() -> None:
 
 def main(names: list[str]) -> None:
     """Draw the named pictures, or all of them."""
-    for draw in (flight, mixed, allan, measured, cameras, lidar):
+    for draw in (flight, mixed, scenery, allan, measured, cameras, lidar):
         if not names or draw.__name__ in names:
             draw()
             print(f"drew {draw.__name__}", flush=True)

@@ -111,7 +111,8 @@ def _close_over_data(fn: Callable[..., Any], data: SimData) -> Callable[..., Any
         states, objects = poses_only.states.replace(pos=pos, quat=quat), poses_only.objects
         core = poses_only.core.replace(drone_id=jnp.broadcast_to(jnp.arange(pos.shape[-2]), pos.shape[:-1]))
         if objects is not None:
-            objects = objects.replace(pos=objects_pos, quat=objects_quat)
+            # Plugins, whose records are not among the arguments, have moved their objects already.
+            objects = objects.replace(pos=objects_pos, quat=objects_quat, recorded=True)
         return fn(poses_only.replace(states=states, objects=objects, core=core, plugins={}), mocap)
 
     return query_poses

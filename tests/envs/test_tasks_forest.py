@@ -36,9 +36,9 @@ def standing_trees(env, data):
     forest = env.task.trees(env.sim.n_drones)
     pos = np.asarray(vmap_worlds(lambda data: forest.poses(data)[0])(data))
     cells = np.divmod(forest.order, forest.n_cells[1])
-    trees = vmap_worlds(lambda data: forest.trees(forest.read(data), *cells))(data)
+    trees = vmap_worlds(lambda data: forest.columns(data, *cells))(data)
     np.testing.assert_allclose(pos[..., 0], trees.x, atol=1e-5)
-    radius = np.broadcast_to(np.asarray(trees.radius), trees.stands.shape)
+    radius = np.broadcast_to(np.asarray(trees.size), trees.stands.shape)
     return np.stack([trees.x, trees.y], axis=-1), radius, np.asarray(trees.stands)
 
 
@@ -160,8 +160,8 @@ def test_speed_pays_up_to_the_set_one_and_trees_nearby_cost(begun):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"density": 2.0}, "expected trees that fit into their cells of 0.707 m"),
-        ({"radii": (0.3, 0.1)}, "expected radii as smallest and largest"),
+        ({"density": 2.0}, "expected obstacles that fit into their cells of 0.707 m"),
+        ({"radii": (0.3, 0.1)}, "expected the smallest before the largest size"),
         ({"speed": 0.0}, "expected speed of Forest to be positive, at most 20, got 0.0"),
         ({"trees_seen": 13}, "expected trees_seen of Forest .*12, got 13"),
     ],

@@ -30,6 +30,7 @@ from crazysim.plugins.effects import Battery, Grid
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.payloads import SlungLoad
+from crazysim.plugins.scenery.forest import StandingObstacles
 from crazysim.plugins.scenery.scenery import Scenery
 from crazysim.plugins.sensors import IMU, Barometer, ImageSensor, MotionCapture, RangeFinder, Triad
 from crazysim.plugins.sensors.onboard import NoisySensor
@@ -40,9 +41,8 @@ from crazysim.tables import MAX_NUMBER
 from crazysim.trajectories import circle
 
 ABSTRACT = {
-    FunctionPlugin, Population, Sensor, NoisySensor, ImageSensor, Estimator, ErrorStateFilter, Scenery, GoalTask,
-    TouchDown,
-    BringLoad,
+    FunctionPlugin, Population, Sensor, NoisySensor, ImageSensor, Estimator, ErrorStateFilter, Scenery,
+    StandingObstacles, GoalTask, TouchDown, BringLoad,
 }  # fmt: skip
 """Base classes, which are not added."""
 TABLES = {"heights"}

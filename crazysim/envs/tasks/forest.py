@@ -175,14 +175,14 @@ class Forest(Task):
             for k in range(2)
         ]
         columns, rows = np.repeat(np.arange(-1, 3), 3).astype(np.int32), np.tile(np.arange(-1, 2), 4).astype(np.int32)
-        trees = forest.trees(forest.read(data), index[0][:, None] + columns, index[1][:, None] + rows)
+        trees = forest.columns(data, index[0][:, None] + columns, index[1][:, None] + rows)
         offset = jnp.stack([trees.x - pos[:, :1], trees.y - pos[:, 1:2]], axis=-1)
         distance = rotation.safe_norm(offset)[..., 0]
-        gap = jnp.where(trees.stands, jnp.minimum(distance - trees.radius, VIEW_RANGE), VIEW_RANGE)
+        gap = jnp.where(trees.stands, jnp.minimum(distance - trees.size, VIEW_RANGE), VIEW_RANGE)
         way = offset * (gap / jnp.maximum(distance, 1e-3))[..., None]
         ahead, left = rotation.heading(data.states.quat)
         along = [jnp.sum(way * axis[:, None, :2], axis=-1) for axis in (ahead, left)]
-        entries = jnp.stack([*along, trees.radius], axis=-1)
+        entries = jnp.stack([*along, trees.size], axis=-1)
         return nearest_entries(gap, entries, n)
 
     def observe(self, data: SimData) -> dict[str, Array]:

@@ -1,4 +1,4 @@
-"""Forests: trees in cells of a jittered grid."""
+"""Obstacles that stand in cells of a jittered grid: the trees of a forest, and pillars."""
 
 from __future__ import annotations
 
@@ -16,60 +16,83 @@ from crazysim.core.data import SimData
 from crazysim.core.random import STRIDE
 from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
-from crazysim.geometry.points import POINT_DISTANCE
+from crazysim.geometry import Shape
+from crazysim.geometry.points import POINT_DISTANCE, box_distance
 from crazysim.geometry.rays import SizedShapes
-from crazysim.plugins.scenery.scenery import HIDDEN_DEPTH, Model, Scenery, SceneryData
+from crazysim.plugins.scenery.scenery import HIDDEN_DEPTH, Model, Scenery
 
 SIZE_BITS = 3
-"""Bits of the number of a radius: there are 8, so that a contact report computes trees of one radius side by side."""
+"""Bits of the number of a size: there are 8, so that a contact report computes obstacles of one size side by side."""
 
 
-class Trees(NamedTuple):
-    """Trees of some cells."""
+class Columns(NamedTuple):
+    """Obstacles of some cells."""
 
     x: Array
     """Position of the axis, m. (...)"""
     y: Array
     """Position of the axis, m. (...)"""
-    radius: Array
-    """Radius, m. (...)"""
+    half_turn: Array
+    """Half the angle about the axis, rad. (...)"""
+    size: Array
+    """Size, m. (...)"""
     stands: Array
-    """True where the cell has a tree. (...)"""
+    """True where the cell has an obstacle. (...)"""
 
 
-class Forest(Scenery):
-    """Upright trunks, one in each square cell of ``1 / density``, with another place in it in every world and episode.
+class StandingObstacles(Scenery):
+    """Base class of upright obstacles, one in each square cell of ``1 / density``.
 
-    Columns of cells, along y, are shifted against each other by a random length, so that there are no straight aisles
-    along x. A tree keeps a distance of ``gap / 2`` from the edges of its cell: from every point beside the trees there
-    is a path of width ``gap`` to every other. Which tree has which of 8 radii is the same in all worlds.
+    Rows of cells along y are shifted against each other by a random length, so that there are no straight aisles along
+    x. An obstacle keeps a distance of ``gap / 2`` from the edges of its cell: from every point beside the obstacles
+    there is a path of width ``gap`` to every other. Which obstacle has which of 8 sizes is the same in all worlds.
 
-    ``difficulty`` is the share of the trees that stand.
+    ``difficulty`` is the share of the obstacles that stand.
     """
 
     density: float = setting(default=1 / 16, positive=True)
-    """Trees per square metre, 1/m^2."""
-    radii: ArrayLike = setting(default=(0.1, 0.3), positive=True, shapes=((2,),))
-    """Smallest and largest radius, m. (2,)"""
+    """Obstacles per square metre, 1/m^2."""
     size: ArrayLike = setting(default=(32.0, 20.0), positive=True, shapes=((2,),))
     """Length along x and width along y, m, rounded up to whole cells. (2,)"""
     center: ArrayLike = setting(default=(0.0, 0.0), shapes=((2,),))
-    """Middle of the forest, x and y, m. (2,)"""
+    """Middle of the area, x and y, m. (2,)"""
     height: float = setting(default=5.0, positive=True)
-    """Height of the trees, m."""
+    """Height of the obstacles, m."""
     gap: float = setting(default=0.6, low=0.0)
-    """Smallest distance between two trees of a column of cells and between columns, m."""
-    name: str = "forest"
+    """Smallest distance between two obstacles of a row of cells, and between rows, m."""
+
+    @property
+    def sizes(self) -> tuple[float, float]:
+        """Smallest and largest size, m."""
+        raise NotImplementedError
+
+    def radius(self, size: Any) -> Any:
+        """Return the radius of the circle around obstacles of a size, m. (...)"""
+        raise NotImplementedError
+
+    def model(self, size: float) -> tuple[str, dict[str, Any], Shape]:
+        """Return name and settings of the primitive of obstacles of a size, and its shape."""
+        raise NotImplementedError
+
+    def distance(self, columns: Columns, offset: Sequence[Array]) -> Array:
+        """Return the distance to obstacles, m. (...)
+
+        Args:
+            columns: The obstacles.
+            offset: Components of the vectors from their middles to a point, world frame, m. 3 of (...)
+        """
+        raise NotImplementedError
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = np.asarray(self.radii, np.float64)
+        low, high = self.sizes
         if low > high:
-            raise ConfigError(f"expected radii as smallest and largest, got {self.radii!r}")
-        if 2 * high + self.gap > self.cell:
+            raise ConfigError(f"expected the smallest before the largest size of {self.name!r}, got {(low, high)}")
+        if 2 * self.radius(high) + self.gap > self.cell:
             raise ConfigError(
-                f"expected trees that fit into their cells of {self.cell:.3g} m with half the gap on each side, got a "
-                f"diameter of {2 * high:g} m and a gap of {self.gap:g} m. Use a lower density, or a smaller gap."
+                f"expected obstacles that fit into their cells of {self.cell:.3g} m with half the gap on each side, "
+                f"got a diameter of {2 * self.radius(high):.3g} m and a gap of {self.gap:g} m. Use a lower density, or "
+                f"a smaller gap."
             )
 
     @property
@@ -85,85 +108,147 @@ class Forest(Scenery):
 
     @functools.cached_property
     def order(self) -> np.ndarray:
-        """Cell of each tree: trees of one radius are neighbours. (n_trees,)"""
+        """Cell of each obstacle: obstacles of one size are neighbours. (n,)"""
         return np.argsort(self._size_index(np.arange(math.prod(self.n_cells))), kind="stable")
 
     def models(self) -> Sequence[Model]:
         cells, models = self.order, []
-        column, row = np.divmod(cells, self.n_cells[1])
-        middle = np.stack([*self._middle(column, row), np.zeros(len(cells))], axis=-1)
+        middle = np.stack([*self._middle(*np.divmod(cells, self.n_cells[1])), np.zeros(len(cells))], axis=-1)
         size_index = self._size_index(cells)
         for index in np.unique(size_index):
-            radius = float(self._radius(index))
-            models.append(Model("cylinder", {"radius": radius, "height": self.height}, middle[size_index == index]))
+            source, options, shape = self.model(float(self._size(index)))
+            shapes = [(shape, (0.0, 0.0, self.height / 2))]
+            models.append(Model(source, options, shapes, middle[size_index == index]))
         return models
 
     def poses(self, data: SimData) -> tuple[Array, Array]:
-        trees = self.trees(self.read(data), *np.divmod(self.order, self.n_cells[1]))
-        z = jnp.where(trees.stands, 0.0, -HIDDEN_DEPTH)
-        pos = jnp.stack([trees.x, trees.y, z], axis=-1)
-        return pos, jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.0, 1.0], pos.dtype), (*pos.shape[:-1], 4))
+        columns = self.columns(data, *np.divmod(self.order, self.n_cells[1]))
+        z = jnp.where(columns.stands, 0.0, -HIDDEN_DEPTH)
+        pos, zero = jnp.stack([columns.x, columns.y, z], axis=-1), jnp.zeros_like(z)
+        quat = jnp.stack([zero, zero, jnp.sin(columns.half_turn), jnp.cos(columns.half_turn)], axis=-1)
+        return pos, quat
 
-    def trees(self, record: SceneryData, column: Any, row: Any) -> Trees:
-        """Return the trees of cells, absent for cells outside of the forest.
+    def columns(self, data: SimData, column: Any, row: Any) -> Columns:
+        """Return the obstacles of cells, absent for cells outside of the area.
 
         Args:
-            record: Record of all worlds, of one world or of one drone.
+            data: All worlds, one world, or one drone.
             column: Index of each cell along x, integer; it broadcasts with the axes of worlds. (...)
             row: Index along y. (...)
         """
-        n_x, n_y = self.n_cells
+        record, (n_x, n_y) = self.read(data), self.n_cells
         cell = column * n_y + row
-        x, y = self._middle(column, row)
-        u, v, w = (record.uniform(3 * cell + k) for k in range(3))
-        radius = self._radius(self._size_index(cell)).astype(u.dtype)
-        reach = self.cell - self.gap - 2 * radius
-        x, y = x + (u - 0.5) * reach, y + (v - 0.5) * reach + self._shift(record, column)
+        place_x, place_y, share = (record.uniform(3 * cell + k) for k in range(3))
+        turn, vel_x, vel_y = (record.uniform(4 * n_x * n_y + 3 * cell + k) for k in range(3))
+        size = self._size(self._size_index(cell)).astype(place_x.dtype)
+        reach = self.cell - self.gap - 2 * self.radius(size)
+        middle_x, middle_y = self._middle(column, row)
+        middle_y = middle_y + self._shift(data, column)
+        x = middle_x + self.wander(data, place_x, vel_x, reach)
+        y = middle_y + self.wander(data, place_y, vel_y, reach)
         is_inside = (column >= 0) & (column < n_x) & (row >= 0) & (row < n_y)
-        return Trees(x, y, radius, is_inside & (w < record.difficulty) & self.is_free(x, y, radius))
+        is_free = self.is_free((x, y), (middle_x, middle_y), self.radius(size), reach)
+        stands = is_inside & (share < record.difficulty) & is_free
+        return Columns(x, y, jnp.pi * turn, size, stands)
 
     def clearance(self, data: SimData, pos: Array) -> Array:
-        """Return the distance from points to the surface of the nearest tree, m, negative inside. (...)
+        """Return the distance from points to the surface of the nearest obstacle, m, negative inside. (...)
 
-        Distances are computed up to the width of a cell; where the nearest tree is farther away, that is the result.
-        Only the nine cells around a point are read, so the cost does not depend on the size of the forest.
+        Distances are computed up to the width of a cell; where the nearest obstacle is farther away, that is the
+        result. Only the nine cells around a point are read, so the cost does not depend on the size of the area.
 
         Args:
             data: All worlds, one world, or one drone.
             pos: Points, world frame, m: (n_worlds, n, 3), without n_worlds in one world, or (3,) for one drone.
         """
-        record, (n_x, n_y) = self.read(data), self.n_cells
+        n_x, n_y = self.n_cells
         corner_x, corner_y = self._middle(-0.5, -0.5)
         neighbours = np.arange(-1, 2, dtype=np.int32).reshape(3, *[1] * (pos.ndim - 1))
         column = neighbours + _cell_index((pos[..., 0] - corner_x) / self.cell, n_x)
-        shift = self._shift(record, column)
-        row = neighbours[:, None] + _cell_index((pos[..., 1] - corner_y - shift) / self.cell, n_y)
-        trees = self.trees(record, column, row)
-        offset = [pos[..., 0] - trees.x, pos[..., 1] - trees.y, pos[..., 2] - self.height / 2]
-        trunk = SizedShapes("cylinder", [trees.radius, jnp.full_like(trees.radius, self.height / 2)])
-        distance = POINT_DISTANCE["cylinder"](trunk, jnp.stack(jnp.broadcast_arrays(*offset), axis=-1))
-        return jnp.min(jnp.where(trees.stands & (distance < self.cell), distance, self.cell), axis=(0, 1))
+        row = neighbours[:, None] + _cell_index((pos[..., 1] - corner_y - self._shift(data, column)) / self.cell, n_y)
+        columns = self.columns(data, column, row)
+        offset = [pos[..., 0] - columns.x, pos[..., 1] - columns.y, pos[..., 2] - self.height / 2]
+        distance = self.distance(columns, jnp.broadcast_arrays(*offset))
+        return jnp.min(jnp.where(columns.stands & (distance < self.cell), distance, self.cell), axis=(0, 1))
 
     def _middle(self, column: Any, row: Any) -> tuple[Any, Any]:
-        """Return the middle of cells, before the shifts of the columns, m. (...) and (...)"""
+        """Return the middle of cells, before the shifts of their rows, m. (...) and (...)"""
         x, y = (
             middle + self.cell * (index - (n - 1) / 2)
             for middle, index, n in zip(np.asarray(self.center).tolist(), (column, row), self.n_cells, strict=True)
         )
         return x, y
 
-    def _shift(self, record: SceneryData, column: Any) -> Array:
-        """Return the shift of columns of cells along y, m. (...)"""
-        return (record.uniform(3 * math.prod(self.n_cells) + column) - 0.5) * self.cell
+    def _shift(self, data: SimData, column: Any) -> Array:
+        """Return the shift along y of the cells with an index along x, m. (...)"""
+        return (self.read(data).uniform(3 * math.prod(self.n_cells) + column) - 0.5) * self.cell
 
     def _size_index(self, cell: Any) -> Any:
-        """Return the number of the radius of the trees of cells, from 0 to 7. (...)"""
+        """Return the number of the size of the obstacles of cells, from 0 to 7. (...)"""
         return (cell.astype(np.uint32) * STRIDE) >> (32 - SIZE_BITS)
 
-    def _radius(self, size_index: Any) -> Any:
-        """Return the radius with a number, m. (...)"""
-        low, high = np.asarray(self.radii, np.float64).tolist()
+    def _size(self, size_index: Any) -> Any:
+        """Return the size with a number, m. (...)"""
+        low, high = self.sizes
         return low + (high - low) / (2**SIZE_BITS - 1) * size_index
+
+
+class Forest(StandingObstacles):
+    """Upright trunks, one in each square cell of ``1 / density``, with another place in it in every world and episode.
+
+    Rows of cells along y are shifted against each other by a random length, so that there are no straight aisles along
+    x. A tree keeps a distance of ``gap / 2`` from the edges of its cell: from every point beside the trees there is a
+    path of width ``gap`` to every other. Which tree has which of 8 radii is the same in all worlds.
+
+    ``difficulty`` is the share of the trees that stand.
+    """
+
+    radii: ArrayLike = setting(default=(0.1, 0.3), positive=True, shapes=((2,),))
+    """Smallest and largest radius, m. (2,)"""
+    name: str = "forest"
+
+    @property
+    def sizes(self) -> tuple[float, float]:
+        low, high = np.asarray(self.radii, np.float64).tolist()
+        return low, high
+
+    def radius(self, size: Any) -> Any:
+        return size
+
+    def model(self, size: float) -> tuple[str, dict[str, Any], Shape]:
+        return "cylinder", {"radius": size, "height": self.height}, Shape("cylinder", (size, self.height / 2))
+
+    def distance(self, columns: Columns, offset: Sequence[Array]) -> Array:
+        trunk = SizedShapes("cylinder", [columns.size, jnp.full_like(columns.size, self.height / 2)])
+        return POINT_DISTANCE["cylinder"](trunk, jnp.stack(offset, axis=-1))
+
+
+class Pillars(StandingObstacles):
+    """Square pillars that are turned about their axes, one in each square cell of ``1 / density``; see ``Forest``."""
+
+    widths: ArrayLike = setting(default=(0.3, 0.8), positive=True, shapes=((2,),))
+    """Smallest and largest width, m. (2,)"""
+    height: float = setting(default=3.0, positive=True)
+    name: str = "pillars"
+
+    @property
+    def sizes(self) -> tuple[float, float]:
+        low, high = np.asarray(self.widths, np.float64).tolist()
+        return low, high
+
+    def radius(self, size: Any) -> Any:
+        return size / math.sqrt(2)
+
+    def model(self, size: float) -> tuple[str, dict[str, Any], Shape]:
+        shape = Shape("box", (size / 2, size / 2, self.height / 2))
+        return "wall", {"thickness": size, "length": size, "height": self.height}, shape
+
+    def distance(self, columns: Columns, offset: Sequence[Array]) -> Array:
+        sin, cos = jnp.sin(2 * columns.half_turn), jnp.cos(2 * columns.half_turn)
+        x, y, z = offset
+        half = columns.size / 2
+        local = cos * x + sin * y, cos * y - sin * x, z
+        return box_distance((half, half, jnp.full_like(half, self.height / 2)), local)  # type: ignore[arg-type]
 
 
 def _cell_index(position: Array, n: int) -> Array:

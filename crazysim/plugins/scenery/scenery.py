@@ -7,6 +7,8 @@ it computes the poses of those alone.
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -16,15 +18,22 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from crazysim import rotation
 from crazysim.core.data import Objects, SimData
 from crazysim.core.plugin import Plugin, Simulation, parameter
 from crazysim.core.random import uniform_at, world_key
 from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
+from crazysim.geometry import Shape
+from crazysim.geometry.distance import point_distance
 from crazysim.pytree import PyTree, device_array, leaf
 
 HIDDEN_DEPTH = 100.0
 """Depth below their places of obstacles that a layout leaves out, m."""
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+"""Attitude of obstacles that are not turned, xyzw."""
+MIN_REACH = 1e-3
+"""Length of a region below which an obstacle counts as standing still, m."""
 MAX_OBSTACLES = 10_000
 """Largest number of obstacles of a layout."""
 DIFFICULTY_INDEX = np.uint32(2**32 - 1)
@@ -47,25 +56,32 @@ class SceneryData(PyTree):
 
 
 class Model(NamedTuple):
-    """Obstacles of one shape."""
+    """Obstacles of one kind."""
 
     source: str
     """Name of a primitive, or MJCF."""
     options: Mapping[str, Any]
     """Settings of the primitive."""
+    shapes: Sequence[tuple[Shape, tuple[float, float, float]]]
+    """Shapes of an obstacle, and their positions in its frame, m."""
     pos: np.ndarray
-    """Middles of the regions of the obstacles, m: their positions until a layout is drawn. (n, 3)"""
+    """Middles of the regions of the obstacles, m: their positions in the compiled scene, by which rays sort them.
+    (n, 3)"""
 
 
 class Scenery(Plugin):
     """Base class of layouts of obstacles, drawn again in every world at every reset.
 
-    A subclass defines ``models`` and ``poses``. Tasks call ``place`` where an episode starts.
+    A subclass defines ``models`` and ``poses``. Tasks call ``place`` where an episode starts. An obstacle that a layout
+    leaves out is 100 m below its place.
     """
 
     difficulty: ArrayLike = parameter(default=1.0, low=0.0, high=1.0, shapes=((), (2,)))
     """Difficulty, 0 to 1, or its range, lowest and highest, within which every world draws one at its resets. ()
     or (2,)"""
+    speed: float = setting(default=0.0, low=0.0)
+    """Largest component of the velocities of obstacles that move to and fro in their regions, m/s; 0 for obstacles that
+    stand still."""
     free: ArrayLike = setting(default=((0.0, 0.0, 1.0),), shapes=(("any", 3),))
     """Discs that stay free of obstacles, x, y and radius, m. (n, 3)"""
     name: str = "scenery"
@@ -100,7 +116,14 @@ class Scenery(Plugin):
             data: All worlds, one world, or one drone.
             pos: Points, world frame, m: (n_worlds, n, 3), without n_worlds in one world, or (3,) for one drone.
         """
-        raise NotImplementedError
+        place, quat = (x[..., None, :, :] if x.ndim == 3 else x for x in self.poses(data))
+        gaps, start = [], 0
+        for model in self.models():
+            rows = slice(start, start + len(model.pos))
+            local = rotation.rotate_inverse(quat[..., rows, :], pos[..., None, :] - place[..., rows, :])
+            gaps += [point_distance(shape, local - jnp.asarray(at, pos.dtype)) for shape, at in model.shapes]
+            start = rows.stop
+        return functools.reduce(jnp.minimum, [jnp.min(gap, axis=-1) for gap in gaps])
 
     def place(self, data: SimData, key: Array, difficulty: Array | None = None) -> SimData:
         """Return the data of one world with another layout. Pure; tasks call it in ``spawn``.
@@ -156,9 +179,33 @@ class Scenery(Plugin):
         }
         return objects.replace(**rows)
 
-    def is_free(self, x: Array, y: Array, radius: Array | float) -> Array:
-        """Return True for circles of a radius around points that do not meet the discs of ``free``. (...)"""
-        free = jnp.ones(jnp.shape(x), bool)
+    def wander(self, data: SimData, place: Any, velocity: Any, reach: Any) -> Array:
+        """Return the coordinate of points that move to and fro between ``-reach / 2`` and ``reach / 2``, m. (...)
+
+        Args:
+            data: All worlds, one world, or one drone, for the time since the reset.
+            place: Random numbers from 0 to 1 that give the places at the reset. (...)
+            velocity: Random numbers from 0 to 1 that give the velocities. (...)
+            reach: Length of the regions, m. (...)
+        """
+        if not self.speed:
+            return (place - 0.5) * reach
+        travelled = (data.core.steps / data.core.freq).astype(place.dtype) * (2 * velocity - 1) * self.speed
+        phase = (place + travelled / jnp.maximum(reach, MIN_REACH)) / 2  # of a triangle wave with period 1
+        phase = phase - jnp.floor(phase)
+        return (2 * jnp.minimum(phase, 1 - phase) - 0.5) * reach
+
+    def is_free(self, pos: Sequence[Any], middle: Sequence[Any], radius: Any, reach: Any) -> Array:
+        """Return True for obstacles that do not meet the discs of ``free``, wherever they move. (...)
+
+        Args:
+            pos: Position, x and y, m. 2 of (...)
+            middle: Middle of the square region, x and y, m. 2 of (...)
+            radius: Radius of the circle around an obstacle, m. (...)
+            reach: Length of the sides of the region, m. (...)
+        """
+        (x, y), radius = (middle, radius + reach / math.sqrt(2)) if self.speed else (pos, radius)
+        is_free = jnp.ones(jnp.shape(pos[0]), bool)
         for free_x, free_y, free_radius in np.asarray(self.free, np.float64).tolist():
-            free &= (x - free_x) ** 2 + (y - free_y) ** 2 > (free_radius + radius) ** 2
-        return free
+            is_free &= (x - free_x) ** 2 + (y - free_y) ** 2 > (free_radius + radius) ** 2
+        return is_free

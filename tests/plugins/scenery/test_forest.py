@@ -163,6 +163,8 @@ def test_rays_meet_the_trees_of_each_world(half):
         np.asarray(sim.airframe.value("shape.fpv_camera")) + [4, -2, 1.5],
     )
     assert not np.allclose(distance[0], distance[1], rtol=0.01)
+    image = sim.depth("fpv_cam:0", 64, 4, drones=False, along="ray")
+    np.testing.assert_allclose(image, hits.distance, rtol=1e-6)
     points, geom = np.asarray(hits.point)[:, 0, 1], np.zeros(1, np.int32)
     model, own = sim.scene.mj_model, sim.scene.mj_model.body("drone:0").id
     n_trees = 0
@@ -255,7 +257,7 @@ def test_a_task_places_a_forest_in_its_episodes():
 
 
 BAD = {
-    "radii": ({"radii": (0.3, 0.1)}, "expected radii as smallest and largest, got"),
+    "radii": ({"radii": (0.3, 0.1)}, "expected the smallest before the largest size of .forest., got"),
     "dense": ({"density": 4.0}, "Use a lower density, or a smaller gap"),
     "many": ({"size": (1000.0, 1000.0)}, "expected at most 10000 obstacles in Forest, got 62500"),
     "difficulty": ({"difficulty": 1.5}, "difficulty"),

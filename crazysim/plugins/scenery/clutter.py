@@ -1,0 +1,133 @@
+"""Clutter: boxes, balls and convex meshes in the air."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.core.data import SimData
+from crazysim.core.settings import setting
+from crazysim.errors import ConfigError
+from crazysim.geometry import Shape, hull
+from crazysim.plugins.scenery.scenery import HIDDEN_DEPTH, Model, Scenery
+
+N_SIZES = 4
+"""Number of sizes of boxes, and of balls."""
+ORIGIN = (0.0, 0.0, 0.0)
+"""Position of a shape in the middle of its obstacle, m."""
+
+
+class Clutter(Scenery):
+    """Boxes, balls and convex meshes at any attitude, one in each cubic cell of ``1 / density``.
+
+    An obstacle keeps a distance of ``gap / 2`` from the sides of its cell, so that aisles of width ``gap`` lead along
+    all sides. The cells take boxes and balls, of 4 sizes each, and meshes in turn, the same in all worlds.
+
+    ``difficulty`` is the share of the obstacles that are there.
+    """
+
+    density: float = setting(default=1 / 8, positive=True)
+    """Obstacles per cubic metre, 1/m^3."""
+    size: ArrayLike = setting(default=(12.0, 8.0, 4.0), positive=True, shapes=((3,),))
+    """Lengths along x, y and z, m, rounded up to whole cells. (3,)"""
+    center: ArrayLike = setting(default=(0.0, 0.0, 2.0), shapes=((3,),))
+    """Middle of the area, m. (3,)"""
+    sizes: ArrayLike = setting(default=(0.2, 0.6), positive=True, shapes=((2,),))
+    """Smallest and largest edge of a box and diameter of a ball, m. (2,)"""
+    meshes: Sequence[Any] = ()
+    """Corners of convex bodies, in the frame of each, m. (n, 3) each"""
+    gap: float = setting(default=0.6, low=0.0)
+    """Smallest distance between two obstacles, m."""
+    name: str = "clutter"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = np.asarray(self.sizes, np.float64)
+        if low > high:
+            raise ConfigError(f"expected sizes as smallest and largest, got {self.sizes!r}")
+        diameter = 2 * max(_radius(shape) for _, _, shape in self._kinds())
+        if diameter + self.gap > self.cell:
+            raise ConfigError(
+                f"expected obstacles that fit into their cells of {self.cell:.3g} m with half the gap on each side, "
+                f"got a diameter of {diameter:.3g} m and a gap of {self.gap:g} m. Use a lower density, or a smaller "
+                f"gap."
+            )
+
+    @property
+    def cell(self) -> float:
+        """Width of a cell, m."""
+        return self.density ** (-1 / 3)
+
+    @property
+    def n_cells(self) -> np.ndarray:
+        """Number of cells along x, y and z. (3,)"""
+        return np.ceil(np.asarray(self.size, np.float64) / self.cell - 1e-6).astype(int)
+
+    def models(self) -> Sequence[Model]:
+        kinds = self._kinds()
+        middle = self._middles()
+        return [
+            Model(source, options, [(shape, ORIGIN)], middle[k :: len(kinds)])
+            for k, (source, options, shape) in enumerate(kinds)
+            if k < len(middle)
+        ]
+
+    def poses(self, data: SimData) -> tuple[Array, Array]:
+        record, kinds, n = self.read(data), self._kinds(), math.prod(self.n_cells.tolist())
+        cell = np.concatenate([np.arange(k, n, len(kinds)) for k in range(len(kinds))])
+        radius = np.concatenate([np.full(len(range(k, n, len(kinds))), _radius(x[2])) for k, x in enumerate(kinds)])
+        u = [record.uniform(cell + k * n) for k in range(10)]
+        dtype = u[0].dtype
+        radius, *middle = jnp.asarray(np.concatenate([radius[:, None], self._middles()[cell]], axis=1).T, dtype)
+        reach = self.cell - self.gap - 2 * radius
+        pos = [middle[k] + self.wander(data, u[k], u[k + 3], reach) for k in range(3)]
+        is_there = (u[6] < record.difficulty) & self.is_free(pos[:2], middle[:2], radius, reach)
+        pos[2] = jnp.where(is_there, pos[2], pos[2] - HIDDEN_DEPTH)
+        r1, r2 = jnp.sqrt(1 - u[7]), jnp.sqrt(u[7])
+        a, b = 2 * jnp.pi * u[8], 2 * jnp.pi * u[9]
+        quat = [r1 * jnp.sin(a), r1 * jnp.cos(a), r2 * jnp.sin(b), r2 * jnp.cos(b)]  # uniform: Shoemake 1992
+        return jnp.stack(pos, axis=-1), jnp.stack(quat, axis=-1)
+
+    def _middles(self) -> np.ndarray:
+        """Return the middles of the cells, m. (n, 3)"""
+        index = np.indices(self.n_cells.tolist()).reshape(3, -1).T
+        return np.asarray(self.center, np.float64) + self.cell * (index - (self.n_cells - 1) / 2)
+
+    def _kinds(self) -> list[tuple[str, dict[str, Any], Shape]]:
+        """Return source, settings of the primitive and shape of each kind of obstacles."""
+        kinds: list[tuple[str, dict[str, Any], Shape]] = []
+        low, high = np.asarray(self.sizes, np.float64).tolist()
+        for size in np.linspace(low, high, N_SIZES).tolist():
+            kinds += [
+                ("box", {"size": (size, size, size)}, Shape("box", (size / 2, size / 2, size / 2))),
+                ("sphere", {"radius": size / 2}, Shape("sphere", (size / 2,))),
+            ]
+        for corners in self.meshes:
+            array = np.asarray(corners, np.float64)
+            if array.ndim != 2 or array.shape[1] != 3 or not np.all(np.isfinite(array)):
+                raise ConfigError(f"expected a mesh as corners (n, 3), m, got shape {array.shape}")
+            kinds.append((_mesh_xml(array), {}, hull(array)))
+        return kinds
+
+
+def _radius(shape: Shape) -> float:
+    """Return the radius of the ball around the origin that contains a shape, m."""
+    if shape.kind == "mesh":
+        return float(np.linalg.norm(shape.array("vertices"), axis=-1).max())
+    return float(np.linalg.norm(shape.size))
+
+
+def _mesh_xml(corners: np.ndarray) -> str:
+    """Return MJCF of a convex mesh that drones touch."""
+    numbers = " ".join(f"{x:.9g}" for x in corners.reshape(-1))
+    geom = '<geom type="mesh" mesh="mesh" contype="0" conaffinity="2" rgba="0.55 0.5 0.35 1"/>'
+    return (
+        f'<mujoco><asset><mesh name="mesh" vertex="{numbers}"/></asset><worldbody><body name="mesh">{geom}</body>'
+        f"</worldbody></mujoco>"
+    )

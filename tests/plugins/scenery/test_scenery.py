@@ -1,0 +1,140 @@
+"""Pillars, clutter, gates and rooms: distances, layouts, free paths, motion, and wrong input."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import with_states
+from scipy import ndimage
+
+from crazysim import Clutter, ConfigError, Forest, Gates, Pillars, Rooms, Sim
+
+TETRAHEDRON = np.array([[0, 0, 0.3], [0.3, 0, -0.1], [-0.15, 0.26, -0.1], [-0.15, -0.26, -0.1]])
+KINDS = {
+    "pillars": Pillars(density=0.25, size=(8.0, 6.0), speed=1.0),
+    "clutter": Clutter(size=(8.0, 4.0, 2.0), meshes=[TETRAHEDRON], difficulty=0.7),
+    "gates": Gates(speed=0.5),
+    "rooms": Rooms(count=(2, 2), difficulty=0.8),
+}
+
+
+def build(plugin, n_worlds=3, n_drones=2):
+    sim = Sim(n_worlds, n_drones, control="rotor_vel", rng_key=5)
+    sim.add(plugin)
+    sim.reset()
+    return sim
+
+
+def after(sim, seconds):
+    """Return the data some time after the reset."""
+    core = sim.data.core
+    return sim.data.replace(core=core.replace(steps=core.steps + round(seconds * sim.freq)))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_clearance_is_the_distance_of_the_contact_report(name):
+    plugin = KINDS[name]
+    sim = build(plugin)
+    ball = sim.scene.collision_model.drones[0].geoms[0]
+    contacts, clearance = jax.jit(sim.scene.contact_fn(floor=False, drones=False)), jax.jit(plugin.clearance)
+    rng, data, found, expected = np.random.default_rng(0), after(sim, 7.3), [], []
+    place = plugin.poses(data)[0]
+    for _ in range(100):
+        near = np.asarray(place)[:, rng.integers(place.shape[1], size=2)] * [1, 1, 0] + [0, 0, 1.5]
+        data = with_states(data, pos=near + rng.normal(0, 0.7, (3, 2, 3)))
+        found.append(clearance(data, data.states.pos + np.float32(ball.pos)))
+        expected.append(contacts(data).object_distance.min(axis=-1) + ball.shape.size[0])
+    limit = plugin.cell if isinstance(plugin, Pillars) else np.inf
+    assert np.min(found) < 0.02
+    np.testing.assert_allclose(found, np.minimum(expected, limit), atol=3e-6)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_law_10_a_layout_is_of_world_and_episode(name):
+    plugin = KINDS[name]
+    sim, more = build(plugin), build(plugin, 4, 1)
+    first, all_worlds = (np.concatenate(plugin.poses(s.data), axis=-1) for s in (sim, more))
+    np.testing.assert_array_equal(first, all_worlds[:3])
+    assert len({x.tobytes() for x in all_worlds}) == 4
+    more.reset(np.array([False, True, False, False]))
+    changed = np.any(np.concatenate(plugin.poses(more.data), axis=-1) != all_worlds, axis=(1, 2))
+    np.testing.assert_array_equal(changed, [False, True, False, False])
+
+
+@pytest.mark.parametrize(
+    "plugin", [Forest(size=(12.0, 12.0), speed=1.5), Clutter(size=(6.0, 4.0, 4.0), speed=1.5), Gates(speed=1.5)]
+)
+def test_moving_obstacles_stay_in_their_regions_below_their_speed(plugin):
+    sim = build(plugin, 4)
+    times = np.arange(0.0, 8.0, 0.02)
+    poses = jax.jit(plugin.poses)
+    path = np.array([poses(after(sim, t))[0] for t in times])
+    vel = np.diff(path, axis=0) / 0.02
+    assert np.abs(vel).max() <= 1.5 + 1e-3
+    assert np.quantile(np.abs(vel[..., 0]), 0.9) > 1.2
+    middle = np.concatenate([model.pos for model in plugin.models()])
+    way = np.abs(path - middle)[..., 0] if not isinstance(plugin, Clutter) else None
+    if way is not None:
+        reach = plugin.offset[0] if isinstance(plugin, Gates) else (plugin.cell - plugin.gap) / 2
+        assert way.max() <= reach + 1e-5
+        assert way.max() > 0.8 * reach
+    sim.step(50)
+    np.testing.assert_allclose(plugin.poses(sim.data)[0], path[5], atol=1e-5)  # 0.1 s
+
+
+def test_boxes_and_balls_keep_their_distance():
+    plugin = Clutter(density=1.0, size=(4.0, 3.0, 2.0), sizes=(0.1, 0.25), gap=0.3, free=np.zeros((0, 3)))
+    sim = build(plugin, 20)
+    pos = np.asarray(plugin.poses(sim.data)[0])
+    models = plugin.models()
+    radius = np.concatenate([np.full(len(m.pos), np.linalg.norm(m.shapes[0][0].size)) for m in models])
+    assert pos.shape == (20, 24, 3)
+    assert {m.source for m in models} == {"box", "sphere"}
+    gap = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1) - radius[:, None] - radius
+    assert gap[:, ~np.eye(24, dtype=bool)].min() >= 0.3 - 1e-5
+
+
+def test_difficulty_moves_gates_out_of_their_line():
+    easy, hard = (Gates(difficulty=x) for x in (0.0, 1.0))
+    pos, quat = (np.asarray(x) for x in easy.poses(build(easy).data))
+    np.testing.assert_allclose(pos, np.broadcast_to([[3 + 4 * k, 0, 1.5] for k in range(6)], (3, 6, 3)), atol=1e-6)
+    np.testing.assert_array_equal(quat[..., 3], 1)
+    moved, turned = (np.asarray(x) for x in hard.poses(build(hard, 200).data))
+    np.testing.assert_allclose(np.abs(moved - pos[0]).max(axis=(0, 1)), [0.5, 2.0, 0.5], rtol=0.02)
+    assert 2 * np.arcsin(np.abs(turned[..., 2]).max()) == pytest.approx(0.6, rel=0.02)
+
+
+def test_a_path_leads_from_each_room_to_all_others():
+    """On a grid of 0.2 m, with 0.2 m to all walls, in 100 buildings."""
+    plugin = Rooms(count=(3, 2))
+    sim = build(plugin, 100, 1)
+    x, y = np.meshgrid(np.arange(-5.9, 6, 0.2), np.arange(-3.9, 4, 0.2), indexing="ij")
+    points = jnp.broadcast_to(np.float32(np.stack([x, y, x * 0 + 1], axis=-1).reshape(-1, 3)), (100, x.size, 3))
+    gap = np.asarray(jax.jit(plugin.clearance)(sim.data, points)).reshape(100, *x.shape)
+    in_layer = np.zeros((3, 3, 3))
+    in_layer[1] = ndimage.generate_binary_structure(2, 1)
+    area, _ = ndimage.label(gap >= 0.2, in_layer)
+    middles = area[:, [10, 30, 50]][:, :, [10, 30]].reshape(100, -1)
+    assert middles.min() > 0
+    np.testing.assert_array_equal(middles, middles[:, :1].repeat(6, axis=1))
+    np.testing.assert_allclose(np.mean(gap < 0.05), np.mean(gap[0] < 0.05), rtol=0.02)
+    door_at = [np.argmax(gap[k, 20, :20] > 0.4) for k in range(100)]
+    assert len(set(door_at)) > 2
+
+
+BAD = {
+    "widths": (lambda: Pillars(widths=(0.8, 0.3)), "expected the smallest before the largest size of 'pillars'"),
+    "pillars": (lambda: Pillars(density=2.0), "Use a lower density, or a smaller gap"),
+    "sizes": (lambda: Clutter(sizes=(0.5, 0.2)), "expected sizes as smallest and largest"),
+    "clutter": (lambda: Clutter(density=2.0), "Use a lower density, or a smaller gap"),
+    "mesh": (lambda: Clutter(meshes=[[0.0, 1.0]]), r"expected a mesh as corners \(n, 3\)"),
+    "gates": (lambda: Gates(start=(0, 0, 0.5)), "expected gates above the floor"),
+    "rooms": (lambda: Rooms(room=1.5, door=1.0), "expected rooms at least twice as wide as a door"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_law_09_wrong_settings_are_errors(what):
+    make, message = BAD[what]
+    with pytest.raises(ConfigError, match=message):
+        make()
