@@ -30,7 +30,8 @@ QUARTER_TURN = np.pi / 2
 MIN_THRUST_TO_WEIGHT = 1.5
 """Thrust over weight below which a warning is given (dimensionless)."""
 MIN_AUTHORITY = {"roll": 4.0, "pitch": 4.0, "yaw": 0.2}
-"""Angular acceleration in hover below which a warning is given, rad/s^2: the least of the airframes in the tests."""
+"""Angular acceleration under controller ``auto`` below which a warning is given, rad/s^2: the least of the airframes in
+the tests."""
 MAX_PRECESSION_RATIO = 2.5
 """Ratio of the precession rate to the bandwidth of the attitude loop above which ``auto`` may be unstable
 (dimensionless). Of 1,960 random airframes with an odd number of rotors, all with ratios up to 2.45 fly, and the one
