@@ -263,11 +263,8 @@ def _collect_samples(
             reward + discount * jnp.where(truncated, final_values, 0.0),
             jnp.broadcast_to(done, reward.shape),
         )
-        return (
-            sample,
-            raw_obs,
-            (reward, terminated, error),
-        )  # a mean in each step would need an exchange between devices in each
+        # Not their means, which devices would have to exchange in each step.
+        return sample, raw_obs, (reward, terminated, error)
 
     initial_memory = _initial_memories(agents.network, learner.env)
     state, memory, (samples, raw_obs, (reward, terminated_counts, error)) = rollout(

@@ -47,8 +47,6 @@ VIEW_RANGE = 8.0
 """Distance beyond which trees do not matter, m."""
 PRIVILEGED_TREES = 4
 """Number of nearest trees that a privileged critic sees."""
-DRONE_RANGE = 3.0
-"""Distance beyond which other drones do not matter, m."""
 
 
 class Passage(PyTree):

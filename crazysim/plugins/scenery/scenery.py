@@ -30,8 +30,6 @@ from crazysim.pytree import PyTree, device_array, leaf
 
 HIDDEN_DEPTH = 100.0
 """Depth below their places of obstacles that a layout leaves out, m."""
-UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-"""Attitude of obstacles that are not turned, xyzw."""
 MIN_REACH = 1e-3
 """Length of a region below which an obstacle counts as standing still, m."""
 MAX_OBSTACLES = 10_000
