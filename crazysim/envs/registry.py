@@ -113,7 +113,8 @@ def make(
         randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
             ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
         camera: Camera or lidar whose images the drones observe in addition, or several; see ``CameraImages``. None for
-            the camera of the task, which few tasks have, and whose depth images are ``"depth"``; ``()`` for no images.
+            the camera of the task, which few tasks have, and whose images are named ``"depth"`` and so on by output;
+            ``()`` for no images.
         depth_image: Width and height in pixels of depth images that the drones observe as ``"depth"``, short for a
             ``Camera`` that takes one in every step, which takes the place of the task's. None for no such images.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
@@ -157,7 +158,7 @@ def make(
             env = CameraImages(env, source)  # type: ignore[arg-type]  # checked there
     if depth_image is None:
         own_camera = task.policy_camera() if camera is None else None
-        return env if own_camera is None else CameraImages(env, own_camera, {"depth": "depth"})
+        return env if own_camera is None else CameraImages(env, own_camera, {x: x for x in own_camera.outputs})
     if not isinstance(depth_image, (tuple, list)) or len(depth_image) != 2:
         raise ConfigError(
             f"expected depth_image as width and height in pixels, got {short_repr(depth_image)}. Try (16, 12)."

@@ -153,7 +153,7 @@ class Task:
         return None
 
     def policy_camera(self) -> ImageSensor | None:
-        """Return the camera of every drone whose depth images policies need; None for none. ``make`` adds it."""
+        """Return the camera of every drone whose images policies need; None for none. ``make`` adds it."""
         return None
 
     def succeeded(self, data: SimData) -> Array | None:

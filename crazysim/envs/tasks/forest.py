@@ -20,7 +20,7 @@ from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.goals import install_rules, nearest_entries, on_floor, with_record
+from crazysim.envs.tasks.goals import install_rules, motion_of, nearest_entries, on_floor, to_heading, with_record
 from crazysim.plugins.scenery.forest import Forest as Trees
 from crazysim.plugins.sensors.camera import Camera
 from crazysim.pytree import PyTree, device_array, leaf
@@ -188,18 +188,12 @@ class Forest(Task):
 
         Horizontal vectors are in the frame of the heading: ahead, left, up.
         """
-        s, offset = data.states, passage_of(data).goal - data.states.pos
+        offset = passage_of(data).goal - data.states.pos
         distance = rotation.safe_norm(offset)
-        ahead, _ = rotation.heading(s.quat)
-        obs = {
-            "ang_vel": s.ang_vel,
-            "goal_direction": _to_heading(data, offset / jnp.maximum(distance, 1e-3)),
+        obs = motion_of(data) | {
+            "goal_direction": to_heading(data, offset / jnp.maximum(distance, 1e-3)),
             "goal_distance": distance,
-            "heading": ahead[..., :2],
-            "heading_vel": _to_heading(data, s.vel),
-            "height": s.pos[..., 2:],
-            "offset": s.pos[..., 1:2],
-            "up": rotation.matrix(s.quat)[..., 2, :],
+            "offset": data.states.pos[..., 1:2],
         }
         if self.trees_seen:
             obs["trees_near"] = self.nearest_trees(data, self.trees_seen).reshape(data.core.n_drones, -1)
@@ -254,10 +248,3 @@ class Forest(Task):
 def passage_of(data: SimData) -> Passage:
     """Return the task's record."""
     return data.plugins[NAME]
-
-
-def _to_heading(data: SimData, vector: Array) -> Array:
-    """Return a vector of the world frame along the heading of each drone: ahead, left, up. (..., 3)"""
-    ahead, left = rotation.heading(data.states.quat)
-    parts = [jnp.sum(vector * axis, axis=-1) for axis in (ahead, left)]
-    return jnp.stack([*parts, vector[..., 2]], axis=-1)

@@ -106,6 +106,32 @@ def state_of(data: SimData) -> dict[str, Array]:
     }
 
 
+def motion_of(data: SimData) -> dict[str, Array]:
+    """Return attitude, velocities and height, the observations of tasks that are flown by a camera.
+
+    ``heading`` is the horizontal unit vector along the yaw, world frame, x and y; ``heading_vel`` the velocity along
+    the heading: ahead, left, up, m/s; ``up`` the upward unit vector, body frame; ``ang_vel`` in rad/s; ``height`` in m.
+
+    Returns:
+        (..., n_drones, k) each
+    """
+    s = data.states
+    return {
+        "ang_vel": s.ang_vel,
+        "heading": rotation.heading(s.quat)[0][..., :2],
+        "heading_vel": to_heading(data, s.vel),
+        "height": s.pos[..., 2:],
+        "up": rotation.matrix(s.quat)[..., 2, :],
+    }
+
+
+def to_heading(data: SimData, vector: Array) -> Array:
+    """Return a vector of the world frame along the heading of each drone: ahead, left, up. (..., 3)"""
+    ahead, left = rotation.heading(data.states.quat)
+    parts = [jnp.sum(vector * axis, axis=-1) for axis in (ahead, left)]
+    return jnp.stack([*parts, vector[..., 2]], axis=-1)
+
+
 def on_floor(data: SimData) -> Array:
     """Return true where a drone is on the floor or below. (..., n_drones)"""
     return data.states.pos[..., 2] < FLOOR
