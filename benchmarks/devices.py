@@ -1,13 +1,14 @@
 """Rates on several devices beside those on one: physics, environments, training, gradients and depth images.
 
-    python benchmarks/devices.py [--device gpu] [--devices 1 2] [--cases physics PPO] [--processes 12] [--small]
+    python benchmarks/devices.py [--device gpu] [--devices 1 2] [--hosts 2] [--cases physics PPO] [--processes 12]
 
 The worlds of each device are the same for any number of devices (weak scaling), except for ``seeds``: sixteen seeds are
 divided among the devices. One JSON line for each case and number of devices: the rate, its ratio to that on the
 first number of devices, the bytes that the devices exchange in a call and the memory of its program on a device, both
 from the compiled program, and the compile time. With ``--processes`` several cases are compiled at the same time, in
-processes of their own, and then timed one after another. The line ``weights`` compares the weights of PPO after three
-iterations. ``--small`` is for a try on CPUs, with ``XLA_FLAGS=--xla_force_host_platform_device_count=4``.
+processes of their own, and then timed one after another. With ``--hosts`` the largest number of devices is measured
+once more, divided among processes that ``jax.distributed`` connects. The line ``weights`` compares the weights of PPO
+after three iterations. ``--small`` is for a try on CPUs, with ``XLA_FLAGS=--xla_force_host_platform_device_count=4``.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import multiprocessing
+import os
+import socket
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stdout
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -29,6 +32,7 @@ from measure import digits, hovering, medians, report
 import crazysim.envs as envs
 from crazysim import Sim, __version__
 from crazysim.core import functional, world_mesh
+from crazysim.core.sharding import distribute
 from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.train import apg, ppo
@@ -80,11 +84,43 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--small", action="store_true", help="few worlds and steps, for a try")
     parser.add_argument("--processes", type=int, default=1, help="cases that are compiled at the same time")
+    parser.add_argument("--hosts", type=int, default=1, help="processes among which the devices are divided at last")
     args = parser.parse_args()
-    if args.processes == 1:
+    n_hosts, args.hosts = args.hosts, 1
+    if args.processes > 1:
+        run_in_processes(args)
+    else:
         for name in args.cases:
             run(name, args)
-        return
+    if n_hosts > 1:
+        args.hosts, args.devices = n_hosts, [max(args.devices)]
+        args.cases = [name for name in args.cases if name != WEIGHTS]
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            address = f"127.0.0.1:{free.getsockname()[1]}"
+        context = multiprocessing.get_context("spawn")
+        hosts = [context.Process(target=run_on_host, args=(i, address, args)) for i in range(n_hosts)]
+        for process in hosts:
+            process.start()
+        for process in hosts:
+            process.join()
+        if any(process.exitcode for process in hosts):
+            raise SystemExit("a host failed; the errors are above")
+
+
+def run_on_host(i: int, address: str, args: argparse.Namespace) -> None:
+    """Run all cases as one of the processes that share the devices; the first one prints the lines."""
+    n_devices = args.devices[0] // args.hosts
+    if args.device == "cpu":
+        os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={n_devices}"
+    jax.distributed.initialize(address, args.hosts, i, list(range(i * n_devices, (i + 1) * n_devices)))
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere) if i else nullcontext():
+        for name in args.cases:
+            run(name, args)
+
+
+def run_in_processes(args: argparse.Namespace) -> None:
+    """Run the cases in processes of their own, several of which compile at the same time."""
     context = multiprocessing.get_context("spawn")
     failed = []
     for k in range(0, len(args.cases), args.processes):
@@ -164,7 +200,7 @@ def measure(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None
         text, memory = case.call.as_text(), case.call.memory_analysis()
         n_bytes = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
         report(
-            args.device, benchmark="devices", case=name, n_devices=n, unit=size.unit,
+            args.device, benchmark="devices", case=name, n_devices=n, n_hosts=args.hosts, unit=size.unit,
             n_worlds=size.small if args.small else size.n_worlds, call_s=digits(call_times[n]), rate=digits(rates[n]),
             ratio=digits(rates[n] / rates[args.devices[0]]),
             exchanged=exchanged_bytes(text), memory_bytes=n_bytes - memory.alias_size_in_bytes,
@@ -198,10 +234,10 @@ def rollouts(
     n_steps = small_size or 50
     env = envs.AutoReset(envs.make(task, n_worlds, **device_options))
     replicated = replicated_sharding(env.sim)
-    state = jax.jit(env.reset)(jax.device_put(jax.random.key(0), replicated))
+    state = jax.jit(env.reset)(distribute(jax.random.key(0), replicated))
     shape, n_obs = state.action.shape, flatten(state.obs).shape[-1]
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, env.actions.size), 0.01))
-    policy = jax.device_put(policy, replicated)
+    policy = distribute(policy, replicated)
 
     def run(carry: Any, policy: Any) -> Any:
         def act(obs: Any, memory: Any, key: Any) -> Any:
@@ -214,7 +250,7 @@ def rollouts(
         state, _, transitions = envs.rollout(env, state, act, rollout_key, n_steps)
         return (state, key), transitions
 
-    carry = state, jax.device_put(jax.random.key(2), replicated)
+    carry = state, distribute(jax.random.key(2), replicated)
     return compile_case(jax.jit(run), carry, policy, work=n_worlds * n_steps, carries=True)
 
 
@@ -227,7 +263,7 @@ def training(
     base = envs.make("hover", n_seeds * n_worlds, **device_options)
     env, recipes = envs.AutoReset(base) if algorithm is ppo else base, (recipe,) * n_seeds
     replicated = replicated_sharding(base.sim)
-    keys = jax.device_put(jax.random.split(jax.random.key(0), n_seeds), replicated)
+    keys = distribute(jax.random.split(jax.random.key(0), n_seeds), replicated)
     shapes = jax.eval_shape(partial(algorithm.init, env, recipes), keys)
     shardings = learner_shardings(shapes, base.sim, n_seeds)
     learner = jax.jit(algorithm.init, static_argnums=(0, 1), out_shardings=shardings)(env, recipes, keys)

@@ -497,7 +497,7 @@ FIGURES: dict[str, Figure] = {
     "devices": Figure(
         "docs/guides/devices.md",
         (*ENVS, *SCENE, "crazysim/train"),
-        gpu="devices.py --devices 1 2 --processes 12",
+        gpu="devices.py --devices 1 2 4 --processes 12 --hosts 2",
         table=tables.devices,
     ),
     "trainers": Figure(

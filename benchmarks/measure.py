@@ -42,10 +42,8 @@ def hovering(sim: Any, control: str) -> None:
     """
     n_worlds, n_drones = sim.n_worlds, sim.n_drones
     states = sim.data.states
-    pos, rotor_vel = np.array(states.pos), np.array(states.rotor_vel)
-    pos[..., 2], rotor_vel[...] = 1.0, 15864.0
-    to_device = lambda value: jax.device_put(np.float32(value), states.pos.sharding)  # noqa: E731
-    sim.data = sim.data.replace(states=states.replace(pos=to_device(pos), rotor_vel=to_device(rotor_vel)))
+    pos, rotor_vel = states.pos.at[..., 2].set(1.0), states.rotor_vel.at[:].set(15864.0)
+    sim.data = sim.data.replace(states=states.replace(pos=pos, rotor_vel=rotor_vel))
     command = np.asarray(COMMANDS[control](0.0434 * 9.81, 15864.0), np.float32)
     command = np.tile(command, (n_worlds, n_drones, 1))
     if control == "state":

@@ -354,23 +354,27 @@ def readme(records: list[Line]) -> str:
 
 
 def devices(lines: list[Line]) -> str:
-    """Return rates on numbers of devices, their ratios, and bytes, memory and compile time of the last number."""
-    cases: dict[str, dict[int, Line]] = {}
+    """Return rates on numbers of devices, their ratios, and bytes, memory and compile time of the last number.
+
+    The last column of rates is of several hosts, if they were measured.
+    """
+    cases: dict[str, dict[tuple[int, int], Line]] = {}
     for line in lines:
         if "rate" in line:
-            cases.setdefault(line["case"], {})[line["n_devices"]] = line
-    numbers = sorted({n for case in cases.values() for n in case})
-    head = ["", "Worlds", *(f"{n} device{'s' * (n > 1)}" for n in numbers), "Ratio", "Bytes", "Memory", "Compile time"]
+            cases.setdefault(line["case"], {})[line["n_hosts"], line["n_devices"]] = line
+    columns = sorted({column for case in cases.values() for column in case})
+    names = [f"{n} device{'s' * (n > 1)}" + f" of {n_hosts} processes" * (n_hosts > 1) for n_hosts, n in columns]
     rows = []
     for name, case in cases.items():
-        last = case[max(case)]
-        rates = [si(case[n]["rate"]) if n in case else "" for n in numbers]
+        last = case[max(column for column in case if column[0] == 1)]
+        rates = [si(case[column]["rate"]) if column in case else "" for column in columns]
         sizes = sum(last["exchanged"].values()), last["memory_bytes"]
         exchanged, memory = (f"{x} B" if x < 1000 else f"{si(x)}B" for x in sizes)
         worlds = f"{worlds_of(last)} a {'seed' if name.startswith('seeds') else 'device'}"
-        facts = [f"{last['ratio']:.3g}", exchanged, memory, duration(last["compile_s"])]
+        ratios = [f"{line['ratio']:.3g}" for (n_hosts, n), line in sorted(case.items()) if n_hosts == 1 and n > 1]
+        facts = [", ".join(ratios), exchanged, memory, duration(last["compile_s"])]
         rows.append([f"{name}, {last['unit']} a second", worlds, *rates, *facts])
-    text = table_of(head, rows)
+    text = table_of(["", "Worlds", *names, "Ratios", "Bytes", "Memory", "Compile time"], rows)
     for line in lines:
         if "difference" in line:
             text += (

@@ -1,4 +1,4 @@
-"""Outputs and gradients of tanh networks by one CUDA kernel each, for PPO on one NVIDIA GPU of the Hopper architecture.
+"""Outputs and gradients of tanh networks by one CUDA kernel each, for PPO on NVIDIA GPUs of the Hopper architecture.
 
 XLA writes the activations of every layer to memory and reads them again, which takes most of the time of an update.
 Here a warp computes all layers of 16 samples in its registers. For gradients it computes the activations again; each
@@ -17,16 +17,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh, PartitionSpec
 
 from crazysim import jaxcompat
+from crazysim.core.sharding import WORLD_AXIS
 from crazysim.engine.backends import cuda
-from crazysim.train.networks import MEMORYLESS, Layers, Network, mlp
+from crazysim.train.networks import MEMORYLESS, ApplyLayers, Layers, Network, mlp
 
 MAX_WIDTH, MAX_UNITS, MAX_LAYERS = 128, 64, 4
 """Largest number of inputs or outputs, of units of a hidden layer, and of layers."""
@@ -280,18 +282,42 @@ def cuda_source(sizes: tuple[int, ...], gradient: bool) -> tuple[str, int]:
     return "\n".join(text), ends[-1]
 
 
-def choose_mlp(network: Network, device: jax.Device, n_devices: int = 1) -> Callable[[Layers, Array], Array]:
-    """Return ``apply_mlp`` where its kernels run and its inputs are constants, otherwise ``mlp``.
+def choose_mlp(network: Network, device: jax.Device, mesh: Mesh | None = None, n_seeds: int = 1) -> ApplyLayers:
+    """Return a function that runs the kernels, on each device for its own samples; ``mlp`` where they cannot be used.
 
     Args:
         network: Network before the layers; one with weights needs gradients with respect to its features, which kernels
             do not give.
         device: Device of the training.
-        n_devices: Number of devices of the training; XLA does not distribute kernels over several.
+        mesh: Devices of a training on several.
+        n_seeds: Number of seeds. Of several that cannot be divided among the devices, XLA computes the networks.
     """
-    is_usable = network is MEMORYLESS and n_devices == 1 and not jaxcompat.FALLBACKS and device.platform == "gpu"
+    is_usable = network is MEMORYLESS and not jaxcompat.FALLBACKS and device.platform == "gpu"
     is_usable = is_usable and jaxcompat.compute_capability(device) == CAPABILITY and cuda.nvrtc() is not None
-    return apply_mlp if is_usable else mlp
+    if mesh is None or n_seeds % mesh.size == 0:
+        return apply_mlp if is_usable else mlp
+    return DistributedMlp(mesh) if is_usable and n_seeds == 1 else mlp
+
+
+class DistributedMlp(NamedTuple):
+    """``apply_mlp`` on the devices of a mesh, each for the samples of its own worlds."""
+
+    mesh: Mesh
+    """The devices."""
+
+    def __call__(self, layers: Layers, x: Array) -> Array:
+        """Return the outputs, (..., n_out), for inputs (n_steps, n_groups, k, n_drones, n_in) or (n_worlds, ..., n_in).
+
+        The second axis of a minibatch, groups of worlds, or the first axis of other inputs is distributed; if the
+        devices do not divide it, XLA computes the outputs.
+        """
+        axis = 1 if x.ndim == 5 else 0
+        if x.shape[axis] % self.mesh.size:
+            return mlp(layers, x)
+        over_worlds = PartitionSpec(*[None] * axis, WORLD_AXIS)
+        specs = (PartitionSpec(), over_worlds)
+        apply = jax.shard_map(apply_mlp, mesh=self.mesh, in_specs=specs, out_specs=over_worlds, check_vma=False)
+        return apply(layers, x)
 
 
 def apply_mlp(layers: Layers, x: Array) -> Array:

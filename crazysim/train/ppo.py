@@ -176,7 +176,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     state = env.reset(k_env)
     policy_obs = _policy_obs(state.obs, config)
     network = choose_network(config.memory, network, config.convolution, _find_images(env, policy_obs, config))
-    apply_layers = choose_mlp(network, env.sim.device, 1 if env.sim.mesh is None else env.sim.mesh.size)
+    apply_layers = choose_mlp(network, env.sim.device, env.sim.mesh, len(configs))
     n_obs = flatten(policy_obs).shape[-1]
 
     def init_agent(k_policy: Array, k_value: Array, key: Array, obs: Array) -> Agent:
@@ -208,7 +208,9 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     blocks = split_blocks((learner.memory, final_critic_inputs), len(configs))
     update_agent = partial(_update_agent, config=configs[0])
     axes = (0, 1, 1, 0, 0, 0, 0)
-    agents, losses = for_each_seed(update_agent, agents, samples, raw_obs, *blocks, rates, k_learn, axes=axes)
+    agents, losses = for_each_seed(
+        update_agent, agents, samples, raw_obs, *blocks, rates, k_learn, axes=axes, mesh=env.sim.mesh
+    )
     return Learner(agents, state, memory, learner.iteration + 1), metrics | losses
 
 
@@ -233,7 +235,7 @@ def _collect_samples(
 
     def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:
         raw_obs, memory = split_seeds((_critic_obs(obs, config), memory))
-        action, memory, extras = for_each_seed(act, agents, raw_obs, memory, keys)
+        action, memory, extras = for_each_seed(act, agents, raw_obs, memory, keys, mesh=env.sim.mesh)
         return join_blocks(action), join_blocks(memory), (action, *extras)
 
     def record_transition(transition: Transition) -> tuple[Sample, Array, Any]:
@@ -252,7 +254,11 @@ def _collect_samples(
             return _value(agent, agent.stats.normalize(raw_obs), memory, config)[0]
 
         final_values = for_each_seed(
-            compute_final_value, agents, split_seeds(_critic_obs(transition.final_obs, config)), memory
+            compute_final_value,
+            agents,
+            split_seeds(_critic_obs(transition.final_obs, config)),
+            memory,
+            mesh=env.sim.mesh,
         )
         discount = rates["discount"][:, None, None]
         sample = Sample(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
+from crazysim.core.sharding import WORLD_AXIS
 from crazysim.pytree import float_dtype
 from crazysim.train.hyperparameters import SWEEPABLE
 
@@ -36,7 +39,7 @@ def join_blocks(tree: T) -> T:
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tree)
 
 
-def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | int = 0) -> Any:
+def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | int = 0, mesh: Mesh | None = None) -> Any:
     """Return the results of a function of one seed for all seeds, stacked along their first axis.
 
     A single seed is computed without ``jax.vmap``, so that it is the same program as the function itself.
@@ -45,9 +48,17 @@ def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | in
         fn: Function that takes the arguments of one seed.
         args: Arguments of all seeds: pytrees whose arrays are stacked along an axis of seeds.
         axes: Index of this axis: one for all arguments, or one for each.
+        mesh: Devices among which the seeds are divided, each of which computes its own; None to leave the distribution
+            to XLA. If the number of seeds is no multiple of the devices, XLA distributes the computation, too.
     """
     axes = (axes,) * len(args) if isinstance(axes, int) else axes
-    if jax.tree.leaves(args[0])[0].shape[axes[0]] > 1:
+    n_seeds = jax.tree.leaves(args[0])[0].shape[axes[0]]
+    if mesh is not None and n_seeds % mesh.size == 0:
+        specs = tuple(PartitionSpec(*[None] * axis, WORLD_AXIS) for axis in axes)
+        fn_of_device = partial(for_each_seed, fn, axes=axes)
+        out_specs = PartitionSpec(WORLD_AXIS)
+        return jax.shard_map(fn_of_device, mesh=mesh, in_specs=specs, out_specs=out_specs, check_vma=False)(*args)
+    if n_seeds > 1:
         return jax.vmap(fn, in_axes=axes)(*args)
     squeezed_args = [
         jax.tree.map(lambda x, axis=axis: x.squeeze(axis), arg) for arg, axis in zip(args, axes, strict=True)

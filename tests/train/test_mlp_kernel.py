@@ -4,6 +4,8 @@ import ctypes
 import re
 import subprocess
 import sys
+import threading
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crazysim.core.sharding import world_mesh
 from crazysim.engine.backends import cuda
 from crazysim.train import mlp_kernel
-from crazysim.train.mlp_kernel import CAPABILITY, INTRINSICS, apply_mlp, choose_mlp, cuda_source
+from crazysim.train.mlp_kernel import CAPABILITY, INTRINSICS, DistributedMlp, apply_mlp, choose_mlp, cuda_source
 from crazysim.train.networks import MEMORYLESS, gru_network, init_mlp, mlp
 
 HOST = Path(__file__).with_name("gpu_on_host.h")
@@ -48,12 +51,14 @@ def compile_for_host(tmp_path_factory):
 @pytest.fixture
 def on_host(monkeypatch, compile_for_host):
     """Kernels run on the host."""
+    lock = threading.Lock()
 
     def run_kernel(source, name, grid, arrays, result):
         def run(*arrays):
             arrays = [np.ascontiguousarray(x) for x in arrays] + [np.full(result.shape, np.nan, result.dtype)]
             pointers = (ctypes.c_void_p * len(arrays))(*(x.ctypes.data for x in arrays))
-            compile_for_host(source, name, grid[2])(pointers, grid[0], grid[1])
+            with lock:  # the threads on the host are static variables
+                compile_for_host(source, name, grid[2])(pointers, grid[0], grid[1])
             return arrays[-1]
 
         return jax.pure_callback(run, result, *arrays)
@@ -90,6 +95,24 @@ def test_outputs_and_gradients_of_the_kernels_are_those_of_jax(on_host, sizes):
             assert np.linalg.norm(of_a - of_b) < 3e-3 * np.linalg.norm(of_b)  # 11 bits
 
 
+@pytest.mark.parametrize("shape", [(8, 5, 13), (3, 4, 2, 5, 13), (6, 5, 13)])
+def test_each_device_runs_the_kernels_for_its_own_worlds(on_host, shape):
+    """Inputs of worlds, and of a minibatch with groups of worlds; six worlds cannot be divided among four devices."""
+    apply_distributed = DistributedMlp(world_mesh(jax.devices()[:4]))
+    layers = jax.tree.map(lambda x: x[0], networks((13, 16, 3), 1))
+    x = jax.random.normal(jax.random.key(1), shape)
+    cotangent = jax.random.normal(jax.random.key(2), (*shape[:-1], 3))
+
+    @partial(jax.jit, static_argnums=0)
+    def compute_outputs_and_gradients(apply):
+        out, backward = jax.vjp(lambda layers: apply(layers, x), layers)
+        return out, backward(cotangent)[0]
+
+    found, expected = (jax.tree.leaves(compute_outputs_and_gradients(apply)) for apply in (apply_distributed, mlp))
+    for a, b in zip(found, expected, strict=True):
+        assert np.linalg.norm(a - b) < 3e-3 * np.linalg.norm(b)  # 11 bits
+
+
 def test_gradients_of_zeros_are_zero_and_inputs_get_none(on_host):
     layers = jax.tree.map(lambda x: x[0], networks((13, 48, 32, 3), 1))
     x = jnp.ones((5, 13))
@@ -124,12 +147,15 @@ def test_other_dtypes_are_computed_by_xla():
     np.testing.assert_array_equal(apply_mlp(layers, x), mlp(layers, x))
 
 
-def test_kernels_are_used_on_one_h100_without_a_network_before_the_layers(monkeypatch):
+def test_kernels_are_used_on_h100s_without_a_network_before_the_layers(monkeypatch):
     monkeypatch.setattr(cuda, "nvrtc", lambda: "found")
     assert choose_mlp(MEMORYLESS, H100) is apply_mlp
     assert choose_mlp(MEMORYLESS, jax.devices("cpu")[0]) is mlp
     assert choose_mlp(MEMORYLESS, SimpleNamespace(platform="gpu", compute_capability="8.9")) is mlp
-    assert choose_mlp(MEMORYLESS, H100, 2) is mlp
+    mesh = world_mesh(jax.devices()[:2])
+    assert choose_mlp(MEMORYLESS, H100, mesh) == DistributedMlp(mesh)
+    assert choose_mlp(MEMORYLESS, H100, mesh, 4) is apply_mlp
+    assert choose_mlp(MEMORYLESS, H100, mesh, 3) is mlp
     assert choose_mlp(gru_network(8), H100) is mlp
     monkeypatch.setattr(cuda, "nvrtc", lambda: None)
     assert choose_mlp(MEMORYLESS, H100) is mlp
