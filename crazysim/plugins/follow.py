@@ -27,7 +27,7 @@ MIN_SLOT_DEGREE = 7
 DRAWN_TIME = 2.0
 """Time of the path ahead that is drawn, s."""
 N_DRAWN_LINES = 40
-"""Number of line segments of that path."""
+"""Number of line segments of the drawn path."""
 PATH_COLOR = (0.1, 0.9, 0.3, 0.8)
 """Colour of paths and setpoints, rgba."""
 
@@ -44,7 +44,7 @@ class FollowData(PyTree):
     index: Array = leaf("parameter", 1, (1,))
     """Slot that a drone follows. (1,)"""
     start: Array = leaf("parameter", 1, (1,))
-    """Time of the world at which a drone starts, s. (1,)"""
+    """Time since the reset of the world at which a drone starts, s. (1,)"""
     rate: Array = leaf("parameter", 1, (1,))
     """Speed at which a drone goes through its trajectory, 1: at 2 it takes half the time. (1,)"""
     degrees: tuple[int, ...] = static()
@@ -162,8 +162,8 @@ class Follow(Plugin):
                 f"{degrees}. Use Follow(..., n_slots=...) to keep room for others."
             )
         leaves = jax.tree.leaves(trajectory.padded(n_pieces, n_coefficients - 1))
-        old = [record.ends, record.coefficients, record.repeats]
-        ends, coefficients, repeats = _replace_slot(old, leaves, np.int32(slot))
+        old_arrays = [record.ends, record.coefficients, record.repeats]
+        ends, coefficients, repeats = _replace_slot(old_arrays, leaves, np.int32(slot))
         return self.write(data, record.replace(ends=ends, coefficients=coefficients, repeats=repeats))
 
     def upload(self, sim: Simulation, slot: int, trajectory: Trajectory) -> None:
@@ -188,8 +188,8 @@ class Follow(Plugin):
         Args:
             sim: The simulation.
             index: Slots. (), (n_drones,) or (n_worlds, n_drones)
-            start: Times of the worlds at which the drones start, s; may be negative. (), (n_drones,) or (n_worlds,
-                n_drones)
+            start: Times since the reset of the worlds at which the drones start, s; may be negative. (), (n_drones,) or
+                (n_worlds, n_drones)
             rate: Speeds at which they go through their trajectories, 1. (), (n_drones,) or (n_worlds, n_drones)
         """
         new = {name: value for name, value in (("index", index), ("start", start), ("rate", rate)) if value is not None}
@@ -205,11 +205,11 @@ class Follow(Plugin):
             return
         record = self.read(sim.data)
         now = float(sim.data.core.steps[world, 0]) / sim.data.core.freq
-        of_drones = [
+        slot_values = [
             np.broadcast_to(np.asarray(x)[world] if np.ndim(x) > 1 else np.asarray(x), (sim.n_drones, 1))
             for x in (record.index, record.start, record.rate)
         ]
-        paths = np.asarray(_future_paths(record, of_drones, now + np.linspace(0.0, DRAWN_TIME, N_DRAWN_LINES + 1)))
+        paths = np.asarray(_future_paths(record, slot_values, now + np.linspace(0.0, DRAWN_TIME, N_DRAWN_LINES + 1)))
         overlays = sim.scene.renderer.overlays
         overlays.points(paths[:, 0], PATH_COLOR, 0.02)
         for path in paths:
@@ -217,7 +217,7 @@ class Follow(Plugin):
                 overlays.line(path, PATH_COLOR, 2.0, 2.0)
 
     def _trajectory_list(self) -> list[Trajectory]:
-        """Return the given trajectories, one by one."""
+        """Return the setting ``trajectories`` as a list of single trajectories."""
         trajectories = self.trajectories
         trajectories = trajectories.unstacked() if isinstance(trajectories, Trajectory) else trajectories
         if not trajectories or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in trajectories):
@@ -246,16 +246,22 @@ def _check_count(name: str, value: object, minimum: int) -> int:
 
 
 @jax.jit
-def _replace_slot(old: list[Array], new: list[Array], slot: Array) -> list[Array]:
-    return [x.at[slot].set(y) for x, y in zip(old, new, strict=True)]
+def _replace_slot(old_arrays: list[Array], new_arrays: list[Array], slot: Array) -> list[Array]:
+    return [x.at[slot].set(y) for x, y in zip(old_arrays, new_arrays, strict=True)]
 
 
 @jax.jit
-def _future_paths(record: FollowData, slots: list[Array], times: Array) -> Array:
-    """Return the positions of all drones of a world at several times. (n_drones, n_times, 3)"""
+def _future_paths(record: FollowData, slot_values: list[Array], times: Array) -> Array:
+    """Return the positions of all drones of a world at several times. (n_drones, n_times, 3)
+
+    Args:
+        record: The trajectories.
+        slot_values: Index, start and rate of every drone. (n_drones, 1) each
+        times: Times of the world, s. (n_times,)
+    """
 
     def drone_path(index: Array, start: Array, rate: Array) -> Array:
         vehicle = record.replace(index=index, start=start, rate=rate)
         return jax.vmap(lambda t: vehicle.setpoint(t).pos)(times)
 
-    return jax.vmap(drone_path)(*slots)
+    return jax.vmap(drone_path)(*slot_values)

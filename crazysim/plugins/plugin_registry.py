@@ -49,7 +49,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._sim = sim
         self._installed: dict[str, _Installed] = {}
         self._move_objects: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
-        self._observing: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
+        self._observe_fn: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
         self._checked = True
 
     def __getitem__(self, name: str) -> Plugin:
@@ -86,7 +86,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             raise ConfigError(f"data.plugins already has a record {name!r}. Use sim.add(..., name=...).")
         self._require_names(plugin, self._sim.names)
         self._require_terms(plugin, self.values())
-        with self._unchanged_on_error():
+        with self._restore_on_error():
             record, default = plugin.record(self._sim), plugin.default_record(self._sim)
             pipeline, installed = _add_stages(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
             pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
@@ -113,21 +113,21 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     def replace(self, plugin: P) -> P:
         """Replace the settings of a plugin; see ``Sim.replace``."""
-        with self._unchanged_on_error():
+        with self._restore_on_error():
             return self._replace_plugin(plugin)
 
     def _replace_plugin(self, plugin: P) -> P:
-        before = self[plugin.name]
-        if type(before) is not type(plugin):
+        old_plugin = self[plugin.name]
+        if type(old_plugin) is not type(plugin):
             raise ConfigError(
-                f"expected a {type(before).__name__} to replace {plugin.name!r}, got a {type(plugin).__name__}. Use "
-                f"sim.remove({plugin.name!r}) first, or another name=."
+                f"expected a {type(old_plugin).__name__} to replace {plugin.name!r}, got a {type(plugin).__name__}. "
+                f"Use sim.remove({plugin.name!r}) first, or another name=."
             )
         sim, name = self._sim, plugin.name
-        self._require_names(plugin, [other for other in sim.names if other not in self.members_of(before)])
-        self._require_terms(plugin, [other for other in self.values() if other is not before])
+        self._require_names(plugin, [other for other in sim.names if other not in self.members_of(old_plugin)])
+        self._require_terms(plugin, [other for other in self.values() if other is not old_plugin])
         old_record, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
-        if _have_same_code(before, plugin) and jax.tree.structure(old_record) == jax.tree.structure(record):
+        if _have_same_code(old_plugin, plugin) and jax.tree.structure(old_record) == jax.tree.structure(record):
             self._put_records(name, _continue_states(record, old_record), default)
             self._installed[name] = self._installed[name]._replace(plugin=plugin)
             self._checked = False
@@ -137,9 +137,9 @@ class PluginRegistry(Mapping[str, Plugin]):
         pipeline, installed = _add_stages(dict(sim.step_pipeline), plugin, _placements(plugin, sim))
         pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
         resets = dict(self._sim.reset_pipeline)
-        if _in_reset_pipeline(plugin) and (name in resets or not _in_reset_pipeline(before)):
+        if _in_reset_pipeline(plugin) and (name in resets or not _in_reset_pipeline(old_plugin)):
             resets[name] = Stage(plugin.reset_episode, plugin.scope)
-        elif _in_reset_pipeline(before):
+        elif _in_reset_pipeline(old_plugin):
             resets.pop(name, None)
         self._put_records(name, _continue_states(record, old_record), default)
         self._installed[name] = installed
@@ -147,11 +147,11 @@ class PluginRegistry(Mapping[str, Plugin]):
         return plugin
 
     @contextlib.contextmanager
-    def _unchanged_on_error(self) -> Iterator[None]:
+    def _restore_on_error(self) -> Iterator[None]:
         """Restore the simulation and its scene if an error ends the block."""
         sim, installed = self._sim, dict(self._installed)
         data, default, steps, resets = sim.data, sim.default_data, sim.step_pipeline, sim.reset_pipeline
-        with sim.scene.unchanged_on_error():
+        with sim.scene.restore_on_error():
             try:
                 yield
             except BaseException:
@@ -217,11 +217,11 @@ class PluginRegistry(Mapping[str, Plugin]):
             measured: True for observations that are calculated from the states as sensors measure them.
         """
         plugins = tuple(self.values())
-        first = [*map(id, plugins)] != [*map(id, self._observing[0])]
-        if first:
-            self._observing = plugins, jit_unless_traced("measured")(functools.partial(_observations, plugins))
-        with keep_programs(enabled=first):
-            return self._observing[1](data, measured=measured)
+        is_changed = [*map(id, plugins)] != [*map(id, self._observe_fn[0])]
+        if is_changed:
+            self._observe_fn = plugins, jit_unless_traced("measured")(functools.partial(_observations, plugins))
+        with keep_programs(enabled=is_changed):
+            return self._observe_fn[1](data, measured=measured)
 
     def measured_states(self, data: SimData) -> SimData:
         """Return the data of one world with the states that sensors measure in place of the true ones."""
@@ -276,7 +276,7 @@ def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
 
 
 def _placements(plugin: Plugin, sim: Simulation) -> object:
-    """Return the placements of a plugin's stages, after the one that resets it in the first step of an episode."""
+    """Return the placements of a plugin's stages, after the stage that resets it in the first step of an episode."""
     placements = plugin.stages(sim)
     if not plugin.resets_episode or not isinstance(placements, (list, tuple)):
         return placements
@@ -355,10 +355,10 @@ def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | 
     return pipeline
 
 
-def _have_same_code(before: Plugin, after: Plugin) -> bool:
+def _have_same_code(old_plugin: Plugin, new_plugin: Plugin) -> bool:
     """Return True if two plugins of one class differ at most in numbers of their records."""
-    static_settings = [name for name, setting in collect_settings(type(before)).items() if not setting.is_parameter]
-    return all(_are_equal(getattr(before, name), getattr(after, name)) for name in static_settings)
+    static_settings = [name for name, setting in collect_settings(type(old_plugin)).items() if not setting.is_parameter]
+    return all(_are_equal(getattr(old_plugin, name), getattr(new_plugin, name)) for name in static_settings)
 
 
 def _are_equal(a: Any, b: Any) -> bool:
@@ -372,13 +372,13 @@ def _are_equal(a: Any, b: Any) -> bool:
         return False
 
 
-def _continue_states(record: PyTree | None, before: PyTree | None) -> PyTree | None:
+def _continue_states(record: PyTree | None, old_record: PyTree | None) -> PyTree | None:
     """Return a record with the states of the previous record, wherever structure, shape and type agree."""
-    if record is None or type(record) is not type(before):
+    if record is None or type(record) is not type(old_record):
         return record
     states = {}
     for f in dataclasses.fields(record):  # type: ignore[arg-type]
-        new, old = getattr(record, f.name), getattr(before, f.name)
+        new, old = getattr(record, f.name), getattr(old_record, f.name)
         if isinstance(new, PyTree):
             states[f.name] = _continue_states(new, old)
         elif not f.metadata.get("static") and f.metadata.get("scope") not in _SETTING_SCOPES:

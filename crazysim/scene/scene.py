@@ -123,7 +123,7 @@ class Scene:
             mocap: True for objects that can be moved, in each world on their own; others stay at ``pos`` everywhere.
             **options: Settings of a primitive: lengths in m, ``rgba``. ``crazysim.scene.primitives`` lists them.
         """
-        with self.unchanged_on_error():
+        with self.restore_on_error():
             handle = self.added.add(self.spec, source, name, count, pos, quat, mocap, options)
         self.revision += 1
         return handle
@@ -180,7 +180,7 @@ class Scene:
             self.add(source, name, count=count, **options)
 
     @contextlib.contextmanager
-    def unchanged_on_error(self) -> Iterator[None]:
+    def restore_on_error(self) -> Iterator[None]:
         """Remove objects that were added within the block if an error ends the block."""
         snapshot = self.added.take_snapshot(self.spec)
         try:

@@ -46,7 +46,7 @@ class CameraImages(Wrapper):
         self._period = sim.freq // rate
         camera.check(sim, self._period)
         self._is_immediate = self._period == env.n_substeps and camera.latency == 0
-        self._take = camera.image_fn(sim)
+        self._take_images = camera.image_fn(sim)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -60,12 +60,12 @@ class CameraImages(Wrapper):
     def look(self, state: EnvState) -> EnvState:
         data, camera = state.data, self.camera
         if self._is_immediate:
-            images = self._take(data)
+            images = self._take_images(data)
         else:
             if self.name in state.memory:
-                record = camera.update(self._take, data, self.recall(state), self._period)
+                record = camera.update(self._take_images, data, self.recall(state), self._period)
             else:
-                record = camera.begin(self._take, data, self._period)
+                record = camera.initial_record(self._take_images, data, self._period)
             state, images = self.remember(state, record), record.images
         dtype, shape = data.states.pos.dtype, data.states.pos.shape[:2]
         flat = {self.names[name]: image.reshape(*shape, -1).astype(dtype) for name, image in images.items()}

@@ -27,8 +27,9 @@ from crazysim.pytree import PyTree, leaf
 
 HEIGHT_FREQ = 100
 """Updates of the height per second, Hz (estimator_complementary.c)."""
-KEEP_HEIGHT, KEEP_VELOCITY = 0.9, 0.995
-"""Share of the height, and of the velocity, that an update keeps (position_estimator_altitude.c)."""
+HEIGHT_WEIGHT, VELOCITY_DECAY = 0.9, 0.995
+"""Weight of the previous height in an update, and factor of the velocity in each update
+(position_estimator_altitude.c)."""
 CLIMB_DEADBAND = 0.04
 """Vertical acceleration that counts as zero, in units of gravity (position_estimator_altitude.c)."""
 MAX_RANGE_AGE = 0.05
@@ -163,7 +164,7 @@ def filtered_height(height: Array, measured: Array, shift: Array) -> Array:
         measured: Measured height, m. (1,)
         shift: Change of the height in the interval by the inertial velocity, m. (1,)
     """
-    return KEEP_HEIGHT * height + (1 - KEEP_HEIGHT) * measured + shift
+    return HEIGHT_WEIGHT * height + (1 - HEIGHT_WEIGHT) * measured + shift
 
 
 def height_over_surface(
@@ -219,4 +220,4 @@ def inertial_climb(climb: Array, quat: Array, accel: Array, dt: float) -> Array:
     """
     acc = rotation.matrix(quat)[2:] @ accel / GRAVITY_MAGNITUDE - 1.0
     excess_acc = jnp.sign(acc) * jnp.maximum(jnp.abs(acc) - CLIMB_DEADBAND, 0.0)
-    return KEEP_VELOCITY * (climb + GRAVITY_MAGNITUDE * dt * excess_acc)
+    return VELOCITY_DECAY * (climb + GRAVITY_MAGNITUDE * dt * excess_acc)

@@ -66,8 +66,8 @@ class Estimate(PyTree):
 def covariance(upper: Array) -> Array:
     """Return the covariance, (..., n, n), from its upper triangle, row by row. (..., n (n + 1) / 2)"""
     n = _n_errors(upper)
-    # Unsigned, because JAX 0.10 adds axis sizes to signed indices, typed for the precision in which it indexed first,
-    # float32 or float64.
+    # Unsigned, because JAX 0.10 adds the axis size to signed indices, with an integer type that depends on whether
+    # float32 or float64 was indexed first.
     index = np.zeros((n, n), np.uint32)
     index[_upper_triangle(n)] = np.arange(upper.shape[-1])
     return upper[..., np.maximum(index, index.T)]
@@ -98,7 +98,7 @@ def initial_estimate(
 
 
 def predict(
-    estimate: Estimate, accel: Array, gyro: Array, dt: float, resting: Array | None = None, all_axes: bool = False
+    estimate: Estimate, accel: Array, gyro: Array, dt: float, resting_quat: Array | None = None, all_axes: bool = False
 ) -> Estimate:
     """Return the estimate after an interval, without process noise; ``add_noise`` also bounds the variances.
 
@@ -107,7 +107,7 @@ def predict(
         accel: Specific force, body frame, m/s^2. (3,)
         gyro: Angular velocity, body frame, rad/s. (3,)
         dt: Length of the interval, s.
-        resting: Attitude towards which a drone on the ground is drawn, (4,); None in flight.
+        resting_quat: Attitude towards which a drone on the ground is drawn, (4,); None in flight.
         all_axes: True to use the force along all axes in flight; False to use only the force along the z axis of the
             body, as the firmware does, because rotors can generate no other force.
     """
@@ -116,26 +116,26 @@ def predict(
     gravity = GRAVITY_MAGNITUDE * rot[2]  # in the body frame
 
     # The linearised step: rows of the errors of position, velocity and attitude.
-    to_pos = dt * rot
-    att_to_pos = -to_pos @ rotation.cross_matrix(vel)
+    vel_to_pos = dt * rot
+    att_to_pos = -vel_to_pos @ rotation.cross_matrix(vel)
     vel_to_vel = identity - rotation.cross_matrix(angle)
     att_to_vel = -dt * rotation.cross_matrix(gravity)
     error_rot = _error_rotation(0.5 * angle)
     p = covariance(estimate.cov)
-    pos_rows = p[:3] + to_pos @ p[3:6] + att_to_pos @ p[6:]
+    pos_rows = p[:3] + vel_to_pos @ p[3:6] + att_to_pos @ p[6:]
     vel_rows = vel_to_vel @ p[3:6] + att_to_vel @ p[6:]
     rows = jnp.concatenate([pos_rows, vel_rows, error_rot @ p[6:]])
-    pos_columns = rows[:, :3] + rows[:, 3:6] @ to_pos.T + rows[:, 6:] @ att_to_pos.T
+    pos_columns = rows[:, :3] + rows[:, 3:6] @ vel_to_pos.T + rows[:, 6:] @ att_to_pos.T
     vel_columns = rows[:, 3:6] @ vel_to_vel.T + rows[:, 6:] @ att_to_vel.T
     p = jnp.concatenate([pos_columns, vel_columns, rows[:, 6:] @ error_rot.T], axis=1)
 
-    force = rotation.along_z(accel[2]) if resting is None and not all_axes else accel
+    force = rotation.along_z(accel[2]) if resting_quat is None and not all_axes else accel
     shift = dt * vel + 0.5 * dt**2 * force
     pos = rotation.matvec(rot, shift, pos) - jnp.asarray([0.0, 0.0, 0.5 * GRAVITY_MAGNITUDE * dt**2], pos.dtype)
     new_vel = vel + dt * (force - rotation.cross(gyro, vel) - gravity)
     upper = p[_upper_triangle(N)]
     cov = jnp.where(_is_variance(N), upper, _limit_covariances(upper))
-    return estimate.replace(pos=pos, vel=new_vel, quat=turn_attitude(quat, angle, resting), cov=cov)
+    return estimate.replace(pos=pos, vel=new_vel, quat=turn_attitude(quat, angle, resting_quat), cov=cov)
 
 
 def propagate(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, gravity: Array) -> Estimate:
@@ -293,17 +293,17 @@ def bound_covariance(p: Array) -> Array:
     return jnp.where(_is_variance(n), _limit_variances(upper, n), _limit_covariances(upper))
 
 
-def turn_attitude(quat: Array, angle: Array, resting: Array | None = None) -> Array:
+def turn_attitude(quat: Array, angle: Array, resting_quat: Array | None = None) -> Array:
     """Return an attitude turned in the body frame by a rotation vector, rad, with the firmware's guards. (4,)
 
-    If ``resting`` is given, a share of it is mixed in (``REVERSION_SHARE``).
+    If ``resting_quat`` is given, a share of it is mixed in (``REVERSION_SHARE``).
     """
     size = rotation.safe_norm(angle) + EPS
     half_angle = 0.5 * size
     step = jnp.concatenate([jnp.sin(half_angle) / size * angle, jnp.cos(half_angle)])
     quat = rotation.multiply(quat, step)
-    if resting is not None:
-        quat = (1 - REVERSION_SHARE) * quat + REVERSION_SHARE * resting
+    if resting_quat is not None:
+        quat = (1 - REVERSION_SHARE) * quat + REVERSION_SHARE * resting_quat
     return quat / (rotation.safe_norm(quat) + EPS)
 
 
@@ -333,7 +333,7 @@ def _upper_triangle(n: int) -> tuple[np.ndarray, ...]:
     return tuple([x.astype(np.uint32) for x in np.triu_indices(n)])
 
 
-def _error_rotation(half: Array) -> Array:
-    """Return the rotation of the error of an attitude that turns by twice ``half``, to second order. (3, 3)"""
-    cross = rotation.cross_matrix(half)
-    return jnp.eye(3, dtype=half.dtype) - cross + 0.5 * (cross @ cross)
+def _error_rotation(half_angle: Array) -> Array:
+    """Return the rotation of the error of an attitude that turns by twice ``half_angle``, to second order. (3, 3)"""
+    cross = rotation.cross_matrix(half_angle)
+    return jnp.eye(3, dtype=half_angle.dtype) - cross + 0.5 * (cross @ cross)

@@ -99,13 +99,13 @@ class ErrorStateFilter(Estimator):
         return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
 
     def _is_new(self, k: int, sensor: Sensor) -> Callable[[SimData], Array]:
-        return lambda data: sensor.read(data).samples.taken[0] != self.read(data).used_steps[k]
+        return lambda data: sensor.read(data).samples.taken_step[0] != self.read(data).used_steps[k]
 
     def _fusion_stage(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
         def fuse(data: SimData) -> SimData:
             """Use a new measurement of one sensor."""
-            record, taken = self.read(data), sensor.read(data).samples.taken
-            used_steps = record.used_steps.at[k].set(taken[0])
+            record, taken_step = self.read(data), sensor.read(data).samples.taken_step
+            used_steps = record.used_steps.at[k].set(taken_step[0])
             return self.write(
                 data, record.replace(estimate=self.update_estimate(sensor, data, record), used_steps=used_steps)
             )

@@ -20,7 +20,13 @@ from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.inertial_path import InertialPath
 from crazysim.plugins.estimators.kalman import UPDATE_FNS as KALMAN_UPDATE_FNS
-from crazysim.plugins.sensors.barometer import LAPSE, PRESSURE_EXPONENT, SEA_LEVEL_TEMPERATURE, Barometer, pressure_at
+from crazysim.plugins.sensors.barometer import (
+    LAPSE_RATE,
+    PRESSURE_EXPONENT,
+    SEA_LEVEL_TEMPERATURE,
+    Barometer,
+    pressure_at,
+)
 from crazysim.plugins.sensors.beacons import UWB, Lighthouse
 from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight, range_deviation
 from crazysim.plugins.sensors.gps import GPS
@@ -171,7 +177,7 @@ class ESKF(ErrorStateFilter):
         return predict
 
     def _path_start_stage(self, sensor: Sensor, period: int) -> Callable[[SimData], SimData]:
-        def begin_path(data: SimData) -> SimData:
+        def start_path(data: SimData) -> SimData:
             """Start a path at a new measurement of one sensor.
 
             It leads back to the last prediction; the next prediction extends it.
@@ -189,7 +195,7 @@ class ESKF(ErrorStateFilter):
             paths = [record.paths[:first], path_back[None], record.paths[first : last - 1], record.paths[last:]]
             return self.write(data, record.replace(paths=jnp.concatenate(paths)))
 
-        return begin_path
+        return start_path
 
     def _path_rows(self, sensor: Sensor, data: SimData) -> tuple[int, int]:
         """Return the first row of the paths of one sensor, and the row after its last one."""
@@ -202,9 +208,9 @@ class ESKF(ErrorStateFilter):
 
         The estimate is moved to the time at which the measurement was taken, updated, and moved back.
         """
-        steps, taken, gravity = data.core.steps, sensor.read(data).samples.taken[0], data.params.gravity_vec
+        steps, taken_step, gravity = data.core.steps, sensor.read(data).samples.taken_step[0], data.params.gravity_vec
         period, (gyro, accel) = self.prediction_schedule(data.core.freq)[0], self.inertial(data)
-        since_prediction = (taken - steps + (steps + 1) % period).astype(
+        since_prediction = (taken_step - steps + (steps + 1) % period).astype(
             gyro.dtype
         ) / data.core.freq  # negative before the last prediction
         if not sensor.is_late:
@@ -213,9 +219,9 @@ class ESKF(ErrorStateFilter):
             return error_state.propagate(past_estimate, accel, gyro, -since_prediction, gravity)
         interval, (first, last) = data.core.freq // (sensor.freq or data.core.freq), self._path_rows(sensor, data)
         paths: Array = record.paths  # type: ignore[assignment]
-        row, number = paths[first], (steps - taken) // interval
+        row, age = paths[first], (steps - taken_step) // interval  # in measurements
         for k in range(first + 1, last):
-            row = jnp.where(number == k - first, paths[k], row)
+            row = jnp.where(age == k - first, paths[k], row)
         path, estimate = InertialPath.from_row(row, -since_prediction), record.estimate
         path_back = path.without_biases(estimate).reverse()
         past_estimate = inertial_path.propagate_along(estimate, path_back, gravity)
@@ -231,8 +237,8 @@ class ESKF(ErrorStateFilter):
 
 def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
     """Return the number of measurements of one sensor that can be in transit."""
-    due = sensor.read(data).samples.due
-    return 0 if due is None else due.shape[-1]
+    arrival_steps = sensor.read(data).samples.arrival_steps
+    return 0 if arrival_steps is None else arrival_steps.shape[-1]
 
 
 def _sampling_predicate(sensor: Sensor) -> Callable[[SimData], Array | None]:
@@ -271,7 +277,7 @@ def _use_pressure(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate
     record = sensor.read(data)
     altitude = estimate.pos[2:] + record.altitude
     predicted = pressure_at(altitude)
-    slope = -PRESSURE_EXPONENT * LAPSE * predicted / (SEA_LEVEL_TEMPERATURE - LAPSE * altitude)
+    slope = -PRESSURE_EXPONENT * LAPSE_RATE * predicted / (SEA_LEVEL_TEMPERATURE - LAPSE_RATE * altitude)
     std = _combined_std(record.noise, record.drift, record.offset_spread, min_std=100 * MIN_STD)
     error = sensor.part(data, "pressure") - predicted
     return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
@@ -295,8 +301,8 @@ def _use_flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate) 
 def _use_range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, distance = sensor.read(data), sensor.latest(data)
     std = _combined_std(record.noise + range_deviation(distance, record.far_noise))
-    after = updates.update_ray(estimate, distance[0], std[0])
-    return error_state.select_estimate(distance[0] < record.max_range[0], after, estimate)
+    updated = updates.update_ray(estimate, distance[0], std[0])
+    return error_state.select_estimate(distance[0] < record.max_range[0], updated, estimate)
 
 
 def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:

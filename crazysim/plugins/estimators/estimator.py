@@ -111,7 +111,7 @@ class Estimator(Plugin):
         return rotation.rotate(mounting, gyro), rotation.rotate(mounting, accel)
 
     def check_sensors(self, sim: Simulation) -> None:
-        """Check the sensors."""
+        """Check that there is one ``IMU``, that all kinds are supported, and that the simulation has all sensors."""
         names = ", ".join(kind.__name__ for kind in self.kinds)
         if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
             got = [type(sensor).__name__ for sensor in self.sensors]

@@ -52,14 +52,15 @@ class KalmanData(PyTree):
 
     estimate: Estimate
     """The estimate."""
-    previous: Array = leaf("drone", 1)
+    previous_quat: Array = leaf("drone", 1)
     """Attitude at the end of the previous step, xyzw, with which measurements are predicted. (n_worlds, n_drones, 4)"""
     accel: Array = leaf("drone", 1, (3,))
     """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
     gyro: Array = leaf("drone", 1, (3,))
     """Sum of the angular velocities since the last prediction, body frame, rad/s. (n_worlds, n_drones, 3)"""
     used_steps: Array = leaf("drone", 1)
-    """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
+    """Step in which the latest used measurement of each sensor was taken; -1 before the first.
+    (n_worlds, n_drones, n_sensors)"""
     failures: Array = leaf("drone", 1)
     """Number of times that the estimate left its bounds and the filter restarted. (n_worlds, n_drones, 1)"""
     accel_noise: Array = leaf("parameter", 1, (3,))
@@ -109,7 +110,7 @@ class Kalman(ErrorStateFilter):
             sim,
             KalmanData,
             Estimate(zeros, zeros, level, zeros, drone_array(sim, cov, *cov.shape), None, None),
-            previous=level,
+            previous_quat=level,
             deviations=device_array(np.array([deviations[name] for name in MEASUREMENT_STD]), level.dtype),
         )
 
@@ -122,7 +123,7 @@ class Kalman(ErrorStateFilter):
             *self.fusion_stages(),
             ("finalize", Stage(self._finalize, "drone", self._is_updated)),
             ("restart", self.restart_stage()),
-            ("", Stage(self._finish, "drone")),
+            ("", Stage(self._store_attitude, "drone")),
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
@@ -133,7 +134,7 @@ class Kalman(ErrorStateFilter):
     def reset_episode(self, data: SimData) -> SimData:
         s, record = data.states, self.read(data)
         estimate = error_state.initial_estimate(s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, INITIAL_STD)
-        return self.write(data, record.replace(estimate=estimate, previous=s.quat))
+        return self.write(data, record.replace(estimate=estimate, previous_quat=s.quat))
 
     def _prediction_stage(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
@@ -150,12 +151,14 @@ class Kalman(ErrorStateFilter):
     def _add_noise(self, data: SimData) -> SimData:
         """Add the process noise of as many loops of the firmware as a step lasts."""
         record, dt = self.read(data), 1 / FIRMWARE_RATE
-        accel, loops = record.accel_noise, FIRMWARE_RATE / data.core.freq
+        accel, n_loops = record.accel_noise, FIRMWARE_RATE / data.core.freq
         deviations = jnp.concatenate([dt**2 * accel, dt * accel, dt * record.gyro_noise])
-        return self.write(data, record.replace(estimate=error_state.add_noise(record.estimate, loops * deviations**2)))
+        return self.write(
+            data, record.replace(estimate=error_state.add_noise(record.estimate, n_loops * deviations**2))
+        )
 
     def update_estimate(self, sensor: Sensor, data: SimData, record: KalmanData) -> Estimate:
-        rot, std = rotation.matrix(record.previous), dict(zip(MEASUREMENT_STD, record.deviations, strict=True))
+        rot, std = rotation.matrix(record.previous_quat), dict(zip(MEASUREMENT_STD, record.deviations, strict=True))
         return UPDATE_FNS[type(sensor)](sensor, self.imu, data, record.estimate, rot, std)
 
     def _is_updated(self, data: SimData) -> Array:
@@ -167,10 +170,10 @@ class Kalman(ErrorStateFilter):
         record = self.read(data)
         return self.write(data, record.replace(estimate=error_state.finalize(record.estimate)))
 
-    def _finish(self, data: SimData) -> SimData:
+    def _store_attitude(self, data: SimData) -> SimData:
         """Store the attitude of one drone at the end of the step."""
         record = self.read(data)
-        return self.write(data, record.replace(previous=record.estimate.quat))
+        return self.write(data, record.replace(previous_quat=record.estimate.quat))
 
     def restarted_estimate(self, data: SimData, pos: Array, quat: Array) -> Estimate:
         return error_state.initial_estimate(pos, jnp.zeros_like(pos), quat, INITIAL_STD)

@@ -90,21 +90,21 @@ def update_flow(
         scale: Pixels by which the image moves at 1 rad/s. ()
         deviation: Standard deviation of a motion, pixels.
     """
-    predicted_from = estimate
+    prior = estimate
     for k, (axis, sign) in enumerate(((1, -1.0), (0, 1.0))):
-        height = jnp.maximum(predicted_from.pos[2], MIN_FLOW_HEIGHT)
+        height = jnp.maximum(prior.pos[2], MIN_FLOW_HEIGHT)
         flow_per_vel = rot[2, 2] / height
         turn_rate, rows, slopes = (
             gyro[axis],
             [POS[2], VEL[k]],
-            [-predicted_from.vel[k] * flow_per_vel / height, flow_per_vel],
+            [-prior.vel[k] * flow_per_vel / height, flow_per_vel],
         )
-        if predicted_from.gyro_bias is not None:
-            turn_rate = turn_rate - predicted_from.gyro_bias[axis]
+        if prior.gyro_bias is not None:
+            turn_rate = turn_rate - prior.gyro_bias[axis]
             rows, slopes = [*rows, GYRO[axis]], [*slopes, jnp.full_like(flow_per_vel, -sign)]
-        predicted = scale * (predicted_from.vel[k] * flow_per_vel + sign * turn_rate)
+        predicted = scale * (prior.vel[k] * flow_per_vel + sign * turn_rate)
         estimate = update(estimate, rows, scale * jnp.stack(slopes), flow[k] - predicted, deviation)
-        predicted_from = predicted_from if estimate.gyro_bias is None else estimate
+        prior = prior if estimate.gyro_bias is None else estimate
     return estimate
 
 
@@ -175,7 +175,7 @@ def update_difference(
 
 
 def update_differences(estimate: Estimate, anchors: Array, differences: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after simultaneous differences between the distances to the others and to the first anchor.
+    """Return the estimate after differences of simultaneous distances, to each other anchor minus to the first one.
 
     The differences share the error of the first distance. A distance minus the mean of the k distances before it is a
     combination of differences; such combinations have independent errors, with ``1 + 1 / k`` times the variance of one

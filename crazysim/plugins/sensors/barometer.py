@@ -16,9 +16,9 @@ from crazysim.core.random import normal
 from crazysim.plugins.sensors.sensor import Samples, Sensor, gauss_markov_step, quantise
 from crazysim.pytree import PyTree, leaf
 
-SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE, LAPSE = 101325.0, 288.15, 0.0065
+SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE, LAPSE_RATE = 101325.0, 288.15, 0.0065
 """Pressure, Pa, and temperature, K, at sea level, and decrease of temperature with height, K/m (ISO 2533:1975)."""
-PRESSURE_EXPONENT = 9.80665 * 0.0289644 / (8.31432 * LAPSE)
+PRESSURE_EXPONENT = 9.80665 * 0.0289644 / (8.31432 * LAPSE_RATE)
 """Exponent of the pressure, 5.256: g M / (R L) with the constants of the US Standard Atmosphere 1976."""
 
 
@@ -98,10 +98,10 @@ def pressure_at(altitude: Array) -> Array:
     Args:
         altitude: Geopotential altitude above sea level, m. (...)
     """
-    return SEA_LEVEL_PRESSURE * jnp.exp(PRESSURE_EXPONENT * jnp.log1p(-LAPSE / SEA_LEVEL_TEMPERATURE * altitude))
+    return SEA_LEVEL_PRESSURE * jnp.exp(PRESSURE_EXPONENT * jnp.log1p(-LAPSE_RATE / SEA_LEVEL_TEMPERATURE * altitude))
 
 
 def pressure_altitude(pressure: Array) -> Array:
     """Return the altitude at which the standard atmosphere has a pressure, m; the inverse of ``pressure_at``. (...)"""
     log = jnp.log1p((pressure - SEA_LEVEL_PRESSURE) / SEA_LEVEL_PRESSURE)
-    return -SEA_LEVEL_TEMPERATURE / LAPSE * jnp.expm1(log / PRESSURE_EXPONENT)
+    return -SEA_LEVEL_TEMPERATURE / LAPSE_RATE * jnp.expm1(log / PRESSURE_EXPONENT)

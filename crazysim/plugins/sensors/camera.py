@@ -47,7 +47,7 @@ class Camera(ImageSensor):
     max_depth: float = setting(default=10.0, positive=True)
     """Largest depth and distance, m; also the value where nothing is nearer."""
     noise: StereoNoise | None = None
-    """Errors of depths and distances, such as ``StereoNoise()``, which are those of a RealSense D435; None for none."""
+    """Errors of depths and distances, such as ``StereoNoise()`` for a RealSense D435; None for none."""
     distortion: Distortion | None = None
     """Distortion of the lens; ``fovy`` is the field of view without it. None for none."""
     name: str = "camera"
@@ -71,7 +71,7 @@ class Camera(ImageSensor):
         return self.noise is not None
 
     @property
-    def farthest(self) -> np.ndarray:
+    def far_ratio(self) -> np.ndarray:
         return 1 / self.rays[..., 0]
 
     def measure(self, distance: Array, key: Array) -> Array:

@@ -71,10 +71,10 @@ class StereoNoise:
         measured = quantise(measured, jnp.asarray(self.resolution, depth.dtype)) if self.resolution else measured
         is_hole = depth < self.min_depth
         if self.has_holes:
-            is_hole |= self.occluded(depth, image_focal)
+            is_hole |= self.is_occluded(depth, image_focal)
         return jnp.where(is_hole, 0.0, measured)
 
-    def occluded(self, depth: Array, image_focal: float) -> Array:
+    def is_occluded(self, depth: Array, image_focal: float) -> Array:
         """Return True for pixels that the second imager does not see; see ``apply``. (height, width)"""
         disparity = image_focal * self.baseline / jnp.maximum(depth, 1e-3)
         column = jnp.arange(depth.shape[1], dtype=depth.dtype) - disparity
@@ -138,7 +138,7 @@ class Distortion:
         return u, v
 
     def _slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of ``distort``: of x by x, of x by y, which is that of y by x, and of y by y."""
+        """Return the derivatives of ``distort``: of x by x, of x by y (equal to y by x), and of y by y."""
         r2 = x**2 + y**2
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         slope = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3))

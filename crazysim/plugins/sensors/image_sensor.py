@@ -24,7 +24,7 @@ from crazysim.core.random import drone_keys
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError, short_repr
-from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, steps_between
+from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, sampling_period
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, View, check_image_memory
 from crazysim.scene.ray_casting import body_names
@@ -35,7 +35,7 @@ UNFUSED_REASON = "images are taken by kernels with a lane for each ray"
 
 Images = dict[str, Array]
 """Images by output, (n_worlds, n_drones, height, width), and (n_worlds, n_drones, height, width, 3) for normals."""
-TakeImages = Callable[[SimData], Images]
+ImageFn = Callable[[SimData], Images]
 
 
 class ImageData(PyTree):
@@ -44,7 +44,7 @@ class ImageData(PyTree):
     images: dict[str, Array] = leaf("drone", None)
     """Last image of each output. (n_worlds, n_drones, height, width), for normals (n_worlds, n_drones, height, width,
     3)"""
-    taken: Array = leaf("world")
+    taken_step: Array = leaf("world")
     """Step in which these images were taken, negative before the first ones. (n_worlds, 1)"""
     transit: dict[str, Array] = leaf("drone", None)
     """Images of each output that were taken last, newest first; empty without latency. (n_worlds, n_drones, n_rows,
@@ -61,7 +61,7 @@ class ImageSensor(Plugin):
 
     _: dataclasses.KW_ONLY
     pos: ArrayLike | None = setting(default=None, shapes=((3,),))
-    """Position of the sensor in the body frame, m; None for that of ``fpv_cam``. (3,)"""
+    """Position of the sensor in the body frame, m; None for the position of ``fpv_cam``. (3,)"""
     rpy: ArrayLike = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Roll, pitch and yaw of the sensor's frame (x ahead, y left, z up) in the body frame, rad. (3,)"""
     outputs: Sequence[str] = ("depth",)
@@ -97,8 +97,8 @@ class ImageSensor(Plugin):
         raise NotImplementedError
 
     @property
-    def farthest(self) -> np.ndarray | float:
-        """Distance of points at ``far``, as a multiple of it. (height, width) or ()"""
+    def far_ratio(self) -> np.ndarray | float:
+        """Largest distance along each ray divided by ``far``. (height, width) or ()"""
         return 1.0
 
     @property
@@ -163,19 +163,22 @@ class ImageSensor(Plugin):
         bytes_per_pixel = 4 * sum(math.prod(OUTPUTS[name]) for name in self.outputs) * (1 + n_rows) + BYTES_PER_RAY
         check_image_memory(sim.n_worlds * sim.n_drones, width, height, bytes_per_pixel, sim.scene.device)
 
-    def image_fn(self, sim: Simulation) -> TakeImages:
-        """Return ``take(data)``, pure: the images of all worlds, for the present scene, without rate and latency."""
+    def image_fn(self, sim: Simulation) -> ImageFn:
+        """Return a pure function of the data of all worlds that returns their images, without rate and latency.
+
+        It is for the scene as it is now.
+        """
         self.check(sim)
         rays, far, view = self.rays, self.far, self._view(sim)
-        look, rot = sim.scene.depth_fn(view, drones=self.drones, along="ray"), view.rot
+        cast_rays, rot = sim.scene.depth_fn(view, drones=self.drones, along="ray"), view.rot
 
-        def take(data: SimData) -> Images:
-            hits, quat = look(data), data.states.quat[..., None, None, :]
+        def take_images(data: SimData) -> Images:
+            hits, quat = cast_rays(data), data.states.quat[..., None, None, :]
             cosine = jnp.asarray(rays[..., 0], hits.distance.dtype)
             distance = hits.distance
             if self.has_errors:
                 keys = drone_keys(data, self.name)
-                distance = jax.vmap(jax.vmap(self.measure))(jnp.minimum(distance, far * self.farthest), keys)
+                distance = jax.vmap(jax.vmap(self.measure))(jnp.minimum(distance, far * self.far_ratio), keys)
             images = {}
             for name in self.outputs:
                 if name == "depth":
@@ -192,25 +195,25 @@ class ImageSensor(Plugin):
                     images[name] = hits.body_index
             return images
 
-        return take
+        return take_images
 
-    def begin(self, take: TakeImages, data: SimData, period: int) -> ImageData:
+    def initial_record(self, take_images: ImageFn, data: SimData, period: int) -> ImageData:
         """Return the record of all worlds with images that are taken and delivered now.
 
         Args:
-            take: From ``image_fn``.
+            take_images: Function that ``image_fn`` returned.
             data: Data of all worlds.
             period: Steps between images.
         """
-        images, n = take(data), self._n_rows(data, period)
+        images, n = take_images(data), self._n_rows(data, period)
         transit = {k: jnp.repeat(x[:, :, None], n, axis=2) for k, x in images.items()} if n else {}
-        return ImageData(images=images, taken=data.core.steps, transit=transit)
+        return ImageData(images=images, taken_step=data.core.steps, transit=transit)
 
-    def update(self, take: TakeImages, data: SimData, record: ImageData, period: int) -> ImageData:
+    def update(self, take_images: ImageFn, data: SimData, record: ImageData, period: int) -> ImageData:
         """Return the record of all worlds after a step: images are taken where they are due, and delivered.
 
         Args:
-            take: From ``image_fn``.
+            take_images: Function that ``image_fn`` returned.
             data: Data of all worlds.
             record: The record before.
             period: Steps between images.
@@ -222,7 +225,7 @@ class ImageSensor(Plugin):
             return jnp.where(is_due.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
         def capture(record: ImageData) -> ImageData:
-            images = take(data)
+            images = take_images(data)
             if not latency:
                 return record.replace(images=jax.tree.map(select, images, record.images))
             queues = {k: jnp.concatenate([x[:, :, None], record.transit[k][:, :, :-1]], 2) for k, x in images.items()}
@@ -241,10 +244,10 @@ class ImageSensor(Plugin):
                 return jnp.take_along_axis(queue, index, axis=2)[:, :, 0]
 
             record = record.replace(images=jax.tree.map(read_row, record.transit))
-        return record.replace(taken=delivered * period)
+        return record.replace(taken_step=delivered * period)
 
     def record(self, sim: Simulation) -> ImageData:
-        period = steps_between(self, sim)
+        period = sampling_period(self, sim)
         self.check(sim, period)
         shape, n = (*sim.data.states.pos.shape[:2], *self.image_size), self._n_rows(sim.data, period)
         images, transit = {}, {}
@@ -257,21 +260,21 @@ class ImageSensor(Plugin):
         return ImageData(images, device_array(np.full((shape[0], 1), -1), np.int32), transit)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        period, latency = steps_between(self, sim), self._latency_steps(sim.data)
+        period, latency = sampling_period(self, sim), self._latency_steps(sim.data)
 
-        def take_images(data: SimData) -> SimData:
+        def update_record(data: SimData) -> SimData:
             """Take and deliver images, in a call that is skipped if no world is due."""
 
             def update(data: SimData) -> SimData:
                 # The function is made here so that objects are visible that were added after the sensor.
-                take = self.image_fn(sim)
-                return self.write(data, self.update(take, data, self.read(data), period))
+                take_images = self.image_fn(sim)
+                return self.write(data, self.update(take_images, data, self.read(data), period))
 
             steps = data.core.steps
-            acts = (steps % period == 0) | ((steps - latency) % period == 0)
-            return update(data) if period == 1 else jax.lax.cond(jnp.any(acts), update, lambda data: data, data)
+            is_due = (steps % period == 0) | ((steps - latency) % period == 0)
+            return update(data) if period == 1 else jax.lax.cond(jnp.any(is_due), update, lambda data: data, data)
 
-        stage = Stage(take_images, "batch", name=self.name, unfused_reason=UNFUSED_REASON)
+        stage = Stage(update_record, "batch", name=self.name, unfused_reason=UNFUSED_REASON)
         return [StagePlacement(stage, before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
@@ -280,8 +283,8 @@ class ImageSensor(Plugin):
 
     def age(self, data: SimData) -> Array:
         """Return the time since the last images were taken, s; zero before the first ones. (n_worlds, 1)"""
-        taken = self.read(data).taken
-        return jnp.where(taken >= 0, (data.core.steps - 1 - taken) / data.core.freq, 0.0)
+        taken_step = self.read(data).taken_step
+        return jnp.where(taken_step >= 0, (data.core.steps - 1 - taken_step) / data.core.freq, 0.0)
 
     def _view(self, sim: Simulation) -> View:
         fpv_pos = [airframe.value("shape.fpv_camera") for airframe in sim.airframes]

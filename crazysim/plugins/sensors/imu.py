@@ -21,7 +21,7 @@ from crazysim.core.stage import Stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.plugins.effects.ground_effect import rotor_positions
 from crazysim.plugins.effects.moving_air import require_rotors
-from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
+from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting_quat
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
 
@@ -173,17 +173,17 @@ class IMU(Sensor):
         return {"gyro": 3, "accel": 3}
 
     def record(self, sim: Simulation) -> IMUData:
-        shakes = self.imbalance is not None
-        if shakes:
+        has_vibration = self.imbalance is not None
+        if has_vibration:
             require_rotors(sim, "vibration")
         return self.fill_record(
             sim,
             IMUData,
             gyro=self.gyro.record(sim, "gyro"),
             accel=self.accel.record(sim, "accel"),
-            quat=mounting(sim, self.rpy),
-            rotor_pos=rotor_positions(sim) if shakes else None,
-            phase=drone_array(sim, 0.0, sim.data.states.rotor_vel.shape[-1]) if shakes else None,
+            quat=mounting_quat(sim, self.rpy),
+            rotor_pos=rotor_positions(sim) if has_vibration else None,
+            phase=drone_array(sim, 0.0, sim.data.states.rotor_vel.shape[-1]) if has_vibration else None,
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
@@ -218,10 +218,10 @@ class IMU(Sensor):
             phase = record.phase + dt * speed
             phase = phase - 2 * math.pi * jnp.floor(phase / (2 * math.pi))
             p = data.params
-            push, twist, swing = vibration(record.imbalance, speed, phase, record.rotor_pos)  # type: ignore[arg-type]
-            acc = acc + rotation.rotate(s.quat, push) / p.mass
-            ang_acc = ang_acc + rotation.matvec(p.J_inv, twist)
-            ang_vel = ang_vel + rotation.matvec(p.J_inv, swing)
+            shake_force, torque, momentum = vibration(record.imbalance, speed, phase, record.rotor_pos)  # type: ignore[arg-type]
+            acc = acc + rotation.rotate(s.quat, shake_force) / p.mass
+            ang_acc = ang_acc + rotation.matvec(p.J_inv, torque)
+            ang_vel = ang_vel + rotation.matvec(p.J_inv, momentum)
             record = record.replace(phase=phase)
         force = specific_force(s.quat, acc, s.ang_vel, ang_acc, data.params.gravity_vec, record.pos)
         truth = _to_sensor_frame(record.quat, ang_vel, force)
@@ -269,12 +269,12 @@ def vibration(imbalance: Array, speed: Array, phase: Array, rotor_pos: Array) ->
         phase: Angle of the rotors, rad. (n_rotors,)
         rotor_pos: Positions of the rotors, body frame, m. (n_rotors, 3)
     """
-    momentum, zero = imbalance * speed, jnp.zeros_like(speed)
+    impulse_size, zero = imbalance * speed, jnp.zeros_like(speed)
     c, s = jnp.cos(phase), jnp.sin(phase)
-    force = (momentum * speed)[:, None] * jnp.stack([c, s, zero], axis=-1)
-    impulse = momentum[:, None] * jnp.stack([s, -c, zero], axis=-1)
-    torque, swing = rotation.cross(rotor_pos, force), rotation.cross(rotor_pos, impulse)
-    return jnp.sum(force, axis=0), jnp.sum(torque, axis=0), jnp.sum(swing, axis=0)
+    force = (impulse_size * speed)[:, None] * jnp.stack([c, s, zero], axis=-1)
+    impulse = impulse_size[:, None] * jnp.stack([s, -c, zero], axis=-1)
+    torque, momentum = rotation.cross(rotor_pos, force), rotation.cross(rotor_pos, impulse)
+    return jnp.sum(force, axis=0), jnp.sum(torque, axis=0), jnp.sum(momentum, axis=0)
 
 
 def _to_sensor_frame(quat: Array, *vectors: Array) -> Array:

@@ -92,8 +92,8 @@ class Lidar(ImageSensor):
     @property
     def rays(self) -> np.ndarray:
         elevation, azimuth = np.meshgrid(np.radians(self.elevation), np.radians(self.azimuth), indexing="ij")
-        level = np.cos(elevation)
-        return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+        horizontal = np.cos(elevation)
+        return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
     @property
     def optics(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter
 from crazysim.core.random import normal
 from crazysim.errors import ConfigError, short_repr
-from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
+from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting_quat
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
 
@@ -62,7 +62,7 @@ class Magnetometer(Sensor):
                 f"expected field in tesla, of at most {MAX_FIELD} T along an axis, got {short_repr(self.field)}. "
                 f"Use 20e-6 for 20 microtesla, 1e-4 for one gauss."
             )
-        errors, quat = self.errors.record(sim, "errors"), mounting(sim, self.rpy)
+        errors, quat = self.errors.record(sim, "errors"), mounting_quat(sim, self.rpy)
         return self.fill_record(sim, MagnetometerData, errors=errors, quat=quat)
 
     def ideal(self, data: SimData) -> Array:

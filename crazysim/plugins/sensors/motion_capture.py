@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter
 from crazysim.core.random import normal
-from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
+from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting_quat
 from crazysim.pytree import PyTree, leaf
 
 
@@ -66,7 +66,7 @@ class MotionCapture(Sensor):
         return {"pos": 3, "quat": 4, "vel": 3}
 
     def record(self, sim: Simulation) -> MotionCaptureData:
-        return self.fill_record(sim, MotionCaptureData, quat=mounting(sim, self.rpy))
+        return self.fill_record(sim, MotionCaptureData, quat=mounting_quat(sim, self.rpy))
 
     def ideal(self, data: SimData) -> Array:
         """Return the pose and the velocity of the tracked body. (10,)"""

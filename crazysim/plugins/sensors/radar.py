@@ -88,9 +88,9 @@ class Radar(Plugin):
         return RadarData(pos=device_array(pos, dtype), **settings, exposure=drone_array(sim, 0.0, len(pos)))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        return [StagePlacement(Stage(self.count, "drone"), before="increment_steps")]
+        return [StagePlacement(Stage(self.count_exposure, "drone"), before="increment_steps")]
 
-    def count(self, data: SimData) -> SimData:
+    def count_exposure(self, data: SimData) -> SimData:
         """Add one step to the time of one drone within each lobe that it is in."""
         record = self.read(data)
         time = jnp.where(record.margin_at(data.states.pos) > 0, 1 / data.core.freq, 0.0)

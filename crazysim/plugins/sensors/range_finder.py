@@ -17,7 +17,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, parameter
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.plugins.sensors.sensor import steps_between
+from crazysim.plugins.sensors.sensor import sampling_period
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.object_poses import moving_plugins, with_moved_objects
@@ -73,7 +73,7 @@ class RangeFinder(Plugin):
         )
         if rays.ndim != 2 or rays.shape[1] != 3 or not rays.any(axis=-1).all():
             raise ConfigError(f"expected directions as vectors (n_rays, 3), none of them zero, got {rays.tolist()}")
-        steps_between(self, sim)
+        sampling_period(self, sim)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         max_range = float(self.max_range)
         distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), max_range)
@@ -94,7 +94,7 @@ class RangeFinder(Plugin):
         if self.drones:
             n_movable += sum(len(kind.geoms) * len(kind.drones or range(sim.n_drones)) for kind in model.drones)
         scope = "batch" if n_movable > MAX_UNROLLED_GEOMS else "world" if self.drones or movers else "drone"
-        period, scene = steps_between(self, sim), sim.scene
+        period, scene = sampling_period(self, sim), sim.scene
 
         def is_due(data: SimData) -> Array:
             """Return which worlds measure after this step."""

@@ -37,7 +37,7 @@ class Samples(PyTree):
 
     value: Array = leaf("drone", 1)
     """Latest measurement that has arrived. (n_worlds, n_drones, k)"""
-    taken: Array = leaf("drone", 1)
+    taken_step: Array = leaf("drone", 1)
     """Step in which the latest measurement was taken, negative before the first one. (n_worlds, n_drones, 1)"""
     delay: Array | None = leaf("parameter", 1, (1,))
     """Time from measurement to arrival, s; None without delay. (1,)"""
@@ -47,7 +47,7 @@ class Samples(PyTree):
     """Probability that a measurement is lost, 0 to 1; None if no measurement is lost. (1,)"""
     queue: Array | None = leaf("drone", 2)
     """Measurements in transit, newest first; None without delay. (n_worlds, n_drones, n_rows, k)"""
-    due: Array | None = leaf("drone", 1)
+    arrival_steps: Array | None = leaf("drone", 1)
     """Steps in which the queued measurements arrive; None without delay. (n_worlds, n_drones, n_rows)"""
 
 
@@ -106,7 +106,7 @@ class Sensor(Plugin):
 
     def samples(self, sim: Simulation) -> Samples:
         """Return the field ``samples`` of the record, before the first measurement; check the common settings."""
-        period = steps_between(self, sim)
+        period = sampling_period(self, sim)
         k, shape, max_delay = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
         n_rows = math.floor(max_delay * sim.data.core.freq / period + 0.5) + 2 if max_delay > 0 else 0
         if n_rows > MAX_ROWS:
@@ -121,21 +121,23 @@ class Sensor(Plugin):
                 "delay": check_parameter(sim, "delay", self.delay, (1,), 0.0, max_delay),
                 "jitter": check_parameter(sim, "jitter", self.jitter, (1,), 0.0, max_delay),
                 "queue": drone_array(sim, 0.0, n_rows, k),
-                "due": device_array(np.full((*shape, n_rows), NEVER_ARRIVES), np.int32),
+                "arrival_steps": device_array(np.full((*shape, n_rows), NEVER_ARRIVES), np.int32),
             }
         return Samples(
             value=drone_array(sim, 0.0, k),
-            taken=device_array(np.full((*shape, 1), -1), np.int32),
+            taken_step=device_array(np.full((*shape, 1), -1), np.int32),
             delay=transit.get("delay"),
             jitter=transit.get("jitter"),
             dropout=check_parameter(sim, "dropout", self.dropout, (1,), 0.0, 1.0) if can_lose else None,
             queue=transit.get("queue"),
-            due=transit.get("due"),
+            arrival_steps=transit.get("arrival_steps"),
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         end, placements = "increment_steps", []
-        condition = None if steps_between(self, sim) == 1 else lambda data: acts_now(data, self.freq or data.core.freq)
+        condition = (
+            None if sampling_period(self, sim) == 1 else lambda data: acts_now(data, self.freq or data.core.freq)
+        )
         placements.append(StagePlacement(Stage(self._take_measurement, "drone", condition), before=end))
         if self.is_late:
             placements.append(
@@ -146,7 +148,7 @@ class Sensor(Plugin):
     def latest(self, data: SimData) -> Array:
         """Return the latest measurement of one drone; a perfect one before the first arrives. (k,)"""
         samples = self.read(data).samples
-        return jnp.where(samples.taken >= 0, samples.value, self.ideal(data))
+        return jnp.where(samples.taken_step >= 0, samples.value, self.ideal(data))
 
     def part(self, data: SimData, channel: str) -> Array:
         """Return one of the ``channels`` of the latest measurement of one drone. (k,)"""
@@ -154,9 +156,9 @@ class Sensor(Plugin):
 
     def age(self, data: SimData) -> Array:
         """Return the time since the latest measurement was taken, s; zero before the first one arrives. (..., 1)"""
-        taken = self.read(data).samples.taken
-        steps = data.core.steps[..., None] if taken.ndim > data.core.steps.ndim else data.core.steps
-        return jnp.where(taken >= 0, (steps - 1 - taken) / data.core.freq, 0.0)
+        taken_step = self.read(data).samples.taken_step
+        steps = data.core.steps[..., None] if taken_step.ndim > data.core.steps.ndim else data.core.steps
+        return jnp.where(taken_step >= 0, (steps - 1 - taken_step) / data.core.freq, 0.0)
 
     def split(self, value: Array) -> dict[str, Array]:
         """Return the parts of a measurement by the names of ``channels``. (..., n) each"""
@@ -195,38 +197,40 @@ class Sensor(Plugin):
             is_lost = False if samples.dropout is None else chance[:1] < samples.dropout
             jitter_share = chance[1:]
         if samples.queue is None:
-            taken = jnp.broadcast_to(step, (1,))
+            taken_step = jnp.broadcast_to(step, (1,))
             if samples.dropout is not None:
-                value, taken = jnp.where(is_lost, samples.value, value), jnp.where(is_lost, samples.taken, taken)
-            samples = samples.replace(value=value, taken=taken)
+                value = jnp.where(is_lost, samples.value, value)
+                taken_step = jnp.where(is_lost, samples.taken_step, taken_step)
+            samples = samples.replace(value=value, taken_step=taken_step)
         else:
             arrival_step = step + jnp.round(data.core.freq * (samples.delay + jitter_share * samples.jitter)).astype(
                 jnp.int32
             )
             arrival_step = arrival_step if samples.dropout is None else jnp.where(is_lost, NEVER_ARRIVES, arrival_step)
             queue = jnp.concatenate([value[None], samples.queue[:-1]])
-            samples = samples.replace(queue=queue, due=jnp.concatenate([arrival_step, samples.due[:-1]]))
+            arrival_steps = jnp.concatenate([arrival_step, samples.arrival_steps[:-1]])
+            samples = samples.replace(queue=queue, arrival_steps=arrival_steps)
         return self.write(data, record.replace(samples=samples))
 
     def _deliver_measurement(self, data: SimData) -> SimData:
         """Replace the latest measurement of one drone by the newest one that has arrived."""
         record, step = self.read(data), data.core.steps
         samples, period = record.samples, data.core.freq // (self.freq or data.core.freq)
-        value, taken = samples.value, samples.taken
-        for row in reversed(range(samples.due.shape[0])):  # the newest one last, so that it is kept
-            arrived = samples.due[row] <= step
-            value = jnp.where(arrived, samples.queue[row], value)
-            taken = jnp.where(arrived, step - step % period - row * period, taken)
-        return self.write(data, record.replace(samples=samples.replace(value=value, taken=taken)))
+        value, taken_step = samples.value, samples.taken_step
+        for row in reversed(range(samples.arrival_steps.shape[0])):  # the newest one last, so that it is kept
+            has_arrived = samples.arrival_steps[row] <= step
+            value = jnp.where(has_arrived, samples.queue[row], value)
+            taken_step = jnp.where(has_arrived, step - step % period - row * period, taken_step)
+        return self.write(data, record.replace(samples=samples.replace(value=value, taken_step=taken_step)))
 
 
-def steps_between(sensor: Any, sim: Simulation) -> int:
+def sampling_period(sensor: Any, sim: Simulation) -> int:
     """Return the number of steps between measurements of a plugin with ``freq`` and ``name``."""
     steps = sim.data.core.freq
     return 1 if sensor.freq is None else steps // dividing_rate(f"freq of {sensor.name!r}", sensor.freq, steps)
 
 
-def mounting(sim: Simulation, rpy: ArrayLike) -> Array:
+def mounting_quat(sim: Simulation, rpy: ArrayLike) -> Array:
     """Return the attitude of a sensor, sensor to body, as a parameter of quaternions, xyzw.
 
     Args:

@@ -45,7 +45,7 @@ def test_images_are_taken_at_a_rate_and_delivered_late(flight):
     _, _, seen, records = flight
     for step, (record, age) in enumerate(records):
         shown = max((step - 6) // 4 * 4, 0)
-        assert (record.taken == shown).all()
+        assert (record.taken_step == shown).all()
         np.testing.assert_allclose(age, (step - shown) / 200, rtol=1e-6)
         for name, image in record.images.items():
             np.testing.assert_allclose(image, seen[shown][name], rtol=1e-5, atol=1e-6, err_msg=f"{name} {step}")

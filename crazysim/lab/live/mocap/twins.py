@@ -125,7 +125,7 @@ class Twins(Closing):
             twin_by_name[name] = twin
         self.twins = twin_by_name
         self._order = _parents_first(twin_by_name)
-        with sim.scene.unchanged_on_error():
+        with sim.scene.restore_on_error():
             self.handles: dict[str, Handle] = {
                 name: sim.scene.add(t.model, name, pos=HIDDEN_POSITION, mocap=True, **t.options)
                 for name, t in twin_by_name.items()

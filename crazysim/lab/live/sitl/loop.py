@@ -195,7 +195,7 @@ class SoftwareInTheLoop(Closing):
         if sensor is None:
             return None, None
         record = sensor.read(self.sim.data)
-        value, taken = np.asarray(record.samples.value, float), np.asarray(record.samples.taken).reshape(-1)
+        value, taken = np.asarray(record.samples.value, float), np.asarray(record.samples.taken_step).reshape(-1)
         if taken.min() < 0:
             observed = self.sim.plugins.observations(self.sim.data)
             value = np.concatenate([observed[f"{sensor.name}.{name}"] for name in sensor.channels], axis=-1)

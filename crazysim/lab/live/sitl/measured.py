@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crazysim.core.settings import check_settings, setting
 from crazysim.errors import ConfigError, short_repr
-from crazysim.plugins.sensors.barometer import LAPSE, PRESSURE_EXPONENT, SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE
+from crazysim.plugins.sensors.barometer import LAPSE_RATE, PRESSURE_EXPONENT, SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE
 from crazysim.plugins.sensors.sensor import Sensor
 
 METRES_PER_DEGREE = 6371000.0 * np.pi / 180
@@ -87,7 +87,7 @@ class Origin:
 
     def pressure(self, height: float) -> float:
         """Return the pressure of the standard atmosphere at a height above the origin, m, in Pa."""
-        base = 1 - LAPSE / SEA_LEVEL_TEMPERATURE * (self.altitude + height)
+        base = 1 - LAPSE_RATE / SEA_LEVEL_TEMPERATURE * (self.altitude + height)
         return SEA_LEVEL_PRESSURE * base**PRESSURE_EXPONENT
 
 

@@ -57,7 +57,7 @@ def read_ranges(sim: Sim, drone: int) -> dict[str, float]:
     max_range, distances = float(record.max_range), np.asarray(record.distance)[0, drone].tolist()
     if ranger is not None:
         samples = ranger.read(sim.data).samples
-        if samples.taken[0, drone, 0] >= 0:
+        if samples.taken_step[0, drone, 0] >= 0:
             distances = np.asarray(samples.value)[0, drone].tolist()
     ranges = {}
     for direction, distance in zip(np.asarray(record.direction), distances, strict=True):
