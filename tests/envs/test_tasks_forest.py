@@ -38,8 +38,8 @@ def standing_trees(env, data):
     cells = np.divmod(forest.order, forest.n_cells[1])
     trees = vmap_worlds(lambda data: forest.columns(data, *cells))(data)
     np.testing.assert_allclose(pos[..., 0], trees.x, atol=1e-5)
-    radius = np.broadcast_to(np.asarray(trees.size), trees.stands.shape)
-    return np.stack([trees.x, trees.y], axis=-1), radius, np.asarray(trees.stands)
+    radius = np.broadcast_to(np.asarray(trees.size), trees.is_standing.shape)
+    return np.stack([trees.x, trees.y], axis=-1), radius, np.asarray(trees.is_standing)
 
 
 def test_every_world_has_a_forest_of_its_own_with_clear_starts(begun):

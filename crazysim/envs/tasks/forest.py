@@ -146,7 +146,7 @@ class Forest(Task):
         row = np.zeros((n_drones, 3))
         row[:, 1], row[:, 2] = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2), HEIGHT
         jitter = np.array([JITTER[0], JITTER[1] if n_drones == 1 else 0.2, JITTER[2]])
-        data = self.trees(n_drones).place(data, jax.random.fold_in(key, 1))
+        data = self.trees(n_drones).sample_layout(data, jax.random.fold_in(key, 1))
         start_pos = (row + jitter * start).astype(dtype)
         data = flying(data, start_pos, rotation.from_rpy(0.1 * rpy), 0.3 * vel)
         goal = (row + jitter * goal + np.array([self.length + EDGE, 0.0, 0.0])).astype(dtype)
@@ -176,7 +176,7 @@ class Forest(Task):
         trees = forest.columns(data, index[0][:, None] + columns, index[1][:, None] + rows)
         offset = jnp.stack([trees.x - pos[:, :1], trees.y - pos[:, 1:2]], axis=-1)
         distance = rotation.safe_norm(offset)[..., 0]
-        gap = jnp.where(trees.stands, jnp.minimum(distance - trees.size, VIEW_RANGE), VIEW_RANGE)
+        gap = jnp.where(trees.is_standing, jnp.minimum(distance - trees.size, VIEW_RANGE), VIEW_RANGE)
         way = offset * (gap / jnp.maximum(distance, 1e-3))[..., None]
         ahead, left = rotation.heading(data.states.quat)
         along = [jnp.sum(way * axis[:, None, :2], axis=-1) for axis in (ahead, left)]

@@ -18,7 +18,7 @@ from crazysim.core.stage import Stage
 from crazysim.core.stages import FLOOR_HEIGHT, stop_below
 from crazysim.errors import ConfigError
 from crazysim.plugins.contacts.response import ContactResponse
-from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, WHY_UNFUSED
+from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON
 from crazysim.plugins.effects.ground import TerrainData, ground_height
 from crazysim.pytree import device_array
 from crazysim.storage import read_bytes
@@ -62,7 +62,7 @@ class Terrain(Plugin):
         record = TerrainData(
             heights=device_array(heights, dtype),
             middle=device_array(pos, dtype),
-            half=device_array(size / 2, dtype),
+            half_size=device_array(size / 2, dtype),
             height_below=drone_array(sim, 0.0, 1),
             floor=self.floor,
         )
@@ -71,7 +71,7 @@ class Terrain(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         scope = "drone" if self._check_heights(sim)[0].size <= MAX_FUSED_VALUES else "batch"
-        stop = Stage(self.stop, scope, batched=True, unfused_reason=WHY_UNFUSED)
+        stop = Stage(self.stop, scope, batched=True, unfused_reason=UNFUSED_REASON)
         return [StagePlacement(stop, before="increment_steps", replaces="clip_floor_pos")]
 
     def stop(self, data: SimData) -> SimData:

@@ -130,9 +130,9 @@ class Battery(Plugin):
 
     def influence(self, data: SimData) -> SimData:
         battery, controls = self.read(data), controls_of(data)
-        share = battery.voltage / battery.full_speed_voltage
-        share = jnp.where(battery.charge > 0, jnp.where(share < 1, share, 1.0), 0.0)
-        limit = share * data.params.rotor_vel_max
+        speed_ratio = battery.voltage / battery.full_speed_voltage
+        speed_ratio = jnp.where(battery.charge > 0, jnp.where(speed_ratio < 1, speed_ratio, 1.0), 0.0)
+        limit = speed_ratio * data.params.rotor_vel_max
         rotor_vel = controls.rotor_vel
         if battery.command_voltage is not None:
             rotor_vel = rotor_vel * (battery.voltage / battery.command_voltage)
@@ -151,10 +151,10 @@ class Battery(Plugin):
         empty battery supplies nothing.
         """
         battery, p, rotor_vel = self.read(data), data.params, data.states.rotor_vel
-        mechanical = jnp.sum(
+        mechanical_power = jnp.sum(
             quadratic_curve(rotor_vel, p.rpm2torque) * rotor_vel * RPM_TO_RAD_S, axis=-1, keepdims=True
         )
-        power = jnp.where(mechanical > 0, mechanical, 0.0) / battery.efficiency + battery.base_power
+        power = jnp.where(mechanical_power > 0, mechanical_power, 0.0) / battery.efficiency + battery.base_power
         power = jnp.where(battery.charge > 0, power, 0.0)
         voltage, current = voltage_under_load(
             power, open_circuit_voltage(battery.charge, battery.n_cells), battery.resistance

@@ -73,9 +73,9 @@ class Downwash(Plugin):
         return with_moving_air(data, self.read(data).velocity_at_drone(data))
 
     def sum_jets(self, data: SimData) -> SimData:
-        """Add up the jets of all drones of the world at one drone; a jet does not act on its own drone.
+        """Add up the jets of all other drones of the world at one drone.
 
-        Jets are also added up at the drone's load. The jet of its own drone acts on the load, too.
+        At the load of the drone, the jet of its own drone is included.
         """
         record, s = self.read(data), data.states
         bodies = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.air_vel is not None}
@@ -134,14 +134,14 @@ class JetSource(NamedTuple):
     """``u_0 B d``, m^2/s; zero without thrust. (..., 1)"""
     origin: Array
     """Distance ``B d`` of the virtual origin above the rotors, m. (..., 1)"""
-    per_diameter: Array
+    inverse_diameter: Array
     """``1 / d``, 1/m. (..., 1)"""
 
 
 def jet_source(thrust: Array, diameter: Array, air_density: Array) -> JetSource:
     """Return the source of a drone's jet; for the arguments see ``hover_jet_speed``."""
-    pushes = thrust > 0
-    impulse = jnp.where(pushes, jnp.sqrt(jnp.where(pushes, thrust, 1.0) * 4 / (math.pi * air_density)), 0.0)
+    has_thrust = thrust > 0
+    impulse = jnp.where(has_thrust, jnp.sqrt(jnp.where(has_thrust, thrust, 1.0) * 4 / (math.pi * air_density)), 0.0)
     return JetSource(DECAY * impulse, DECAY * diameter, 1 / diameter)
 
 
@@ -157,7 +157,7 @@ def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
     positive_depth = jnp.where(depth < 0, 0.0, depth)
     q = positive_depth + source.origin
     w = q / (q * q + (math.sqrt(2) - 1) / SPREAD**2 * rotation.dot(off_axis, off_axis))
-    x = positive_depth * source.per_diameter
+    x = positive_depth * source.inverse_diameter
     x = jnp.where(x > 1, 1.0, x)
     fade_in = x * x * (3 - 2 * x)
     return fade_in * source.strength * q * w * w

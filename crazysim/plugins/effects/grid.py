@@ -20,7 +20,7 @@ from crazysim.tables import ANY_NUMBER, MAX_NUMBER, POSITIVE, read_numbers
 MAX_FUSED_VALUES = 400_000
 """Largest number of values of a table that a fused kernel reads; each value adds 8 µs to the compilation of the
 step."""
-WHY_UNFUSED = f"its table has more than {MAX_FUSED_VALUES:,} numbers"
+UNFUSED_REASON = f"its table has more than {MAX_FUSED_VALUES:,} numbers"
 """Reason why a stage that reads a table is not fused."""
 MAX_FILE_BYTES = 2**30
 """Largest file of a grid, bytes."""
@@ -51,10 +51,11 @@ class Grid(NamedTuple):
         )
         core = () if k is None else (k,)
         if values.ndim != 3 + len(core) or values.shape[3:] != core or min(values.shape) < 1:
-            key = "one number" if k is None else f"{k} numbers"
+            node_values = "one number" if k is None else f"{k} numbers"
             shape = f"(n_x, n_y, n_z{', ' if core else ''}{', '.join(map(str, core))})"
             raise ConfigError(
-                f"expected {name} as values of shape {shape}, got {values.shape}. Give each node of the grid {key}."
+                f"expected {name} as values of shape {shape}, got {values.shape}. Give each node of the "
+                f"grid {node_values}."
             )
         if origin.shape != (3,) or spacing.shape not in ((), (3,)):
             raise ConfigError(
@@ -80,11 +81,11 @@ def interpolate(values: Array, position: Array) -> Array:
     n_axes = position.shape[-1]
     shares, nodes = [], []
     for k in range(n_axes):
-        last = values.shape[k] - 1
-        cells = safe_clip(position[..., k], 0.0, float(last))
-        low = jnp.clip(jnp.floor(cells), 0, max(last - 1, 0))
-        share, low = cells - low, low.astype(jnp.int32)
-        nodes.append((low, jnp.minimum(low + 1, last)))
+        last_node = values.shape[k] - 1
+        cells = safe_clip(position[..., k], 0.0, float(last_node))
+        lower_node = jnp.clip(jnp.floor(cells), 0, max(last_node - 1, 0))
+        share, lower_node = cells - lower_node, lower_node.astype(jnp.int32)
+        nodes.append((lower_node, jnp.minimum(lower_node + 1, last_node)))
         shares.append((1 - share, share))
     core = (1,) * (values.ndim - n_axes)
     total: Any = 0.0
@@ -108,8 +109,8 @@ def is_inside(shape: tuple[int, ...], position: Array) -> Array:
     Returns:
         (...)
     """
-    last = jnp.asarray(np.array(shape) - 1, position.dtype)
-    return jnp.all((position >= 0) & (position <= last), axis=-1)
+    last_node = jnp.asarray(np.array(shape) - 1, position.dtype)
+    return jnp.all((position >= 0) & (position <= last_node), axis=-1)
 
 
 def load_wind_grid(path: str | Path) -> Grid:
@@ -143,7 +144,8 @@ def load_wind_grid(path: str | Path) -> Grid:
         ) from error
     if not np.all(np.abs(table) <= MAX_NUMBER):
         raise ConfigError(
-            f"expected finite numbers in {str(path)!r}, got NaN, infinity or a larger one. Fill the gaps."
+            f"expected finite numbers in {str(path)!r}, got NaN, infinity or a number above {MAX_NUMBER:g}. "
+            f"Fill the gaps."
         )
     axes, indices = zip(*(_nodes(table[:, k]) for k in range(3)), strict=True)
     shape = tuple(map(len, axes))

@@ -18,7 +18,7 @@ class TerrainData(PyTree):
     """Heights of the nodes above the middle of the terrain, rows along y and columns along x, m. (n_rows, n_columns)"""
     middle: Array = leaf("shared", 1)
     """Position of the middle of the terrain, world frame, m. (3,)"""
-    half: Array = leaf("shared", 1)
+    half_size: Array = leaf("shared", 1)
     """Half extents along x and y, m. (2,)"""
     height_below: Array = leaf("drone", 1)
     """Height of the ground below the drone after the last step, world frame, m. (n_worlds, n_drones, 1)"""
@@ -38,7 +38,7 @@ class TerrainData(PyTree):
         Returns:
             Height, world frame, m (..., 1), and unit normal, upwards (..., 3).
         """
-        height, normal, is_inside = surface_at(self.heights, self.half, pos - self.middle)
+        height, normal, is_inside = surface_at(self.heights, self.half_size, pos - self.middle)
         if self.floor:
             normal = jnp.where(is_inside[..., None], normal, jnp.asarray([0.0, 0.0, 1.0], normal.dtype))
             return jnp.where(is_inside, height + self.middle[2], 0.0)[..., None], normal
@@ -54,7 +54,7 @@ class TerrainData(PyTree):
             Distance, m, ``OUTSIDE_DISTANCE`` beyond the border of a terrain that a flat floor surrounds (...), and unit
             normal (..., 3).
         """
-        height, normal, is_inside = surface_at(self.heights, self.half, point - self.middle)
+        height, normal, is_inside = surface_at(self.heights, self.half_size, point - self.middle)
         gap = (point[..., 2] - self.middle[2] - height) * normal[..., 2]
         return jnp.where(is_inside, gap, OUTSIDE_DISTANCE) if self.floor else gap, normal
 

@@ -50,10 +50,10 @@ class Latency(Plugin):
     order: ClassVar[int] = -1  # before the effects that limit commands, so that they limit a late one too
 
     def record(self, sim: Simulation) -> LatencyData:
-        return self._filled_queue(sim, sim.data)
+        return self._initial_record(sim, sim.data)
 
     def default_record(self, sim: Simulation) -> LatencyData:
-        return self._filled_queue(sim, sim.default_data)
+        return self._initial_record(sim, sim.default_data)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         queue = stage("drone")(self.move_queue)
@@ -86,11 +86,11 @@ class Latency(Plugin):
 
         return Stage(run_on_delayed_state, scope, controller.when, controller.batched, controller.__name__)
 
-    def _filled_queue(self, sim: Simulation, data: SimData) -> LatencyData:
-        delay, longest = np.asarray(self.delay), self.max_delay
-        longest = int(np.max(delay)) if longest is None else longest
-        steps, command = check_parameter(sim, "delay", delay, (1,), 0, longest, jnp.int32), _staged_command(data)
-        queue = np.repeat(np.asarray(command)[..., None, :], int(longest) + 1, axis=-2)
+    def _initial_record(self, sim: Simulation, data: SimData) -> LatencyData:
+        delay, max_delay = np.asarray(self.delay), self.max_delay
+        max_delay = int(np.max(delay)) if max_delay is None else max_delay
+        steps, command = check_parameter(sim, "delay", delay, (1,), 0, max_delay, jnp.int32), _staged_command(data)
+        queue = np.repeat(np.asarray(command)[..., None, :], int(max_delay) + 1, axis=-2)
         return LatencyData(steps, device_array(queue, command.dtype), command)
 
 

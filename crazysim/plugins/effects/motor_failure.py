@@ -70,8 +70,8 @@ class MotorFailure(Plugin):
         motors = self.read(data)
         effectiveness = motors.effectiveness
         if motors.fail_step is not None:
-            due = (motors.fail_step >= 0) & (data.core.steps >= motors.fail_step)
-            effectiveness = jnp.where(due, 0.0, effectiveness)
+            is_due = (motors.fail_step >= 0) & (data.core.steps >= motors.fail_step)
+            effectiveness = jnp.where(is_due, 0.0, effectiveness)
         if motors.rate is not None:
             chance = uniform(drone_key(data, self.name), effectiveness.shape, effectiveness.dtype)
             effectiveness = jnp.where(chance < jnp.exp(-motors.rate / data.core.freq), effectiveness, 0.0)
@@ -87,6 +87,7 @@ class MotorFailure(Plugin):
         if self.name not in data.plugins:
             raise ConfigError(f"{self.name} is not enabled. Use sim.add(MotorFailure(...)) first.")
         motors = self.read(data)
-        before = motors.effectiveness
-        mask = as_mask(mask, before.shape, item="rotor (n_worlds, n_drones, n_rotors)")
-        return self.write(data, motors.replace(effectiveness=select_worlds(mask, jnp.zeros_like(before), before)))
+        effectiveness = motors.effectiveness
+        mask = as_mask(mask, effectiveness.shape, item="rotor (n_worlds, n_drones, n_rotors)")
+        effectiveness = select_worlds(mask, jnp.zeros_like(effectiveness), effectiveness)
+        return self.write(data, motors.replace(effectiveness=effectiveness))

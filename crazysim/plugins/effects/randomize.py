@@ -150,18 +150,18 @@ class Randomize(Plugin):
 
     def record(self, sim: Simulation) -> RandomizeData:
         require_rotors(sim, "randomisation of motors")
-        blows = self.wind is not None
-        if blows and "wind" in self.optional and not has_drag(sim):
-            blows = False
-        elif blows:
+        has_wind = self.wind is not None
+        if has_wind and "wind" in self.optional and not has_drag(sim):
+            has_wind = False
+        elif has_wind:
             require_drag(sim, "wind")
-        settings = self if blows or self.wind is None else dataclasses.replace(self, wind=None)
+        settings = self if has_wind or self.wind is None else dataclasses.replace(self, wind=None)
         record = settings.fill_record(
             sim,
             RandomizeData,
             factors=drone_array(sim, 1.0, len(FACTOR_SETTINGS)),
             thrust_factors=drone_array(sim, 1.0, sim.data.states.rotor_vel.shape[-1]),
-            air_vel=drone_array(sim, 0.0, 3) if blows else None,
+            air_vel=drone_array(sim, 0.0, 3) if has_wind else None,
         )
         for name in RANGE_SETTINGS:
             limits, values = getattr(record, name), getattr(self, name)
@@ -177,17 +177,17 @@ class Randomize(Plugin):
         records = sim.data.plugins.values()
         latencies = {name: x for name, x in sim.data.plugins.items() if isinstance(x, LatencyData)}
         has_battery = any(isinstance(x, BatteryData) for x in records)
-        drags = has_drag(sim) or any(isinstance(x, RotorAerodynamicsData) for x in records)
-        unmet = {
+        has_any_drag = has_drag(sim) or any(isinstance(x, RotorAerodynamicsData) for x in records)
+        requirements = {
             "charge": (has_battery, "a battery", "sim.add(Battery())"),
-            "drag": (drags, "an airframe with drag", "sim.add(RotorAerodynamics(...))"),
-            "delay": (bool(latencies), "late commands", f"sim.add({self._latency(sim)})"),
+            "drag": (has_any_drag, "an airframe with drag", "sim.add(RotorAerodynamics(...))"),
+            "delay": (bool(latencies), "late commands", f"sim.add({self._latency_code(sim)})"),
         }
-        for setting, (is_met, needs, remedy) in unmet.items():
+        for setting, (is_met, requirement, remedy) in requirements.items():
             if getattr(self, setting) is not None and not is_met and setting not in self.optional:
                 raise ConfigError(
-                    f"expected {needs} for Randomize({setting}=...), got a simulation without. Use {remedy} too, or "
-                    f"{setting}=None."
+                    f"expected {requirement} for Randomize({setting}=...), got a simulation without. Use {remedy} too, "
+                    f"or {setting}=None."
                 )
         for name, latency in latencies.items() if self.delay is not None else ():
             batch = (sim.n_worlds, sim.n_drones)
@@ -195,7 +195,7 @@ class Randomize(Plugin):
                 raise ConfigError(
                     f"expected plugin {name!r} with one delay per drone, of up to {self._max_delay} steps, got delay "
                     f"of shape {latency.delay.shape} and queues of {latency.queue.shape[-2]} rows. Use "
-                    f"{self._latency(sim)}."
+                    f"{self._latency_code(sim)}."
                 )
 
     @property
@@ -203,7 +203,7 @@ class Randomize(Plugin):
         """Longest delay, steps."""
         return 0 if self.delay is None else int(np.max(np.asarray(self.delay)))
 
-    def _latency(self, sim: Simulation) -> str:
+    def _latency_code(self, sim: Simulation) -> str:
         """Return the expression, for messages, of a ``Latency`` whose delays can be drawn."""
         return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._max_delay})"
 
@@ -248,12 +248,12 @@ class Randomize(Plugin):
             changes["air_vel"] = jnp.concatenate([speed * jnp.cos(angle), speed * jnp.sin(angle), 0 * speed])
         data = self.write(data, record.replace(**changes))
 
-        others = dict(data.plugins)
+        records = dict(data.plugins)
         for name, other in data.plugins.items():
             if isinstance(other, BatteryData) and record.charge is not None:
                 charge = draw_factor(record.charge, other_draws[3:4])
-                others[name] = other.replace(charge=charge, voltage=open_circuit_voltage(charge, other.n_cells))
+                records[name] = other.replace(charge=charge, voltage=open_circuit_voltage(charge, other.n_cells))
             if isinstance(other, LatencyData) and record.delay is not None:
                 steps = jnp.floor(draw_factor(record.delay, other_draws[4:5])).astype(other.delay.dtype)
-                others[name] = other.replace(delay=steps)
-        return data.replace(plugins=others)
+                records[name] = other.replace(delay=steps)
+        return data.replace(plugins=records)

@@ -81,12 +81,14 @@ class Residual(Plugin):
             coefficients = _airframe_coefficients(sim)
         n_hidden = 0 if coefficients["hidden"] is None else np.atleast_2d(coefficients["hidden"]).shape[-2]
 
-        def checked(key: str, shape: tuple[int, int]) -> Array | None:
+        def check_coefficients(key: str, shape: tuple[int, int]) -> Array | None:
             value = coefficients[key]
             return None if value is None else check_parameter(sim, key, value, shape)
 
         linear = check_parameter(sim, "linear", coefficients["linear"], (6, N_INPUTS))
-        return ResidualData(linear, checked("hidden", (n_hidden, N_INPUTS)), checked("output", (6, n_hidden)))
+        return ResidualData(
+            linear, check_coefficients("hidden", (n_hidden, N_INPUTS)), check_coefficients("output", (6, n_hidden))
+        )
 
     def influence(self, data: SimData) -> SimData:
         s = data.states

@@ -13,7 +13,7 @@ from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array
 from crazysim.core.random import uniform, world_key
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, WHY_UNFUSED, Grid, interpolate
+from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON, Grid, interpolate
 from crazysim.plugins.effects.moving_air import BodiesInAir, MovingAir, require_drag, with_moving_air
 from crazysim.pytree import device_array, leaf
 
@@ -88,7 +88,7 @@ class WindField(Plugin):
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         is_small = np.size(self.field.values) <= MAX_FUSED_VALUES
         scope = "drone" if is_small else "batch"
-        return [StagePlacement(Stage(self.look_up, scope, batched=True, unfused_reason=WHY_UNFUSED))]
+        return [StagePlacement(Stage(self.look_up, scope, batched=True, unfused_reason=UNFUSED_REASON))]
 
     @property
     def resets_episode(self) -> bool:
@@ -108,5 +108,7 @@ class WindField(Plugin):
         data = self.write(data, record.replace(air_vel=record.velocity_at(data.states.pos)))
         fields = [x for x in data.plugins.values() if isinstance(x, WindFieldData)]
         loads = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.wind_vel is not None}
-        in_wind = {name: x.replace(wind_vel=sum(f.velocity_at(x.pos) for f in fields)) for name, x in loads.items()}
-        return data.replace(plugins=data.plugins | in_wind)
+        loads_in_wind = {
+            name: x.replace(wind_vel=sum(f.velocity_at(x.pos) for f in fields)) for name, x in loads.items()
+        }
+        return data.replace(plugins=data.plugins | loads_in_wind)

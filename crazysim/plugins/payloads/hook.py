@@ -163,14 +163,14 @@ class Hook(CollidingPlugin, Plugin):
             & (dot(relative_vel, relative_vel) < load.max_speed**2)
             & (load.mass > 0)
         )
-        picks = load.grip & ~load.attached & can_grip[..., 0]
-        new_load = load.replace(attached=load.grip & (load.attached | picks))
+        is_picked_up = load.grip & ~load.attached & can_grip[..., 0]
+        new_load = load.replace(attached=load.grip & (load.attached | is_picked_up))
         link = self._link_params(new_load)
         joint_vel = load.tip_vel + load.mass / (link.mass + MIN_MASS) * relative_vel
         new_state, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, joint_vel)
 
-        def where_picked(is_picked: Array, unchanged: Array) -> Array:
-            return jnp.where(picks, is_picked, unchanged)
+        def where_picked(new: Array, old: Array) -> Array:
+            return jnp.where(is_picked_up, new, old)
 
         tip_vel = where_picked(tip_vel, load.tip_vel)
         new_load = new_load.replace(
@@ -221,14 +221,14 @@ class Hook(CollidingPlugin, Plugin):
         height = jnp.where(load.attached[..., None], load.clearance, 0.0)
         tip_pos, tip_vel = hanging_state(data.states, load.attach, load.length, height, False)
         tip_pos, tip_vel = select_worlds(mask, tip_pos, load.tip_pos), select_worlds(mask, tip_vel, load.tip_vel)
-        on_hook = load.attached[..., None]
-        new = load.replace(
+        is_held = load.attached[..., None]
+        new_load = load.replace(
             tip_pos=tip_pos,
             tip_vel=tip_vel,
-            pos=jnp.where(on_hook, tip_pos, load.pos),
-            vel=jnp.where(on_hook, tip_vel, load.vel),
+            pos=jnp.where(is_held, tip_pos, load.pos),
+            vel=jnp.where(is_held, tip_vel, load.vel),
         )
-        return self.write(data, new)
+        return self.write(data, new_load)
 
     def move_objects(self, data: SimData) -> Objects:
         if not self.in_scene:

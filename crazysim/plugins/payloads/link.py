@@ -30,7 +30,7 @@ MIN_SQUARED_LENGTH = 1e-20
 """Term added to the squared distance, m^2, so that the direction of a link without length is zero."""
 BOUNCE_SPEED = 0.1
 """Speed below which a cable that becomes taut does not bounce, m/s."""
-CORRECTION, MOST_CORRECTION = 50.0, 0.5
+CORRECTION_RATE, MAX_CORRECTION_SHARE = 50.0, 0.5
 """Rate at which a scheme of higher order removes errors in length, 1/s, and the largest share of an error that a step
 removes. The order of the scheme requires a rate that does not depend on the step."""
 SLACK_ACCELERATION = 1e9
@@ -156,7 +156,7 @@ def couple_bodies(
     rel_acc = free_acc - attach_acc
 
     link_pull = UnitPull.create(geometry.direction, geometry.rot, J_inv, link.attach)
-    # Of equal directions: their product is 1 but for rounding.
+    # This is ``m * link_pull.response(link_pull, mass)``, where the product of the equal directions is 1.
     mass_ratio = m / mass
     if link_pull.lever is not None and link_pull.ang_acc is not None:
         mass_ratio = m / mass + m * dot(link_pull.lever, link_pull.ang_acc)
@@ -184,7 +184,7 @@ def couple_bodies(
         tensions[0] = tensions[0] - damping_rate * radial_speed
     parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
     pull = sum(parts[1:], parts[0])
-    # Constants are multiplied first, which is then done once, and the rest are multiply-adds.
+    # Products of constants come first: they are computed once, and the rest are multiply-adds.
     mass_ratio, new_deriv = m / mass, deriv
     if damping is not None:
         pull = pull + damping
@@ -231,7 +231,7 @@ def _swing_velocities(state: SimState, geometry: LinkGeometry) -> tuple[Array, A
 
 def correction_rate(freq: int) -> float:
     """Return the rate at which a scheme of higher order removes errors in length, 1/s."""
-    return min(CORRECTION, MOST_CORRECTION * freq)
+    return min(CORRECTION_RATE, MAX_CORRECTION_SHARE * freq)
 
 
 def drag_rate(coefficient: Array, mass: Array, dt: float | None, freq: int) -> Array:
@@ -308,7 +308,9 @@ def _tip_pos_rate(
         stretch = jnp.where(stretch > -TAUT_BAND * link.length, stretch, 0.0)
     correction = freq if dt is not None else correction_rate(freq)
     correction = correction if is_attached is None else jnp.where(is_attached, correction, 0.0)
-    pos_rate = vel if dt is None else vel + dt * tip_acc  # as the integrator has it: computed once
+    pos_rate = (
+        vel if dt is None else vel + dt * tip_acc
+    )  # the same expression as in the integrator, so it is computed once
     pos_rate = pos_rate - correction * stretch * geometry.direction
     if link.is_hinge:
         pos_rate = pos_rate - correction * dot(geometry.rot[..., 1], geometry.offset) * geometry.rot[..., 1]

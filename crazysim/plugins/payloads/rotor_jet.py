@@ -19,7 +19,7 @@ from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.downwash import collective_thrust, hover_jet_speed, mean_rotor_vel, stream_diameter
-from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, WHY_UNFUSED, interpolate, is_inside
+from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON, interpolate, is_inside
 from crazysim.plugins.effects.moving_air import checked_propeller_radius, require_rotors
 from crazysim.plugins.payloads.colliders import CollidingPlugin
 from crazysim.plugins.payloads.jet_table import JetTable
@@ -111,7 +111,7 @@ class RotorJet(Plugin):
 
         numbers = 0 if self.table is None else sum(np.size(x) for x in (self.table.pressure, self.table.velocity))
         scope = "world" if self.all_drones else "drone" if numbers <= MAX_FUSED_VALUES else "batch"
-        return [StagePlacement(Stage(apply_jets, scope, batched=not self.all_drones, unfused_reason=WHY_UNFUSED))]  # type: ignore[arg-type]
+        return [StagePlacement(Stage(apply_jets, scope, batched=not self.all_drones, unfused_reason=UNFUSED_REASON))]  # type: ignore[arg-type]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the force of the jet on the load, world frame, N."""

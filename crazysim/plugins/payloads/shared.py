@@ -75,8 +75,8 @@ def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Arr
     """
     mean = states.pos.mean(axis=1, keepdims=True)
     # As low as the cables of the drones around it allow.
-    level = rotation.safe_norm((states.pos - mean)[..., :2])
-    drop = rotation.safe_sqrt((length - level) * (length + level))
+    horizontal_distance = rotation.safe_norm((states.pos - mean)[..., :2])
+    drop = rotation.safe_sqrt((length - horizontal_distance) * (length + horizontal_distance))
     height = jnp.maximum(jnp.max(states.pos[..., 2:] - drop, axis=1, keepdims=True), clearance)
     return jnp.concatenate([mean[..., :2], height], axis=-1), states.vel.mean(axis=1, keepdims=True)
 
@@ -149,18 +149,20 @@ class SharedLoad(PointLoad, Plugin):
         m, n = load.mass, s.pos.shape[0]
         gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else jnp.mean(p.gravity_vec, axis=0)
         r = link_geometry(s, load.pos, load.vel, load.attach)
-        q, out = r.direction, rotation.dot(r.direction, r.vel)
+        q, radial_speed = r.direction, rotation.dot(r.direction, r.vel)
         pull = UnitPull.create(q, r.rot, p.J_inv, load.attach)
         share = 1.0 if dt is None else 0.5
         rel_acc = gravity - acceleration_at(s, deriv, r.rot, load.attach, share)
-        rhs = rotation.dot(q, rel_acc) + share / load.length * (rotation.dot(r.vel, r.vel) - out * out)
+        rhs = rotation.dot(q, rel_acc) + share / load.length * (
+            rotation.dot(r.vel, r.vel) - radial_speed * radial_speed
+        )
         is_active = load.attached
         if dt is None:
-            rhs = rhs + 2 * correction_rate(freq) * out
+            rhs = rhs + 2 * correction_rate(freq) * radial_speed
             is_active = is_active & (r.distance > (1 - TAUT_BAND) * load.length)[..., 0] if self.cable else is_active
         else:
             gap = jnp.maximum(load.length - r.distance, 0.0) if self.cable else 0.0
-            rhs = rhs + freq * (out - freq * gap)
+            rhs = rhs + freq * (radial_speed - freq * gap)
         ratio = jnp.broadcast_to(m / p.mass, (n, 1))
         ratio = (
             ratio if pull.lever is None or pull.ang_acc is None else ratio + m * rotation.dot(pull.lever, pull.ang_acc)

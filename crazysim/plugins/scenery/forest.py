@@ -36,7 +36,7 @@ class Columns(NamedTuple):
     """Half the angle about the axis, rad. (...)"""
     size: Array
     """Size, m. (...)"""
-    stands: Array
+    is_standing: Array
     """True where the cell has an obstacle. (...)"""
 
 
@@ -123,7 +123,7 @@ class StandingObstacles(Scenery):
 
     def poses(self, data: SimData) -> tuple[Array, Array]:
         columns = self.columns(data, *np.divmod(self.order, self.n_cells[1]))
-        z = jnp.where(columns.stands, 0.0, -HIDDEN_DEPTH)
+        z = jnp.where(columns.is_standing, 0.0, -HIDDEN_DEPTH)
         pos, zero = jnp.stack([columns.x, columns.y, z], axis=-1), jnp.zeros_like(z)
         quat = jnp.stack([zero, zero, jnp.sin(columns.half_turn), jnp.cos(columns.half_turn)], axis=-1)
         return pos, quat
@@ -138,18 +138,18 @@ class StandingObstacles(Scenery):
         """
         record, (n_x, n_y) = self.read(data), self.n_cells
         cell = column * n_y + row
-        place_x, place_y, share = (record.uniform(3 * cell + k) for k in range(3))
+        start_x, start_y, share = (record.uniform(3 * cell + k) for k in range(3))
         turn, vel_x, vel_y = (record.uniform(4 * n_x * n_y + 3 * cell + k) for k in range(3))
-        size = self._size(self._size_index(cell)).astype(place_x.dtype)
+        size = self._size(self._size_index(cell)).astype(start_x.dtype)
         reach = self.cell - self.gap - 2 * self.radius(size)
         middle_x, middle_y = self._middle(column, row)
         middle_y = middle_y + self._shift(data, column)
-        x = middle_x + self.wander(data, place_x, vel_x, reach)
-        y = middle_y + self.wander(data, place_y, vel_y, reach)
+        x = middle_x + self.wander(data, start_x, vel_x, reach)
+        y = middle_y + self.wander(data, start_y, vel_y, reach)
         is_inside = (column >= 0) & (column < n_x) & (row >= 0) & (row < n_y)
         is_free = self.is_free((x, y), (middle_x, middle_y), self.radius(size), reach)
-        stands = is_inside & (share < record.difficulty) & is_free
-        return Columns(x, y, jnp.pi * turn, size, stands)
+        is_standing = is_inside & (share < record.difficulty) & is_free
+        return Columns(x, y, jnp.pi * turn, size, is_standing)
 
     def clearance(self, data: SimData, pos: Array) -> Array:
         """Return the distance from points to the surface of the nearest obstacle, m, negative inside. (...)
@@ -169,7 +169,7 @@ class StandingObstacles(Scenery):
         columns = self.columns(data, column, row)
         offset = [pos[..., 0] - columns.x, pos[..., 1] - columns.y, pos[..., 2] - self.height / 2]
         distance = self.distance(columns, jnp.broadcast_arrays(*offset))
-        return jnp.min(jnp.where(columns.stands & (distance < self.cell), distance, self.cell), axis=(0, 1))
+        return jnp.min(jnp.where(columns.is_standing & (distance < self.cell), distance, self.cell), axis=(0, 1))
 
     def _middle(self, column: Any, row: Any) -> tuple[Any, Any]:
         """Return the middle of cells, before the shifts of their rows, m. (...) and (...)"""
@@ -194,7 +194,7 @@ class StandingObstacles(Scenery):
 
 
 class Forest(StandingObstacles):
-    """Upright trunks, one in each square cell of ``1 / density``, with another place in it in every world and episode.
+    """Upright trunks, one in each square cell of ``1 / density``, at another position in it in every world and episode.
 
     Rows of cells along y are shifted against each other by a random length, so that there are no straight aisles along
     x. A tree keeps a distance of ``gap / 2`` from the edges of its cell: from every point beside the trees there is a

@@ -1,4 +1,4 @@
-"""Gates: a course of gates with other places in every world and episode."""
+"""Gates: a course of gates at other positions in every world and episode."""
 
 from __future__ import annotations
 
@@ -54,17 +54,20 @@ class Gates(Scenery):
         y, z, b = width / 2, height / 2, self.bar / 2
         shapes = [(Shape("box", (b, b, z + self.bar)), (0.0, side * (y + b), 0.0)) for side in (-1, 1)]
         shapes += [(Shape("box", (b, y, b)), (0.0, 0.0, side * (z + b))) for side in (-1, 1)]
-        return [Model("gate", options, shapes, self._line())]
+        return [Model("gate", options, shapes, self._undisplaced_positions())]
 
     def poses(self, data: SimData) -> tuple[Array, Array]:
-        record, number = self.read(data), np.arange(self.count)
-        u = [record.uniform(number + k * self.count) for k in range(7)]
+        record, gate = self.read(data), np.arange(self.count)
+        u = [record.uniform(gate + k * self.count) for k in range(7)]
         reach = 2 * np.asarray(self.offset, np.float64)
-        pos = [self._line()[:, k] + self.wander(data, u[k], u[k + 3], record.difficulty * reach[k]) for k in range(3)]
+        pos = [
+            self._undisplaced_positions()[:, k] + self.wander(data, u[k], u[k + 3], record.difficulty * reach[k])
+            for k in range(3)
+        ]
         half_turn = (u[6] - 0.5) * self.turn * record.difficulty
         quat = [0 * half_turn, 0 * half_turn, jnp.sin(half_turn), jnp.cos(half_turn)]
         return jnp.stack([x.astype(half_turn.dtype) for x in pos], axis=-1), jnp.stack(quat, axis=-1)
 
-    def _line(self) -> np.ndarray:
+    def _undisplaced_positions(self) -> np.ndarray:
         """Return the middles of the gates before they are displaced, m. (count, 3)"""
         return np.asarray(self.start, np.float64) + self.spacing * np.arange(self.count)[:, None] * [1.0, 0.0, 0.0]

@@ -1,4 +1,4 @@
-"""Rooms: a building whose doors have other places in every world and episode."""
+"""Rooms: a building whose doors are elsewhere in every world and episode."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ class Rooms(Scenery):
         return int(self.room / self.door + 1e-6)
 
     def models(self) -> Sequence[Model]:
-        outer = [Model(*self._wall(length), np.array([middle])) for length, middle in self._outer_walls()]
-        inner = [Model(*self._wall(self.room / self.n_panels), self._panels())] if self.n_walls else []
-        return [*outer, *inner]
+        outer_walls = [Model(*self._wall(length), np.array([middle])) for length, middle in self._outer_walls()]
+        inner_walls = [Model(*self._wall(self.room / self.n_panels), self._panels())] if self.n_walls else []
+        return [*outer_walls, *inner_walls]
 
     @property
     def n_walls(self) -> int:
@@ -67,11 +67,11 @@ class Rooms(Scenery):
         record, n_panels = self.read(data), self.n_panels
         wall, panel = np.divmod(np.arange(self.n_walls * n_panels), n_panels)
         is_along_x = wall >= (self._counts()[0] - 1) * self._counts()[1]
-        stands = record.uniform(self.n_walls + wall) < record.difficulty
+        is_standing = record.uniform(self.n_walls + wall) < record.difficulty
         has_door = jnp.floor(record.uniform(wall) * n_panels) == panel
-        depth = jnp.where(stands & ~has_door, 0.0, HIDDEN_DEPTH).astype(record.difficulty.dtype)
-        outer = np.array([middle for _, middle in self._outer_walls()])
-        pos = jnp.asarray(np.concatenate([outer, self._panels()]), depth.dtype)
+        depth = jnp.where(is_standing & ~has_door, 0.0, HIDDEN_DEPTH).astype(record.difficulty.dtype)
+        outer_walls = np.array([middle for _, middle in self._outer_walls()])
+        pos = jnp.asarray(np.concatenate([outer_walls, self._panels()]), depth.dtype)
         depth = jnp.concatenate([jnp.zeros((*depth.shape[:-1], 4), depth.dtype), depth], axis=-1)
         half_turn = np.concatenate([[0.0, 0.0, np.pi / 4, np.pi / 4], is_along_x * np.pi / 4])
         quat = jnp.asarray(np.stack([0 * half_turn, 0 * half_turn, np.sin(half_turn), np.cos(half_turn)], axis=-1))
@@ -100,8 +100,8 @@ class Rooms(Scenery):
         """Return the middles of the panels: of the walls along y, then of those along x, m. (n_walls * n_panels, 3)"""
         n_x, n_y = self._counts()
         corner = np.asarray(self.center, np.float64) - self.room * np.array([n_x, n_y]) / 2
-        at = self.room * (np.arange(self.n_panels) + 0.5) / self.n_panels
+        offsets = self.room * (np.arange(self.n_panels) + 0.5) / self.n_panels
         panels = [
-            [self.room * (i + 1), self.room * j + a, 0.0] for i in range(n_x - 1) for j in range(n_y) for a in at
-        ] + [[self.room * i + a, self.room * (j + 1), 0.0] for i in range(n_x) for j in range(n_y - 1) for a in at]
+            [self.room * (i + 1), self.room * j + a, 0.0] for i in range(n_x - 1) for j in range(n_y) for a in offsets
+        ] + [[self.room * i + a, self.room * (j + 1), 0.0] for i in range(n_x) for j in range(n_y - 1) for a in offsets]
         return np.array(panels).reshape(-1, 3) + [*corner, 0.0]

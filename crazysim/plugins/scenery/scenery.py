@@ -29,7 +29,7 @@ from crazysim.geometry.distance import point_distance
 from crazysim.pytree import PyTree, device_array, leaf
 
 HIDDEN_DEPTH = 100.0
-"""Depth below their places of obstacles that a layout leaves out, m."""
+"""Depth by which obstacles that a layout leaves out are moved down, m."""
 MIN_REACH = 1e-3
 """Length of a region below which an obstacle counts as standing still, m."""
 MAX_OBSTACLES = 10_000
@@ -70,8 +70,8 @@ class Model(NamedTuple):
 class Scenery(Plugin):
     """Base class of layouts of obstacles, drawn again in every world at every reset.
 
-    A subclass defines ``models`` and ``poses``. Tasks call ``place`` where an episode starts. An obstacle that a layout
-    leaves out is 100 m below its place.
+    A subclass defines ``models`` and ``poses``. Tasks call ``sample_layout`` where an episode starts. An obstacle that
+    a layout leaves out is 100 m below its position.
     """
 
     difficulty: ArrayLike = parameter(default=1.0, low=0.0, high=1.0, shapes=((), (2,)))
@@ -114,16 +114,16 @@ class Scenery(Plugin):
             data: All worlds, one world, or one drone.
             pos: Points, world frame, m: (n_worlds, n, 3), without n_worlds in one world, or (3,) for one drone.
         """
-        place, quat = (x[..., None, :, :] if x.ndim == 3 else x for x in self.poses(data))
+        obstacle_pos, quat = (x[..., None, :, :] if x.ndim == 3 else x for x in self.poses(data))
         gaps, start = [], 0
         for model in self.models():
             rows = slice(start, start + len(model.pos))
-            local = rotation.rotate_inverse(quat[..., rows, :], pos[..., None, :] - place[..., rows, :])
-            gaps += [point_distance(shape, local - jnp.asarray(at, pos.dtype)) for shape, at in model.shapes]
+            local = rotation.rotate_inverse(quat[..., rows, :], pos[..., None, :] - obstacle_pos[..., rows, :])
+            gaps += [point_distance(shape, local - jnp.asarray(x, pos.dtype)) for shape, x in model.shapes]
             start = rows.stop
         return functools.reduce(jnp.minimum, [jnp.min(gap, axis=-1) for gap in gaps])
 
-    def place(self, data: SimData, key: Array, difficulty: Array | None = None) -> SimData:
+    def sample_layout(self, data: SimData, key: Array, difficulty: Array | None = None) -> SimData:
         """Return the data of one world with another layout. Pure; tasks call it in ``spawn``.
 
         Args:
@@ -146,25 +146,25 @@ class Scenery(Plugin):
                 f"expected at most {MAX_OBSTACLES} obstacles in {type(self).__name__}, got {n}. Use a smaller size, or "
                 f"a lower density."
             )
-        for before in sim.scene.plugins():
-            if before.name == self.name and isinstance(before, Scenery) and repr(before.models()) != repr(models):
+        for other in sim.scene.plugins():
+            if other.name == self.name and isinstance(other, Scenery) and repr(other.models()) != repr(models):
                 raise ConfigError(
                     f"expected the obstacles of {self.name!r} as they are in the scene, where they stay, got others. "
-                    f"sim.replace can change difficulty=; use another name=, or a new simulation, for the rest."
+                    f"Use sim.replace only to change difficulty=; for the rest use another name= or a new simulation."
                 )
         for kind, model in zip(self.moved_kinds, models, strict=True):
             sim.scene.add_once(model.source, kind, len(model.pos), pos=model.pos, **model.options)
-        low_high = np.broadcast_to(np.asarray(self.difficulty, np.float64), 2)
-        if low_high[0] > low_high[1]:
+        difficulty_range = np.broadcast_to(np.asarray(self.difficulty, np.float64), 2)
+        if difficulty_range[0] > difficulty_range[1]:
             raise ConfigError(f"expected a range of difficulty, lowest first, got {self.difficulty!r}")
         return SceneryData(
             words=device_array(np.zeros((sim.n_worlds, 1, 2)), np.uint32),
-            difficulty=device_array(np.full((sim.n_worlds, 1), low_high[1])),
-            difficulty_range=device_array(low_high),
+            difficulty=device_array(np.full((sim.n_worlds, 1), difficulty_range[1])),
+            difficulty_range=device_array(difficulty_range),
         )
 
     def reset_episode(self, data: SimData) -> SimData:
-        return self.place(data, world_key(data, self.name))
+        return self.sample_layout(data, world_key(data, self.name))
 
     def move_objects(self, data: SimData) -> Objects:
         objects: Any = data.objects
@@ -177,19 +177,19 @@ class Scenery(Plugin):
         }
         return objects.replace(**rows)
 
-    def wander(self, data: SimData, place: Any, velocity: Any, reach: Any) -> Array:
+    def wander(self, data: SimData, start: Any, velocity: Any, reach: Any) -> Array:
         """Return the coordinate of points that move to and fro between ``-reach / 2`` and ``reach / 2``, m. (...)
 
         Args:
             data: All worlds, one world, or one drone, for the time since the reset.
-            place: Random numbers from 0 to 1 that give the places at the reset. (...)
+            start: Random numbers from 0 to 1 that give the coordinates at the reset. (...)
             velocity: Random numbers from 0 to 1 that give the velocities. (...)
             reach: Length of the regions, m. (...)
         """
         if not self.speed:
-            return (place - 0.5) * reach
-        travelled = (data.core.steps / data.core.freq).astype(place.dtype) * (2 * velocity - 1) * self.speed
-        phase = (place + travelled / jnp.maximum(reach, MIN_REACH)) / 2  # of a triangle wave with period 1
+            return (start - 0.5) * reach
+        travelled = (data.core.steps / data.core.freq).astype(start.dtype) * (2 * velocity - 1) * self.speed
+        phase = (start + travelled / jnp.maximum(reach, MIN_REACH)) / 2  # of a triangle wave with period 1
         phase = phase - jnp.floor(phase)
         return (2 * jnp.minimum(phase, 1 - phase) - 0.5) * reach
 

@@ -217,7 +217,7 @@ class Wander(Task):
         sim.add(self.forest)
 
     def spawn(self, data, key):
-        return flying(self.forest.place(data, key, jnp.float32(0.75)), jnp.float32([[0, 0, 1.0]]))
+        return flying(self.forest.sample_layout(data, key, jnp.float32(0.75)), jnp.float32([[0, 0, 1.0]]))
 
     def observe(self, data):
         return {"gap": self.forest.clearance(data, data.states.pos)[:, None]}
