@@ -23,9 +23,11 @@ from crazysim.envs.task import Task
 from crazysim.envs.tasks.avoid import Avoid
 from crazysim.envs.tasks.chase import Chase
 from crazysim.envs.tasks.deliver import Deliver
+from crazysim.envs.tasks.follow_car import FollowCar
 from crazysim.envs.tasks.forest import Forest
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
+from crazysim.envs.tasks.land_on_marker import LandOnMarker
 from crazysim.envs.tasks.race import Race
 from crazysim.envs.tasks.reach_vel import ReachVel
 from crazysim.envs.tasks.recover import Recover
@@ -65,7 +67,9 @@ TASKS: dict[str, Entry] = {
     "recover": Entry(Recover, "crazysim/Recover-v0"),
     "track": Entry(TrackTrajectory, "crazysim/Track-v0"),
     "land": Entry(Land, "crazysim/Land-v0"),
+    "land_on_marker": Entry(LandOnMarker, "crazysim/LandOnMarker-v0"),
     "chase": Entry(Chase, "crazysim/Chase-v0"),
+    "follow_car": Entry(FollowCar, "crazysim/FollowCar-v0"),
     "deliver": Entry(Deliver, "crazysim/Deliver-v0"),
     "race": Entry(Race, "crazysim/Race-v0"),
     "multi_race": Entry(Race, "crazysim/MultiRace-v0", n_drones=2),

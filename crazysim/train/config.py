@@ -46,6 +46,8 @@ class Recipe:
 
 _LONG_ROLLOUTS = {"n_steps": 64, "minibatches": 32, "hidden": (128, 128), "discount": 0.99}
 """Hyperparameters of tasks in which a reward follows seconds after the actions that earn it."""
+_BY_CAMERA = {**_LONG_ROLLOUTS, "entropy": 0.003, "convolution": (8, 16), "critic": "privileged"}
+"""Hyperparameters of tasks that are flown by the images of a camera."""
 
 RECIPES: dict[str, Recipe] = {
     "hover": Recipe(config={"iterations": 80, "minibatches": 16, "learning_rate": 2e-3}),
@@ -71,14 +73,7 @@ RECIPES: dict[str, Recipe] = {
     "avoid": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400, "minibatches": 64, "entropy": 0.003}),
     "forest": Recipe(
         n_worlds=4096,
-        config={
-            **_LONG_ROLLOUTS,
-            "iterations": 400,
-            "minibatches": 64,
-            "entropy": 0.003,
-            "convolution": (8, 16),
-            "critic": "privileged",
-        },
+        config={**_BY_CAMERA, "iterations": 400, "minibatches": 64},
         practice={"difficulty": (0.0, 1.0)},
     ),
     "transport": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400}),
@@ -92,6 +87,8 @@ RECIPES: dict[str, Recipe] = {
         n_worlds=2048,
         config={"iterations": 200, "n_steps": 64, "minibatches": 32, "discount": 0.99, "entropy": 0.003},
     ),
+    "land_on_marker": Recipe(n_worlds=4096, config={**_BY_CAMERA, "iterations": 150}),
+    "follow_car": Recipe(n_worlds=2048, config={**_BY_CAMERA, "iterations": 100}),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }
 """Recipes by task."""

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from crazysim import ConfigError, Sim
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
-from crazysim.envs.tasks.land import Land, pad_of
+from crazysim.envs.tasks.land import Land
 from crazysim.train.evaluation import evaluate
 
 N_SPAWNS, SPEED = 2048, 0.5
@@ -119,7 +119,7 @@ def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes
 
         def spawn(self, data, key):
             data = super().spawn(data, key)
-            pos, vel = pad_of(data, data.core.steps)
+            pos, vel = self.pad_motion(data, data.core.steps)
             quat = jnp.array([[[0.0, 0, 0, 1]], [[1.0, 0, 0, 0]]])[data.core.world_id]
             states = data.states.replace(pos=pos + jnp.array([0.0, 0.0, 0.35]), vel=vel, quat=quat)
             return data.replace(states=states)

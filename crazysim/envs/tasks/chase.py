@@ -65,18 +65,10 @@ class Chase(TouchDown):
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, and drones in flight around them."""
-        n, car, vehicle = data.core.n_drones, data.plugins[CARS], load_vehicle(VEHICLE)
+        n, car = data.core.n_drones, data.plugins[CARS]
         x = draw(key, n, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1)
         speed, steer = self.speed * scale_to(x["speed"], MIN_SPEED_SHARE, 1.0), scale_symmetric(x["steer"], MAX_STEER)
-        # Velocities of a car that rolls without slip; its tyres then slip a little.
-        side = jnp.tan(steer) * (vehicle.number("axles.rear") / vehicle.wheelbase)
-        car = car.replace(
-            yaw=scale_symmetric(x["yaw"], np.pi),
-            body_vel=jnp.concatenate([speed, side * speed], axis=-1),
-            yaw_rate=speed * jnp.tan(steer) / vehicle.wheelbase,
-            steer=steer,
-            command=jnp.concatenate([speed, steer], axis=-1),
-        )
+        car = rolling_car(car, scale_symmetric(x["yaw"], np.pi), speed, steer)
         data = data.replace(plugins=data.plugins | {CARS: car})
         pos = car.pos + scale_symmetric(x["start"], np.array([1.0, 1.0, 0.4])) + np.array([0.0, 0.0, 1.1])
         return flying(data, pos, rotation.from_rpy(scale_symmetric(x["rpy"], 0.2)), scale_symmetric(x["vel"], 0.3))
@@ -111,6 +103,26 @@ class Chase(TouchDown):
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         del n_drones
         return {"elevation": -25}
+
+
+def rolling_car(car: CarData, yaw: Array, speed: Array, steer: Array) -> CarData:
+    """Return cars that roll without slip, and are commanded to go on; their tyres then slip a little.
+
+    Args:
+        car: Cars of the model ``VEHICLE``.
+        yaw: Heading, rad. (n, 1)
+        speed: Speed of the rear axle, m/s. (n, 1)
+        steer: Steering angle, rad. (n, 1)
+    """
+    vehicle = load_vehicle(VEHICLE)
+    side = jnp.tan(steer) * (vehicle.number("axles.rear") / vehicle.wheelbase)
+    return car.replace(
+        yaw=yaw,
+        body_vel=jnp.concatenate([speed, side * speed], axis=-1),
+        yaw_rate=speed * jnp.tan(steer) / vehicle.wheelbase,
+        steer=steer,
+        command=jnp.concatenate([speed, steer], axis=-1),
+    )
 
 
 def roof() -> np.ndarray:

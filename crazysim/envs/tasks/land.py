@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +24,8 @@ from crazysim.pytree import device_array, leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
+PAD = "pad"
+"""Name of the pads in the scene, without their numbers."""
 RADIUS, HEIGHT = 0.25, 0.2
 """Default radius of a pad, and height of its upper side, m."""
 SPACING = 3.0
@@ -63,6 +65,8 @@ class Land(TouchDown):
     crash_cost = (
         2.0  # at 10, the reward of a landing, policies hover next to the pad: few of their first contacts are soft
     )
+    height: ClassVar[float] = HEIGHT
+    """Height of the upper side of a pad, m."""
 
     speed: float = setting(default=0.0, low=0.0, high=10.0)
     """Speed of a pad on a circle of 0.3 to 0.7 m radius, in either direction, m/s; zero for pads that stand still."""
@@ -72,14 +76,14 @@ class Land(TouchDown):
     def install(self, sim: Sim) -> None:
         """Add the pads, their motion and the check of contacts."""
         pads = sim.scene.add(
-            "landing_pad", "pad", count=sim.n_drones, pos=path_centres(sim.n_drones), radius=self.radius
+            "landing_pad", PAD, count=sim.n_drones, pos=self.path_centres(sim.n_drones), radius=self.radius
         )
         contacts = sim.scene.contact_fn([pads], drones=False)
 
         @stage("world")
         def move_pads(data: SimData) -> SimData:
             """Move the pads to their places at the end of this step."""
-            pos, vel = pad_of(data, data.core.steps + 1)
+            pos, vel = self.pad_motion(data, data.core.steps + 1)
             return pads.set_pose(data, pos, vel=vel)
 
         zero = device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)
@@ -96,7 +100,7 @@ class Land(TouchDown):
         dtype = data.states.pos.dtype
         start, rpy, vel = (2 * x[name] - 1 for name in ("start", "rpy", "vel"))
         start_pos = (
-            path_centres(n_drones).astype(dtype)
+            self.path_centres(n_drones).astype(dtype)
             + start * np.array([1.0, 1.0, 0.4], dtype)
             + np.array([0, 0, 1.0], dtype)
         )
@@ -108,17 +112,38 @@ class Land(TouchDown):
             circle=is_moving * circle, ang_vel=is_moving * ang_vel, phase=2 * jnp.pi * x["phase"]
         )
         data = with_record(data, record)
-        pos, pad_vel = pad_of(data, data.core.steps)
+        pos, pad_vel = self.pad_motion(data, data.core.steps)
         return record.pads.set_pose(data, pos, vel=pad_vel) if self.speed > 0 else data
 
     def target_motion(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's pad, of one drone or one world. (..., 3) each"""
-        return pad_of(data, data.core.steps + ahead if ahead else data.core.steps)
+        return self.pad_motion(data, data.core.steps + ahead if ahead else data.core.steps)
 
     def has_left_arena(self, data: SimData) -> Array:
         """Return true where a drone has left its part of the arena. (...)"""
         pos = data.states.pos
-        return jnp.any(jnp.abs(pos - path_centre_of(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
+        return jnp.any(jnp.abs(pos - self.path_centre(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
+
+    def path_centres(self, n_drones: int) -> np.ndarray:
+        """Return the middle of each pad's path, m. (n_drones, 3)"""
+        return np.concatenate([SPACING * grid_2d(n_drones), np.full((n_drones, 1), self.height)], axis=-1)
+
+    def path_centre(self, data: SimData) -> Array:
+        """Return the middle of the path of each drone's pad, of one drone or one world, m. (..., 3)"""
+        centres = jnp.asarray(self.path_centres(data.core.n_drones), data.states.pos.dtype)
+        return pick_entry(centres, data.core.drone_id)
+
+    def pad_motion(self, data: SimData, steps: Array) -> tuple[Array, Array]:
+        """Return position, m, and velocity, m/s, of each drone's pad after some steps, of one drone or one world.
+
+        Returns:
+            (..., 3) each
+        """
+        record = landing_of(data)
+        angle = record.phase + record.ang_vel * (steps / data.core.freq)
+        radial = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
+        tangential = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)
+        return self.path_centre(data) + record.circle * radial, record.circle * record.ang_vel * tangential
 
     def subjects(self, data: SimData) -> Array:
         """Return four points on the rim of each pad, m. (4 n_drones, 3)"""
@@ -129,26 +154,3 @@ class Land(TouchDown):
         """Return the camera of images and films."""
         del n_drones
         return {"elevation": -20}
-
-
-def path_centres(n_drones: int) -> np.ndarray:
-    """Return the middle of each pad's path, m. (n_drones, 3)"""
-    return np.concatenate([SPACING * grid_2d(n_drones), np.full((n_drones, 1), HEIGHT)], axis=-1)
-
-
-def path_centre_of(data: SimData) -> Array:
-    """Return the middle of the path of each drone's pad, of one drone or one world, m. (..., 3)"""
-    return pick_entry(jnp.asarray(path_centres(data.core.n_drones), data.states.pos.dtype), data.core.drone_id)
-
-
-def pad_of(data: SimData, steps: Array) -> tuple[Array, Array]:
-    """Return position, m, and velocity, m/s, of each drone's pad after some steps, of one drone or one world.
-
-    Returns:
-        (..., 3) each
-    """
-    record = landing_of(data)
-    angle = record.phase + record.ang_vel * (steps / data.core.freq)
-    radial = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
-    tangential = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)
-    return path_centre_of(data) + record.circle * radial, record.circle * record.ang_vel * tangential

@@ -115,8 +115,12 @@ class TouchDown(Task):
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the vector to its place, m, and the place's relative velocity, m/s."""
+        return state_of(data) | self.relative_target_motion(data)
+
+    def relative_target_motion(self, data: SimData) -> dict[str, Array]:
+        """Return the vector to each drone's place, m, and the place's relative velocity, m/s, as observations."""
         pos, vel = self.target_motion(data)
-        return state_of(data) | {
+        return {
             f"difference_to_{self.target_name}": pos - data.states.pos,
             f"difference_to_{self.target_name}_vel": vel - data.states.vel,
         }

@@ -1,0 +1,181 @@
+"""Follow a car, seen by a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.settings import setting
+from crazysim.envs import terms
+from crazysim.envs.random import draw, scale_symmetric, scale_to
+from crazysim.envs.spawn import flying
+from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.chase import CARS, VEHICLE, rolling_car
+from crazysim.envs.tasks.goals import motion_of, with_record
+from crazysim.envs.tasks.target_camera import TargetCamera
+from crazysim.plugins.vehicles import Cars
+from crazysim.plugins.vehicles.car_data import CarData
+from crazysim.plugins.vehicles.model import load_vehicle
+from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.sim.sim import Sim
+
+SPACING = 6.0
+"""Distance between the lanes of the cars of several drones, m; a drone follows its own car."""
+BEHIND, ABOVE = 0.8, 0.7
+"""Distance of the point to keep behind a car's centre of mass, along its heading, and its height above it, m."""
+MAX_DISTANCE, MIN_HEIGHT = 2.0, 0.25
+"""Largest distance of a drone from this point, and smallest height of a drone, which is higher than cars, m."""
+SPEED_RANGE = (0.2, 0.8)
+"""Smallest and largest mean speed of a car, as a share of ``speed``."""
+SPEED_AMPLITUDE = 0.2
+"""Amplitude of a car's speed, as a share of ``speed``."""
+STEER_RANGE = (0.1, 0.25)
+"""Smallest and largest amplitude of a car's steering angle, rad."""
+ANG_FREQS = ((0.5, 1.5), (1.0, 2.0))
+"""Range of the angular frequencies of speed and steering angle, rad/s."""
+MAX_YAW = 0.3
+"""Largest angle between a car's mean heading at the start and the x axis, rad."""
+
+
+class Manoeuvre(PyTree):
+    """Motion of each drone's car: its speed oscillates about a mean, and its steering angle about zero."""
+
+    speed: Array = leaf("drone", 1)
+    """Mean speed, m/s. (n_worlds, n_drones, 1)"""
+    amplitude: Array = leaf("drone", 1)
+    """Amplitude of speed, m/s, and steering angle, rad. (n_worlds, n_drones, 2)"""
+    ang_freq: Array = leaf("drone", 1)
+    """Angular frequency of speed and steering angle, rad/s. (n_worlds, n_drones, 2)"""
+    phase: Array = leaf("drone", 1)
+    """Phase of speed and steering angle at the start of the episode, rad. (n_worlds, n_drones, 2)"""
+
+    def command(self, time: Array) -> Array:
+        """Return speed, m/s, and steering angle, rad, at some time of the episode, s. (..., 2)"""
+        change = self.amplitude * jnp.sin(self.ang_freq * time + self.phase)
+        return jnp.concatenate([self.speed + change[..., :1], change[..., 1:]], axis=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FollowCar(Task):
+    """Stay behind and above a car, seen by a camera.
+
+    Speed and steering angle of the car change differently in every episode; on average it drives along the x axis. A
+    drone starts near the point 0.8 m behind and 0.7 m above the car. It succeeds if its distance from this point is
+    below the tolerance during the last second. An episode ends when a drone is lower than 0.25 m, or more than 2 m away
+    from its point. Policies observe neither the car's position nor their own: ``segmentation`` is 1 where a pixel of
+    the camera, which ``make`` adds, shows the car's body, and ``depth`` is its depth image.
+    """
+
+    name = "follow_car"
+    Record = Manoeuvre
+
+    speed: float = setting(default=1.2, low=0.0, high=3.0)
+    """Largest speed of a car, m/s."""
+    seconds: float = 6.0
+    """Length of an episode, s."""
+    tolerance: float = 0.3
+    """Distance from the point behind and above the car below which a drone follows it, m."""
+
+    def install(self, sim: Sim) -> None:
+        lanes = SPACING * (np.arange(sim.n_drones) - (sim.n_drones - 1) / 2)
+        pos = np.stack([np.zeros(sim.n_drones), lanes], axis=-1)
+        sim.add(Cars(sim.n_drones, vehicle=VEHICLE, pos=pos, level="speed", name=CARS))
+        shape, dtype = (sim.n_worlds, sim.n_drones), sim.data.states.pos.dtype
+        one, two = (device_array(np.zeros((*shape, n)), dtype) for n in (1, 2))
+        self.add_record(sim, Manoeuvre(one, two, two, two))
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return cars that drive, and drones in flight behind them."""
+        x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1, ang_freq=2, phase=2)
+        low, high = np.array(ANG_FREQS).T
+        steer = scale_to(x["steer"], *STEER_RANGE)
+        manoeuvre = Manoeuvre(
+            speed=self.speed * scale_to(x["speed"], *SPEED_RANGE),
+            amplitude=jnp.concatenate([jnp.full_like(steer, self.speed * SPEED_AMPLITUDE), steer], axis=-1),
+            ang_freq=scale_to(x["ang_freq"], low, high),
+            phase=2 * np.pi * x["phase"],
+        )
+        speed, steer = jnp.split(manoeuvre.command(jnp.zeros_like(steer)), 2, axis=-1)
+        # The heading oscillates about its mean with this amplitude, rad.
+        yaw_amplitude = manoeuvre.speed * jnp.tan(manoeuvre.amplitude[..., 1:]) / load_vehicle(VEHICLE).wheelbase
+        yaw_amplitude = yaw_amplitude / manoeuvre.ang_freq[..., 1:]
+        yaw = scale_symmetric(x["yaw"], MAX_YAW) - yaw_amplitude * jnp.cos(manoeuvre.phase[..., 1:])
+        car = rolling_car(data.plugins[CARS], yaw, speed, steer)
+        data = with_record(data.replace(plugins=data.plugins | {CARS: car}), manoeuvre)
+        pos, vel = self.target_motion(data)
+        rpy = scale_symmetric(x["rpy"], 0.2) + jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1)
+        return flying(
+            data,
+            pos + scale_symmetric(x["start"], np.array([0.5, 0.5, 0.3])),
+            rotation.from_rpy(rpy),
+            vel + scale_symmetric(x["vel"], 0.3),
+        )
+
+    def before_step(self, data: SimData) -> SimData:
+        """Return the data with the commands of the cars for this environment step."""
+        car = data.plugins[CARS]
+        command = data.plugins[NAME].command(data.core.steps / data.core.freq)
+        return data.replace(plugins=data.plugins | {CARS: car.replace(command=command)})
+
+    def target_motion(self, data: SimData) -> tuple[Array, Array]:
+        """Return position, m, and velocity, m/s, of the point behind and above each drone's car. (n_drones, 3) each"""
+        car: CarData = data.plugins[CARS]
+        arm = jnp.concatenate([jnp.cos(car.yaw), jnp.sin(car.yaw), 0 * car.yaw], axis=-1) * -BEHIND
+        turn = jnp.concatenate([-arm[..., 1:2], arm[..., :1], 0 * car.yaw], axis=-1) * car.yaw_rate
+        return car.pos + arm + np.array([0.0, 0.0, ABOVE], car.pos.dtype), car.vel + turn
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return attitude, velocities and height of the drone."""
+        return motion_of(data)
+
+    def privileged(self, data: SimData) -> dict[str, Array]:
+        (pos, vel), car = self.target_motion(data), data.plugins[CARS]
+        return {
+            "difference_to_point": pos - data.states.pos,
+            "difference_to_point_vel": vel - data.states.vel,
+            "car_heading": jnp.concatenate([jnp.cos(car.yaw), jnp.sin(car.yaw)], axis=-1),
+            "car_vel": car.vel,
+            "car_yaw_rate": car.yaw_rate,
+        }
+
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        return {
+            "proximity": terms.proximity(self.error(data), coarse=2.0, fine=8.0),
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "lost": -10.0 * self.is_lost(data),
+        }
+
+    def is_lost(self, data: SimData) -> Array:
+        """Return true where a drone is too low, or too far from its point. (n_drones,)"""
+        return (self.error(data) > MAX_DISTANCE) | (data.states.pos[..., 2] < MIN_HEIGHT)
+
+    def terminated(self, data: SimData) -> Array:
+        return jnp.any(self.is_lost(data))
+
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the point behind and above the car, m."""
+        return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
+
+    def target(self, data: SimData) -> Array:
+        return self.target_motion(data)[0]
+
+    def subjects(self, data: SimData) -> Array:
+        """Return the positions of the cars, m. (n_drones, 3)"""
+        return data.plugins[CARS].pos
+
+    def policy_camera(self) -> TargetCamera:
+        return TargetCamera(
+            24, 18, fovy=80.0, max_depth=4.0, rpy=(0.0, 0.6, 0.0), outputs=("depth", "segmentation"), target=CARS
+        )
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        del n_drones
+        return {"follow": 0, "distance": 3.0, "azimuth": 30.0, "elevation": -25.0}

@@ -1,0 +1,36 @@
+"""Land on a marker on the ground, seen by a camera that looks down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.envs.tasks.goals import motion_of
+from crazysim.envs.tasks.land import PAD, Land
+from crazysim.envs.tasks.target_camera import TargetCamera
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandOnMarker(Land):
+    """Land on a marker on the ground, 2 cm thick, seen by a camera that looks down.
+
+    Rules and settings are those of ``land``, with a marker instead of the pad. Policies observe neither the marker's
+    position nor their own: ``segmentation`` is 1 where a pixel of the camera, which ``make`` adds, shows the marker.
+    """
+
+    name = "land_on_marker"
+    target_name = "marker"
+    height = 0.02
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return attitude, velocities and height of the drone."""
+        return motion_of(data)
+
+    def privileged(self, data: SimData) -> dict[str, Array]:
+        return self.relative_target_motion(data)
+
+    def policy_camera(self) -> TargetCamera:
+        return TargetCamera(16, 16, fovy=120.0, pos=(0.0, 0.0, 0.0), rpy=(0.0, np.pi / 2, 0.0), target=PAD)

@@ -1,0 +1,138 @@
+"""Following a car: how it drives, what the camera shows of it, what counts as following it and what as losing it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.core.stage import vmap_worlds
+from crazysim.envs import DroneEnv, PrivilegedObservation, make
+from crazysim.envs.tasks.follow_car import ABOVE, BEHIND, MAX_DISTANCE, MIN_HEIGHT, FollowCar
+from crazysim.train.evaluation import evaluate
+
+N_WORLDS, N_STEPS = 64, 100
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make("follow_car", N_WORLDS, engine="interpret")
+
+
+@pytest.fixture(scope="module")
+def begun(env):
+    return jax.jit(env.reset)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def target_motion(env):
+    return jax.jit(vmap_worlds(env.task.target_motion))
+
+
+@pytest.fixture(scope="module")
+def step(env):
+    return jax.jit(env.step)
+
+
+def with_drones(state, **states):
+    """Return the state with drones elsewhere."""
+    return state.replace(data=state.data.replace(states=state.data.states.replace(**states)))
+
+
+def test_every_car_drives_in_its_own_way(env, begun):
+    """Drones that fall are no matter here, so that the cars are stepped without episodes."""
+    state, speeds, yaws = begun, [], []
+    simulate = jax.jit(lambda data: env.sim.step_fn(vmap_worlds(env.task.before_step)(data), env.n_substeps))
+    data = state.data
+    for _ in range(N_STEPS):
+        data = simulate(data)
+        car = data.plugins["cars"]
+        speeds.append(np.asarray(car.body_vel)[:, 0, 0])
+        yaws.append(np.asarray(car.yaw)[:, 0, 0])
+    speeds, yaws = np.array(speeds), np.array(yaws)
+    expected = vmap_worlds(lambda d: d.plugins["task"].command(d.core.steps / d.core.freq))(data)
+    np.testing.assert_allclose(speeds[-1], np.asarray(expected)[:, 0, 0], atol=0.1)
+    assert speeds.min() > -0.05
+    assert speeds.max() < 1.25
+    assert np.ptp(speeds, axis=0).mean() > 0.2, "it speeds up and slows down"
+    assert np.ptp(yaws, axis=0).mean() > 0.2, "it turns"
+    assert np.abs(yaws).mean() < 0.5, "on the whole it drives along the x axis"
+    assert np.std(yaws[-1]) > 0.1
+
+
+def test_the_point_is_behind_and_above_the_car(begun, step, target_motion):
+    before, after = begun.data, step(begun, begun.action).data
+    (pos, vel), (later, _) = (jax.device_get(target_motion(data)) for data in (before, after))
+    car = before.plugins["cars"]
+    heading = np.concatenate([np.cos(car.yaw), np.sin(car.yaw), 0 * car.yaw], axis=-1)
+    offset = pos - np.asarray(car.pos)
+    np.testing.assert_allclose(np.sum(offset * heading, axis=-1), -BEHIND, atol=1e-5)
+    np.testing.assert_allclose(offset[..., 2], ABOVE, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(offset[..., :2], axis=-1), BEHIND, atol=1e-5)
+    np.testing.assert_allclose((later - pos) * 50, vel, atol=0.05)
+
+
+def test_images_show_the_car(env, begun):
+    """Almost every episode begins with the car in view; what is shown as car is as far away as the car."""
+    format = env.image_formats()["segmentation"]
+    shape = (N_WORLDS, format["height"], format["width"])
+    mask, depth = (np.asarray(begun.obs[name]).reshape(shape) for name in ("segmentation", "depth"))
+    assert set(np.unique(mask)) == {0, 1}
+    assert mask.any(axis=(1, 2)).mean() > 0.95
+    distance = np.linalg.norm(np.asarray(begun.data.plugins["cars"].pos - begun.data.states.pos)[:, 0], axis=-1)
+    for image, depths, far in zip(mask, depth, distance, strict=True):
+        assert not image.any() or depths[image > 0].min() < far + 0.3
+        assert not image.any() or depths[image > 0].max() < far + 0.3
+
+
+def test_a_drone_is_lost_where_it_is_too_low_or_too_far_away(env, begun, step, target_motion):
+    pos, vel = (np.array(x) for x in target_motion(begun.data))
+    pos[0, 0, 1] += MAX_DISTANCE + 0.05
+    pos[1, 0, 2] = MIN_HEIGHT - 0.05
+    pos[2, 0, 0] += MAX_DISTANCE - 0.1
+    level = jnp.broadcast_to(jnp.asarray([0, 0, 0, 1.0]), begun.data.states.quat.shape)
+    state = with_drones(begun, pos=jnp.asarray(pos), vel=jnp.asarray(vel), quat=level)
+    after = step(state, state.action)
+    np.testing.assert_array_equal(np.flatnonzero(after.terminated), [0, 1])
+    reward = np.asarray(after.reward)[:, 0]
+    assert reward[:2].max() < -8
+    assert 0 < reward[2] < 0.1
+    assert reward[3:].min() > 1, "being at the point pays most"
+
+
+def test_a_drone_that_knows_the_car_can_follow_it():
+    class Informed(FollowCar):
+        """Observe what only the critic may see."""
+
+        def observe(self, data):
+            return super().observe(data) | self.privileged(data)
+
+    def fly(obs):
+        """Accelerate towards the point, along the axes of the world, with yaw zero."""
+        acc = 4 * obs["difference_to_point_vel"] + 5 * obs["difference_to_point"]
+        roll, pitch = -acc[..., 1:2] / 9.81, acc[..., :1] / 9.81
+        return jnp.concatenate([roll / (jnp.pi / 4), pitch / (jnp.pi / 4), 0 * roll, 0.1 * acc[..., 2:]], axis=-1)
+
+    base = make("follow_car", 16, camera=(), engine="interpret")
+    outcome = evaluate(DroneEnv(base.sim, Informed()), jax.tree_util.Partial(fly))
+    assert outcome["success"] == 1
+    assert outcome["crashed"] == 0
+
+
+def test_only_the_critic_knows_where_the_car_is(env, begun):
+    assert set(begun.obs) == {"ang_vel", "depth", "heading", "heading_vel", "height", "segmentation", "up"}
+    privileged = jax.eval_shape(PrivilegedObservation(env).reset, jax.random.key(0)).obs["privileged"]
+    hover = jax.eval_shape(PrivilegedObservation(make("hover", 2)).reset, jax.random.key(0)).obs["privileged"]
+    assert privileged.shape[-1] - hover.shape[-1] == 12
+
+
+def test_each_drone_has_a_car_of_its_own():
+    env = make("follow_car", 2, n_drones=2, engine="interpret")
+    state = jax.jit(env.reset)(jax.random.key(0))
+    assert np.asarray(state.obs["segmentation"]).any(axis=-1).all()
+
+
+@pytest.mark.parametrize("speed", [-1, 4.0, "x"])
+def test_law_09_a_speed_out_of_range_is_refused(speed):
+    with pytest.raises(ConfigError, match=r"expected speed of FollowCar (to be from 0 to 3|as a number), got"):
+        make("follow_car", 1, speed=speed)

@@ -1,0 +1,106 @@
+"""Landing on a marker: what the camera shows of it, what policies do not observe, and what counts as landed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, rotation
+from crazysim.envs import PrivilegedObservation, make
+
+CONTACT = 0.066
+"""Height of the centre of mass over a level pad that the drone touches, m: radius 0.086 less 0.02."""
+CASES = {
+    # Position relative to the marker's middle, m, velocity, m/s, yaw, rad.
+    "soft": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
+    "edge": ((0.24, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
+    "fast": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.7), 0.0),
+    "floor": ((0.6, 0.0, CONTACT - 0.02), (0, 0, -0.3), 0.0),
+    "above": ((0.0, 0.0, 1.0), (0, 0, 0), 0.0),
+    "ahead of it": ((0.8, 0.0, 1.0), (0, 0, 0), 0.0),
+    "right of it": ((0.0, -0.8, 1.0), (0, 0, 0), 0.0),
+    "turned": ((0.8, 0.0, 1.0), (0, 0, 0), np.pi / 2),
+    "too far to see it": ((1.3, 0.0, 0.2), (0, 0, 0), 0.0),
+}
+"""One world each."""
+LANDED, CRASHED = {"soft", "edge"}, {"fast", "floor"}
+SIDE, FOCAL = 16, 8 / np.tan(np.radians(60))
+"""Side of the image and focal length, pixels."""
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make("land_on_marker", len(CASES), engine="interpret")
+
+
+@pytest.fixture(scope="module")
+def placed(env):
+    """Return the state of all cases before a step."""
+    state = jax.jit(env.reset)(jax.random.key(0))
+    offset, vel, yaw = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
+    quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
+    pos = offset + np.float32([0, 0, env.task.height])
+    states = state.data.states.replace(pos=jnp.asarray(pos)[:, None], vel=jnp.asarray(vel)[:, None], quat=quat[:, None])
+    return state.replace(data=state.data.replace(states=states))
+
+
+@pytest.fixture(scope="module")
+def flown(env, placed):
+    """Return the state after a step from all cases."""
+    return jax.jit(env.step)(placed, placed.action)
+
+
+def names(mask):
+    return {name for name, x in zip(CASES, np.asarray(mask)[:, 0], strict=True) if x}
+
+
+def test_rules_are_those_of_land(env, flown):
+    assert names(flown.info["landed"]) == LANDED == names(env.succeeded(flown))
+    assert names(flown.info["crashed"]) == CRASHED
+
+
+def test_images_show_the_marker_where_it_is(flown):
+    images = np.asarray(flown.obs["segmentation"]).reshape(len(CASES), SIDE, SIDE)
+    assert set(np.unique(images)) == {0, 1}
+    middle = (SIDE - 1) / 2
+    shift = FOCAL * 0.8
+    expected = {
+        "above": (middle, middle),
+        "ahead of it": (middle + shift, middle),
+        "right of it": (middle, middle - shift),
+        "turned": (middle, middle - shift),
+    }
+    for name, pixel in expected.items():
+        image = images[list(CASES).index(name)]
+        np.testing.assert_allclose(np.argwhere(image).mean(axis=0), pixel, atol=0.6, err_msg=name)
+        # A disc of 0.25 m at a metre.
+        assert abs(image.sum() - np.pi * (FOCAL * 0.25) ** 2) < 2.5, name
+    assert not images[list(CASES).index("too far to see it")].any()
+    assert images[list(CASES).index("soft")].all(), "the marker fills the image at touch-down"
+
+
+def test_each_drone_sees_its_own_marker_alone():
+    env = make("land_on_marker", 1, n_drones=2)
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    assert state.obs["segmentation"].shape == (1, 2, SIDE**2)
+    data = jax.jit(env.reset)(jax.random.key(0)).data
+    centres = env.task.path_centres(2)
+    pos = np.stack([centres[0] + [0.4, 0, 1.0], centres[0] + [0, 0.4, 1.0]])[None].astype(np.float32)
+    level = jnp.broadcast_to(jnp.asarray([0, 0, 0, 1.0]), data.states.quat.shape)
+    images = env.task.policy_camera().image_fn(env.sim)
+    seen = images(data.replace(states=data.states.replace(pos=jnp.asarray(pos), quat=level)))["segmentation"]
+    assert np.asarray(seen).any(axis=(2, 3)).tolist() == [[True, False]]
+
+
+def test_only_the_critic_knows_where_the_marker_is(env, placed):
+    assert set(placed.obs) == {"ang_vel", "heading", "heading_vel", "height", "segmentation", "up"}
+    privileged = jax.eval_shape(PrivilegedObservation(env).reset, jax.random.key(0)).obs["privileged"]
+    hover = jax.eval_shape(PrivilegedObservation(make("hover", 2)).reset, jax.random.key(0)).obs["privileged"]
+    assert privileged.shape[-1] - hover.shape[-1] == 6
+    assert env.image_formats()["segmentation"]["unit"] == "1"
+
+
+@pytest.mark.parametrize("options", [{"radius": 0.7}, {"speed": -1.0}])
+def test_law_09_wrong_settings_are_refused(options):
+    with pytest.raises(ConfigError, match=r"expected (radius|speed) of LandOnMarker"):
+        make("land_on_marker", 1, **options)
