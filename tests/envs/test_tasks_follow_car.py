@@ -100,6 +100,7 @@ def test_a_drone_is_lost_where_it_is_too_low_or_too_far_away(env, begun, step, t
     assert reward[3:].min() > 1, "being at the point pays most"
 
 
+@pytest.mark.long("flies whole episodes, step by step")
 def test_a_drone_that_knows_the_car_can_follow_it():
     class Informed(FollowCar):
         """Observe what only the critic may see."""
