@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, rotation
+from crazysim import ConfigError, Sim, rotation
 from crazysim.envs import PrivilegedObservation, make
+from crazysim.envs.tasks.target_camera import TargetCamera
 
 CONTACT = 0.066
 """Height of the centre of mass over a level pad that the drone touches, m: radius 0.086 less 0.02."""
@@ -104,3 +105,10 @@ def test_only_the_critic_knows_where_the_marker_is(env, placed):
 def test_law_09_wrong_settings_are_refused(options):
     with pytest.raises(ConfigError, match=r"expected (radius|speed) of LandOnMarker"):
         make("land_on_marker", 1, **options)
+
+
+def test_law_09_a_camera_without_targets_is_refused():
+    with pytest.raises(
+        ConfigError, match=r"expected target of 'camera' as the name of objects.*without an object 'pad:0'"
+    ):
+        TargetCamera(target="pad").image_fn(Sim())

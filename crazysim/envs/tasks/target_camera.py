@@ -10,6 +10,7 @@ import numpy as np
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
+from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.camera import Camera
 from crazysim.plugins.sensors.image_sensor import ImageFn, Images
 
@@ -31,12 +32,19 @@ class TargetCamera(Camera):
         return {k: x | ({"unit": "1", "far": 0} if k == "segmentation" else {}) for k, x in formats.items()}
 
     def image_fn(self, sim: Simulation) -> ImageFn:
-        take_all_bodies = super().image_fn(sim)
-        first = self.segment_names(sim).index(f"{self.target}:0")
-        index = (first + np.arange(sim.n_drones, dtype=np.int32))[:, None, None]
+        take_all_bodies, names = super().image_fn(sim), self.segment_names(sim)
+        targets = [f"{self.target}:{k}" for k in range(sim.n_drones)]
+        if missing := [name for name in targets if name not in names]:
+            raise ConfigError(
+                f"expected target of {self.name!r} as the name of objects, one per drone, got {self.target!r} without "
+                f"an object {missing[0]!r}. Use sim.scene.add(..., name={self.target!r}, count=sim.n_drones)."
+            )
+        index = np.array([names.index(name) for name in targets], np.int32)[:, None, None]
 
         def take_images(data: SimData) -> Images:
             images = take_all_bodies(data)
+            if "segmentation" not in images:
+                return images
             is_target = images["segmentation"] == index
             return images | {"segmentation": is_target.astype(np.int32)}
 
