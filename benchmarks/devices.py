@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import multiprocessing
+import multiprocessing.connection
 import os
 import socket
 import time
@@ -102,8 +103,10 @@ def main() -> None:
         hosts = [context.Process(target=run_on_host, args=(i, address, args)) for i in range(n_hosts)]
         for process in hosts:
             process.start()
+        multiprocessing.connection.wait([process.sentinel for process in hosts])
         for process in hosts:
-            process.join()
+            process.join(60)
+            process.kill()  # one that waits for another that failed
         if any(process.exitcode for process in hosts):
             raise SystemExit("a host failed; the errors are above")
 
@@ -171,7 +174,8 @@ def build(name: str, devices: list[jax.Device], small: bool) -> Case:
     """Return a case on some devices."""
     (make_case, size), n = CASES[name], len(devices)
     n_worlds = size.small if small else size.n_worlds
-    device_options = {"device": devices[0], "mesh": world_mesh(devices) if n > 1 else None}
+    first_device = next(device for device in devices if device.process_index == jax.process_index())
+    device_options = {"device": first_device, "mesh": world_mesh(devices) if n > 1 else None}
     return make_case(n_worlds if name.startswith("seeds") else n * n_worlds, device_options, 4 if small else None)
 
 

@@ -250,9 +250,11 @@ def find_device(device: str | jax.Device) -> jax.Device:
     """Return the device with a name such as ``cpu`` or ``gpu:1``.
 
     Raises:
-        ConfigError: If there is no such device; the message lists all devices.
+        ConfigError: If there is no such device, or on another host; the message lists all devices of this host.
     """
     if isinstance(device, jax.Device):
+        if device.process_index != jax.process_index():
+            raise ConfigError(f"expected a device of this host, got {device}. Use one of jax.local_devices().")
         return device
     platform, colon, index = device.partition(":") if isinstance(device, str) else ("", "", "")
     if not platform or (colon and not index.isdecimal()):

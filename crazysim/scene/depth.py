@@ -155,21 +155,25 @@ def check_image_size(width: object, height: object) -> None:
             raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")
 
 
-def check_image_memory(n_images: int, width: int, height: int, bytes_per_pixel: float, device: jax.Device) -> None:
-    """Check that images fit into the memory of a device, before anything is allocated.
+def check_image_memory(
+    n_images: int, width: int, height: int, bytes_per_pixel: float, device: jax.Device, n_devices: int = 1
+) -> None:
+    """Check that images fit into the memory of their devices, before anything is allocated.
 
     Args:
         n_images: Images of all worlds together.
         width: Pixels.
         height: Pixels.
         bytes_per_pixel: Memory that a pixel needs at least.
-        device: Device of the images.
+        device: Device of the images, or one of several.
+        n_devices: Number of devices among which the images are divided.
     """
-    n_bytes, memory = n_images * width * height * bytes_per_pixel, _memory_size(device)
+    n_bytes, memory = n_images * width * height * bytes_per_pixel, n_devices * _memory_size(device)
     if n_bytes > memory:
+        others = f" and {n_devices - 1} more" if n_devices > 1 else ""
         raise ConfigError(
-            f"expected images that fit into the {memory / 2**30:.1f} GiB of {device}, got {n_images} of {width} x "
-            f"{height} pixels, which need {n_bytes / 2**30:.1f} GiB. Use fewer worlds or pixels."
+            f"expected images that fit into the {memory / 2**30:.1f} GiB of {device}{others}, got {n_images} of "
+            f"{width} x {height} pixels, which need {n_bytes / 2**30:.1f} GiB. Use fewer worlds or pixels."
         )
 
 

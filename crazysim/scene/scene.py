@@ -244,6 +244,11 @@ class Scene:
         movable = self.added.movable
         return self.added.record(before, self._ids(movable) if self._is_edited else self._object_ids)
 
+    def _check_image_memory(self, n_cameras: int, size: tuple[int, int], bytes_per_pixel: float) -> None:
+        """Check that the images of all worlds fit into the memory of their devices."""
+        n_devices = 1 if self.mesh is None else self.mesh.size
+        depth.check_image_memory(self.n_worlds * n_cameras, *size, bytes_per_pixel, self.device, n_devices)
+
     def _ids(self, names: Sequence[str]) -> list[int]:
         """Return mocap ids in the spec, which equal the ids in the compiled model; nothing is compiled."""
         ids = build.spec_mocap_ids(self.spec)
@@ -333,7 +338,7 @@ class Scene:
             depth.check_image_size(width, height)
             objects = (*self.added.movable, *self.visual_model.mocap_bodies)
             cameras = depth.find_cameras(self.mj_model, camera, objects)
-        depth.check_image_memory(self.n_worlds * len(cameras), width, height, depth.BYTES_PER_RAY, self.device)
+        self._check_image_memory(len(cameras), (width, height), depth.BYTES_PER_RAY)
         if isinstance(camera, depth.View):
             # The frame of MuJoCo's cameras: x right, y up, z back.
             rays = [np.stack([-camera.rays[..., 1], camera.rays[..., 2], -camera.rays[..., 0]], axis=-1)] * len(cameras)
@@ -373,7 +378,7 @@ class Scene:
         names = [camera] if isinstance(camera, (str, int, np.integer)) else list(camera)
         cameras = [found for name in names for found in depth.find_cameras(self.mj_model, name, objects)]
         size = splat_images.check_size(width, height)
-        depth.check_image_memory(self.n_worlds * len(cameras), *size, splat_images.BYTES_PER_PIXEL, self.device)
+        self._check_image_memory(len(cameras), size, splat_images.BYTES_PER_PIXEL)
         return splat_images.build_splat_fn(
             self.visual_model, cameras, width, height, background, min_coverage, renderer, self.device.platform,
             self.plugins,

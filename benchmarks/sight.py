@@ -1,0 +1,120 @@
+"""Rates of flying by sight: the task ``forest`` with its convolution, and lidars amid trees.
+
+    python benchmarks/sight.py [--device gpu] [--worlds 4096] [--repeats 7] [--small]
+
+``policy``: rollouts of ``forest`` with automatic resets, in a corridor that is long enough for 200 trees, which every
+world draws anew in every episode; the policy has the convolution and the layers of the recipe and receives a depth
+image of 16 x 12 pixels in every step. ``lidar``: steps of hovering drones amid 200 trees, whose lidars take 16 x 360
+rays at 10 Hz; its realtime factor is of one world.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from measure import digits, engine_name, hovering, medians, report
+
+import crazysim.envs as envs
+from crazysim import Forest, Lidar, Sim, __version__
+from crazysim.envs.state import flatten
+from crazysim.envs.statistics import RunningStats
+from crazysim.train.config import TrainConfig
+from crazysim.train.convolution import find_images
+from crazysim.train.networks import Policy, choose_network, init_weights
+
+N_TREES, AREA_OF_TREE = 200, 16.0
+"""Trees of a world, and the area for each of them, m^2."""
+CORRIDOR = 16.0
+"""Width of the corridor of ``forest``, m."""
+LIDAR_FREQ = 10
+"""Rate of the lidars, Hz."""
+N_CALLS = 5
+"""Calls that are timed together."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--worlds", type=int, default=4096)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--small", action="store_true", help="few steps, for a try")
+    args = parser.parse_args()
+    n_steps = 4 if args.small else 50
+    rollouts(args, n_steps)
+    lidars(args, 2 if args.small else 10)
+
+
+def rollouts(args: argparse.Namespace, n_steps: int) -> None:
+    """Time rollouts of ``forest`` with its recipe's network."""
+    length = N_TREES * AREA_OF_TREE / CORRIDOR
+    env = envs.AutoReset(envs.make("forest", args.worlds, length=length, device=args.device))
+    recipe: Any = TrainConfig.create("forest", "ppo", n_worlds=args.worlds).algorithm_config()
+    state = jax.jit(env.reset)(jax.device_put(jax.random.key(0), env.sim.device))
+    images = find_images({name: x.shape[-1] for name, x in state.obs.items()}, env.image_formats())
+    network = choose_network(0, None, recipe.convolution, images)
+    n_obs, shape = flatten(state.obs).shape[-1], state.action.shape
+    weights = init_weights(network, jax.random.key(1), n_obs, (*recipe.hidden, env.actions.size), 0.01)
+    policy = Policy(RunningStats.create(n_obs, network.pixels), weights.layers, weights.body, network)
+    policy = jax.device_put(policy, env.sim.device)
+
+    def act(obs: Any, memory: Any, key: Any) -> Any:
+        return policy(obs) + 0.1 * jax.random.normal(key, shape), memory, ()
+
+    @jax.jit
+    def run(carry: Any) -> Any:
+        state, key = carry
+        key, rollout_key = jax.random.split(key)
+        state, _, done = envs.rollout(env, state, act, rollout_key, n_steps, lambda x: x.done.mean())
+        return (state, key), done
+
+    call_s, first_s, done = timed(run, (state, jax.device_put(jax.random.key(2), env.sim.device)), args.repeats)
+    report(
+        args.device, benchmark="sight", case="policy", engine=engine_name(env.sim), n_worlds=args.worlds,
+        n_trees=N_TREES, image=[16, 12], env_steps_per_s=digits(args.worlds * n_steps / call_s),
+        rays_per_s=digits(args.worlds * n_steps * 16 * 12 / call_s), done=digits(float(np.mean(done))),
+        first_s=round(first_s, 1), crazysim=__version__,
+    )  # fmt: skip
+
+
+def lidars(args: argparse.Namespace, n_images: int) -> None:
+    """Time steps of drones with lidars amid trees."""
+    side = (N_TREES * AREA_OF_TREE) ** 0.5
+    trees = Forest(density=1 / AREA_OF_TREE, radii=(0.1, 0.3), size=(side, side))
+    lidar = Lidar.vlp16(360, freq=LIDAR_FREQ)
+    sim = Sim(args.worlds, control="attitude", device=args.device, plugins=[trees, lidar])
+    hovering(sim, "attitude")
+    step, n_steps = sim.build_step_fn(), n_images * sim.freq // LIDAR_FREQ
+    run = jax.jit(lambda data: (step(data, n_steps), ()))
+    call_s, first_s, _ = timed(run, sim.data, args.repeats)
+    n_rays = lidar.image_size[0] * lidar.image_size[1]
+    report(
+        args.device, benchmark="sight", case="lidar", engine=engine_name(sim), n_worlds=args.worlds, n_trees=N_TREES,
+        image=[*lidar.image_size[::-1]], realtime=digits(n_steps / sim.freq / call_s),
+        rays_per_s=digits(args.worlds * n_images * n_rays / call_s), first_s=round(first_s, 1), crazysim=__version__,
+    )  # fmt: skip
+
+
+def timed(run: Callable[[Any], Any], carry: Any, repeats: int) -> tuple[float, float, Any]:
+    """Return the time of a call and of the first one, s, and the last call's second result."""
+    results = [carry, None]
+
+    def call(n_calls: int) -> float:
+        start_time = time.perf_counter()
+        for _ in range(n_calls):
+            results[:] = run(results[0])
+        jax.block_until_ready(results)
+        return (time.perf_counter() - start_time) / n_calls
+
+    first_s = call(1)
+    call(1)
+    return medians({"": partial(call, N_CALLS)}, repeats)[""], first_s, results[1]
+
+
+if __name__ == "__main__":
+    main()
