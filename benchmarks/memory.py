@@ -23,7 +23,7 @@ from measure import digits, machine
 from crazysim.commands.training import parse_seeds
 from crazysim.envs import make
 from crazysim.train import evaluate, run_many
-from crazysim.train.training import CHECKPOINT
+from crazysim.train.training import CHECKPOINT_FILE
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "memoryless": {},
@@ -61,7 +61,7 @@ def main() -> None:
                 task,
                 folder,
                 seeds=args.seeds,
-                resume=(folder / CHECKPOINT).exists(),
+                resume=(folder / CHECKPOINT_FILE).exists(),
                 evaluation_worlds=args.starts,
                 progress=False,
                 algorithm="ppo",

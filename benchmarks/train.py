@@ -45,8 +45,8 @@ from crazysim.commands.training import parse_seeds
 from crazysim.envs.registry import TASKS, entry_of
 from crazysim.train.config import find_recipe
 from crazysim.train.show import read_curve
-from crazysim.train.training import CHECKPOINT, kept_point, least_kept_success, stored_configs
-from crazysim.train.training import TABLE as SEEDS_TABLE
+from crazysim.train.training import CHECKPOINT_FILE, kept_point, least_kept_success, stored_configs
+from crazysim.train.training import TABLE_FILE as SEEDS_TABLE_FILE
 
 PACKAGE = Path(crazysim.__file__).parent
 TABLE = Path(__file__).parents[1] / "docs" / "concepts" / "training-results.json"
@@ -213,7 +213,7 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
         folder.mkdir(parents=True)
         sources_file.write_text(about["sources"])
     command = [sys.executable, "-P", "-m", "crazysim", "train", task, "--seeds", seeds, "--out", str(folder)]
-    command += ["--resume"] if (folder / CHECKPOINT).exists() else []  # of a training that was interrupted
+    command += ["--resume"] if (folder / CHECKPOINT_FILE).exists() else []  # of a training that was interrupted
     # By default each process would take three quarters of the memory of a GPU.
     environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if about["parallel"] > 1 else {}) | os.environ
     # The same package as here, whatever the folder in which this runs.
@@ -231,7 +231,7 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
         last_line = (log.read_text().strip().splitlines() or ["no output"])[-1]
         raise RuntimeError(f"status {process.returncode}, {last_line} (see {log})")
     algorithm = next(iter(stored_configs(folder).values())).algorithm
-    diverged = {row["seed"]: row["diverged"] for row in json.loads((folder / SEEDS_TABLE).read_text())}
+    diverged = {row["seed"]: row["diverged"] for row in json.loads((folder / SEEDS_TABLE_FILE).read_text())}
     results = [read_result(folder / f"seed-{key[1]}", diverged[key[1]]) for key in group]
     shared = {"algorithm": algorithm, "wall_s": digits(wall_s), "together": len(group)}
     return [result | shared for result in results]

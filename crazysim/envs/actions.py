@@ -50,8 +50,8 @@ class Actions:
         """Create a map.
 
         Args:
-            centre: Command at a zero action, in the units of the command level. (k,), or (n_drones, k) if drones differ
-            scale: Change of the command per unit of action. Same shape
+            centre: Command at a zero action, in the command's units. (k,), or (n_drones, k) if drones differ
+            scale: Change of the command per unit of action, of the same shape.
             control: Command level.
         """
         self.centre, self.scale, self.control = np.asarray(centre, float), np.asarray(scale, float), control
@@ -87,8 +87,8 @@ def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: f
 
     Args:
         airframe: Airframe of all drones, or of each, for the limits of the rotors.
-        params: Parameters, for the hover command. If drones of one airframe have different ones, the first drone's are
-            used.
+        params: Parameters, for the hover command. If they differ between drones of one airframe, the first
+            drone's are used.
         control: Command level.
         tilt: Largest roll and pitch of the attitude level, rad.
     """
@@ -106,7 +106,7 @@ def _drone_actions(airframe: Airframe, params: SimParams, control: Control, tilt
     params = jax.tree.map(lambda scope, x: fetch_rows(x, (0, drone)) if scope == "drone" else x, scopes(params), params)
     n_rotors = airframe.n_rotors
     max_thrust = float(airframe.value("rotors.thrust_max", ()))
-    hover = float(jax.jit(hover_thrust)(params)[0])  # one program, where each operation would be one
+    hover = float(jax.jit(hover_thrust)(params)[0])  # one program, instead of one for each operation
     thrust_range = n_rotors * max_thrust - hover
     if control == Control.attitude:
         return Actions(np.array([0, 0, 0, hover]), np.array([tilt, tilt, MAX_YAW, thrust_range]), control)

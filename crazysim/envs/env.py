@@ -228,7 +228,7 @@ class Env(ABC):
         leaves, treedef = jax.tree.flatten(state)
         key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]))
         if key not in self._stepped_shapes:
-            self._stepped_shapes[key] = jax.eval_shape(self.phases.outline, state)
+            self._stepped_shapes[key] = jax.eval_shape(self.phases.step_without_physics, state)
         stepped = self._stepped_shapes[key]
         added_info = {k: x for k, x in stepped.info.items() if k not in state.info}
         state = state.replace(info=state.info | jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), added_info))
@@ -237,7 +237,7 @@ class Env(ABC):
 
     @functools.cached_property
     def _stepped_shapes(self) -> dict[Any, EnvState]:
-        """Cache of the shapes and dtypes of a state after a step, by structure and shapes of the state before it."""
+        """Cache of the shapes and dtypes of a state after a step, by structure and shapes of the state before."""
         return {}
 
     def explain(self) -> str:
@@ -323,8 +323,8 @@ class DroneEnv(Env):
             )
         sim.plugins.check()
         if NAME in sim.plugins:
-            raise ConfigError(f"expected no plugin of the name {NAME!r}, which the environment's record has")
-        self.physics = sim.build_step_fn().without_stages(sim.plugins.reset_stages)  # every episode begins by a reset
+            raise ConfigError(f"expected no plugin of the name {NAME!r}, which is the name of the environment's record")
+        self.physics = sim.build_step_fn().without_stages(sim.plugins.reset_stages)  # every episode begins with a reset
         """The step of the physics."""
         self.episode_reset = EpisodeReset(sim)
         """Resets of data at the start of an episode."""
@@ -365,15 +365,15 @@ class DroneEnv(Env):
             names = ", ".join(plugin.name for plugin in self._plugins)
             raise ConfigError(
                 f"expected the plugins with which the environment was made ({names or 'none'}), got "
-                f"{', '.join(plugin.name for plugin in plugins) or 'none'}: an environment does not follow its "
-                f"simulation. Use make(..., effects=[...]), or a new environment."
+                f"{', '.join(plugin.name for plugin in plugins) or 'none'}: an environment does not follow "
+                f"changes of its simulation. Use make(..., effects=[...]), or a new environment."
             )
         if len(arrays := _default_arrays(self._sim)) != len(self._default_arrays) or not all(
             map(is_, arrays, self._default_arrays)
         ):
             raise ConfigError(
                 "expected the default data with which the environment was made, got others: an environment does not "
-                "follow its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data of a state."
+                "follow changes of its simulation. Set sim.default_data before DroneEnv(sim, ...), or change state.data."
             )
         data, mesh = self.episode_reset.broadcast_default(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
         data = data.replace(core=_set_keys(data.core, key))

@@ -21,7 +21,7 @@ from crazysim.sim.sim import Sim
 
 
 class EpisodeReset:
-    """Resets of data at the start of an episode, with the present default data and reset pipeline of a simulation."""
+    """Resets of data at the start of an episode, with the default data and reset pipeline that a simulation has now."""
 
     def __init__(self, sim: Sim):
         self._default = default = deduplicate(sim.default_data)
@@ -29,7 +29,7 @@ class EpisodeReset:
         names = [name for name, fn in other_stages if not isinstance(fn, Stage)]
         names += [] if first_stage[1] is reset else [first_stage[0]]
         self.has_foreign_record = "batched" in jax.tree.leaves(scopes(sim.default_data))
-        """True if a record in ``data.plugins`` is of another library. Such a record is not divided among worlds."""
+        """True if a record in ``data.plugins`` belongs to another library. Such a record is not divided among worlds."""
         self.takes_all_worlds = bool(names) or self.has_foreign_record
         """True if ``reset_data`` takes all worlds at once."""
         self.batched_reason: str | None = None
@@ -84,17 +84,17 @@ def _reset_world(stages: Sequence[Any], keep_objects: bool) -> Callable[[SimData
             resets hundreds of them would take a minute to compile.
     """
 
-    def reset_one(data: SimData, default: SimData) -> SimData:
+    def reset_single_world(data: SimData, default: SimData) -> SimData:
         data = reset_world(data, default.replace(objects=data.objects) if keep_objects else default)
         axes = Axes(data)  # a wrapper may have given each drone its own parameters
         for stage in stages:
             data = world_function(stage, axes)(data)
         return data
 
-    return reset_one
+    return reset_single_world
 
 
-_AXES = {"drone": (0, 1), "world": (0,)}
+_BATCH_AXES = {"drone": (0, 1), "world": (0,)}
 """Axes of worlds and drones by scope. The axis of members of other populations is never deduplicated."""
 
 
@@ -105,7 +105,7 @@ def deduplicate(data: SimData) -> SimData:
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
             return x
         host = fetch(x)
-        for axis in _AXES.get(scope, (0,) if has_members(scope) else ()):
+        for axis in _BATCH_AXES.get(scope, (0,) if has_members(scope) else ()):
             first_entry = host.take([0], axis)
             if np.array_equal(host, np.broadcast_to(first_entry, host.shape), equal_nan=host.dtype.kind == "f"):
                 host = first_entry

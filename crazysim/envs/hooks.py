@@ -1,4 +1,4 @@
-"""Hooks: functions, most of them of one world, that add to the phases of an environment step."""
+"""Hooks: functions that wrappers add to the phases of an environment step, most of them of one world."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Hooks:
     def look(self, state: EnvState) -> EnvState:
         """Return the state of all worlds with new images in ``state.record.images``, which are observations.
 
-        They are taken once a step, after new episodes have begun, by kernels of their own. The wrapper's memory may
+        They are taken once per step, after new episodes have begun, by separate kernels. The wrapper's memory may
         change, too; before the first episode it is empty.
         """
         return state

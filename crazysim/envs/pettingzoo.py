@@ -123,7 +123,7 @@ class DroneParallelEnv(ParallelEnv):
     def state(self) -> np.ndarray:
         """Return the observations of all drones as one vector: drone after drone, each sorted by name."""
         if self.env_state is None:
-            raise ConfigError("there is no state before the first reset(): call it first")
+            raise ConfigError("expected a reset before state(), got none. Call reset() first.")
         return np.array(flatten(self.env_state.obs)).ravel()
 
     def render(self) -> np.ndarray | None:

@@ -1,6 +1,6 @@
 """Phases of an environment step: act, (physics), observe, reset episode, look.
 
-Each but the last is written for one world, and becomes a stage of the step: ``act`` before the physics, ``observe``
+All but the last are written for one world, and become stages of the step: ``act`` before the physics, ``observe``
 after it, and ``reset_episode`` where an episode is over. ``look`` takes the images of all worlds. ``Env.reset`` and
 ``Env.restart`` also call ``reset_episode`` and ``look``, for all worlds.
 """
@@ -135,10 +135,12 @@ class Phases:
         for wrapper in self.wrappers:
             state = wrapper.look(state)
         images = state.record.images
-        if both := images.keys() & state.record.obs.keys():
-            raise ConfigError(f"expected other names of images than those of observations, got {min(both)!r} as both")
-        invalid = state.full_data.core.nonfinite[..., None]
-        images = {name: jnp.where(invalid, jnp.zeros((), x.dtype), x) for name, x in images.items()}
+        if duplicates := images.keys() & state.record.obs.keys():
+            raise ConfigError(
+                f"expected other names of images than those of observations, got {min(duplicates)!r} as both"
+            )
+        nonfinite = state.full_data.core.nonfinite[..., None]
+        images = {name: jnp.where(nonfinite, jnp.zeros((), x.dtype), x) for name, x in images.items()}
         return state.replace(images=images)
 
     def _act(self, data: SimData, vectorize: Vectorize) -> SimData:
@@ -163,8 +165,8 @@ class Phases:
             data, select_states(data.plugins[NAME].must_reset[:, 0], new_state, final_state) if batched else new_state
         )
 
-    def outline(self, state: EnvState) -> EnvState:
-        """Return a state of all worlds with the structure, shapes and types that a step returns."""
+    def step_without_physics(self, state: EnvState) -> EnvState:
+        """Return the state of all worlds after a step without the physics, whose shapes and types are those of a step."""
         state, action = self.act(state, state.record.next_action, vectorize_over_worlds)
         return self.after_physics(state, action, vectorize_over_worlds)
 
@@ -222,10 +224,10 @@ class Phases:
         return state
 
     def reset_episode(self, state: EnvState, default: SimData, vectorize: Vectorize) -> EnvState:
-        """Return the state at the start of an episode. Only data, info and memory of the state before are read.
+        """Return the state at the start of an episode. Only data, info and memory of the earlier state are read.
 
         Args:
-            state: The state before.
+            state: The earlier state.
             default: Data that the world is reset to.
             vectorize: ``skip_vectorization`` or ``vectorize_over_worlds``.
         """
@@ -293,7 +295,7 @@ def _step_info(task: Task, data: SimData) -> dict[str, Array]:
 
 
 def _check_spawn(task: Task, reset_data: SimData, spawned: Any) -> SimData:
-    """Return the data from ``spawn`` with the shapes and dtypes of before, so that no step is compiled again."""
+    """Return the data from ``spawn`` with its earlier shapes and dtypes, so that no step is compiled again."""
     if jax.tree.structure(spawned) != jax.tree.structure(reset_data):
         old_paths, new_paths = (
             {keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (reset_data, spawned)
@@ -303,7 +305,7 @@ def _check_spawn(task: Task, reset_data: SimData, spawned: Any) -> SimData:
             + [f"with {x}" for x in sorted(new_paths - old_paths)]
         )
         raise ConfigError(
-            f"task {task.name!r}: expected spawn to return the data that it is given with other values, got a "
+            f"task {task.name!r}: expected spawn to return the data that it gets with other values, got a "
             f"{type(spawned).__name__} {changes or 'of another structure'}. The task's record is data.plugins['task']; "
             f"docs/guides/tasks.md has an example."
         )

@@ -1,7 +1,7 @@
 """Random numbers of episodes: as reproducible as ``crazysim.core.random``, with a twentieth of the arithmetic.
 
-All worlds draw the numbers of a new episode in every step, although few begin one, and a million worlds with twenty
-numbers each must cost less than the physics. JAX's generator is a cipher of twenty rounds; here two rounds of an
+In every step all worlds draw the numbers of a new episode, although few begin one. For a million worlds with twenty
+numbers each, this must cost less than the physics. JAX's generator is a cipher of twenty rounds; here two rounds of an
 integer hash, ``core.random.mix_bits``, mix seed, world and episode.
 """
 
@@ -21,7 +21,7 @@ from crazysim.errors import ConfigError, short_repr
 
 
 def as_seed(seed: object) -> int | None:
-    """Return a validated seed of the random numbers of all worlds; None stays None."""
+    """Return a validated seed of the random numbers of all worlds, or None for None."""
     if seed is None:
         return None
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**63:

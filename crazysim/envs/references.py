@@ -1,4 +1,4 @@
-"""References to tasks of users, ``FILE.py:NAME`` or ``MODULE:NAME``, and the list of those that this user has named.
+"""References to tasks of users, ``FILE.py:NAME`` or ``MODULE:NAME``, and the list of references this user has named.
 
 Loading a file executes it. The files of a training run contain the reference of their task, and may come from other
 people. Therefore a reference that was read from them is only loaded if this user has named it before, in a call or on
@@ -25,7 +25,7 @@ from crazysim.storage import make_private, untrusted_reason
 GUIDE = "docs/guides/tasks.md"
 _CLASSES: dict[str, type[Task]] = {}
 """Classes for which this process has made references, by reference."""
-_LOADED: set[str] = set()
+_NAMED: set[str] = set()
 """References that were named in this process."""
 
 
@@ -79,7 +79,7 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
     if reference in _CLASSES:
         return _CLASSES[reference]
     location, name = split_reference(reference)
-    module = _from_file(Path(location)) if location.endswith(".py") else _from_module(location)
+    module = _import_file(Path(location)) if location.endswith(".py") else _import_module(location)
     classes = {k: x for k, x in vars(module).items() if _is_task(x) and x.__module__ == module.__name__}
     if not name and len(classes) == 1:
         name = next(iter(classes))
@@ -90,19 +90,19 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
             f"expected the name of a task in {location}, got {name!r}; it defines {defined}. Write {location}:NAME "
             f"with a subclass of Task, or a name that the file registers; {GUIDE} has an example."
         )
-    _LOADED.add(reference)
+    _NAMED.add(reference)
     _add_to_list(reference)
     return task_class if _is_task(task_class) else name  # type: ignore[return-value]
 
 
-def load_noted_task(reference: str, names: Container[str]) -> type[Task] | str:
-    """Load a task as ``load_task`` does, by a reference that was read from the files of a run.
+def load_listed_task(reference: str, names: Container[str]) -> type[Task] | str:
+    """Load a task as ``load_task`` does, by a reference from the files of a run that this user has named before.
 
     Raises:
-        ConfigError: If this user has not named it before, others could have changed its file, or ``load_task`` fails.
+        ConfigError: If this user has not named it before, if others could have changed its file, or if ``load_task`` fails.
     """
     location, name = split_reference(reference)
-    if reference in _CLASSES or reference in _LOADED:
+    if reference in _CLASSES or reference in _NAMED:
         return load_task(reference, names)
     remedy = (
         f"Read the code of the task, and name it yourself: --task FILE.py:{name or 'NAME'} in a command, or "
@@ -130,7 +130,7 @@ def _is_task(x: object) -> bool:
     return inspect.isclass(x) and issubclass(x, Task) and x is not Task
 
 
-def _from_file(path: Path) -> ModuleType:
+def _import_file(path: Path) -> ModuleType:
     """Return the module of a file. Each version of the file is executed once, with its folder on ``sys.path``."""
     try:
         source = path.read_bytes()
@@ -155,7 +155,7 @@ def _from_file(path: Path) -> ModuleType:
     return module
 
 
-def _from_module(name: str) -> ModuleType:
+def _import_module(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:

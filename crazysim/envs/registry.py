@@ -18,7 +18,7 @@ from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.settings import enum_member, positive_integer
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv, Env
-from crazysim.envs.references import is_reference, load_noted_task, load_task
+from crazysim.envs.references import is_reference, load_listed_task, load_task
 from crazysim.envs.task import Task
 from crazysim.envs.tasks.avoid import Avoid
 from crazysim.envs.tasks.chase import Chase
@@ -80,7 +80,7 @@ TASKS: dict[str, Entry] = {
 }
 """All registered tasks, by name."""
 
-BUILT_IN = frozenset(TASKS)
+BUILT_IN_TASKS = frozenset(TASKS)
 """Names of the tasks of this package."""
 ENTRY_POINTS = "crazysim.tasks"
 """Group of entry points in which an installed package lists its task classes by name."""
@@ -106,7 +106,7 @@ def make(
     """Return an environment of many worlds of a task, with a simulation of its own.
 
     Args:
-        task: One of ``TASKS``, the reference of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
+        task: One of ``TASKS``, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
         n_worlds: Number of worlds.
         freq: Environment steps per second, Hz.
         actions: Meaning of an action; None for the usual one of the command level.
@@ -143,7 +143,7 @@ def make(
         if randomize not in RANDOMIZATIONS:
             raise ConfigError(
                 f"expected randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}, got {short_repr(randomize)}. "
-                f"Use effects=[Randomize(...)] for ranges of your task_options."
+                f"Use effects=[Randomize(...)] for other ranges."
             )
         plugins.append(RANDOMIZATIONS[randomize]())
     sim = Sim(n_worlds=n_worlds, **settings)
@@ -151,7 +151,7 @@ def make(
     if repeated:
         raise ConfigError(
             f"expected no plugin {repeated[0]!r} besides those that the simulation's settings add, got another. Leave "
-            f"it out, give it another name=, or use estimator=Kalman([...]) with sensors of your own."
+            f"it out, give it another name=, or use estimator=Kalman([...]) with your own sensors."
         )
     task.install(sim)
     for plugin in plugins:
@@ -171,7 +171,7 @@ def make(
 
 
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:
-    """Register a task of your own by a name, for ``make``, training and Gymnasium, and return its id there.
+    """Register a custom task by name, for ``make``, training and Gymnasium, and return its id there.
 
     Registering a name again, such as by executing a notebook cell again, replaces its class.
 
@@ -184,7 +184,7 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
     Returns:
         Id in Gymnasium's registry, such as ``"crazysim/TwoHoops-v0"``, for ``gymnasium.make_vec``.
     """
-    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in BUILT_IN:
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in BUILT_IN_TASKS:
         raise ConfigError(
             f"expected a name of lower case letters, digits and underscores that no built-in task has, got {name!r}. "
             f"Use for example 'two_hoops'."
@@ -197,12 +197,13 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
 
 
 def entry_of(task: str | Task, named: bool = True) -> Entry:
-    """Return the registered entry of a task, or one with the usual command level for a class of your own.
+    """Return the registered entry of a task, or one with the usual command level for a custom class.
 
     Args:
-        task: One of ``TASKS``, a name from the entry points of an installed package, the reference of a class of your
-            own, or a task.
-        named: False for a reference that was read from the files of a run; see ``crazysim.envs.references``.
+        task: One of ``TASKS``, a name from the entry points of an installed package, the reference of your class, or
+            a task.
+        named: True if this user has named the task; False for a reference from the files of a run, which may come from
+            other people, see ``crazysim.envs.references``.
 
     Raises:
         ConfigError: If there is no such file, module or class, or it may not be executed.
@@ -215,15 +216,15 @@ def entry_of(task: str | Task, named: bool = True) -> Entry:
     if task in TASKS:
         return TASKS[task]
     if is_reference(task):
-        loaded = load_task(task, TASKS) if named else load_noted_task(task, TASKS)
+        loaded = load_task(task, TASKS) if named else load_listed_task(task, TASKS)
         return TASKS[loaded] if isinstance(loaded, str) else Entry(_check_class(loaded), "")
     plugins = importlib.metadata.entry_points(group=ENTRY_POINTS)
     if task in plugins.names:
         register(task, plugins[task].load())
         return TASKS[task]
     raise UnknownNameError(
-        f"task {task!r} does not exist; there are {', '.join([*TASKS, *sorted(plugins.names)])}. A task of your own is "
-        f"named as FILE.py:CLASS."
+        f"task {task!r} does not exist; there are {', '.join([*TASKS, *sorted(plugins.names)])}. Name a custom task "
+        f"as FILE.py:CLASS."
     )
 
 

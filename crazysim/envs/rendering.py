@@ -47,7 +47,7 @@ class Renderer:
         """
         if self.mode is None or state is None:
             raise ConfigError(
-                "expected an environment with render_mode='rgb_array' or 'human' after its reset, got none. Make it so."
+                "expected an environment with render_mode='rgb_array' or 'human' after its reset, got none. Pass render_mode to make."
             )
         self.sim.data = state.data
         width, height = self.size

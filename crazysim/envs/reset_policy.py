@@ -38,7 +38,7 @@ class ResetPolicy:
 
 
 def _add_final_obs(state: EnvState) -> EnvState:
-    # In a step these are images of earlier steps, which stay what they are until new ones are taken.
+    # Within a step these are images of an earlier step, until new ones are taken.
     images = {name: state.info.get("final_obs", state.obs)[name] for name in state.record.images}
     return state.replace(info=state.info | {"final_obs": state.record.obs | images})
 

@@ -73,13 +73,13 @@ def rollout(
     initial_memory: Any = (),
     memory: Any = None,
 ) -> tuple[EnvState, Any, Any]:
-    """Run a policy for some steps in one ``jax.lax.scan``. The function is pure, for jit and grad.
+    """Run a policy for some steps in one ``jax.lax.scan``. The function is pure and works with jit and grad.
 
     Args:
         env: The environment, usually inside ``AutoReset``.
         state: The state at the start.
         policy: The policy, for all worlds at once.
-        key: Random key, or several; each step receives as many of its own. () or (n_keys,)
+        key: Random key, or several. Each step receives the same number of new keys. () or (n_keys,)
         n_steps: Number of steps, a positive integer.
         keep: ``keep(transition)``: the part of each transition to return; reward and ``done`` by default.
         initial_memory: Memory of the policy at the start of an episode; ``()`` for none. (n_worlds, ...) each

@@ -75,7 +75,7 @@ class DroneVecEnv(VecEnv):
         )
 
     def reset(self) -> Any:
-        """Start new episodes in all worlds, with the last seed passed to ``seed`` if it is unused."""
+        """Start new episodes in all worlds, with the last seed passed to ``seed`` if it has not been used yet."""
         seed = as_seed(self._seeds[0])
         number = seed if seed is not None else int(self._generator.integers(2**31))
         if seed is not None:

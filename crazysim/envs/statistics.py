@@ -9,7 +9,7 @@ from jax import Array
 from crazysim.pytree import PyTree, leaf, static
 
 CLIP, EPSILON = 10.0, 1e-6
-"""Largest magnitude of a normalised observation, and the addend that keeps the root of a variance above zero."""
+"""Largest magnitude of a normalised observation, and the number that is added to a variance before its root is taken."""
 
 
 class RunningStats(PyTree):
@@ -38,7 +38,7 @@ class RunningStats(PyTree):
 
     def update(self, x: Array) -> RunningStats:
         """Return the statistics with one more batch. (..., k)"""
-        axes = tuple(range(x.ndim - 1))  # reduced as they are: worlds that are spread over devices stay where they are
+        axes = tuple(range(x.ndim - 1))  # not flattened, so that worlds on several devices stay on their devices
         n, mean, var = x.size // x.shape[-1], x.mean(axis=axes), x.var(axis=axes)
         total = self.count + n
         delta = mean - self.mean

@@ -70,7 +70,7 @@ class EnvStepper:
         flat = self._flat
         if flat is None:
             raise ConfigError("expected a state before the first step, got none. Assign stepper.state.")
-        if self._env.sim.mesh is not None:  # actions of a policy on one device
+        if self._env.sim.mesh is not None:  # the actions may be on one device
             actions = jax.device_put(actions, NamedSharding(self._env.sim.mesh, PartitionSpec(WORLD_AXIS)))
         carry, fixed_leaves = (
             [flat.leaves[i] for i in indices] for indices in (self._carried_indices, self._fixed_indices)

@@ -63,7 +63,7 @@ def check_record(state: EnvState, after: EnvState) -> None:
         name = keystr(path).lstrip(".")
         if kind in ("batched", "opaque"):
             raise ConfigError(
-                f"expected {name} to be declared for drones, worlds or all of them, got a field that is {kind!r}. "
+                f"expected {name} to be declared for drones, worlds or as shared, got a field that is {kind!r}. "
                 f'Declare it with leaf("drone"), leaf("world") or leaf("shared").'
             )
         if kind == "drone" and x.shape[1:2] != (n_drones,):
@@ -75,11 +75,11 @@ def check_record(state: EnvState, after: EnvState) -> None:
         if y is None or (x.shape, x.dtype) != (y.shape, y.dtype):
             raise ConfigError(
                 f"expected a step to return {name} as it is at the start of an episode, {_describe(x)}, got "
-                f"{'none' if y is None else _describe(y)}. Tasks and wrappers return the same names and shapes always."
+                f"{'none' if y is None else _describe(y)}. Tasks and wrappers must always return the same names and shapes."
             )
     if added := [keystr(path).lstrip(".") for path in stepped_leaves if path not in before]:
         raise ConfigError(
-            f"expected a step to return what there is at the start of an episode, got {', '.join(added)} besides. "
+            f"expected a step to return the entries that exist at the start of an episode, got {', '.join(added)} as well. "
             f"Set it in after_reset, too."
         )
 
@@ -143,7 +143,7 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
     if getattr(terminated, "shape", None) != batch or not jnp.issubdtype(terminated.dtype, jnp.bool_):
         raise ConfigError(
             f"{title}: expected terminated of type bool and shape ({names.removesuffix(', ')}), got "
-            f"{_describe(terminated)}. It is of a world: use jnp.any or jnp.all over its drones."
+            f"{_describe(terminated)}. It is one value per world: use jnp.any or jnp.all over its drones."
         )
 
 

@@ -1,4 +1,4 @@
-"""Terms of rewards, which tasks share. Each is of every drone of a world; a task weights them."""
+"""Terms of rewards that several tasks use, unweighted. Each is computed for every drone of a world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Race courses: poses of gates, obstacles and starts, given or drawn at random."""
+"""Race courses: poses of gates, obstacles and starts, fixed or drawn at random."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from crazysim.errors import ConfigError
 CELL = (1.0, 1.2)
 """Size of the cells that a random course spreads its gates over, along x and y, m."""
 MARGIN = (0.5, 0.3)
-"""Distance of the cells from the limits of the arena, m."""
+"""Distance of the cells from the limits of the arena along x and y, m."""
 CELL_JITTER = 0.05
 """Largest component of a gate's offset from the middle of its cell, m."""
 MAX_TURN = 1.0
-"""Largest angle between a gate of a random course and the way that leads to it, rad."""
+"""Largest angle between the axis of a gate of a random course and the leg that leads to the gate, rad."""
 START_SPACING = 0.4
 """Distance between neighbouring starts in one world, m."""
 START_HEIGHT = 0.4
 """Height of the starts of a random course, m."""
 
 Points = Sequence[Sequence[float]]
+"""Points or angles, (n, 3)."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,8 @@ class Track:
     @property
     def grid(self) -> tuple[int, int]:
         """Numbers of cells of a random course along x and y."""
-        room = (np.asarray(self.high) - np.asarray(self.low))[:2] - 2 * np.array(MARGIN)
-        n_x, n_y = np.floor(room / CELL + 1e-6).astype(int)
+        free_size = (np.asarray(self.high) - np.asarray(self.low))[:2] - 2 * np.array(MARGIN)
+        n_x, n_y = np.floor(free_size / CELL + 1e-6).astype(int)
         return int(n_x), int(n_y)
 
 
@@ -78,34 +79,34 @@ def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Tra
         is_valid = value.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, value.shape, strict=True))
         if not is_valid or not value.size or not np.all(np.isfinite(value)):
             expected = str(shape).replace("-1", "n")
-            raise ConfigError(f"the track's {name} has shape {value.shape}; needed are finite numbers, {expected}")
+            raise ConfigError(f"expected {name} of the track as finite numbers, {expected}, got shape {value.shape}")
     low, high = np.asarray(track.low, float), np.asarray(track.high, float)
     if np.any(high <= low):
-        raise ConfigError(f"the track's arena reaches from {low} to {high}; every upper limit must be the larger")
+        raise ConfigError(f"expected upper limits of the arena above the lower ones, got {high} and {low}")
     if random:
         n_x, n_y = track.grid
         if n_x * n_y < track.n_gates + 1 or (n_x + 1) * (n_y + 1) < track.n_obstacles:
             raise ConfigError(
-                f"a random course of {track.n_gates} gates and {track.n_obstacles} obstacles has no room: the arena "
-                f"takes {n_x} x {n_y} cells of {CELL[0]} x {CELL[1]} m, and start and gates take one each. Set wider "
+                f"expected an arena with room for a random course of {track.n_gates} gates and {track.n_obstacles} "
+                f"obstacles, got {n_x} x {n_y} cells of {CELL[0]} x {CELL[1]} m; start and gates take one each. Set wider "
                 f"limits with Track(low=..., high=...), or use fewer."
             )
         if n_drones > 8:
-            raise ConfigError(f"{n_drones} drones; a random course has room for 8 at its start. Use level 0, 1 or 2.")
+            raise ConfigError(f"expected at most 8 drones on a random course, got {n_drones}. Use level 0, 1 or 2.")
         return track
     starts = np.asarray(track.start) + start_offsets(n_drones)
-    for kind, points, room in (("gate", track.gates_pos, 0.45), ("obstacle", track.obstacles_pos, 0.15)):
+    for kind, points, clearance in (("gate", track.gates_pos, 0.45), ("obstacle", track.obstacles_pos, 0.15)):
         distance = np.linalg.norm((starts[:, None] - np.asarray(points)[None])[..., :2], axis=-1)
-        if np.any(distance < room + jitter):
-            k = int(np.argwhere(distance < room + jitter)[0, 1])
+        if np.any(distance < clearance + jitter):
+            k = int(np.argwhere(distance < clearance + jitter)[0, 1])
             raise ConfigError(
-                f"{kind} {k} of the track is {distance.min():.2f} m from a start, where {room + jitter:.2f} m are "
-                f"needed in the plane; move it, or Track(start=...)"
+                f"expected {kind} {k} of the track at least {clearance + jitter:.2f} m from every start in the plane, got "
+                f"{distance.min():.2f} m. Move it, or set Track(start=...)."
             )
     if np.any(starts < low + [0.2, 0.2, 0.2]) or np.any(starts > high - 0.2):
         raise ConfigError(
-            f"a start of the {n_drones} drones around {tuple(track.start)} is not 0.2 m within the limits of the arena "
-            f"or over the floor; move Track(start=...), or set wider limits low= and high="
+            f"expected starts at least 0.2 m within the limits of the arena and above the floor, got {n_drones} drones "
+            f"around {tuple(track.start)}. Move Track(start=...), or set wider limits low= and high=."
         )
     return track
 
@@ -129,10 +130,10 @@ def random_count(track: Track) -> int:
 
 
 def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
-    """Return a course drawn at random: start and gates in cells of their own, obstacles in corners of cells.
+    """Return a course drawn at random: start and gates in different cells, obstacles in corners of cells.
 
-    Hence no object is in the way of another in any draw. Heights are the track's. A gate faces along the way from the
-    gate before it, with a deviation of up to 1 rad.
+    Therefore objects never overlap. Heights are those of the track. The axis of a gate points along the leg from the
+    previous gate, with a deviation of up to 1 rad.
 
     Args:
         track: Track with the heights and numbers of gates and obstacles, and the limits of the arena.
@@ -143,28 +144,30 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
         of obstacles, m (..., n_obstacles, 3).
     """
     n, (n_x, n_y) = track.n_gates, track.grid
-    cells, corners, shifts, turns = jnp.split(x, np.cumsum([n_x * n_y, (n_x + 1) * (n_y + 1), 2 * n]), axis=-1)
+    cell_numbers, corner_numbers, shift_numbers, yaw_numbers = jnp.split(
+        x, np.cumsum([n_x * n_y, (n_x + 1) * (n_y + 1), 2 * n]), axis=-1
+    )
     middle = (np.asarray(track.low)[:2] + np.asarray(track.high)[:2]) / 2
     size = np.array(CELL)
     origin = middle - size * (np.array([n_x, n_y]) - 1) / 2
 
-    cell = ranks(cells, n + 1)
-    flat = jnp.asarray(origin) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
-    shift = CELL_JITTER * (2 * shifts.reshape(*x.shape[:-1], n, 2) - 1)
-    gates = flat[..., 1:, :] + shift
-    start = jnp.concatenate([flat[..., 0, :], jnp.full_like(flat[..., 0, :1], START_HEIGHT)], axis=-1)
+    cell = ranks(cell_numbers, n + 1)
+    centres = jnp.asarray(origin) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
+    shift = CELL_JITTER * (2 * shift_numbers.reshape(*x.shape[:-1], n, 2) - 1)
+    gates = centres[..., 1:, :] + shift
+    start = jnp.concatenate([centres[..., 0, :], jnp.full_like(centres[..., 0, :1], START_HEIGHT)], axis=-1)
 
-    way = gates - jnp.concatenate([flat[..., :1, :], gates[..., :-1, :]], axis=-2)
-    yaw = jnp.arctan2(way[..., 1], way[..., 0]) + MAX_TURN * (2 * turns - 1)
+    legs = gates - jnp.concatenate([centres[..., :1, :], gates[..., :-1, :]], axis=-2)
+    yaw = jnp.arctan2(legs[..., 1], legs[..., 0]) + MAX_TURN * (2 * yaw_numbers - 1)
     quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
 
-    corner = ranks(corners, track.n_obstacles)
+    corner = ranks(corner_numbers, track.n_obstacles)
     poles = jnp.asarray(origin - size / 2) + size * jnp.stack([corner % (n_x + 1), corner // (n_x + 1)], axis=-1)
     return start, _add_height(gates, track.gates_pos), quat, _add_height(poles, track.obstacles_pos)
 
 
 def ranks(x: Array, n: int) -> Array:
-    """Return the rank of each of the first ``n`` numbers among all: a draw without replacement.
+    """Return the rank of each of the first ``n`` numbers among all: ``n`` draws without replacement.
 
     Args:
         x: Random numbers, at least ``n``. (..., m)
@@ -179,6 +182,7 @@ def ranks(x: Array, n: int) -> Array:
     return jnp.sum((all_numbers < ranked) | ((all_numbers == ranked) & earlier), axis=-1, dtype=jnp.int32)
 
 
-def _add_height(flat: Array, points: Points) -> Array:
-    height = np.asarray(points, float)[:, 2:].astype(flat.dtype)
-    return jnp.concatenate([flat, jnp.broadcast_to(height, (*flat.shape[:-1], 1))], axis=-1)
+def _add_height(xy: Array, points: Points) -> Array:
+    """Return horizontal positions with the heights of points. (..., n, 2) -> (..., n, 3)"""
+    height = np.asarray(points, float)[:, 2:].astype(xy.dtype)
+    return jnp.concatenate([xy, jnp.broadcast_to(height, (*xy.shape[:-1], 1))], axis=-1)

@@ -178,7 +178,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return gymnasium.spaces.Box(-limit, limit, shape, x.dtype)
 
     def render(self) -> tuple[Any, ...] | None:
-        """Render all worlds, or those that were chosen: return an image (height, width, 3) of each, or draw the first.
+        """Render all worlds, or ``render_worlds``: return an image (height, width, 3) of each, or draw the first.
 
         Raises:
             RenderError: If this machine cannot render.

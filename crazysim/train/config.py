@@ -133,9 +133,9 @@ class TrainConfig:
     config: dict[str, Any]
     """Hyperparameters of the algorithm; omitted ones have their defaults."""
     own_network: bool = False
-    """True if the policy has a network of your own instead of the built-in one."""
+    """True if the policy has a custom network instead of the built-in one."""
     network: Network | None = field(default=None, compare=False)
-    """Network of your own; None for the built-in one. The files of a run hold its weights, but not its functions."""
+    """Custom network; None for the built-in one. The files of a run hold its weights, but not its functions."""
     devices: Devices | None = field(default=None, compare=False)
     """Devices that the worlds of the training are distributed over; None for the device of the options alone. The files
     of a run do not hold them: a resumed run may have others."""
@@ -158,9 +158,7 @@ class TrainConfig:
             )
         if self.network is not None:
             if self.algorithm != "ppo":
-                raise ConfigError(
-                    f"expected no network of your own for {self.algorithm}, got one. Use algorithm='ppo'."
-                )
+                raise ConfigError(f"expected no custom network for {self.algorithm}, got one. Use algorithm='ppo'.")
             choose_network(self.config.get("memory", 0), self.network, self.config.get("convolution", ()))
             object.__setattr__(self, "own_network", True)
         config = dataclasses.asdict(self.algorithm_config())
@@ -188,14 +186,14 @@ class TrainConfig:
         """Return the configuration of a run; omitted values come from the recipe of the task.
 
         Args:
-            task: Name of a task, the reference of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
+            task: Name of a task, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
             algorithm: Name of the algorithm, a key of ``ALGORITHMS``.
             seed: Random seed; None for 0.
             n_worlds: Number of parallel worlds.
             options: Options of ``crazysim.envs.make``.
             config: Hyperparameters of the algorithm.
             resumed: Configuration of the run to continue, which then provides omitted values; None for a new run.
-            network: Network of your own; None for the built-in one.
+            network: Custom network; None for the built-in one.
             devices: Devices that the worlds are distributed over: ``"all"``, their number, or their indices; of the
                 platform ``options["device"]``, or else of JAX's default platform. None for one device.
         """
@@ -218,7 +216,7 @@ class TrainConfig:
                 recipe = Recipe(resumed.algorithm, resumed.n_worlds, resumed.config)
         n_worlds = recipe.n_worlds if n_worlds is None else n_worlds
         options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
-        if is_airframe_file(options.get("drone")):  # so that the run can be flown from any folder
+        if is_airframe_file(options.get("drone")):  # the run can then be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())
         if devices is not None:
             options["device"] = evaluation_device(options.get("device"), devices)

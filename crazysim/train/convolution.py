@@ -22,7 +22,7 @@ KERNEL, STRIDE = 3, 2
 
 
 class Image(NamedTuple):
-    """Place of an image among the concatenated observations."""
+    """Position and format of an image among the concatenated observations."""
 
     start: int
     """Index of its first pixel."""
@@ -31,7 +31,7 @@ class Image(NamedTuple):
     width: int
     """Pixels."""
     channels: int = 1
-    """Numbers of a pixel."""
+    """Number of values of a pixel."""
     is_depth: bool = True
     """True if pixels are depths or distances, m."""
 
@@ -55,11 +55,11 @@ class Image(NamedTuple):
 
 
 def find_images(sizes: Mapping[str, int], formats: Mapping[str, Mapping[str, Any]]) -> tuple[Image, ...]:
-    """Return the places of images among observations that are concatenated in alphabetical order.
+    """Return the images among observations that are concatenated in alphabetical order.
 
     Args:
         sizes: Sizes of the observations by name.
-        formats: Formats of those that are images, from ``Env.image_formats``.
+        formats: Formats of the observations that are images, from ``Env.image_formats``.
 
     Raises:
         ConfigError: If there is no image.
@@ -82,14 +82,14 @@ def find_images(sizes: Mapping[str, int], formats: Mapping[str, Mapping[str, Any
 def scale_depth(depth: Array) -> Array:
     """Return 1 / (1 + d) for a depth of d metres: 1 at the lens, 1/2 at 1 m, and nearly 0 where nothing is near.
 
-    Running statistics would scale every pixel on its own, and the depth itself differs most where it matters least. The
-    inverse resolves what is near; adding 1 m keeps it and its derivative finite.
+    Normalisation by running statistics would scale every pixel differently, and the depth itself varies most where it
+    is large and matters least. The inverse resolves what is near; adding 1 m keeps it and its derivative finite.
     """
     return 1.0 / (1.0 + depth)
 
 
 def convolve(layers: Sequence[tuple[Array, Array]], image: Array) -> Array:
-    """Return the features of one image, with the larger of zero and the sum after each layer. (n_features,)
+    """Return the features of one image, with a rectifier (ReLU) after each layer. (n_features,)
 
     Args:
         layers: Weights (9 n_in, n_out), with rows in the order row, column and channel of a patch, and biases (n_out,).

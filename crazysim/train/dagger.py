@@ -3,7 +3,7 @@
 The student flies, so that it learns in the states that its own errors lead to, and the teacher's action in each state
 is its label. The paper's algorithm fits all samples so far. This one takes gradient steps on each rollout and then
 discards it; the paper's bounds hold for any no-regret learner. A rollout of hundreds of worlds has enough samples for
-such steps, and images of all iterations would not fit in memory.
+these steps, and the images of all iterations would not fit in memory.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Config:
     learning_rate: float = 3e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     teacher_decay: float = 0.8
-    """Factor by which the probability that the teacher acts in a step changes with every iteration; it begins at 1."""
+    """Factor from one iteration to the next of the probability that the teacher acts in a step, which begins at 1."""
     max_grad_norm: float = 1.0
     """Largest global norm of a gradient; larger ones are scaled down to it."""
 
@@ -125,12 +125,12 @@ class TeacherObservation(Wrapper):
         self.observe, self.batched = observe, env.task.batched
 
     def after_reset(self, state: EnvState) -> EnvState:
-        return self._add(state)
+        return self._add_teacher_obs(state)
 
     def after_step(self, state: EnvState) -> EnvState:
-        return self._add(state)
+        return self._add_teacher_obs(state)
 
-    def _add(self, state: EnvState) -> EnvState:
+    def _add_teacher_obs(self, state: EnvState) -> EnvState:
         return state.replace(obs=state.obs | {TEACHER_PREFIX + name: x for name, x in self.observe(state.data).items()})
 
 
@@ -138,7 +138,7 @@ def wrap_with_teacher(env: Env, config: Config) -> TeacherObservation:
     """Return an environment with the observations of the teacher in ``config.teacher`` as well.
 
     Raises:
-        ConfigError: If there is no teacher, or the student's task does not keep the record of the teacher's task.
+        ConfigError: If there is no teacher, or the student's task does not have the teacher's task record.
     """
     from crazysim.train.training import load_policy
 
@@ -203,11 +203,11 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
     agents, rates, config = learner.agents.replace(key=key), stack_rates(configs), configs[0]
     split_seeds = functools.partial(split_blocks, n_seeds=len(configs))
-    teacher_share = config.teacher_decay**learner.iteration
+    teacher_probability = config.teacher_decay**learner.iteration
 
     def act(agent: Agent, raw_obs: Array, label: Array, key: Array) -> tuple[Array, Any]:
         action = agent.act(agent.stats.normalize(raw_obs))
-        teacher_acts = jax.random.bernoulli(key, teacher_share, (len(action), 1, 1))
+        teacher_acts = jax.random.bernoulli(key, teacher_probability, (len(action), 1, 1))
         return jnp.where(teacher_acts, label, action), (raw_obs, label, jnp.square(action - label).mean())
 
     def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:

@@ -54,15 +54,15 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
     Raises:
         ConfigError: If a device does not exist, or if ``devices`` is not one of the forms of ``Devices``.
     """
-    chosen, first_device = _read_devices(devices), find_device(device)
+    selection, first_device = _read_devices(devices), find_device(device)
     platform, available = first_device.platform, jax.devices(first_device.platform)
-    if isinstance(chosen, tuple):
-        indices = list(chosen)
-    elif chosen is None:
+    if isinstance(selection, tuple):
+        indices = list(selection)
+    elif selection is None:
         indices = list(range(len(available)))
     else:
         first = available.index(first_device) if isinstance(device, str) and ":" in device else 0
-        indices = list(range(first, first + chosen))
+        indices = list(range(first, first + selection))
     if missing := [i for i in indices if i >= len(available)]:
         hint = "" if platform != "cpu" else (
             " A CPU is one device, or N with XLA_FLAGS=--xla_force_host_platform_device_count=N in the environment."
@@ -127,7 +127,7 @@ def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
 
 
 def replicated_sharding(sim: Sim) -> jax.sharding.Sharding:
-    """Return the sharding of arrays of which every device of a simulation has a copy."""
+    """Return the sharding of arrays that are copied to every device of a simulation."""
     return SingleDeviceSharding(sim.device) if sim.mesh is None else NamedSharding(sim.mesh, PartitionSpec())
 
 
@@ -150,7 +150,7 @@ def exchanged_bytes(program: str) -> dict[str, int]:
 
     bytes_by_operation: dict[str, int] = {}
 
-    def count(name: str, times: int) -> None:
+    def count_bytes(name: str, n_calls: int) -> None:
         for line in computations.get(name, ()):
             if collective := _COLLECTIVE.search(line):
                 arrays, operation, started = collective.groups()
@@ -160,13 +160,13 @@ def exchanged_bytes(program: str) -> dict[str, int]:
                 ]
                 # The start of a gather also lists its operands, which are smaller than its result.
                 n_bytes = max(sizes) if started and operation != "all-reduce" else sum(sizes)
-                bytes_by_operation[operation] = bytes_by_operation.get(operation, 0) + times * n_bytes
-            trips = _TRIP_COUNT.search(line) if " while(" in line else None
+                bytes_by_operation[operation] = bytes_by_operation.get(operation, 0) + n_calls * n_bytes
+            trip_count = _TRIP_COUNT.search(line) if " while(" in line else None
             for names in [] if "-done(" in line or "-update(" in line else _CALLED_COMPUTATIONS.findall(line):
-                for called in names.split(", "):
-                    count(called, times * (int(trips[1]) if trips else 1))
+                for computation in names.split(", "):
+                    count_bytes(computation, n_calls * (int(trip_count[1]) if trip_count else 1))
 
-    count(entry, 1)
+    count_bytes(entry, 1)
     return bytes_by_operation
 
 
@@ -177,15 +177,15 @@ def _read_devices(devices: Devices) -> int | tuple[int, ...] | None:
     try:
         if isinstance(devices, str):
             numbers = [int(x) for x in devices.split(",")]
-            chosen = tuple(numbers) if len(numbers) > 1 else numbers[0]
+            selection = tuple(numbers) if len(numbers) > 1 else numbers[0]
         else:
-            chosen = devices if isinstance(devices, int) else tuple([int(x) for x in devices])
+            selection = devices if isinstance(devices, int) else tuple([int(x) for x in devices])
     except (TypeError, ValueError):
-        chosen = 0
-    indices = chosen if isinstance(chosen, tuple) else (chosen - 1,)
+        selection = 0
+    indices = selection if isinstance(selection, tuple) else (selection - 1,)
     if isinstance(devices, bool) or not indices or min(indices) < 0 or len(set(indices)) < len(indices):
         raise ConfigError(
             f"expected 'all', a number of devices, or their indices, each once, got {devices!r}. Use for example "
             f"--devices 2, or --devices 0,2,3."
         )
-    return chosen
+    return selection

@@ -79,8 +79,8 @@ class PolicyNumbers(NamedTuple):
         return len(self.gru[0][2]) if self.gru else 0
 
     @property
-    def others(self) -> list[range]:
-        """Indices of the observations before, between and after the images."""
+    def vector_ranges(self) -> list[range]:
+        """Indices of the observations that are not pixels: before, between and after the images."""
         starts, ends = [0, *(x.pixels.stop for x in self.images)], [x.start for x in self.images] + [len(self.mean)]
         return [range(start, end) for start, end in zip(starts, ends, strict=True) if start < end]
 
@@ -134,7 +134,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise ImportError(not_installed("ONNX files need", "onnx", "onnx")) from error
-    numbers = _check_numbers(policy, meta)
+    numbers = _policy_numbers(policy, meta)
     constants = {"mean": numbers.mean, "std": numbers.std, "low": np.float32(-CLIP), "high": np.float32(CLIP)}
     nodes = []
 
@@ -250,7 +250,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ConfigError(f"expected the name of a C function, got {name!r}; use letters, digits and underscores")
-    numbers = _check_numbers(policy, meta)
+    numbers = _policy_numbers(policy, meta)
     n_obs, n_memory, n_actions = len(numbers.mean), numbers.n_memory, len(numbers.layers[-1][1])
     guard = f"CRAZYSIM_{name.upper()}_H"
     lines = [
@@ -292,11 +292,11 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     return path
 
 
-def _check_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
+def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     """Return the numbers of a policy, after checking them."""
     if not policy.network.is_built_in:
         raise ConfigError(
-            "expected a policy with the built-in network, got one with a network of your own. Export it with its "
+            "expected a policy with the built-in network, got one with a custom network. Export it with its "
             "library, or with jax.export."
         )
     host_policy = jax.tree.map(lambda x: np.asarray(x, np.float32), policy)
@@ -349,7 +349,7 @@ def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
     n_inputs, n_memory, limit = numbers.n_inputs, numbers.n_memory, float_literal(CLIP)
     yield f"float x0[{n_inputs + n_memory}];"
     offset = 0
-    for indices in numbers.others:
+    for indices in numbers.vector_ranges:
         yield f"for (int i = {indices.start}; i < {indices.stop}; ++i) {{"
         yield f"    const float x = (observation[i] - {name}_mean[i]) / {name}_std[i];"
         target = "i" if indices.start == offset else f"i - {indices.start - offset}"

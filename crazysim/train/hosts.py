@@ -1,4 +1,4 @@
-"""Agreement of the hosts of a training: they run the same program, step by step."""
+"""Checks and decisions that keep the hosts of a training in agreement: all of them run the same program in lockstep."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import crazysim
 from crazysim import jaxcompat
 from crazysim.errors import ConfigError
 
-AGREEMENT_SECONDS = 300
-"""Time that hosts wait for the settings of the others, s: as JAX waits for their connection."""
-_exchanges = itertools.count()
-"""Numbers of the exchanges of texts, which all hosts make in the same order."""
+SETTINGS_TIMEOUT = 300
+"""Time that a host waits for the settings of the others, s; JAX waits as long for their connection."""
+_exchange_numbers = itertools.count()
+"""Numbers of the exchanges of texts. All hosts make the exchanges in the same order."""
 
 
 def is_first_host() -> bool:
@@ -25,7 +25,7 @@ def is_first_host() -> bool:
 
 
 def require_same_versions() -> None:
-    """Check that all hosts have the same versions of crazysim and JAX; before a backend starts.
+    """Check that all hosts have the same versions of crazysim and JAX; call it before a backend starts.
 
     Raises:
         ConfigError: On all hosts, if one of them has another version.
@@ -48,7 +48,7 @@ def _require_same(what: str, values: Mapping[str, Any], remedy: str) -> None:
     hosts = jaxcompat.connected_hosts()
     if hosts is None:
         return
-    first, *others = (json.loads(text) for text in _exchange(json.dumps(dict(values)), hosts))
+    first, *others = (json.loads(text) for text in _exchange_texts(json.dumps(dict(values)), hosts))
     for host, other in enumerate(others, 1):
         for name in {**first, **other}:
             if first.get(name) != other.get(name):
@@ -58,16 +58,16 @@ def _require_same(what: str, values: Mapping[str, Any], remedy: str) -> None:
                 )
 
 
-def _exchange(text: str, hosts: jaxcompat.Hosts) -> list[str]:
-    """Return the texts of all hosts, in their order; they go through the coordinator, not through devices."""
+def _exchange_texts(text: str, hosts: jaxcompat.Hosts) -> list[str]:
+    """Return the texts of all hosts, in the order of the hosts. They are sent through the coordinator, not the devices."""
     client, host_id, n_hosts = hosts
-    folder = f"crazysim/exchange-{next(_exchanges)}"
+    folder = f"crazysim/exchange-{next(_exchange_numbers)}"
     client.key_value_set(f"{folder}/{host_id}", text)
-    return [client.blocking_key_value_get(f"{folder}/{i}", 1000 * AGREEMENT_SECONDS) for i in range(n_hosts)]
+    return [client.blocking_key_value_get(f"{folder}/{i}", 1000 * SETTINGS_TIMEOUT) for i in range(n_hosts)]
 
 
 def must_stop(iteration: int) -> bool:
-    """Return True on all hosts after the same iteration, if a host has received SIGTERM; False without other hosts.
+    """Return True if a host has received SIGTERM: on all hosts after the same iteration; False if there is one host.
 
     Args:
         iteration: Number of the iteration that has ended.
@@ -75,6 +75,6 @@ def must_stop(iteration: int) -> bool:
     return jax.process_count() > 1 and jaxcompat.is_stop_requested(iteration)
 
 
-def decided_by_first(decision: bool) -> bool:
-    """Return the decision of host 0, on all hosts: clocks of hosts differ. Waits for the devices of all hosts."""
+def broadcast_decision(decision: bool) -> bool:
+    """Return the decision of host 0 on all hosts, whose clocks differ. Waits for the devices of all hosts."""
     return decision if jax.process_count() == 1 else jaxcompat.broadcast_from_first(decision)

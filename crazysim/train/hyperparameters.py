@@ -12,20 +12,18 @@ from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
 
 SWEEPABLE = ("learning_rate", "discount", "gae_lambda", "clip", "entropy", "value_weight", "max_grad_norm")
-"""Hyperparameters that may differ between the seeds of one program, and change when a run is resumed: neither shapes
-nor counters of its state depend on them."""
+"""Hyperparameters that may differ between the seeds of one program, and may change when a run is resumed: shapes and
+counters of its state do not depend on them."""
 FRACTIONS = ("discount", "gae_lambda", "teacher_decay")
 """Hyperparameters from 0 to 1."""
 WEIGHTS = ("entropy", "value_weight")
 """Hyperparameters that are finite, and 0 or larger."""
 LIMITS = ("max_grad_norm",)
 """Hyperparameters that are larger than 0, and may be infinite. All other numbers are finite and larger than 0."""
-
-
 COUNTS = ("memory",)
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
 CHOICES = {"critic": ("observations", "privileged", "all_drones", "all_drones_privileged")}
-"""Hyperparameters that are one of some words."""
+"""Values of the hyperparameters that are one of several words, by name."""
 
 
 def check_hyperparameters(config: Any) -> None:

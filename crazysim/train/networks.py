@@ -194,12 +194,12 @@ def _apply_convolution(
     images: tuple[Image, ...], apply: Callable[..., Any], encoder: Encoder, obs: Array, memory: Any
 ) -> tuple[Array, Any]:
     ends = [end for pixels in (image.pixels for image in images) for end in (pixels.start, pixels.stop)]
-    others = jnp.split(obs, ends)[::2]
+    vectors = jnp.split(obs, ends)[::2]
     features = []
     for image, layers in zip(images, encoder.convolutions, strict=True):
         pixels = obs[image.pixels.start : image.pixels.stop]
         features.append(convolve(layers, (scale_depth(pixels) if image.is_depth else pixels).reshape(image.shape)))
-    return apply(encoder.memory, jnp.concatenate([*others, *features]), memory)
+    return apply(encoder.memory, jnp.concatenate([*vectors, *features]), memory)
 
 
 def choose_network(
@@ -209,7 +209,7 @@ def choose_network(
 
     Args:
         memory: Size of the memory of the built-in network; 0 for none.
-        network: Network of your own; None for the built-in one.
+        network: Custom network; None for the built-in one.
         convolution: Channels of the layers of the convolution of the built-in network; none without.
         images: Images among the observations, for the convolution.
 
@@ -224,11 +224,11 @@ def choose_network(
         raise ConfigError(f"expected a Network, got {network!r}. Use crazysim.train.Network(init, apply).")
     if convolution:
         raise ConfigError(
-            f"expected no convolution with a network of your own, got {list(convolution)}. Put it into the network."
+            f"expected no convolution with a custom network, got {list(convolution)}. Put it into the network."
         )
     if memory:
         raise ConfigError(
-            f"expected memory=0 with a network of your own, got {memory}. Give the network an initial_memory instead."
+            f"expected memory=0 with a custom network, got {memory}. Give the network an initial_memory instead."
         )
     return network
 

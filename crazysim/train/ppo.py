@@ -37,7 +37,7 @@ from crazysim.train.networks import (
 from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates
 
 PRIVILEGED_CRITICS = ("privileged", "all_drones_privileged")
-"""Critics that see the observation of ``PrivilegedObservation``."""
+"""Critics that receive the observation of ``PrivilegedObservation``."""
 MAX_GROUPS = 64
 """Largest number of groups of neighbouring worlds. A minibatch takes the same number of worlds from every group. A
 device holds whole groups, so it needs no samples of others, and minibatches do not depend on the number of devices."""
@@ -56,7 +56,7 @@ class Config:
     minibatches: int = 8
     """Minibatches, and hence updates, per epoch; each contains all samples of a subset of the worlds."""
     hidden: tuple[int, ...] = (64, 64)
-    """Sizes of the hidden layers of policy and value function; not used with a network of your own."""
+    """Sizes of the hidden layers of policy and value function; not used with a custom network."""
     memory: int = 0
     """Size of the memory of policy and value function, a gated recurrent unit before the hidden layers; 0 for none."""
     convolution: tuple[int, ...] = ()
@@ -163,7 +163,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
             all seeds share the statistics of a ``Normalize`` wrapper.
         configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
-        network: Network of your own, for policy and value function; None for the built-in one.
+        network: Custom network, for policy and value function; None for the built-in one.
     """
     config, n_worlds = configs[0], env.sim.n_worlds // len(configs)
     if n_worlds % config.minibatches:
@@ -269,17 +269,17 @@ def _collect_samples(
             reward + discount * jnp.where(truncated, final_values, 0.0),
             jnp.broadcast_to(done, reward.shape),
         )
-        # Not their means, which devices would have to exchange in each step.
+        # Means would make the devices communicate in each step.
         return sample, raw_obs, (reward, terminated, error)
 
     initial_memory = _initial_memories(agents.network, learner.env)
-    state, memory, (samples, raw_obs, (reward, terminated_counts, error)) = rollout(
+    state, memory, (samples, raw_obs, (reward, terminated, error)) = rollout(
         env, learner.env, policy, keys, config.n_steps, record_transition, initial_memory, learner.memory
     )
     done = samples.done.any(axis=-1)
     metrics = {
         "reward": reward.mean(axis=(0, 2, 3)),
-        "crashed": terminated_counts.sum(axis=(0, 2)) / jnp.maximum(done.sum(axis=(0, 2)), 1),
+        "crashed": terminated.sum(axis=(0, 2)) / jnp.maximum(done.sum(axis=(0, 2)), 1),
         "error": error.mean(axis=(0, 2, 3)),
     }
     return state, memory, samples, raw_obs, metrics
@@ -403,7 +403,7 @@ def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.
 
 
 def _find_images(env: Env, policy_obs: Obs, config: Config) -> tuple[Image, ...]:
-    """Return the images that a convolution replaces by features; none without one."""
+    """Return the images that a convolution replaces by features; none without a convolution."""
     if not config.convolution:
         return ()
     if config.critic.startswith("all_drones"):
@@ -426,13 +426,13 @@ def _critic_obs(obs: Obs, config: Config) -> Array:
 
 
 def _policy_obs(obs: Obs, config: Config) -> Obs:
-    """Return the observations of the policy: all of them, except for a privileged critic's."""
+    """Return the observations of the policy: all of them, without the one for a privileged critic."""
     is_hidden = config.critic in PRIVILEGED_CRITICS
     return {name: x for name, x in obs.items() if not (is_hidden and name == PRIVILEGED)}
 
 
 def _critic_input(obs: Array, config: Config) -> Array:
-    """Return the inputs of the value function for each drone, to which a critic of all drones appends the others'.
+    """Return the inputs of the value function for each drone. A critic of all drones also gets those of the others.
 
     Args:
         obs: Result of ``_critic_obs``, normalised or not. (..., n_drones, k)

@@ -14,7 +14,16 @@ from crazysim.train.hosts import is_first_host
 from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.show import film as film_policy
 from crazysim.train.show import plot_curve, plot_episode, plot_spread, read_curve
-from crazysim.train.training import CHECKPOINT, CURVE, POLICY, TABLE, TrainResult, stored_configs, train, train_many
+from crazysim.train.training import (
+    CHECKPOINT_FILE,
+    CURVE_FILE,
+    POLICY_FILE,
+    TABLE_FILE,
+    TrainResult,
+    stored_configs,
+    train,
+    train_many,
+)
 
 SETTINGS = ("algorithm", "seed", "n_worlds", "options", "config", "network", "devices")
 """Settings of ``TrainConfig.create`` that ``run`` takes."""
@@ -40,7 +49,7 @@ def run(
     is logged. An interrupt (Ctrl-C) writes a checkpoint first, and so does a ``SystemExit`` from a signal handler.
 
     Args:
-        task: Name of a task, the reference of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task, such
+        task: Name of a task, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task, such
             as ``TwoHoops(radius=0.4)``.
         folder: Folder of the run; None for ``out/NAME``.
         resume: True to continue from the checkpoint in the folder, with its settings where none are given.
@@ -56,8 +65,8 @@ def run(
             ``TrainConfig.create``.
 
     Raises:
-        ConfigError: If the folder holds a run and ``resume`` is False, or the run has other settings than those that
-            may change or is damaged; if a setting is invalid; if files cannot be written.
+        ConfigError: If the folder holds a run and ``resume`` is False; if the run is damaged, or has other values of
+            settings that must not change; if a setting is invalid; if files cannot be written.
         DivergedError: If weights or losses become non-finite; the last checkpoint stays.
         KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
@@ -69,7 +78,7 @@ def run(
     result = train(config, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
     if not is_first_host():
         return result
-    log(f"wrote {folder / CHECKPOINT}, {folder / POLICY}")
+    log(f"wrote {folder / CHECKPOINT_FILE}, {folder / POLICY_FILE}")
     try:
         plot_curve({config.title: read_curve(folder)}, folder / "curve.png")
         plot_episode(result.env, result.policy, folder / "episode.png")
@@ -139,7 +148,9 @@ def run_many(
     results = train_many(configs, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
     if not is_first_host():
         return results
-    log(f"wrote {folder / CHECKPOINT}, {folder / TABLE}, and {POLICY} and {CURVE} in {', '.join(configs)}")
+    log(
+        f"wrote {folder / CHECKPOINT_FILE}, {folder / TABLE_FILE}, and {POLICY_FILE} and {CURVE_FILE} in {', '.join(configs)}"
+    )
     curves: dict[str, list[Any]] = {}
     for name in configs:
         curves.setdefault(name.rpartition("seed-")[0].strip("-") or config.title, []).append(read_curve(folder / name))
@@ -163,7 +174,7 @@ def make_variants(
 
     Raises:
         ConfigError: If there are no seeds or no values, if one of them occurs twice, or if a hyperparameter to sweep
-            cannot differ between trainings of one program or is also in ``config``.
+            is not one of ``SWEEPABLE`` or is also in ``config``.
     """
     values_by_name: dict[str, list[Any]] = {"seeds": list(seeds)} | {
         name: list(values) for name, values in sweep.items()

@@ -21,7 +21,7 @@ from crazysim.sim.visualize import draw_points
 from crazysim.storage import reading, write_figure
 from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, act, as_tree, fly_episodes, initial_memory
 from crazysim.train.networks import Policy
-from crazysim.train.training import CURVE
+from crazysim.train.training import CURVE_FILE
 
 TARGET_COLOR, TARGET_SIZE = (0.1, 0.8, 0.3, 0.6), 0.03
 """Colour of the mark of a drone's target, RGBA, and its smallest radius, m."""
@@ -175,7 +175,7 @@ def read_curve(folder: Path) -> list[dict[str, float]]:
         ConfigError: If the file does not exist.
         DamagedFileError: If it is damaged.
     """
-    path = folder / CURVE
+    path = folder / CURVE_FILE
     with reading(path, "a learning curve", "Write it again with 'crazysim train TASK --resume'."):
         curve = json.loads(path.read_bytes())
         return [{"iteration" if name == "round" else name: x for name, x in point.items()} for point in curve]

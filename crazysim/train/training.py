@@ -43,16 +43,16 @@ from crazysim.train.convolution import find_images
 from crazysim.train.devices import exchanged_bytes, learner_shardings, replicated_sharding
 from crazysim.train.evaluation import describe_outcome, evaluate_blocks
 from crazysim.train.export import describe
-from crazysim.train.hosts import decided_by_first, is_first_host, must_stop, require_same_settings
+from crazysim.train.hosts import broadcast_decision, is_first_host, must_stop, require_same_settings
 from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.networks import Network, Policies, Policy, choose_network, init_weights
 from crazysim.train.seeds import take_seed
 
-CHECKPOINT, POLICY, CURVE, TABLE = "checkpoint.npz", "policy.npz", "curve.json", "seeds.json"
-"""Names of the files of a run."""
+CHECKPOINT_FILE, POLICY_FILE, CURVE_FILE, TABLE_FILE = "checkpoint.npz", "policy.npz", "curve.json", "seeds.json"
+"""Names of the files of a run: its checkpoint, the kept policy, the learning curve, and the table of all seeds."""
 
 CHECK_SEED = 0xC4EC
-"""Seed of the initial states on which the policy to keep is chosen; see ``EVALUATION_SEED``."""
+"""Seed of the initial states of the check set, which differ from the held-out ones of ``EVALUATION_SEED``."""
 Learner = ppo.Learner | apg.Learner | dagger.Learner
 """State of a training run."""
 
@@ -104,8 +104,8 @@ def train_many(
 ) -> dict[str, TrainResult]:
     """Train policies in one program and write their files.
 
-    Each training has a block of worlds, and a folder of its own for its learning curve and policy. The folder above
-    these holds one checkpoint of all trainings. Every evaluation flies two sets of initial states that are not used for
+    Each training has a block of worlds, and its own folder for its learning curve and policy. Their parent folder holds
+    one checkpoint of all trainings. Every evaluation flies from two sets of initial states that are not used for
     training. The success on the check set decides which policy is kept; the held-out set is only used for the reported
     figures.
 
@@ -134,7 +134,7 @@ def train_many(
         KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
     folder = Path(folder)
-    path = folder / CHECKPOINT
+    path = folder / CHECKPOINT_FILE
     start_time = time.perf_counter()
     evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
     log = log if is_first_host() else lambda _: None
@@ -251,9 +251,9 @@ def train_many(
         saved_iteration, save_time = int(learner.iteration), time.perf_counter()
 
     def evaluate_and_save(learner: Learner, metrics: dict[str, Array]) -> list[dict[str, Any]]:
-        """Evaluate the policies, keep each if none was clearly better, write all files, and return the points."""
+        """Evaluate the policies, keep those that no earlier one clearly beats, write all files, and return the points."""
         iteration, policies = int(learner.iteration), fetch(learner.as_policy())
-        stop_diverged(metrics, iteration)
+        mark_diverged(metrics, iteration)
         is_planned = iteration % evaluation_period == 0 or iteration == n_iterations
         results, checks = evaluate_policies(policies, None), evaluate_policies(policies, check_key)
         counters = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds()}
@@ -266,7 +266,7 @@ def train_many(
         save_checkpoint(learner)
         return [training.curve[-1] for training in trainings]
 
-    def stop_diverged(metrics: dict[str, Array], iteration: int) -> None:
+    def mark_diverged(metrics: dict[str, Array], iteration: int) -> None:
         """Mark the trainings that have diverged according to the metrics of an iteration; raise an error if all have.
 
         Args:
@@ -286,7 +286,7 @@ def train_many(
             kept = [f"{kept_point(x.curve)['iteration']}{name}" for x, name in zip(trainings, names, strict=True)]
             raise DivergedError(
                 f"expected finite weights and losses, got NaN or infinity in iteration {', '.join(diverged)} of "
-                f"{config.title} by {config.algorithm}; {path} is of iteration {saved_iteration}, {POLICY} of "
+                f"{config.title} by {config.algorithm}; {path} is of iteration {saved_iteration}, {POLICY_FILE} of "
                 f"iteration {', '.join(kept)}. Use a smaller learning_rate or max_grad_norm, with another --out."
             )
 
@@ -300,7 +300,7 @@ def train_many(
             for i in range(n_done, n_iterations):
                 metrics_before = learner_and_metrics[1]
                 learner_and_metrics = iterate(learner_and_metrics[0])
-                stop_diverged(metrics_before, i)  # waits for the previous iteration while this one runs
+                mark_diverged(metrics_before, i)  # waits for the previous iteration while this one runs
                 show_progress(learner_and_metrics[1] if i % 5 == 0 else None)
                 points = None
                 if (i + 1) % evaluation_period == 0 and i + 1 < n_iterations:
@@ -308,10 +308,10 @@ def train_many(
                     show_progress(
                         {name: [point[name] for point in points] for name in ("success", "error", "reward")}, 0
                     )
-                elif checkpoint_every is not None and decided_by_first(
+                elif checkpoint_every is not None and broadcast_decision(
                     time.perf_counter() - save_time > checkpoint_every
                 ):
-                    stop_diverged(learner_and_metrics[1], i + 1)
+                    mark_diverged(learner_and_metrics[1], i + 1)
                     save_checkpoint(learner_and_metrics[0])
                 if on_iteration is not None and i + 1 < n_iterations:
                     on_iteration(i + 1, _host_metrics(learner_and_metrics[1], points))
@@ -320,7 +320,7 @@ def train_many(
         final_points = evaluate_and_save(*learner_and_metrics)
     except (KeyboardInterrupt, SystemExit) as error:
         if jax.process_count() > 1 and not isinstance(error, SystemExit):
-            raise  # the other hosts go on, and would not take part
+            raise  # the other hosts continue, and would not join the evaluation
         evaluate_and_save(*learner_and_metrics)
         log(
             f"interrupted after iteration {int(learner_and_metrics[0].iteration)}; wrote {path}; continue with --resume"
@@ -390,8 +390,8 @@ class _Training:
         point["kept"] = point["check"] >= least_kept_success(best_check, n_starts)
         best_policy = policy if point["kept"] else self.kept_policy
         if is_first_host():
-            checkpoint.save(self.folder / POLICY, best_policy, self.meta | description)
-            write_file(self.folder / CURVE, json.dumps([*self.curve, point], indent=1))
+            checkpoint.save(self.folder / POLICY_FILE, best_policy, self.meta | description)
+            write_file(self.folder / CURVE_FILE, json.dumps([*self.curve, point], indent=1))
         self.kept_policy, point["kept"] = (best_policy, point["kept"]) if is_planned else (self.kept_policy, False)
         self.curve.append(point)
 
@@ -413,13 +413,13 @@ class _Training:
 def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
     """Write the table of the trainings of a program as JSON and CSV, with empty cells where a value is missing."""
     rows = [{name: None if x != x else x for name, x in row.items()} for row in rows]
-    with replacing(folder / TABLE) as file:
+    with replacing(folder / TABLE_FILE) as file:
         file.write(json.dumps(rows, indent=1).encode())
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with replacing((folder / TABLE).with_suffix(".csv")) as file:
+    with replacing((folder / TABLE_FILE).with_suffix(".csv")) as file:
         file.write(text.getvalue().encode())
 
 
@@ -465,7 +465,9 @@ def _describe_devices(sim: Sim, iterate: Any) -> str:
 
 def _attach_shardings(shapes: Learner, shardings: Learner) -> Learner:
     """Return the shapes with shardings attached."""
-    return jax.tree.map(lambda x, to: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=to), shapes, shardings)
+    return jax.tree.map(
+        lambda x, sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes, shardings
+    )
 
 
 def load_policy(
@@ -476,14 +478,14 @@ def load_policy(
     Args:
         folder: Folder of the run.
         task: Reference of the task's class, ``FILE.py:NAME`` or ``MODULE:NAME``, if it has moved since the training, or
-            if this user has not named it on this machine before; its code is executed. None for the reference in the
-            run, which ``config.make_env`` only loads if this user has named it before.
-        network: Network of your own with which the policy was trained; None for the built-in one.
+            if this user has never named it on this machine. Its code is executed. None for the reference in the run,
+            which ``config.make_env`` only loads if this user has named it before.
+        network: Custom network with which the policy was trained; None for the built-in one.
 
     Raises:
         ConfigError: If the folder holds no policy that this version can read, or its policy has another network.
     """
-    path = Path(folder) / POLICY
+    path = Path(folder) / POLICY_FILE
     arrays, meta = checkpoint.read(path)
     with checkpoint.reading_checkpoint(path):
         config = TrainConfig(**meta["settings"])
@@ -493,7 +495,7 @@ def load_policy(
         convolution = config.config["convolution"] if config.algorithm != "apg" else ()
         images = find_images(meta["observations"], meta["images"]) if convolution else ()
     if config.own_network != (network is not None):
-        expected = "the network of your own" if config.own_network else "no network besides the built-in one"
+        expected = "the custom network" if config.own_network else "no network besides the built-in one"
         raise ConfigError(
             f"expected {expected} with which {path} was trained, got {network}. Use crazysim.train.load_policy(folder, "
             f"network={'network' if config.own_network else None})."
@@ -518,7 +520,7 @@ def _run_metadata(config: TrainConfig) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise ConfigError(
             f"expected options that a checkpoint can hold, got {config.options!r}: {error}. Use numbers, texts and "
-            f"lists, and add plugins in install of a task of your own."
+            f"lists, and add plugins in install of a custom task."
         ) from error
 
 
@@ -536,7 +538,7 @@ def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
     Raises:
         ConfigError: If there is no intact checkpoint.
     """
-    path = Path(folder) / CHECKPOINT
+    path = Path(folder) / CHECKPOINT_FILE
     meta = checkpoint.read(path)[1]
     with checkpoint.reading_checkpoint(path):
         return {name: TrainConfig(**run["settings"]) for name, run in meta["runs"].items()}
@@ -545,7 +547,7 @@ def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
 def _read_run(
     path: Path, configs: Mapping[str, TrainConfig]
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str, float]:
-    """Return the arrays of a checkpoint, the metadata of each training, the hash of the task's code, and its time, s.
+    """Return arrays, metadata of each training, hash of the task's code and time so far, s, of a checkpoint.
 
     Raises:
         ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.
@@ -578,7 +580,7 @@ def _require_same_settings(path: Path, settings: dict[str, Any], config: TrainCo
         has_own_network = not config.own_network
         raise ConfigError(
             f"expected {path} to be resumed with "
-            f"{'its network of your own' if has_own_network else 'the built-in network'}. "
+            f"{'its custom network' if has_own_network else 'the built-in network'}. "
             f"Use network={'network' if has_own_network else None}, or start a new run in another folder with --out."
         )
     for name in {**stored_settings, **requested_settings}:
@@ -601,18 +603,18 @@ def _fixed_settings(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _require_same_on_hosts(metadata: Mapping[str, dict[str, Any]], **others: Any) -> None:
-    """Check that all hosts train with the same metadata of each training, by name, and the same other settings."""
+    """Check that all hosts have the same metadata of each training, by name, and the same other settings."""
     runs = {
         name: _fixed_settings(x["settings"]) | x["settings"]["config"] | {"code": x["code"]}
         for name, x in metadata.items()
     }
-    named = {f"{name} {key}".strip(): x for name, run in runs.items() for key, x in run.items()}
-    require_same_settings({"trainings": list(metadata)} | others | named)
+    settings = {f"{name} {key}".strip(): x for name, run in runs.items() for key, x in run.items()}
+    require_same_settings({"trainings": list(metadata)} | others | settings)
 
 
 @contextmanager
 def _iteration_bar(total: int, n_done: int, enabled: bool) -> Iterator[Callable[..., None]]:
-    """Yield a function that shows metrics on a progress bar; without ``enabled`` or tqdm it does nothing."""
+    """Yield a function that shows metrics on a progress bar, or does nothing if not ``enabled`` or without tqdm."""
     bar = progress_bar(unit="iteration", total=total, initial=n_done, ncols=100) if enabled else None
     if bar is None:
         yield lambda *_: None

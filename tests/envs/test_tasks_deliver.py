@@ -8,7 +8,7 @@ import pytest
 from crazysim import ConfigError
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import make
-from crazysim.envs.tasks.deliver import MIN_HEIGHT, moving_rings, rings_of
+from crazysim.envs.tasks.deliver import MIN_HEIGHT, ring_motion, ring_positions
 
 N_WORLDS = 5
 
@@ -44,13 +44,13 @@ def test_a_load_rides_on_its_trailer(begun, step):
         state = step(state, state.action)
     data = state.data
     load = data.plugins["load"]
-    np.testing.assert_allclose(load.pos, vmap_worlds(rings_of)(data.plugins["cars"]), atol=1e-6)
+    np.testing.assert_allclose(load.pos, vmap_worlds(ring_positions)(data.plugins["cars"]), atol=1e-6)
     assert np.linalg.norm(load.pos - begun.data.plugins["load"].pos, axis=-1).min() > 0.02
     ahead = step(state, state.action).data.plugins["load"]
     np.testing.assert_allclose((ahead.pos - load.pos) * 50, load.vel, atol=0.02)
     with jax.enable_x64(True):  # a difference of positions in float32 would be off by 2e-4 m/s
         cars = jax.tree.map(lambda x: np.asarray(x, float) if x.dtype == np.float32 else x, data.plugins["cars"])
-        _, exact = vmap_worlds(moving_rings)(cars)
+        _, exact = vmap_worlds(ring_motion)(cars)
     assert exact.dtype == np.float64
     np.testing.assert_allclose(load.vel, exact, atol=2e-6)
 

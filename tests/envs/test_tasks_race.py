@@ -349,13 +349,13 @@ def test_a_given_track_is_flown_and_judged():
     ("options", "message"),
     [
         ({"level": 4}, "level of Race to be from 0 to 3, got 4"),
-        ({"track": Track(gates_rpy=[(0, 0, 0)])}, "gates_rpy has shape"),
-        ({"track": Track(start=(0.3, 0.25, 0.7))}, "gate 0 of the track is"),
-        ({"track": Track(obstacles_pos=[(-1.5, 0.7, 1.5)])}, "obstacle 0 of the track is"),
+        ({"track": Track(gates_rpy=[(0, 0, 0)])}, "expected gates_rpy of the track as"),
+        ({"track": Track(start=(0.3, 0.25, 0.7))}, "expected gate 0 of the track at least"),
+        ({"track": Track(obstacles_pos=[(-1.5, 0.7, 1.5)])}, "expected obstacle 0 of the track at least"),
         ({"track": Track(start=(-2.4, 0.75, 0.4))}, "within the limits"),
         ({"track": Track(low=(3, 0, 0))}, "upper limit"),
-        ({"track": Track(low=(-1, -1, 0), high=(1, 1, 2)), "level": 3}, "has no room"),
-        ({"n_drones": 9, "level": 3}, "room for 8"),
+        ({"track": Track(low=(-1, -1, 0), high=(1, 1, 2)), "level": 3}, "expected an arena with room"),
+        ({"n_drones": 9, "level": 3}, "expected at most 8 drones"),
     ],
 )
 def test_what_cannot_be_raced_is_refused(options, message):

@@ -25,7 +25,7 @@ from crazysim.train.export import describe, to_c, to_onnx
 from crazysim.train.networks import Policies, Policy, choose_network, init_mlp, init_weights, unroll
 from crazysim.train.seeds import stack_rates, take_seed
 from crazysim.train.show import color_depth, film
-from crazysim.train.training import CHECKPOINT, load_policy, train
+from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
 
 SHORT = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,), "convolution": (2, 3)}
 OPTIONS = {"seconds": 0.1, "depth_image": (5, 4)}
@@ -194,7 +194,7 @@ def test_a_run_with_a_convolution_resumes_bit_for_bit_and_its_policy_comes_back(
     with pytest.raises(KeyboardInterrupt):
         trained(tmp_path / "cut", on_iteration=interrupt)
     trained(tmp_path / "cut", resume=True)
-    mine, others = (read(tmp_path / name / CHECKPOINT)[0] for name in ("cut", "whole"))
+    mine, others = (read(tmp_path / name / CHECKPOINT_FILE)[0] for name in ("cut", "whole"))
     for name, x in mine.items():
         np.testing.assert_array_equal(x, others[name], err_msg=name)
     policy, config, meta = load_policy(tmp_path / "whole")
@@ -250,7 +250,7 @@ def test_law_09_convolutions_that_do_not_fit_are_refused(env):
     with pytest.raises(ConfigError, match=r"convolution\[1\] is 0; it must be a positive"):
         ppo.Config(convolution=(2, 0))
     network = Network(lambda key, n: init_mlp(key, (n, 2), 1.0), lambda weights, obs, memory: (obs, memory))
-    with pytest.raises(ConfigError, match=r"expected no convolution with a network of your own, got \[2\]\. Put it"):
+    with pytest.raises(ConfigError, match=r"expected no convolution with a custom network, got \[2\]\. Put it"):
         TrainConfig.create("hover", options=OPTIONS, config={"convolution": (2,)}, network=network)
     with pytest.raises(ConfigError, match=r"expected hyperparameters of apg, got convolution"):
         TrainConfig.create("hover", "apg", options=OPTIONS, config={"convolution": (2,)})

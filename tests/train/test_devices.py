@@ -18,7 +18,7 @@ from crazysim.train import config as configs
 from crazysim.train.config import TrainConfig
 from crazysim.train.devices import exchanged_bytes, find_devices, learner_shardings, replicated_sharding
 from crazysim.train.show import read_curve
-from crazysim.train.training import CHECKPOINT, load_policy, train
+from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
 
 PPO = ppo.Config(iterations=3, n_steps=8, minibatches=4, epochs=2, hidden=(8,), learning_rate=1e-2)
 APG = apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=1e-2)
@@ -139,7 +139,7 @@ def test_a_run_continues_on_another_number_of_devices(tmp_path, monkeypatch):
     lines.clear()
     trained("2,0", resume=True)
     assert re.search(r"in 16 worlds, 8 on each of 2 devices, .*; continues after iteration 2", lines[0])
-    arrays, meta = checkpoint.read(tmp_path / CHECKPOINT)
+    arrays, meta = checkpoint.read(tmp_path / CHECKPOINT_FILE)
     one = Training(ppo, PPO, 1, 16, 1).learner
     found = checkpoint.restore("", {k: x for k, x in arrays.items() if k.startswith("['learner']")}, {"learner": one})
     assert_same(found["learner"], one, atol=1e-5)

@@ -17,7 +17,7 @@ from waiting import wait_for
 from crazysim.__main__ import main
 from crazysim.commands import hosts
 from crazysim.train import checkpoint
-from crazysim.train.training import CHECKPOINT, CURVE, POLICY
+from crazysim.train.training import CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE
 
 SMALL = "--worlds 64 --no-film --set seconds=0.2 --config n_steps=4 minibatches=2 epochs=1 hidden=[8]".split()
 HEARTBEAT = 20
@@ -73,13 +73,13 @@ def training(out, *further):
 
 def iteration(out):
     """Return the last iteration in the checkpoint of a run; -1 without one."""
-    path = out / CHECKPOINT
+    path = out / CHECKPOINT_FILE
     return int(checkpoint.read(path)[0]["['learner'].iteration"]) if path.exists() else -1
 
 
 def assert_same_files(mine, others):
     """Assert that the checkpoints and policies of two runs agree to rounding."""
-    for name in (CHECKPOINT, POLICY):
+    for name in (CHECKPOINT_FILE, POLICY_FILE):
         (x, _), (y, _) = (checkpoint.read(out / name) for out in (mine, others))
         assert x.keys() == y.keys()
         for key in x:
@@ -98,7 +98,7 @@ def test_two_hosts_train_as_one_stop_together_and_survive_the_loss_of_one(tmp_pa
     assert "success" not in ended[1][1], "only host 0 reports"
     assert main(training(alone, "--iterations", "3", "--devices", "4")) == 0
     assert_same_files(out, alone)
-    assert len(json.loads((out / CURVE).read_text())) == 2
+    assert len(json.loads((out / CURVE_FILE).read_text())) == 2
 
     endless = training(out, "--resume", "--iterations", "100000", "--checkpoint-every", "0.01")
     first, second = start(tmp_path, endless)
@@ -130,7 +130,7 @@ def test_hosts_with_other_settings_stop_together(tmp_path):
         status, text = process.end()
         assert status == 2
         assert "expected the same settings on all hosts, got seed = 0 on host 0 and 1 on host 1" in text, i
-    assert not (tmp_path / "out" / CHECKPOINT).exists()
+    assert not (tmp_path / "out" / CHECKPOINT_FILE).exists()
 
 
 VERSION = """

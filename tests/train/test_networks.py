@@ -30,7 +30,7 @@ from crazysim.train.networks import Policies, gru_network, init_weights, unroll
 from crazysim.train.out_of_tree import to_out_of_tree
 from crazysim.train.seeds import stack_rates, take_seed
 from crazysim.train.show import film
-from crazysim.train.training import CHECKPOINT, load_policy, train
+from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "training.md"
 SHORT = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,)}
@@ -145,7 +145,7 @@ def test_a_run_with_memory_resumes_is_evaluated_filmed_and_exported(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         trained(tmp_path / "cut", config, iterations=4, on_iteration=interrupt)
     trained(tmp_path / "cut", config, iterations=4, resume=True)
-    mine, others = (read(tmp_path / name / CHECKPOINT)[0] for name in ("cut", "whole"))
+    mine, others = (read(tmp_path / name / CHECKPOINT_FILE)[0] for name in ("cut", "whole"))
     assert mine.keys() == others.keys()
     for name, x in mine.items():
         np.testing.assert_array_equal(x, others[name], err_msg=name)
@@ -332,13 +332,11 @@ def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_networ
     start = take_seed(ppo.init(AutoReset(result.env), (ppo.Config(),), jax.random.key(0)[None], network).as_policy(), 0)
     changed = jax.tree.map(lambda x, y: bool(np.any(x != y)), start.body, policy.body)
     assert all(jax.tree.leaves(changed)), "all weights are trained"
-    with pytest.raises(
-        ConfigError, match=r"expected the network of your own with which .* was trained, got None\. Use"
-    ):
+    with pytest.raises(ConfigError, match=r"expected the custom network with which .* was trained, got None\. Use"):
         load_policy(tmp_path)
     with pytest.raises(ConfigError, match=r"expected the arrays of this task and version|expected .* in .* as float32"):
         load_policy(tmp_path, network=Network(lambda key, n: jnp.zeros((n, 3)), lambda w, x, m: (x @ w, m)))
-    with pytest.raises(ConfigError, match=r"to be resumed with its network of your own. Use network=network"):
+    with pytest.raises(ConfigError, match=r"to be resumed with its custom network. Use network=network"):
         trained(tmp_path, {}, resume=True)
     with pytest.raises(
         ConfigError, match="expected a policy with the built-in network, got one with a network of your"
@@ -349,9 +347,9 @@ def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_networ
 def test_wrong_networks_are_refused():
     network = plain_network()
     given = {"task": "hover", **SIZES}
-    with pytest.raises(ConfigError, match="expected memory=0 with a network of your own, got 8"):
+    with pytest.raises(ConfigError, match="expected memory=0 with a custom network, got 8"):
         TrainConfig.create(**given, config={"memory": 8}, network=network)
-    with pytest.raises(ConfigError, match=r"expected no network of your own for apg, got one\. Use algorithm='ppo'"):
+    with pytest.raises(ConfigError, match=r"expected no custom network for apg, got one\. Use algorithm='ppo'"):
         TrainConfig.create(**given, algorithm="apg", network=network)
     with pytest.raises(ConfigError, match=r"expected a Network, got <function"):
         TrainConfig.create(**given, network=plain_network)

@@ -47,7 +47,7 @@ def own_list(tmp_path_factory, monkeypatch):
     path = tmp_path_factory.mktemp("user") / "crazysim" / "tasks"
     monkeypatch.setattr(references, "_list_path", lambda: path)
     monkeypatch.setattr(references, "_CLASSES", {})
-    monkeypatch.setattr(references, "_LOADED", set())
+    monkeypatch.setattr(references, "_NAMED", set())
     tasks, ids = dict(TASKS), dict(gymnasium.registry)
     yield path
     TASKS.clear()
@@ -66,7 +66,7 @@ def file(tmp_path):
 def another_process(monkeypatch):
     """Forget what this process has named, as another one would."""
     monkeypatch.setattr(references, "_CLASSES", {})
-    monkeypatch.setattr(references, "_LOADED", set())
+    monkeypatch.setattr(references, "_NAMED", set())
 
 
 def test_a_file_is_trained_evaluated_resumed_and_exported(file, tmp_path, monkeypatch, capsys):

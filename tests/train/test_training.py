@@ -35,7 +35,7 @@ from crazysim.train.networks import Policies
 from crazysim.train.runs import run
 from crazysim.train.seeds import stack_rates, take_seed
 from crazysim.train.show import plot_episode, read_curve
-from crazysim.train.training import CHECKPOINT, POLICY, load_policy, train
+from crazysim.train.training import CHECKPOINT_FILE, POLICY_FILE, load_policy, train
 
 SMALL = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (16, 16)}
 
@@ -71,7 +71,7 @@ def whole(tmp_path_factory):
 
 
 def arrays(folder):
-    with np.load(folder / CHECKPOINT) as file:
+    with np.load(folder / CHECKPOINT_FILE) as file:
         return {name: file[name] for name in file.files if name != checkpoint.META_ENTRY}
 
 
@@ -100,7 +100,7 @@ def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
     with interrupted_after(2, monkeypatch), pytest.raises(KeyboardInterrupt):
         train(small_config(), tmp_path, evaluation_worlds=8, log=lines.append, progress=False)
     assert "interrupted after iteration 2" in lines[-1]
-    assert str(tmp_path / CHECKPOINT) in lines[-1]
+    assert str(tmp_path / CHECKPOINT_FILE) in lines[-1]
     assert "--resume" in lines[-1]
     trained(tmp_path, small_config(), resume=True)
     mine, others = arrays(tmp_path), arrays(whole.folder)
@@ -142,7 +142,7 @@ def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path):
     command = [sys.executable, "-m", "crazysim", "train", "hover", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert "hover by ppo" in process.stdout.readline()
-        wait_for(lambda: (tmp_path / CHECKPOINT).exists() and arrays(tmp_path)["['learner'].iteration"] > 0)
+        wait_for(lambda: (tmp_path / CHECKPOINT_FILE).exists() and arrays(tmp_path)["['learner'].iteration"] > 0)
         process.terminate()
         process.terminate()
         out = process.stdout.read()
@@ -231,7 +231,7 @@ def test_resuming_with_another_configuration_is_an_error(whole, tmp_path):
 
 def test_a_finished_run_resumes_with_more_iterations(whole, tmp_path):
     """What is given changes; everything else, the number of worlds too, is that of the run."""
-    shutil.copy(whole.folder / CHECKPOINT, tmp_path)
+    shutil.copy(whole.folder / CHECKPOINT_FILE, tmp_path)
     lines = []
     quiet = {"film": False, "evaluation_worlds": 8, "progress": False, "log": lines.append}
     result = run("hover", tmp_path, resume=True, config={"iterations": 6, "learning_rate": 1e-4}, **quiet)
@@ -287,16 +287,16 @@ def test_evaluations_hold_the_terms_of_the_reward(whole, tmp_path):
 
 
 def test_a_checkpoint_of_another_version_is_refused(whole, tmp_path):
-    _, meta = checkpoint.read(whole.folder / CHECKPOINT)
+    _, meta = checkpoint.read(whole.folder / CHECKPOINT_FILE)
     learner = {"x": np.zeros(2, np.float32)}
-    checkpoint.save(tmp_path / CHECKPOINT, learner, meta | {"crazysim": "0.0.1"})
+    checkpoint.save(tmp_path / CHECKPOINT_FILE, learner, meta | {"crazysim": "0.0.1"})
     with pytest.raises(ConfigError, match=r"expected a checkpoint of crazysim .*, got .* of 0\.0\.1"):
         trained(tmp_path, small_config(), resume=True)
-    stored, _ = checkpoint.read(tmp_path / CHECKPOINT)
+    stored, _ = checkpoint.read(tmp_path / CHECKPOINT_FILE)
     with pytest.raises(ConfigError, match="expected the arrays of this task and version"):
-        checkpoint.restore(tmp_path / CHECKPOINT, stored, {"y": np.zeros(2, np.float32)})
+        checkpoint.restore(tmp_path / CHECKPOINT_FILE, stored, {"y": np.zeros(2, np.float32)})
     with pytest.raises(ConfigError, match=r"expected \['x'\] in .* as float32 \(3,\), got float32 \(2,\)"):
-        checkpoint.restore(tmp_path / CHECKPOINT, stored, {"x": np.zeros(3, np.float32)})
+        checkpoint.restore(tmp_path / CHECKPOINT_FILE, stored, {"x": np.zeros(3, np.float32)})
 
 
 def cut(content):
@@ -320,7 +320,7 @@ def other_meta(content):
                          ids=["cut", "flipped", "other", "empty", "text", "random"])  # fmt: skip
 def test_a_damaged_run_is_refused_with_the_name_of_the_file(whole, tmp_path, damage):
     """At once: nothing is compiled for it, and the file stays as it is."""
-    for name in (CHECKPOINT, POLICY):
+    for name in (CHECKPOINT_FILE, POLICY_FILE):
         content = (whole.folder / name).read_bytes()
         (tmp_path / name).write_bytes(damage(content) if damage is not np.random.bytes else damage(1000))
     with pytest.raises(
@@ -332,7 +332,7 @@ def test_a_damaged_run_is_refused_with_the_name_of_the_file(whole, tmp_path, dam
 
 
 def test_a_run_without_its_learning_curve_resumes(whole, tmp_path):
-    shutil.copy(whole.folder / CHECKPOINT, tmp_path)
+    shutil.copy(whole.folder / CHECKPOINT_FILE, tmp_path)
     with pytest.raises(ConfigError, match=r"expected an existing file with a learning curve, got .*curve\.json"):
         read_curve(tmp_path)
     (tmp_path / "curve.json").write_text('[{"iteration": 0, "env')
@@ -396,7 +396,7 @@ def test_invalid_settings_of_a_run_are_refused(tmp_path):
         trained(tmp_path / "run", small_config(config={"n_steps": 16, "minibatches": 7}))
     with pytest.raises(ConfigError, match="expected options that a checkpoint can hold"):
         trained(tmp_path / "run", small_config(options={"seconds": 0.4, "pos": np.zeros(3)}))
-    with pytest.raises(ConfigError, match=r"not JSON serializable.* add plugins in install of a task of your own"):
+    with pytest.raises(ConfigError, match=r"not JSON serializable.* add plugins in install of a custom task"):
         trained(tmp_path / "run", small_config(options={"effects": [Randomize.crazyflie()]}))
     with pytest.raises(ConfigError, match="expected checkpoint_every to be positive, got 0"):
         trained(tmp_path / "run", small_config(), checkpoint_every=0)
@@ -444,7 +444,7 @@ def test_an_interrupt_before_nan_is_found_keeps_the_last_checkpoint(tmp_path, tr
     """The first iteration diverges, which is only looked at while the second one runs. Before, Ctrl-C in between wrote
     the weights that are not finite."""
     config = small_config(config=SMALL | {"iterations": 4, "learning_rate": 1e38})
-    traced(interrupting("stop_diverged", 2))  # the first call is that of the evaluation before the training
+    traced(interrupting("mark_diverged", 2))  # the first call is that of the evaluation before the training
     with pytest.raises(DivergedError, match=r"NaN or infinity in iteration 1 of hover .*iteration 0\. Use a sm"):
         trained(tmp_path, config)
     assert [point["iteration"] for point in read_curve(tmp_path)] == [0]
@@ -472,11 +472,11 @@ def test_an_interrupt_during_a_planned_evaluation_leaves_the_curve_of_an_uninter
 
 
 def test_a_full_disk_leaves_the_last_checkpoint_and_nothing_else(tmp_path):
-    path = tmp_path / CHECKPOINT
+    path = tmp_path / CHECKPOINT_FILE
     checkpoint.save(path, {"x": np.zeros(2)}, {"iteration": 1})
     with full_disk(2000), pytest.raises(ConfigError, match=r"expected a file that can be written, got .*checkpoint"):
         checkpoint.save(path, {"x": np.zeros(2000)}, {"iteration": 2})
-    assert [p.name for p in tmp_path.iterdir()] == [CHECKPOINT]
+    assert [p.name for p in tmp_path.iterdir()] == [CHECKPOINT_FILE]
     assert checkpoint.read(path)[1] == {"iteration": 1}
 
 

@@ -37,7 +37,7 @@ POLE_RADIUS, BOX_WIDTH = 0.05, 0.3
 HEIGHT = 2.0
 """Height of poles and ceiling, m."""
 JITTER = 0.15
-"""Largest component of the offset of starts and goals from their places, m."""
+"""Largest component of the offset of starts and goals from their mean positions, m."""
 CRUISE_SPEED = 2.0
 """Speed above which flying faster costs reward, m/s. Actions tilt a drone by at most 45 degrees, so that it brakes
 with up to g and stops from this speed within v^2 / (2 g) = 0.2 m, a quarter of a cell."""
@@ -70,14 +70,14 @@ class Crossing(PyTree):
 class Field(NamedTuple):
     """Dimensions of the field and the arena for a number of drones."""
 
-    width: int
-    """Number of cells across."""
+    n_cells_across: int
+    """Number of cells across the flight direction."""
     size: np.ndarray
     """Length and width, m. (2,)"""
-    half: np.ndarray
+    arena_half_size: np.ndarray
     """Half the size of the arena, m. (2,)"""
     goals: np.ndarray
-    """Places of the goals; the starts are opposite, m. (n_drones, 3)"""
+    """Mean positions of the goals; the starts are opposite, m. (n_drones, 3)"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,14 +111,14 @@ class Avoid(Task):
     def field(self, n_drones: int) -> Field:
         """Return the dimensions of the field: a third of the cells stay free, and all drones fit next to each other."""
         n = self.n_poles + self.n_boxes
-        width = max(4, -(-3 * n // (2 * FIELD_LENGTH)), -(-int(10 * SPACING * n_drones) // int(10 * CELL)))
-        size = CELL * np.array([FIELD_LENGTH, width])
-        half = np.array([size[0] / 2 + FIELD_GAP + JITTER + 0.5, size[1] / 2 + 0.5])
+        n_cells_across = max(4, -(-3 * n // (2 * FIELD_LENGTH)), -(-int(10 * SPACING * n_drones) // int(10 * CELL)))
+        size = CELL * np.array([FIELD_LENGTH, n_cells_across])
+        arena_half_size = np.array([size[0] / 2 + FIELD_GAP + JITTER + 0.5, size[1] / 2 + 0.5])
         row = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
         goals = np.stack(
             [np.full(n_drones, size[0] / 2 + FIELD_GAP + JITTER), row, np.full(n_drones, HEIGHT / 2)], axis=-1
         )
-        return Field(width, size, half, goals)
+        return Field(n_cells_across, size, arena_half_size, goals)
 
     def install(self, sim: Sim) -> None:
         handles = []
@@ -130,27 +130,28 @@ class Avoid(Task):
             )
         contacts = sim.scene.contact_fn(handles, drones=False)
         shape = (sim.n_worlds, sim.n_drones)
-        zero, no = device_array(np.zeros((*shape, 3)), sim.data.states.pos.dtype), device_array(np.zeros(shape), bool)
-        half = self.field(sim.n_drones).half
+        zero = device_array(np.zeros((*shape, 3)), sim.data.states.pos.dtype)
+        false = device_array(np.zeros(shape), bool)
+        half_size = self.field(sim.n_drones).arena_half_size
 
         @stage("drone")
         def update_record(data: SimData) -> SimData:
             """Disable a drone that touches something or leaves the arena, and record when it reaches its goal."""
             record, pos = crossing_of(data), data.states.pos
-            has_left = jnp.any(jnp.abs(pos[:2]) > half.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
+            has_left = jnp.any(jnp.abs(pos[:2]) > half_size.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
             disabled = record.disabled | (~record.reached & (has_left | contacts(data).any))
             offset = pos - record.goal
             reached = record.reached | (~disabled & (rotation.dot(offset, offset)[0] < self.tolerance**2))
             return with_record(data, record.replace(disabled=disabled, reached=reached))
 
-        record = Crossing(zero, no, no, no, zero[..., 0], tuple(handles))
+        record = Crossing(zero, false, false, false, zero[..., 0], tuple(handles))
         install_rules(sim, record, update_record, collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight before the field, and obstacles in cells of their own."""
+        """Return drones in flight before the field, and obstacles in different cells."""
         n, n_drones, dtype = self.n_poles + self.n_boxes, data.core.n_drones, data.states.pos.dtype
         field = self.field(n_drones)
-        x = draw(key, cells=FIELD_LENGTH * field.width, obstacles=(n, 4), drones=(n_drones, 12))
+        x = draw(key, cells=FIELD_LENGTH * field.n_cells_across, obstacles=(n, 4), drones=(n_drones, 12))
         cell, shift = ranks(x["cells"], n), 2 * x["obstacles"] - 1
         corner = jnp.asarray((CELL - field.size) / 2, dtype)
         cell_pos = (
@@ -197,9 +198,9 @@ class Avoid(Task):
         nearest = rotation.safe_clip(local_pos, -half_size, half_size)
         distance = rotation.safe_norm(nearest - local_pos)
         gap = distance - radius[:, None].astype(dtype)
-        ways = rotation.rotate(quat, nearest - local_pos) * (gap / jnp.where(distance > 1e-3, distance, 1))
+        to_nearest = rotation.rotate(quat, nearest - local_pos) * (gap / jnp.where(distance > 1e-3, distance, 1))
         to_middle = jnp.where(is_box, rotation.rotate(quat, -nearest), 0)
-        vectors = jnp.concatenate([ways, to_middle], axis=-1)
+        vectors = jnp.concatenate([to_nearest, to_middle], axis=-1)
         nearest_vectors = nearest_entries(gap[..., 0], vectors, min(self.n_seen, n_poles + n_boxes))
         return nearest_vectors[..., :3], nearest_vectors[..., 3:]
 
@@ -210,10 +211,10 @@ class Avoid(Task):
         middles of boxes, and zero for poles.
         """
         n_drones = data.core.n_drones
-        ways, to_middle = self.nearest_obstacles(data)
+        to_nearest, to_middle = self.nearest_obstacles(data)
         obs = state_of(data) | {
             "difference_to_goal": crossing_of(data).goal - data.states.pos,
-            "obstacles_near": ways.reshape(n_drones, -1),
+            "obstacles_near": to_nearest.reshape(n_drones, -1),
             "obstacles_middle": to_middle.reshape(n_drones, -1),
         }
         if n_drones > 1:
@@ -225,7 +226,7 @@ class Avoid(Task):
         record = crossing_of(data)
         gap = rotation.safe_norm(self.nearest_obstacles(data)[0][..., 0, :])[..., 0]
         speed = rotation.safe_norm(data.states.vel)[..., 0]
-        paid = {
+        reward_terms = {
             "progress": 2.0 * (record.remaining_way_before - self.error(data)),
             "closeness": -0.2 * jnp.exp(-6 * gap),
             "haste": -0.1 * jnp.maximum(speed - CRUISE_SPEED, 0),
@@ -234,7 +235,7 @@ class Avoid(Task):
             "reached": 10.0 * record.reached,
             "disabled": -10.0 * record.disabled,
         }
-        return terms.only_where(~record.flight_over_before, paid)
+        return terms.only_where(~record.flight_over_before, reward_terms)
 
     def terminated(self, data: SimData) -> Array:
         return jnp.all(crossing_of(data).flight_over)

@@ -37,7 +37,7 @@ class Delivery(PyTree):
 
 @dataclass(frozen=True, kw_only=True)
 class BringLoad(Task):
-    """Base of tasks in which every drone brings a load of its own to a goal and holds it there.
+    """Base of tasks in which every drone brings its load to a goal and holds it there.
 
     Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``remaining_way``, ``observe`` and
     ``rewards``. Their ``install`` adds the load, whose plugin is named ``load``, and a stage of one drone that stores
@@ -106,11 +106,11 @@ def initial_outcome(data: SimData) -> dict[str, Array]:
     """Return the fields of ``Delivery`` of all worlds at the start: nothing is delivered, and no drone has crashed."""
     pos = data.states.pos
     shape = pos.shape[:2]
-    no = device_array(np.zeros(shape), bool)
+    false = device_array(np.zeros(shape), bool)
     return {
         "goal": device_array(np.zeros(pos.shape), pos.dtype),
         "remaining_way_before": device_array(np.zeros(shape), pos.dtype),
         "steps_there": device_array(np.zeros(shape), np.int32),
-        "delivered": no,
-        "crashed": no,
+        "delivered": false,
+        "crashed": false,
     }

@@ -36,19 +36,19 @@ SPACING = 10.0
 HALF_WIDTH, MIN_HEIGHT, CEILING = 4.5, 0.25, 2.5
 """Largest distance of a drone from its car's initial position along x and y, and its smallest and largest height, m.
 The smallest height keeps it above cars and trailers."""
-SIZE, RING = (0.08, 0.08, 0.05), 0.07
+LOAD_SIZE, RING_HEIGHT = (0.08, 0.08, 0.05), 0.07
 """Full lengths of a load, and height of its ring above its middle, m."""
-HOOK_MASS, DAMPING, REACH, MAX_SPEED = 0.003, 2e-4, 0.07, 0.6
+HOOK_MASS, HOOK_DAMPING, HOOK_REACH, MAX_HOOK_SPEED = 0.003, 2e-4, 0.07, 0.6
 """Mass of the hook, kg; damping of its joint, N m s; largest distance, m, and speed relative to a ring, m/s, at
 which it picks up a load."""
 MIN_SPEED_SHARE = 0.3
 """Smallest speed of a car, as a share of the largest."""
 MAX_STEER = 0.25
 """Largest steering angle of a car, rad: circles of 1.3 m radius."""
-GOAL = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
+GOAL_BOX = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
 """Lower and upper corner of the box of a load's goals, relative to its car's initial position, m."""
 DROP_HEIGHT = 0.15
-"""Height of a ring below which a load that was taken counts as dropped, m: it hangs lower than the trailer."""
+"""Height of a ring below which a load that was taken counts as dropped, m; a ring on a trailer is higher."""
 
 
 class TrailerDelivery(Delivery):
@@ -82,19 +82,24 @@ class Deliver(BringLoad):
     """Length of an episode, s."""
 
     def install(self, sim: Sim) -> None:
-        places = SPACING * grid_2d(sim.n_drones)
-        settings: dict[str, Any] = {"pos": places, "level": "speed", "trailer": True, "name": CARS}
+        car_positions = SPACING * grid_2d(sim.n_drones)
+        settings: dict[str, Any] = {"pos": car_positions, "level": "speed", "trailer": True, "name": CARS}
         sim.add(Cars(sim.n_drones, vehicle=VEHICLE, **settings))
-        rings = np.broadcast_to(np.pad(places, ((0, 0), (0, 1))), (sim.n_worlds, sim.n_drones, 3))
-        hook: dict[str, Any] = {"hook_mass": HOOK_MASS, "damping": DAMPING, "reach": REACH, "max_speed": MAX_SPEED}
-        sim.add(Hook(self.mass, length=self.length, size=SIZE, ring=RING, load_at=rings, **hook))
+        rings = np.broadcast_to(np.pad(car_positions, ((0, 0), (0, 1))), (sim.n_worlds, sim.n_drones, 3))
+        hook: dict[str, Any] = {
+            "hook_mass": HOOK_MASS,
+            "damping": HOOK_DAMPING,
+            "reach": HOOK_REACH,
+            "max_speed": MAX_HOOK_SPEED,
+        }
+        sim.add(Hook(self.mass, length=self.length, size=LOAD_SIZE, ring=RING_HEIGHT, load_at=rings, **hook))
 
         @stage("drone")
         def update_record(data: SimData) -> SimData:
-            """Move a load that waits along with its trailer; record pick-ups, deliveries and crashes."""
+            """Move each waiting load along with its trailer; record pick-ups, deliveries and crashes."""
             load = data.plugins["load"]
             taken = delivery_of(data).taken | load.attached
-            ring, vel = (pick_entry(x, data.core.drone_id) for x in moving_rings(data.plugins[CARS]))
+            ring, vel = (pick_entry(x, data.core.drone_id) for x in ring_motion(data.plugins[CARS]))
             load = load.replace(pos=jnp.where(taken, load.pos, ring), vel=jnp.where(taken, load.vel, vel))
             data = data.replace(plugins=data.plugins | {"load": load})
             crashed = has_left_arena(data) | (taken & (load.pos[2] < DROP_HEIGHT))
@@ -116,7 +121,7 @@ class Deliver(BringLoad):
             steer=0 * steer,
             command=jnp.concatenate([speed, steer], axis=-1),
         )
-        ring, ring_vel = moving_rings(car)
+        ring, ring_vel = ring_motion(car)
         pos = ring + scale_symmetric(x["start"], np.array([0.8, 0.8, 0.3])) + np.array([0.0, 0.0, self.length + 0.6])
         vel = scale_symmetric(x["vel"], 0.3)
         data = flying(data, pos, rotation.from_rpy(scale_symmetric(x["rpy"], 0.1)), vel)
@@ -129,7 +134,7 @@ class Deliver(BringLoad):
             grip=jnp.ones_like(load.grip),
         )
         data = data.replace(plugins=data.plugins | {CARS: car, "load": load})
-        goal = scale_to(x["goal"], *np.array(GOAL)) + middle_of(data)
+        goal = scale_to(x["goal"], *np.array(GOAL_BOX)) + initial_car_pos(data)
         return with_record(data, delivery_of(data).replace(goal=goal))
 
     def remaining_way(self, data: SimData) -> Array:
@@ -140,7 +145,7 @@ class Deliver(BringLoad):
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and hook, load and goal relative to it.
 
-        Those are ``hook_pos``, m, and ``hook_vel``, m/s, relative to the drone; ``difference_to_load``, m, and
+        These are ``hook_pos``, m, and ``hook_vel``, m/s, relative to the drone; ``difference_to_load``, m, and
         ``difference_to_load_vel``, m/s, from the hook to the ring; ``difference_to_goal``, from the ring to its goal,
         m; and ``taken``, 1 once the hook has taken the load.
         """
@@ -178,39 +183,38 @@ class Deliver(BringLoad):
         return {"elevation": -20}
 
 
-def rings_of(car: CarData) -> Array:
-    """Return the positions of rings of loads in the middle of the trailers' decks, of one world, m. (n_members, 3)"""
+def ring_positions(car: CarData) -> Array:
+    """Return the positions of the rings of loads that lie on the trailers' decks, of one world, m. (n_members, 3)"""
     vehicle = load_vehicle(VEHICLE)
     centre, thickness = vehicle.value("trailer.deck_centre"), vehicle.value("trailer.deck")[2]
     front, _ = trailer_axles(car.state, car.params)
     deck_offset = jnp.concatenate([car.yaw * 0 + centre[0], car.yaw * 0], axis=-1)
     deck_centre = front + to_world_frame(car.joints[..., 1:], deck_offset)  # type: ignore[index]
-    height = vehicle.number("trailer.wheel_radius") + centre[2] + thickness / 2 + SIZE[2] / 2 + RING
+    height = vehicle.number("trailer.wheel_radius") + centre[2] + thickness / 2 + LOAD_SIZE[2] / 2 + RING_HEIGHT
     return jnp.concatenate([deck_centre, jnp.full_like(car.yaw, height)], axis=-1)
 
 
-def moving_rings(car: CarData) -> tuple[Array, Array]:
-    """Return the positions of ``rings_of``, m, and their velocities, m/s, of one world. (n_members, 3) each
+def ring_motion(car: CarData) -> tuple[Array, Array]:
+    """Return the positions of ``ring_positions``, m, and their velocities, m/s, of one world. (n_members, 3) each
 
-    The velocities are derivatives of ``rings_of``: a difference of two float32 positions, times 500 Hz, would be off by
-    2e-4 m/s.
+    The velocities are exact derivatives. A difference of two float32 positions, times 500 Hz, would be off by 2e-4 m/s.
     """
 
-    def ring_positions(*state: Array) -> Array:
-        return rings_of(car.replace(**dict(zip(("pos", "yaw", "joints"), state, strict=True))))
+    def positions_of_state(*state: Array) -> Array:
+        return ring_positions(car.replace(**dict(zip(("pos", "yaw", "joints"), state, strict=True))))
 
     rates = car.vel, car.yaw_rate, trailer_rates(car.state, car.params)
-    return jax.jvp(ring_positions, (car.pos, car.yaw, car.joints), rates)
+    return jax.jvp(positions_of_state, (car.pos, car.yaw, car.joints), rates)
 
 
-def middle_of(data: SimData) -> Array:
+def initial_car_pos(data: SimData) -> Array:
     """Return the initial position of each drone's car, of one drone or one world, m. (..., 3)"""
-    places = np.pad(SPACING * grid_2d(data.core.n_drones), ((0, 0), (0, 1)))
-    return pick_entry(jnp.asarray(places, data.states.pos.dtype), data.core.drone_id)
+    car_positions = np.pad(SPACING * grid_2d(data.core.n_drones), ((0, 0), (0, 1)))
+    return pick_entry(jnp.asarray(car_positions, data.states.pos.dtype), data.core.drone_id)
 
 
 def has_left_arena(data: SimData) -> Array:
     """Return true where a drone has left its part of the arena. (...)"""
     pos = data.states.pos
-    is_far = jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1)
+    is_far = jnp.any(jnp.abs(pos - initial_car_pos(data))[..., :2] > HALF_WIDTH, axis=-1)
     return is_far | (pos[..., 2] < MIN_HEIGHT) | (pos[..., 2] > CEILING)

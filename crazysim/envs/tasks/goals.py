@@ -203,7 +203,7 @@ def collision_stage(sim: Sim) -> Stage:
     def collide(data: SimData) -> SimData:
         record, s = data.plugins[NAME], data.states
         flight_over = record.flight_over
-        # Only for this query: drones whose flight is over are moved far apart from each other and from all others.
+        # For this query only, drones whose flight is over are moved far away from each other and from all others.
         far_pos = 1000.0 * (1 + np.arange(len(flight_over)))[:, None] * np.array([0.0, 0.0, 1.0])
         query_pos = jnp.where(flight_over[:, None], far_pos.astype(s.pos.dtype), s.pos)
         hit = contacts(data.replace(states=s.replace(pos=query_pos))).any & ~flight_over

@@ -52,7 +52,7 @@ class Race(Task):
 
     A gate is passed when its plane is crossed along its x axis within the opening. A drone is disabled when it touches
     a gate, an obstacle, the floor or another drone, or leaves the arena; contacts are checked at every physics step.
-    The others race on as if it were not there. An episode ends when every drone is disabled or has passed all gates.
+    The others continue and do not collide with it. An episode ends when every drone is disabled or has passed all gates.
 
     | Level | Drawn for every episode |
     | --- | --- |
@@ -77,13 +77,13 @@ class Race(Task):
     """Function that returns the terms of the reward; ``race_rules.sparse`` is an alternative."""
     practice: bool = False
     """True to start anywhere on the course, for learning: with equal probability at the start or behind any gate except
-    the last, with the gates up to there passed. Several drones are all at the start, or each behind another gate."""
+    the last, with the gates up to there passed. Several drones all begin at the start, or behind different gates."""
 
     def install(self, sim: Sim) -> None:
         if self.practice and sim.n_drones >= max(self.track.n_gates, 2):
             raise ConfigError(
                 f"expected fewer drones than gates for practice, got {sim.n_drones} drones and {self.track.n_gates} "
-                f"gates: each is behind another gate. Use practice=False."
+                f"gates: they start behind different gates. Use practice=False."
             )
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
         course = check_track(self.track, sim.n_drones, float(jitter), self.level == 3)
@@ -222,7 +222,7 @@ class Race(Task):
 
 
 def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
-    """Give every drone parameters of its own, by name and number of dimensions."""
+    """Repeat parameters for every drone, by name and number of dimensions."""
 
     def repeat_params(data: SimData) -> SimData:
         params, shape, per_drone = data.params, data.states.pos.shape[:2], {}
@@ -234,10 +234,10 @@ def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
     sim.data, sim.default_data = repeat_params(sim.data), repeat_params(sim.default_data)
 
 
-def _randomize_inertia(params: SimParams, shares: Array) -> SimParams:
+def _randomize_inertia(params: SimParams, x: Array) -> SimParams:
     """Return parameters with masses and inertias randomised by numbers in [-1, 1]. (n_drones, 4)"""
-    mass = params.mass * (1 + MASS_DEVIATION * shares[..., :1])
-    root = jnp.sqrt(1 + INERTIA_DEVIATION * shares[..., 1:])
+    mass = params.mass * (1 + MASS_DEVIATION * x[..., :1])
+    root = jnp.sqrt(1 + INERTIA_DEVIATION * x[..., 1:])
     scale = root[..., :, None] * root[..., None, :]
     return params.replace(mass=mass, J=params.J * scale, J_inv=params.J_inv / scale)
 

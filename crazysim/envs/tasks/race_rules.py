@@ -22,7 +22,7 @@ OPENING = 0.45
 POLE_HEIGHT = 1.7
 """Length of an obstacle, m; if its upper end is lower than that, the rest is below the floor."""
 BYPASS_DISTANCE = 0.45
-"""Distance from the middle of a gate at which the way around its frame passes, m."""
+"""Distance from the middle of a gate at which a detour passes its frame, m."""
 FUNNEL = 0.15
 """Radius around a gate's axis within which the way to the gate has no detour, m, at the gate itself; it grows by 1 m
 per metre before the gate."""
@@ -99,8 +99,8 @@ def passes_gate(data: SimData) -> Array:
     pos, quat = next_gate(data)
     pos_before, pos_now = (rotation.rotate_inverse(quat, x - pos) for x in (record.last_pos, data.states.pos))
     crossed = (pos_before[..., 0] < 0) & (pos_now[..., 0] >= 0)
-    share = pos_before[..., :1] / jnp.where(crossed[..., None], pos_before[..., :1] - pos_now[..., :1], 1)
-    crossing = pos_before + share * (pos_now - pos_before)
+    fraction = pos_before[..., :1] / jnp.where(crossed[..., None], pos_before[..., :1] - pos_now[..., :1], 1)
+    crossing = pos_before + fraction * (pos_now - pos_before)
     return crossed & jnp.all(jnp.abs(crossing[..., 1:]) < OPENING / 2, axis=-1) & ~record.finished
 
 
@@ -143,14 +143,14 @@ def way_to_gate(pos: Array) -> Array:
 def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
     """Return rewards for progress, m, and gates, and costs of turning, changing actions and being disabled."""
     record = race_of(data)
-    paid = {
+    reward_terms = {
         "progress": 2.0 * (record.remaining_way_before - remaining_way(data)),
         "gates": 2.0 * (record.passed - record.passed_before),
         "spin": -0.001 * terms.spin(data),
         "action_rate": -0.01 * terms.action_rate(action, last_action),
         "disabled": -2.0 * record.disabled,
     }
-    return terms.only_where(~record.flight_over_before, paid)
+    return terms.only_where(~record.flight_over_before, reward_terms)
 
 
 def sparse(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:

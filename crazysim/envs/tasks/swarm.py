@@ -54,8 +54,8 @@ class SwarmRecord(PyTree):
 class Swarm(Task):
     """Change places on a circle, or form a formation, at a distance from each other.
 
-    The drones start on a circle that is turned at random. Without a formation, each one must take the place of
-    another, the same number of places further along the circle for all. No drone may enter the ellipsoid around
+    The drones start on a circle that is turned at random. Without a formation, all of them must move by the same random
+    number of places along the circle. No drone may enter the ellipsoid around
     another, with half axes of 0.24 m horizontally and 0.6 m vertically because of the downwash; that is checked at
     every physics step. An episode ends when a drone enters one, if ``strict``, when it touches the floor, or
     when it leaves the arena, whose limits are 1.5 m beyond the circle and the formation.
@@ -196,8 +196,8 @@ def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndar
     if separations.min() < 1.2:
         pair = sorted(np.argsort(separations)[:2].tolist())
         raise ConfigError(
-            f"expected places of the formation at 1.2 times the smallest separation, which is {SEPARATION[0]} m beside "
-            f"and {SEPARATION[2]} m above each other, got {separations.min():.2f} between places {pair}"
+            f"expected places of the formation at 1.2 times the smallest separation, {SEPARATION[0]} m horizontally "
+            f"and {SEPARATION[2]} m vertically, got {separations.min():.2f} between places {pair}"
         )
     return slots
 

@@ -27,7 +27,7 @@ from crazysim.trajectories import Trajectory, figure_eight
 MAX_ERROR = 1.5
 """Distance from the trajectory at which an episode ends, m."""
 MAX_SAMPLES = 1000
-"""Largest number of samples ahead; they are 3,000 numbers of an observation."""
+"""Largest number of future samples; they are 3,000 numbers of an observation."""
 MAX_START_TIME = 20.0
 """Latest time on the trajectory at which an episode starts, s."""
 
@@ -35,7 +35,7 @@ MAX_START_TIME = 20.0
 class Phase(PyTree):
     """Start of an episode on the trajectory."""
 
-    since: Array = leaf("drone", 1)
+    start_time: Array = leaf("drone", 1)
     """Time on the trajectory at the start of the episode, s. (n_worlds, n_drones, 1)"""
 
 
@@ -44,7 +44,7 @@ class TrackTrajectory(Task):
     """Follow a trajectory.
 
     A drone starts near a random point of the trajectory, and observes the next samples of it. An episode ends when a
-    drone touches the floor, or is more than 1.5 m away from where it should be.
+    drone touches the floor, or is more than 1.5 m away from its position on the trajectory.
     """
 
     name = "track"
@@ -70,17 +70,17 @@ class TrackTrajectory(Task):
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones near the trajectory, moving along it."""
-        x = draw(key, data.core.n_drones, offset=3, rpy=3, vel=3, begin=1)
+        x = draw(key, data.core.n_drones, offset=3, rpy=3, vel=3, start_time=1)
         dtype = data.states.pos.dtype
         offset = (2 * x["offset"] - 1) * np.asarray(self.spread, dtype)
         rpy, vel = ((2 * x[name] - 1) * np.asarray(0.2, dtype) for name in ("rpy", "vel"))
-        start_time = MAX_START_TIME * x["begin"]
+        start_time = MAX_START_TIME * x["start_time"]
         pos, path_vel = self.motion(start_time[..., 0])
         return with_record(flying(data, pos + offset, rotation.from_rpy(rpy), path_vel + vel), Phase(start_time))
 
     def time(self, data: SimData) -> Array:
         """Return the time on the trajectory, s. (n_drones,)"""
-        return data.plugins[NAME].since[..., 0] + data.core.steps / data.core.freq
+        return data.plugins[NAME].start_time[..., 0] + data.core.steps / data.core.freq
 
     def motion(self, t: Array) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, at times on the trajectory, s. (...) to (..., 3) each"""

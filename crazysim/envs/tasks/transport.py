@@ -25,23 +25,23 @@ from crazysim.pytree import static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
-LANE = 3.0
+LANE_SPACING = 3.0
 """Distance between the gates of several drones along y, m; each drone stays in its own lane."""
 HALF_SIZE, CEILING = (2.6, 1.4), 2.5
 """Largest distance of a drone from the middle of its lane along x and y, and largest height, m."""
-START = ((-2.2, -0.5, 1.2), (-1.4, 0.5, 1.7))
+START_BOX = ((-2.2, -0.5, 1.2), (-1.4, 0.5, 1.7))
 """Lowest and highest start of a drone in its lane, m."""
-GOAL = ((1.0, -0.5, 1.0), (1.8, 0.5, 1.5))
+GOAL_BOX = ((1.0, -0.5, 1.0), (1.8, 0.5, 1.5))
 """Lowest and highest goal of a load in its lane, m."""
-GATE = ((0.0, -0.3, 1.2), (0.0, 0.3, 1.5))
+GATE_BOX = ((0.0, -0.3, 1.2), (0.0, 0.3, 1.5))
 """Lowest and highest middle of a gate in its lane, m."""
-TURN = 0.3
+MAX_GATE_YAW = 0.3
 """Largest yaw of a gate, rad."""
-BAR = 0.05
+BAR_THICKNESS = 0.05
 """Thickness of a gate's frame, m."""
-RADIUS = 0.03
+LOAD_RADIUS = 0.03
 """Radius of a load, m."""
-ROOM = 0.25
+MIN_OPENING_MARGIN = 0.25
 """Smallest difference between the opening's height and the link's length, m: drone and load pass it together."""
 
 
@@ -82,23 +82,25 @@ class Transport(BringLoad):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.length + ROOM <= self.opening <= 1.6:
+        if not self.length + MIN_OPENING_MARGIN <= self.opening <= 1.6:
             raise ConfigError(
-                f"expected opening from {self.length + ROOM:g} m, {ROOM} m above the length of the link, to 1.6 m, got "
-                f"{self.opening!r}"
+                f"expected opening from {self.length + MIN_OPENING_MARGIN:g} m, {MIN_OPENING_MARGIN} m above the length of "
+                f"the link, to 1.6 m, got {self.opening!r}"
             )
 
     def install(self, sim: Sim) -> None:
-        sim.add(SlungLoad(mass=self.mass, length=self.length, cable=self.cable, size=RADIUS))
-        middle = lanes(sim.n_drones) + np.mean(GATE, axis=0)
-        gates = sim.scene.add("gate", count=sim.n_drones, pos=middle, width=self.opening, height=self.opening, bar=BAR)
+        sim.add(SlungLoad(mass=self.mass, length=self.length, cable=self.cable, size=LOAD_RADIUS))
+        middle = lanes(sim.n_drones) + np.mean(GATE_BOX, axis=0)
+        gates = sim.scene.add(
+            "gate", count=sim.n_drones, pos=middle, width=self.opening, height=self.opening, bar=BAR_THICKNESS
+        )
         contacts = sim.scene.contact_fn([gates], drones=False)
 
         @stage("drone")
         def update_record(data: SimData) -> SimData:
             """Record crashes, and loads that stay at their goals."""
             return with_record(
-                data, self.update_outcome(data, contacts(data).any | self.misses(data) | out_of_lane(data))
+                data, self.update_outcome(data, contacts(data).any | self.misses_gate(data) | out_of_lane(data))
             )
 
         install_rules(sim, GateDelivery(**initial_outcome(sim.data), gates=gates), update_record)
@@ -109,16 +111,16 @@ class Transport(BringLoad):
         x = draw(key, n_drones, start=3, goal=3, gate=3, turn=1, rpy=3, vel=3, swing=2, swing_rate=2)
         lane = jnp.asarray(lanes(n_drones), data.states.pos.dtype)
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.1))
-        data = flying(data, lane + scale_to(x["start"], *np.array(START)), quat, scale_symmetric(x["vel"], 0.3))
-        yaw = scale_symmetric(x["turn"], TURN)
+        data = flying(data, lane + scale_to(x["start"], *np.array(START_BOX)), quat, scale_symmetric(x["vel"], 0.3))
+        yaw = scale_symmetric(x["turn"], MAX_GATE_YAW)
         gate_quat = rotation.from_rpy(jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1))
-        data = record.gates.set_pose(data, lane + scale_to(x["gate"], *np.array(GATE)), gate_quat)
-        data = self.hang(
+        data = record.gates.set_pose(data, lane + scale_to(x["gate"], *np.array(GATE_BOX)), gate_quat)
+        data = self.hang_loads(
             data, scale_symmetric(x["swing"], self.swing), scale_symmetric(x["swing_rate"], 1.5 * self.swing)
         )
-        return with_record(data, record.replace(goal=lane + scale_to(x["goal"], *np.array(GOAL))))
+        return with_record(data, record.replace(goal=lane + scale_to(x["goal"], *np.array(GOAL_BOX))))
 
-    def hang(self, data: SimData, angle: Array, rate: Array) -> SimData:
+    def hang_loads(self, data: SimData, angle: Array, rate: Array) -> SimData:
         """Return the data with loads on taut links.
 
         Args:
@@ -140,8 +142,8 @@ class Transport(BringLoad):
     def remaining_way(self, data: SimData) -> Array:
         """Return the length of the load's way to its goal, through the opening if it is before the gate, m. (...)
 
-        In the opening, the load aims half the link's length below the middle, so that drone and load pass with equal
-        margins.
+        The way leads through the opening half the link's length below its middle, so that drone and load pass with
+        equal margins.
         """
         pos, quat = gate_of(data)
         load, goal = load_pos(data), delivery_of(data).goal
@@ -149,15 +151,15 @@ class Transport(BringLoad):
         way_through_gate = rotation.safe_norm(aim - load)[..., 0] + rotation.safe_norm(goal - aim)[..., 0]
         return jnp.where(is_behind(load, pos, quat), self.error(data), way_through_gate)
 
-    def misses(self, data: SimData) -> Array:
+    def misses_gate(self, data: SimData) -> Array:
         """Return true where a drone or its load is between the faces of its gate, but not in the opening. (...)"""
         pos, quat = gate_of(data)
         misses_opening = [
-            (jnp.abs(local_pos[..., 0]) <= BAR / 2)
+            (jnp.abs(local_pos[..., 0]) <= BAR_THICKNESS / 2)
             & (jnp.any(jnp.abs(local_pos[..., 1:]) > self.opening / 2 - r, axis=-1))
             for local_pos, r in (
                 (rotation.rotate_inverse(quat, data.states.pos - pos), 0.0),
-                (rotation.rotate_inverse(quat, load_pos(data) - pos), RADIUS),
+                (rotation.rotate_inverse(quat, load_pos(data) - pos), LOAD_RADIUS),
             )
         ]
         return misses_opening[0] | misses_opening[1]
@@ -168,7 +170,7 @@ class Transport(BringLoad):
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and load, gate and goal relative to it.
 
-        Those are ``load_pos``, m, and ``load_vel``, m/s, relative to the drone; ``difference_to_gate``, from the drone
+        These are ``load_pos``, m, and ``load_vel``, m/s, relative to the drone; ``difference_to_gate``, from the drone
         to the middle of the gate, m; ``gate_axis``, the unit vector along which it is passed; and
         ``difference_to_goal``, from the load to its goal, m.
         """
@@ -210,7 +212,7 @@ class Transport(BringLoad):
 
 def lanes(n_drones: int) -> np.ndarray:
     """Return the middle of each drone's lane on the floor, m. (n_drones, 3)"""
-    y = LANE * (np.arange(n_drones) - (n_drones - 1) / 2)
+    y = LANE_SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
     return np.stack([0 * y, y, 0 * y], axis=-1)
 
 
@@ -228,7 +230,7 @@ def gate_axis(quat: Array) -> Array:
 
 
 def is_behind(point: Array, pos: Array, quat: Array) -> Array:
-    """Return true where a place is behind the plane of a gate. (...)
+    """Return true where a point is behind the plane of a gate. (...)
 
     Args:
         point: Position, m. (..., 3)
@@ -243,4 +245,4 @@ def out_of_lane(data: SimData) -> Array:
     pos = data.states.pos
     middle = pick_entry(jnp.asarray(lanes(data.core.n_drones), pos.dtype), data.core.drone_id)
     is_far = jnp.any(jnp.abs(pos - middle)[..., :2] > np.array(HALF_SIZE, pos.dtype), axis=-1) | (pos[..., 2] > CEILING)
-    return is_far | (load_pos(data)[..., 2] <= RADIUS)
+    return is_far | (load_pos(data)[..., 2] <= LOAD_RADIUS)

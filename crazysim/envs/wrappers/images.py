@@ -34,13 +34,13 @@ class CameraImages(Wrapper):
         self._sim: Any = env.sim
         sim = self._sim
         if not isinstance(camera, ImageSensor):
-            raise ConfigError(f"expected a camera or lidar, got {camera!r}. Use Camera(16, 12), say.")
+            raise ConfigError(f"expected a camera or lidar, got {camera!r}. Use for example Camera(16, 12).")
         self.camera = camera
         self.names = {output: f"{camera.name}.{output}" for output in camera.outputs} | dict(names or {})
         """Names of the observations by output."""
-        taken = {name for wrapper in env.wrappers if isinstance(wrapper, CameraImages) for name in wrapper.shapes}
-        if both := taken & self.shapes.keys():
-            raise ConfigError(f"expected cameras of different names, got images {min(both)!r} twice. Use name=.")
+        used_names = {name for wrapper in env.wrappers if isinstance(wrapper, CameraImages) for name in wrapper.shapes}
+        if duplicates := used_names & self.shapes.keys():
+            raise ConfigError(f"expected cameras of different names, got images {min(duplicates)!r} twice. Use name=.")
         freq = env.base.freq
         rate = freq if camera.freq is None else dividing_rate(f"freq of {camera.name!r}", camera.freq, freq)
         self._period = sim.freq // rate

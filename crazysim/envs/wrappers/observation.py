@@ -80,7 +80,7 @@ class ObservationNoise(Wrapper):
         super().__init__(env)
         if not isinstance(std, Mapping):
             raise ConfigError(
-                f"expected std as a dict of numbers by name, got {short_repr(std)}. Use {{'pos': 0.01}}, say."
+                f"expected std as a dict of numbers by name, got {short_repr(std)}. Use for example {{'pos': 0.01}}."
             )
         self.std = {name: read_number(f"std of {name!r}", value, NOT_NEGATIVE) for name, value in std.items()}
 
@@ -111,8 +111,8 @@ class Normalize(Wrapper):
     Images are not normalised.
 
     ``state.memory["Normalize"]`` holds the statistics, by name of the observation. To fly a policy with the
-    statistics of its training, pass them: ``Normalize(env, stats)`` does not update them. Blocks of worlds with keys of
-    their own, such as several seeds in one training, share the statistics.
+    statistics of its training, pass them: ``Normalize(env, stats)`` does not update them. Blocks of worlds with different
+    keys, such as several seeds in one training, share the statistics.
     """
 
     batched = True
