@@ -11,7 +11,7 @@ from crazysim.train import checkpoint
 from crazysim.train.config import TrainConfig
 from crazysim.train.export import describe
 from crazysim.train.networks import Policy
-from crazysim.train.training import POLICY
+from crazysim.train.training import POLICY_FILE
 
 KP, KD, TILT, LIFT = 4.0, 3.0, 0.13, 0.15
 """Gains of position, 1/s^2, and velocity, 1/s; actions per acceleration, s^2/m."""
@@ -31,5 +31,5 @@ def save_steering(folder, **options):
     config = TrainConfig.create("hover", config={"hidden": []}, options=options)
     policy = Policy(RunningStats.create(21), [(jnp.asarray(weight), jnp.zeros(4))])
     meta = describe(make("hover", **options)) | {"settings": dataclasses.asdict(config)}
-    checkpoint.save(folder / POLICY, policy, meta)
+    checkpoint.save(folder / POLICY_FILE, policy, meta)
     return folder

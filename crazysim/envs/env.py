@@ -373,7 +373,8 @@ class DroneEnv(Env):
         ):
             raise ConfigError(
                 "expected the default data with which the environment was made, got others: an environment does not "
-                "follow changes of its simulation. Set sim.default_data before DroneEnv(sim, ...), or change state.data."
+                "follow changes of its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data "
+                "of a state."
             )
         data, mesh = self.episode_reset.broadcast_default(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
         data = data.replace(core=_set_keys(data.core, key))

@@ -29,7 +29,7 @@ class EpisodeReset:
         names = [name for name, fn in other_stages if not isinstance(fn, Stage)]
         names += [] if first_stage[1] is reset else [first_stage[0]]
         self.has_foreign_record = "batched" in jax.tree.leaves(scopes(sim.default_data))
-        """True if a record in ``data.plugins`` belongs to another library. Such a record is not divided among worlds."""
+        """True if a record in ``data.plugins`` is of another library. Such a record is not divided among worlds."""
         self.takes_all_worlds = bool(names) or self.has_foreign_record
         """True if ``reset_data`` takes all worlds at once."""
         self.batched_reason: str | None = None

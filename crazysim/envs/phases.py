@@ -166,7 +166,7 @@ class Phases:
         )
 
     def step_without_physics(self, state: EnvState) -> EnvState:
-        """Return the state of all worlds after a step without the physics, whose shapes and types are those of a step."""
+        """Return the state of all worlds after a step without physics; shapes and types are as after a full step."""
         state, action = self.act(state, state.record.next_action, vectorize_over_worlds)
         return self.after_physics(state, action, vectorize_over_worlds)
 

@@ -99,7 +99,7 @@ def load_listed_task(reference: str, names: Container[str]) -> type[Task] | str:
     """Load a task as ``load_task`` does, by a reference from the files of a run that this user has named before.
 
     Raises:
-        ConfigError: If this user has not named it before, if others could have changed its file, or if ``load_task`` fails.
+        ConfigError: If this user has not named it before, if others could have changed its file, or as ``load_task``.
     """
     location, name = split_reference(reference)
     if reference in _CLASSES or reference in _NAMED:

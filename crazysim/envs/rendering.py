@@ -47,7 +47,8 @@ class Renderer:
         """
         if self.mode is None or state is None:
             raise ConfigError(
-                "expected an environment with render_mode='rgb_array' or 'human' after its reset, got none. Pass render_mode to make."
+                "expected an environment with render_mode='rgb_array' or 'human' after its reset, got none. "
+                "Pass render_mode when you make it."
             )
         self.sim.data = state.data
         width, height = self.size

@@ -9,7 +9,7 @@ from jax import Array
 from crazysim.pytree import PyTree, leaf, static
 
 CLIP, EPSILON = 10.0, 1e-6
-"""Largest magnitude of a normalised observation, and the number that is added to a variance before its root is taken."""
+"""Largest magnitude of a normalised observation, and the number that is added to a variance before taking its root."""
 
 
 class RunningStats(PyTree):

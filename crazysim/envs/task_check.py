@@ -75,12 +75,13 @@ def check_record(state: EnvState, after: EnvState) -> None:
         if y is None or (x.shape, x.dtype) != (y.shape, y.dtype):
             raise ConfigError(
                 f"expected a step to return {name} as it is at the start of an episode, {_describe(x)}, got "
-                f"{'none' if y is None else _describe(y)}. Tasks and wrappers must always return the same names and shapes."
+                f"{'none' if y is None else _describe(y)}. Tasks and wrappers must always return the "
+                f"same names and shapes."
             )
     if added := [keystr(path).lstrip(".") for path in stepped_leaves if path not in before]:
         raise ConfigError(
-            f"expected a step to return the entries that exist at the start of an episode, got {', '.join(added)} as well. "
-            f"Set it in after_reset, too."
+            f"expected a step to return the entries that exist at the start of an episode, got {', '.join(added)} as "
+            f"well. Set it in after_reset, too."
         )
 
 

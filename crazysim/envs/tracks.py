@@ -88,8 +88,8 @@ def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Tra
         if n_x * n_y < track.n_gates + 1 or (n_x + 1) * (n_y + 1) < track.n_obstacles:
             raise ConfigError(
                 f"expected an arena with room for a random course of {track.n_gates} gates and {track.n_obstacles} "
-                f"obstacles, got {n_x} x {n_y} cells of {CELL[0]} x {CELL[1]} m; start and gates take one each. Set wider "
-                f"limits with Track(low=..., high=...), or use fewer."
+                f"obstacles, got {n_x} x {n_y} cells of {CELL[0]} x {CELL[1]} m; start and gates take one each. Set "
+                f"wider limits with Track(low=..., high=...), or use fewer."
             )
         if n_drones > 8:
             raise ConfigError(f"expected at most 8 drones on a random course, got {n_drones}. Use level 0, 1 or 2.")
@@ -100,8 +100,8 @@ def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Tra
         if np.any(distance < clearance + jitter):
             k = int(np.argwhere(distance < clearance + jitter)[0, 1])
             raise ConfigError(
-                f"expected {kind} {k} of the track at least {clearance + jitter:.2f} m from every start in the plane, got "
-                f"{distance.min():.2f} m. Move it, or set Track(start=...)."
+                f"expected {kind} {k} of the track at least {clearance + jitter:.2f} m from every start in the plane, "
+                f"got {distance.min():.2f} m. Move it, or set Track(start=...)."
             )
     if np.any(starts < low + [0.2, 0.2, 0.2]) or np.any(starts > high - 0.2):
         raise ConfigError(

@@ -72,9 +72,9 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
     Returns:
         ``error``: task error after every step, constant after the end of the episode (n_steps, n_worlds, n_drones);
         ``over``: True once the episode has terminated (n_steps, n_worlds); ``nonfinite``: True where it terminated
-        because the world became non-finite (n_worlds,); ``reward``: sum over the episode (n_worlds, n_drones); ``terms``: terms
-        of the reward by name, means over the worlds and drones of a block, zero from the end of an episode on
-        (n_steps, n_blocks) each;
+        because the world became non-finite (n_worlds,); ``reward``: sum over the episode (n_worlds, n_drones);
+        ``terms``: terms of the reward by name, means over the worlds and drones of a block, zero from the end of an
+        episode on (n_steps, n_blocks) each;
         ``succeeded``: True where a task with ``task.succeeded`` was completed during the episode (n_worlds, n_drones).
     """
     env = RewardTerms(env)

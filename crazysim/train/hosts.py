@@ -59,7 +59,7 @@ def _require_same(what: str, values: Mapping[str, Any], remedy: str) -> None:
 
 
 def _exchange_texts(text: str, hosts: jaxcompat.Hosts) -> list[str]:
-    """Return the texts of all hosts, in the order of the hosts. They are sent through the coordinator, not the devices."""
+    """Return the texts of all hosts, in the order of the hosts. They go through the coordinator, not the devices."""
     client, host_id, n_hosts = hosts
     folder = f"crazysim/exchange-{next(_exchange_numbers)}"
     client.key_value_set(f"{folder}/{host_id}", text)

@@ -149,7 +149,8 @@ def run_many(
     if not is_first_host():
         return results
     log(
-        f"wrote {folder / CHECKPOINT_FILE}, {folder / TABLE_FILE}, and {POLICY_FILE} and {CURVE_FILE} in {', '.join(configs)}"
+        f"wrote {folder / CHECKPOINT_FILE}, {folder / TABLE_FILE}, and {POLICY_FILE} and {CURVE_FILE} in "
+        f"{', '.join(configs)}"
     )
     curves: dict[str, list[Any]] = {}
     for name in configs:

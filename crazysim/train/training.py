@@ -251,7 +251,7 @@ def train_many(
         saved_iteration, save_time = int(learner.iteration), time.perf_counter()
 
     def evaluate_and_save(learner: Learner, metrics: dict[str, Array]) -> list[dict[str, Any]]:
-        """Evaluate the policies, keep those that no earlier one clearly beats, write all files, and return the points."""
+        """Evaluate the policies, keep those that no earlier one clearly beats, write all files, and return points."""
         iteration, policies = int(learner.iteration), fetch(learner.as_policy())
         mark_diverged(metrics, iteration)
         is_planned = iteration % evaluation_period == 0 or iteration == n_iterations

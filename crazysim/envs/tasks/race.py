@@ -52,7 +52,8 @@ class Race(Task):
 
     A gate is passed when its plane is crossed along its x axis within the opening. A drone is disabled when it touches
     a gate, an obstacle, the floor or another drone, or leaves the arena; contacts are checked at every physics step.
-    The others continue and do not collide with it. An episode ends when every drone is disabled or has passed all gates.
+    The others continue and do not collide with it. An episode ends when every drone is disabled or has passed all
+    gates.
 
     | Level | Drawn for every episode |
     | --- | --- |

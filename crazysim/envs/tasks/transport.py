@@ -84,8 +84,8 @@ class Transport(BringLoad):
         super().__post_init__()
         if not self.length + MIN_OPENING_MARGIN <= self.opening <= 1.6:
             raise ConfigError(
-                f"expected opening from {self.length + MIN_OPENING_MARGIN:g} m, {MIN_OPENING_MARGIN} m above the length of "
-                f"the link, to 1.6 m, got {self.opening!r}"
+                f"expected opening from {self.length + MIN_OPENING_MARGIN:g} m, {MIN_OPENING_MARGIN} m above the "
+                f"length of the link, to 1.6 m, got {self.opening!r}"
             )
 
     def install(self, sim: Sim) -> None:

@@ -111,8 +111,8 @@ class Normalize(Wrapper):
     Images are not normalised.
 
     ``state.memory["Normalize"]`` holds the statistics, by name of the observation. To fly a policy with the
-    statistics of its training, pass them: ``Normalize(env, stats)`` does not update them. Blocks of worlds with different
-    keys, such as several seeds in one training, share the statistics.
+    statistics of its training, pass them: ``Normalize(env, stats)`` does not update them. Blocks of worlds with
+    different keys, such as several seeds in one training, share the statistics.
     """
 
     batched = True
