@@ -15,7 +15,7 @@ import time
 from typing import Any
 
 import jax.numpy as jnp
-from measure import engine_name, hovering, machine, run_in_process
+from measure import describe_machine, engine_name, run_in_process, start_hovering
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
@@ -37,10 +37,10 @@ def measure(control: str, integrator: str, n_worlds: int, engine: str, device: s
     """Return the times of one case."""
     start_time = time.perf_counter()
     sim = Sim(n_worlds=n_worlds, control=control, integrator=integrator, engine=engine, device=device)
-    hovering(sim, control)
-    built = time.perf_counter()
+    start_hovering(sim, control)
+    build_end = time.perf_counter()
     lowered = sim.build_step_fn().lower(sim.data, jnp.int32(1))
-    traced = time.perf_counter()
+    trace_end = time.perf_counter()
     lowered.compile()
     end_time = time.perf_counter()
     return {
@@ -49,11 +49,11 @@ def measure(control: str, integrator: str, n_worlds: int, engine: str, device: s
         "control": control,
         "integrator": integrator,
         "n_worlds": n_worlds,
-        "build_s": round(built - start_time, 4),
-        "trace_s": round(traced - built, 4),
-        "compile_s": round(end_time - traced, 4),
+        "build_s": round(build_end - start_time, 4),
+        "trace_s": round(trace_end - build_end, 4),
+        "compile_s": round(end_time - trace_end, 4),
         "crazysim": __version__,
-        **machine(device),
+        **describe_machine(device),
     }
 
 

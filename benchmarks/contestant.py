@@ -18,10 +18,10 @@ def main(package: str) -> None:
     start_time = time.perf_counter()
     module = importlib.import_module(f"{package}.sim")
     import jax  # after the package, so that its import counts as part of the package's
-    from measure import machine
+    from measure import describe_machine
 
     import_s = time.perf_counter() - start_time
-    timed: dict[str, Any] = {}
+    contestants: dict[str, Any] = {}
     for line in sys.stdin:
         request = json.loads(line)
         answer: dict[str, Any] = {}
@@ -33,17 +33,17 @@ def main(package: str) -> None:
                 jax.block_until_ready(sim.data.states.pos)
                 answer = {"import_s": import_s, "to_first_step_s": time.perf_counter() - start_time}
             case "memory":
-                sim = scene(module, package, request["n_worlds"], request["n_drones"], request["device"])
-                answer = {"bytes": memory(sim, package)}
+                sim = make_scene(module, package, request["n_worlds"], request["n_drones"], request["device"])
+                answer = {"bytes": bytes_in_use(sim, package)}
             case "build":
                 contestant = build(package, request["task"], request["case"], request["device"])
-                timed[request["name"]], answer = contestant, {"seconds": contestant.first_s}
+                contestants[request["name"]], answer = contestant, {"seconds": contestant.first_s}
             case "time":
-                answer = {"seconds": timed[request["name"]].seconds()}
+                answer = {"seconds": contestants[request["name"]].seconds()}
             case "end":
-                timed.pop(request["name"]).require_flying()
+                contestants.pop(request["name"]).require_flying()
             case "machine":
-                answer = {package: importlib.import_module(package).__version__, **machine(request["device"])}
+                answer = {package: importlib.import_module(package).__version__, **describe_machine(request["device"])}
         print(json.dumps(answer), flush=True)
 
 
@@ -53,8 +53,8 @@ def build(package: str, task: str, case: dict[str, Any], device: str) -> Any:
 
     if task == "gym":
         return GymSteps(package, case, device)
-    if task in QUESTIONS:
-        return Question(package, task, case, device)
+    if task in SCENE_QUERIES:
+        return SceneQuery(package, task, case, device)
     settings = dict(case)
     n_steps = settings.pop("n_steps")
     sim = importlib.import_module(f"{package}.sim").Sim(**settings, device=device)
@@ -69,9 +69,9 @@ class Loop:
     def __init__(self, sim: Any, control: str, n_steps: int, iterations: int = 50):
         """Fly it once, which compiles it."""
         import numpy as np
-        from measure import hovering
+        from measure import start_hovering
 
-        hovering(sim, control)
+        start_hovering(sim, control)
         self._sim, self._initial_data, self._n_steps, self._iterations = sim, sim.data, n_steps, iterations
         self._send = getattr(sim, f"{control}_control")
         self._command = np.array(getattr(sim.data.controls, control).staged_cmd)
@@ -95,9 +95,9 @@ class Loop:
         Raises:
             SystemExit: If they are not.
         """
-        from measure import still_flies
+        from measure import is_flying
 
-        if not still_flies(self._sim):
+        if not is_flying(self._sim):
             raise SystemExit("a drone has crashed; no figure")
 
 
@@ -108,10 +108,10 @@ class Gradient:
         """Compile the gradient."""
         import jax
         import jax.numpy as jnp
-        from measure import hovering, seconds
+        from measure import seconds, start_hovering
 
         functional = importlib.import_module(f"{package}.sim.functional")
-        hovering(sim, "attitude")
+        start_hovering(sim, "attitude")
         step, initial_data = sim.build_step_fn(), sim.data
 
         def loss(cmd: jax.Array) -> jax.Array:
@@ -191,15 +191,15 @@ OBJECTS = {
     "ball": ('<geom type="sphere" size="0.1"/>', [[2, 0, 1.1], [-3, 2, 1]]),
 }
 """Kinds and positions of eight movable objects, none of them in the way of the drones."""
-TURN = 0.25
+BATCH_SECONDS = 0.25
 """Duration of a batch of queries, s. Their median counts, because the first after a pause are slower."""
-QUESTIONS = ("contacts", "depth", "swarm_build")
+SCENE_QUERIES = ("contacts", "depth", "swarm_build")
 
 
-def scene(module: Any, package: str, n_worlds: int, n_drones: int, device: str) -> Any:
+def make_scene(module: Any, package: str, n_worlds: int, n_drones: int, device: str) -> Any:
     """Return a simulation of hovering drones among the objects, built with the API of the program."""
     import mujoco
-    from measure import hovering
+    from measure import start_hovering
 
     sim = module.Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude", device=device)
     for name, (geom, positions) in OBJECTS.items():
@@ -214,11 +214,11 @@ def scene(module: Any, package: str, n_worlds: int, n_drones: int, device: str) 
             body.pos, body.mocap = pos, True
     if package != "crazysim":
         sim.build_mjx()
-    hovering(sim, "attitude")
+    start_hovering(sim, "attitude")
     return sim
 
 
-def memory(sim: Any, package: str) -> int:
+def bytes_in_use(sim: Any, package: str) -> int:
     """Return the bytes in use on the device after a contact query."""
     import jax
 
@@ -227,7 +227,7 @@ def memory(sim: Any, package: str) -> int:
     return sum(x.nbytes for x in jax.live_arrays())
 
 
-class Question:
+class SceneQuery:
     """Scene query after a step, timed without the step; or the construction of a swarm."""
 
     def __init__(self, package: str, task: str, case: dict[str, Any], device: str):
@@ -235,7 +235,7 @@ class Question:
         self._module, self._case, self._device = importlib.import_module(f"{package}.sim"), case, device
         self._task, self._sim = task, None
         if task != "swarm_build":
-            self._sim = scene(self._module, package, case["n_worlds"], case["n_drones"], device)
+            self._sim = make_scene(self._module, package, case["n_worlds"], case["n_drones"], device)
         if task == "contacts":
             self._query = lambda: self._sim.contact_report() if package == "crazysim" else self._sim.contacts()
         elif package == "crazysim":
@@ -254,7 +254,7 @@ class Question:
             self._sim = self._module.Sim(n_drones=self._case["n_drones"], device=self._device)
             return time.perf_counter() - start_time
         seconds: list[float] = []
-        while sum(seconds) < TURN:
+        while sum(seconds) < BATCH_SECONDS:
             self._sim.step()
             jax.block_until_ready(self._sim.data.states.pos)
             start_time = time.perf_counter()
@@ -268,9 +268,9 @@ class Question:
         Raises:
             SystemExit: If they are not.
         """
-        from measure import still_flies
+        from measure import is_flying
 
-        if self._task != "swarm_build" and not still_flies(self._sim):
+        if self._task != "swarm_build" and not is_flying(self._sim):
             raise SystemExit("a drone has crashed; no figure")
 
 

@@ -3,7 +3,7 @@
     python benchmarks/controllers.py [--controllers auto indi ...] [--drones cf21B_500 my_drone.toml ...] [--speed 2]
 
 - hover: from the floor to a height of 1 m, distance from the setpoint after 5 s, m
-- tracking: figure eight of 2 m, ``--speed`` in its middle, from a matching start, RMS distance over 9 s, m
+- tracking: figure eight of 2 m with ``--speed`` in its middle, from a start on it, RMS distance over 9 s, m
 - pushed: hover under a sideways force of a tenth of the weight from 2 s on, distance 5 s later, and its largest, m
 - heavier: hover with 20% more mass from 0 s on, distance after 5 s, m
 - home: share of the flights from random attitudes at 5 rad/s that end within 0.1 m of the setpoint, after 15 s
@@ -12,9 +12,8 @@
 - error_attitude, error_body_rate: largest error 2 s after these steps and later, over their size
 - steps_per_s: physics steps of many worlds that hover, in calls of 100 steps; omitted with --worlds 0
 
-Without --drones these are all built-in airframes with rotors, and three made of plain physics (``own_airframes``). A
-controller that lacks numbers of an airframe is left out for it. Of the flights, ``tracking_lqr`` only flies the figure
-eight.
+Without --drones, the airframes are all built-in ones with rotors, and three generic ones (``generic_airframes``). A
+controller is left out for an airframe that lacks its constants. ``tracking_lqr`` only flies the figure eight.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from measure import digits, engine_name, medians, report, seconds
+from measure import engine_name, medians, report, round_digits, seconds
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
@@ -51,10 +50,10 @@ TAKE_OFF_WORLD, TRACKING_WORLD, PUSHED_WORLD, HEAVY_WORLD, INVERTED_WORLD, FIRST
 """Worlds of the flights; the last is the first of many."""
 
 
-def own_airframe(
+def generic_airframe(
     name: str, mass: float, radius: float, n: int, inertia: list[float], thrust_max: float, rpm: float, lag_rate: float
 ) -> Airframe:
-    """Return an airframe of plain physics: rotors on a circle that hover at a speed, and nothing about controllers."""
+    """Return a generic airframe: rotors on a circle that hover at ``rpm``, without constants of controllers."""
     angles = 2 * np.pi * (np.arange(n) + 0.5) / n
     k2 = mass * 9.81 / n / rpm**2
     return load_airframe(
@@ -76,19 +75,19 @@ def own_airframe(
     )
 
 
-def own_airframes() -> list[Airframe]:
+def generic_airframes() -> list[Airframe]:
     """Return a quadrotor with propellers of 3 inches, one of 5 inches, and a hexarotor."""
     return [
-        own_airframe("quad_3_inch", 0.25, 0.07, 4, [2.5e-4, 2.5e-4, 4.2e-4], 2.2, 15e3, 30.0),
-        own_airframe("quad_5_inch", 1.2, 0.12, 4, [5e-3, 5e-3, 9e-3], 12.0, 11e3, 20.0),
-        own_airframe("hexa", 4.0, 0.35, 6, [0.08, 0.08, 0.14], 16.0, 5.5e3, 10.0),
+        generic_airframe("quad_3_inch", 0.25, 0.07, 4, [2.5e-4, 2.5e-4, 4.2e-4], 2.2, 15e3, 30.0),
+        generic_airframe("quad_5_inch", 1.2, 0.12, 4, [5e-3, 5e-3, 9e-3], 12.0, 11e3, 20.0),
+        generic_airframe("hexa", 4.0, 0.35, 6, [0.08, 0.08, 0.14], 16.0, 5.5e3, 10.0),
     ]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--drones", nargs="+", help="airframes; by default all with rotors and three of plain physics")
+    parser.add_argument("--drones", nargs="+", help="airframes; by default all with rotors and three generic ones")
     parser.add_argument(
         "--dynamics", default="first_principles", help="dynamics model; only controller auto flies fitted models"
     )
@@ -101,25 +100,25 @@ def main() -> None:
     names = args.drones or supported_drones(args.dynamics)
     is_first_principles = args.dynamics == "first_principles"
     airframes = [load_airframe(name) for name in names] + (
-        own_airframes() if is_first_principles and not args.drones else []
+        generic_airframes() if is_first_principles and not args.drones else []
     )
     for name in args.controllers:
-        able = [airframe for airframe in airframes if is_able(name, airframe, args.dynamics)]
-        if able:
-            rows = fly(name, able, args.speed, args.attitudes, args.dynamics, args.device)
+        supported_airframes = [airframe for airframe in airframes if is_supported(name, airframe, args.dynamics)]
+        if supported_airframes:
+            rows = fly_airframes(name, supported_airframes, args.speed, args.attitudes, args.dynamics, args.device)
             for level in COMMAND_STEPS:
-                if not is_first_principles or not is_able(name, able[0], args.dynamics, level):
+                if not is_first_principles or not is_supported(name, supported_airframes[0], args.dynamics, level):
                     continue
-                for drone, row in step_response_figures(name, able, level, args.device).items():
+                for drone, row in step_response_metrics(name, supported_airframes, level, args.device).items():
                     rows[drone] |= row
             for drone, row in rows.items():
-                row = {key: digits(value) for key, value in row.items()}
+                row = {key: round_digits(value) for key, value in row.items()}
                 report(args.device, benchmark="controllers", controller=name, drone=drone, speed=args.speed, **row)
     if args.worlds:
-        cost(args)
+        report_cost(args)
 
 
-def is_able(name: str, airframe: Airframe, dynamics: str, level: str = "state") -> bool:
+def is_supported(name: str, airframe: Airframe, dynamics: str, level: str = "state") -> bool:
     """Return True if a controller takes commands of a level and an airframe has the numbers that it needs."""
     try:
         Sim(drone=airframe, dynamics=dynamics, control=level, controller=make_controller(name))
@@ -129,14 +128,14 @@ def is_able(name: str, airframe: Airframe, dynamics: str, level: str = "state") 
 
 
 def make_controller(name: str, speed: float = 2.0) -> Any:
-    """Return the argument ``controller`` of a simulation."""
+    """Return the argument ``controller`` of ``Sim`` for the name of a controller."""
     if name == "tracking_lqr":
-        eight = figure_eight(2.0, 1.0, speed=speed, height=1.0)
-        return TrackingLQR(jax.vmap(eight.evaluate)(GAIN_INTERVAL * np.arange(60, dtype=np.float32)), dt=GAIN_INTERVAL)
+        path = figure_eight(2.0, 1.0, speed=speed, height=1.0)
+        return TrackingLQR(jax.vmap(path.evaluate)(GAIN_INTERVAL * np.arange(60, dtype=np.float32)), dt=GAIN_INTERVAL)
     return name
 
 
-def fly(
+def fly_airframes(
     name: str,
     airframes: list[Airframe],
     speed: float,
@@ -148,8 +147,8 @@ def fly(
     worlds, drones = FIRST_TUMBLING_WORLD + n, len(airframes)
     controller = make_controller(name, speed)
     sim = Sim(worlds, drone=airframes, dynamics=dynamics, control="state", controller=controller, device=device)
-    eight, s, params = figure_eight(2.0, 1.0, speed=speed, height=1.0), sim.data.states, sim.data.params
-    start_setpoint, rng = eight.evaluate(jnp.float32(0)), np.random.default_rng(0)
+    path, s, params = figure_eight(2.0, 1.0, speed=speed, height=1.0), sim.data.states, sim.data.params
+    start_setpoint, rng = path.evaluate(jnp.float32(0)), np.random.default_rng(0)
 
     pos, vel, quat, ang_vel = (np.array(x) for x in (s.pos, s.vel, s.quat, s.ang_vel))
     rotor_vel = np.array(np.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
@@ -175,15 +174,15 @@ def fly(
     )
     target = np.array(np.broadcast_to([0, 0, 1.0], pos.shape))
     target[INVERTED_WORLD:, :, 2] = START_HEIGHT
-    flown_pos, path_pos = positions(sim, eight, target, as_data(force))
-    return {airframe.name: figures(flown_pos[:, :, k], path_pos, name) for k, airframe in enumerate(airframes)}
+    flown_pos, path_pos = fly_positions(sim, path, target, as_data(force))
+    return {airframe.name: flight_metrics(flown_pos[:, :, k], path_pos, name) for k, airframe in enumerate(airframes)}
 
 
-def step_response_figures(
+def step_response_metrics(
     name: str, airframes: list[Airframe], level: str, device: str = "cpu"
 ) -> dict[str, dict[str, float]]:
     """Return overshoot and error of a controller for each airframe after steps of the command."""
-    normalized_responses = responses(name, airframes, level, device)
+    normalized_responses = step_responses(name, airframes, level, device)
     overshoot = normalized_responses.max(axis=(0, 1)) - 1
     error = np.abs(normalized_responses[100:] - 1).max(axis=(0, 1))
     return {
@@ -192,7 +191,7 @@ def step_response_figures(
     }
 
 
-def responses(name: str, airframes: list[Airframe], level: str, device: str = "cpu") -> np.ndarray:
+def step_responses(name: str, airframes: list[Airframe], level: str, device: str = "cpu") -> np.ndarray:
     """Return angles or body rates over 3 s after steps of the command, over their sizes.
 
     One every 0.02 s. (n_times, n_command_steps, n_airframes)
@@ -220,27 +219,27 @@ def responses(name: str, airframes: list[Airframe], level: str, device: str = "c
     return np.array(results)
 
 
-def positions(sim: Sim, eight: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+def fly_positions(sim: Sim, path: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:
     """Return the positions of all drones after each step of 15 s, and of the figure eight, m."""
     step, takes_feedforward = sim.build_step_fn(), sim.data.controls.state.staged_feedforward is not None
     zeros, command = step.zeros(sim.data), np.zeros((*target.shape[:2], 16), np.float32)
     command[..., :3], command[..., 12] = target, 1
 
     def fly_step(data: Any, k: jax.Array) -> Any:
-        setpoint = eight.evaluate(k / sim.freq)
+        setpoint = path.evaluate(k / sim.freq)
         feedforward = jnp.zeros((*target.shape[:2], 8)).at[TRACKING_WORLD].set(setpoint.feedforward())
         commands = jnp.asarray(command).at[TRACKING_WORLD].set(setpoint.command())
         data = F.state_control(data, commands, feedforward=feedforward if takes_feedforward else None)
         data = data.replace(states=data.states.replace(force=jnp.where(k < 2 * sim.freq, 0.0, force)))
         data = step(data, 1, zeros)
-        return data, (data.states.pos, eight.evaluate((k + 1) / sim.freq).pos)
+        return data, (data.states.pos, path.evaluate((k + 1) / sim.freq).pos)
 
     steps = jnp.arange(15 * sim.freq)
     _, (flown_pos, path_pos) = jax.jit(lambda data: jax.lax.scan(fly_step, data, steps))(sim.data)
     return np.asarray(flown_pos), np.asarray(path_pos)
 
 
-def figures(pos: np.ndarray, path_pos: np.ndarray, name: str) -> dict[str, float]:
+def flight_metrics(pos: np.ndarray, path_pos: np.ndarray, name: str) -> dict[str, float]:
     """Return the figures of one airframe from its positions. (n_steps, n_worlds, 3)"""
     steps_per_s, setpoint_pos = len(pos) // 15, np.array([0, 0, 1.0])
     distance = np.linalg.norm(pos - setpoint_pos, axis=-1)
@@ -262,7 +261,7 @@ def figures(pos: np.ndarray, path_pos: np.ndarray, name: str) -> dict[str, float
     }
 
 
-def cost(args: argparse.Namespace) -> None:
+def report_cost(args: argparse.Namespace) -> None:
     """Print the step rates of many hovering worlds, measured alternately."""
 
     def compile_steps(sim: Sim) -> Any:
@@ -281,7 +280,7 @@ def cost(args: argparse.Namespace) -> None:
         sims[name].state_control(command)
     for name, duration in medians({name: compile_steps(sim) for name, sim in sims.items()}, args.repeats).items():
         rate, engine = args.worlds * 100 / duration, engine_name(sims[name])
-        line = {"n_worlds": args.worlds, "engine": engine, "steps_per_s": digits(rate)}
+        line = {"n_worlds": args.worlds, "engine": engine, "steps_per_s": round_digits(rate)}
         report(args.device, benchmark="controllers", controller=name, **line)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from measure import Flight, digits, engine_name, medians, report
+from measure import Flight, engine_name, medians, report, round_digits
 
 from crazysim import Downwash, Sim, __version__
 
@@ -48,7 +48,7 @@ def measure(case: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
     flights = {name: Flight(sim, args.control, args.steps, args.device) for name, sim in sims.items()}
     durations = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
     n_steps = case["n_worlds"] * case["n_drones"] * args.steps
-    rates = {name: digits(n_steps / seconds) for name, seconds in durations.items()}
+    rates = {name: round_digits(n_steps / seconds) for name, seconds in durations.items()}
     return {"engine": engine_name(sims["downwash"]), "steps_per_s": rates}
 
 

@@ -1,8 +1,9 @@
 """Rays per second of depth images, and the time to the first image; or the time of a step with a range finder.
 
-One JSON line for each number of poles, fixed and movable, with rays or steps by the clock (median) and by the time of
-processors (least). For the figures of another version, run this file with its folder in PYTHONPATH, in turns with this
-one. With ``--range-finder`` drones at random places measure six distances up to 4 m in each step.
+One JSON line for each number of poles, fixed and movable, with rates by wall time (median) and by
+processor time (least). To compare with another version, run this file with the folder of that version in PYTHONPATH,
+alternating with this one. With ``--range-finder``, drones at random positions measure six distances up to 4 m in each
+step.
 
     python benchmarks/depth.py [--device gpu] [--worlds 64] [--size 64 64] [--poles 0 30 1000] [--range-finder]
 """
@@ -17,7 +18,7 @@ from functools import partial
 import jax
 import numpy as np
 from jax import Array
-from measure import digits, engine_name, medians, report, seconds
+from measure import engine_name, medians, report, round_digits, seconds
 
 from crazysim import RangeFinder, Sim, __version__
 
@@ -35,9 +36,9 @@ def main() -> None:
     parser.add_argument("--range-finder", action="store_true", help="time a step with a range finder, not images")
     args = parser.parse_args()
     for n_poles, movable in [(n, movable) for n in args.poles for movable in ((False, True) if n else (False,))]:
-        sim = scene(args.worlds, n_poles, movable, args.device)
+        sim = make_scene(args.worlds, n_poles, movable, args.device)
         if args.range_finder:
-            range_finder_steps(sim, n_poles, movable, args)
+            report_range_finder(sim, n_poles, movable, args)
             continue
         render = partial(sim.depth, "fpv_cam", args.size[0], args.size[1])
         start_time = time.perf_counter()
@@ -48,12 +49,12 @@ def main() -> None:
         n_rays = args.worlds * args.size[0] * args.size[1]
         report(
             args.device, benchmark="depth", n_poles=n_poles, movable=movable, n_worlds=args.worlds, width=args.size[0],
-            height=args.size[1], first_s=digits(first_s), rays_per_s=digits(n_rays / render_s),
-            rays_per_processor_s=digits(n_rays / processor_s), crazysim=__version__,
+            height=args.size[1], first_s=round_digits(first_s), rays_per_s=round_digits(n_rays / render_s),
+            rays_per_processor_s=round_digits(n_rays / processor_s), crazysim=__version__,
         )  # fmt: skip
 
 
-def range_finder_steps(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
+def report_range_finder(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
     """Print the time of a step with a range finder."""
     n, n_steps = sim.n_worlds, 20
     pos = (
@@ -73,24 +74,23 @@ def range_finder_steps(sim: Sim, n_poles: int, movable: bool, args: argparse.Nam
     first_s = time.perf_counter() - start_time
     step_s = medians({"step": partial(seconds, steps)}, args.repeats)["step"] / n_steps
     processor_s = min(processor_seconds(steps) for _ in range(args.repeats)) / n_steps
-    share_near = float(np.mean(np.asarray(sim.data.plugins["range_finder"].distance)[..., :4] < 4))
+    fraction_near = float(np.mean(np.asarray(sim.data.plugins["range_finder"].distance)[..., :4] < 4))
     report(
-        args.device, benchmark="range_finder", n_poles=n_poles, movable=movable, n_worlds=n, first_s=digits(first_s),
-        step_us=digits(1e6 * step_s), processor_ns_per_drone=digits(1e9 * processor_s / n),
-        fraction_that_meets=digits(share_near), engine=engine_name(sim), crazysim=__version__,
+        args.device, benchmark="range_finder", n_poles=n_poles, movable=movable, n_worlds=n,
+        first_s=round_digits(first_s), step_us=round_digits(1e6 * step_s),
+        processor_ns_per_drone=round_digits(1e9 * processor_s / n),
+        fraction_that_meets=round_digits(fraction_near), engine=engine_name(sim), crazysim=__version__,
     )  # fmt: skip
 
 
 def processor_seconds(render: Callable[[], Array]) -> float:
-    """Return the time that all threads of this process compute for a call, which other work on the machine disturbs
-    less than the time by the clock.
-    """
+    """Return the processor time of a call over all threads, s, which other work on the machine affects less."""
     start_time = time.process_time()
     jax.block_until_ready(render())
     return time.process_time() - start_time
 
 
-def scene(n_worlds: int, n_poles: int, movable: bool, device: str) -> Sim:
+def make_scene(n_worlds: int, n_poles: int, movable: bool, device: str) -> Sim:
     """Return a drone at a height of 1 m amid poles."""
     sim = Sim(n_worlds, control="attitude", device=device)
     if n_poles:

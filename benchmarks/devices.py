@@ -1,4 +1,4 @@
-"""Rates on several devices beside those on one: physics, environments, training, gradients and depth images.
+"""Rates on several devices compared with one device: physics, environments, training, gradients and depth images.
 
     python benchmarks/devices.py [--device gpu] [--devices 1 2] [--hosts 2] [--cases physics PPO] [--processes 12]
 
@@ -6,9 +6,10 @@ The worlds of each device are the same for any number of devices (weak scaling),
 divided among the devices. One JSON line for each case and number of devices: the rate, its ratio to that on the
 first number of devices, the bytes that the devices exchange in a call and the memory of its program on a device, both
 from the compiled program, and the compile time. With ``--processes`` several cases are compiled at the same time, in
-processes of their own, and then timed one after another. With ``--hosts`` the largest number of devices is measured
-once more, divided among processes that ``jax.distributed`` connects. The line ``weights`` compares the weights of PPO
-after three iterations. ``--small`` is for a try on CPUs, with ``XLA_FLAGS=--xla_force_host_platform_device_count=4``.
+separate processes, and then timed one after another. With ``--hosts`` the largest number of devices is measured
+again, divided among processes that ``jax.distributed`` connects. The line ``weights`` compares the weights of PPO
+after three iterations. ``--small`` is for a trial run on CPUs, with
+``XLA_FLAGS=--xla_force_host_platform_device_count=4``.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from measure import digits, hovering, medians, report
+from measure import medians, report, round_digits, start_hovering
 
 import crazysim.envs as envs
 from crazysim import Sim, __version__
@@ -57,11 +58,11 @@ class Case(NamedTuple):
     call: Any
     """Compiled program."""
     arguments: tuple[Any, ...]
-    """Its arguments; results that come first and have their structure are the arguments of the next call."""
-    carries: bool
+    """Its arguments."""
+    is_carried: bool
     """True if the first result is the argument of the next call."""
-    work: int
-    """What one call computes, in units of the case."""
+    n_units: int
+    """Number of units, such as steps, that one call computes."""
     compile_s: float
     """Compile time, s."""
 
@@ -74,7 +75,7 @@ class Size(NamedTuple):
     small: int
     """The same with ``--small``."""
     unit: str
-    """What is counted."""
+    """Unit of the rate."""
 
 
 def main() -> None:
@@ -83,9 +84,11 @@ def main() -> None:
     parser.add_argument("--devices", type=int, nargs="+", default=[1, 2], help="numbers of devices")
     parser.add_argument("--cases", nargs="+", default=[*CASES, WEIGHTS], choices=[*CASES, WEIGHTS])
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--small", action="store_true", help="few worlds and steps, for a try")
+    parser.add_argument("--small", action="store_true", help="few worlds and steps, for a trial run")
     parser.add_argument("--processes", type=int, default=1, help="cases that are compiled at the same time")
-    parser.add_argument("--hosts", type=int, default=1, help="processes among which the devices are divided at last")
+    parser.add_argument(
+        "--hosts", type=int, default=1, help="processes among which the devices are divided in the last measurement"
+    )
     args = parser.parse_args()
     n_hosts, args.hosts = args.hosts, 1
     if args.processes > 1:
@@ -96,9 +99,9 @@ def main() -> None:
     if n_hosts > 1:
         args.hosts, args.devices = n_hosts, [max(args.devices)]
         args.cases = [name for name in args.cases if name != WEIGHTS]
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            address = f"127.0.0.1:{free.getsockname()[1]}"
+        with socket.socket() as free_socket:
+            free_socket.bind(("127.0.0.1", 0))
+            address = f"127.0.0.1:{free_socket.getsockname()[1]}"
         context = multiprocessing.get_context("spawn")
         hosts = [context.Process(target=run_on_host, args=(i, address, args)) for i in range(n_hosts)]
         for process in hosts:
@@ -117,22 +120,22 @@ def run_on_host(i: int, address: str, args: argparse.Namespace) -> None:
     if args.device == "cpu":
         os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={n_devices}"
     jax.distributed.initialize(address, args.hosts, i, list(range(i * n_devices, (i + 1) * n_devices)))
-    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere) if i else nullcontext():
+    with open(os.devnull, "w") as devnull, redirect_stdout(devnull) if i else nullcontext():
         for name in args.cases:
             run(name, args)
 
 
 def run_in_processes(args: argparse.Namespace) -> None:
-    """Run the cases in processes of their own, several of which compile at the same time."""
+    """Run each case in a separate process, several of which compile at the same time."""
     context = multiprocessing.get_context("spawn")
     failed = []
     for k in range(0, len(args.cases), args.processes):
         names = args.cases[k : k + args.processes]
-        turns = context.Barrier(len(names)), context.Lock()
-        running = {name: context.Process(target=run, args=(name, args, *turns)) for name in names}
-        for process in running.values():
+        barrier_and_lock = context.Barrier(len(names)), context.Lock()
+        processes = {name: context.Process(target=run, args=(name, args, *barrier_and_lock)) for name in names}
+        for process in processes.values():
             process.start()
-        for name, process in running.items():
+        for name, process in processes.items():
             process.join()
             failed += [name] if process.exitcode else []
     if failed:
@@ -140,14 +143,14 @@ def run_in_processes(args: argparse.Namespace) -> None:
 
 
 def run(name: str, args: argparse.Namespace, ready: Any = None, turn: Any = None) -> None:
-    """Compile a case for each number of devices, time it in turn once all are ``ready``, and print its lines."""
+    """Compile a case for each number of devices, time it once all cases are ``ready``, and print its lines."""
     devices = jax.devices(args.device)
     if len(devices) < max(args.devices):
         raise SystemExit(f"expected {max(args.devices)} devices, got {len(devices)}. See --help for CPUs.")
     if name == WEIGHTS:
-        make_result, print_result = trained_weights, compare
+        make_result, print_result = trained_weights, compare_weights
     else:
-        make_result, print_result = partial(build, name), partial(measure, name)
+        make_result, print_result = partial(build_case, name), partial(time_and_report, name)
     try:
         results: dict[int, Any] = {n: make_result(devices[:n], args.small) for n in args.devices}
     finally:
@@ -157,7 +160,7 @@ def run(name: str, args: argparse.Namespace, ready: Any = None, turn: Any = None
         print_result(results, args)
 
 
-def compare(weights: dict[int, tuple[np.ndarray, np.ndarray]], args: argparse.Namespace) -> None:
+def compare_weights(weights: dict[int, tuple[np.ndarray, np.ndarray]], args: argparse.Namespace) -> None:
     """Print the lines that compare weights before and after a training."""
     first_start, first_end = weights[args.devices[0]]
     for n in args.devices[1:]:
@@ -165,12 +168,12 @@ def compare(weights: dict[int, tuple[np.ndarray, np.ndarray]], args: argparse.Na
         report(
             args.device, benchmark="devices", case=WEIGHTS, n_devices=n, compared_with=args.devices[0],
             same_start=bool(np.array_equal(start, first_start)),
-            difference=digits(float(np.linalg.norm(end - first_end))),
-            moved=digits(float(np.linalg.norm(first_end - first_start))), crazysim=__version__,
+            difference=round_digits(float(np.linalg.norm(end - first_end))),
+            moved=round_digits(float(np.linalg.norm(first_end - first_start))), crazysim=__version__,
         )  # fmt: skip
 
 
-def build(name: str, devices: list[jax.Device], small: bool) -> Case:
+def build_case(name: str, devices: list[jax.Device], small: bool) -> Case:
     """Return a case on some devices."""
     (make_case, size), n = CASES[name], len(devices)
     n_worlds = size.small if small else size.n_worlds
@@ -179,7 +182,7 @@ def build(name: str, devices: list[jax.Device], small: bool) -> Case:
     return make_case(n_worlds if name.startswith("seeds") else n * n_worlds, device_options, 4 if small else None)
 
 
-def measure(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None:
+def time_and_report(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None:
     """Print the lines of a case."""
     size = CASES[name][1]
     states: dict[int, list[Any]] = {n: list(case.arguments) for n, case in cases.items()}
@@ -190,7 +193,7 @@ def measure(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None
         start_time = time.perf_counter()
         for _ in range(N_CALLS):  # queued, as in a training
             results = case.call(*state)
-            if case.carries:
+            if case.is_carried:
                 state[0] = results[0]
         jax.block_until_ready((state, results))
         return (time.perf_counter() - start_time) / N_CALLS
@@ -199,39 +202,41 @@ def measure(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None
         seconds(n)
         seconds(n)
     call_times = medians({n: partial(seconds, n) for n in cases}, args.repeats)
-    rates = {n: cases[n].work / call_times[n] for n in cases}
+    rates = {n: cases[n].n_units / call_times[n] for n in cases}
     for n, case in cases.items():
         text, memory = case.call.as_text(), case.call.memory_analysis()
         n_bytes = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
         report(
             args.device, benchmark="devices", case=name, n_devices=n, n_hosts=args.hosts, unit=size.unit,
-            n_worlds=size.small if args.small else size.n_worlds, call_s=digits(call_times[n]), rate=digits(rates[n]),
-            ratio=digits(rates[n] / rates[args.devices[0]]),
+            n_worlds=size.small if args.small else size.n_worlds, call_s=round_digits(call_times[n]),
+            rate=round_digits(rates[n]), ratio=round_digits(rates[n] / rates[args.devices[0]]),
             exchanged=exchanged_bytes(text), memory_bytes=n_bytes - memory.alias_size_in_bytes,
             compile_s=round(case.compile_s, 1), crazysim=__version__,
         )  # fmt: skip
 
 
-def compile_case(fn: Any, *arguments: Any, work: int, carries: bool = False, static: tuple[Any, ...] = ()) -> Case:
+def compile_case(
+    fn: Any, *arguments: Any, n_units: int, is_carried: bool = False, static: tuple[Any, ...] = ()
+) -> Case:
     """Return the case of a jitted function."""
     lowered = fn.lower(*arguments, *static)
     start_time = time.perf_counter()
     call = lowered.compile()
-    return Case(call, arguments, carries, work, time.perf_counter() - start_time)
+    return Case(call, arguments, is_carried, n_units, time.perf_counter() - start_time)
 
 
-def physics(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
+def physics_case(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
     """Return steps of attitude commands."""
     n_steps = small_size or 100
     sim = Sim(n_worlds, control="attitude", **device_options)
-    hovering(sim, "attitude")
+    start_hovering(sim, "attitude")
     step = sim.build_step_fn()
     return compile_case(
-        jax.jit(lambda data: (step(data, n_steps), ())), sim.data, work=n_worlds * n_steps, carries=True
+        jax.jit(lambda data: (step(data, n_steps), ())), sim.data, n_units=n_worlds * n_steps, is_carried=True
     )
 
 
-def rollouts(
+def rollout_case(
     task: str, with_policy: bool, n_worlds: int, device_options: dict[str, Any], small_size: int | None
 ) -> Case:
     """Return rollouts with automatic resets, with random actions or with a policy of two layers of 64."""
@@ -255,10 +260,10 @@ def rollouts(
         return (state, key), transitions
 
     carry = state, distribute(jax.random.key(2), replicated)
-    return compile_case(jax.jit(run), carry, policy, work=n_worlds * n_steps, carries=True)
+    return compile_case(jax.jit(run), carry, policy, n_units=n_worlds * n_steps, is_carried=True)
 
 
-def training(
+def training_case(
     algorithm: Any, n_seeds: int, n_worlds: int, device_options: dict[str, Any], small_size: int | None
 ) -> Case:
     """Return iterations of a training of ``hover``, all of its seeds."""
@@ -272,15 +277,15 @@ def training(
     shardings = learner_shardings(shapes, base.sim, n_seeds)
     learner = jax.jit(algorithm.init, static_argnums=(0, 1), out_shardings=shardings)(env, recipes, keys)
     iterate = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(shardings, replicated))
-    work = n_seeds * n_worlds * recipe.n_steps
-    return compile_case(iterate, learner, work=work, carries=True, static=(env, recipes))
+    n_units = n_seeds * n_worlds * recipe.n_steps
+    return compile_case(iterate, learner, n_units=n_units, is_carried=True, static=(env, recipes))
 
 
-def gradient(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
+def gradient_case(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
     """Return gradients of distances after some steps with respect to attitude commands."""
     n_steps = small_size or 100
     sim = Sim(n_worlds, control="attitude", **device_options)
-    hovering(sim, "attitude")
+    start_hovering(sim, "attitude")
     step, zeros = sim.build_step_fn(), sim.step_fn.zeros(sim.data)
 
     def distance(cmd: Any, start: Any) -> Any:
@@ -288,26 +293,26 @@ def gradient(n_worlds: int, device_options: dict[str, Any], small_size: int | No
         return jnp.sum((end.states.pos - start.states.pos) ** 2)
 
     cmd = 1.01 * sim.data.controls.attitude.staged_cmd
-    return compile_case(jax.jit(jax.grad(distance)), cmd, sim.data, work=n_worlds * n_steps)
+    return compile_case(jax.jit(jax.grad(distance)), cmd, sim.data, n_units=n_worlds * n_steps)
 
 
-def depth(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
+def depth_case(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
     """Return depth images of a drone amid 30 movable poles, rays."""
     size = (small_size, small_size) if small_size else IMAGE
     sim = Sim(n_worlds, control="attitude", **device_options)
     pos = np.zeros((30, 3))
     pos[:, :2] = np.random.default_rng(0).uniform(-10, 10, (30, 2))
     sim.scene.add("pole", count=30, pos=pos, mocap=True)
-    hovering(sim, "attitude")
+    start_hovering(sim, "attitude")
     take_image = sim.scene.depth_fn("fpv_cam", *size)
-    return compile_case(jax.jit(lambda data: take_image(data).distance), sim.data, work=n_worlds * size[0] * size[1])
+    return compile_case(jax.jit(lambda data: take_image(data).distance), sim.data, n_units=n_worlds * size[0] * size[1])
 
 
 def trained_weights(devices: list[jax.Device], small: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of a policy before and after three iterations of PPO."""
     device_options = {"device": devices[0], "mesh": world_mesh(devices) if len(devices) > 1 else None}
     with jax.default_matmul_precision("highest"):  # a GPU would round the products of each order of sums to 10 bits
-        case = training(ppo, 1, 256 if small else 16384, device_options, 4 if small else None)
+        case = training_case(ppo, 1, 256 if small else 16384, device_options, 4 if small else None)
     learner = case.arguments[0]
     weights = [learner.agents.policy]
     for _ in range(3):
@@ -318,17 +323,17 @@ def trained_weights(devices: list[jax.Device], small: bool) -> tuple[np.ndarray,
 
 
 CASES: dict[str, tuple[Callable[..., Case], Size]] = {
-    "physics": (physics, Size(4194304, 64, "steps")),
-    "hover, random actions": (partial(rollouts, "hover", False), Size(1048576, 64, "environment steps")),
-    "hover, policy": (partial(rollouts, "hover", True), Size(1048576, 64, "environment steps")),
-    "race, random actions": (partial(rollouts, "race", False), Size(1048576, 64, "environment steps")),
-    "race, policy": (partial(rollouts, "race", True), Size(1048576, 64, "environment steps")),
-    "PPO": (partial(training, ppo, 1), Size(262144, 64, "environment steps")),
-    "analytic policy gradients": (partial(training, apg, 1), Size(16384, 64, "environment steps")),
-    "gradient": (gradient, Size(131072, 64, "steps")),
-    "depth": (depth, Size(16384, 8, "rays")),
-    "seeds": (partial(training, ppo, N_SEEDS), Size(16384, 16, "environment steps")),
-    "seeds, recipe": (partial(training, ppo, N_SEEDS), Size(1024, 16, "environment steps")),
+    "physics": (physics_case, Size(4194304, 64, "steps")),
+    "hover, random actions": (partial(rollout_case, "hover", False), Size(1048576, 64, "environment steps")),
+    "hover, policy": (partial(rollout_case, "hover", True), Size(1048576, 64, "environment steps")),
+    "race, random actions": (partial(rollout_case, "race", False), Size(1048576, 64, "environment steps")),
+    "race, policy": (partial(rollout_case, "race", True), Size(1048576, 64, "environment steps")),
+    "PPO": (partial(training_case, ppo, 1), Size(262144, 64, "environment steps")),
+    "analytic policy gradients": (partial(training_case, apg, 1), Size(16384, 64, "environment steps")),
+    "gradient": (gradient_case, Size(131072, 64, "steps")),
+    "depth": (depth_case, Size(16384, 8, "rays")),
+    "seeds": (partial(training_case, ppo, N_SEEDS), Size(16384, 16, "environment steps")),
+    "seeds, recipe": (partial(training_case, ppo, N_SEEDS), Size(1024, 16, "environment steps")),
 }
 """Cases by name: function that builds one, and its size."""
 

@@ -5,8 +5,8 @@
 
 An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training; every line
 contains the fraction of worlds whose episode ends per step. With ``--randomize`` the same rollouts with
-``Randomize.crazyflie()`` are timed in turn with them. With ``--depth`` the policies receive a depth image of each
-drone's camera at every environment step, too. ``training`` times the iterations of ``crazysim train`` by PPO, rollout
+``Randomize.crazyflie()`` are timed alternately. With ``--depth`` the policies also receive a depth image of each
+drone's camera at every environment step. ``training`` times the iterations of ``crazysim train`` by PPO, rollout
 and updates, without compilation and evaluation; its batches grow with the number of worlds.
 """
 
@@ -19,7 +19,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from measure import digits, engine_name, medians, report
+from measure import engine_name, medians, report, round_digits
 
 import crazysim.envs as envs
 from crazysim import Randomize
@@ -31,8 +31,8 @@ from crazysim.train.networks import Policy, init_mlp
 
 MAX_DEPTH = 5.0
 """Largest distance that a policy receives, m."""
-ACTIONS = ("random", "policy", "bfloat16")
-SIZES = {"cpu": (1024, 16384), "gpu": (4096, 65536, 1048576)}
+DEFAULT_ACTIONS = ("random", "policy", "bfloat16")
+DEFAULT_WORLDS = {"cpu": (1024, 16384), "gpu": (4096, 65536, 1048576)}
 
 
 def main() -> None:
@@ -42,17 +42,21 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, nargs="+", help="numbers of worlds")
     parser.add_argument("--steps", type=int, default=50, help="environment steps per call")
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--randomize", action="store_true", help="time the same with Randomize.crazyflie() in turn")
+    parser.add_argument(
+        "--randomize", action="store_true", help="also time the same with Randomize.crazyflie(), alternately"
+    )
     parser.add_argument("--depth", type=int, nargs=2, help="width and height of images that the policies receive")
-    parser.add_argument("--actions", nargs="+", default=ACTIONS, choices=(*ACTIONS, "training"), help="what is timed")
+    parser.add_argument(
+        "--actions", nargs="+", default=DEFAULT_ACTIONS, choices=(*DEFAULT_ACTIONS, "training"), help="what is timed"
+    )
     args = parser.parse_args()
     for task in args.tasks:
-        for n_worlds in args.worlds or SIZES["cpu" if args.device == "cpu" else "gpu"]:
+        for n_worlds in args.worlds or DEFAULT_WORLDS["cpu" if args.device == "cpu" else "gpu"]:
             sizes = task, n_worlds, args.steps, args.device, args.repeats
-            rollouts(*sizes, args.randomize, args.depth, args.actions)
+            report_rates(*sizes, args.randomize, args.depth, args.actions)
 
 
-def rollouts(
+def report_rates(
     task: str,
     n_worlds: int,
     n_steps: int,
@@ -64,65 +68,65 @@ def rollouts(
 ) -> None:
     """Print the rates of rollouts and of training."""
     base = envs.make(task, n_worlds, device=device)
-    places = {"as the airframe": envs.AutoReset(base)}
+    env_by_drones = {"as the airframe": envs.AutoReset(base)}
     if randomize:
         randomized_env = envs.make(task, n_worlds, device=device, effects=[Randomize.crazyflie()])
-        places["randomized"] = envs.AutoReset(randomized_env)
+        env_by_drones["randomized"] = envs.AutoReset(randomized_env)
     env_device = base.sim.device
     key = jax.device_put(jax.random.key(0), env_device)
-    starts = {drones: jax.jit(env.reset)(key) for drones, env in places.items()}
+    starts = {drones: jax.jit(env.reset)(key) for drones, env in env_by_drones.items()}
     n_obs = flatten(starts["as the airframe"].obs).shape[-1] + (size[0] * size[1] if size else 0)
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
     policy = jax.device_put(policy, env_device)
 
     shape = starts["as the airframe"].action.shape
 
-    def flying(policy: Policy) -> Any:
+    def act_with_noise(policy: Policy) -> Any:
         return lambda obs, memory, key: (policy(obs) + 0.1 * jax.random.normal(key, shape), memory, ())
 
-    def figures(step: Any) -> Any:
+    def summarize_transition(step: Any) -> Any:
         return step.reward.mean(), step.done.mean()
 
     def rollout_with_images(env: Any, state: Any, act: Any, key: Any) -> Any:
-        """Return what a rollout does for a policy that also gets images, which no observation of a task has."""
+        """Return the results of a rollout of a policy that also gets depth images."""
         render = base.sim.scene.depth_fn("fpv_cam", *size)  # type: ignore[misc]
 
         def step(state: Any, key: Any) -> Any:
             depth = jnp.minimum(render(state.data).distance, MAX_DEPTH)
             action, _, _ = act({**state.obs, "depth": depth.reshape(*depth.shape[:2], -1)}, (), key)
             state = env.step(state, action)
-            return state, figures(state)
+            return state, summarize_transition(state)
 
         return jax.lax.scan(step, state, jax.random.split(key, n_steps))
 
-    def jitted(env: Any, act: Any) -> Any:
+    def jit_rollout(env: Any, act: Any) -> Any:
         def run(carry: Any) -> Any:
             state, key = carry
             key, step_key = jax.random.split(key)
             if size:
                 state, outputs = rollout_with_images(env, state, act, step_key)
             else:
-                state, _, outputs = envs.rollout(env, state, act, step_key, n_steps, figures)
+                state, _, outputs = envs.rollout(env, state, act, step_key, n_steps, summarize_transition)
             return (state, key), outputs
 
         return jax.jit(run)
 
-    acts = {
+    act_functions = {
         "random": lambda obs, memory, key: (jax.random.uniform(key, shape, minval=-0.3, maxval=0.3), memory, ()),
-        "policy": flying(policy),
-        "bfloat16": flying(policy.replace(layers=jax.tree.map(lambda x: x.astype("bfloat16"), policy.layers))),
+        "policy": act_with_noise(policy),
+        "bfloat16": act_with_noise(policy.replace(layers=jax.tree.map(lambda x: x.astype("bfloat16"), policy.layers))),
     }
     recipe = TrainConfig.create(task, "ppo", n_worlds=n_worlds).algorithm_config()
     for name in actions:
         measures: dict[str, Any] = {}
-        compile_s, lasts = {}, {}
-        for drones, env in places.items():
+        compile_s, last_results = {}, {}
+        for drones, env in env_by_drones.items():
             if name == "training":
                 carry = ppo.init(env, (recipe,), key[None])
                 lowered = ppo.iterate.lower(carry, env, (recipe,))
             else:
                 carry = (starts[drones], jax.device_put(jax.random.key(2), env_device))
-                lowered = jitted(env, acts[name]).lower(carry)
+                lowered = jit_rollout(env, act_functions[name]).lower(carry)
             start_time = time.perf_counter()
             run = lowered.compile()
             compile_s[drones] = time.perf_counter() - start_time
@@ -136,10 +140,12 @@ def rollouts(
                 jax.block_until_ready(results)
                 return time.perf_counter() - start_time
 
-            measures[drones], lasts[drones] = measure, results
+            measures[drones], last_results[drones] = measure, results
         steps = recipe.n_steps if name == "training" else n_steps
         for drones, seconds in medians(measures, repeats).items():
-            ended_share = {} if name == "training" else {"ended": digits(float(jnp.mean(lasts[drones][1][1])))}
+            ended_share = (
+                {} if name == "training" else {"ended": round_digits(float(jnp.mean(last_results[drones][1][1])))}
+            )
             report(
                 device,
                 benchmark="envs",
@@ -151,7 +157,7 @@ def rollouts(
                 depth=size,
                 engine=engine_name(base.sim),
                 compile_s=round(compile_s[drones], 2),
-                env_steps_per_s=digits(n_worlds * base.sim.n_drones * steps / seconds),
+                env_steps_per_s=round_digits(n_worlds * base.sim.n_drones * steps / seconds),
                 **ended_share,
             )
 

@@ -36,7 +36,7 @@ from tables import Line
 ROOT = Path(__file__).parents[1]
 STORE = ROOT / "docs" / "concepts" / "figures.json"
 MACHINE_KEYS = ("device", "processor", "vectors", "cores", "jax", "python", "date", "crazysim")
-"""Keys of lines that a record has once."""
+"""Keys of lines that a record holds once for all lines."""
 
 ENGINE = ("crazysim/engine", ":(exclude)crazysim/engine/tools")
 BASE = ("crazysim/rotation.py", "crazysim/pytree.py", "crazysim/jaxcompat.py", "crazysim/drones")
@@ -54,7 +54,7 @@ class Figure(NamedTuple):
     page: str
     """Page with the figure."""
     sources: tuple[str, ...]
-    """What the figure measures, as Git's path specifications; the script of the command is added."""
+    """Sources that the figure measures, as Git's path specifications, without the script of the command."""
     cpu: str = ""
     """Command on two cores, without ``python benchmarks/``; empty if there is none."""
     gpu: str = ""
@@ -62,13 +62,13 @@ class Figure(NamedTuple):
     table: Callable[[list[Line]], str] | None = None
     """Function that returns the Markdown of a record's lines; None where the page is written by hand."""
     commits: Callable[[], dict[str, str]] | None = None
-    """Commits of figures that a command of their own stores, by name."""
+    """Commits of figures that another command stores, by name."""
 
     def command(self, device: str) -> str:
         """Return the command for a device."""
         return self.gpu if device == "gpu" else self.cpu
 
-    def spec(self) -> tuple[str, ...]:
+    def tracked_paths(self) -> tuple[str, ...]:
         """Return the sources with the scripts of the commands."""
         scripts = {f"benchmarks/{shlex.split(command)[0]}" for command in (self.cpu, self.gpu) if command}
         return (*self.sources, *sorted(scripts))
@@ -117,7 +117,7 @@ def list_figures() -> list[str]:
 
 
 def measure(args: argparse.Namespace) -> tuple[list[Line], list[str]]:
-    """Run the commands of figures on a device, and return their records and what failed."""
+    """Run the commands of figures on a device, and return their records and messages about failures."""
     commit, records, failures = args.commit or current_commit(), [], []
     for name in args.only:
         command = FIGURES[name].command(args.device)
@@ -125,18 +125,18 @@ def measure(args: argparse.Namespace) -> tuple[list[Line], list[str]]:
             continue
         words = shlex.split(command)
         words += ["--device", "gpu"] * (args.device == "gpu")
-        shown = shlex.join(words)
+        shown_command = shlex.join(words)
         words += ["--peer-python", args.peer_python] if args.peer_python and words[0] == Path(VERSUS[0]).name else []
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-        print(f"{name}: {shown}", file=sys.stderr, flush=True)
+        print(f"{name}: {shown_command}", file=sys.stderr, flush=True)
         process = subprocess.run(
             [sys.executable, *words], cwd=ROOT / "benchmarks", env=environment, stdout=subprocess.PIPE, text=True
         )
         lines = [json.loads(text) for text in process.stdout.splitlines() if text.startswith("{")]
         if process.returncode or not lines:
-            failures.append(f"{name}: {shown} failed with status {process.returncode}; its error is above.")
+            failures.append(f"{name}: {shown_command} failed with status {process.returncode}; its error is above.")
             continue
-        records.append(record(name, shown, commit, lines))
+        records.append(record(name, shown_command, commit, lines))
         if args.records is not None:
             args.records.write_text(records_text(records))
     return records, failures
@@ -144,14 +144,14 @@ def measure(args: argparse.Namespace) -> tuple[list[Line], list[str]]:
 
 def record(name: str, command: str, commit: str, lines: list[Line]) -> Line:
     """Return the record of a figure."""
-    about = next(line for line in lines if "device" in line)
-    cores = f"{about['cores']} cores of {about['processor']} ({about['vectors']})"
+    machine_line = next(line for line in lines if "device" in line)
+    cores = f"{machine_line['cores']} cores of {machine_line['processor']} ({machine_line['vectors']})"
     return {
         "figure": name,
-        "machine": cores if about["device"] == "cpu" else about["device"],
-        "jax": about["jax"],
-        "python": about["python"],
-        "date": about["date"],
+        "machine": cores if machine_line["device"] == "cpu" else machine_line["device"],
+        "jax": machine_line["jax"],
+        "python": machine_line["python"],
+        "date": machine_line["date"],
         "commit": commit,
         "command": command,
         "lines": [{key: value for key, value in line.items() if key not in MACHINE_KEYS} for line in lines],
@@ -165,7 +165,7 @@ def current_commit() -> str:
 
 
 def git(*words: str) -> str:
-    """Return what Git prints about this repository."""
+    """Return the output of a Git command in this repository."""
     process = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True)
     if process.returncode:
         raise RuntimeError(process.stderr.strip())
@@ -221,8 +221,8 @@ def figure_tables(name: str, records: list[Line]) -> str:
     parts = []
     for record in records:
         if record["figure"] == name and table is not None:
-            about = f"jax {record['jax']}, Python {record['python']}, {record['date']}, commit {record['commit']}"
-            parts.append(f"{record['machine']} ({about}, `{record['command']}`):\n\n{table(record['lines'])}")
+            origin = f"jax {record['jax']}, Python {record['python']}, {record['date']}, commit {record['commit']}"
+            parts.append(f"{record['machine']} ({origin}, `{record['command']}`):\n\n{table(record['lines'])}")
     return "\n\n".join(parts)
 
 
@@ -236,7 +236,7 @@ def stale_records() -> list[str]:
             reports.append(f"{name}: no record")
         for machine, commit in measured:
             try:
-                paths = changed_files(commit, figure.spec())
+                paths = changed_files(commit, figure.tracked_paths())
             except RuntimeError as error:
                 reports.append(f"{name}, {machine}: {error}")
                 continue
@@ -247,7 +247,7 @@ def stale_records() -> list[str]:
 
 
 def changed_files(commit: str, spec: Iterable[str]) -> list[str]:
-    """Return the files whose code differs between a commit and the working tree, apart from new names for the same."""
+    """Return the files whose code differs between a commit and the working tree, apart from renamed names."""
     if commit.endswith("+"):
         raise RuntimeError(f"measured with changes beyond commit {commit[:-1]}")
     paths = git("diff", "--name-only", "--no-renames", commit, "--", *spec).split()
@@ -256,7 +256,7 @@ def changed_files(commit: str, spec: Iterable[str]) -> list[str]:
     old_names, new_names, renamed = defined[0] - defined[1], defined[1] - defined[0], {}
 
     def is_same(old: Iterable[str], new: Iterable[str]) -> bool:
-        """Return True if two sequences differ only in names that were defined before or after, each always by one."""
+        """Return True if two sequences differ only in defined names, each always replaced by the same one."""
         return all(x == y or (x in old_names and y in new_names and renamed.setdefault(x, y) == y)
                    for x, y in zip(old, new, strict=True))  # fmt: skip
 
@@ -275,7 +275,7 @@ def changed_files(commit: str, spec: Iterable[str]) -> list[str]:
 
 
 class Code(NamedTuple):
-    """What matters of a Python source."""
+    """Parts of a Python source that can change a measurement."""
 
     atoms: list[str]
     """Instructions, names and constants, without docstrings, annotations of functions, error messages and imports."""

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 
-from measure import machine
+from measure import describe_machine
 
 from crazysim import __version__
 from crazysim.cache import CACHE_VARIABLE
@@ -66,14 +66,14 @@ def main() -> None:
     args = parser.parse_args()
     for case in args.cases:
         with tempfile.TemporaryDirectory() as folder:
-            cold = [measure_cases(case, "off") for _ in range(args.repeat)]
+            uncached = [measure_cases(case, "off") for _ in range(args.repeat)]
             measure_cases(case, folder)
             cached = [measure_cases(case, folder) for _ in range(args.repeat)]
-        for name, runs in (("off", cold), ("on", cached)):
+        for name, runs in (("off", uncached), ("on", cached)):
             wall, cpu = map(statistics.median, zip(*runs, strict=True))
             line = {"benchmark": "first_results", "case": case, "cache": name}
             times = {"wall_s": round(wall, 2), "cpu_s": round(cpu, 2), "crazysim": __version__}
-            print(json.dumps(line | times | machine("cpu")), flush=True)
+            print(json.dumps(line | times | describe_machine("cpu")), flush=True)
 
 
 def measure_cases(case: str, cache: str) -> tuple[float, float]:

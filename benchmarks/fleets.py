@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from measure import Flight, digits, engine_name, medians, report
+from measure import Flight, engine_name, medians, report, round_digits
 
 from crazysim import Sim, __version__
 from crazysim.plugins.vehicles import Cars
@@ -39,11 +39,11 @@ def main() -> None:
                    for name, sim in (("reference", reference), ("fleet", fleet))}  # fmt: skip
         durations = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
         n_steps = args.worlds * args.drones * args.steps
-        rates = {name: digits(n_steps / seconds) for name, seconds in durations.items()}
+        rates = {name: round_digits(n_steps / seconds) for name, seconds in durations.items()}
         report(args.device, benchmark="fleets", case=case, n_worlds=args.worlds, n_drones=args.drones,
                n_cars=args.cars * (case == "cars"), n_steps=args.steps, engine=engine_name(fleet),
                drone_steps_per_s=rates,
-               ratio=digits(durations["reference"] / durations["fleet"]), crazysim=__version__)  # fmt: skip
+               ratio=round_digits(durations["reference"] / durations["fleet"]), crazysim=__version__)  # fmt: skip
 
 
 def drones(args: argparse.Namespace, own: bool = False) -> Sim:

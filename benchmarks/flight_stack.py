@@ -29,11 +29,11 @@ from crazysim.trajectories import Trajectory, figure_eight
 
 N_STEPS = 100
 """Steps per call."""
-EIGHT = (0.4, 0.2)
+FIGURE_EIGHT_SIZE = (0.4, 0.2)
 """Size of the figure eight that drones follow, m; its period is 5 s."""
 N_SLOTS, N_PIECES = 16, 60
 """Trajectories and pieces of each in the case ``slots``."""
-LOAD = {"mass": 0.0005, "length": 0.3, "in_scene": False}
+LOAD_SETTINGS = {"mass": 0.0005, "length": 0.3, "in_scene": False}
 """Settings of loads, kg and m: so light that the rotor command of a bare drone holds them up for a while."""
 
 
@@ -48,13 +48,13 @@ def main() -> None:
     args = parser.parse_args()
     references = [name for name in REFERENCES if any(CASES[case][0] == name for case in args.cases)]
     cases = dict.fromkeys([*references, *args.cases])
-    flights = {name: fly(args, name) for name in cases}
-    counts = {"operations": operations} if args.operations else {}
+    flights = {name: make_flight(args, name) for name in cases}
+    counts = {"operations": count_operations} if args.operations else {}
     reference = {name: CASES[name][0] for name in flights}
     report_flights(args.device, flights, args.repeats, reference, benchmark="flight_stack", **counts)
 
 
-def fly(args: argparse.Namespace, name: str) -> Flight:
+def make_flight(args: argparse.Namespace, name: str) -> Flight:
     """Return the compiled flight of a case."""
     reference, settings, add = CASES[name]
     sim = Sim(args.worlds, device=args.device, engine=args.engine, **settings)
@@ -63,55 +63,55 @@ def fly(args: argparse.Namespace, name: str) -> Flight:
     return Flight(sim, "rotor_vel" if reference == "rotor" else "state", N_STEPS, args.device)
 
 
-def follow(sim: Sim) -> None:
+def follow_trajectory(sim: Sim) -> None:
     """Let all drones follow one trajectory."""
-    sim.add(Follow(figure_eight(*EIGHT), visible=False))
+    sim.add(Follow(figure_eight(*FIGURE_EIGHT_SIZE), visible=False))
 
 
 def follow_from_own_starts(sim: Sim) -> None:
-    """Let all drones follow one trajectory, each from its own time on."""
-    sim.add(Follow(figure_eight(*EIGHT), start=own_starts(sim), visible=False))
+    """Let all drones follow one trajectory, each from a different time on."""
+    sim.add(Follow(figure_eight(*FIGURE_EIGHT_SIZE), start=start_times(sim), visible=False))
 
 
 def follow_slots(sim: Sim) -> None:
-    """Let the drones follow 16 trajectories of 60 pieces, each from its own time on."""
+    """Let the drones follow 16 trajectories of 60 pieces, each from a different time on."""
     coefficients = np.random.default_rng(0).normal(0.0, 0.01, (N_PIECES, 4, 8))
     coefficients[:, 2, 0] = 1.0
     pieces = Trajectory.of_pieces(np.full(N_PIECES, 0.1), coefficients)
     index = np.arange(sim.n_worlds)[:, None] % N_SLOTS
-    sim.add(Follow([pieces] * N_SLOTS, index=index, start=own_starts(sim), visible=False))
+    sim.add(Follow([pieces] * N_SLOTS, index=index, start=start_times(sim), visible=False))
 
 
-def own_starts(sim: Sim) -> np.ndarray:
+def start_times(sim: Sim) -> np.ndarray:
     """Return times at which the drones start, s. (n_worlds, 1)"""
     return np.linspace(-1.0, 0.0, sim.n_worlds)[:, None]
 
 
-def load(**settings: Any) -> Callable[[Sim], Any]:
-    """Return the function that adds a load with these settings."""
-    return lambda sim: sim.add(SlungLoad(**(LOAD | settings)))
+def load_adder(**settings: Any) -> Callable[[Sim], Any]:
+    """Return a function that adds a load with these settings to a simulation."""
+    return lambda sim: sim.add(SlungLoad(**(LOAD_SETTINGS | settings)))
 
 
-STATE: dict[str, Any] = {"control": "state"}
-ROTOR: dict[str, Any] = {"control": "rotor_vel"}
+STATE_SETTINGS: dict[str, Any] = {"control": "state"}
+ROTOR_SETTINGS: dict[str, Any] = {"control": "rotor_vel"}
 REFERENCES = ("state", "rotor")
 CASES: dict[str, tuple[str, dict[str, Any], Callable[[Sim], Any] | None]] = {
-    "state": ("state", STATE, None),
-    "follow": ("state", STATE, follow),
-    "starts": ("state", STATE, follow_from_own_starts),
-    "slots": ("state", STATE, follow_slots),
-    "geometric": ("state", STATE | {"controller": "geometric", "state_freq": 100}, follow),
-    "pid": ("state", STATE | {"controller": "pid"}, None),
-    "mellinger": ("state", STATE | {"controller": "mellinger"}, None),
-    "rotor": ("rotor", ROTOR, None),
-    "rod": ("rotor", ROTOR, load()),
-    "cable": ("rotor", ROTOR, load(cable=True)),
-    "offset": ("rotor", ROTOR, load(attach=[0.0, 0.0, -0.02], damping=1e-5)),
+    "state": ("state", STATE_SETTINGS, None),
+    "follow": ("state", STATE_SETTINGS, follow_trajectory),
+    "starts": ("state", STATE_SETTINGS, follow_from_own_starts),
+    "slots": ("state", STATE_SETTINGS, follow_slots),
+    "geometric": ("state", STATE_SETTINGS | {"controller": "geometric", "state_freq": 100}, follow_trajectory),
+    "pid": ("state", STATE_SETTINGS | {"controller": "pid"}, None),
+    "mellinger": ("state", STATE_SETTINGS | {"controller": "mellinger"}, None),
+    "rotor": ("rotor", ROTOR_SETTINGS, None),
+    "rod": ("rotor", ROTOR_SETTINGS, load_adder()),
+    "cable": ("rotor", ROTOR_SETTINGS, load_adder(cable=True)),
+    "offset": ("rotor", ROTOR_SETTINGS, load_adder(attach=[0.0, 0.0, -0.02], damping=1e-5)),
 }
-"""Reference, settings of ``Sim``, and what is added, of each case."""
+"""Reference, settings of ``Sim``, and function that adds to the simulation, of each case."""
 
 
-def operations(sim: Sim) -> dict[str, int]:
+def count_operations(sim: Sim) -> dict[str, int]:
     """Return the number of operations of each kind in the program of a step, or none if the step has no program."""
     program = sim.build_step_fn().plan(sim.data).program
     blocks = [segment.block for segment in program.segments if isinstance(segment, Segment)] if program else []

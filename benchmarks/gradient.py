@@ -1,4 +1,4 @@
-"""Gradients, and the steps that they go through: one JSON line for each command level and number of worlds.
+"""Times of gradients and of the steps that they go through: one JSON line for each command level and number of worlds.
 
     python benchmarks/gradient.py [--device gpu] [--worlds 1024 16384 131072] [--controls attitude] [--steps 100]
 
@@ -17,12 +17,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from measure import COMMANDS, digits, hovering, medians, report
+from measure import COMMANDS, medians, report, round_digits, start_hovering
 
 from crazysim import Sim, __version__
 from crazysim.core import functional
 
-BATCH = {"cpu": 1, "gpu": 10}
+BATCH_CALLS = {"cpu": 1, "gpu": 10}
 """Calls of a batch."""
 
 
@@ -42,7 +42,7 @@ def main() -> None:
 def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int) -> None:
     """Print the line of one case."""
     sim = Sim(n_worlds, control=control, device=args.device, engine=args.engine)
-    hovering(sim, control)
+    start_hovering(sim, control)
     step, initial_data = sim.build_step_fn(), sim.data
     stage_command, zeros = getattr(functional, f"{control}_control"), sim.step_fn.zeros(sim.data)
     hover = jnp.asarray(COMMANDS[control](0.0434 * 9.81, 15864.0), jnp.float32)
@@ -58,7 +58,7 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
         "jvp": jax.jit(lambda cmd: jax.jvp(distance, (cmd,), (cmd,))),
     }
     first_s = {name: seconds(fn, cmd, 1) for name, fn in functions.items()}
-    batch = BATCH["cpu" if args.device == "cpu" else "gpu"]
+    batch = BATCH_CALLS["cpu" if args.device == "cpu" else "gpu"]
     durations = medians({name: lambda fn=fn: seconds(fn, cmd, batch) for name, fn in functions.items()}, args.repeats)
     slope = functions["gradient"](cmd)
     if not (jnp.all(jnp.isfinite(slope)) and jnp.any(slope != 0)):
@@ -73,14 +73,14 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
         n_worlds=n_worlds,
         n_steps=n_steps,
         ran=[line for line in sim.explain().splitlines() if line.startswith(("gradient: ", "jvp: "))],
-        compile_s=digits(first_s["gradient"] - durations["gradient"]),
-        jvp_compile_s=digits(first_s["jvp"] - durations["jvp"]),
-        forward_s=digits(durations["forward"]),
-        gradient_s=digits(durations["gradient"]),
-        jvp_s=digits(durations["jvp"]),
-        forward_passes=digits(durations["gradient"] / durations["forward"]),
-        jvp_passes=digits(durations["jvp"] / durations["forward"]),
-        steps_per_s=digits(n_worlds * n_steps / durations["gradient"]),
+        compile_s=round_digits(first_s["gradient"] - durations["gradient"]),
+        jvp_compile_s=round_digits(first_s["jvp"] - durations["jvp"]),
+        forward_s=round_digits(durations["forward"]),
+        gradient_s=round_digits(durations["gradient"]),
+        jvp_s=round_digits(durations["jvp"]),
+        forward_passes=round_digits(durations["gradient"] / durations["forward"]),
+        jvp_passes=round_digits(durations["jvp"] / durations["forward"]),
+        steps_per_s=round_digits(n_worlds * n_steps / durations["gradient"]),
         crazysim=__version__,
     )
 

@@ -1,6 +1,6 @@
 """Lower bound of the time of each case on this machine, and the measured time relative to it.
 
-The lower bound is the larger of two times: for the operations at the rate of multiply-adds measured here through
+The lower bound is the larger of two n_copies: for the operations at the rate of multiply-adds measured here through
 the same engine, and for the data, with each number that a call reads or writes moved once at the bandwidth of a
 copy measured here. Both rates are the best of all repeats; the measured time is a median. Data that fits into a cache
 may move faster than the copy, which does not fit.
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from measure import Flight, digits, engine_name, medians, report, seconds
+from measure import Flight, engine_name, medians, report, round_digits, seconds
 
 from crazysim import PyTree, Sim, __version__, leaf
 from crazysim.core.stage import stage
@@ -32,10 +32,10 @@ from crazysim.engine.ir.ops import TABLE
 COPY_SIZES = {"cpu": 2**26, "gpu": 2**28}
 """Number of float32 in the copy that measures the bandwidth, larger than any cache."""
 
-WORLDS = {"cpu": 2**14, "gpu": 2**20}
+DEFAULT_WORLDS = {"cpu": 2**14, "gpu": 2**20}
 """Number of drones, and default number of worlds, that fill every core."""
 
-CHAINS, LENGTH = 8, 32
+N_CHAINS, CHAIN_LENGTH = 8, 32
 """Number of independent chains of multiply-adds, and their length in one step."""
 
 
@@ -43,7 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", nargs="+", default=["auto"], choices=ENGINES)
-    parser.add_argument("--worlds", type=int, nargs="+", help=f"by default {WORLDS}")
+    parser.add_argument("--worlds", type=int, nargs="+", help=f"by default {DEFAULT_WORLDS}")
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])
     parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"])
     parser.add_argument("--steps", type=int, nargs="+", default=[100], help="physics steps per call")
@@ -52,11 +52,11 @@ def main() -> None:
     platform = "cpu" if args.device == "cpu" else "gpu"
     machine = Machine(
         bytes_per_s=copy_bandwidth(args.device, COPY_SIZES[platform], args.repeats),
-        multiply_adds_per_s=arithmetic_rate(args.device, WORLDS[platform], args.repeats),
+        multiply_adds_per_s=arithmetic_rate(args.device, DEFAULT_WORLDS[platform], args.repeats),
     )
-    figures = {name: digits(value) for name, value in machine._asdict().items()}
-    report(args.device, benchmark="limits/machine", engine=fastest(args.device), **figures, crazysim=__version__)
-    worlds = args.worlds or [WORLDS[platform]]
+    figures = {name: round_digits(value) for name, value in machine._asdict().items()}
+    report(args.device, benchmark="limits/machine", engine=fastest_engine(args.device), **figures, crazysim=__version__)
+    worlds = args.worlds or [DEFAULT_WORLDS[platform]]
     for case in itertools.product(args.controls, args.integrators, worlds, args.steps, args.engine):
         measure(args, machine, *case)
 
@@ -78,8 +78,8 @@ def measure(
     flight = Flight(sim, control, n_steps, args.device)
     measured = medians({"step": flight.seconds}, args.repeats)["step"]
     flight.require_flying()
-    each_step, each_call, n_bytes = work(sim)
-    arithmetic = n_worlds * (each_step * n_steps + each_call) / machine.multiply_adds_per_s
+    step_operations, call_operations, n_bytes = count_work(sim)
+    arithmetic = n_worlds * (step_operations * n_steps + call_operations) / machine.multiply_adds_per_s
     memory = n_worlds * n_bytes / machine.bytes_per_s
     report(
         args.device,
@@ -89,18 +89,18 @@ def measure(
         integrator=integrator,
         n_worlds=n_worlds,
         n_steps=n_steps,
-        operations_a_step=round(each_step),
+        operations_a_step=round(step_operations),
         bytes_a_call=n_bytes,
-        arithmetic_s=digits(arithmetic),
-        memory_s=digits(memory),
-        floor_s=digits(max(arithmetic, memory)),
-        measured_s=digits(measured),
+        arithmetic_s=round_digits(arithmetic),
+        memory_s=round_digits(memory),
+        floor_s=round_digits(max(arithmetic, memory)),
+        measured_s=round_digits(measured),
         ratio=round(measured / max(arithmetic, memory), 2),
         crazysim=__version__,
     )
 
 
-def work(sim: Sim) -> tuple[float, float, int]:
+def count_work(sim: Sim) -> tuple[float, float, int]:
     """Return the multiply-adds of one drone per step, those per call, and the bytes that a call reads and writes.
 
     The program is taken from ``lanes`` with one world, whichever engine runs.
@@ -114,30 +114,32 @@ def work(sim: Sim) -> tuple[float, float, int]:
     if program.unfused_stages:
         stage = program.unfused_stages[0]
         raise SystemExit(f"{stage.explanation}; its operations cannot be counted. Remove the stage.")
-    often = sim.control_freq / sim.freq  # the one condition in the built-in pipelines is the state controller's rate
-    each_step = sum(operations(segment.block, often) for segment in program.fused_segments)
+    when_rate = (
+        sim.control_freq / sim.freq
+    )  # the one condition in the built-in pipelines is the state controller's rate
+    step_operations = sum(count_operations(segment.block, when_rate) for segment in program.fused_segments)
     blocks = [s.hoisted for s in program.fused_segments] + (
         [program.check_segment.block] if program.check_segment else []
     )
-    each_call = sum(operations(block, often) for block in blocks)
+    call_operations = sum(count_operations(block, when_rate) for block in blocks)
     batched = [i for i, leaf in enumerate(program.leaves) if leaf.scope in ("drone", "world")]
     sizes = {i: program.leaves[i].size * program.leaves[i].number_type.itemsize for i in batched}
     read_numbers, written_numbers = (
         sum(sizes[i] for i in batched if i in leaves) for leaves in (program.read_leaves, program.written_leaves)
     )
-    return each_step, each_call, read_numbers + written_numbers
+    return step_operations, call_operations, read_numbers + written_numbers
 
 
-def operations(block: Block, often: float) -> float:
+def count_operations(block: Block, when_rate: float) -> float:
     """Return the operations of a block in multiply-adds; conditional blocks count with their frequency."""
-    total = -float(_contracted(block))
+    total = -float(_count_contracted(block))
     for op in block.operations:
-        turns = {"when": often, "loop": dict(op.params).get("length", 1)}.get(op.name, 1)
-        total += TABLE[op.name].cost + turns * sum(operations(inner, often) for inner in op.blocks)
+        count = {"when": when_rate, "loop": dict(op.params).get("length", 1)}.get(op.name, 1)
+        total += TABLE[op.name].cost + count * sum(count_operations(inner, when_rate) for inner in op.blocks)
     return total
 
 
-def _contracted(block: Block) -> int:
+def _count_contracted(block: Block) -> int:
     """Return the number of products that are contracted with a sum, at most one per sum."""
     users: dict[Value, list[Operation]] = {}
     for op in block.walk():
@@ -160,38 +162,38 @@ def copy_bandwidth(device: str, size: int, repeats: int) -> float:
     """Return the bandwidth of an in-place copy, bytes read and written per second."""
     copy = jax.jit(lambda x: x + 1, donate_argnums=0)
     x = jax.device_put(jnp.zeros(size, jnp.float32), jax.devices(device)[0])
-    times = 10
+    n_copies = 10
 
     def run() -> jax.Array:
         nonlocal x
-        for _ in range(times):
+        for _ in range(n_copies):
             x = copy(x)
         return x
 
     seconds(run)
-    return 2 * x.nbytes * times / min(seconds(run) for _ in range(repeats))
+    return 2 * x.nbytes * n_copies / min(seconds(run) for _ in range(repeats))
 
 
 class Chain(PyTree):
     """State of the chains of multiply-adds."""
 
     x: Array = leaf("drone", 1)
-    """Current value of each chain. (n_worlds, n_drones, CHAINS)"""
+    """Current value of each chain. (n_worlds, n_drones, N_CHAINS)"""
 
 
 @stage("drone")
 def multiply_adds(data: Any) -> Any:
-    """Advance every chain by ``LENGTH`` dependent multiply-adds."""
-    items = [data.plugins["chain"].x[k] for k in range(CHAINS)]
-    for _ in range(LENGTH):
-        items = [0.99 * x + 0.01 for x in items]
-    return data.replace(plugins={"chain": Chain(jnp.stack(items))})
+    """Advance every chain by ``CHAIN_LENGTH`` dependent multiply-adds."""
+    values = [data.plugins["chain"].x[k] for k in range(N_CHAINS)]
+    for _ in range(CHAIN_LENGTH):
+        values = [0.99 * x + 0.01 for x in values]
+    return data.replace(plugins={"chain": Chain(jnp.stack(values))})
 
 
 def arithmetic_rate(device: str, n_worlds: int, repeats: int, n_steps: int = 1000) -> float:
     """Return the multiply-adds per second of a pipeline that does nothing else, on the fastest engine."""
-    sim = Sim(n_worlds, device=device, engine=fastest(device))
-    sim.data = sim.data.replace(plugins={"chain": Chain(jnp.zeros((n_worlds, 1, CHAINS)))})
+    sim = Sim(n_worlds, device=device, engine=fastest_engine(device))
+    sim.data = sim.data.replace(plugins={"chain": Chain(jnp.zeros((n_worlds, 1, N_CHAINS)))})
     sim.step_pipeline = {"multiply_adds": multiply_adds}
     sim.build_step_fn()
 
@@ -200,10 +202,10 @@ def arithmetic_rate(device: str, n_worlds: int, repeats: int, n_steps: int = 100
         return sim.data.plugins["chain"].x
 
     seconds(run)
-    return n_worlds * n_steps * CHAINS * LENGTH / min(seconds(run) for _ in range(repeats))
+    return n_worlds * n_steps * N_CHAINS * CHAIN_LENGTH / min(seconds(run) for _ in range(repeats))
 
 
-def fastest(device: str) -> str:
+def fastest_engine(device: str) -> str:
     """Return the engine that reaches the arithmetic rate of the machine."""
     return "lanes" if fused.unavailable_reason("cpu" if device == "cpu" else "gpu") else "fused"
 

@@ -19,7 +19,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from measure import digits, report
+from measure import report, round_digits
 
 from crazysim import Sim
 from crazysim.lab.live import Browser, Live
@@ -57,22 +57,22 @@ def measure(case: str, n_drones: int, seconds: float) -> None:
         case=case,
         n_drones=n_drones,
         seconds=seconds,
-        factor=digits(result.factor),
-        pictures_per_s=digits(result.pictures / result.wall_s),
+        factor=round_digits(result.factor),
+        pictures_per_s=round_digits(result.pictures / result.wall_s),
         late=result.late,
-        lateness_999_ms=digits(1e3 * result.lateness_999),
-        worst_ms=digits(1e3 * result.worst),
+        lateness_999_ms=round_digits(1e3 * result.lateness_999),
+        worst_ms=round_digits(1e3 * result.worst),
     )
 
 
 def show_to_client(live: Live) -> None:
     """Show a simulation in a page that one client reads in a thread."""
     page = live.show(Browser(port=0))
-    threading.Thread(target=read, args=(page.url,), daemon=True).start()
+    threading.Thread(target=read_page, args=(page.url,), daemon=True).start()
 
 
-def read(url: str) -> Any:
-    """Read what the server of a page sends, as a browser does, and discard it."""
+def read_page(url: str) -> Any:
+    """Read and discard the messages of a page's server, as a browser would."""
     from viser import __version__
     from websockets.sync.client import connect
     from websockets.typing import Subprotocol

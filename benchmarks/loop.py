@@ -2,9 +2,9 @@
 
     python benchmarks/loop.py [--device gpu] [--worlds 1 64 1024 16384] [--controls state attitude]
 
-One JSON line for each command level and number of worlds, with the median time of an iteration and the shortest. Then
-JAX's share: the sum of as many positions and one, compiled, read into NumPy. The last line is the loop of C MuJoCo and
-one free box: set its force, take 5 steps with ``mj_step``, read its position.
+One JSON line for each command level and number of worlds, with the median time of an iteration and the shortest. The
+next lines show the share of JAX: one compiled addition to as many positions, read into NumPy. The last line is the loop
+of C MuJoCo with one free box: set its force, take 5 steps with ``mj_step``, read its position.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from collections.abc import Callable
 import jax
 import mujoco
 import numpy as np
-from measure import hovering, report, still_flies
+from measure import is_flying, report, start_hovering
 
 from crazysim import Sim
 
-STEPS = 5
+N_STEPS = 5
 """Physics steps per command: 100 commands per second at 500 Hz."""
-ITERATIONS = 50
+N_ITERATIONS = 50
 """Iterations of a repeat, 0.5 s of flight."""
 
 
@@ -36,49 +36,49 @@ def main() -> None:
     args = parser.parse_args()
     for control, n_worlds in itertools.product(args.controls, args.worlds):
         sim = Sim(n_worlds, control=control, device=args.device)
-        hovering(sim, control)
+        start_hovering(sim, control)
         initial_data, command = sim.data, np.asarray(getattr(sim.data.controls, control).staged_cmd)
-        setter = getattr(sim, f"{control}_control")
+        send_command = getattr(sim, f"{control}_control")
 
         def reset(sim: Sim = sim, initial_data=initial_data) -> None:
             sim.data = initial_data
 
-        def iterate(sim: Sim = sim, command=command, setter=setter) -> None:
-            setter(command)
-            sim.step(STEPS)
+        def iterate(sim: Sim = sim, command=command, send_command=send_command) -> None:
+            send_command(command)
+            sim.step(N_STEPS)
             np.asarray(sim.data.states.pos)
 
         times = measure_times(reset, iterate, args.repeats)
-        if not still_flies(sim):
+        if not is_flying(sim):
             raise RuntimeError("the drones crashed; a crashed drone costs less to simulate")
-        realtime = STEPS / sim.freq * n_worlds / times["iteration_s"]
+        realtime = N_STEPS / sim.freq * n_worlds / times["iteration_s"]
         report(args.device, benchmark="loop", control=control, n_worlds=n_worlds, **times, realtime=realtime)
     for n_worlds in args.worlds:
         report(
             args.device,
             benchmark="loop/jax",
             n_worlds=n_worlds,
-            **measure_times(*sum_with_one(args.device, n_worlds), args.repeats),
+            **measure_times(*jax_loop(args.device, n_worlds), args.repeats),
         )
-    report("cpu", benchmark="loop/mj_step", n_worlds=1, **measure_times(*free_box(), args.repeats))
+    report("cpu", benchmark="loop/mj_step", n_worlds=1, **measure_times(*mujoco_loop(), args.repeats))
 
 
 def measure_times(reset: Callable[[], None], iterate: Callable[[], None], repeats: int) -> dict[str, float]:
-    """Return the median and the shortest time of an iteration, s, of some repeats that each start anew."""
+    """Return the median and the shortest time of an iteration, s, over repeats that each begin with a reset."""
     reset()
     iterate()
     times = []
     for _ in range(repeats):
         reset()
-        for _ in range(ITERATIONS):
+        for _ in range(N_ITERATIONS):
             start_time = time.perf_counter()
             iterate()
             times.append(time.perf_counter() - start_time)
     return {"iteration_s": float(np.median(times)), "shortest_s": min(times)}
 
 
-def sum_with_one(device: str, n_worlds: int) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return the start and the iteration of a loop that computes next to nothing, and reads as many positions."""
+def jax_loop(device: str, n_worlds: int) -> tuple[Callable[[], None], Callable[[], None]]:
+    """Return the reset and the iteration of a loop that adds one to as many positions and reads them."""
     positions = jax.device_put(np.zeros((n_worlds, 1, 3), np.float32), jax.devices(device)[0])
     plus_one = jax.jit(lambda x: x + 1.0)
 
@@ -88,8 +88,8 @@ def sum_with_one(device: str, n_worlds: int) -> tuple[Callable[[], None], Callab
     return iterate, iterate
 
 
-def free_box() -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return the start and the iteration of a loop of C MuJoCo: one box that hovers by the force on it."""
+def mujoco_loop() -> tuple[Callable[[], None], Callable[[], None]]:
+    """Return the reset and the iteration of a loop of C MuJoCo with one box that a force holds up."""
     text = '<mujoco><worldbody><body><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>'
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
@@ -97,7 +97,7 @@ def free_box() -> tuple[Callable[[], None], Callable[[], None]]:
 
     def iterate() -> None:
         data.xfrc_applied[1, :3] = force
-        mujoco.mj_step(model, data, STEPS)
+        mujoco.mj_step(model, data, N_STEPS)
         data.qpos[:3].copy()
 
     return lambda: mujoco.mj_resetData(model, data), iterate

@@ -31,11 +31,11 @@ COMMANDS = {
 BATCH_STEPS = {"cpu": 100, "gpu": 1000}
 """Steps after which the flight restarts; hovering without a position controller drifts by 7 cm in 1,000 steps."""
 
-PATIENCE = 60.0
+REPEATS_TIME_LIMIT = 60.0
 """Duration after which three repeats are enough, s."""
 
 
-def hovering(sim: Any, control: str) -> None:
+def start_hovering(sim: Any, control: str) -> None:
     """Place every drone of a simulation of either program at 1 m with hovering rotors, and command it to hover.
 
     A weight of 0.0434 kg * 9.81 m/s^2 needs 15,864 rpm of each of four rotors by the thrust curve of the airframe.
@@ -51,7 +51,7 @@ def hovering(sim: Any, control: str) -> None:
     getattr(sim, f"{control}_control")(command)
 
 
-def still_flies(sim: Any) -> bool:
+def is_flying(sim: Any) -> bool:
     """Return True if every drone is still flying near its start."""
     pos = np.asarray(sim.data.states.pos)
     return bool(np.all(np.isfinite(pos)) and pos[..., 2].min() > 0.5 and pos[..., 2].max() < 2.0)
@@ -71,24 +71,24 @@ class Flight:
 
     def __init__(self, sim: Any, control: str, n_steps: int, device: str):
         """Make the drones hover, and step once, which compiles."""
-        hovering(sim, control)
-        self.sim, self.n_steps, self.start = sim, n_steps, sim.data
-        self.queued = device != "cpu"
-        self.calls = max(BATCH_STEPS["gpu" if self.queued else "cpu"] // n_steps, 1)
+        start_hovering(sim, control)
+        self.sim, self.n_steps, self.start_data = sim, n_steps, sim.data
+        self.is_queued = device != "cpu"
+        self.n_calls = max(BATCH_STEPS["gpu" if self.is_queued else "cpu"] // n_steps, 1)
         self.first_s = seconds(self._step)
         self.seconds()  # Crazyflow compiles a second time for data that a step returned; no figure includes that
 
     def seconds(self) -> float:
         """Return the time of one call in a batch, s."""
-        self.sim.data = self.start
+        self.sim.data = self.start_data
         jax.block_until_ready(self.sim.data.states.pos)
         start_time = time.perf_counter()
-        for _ in range(self.calls):
+        for _ in range(self.n_calls):
             pos = self._step()
-            if not self.queued:
+            if not self.is_queued:
                 jax.block_until_ready(pos)
         jax.block_until_ready(self.sim.data.states.pos)
-        return (time.perf_counter() - start_time) / self.calls
+        return (time.perf_counter() - start_time) / self.n_calls
 
     def require_flying(self) -> None:
         """Check that the drones still fly.
@@ -96,7 +96,7 @@ class Flight:
         Raises:
             SystemExit: If one does not.
         """
-        if not still_flies(self.sim):
+        if not is_flying(self.sim):
             raise SystemExit(f"{self.sim.control}, {self.sim.integrator}: the drones do not fly any more; no figure")
 
     def _step(self) -> Any:
@@ -116,7 +116,7 @@ def medians(measures: dict[Any, Callable[[], float]], repeats: int) -> dict[Any,
     durations: dict[Any, list[float]] = {name: [] for name in measures}
     start_time = time.perf_counter()
     for n_done in range(repeats):
-        if n_done >= 3 and time.perf_counter() - start_time > PATIENCE:
+        if n_done >= 3 and time.perf_counter() - start_time > REPEATS_TIME_LIMIT:
             break
         for name, measure in measures.items():
             durations[name].append(measure())
@@ -149,11 +149,11 @@ def report_flights(
             engine=engine_name(sim),
             n_worlds=sim.n_worlds,
             n_drones=sim.n_drones,
-            first_s=digits(flight.first_s),
-            call_s=digits(durations[name]),
-            steps_per_s=digits(sim.n_worlds * sim.n_drones * flight.n_steps / durations[name]),
+            first_s=round_digits(flight.first_s),
+            call_s=round_digits(durations[name]),
+            steps_per_s=round_digits(sim.n_worlds * sim.n_drones * flight.n_steps / durations[name]),
             reference=reference,
-            ratio=digits(durations[name] / durations[reference]),
+            ratio=round_digits(durations[name] / durations[reference]),
             **{key: value(sim) if callable(value) else value for key, value in line.items()},
         )
 
@@ -164,17 +164,17 @@ def run_in_process(function: Any, *args: Any) -> Any:
         return pool.submit(function, *args).result()
 
 
-def digits(value: float, n: int = 3) -> float:
+def round_digits(value: float, n: int = 3) -> float:
     """Return a number rounded to its significant digits."""
     return float(f"{value:.{n}g}")
 
 
 def report(device: str, **line: Any) -> None:
     """Print one JSON line with the results and the machine."""
-    print(json.dumps(line | machine(device)), flush=True)
+    print(json.dumps(line | describe_machine(device)), flush=True)
 
 
-def machine(device: str) -> dict[str, Any]:
+def describe_machine(device: str) -> dict[str, Any]:
     """Return device, processor and versions."""
     return {
         "device": "cpu" if device == "cpu" else jax.devices(device)[0].device_kind,

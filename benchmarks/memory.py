@@ -18,7 +18,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from measure import digits, machine
+from measure import describe_machine, round_digits
 
 from crazysim.commands.training import parse_seeds
 from crazysim.envs import make
@@ -51,7 +51,7 @@ def main() -> None:
     options: dict[str, Any] = {"randomize": "generic", "device": args.device}
     options |= {} if args.seconds is None else {"seconds": args.seconds}
     sets: dict[str, dict[str, Any]] = {"drawn": options} | {drone: options | {"drone": drone} for drone in AIRFRAMES}
-    about = machine(args.device)
+    machine_facts = describe_machine(args.device)
     for task in args.tasks:
         envs = {name: make(task, args.starts, **env_options) for name, env_options in sets.items()}
         for variant in args.variants:
@@ -71,13 +71,13 @@ def main() -> None:
             )
             for seed, result in zip(args.seeds, results.values(), strict=True):
                 line = {"benchmark": "memory", "task": task, "variant": variant, "seed": seed, "starts": args.starts}
-                line |= {name: digits(result.metrics[name]) for name in ("env_steps", "seconds")}
+                line |= {name: round_digits(result.metrics[name]) for name in ("env_steps", "seconds")}
                 for name, env in envs.items():
                     metrics = evaluate(env, result.policy)
                     line[name] = {
-                        x: digits(metrics[x]) for x in ("success", "crashed", "error") if metrics[x] == metrics[x]
+                        x: round_digits(metrics[x]) for x in ("success", "crashed", "error") if metrics[x] == metrics[x]
                     }
-                print(json.dumps(line | about), flush=True)
+                print(json.dumps(line | machine_facts), flush=True)
 
 
 if __name__ == "__main__":

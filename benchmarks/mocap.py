@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import jax
 import numpy as np
-from measure import digits, report
+from measure import report, round_digits
 
 from crazysim import Sim
 from crazysim.lab.live.mocap import FunctionSource, RealTimeSource, Twin, Twins
@@ -78,10 +78,10 @@ def measure(n_objects: int, freq: float, seconds: float) -> None:
         freq=freq,
         frames=twins.tracker.n_frames - len(frames),
         lost=twins.reports.count("overrun"),
-        frame_ms=digits(1e3 * float(np.median(rules))),
-        frame_p99_ms=digits(1e3 * float(np.percentile(rules, 99))),
-        update_ms=digits(1e3 * float(np.median(updates))),
-        update_p99_ms=digits(1e3 * float(np.percentile(updates, 99))),
+        frame_ms=round_digits(1e3 * float(np.median(rules))),
+        frame_p99_ms=round_digits(1e3 * float(np.percentile(rules, 99))),
+        update_ms=round_digits(1e3 * float(np.median(updates))),
+        update_p99_ms=round_digits(1e3 * float(np.percentile(updates, 99))),
     )
 
 

@@ -1,9 +1,9 @@
-"""Commands per second of sampling model-predictive control for one drone, each of one compiled call.
+"""Commands per second of sampling model-predictive control for one drone, with one compiled call per command.
 
     python benchmarks/mppi.py [--device gpu] [--samples 1024 16384] [--horizon 50] [--substeps 2] [--knots 10]
 
 A command flies all samples over the horizon from the present state, weights them, and returns the first command of the
-new plan. On a GPU the state stays there, and every command is waited for.
+new plan. On a GPU the state stays on the device, and the program waits for every command.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import argparse
 
 import jax
 import jax.numpy as jnp
-from measure import digits, hovering, medians, report, seconds
+from measure import medians, report, round_digits, seconds, start_hovering
 
 from crazysim import Sim
 from crazysim.control import Setpoint
 from crazysim.sim.mppi import MPPI
 
-SAMPLES = {"cpu": (1024,), "gpu": (16384,)}
+DEFAULT_SAMPLES = {"cpu": (1024,), "gpu": (16384,)}
 
 
 def main() -> None:
@@ -32,14 +32,14 @@ def main() -> None:
     parser.add_argument("--freq", type=int, default=125, help="physics steps per second of the rollouts")
     parser.add_argument("--repeats", type=int, default=50)
     args = parser.parse_args()
-    for samples in args.samples or SAMPLES["cpu" if args.device == "cpu" else "gpu"]:
-        commands(samples, args)
+    for samples in args.samples or DEFAULT_SAMPLES["cpu" if args.device == "cpu" else "gpu"]:
+        report_rate(samples, args)
 
 
-def commands(samples: int, args: argparse.Namespace) -> None:
+def report_rate(samples: int, args: argparse.Namespace) -> None:
     """Print the rate of commands."""
     sim = Sim(control=args.control, device=args.device)
-    hovering(sim, args.control)
+    start_hovering(sim, args.control)
     settings = {"substeps": args.substeps, "knots": args.knots, "freq": args.freq}
     mppi = MPPI(sim, args.horizon, samples, **settings)
     zero, no_feedforward = jnp.zeros(3), jnp.zeros(1)
@@ -57,7 +57,7 @@ def commands(samples: int, args: argparse.Namespace) -> None:
         knots=args.knots,
         engine=mppi.engine,
         compile_s=round(compile_s, 2),
-        commands_per_s=digits(1 / command_s),
+        commands_per_s=round_digits(1 / command_s),
     )
 
 

@@ -1,4 +1,4 @@
-"""Cost of sensors, estimators and effects: time of a step with each over that without, one JSON line each.
+"""Cost of sensors, estimators and effects: time of a step with each of them over the time without, one JSON line each.
 
     python benchmarks/plugins.py [--device gpu] [--worlds 262144] [--drones 2] [--cases imu kalman everything ...]
 
@@ -35,26 +35,27 @@ from crazysim.plugins.estimators import ESKF, Complementary, Estimator
 
 N_STEPS = 100
 """Steps per call."""
-CORNERS = np.array([[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]])
+ANCHOR_POSITIONS = np.array([[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]])
 """Positions of anchors, m."""
-STATIONS = [[-2, -2, 2.5], [2, 2, 2.5]], [[0, 0.5, 0.8], [0, 0.5, -2.4]]
+LIGHTHOUSE_POSES = [[-2, -2, 2.5], [2, 2, 2.5]], [[0, 0.5, 0.8], [0, 0.5, -2.4]]
 """Positions, m, and roll, pitch and yaw, rad, of lighthouses."""
 SPACING = 3.0
 """Distance between drones of a world, m."""
-Build = Callable[[], Sequence[Plugin]]
+MakePlugins = Callable[[], Sequence[Plugin]]
+"""Function that returns new plugins."""
 
 
 def _with_estimator(estimator: Estimator) -> list[Plugin]:
     return [*estimator.sensors, estimator]
 
 
-SENSORS: dict[str, Build] = {
+SENSORS: dict[str, MakePlugins] = {
     "imu": lambda: [sensors.IMU.crazyflie()],
     "motion_capture": lambda: [sensors.MotionCapture(1e-3, 1e-3)],
     "optical_flow": lambda: [sensors.OpticalFlow(0.2)],
     "time_of_flight": lambda: [sensors.TimeOfFlight()],
-    "uwb": lambda: [sensors.UWB(CORNERS, 0.1)],
-    "lighthouse": lambda: [sensors.Lighthouse(*STATIONS, 1e-3)],
+    "uwb": lambda: [sensors.UWB(ANCHOR_POSITIONS, 0.1)],
+    "lighthouse": lambda: [sensors.Lighthouse(*LIGHTHOUSE_POSES, 1e-3)],
     "barometer": lambda: [sensors.Barometer(1.0)],
     "magnetometer": lambda: [sensors.Magnetometer((0.0, 2e-5, -4.5e-5), sensors.Triad(noise=5e-7))],
     "gps": lambda: [sensors.GPS(0.5)],
@@ -63,7 +64,7 @@ SENSORS: dict[str, Build] = {
     "multi_ranger": lambda: [RangeFinder(freq=10), sensors.MultiRanger(0.01)],
 }
 """Plugins of each kind of sensor."""
-EFFECTS: dict[str, Build] = {
+EFFECTS: dict[str, MakePlugins] = {
     "wind": lambda: [Wind((1.0, 0.0, 0.0), 7.7)],
     "downwash": lambda: [Downwash()],
     "ground_effect": lambda: [GroundEffect()],
@@ -83,15 +84,15 @@ def _all_aids() -> list[Plugin]:
 
 def _all_plugins() -> list[Plugin]:
     aids = [*SENSORS["imu"](), *SENSORS["motion_capture"]()]
-    others = [plugin for name in (*SENSORS, *EFFECTS) if name not in EXCLUDED for plugin in CASES[name]()]
+    others = [plugin for name in (*SENSORS, *EFFECTS) if name not in NOT_IN_EVERYTHING for plugin in CASES[name]()]
     return [*others, *aids, Kalman(aids)]  # type: ignore[arg-type]
 
 
-OUTDOORS = ("imu", "gps", "barometer", "magnetometer")
+OUTDOOR_SENSORS = ("imu", "gps", "barometer", "magnetometer")
 """Cases of the sensors of ``outdoors``."""
-EXCLUDED = ("imu", "motion_capture", "battery", "rotor_aerodynamics", "randomize")
-"""Cases that ``everything`` has otherwise (sensors of the filter, the battery of its voltage), or lacks."""
-CASES: dict[str, Build] = {
+NOT_IN_EVERYTHING = ("imu", "motion_capture", "battery", "rotor_aerodynamics", "randomize")
+"""Cases that ``everything`` leaves out, or adds in another way: sensors with the filter, battery with its voltage."""
+CASES: dict[str, MakePlugins] = {
     "none": lambda: [],
     **SENSORS,
     "imu_vibration": lambda: [sensors.IMU.bmi088(imbalance=1e-8)],
@@ -101,7 +102,7 @@ CASES: dict[str, Build] = {
     ),
     "kalman": lambda: _with_estimator(Kalman.default()),
     "eskf": lambda: _with_estimator(ESKF.default()),
-    "outdoors": lambda: _with_estimator(ESKF([s for name in OUTDOORS for s in SENSORS[name]()])),  # type: ignore[misc]
+    "outdoors": lambda: _with_estimator(ESKF([s for name in OUTDOOR_SENSORS for s in SENSORS[name]()])),  # type: ignore[misc]
     "all_aids": _all_aids,
     **EFFECTS,
     "everything": _all_plugins,

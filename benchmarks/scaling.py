@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from measure import Flight, digits, engine_name, machine, medians, run_in_process
+from measure import Flight, describe_machine, engine_name, medians, round_digits, run_in_process
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
@@ -85,11 +85,11 @@ def measure(case: dict[str, Any], n_steps: int, device: str, repeats: int) -> di
     return {
         "engine": engine_name(sim),
         "compile_s": round(flight.first_s - step_s, 2),
-        "call_s": digits(step_s),
-        "steps_per_s": digits(n_worlds * n_drones * n_steps / step_s),
+        "call_s": round_digits(step_s),
+        "steps_per_s": round_digits(n_worlds * n_drones * n_steps / step_s),
         "bytes_a_world": bytes_a_world(sim),
         "crazysim": __version__,
-        **machine(device),
+        **describe_machine(device),
     }
 
 
@@ -99,8 +99,13 @@ def bytes_a_world(sim: Sim) -> int:
     return sum(x.nbytes for scope, x in pairs if scope in ("drone", "world")) // sim.n_worlds
 
 
-SERIES = {"worlds": ("n_worlds", "worlds of one drone"), "drones": ("n_drones", "drones a world")}
-MARKS = {"plain": ("#9a6a3a", "s"), "lanes": ("#2b7a78", "o"), "fused": ("#c1443c", "^"), "auto": ("#555555", "D")}
+SERIES_AXES = {"worlds": ("n_worlds", "worlds of one drone"), "drones": ("n_drones", "drones a world")}
+ENGINE_STYLES = {
+    "plain": ("#9a6a3a", "s"),
+    "lanes": ("#2b7a78", "o"),
+    "fused": ("#c1443c", "^"),
+    "auto": ("#555555", "D"),
+}
 
 
 def plot(lines: list[dict[str, Any]], path: Path) -> None:
@@ -112,15 +117,15 @@ def plot(lines: list[dict[str, Any]], path: Path) -> None:
 
     lines = [line for line in lines if "steps_per_s" in line]
     controls = list(dict.fromkeys(line["control"] for line in lines))
-    plotted_series = [series for series in SERIES if any(line["series"] == series for line in lines)]
+    plotted_series = [series for series in SERIES_AXES if any(line["series"] == series for line in lines)]
     quantities = {"steps_per_s": "drone steps per second", "compile_s": "compile time, s"}
     figure, grid = plt.subplots(
         len(quantities), len(plotted_series), figsize=(5 * len(plotted_series), 7), squeeze=False
     )
     for row, (quantity, label) in zip(grid, quantities.items(), strict=True):
         for axes, series in zip(row, plotted_series, strict=True):
-            size, name = SERIES[series]
-            for engine, (colour, mark) in MARKS.items():
+            size, name = SERIES_AXES[series]
+            for engine, (colour, mark) in ENGINE_STYLES.items():
                 for control, style in zip(controls, ("-", "--", ":", "-.", (0, (1, 3))), strict=False):
                     selection = {"series": series, "engine": engine, "control": control}
                     points = [(line[size], line[quantity]) for line in lines if line.items() >= selection.items()]

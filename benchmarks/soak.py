@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from live import show_to_client
-from measure import digits, report
+from measure import report, round_digits
 from mocap import circling_bodies
 
 from crazysim import Sim
@@ -66,17 +66,17 @@ def measure(seconds: float, n_drones: int, n_objects: int) -> None:
         n_drones=n_drones,
         n_objects=n_objects,
         seconds=seconds,
-        factor=digits(result.factor),
+        factor=round_digits(result.factor),
         memory_mb=[round(memory_bytes[0]), round(memory_bytes[-1])],
-        growth_mb_per_hour=digits(3600 * np.polyfit(times, memory_bytes, 1)[0]),
+        growth_mb_per_hour=round_digits(3600 * np.polyfit(times, memory_bytes, 1)[0]),
         frames=twins.tracker.n_frames,
         frames_lost=twins.reports.count("overrun"),
-        pictures_per_s=digits(result.pictures / result.wall_s),
-        recorded_mb=digits(1e-6 * recorded),
+        pictures_per_s=round_digits(result.pictures / result.wall_s),
+        recorded_mb=round_digits(1e-6 * recorded),
         late=result.late,
-        lateness_999_ms=digits(1e3 * result.lateness_999),
-        worst_ms=digits(1e3 * result.worst),
-        lost_s=digits(result.lost_s),
+        lateness_999_ms=round_digits(1e3 * result.lateness_999),
+        worst_ms=round_digits(1e3 * result.worst),
+        lost_s=round_digits(result.lost_s),
         failures=result.failures,
     )
 

@@ -15,7 +15,7 @@ import itertools
 
 import jax
 import jax.numpy as jnp
-from measure import Flight, digits, engine_name, medians, report
+from measure import Flight, engine_name, medians, report, round_digits
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
@@ -63,8 +63,8 @@ def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: i
                 randomised=args.randomised,
                 drag=not args.no_drag,
                 compile_s=compile_s.setdefault(case, round(flight.first_s - durations[case], 2)),
-                call_s=digits(durations[case]),
-                steps_per_s=digits(n_worlds * n_drones * n_steps / durations[case]),
+                call_s=round_digits(durations[case]),
+                steps_per_s=round_digits(n_worlds * n_drones * n_steps / durations[case]),
                 crazysim=__version__,
             )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from measure import digits
+from measure import round_digits
 
 Line = dict[str, Any]
 """JSON line of a benchmark, or record of a figure."""
@@ -50,18 +50,18 @@ def worlds_of(line: Line) -> str:
     return f"{line['n_worlds']:,}"
 
 
-def si(value: float) -> str:
+def si_text(value: float) -> str:
     """Return a number with three digits and a prefix, such as ``46.2 G``."""
-    value, k = digits(value), 0
+    value, k = round_digits(value), 0
     while value >= 1000 and k < 3:
-        value, k = digits(value / 1000), k + 1
+        value, k = round_digits(value / 1000), k + 1
     return f"{value:g} {' kMG'[k]}".strip()
 
 
-def duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a duration with three digits and its unit."""
     factor, unit = next(((f, u) for f, u in ((1, "s"), (1e3, "ms"), (1e6, "us")) if seconds * f >= 1), (1e9, "ns"))
-    return f"{digits(seconds * factor):g} {unit}"
+    return f"{round_digits(seconds * factor):g} {unit}"
 
 
 def loops(lines: list[Line]) -> str:
@@ -69,8 +69,8 @@ def loops(lines: list[Line]) -> str:
 
     def time_of(line: Line) -> str:
         if "ratio" in line:
-            return f"{duration(line['crazysim_call_s'])}, {digits(line['ratio'], 2):g}"
-        return duration(line["iteration_s"])
+            return f"{duration_text(line['crazysim_call_s'])}, {round_digits(line['ratio'], 2):g}"
+        return duration_text(line["iteration_s"])
 
     names = {"loop/jax": "a compiled sum, read", "loop/mj_step": "C MuJoCo, one box"}
 
@@ -85,16 +85,16 @@ def versus(lines: list[Line]) -> str:
     return columns(
         Commands=case_of,
         Worlds=worlds_of,
-        crazysim=lambda x: si(x["crazysim_steps_per_s"]),
-        Crazyflow=lambda x: si(x["crazyflow_steps_per_s"]),
-        Ratio=lambda x: f"{digits(x['ratio'], 2):g}",
+        crazysim=lambda x: si_text(x["crazysim_steps_per_s"]),
+        Crazyflow=lambda x: si_text(x["crazyflow_steps_per_s"]),
+        Ratio=lambda x: f"{round_digits(x['ratio'], 2):g}",
         Compilation=lambda x: f"{x['crazysim_compile_s']:.2g} s, Crazyflow {x['crazyflow_compile_s']:.2g} s",
     )(lines)
 
 
 def rates(lines: list[Line]) -> str:
     """Return steps per second by case and number of worlds."""
-    return pivot(lines, case_of, worlds_of, lambda x: si(x["steps_per_s"]), "Commands, worlds")
+    return pivot(lines, case_of, worlds_of, lambda x: si_text(x["steps_per_s"]), "Commands, worlds")
 
 
 def gradients(lines: list[Line]) -> str:
@@ -102,7 +102,7 @@ def gradients(lines: list[Line]) -> str:
     return columns(
         Commands=lambda x: LEVELS[x["control"]],
         Worlds=worlds_of,
-        Steps_per_second=lambda x: si(x["n_worlds"] * x["n_steps"] / x["gradient_s"]),
+        Steps_per_second=lambda x: si_text(x["n_worlds"] * x["n_steps"] / x["gradient_s"]),
         Over_steps_alone=lambda x: f"{x['forward_passes']:.2g}",
         Forward_mode_over_steps_alone=lambda x: f"{x['jvp_passes']:.2g}",
         First_gradient_compiles_in=lambda x: f"{x['compile_s']:.2g} s",
@@ -119,7 +119,7 @@ def env_rates(lines: list[Line]) -> str:
         drawn = ", `Randomize.crazyflie()`" if line["drones"] == "randomized" else ""
         return f"`{line['task']}`, {names[line['actions']]}{image}{drawn}"
 
-    return pivot(lines, row_of, worlds_of, lambda x: si(x["env_steps_per_s"]), "Environment steps/s, worlds")
+    return pivot(lines, row_of, worlds_of, lambda x: si_text(x["env_steps_per_s"]), "Environment steps/s, worlds")
 
 
 def queries(lines: list[Line]) -> str:
@@ -135,13 +135,13 @@ def queries(lines: list[Line]) -> str:
         name = line["benchmark"].partition("/")[2]
         if name == "memory":
             key, label = "bytes_per_world", f"memory of a world, drones: {line['n_drones']}"
-            ours, theirs = (f"{digits(line[f'{x}_{key}'] / 1000):g} kB" for x in ("crazysim", "crazyflow"))
-            return [label, ours, theirs, f"{digits(1 / line['ratio'], 2):g}"]
+            ours, theirs = (f"{round_digits(line[f'{x}_{key}'] / 1000):g} kB" for x in ("crazysim", "crazyflow"))
+            return [label, ours, theirs, f"{round_digits(1 / line['ratio'], 2):g}"]
         return [
             names[name],
-            duration(line["crazysim_s"]),
-            duration(line["crazyflow_s"]),
-            f"{digits(line['ratio'], 2):g}",
+            duration_text(line["crazysim_s"]),
+            duration_text(line["crazyflow_s"]),
+            f"{round_digits(line['ratio'], 2):g}",
         ]
 
     return table_of(["", "crazysim", "Crazyflow", "Crazyflow over crazysim"], [row_of(line) for line in lines])
@@ -155,14 +155,14 @@ def poles_of(line: Line) -> str:
 depths = columns(
     Poles=poles_of,
     Image=lambda x: f"{x['width']} x {x['height']}, {x['n_worlds']:,} worlds",
-    Rays_per_second=lambda x: si(x["rays_per_s"]),
-    First_image=lambda x: duration(x["first_s"]),
+    Rays_per_second=lambda x: si_text(x["rays_per_s"]),
+    First_image=lambda x: duration_text(x["first_s"]),
 )
 range_finders = columns(
     Poles=poles_of,
     Worlds=worlds_of,
-    One_step=lambda x: duration(1e-6 * x["step_us"]),
-    First_step=lambda x: duration(x["first_s"]),
+    One_step=lambda x: duration_text(1e-6 * x["step_us"]),
+    First_step=lambda x: duration_text(x["first_s"]),
 )
 
 
@@ -172,15 +172,15 @@ def costs(lines: list[Line]) -> str:
         Case=lambda x: f"`{x['case']}`",
         Time_over_reference=lambda x: f"{x['ratio']:.3g}",
         Reference=lambda x: f"`{x['reference']}`",
-        Steps_per_second=lambda x: si(x["steps_per_s"]),
-        First_call=lambda x: duration(x["first_s"]),
+        Steps_per_second=lambda x: si_text(x["steps_per_s"]),
+        First_call=lambda x: duration_text(x["first_s"]),
     )(lines)
 
 
 coupled = columns(
     Drones_per_world=lambda x: str(x["n_drones"]),
-    with_downwash=lambda x: si(x["steps_per_s"]["downwash"]),
-    without=lambda x: si(x["steps_per_s"]["uncoupled"]),
+    with_downwash=lambda x: si_text(x["steps_per_s"]["downwash"]),
+    without=lambda x: si_text(x["steps_per_s"]["uncoupled"]),
 )
 fleets = columns(
     Fleet=lambda x: {
@@ -188,13 +188,13 @@ fleets = columns(
         "airframes": "two airframes, over one with parameters per drone",
     }[x["case"]],
     Worlds=worlds_of,
-    Rate_of_the_drones=lambda x: f"{digits(x['ratio'], 2):g}",
+    Rate_of_the_drones=lambda x: f"{round_digits(x['ratio'], 2):g}",
 )
-vehicles = columns(Case=lambda x: f"`{x['case']}`", Steps_per_second=lambda x: si(x["steps_per_s"]))
+vehicles = columns(Case=lambda x: f"`{x['case']}`", Steps_per_second=lambda x: si_text(x["steps_per_s"]))
 commands = columns(
     Samples=lambda x: f"{x['samples']:,}",
-    Commands_per_second=lambda x: si(x["commands_per_s"]),
-    Compilation=lambda x: duration(x["compile_s"]),
+    Commands_per_second=lambda x: si_text(x["commands_per_s"]),
+    Compilation=lambda x: duration_text(x["compile_s"]),
 )
 live = columns(
     Case=lambda x: f"`{x['case']}`, {x['n_drones']} drones",
@@ -267,7 +267,7 @@ def control(lines: list[Line]) -> str:
 def control_rates(lines: list[Line]) -> str:
     """Return the ratios of the rates of the controllers to the rate of ``crazyflow``."""
     rate_by_controller = {line["controller"]: line["steps_per_s"] for line in lines if "steps_per_s" in line}
-    cells = [f"{rate / rate_by_controller['crazyflow']:.2f} ({si(rate)})" for rate in rate_by_controller.values()]
+    cells = [f"{rate / rate_by_controller['crazyflow']:.2f} ({si_text(rate)})" for rate in rate_by_controller.values()]
     return table_of([f'`"{name}"`' for name in rate_by_controller], [cells])
 
 
@@ -283,8 +283,8 @@ def trainers(lines: list[Line]) -> str:
     return columns(
         Worlds=worlds_of,
         Trainer=lambda x: f"{names[x['trainer']]} {x['version']}" + (f", torch {x['torch']}" if "torch" in x else ""),
-        Environment_steps_a_second=lambda x: si(x["env_steps_per_s"]),
-        Training_without_compilation=lambda x: f"{si(x['env_steps'])} steps in {duration(x['seconds'])}",
+        Environment_steps_a_second=lambda x: si_text(x["env_steps_per_s"]),
+        Training_without_compilation=lambda x: f"{si_text(x['env_steps'])} steps in {duration_text(x['seconds'])}",
         Success_of_each_seed=lambda x: ", ".join(f"{success:.1%}" for success in x["success"]),
     )(lines)
 
@@ -306,48 +306,52 @@ def readme(records: list[Line]) -> str:
 
     def span(values: Iterable[float]) -> str:
         """Return the least and the largest number, of two digits."""
-        found = sorted(digits(value, 2) for value in values)
-        return f"{found[0]:g} to {found[-1]:g}" if found else ""
+        ordered_values = sorted(round_digits(value, 2) for value in values)
+        return f"{ordered_values[0]:g} to {ordered_values[-1]:g}" if ordered_values else ""
 
     def join_rates(values: Iterable[str]) -> str:
         return " and ".join(values)
 
-    auto, same = {"control": "attitude", "controller": "auto"}, {"control": "attitude", "controller": "crazyflow"}
+    auto, crazyflow_control = (
+        {"control": "attitude", "controller": "auto"},
+        {"control": "attitude", "controller": "crazyflow"},
+    )
     euler = {"integrator": "euler"}
-    most_envs = {"cpu": 16384, "gpu": 1048576}
-    most = {"cpu": ("versus", "crazysim_steps_per_s", 16384), "gpu": ("step", "steps_per_s", 4194304)}
+    largest_n_worlds = {"cpu": 16384, "gpu": 1048576}
+    largest_case = {"cpu": ("versus", "crazysim_steps_per_s", 16384), "gpu": ("step", "steps_per_s", 4194304)}
 
     def steps(device: str, case: Line) -> str:
-        name, key, n_worlds = most[device]
-        return join_rates(si(x[key]) for x in lines_of(name, device, n_worlds=n_worlds, **case, **euler))
+        name, key, n_worlds = largest_case[device]
+        return join_rates(si_text(x[key]) for x in lines_of(name, device, n_worlds=n_worlds, **case, **euler))
 
     def gym(device: str) -> str:
         return join_rates(
-            si(x["n_worlds"] * x["n_steps"] / x["crazysim_s"])
+            si_text(x["n_worlds"] * x["n_steps"] / x["crazysim_s"])
             for x in lines_of("queries", device, benchmark="versus_crazyflow/gym")
         )
 
     rows = {
         "one iteration of a script (attitude command, 5 steps, read), 64 and 1,024 worlds": lambda device: join_rates(
-            duration(x.get("crazysim_call_s") or x["iteration_s"])
+            duration_text(x.get("crazysim_call_s") or x["iteration_s"])
             for n in (64, 1024)
             for x in lines_of("loop", device, n_worlds=n, control="attitude")
             if x.get("controller", "auto") == "auto"
         ),
-        "the same, 1 to 16,384 worlds: Crazyflow 0.4.0's time over ours, same control": lambda device: span(
-            x["ratio"] for x in lines_of("loop", device, **same)
+        "the crazyflow_control, 1 to 16,384 worlds: Crazyflow 0.4.0's time over ours, same control": lambda device: (
+            span(x["ratio"] for x in lines_of("loop", device, **crazyflow_control))
         ),
         "physics steps per second, attitude commands, the default controller": lambda device: steps(device, auto),
-        "the same with Crazyflow's control": lambda device: steps(device, same),
+        "the same with Crazyflow's control": lambda device: steps(device, crazyflow_control),
         "physics steps per second: ours over Crazyflow 0.4.0's, same control": lambda device: span(
-            x["ratio"] for x in lines_of("versus", device, **same, **euler)
+            x["ratio"] for x in lines_of("versus", device, **crazyflow_control, **euler)
         ),
         "gradient of 100 steps of 1,024 worlds: Crazyflow 0.4.0's time over ours": lambda device: span(
-            x["ratio"] for x in lines_of("gradient-versus", device, **same)
+            x["ratio"] for x in lines_of("gradient-versus", device, **crazyflow_control)
         ).partition(" to ")[0],
         "environment steps per second through Gymnasium, 4,096 worlds": gym,
         "environment steps per second in compiled rollouts": lambda device: join_rates(
-            si(x["env_steps_per_s"]) for x in lines_of("envs", device, actions="random", n_worlds=most_envs[device])
+            si_text(x["env_steps_per_s"])
+            for x in lines_of("envs", device, actions="random", n_worlds=largest_n_worlds[device])
         ),
     }
     return table_of(head, [[name, cells("cpu"), cells("gpu")] for name, cells in rows.items()])
@@ -367,12 +371,12 @@ def devices(lines: list[Line]) -> str:
     rows = []
     for name, case in cases.items():
         last = case[max(column for column in case if column[0] == 1)]
-        rates = [si(case[column]["rate"]) if column in case else "" for column in columns]
+        rates = [si_text(case[column]["rate"]) if column in case else "" for column in columns]
         sizes = sum(last["exchanged"].values()), last["memory_bytes"]
-        exchanged, memory = (f"{x} B" if x < 1000 else f"{si(x)}B" for x in sizes)
+        exchanged, memory = (f"{x} B" if x < 1000 else f"{si_text(x)}B" for x in sizes)
         worlds = f"{worlds_of(last)} a {'seed' if name.startswith('seeds') else 'device'}"
         ratios = [f"{line['ratio']:.3g}" for (n_hosts, n), line in sorted(case.items()) if n_hosts == 1 and n > 1]
-        facts = [", ".join(ratios), exchanged, memory, duration(last["compile_s"])]
+        facts = [", ".join(ratios), exchanged, memory, duration_text(last["compile_s"])]
         rows.append([f"{name}, {last['unit']} a second", worlds, *rates, *facts])
     text = table_of(["", "Worlds", *names, "Ratios", "Bytes", "Memory", "Compile time"], rows)
     for line in lines:

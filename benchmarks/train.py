@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import digits, machine, run_in_process
+from measure import describe_machine, round_digits, run_in_process
 
 import crazysim
 from crazysim.commands.training import parse_seeds
@@ -54,7 +54,7 @@ TABLE = Path(__file__).parents[1] / "docs" / "concepts" / "training-results.json
 PAGE = TABLE.with_suffix(".md")
 """The page that shows the table, between two comments."""
 TABLE_START, TABLE_END = "<!-- table of benchmarks/train.py -->", "<!-- end of the table -->"
-STARTS = 1000
+N_STARTS = 1000
 """Held-out starts of an evaluation of ``crazysim train``."""
 TABLE_COLUMNS = ("task", "seed", "success", "diverged", "crashed", "error", "seconds")
 """Entries of a result that are printed."""
@@ -95,12 +95,14 @@ def main() -> None:
         missing_keys = [key for key in keys if key not in results]
         print(json.dumps({"finished": len(results), "to_train": len(missing_keys)}), flush=True)
         groups = group_runs(missing_keys, args.together)
-        about = {"sources": source, "commit": args.commit, "parallel": min(args.parallel, max(len(groups), 1))}
+        run_info = {"sources": source, "commit": args.commit, "parallel": min(args.parallel, max(len(groups), 1))}
         if missing_keys:
-            about |= run_in_process(machine, args.device)  # in this process it would hold memory of the device
-            cores = f"{about['cores']} cores of {about['processor']}"
-            about["machine"] = cores if about["device"] == "cpu" else about["device"]
-        failures = train_all(groups, args.out, store, about, results)
+            run_info |= run_in_process(
+                describe_machine, args.device
+            )  # in this process it would hold memory of the device
+            cores = f"{run_info['cores']} cores of {run_info['processor']}"
+            run_info["machine"] = cores if run_info["device"] == "cpu" else run_info["device"]
+        failures = train_all(groups, args.out, store, run_info, results)
 
     finished = {task: [results[key] for key in keys if key[0] == task and key in results] for task in tasks}
     rows = [make_row(runs) for runs in finished.values() if runs]
@@ -140,12 +142,12 @@ def read_results(store: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
     return {(x["task"], x["seed"], x["on"], *x["arguments"]): x for x in results}
 
 
-def group_runs(keys: list[tuple[Any, ...]], largest: int) -> list[list[tuple[Any, ...]]]:
-    """Return the runs to train in groups of at most ``largest`` that differ only in the seed, the longest first."""
+def group_runs(keys: list[tuple[Any, ...]], max_size: int) -> list[list[tuple[Any, ...]]]:
+    """Return the runs to train in groups of at most ``max_size`` that differ only in the seed, the longest first."""
     groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
     for key in keys:
         groups.setdefault((key[0], *key[2:]), []).append(key)
-    parts = [group[i : i + largest] for group in groups.values() for i in range(0, len(group), largest)]
+    parts = [group[i : i + max_size] for group in groups.values() for i in range(0, len(group), max_size)]
 
     def n_samples(part: list[tuple[Any, ...]]) -> int:
         recipe = find_recipe(part[0][0])
@@ -158,14 +160,14 @@ def train_all(
     groups: list[list[tuple[Any, ...]]],
     out: Path,
     store: Path,
-    about: dict[str, Any],
+    run_info: dict[str, Any],
     results: dict[Any, dict[str, Any]],
 ) -> list[str]:
     """Train each group, add the results of successful trainings to ``results`` and its file, and return failures."""
     failures = []
     out.mkdir(parents=True, exist_ok=True)
-    with ThreadPoolExecutor(about["parallel"]) as pool:
-        runs = {pool.submit(train, group, out, about): group for group in groups}
+    with ThreadPoolExecutor(run_info["parallel"]) as pool:
+        runs = {pool.submit(train, group, out, run_info): group for group in groups}
         try:
             for run in as_completed(runs):
                 task, _, device, *arguments = runs[run][0]
@@ -177,7 +179,9 @@ def train_all(
                     print(json.dumps({"task": task, "seeds": seeds, "failed": str(error)}), flush=True)
                     continue
                 for key, result in zip(runs[run], new_results, strict=True):
-                    results[key] = {"task": task, "seed": key[1], "on": device, "arguments": arguments} | result | about
+                    results[key] = (
+                        {"task": task, "seed": key[1], "on": device, "arguments": arguments} | result | run_info
+                    )
                     with store.open("a") as file:
                         file.write(json.dumps(results[key]) + "\n")
                     print(json.dumps({name: results[key][name] for name in TABLE_COLUMNS}), flush=True)
@@ -192,13 +196,13 @@ def run_folder(out: Path, task: str, seeds: str, device: str, *arguments: str) -
     return out / re.sub(r"[^A-Za-z0-9_.-]+", "_", "-".join([task, device, seeds, *arguments]))
 
 
-def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
+def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> list[dict[str, Any]]:
     """Train some seeds of a task in a new process and return the results of each.
 
     Args:
         group: Task, seed, device and further arguments of ``crazysim train`` for each run; only the seeds differ.
         out: Folder of the runs.
-        about: Hash of the sources, and the number of processes that run at the same time.
+        run_info: Hash of the sources, and the number of processes that run at the same time.
 
     Raises:
         RuntimeError: If the training fails, with the end of its output.
@@ -207,15 +211,15 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
     seeds = ",".join(str(key[1]) for key in group)
     folder = run_folder(out, task, seeds, device, *arguments)
     sources_file = folder / "sources.txt"
-    is_same = sources_file.exists() and sources_file.read_text() == about["sources"]
+    is_same = sources_file.exists() and sources_file.read_text() == run_info["sources"]
     if not is_same:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        sources_file.write_text(about["sources"])
+        sources_file.write_text(run_info["sources"])
     command = [sys.executable, "-P", "-m", "crazysim", "train", task, "--seeds", seeds, "--out", str(folder)]
     command += ["--resume"] if (folder / CHECKPOINT_FILE).exists() else []  # of a training that was interrupted
     # By default each process would take three quarters of the memory of a GPU.
-    environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if about["parallel"] > 1 else {}) | os.environ
+    environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if run_info["parallel"] > 1 else {}) | os.environ
     # The same package as here, whatever the folder in which this runs.
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(PACKAGE.parent), os.environ.get("PYTHONPATH")]))
     log, start_time = folder.with_name(f"{folder.name}.log"), time.perf_counter()
@@ -233,7 +237,7 @@ def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> lis
     algorithm = next(iter(stored_configs(folder).values())).algorithm
     diverged = {row["seed"]: row["diverged"] for row in json.loads((folder / SEEDS_TABLE_FILE).read_text())}
     results = [read_result(folder / f"seed-{key[1]}", diverged[key[1]]) for key in group]
-    shared = {"algorithm": algorithm, "wall_s": digits(wall_s), "together": len(group)}
+    shared = {"algorithm": algorithm, "wall_s": round_digits(wall_s), "together": len(group)}
     return [result | shared for result in results]
 
 
@@ -252,13 +256,13 @@ def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
         "success": round(point["success"], 4) if diverged is None else 0.0,
         "diverged": diverged,
         "crashed": round(point["crashed"], 4),
-        "error": digits(point["error"]) if point["error"] == point["error"] else None,
+        "error": round_digits(point["error"]) if point["error"] == point["error"] else None,
         "kept_iteration": point["iteration"],
         "env_steps": last_point["env_steps"],
-        "seconds": digits(last_point["seconds"]),
-        "compile_seconds": digits(last_point["compile_seconds"]),
-        "seconds_to_95_percent": None if seconds_to_95_percent is None else digits(seconds_to_95_percent),
-        "curve": [[digits(p["seconds"]), round(p["success"], 4)] for p in curve],
+        "seconds": round_digits(last_point["seconds"]),
+        "compile_seconds": round_digits(last_point["compile_seconds"]),
+        "seconds_to_95_percent": None if seconds_to_95_percent is None else round_digits(seconds_to_95_percent),
+        "curve": [[round_digits(p["seconds"]), round(p["success"], 4)] for p in curve],
     }
 
 
@@ -274,9 +278,9 @@ def make_row(runs: list[dict[str, Any]]) -> dict[str, Any]:
         "least": min(success),
         "tenth": round(float(np.quantile(success, 0.1)), 4),
         "median": round(statistics.median(success), 4),
-        "error": digits(statistics.median(errors)) if errors else None,
+        "error": round_digits(statistics.median(errors)) if errors else None,
         "unit": entry_of(runs[0]["task"]).task.unit,
-        "seconds": digits(statistics.median(run["seconds"] for run in runs)),
+        "seconds": round_digits(statistics.median(run["seconds"] for run in runs)),
     }
     row |= {name: max(run.get(name, 1) for run in runs) for name in ("parallel", "together")}
     return row | {name: ", ".join(sorted({run[name] for run in runs})) for name in ("commit", "date", "machine", "jax")}
@@ -305,11 +309,11 @@ def table_markdown(rows: list[dict[str, Any]]) -> str:
         diverged = f"; diverged: {', '.join(map(str, row['diverged']))}" if "diverged" in row else ""
         cells = (
             f"`{row['task']}`",
-            f"{names[row['algorithm']]}, {digits(row['env_steps'] / 1e6, 2):g} M",
+            f"{names[row['algorithm']]}, {round_digits(row['env_steps'] / 1e6, 2):g} M",
             (f"{seeds[0]} to {seeds[-1]}" if is_range else ", ".join(map(str, seeds))) + diverged,
             f"{row['least']:.1%}",
             f"{row['median']:.1%}",
-            "" if row["error"] is None else f"{digits(row['error'], 2):g} {row['unit']}",
+            "" if row["error"] is None else f"{round_digits(row['error'], 2):g} {row['unit']}",
             time_text(row),
             f"{row['commit']}, {row['date']}",
             f"{row['machine']}, jax {row['jax']}",
@@ -320,7 +324,7 @@ def table_markdown(rows: list[dict[str, Any]]) -> str:
 
 def time_text(row: dict[str, Any]) -> str:
     """Return the training time in a row as text, with the number of seeds and processes that shared it."""
-    text = f"{digits(row['seconds'], 2):g} s"
+    text = f"{round_digits(row['seconds'], 2):g} s"
     text += f" for {row['together']} seeds" if row.get("together", 1) != 1 else ""
     return text + (f", {row['parallel']} at a time" if row["parallel"] != 1 else "")
 
@@ -333,10 +337,10 @@ def check_success(runs: list[dict[str, Any]]) -> list[str]:
         task, success = run["task"], run["success"]
         if task not in required:
             failures.append(f"{task} has no row in {TABLE.name} to compare with. Add it with --tasks {task} --write.")
-        elif success < least_kept_success(required[task], STARTS):
+        elif success < least_kept_success(required[task], N_STARTS):
             failures.append(
                 f"{task}: expected at least {required[task]:.1%} as in {TABLE.name}, got {success:.1%} with seed "
-                f"{run['seed']}, lower by more than two standard errors of {STARTS:,} starts."
+                f"{run['seed']}, lower by more than two standard errors of {N_STARTS:,} starts."
             )
     return failures
 

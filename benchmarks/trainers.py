@@ -36,7 +36,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
-from measure import digits, machine, run_in_process
+from measure import describe_machine, round_digits, run_in_process
 
 import crazysim
 from crazysim.envs import AutoReset, BraxEnv, make
@@ -52,7 +52,7 @@ QUARTERS = 4
 PACKAGES = {"crazysim": "crazysim", "brax": "brax", "rsl_rl": "rsl-rl-lib"}
 """Package on PyPI of each trainer, by the name of its module."""
 
-Training = tuple[float, Any]
+TrainingResult = tuple[float, Any]
 """Duration of the last three quarters of a training, s, and its policy."""
 
 
@@ -65,37 +65,37 @@ class PeerPolicy(PyTree):
     """Divisor of the observations. (n_obs,)"""
     layers: Layers
     """Weights and biases."""
-    bounded: bool = static()
+    has_tanh: bool = static()
     """True if a tanh follows the layers."""
 
     def __call__(self, obs: Obs) -> Array:
         """Return the actions for observations."""
         out = mlp(self.layers, (flatten(obs) - self.mean) / self.std)
-        return jnp.tanh(out) if self.bounded else out
+        return jnp.tanh(out) if self.has_tanh else out
 
 
-def train_crazysim(env: Env, config: ppo.Config, seed: int) -> Training:
+def train_crazysim(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
     """Train by ``crazysim.train.ppo``."""
-    resetting = _resetting(env)
+    auto_reset_env = _auto_reset(env)
     key = jnp.stack([jax.random.fold_in(jax.random.key(seed), 1)])
-    learner, configs, start_time = ppo.init(resetting, (config,), key), (config,), 0.0
+    learner, configs, start_time = ppo.init(auto_reset_env, (config,), key), (config,), 0.0
     for i in range(config.iterations):
         if i == config.iterations // QUARTERS:
             jax.block_until_ready(learner)
             start_time = time.perf_counter()
-        learner, _ = ppo.iterate(learner, resetting, configs)
+        learner, _ = ppo.iterate(learner, auto_reset_env, configs)
     jax.block_until_ready(learner)
     seconds = time.perf_counter() - start_time
     return seconds, jax.tree.map(lambda x: x[0], learner.as_policy())
 
 
 @functools.cache
-def _resetting(env: Env) -> AutoReset:
+def _auto_reset(env: Env) -> AutoReset:
     """Return the environment with automatic resets, the same one for all seeds, so that they share programs."""
     return AutoReset(env)
 
 
-def train_brax(env: Env, config: ppo.Config, seed: int) -> Training:
+def train_brax(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
     """Train by the PPO of Brax."""
     from brax.training.agents.ppo import networks, train
     from flax import linen
@@ -146,22 +146,22 @@ def _device_put_replicated(tree: Any, devices: Any) -> Any:
     return jax.tree.map(lambda x: jax.device_put(jnp.stack([x] * len(devices)), sharding), tree)
 
 
-def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> Training:
+def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
     """Train by RSL-RL, whose networks run in Torch."""
     import torch
     from rsl_rl.env import VecEnv
     from rsl_rl.runners import OnPolicyRunner
     from tensordict import TensorDict
 
-    resetting, n_worlds = _resetting(env), env.sim.n_worlds
-    step = _compiled_step(resetting)
+    auto_reset_env, n_worlds = _auto_reset(env), env.sim.n_worlds
+    step = _compiled_step(auto_reset_env)
 
     class TorchEnv(VecEnv):
         """The environment as RSL-RL steps it."""
 
         def __init__(self) -> None:
             self.num_envs, self.num_actions, self.max_episode_length = n_worlds, env.actions.size, env.max_steps
-            self.state = jax.jit(resetting.reset)(jax.random.key(seed))
+            self.state = jax.jit(auto_reset_env.reset)(jax.random.key(seed))
             self.device = str(torch.from_dlpack(self.state.reward).device)
             self.episode_length_buf = torch.zeros(n_worlds, dtype=torch.long, device=self.device)
             self.cfg = {}
@@ -261,15 +261,17 @@ def main() -> None:
             if importlib.util.find_spec(name) is None:
                 print(f"left out {name}: pip install {PACKAGES[name]}", flush=True)
                 continue
-            line = run_in_process(run, name, args.task, args.device, n_worlds, config, args.seeds, args.starts)
+            line = run_in_process(
+                measure_trainer, name, args.task, args.device, n_worlds, config, args.seeds, args.starts
+            )
             print(json.dumps(line), flush=True)
 
 
-def run(
+def measure_trainer(
     name: str, task: str, device: str, n_worlds: int, config: ppo.Config, n_seeds: int, n_starts: int
 ) -> dict[str, Any]:
     """Return the line of one trainer and number of worlds."""
-    env, starts = (make(task, n, device=device) for n in (n_worlds, n_starts))
+    env, eval_env = (make(task, n, device=device) for n in (n_worlds, n_starts))
     n_steps = config.iterations * config.n_steps * n_worlds
     rates, success = [], []
     for seed in range(n_seeds):
@@ -277,7 +279,7 @@ def run(
         seconds, policy = TRAINERS[name](env, config, seed)
         rates.append(n_steps * (1 - (config.iterations // QUARTERS) / config.iterations) / seconds)
         total_s = time.perf_counter() - start_time
-        success.append(round(evaluate(starts, policy)["success"], 4))
+        success.append(round(evaluate(eval_env, policy)["success"], 4))
         print(f"{name}, seed {seed}: {total_s:.1f} s, success {success[-1]:.1%}", file=sys.stderr, flush=True)
     rate = statistics.median(rates)
     line: dict[str, Any] = {
@@ -288,8 +290,8 @@ def run(
     if name == "rsl_rl":
         line["torch"] = importlib.metadata.version("torch")
     line |= {"task": task, "n_worlds": n_worlds, "iterations": config.iterations, "env_steps": n_steps}
-    line |= {"env_steps_per_s": digits(rate), "seconds": digits(n_steps / rate), "success": success}
-    return line | machine(device)
+    line |= {"env_steps_per_s": round_digits(rate), "seconds": round_digits(n_steps / rate), "success": success}
+    return line | describe_machine(device)
 
 
 def _version(name: str) -> str:

@@ -12,7 +12,7 @@ import argparse
 from typing import Any
 
 import numpy as np
-from measure import digits, engine_name, medians, report, seconds
+from measure import engine_name, medians, report, round_digits, seconds
 
 from crazysim import Sim
 from crazysim.plugins.vehicles import Cars, PathLQR, PurePursuit, Stanley
@@ -81,7 +81,7 @@ def measure(case: str, args: argparse.Namespace) -> None:
         n_cars=args.cars,
         n_steps=args.steps,
         compile_s=round(compile_s, 2),
-        steps_per_s=digits(n_worlds * args.cars * args.steps / step_s),
+        steps_per_s=round_digits(n_worlds * args.cars * args.steps / step_s),
     )
 
 

@@ -2,7 +2,7 @@
 
 Each program runs in its own process with the same JAX. The two alternate batch by batch, so that the noise of a shared
 machine affects both. Medians and the ratios of medians are printed. Steps, loops, calls and gradients are measured with
-each controller of ``--controllers``: ``crazyflow`` is the control of the other program. The cases:
+each controller of ``--controllers``; ``crazyflow`` is Crazyflow's. The cases:
 
     first_step  from Sim(n_worlds=1) to its first step, in fresh processes
     step        100 physics steps per call, for each command level, integrator and number of worlds
@@ -35,13 +35,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from measure import digits, medians
+from measure import medians, round_digits
 
 FOLDER = Path(__file__).parent
 PEER_FOLDER = FOLDER.parent / ".cache" / "crazyflow"
 CASES = ("first_step", "step", "loop", "call", "gradient", "swarm", "contacts", "depth", "swarm_build", "gym", "memory")
 LEVELS = ("rotor_vel", "force_torque", "body_rate", "attitude", "state")
-CONTROLLED = ("body_rate", "attitude", "state")
+CONTROLLED_LEVELS = ("body_rate", "attitude", "state")
 """Command levels at which a controller runs."""
 
 
@@ -67,53 +67,53 @@ def main() -> None:
     if set(args.only) != {"swarm"}:
         pythons["crazyflow"] = str(args.peer_python or peer_environment(args.device))
     if "first_step" in args.only:
-        first_steps(pythons, args.device)
+        compare_first_steps(pythons, args.device)
     workers = {name: Worker(python, name) for name, python in pythons.items()}
-    versus = Versus(workers, args.engine, args.controllers, args.device, args.repeats)
+    comparison = Comparison(workers, args.engine, args.controllers, args.device, args.repeats)
     if "step" in args.only:
         for control, integrator, n_worlds in itertools.product(args.controls, args.integrators, args.worlds):
-            versus.compare("step", control=control, integrator=integrator, n_worlds=n_worlds, n_steps=100)
+            comparison.compare_rates("step", control=control, integrator=integrator, n_worlds=n_worlds, n_steps=100)
     if "loop" in args.only:
         for control, n_worlds in itertools.product(("attitude", "state"), args.loop_worlds):
-            versus.compare("loop", control=control, integrator="euler", n_worlds=n_worlds, n_steps=5)
+            comparison.compare_rates("loop", control=control, integrator="euler", n_worlds=n_worlds, n_steps=5)
     if "call" in args.only:
         for control in LEVELS:
-            versus.compare("call", control=control, integrator="euler", n_worlds=1, n_steps=1)
+            comparison.compare_rates("call", control=control, integrator="euler", n_worlds=1, n_steps=1)
     if "gradient" in args.only:
         case = {"control": "attitude", "integrator": "euler", "n_worlds": args.batch_worlds, "n_steps": 100}
-        versus.compare("gradient", **case)
+        comparison.compare_rates("gradient", **case)
     if "swarm" in args.only:
-        versus.swarm(args.batch_worlds, args.swarm)
+        comparison.compare_swarm(args.batch_worlds, args.swarm)
     for task, case in (
         ("contacts", {"n_worlds": 4096, "n_drones": 4, "n_steps": 1}),
         ("depth", {"n_worlds": 1024, "n_drones": 1, "n_steps": 1}),
         ("swarm_build", {"n_worlds": 1, "n_drones": 1024, "n_steps": 1}),
     ):
         if task in args.only:
-            versus.question(task, **case)
+            comparison.compare_query(task, **case)
     if "gym" in args.only:
-        versus.question("gym", n_worlds=args.gym_worlds, n_drones=1, n_steps=100, freq=50)
+        comparison.compare_query("gym", n_worlds=args.gym_worlds, n_drones=1, n_steps=100, freq=50)
     if "memory" in args.only:
-        versus.memory()
+        comparison.compare_memory()
     for worker in workers.values():
         worker.close()
 
 
-class Versus:
-    """Comparisons of engines of crazysim with Crazyflow."""
+class Comparison:
+    """Comparison of engines and controllers of crazysim with Crazyflow."""
 
     def __init__(
         self, workers: dict[str, Worker], engines: list[str], controllers: list[str], device: str, repeats: int
     ):
-        """Store the two programs."""
+        """Store the workers and the variants to compare."""
         self.workers, self.engines, self.controllers = workers, engines, controllers
         self.device, self.repeats = device, repeats
         self.machine = workers["crazysim"].request(do="machine", device=device)
 
-    def compare(self, benchmark: str, **case: Any) -> None:
+    def compare_rates(self, benchmark: str, **case: Any) -> None:
         """Print steps per second and compile time of each engine and controller and of Crazyflow, and the ratio."""
         ours, peer = self.workers["crazysim"], self.workers["crazyflow"]
-        controllers = self.controllers if case["control"] in CONTROLLED else self.controllers[:1]
+        controllers = self.controllers if case["control"] in CONTROLLED_LEVELS else self.controllers[:1]
         variants = [
             {"engine": engine, "controller": controller} for engine in self.engines for controller in controllers
         ]
@@ -124,23 +124,23 @@ class Versus:
             line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{benchmark}", **variant, **case}
             variant_duration = durations[json.dumps(variant)]
             for name, (seconds, compile_s) in (("crazysim", variant_duration), ("crazyflow", durations["crazyflow"])):
-                line[f"{name}_call_s"] = digits(seconds)
-                line[f"{name}_steps_per_s"] = digits(steps / seconds)
+                line[f"{name}_call_s"] = round_digits(seconds)
+                line[f"{name}_steps_per_s"] = round_digits(steps / seconds)
                 line[f"{name}_compile_s"] = round(compile_s, 2)
             line["ratio"] = round(durations["crazyflow"][0] / variant_duration[0], 2)
             print(json.dumps(line | self.machine), flush=True)
 
-    def question(self, task: str, **case: Any) -> None:
+    def compare_query(self, task: str, **case: Any) -> None:
         """Print the time of a query in both programs."""
         durations = self._measure(task, {name: (worker, case) for name, worker in self.workers.items()})
         line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{task}", **case}
         for name, (seconds, compile_s) in durations.items():
-            line[f"{name}_s"] = digits(seconds)
+            line[f"{name}_s"] = round_digits(seconds)
             line[f"{name}_compile_s"] = round(compile_s, 2)
         line["ratio"] = round(durations["crazyflow"][0] / durations["crazysim"][0], 2)
         print(json.dumps(line | self.machine), flush=True)
 
-    def memory(self, min_worlds: int = 64, max_worlds: int = 1088) -> None:
+    def compare_memory(self, min_worlds: int = 64, max_worlds: int = 1088) -> None:
         """Print the bytes per additional world after a contact query."""
         for n_drones in (1, 4):
             line: dict[str, Any] = {"benchmark": "versus_crazyflow/memory", "n_drones": n_drones}
@@ -153,7 +153,7 @@ class Versus:
             line["ratio"] = round(line["crazysim_bytes_per_world"] / line["crazyflow_bytes_per_world"], 4)
             print(json.dumps(line | self.machine), flush=True)
 
-    def swarm(self, n_worlds: int, n_drones: int) -> None:
+    def compare_swarm(self, n_worlds: int, n_drones: int) -> None:
         """Print the cost of drones that share worlds, compared with as many in separate worlds."""
         case = {"control": "attitude", "integrator": "euler", "n_steps": 100}
         sizes = {"swarm": (n_worlds, n_drones), "single": (n_worlds * n_drones, 1)}
@@ -165,7 +165,7 @@ class Versus:
             durations = self._measure("step", contestants)
             line = {"benchmark": "swarm", "engine": engine, **case, "n_worlds": n_worlds, "n_drones": n_drones}
             for name, (seconds, compile_s) in durations.items():
-                line[f"{name}_steps_per_s"] = digits(n_worlds * n_drones * case["n_steps"] / seconds)
+                line[f"{name}_steps_per_s"] = round_digits(n_worlds * n_drones * case["n_steps"] / seconds)
                 line[f"{name}_compile_s"] = round(compile_s, 2)
             line["ratio"] = round(durations["single"][0] / durations["swarm"][0], 2)
             print(json.dumps(line | self.machine), flush=True)
@@ -176,14 +176,14 @@ class Versus:
             name: worker.request(do="build", task=task, name=name, device=self.device, case=case)["seconds"]
             for name, (worker, case) in contestants.items()
         }
-        turns = {name: functools.partial(worker.time, name) for name, (worker, _) in contestants.items()}
-        seconds = medians(turns, self.repeats)
+        measures = {name: functools.partial(worker.time, name) for name, (worker, _) in contestants.items()}
+        seconds = medians(measures, self.repeats)
         for name, (worker, _) in contestants.items():
             worker.request(do="end", name=name)
         return {name: (seconds[name], first_durations[name] - seconds[name]) for name in contestants}
 
 
-def first_steps(pythons: dict[str, str], device: str, repeats: int = 3) -> None:
+def compare_first_steps(pythons: dict[str, str], device: str, repeats: int = 3) -> None:
     """Print the time from Sim(n_worlds=1) to its first step in fresh processes, alternating."""
     times: dict[str, list[dict[str, float]]] = {name: [] for name in pythons}
     for _ in range(repeats):
@@ -216,10 +216,10 @@ class Worker:
         for line in self._out:
             if line.startswith("{"):  # skip anything that the packages print on import
                 return json.loads(line)
-        raise SystemExit("a worker ended without an answer; its error stands above")
+        raise SystemExit("a worker ended without an answer; its error is above")
 
     def time(self, name: str) -> float:
-        """Return the seconds of a call of what was built under a name."""
+        """Return the time of a call of the case with a name, s."""
         return self.request(do="time", name=name)["seconds"]
 
     def close(self) -> None:
@@ -236,12 +236,12 @@ def peer_environment(device: str) -> Path:
     if not python.exists():
         print(f"making an environment for Crazyflow 0.4.0 in {folder} ...", file=sys.stderr)
         subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-        packages = ["crazyflow==0.4.0", f"jax{_extra(device)}=={jax.__version__}"]
+        packages = ["crazyflow==0.4.0", f"jax{_jax_extra(device)}=={jax.__version__}"]
         subprocess.run([python, "-m", "pip", "install", "--quiet", *packages], check=True)
     return python
 
 
-def _extra(device: str) -> str:
+def _jax_extra(device: str) -> str:
     """Return the extra of JAX that this environment has for a device."""
     if device == "cpu":
         return ""

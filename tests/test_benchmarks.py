@@ -76,7 +76,7 @@ def test_memory_prints_the_success_of_each_variant_on_other_airframes(run, tmp_p
     small = ["--worlds", 16, "--iterations", 1, "--starts", 8, "--seconds", 0.1, "--tasks", "hover", "--out", tmp_path]
     lines = run("memory.py", *small, "--variants", "memory-privileged", "--seeds", "3:5")
     assert [(line["variant"], line["seed"]) for line in lines] == [("memory-privileged", 3), ("memory-privileged", 4)]
-    assert all(line["env_steps"] == pytest.approx(16 * 64, rel=0.01) for line in lines)  # three digits
+    assert all(line["env_steps"] == pytest.approx(16 * 64, rel=0.01) for line in lines)  # three round_digits
     for line in lines:
         assert all(0 <= line[drones]["success"] <= 1 for drones in ("drawn", "cf2x_L250", "cf2x_P250", "cf2x_T350"))
 
@@ -95,12 +95,12 @@ def test_crashed_drones_are_detected(benchmarks):
     from crazysim import Sim
 
     sim = Sim(n_worlds=2, control="rotor_vel")
-    measure.hovering(sim, "rotor_vel")
+    measure.start_hovering(sim, "rotor_vel")
     sim.step(100)
-    assert measure.still_flies(sim)
+    assert measure.is_flying(sim)
     sim.rotor_vel_control([[[0.0] * 4]] * 2)
     sim.step(500)
-    assert not measure.still_flies(sim)
+    assert not measure.is_flying(sim)
 
 
 @pytest.mark.parametrize(("device", "n_calls"), [("cpu", 2), ("gpu", 20)])
@@ -110,7 +110,7 @@ def test_a_batch_begins_where_the_one_before_began(benchmarks, device, n_calls):
     from crazysim import Sim
 
     flight = measure.Flight(Sim(engine="lanes"), "attitude", n_steps=50, device=device)
-    assert flight.calls == n_calls
+    assert flight.n_calls == n_calls
     ends = [(flight.seconds(), flight.sim.data.core.steps.item())[1] for _ in range(3)]
     assert ends == [50 * n_calls] * 3
 
@@ -156,7 +156,7 @@ def test_limits_prints_a_floor_and_how_far_from_it(monkeypatch, benchmarks, caps
     import limits
 
     monkeypatch.setattr(limits, "COPY_SIZES", {"cpu": 2**16})
-    monkeypatch.setattr(limits, "WORLDS", {"cpu": 64})
+    monkeypatch.setattr(limits, "DEFAULT_WORLDS", {"cpu": 64})
     monkeypatch.setattr(
         sys, "argv", ["limits.py", "--repeats", "1", "--controls", "rotor_vel", "--integrators", "euler"]
     )
@@ -177,17 +177,17 @@ def test_operations_are_counted_in_multiply_adds(benchmarks):
     x, y = builder.input(np.float32), builder.input(np.float32)
     product = builder.add("mul", (x, y), np.float32)
     total = builder.add("add", (product, x), np.float32)
-    assert limits.operations(builder.finish([total]), 1.0) == 1  # one multiply-add
-    assert limits.operations(builder.finish([total, product]), 1.0) == 2  # the product is needed for itself
+    assert limits.count_operations(builder.finish([total]), 1.0) == 1  # one multiply-add
+    assert limits.count_operations(builder.finish([total, product]), 1.0) == 2  # the product is needed for itself
     root = builder.add("sqrt", (total,), np.float32)
-    assert limits.operations(builder.finish([root]), 1.0) == 5
+    assert limits.count_operations(builder.finish([root]), 1.0) == 5
 
     outer = Builder()
     mask, old = outer.input(bool), outer.input(np.float32)
     inner = Builder(outer)
     guarded = inner.finish([inner.add("max", (old, np.float32(1)), np.float32)])
     new = outer.add_many("when", (mask, old), (np.float32,), (), (guarded,))
-    assert limits.operations(outer.finish(new), 0.2) == pytest.approx(0.2)
+    assert limits.count_operations(outer.finish(new), 0.2) == pytest.approx(0.2)
 
 
 def test_bytes_and_operations_of_a_step_are_counted(benchmarks):
@@ -195,11 +195,11 @@ def test_bytes_and_operations_of_a_step_are_counted(benchmarks):
 
     from crazysim import Sim
 
-    each_step, _, n_bytes = limits.work(Sim(control="rotor_vel", engine="lanes"))
+    each_step, _, n_bytes = limits.count_work(Sim(control="rotor_vel", engine="lanes"))
     # Read: pos, quat, vel, ang_vel, force, torque, rotor speeds and their commands, steps; all written but the forces.
     read = 3 + 4 + 3 + 3 + 3 + 3 + 4 + 4 + 1
     assert n_bytes == 4 * (2 * read - 6)
-    assert limits.work(Sim(control="rotor_vel", integrator="rk4", engine="lanes"))[0] > 3 * each_step
+    assert limits.count_work(Sim(control="rotor_vel", integrator="rk4", engine="lanes"))[0] > 3 * each_step
 
 
 def test_versus_crazyflow_runs_swarm_without_crazyflow(run):

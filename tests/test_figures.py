@@ -22,9 +22,9 @@ def thrust(speed: float) -> float:
 SCRIPT = f"""
 import json, sys
 sys.path.insert(0, {str(ROOT / "benchmarks")!r})
-from measure import machine
+from measure import describe_machine
 print("something else")
-print(json.dumps(dict(machine("cpu"), case=sys.argv[1], rate=5e3)))
+print(json.dumps(dict(describe_machine("cpu"), case=sys.argv[1], rate=5e3)))
 """
 
 

@@ -28,7 +28,7 @@ HIGH = 50.0
 
 @functools.cache
 def benchmark():
-    """Return the benchmark of controllers, whose flights and own airframes these tests use."""
+    """Return the benchmark of controllers, whose flights and generic airframes these tests use."""
     sys.path.insert(0, str(BENCHMARKS))
     try:
         import controllers
@@ -39,15 +39,15 @@ def benchmark():
 
 @functools.cache
 def airframes():
-    return [load_airframe(name) for name in supported_drones("first_principles")] + benchmark().own_airframes()
+    return [load_airframe(name) for name in supported_drones("first_principles")] + benchmark().generic_airframes()
 
 
 # Flights --------------------------------------------------------------------------------------------------------
 
 
 def test_every_airframe_goes_where_it_is_sent():
-    """The figures of the page on controllers for all built-in airframes and three of plain physics."""
-    found = benchmark().fly("auto", airframes(), 2.0, 100)
+    """The figures of the page on controllers for all built-in airframes and three generic ones."""
+    found = benchmark().fly_airframes("auto", airframes(), 2.0, 100)
     assert len(found) == 11
     for name, row in found.items():
         assert row["hover"] < 2e-3, (name, row)
@@ -61,7 +61,7 @@ def test_every_airframe_goes_where_it_is_sent():
 def test_the_position_loop_flies_fitted_dynamics(dynamics):
     """The same figures above the attitude response of the models; hb_x500, the slowest, tracks within 4 cm."""
     names = [load_airframe(name) for name in supported_drones(dynamics)]
-    for name, row in benchmark().fly("auto", names, 2.0, 1, dynamics).items():
+    for name, row in benchmark().fly_airframes("auto", names, 2.0, 1, dynamics).items():
         assert row["hover"] < 2e-3, (name, row)
         assert row["tracking"] < (0.04 if name == "hb_x500" else 0.03), (name, row)
         assert row["pushed"] < 0.01, (name, row)
@@ -81,7 +81,7 @@ def flying(level, worlds, controller="auto", **settings):
 @pytest.mark.parametrize("level", ["attitude", "body_rate"])
 def test_steps_of_the_command_settle_without_overshoot(level):
     """At most 10%, within 2% after 2 s; half of the way within 0.3 s, for yaw within 0.6 s."""
-    y = benchmark().responses("auto", airframes(), level)
+    y = benchmark().step_responses("auto", airframes(), level)
     assert y.max() < 1.1
     np.testing.assert_allclose(y[100:], 1.0, atol=0.02)
     assert np.all(y[15, :3] > 0.5)
