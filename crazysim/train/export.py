@@ -213,7 +213,7 @@ def _add_convolutions(
         constants.update({f"{name}_start": np.array([indices.start]), f"{name}_end": np.array([indices.stop])})
         return add_node("Slice", [source, f"{name}_start", f"{name}_end", "axis"], name)
 
-    parts = [add_slice(normalized, indices) for indices in numbers.others]
+    parts = [add_slice(normalized, indices) for indices in numbers.vector_ranges]
     for i, (image, layers) in enumerate(zip(numbers.images, numbers.convolutions, strict=True)):
         constants[f"shape{i}"] = np.array([0, *image.shape])
         x = add_slice("observation", image.pixels)

@@ -339,7 +339,7 @@ def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_networ
     with pytest.raises(ConfigError, match=r"to be resumed with its custom network. Use network=network"):
         trained(tmp_path, {}, resume=True)
     with pytest.raises(
-        ConfigError, match="expected a policy with the built-in network, got one with a network of your"
+        ConfigError, match="expected a policy with the built-in network, got one with a custom network"
     ):
         to_c(policy, tmp_path / "policy.h", meta)
 

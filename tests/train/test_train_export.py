@@ -216,7 +216,7 @@ def test_a_network_of_your_own_with_the_weights_of_a_gru_is_refused(tmp_path, po
     """Before, only the type of the weights was checked, and the file computed another function."""
     remembers = remembering(policy, 3)
     network = Network(remembers.network.init, lambda gru, obs, memory: (obs, -gru(obs, memory)), np.zeros(3))
-    with pytest.raises(ConfigError, match="expected a policy with the built-in network, got one with a network of y"):
+    with pytest.raises(ConfigError, match="expected a policy with the built-in network, got one with a custom"):
         to_c(remembers.replace(network=network), tmp_path / "policy.h", meta)
     assert not list(tmp_path.iterdir())
 
