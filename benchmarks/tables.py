@@ -337,8 +337,8 @@ def readme(records: list[Line]) -> str:
             for x in lines_of("loop", device, n_worlds=n, control="attitude")
             if x.get("controller", "auto") == "auto"
         ),
-        "the crazyflow_control, 1 to 16,384 worlds: Crazyflow 0.4.0's time over ours, same control": lambda device: (
-            span(x["ratio"] for x in lines_of("loop", device, **crazyflow_control))
+        "the same, 1 to 16,384 worlds: Crazyflow 0.4.0's time over ours, same control": lambda device: span(
+            x["ratio"] for x in lines_of("loop", device, **crazyflow_control)
         ),
         "physics steps per second, attitude commands, the default controller": lambda device: steps(device, auto),
         "the same with Crazyflow's control": lambda device: steps(device, crazyflow_control),

@@ -43,7 +43,7 @@ def repository(figures, monkeypatch, tmp_path):
     (tmp_path / "page.md").write_text("Before.\n\n<!-- figure speed -->\n\n<!-- end of speed -->\n\nAfter.\n")
     (tmp_path / "README.md").write_text("Nothing.\n")
     (tmp_path / "figures.json").write_text("[]\n")
-    table = figures.tables.columns(Case=lambda x: x["case"], Rate=lambda x: figures.tables.si(x["rate"]))
+    table = figures.tables.columns(Case=lambda x: x["case"], Rate=lambda x: figures.tables.si_text(x["rate"]))
     figure = figures.Figure("page.md", ("thrust.py",), cpu="speed.py --fast", table=table)
     monkeypatch.setattr(figures, "ROOT", tmp_path)
     monkeypatch.setattr(figures, "STORE", tmp_path / "figures.json")
@@ -68,7 +68,7 @@ def record(figures, commit, processor="EPYC", rate=2e9):
 def test_each_figure_has_a_script_and_a_place_on_its_page(figures):
     for name, figure in figures.FIGURES.items():
         assert figure.cpu or figure.gpu or figure.commits, name
-        for path in figure.spec():
+        for path in figure.tracked_paths():
             assert (ROOT / path.removeprefix(":(exclude)")).exists(), f"{name}: {path} does not exist"
     places = [(name, str(page.relative_to(ROOT))) for page in PAGES for name in figures.figure_names(page.read_text())]
     wanted = [(name, figure.page) for name, figure in figures.FIGURES.items() if figure.table]

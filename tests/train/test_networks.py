@@ -338,9 +338,7 @@ def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_networ
         load_policy(tmp_path, network=Network(lambda key, n: jnp.zeros((n, 3)), lambda w, x, m: (x @ w, m)))
     with pytest.raises(ConfigError, match=r"to be resumed with its custom network. Use network=network"):
         trained(tmp_path, {}, resume=True)
-    with pytest.raises(
-        ConfigError, match="expected a policy with the built-in network, got one with a custom network"
-    ):
+    with pytest.raises(ConfigError, match="expected a policy with the built-in network, got one with a custom network"):
         to_c(policy, tmp_path / "policy.h", meta)
 
 
