@@ -243,7 +243,7 @@ class Env(ABC):
     def explain(self) -> str:
         """Return how a step is executed, as ``Sim.explain`` does for a step of the physics."""
         state = jax.eval_shape(self.reset, jax.random.key(0))
-        step, rays = explain(self.step_fn, state.full_data, zeros=()), self.sim.scene.ray_kernels.used
+        step, rays = explain(self.step_fn, state.full_data, zeros=()), self.sim.scene.ray_kernels.last_used
         return f"{step}\nrays: {rays}" if rays else step
 
     def target(self, state: EnvState) -> Array | None:

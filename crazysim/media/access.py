@@ -48,7 +48,7 @@ class Access:
         host = "127.0.0.1" if self.host in WILDCARD_ADDRESSES else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}"
 
-    def refusal(self, path: str, headers: Mapping[str, str]) -> str:
+    def refusal_reason(self, path: str, headers: Mapping[str, str]) -> str:
         """Return the reason why a request is refused; empty if it is accepted.
 
         Args:
@@ -66,7 +66,7 @@ class Access:
 
     def answer(self, connection: Any, request: Any) -> Any:
         """Return a websockets response that refuses a request, or remove the token from its path and return None."""
-        reason = self.refusal(request.path, request.headers)
+        reason = self.refusal_reason(request.path, request.headers)
         if not reason:
             request.path = request.path.removeprefix(f"/{self._token}") or "/"
             return None
@@ -80,21 +80,21 @@ class Access:
         return path.partition("?")[0].split("/")[1] if path.startswith("/") else ""
 
 
-def is_own_name(host: str, listening: str) -> bool:
-    """Return True if a ``Host`` header names this machine in a way that no other site can.
+def is_own_name(host: str, listen_address: str) -> bool:
+    """Return True if a ``Host`` header has a name of this machine that no other site can have.
 
     Such names are IP addresses, ``localhost``, the machine's name, and the address that the server listens at.
 
     Args:
         host: Value of the header.
-        listening: Address that the server listens at.
+        listen_address: Address that the server listens at.
     """
     try:
         name = urlsplit(f"//{host}").hostname or ""
     except ValueError:
         return False
     host_name = socket.gethostname().lower()
-    if name in ("localhost", host_name, f"{host_name}.local", listening.lower()):
+    if name in ("localhost", host_name, f"{host_name}.local", listen_address.lower()):
         return True
     try:
         ipaddress.ip_address(name)
@@ -105,10 +105,10 @@ def is_own_name(host: str, listening: str) -> bool:
 
 def wrong_name_message(host: str) -> str:
     """Return the message for a ``Host`` header that is refused."""
-    return f"expected an address of this machine, got {host!r}. Use its number, its name or localhost."
+    return f"expected an address of this machine, got {host!r}. Use its IP address, its name or localhost."
 
 
-def guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
+def start_guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
     """Return a running viser server that answers only accepted requests.
 
     viser has no setting for this. Its server is a websockets server; while viser creates it, ``websockets``' ``serve``
@@ -122,29 +122,29 @@ def guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
     Raises:
         RenderError: If this version of viser creates its server in another way.
     """
-    import websockets.asyncio.server as library
+    import websockets.asyncio.server as server_module
 
-    guarded = False
+    is_guarded = False
 
     def serve(handler: Any, *args: Any, process_request: Any = None, **options: Any) -> Any:
-        nonlocal guarded
+        nonlocal is_guarded
         if not handler.__module__.startswith("viser."):
             return original(handler, *args, process_request=process_request, **options)
 
         def process_checked(connection: Any, request: Any) -> Any:
-            refused = access.answer(connection, request)
-            return process_request(connection, request) if refused is None else refused
+            refusal = access.answer(connection, request)
+            return process_request(connection, request) if refusal is None else refusal
 
-        guarded = True
+        is_guarded = True
         return original(handler, *args, process_request=process_checked, **options)
 
     with _LOCK:
-        original, library.serve = library.serve, serve
+        original, server_module.serve = server_module.serve, serve
         try:
             server = viser.ViserServer(host=access.host, port=access.port, verbose=False, **settings)
         finally:
-            library.serve = original
-    if not guarded:
+            server_module.serve = original
+    if not is_guarded:
         server.stop()
         raise RenderError(
             f"expected a server of viser that can be guarded, got viser {viser.__version__}. Use viser 1.1."

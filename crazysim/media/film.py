@@ -83,7 +83,7 @@ class Film:
                 f"{even_size[0]} x {even_size[1]}."
             )
         self.fps, self.speed, self.n_frames = float(fps), float(speed), 0
-        self._command = self._encode(*size)
+        self._command = self._ffmpeg_command(*size)
         self._ffmpeg: subprocess.Popen[bytes] | None = None
         shows_progress = check_flag("progress", progress)
         self._bar = progress_bar(label="filming", required=True, total=total) if shows_progress else None
@@ -95,13 +95,13 @@ class Film:
         Raises:
             RenderError: If this machine cannot draw, or the file cannot be written.
         """
-        first = self.view.worlds[0]
-        require_world(sim, first)
-        elapsed = self._clock.elapsed_at(float(sim.time[first, 0]))
-        due = int(elapsed * self.fps / self.speed + 1e-4) + 1 - self.n_frames
-        if due > 0:
-            self.write(self.view.render(sim), due)
-        return max(due, 0)
+        first_world = self.view.worlds[0]
+        require_world(sim, first_world)
+        elapsed = self._clock.elapsed_at(float(sim.time[first_world, 0]))
+        n_due = int(elapsed * self.fps / self.speed + 1e-4) + 1 - self.n_frames
+        if n_due > 0:
+            self.write(self.view.render(sim), n_due)
+        return max(n_due, 0)
 
     def play(self, sim: Sim, flight: Flight) -> int:
         """Add all frames of a recorded flight, and return their number.
@@ -146,7 +146,7 @@ class Film:
             for _ in range(n_frames):
                 self._ffmpeg.stdin.write(pixels.tobytes())
         except OSError:
-            self._end(self._ffmpeg)
+            self._finish_file(self._ffmpeg)
         self.n_frames += n_frames
         if self._bar is not None:
             self._bar.update(n_frames)
@@ -160,13 +160,13 @@ class Film:
         if self._bar is not None:
             self._bar.close()
         if self._ffmpeg is not None:
-            self._end(self._ffmpeg)
+            self._finish_file(self._ffmpeg)
         elif not self.n_frames:
             raise ConfigError(
                 f"expected at least one frame of {str(self.path)!r}, got none. Call film.add(sim) between steps."
             )
 
-    def _end(self, ffmpeg: subprocess.Popen[bytes]) -> None:
+    def _finish_file(self, ffmpeg: subprocess.Popen[bytes]) -> None:
         self._ffmpeg = None
         with contextlib.suppress(OSError):
             ffmpeg.stdin.close()
@@ -181,7 +181,7 @@ class Film:
                 f"expected a file that can be written, got {str(self.path)!r}: {message or 'ffmpeg failed'}"
             )
 
-    def _encode(self, width: int, height: int) -> list[str]:
+    def _ffmpeg_command(self, width: int, height: int) -> list[str]:
         try:
             from imageio_ffmpeg import get_ffmpeg_exe
         except ImportError as error:
@@ -199,9 +199,9 @@ class Film:
             "-",
         ]
         encoder = [*ENCODERS[self.path.suffix.lower()], "-g", f"{math.ceil(self.fps)}"]  # a key frame every second
-        target = str(unfinished_path(self._file))
-        kind = ["-f", self.path.suffix[1:].lower()]
-        return [get_ffmpeg_exe(), "-loglevel", "error", *input_options, *encoder, *kind, "-y", target]
+        output = str(unfinished_path(self._file))
+        file_format = ["-f", self.path.suffix[1:].lower()]
+        return [get_ffmpeg_exe(), "-loglevel", "error", *input_options, *encoder, *file_format, "-y", output]
 
     def __enter__(self) -> Film:
         return self

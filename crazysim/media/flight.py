@@ -67,21 +67,21 @@ class Flight:
         span = self.time[after] - self.time[before]
         weight = float(np.clip((time - self.time[before]) / span, 0, 1)) if span > 0 else 0.0
 
-        def linear(values: NDArray) -> NDArray:
+        def interpolate(values: NDArray) -> NDArray:
             return (1 - weight) * values[before] + weight * values[after]
 
-        def spherical(quat: NDArray) -> NDArray:
+        def interpolate_attitude(quat: NDArray) -> NDArray:
             # q and -q are the same attitude: interpolate along the shorter arc.
             sign = np.where((quat[before] * quat[after]).sum(-1, keepdims=True) < 0, -1, 1)
             blended = (1 - weight) * quat[before] + weight * sign * quat[after]
             return blended / np.linalg.norm(blended, axis=-1, keepdims=True)
 
         return {
-            "pos": linear(self.pos),
-            "quat": spherical(self.quat),
-            "body_pos": linear(self.body_pos),
-            "body_quat": spherical(self.body_quat),
-            "setpoint": linear(self.setpoint),
+            "pos": interpolate(self.pos),
+            "quat": interpolate_attitude(self.quat),
+            "body_pos": interpolate(self.body_pos),
+            "body_quat": interpolate_attitude(self.body_quat),
+            "setpoint": interpolate(self.setpoint),
         }
 
     def save(self, path: str | Path) -> None:
@@ -115,7 +115,9 @@ class Flight:
                     arrays = read_arrays(file, str(path))
             if int(arrays["format"]) != FORMAT:
                 raise ConfigError(f"expected a recording of format {FORMAT}, got format {arrays['format']} in {path}")
-            return cls(**{f.name: arrays[f.name] for f in fields(cls) if f.name != "shapes"}, shapes=_shapes(arrays))
+            return cls(
+                **{f.name: arrays[f.name] for f in fields(cls) if f.name != "shapes"}, shapes=_read_shapes(arrays)
+            )
 
 
 def shape_arrays(shapes: Sequence[VisualGeom]) -> dict[str, NDArray]:
@@ -129,7 +131,7 @@ def shape_arrays(shapes: Sequence[VisualGeom]) -> dict[str, NDArray]:
     return arrays
 
 
-def _shapes(arrays: dict[str, NDArray]) -> list[VisualGeom]:
+def _read_shapes(arrays: dict[str, NDArray]) -> list[VisualGeom]:
     """Return the geoms in the arrays of a file."""
     n = arrays["shape_n"]
     vertices = np.split(arrays["shape_vertices"], np.cumsum(n[:, 0])[:-1]) if len(n) else []

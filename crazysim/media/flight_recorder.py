@@ -27,13 +27,13 @@ class Clock:
 
     def __init__(self) -> None:
         self.elapsed = 0.0
-        self._last: float | None = None
+        self._last_time: float | None = None
 
     def elapsed_at(self, time: float) -> float:
         """Return the time since the first call, s, given the world's time since its last reset, s."""
-        if self._last is not None:
-            self.elapsed += time - self._last if time >= self._last else time
-        self._last = time
+        if self._last_time is not None:
+            self.elapsed += time - self._last_time if time >= self._last_time else time
+        self._last_time = time
         return self.elapsed
 
 
@@ -63,17 +63,17 @@ class Recorder:
         """
         self._sim = sim
         self._worlds = world_indices(sim, worlds)
-        self._scene = _scene(sim, self._worlds)
+        self._scene = _constant_fields(sim, self._worlds)
         self._clock = Clock()
         self._samples: list[dict[str, Any]] = []
-        self._n, self._last = 0, -np.inf
+        self._n_samples, self._last_time = 0, -np.inf
         self._journal = None if path is None else Journal(path)
         if self._journal is not None:
             self._journal.append(SCENE_CHUNK, pack_scene(self._scene))
 
     def __len__(self) -> int:
         """Return the number of samples."""
-        return self._n
+        return self._n_samples
 
     def add(self, time: float | None = None) -> None:
         """Record the present poses.
@@ -90,13 +90,13 @@ class Recorder:
         sim, worlds = self._sim, self._worlds
         if time is None:
             time = self._clock.elapsed_at(float(sim.time[self._worlds[0], 0]))
-        if self._n and self._last == time:
+        if self._n_samples and self._last_time == time:
             if self._journal is not None:
                 return
             self._samples.pop()
-            self._n -= 1
+            self._n_samples -= 1
         states, state = sim.data.states, sim.data.controls.state
-        body_pos, body_quat = _bodies(sim, self._worlds)
+        body_pos, body_quat = _body_poses(sim, self._worlds)
         sample = {
             "time": time,
             "pos": np.asarray(states.pos, float)[worlds],
@@ -111,11 +111,11 @@ class Recorder:
             self._samples.append(sample)
         else:
             self._journal.append(SAMPLE_CHUNK, pack_sample(sample))
-        self._n, self._last = self._n + 1, time
+        self._n_samples, self._last_time = self._n_samples + 1, time
 
     def flight(self) -> Flight:
         """Return the flight up to the last sample."""
-        if not self._n:
+        if not self._n_samples:
             raise ConfigError("expected at least one sample, got none. Call recorder.add() between steps.")
         if self._journal is not None:
             return Flight.load(self._journal.path)
@@ -149,7 +149,7 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
     n = len(states.pos)
     if not n:
         raise ConfigError("expected at least one state, got none")
-    body_pos, body_quat = _bodies(sim, indices)
+    body_pos, body_quat = _body_poses(sim, indices)
     return Flight(
         time=dt * np.arange(n),
         pos=np.asarray(fetch_rows(states.pos, (slice(None), indices)), float),
@@ -157,7 +157,7 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
         body_pos=np.broadcast_to(body_pos, (n, *body_pos.shape)),
         body_quat=np.broadcast_to(body_quat, (n, *body_quat.shape)),
         setpoint=np.zeros((n, len(indices), 0, 3)),
-        **_scene(sim, indices),
+        **_constant_fields(sim, indices),
     )
 
 
@@ -183,41 +183,47 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
             f"expected a simulation of {recorded_counts[0]} drones and {recorded_counts[1]} other mocap bodies, as the "
             f"flight has, got {counts[0]} and {counts[1]}"
         )
-    now, data = flight.at(time), sim.data
+    poses, data = flight.at(time), sim.data
     controls, objects = data.controls, data.objects
-    old = {"pos": data.states.pos, "quat": data.states.quat, "steps": data.core.steps}
-    new = {"pos": now["pos"], "quat": now["quat"], "steps": np.full((len(worlds), 1), round(time * sim.freq), np.int32)}
-    if controls.state is not None and now["setpoint"].size:
-        old["setpoint"], new["setpoint"] = staged_leaves(data)[0], now["setpoint"]
+    old_values = {"pos": data.states.pos, "quat": data.states.quat, "steps": data.core.steps}
+    new_values = {
+        "pos": poses["pos"],
+        "quat": poses["quat"],
+        "steps": np.full((len(worlds), 1), round(time * sim.freq), np.int32),
+    }
+    if controls.state is not None and poses["setpoint"].size:
+        old_values["setpoint"], new_values["setpoint"] = staged_leaves(data)[0], poses["setpoint"]
     if objects is not None:
         columns = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
-        old |= {"body_pos": objects.pos, "body_quat": objects.quat}
-        new |= {name: now[name][:, None, columns] for name in ("body_pos", "body_quat")}
-    shown_record = _with_worlds(old, worlds, new)
-    states = data.states.replace(pos=shown_record["pos"], quat=shown_record["quat"])
-    core = data.core.replace(steps=shown_record["steps"])
+        old_values |= {"body_pos": objects.pos, "body_quat": objects.quat}
+        new_values |= {name: poses[name][:, None, columns] for name in ("body_pos", "body_quat")}
+    updated = _replace_in_worlds(old_values, worlds, new_values)
+    states = data.states.replace(pos=updated["pos"], quat=updated["quat"])
+    core = data.core.replace(steps=updated["steps"])
     if objects is not None:
         recorded = any(plugin.moves_objects for plugin in sim.plugins.values())
-        objects = objects.replace(pos=shown_record["body_pos"], quat=shown_record["body_quat"], recorded=recorded)
+        objects = objects.replace(pos=updated["body_pos"], quat=updated["body_quat"], recorded=recorded)
     data = data.replace(states=states, core=core, objects=objects)
-    if "setpoint" in shown_record:
-        command, (_, *before) = shown_record["setpoint"], staged_leaves(data)
+    if "setpoint" in updated:
+        command, (_, *feedforward_leaves) = updated["setpoint"], staged_leaves(data)
         feedforward = [
-            x.at[worlds].set(default_feedforward(command)[worlds]) for x in before
+            x.at[worlds].set(default_feedforward(command)[worlds]) for x in feedforward_leaves
         ]  # other worlds keep theirs
         data = stage_command(data, command, *feedforward)
     sim.data = data
-    body_pos, body_quat = _bodies(sim, worlds)
-    if not (np.allclose(body_pos, now["body_pos"], atol=1e-6) and np.allclose(body_quat, now["body_quat"], atol=1e-6)):
+    body_pos, body_quat = _body_poses(sim, worlds)
+    if not (
+        np.allclose(body_pos, poses["body_pos"], atol=1e-6) and np.allclose(body_quat, poses["body_quat"], atol=1e-6)
+    ):
         ids = np.ix_(worlds, _body_ids(sim))  # some are moved through mjx_data
         sim.mjx_data = sim.mjx_data.replace(
-            mocap_pos=sim.mjx_data.mocap_pos.at[ids].set(now["body_pos"]),
-            mocap_quat=sim.mjx_data.mocap_quat.at[ids].set(np.roll(now["body_quat"], 1, axis=-1)),
+            mocap_pos=sim.mjx_data.mocap_pos.at[ids].set(poses["body_pos"]),
+            mocap_quat=sim.mjx_data.mocap_quat.at[ids].set(np.roll(poses["body_quat"], 1, axis=-1)),
         )
 
 
 @jax.jit
-def _with_worlds(old: dict[str, Array], worlds: Array, new: dict[str, Array]) -> dict[str, Array]:
+def _replace_in_worlds(old: dict[str, Array], worlds: Array, new: dict[str, Array]) -> dict[str, Array]:
     """Return arrays with new values in some worlds. Where their last axis is shorter, its first entries are set."""
     return {name: x.at[worlds, ..., : new[name].shape[-1]].set(new[name]) for name, x in old.items()}
 
@@ -227,7 +233,7 @@ def _body_ids(sim: Sim) -> NDArray:
     return np.setdiff1d(np.arange(sim.mj_model.nmocap), np.asarray(sim.data.core.drone_mocap_ids))
 
 
-def _scene(sim: Sim, worlds: NDArray) -> dict[str, Any]:
+def _constant_fields(sim: Sim, worlds: NDArray) -> dict[str, Any]:
     """Return the fields of a flight that do not change with time."""
     ids = _body_ids(sim)
     sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
@@ -239,7 +245,7 @@ def _scene(sim: Sim, worlds: NDArray) -> dict[str, Any]:
     }
 
 
-def _bodies(sim: Sim, worlds: NDArray) -> tuple[NDArray, NDArray]:
+def _body_poses(sim: Sim, worlds: NDArray) -> tuple[NDArray, NDArray]:
     """Return poses of bodies other than drones. (n_worlds, n_bodies, 3) and (n_worlds, n_bodies, 4), xyzw"""
     ids = _body_ids(sim)
     pos, quat = mocap_poses(sim, worlds)

@@ -1,4 +1,4 @@
-"""Poses of everything that moves in the scene, read without a sync of MuJoCo's side."""
+"""Poses of all mocap bodies of the scene, read from the data without a sync of the MuJoCo scene."""
 
 from __future__ import annotations
 

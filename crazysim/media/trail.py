@@ -52,18 +52,18 @@ class Trail:
             time: Time of each world, s. (n_worlds,)
             pos: Positions of the drones, world frame, m. (n_worlds, n_drones, 3)
         """
-        now, pos = np.array(time, float), np.array(pos, float)
-        if pos.ndim != 3 or pos.shape[2] != 3 or now.shape != pos.shape[:1]:
+        times, pos = np.array(time, float), np.array(pos, float)
+        if pos.ndim != 3 or pos.shape[2] != 3 or times.shape != pos.shape[:1]:
             raise ConfigError(
-                f"expected times of shape (n_worlds,) and positions of shape (n_worlds, n_drones, 3), got {now.shape} "
-                f"and {pos.shape}"
+                f"expected times of shape (n_worlds,) and positions of shape (n_worlds, n_drones, 3), got "
+                f"{times.shape} and {pos.shape}"
             )
         if self._samples and self._samples[-1][1].shape != pos.shape:
             raise ConfigError(f"expected positions of shape {self._samples[-1][1].shape}, as before, got {pos.shape}")
-        if self._samples and (self._samples[-1][0] == now).all():
+        if self._samples and (self._samples[-1][0] == times).all():
             self._samples.pop()
-        self._samples.append((now, pos))
-        while all(self._has_expired(self._samples[0][0], now)):
+        self._samples.append((times, pos))
+        while all(self._has_expired(self._samples[0][0], times)):
             self._samples.popleft()
 
     def _has_expired(self, point_time: NDArray, time: NDArray) -> NDArray:
@@ -76,11 +76,11 @@ class Trail:
             world: Index of the world in the arrays that ``add`` receives.
         """
         path: list[NDArray] = []
-        later = np.inf
+        next_time = np.inf
         for time, pos in reversed(self._samples):
-            if time[world] > later or time[world] < self._samples[-1][0][world] - self.seconds - 1e-6:
+            if time[world] > next_time or time[world] < self._samples[-1][0][world] - self.seconds - 1e-6:
                 break
-            later = time[world]
+            next_time = time[world]
             path.append(pos[world])
         return np.stack(path[::-1]) if path else np.zeros((0, 0, 3))
 

@@ -96,7 +96,7 @@ class View:
             )
         if self.trail != 0:
             self._trail = Trail(self.trail)
-        _fill(self.text, 0, 0.0)
+        _format_text(self.text, 0, 0.0)
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -129,13 +129,13 @@ class View:
         Raises:
             RenderError: If this machine cannot draw.
         """
-        time, pos = self._sample(sim)
+        time, pos = self._read_worlds(sim)
         image = np.full((self.height, self.width, 3), BORDER_COLOR, np.uint8)
         width, height = self.tile_size
-        before = sim.overlays.copy()
+        saved_overlays = sim.overlays.copy()
         try:
             for k, world in enumerate(self.worlds):
-                sim.overlays.restore(before)
+                sim.overlays.restore(saved_overlays)
                 self._draw(sim, k, time[k])
                 config = self._cam_config(sim, k, time[k], pos[k])
                 tile = image[self.tile(k)]
@@ -143,7 +143,7 @@ class View:
                 if self.inset is not None:
                     _draw_inset(tile, self.inset(sim, world))
         except Exception:
-            sim.overlays.restore(before)  # they are kept for the next image
+            sim.overlays.restore(saved_overlays)  # they are kept for the next image
             raise
         return image
 
@@ -153,13 +153,13 @@ class View:
         Raises:
             RenderError: If there is no screen.
         """
-        time, pos = self._sample(sim)
+        time, pos = self._read_worlds(sim)
         self._draw(sim, 0, time[0])
         sim.render(
             "human", self.worlds[0], self.camera, self._cam_config(sim, 0, time[0], pos[0]), self.width, self.height
         )
 
-    def _sample(self, sim: Sim) -> tuple[NDArray, NDArray]:
+    def _read_worlds(self, sim: Sim) -> tuple[NDArray, NDArray]:
         """Return times, s (n,), and drone positions, m (n, n_drones, 3), of the worlds, and extend the trails."""
         worlds = world_indices(sim, self.worlds)
         if self.follow is not None and self.follow not in range(sim.n_drones):
@@ -181,7 +181,7 @@ class View:
         if self.draw is not None:
             self.draw(sim, self.worlds[k])
         if self.text is not None:
-            draw_text(sim, _fill(self.text, self.worlds[k], time))
+            draw_text(sim, _format_text(self.text, self.worlds[k], time))
 
     def _cam_config(self, sim: Sim, k: int, time: float, pos: NDArray) -> dict[str, Any]:
         """Return the settings of the free camera for the k-th world, with drones at ``pos``."""
@@ -198,14 +198,14 @@ class View:
             if target.shape[-1:] != (3,):
                 raise ConfigError(f"expected hold to return points of shape (n, 3), got shape {target.shape}.")
             points = np.concatenate([pos, target.reshape(-1, 3)])
-            aim = self._smooth_aim(k, time, _aim_at(points, float(sim.mj_model.vis.global_.fovy)))
+            aim = self._smooth_aim(k, time, _frame_points(points, float(sim.mj_model.vis.global_.fovy)))
             config |= {"lookat": aim[:3], "distance": aim[3]}
         return config
 
     def _smooth_aim(self, k: int, time: float, aim: NDArray) -> NDArray:
         """Return where the camera of the k-th world aims, with first-order lag; after a reset it jumps."""
-        before, value = self._aim.get(k, (np.inf, aim))
-        weight = 1.0 if time < before or self.lag == 0 else 1 - np.exp(-(time - before) / self.lag)
+        last_time, value = self._aim.get(k, (np.inf, aim))
+        weight = 1.0 if time < last_time or self.lag == 0 else 1 - np.exp(-(time - last_time) / self.lag)
         if np.isfinite(aim).all():
             value = value + weight * (aim - value)
         self._aim[k] = (time, value)
@@ -222,7 +222,7 @@ def _draw_inset(tile: NDArray, picture: NDArray | None) -> None:
     tile[tile.shape[0] - height :, tile.shape[1] - width :] = picture[:height, :width]
 
 
-def _aim_at(points: NDArray, fovy: float) -> NDArray:
+def _frame_points(points: NDArray, fovy: float) -> NDArray:
     """Return the middle of points, m, and the distance from which all are in view, m. (n, 3) -> (4,)
 
     Args:
@@ -237,7 +237,7 @@ def _aim_at(points: NDArray, fovy: float) -> NDArray:
     return np.append(middle, DISTANCE_MARGIN * radius / np.sin(np.radians(fovy) / 2))
 
 
-def _fill(text: str | None, world: int, time: float) -> str:
+def _format_text(text: str | None, world: int, time: float) -> str:
     try:
         return "" if text is None else text.format(world=world, time=time)
     except (KeyError, IndexError, ValueError) as error:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, RenderError, not_installed
-from crazysim.media.access import LOOPBACK_ADDRESSES, Access, guarded_server, is_own_name, wrong_name_message
+from crazysim.media.access import LOOPBACK_ADDRESSES, Access, is_own_name, start_guarded_server, wrong_name_message
 from crazysim.media.flight import Flight
 from crazysim.media.trail import choose_drone_colors
 from crazysim.scene.visual_geoms import VisualGeom
@@ -52,7 +52,7 @@ def page(flight: Flight, world: int | None = None, lights: NDArray | None = None
     with contextlib.redirect_stdout(
         io.StringIO()
     ):  # viser prints the address of its server, which runs for this call only
-        server = guarded_server(viser, Access("127.0.0.1", free_port()))
+        server = start_guarded_server(viser, Access("127.0.0.1", free_port()))
         try:
             return _record_scene(server, flight, k, lights).as_html()
         finally:
@@ -110,8 +110,8 @@ def initial_camera_pose(flight: Flight, k: int) -> tuple[NDArray, NDArray]:
     points = flight.pos[:, k].reshape(-1, 3)
     points = points[np.isfinite(points).all(-1)]
     low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.ones(3))
-    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
-    return middle + reach * np.array([0.0, -1.1, 0.7]), middle
+    middle, extent = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
+    return middle + extent * np.array([0.0, -1.1, 0.7]), middle
 
 
 def serve(flight: Flight, world: int | None = None, port: int = 8080, host: str = "127.0.0.1") -> None:
@@ -154,7 +154,7 @@ def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -
         by_color[shape.mocap, tuple(np.round(shape.rgba, 3))].append(shape)
     for i, ((mocap, rgba), shapes) in enumerate(by_color.items()):
         parent = f"/bodies/{mocap}" if mocap in frames else "/scene"
-        add_static(scene, f"{parent}/{i}", shapes, rgba)
+        add_geoms(scene, f"{parent}/{i}", shapes, rgba)
 
     colors = choose_drone_colors(flight.n_drones, None)
     for drone in range(flight.n_drones):
@@ -210,9 +210,9 @@ def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -
     return recording
 
 
-def add_static(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> None:
+def add_geoms(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> None:
     """Add the geoms of one body and colour to a viser scene: each plane as a grid, all other geoms as one mesh."""
-    solid = [shape for shape in shapes if shape.kind != "plane"]
+    solid_shapes = [shape for shape in shapes if shape.kind != "plane"]
     for i, shape in enumerate(shape for shape in shapes if shape.kind == "plane"):
         width, height = (2 * PLANE_SIZE if size == 0 else 2 * float(size) for size in shape.size[:2])
         scene.add_grid(
@@ -221,8 +221,8 @@ def add_static(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> 
             infinite_grid=not shape.size[:2].any(), fade_distance=2 * PLANE_SIZE,
             position=shape.pos, wxyz=np.roll(shape.quat, 1),
         )  # fmt: skip
-    if solid:
-        mesh = create_mesh(solid)
+    if solid_shapes:
+        mesh = create_mesh(solid_shapes)
         scene.add_mesh_simple(
             name,
             np.asarray(mesh.vertices, np.float32),
@@ -245,11 +245,11 @@ def create_mesh(shapes: list[VisualGeom]) -> Any:
         pose = np.eye(4)
         pose[:3, :3] = trimesh.transformations.quaternion_matrix(np.roll(shape.quat, 1))[:3, :3]
         pose[:3, 3] = shape.pos
-        meshes.append(_mesh(shape).apply_transform(pose))
+        meshes.append(_create_geom_mesh(shape).apply_transform(pose))
     return trimesh.util.concatenate(meshes)
 
 
-def _mesh(shape: VisualGeom) -> Any:
+def _create_geom_mesh(shape: VisualGeom) -> Any:
     """Return a geom as triangles, in its own frame."""
     import trimesh
 
@@ -266,9 +266,9 @@ def _mesh(shape: VisualGeom) -> Any:
     return mesh.apply_scale(shape.size if shape.kind == "ellipsoid" else radius)
 
 
-def rgb(rgba: Any, darker: float = 1.0) -> tuple[int, int, int]:
-    """Return red, green and blue from 0 to 255 of a colour from 0 to 1, multiplied by ``darker``."""
-    r, g, b = (round(255 * darker * float(np.clip(channel, 0, 1))) for channel in rgba[:3])
+def rgb(rgba: Any, brightness: float = 1.0) -> tuple[int, int, int]:
+    """Return red, green and blue from 0 to 255 of a colour from 0 to 1, multiplied by ``brightness``."""
+    r, g, b = (round(255 * brightness * float(np.clip(channel, 0, 1))) for channel in rgba[:3])
     return r, g, b
 
 

@@ -46,8 +46,8 @@ class BatchRenderer:
         if not is_installed():
             raise ImportError(INSTALL_MESSAGE)
         require_size(width, height)
-        number = camera_id(model, camera)
-        if number < 0:
+        camera_index = camera_id(model, camera)
+        if camera_index < 0:
             raise ConfigError("expected a camera of the scene, got the free camera, which MuJoCo Warp cannot render")
         import mujoco.mjx.third_party.mujoco_warp as mjw
         import warp as wp
@@ -65,7 +65,7 @@ class BatchRenderer:
                 render_rgb=True,
                 render_depth=False,
                 render_seg=False,
-                cam_active=[number],
+                cam_active=[camera_index],
                 use_shadows=True,
                 render_skybox=has_sky,
             )
@@ -80,14 +80,14 @@ class BatchRenderer:
         """
         wp, mjw, d = self._wp, self._mjw, self._data
         with wp.ScopedDevice(self._device):
-            for target, x, kind in (
+            for target, x, dtype in (
                 (d.mocap_pos, mocap_pos, wp.vec3),
                 (d.mocap_quat, mocap_quat, wp.quat),
                 (d.qpos, qpos, wp.float32),
             ):
                 if x.size:
                     x = jax.block_until_ready(jnp.asarray(x, jnp.float32))
-                    wp.copy(target, wp.from_jax(x, dtype=kind))
+                    wp.copy(target, wp.from_jax(x, dtype=dtype))
             for stage in (mjw.kinematics, mjw.com_pos, mjw.camlight):
                 stage(self._model, d)
             mjw.refit_bvh(self._model, d, self._context)

@@ -87,7 +87,7 @@ def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
     if n_drones <= DRONES_PER_CHUNK:
         _add_bodies(spec, airframes, range(n_drones))
         return
-    with _no_warnings():
+    with _suppress_attach_warnings():
         for first in range(0, n_drones, DRONES_PER_CHUNK):
             chunk = mujoco.MjSpec()
             _add_bodies(chunk, airframes, range(first, min(first + DRONES_PER_CHUNK, n_drones)))
@@ -95,21 +95,21 @@ def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
 
 
 @contextlib.contextmanager
-def _no_warnings() -> Iterator[None]:
+def _suppress_attach_warnings() -> Iterator[None]:
     """Suppress MuJoCo's warning, on the terminal and in MUJOCO_LOG.TXT, that attached names have no prefix."""
-    before = mujoco.get_mju_user_warning()
+    previous_handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
         yield
     finally:
-        mujoco.set_mju_user_warning(before)
+        mujoco.set_mju_user_warning(previous_handler)
 
 
-def _add_bodies(spec: mujoco.MjSpec, airframes: Sequence[Airframe], drones: range) -> None:
-    kinds = {id(airframe): airframe for airframe in airframes}
-    bodies = {key: (body_geoms(airframe), body_cameras(airframe)) for key, airframe in kinds.items()}
-    for i in drones:
-        geoms, cameras = bodies[id(airframes[i])]
+def _add_bodies(spec: mujoco.MjSpec, airframes: Sequence[Airframe], indices: range) -> None:
+    unique_airframes = {id(airframe): airframe for airframe in airframes}
+    parts = {key: (body_geoms(airframe), body_cameras(airframe)) for key, airframe in unique_airframes.items()}
+    for i in indices:
+        geoms, cameras = parts[id(airframes[i])]
         body = spec.worldbody.add_body(name=f"drone:{i}", mocap=True)
         for geom in geoms:
             _add_geom(body, geom, i)
@@ -133,7 +133,7 @@ def _add_geom(body: mujoco.MjsBody, geom: BodyGeom, i: int) -> None:
             1,
             (0.5, 0.5, 0.5, 0.3),
         )
-        _set_touching(spec_geom, geom.name == "col_sphere")
+        _set_collision_bits(spec_geom, geom.name == "col_sphere")
     else:
         spec_geom.group, spec_geom.contype, spec_geom.conaffinity = 2, 0, 0
         spec_geom.material = f"{geom.material}:{i}" if geom.material in LED_MATERIALS else geom.material
@@ -144,12 +144,12 @@ def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
     for i in range(n_drones):
         for kind in ("col_sphere", "col_box"):
             geom = spec.geom(f"{kind}:{i}")
-            _set_touching(geom, (kind == "col_box") == enable)
+            _set_collision_bits(geom, (kind == "col_box") == enable)
 
 
-def _set_touching(geom: mujoco.MjsGeom, is_touching: bool) -> None:
+def _set_collision_bits(geom: mujoco.MjsGeom, collides: bool) -> None:
     """Make a geom of a drone touch the scene, other drones, and geoms that only drones touch (bit 2), or no geom."""
-    geom.contype, geom.conaffinity = (3, 1) if is_touching else (0, 0)
+    geom.contype, geom.conaffinity = (3, 1) if collides else (0, 0)
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:

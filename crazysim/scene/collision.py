@@ -23,8 +23,8 @@ VISIBLE_GROUPS = range(3)
 MIN_ALPHA = 0.5
 """Smallest alpha of geoms that rays hit."""
 
-Kinds = Sequence[tuple[int, ...] | None]
-"""Indices of the drones of each airframe; None for all drones."""
+DroneGroups = Sequence[tuple[int, ...] | None]
+"""Indices of the drones of each airframe; None in place of the indices of all drones."""
 Matrix = tuple[tuple[float, float, float], ...]
 
 
@@ -66,7 +66,7 @@ class DroneGeoms:
     """Indices of the drones; None for all."""
 
     def drone_mask(self, drone_id: Array) -> Array | None:
-        """Return True where an index is of one of these drones; None if all drones have these geoms. (...)"""
+        """Return True where an index belongs to one of these drones; None if all drones have these geoms. (...)"""
         if self.drones is None:
             return None
         return functools.reduce(
@@ -105,13 +105,15 @@ class CollisionModel:
         return dataclasses.replace(self, mocap_bodies=(), mocap_ids=())
 
 
-def collision_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds = (None,)) -> CollisionModel:
+def collision_model(
+    model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,)
+) -> CollisionModel:
     """Return the geoms that drones touch.
 
     Args:
         model: Compiled scene.
         handles: Bodies with handles, in the order of ``data.objects``.
-        kinds: Drones of each airframe.
+        drone_groups: Drones of each airframe.
     """
 
     def can_touch(geom: int) -> bool:
@@ -120,16 +122,16 @@ def collision_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds 
     def touches_drones(geom: int) -> bool:
         return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
 
-    return _model(model, handles, kinds, can_touch, touches_drones)
+    return _build_model(model, handles, drone_groups, can_touch, touches_drones)
 
 
-def visual_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds = (None,)) -> CollisionModel:
+def visual_model(model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,)) -> CollisionModel:
     """Return the geoms that cameras see: meshes as convex hulls, without geoms that are more than half transparent.
 
     Args:
         model: Compiled scene.
         handles: Bodies with handles, in the order of ``data.objects``.
-        kinds: Drones of each airframe.
+        drone_groups: Drones of each airframe.
     """
 
     def is_seen(geom: int) -> bool:
@@ -137,30 +139,30 @@ def visual_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds = (
         alpha = model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3]
         return model.geom_group[geom] in VISIBLE_GROUPS and alpha >= MIN_ALPHA
 
-    return _model(model, handles, kinds, is_seen, is_seen)
+    return _build_model(model, handles, drone_groups, is_seen, is_seen)
 
 
-def _model(
+def _build_model(
     model: mujoco.MjModel,
     handles: Sequence[str],
-    kinds: Kinds,
-    is_taken: Callable[[int], bool],
-    of_drone: Callable[[int], bool],
+    drone_groups: DroneGroups,
+    is_included: Callable[[int], bool],
+    is_drone_geom: Callable[[int], bool],
 ) -> CollisionModel:
-    """Return the geoms of the scene, and of the first drone of each kind, for which the predicates hold."""
+    """Return the geoms of the scene, and of the first drone of each airframe, for which the predicates hold."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     floor = []
-    drone_geoms: dict[str, list[CollisionGeom]] = {f"drone:{kind[0] if kind else 0}": [] for kind in kinds}
-    geoms_of = dict[int, list[int]]()
+    drone_geoms: dict[str, list[CollisionGeom]] = {f"drone:{group[0] if group else 0}": [] for group in drone_groups}
+    geoms_by_root = dict[int, list[int]]()
     for geom in range(model.ngeom):
         root = int(model.body_rootid[model.geom_bodyid[geom]])
         name = body_name(model, root)
         if name.startswith("drone:"):
-            if name in drone_geoms and of_drone(geom):
-                drone_geoms[name].append(_geom(model, data, geom, root))
+            if name in drone_geoms and is_drone_geom(geom):
+                drone_geoms[name].append(_read_geom(model, data, geom, root))
             continue
-        if not is_taken(geom):
+        if not is_included(geom):
             continue
         kind = GEOM_KINDS.get(int(model.geom_type[geom]))
         if kind is None:
@@ -169,9 +171,9 @@ def _model(
                 f"{int(model.geom_type[geom])}. Give it contype='0' conaffinity='0', or another type."
             )
         if root == 0 and kind in ("plane", "hfield"):
-            floor.append(_geom(model, data, geom, None))
+            floor.append(_read_geom(model, data, geom, None))
         else:
-            geoms_of.setdefault(root, []).append(geom)
+            geoms_by_root.setdefault(root, []).append(geom)
     mocap = {
         name: int(mocap_id)
         for body, mocap_id in enumerate(model.body_mocapid)
@@ -179,18 +181,20 @@ def _model(
     }
     rows = {name: row for row, name in enumerate((*handles, *mocap))}
     objects = []
-    for root, geoms in geoms_of.items():
+    for root, geoms in geoms_by_root.items():
         row = rows.get(body_name(model, root))
         frame = None if row is None else root
         objects.append(
             CollisionBody(
                 body_name(model, root),
                 row,
-                tuple(_geom(model, data, geom, frame) for geom in geoms),
+                tuple(_read_geom(model, data, geom, frame) for geom in geoms),
                 tuple(map(float, data.xpos[root])),
             )
         )
-    drones = tuple([DroneGeoms(tuple(geoms), kind) for geoms, kind in zip(drone_geoms.values(), kinds, strict=True)])
+    drones = tuple(
+        [DroneGeoms(tuple(geoms), group) for geoms, group in zip(drone_geoms.values(), drone_groups, strict=True)]
+    )
     return CollisionModel(tuple(floor), tuple(objects), drones, tuple(mocap), tuple(mocap.values()))
 
 
@@ -199,7 +203,7 @@ def body_name(model: mujoco.MjModel, body: int) -> str:
     return model.body(body).name or f"body {body}"
 
 
-def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | None) -> CollisionGeom:
+def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | None) -> CollisionGeom:
     """Return a geom in the frame of a body, or of the world."""
     pos, rot = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
     if body is not None:
@@ -209,13 +213,13 @@ def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | Non
     # The compiler stores attitudes as quaternions, whose rounding would turn axis-aligned boxes.
     rot = np.where(np.abs(np.abs(rot) - 1) < 1e-9, np.sign(rot), rot)
     rows = None if np.allclose(rot, np.eye(3), rtol=0, atol=1e-9) else tuple(tuple(map(float, row)) for row in rot)
-    return CollisionGeom(_shape(model, geom), tuple(map(float, pos)), rows, model.geom(geom).name)  # type: ignore[arg-type]
+    return CollisionGeom(_read_shape(model, geom), tuple(map(float, pos)), rows, model.geom(geom).name)  # type: ignore[arg-type]
 
 
-def _shape(model: mujoco.MjModel, geom: int) -> Shape:
+def _read_shape(model: mujoco.MjModel, geom: int) -> Shape:
     kind, size = GEOM_KINDS[int(model.geom_type[geom])], model.geom_size[geom]
     if kind == "mesh":
-        return _hull(model, int(model.geom_dataid[geom]))
+        return _read_hull(model, int(model.geom_dataid[geom]))
     if kind == "hfield":
         field = int(model.geom_dataid[geom])
         rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
@@ -225,7 +229,7 @@ def _shape(model: mujoco.MjModel, geom: int) -> Shape:
     return Shape(kind, tuple(map(float, size)))
 
 
-def _hull(model: mujoco.MjModel, mesh: int) -> Shape:
+def _read_hull(model: mujoco.MjModel, mesh: int) -> Shape:
     """Return the convex hull of a mesh, which MuJoCo uses for contacts, too.
 
     MuJoCo's ``mesh_graph`` of a hull holds the numbers of vertices and faces, an address for each vertex, the indices

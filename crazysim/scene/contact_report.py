@@ -180,18 +180,19 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, in_data: bool
 
 
 def _group_key(body: CollisionBody) -> tuple[Any, ...]:
-    """Return equal keys for objects whose distances can be computed side by side."""
+    """Return a key that is equal for objects whose distances can be computed together."""
     if body.row is not None:
         return (True, body.geoms)
     kinds = tuple([(geom.shape, geom.rot is None) for geom in body.geoms])
-    # The geoms of a body that cannot move are in the world frame: bodies of one geom differ in its pose alone.
+    # Geoms of a body that cannot move are in the world frame, so bodies with one equal geom differ only in its pose.
     return (False, *kinds) if len(kinds) == 1 else (False, body.name)
 
 
 def kernel_size(model: CollisionModel, objects: ObjectSelection) -> int:
     """Return a measure of the length of a contact kernel: the number of geoms, with movable ones counted four times.
 
-    Of many fixed geoms of a body ``MAX_LISTED_GEOMS`` count, since a kernel searches for the nearest one.
+    Of the fixed geoms of one shape in a body, at most ``MAX_LISTED_GEOMS`` count, since a kernel searches a hierarchy
+    of more geoms.
     """
     bodies = select_bodies(model, objects, in_data=False)
     return sum(
@@ -216,7 +217,7 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
     geoms = group[0].geoms
     if group[0].row is None:
         if len(group) > MAX_UNROLLED_GEOMS:
-            stacked_geoms = StackedGeoms.of([body.geoms[0] for body in group])
+            stacked_geoms = StackedGeoms.from_geoms([body.geoms[0] for body in group])
             return _minimum(
                 [
                     _stacked_distances(part, part_pos, drone_rot, stacked_geoms, is_present)
@@ -227,8 +228,8 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
         return jnp.stack([_fixed_distance(parts, drone_rot, body.geoms) for body in group], axis=-1)
     objects = data.objects
     rows = [body.row for body in group if body.row is not None]
-    run = slice(rows[0], rows[-1] + 1) if rows == list(range(rows[0], rows[-1] + 1)) else np.array(rows)
-    pos, quat = objects.pos[..., run, :], objects.quat[..., run, :]
+    row_selection = slice(rows[0], rows[-1] + 1) if rows == list(range(rows[0], rows[-1] + 1)) else np.array(rows)
+    pos, quat = objects.pos[..., row_selection, :], objects.quat[..., row_selection, :]
     rot = None
     if drone_rot is not None:
         rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), drone_rot[..., None, :, :])
@@ -243,18 +244,19 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
 def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
     """Return the distance to the nearest of some geoms in the world frame, m. (...)
 
-    Distances to many geoms of one shape, or to many boxes, are computed side by side.
+    Distances to many geoms of one shape, or to many boxes, are computed together.
     """
     gaps = []
     for equal_geoms in _geoms_by_kind(geoms):
         for part, part_pos, is_present in parts:
             if len(equal_geoms) > MAX_LISTED_GEOMS and part_pos.ndim == 1:
-                gap = _nearest_distance(part, part_pos, drone_rot, StackedGeoms.of(equal_geoms))
+                gap = _nearest_distance(part, part_pos, drone_rot, StackedGeoms.from_geoms(equal_geoms))
                 gaps.append(_mask_absent(is_present, gap))
             elif len(equal_geoms) > MAX_UNROLLED_GEOMS:
                 gaps.append(
                     jnp.min(
-                        _stacked_distances(part, part_pos, drone_rot, StackedGeoms.of(equal_geoms), is_present), axis=-1
+                        _stacked_distances(part, part_pos, drone_rot, StackedGeoms.from_geoms(equal_geoms), is_present),
+                        axis=-1,
                     )
                 )
             else:
@@ -265,7 +267,7 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
 
 
 def _geoms_by_kind(geoms: Sequence[CollisionGeom]) -> list[list[CollisionGeom]]:
-    """Return geoms in groups of one shape, or of boxes, either all turned or none."""
+    """Return geoms in groups of one shape, or of boxes. In a group, all geoms are rotated or none is."""
     kinds: dict[Any, list[CollisionGeom]] = {}
     for geom in geoms:
         kinds.setdefault(("box" if geom.shape.kind == "box" else geom.shape, geom.rot is None), []).append(geom)
@@ -285,8 +287,8 @@ class StackedGeoms(NamedTuple):
     """Half lengths of boxes that differ, m; None for equal shapes. (n, 3)"""
 
     @staticmethod
-    def of(geoms: Sequence[CollisionGeom]) -> StackedGeoms:
-        """Return geoms of one shape, or boxes, either all turned or none."""
+    def from_geoms(geoms: Sequence[CollisionGeom]) -> StackedGeoms:
+        """Return the stack of geoms of one shape, or of boxes, of which all are rotated or none is."""
         rot = None if geoms[0].rot is None else np.array([geom.rot for geom in geoms])
         sizes = None
         if any(geom.shape != geoms[0].shape for geom in geoms):
@@ -315,9 +317,9 @@ def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | N
     columns = [geoms.pos, halves, *([] if geoms.rot is None else [geoms.rot.reshape(n, 9)])]
     table = jnp.asarray(np.concatenate(columns, axis=1), dtype)
 
-    def distance_of(row: list[Array], part_pos: Array, drone_rot: Array | None) -> Array:
-        pos, rest = jnp.stack(row[:3]), row[6:]
-        rot = jnp.stack(rest).reshape(3, 3) if rest else None
+    def distance_to_row(row: list[Array], part_pos: Array, drone_rot: Array | None) -> Array:
+        pos, rot_entries = jnp.stack(row[:3]), row[6:]
+        rot = jnp.stack(rot_entries).reshape(3, 3) if rot_entries else None
         sizes = None if geoms.box_sizes is None else jnp.stack(row[3:6])
         return _geom_distance(part, part_pos, drone_rot, StackedGeoms(geoms.shape, pos, rot, sizes))
 
@@ -327,9 +329,9 @@ def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | N
         np.asarray(middles + reaches),
         list(components(part_pos)),
         float(np.linalg.norm(bounding_box(part.shape)[1])) if part.shape.kind != "sphere" else part.shape.size[0],
-        lambda k: distance_of(table_rows(table, k), fixed_pos, fixed_rot),
+        lambda k: distance_to_row(table_rows(table, k), fixed_pos, fixed_rot),
     )
-    return distance_of(list(jnp.take(table, index, axis=0)), part_pos, drone_rot)
+    return distance_to_row(list(jnp.take(table, index, axis=0)), part_pos, drone_rot)
 
 
 def _geom_distance(
@@ -431,7 +433,7 @@ def _nearest_drones(parts: DroneParts, drone_rot: Array | None) -> tuple[Array, 
 
 
 def _argmin(gaps: Array) -> Array:
-    """Return the index of the smallest of some distances, int32 also where x64 is enabled: kernels have no int64.
+    """Return the index of the smallest distance, int32 even if x64 is enabled, since kernels have no int64.
 
     Args:
         gaps: Distances, m. (..., n)

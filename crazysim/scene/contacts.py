@@ -18,16 +18,16 @@ def contact_flags(mjx_data: mjx.Data) -> Array:
 
 def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) -> Array:
     """Return a mask of the contact slots in which a geom of the body touches another geom. (n_worlds, n_slots)"""
-    is_of_body = mj_model.geom_bodyid == body_id(mj_model, body)
+    belongs_to_body = mj_model.geom_bodyid == body_id(mj_model, body)
     contact = mjx_data._impl.contact
-    return _slot_flags(contact.dist, contact.geom1, contact.geom2, is_of_body)
+    return _slot_flags(contact.dist, contact.geom1, contact.geom2, belongs_to_body)
 
 
 @jit_unless_traced()
-def _slot_flags(dist: Array, geom1: Array, geom2: Array, is_of_body: Array) -> Array:
-    """Return True for every slot that touches and has a geom of a body, given for each geom whether it is of it."""
-    is_of_body = jnp.asarray(is_of_body)
-    return (dist < 0) & ((geom1 >= 0) & is_of_body[geom1] | (geom2 >= 0) & is_of_body[geom2])
+def _slot_flags(dist: Array, geom1: Array, geom2: Array, belongs_to_body: Array) -> Array:
+    """Return True for every slot that touches and has a geom where ``belongs_to_body``. (n_worlds, n_slots)"""
+    belongs_to_body = jnp.asarray(belongs_to_body)
+    return (dist < 0) & ((geom1 >= 0) & belongs_to_body[geom1] | (geom2 >= 0) & belongs_to_body[geom2])
 
 
 def body_id(mj_model: mujoco.MjModel, body: str) -> int:

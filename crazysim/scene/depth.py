@@ -28,21 +28,22 @@ MAX_RAYS = 1 << 22
 """Largest number of rays that XLA casts at a time; larger batches of worlds are split."""
 
 MAX_RAYS_OF_KERNEL = 1 << 28
-"""Largest number of rays in a kernel; numbers of rays and indices of tables are int32."""
+"""Largest number of rays in a kernel, whose indices of rays and of entries of tables are int32."""
 
 TILE_SIDE = 4
-"""Height and width of the tiles of pixels whose rays follow each other, so that neighbouring lanes of a kernel meet
-similar geoms, pixels."""
+"""Height and width of tiles, pixels. Rays are ordered tile by tile, so that neighbouring lanes of a kernel meet similar
+geoms."""
 
 Along = Literal["axis", "ray"]
+"""Direction of distances: along the axis of the camera, or along the ray."""
 
 BYTES_PER_RAY = 16
-"""Memory of a ray, at least: distance, index of the geom, and the image of each of them, in four bytes each."""
+"""Smallest memory of a ray, bytes: distance and index of the geom, and a pixel for each of them, four bytes each."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class View:
-    """A camera that every drone carries: the directions of its pixels, and its mounting."""
+class DroneCamera:
+    """A camera that every drone carries: directions of its pixels, and mounting on each drone."""
 
     rays: np.ndarray
     """Unit directions of the pixels, frame of the camera (x ahead, y left, z up). (height, width, 3)"""
@@ -62,7 +63,7 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class CarriedCamera:
-    """A camera relative to the body that carries it."""
+    """A camera and its pose in the frame of the body that carries it."""
 
     carrier: Literal["world", "drone", "object"]
     """Kind of that body."""
@@ -75,20 +76,20 @@ class CarriedCamera:
     rot: tuple[tuple[float, ...], ...]
     """Rotation matrix whose columns are the camera's right, up and back in that frame. (3, 3)"""
     follows_rotation: bool
-    """True if it turns with that body; false if it follows its position only."""
+    """True if the camera turns with that body; False if it only follows the body's position."""
     fovy: float
     """Vertical field of view, degrees."""
 
     @classmethod
-    def of_view(cls, view: View, drone: int) -> CarriedCamera:
-        """Return the camera of a view on one drone."""
-        ahead, left, up = view.rot.T
-        columns = tuple(tuple(map(float, line)) for line in np.stack([-left, up, -ahead], axis=-1))
-        return cls("drone", f"drone:{drone}", drone, tuple(map(float, view.pos[drone])), columns, True, 0.0)
+    def on_drone(cls, camera: DroneCamera, drone: int) -> CarriedCamera:
+        """Return the camera that one drone carries."""
+        forward, left, up = camera.rot.T
+        columns = tuple(tuple(map(float, row)) for row in np.stack([-left, up, -forward], axis=-1))
+        return cls("drone", f"drone:{drone}", drone, tuple(map(float, camera.pos[drone])), columns, True, 0.0)
 
 
 def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str]) -> list[CarriedCamera]:
-    """Return the camera with a name or id, or every drone's camera for a name without index, such as ``fpv_cam``.
+    """Return the camera with a name or id, or the cameras of all drones for a name without index, such as ``fpv_cam``.
 
     Args:
         model: Compiled scene.
@@ -161,10 +162,10 @@ def check_image_memory(
     """Check that images fit into the memory of their devices, before anything is allocated.
 
     Args:
-        n_images: Images of all worlds together.
+        n_images: Number of images in all worlds together.
         width: Pixels.
         height: Pixels.
-        bytes_per_pixel: Memory that a pixel needs at least.
+        bytes_per_pixel: Smallest memory of a pixel, bytes.
         device: Device of the images, or one of several.
         n_devices: Number of devices among which the images are divided.
     """
@@ -201,8 +202,9 @@ def build_depth_fn(
     plugins: ListPlugins,
     kernels: RayKernels,
 ) -> DepthFn:
-    """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width), without n_worlds in one world;
-    see ``Scene.depth_fn``.
+    """Return ``depth(data, mocap=None) -> Hits``; see ``Scene.depth_fn``.
+
+    The images have shape (n_worlds, n_cameras, height, width), or without n_worlds in a function of one world.
 
     Args:
         model: Visual model of the scene.
@@ -219,25 +221,25 @@ def build_depth_fn(
     drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
     height, width = rays[0].shape[:2]
     h, w = (math.gcd(n, TILE_SIDE) for n in (height, width))
-    order = np.arange(height * width).reshape(height // h, h, width // w, w).swapaxes(1, 2).reshape(-1)
+    tile_order = np.arange(height * width).reshape(height // h, h, width // w, w).swapaxes(1, 2).reshape(-1)
     directions = np.zeros((len(cameras), height * width, 4))
-    for camera, pixels, table in zip(cameras, rays, directions, strict=True):
-        table[:, :3] = pixels.reshape(-1, 3)[order]
-        table[:, 3] = camera.row if camera.carrier == "drone" and hide_own else IGNORES_NONE
+    for camera, pixels, pixel_rows in zip(cameras, rays, directions, strict=True):
+        pixel_rows[:, :3] = pixels.reshape(-1, 3)[tile_order]
+        pixel_rows[:, 3] = camera.row if camera.carrier == "drone" and hide_own else IGNORES_NONE
     n_rays = len(cameras) * width * height
 
-    ignored = directions[..., 3].reshape(-1).astype(int)
+    ignored_drones = directions[..., 3].reshape(-1).astype(int)
 
     def cast_in_worlds(data: SimData, kernels: RayKernels) -> Hits:
         poses = [camera_pose(camera, data) for camera in cameras]
         if data.states.pos.ndim == 2:
             origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
             direction = jnp.concatenate(
-                [_directions(rot, table) for (_, rot), table in zip(poses, directions, strict=True)]
+                [_directions(rot, pixel_rows) for (_, rot), pixel_rows in zip(poses, directions, strict=True)]
             )
-            return untile_results(cast_rays(model_without_mocap, data, origin, direction, ignored, drones))
-        eyes = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
-        return untile_results(cast_rays_in_worlds(model_without_mocap, data, eyes, directions, drones, kernels))
+            return untile_results(cast_rays(model_without_mocap, data, origin, direction, ignored_drones, drones))
+        camera_poses = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
+        return untile_results(cast_rays_in_worlds(model_without_mocap, data, camera_poses, directions, drones, kernels))
 
     def untile_results(hits: Hits) -> Hits:
         """Return the results of rays, tile by tile, as images, row by row."""
@@ -271,8 +273,8 @@ def build_depth_fn(
     def cast_in_parts(data: SimData, kernels: RayKernels) -> Hits:
         """Cast the rays of all worlds, in parts of at most ``MAX_RAYS`` or ``MAX_RAYS_OF_KERNEL``."""
         max_rays = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
-        n_worlds, at_a_time = data.states.pos.shape[0], max(1, max_rays // n_rays)
-        if n_worlds <= at_a_time:
+        n_worlds, worlds_per_batch = data.states.pos.shape[0], max(1, max_rays // n_rays)
+        if n_worlds <= worlds_per_batch:
             return cast_in_worlds(data, kernels)
         objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
 
@@ -282,7 +284,7 @@ def build_depth_fn(
             world_data = data.replace(states=states, objects=objects)
             return jax.tree.map(lambda x: x[0], cast_in_worlds(world_data, kernels))
 
-        return jax.lax.map(cast_in_world, (data.states.pos, data.states.quat, objects), batch_size=at_a_time)
+        return jax.lax.map(cast_in_world, (data.states.pos, data.states.quat, objects), batch_size=worlds_per_batch)
 
     return depth
 

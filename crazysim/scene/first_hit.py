@@ -1,7 +1,7 @@
 """The first geom that a ray meets: a function of one ray, for kernels of all rays and for stages of a step.
 
 Geoms that do not move are in a hierarchy of boxes. For kernels of all rays, geoms of movable bodies and drones are in a
-second one, whose nodes every world fills with boxes of its own.
+second hierarchy, whose boxes are computed for each world.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Target:
     geom: CollisionGeom
     """The geom, in the frame of its body."""
     carrier: Literal["world", "object", "drone"]
-    """Kind of its body; the world's do not move."""
+    """Kind of its body; geoms of the world do not move."""
     row: int
     """Row of the body among the objects or drones."""
     body_index: int
@@ -59,7 +59,7 @@ class Target:
         return shape if shape.kind in ("mesh", "hfield") else shape.kind
 
     def table_row(self, pos: np.ndarray) -> np.ndarray:
-        """Return position, a zero, rotation by rows, and size in three numbers: a row of the table of geoms. (16,)
+        """Return the geom's row in a table: position, a zero, rotation matrix by rows, size in three numbers. (16,)
 
         Args:
             pos: Position, m. (3,)
@@ -79,7 +79,7 @@ class Hierarchy(NamedTuple):
     boxes: Array
     """Boxes of the nodes, one order after the other. (8 * n_nodes, 6)"""
     links: Array
-    """Index of the node behind the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
+    """Index of the node after the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
     geoms: Array
     """Geoms, world frame; see ``Target.table_row``. (n_fixed, 16)"""
 
@@ -88,22 +88,22 @@ class Tables(NamedTuple):
     """Everything that rays of all worlds need, as tables in memory."""
 
     counts: Array
-    """Numbers of nodes in one order, of fixed geoms, of movable geoms, and of nodes of these in one order. (1, 4)"""
+    """Numbers of fixed nodes per order, of fixed geoms, of movable geoms, and of movable nodes per order. (1, 4)"""
     codes: Array
     """Index of the surface, and the drone that a geom belongs to, of fixed and then movable geoms. (n, 2)"""
     boxes: Array
     """As in ``Hierarchy``, of the fixed geoms. (8 * n_nodes, 6)"""
     links: Array
     """As in ``Hierarchy``. (8 * n_nodes, 2)"""
-    fixed: Array
+    fixed_geoms: Array
     """Fixed geoms, world frame; see ``Target.table_row``. (n_fixed, 16)"""
     movable_boxes: Array
     """Boxes of the nodes of the movable geoms in every world, in the first order. (n_worlds * n_movable_nodes, 6)"""
     movable_links: Array
     """As ``links``, then the index of the node in the first order. (8 * n_movable_nodes, 3)"""
-    movable: Array
+    movable_geoms: Array
     """Movable geoms, world frame. (n_worlds * n_movable, 16)"""
-    eyes: Array
+    camera_poses: Array
     """Position, and axes by rows, of the cameras. (n_worlds * n_cameras, 12)"""
     pixels: Array
     """Direction of each ray in the frame of its camera, and ``Ray.ignored_drone``. (n_cameras * n_pixels, 4)"""
@@ -129,43 +129,43 @@ class Targets:
             for row in range(n_drones) if kind.drones is None else kind.drones:
                 if row != ignored_drone:
                     targets += [Target(geom, "drone", row, 1 + len(model.objects) + row) for geom in kind.geoms]
-        self.fixed = [x for x in targets if x.carrier == "world"]
+        self.fixed_geoms = [x for x in targets if x.carrier == "world"]
         """Geoms that do not move."""
-        self.movable = [x for carrier in ("object", "drone") for x in targets if x.carrier == carrier]
+        self.movable_geoms = [x for carrier in ("object", "drone") for x in targets if x.carrier == carrier]
         """Geoms of movable objects, then geoms of drones."""
-        self.all = [*self.fixed, *self.movable]
+        self.all_geoms = [*self.fixed_geoms, *self.movable_geoms]
         """All geoms, in the order of their indices."""
-        self.surfaces: tuple[Surface, ...] = tuple(dict.fromkeys(x.surface for x in self.all))
+        self.surfaces: tuple[Surface, ...] = tuple(dict.fromkeys(x.surface for x in self.all_geoms))
         """Distinct surfaces of the geoms."""
-        owners = [x.row if x.carrier == "drone" else NOT_A_DRONE for x in self.all]
-        codes = [(self.surfaces.index(x.surface), owner) for x, owner in zip(self.all, owners, strict=True)]
+        owners = [x.row if x.carrier == "drone" else NOT_A_DRONE for x in self.all_geoms]
+        codes = [(self.surfaces.index(x.surface), owner) for x, owner in zip(self.all_geoms, owners, strict=True)]
         self.codes = np.array(codes, np.int32).reshape(-1, 2)
         """Index of the surface of each geom, and the drone that it belongs to. (n, 2)"""
 
     def hierarchy(self, dtype: DTypeLike) -> Hierarchy:
         """Return the fixed geoms; see ``build_hierarchy``."""
-        low, high = np.zeros((2, len(self.fixed), 3))
-        for k, target in enumerate(self.fixed):
+        low, high = np.zeros((2, len(self.fixed_geoms), 3))
+        for k, target in enumerate(self.fixed_geoms):
             rot = np.eye(3) if target.geom.rot is None else np.array(target.geom.rot)
-            centre, half = bounding_box(target.geom.shape)
-            centre, half = np.array(target.geom.pos) + rot @ centre, np.abs(rot) @ half
-            low[k], high[k] = centre - half, centre + half
+            middle, half = bounding_box(target.geom.shape)
+            middle, half = np.array(target.geom.pos) + rot @ middle, np.abs(rot) @ half
+            low[k], high[k] = middle - half, middle + half
         boxes, links = (x.reshape(-1, x.shape[-1]) for x in hierarchy.build_hierarchy(low, high))
-        geoms = np.array([x.table_row(np.array(x.geom.pos)) for x in self.fixed]).reshape(-1, 16)
-        codes = self.codes[: len(self.fixed)]
+        geoms = np.array([x.table_row(np.array(x.geom.pos)) for x in self.fixed_geoms]).reshape(-1, 16)
+        codes = self.codes[: len(self.fixed_geoms)]
         return Hierarchy(jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links), jnp.asarray(geoms, dtype))
 
     def movable_nodes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the nodes of the hierarchy of movable geoms, ordered by where the geoms are in the compiled scene.
 
         Returns:
-            First and end of the leaves of each node in the first order. (n_nodes, 2)
-            Index among the movable geoms of each leaf in the first order. (n_movable,)
+            Index of the first leaf of each node, and of the one after its last leaf, in the first order. (n_nodes, 2)
+            Index of each leaf's geom among the movable geoms, in the first order. (n_movable,)
             As in ``Tables.movable_links``. (8, n_nodes, 3)
         """
-        low, high = np.zeros((2, len(self.movable), 3))
-        drone_pos = np.pad(grid_2d(1 + max([x.row for x in self.movable], default=0)), ((0, 0), (0, 1)))
-        for k, target in enumerate(self.movable):
+        low, high = np.zeros((2, len(self.movable_geoms), 3))
+        drone_pos = np.pad(grid_2d(1 + max([x.row for x in self.movable_geoms], default=0)), ((0, 0), (0, 1)))
+        for k, target in enumerate(self.movable_geoms):
             pos = (
                 drone_pos[target.row] + FAR_FROM_OBJECTS if target.carrier == "drone" else np.array(target.initial_pos)
             )
@@ -175,9 +175,11 @@ class Targets:
         geoms = links[0, :, 1]
         leaves_before = np.concatenate([[0], np.cumsum(geoms >= 0)])
         ranges = np.stack([leaves_before[:-1], leaves_before[links[0, :, 0]]], axis=-1)
-        # A node is known by its leaves, which are the same in all orders.
-        node_of = {_leaf_set(links[0], k): k for k in range(len(geoms))}
-        indices = np.array([[node_of[_leaf_set(order, k)] for k in range(len(geoms))] for order in links], np.int32)
+        # A node has the same leaves in all orders, which identify it.
+        node_by_leaves = {_leaf_set(links[0], k): k for k in range(len(geoms))}
+        indices = np.array(
+            [[node_by_leaves[_leaf_set(order, k)] for k in range(len(geoms))] for order in links], np.int32
+        )
         return ranges.astype(np.int32), geoms[geoms >= 0], np.concatenate([links, indices[..., None]], axis=-1)
 
     def movable_rows(self, data: SimData) -> tuple[Array, Array]:
@@ -191,7 +193,7 @@ class Targets:
         n_worlds = states.pos.shape[0]
         boxes, geoms = [jnp.zeros((n_worlds, 0, 6), dtype)], [jnp.zeros((n_worlds, 0, 16), dtype)]
         for carrier in ("object", "drone"):
-            targets = [x for x in self.movable if x.carrier == carrier]
+            targets = [x for x in self.movable_geoms if x.carrier == carrier]
             if not targets:
                 continue
             if carrier == "object" and data.objects is not None:
@@ -201,34 +203,34 @@ class Targets:
             pos, quat = (x[:, np.array([t.row for t in targets])] for x in poses)
             rows = np.array([t.table_row(np.array(t.geom.pos)) for t in targets])
             rot = rows[:, 4:13].reshape(-1, 3, 3)
-            middle, half = (np.array(x) for x in zip(*(bounding_box(t.geom.shape) for t in targets), strict=True))
+            local_middle, half = (np.array(x) for x in zip(*(bounding_box(t.geom.shape) for t in targets), strict=True))
             geom_pos = pos + rotation.rotate(quat, jnp.asarray(rows[:, :3], dtype))
             axes = jnp.stack([rotation.rotate(quat, jnp.asarray(rot[:, :, k], dtype)) for k in range(3)], axis=-1)
-            middle, half = (jnp.asarray(x, dtype)[:, None] for x in (middle, half))
-            centre, reach = geom_pos + jnp.sum(axes * middle, axis=-1), jnp.sum(jnp.abs(axes) * half, axis=-1)
-            reach = reach + hierarchy.BOX_PADDING + 4 * jnp.finfo(dtype).eps * jnp.abs(centre)
-            boxes.append(jnp.concatenate([centre - reach, centre + reach], axis=-1))
+            local_middle, half = (jnp.asarray(x, dtype)[:, None] for x in (local_middle, half))
+            middle, reach = geom_pos + jnp.sum(axes * local_middle, axis=-1), jnp.sum(jnp.abs(axes) * half, axis=-1)
+            reach = reach + hierarchy.BOX_PADDING + 4 * jnp.finfo(dtype).eps * jnp.abs(middle)
+            boxes.append(jnp.concatenate([middle - reach, middle + reach], axis=-1))
             size = jnp.broadcast_to(jnp.asarray(rows[:, 13:], dtype), (*geom_pos.shape[:2], 3))
             zero = jnp.zeros_like(geom_pos[..., :1])
             geoms.append(jnp.concatenate([geom_pos, zero, axes.reshape(*geom_pos.shape[:2], 9), size], axis=-1))
         return jnp.concatenate(boxes, axis=1), jnp.concatenate(geoms, axis=1)
 
-    def tables(self, boxes: Array, links: np.ndarray, geoms: Array, eyes: Array, pixels: Array) -> Tables:
+    def tables(self, boxes: Array, links: np.ndarray, geoms: Array, camera_poses: Array, pixels: Array) -> Tables:
         """Return the tables of rays of all worlds.
 
         Args:
             boxes: Boxes of the nodes of the movable geoms in every world. (n_worlds, n_nodes, 6)
             links: From ``movable_nodes``.
             geoms: From ``movable_rows``.
-            eyes: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
+            camera_poses: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
             pixels: Directions in the frame of the camera, and ``Ray.ignored_drone``. (n_cameras, n_pixels, 4)
         """
-        fixed_tables = self.hierarchy(eyes.dtype)
-        n_nodes = len(fixed_tables.boxes) // hierarchy.N_ORDERS
-        counts = np.array([[n_nodes, len(self.fixed), len(self.movable), links.shape[1]]], np.int32)
+        fixed_hierarchy = self.hierarchy(camera_poses.dtype)
+        n_nodes = len(fixed_hierarchy.boxes) // hierarchy.N_ORDERS
+        counts = np.array([[n_nodes, len(self.fixed_geoms), len(self.movable_geoms), links.shape[1]]], np.int32)
         tables = (
-            jnp.asarray(counts), jnp.asarray(self.codes), *fixed_tables[1:], boxes, jnp.asarray(links), geoms, eyes,
-            pixels,
+            jnp.asarray(counts), jnp.asarray(self.codes), *fixed_hierarchy[1:], boxes, jnp.asarray(links), geoms,
+            camera_poses, pixels,
         )  # fmt: skip
         # Empty tables get a row of zeros, since an array without rows has no memory.
         flat_tables = [x.reshape(-1, x.shape[-1]) for x in tables]
@@ -245,24 +247,24 @@ def node_box(index: Array, counts: Array, ranges: Array, leaf_boxes: Array) -> l
     """Return the box around the leaves of a node in one world, as lower and upper corner. 6 of ()
 
     Args:
-        index: Number of the node: those of the first world come first. ()
-        counts: Numbers of nodes and of leaves of a world. (1, 2)
-        ranges: First and end of the leaves of each node. (n_nodes, 2)
+        index: Index of the node; nodes of the first world come first. ()
+        counts: Number of nodes and number of leaves of a world. (1, 2)
+        ranges: Index of the first leaf of each node, and of the one after its last leaf. (n_nodes, 2)
         leaf_boxes: Boxes of the leaves of every world. (n_worlds * n_leaves, 6)
     """
     n_nodes, n_leaves = table_rows(counts, jnp.int32(0))
     world = lax.div(index, n_nodes)
-    first, end = table_rows(ranges, index - world * n_nodes)
+    first_leaf, end_leaf = table_rows(ranges, index - world * n_nodes)
 
     def include(carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
-        k, box = carry
-        leaf = table_rows(leaf_boxes, world * n_leaves + k)
-        low = [_minimum(a, b) for a, b in zip(box[:3], leaf[:3], strict=True)]
-        high = [_maximum(a, b) for a, b in zip(box[3:], leaf[3:], strict=True)]
-        return k + 1, [*low, *high]
+        leaf, box = carry
+        box_of_leaf = table_rows(leaf_boxes, world * n_leaves + leaf)
+        low = [_minimum(a, b) for a, b in zip(box[:3], box_of_leaf[:3], strict=True)]
+        high = [_maximum(a, b) for a, b in zip(box[3:], box_of_leaf[3:], strict=True)]
+        return leaf + 1, [*low, *high]
 
     infinite = jnp.asarray(jnp.inf, leaf_boxes.dtype)
-    return lax.while_loop(lambda carry: carry[0] < end, include, (first, [infinite] * 3 + [-infinite] * 3))[1]
+    return lax.while_loop(lambda carry: carry[0] < end_leaf, include, (first_leaf, [infinite] * 3 + [-infinite] * 3))[1]
 
 
 class Ray(NamedTuple):
@@ -273,64 +275,65 @@ class Ray(NamedTuple):
     direction: Components
     """Unit direction, world frame."""
     ignored_drone: Array
-    """Index of the drone that it passes through, or ``IGNORES_NONE``."""
+    """Index of the drone that the ray passes through, or ``IGNORES_NONE``."""
 
 
 BestHit = tuple[Array, Array]
-"""Distance to the first geom so far, m, infinite for none, and its index, -1 for none."""
+"""Distance to the nearest geom so far, m, and its index; infinite and -1 if there is none."""
 
 
 def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index: Array, *tables: Array) -> BestHit:
-    """Return the distance to the first geom that a ray meets, and the index of the geom; see ``Targets.all``.
+    """Return the distance to the first geom that a ray meets, and the index of the geom; see ``Targets.all_geoms``.
 
-    Of geoms at the same distance the lowest index is returned.
+    If several geoms are at the same distance, the lowest index is returned.
 
     Args:
         surfaces: ``Targets.surfaces``.
         n_pixels: Rays of a camera.
         n_cameras: Cameras of a world.
-        index: Number of the ray: pixels of the first camera of the first world come first. ()
+        index: Index of the ray; pixels of the first camera of the first world come first. ()
         *tables: ``Tables``.
     """
     t = Tables(*tables)
     n_nodes, n_fixed, n_movable, n_movable_nodes = table_rows(t.counts, jnp.int32(0))
     world, ray = _camera_ray(t, n_pixels, n_cameras, index)
     best = jnp.full_like(ray.origin[0], jnp.inf), jnp.int32(-1)
-    best = first_fixed_hit(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed), ray, best, n_nodes)
+    best = first_fixed_hit(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed_geoms), ray, best, n_nodes)
 
-    def node(k: Array) -> tuple[Sequence[Array], Array, Array]:
-        after, geom, first_order = table_rows(t.movable_links, k)
-        return table_rows(t.movable_boxes, world * n_movable_nodes + first_order), after, geom
+    def read_node(k: Array) -> tuple[Sequence[Array], Array, Array]:
+        next_node, geom, first_order = table_rows(t.movable_links, k)
+        return table_rows(t.movable_boxes, world * n_movable_nodes + first_order), next_node, geom
 
-    def hit(k: Array, is_near: Array, best: BestHit) -> BestHit:
+    def hit_geom(k: Array, is_near: Array, best: BestHit) -> BestHit:
         code, owner = table_rows(t.codes, n_fixed + k)
         is_near = is_near & (owner != ray.ignored_drone)
-        row = table_rows(t.movable, world * n_movable + k)
+        row = table_rows(t.movable_geoms, world * n_movable + k)
         return _nearer_hit(surfaces, code, n_fixed + k, row, ray, is_near, best)
 
-    return _walk_hierarchy(node, hit, ray, best, n_movable_nodes)
+    return _walk_hierarchy(read_node, hit_geom, ray, best, n_movable_nodes)
 
 
 def _camera_ray(t: Tables, n_pixels: int, n_cameras: int, index: Array) -> tuple[Array, Ray]:
-    """Return the world of a ray with a number, and the ray; see ``first_hit``."""
-    view = lax.div(index, jnp.int32(n_pixels))
-    world = lax.div(view, jnp.int32(n_cameras))
-    camera, pixel = view - world * n_cameras, index - view * n_pixels
-    eye, (*look, ignored_drone) = table_rows(t.eyes, view), table_rows(t.pixels, camera * n_pixels + pixel)
-    x, y, z = (eye[k] * look[0] + eye[k + 1] * look[1] + eye[k + 2] * look[2] for k in (3, 6, 9))
-    return world, Ray((eye[0], eye[1], eye[2]), (x, y, z), ignored_drone.astype(jnp.int32))
+    """Return the world of the ray with an index, and the ray; see ``first_hit``."""
+    camera_number = lax.div(index, jnp.int32(n_pixels))
+    world = lax.div(camera_number, jnp.int32(n_cameras))
+    camera, pixel = camera_number - world * n_cameras, index - camera_number * n_pixels
+    pose = table_rows(t.camera_poses, camera_number)
+    *direction, ignored_drone = table_rows(t.pixels, camera * n_pixels + pixel)
+    x, y, z = (pose[k] * direction[0] + pose[k + 1] * direction[1] + pose[k + 2] * direction[2] for k in (3, 6, 9))
+    return world, Ray((pose[0], pose[1], pose[2]), (x, y, z), ignored_drone.astype(jnp.int32))
 
 
 def normal_at_hit(
     surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index: Array, *tables: Array
 ) -> Components:
-    """Return the unit normal where a ray meets its first geom, world frame, zero where it meets nothing.
+    """Return the unit normal where a ray meets its first geom, world frame; zero if it meets nothing.
 
     Args:
         surfaces: ``Targets.surfaces``.
         n_pixels: Rays of a camera.
         n_cameras: Cameras of a world.
-        index: Number of the ray, as in ``first_hit``. ()
+        index: Index of the ray, as in ``first_hit``. ()
         *tables: ``Tables``, then the two results of ``first_hit`` for all rays. (n_rays, 1) each
     """
     t, (distances, geoms) = Tables(*tables[:-2]), tables[-2:]
@@ -339,53 +342,55 @@ def normal_at_hit(
     (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)
     code, _ = table_rows(t.codes, _maximum(geom, jnp.int32(0)))
 
-    def in_world_frame(row: Sequence[Array], normal: Components) -> Components:
+    def normal_in_world_frame(row: Sequence[Array], normal: Components) -> Components:
         """Return the normal of the geom with the given row."""
-        start, along = ray_in_frame(row, ray.origin, ray.direction)
+        local_origin, local_direction = ray_in_frame(row, ray.origin, ray.direction)
         for k, surface in enumerate(surfaces):
 
-            def of_surface(_: Components, surface: Surface = surface) -> Components:
-                local = _normal_in_frame(surface, row, start, along, distance)
-                a, b, c = local
+            def normal_of_surface(_: Components, surface: Surface = surface) -> Components:
+                local_normal = _normal_in_frame(surface, row, local_origin, local_direction, distance)
+                a, b, c = local_normal
                 x, y, z = (row[i] * a + row[i + 1] * b + row[i + 2] * c for i in (4, 7, 10))
                 return x, y, z
 
-            normal = compute_where(code == k, of_surface, normal) if len(surfaces) > 1 else of_surface(normal)
+            normal = (
+                compute_where(code == k, normal_of_surface, normal) if len(surfaces) > 1 else normal_of_surface(normal)
+            )
         return normal
 
-    def of_fixed(normal: Components) -> Components:
-        return in_world_frame(table_rows(t.fixed, geom), normal)
+    def normal_of_fixed_geom(normal: Components) -> Components:
+        return normal_in_world_frame(table_rows(t.fixed_geoms, geom), normal)
 
-    def of_movable(normal: Components) -> Components:
-        return in_world_frame(table_rows(t.movable, world * n_movable + geom - n_fixed), normal)
+    def normal_of_movable_geom(normal: Components) -> Components:
+        return normal_in_world_frame(table_rows(t.movable_geoms, world * n_movable + geom - n_fixed), normal)
 
     zero = jnp.zeros_like(distance)
-    normal = compute_where((geom >= 0) & (geom < n_fixed), of_fixed, (zero, zero, zero))
-    return compute_where(geom >= n_fixed, of_movable, normal)
+    normal = compute_where((geom >= 0) & (geom < n_fixed), normal_of_fixed_geom, (zero, zero, zero))
+    return compute_where(geom >= n_fixed, normal_of_movable_geom, normal)
 
 
 def _normal_in_frame(
-    surface: Surface, row: Sequence[Array], start: Components, along: Components, distance: Array
+    surface: Surface, row: Sequence[Array], origin: Components, direction: Components, distance: Array
 ) -> Components:
-    """Return the outward unit normal where one ray in the frame of a geom hits it, at a distance in m. 3 of ()"""
+    """Return the outward unit normal where a ray hits a geom at a distance, m, all in the geom's frame. 3 of ()"""
     if isinstance(surface, Shape) and surface.kind == "hfield":
-        return components(field_ray(surface, jnp.stack(start), jnp.stack(along))[1])
+        return components(field_ray(surface, jnp.stack(origin), jnp.stack(direction))[1])
     if isinstance(surface, Shape):
-        return _mesh_normal(surface, *(s + distance * a for s, a in zip(start, along, strict=True)))
-    return components(hit_normal(geom_shape(surface, row), jnp.stack(start), jnp.stack(along), distance))
+        return _mesh_normal(surface, *(s + distance * a for s, a in zip(origin, direction, strict=True)))
+    return components(hit_normal(geom_shape(surface, row), jnp.stack(origin), jnp.stack(direction), distance))
 
 
 def _mesh_normal(shape: Shape, x: Array, y: Array, z: Array) -> Components:
-    """Return the normal of the plane of a mesh that a point of its surface is nearest to, in a loop over the planes."""
+    """Return the normal of the plane of a mesh that is nearest to a point of its surface, in a loop over the planes."""
     planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), x.dtype)
 
     def compare_plane(carry: tuple[Array, Array, Components], _: None) -> tuple[tuple[Array, Array, Components], None]:
-        k, highest, normal = carry
+        k, max_distance, normal = carry
         a, b, c, offset = table_rows(planes, k)
-        above = a * x + b * y + c * z - offset
-        nearer = above > highest
-        u, v, w = (jnp.where(nearer, new, old) for new, old in zip((a, b, c), normal, strict=True))
-        return (k + 1, jnp.where(nearer, above, highest), (u, v, w)), None
+        plane_distance = a * x + b * y + c * z - offset
+        is_nearer = plane_distance > max_distance
+        u, v, w = (jnp.where(is_nearer, new, old) for new, old in zip((a, b, c), normal, strict=True))
+        return (k + 1, jnp.where(is_nearer, plane_distance, max_distance), (u, v, w)), None
 
     zero = jnp.zeros_like(x)
     initial = jnp.int32(0), jnp.full_like(x, -jnp.inf), (zero, zero, zero)
@@ -395,7 +400,7 @@ def _mesh_normal(shape: Shape, x: Array, y: Array, z: Array) -> Components:
 def first_fixed_hit(
     surfaces: Sequence[Surface], tables: Hierarchy, ray: Ray, best: BestHit, n_nodes: Array | int | None = None
 ) -> BestHit:
-    """Return the nearer of the best hit and the first fixed geom that a ray meets.
+    """Return the best hit so far, or a nearer hit of a fixed geom.
 
     Args:
         surfaces: ``Targets.surfaces``.
@@ -406,48 +411,50 @@ def first_fixed_hit(
     """
     n_nodes = len(tables.boxes) // hierarchy.N_ORDERS if n_nodes is None else n_nodes
 
-    def node(k: Array) -> tuple[Sequence[Array], Array, Array]:
-        after, geom = table_rows(tables.links, k)
-        return table_rows(tables.boxes, k), after, geom
+    def read_node(k: Array) -> tuple[Sequence[Array], Array, Array]:
+        next_node, geom = table_rows(tables.links, k)
+        return table_rows(tables.boxes, k), next_node, geom
 
-    def hit(geom: Array, is_crossing: Array, best: BestHit) -> BestHit:
+    def hit_geom(geom: Array, is_crossing: Array, best: BestHit) -> BestHit:
         code, _ = table_rows(tables.codes, geom)
         return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, is_crossing, best)
 
-    return _walk_hierarchy(node, hit, ray, best, n_nodes)
+    return _walk_hierarchy(read_node, hit_geom, ray, best, n_nodes)
 
 
 def _walk_hierarchy(
-    node: Callable[[Array], tuple[Sequence[Array], Array, Array]],
-    hit: Callable[[Array, Array, BestHit], BestHit],
+    read_node: Callable[[Array], tuple[Sequence[Array], Array, Array]],
+    hit_geom: Callable[[Array, Array, BestHit], BestHit],
     ray: Ray,
     best: BestHit,
     n_nodes: Array | int,
 ) -> BestHit:
-    """Return the nearer of the best hit and the first geom of a hierarchy that a ray meets.
+    """Return the best hit so far, or a nearer hit of a geom in a hierarchy.
 
     Args:
-        node: Returns the box of a node, the index of the node after its subtree, and its geom or -1; it takes the index
-            of the node, where nodes of the first order come first.
-        hit: Returns the nearer of the best hit and the hit of a geom, if the ray meets the box of the geom.
+        read_node: Function from the index of a node, where nodes of the first order come first, to its box, the index
+            of the node after its subtree, and its geom or -1.
+        hit_geom: Function from a geom, a flag that is True if the ray meets its box, and the best hit so far, to the
+            best hit so far or a nearer hit of that geom.
         ray: The ray.
         best: Best hit so far.
         n_nodes: Number of nodes in one order.
     """
     inverse = [1 / jnp.where(jnp.abs(d) < MIN_COMPONENT, MIN_COMPONENT, d) for d in ray.direction]
     scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
-    signs = [any_lane(d < 0) for d in ray.direction]
-    start = sum(jnp.where(sign, jnp.int32(1 << k), 0) for k, sign in enumerate(signs)) * n_nodes
+    are_negative = [any_lane(d < 0) for d in ray.direction]
+    order = sum(jnp.where(is_negative, jnp.int32(1 << k), 0) for k, is_negative in enumerate(are_negative))
+    first_node = order * n_nodes
 
     def check_node(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
-        k, best = carry
-        box, after, geom = node(start + k)
+        node, best = carry
+        box, next_node, geom = read_node(first_node + node)
         meets = _meets_box(box[:3], box[3:], scaled, inverse, best[0])
 
         def descend(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
-            return k + 1, compute_where(geom >= 0, lambda best: hit(geom, meets, best), carry[1])
+            return node + 1, compute_where(geom >= 0, lambda best: hit_geom(geom, meets, best), carry[1])
 
-        return compute_where(any_lane(meets), descend, (after, best))
+        return compute_where(any_lane(meets), descend, (next_node, best))
 
     return lax.while_loop(lambda carry: carry[0] < n_nodes, check_node, (jnp.int32(0), best))[1]
 
@@ -485,18 +492,18 @@ def _meets_box(
 
 
 def _nearer_hit(
-    surfaces: Sequence[Surface], code: Array, k: Array, row: Sequence[Array], ray: Ray, is_near: Array, best: BestHit
+    surfaces: Sequence[Surface], code: Array, geom: Array, row: Sequence[Array], ray: Ray, is_near: Array, best: BestHit
 ) -> BestHit:
-    """Return the best hit, or a nearer hit of geom ``k`` where a ray may meet it."""
-    start, direction = ray_in_frame(row, ray.origin, ray.direction)
-    for index, surface in enumerate(surfaces):
+    """Return the best hit so far, or a nearer hit of a geom where ``is_near``."""
+    local_origin, local_direction = ray_in_frame(row, ray.origin, ray.direction)
+    for surface_index, surface in enumerate(surfaces):
 
         def hit_surface(best: BestHit, surface: Surface = surface) -> BestHit:
-            distance = _ray_length(surface, row, start, direction)
-            is_closer = is_near & ((distance < best[0]) | ((distance == best[0]) & (k < best[1])))
-            return jnp.where(is_closer, distance, best[0]), jnp.where(is_closer, k, best[1])
+            distance = _ray_length(surface, row, local_origin, local_direction)
+            is_closer = is_near & ((distance < best[0]) | ((distance == best[0]) & (geom < best[1])))
+            return jnp.where(is_closer, distance, best[0]), jnp.where(is_closer, geom, best[1])
 
-        best = compute_where(code == index, hit_surface, best) if len(surfaces) > 1 else hit_surface(best)
+        best = compute_where(code == surface_index, hit_surface, best) if len(surfaces) > 1 else hit_surface(best)
     return best
 
 

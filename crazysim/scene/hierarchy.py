@@ -67,14 +67,14 @@ def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
     order = np.argsort(low[geoms] + high[geoms], axis=0, kind="stable")  # along each axis
     lows, highs = low[geoms][order], high[geoms][order]  # (n, 3, 3): position, axis of the order, component
 
-    def surfaces(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    def half_surface_areas(low: np.ndarray, high: np.ndarray) -> np.ndarray:
         x, y, z = np.moveaxis(high - low, -1, 0)
         return x * y + y * z + z * x
 
-    first_surface = surfaces(np.minimum.accumulate(lows), np.maximum.accumulate(highs))[:-1]
-    second_surface = surfaces(np.minimum.accumulate(lows[::-1]), np.maximum.accumulate(highs[::-1]))[::-1][1:]
+    first_area = half_surface_areas(np.minimum.accumulate(lows), np.maximum.accumulate(highs))[:-1]
+    second_area = half_surface_areas(np.minimum.accumulate(lows[::-1]), np.maximum.accumulate(highs[::-1]))[::-1][1:]
     count = np.arange(1, n)[:, None]
-    cost = first_surface * count + second_surface * (n - count)
+    cost = first_area * count + second_area * (n - count)
     min_count = n // 8
     cost = cost[min_count : n - 1 - min_count]
     split, axis = np.unravel_index(int(np.argmin(cost)), cost.shape)

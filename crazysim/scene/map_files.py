@@ -1,4 +1,4 @@
-"""Readers of point clouds, triangle meshes and splats: ``.ply``, ``.pcd``, ``.stl`` and ``.obj``, with NumPy alone."""
+"""Readers of point clouds, triangle meshes and splats: ``.ply``, ``.pcd``, ``.stl`` and ``.obj``, in NumPy."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def read_ply(content: bytes) -> dict[str, Columns]:
         if line[0] == "format":
             layout = line[1]
         elif line[0] == "element":
-            elements.append((line[1], _count(line[2]), []))
+            elements.append((line[1], _parse_count(line[2]), []))
         elif line[0] == "property":
             elements[-1][2].append((line[-1], *(PLY_TYPES[kind] for kind in line[1:-1] if kind != "list")))
     if layout == "ascii":
@@ -108,18 +108,18 @@ def _read_pcd(content: bytes) -> tuple[NDArray, None]:
     """Return the points of a ``.pcd`` file without those that are not finite, which mark missing returns."""
     header, body = _split_header(content, b"DATA")
     table = {line[0]: line[1:] for line in header if not line[0].startswith("#")}
-    n, layout = _count(table["POINTS"][0]), table["DATA"][0]
-    counts = [_count(x) for x in table.get("COUNT", ["1"] * len(table["FIELDS"]))]
+    n, layout = _parse_count(table["POINTS"][0]), table["DATA"][0]
+    counts = [_parse_count(x) for x in table.get("COUNT", ["1"] * len(table["FIELDS"]))]
     kinds = [t.lower() + size for t, size in zip(table["TYPE"], table["SIZE"], strict=True)]
     fields = [
         (name, f"<{kind}", (count,))
-        for name, kind, count in zip(_distinct(table["FIELDS"]), kinds, counts, strict=True)
+        for name, kind, count in zip(_number_padding_columns(table["FIELDS"]), kinds, counts, strict=True)
     ]
     if layout == "binary":
         values = np.frombuffer(body, np.dtype(fields), n)
         points = np.stack([values[axis][:, 0] for axis in "xyz"], axis=-1)
     elif layout == "ascii":
-        rows = _numbers(body.split(), n * sum(counts)).reshape(n, -1)
+        rows = _parse_numbers(body.split(), n * sum(counts)).reshape(n, -1)
         first = dict(zip([name for name, *_ in fields], np.cumsum([0, *counts]), strict=False))
         points = rows[:, [first[axis] for axis in "xyz"]]
     else:
@@ -163,8 +163,8 @@ MAP_READERS: dict[str, Callable[[bytes], tuple[NDArray, NDArray | None]]] = {
 """Reader of each kind of file, by its suffix."""
 
 
-def _split_header(content: bytes, last: bytes) -> tuple[list[list[str]], bytes]:
-    """Return the words of the lines up to the one that begins with ``last``, and the bytes after it."""
+def _split_header(content: bytes, last_keyword: bytes) -> tuple[list[list[str]], bytes]:
+    """Return the words of the lines up to the one that begins with ``last_keyword``, and the bytes after it."""
     lines, start = [], 0
     while start < min(len(content), MAX_HEADER_BYTES):
         end = content.find(b"\n", start)
@@ -174,26 +174,26 @@ def _split_header(content: bytes, last: bytes) -> tuple[list[list[str]], bytes]:
         start = end + 1
         if line:
             lines.append(line.decode("ascii").split())
-        if line.startswith(last):
+        if line.startswith(last_keyword):
             return lines, content[start:]
-    raise ValueError(f"expected a header that ends with a line {last.decode()!r}")
+    raise ValueError(f"expected a header that ends with a line {last_keyword.decode()!r}")
 
 
-def _count(number: str | int) -> int:
-    """Return a number of entries, which is not negative."""
+def _parse_count(number: str | int) -> int:
+    """Return a number of entries, after a check that it is not negative."""
     n = int(number)
     if n < 0:
         raise ValueError(f"expected a number of entries, got {n}")
     return n
 
 
-def _distinct(names: list[str]) -> list[str]:
-    """Return names of columns, of which only those of padding, ``_``, may be equal."""
+def _number_padding_columns(names: list[str]) -> list[str]:
+    """Return names of columns with a number after each ``_``, the name of all padding columns."""
     return [f"{name}{k}" if name == "_" else name for k, name in enumerate(names)]
 
 
-def _numbers(words: list[bytes], n: int) -> NDArray[np.float64]:
-    """Return the first ``n`` words as numbers."""
+def _parse_numbers(words: list[bytes], n: int) -> NDArray[np.float64]:
+    """Return the first ``n`` words as numbers, after a check that there are as many."""
     if len(words) < n:
         raise ValueError(f"expected {n} numbers, got {len(words)}")
     return np.array(words[:n], np.float64)
@@ -218,25 +218,27 @@ class _AsciiTable:
     """Rows of numbers in text, read from the first to the last."""
 
     def __init__(self, body: bytes):
-        self._words, self._next = body.split(), 0
+        self._words, self._position = body.split(), 0
 
     def read(self, n: int, properties: list[Property]) -> Columns:
         """Return the properties of the next ``n`` rows."""
         if all(len(p) == 2 for p in properties):
-            rows = _numbers(self._words[self._next : self._next + n * len(properties)], n * len(properties))
-            self._next += n * len(properties)
+            rows = _parse_numbers(
+                self._words[self._position : self._position + n * len(properties)], n * len(properties)
+            )
+            self._position += n * len(properties)
             return {p[0]: column for p, column in zip(properties, rows.reshape(n, len(properties)).T, strict=True)}
-        return _columns(properties, [[self._entry(p) for p in properties] for _ in range(n)])
+        return _join_columns(properties, [[self._read_entry(p) for p in properties] for _ in range(n)])
 
-    def _entry(self, p: Property) -> NDArray:
-        n = 1 if len(p) == 2 else _count(self._take(1)[0].decode())
-        return _numbers(self._take(n), n)
+    def _read_entry(self, p: Property) -> NDArray:
+        n = 1 if len(p) == 2 else _parse_count(self._take_words(1)[0].decode())
+        return _parse_numbers(self._take_words(n), n)
 
-    def _take(self, n: int) -> list[bytes]:
-        words = self._words[self._next : self._next + n]
+    def _take_words(self, n: int) -> list[bytes]:
+        words = self._words[self._position : self._position + n]
         if len(words) < n:
             raise ValueError(f"expected {n} numbers, got {len(words)}")
-        self._next += n
+        self._position += n
         return words
 
 
@@ -244,7 +246,7 @@ class _BinaryTable:
     """Rows of numbers in bytes, read from the first to the last."""
 
     def __init__(self, body: bytes, order: str):
-        self._body, self._order, self._next = body, order, 0
+        self._body, self._order, self._position = body, order, 0
 
     def read(self, n: int, properties: list[Property]) -> Columns:
         """Return the properties of the next ``n`` rows."""
@@ -254,33 +256,33 @@ class _BinaryTable:
 
     def _read_rows(self, n: int, fields: list[tuple]) -> dict[str, NDArray]:
         """Return the fields of the next ``n`` rows of equal length."""
-        rows = np.frombuffer(self._body, np.dtype(fields), n, self._next)
-        self._next += rows.nbytes
+        rows = np.frombuffer(self._body, np.dtype(fields), n, self._position)
+        self._position += rows.nbytes
         return {name: rows[name] for name in rows.dtype.names or ()}
 
     def _read_lists(self, n: int, properties: list[Property]) -> Columns:
         """Return the next ``n`` rows with lists: at once if the lists are as long in every row as in the first."""
-        start, fields = self._next, []
-        lengths = {p[0]: len(self._entry(p)) for p in properties}
+        start, fields = self._position, []
+        lengths = {p[0]: len(self._read_entry(p)) for p in properties}
         for p in properties:
             if len(p) == 3:
                 fields.append((f"length of {p[0]}", self._order + p[1]))
             fields.append((p[0], self._order + p[-1], lengths[p[0]] if len(p) == 3 else ()))
-        self._next = start
+        self._position = start
         if start + n * np.dtype(fields).itemsize <= len(self._body):
             table = self._read_rows(n, fields)
             if all((table[f"length of {p[0]}"] == lengths[p[0]]).all() for p in properties if len(p) == 3):
                 return table
-        self._next = start
-        return _columns(properties, [[self._entry(p) for p in properties] for _ in range(n)])
+        self._position = start
+        return _join_columns(properties, [[self._read_entry(p) for p in properties] for _ in range(n)])
 
-    def _entry(self, p: Property) -> NDArray:
+    def _read_entry(self, p: Property) -> NDArray:
         n = 1 if len(p) == 2 else self._read_rows(1, [("n", self._order + p[1])])["n"][0]
-        return self._read_rows(_count(n), [("x", self._order + p[-1])])["x"]
+        return self._read_rows(_parse_count(n), [("x", self._order + p[-1])])["x"]
 
 
-def _columns(properties: list[Property], rows: list[list[NDArray]]) -> Columns:
-    """Return the columns of rows, by their names; lists of equal lengths as one array, others as they are."""
+def _join_columns(properties: list[Property], rows: list[list[NDArray]]) -> Columns:
+    """Return the columns of rows by name: an array, or a list of arrays if their lengths differ."""
     columns = {p[0]: [row[k] for row in rows] for k, p in enumerate(properties)}
     return {
         p[0]: np.concatenate(columns[p[0]]) if len(p) == 2

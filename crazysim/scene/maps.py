@@ -22,7 +22,7 @@ MIN_EXTENT, MAX_EXTENT = 0.01, 10_000.0
 MAX_COORDINATE = 1e6
 """Largest coordinate of a map, m."""
 MAX_VOXELS = 20_000_000
-"""Largest number of voxels to test or to merge; more would need several GB."""
+"""Largest number of voxels that are tested or merged; more would need several GB."""
 MAX_BOXES = 10_000
 """Largest number of boxes of a map."""
 MAP_RGBA = (0.62, 0.60, 0.57, 1.0)
@@ -47,9 +47,9 @@ def map_spec(
         raise ConfigError(
             f"expected finite coordinates, got {n} of {len(points)} points of the map without. Drop them."
         )
-    points = register(points, pos, quat, scale)
+    points = to_world_frame(points, pos, quat, scale)
     if triangles is None:
-        _require_few("points", len(points), resolution)
+        _check_count("points", len(points), resolution)
         voxels = voxels_of_points(points, resolution, min_points)
         if not len(voxels):
             raise ConfigError(f"expected voxels with min_points={min_points} points, got none. Use a smaller number.")
@@ -57,7 +57,7 @@ def map_spec(
         if min_points > 1:
             raise ConfigError(f"expected min_points=1 for triangles, got {min_points}. Only clouds have noise to drop.")
         corners = points[triangles]
-        _require_few("voxels near triangles", count_candidates(corners, resolution), resolution)
+        _check_count("voxels near triangles", count_candidates(corners, resolution), resolution)
         voxels = voxels_of_triangles(corners, resolution)
     boxes = merge_voxels(voxels)
     if len(boxes) > MAX_BOXES:
@@ -73,14 +73,14 @@ def map_spec(
     return spec
 
 
-def register(points: NDArray, pos: ArrayLike, quat: ArrayLike, scale: float | None) -> NDArray[np.float64]:
+def to_world_frame(points: NDArray, pos: ArrayLike, quat: ArrayLike, scale: float | None) -> NDArray[np.float64]:
     """Return points of a file in the world frame, m. (n, 3)
 
     Args:
         points: Finite points in the frame and unit of the file. (n, 3)
         pos: Origin of the file's frame, world frame, m. (3,)
         quat: Its attitude, file to world, xyzw. (4,)
-        scale: Metres per unit of the file; None for one, if the extent is one that a map in metres can have.
+        scale: Metres per unit of the file; None for a file in metres, whose extent must be plausible.
     """
     pos, rot, scale = read_frame(points, pos, quat, scale)
     points = scale * points @ rot.T + pos
@@ -95,7 +95,7 @@ def register(points: NDArray, pos: ArrayLike, quat: ArrayLike, scale: float | No
 def read_frame(
     points: NDArray, pos: ArrayLike, quat: ArrayLike, scale: float | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return position (3,), rotation matrix (3, 3) and scale of a file's frame, checked; see ``register``."""
+    """Return position (3,), rotation matrix (3, 3) and scale of a file's frame, checked; see ``to_world_frame``."""
     pos = read_numbers("pos", pos, range_between(-MAX_COORDINATE, MAX_COORDINATE), ((3,),))
     quat = read_numbers("quat", quat, shapes=((4,),))
     if not np.linalg.norm(quat) > 0:
@@ -125,9 +125,9 @@ def _read_source(source: MapSource) -> MapFile:
     return MapFile(points, None)
 
 
-def _require_few(what: str, n: int, resolution: float) -> None:
+def _check_count(label: str, n: int, resolution: float) -> None:
     if n > MAX_VOXELS:
         raise ConfigError(
-            f"expected a map of at most {MAX_VOXELS} {what}, got {n} with voxels of {resolution:g} m. Use a larger "
+            f"expected a map of at most {MAX_VOXELS} {label}, got {n} with voxels of {resolution:g} m. Use a larger "
             f"resolution=, or a part of the map."
         )

@@ -2,7 +2,7 @@
 
 It is imported without NVIDIA Warp: nothing here runs MJX on Warp, whose import would take two more seconds. A program
 that runs MJX on Warp imports ``mujoco.mjx`` or ``warp`` itself, before the first contacts. MJX calls trimesh and
-``scipy.spatial`` for scenes with meshes alone, so they are imported at the first call: they take almost a second.
+``scipy.spatial`` only for scenes with meshes. Their import takes almost a second, so it is deferred to the first call.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ __all__ = ["Data", "Model", "camlight", "collision", "com_pos", "kinematics", "p
 def load_module() -> ModuleType:
     """Return the module ``mujoco.mjx``."""
     # MJX prints two lines when Warp cannot be imported.
-    with _light_imports(), contextlib.redirect_stdout(io.StringIO()):
+    with _defer_imports(), contextlib.redirect_stdout(io.StringIO()):
         return importlib.import_module("mujoco.mjx")
 
 
-class _Deferred(ModuleType):
+class _DeferredModule(ModuleType):
     """Stand-in for a module, with functions that import it and call its functions and classes."""
 
     def __getattr__(self, name: str) -> Any:
@@ -38,15 +38,17 @@ class _Deferred(ModuleType):
 
 
 @contextlib.contextmanager
-def _light_imports() -> Iterator[None]:
+def _defer_imports() -> Iterator[None]:
     """Make imports of Warp fail, and defer imports of trimesh and SciPy's geometry, unless they have been imported."""
-    light = {"warp": None, **{name: _Deferred(name) for name in ("trimesh", "scipy.spatial")}}
-    light = {} if "mujoco.mjx" in sys.modules else {k: x for k, x in light.items() if k not in sys.modules}
-    sys.modules.update(light)  # type: ignore[arg-type]
+    replacements = {"warp": None, **{name: _DeferredModule(name) for name in ("trimesh", "scipy.spatial")}}
+    replacements = (
+        {} if "mujoco.mjx" in sys.modules else {k: x for k, x in replacements.items() if k not in sys.modules}
+    )
+    sys.modules.update(replacements)  # type: ignore[arg-type]
     try:
         yield
     finally:
-        for name in light:
+        for name in replacements:
             del sys.modules[name]
 
 

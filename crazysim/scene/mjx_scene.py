@@ -71,8 +71,8 @@ class MjxScene:
 
     def sync(self, data: SimData) -> SimData:
         """Bring all worlds up to date, and return the data with ``core.mjx_synced`` set."""
-        first, self._is_synced = not self._is_synced, True
-        with announce_if_slow("importing MJX and compiling contacts", "2 to 4 s") if first else nullcontext():
+        is_first, self._is_synced = not self._is_synced, True
+        with announce_if_slow("importing MJX and compiling contacts", "2 to 4 s") if is_first else nullcontext():
             data, self._data = sync_sim2mjx(data, self.data, self.model)
         return data
 

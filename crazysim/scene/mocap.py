@@ -44,7 +44,7 @@ def with_mocap_bodies(model: CollisionModel, data: SimData, mocap: MocapPoses) -
 
 
 def require_poses(model: CollisionModel, names: Iterable[str], mocap: MocapPoses) -> None:
-    """Check that the poses of bodies are given where they are moved through ``mjx_data``."""
+    """Check that poses are passed if any of the named bodies is moved through ``mjx_data``."""
     missing = [name for name in names if name in model.mocap_bodies]
     if missing and mocap is None:
         raise ConfigError(
@@ -58,8 +58,8 @@ def _pose_pair(mocap: MocapPoses, data: SimData | None) -> tuple[Array, Array]:
     pos, quat = jnp.asarray(pos), jnp.asarray(quat)
     n = None if data is None else data.states.pos.shape[0]
     for name, x, size in (("mocap_pos", pos, 3), ("mocap_quat", quat, 4)):
-        ok = x.ndim == (2 if n is None else 3) and x.shape[-1] == size and (n is None or x.shape[0] == n)
-        if not ok:
+        is_valid = x.ndim == (2 if n is None else 3) and x.shape[-1] == size and (n is None or x.shape[0] == n)
+        if not is_valid:
             axes = "(n_mocap, " if n is None else f"({n}, n_mocap, "
             raise ConfigError(f"expected {name} of shape {axes}{size}), got {x.shape}. Pass mocap=sim.mjx_data.")
     return pos, quat

@@ -81,7 +81,7 @@ class Handle:
         if pos is not None and vel is None:
             vel = np.zeros(3)
         new = {
-            name: self._with_rows(getattr(objects, name), name, value, mask)
+            name: self._replace_checked_rows(getattr(objects, name), name, value, mask)
             for name, value in (("pos", pos), ("quat", quat), ("vel", vel))
             if value is not None
         }
@@ -103,36 +103,36 @@ class Handle:
             )
         return data.objects  # type: ignore[return-value]
 
-    def _with_rows(self, old: Array, field: str, value: ArrayLike, mask: Array | None) -> Array:
+    def _replace_checked_rows(self, old: Array, field: str, value: ArrayLike, mask: Array | None) -> Array:
         value = require_pose_array(value, field, len(self), old.shape[-1], old.shape[0] if old.ndim == 4 else None)
         return _replace_rows(old, value, mask, self.rows, field == "quat")
 
 
-@jit_unless_traced("numbers", "is_quat")
+@jit_unless_traced("row_indices", "is_quat")
 def _replace_rows(
-    old: Array, value: Array | NDArray, mask: Array | None, numbers: tuple[int, ...], is_quat: bool
+    old: Array, value: Array | NDArray, mask: Array | None, row_indices: tuple[int, ...], is_quat: bool
 ) -> Array:
     """Return positions, attitudes or velocities of all objects with some rows replaced; attitudes are normalised."""
-    n, size = len(numbers), old.shape[-1]
+    n, size = len(row_indices), old.shape[-1]
     value = jnp.asarray(value, old.dtype)
     if is_quat:
         value = value * jax.lax.rsqrt(jnp.sum(value**2, axis=-1, keepdims=True))
     value = jnp.broadcast_to(value[:, None] if value.ndim == 3 else value, (*old.shape[:-2], n, size))
-    start, end = numbers[0], numbers[0] + n
-    if numbers == tuple(range(start, end)):  # compile time does not grow with the number of objects
+    start, end = row_indices[0], row_indices[0] + n
+    if row_indices == tuple(range(start, end)):  # compile time does not grow with the number of objects
         new = jnp.concatenate([old[..., :start, :], value, old[..., end:, :]], axis=-2)
     else:
         rows = [old[..., k, :] for k in range(old.shape[-2])]
-        for i, k in enumerate(numbers):
+        for i, k in enumerate(row_indices):
             rows[k] = value[..., i, :]
         new = jnp.stack(rows, axis=-2)
     return select_worlds(mask, new, old)
 
 
-@jit_unless_traced("numbers")
-def _select_rows(old: Array, numbers: tuple[int, ...]) -> Array:
+@jit_unless_traced("row_indices")
+def _select_rows(poses: Array, row_indices: tuple[int, ...]) -> Array:
     """Return positions or attitudes of some objects. (n, k), or (n_worlds, n, k) for all worlds"""
-    return (old if old.ndim == 2 else old[:, 0])[..., np.array(numbers), :]
+    return (poses if poses.ndim == 2 else poses[:, 0])[..., np.array(row_indices), :]
 
 
 def require_pose_array(value: ArrayLike, field: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
@@ -160,7 +160,7 @@ class SceneSnapshot(NamedTuple):
     """Names of the elements of the spec, in the order of ``_elements``."""
     handles: list[Handle]
     """Handles of all objects."""
-    initial: list[tuple[NDArray, NDArray]]
+    initial_poses: list[tuple[NDArray, NDArray]]
     """Initial poses of the movable objects."""
 
 
@@ -170,7 +170,7 @@ class SceneObjects:
     def __init__(self, n_worlds: int):
         self._n_worlds = n_worlds
         self._handles: list[Handle] = []
-        self._initial: list[tuple[NDArray, NDArray]] = []
+        self._initial_poses: list[tuple[NDArray, NDArray]] = []
 
     @property
     def movable(self) -> tuple[str, ...]:
@@ -210,7 +210,7 @@ class SceneObjects:
         handle = Handle(name, numbers, tuple(first + k for k in numbers) if mocap else ())
         self._handles.append(handle)
         if mocap:
-            self._initial.append((poses[0], poses[1]))
+            self._initial_poses.append((poses[0], poses[1]))
         return handle
 
     def count_objects(self, name: str) -> int:
@@ -220,7 +220,7 @@ class SceneObjects:
     def take_snapshot(self, spec: mujoco.MjSpec) -> SceneSnapshot:
         """Return the present contents of a spec, for ``restore_snapshot``."""
         return SceneSnapshot(
-            [{x.name for x in elements} for elements in _elements(spec)], self._handles[:], self._initial[:]
+            [{x.name for x in elements} for elements in _elements(spec)], self._handles[:], self._initial_poses[:]
         )
 
     def restore_snapshot(self, spec: mujoco.MjSpec, snapshot: SceneSnapshot) -> bool:
@@ -229,23 +229,26 @@ class SceneObjects:
         added = [x for elements, names in pairs for x in elements if x.name not in names]
         for element in added:
             spec.delete(element)
-        self._handles, self._initial = snapshot.handles, snapshot.initial
+        self._handles, self._initial_poses = snapshot.handles, snapshot.initial_poses
         return bool(added)
 
-    def record(self, before: Objects | None, mocap_ids: list[int]) -> Objects | None:
+    def record(self, previous: Objects | None, mocap_ids: list[int]) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects.
 
         Args:
-            before: Earlier record, or None.
+            previous: Earlier record, or None.
             mocap_ids: Mocap ids of the bodies, in the order of ``movable``.
         """
-        if not self._initial:
+        if not self._initial_poses:
             return None
-        pos, quat = (np.concatenate(xs, axis=1)[:, None] for xs in zip(*self._initial, strict=True))
+        pos, quat = (np.concatenate(xs, axis=1)[:, None] for xs in zip(*self._initial_poses, strict=True))
         poses = pos, quat, np.zeros_like(pos)
-        if before is not None:
-            n, old = len(before.names), (before.pos, before.quat, before.vel)
-            poses = tuple(np.concatenate([x, new[..., n:, :]], axis=-2) for x, new in zip(old, poses, strict=True))
+        if previous is not None:
+            n, previous_poses = len(previous.names), (previous.pos, previous.quat, previous.vel)
+            poses = tuple(
+                np.concatenate([x, initial[..., n:, :]], axis=-2)
+                for x, initial in zip(previous_poses, poses, strict=True)
+            )
         pos, quat, vel = (device_array(x) for x in poses)
         return Objects(pos, quat, vel, device_array(mocap_ids, np.int32), self.movable)
 
@@ -281,7 +284,7 @@ def add_bodies(
     if options:
         raise ConfigError(f"expected no settings, which only {', '.join(PRIMITIVES)} have, got {', '.join(options)}")
     for k, (name, pose) in enumerate(zip(names, poses, strict=True)):
-        body_source = _source(source[k] if isinstance(source, list) else source)
+        body_source = _load_source(source[k] if isinstance(source, list) else source)
         body = spec.worldbody.add_body(name=name, mocap=mocap, **pose)
         frame, prefix = body.add_frame(), f"{name}/"
         if isinstance(body_source, mujoco.MjSpec):
@@ -290,7 +293,7 @@ def add_bodies(
             frame.attach_body(body_source, prefix, "")
 
 
-def _source(source: Source) -> mujoco.MjSpec | mujoco.MjsBody:
+def _load_source(source: Source) -> mujoco.MjSpec | mujoco.MjsBody:
     """Return a spec or body to attach; it is read for every body, because attaching may consume it."""
     if isinstance(source, mujoco.MjsBody):
         return source

@@ -21,7 +21,7 @@ IMAGE_CORNERS = {
     "bottom right": mujoco.mjtGridPos.mjGRID_BOTTOMRIGHT,
 }
 """Corners of an image for text."""
-MAX_LABEL = 99
+MAX_LABEL_LENGTH = 99
 """Largest number of characters of a label; MuJoCo cuts off longer ones."""
 
 
@@ -52,7 +52,7 @@ class Overlays:
         self._add([(mujoco.mjtGeom.mjGEOM_LINE, width, a, b) for a, b, width in segments], rgba)
 
     def points(self, points: NDArray, rgba: ArrayLike, size: float, emission: float = 0.0) -> None:
-        """Add spheres of radius ``size``, m, at points in the world frame, m, that emit some of their colour. (n, 3)"""
+        """Add spheres of radius ``size``, m, at points, world frame, m, with an emission from 0 to 1. (n, 3)"""
         self._add([(mujoco.mjtGeom.mjGEOM_SPHERE, size, point, None) for point in points], rgba, emission)
 
     def capsule(self, p1: NDArray, p2: NDArray, radius: float, rgba: ArrayLike, cylinder: bool) -> None:
@@ -62,7 +62,7 @@ class Overlays:
 
     def label(self, text: str, point: NDArray) -> None:
         """Add a line of text at a point, world frame, m, in front of everything. (3,)"""
-        self._add([(mujoco.mjtGeom.mjGEOM_LABEL, 0.0, point, _printable_text(text, MAX_LABEL))], (1, 1, 1, 1))
+        self._add([(mujoco.mjtGeom.mjGEOM_LABEL, 0.0, point, _printable_text(text, MAX_LABEL_LENGTH))], (1, 1, 1, 1))
 
     def text(self, text: str, corner: str) -> None:
         """Add text to a corner of the image, below earlier text."""
@@ -122,13 +122,15 @@ class Overlays:
         self._geoms[:], self._texts = overlays._geoms, dict(overlays._texts)
 
 
-def _printable_text(text: str, longest: int | None = None) -> str:
+def _printable_text(text: str, max_length: int | None = None) -> str:
     """Return text that MuJoCo's font can show."""
     if not isinstance(text, str) or not text:
         raise ConfigError(f"expected a string that is not empty as text, got {text!r}")
-    missing = sorted({character for character in text if character != "\n" and not 32 <= ord(character) < 127})
-    if missing:
-        raise ConfigError(f"expected ASCII text, got {text!r} with {''.join(missing)!r}")
-    if longest is not None and (len(text) > longest or "\n" in text):
-        raise ConfigError(f"expected a label of one line and at most {longest} characters, got {len(text)}: {text!r}")
+    unprintable = sorted({character for character in text if character != "\n" and not 32 <= ord(character) < 127})
+    if unprintable:
+        raise ConfigError(f"expected ASCII text, got {text!r} with {''.join(unprintable)!r}")
+    if max_length is not None and (len(text) > max_length or "\n" in text):
+        raise ConfigError(
+            f"expected a label of one line and at most {max_length} characters, got {len(text)}: {text!r}"
+        )
     return text

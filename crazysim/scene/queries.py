@@ -23,9 +23,9 @@ from crazysim.scene.mocap import MocapPoses, with_mocap_bodies
 from crazysim.scene.objects import Handle
 from crazysim.scene.scene import Scene
 
-MAX_SIZE = 256
-"""Largest ``kernel_size`` of a contact report that gets a kernel, which takes 20 s to compile for 64 movable boxes. XLA
-compiles any number in 1 s, but takes 1.4 times as long in each call."""
+MAX_KERNEL_SIZE = 256
+"""Largest ``kernel_size`` of a contact report that is computed by a kernel. A kernel for 64 movable boxes takes 20 s to
+compile. XLA compiles any number in 1 s, but takes 1.4 times as long in each call."""
 
 
 class SceneQueries:
@@ -40,7 +40,9 @@ class SceneQueries:
         """Return the contacts of every drone; see ``Sim.contact_report``."""
         key = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
         settings = (key, floor, drones)
-        return self._run("contacts", lambda: self._contacts(*settings), self._scene.collision_model, data, *settings)
+        return self._run(
+            "contacts", lambda: self._build_contacts(*settings), self._scene.collision_model, data, *settings
+        )
 
     def depth(
         self, data: SimData, camera: str | int, width: int, height: int, drones: bool, hide_own: bool, along: Along
@@ -49,8 +51,8 @@ class SceneQueries:
         settings = (camera, width, height, drones, hide_own, along)
 
         def build() -> Callable[..., Array]:
-            look = self._scene.depth_fn(*settings)
-            return lambda data, mocap: look(data, mocap).distance
+            depth_fn = self._scene.depth_fn(*settings)
+            return lambda data, mocap: depth_fn(data, mocap).distance
 
         return self._run("depth", build, self._scene.visual_model, data, *settings)
 
@@ -65,27 +67,29 @@ class SceneQueries:
         if is_new:
             compiled[name, *settings] = jax.jit(_close_over_data(build(), data))
         states, objects = data.states, data.objects
-        # Only the arrays that the query needs, since a compiled call costs by their number.
+        # Only the arrays that the query needs, since the cost of a compiled call grows with their number.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
         with keep_programs(enabled=is_new):
             return compiled[name, *settings](*poses, mocap)
 
-    def _contacts(self, objects: ObjectSelection, floor: bool, drones: bool) -> Callable[..., ContactReport]:
+    def _build_contacts(self, objects: ObjectSelection, floor: bool, drones: bool) -> Callable[..., ContactReport]:
         """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""
-        # The data come with the objects of plugins at their poses.
+        # Plugins have already moved their objects in the data.
         model, kernels = self._scene.collision_model, self._scene.ray_kernels
         platform = kernels.platform if kernels.mesh is None else None
-        by_xla = contact_report.build_contact_fn(model, objects, floor, drones)
-        if platform is None or contact_report.kernel_size(model, objects) > MAX_SIZE:
-            return by_xla
-        # Poses of mocap bodies become part of the data before the kernel runs, which reads the data alone.
-        in_data = model.without_mocap_bodies()
+        xla_contacts = contact_report.build_contact_fn(model, objects, floor, drones)
+        if platform is None or contact_report.kernel_size(model, objects) > MAX_KERNEL_SIZE:
+            return xla_contacts
+        # Poses of mocap bodies are added to the data first, since the kernel reads only the data.
+        model_without_mocap = model.without_mocap_bodies()
         queries: list[Query] = []
-        if floor or contact_report.select_bodies(in_data, objects):
-            queries.append(("drone", contact_report.build_contact_fn(in_data, objects, floor, drones=False)))
+        if floor or contact_report.select_bodies(model_without_mocap, objects):
+            queries.append(
+                ("drone", contact_report.build_contact_fn(model_without_mocap, objects, floor, drones=False))
+            )
         if drones:
-            queries.append(("world", contact_report.build_contact_fn(in_data, (), floor=False)))
+            queries.append(("world", contact_report.build_contact_fn(model_without_mocap, (), floor=False)))
 
         def contacts(data: SimData, mocap: MocapPoses) -> ContactReport:
             try:
@@ -96,7 +100,7 @@ class SceneQueries:
                     problem = f"the contact report has no kernel: {error.reason}"
                     remedy = "Leave out the geoms that need it with objects="
                     report_unsupported([problem], kernels.strict, self._reported_messages, remedy)
-                return by_xla(data, mocap)
+                return xla_contacts(data, mocap)
 
         return contacts
 

@@ -41,10 +41,10 @@ from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
 T = TypeVar("T")
 MAX_UNROLLED_GEOMS = 16
-"""Largest number of movable geoms of a world with which a stage should cast rays: its program is unrolled."""
+"""Largest number of movable geoms of a world for which a stage should cast rays, since its program is unrolled."""
 MAX_PAIRS = 36
-"""Largest number of rays times fixed geoms of one world or drone for which the program is unrolled. It is two to three
-times as fast as a hierarchy then, and compiles in about the same time."""
+"""Largest number of rays times fixed geoms of one world or drone for which the program is unrolled. The unrolled
+program is two to three times as fast as a hierarchy, and compiles in about the same time."""
 MAX_LOOP_RAYS = 64
 """Largest number of rays in a loop within a step; an index computed at run time selects among at most 64 entries."""
 
@@ -88,7 +88,7 @@ def cast_rays(
         origin: Origins of the rays, world frame, m. (n_worlds, n_rays, 3), without n_worlds in one world or drone
         direction: Unit directions, world frame. The same shape
         ignored_drones: Index of the drone that a ray passes through; None for no drone. (n_rays,)
-        drones: True for rays to meet drones; a stage of one drone has no access to the others.
+        drones: True for rays to meet drones; must be False in a stage of one drone, which has no access to the others.
         mocap: Poses of bodies that are moved through ``mjx_data``; None if there are none.
         kernels: Kernels that may cast the rays of all worlds; None for XLA.
         limit: Distance beyond which rays of one world or drone may miss fixed geoms, m.
@@ -102,10 +102,10 @@ def cast_rays(
             IGNORES_NONE if ignored_drones is None else ignored_drones,
         )
         axes = jnp.concatenate([direction[..., None], zero], axis=-1).reshape(*direction.shape[:2], 9)
-        ahead = np.zeros((origin.shape[1], 1, 4))
-        ahead[..., 0], ahead[:, 0, 3] = 1.0, ignored
-        eyes = jnp.concatenate([origin, axes], axis=-1)
-        return cast_rays_in_worlds(model, data, eyes, ahead, drones, kernels or RayKernels())
+        pixel_rays = np.zeros((origin.shape[1], 1, 4))
+        pixel_rays[..., 0], pixel_rays[:, 0, 3] = 1.0, ignored
+        camera_poses = jnp.concatenate([origin, axes], axis=-1)
+        return cast_rays_in_worlds(model, data, camera_poses, pixel_rays, drones, kernels or RayKernels())
     best = Hits(
         distance=jnp.full(origin.shape[:-1], jnp.inf, origin.dtype),
         normal=jnp.zeros_like(origin),
@@ -114,8 +114,8 @@ def cast_rays(
         names=body_names(model, data.core.n_drones if drones else 0),
     )
     targets = Targets(model, 0, drones=False)
-    if len(targets.fixed) * len(origin) <= MAX_PAIRS:
-        for target in targets.fixed:
+    if len(targets.fixed_geoms) * len(origin) <= MAX_PAIRS:
+        for target in targets.fixed_geoms:
             best = _nearer_hits(best, *_hit_geom(target.geom, origin, direction), target.body_index)
     else:
         best = _nearer_hits(best, *_hit_fixed_geoms(targets, origin, direction, limit))
@@ -180,13 +180,15 @@ def _hit_bodies(
 
 
 def _hit_geom(geom: CollisionGeom, origin: Array, direction: Array) -> tuple[Array, Array]:
-    """Return the length of rays to a geom, and its normal, in the frame in which the geom is given."""
-    start = origin - jnp.asarray(geom.pos, origin.dtype)
+    """Return the length of rays to a geom, and the normal where they meet it; all in the frame of the geom's pose."""
+    local_origin = origin - jnp.asarray(geom.pos, origin.dtype)
     if geom.rot is None:
-        return ray_distance(geom.shape, start, direction)
-    rows = np.array(geom.rot)
-    distance, normal = ray_distance(geom.shape, _constant_product(rows.T, start), _constant_product(rows.T, direction))
-    return distance, _constant_product(rows, normal)
+        return ray_distance(geom.shape, local_origin, direction)
+    rot = np.array(geom.rot)
+    distance, normal = ray_distance(
+        geom.shape, _constant_product(rot.T, local_origin), _constant_product(rot.T, direction)
+    )
+    return distance, _constant_product(rot, normal)
 
 
 def _constant_product(matrix: np.ndarray, vectors: Array) -> Array:
@@ -220,12 +222,12 @@ def _hit_fixed_geoms(
         limit: Distance beyond which geoms may be missed, m.
 
     Returns:
-        Distance, m, infinite for none. (n_rays,)
-        Unit normal, world frame, zero for none. (n_rays, 3)
+        Distance, m; infinite if a ray meets no geom. (n_rays,)
+        Unit normal, world frame; zero if it meets none. (n_rays, 3)
         Index of the body, as in ``Hits.body_index``. (n_rays,)
     """
     tables = targets.hierarchy(origin.dtype)
-    surfaces = targets.surfaces[: 1 + targets.codes[: len(targets.fixed), 0].max()]
+    surfaces = targets.surfaces[: 1 + targets.codes[: len(targets.fixed_geoms), 0].max()]
     origins, directions = jax.lax.stop_gradient((origin, direction))
     initial = jax.lax.stop_gradient(jnp.asarray(limit, origin.dtype)), jnp.int32(-1)
 
@@ -242,7 +244,7 @@ def _hit_fixed_geoms(
     geom_index = jnp.concatenate([first_geoms(origins[chunk], directions[chunk]) for chunk in chunks])
     rows = jnp.take(tables.geoms, jnp.maximum(geom_index, 0), axis=0)
     distance, normal_at = _hit_rows(surfaces, targets.codes, geom_index, rows, origin, direction)
-    body_indices = jnp.asarray([target.body_index for target in targets.fixed], jnp.int32)
+    body_indices = jnp.asarray([target.body_index for target in targets.fixed_geoms], jnp.int32)
     return distance, normal_at(distance), jnp.take(body_indices, jnp.maximum(geom_index, 0))
 
 
@@ -290,18 +292,18 @@ def _hit_rows(
 
 
 def cast_rays_in_worlds(
-    model: CollisionModel, data: SimData, eyes: Array, pixels: np.ndarray, drones: bool, kernels: RayKernels
+    model: CollisionModel, data: SimData, camera_poses: Array, pixels: np.ndarray, drones: bool, kernels: RayKernels
 ) -> Hits:
     """Return the first surfaces that the rays of cameras meet, in all worlds. (n_worlds, n_cameras * n_pixels)
 
-    A function of one ray finds the distance and the nearest geom, without a derivative, in a kernel of the engine where
-    that is possible; a second one finds the normal there. Derivatives depend on that geom alone; XLA computes them.
-    ``jit`` removes what is not used.
+    A function of one ray finds the distance and the nearest geom without derivatives, in a kernel of the engine if
+    possible. A second function finds the normal at that point. XLA computes the derivatives, from the nearest geom
+    alone. Inside ``jit``, unused results are not computed.
 
     Args:
         model: Model, without bodies whose poses are not part of the data.
         data: Simulation, for the poses of objects and drones.
-        eyes: Position, m, and axes by rows, of the cameras, world frame. (n_worlds, n_cameras, 12)
+        camera_poses: Position, m, and axes by rows, of the cameras, world frame. (n_worlds, n_cameras, 12)
         pixels: Unit directions in the frame of the camera, and the drone that a ray passes through or ``IGNORES_NONE``.
             (n_cameras, n_pixels, 4)
         drones: True for rays to meet drones.
@@ -309,33 +311,36 @@ def cast_rays_in_worlds(
     """
     ignored = np.unique(pixels[..., 3])
     targets = Targets(model, data.core.n_drones, drones, int(ignored[0]) if len(ignored) == 1 else IGNORES_NONE)
-    n_worlds, (n_cameras, n_pixels, _) = eyes.shape[0], pixels.shape
+    n_worlds, (n_cameras, n_pixels, _) = camera_poses.shape[0], pixels.shape
     boxes, movable = targets.movable_rows(data)
     boxes, links = kernels.node_boxes(targets, jax.lax.stop_gradient(boxes))
-    tables = targets.tables(boxes, links, movable, eyes, jnp.asarray(pixels, eyes.dtype))
+    tables = targets.tables(boxes, links, movable, camera_poses, jnp.asarray(pixels, camera_poses.dtype))
     n, tables = n_worlds * n_cameras * n_pixels, jax.lax.stop_gradient(tables)
-    fn = functools.partial(first_hit, targets.surfaces, n_pixels, n_cameras)
-    (ray_length, geom_index), platform = kernels.run(fn, n, tables, targets)
+    ray_fn = functools.partial(first_hit, targets.surfaces, n_pixels, n_cameras)
+    (ray_length, geom_index), platform = kernels.run(ray_fn, n, tables, targets)
     hit_table = ray_length[:, None], geom_index[:, None]
     distance, geom_index = ray_length.reshape(n_worlds, -1), geom_index.reshape(n_worlds, -1)
 
-    look, axes = jnp.asarray(pixels[..., :3], eyes.dtype), eyes[..., 3:].reshape(n_worlds, n_cameras, 1, 3, 3)
-    direction = sum(axes[..., k] * look[..., k, None] for k in range(3)).reshape(n_worlds, -1, 3)
-    origin = jnp.repeat(eyes[..., :3], n_pixels, axis=1)
+    pixel_direction = jnp.asarray(pixels[..., :3], camera_poses.dtype)
+    axes = camera_poses[..., 3:].reshape(n_worlds, n_cameras, 1, 3, 3)
+    direction = sum(axes[..., k] * pixel_direction[..., k, None] for k in range(3)).reshape(n_worlds, -1, 3)
+    origin = jnp.repeat(camera_poses[..., :3], n_pixels, axis=1)
     names = body_names(model, data.core.n_drones if drones else 0)
-    if not targets.all:
+    if not targets.all_geoms:
         return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), geom_index, names)
-    fixed_rows = jnp.broadcast_to(tables.fixed[: len(targets.fixed)], (n_worlds, len(targets.fixed), 16))
+    fixed_rows = jnp.broadcast_to(
+        tables.fixed_geoms[: len(targets.fixed_geoms)], (n_worlds, len(targets.fixed_geoms), 16)
+    )
     rows = jnp.concatenate([fixed_rows, movable], axis=1)
     rows = jnp.take_along_axis(rows, jnp.maximum(geom_index, 0)[..., None], axis=1)
-    exact, normal_at = _hit_rows(targets.surfaces, targets.codes, geom_index, rows, origin, direction)
-    distance = _replace_derivative(distance, exact)
+    differentiable_distance, normal_at = _hit_rows(targets.surfaces, targets.codes, geom_index, rows, origin, direction)
+    distance = _replace_derivative(distance, differentiable_distance)
     normal = normal_at(distance)
     if platform is not None:
-        fn = functools.partial(normal_at_hit, targets.surfaces, n_pixels, n_cameras)
-        by_kernel = map_indices(fn, n, [*tables, *hit_table], platform, compile_now=False)
-        normal = _replace_derivative(jnp.stack(by_kernel, axis=-1).reshape(normal.shape), normal)
-    body_indices = jnp.asarray([*(target.body_index for target in targets.all), -1], jnp.int32)
+        ray_fn = functools.partial(normal_at_hit, targets.surfaces, n_pixels, n_cameras)
+        kernel_normal = map_indices(ray_fn, n, [*tables, *hit_table], platform, compile_now=False)
+        normal = _replace_derivative(jnp.stack(kernel_normal, axis=-1).reshape(normal.shape), normal)
+    body_indices = jnp.asarray([*(target.body_index for target in targets.all_geoms), -1], jnp.int32)
     return Hits(distance, normal, _hit_points(origin, direction, distance), body_indices[geom_index], names)
 
 
@@ -348,15 +353,15 @@ class RayKernels:
     strict: bool = False
     """True to raise an error where XLA would be used with an ``EngineWarning``."""
     mesh: Mesh | None = None
-    """Devices over which the worlds are distributed; None for one, or where the kernels serve the worlds of one."""
-    used: str = ""
-    """Description of the kernels that cast rays last, for ``Sim.explain``."""
-    reported: set[str] = dataclasses.field(default_factory=set)
-    """Warnings that were given."""
+    """Devices over which the worlds are distributed; None for kernels that cast the rays of one device."""
+    last_used: str = ""
+    """Description of the kernels that cast the last rays, for ``Sim.explain``; empty before."""
+    reported_warnings: set[str] = dataclasses.field(default_factory=set)
+    """Warnings that have been given."""
 
     @classmethod
     def choose(cls, engine: str, device: jax.Device, mesh: Mesh | None, strict: bool) -> RayKernels:
-        """Return the choice for a simulation: kernels where its engine may use them, on devices that have them.
+        """Return the kernels for a simulation, or XLA if its engine or its device has no kernels.
 
         Args:
             engine: Engine of its steps, one of ``crazysim.engine.ENGINES``.
@@ -378,7 +383,7 @@ class RayKernels:
             return fn(data, self)
         kernels = dataclasses.replace(self, mesh=None)
         results = map_devices(lambda data: fn(data, kernels), data, self.mesh)
-        self.used = kernels.used
+        self.last_used = kernels.last_used
         return results
 
     def node_boxes(self, targets: Targets, leaf_boxes: Array) -> tuple[Array, np.ndarray]:
@@ -394,23 +399,24 @@ class RayKernels:
             return leaf_boxes, links
         counts = jnp.array([[n_nodes, len(leaves)]], jnp.int32)
         tables = counts, jnp.asarray(ranges), leaf_boxes[:, leaves].reshape(-1, 6)
-        boxes, _ = self._map(node_box, n_worlds * n_nodes, tables)
+        boxes, _ = self._map_indices(node_box, n_worlds * n_nodes, tables)
         return jnp.stack(boxes, axis=-1).reshape(n_worlds, n_nodes, 6), links
 
     def run(
         self, fn: Callable[..., Any], n: int, tables: Sequence[Array], targets: Targets
     ) -> tuple[list[Array], str | None]:
-        """Return the results of a function of one ray for ``n`` rays, and the platform of the kernel; see ``_map``."""
-        hits, platform = self._map(fn, n, tables)
-        any_objects = any(target.carrier == "object" for target in targets.movable)
-        by = "XLA, without a kernel" if platform is None else "one kernel with a lane for each ray"
-        counts = f"{len(targets.fixed)} fixed geoms in a hierarchy, {len(targets.movable)} movable geoms in another"
-        advice = ", which cost more: mocap=False makes them fixed" if any_objects else ""
-        self.used = f"{by}; {counts}{advice}"
+        """Return the results of a function of one ray for ``n`` rays, and the platform of its kernel or None."""
+        hits, platform = self._map_indices(fn, n, tables)
+        has_objects = any(target.carrier == "object" for target in targets.movable_geoms)
+        method = "XLA, without a kernel" if platform is None else "one kernel with a lane for each ray"
+        n_fixed, n_movable = len(targets.fixed_geoms), len(targets.movable_geoms)
+        counts = f"{n_fixed} fixed geoms in a hierarchy, {n_movable} movable geoms in another"
+        advice = ", which cost more: mocap=False makes them fixed" if has_objects else ""
+        self.last_used = f"{method}; {counts}{advice}"
         return hits, platform
 
-    def _map(self, fn: Callable[..., Any], n: int, tables: Sequence[Array]) -> tuple[list[Array], str | None]:
-        """Return what ``map_indices`` does, by a kernel if possible.
+    def _map_indices(self, fn: Callable[..., Any], n: int, tables: Sequence[Array]) -> tuple[list[Array], str | None]:
+        """Return the results of ``map_indices``, by a kernel if possible.
 
         Returns:
             The results. (n,) each
@@ -421,14 +427,14 @@ class RayKernels:
                 return map_indices(fn, n, tables, self.platform), self.platform
             except UnsupportedError as error:
                 problem, remedy = f"rays have no kernel: {error.reason}", "Leave out the geoms that need it"
-                report_unsupported([problem], self.strict, self.reported, remedy)
+                report_unsupported([problem], self.strict, self.reported_warnings, remedy)
         return map_indices(fn, n, tables, None), None
 
 
 @jax.custom_jvp
-def _replace_derivative(value: Array, other: Array) -> Array:
+def _replace_derivative(value: Array, differentiable: Array) -> Array:
     """Return a value with the derivative of another one."""
-    del other
+    del differentiable
     return value
 
 

@@ -55,7 +55,7 @@ class ModelRenderer:
         try:
             return self._draw(renderer, mode, cam, overlays)
         finally:
-            _leave_context()
+            _release_context()
 
     def _draw(
         self, renderer: mujoco.Renderer, mode: str, cam: mujoco.MjvCamera, overlays: Overlays
@@ -63,12 +63,12 @@ class ModelRenderer:
         # Twice: MuJoCo centres infinite planes on the camera of the previous update.
         renderer.update_scene(self._data, camera=cam)
         renderer.update_scene(self._data, camera=cam)
-        bodies = renderer.scene.ngeom
+        n_scene_geoms = renderer.scene.ngeom
         overlays.write(renderer.scene)
         if mode == "rgb_array":
             return _read_image(renderer, overlays)
         color = _read_image(renderer, overlays) if mode == "rgbd_tuple" else None
-        renderer.scene.ngeom = bodies  # depth does not include overlays
+        renderer.scene.ngeom = n_scene_geoms  # depth does not include overlays
         renderer.enable_depth_rendering()
         depth = renderer.render().copy()
         renderer.disable_depth_rendering()
@@ -85,9 +85,9 @@ class ModelRenderer:
 
     def _camera(self, camera: int | str, cam_config: Mapping[str, ArrayLike] | None) -> mujoco.MjvCamera:
         cam = mujoco.MjvCamera()
-        number = camera_id(self._model, camera)
-        if number >= 0:
-            cam.type, cam.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, number
+        index = camera_id(self._model, camera)
+        if index >= 0:
+            cam.type, cam.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, index
             return cam
         mujoco.mjv_defaultFreeCamera(self._model, cam)
         if cam_config is not None and not isinstance(cam_config, Mapping):
@@ -129,11 +129,11 @@ class ModelRenderer:
 def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
     """Return the id of a camera, -1 for the free camera."""
     if isinstance(camera, str):
-        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-        if number < 0:
+        index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        if index < 0:
             names = [model.camera(i).name for i in range(model.ncam)]
             raise UnknownNameError(f"expected -1 or a camera of the scene, {', '.join(names[:12])}, got {camera!r}")
-        return number
+        return index
     if not isinstance(camera, (int, np.integer)) or not -1 <= camera < model.ncam:
         raise UnknownNameError(
             f"expected a camera id from 0 to {model.ncam - 1}, or -1 for the free camera, got {camera!r}"
@@ -162,13 +162,13 @@ def _read_image(renderer: mujoco.Renderer, overlays: Overlays) -> NDArray:
 
 
 def _close_all(renderers: dict[tuple[int, int], mujoco.Renderer], windows: list[SceneWindow]) -> None:
-    for holder in (*renderers.values(), *windows):
-        holder.close()
+    for resource in (*renderers.values(), *windows):
+        resource.close()
     renderers.clear()
     windows.clear()
 
 
-def _leave_context() -> None:
+def _release_context() -> None:
     """Release the OpenGL context that is current in this thread.
 
     While a context is current in one thread, and even after that thread has ended, no other thread can use or free it.

@@ -46,7 +46,7 @@ class Scene:
     """Largest number of pairs that MJX checks per kind of collision, from the next ``compile`` on; -1 for all."""
     renderer: SceneRenderer
     """Renderers and the overlays of the next image."""
-    added: SceneObjects
+    added_objects: SceneObjects
     """Objects that were added with ``add``."""
     plugins: ListPlugins
     """Function that returns the plugins of the simulation."""
@@ -87,11 +87,11 @@ class Scene:
             ConfigError: If the scene cannot be read or compiled.
         """
         self.n_worlds, self.n_drones, self.device, self.mesh = n_worlds, n_drones, device, mesh
-        self.kinds = _airframe_groups(airframes)
+        self.drone_groups = _group_drones(airframes)
         self.max_geom_pairs = -1 if n_drones < LARGE_SWARM else 2 * n_drones
         self.renderer = SceneRenderer(device)
         self.spec = build.build_spec(xml_path, airframes, freq, self.max_geom_pairs)
-        self.added = SceneObjects(n_worlds)
+        self.added_objects = SceneObjects(n_worlds)
         self.plugins = plugins
         self.ray_kernels = ray_kernels
         self.splats = None
@@ -124,7 +124,7 @@ class Scene:
             **options: Settings of a primitive: lengths in m, ``rgba``. ``crazysim.scene.primitives`` lists them.
         """
         with self.restore_on_error():
-            handle = self.added.add(self.spec, source, name, count, pos, quat, mocap, options)
+            handle = self.added_objects.add(self.spec, source, name, count, pos, quat, mocap, options)
         self.revision += 1
         return handle
 
@@ -170,7 +170,7 @@ class Scene:
 
         ``options`` are those of ``add``.
         """
-        n_existing = self.added.count_objects(name)
+        n_existing = self.added_objects.count_objects(name)
         if n_existing not in (0, count):
             raise ConfigError(
                 f"expected {n_existing} objects {name!r}, which are in the scene already, got {count}: objects stay "
@@ -182,11 +182,11 @@ class Scene:
     @contextlib.contextmanager
     def restore_on_error(self) -> Iterator[None]:
         """Remove objects that were added within the block if an error ends the block."""
-        snapshot = self.added.take_snapshot(self.spec)
+        snapshot = self.added_objects.take_snapshot(self.spec)
         try:
             yield
         except BaseException:
-            if self.added.restore_snapshot(self.spec, snapshot):
+            if self.added_objects.restore_snapshot(self.spec, snapshot):
                 self.revision += 1
             raise
 
@@ -214,7 +214,7 @@ class Scene:
         self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
         mj_model = build.compile_spec(self.spec)
         drone_ids = build.mocap_ids(mj_model, [f"drone:{i}" for i in range(self.n_drones)])
-        self._object_ids = build.mocap_ids(mj_model, self.added.movable)
+        self._object_ids = build.mocap_ids(mj_model, self.added_objects.movable)
         self._drone_ids = drone_ids
         self.renderer.close()
         self._mj_model, self._mj_data = mj_model, mujoco.MjData(mj_model)
@@ -237,19 +237,23 @@ class Scene:
     @property
     def drone_mocap_ids(self) -> list[int]:
         """Mocap id of each drone's body, as in the next compiled model. (n_drones,)"""
-        return self._ids([f"drone:{i}" for i in range(self.n_drones)]) if self._is_edited else self._drone_ids
+        return (
+            self._spec_mocap_ids([f"drone:{i}" for i in range(self.n_drones)]) if self._is_edited else self._drone_ids
+        )
 
-    def objects(self, before: Objects | None) -> Objects | None:
+    def objects(self, previous: Objects | None) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects."""
-        movable = self.added.movable
-        return self.added.record(before, self._ids(movable) if self._is_edited else self._object_ids)
+        movable = self.added_objects.movable
+        return self.added_objects.record(
+            previous, self._spec_mocap_ids(movable) if self._is_edited else self._object_ids
+        )
 
     def _check_image_memory(self, n_cameras: int, size: tuple[int, int], bytes_per_pixel: float) -> None:
         """Check that the images of all worlds fit into the memory of their devices."""
         n_devices = 1 if self.mesh is None else self.mesh.size
         depth.check_image_memory(self.n_worlds * n_cameras, *size, bytes_per_pixel, self.device, n_devices)
 
-    def _ids(self, names: Sequence[str]) -> list[int]:
+    def _spec_mocap_ids(self, names: Sequence[str]) -> list[int]:
         """Return mocap ids in the spec, which equal the ids in the compiled model; nothing is compiled."""
         ids = build.spec_mocap_ids(self.spec)
         missing_names = [name for name in names if name not in ids]
@@ -266,7 +270,7 @@ class Scene:
         """Geoms that drones touch; read again after a compilation."""
         model = self.mj_model  # compiles an edited scene
         if self._collision_model is None:
-            self._collision_model = collision.collision_model(model, self.added.movable, self.kinds)
+            self._collision_model = collision.collision_model(model, self.added_objects.movable, self.drone_groups)
         return self._collision_model
 
     @property
@@ -274,7 +278,7 @@ class Scene:
         """Geoms that cameras see; read again after a compilation."""
         model = self.mj_model  # compiles an edited scene
         if self._visual_model is None:
-            self._visual_model = collision.visual_model(model, self.added.movable, self.kinds)
+            self._visual_model = collision.visual_model(model, self.added_objects.movable, self.drone_groups)
         return self._visual_model
 
     @property
@@ -303,7 +307,7 @@ class Scene:
 
     def depth_fn(
         self,
-        camera: str | int | depth.View = "fpv_cam",
+        camera: str | int | depth.DroneCamera = "fpv_cam",
         width: int = 64,
         height: int = 64,
         drones: bool = True,
@@ -331,15 +335,15 @@ class Scene:
         Raises:
             ConfigError: If there is no such camera, or the images do not fit into memory.
         """
-        if isinstance(camera, depth.View):
+        if isinstance(camera, depth.DroneCamera):
             height, width = camera.rays.shape[:2]
-            cameras = [depth.CarriedCamera.of_view(camera, drone) for drone in range(self.n_drones)]
+            cameras = [depth.CarriedCamera.on_drone(camera, drone) for drone in range(self.n_drones)]
         else:
             depth.check_image_size(width, height)
-            objects = (*self.added.movable, *self.visual_model.mocap_bodies)
+            objects = (*self.added_objects.movable, *self.visual_model.mocap_bodies)
             cameras = depth.find_cameras(self.mj_model, camera, objects)
         self._check_image_memory(len(cameras), (width, height), depth.BYTES_PER_RAY)
-        if isinstance(camera, depth.View):
+        if isinstance(camera, depth.DroneCamera):
             # The frame of MuJoCo's cameras: x right, y up, z back.
             rays = [np.stack([-camera.rays[..., 1], camera.rays[..., 2], -camera.rays[..., 0]], axis=-1)] * len(cameras)
         else:
@@ -357,7 +361,7 @@ class Scene:
         min_coverage: float = 0.5,
         renderer: splat_images.Renderer = "auto",
     ) -> splat_images.SplatFn:
-        """Return ``look(data, gaussians, mocap=None) -> SplatImage``, pure: images of Gaussian splats in all worlds.
+        """Return ``splats(data, gaussians, mocap=None) -> SplatImage``, pure: images of Gaussian splats in all worlds.
 
         The Gaussians are ``SplatScene.gaussians``. Images have gradients with respect to them and to the poses in
         ``data``. Bodies of the scene are not drawn.
@@ -374,9 +378,9 @@ class Scene:
             ImportError: If ``renderer="splax"`` and splax is not installed.
             ConfigError: If ``renderer="splax"`` and the simulation is not on a GPU.
         """
-        objects = (*self.added.movable, *self.visual_model.mocap_bodies)
+        objects = (*self.added_objects.movable, *self.visual_model.mocap_bodies)
         names = [camera] if isinstance(camera, (str, int, np.integer)) else list(camera)
-        cameras = [found for name in names for found in depth.find_cameras(self.mj_model, name, objects)]
+        cameras = [match for name in names for match in depth.find_cameras(self.mj_model, name, objects)]
         size = splat_images.check_size(width, height)
         self._check_image_memory(len(cameras), size, splat_images.BYTES_PER_PIXEL)
         return splat_images.build_splat_fn(
@@ -464,7 +468,7 @@ class Scene:
         self.renderer.close()
 
 
-def _airframe_groups(airframes: Sequence[Airframe]) -> tuple[tuple[int, ...] | None, ...]:
+def _group_drones(airframes: Sequence[Airframe]) -> tuple[tuple[int, ...] | None, ...]:
     """Return the indices of the drones of each airframe; None for all."""
     groups: dict[int, list[int]] = {}
     for k, airframe in enumerate(airframes):

@@ -38,7 +38,7 @@ class SceneWindow:
             RenderError: If there is no screen, or no window can be opened on it.
         """
         self._model = model
-        self._glfw = glfw = _glfw()
+        self._glfw = glfw = _load_glfw()
         # One thread cannot use both an EGL context, for images in memory, and a context of another kind.
         egl = os.environ.get("MUJOCO_GL", "").lower() == "egl"
         glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API if egl else glfw.NATIVE_CONTEXT_API)
@@ -211,7 +211,7 @@ def require_screen() -> None:
         )
 
 
-def _glfw() -> Any:
+def _load_glfw() -> Any:
     require_screen()
     import glfw  # comes with mujoco; images in memory do not need it
 

@@ -17,26 +17,26 @@ QUALITY_VARIABLE = "CRAZYSIM_RENDERING"
 CPU_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
 """Parts of the names of OpenGL renderers that run on CPUs, in lower case."""
 QUALITY_LIMITS = {"offsamples": 0, "shadowsize": 0, "numslices": 16, "numstacks": 8}
-"""Largest settings of MuJoCo's quality where a CPU draws.
+"""Largest values of MuJoCo's quality settings if a CPU draws.
 
-Samples of a pixel; width of the map of shadows, pixels, 0 for no shadows; meridians and parallels of round shapes. With
-llvmpipe an image of 640 x 360 pixels takes less than a third of the time that it takes with 4 samples and a map of
-4096, and four Crazyflies a third less than with MuJoCo's 28 meridians. With smaller maps, small images show false
-shadows.
+Samples of a pixel; width of the shadow map, pixels, 0 for no shadows; meridians and parallels of round shapes. With
+llvmpipe an image of 640 x 360 pixels takes less than a third of the time that it takes with 4 samples and a shadow map
+of 4096 pixels. Four Crazyflies take a third less time than with MuJoCo's 28 meridians. Smaller shadow maps would show
+false shadows in small images.
 """
 
 
-def is_fast() -> bool:
-    """Return True where images are drawn with the settings of CPUs."""
+def uses_cpu_quality() -> bool:
+    """Return True if images are drawn with the lower quality for CPUs."""
     quality = os.environ.get(QUALITY_VARIABLE, "")
     if quality not in ("", "full", "fast"):
         raise ConfigError(f"expected full or fast in {QUALITY_VARIABLE}, got {quality!r}. Correct it, or unset it.")
-    return quality == "fast" or (not quality and is_software())
+    return quality == "fast" or (not quality and has_software_renderer())
 
 
 @functools.cache
-def is_software() -> bool:
-    """Return True where OpenGL draws on the CPU; False where there is no OpenGL."""
+def has_software_renderer() -> bool:
+    """Return True if OpenGL draws on the CPU; False if there is no OpenGL."""
     try:
         from OpenGL import GL
 
@@ -48,26 +48,26 @@ def is_software() -> bool:
             context.free()
     except Exception:  # bindings raise errors of any type, which the renderer itself reports
         return False
-    return any(x in name for x in CPU_RENDERERS)
+    return any(part in name for part in CPU_RENDERERS)
 
 
 @contextlib.contextmanager
 def rendering_quality(model: mujoco.MjModel) -> Iterator[None]:
-    """Give a model the settings for this machine while a context is created, which reads them only then."""
-    if not is_fast():
+    """Apply the settings for this machine to a model while a context is created, which reads them only then."""
+    if not uses_cpu_quality():
         yield
         return
     settings = model.vis.quality
-    before = [getattr(settings, name) for name in QUALITY_LIMITS]
-    for (name, limit), value in zip(QUALITY_LIMITS.items(), before, strict=True):
+    previous_values = [getattr(settings, name) for name in QUALITY_LIMITS]
+    for (name, limit), value in zip(QUALITY_LIMITS.items(), previous_values, strict=True):
         setattr(settings, name, min(value, limit))
     try:
         yield
     finally:
-        for name, value in zip(QUALITY_LIMITS, before, strict=True):
+        for name, value in zip(QUALITY_LIMITS, previous_values, strict=True):
             setattr(settings, name, value)
 
 
 def film_size(width: int, height: int) -> tuple[int, int]:
-    """Return the size of a film, pixels: two thirds of the given one, in even numbers, where a CPU draws."""
-    return (width // 3 * 2, height // 3 * 2) if is_fast() else (width, height)
+    """Return the size of a film, pixels: as given, or about two thirds of it, in even numbers, if a CPU draws."""
+    return (width // 3 * 2, height // 3 * 2) if uses_cpu_quality() else (width, height)

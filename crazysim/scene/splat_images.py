@@ -26,9 +26,9 @@ from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_
 from crazysim.scene.splats import Gaussians, spherical_harmonics
 from crazysim.tables import range_between, read_number, read_numbers
 
-NEAR = 0.01
+MIN_DEPTH = 0.01
 """Distance along the camera's axis below which Gaussians are not drawn, m; splax has the same."""
-BLUR = 0.3
+BLUR_VARIANCE = 0.3
 """Variance added to projected Gaussians, pixels^2, so that none is smaller than a pixel (Kerbl et al. 2023)."""
 MAX_SLOPE = 1.3
 """Largest slope of the direction to a Gaussian at which its projection is linearised, as a multiple of the image's."""
@@ -36,12 +36,12 @@ MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.999
 """Alpha below which a Gaussian is left out of a pixel, and largest alpha; splax has the same."""
 MIN_TRANSMITTANCE = 1e-4
 """Transmittance below which nothing more is drawn in a pixel (Kerbl et al. 2023)."""
-BLOCK = 32
-"""Gaussians that are drawn at a time."""
+BLOCK_SIZE = 32
+"""Number of Gaussians that are drawn at a time."""
 MAX_ALPHAS = 1 << 24
-"""Largest number of pixels times ``BLOCK`` that are drawn at a time, over several images."""
+"""Largest number of pixels times ``BLOCK_SIZE`` that are drawn at a time, over several images."""
 BYTES_PER_PIXEL = 20
-"""Memory of a pixel, at least: colour, depth and coverage, bytes."""
+"""Smallest memory of a pixel, bytes: colour, depth and coverage."""
 RENDERERS = ("auto", "splax", "plain")
 """Renderers of splats."""
 
@@ -54,14 +54,14 @@ class SplatImage(PyTree):
     color: Array
     """Red, green and blue, 0 to 1. (n_worlds, n_cameras, height, width, 3)"""
     depth: Array
-    """Mean distance of the surface along the camera's axis, m; infinite where ``coverage`` is below the smallest
-    coverage. (n_worlds, n_cameras, height, width)"""
+    """Mean distance of the surface along the camera's axis, m; infinite where ``coverage`` is below ``min_coverage``.
+    (n_worlds, n_cameras, height, width)"""
     coverage: Array
-    """Share of light that comes from Gaussians and not from the background. (n_worlds, n_cameras, height, width)"""
+    """Fraction of the light that comes from Gaussians, not from the background. (n_worlds, n_cameras, height, width)"""
 
 
 SplatFn = Callable[..., SplatImage]
-"""``look(data, gaussians, mocap=None) -> SplatImage``."""
+"""``splats(data, gaussians, mocap=None) -> SplatImage``."""
 
 
 def check_size(width: object, height: object) -> tuple[int, int]:
@@ -80,7 +80,7 @@ def build_splat_fn(
     platform: str,
     plugins: ListPlugins,
 ) -> SplatFn:
-    """Return ``look(data, gaussians, mocap=None) -> SplatImage``, pure; see ``Scene.splat_fn``."""
+    """Return ``splats(data, gaussians, mocap=None) -> SplatImage``, pure; see ``Scene.splat_fn``."""
     width, height = check_size(width, height)
     color = read_numbers("background", background, range_between(0.0, 1.0), ((3,),))
     min_coverage = read_number("min_coverage", min_coverage, range_between(0.0, 1.0))
@@ -90,10 +90,10 @@ def build_splat_fn(
     draw = functools.partial(
         _choose_renderer(renderer, platform), focal=float(focal), width=width, height=height, background=color
     )
-    at_a_time = max(1, MAX_ALPHAS // (width * height * BLOCK))
+    batch_size = max(1, MAX_ALPHAS // (width * height * BLOCK_SIZE))
     bodies = [camera.body for camera in cameras]
 
-    def look(data: SimData, gaussians: Gaussians, mocap: MocapPoses = None) -> SplatImage:
+    def splats(data: SimData, gaussians: Gaussians, mocap: MocapPoses = None) -> SplatImage:
         if data.states.pos.ndim == 1:
             raise ConfigError("expected data of all worlds or of one world for images, got data of one drone")
         require_poses(model, bodies, mocap)
@@ -101,20 +101,20 @@ def build_splat_fn(
         poses = [camera_pose(camera, data) for camera in cameras]
         pos, rot = (jnp.stack(x, axis=data.states.pos.ndim - 2) for x in zip(*poses, strict=True))
         leading = pos.shape[:-1]
-        eyes = pos.reshape(-1, 3), rot.reshape(-1, 3, 3)
-        images = draw(gaussians, eyes, at_a_time=at_a_time)
+        camera_poses = pos.reshape(-1, 3), rot.reshape(-1, 3, 3)
+        images = draw(gaussians, camera_poses, batch_size=batch_size)
         color, depth, coverage = (x.reshape(*leading, *x.shape[1:]) for x in images)
         return SplatImage(color, jnp.where(coverage < min_coverage, jnp.inf, depth), coverage)
 
-    return look
+    return splats
 
 
 def _choose_renderer(renderer: Renderer, platform: str) -> Callable[..., tuple[Array, Array, Array]]:
-    """Return ``_draw_with_splax`` or ``_draw_plainly``."""
+    """Return ``_draw_with_splax`` or ``_draw_with_jax``."""
     if renderer not in RENDERERS:
         raise ConfigError(f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}")
     if renderer == "plain" or (renderer == "auto" and (platform != "gpu" or not importlib.util.find_spec("splax"))):
-        return _draw_plainly
+        return _draw_with_jax
     if platform != "gpu":
         raise ConfigError(
             f"expected a simulation on a GPU for renderer='splax', got one on {platform!r}. Pass device='gpu', or use "
@@ -141,22 +141,22 @@ def import_splax() -> ModuleType:
     return splax
 
 
-Eyes = tuple[Array, Array]
+CameraPoses = tuple[Array, Array]
 """Positions of cameras, m (n, 3), and axes as columns, right, up and back (n, 3, 3)."""
 
 
 def _draw_with_splax(
     splax: ModuleType,
     gaussians: Gaussians,
-    eyes: Eyes,
+    camera_poses: CameraPoses,
     focal: float,
     width: int,
     height: int,
     background: np.ndarray,
-    at_a_time: int,
+    batch_size: int,
 ) -> tuple[Array, Array, Array]:
-    """Return colours, depths and coverages of images; ``at_a_time`` is not used, since kernels have no arrays."""
-    del at_a_time
+    """Return colours, depths and coverages of images; ``batch_size`` is not used, since kernels have no arrays."""
+    del batch_size
     parameters = (
         gaussians.pos, gaussians.log_scale, jnp.roll(gaussians.quat, 1, axis=-1), gaussians.color,
         gaussians.logit_opacity,
@@ -169,11 +169,11 @@ def _draw_with_splax(
             background=jnp.asarray(background, jnp.float32),
             img_shape=(height, width),
             f=(focal, focal),
-            clip_thresh=NEAR,
+            clip_thresh=MIN_DEPTH,
             render_depth=True,
         )
 
-    image, coverage = jax.vmap(draw)(view_matrices(*eyes))
+    image, coverage = jax.vmap(draw)(view_matrices(*camera_poses))
     return jnp.clip(image[..., :3], 0.0, 1.0), image[..., 3], coverage
 
 
@@ -190,41 +190,47 @@ def view_matrices(pos: Array, rot: Array) -> Array:
     return jnp.concatenate([upper, last], axis=-2)
 
 
-def _draw_plainly(
-    gaussians: Gaussians, eyes: Eyes, focal: float, width: int, height: int, background: np.ndarray, at_a_time: int
+def _draw_with_jax(
+    gaussians: Gaussians,
+    camera_poses: CameraPoses,
+    focal: float,
+    width: int,
+    height: int,
+    background: np.ndarray,
+    batch_size: int,
 ) -> tuple[Array, Array, Array]:
     """Return colours (n, height, width, 3), depths and coverages (n, height, width) of images."""
     draw = functools.partial(_draw_image, gaussians, focal=focal, width=width, height=height, background=background)
-    return jax.lax.map(draw, eyes, batch_size=min(at_a_time, len(eyes[0])))
+    return jax.lax.map(draw, camera_poses, batch_size=min(batch_size, len(camera_poses[0])))
 
 
 def _draw_image(
-    gaussians: Gaussians, eye: Eyes, focal: float, width: int, height: int, background: np.ndarray
+    gaussians: Gaussians, camera_pose: CameraPoses, focal: float, width: int, height: int, background: np.ndarray
 ) -> tuple[Array, Array, Array]:
     """Return colour (height, width, 3), depth and coverage (height, width) of an image (Kerbl et al. 2023).
 
     Gaussians are projected to Gaussians of the image (Zwicker et al. 2001) and blended from near to far.
     """
-    pos, rot = eye
+    pos, rot = camera_pose
     order = jnp.argsort(jnp.sum((gaussians.pos - pos) * -rot[:, 2], axis=-1))
-    order = jnp.pad(order, (0, -len(order) % BLOCK), constant_values=-1).reshape(-1, BLOCK)
+    order = jnp.pad(order, (0, -len(order) % BLOCK_SIZE), constant_values=-1).reshape(-1, BLOCK_SIZE)
     y, x = (np.arange(n, dtype=np.float32) + 0.5 for n in (height, width))
     zero = jnp.zeros((height, width), gaussians.pos.dtype)
 
     def blend(carry: tuple[Array, Array, Array], block: Array) -> tuple[tuple[Array, Array, Array], None]:
         color, depth, transmittance = carry
-        near = jax.tree.map(lambda leaf: leaf[block], gaussians)
-        center, (a, b, c), z, opacity = _project(near, pos, rot, focal, width, height)
+        block_gaussians = jax.tree.map(lambda leaf: leaf[block], gaussians)
+        center, (a, b, c), z, opacity = _project(block_gaussians, pos, rot, focal, width, height)
         dx, dy = (e[:, None, None] - p for e, p in zip(center, (x, y[:, None]), strict=True))
         a, b, c, opacity = (e[:, None, None] for e in (a, b, c, jnp.where(block < 0, 0.0, opacity)))
         alpha = jnp.minimum(MAX_ALPHA, opacity * jnp.exp(-(a * dx * dx + c * dy * dy) / 2 - b * dx * dy))
         alpha = jnp.where(alpha < MIN_ALPHA, 0.0, alpha)
-        after = transmittance * jnp.cumprod(1 - alpha, axis=0)
-        alpha = jnp.where(after > MIN_TRANSMITTANCE, alpha, 0.0)
-        weight = jnp.concatenate([transmittance[None], after[:-1]]) * alpha
-        seen = _colors(near, pos)
+        remaining = transmittance * jnp.cumprod(1 - alpha, axis=0)
+        alpha = jnp.where(remaining > MIN_TRANSMITTANCE, alpha, 0.0)
+        weight = jnp.concatenate([transmittance[None], remaining[:-1]]) * alpha
+        gaussian_colors = _colors(block_gaussians, pos)
         # A GPU may round products of matrices to 10 bits otherwise.
-        color = color + jnp.einsum("kyx,kc->yxc", weight, seen, precision="highest")
+        color = color + jnp.einsum("kyx,kc->yxc", weight, gaussian_colors, precision="highest")
         depth = depth + jnp.sum(weight * z[:, None, None], axis=0)
         return (color, depth, transmittance - jnp.sum(weight, axis=0)), None
 
@@ -243,24 +249,29 @@ def _project(
     right, up, back = (rot[:, k] for k in range(3))
     offset = gaussians.pos - pos
     z = -jnp.sum(offset * back, axis=-1)
-    is_near = z > NEAR
+    is_near = z > MIN_DEPTH
     u, v = (jnp.sum(offset * axis, axis=-1) / jnp.where(is_near, z, 1.0) for axis in (right, -up))
     scale = focal / jnp.where(is_near, z, 1.0)
     # Rows of the product of projection and rotation, and standard deviations along the axes of a Gaussian.
-    ahead, slopes = -back, [jnp.clip(t, -s, s) for t, s in zip((u, v), _slopes(focal, width, height), strict=True)]
-    rows = [scale[:, None] * (axis - t[:, None] * ahead) for axis, t in zip((right, -up), slopes, strict=True)]
+    forward = -back
+    slopes = [jnp.clip(t, -s, s) for t, s in zip((u, v), _max_slopes(focal, width, height), strict=True)]
+    rows = [scale[:, None] * (axis - t[:, None] * forward) for axis, t in zip((right, -up), slopes, strict=True)]
     quat = gaussians.quat * jax.lax.rsqrt(jnp.sum(gaussians.quat**2, axis=-1, keepdims=True))
     deviation = jnp.exp(gaussians.log_scale)
     axes = rotation.matrix(quat)
     px, py = (jnp.sum(row[:, :, None] * axes, axis=1) * deviation for row in rows)
-    xx, xy, yy = jnp.sum(px * px, axis=-1) + BLUR, jnp.sum(px * py, axis=-1), jnp.sum(py * py, axis=-1) + BLUR
+    xx, xy, yy = (
+        jnp.sum(px * px, axis=-1) + BLUR_VARIANCE,
+        jnp.sum(px * py, axis=-1),
+        jnp.sum(py * py, axis=-1) + BLUR_VARIANCE,
+    )
     determinant = xx * yy - xy * xy
     opacity = jnp.where(is_near, jax.nn.sigmoid(gaussians.logit_opacity), 0.0)
     center = focal * u + width / 2, focal * v + height / 2
     return center, (yy / determinant, -xy / determinant, xx / determinant), z, opacity
 
 
-def _slopes(focal: float, width: int, height: int) -> tuple[float, float]:
+def _max_slopes(focal: float, width: int, height: int) -> tuple[float, float]:
     return MAX_SLOPE * width / 2 / focal, MAX_SLOPE * height / 2 / focal
 
 
@@ -268,5 +279,5 @@ def _colors(gaussians: Gaussians, pos: Array) -> Array:
     """Return the colours of Gaussians as seen from a position. (n, 3)"""
     direction = rotation.safe_normalize(gaussians.pos - pos, jnp.array([1.0, 0.0, 0.0], gaussians.pos.dtype))
     harmonics = spherical_harmonics(direction, gaussians.color.shape[1])
-    seen = sum(h[:, None] * gaussians.color[:, k] for k, h in enumerate(harmonics))
-    return jnp.maximum(seen + 0.5, 0.0)
+    colors = sum(h[:, None] * gaussians.color[:, k] for k, h in enumerate(harmonics))
+    return jnp.maximum(colors + 0.5, 0.0)

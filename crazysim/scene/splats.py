@@ -21,8 +21,8 @@ from crazysim.tables import range_between, read_number
 
 N_COLORS = (1, 4, 9, 16)
 """Numbers of spherical harmonics up to degree 0, 1, 2 and 3."""
-CENTRAL = (5.0, 95.0)
-"""Percentiles of coordinates between which the extent of splats is measured: single ones lie far outside."""
+CENTRAL_PERCENTILES = (5.0, 95.0)
+"""Percentiles of the coordinates between which the extent of splats is measured, since a few splats are far outside."""
 
 
 class Gaussians(PyTree):
@@ -68,13 +68,13 @@ class SplatScene:
         """
         values = _read_gaussians(path)
         points = values["pos"]
-        central = np.percentile(points, CENTRAL, axis=0) if len(points) > 100 else points
-        origin, rot, scale = read_frame(central, pos, quat, scale)
-        turn = np.empty(4)
-        mujoco.mju_mat2Quat(turn, rot.reshape(-1))
+        central_points = np.percentile(points, CENTRAL_PERCENTILES, axis=0) if len(points) > 100 else points
+        origin, rot, scale = read_frame(central_points, pos, quat, scale)
+        quat_wxyz = np.empty(4)
+        mujoco.mju_mat2Quat(quat_wxyz, rot.reshape(-1))
         self.gaussians = Gaussians(
             pos=jnp.asarray(scale * points @ rot.T + origin, np.float32),
-            quat=jnp.asarray(_multiply(np.roll(turn, -1), values["quat"]), np.float32),
+            quat=jnp.asarray(_multiply(np.roll(quat_wxyz, -1), values["quat"]), np.float32),
             log_scale=jnp.asarray(values["log_scale"] + np.log(scale), np.float32),
             color=jnp.asarray(_rotate_colors(values["color"], rot), np.float32),
             logit_opacity=jnp.asarray(values["logit_opacity"], np.float32),
@@ -163,7 +163,7 @@ def _multiply(p: NDArray, q: NDArray) -> NDArray:
 
 
 def _rotate_colors(color: NDArray, rot: NDArray) -> NDArray:
-    """Return coefficients of spherical harmonics in a frame turned by a rotation matrix. (n, n_colors, 3)
+    """Return coefficients of spherical harmonics in a frame that is turned by a rotation matrix. (n, n_colors, 3)
 
     The colour seen along a direction d in the new frame is the one seen along ``rot.T @ d`` in the old frame. Both are
     linear in the coefficients of a band, so directions that span the bands determine the new ones.

@@ -15,7 +15,7 @@ from crazysim.scene import mjx
 from crazysim.scene.kinematics import N_DUMMY_JOINTS, update_kinematics
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
-"""Modes of cameras that follow a centre of mass, which a sync computes only for them."""
+"""Modes of cameras that follow a centre of mass. A sync computes centres of mass only for these cameras."""
 
 
 @jax.jit
@@ -54,10 +54,10 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
 
 def _poses(data: SimData) -> list[tuple[Array, Array, Array]]:
     """Return mocap ids, positions and attitudes of drones and of objects with handles."""
-    owned = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
+    poses = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
     if data.objects is not None:
-        owned.append((data.objects.mocap_ids, *_drop_drone_axis(data.objects.pos, data.objects.quat)))
-    return owned
+        poses.append((data.objects.mocap_ids, *_drop_drone_axis(data.objects.pos, data.objects.quat)))
+    return poses
 
 
 @jit_unless_traced()
@@ -116,10 +116,10 @@ def sync_one_world(
     """
     mj_data.mocap_pos[:], mj_data.mocap_quat[:], mj_data.qpos[:] = poses
     states, objects = data.states, data.objects
-    owned = [(data.core.drone_mocap_ids, fetch_rows(states.pos, world), fetch_rows(states.quat, world))]
+    moved_poses = [(data.core.drone_mocap_ids, fetch_rows(states.pos, world), fetch_rows(states.quat, world))]
     if objects is not None:
-        owned.append((objects.mocap_ids, fetch_rows(objects.pos, world)[0], fetch_rows(objects.quat, world)[0]))
-    for ids, pos, quat in owned:
+        moved_poses.append((objects.mocap_ids, fetch_rows(objects.pos, world)[0], fetch_rows(objects.quat, world)[0]))
+    for ids, pos, quat in moved_poses:
         mj_data.mocap_pos[np.asarray(ids)] = pos
         mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat, 1, axis=-1)
     mujoco.mj_kinematics(mj_model, mj_data)

@@ -27,11 +27,11 @@ class VisualGeom:
     rgba: NDArray
     """Colour, 0 to 1. (4,)"""
     mocap: int
-    """Mocap id of that body; -1 for a geom that does not move."""
+    """Mocap id of the body; -1 for a geom that does not move."""
     pos: NDArray
-    """Position in that frame, m. (3,)"""
+    """Position in the frame of the body, or world frame, m. (3,)"""
     quat: NDArray
-    """Attitude in that frame, xyzw. (4,)"""
+    """Attitude in the frame of the body, or world frame, xyzw. (4,)"""
     vertices: NDArray
     """Vertices of a mesh, m. (n, 3)"""
     faces: NDArray
@@ -46,17 +46,19 @@ def visual_geoms(model: mujoco.MjModel, data: mujoco.MjData) -> list[VisualGeom]
         data: State of one world, with its kinematics up to date.
     """
     return [
-        _geom(model, data, geom)
+        _read_geom(model, data, geom)
         for geom in range(model.ngeom)
-        if model.geom_group[geom] in VISIBLE_GROUPS and _kind(model, geom) in GEOM_KINDS and _color(model, geom)[3] > 0
+        if model.geom_group[geom] in VISIBLE_GROUPS
+        and _geom_kind(model, geom) in GEOM_KINDS
+        and _geom_color(model, geom)[3] > 0
     ]
 
 
-def _kind(model: mujoco.MjModel, geom: int) -> str:
+def _geom_kind(model: mujoco.MjModel, geom: int) -> str:
     return mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
 
 
-def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
+def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
     body = int(model.geom_bodyid[geom])
     while body and model.body_mocapid[body] < 0:
         body = int(model.body_parentid[body])
@@ -66,11 +68,11 @@ def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
     inverse, inverse_pos = np.zeros(4), np.zeros(3)
     mujoco.mju_negPose(inverse_pos, inverse, data.xpos[body], data.xquat[body])
     mujoco.mju_mulPose(pos, quat, inverse_pos, inverse, data.geom_xpos[geom], geom_quat)
-    vertices, faces = _mesh(model, geom)
+    vertices, faces = _mesh_arrays(model, geom)
     return VisualGeom(
-        kind=_kind(model, geom),
+        kind=_geom_kind(model, geom),
         size=model.geom_size[geom].copy(),
-        rgba=_color(model, geom),
+        rgba=_geom_color(model, geom),
         mocap=int(model.body_mocapid[body]),
         pos=pos,
         quat=np.roll(quat, -1),
@@ -79,7 +81,7 @@ def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
     )
 
 
-def _color(model: mujoco.MjModel, geom: int) -> NDArray:
+def _geom_color(model: mujoco.MjModel, geom: int) -> NDArray:
     """Return a geom's own colour, or its material's times the mean colour of its texture. (4,)"""
     material = int(model.geom_matid[geom])
     if material < 0 or not np.allclose(model.geom_rgba[geom], DEFAULT_COLOR):
@@ -94,8 +96,8 @@ def _color(model: mujoco.MjModel, geom: int) -> NDArray:
     return color
 
 
-def _mesh(model: mujoco.MjModel, geom: int) -> tuple[NDArray, NDArray]:
-    if _kind(model, geom) != "mesh":
+def _mesh_arrays(model: mujoco.MjModel, geom: int) -> tuple[NDArray, NDArray]:
+    if _geom_kind(model, geom) != "mesh":
         return np.zeros((0, 3)), np.zeros((0, 3), int)
     mesh = int(model.geom_dataid[geom])
     vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])

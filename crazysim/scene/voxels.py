@@ -1,7 +1,7 @@
 """Voxels of point clouds and triangles, merged into boxes.
 
-Voxel (i, j, k) is the cube of one edge length around (i, j, k) times that length, so that a surface at a multiple of it
-lies in the middle of its voxels.
+Voxel (i, j, k) is the cube whose centre is (i, j, k) times the edge length. A surface at a multiple of the edge length
+therefore lies in the middle of its voxels.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def voxels_of_points(points: NDArray, resolution: float, min_points: int = 1) ->
 
 
 def count_candidates(corners: NDArray, resolution: float) -> int:
-    """Return the number of voxels that ``voxels_of_triangles`` tests: those of the boxes around the triangles."""
+    """Return the number of voxels that ``voxels_of_triangles`` tests: all voxels of the boxes around the triangles."""
     return int(np.prod(_voxel_range(corners / resolution)[1].astype(np.float64), axis=1).sum())
 
 
@@ -51,19 +51,19 @@ def voxels_of_triangles(corners: NDArray, resolution: float) -> NDArray[np.int64
     corners = corners / resolution
     first, size = _voxel_range(corners)
     n_candidates = np.prod(size, axis=1)
-    end, found, start = np.cumsum(n_candidates), [np.zeros((0, 3), np.int64)], 0
+    end, voxels_met, start = np.cumsum(n_candidates), [np.zeros((0, 3), np.int64)], 0
     while start < len(corners):
-        done = end[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(end, done + MAX_CANDIDATES, side="right")))
+        n_tested = end[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(end, n_tested + MAX_CANDIDATES, side="right")))
         triangle = np.repeat(np.arange(start, stop), n_candidates[start:stop])
-        number = np.arange(len(triangle)) - np.repeat(
-            end[start:stop] - n_candidates[start:stop] - done, n_candidates[start:stop]
+        candidate = np.arange(len(triangle)) - np.repeat(
+            end[start:stop] - n_candidates[start:stop] - n_tested, n_candidates[start:stop]
         )
         ny, nz = size[triangle, 1], size[triangle, 2]
-        voxels = first[triangle] + np.stack([number // (ny * nz), number // nz % ny, number % nz], axis=-1)
-        found.append(np.unique(voxels[_meets_cube(corners[triangle] - voxels[:, None])], axis=0))
+        voxels = first[triangle] + np.stack([candidate // (ny * nz), candidate // nz % ny, candidate % nz], axis=-1)
+        voxels_met.append(np.unique(voxels[_meets_cube(corners[triangle] - voxels[:, None])], axis=0))
         start = stop
-    return np.unique(np.concatenate(found), axis=0)
+    return np.unique(np.concatenate(voxels_met), axis=0)
 
 
 def _meets_cube(corners: NDArray) -> NDArray[np.bool_]:
@@ -73,26 +73,26 @@ def _meets_cube(corners: NDArray) -> NDArray[np.bool_]:
     axes = [np.cross(np.eye(3)[i], edges[:, k]) for i in range(3) for k in range(3)]
     meets = np.ones(len(corners), bool)
     for axis in [*axes, normal]:
-        along = np.einsum("nkc,nc->nk", corners, axis)
-        reach = np.abs(axis).sum(axis=1) * (0.5 + TOLERANCE) + TOLERANCE
-        meets &= (along.min(axis=1) <= reach) & (along.max(axis=1) >= -reach)
+        projections = np.einsum("nkc,nc->nk", corners, axis)
+        half_width = np.abs(axis).sum(axis=1) * (0.5 + TOLERANCE) + TOLERANCE
+        meets &= (projections.min(axis=1) <= half_width) & (projections.max(axis=1) >= -half_width)
     return meets
 
 
 def merge_voxels(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return boxes that fill the same space as voxels, without overlap: first and last voxel of each. (n, 6)
 
-    Runs of voxels along one axis become bars, bars of equal ends plates, plates of equal outline boxes. Of the six
-    orders of axes, the one with the fewest boxes is chosen.
+    Voxels in a row along a first axis are joined into bars, bars with the same ends along a second axis into plates,
+    and plates with the same outline into boxes. Of the six orders of axes, the one with the fewest boxes is chosen.
 
     Args:
         voxels: Distinct voxels. (n_voxels, 3)
     """
-    single = np.concatenate([voxels, voxels], axis=1)
+    unit_boxes = np.concatenate([voxels, voxels], axis=1)
     orders = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
     results = []
     for order in orders:
-        boxes = single
+        boxes = unit_boxes
         for axis in order:
             boxes = _merge_along(boxes, axis)
         results.append(boxes)
@@ -100,11 +100,13 @@ def merge_voxels(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _merge_along(boxes: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
-    """Return boxes with those joined that continue each other along an axis. (n, 6) -> (m, 6)"""
-    across = [k for k in range(6) if k % 3 != axis]
-    order = np.lexsort((boxes[:, axis], *boxes[:, across].T))
+    """Return boxes after joining boxes that continue each other along an axis. (n, 6) -> (m, 6)"""
+    other_columns = [k for k in range(6) if k % 3 != axis]
+    order = np.lexsort((boxes[:, axis], *boxes[:, other_columns].T))
     boxes = boxes[order]
-    is_next = (boxes[1:, across] == boxes[:-1, across]).all(axis=1) & (boxes[1:, axis] == boxes[:-1, axis + 3] + 1)
+    is_next = (boxes[1:, other_columns] == boxes[:-1, other_columns]).all(axis=1) & (
+        boxes[1:, axis] == boxes[:-1, axis + 3] + 1
+    )
     first = np.concatenate([[True], ~is_next])
     merged = boxes[first]
     merged[:, axis + 3] = boxes[np.concatenate([first[1:], [True]]), axis + 3]

@@ -22,7 +22,7 @@ VehicleKind = AirframeSource | type[Population]
 
 
 def known_kinds() -> dict[str, VehicleKind]:
-    """Return the built-in airframes and populations, by the prefix of the names of their vehicles."""
+    """Return the built-in airframes and populations by the prefix of their vehicles' names."""
     from crazysim.plugins.vehicles import Bicycles, Cars  # imported only when an MJCF file is read
 
     return {"Crazyflie": "crazyflie", "Bumblebee": "bumblebee", Cars.prefix: Cars, Bicycles.prefix: Bicycles}
@@ -58,7 +58,7 @@ def read_vehicles(
         ConfigError: If the file cannot be read, or has no drone.
     """
     spec = read_spec(xml_path)
-    vehicles = take_vehicles(spec, known_kinds() | dict(kinds))
+    vehicles = remove_vehicles(spec, known_kinds() | dict(kinds))
     populations: dict[type[Population], list[Vehicle]] = {}
     for vehicle in vehicles:
         if _is_population(vehicle.kind):
@@ -84,7 +84,7 @@ def vehicle_poses(vehicles: list[Vehicle], template: Array) -> tuple[Array, Arra
     return pos, quat
 
 
-def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list[Vehicle]:
+def remove_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list[Vehicle]:
     """Return the vehicles of a spec, and remove their bodies from it.
 
     A vehicle is a child of the world body that can move (a mocap body, or a body with joints) and whose name is a

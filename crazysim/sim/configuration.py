@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Configuration:
-    """Settings that a simulation keeps from its construction on."""
+    """Settings of a simulation that are fixed at its construction."""
 
     n_worlds: int
     """Number of worlds."""
@@ -67,7 +67,7 @@ class Configuration:
     engine: str
     """Engine that executes steps, one of ``crazysim.engine.ENGINES``."""
     strict: bool
-    """True to raise an error where a slower engine would be taken with a warning."""
+    """True to raise an error where a slower engine would be used with a warning."""
 
     def check(self, data: Any, reference: SimData) -> None:
         """Check that data belong to a simulation with these settings; it takes some microseconds.
@@ -85,8 +85,8 @@ class Configuration:
             raise ConfigError(
                 f"expected the data of a simulation, got {type(data).__name__}. Use sim.data = sim.data.replace(...)."
             ) from None
-        fitted = self.dynamics != Dynamics.first_principles
-        expected = self.n_worlds, self.n_drones, self.freq, self.control, fitted
+        is_fitted = self.dynamics != Dynamics.first_principles
+        expected = self.n_worlds, self.n_drones, self.freq, self.control, is_fitted
         if settings != expected:
             raise ConfigError(
                 f"expected data of {_describe_settings(*expected)}, got data of {_describe_settings(*settings)}. Use "
@@ -142,12 +142,12 @@ class Configuration:
 
 def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None, aero: str | None) -> list[Plugin]:
     """Return the plugins of a new simulation: the plugins that shorthands stand for, then the listed ones."""
-    initial: list[Plugin] = []
+    shorthand_plugins: list[Plugin] = []
     if estimator is not None:
         from crazysim.plugins.estimators import find_estimator
 
         estimator = find_estimator(estimator)
-        initial.extend([*estimator.sensors, estimator])
+        shorthand_plugins.extend([*estimator.sensors, estimator])
     if aero is not None:
         if aero != "identified":
             raise ConfigError(
@@ -156,13 +156,13 @@ def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None
             )
         from crazysim.plugins.effects import Residual
 
-        initial.append(Residual())
-    return [*initial, *plugin_list("plugins", plugins)]
+        shorthand_plugins.append(Residual())
+    return [*shorthand_plugins, *plugin_list("plugins", plugins)]
 
 
-def _describe_settings(n_worlds: int, n_drones: int, freq: int, control: Control, fitted: bool) -> str:
+def _describe_settings(n_worlds: int, n_drones: int, freq: int, control: Control, is_fitted: bool) -> str:
     """Return the settings of data for a message."""
-    dynamics = "fitted" if fitted else "first-principles"
+    dynamics = "fitted" if is_fitted else "first-principles"
     return (
         f"{n_worlds} worlds of {n_drones} drones at {freq} Hz with {control.value!r} commands and {dynamics} dynamics"
     )

@@ -94,8 +94,8 @@ def build_render_splat_fn(
 ) -> Callable[[SimData], Array]:
     """Return ``render_splat_rgb`` as a compiled function of the data."""
     del exclude_self
-    look = _image_fn(sim, drones, resolution, background, 0.0, camera_prefix)
-    return jax.jit(lambda data: look(data).color)
+    render_images = _image_fn(sim, drones, resolution, background, 0.0, camera_prefix)
+    return jax.jit(lambda data: render_images(data).color)
 
 
 def build_render_splat_rgbd_fn(
@@ -110,10 +110,10 @@ def build_render_splat_rgbd_fn(
 ) -> Callable[[SimData], Array]:
     """Return ``render_splat_rgbd`` as a compiled function of the data."""
     del exclude_self
-    look = _image_fn(sim, drones, resolution, background, alpha_threshold, camera_prefix)
+    render_images = _image_fn(sim, drones, resolution, background, alpha_threshold, camera_prefix)
 
     def render(data: SimData) -> Array:
-        image = look(data)
+        image = render_images(data)
         return jnp.concatenate([image.color, jnp.minimum(image.depth, max_range)[..., None]], axis=-1)
 
     return jax.jit(render)
@@ -138,8 +138,8 @@ def _image_fn(
         raise ConfigError(f"expected a resolution of width and height, pixels, got {resolution!r}") from None
     indices = range(sim.n_drones) if drones is None else np.atleast_1d(drones).tolist()
     cameras = [f"{camera_prefix}:{k}" for k in indices]
-    look = sim.scene.splat_fn(cameras, width, height, background, min_coverage)
-    return lambda data: look(data, splats.gaussians)
+    render_images = sim.scene.splat_fn(cameras, width, height, background, min_coverage)
+    return lambda data: render_images(data, splats.gaussians)
 
 
 @jax.jit

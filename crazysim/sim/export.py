@@ -1,4 +1,4 @@
-"""A step of one drone for other tools: as a CasADi function, for acados and the like."""
+"""Export of the step of one drone as a CasADi function, for tools such as acados."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class VectorLayout:
     def of(self, data: SimData, world: int = 0, drone: int = 0) -> np.ndarray:
         """Return the vector of one drone of a simulation. (len(self),)"""
         axes, leaves = Axes(data), jax.tree.leaves(data)
-        places = [axes.names.index(name) for name in self.sizes]
-        parts = [_drone_numbers(axes.scopes[i], leaves[i], world, drone) for i in places]
+        indices = [axes.names.index(name) for name in self.sizes]
+        parts = [_drone_numbers(axes.scopes[i], leaves[i], world, drone) for i in indices]
         return np.concatenate([np.zeros(0), *parts])
 
 
@@ -106,7 +106,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
             f"world {world} and drone {drone}"
         )
     if len(staged_leaves(data)) > 1 and FEEDFORWARD not in parameters:
-        stages = [stage("drone")(_with_feedforward), *stages]
+        stages = [stage("drone")(_stage_default_feedforward), *stages]
     program = fuse(lower_stages(stages, data))
     leaves, names = jax.tree.leaves(data), [leaf.name for leaf in program.leaves]
     command = _command_field(data)
@@ -116,7 +116,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     symbols = {leaf: casadi.SX.sym(names[leaf], size) for leaf, size in sizes.items()}
     constants: dict[int, Any] = {}
 
-    def before(slot: Slot) -> Any:
+    def initial_value(slot: Slot) -> Any:
         leaf, k = slot
         if leaf in symbols:
             return symbols[leaf][k]
@@ -126,19 +126,19 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
             )
         return constants[leaf][k]
 
-    after = _step(program, before)
+    written_values = _step_expressions(program, initial_value)
     next_values = {
-        leaf: casadi.vertcat(*(after.get((leaf, k), symbol[k]) for k in range(symbol.numel())))
+        leaf: casadi.vertcat(*(written_values.get((leaf, k), symbol[k]) for k in range(symbol.numel())))
         for leaf, symbol in symbols.items()
     }
     # Leaves that the next state depends on belong to the state, and so do leaves that these depend on.
-    while memory := [
+    while memory_leaves := [
         leaf
         for leaf, symbol in symbols.items()
         if leaf not in (*state, *inputs)
         and any(casadi.depends_on(next_values[state_leaf], symbol) for state_leaf in state)
     ]:
-        state += memory
+        state += memory_leaves
     state = state[: len(STATES)] + sorted(state[len(STATES) :])
     parts = {"x": state, "u": inputs[:1], "p": inputs[1:]}
     used_parts = [part for part, members in parts.items() if members]
@@ -151,7 +151,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     )
 
 
-def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
+def _step_expressions(program: Program, initial_value: Callable[[Slot], Any]) -> dict[Slot, Any]:
     """Return the expressions that a step writes.
 
     Raises:
@@ -159,26 +159,28 @@ def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
     """
     for segment in program.segments:
         if isinstance(segment, UnfusedStage):
-            raise _refusal(segment.name, segment.error.reason)
-        reader = next((op.stage for op in segment.block.operations if op.name == "over_others"), segment.stages[0])
+            raise _export_error(segment.name, segment.error.reason)
+        coupling_stage = next(
+            (op.stage for op in segment.block.operations if op.name == "over_others"), segment.stages[0]
+        )
         if segment.couples_drones:
-            raise _refusal(reader, "it reads all drones of its world, but a step of one drone is exported")
-    after: dict[Slot, Any] = {}
+            raise _export_error(coupling_stage, "it reads all drones of its world, but a step of one drone is exported")
+    written_values: dict[Slot, Any] = {}
     for segment in program.fused_segments:
         slots = (*segment.reads, *segment.hoisted_reads)
-        numbers = {slot: after[slot] if slot in after else before(slot) for slot in slots}
+        numbers = {slot: written_values[slot] if slot in written_values else initial_value(slot) for slot in slots}
         try:
-            after |= symbolic.step(segment, numbers.__getitem__)
+            written_values |= symbolic.step(segment, numbers.__getitem__)
         except UnsupportedError as error:
-            raise _refusal(error.stage, error.reason) from None
-    return after
+            raise _export_error(error.stage, error.reason) from None
+    return written_values
 
 
-def _refusal(stage: str, reason: str) -> ConfigError:
+def _export_error(stage: str, reason: str) -> ConfigError:
     return ConfigError(f"the step cannot be exported because of its stage {stage!r}: {reason}")
 
 
-def _with_feedforward(data: SimData) -> SimData:
+def _stage_default_feedforward(data: SimData) -> SimData:
     """Return the data with the default feedforward of the staged setpoint."""
     return stage_command(data, staged_leaves(data)[0])
 

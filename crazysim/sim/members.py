@@ -36,11 +36,11 @@ def locked(method: Method) -> Method:
     """Return a method that holds ``self.lock`` while it runs; the lock must be re-entrant."""
 
     @functools.wraps(method)
-    def call(self: Any, *args: Any, **kwargs: Any) -> Any:
+    def locked_method(self: Any, *args: Any, **kwargs: Any) -> Any:
         with self.lock:
             return method(self, *args, **kwargs)
 
-    return call  # type: ignore[return-value]
+    return locked_method  # type: ignore[return-value]
 
 
 class Member:
@@ -93,13 +93,14 @@ class Member:
             self._sim.data = plugin.write(data, record.replace(**{plugin.command_field: staged}))
             return
         level = data.controls.mode
-        staged, *before = F.staged_leaves(data)
+        staged, *feedforward_leaves = F.staged_leaves(data)
         if level == Control.rotor_vel:
             command = self._pad_rotors(command, command_shape(data, level)[-1])
         staged = self._replace_checked_row(f"{level.value} command of {self.name}", staged, command)
         # the feedforward of the other drones stays
         feedforward = [
-            _replace_row(x, self.index, _read_row(F.default_feedforward(staged), self.index)) for x in before
+            _replace_row(x, self.index, _read_row(F.default_feedforward(staged), self.index))
+            for x in feedforward_leaves
         ]
         self._stage(staged, *feedforward)
 
@@ -173,11 +174,13 @@ def find_member(sim: Simulation, plugins: PluginRegistry, name: str, stage: Stag
     for plugin in plugins.values():
         if isinstance(plugin, Population) and name in plugin.names:
             return Member(sim, name, plugin.names.index(name), plugin, stage)
-    raise UnknownNameError(f"expected the name of a drone or member, got {name!r}. {_suggestion(str(name), sim.names)}")
+    raise UnknownNameError(
+        f"expected the name of a drone or member, got {name!r}. {_suggest_names(str(name), sim.names)}"
+    )
 
 
-def _suggestion(name: str, names: Sequence[str]) -> str:
+def _suggest_names(name: str, names: Sequence[str]) -> str:
     if len(names) <= 8:
         return f"There are {', '.join(names)}."
-    close = difflib.get_close_matches(name, names) or names[:3]
-    return f"Did you mean {' or '.join(close)}? sim.names has all."
+    similar_names = difflib.get_close_matches(name, names) or names[:3]
+    return f"Did you mean {' or '.join(similar_names)}? sim.names has all."

@@ -1,4 +1,4 @@
-"""Sampling model-predictive control (MPPI), whose rollouts are worlds of the engine with the full dynamics."""
+"""Sampling model-predictive control (MPPI) with rollouts in worlds of the engine, with the full dynamics."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class RolloutRecord(PyTree):
 
 
 def tracking_cost(states: SimState, setpoint: Setpoint, command: Array) -> Array:
-    """Return the cost of a drone off its setpoint: squared errors of position and velocity, yaw error, body rates. ()
+    """Return the cost of tracking errors: squares of position and velocity errors, yaw error, body rates. ()
 
     An error of 1 m costs as much as 2 m/s, 90 degrees of yaw, or a body rate of 10 rad/s; a height below 5 cm costs 10
     more.
@@ -92,11 +92,11 @@ def setpoint_after(setpoint: Setpoint, t: Array) -> Setpoint:
 class MPPI:
     """Model-predictive path integral control of every drone of a simulation.
 
-    At each call, ``samples`` plans around the last one are flown from the present state by the engine, each in a world
-    of its own, with the simulation's dynamics, command level, effects and parameters. The new plan is their mean,
+    At each call, the engine flies ``samples`` plans around the last one from the present state, each in a separate
+    world, with the simulation's dynamics, command level, effects and parameters. The new plan is their mean,
     weighted by ``exp(-cost / temperature)`` (Williams, Aldrich and Theodorou 2017); its first command is returned, and
-    the plan moves on by one control step. A plan is a polyline through ``knots`` commands over the horizon. With one
-    seed, equal calls return equal commands.
+    the plan is shifted by one control step. A plan is a polyline through ``knots`` commands over the horizon. With the
+    same seed, equal calls return equal commands.
 
     Drones of a world are sampled together but weighted separately, which suits drones that do not interact.
     Rollouts begin at step 0, also for effects that depend on the time since the reset.
@@ -141,7 +141,7 @@ class MPPI:
         self.horizon, self.samples = positive_integer("horizon", horizon), positive_integer("samples", samples)
         self.substeps, self.knots = positive_integer("substeps", substeps), positive_integer("knots", knots)
         if not 2 <= self.knots <= MAX_KNOTS or self.horizon < 2:
-            raise ConfigError(f"expected 2 to {MAX_KNOTS} knots and a horizon from 2 on, got {knots} and {horizon}")
+            raise ConfigError(f"expected 2 to {MAX_KNOTS} knots and a horizon of at least 2, got {knots} and {horizon}")
         if not 0 < temperature < np.inf:
             raise ConfigError(f"expected a positive, finite temperature, got {temperature!r}. Use 0.05.")
         self.temperature, self.cost, self._key = temperature, cost, jax.random.key(seed)
@@ -159,9 +159,9 @@ class MPPI:
         if self.noise.shape != self.hover.shape or not np.all((self.noise >= 0) & np.isfinite(self.noise)):
             raise ConfigError(f"expected noise as {len(self.hover)} finite numbers of at least zero, got {noise!r}")
         pipeline = {
-            "mppi_command": Stage(self._command_stage, "drone", self._control_tick),
+            "mppi_command": Stage(self._command_stage, "drone", self._starts_control_step),
             **self._sim.step_pipeline,
-            "mppi_cost": Stage(self._cost_stage, "drone", self._control_tick),
+            "mppi_cost": Stage(self._cost_stage, "drone", self._starts_control_step),
         }
         self._step = Step(pipeline, c.engine, c.device.platform, device=c.device)
         self._device = c.device
@@ -179,7 +179,7 @@ class MPPI:
         return ", ".join(self._step.engines)
 
     def reset(self) -> None:
-        """Forget the plans of ``command``."""
+        """Reset the plans of ``command`` to hovering."""
         self._memory = jax.device_put(self.init(*self._memory.plan.shape[:2]), self._device)
 
     def command(self, data: SimData, setpoint: Setpoint) -> Array:
@@ -220,19 +220,19 @@ class MPPI:
         setpoints = jax.tree.map(lambda x: jnp.broadcast_to(x, (n_worlds, n_drones, x.shape[-1])), setpoint)
         record = RolloutRecord(
             knots=knots.reshape(n_worlds * self.samples, *plan.shape[1:]),
-            setpoint=jax.tree.map(self._repeat, setpoints),
+            setpoint=jax.tree.map(self._repeat_for_samples, setpoints),
             cost=jnp.zeros((n_worlds * self.samples, n_drones, 1), plan.dtype),
         )
         final = self._step(self._rollouts(data, record), self.horizon * self.substeps)
         costs = final.plugins[RECORD_NAME].cost.reshape(n_worlds, self.samples, n_drones)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         excess_cost = costs - jnp.min(costs, axis=1, keepdims=True)
-        finite = jnp.isfinite(excess_cost)  # a drone whose rollouts all failed keeps its plan
-        mean_excess = jnp.sum(jnp.where(finite, excess_cost, 0.0), axis=1, keepdims=True) / jnp.maximum(
-            jnp.sum(finite, axis=1, keepdims=True), 1
+        is_finite = jnp.isfinite(excess_cost)  # a drone whose rollouts all failed keeps its plan
+        mean_excess = jnp.sum(jnp.where(is_finite, excess_cost, 0.0), axis=1, keepdims=True) / jnp.maximum(
+            jnp.sum(is_finite, axis=1, keepdims=True), 1
         )
         weights = jnp.where(
-            finite, jnp.exp(-jnp.where(finite, excess_cost, 0.0) / (self.temperature * mean_excess + 1e-9)), 0.0
+            is_finite, jnp.exp(-jnp.where(is_finite, excess_cost, 0.0) / (self.temperature * mean_excess + 1e-9)), 0.0
         )
         weights = weights / jnp.maximum(jnp.sum(weights, axis=1, keepdims=True), 1e-9)
         new_plan = plan + jnp.einsum("wsd,wsdkc->wdkc", weights, knots - plan[:, None])
@@ -240,7 +240,7 @@ class MPPI:
 
     # Rollouts -------------------------------------------------------------------------------------------------------
 
-    def _repeat(self, x: Array) -> Array:
+    def _repeat_for_samples(self, x: Array) -> Array:
         return jnp.repeat(x, self.samples, axis=0)
 
     def _rollouts(self, data: SimData, record: RolloutRecord) -> SimData:
@@ -253,7 +253,7 @@ class MPPI:
             )
 
         def repeat_for_rollouts(scope: str, default: Array, x: Array) -> Array:
-            return self._repeat(x) if n_batch_axes(scope) == 2 else default if scope != "shared" else x
+            return self._repeat_for_samples(x) if n_batch_axes(scope) == 2 else default if scope != "shared" else x
 
         leaves = [
             repeat_for_rollouts(*pair)
@@ -269,7 +269,7 @@ class MPPI:
         )
         return initial_record.replace(core=core, plugins=initial_record.plugins | {RECORD_NAME: record})
 
-    def _control_tick(self, data: SimData) -> Array:
+    def _starts_control_step(self, data: SimData) -> Array:
         return data.core.steps % self.substeps == 0
 
     def _command_stage(self, data: SimData) -> SimData:
@@ -293,11 +293,11 @@ class MPPI:
         return knots[index] + (knot - index) * (knots[index + 1] - knots[index])
 
     def _shift_plan(self, plan: Array) -> Array:
-        """Return the plan one control step later; its end is held."""
+        """Return the plan shifted by one control step, with its last command repeated."""
         knot = np.arange(self.knots) + (self.knots - 1) / (self.horizon - 1)
         index = np.minimum(np.floor(knot).astype(int), self.knots - 2)
-        share = np.minimum(knot - index, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
-        return plan[:, :, index] + share * (plan[:, :, index + 1] - plan[:, :, index])
+        fraction = np.minimum(knot - index, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
+        return plan[:, :, index] + fraction * (plan[:, :, index + 1] - plan[:, :, index])
 
 
 def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

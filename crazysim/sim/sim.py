@@ -126,9 +126,9 @@ class Sim:
             xml_path: MJCF scene; None for floor, light and sky.
             rng_key: Seed, or a key.
             mesh: Devices to spread the worlds over, from ``crazysim.core.sharding.world_mesh``.
-            engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` takes the fastest that
-                can run the step pipeline here. ``explain`` says which that is.
-            strict: True to raise an error where a slower engine would be taken with an ``EngineWarning``.
+            engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` selects the fastest that
+                can run the step pipeline here, which ``explain`` names.
+            strict: True to raise an error where a slower engine would be used with an ``EngineWarning``.
             controller: Controller that follows the commands: ``"auto"`` for any airframe, another name of
                 ``crazysim.control.controllers.CONTROLLERS``, such as ``"crazyflow"`` for the cascade of Crazyflow, or a
                 ``crazysim.control.Controller``; or a list of several. The rates above replace its own.
@@ -137,9 +137,9 @@ class Sim:
             estimator: Filter on whose estimate the controllers fly: ``"kalman"``, with an ``IMU`` and a
                 ``MotionCapture``, another name of ``crazysim.plugins.estimators.ESTIMATORS``, or an estimator with
                 sensors of its own, such as ``Kalman([IMU(), OpticalFlow(), TimeOfFlight()])``; None for the true state.
-                Short for its sensors and itself at the head of ``plugins``.
+                Shorthand for its sensors and itself before all other ``plugins``.
             aero: ``"identified"`` for the forces and torques that were identified from flights of the airframes; None
-                for the model alone. Short for ``Residual()`` at the head of ``plugins``.
+                for the model alone. Shorthand for ``Residual()`` before ``plugins``.
             plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. A
                 plugin whose initial state depends on the drones' poses, such as a load, should be added by ``add``
                 when they are in place.
@@ -155,7 +155,7 @@ class Sim:
             n_worlds, n_drones, drone, dynamics, control, integrator, freq, rates, device, mesh, engine, strict,
             controller, switch,
         )  # fmt: skip
-        parts = initial_plugins(plugins, estimator, aero)
+        first_plugins = initial_plugins(plugins, estimator, aero)
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
         self.airframes = c.airframes
@@ -168,7 +168,7 @@ class Sim:
             xml_path, self.airframes, self.n_worlds, self.n_drones, self.freq, self.device, mesh, self.plugins.values,
             kernels,
         )  # fmt: skip
-        self._adopted = self._scene.revision
+        self._adopted_revision = self._scene.revision
         self._stepper = Stepper(self.device, mesh, engine, strict)
         self._queries = SceneQueries(self._scene)
         self._seed = as_key(rng_key)
@@ -178,7 +178,7 @@ class Sim:
         stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
         self._steps = BuiltPipeline("step_pipeline", stages, self._stepper.build)
         self._resets = BuiltPipeline("reset_pipeline", {"reset": reset}, Reset)
-        for plugin in parts:
+        for plugin in first_plugins:
             self.add(plugin)
 
     @classmethod
@@ -252,7 +252,7 @@ class Sim:
 
     @property
     def data(self) -> SimData:
-        """Everything that changes. Assigning to it makes the scene stale, and clears ``core.mjx_synced``."""
+        """Everything that changes. An assignment makes the scene stale, and clears ``core.mjx_synced``."""
         self._adopt_scene()
         return self._stepper.data
 
@@ -274,11 +274,11 @@ class Sim:
         self._default_data = self._stepper.put_on_device(data)
 
     def _adopt_scene(self) -> None:
-        """Give the data the objects and mocap ids of an edited scene; the scene itself is not compiled."""
-        if self._adopted == self._scene.revision:
+        """Update the objects and mocap ids in the data after an edit of the scene, without compiling the scene."""
+        if self._adopted_revision == self._scene.revision:
             return
         with self.lock, jax.ensure_compile_time_eval():  # data that are first read inside a user's trace stay arrays
-            self._adopted = self._scene.revision
+            self._adopted_revision = self._scene.revision
             self.data = self._update_objects(self._stepper.data)
             self._default_data = self._stepper.put_on_device(self._update_objects(self._default_data))
 
@@ -516,7 +516,7 @@ class Sim:
         Args:
             measure: True to measure the cost of stages that are not fused, which compiles a second step.
         """
-        step, rays = explain(self.step_fn, self.data, check_flag("measure", measure)), self._scene.ray_kernels.used
+        step, rays = explain(self.step_fn, self.data, check_flag("measure", measure)), self._scene.ray_kernels.last_used
         return f"{step}\nrays: {rays}" if rays else step
 
     @locked
@@ -552,7 +552,7 @@ class Sim:
 
     @property
     def mjx_model(self) -> mjx.Model:
-        """Compiled scene on the device; made when first read."""
+        """Compiled scene on the device; created on first read."""
         return self._scene.mjx_model
 
     @property
@@ -694,12 +694,12 @@ class Sim:
             RenderError: If this machine cannot draw.
         """
         self._scene.sync_one(self._data_with_moved_objects(), world)
-        before = self.overlays.copy()
+        saved_overlays = self.overlays.copy()
         try:
             self.plugins.draw(world)
             return self._scene.render(mode, camera, cam_config, width, height)
         except Exception:
-            self.overlays.restore(before)  # plugins draw again for the next image
+            self.overlays.restore(saved_overlays)  # plugins draw again for the next image
             raise
 
     def close(self) -> None:

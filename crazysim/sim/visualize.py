@@ -1,4 +1,4 @@
-"""Overlays of the next image, which depth images do not show, and colours of drones."""
+"""Overlays of the next image, which depth images do not show, and colours of drones' materials."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
 
     Args:
         pieces: Trajectories.
-        tolerance: Largest error of a distance, m. A distance is evaluated at its ``time``, so it is never too small.
+        tolerance: Largest error of a distance, m. A distance is never too small, since it is evaluated at its ``time``.
     """
     n = pieces.n_drones
     first, second = np.triu_indices(n, 1)

@@ -10,12 +10,13 @@ from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.interpolation import Floats
 
-Vectors = tuple[Floats, Floats, Floats]
+Deviations = tuple[Floats, Floats, Floats]
+"""Vectors from line segments to curves, their feet on the segments, and their lengths."""
 
 N_SAMPLES = 65
 """Number of times at which the deviation is sampled along each piece, and again around each maximum."""
 RADIUS_MARGIN = 0.01
-"""Fraction of the radius by which half-spaces are inside the corridor. Curves need only half of it, so that the
+"""Fraction of the radius by which half-spaces are inside the corridor. Curves may use up half of it, so that the
 iteration ends."""
 HEIGHT_TOLERANCE = 2e-5
 """Distance by which a curve may be below the smallest height or above the largest one, m."""
@@ -24,7 +25,7 @@ MAX_ITERATIONS = 100
 
 
 class OutsideError(ConfigError):
-    """Waypoints and derivatives that lead out of their corridors or heights."""
+    """Error for waypoints and derivatives that lead out of their corridors or heights."""
 
 
 def fill_in_corridors(
@@ -58,19 +59,23 @@ def fill_in_corridors(
     for _ in range(MAX_ITERATIONS):
         paths = interpolation.unit_coefficients(filled_nodes, lengths)
 
-        def deviation(piece: np.ndarray, u: Floats, paths: Floats = paths) -> Vectors:
+        def deviation(piece: np.ndarray, u: Floats, paths: Floats = paths) -> Deviations:
             return _deviation(paths[piece], nodes[piece, 0], nodes[piece + 1, 0], u)
 
         piece, u = _find_maxima(lambda piece, u: deviation(piece, u)[2], 0.5 * radii)
         offset, nearest, distance = deviation(piece, u)
         is_outside = distance > max_radii[piece]
         piece, normal = piece[is_outside], offset[is_outside] / distance[is_outside, None]
-        cuts = [(piece, u[is_outside], normal, np.sum(normal * nearest[is_outside], axis=-1) + inner_radii[piece])]
-        cuts += [_height_half_spaces(paths[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)]
-        piece, u, normal, reach = (np.concatenate(parts) for parts in zip(*cuts, strict=True))
+        half_spaces = [
+            (piece, u[is_outside], normal, np.sum(normal * nearest[is_outside], axis=-1) + inner_radii[piece])
+        ]
+        half_spaces += [
+            _height_half_spaces(paths[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)
+        ]
+        piece, u, normal, reach = (np.concatenate(parts) for parts in zip(*half_spaces, strict=True))
         if not len(piece):
             return filled_nodes / powers
-        program.add(piece, u, normal, reach)
+        program.add_half_spaces(piece, u, normal, reach)
         filled_nodes = program.solve()
     raise OutsideError(
         f"expected a curve inside its corridors and heights after {MAX_ITERATIONS} iterations, got one whose piece "
@@ -101,7 +106,7 @@ def _height_half_spaces(heights: Floats, limit: float, sign: int) -> tuple[np.nd
     return piece[is_beyond], u[is_beyond], np.tile([0.0, 0.0, float(sign)], (n, 1)), np.full(n, sign * limit)
 
 
-def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Vectors:
+def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Deviations:
     """Return the vectors from line segments to curves, their feet on the segments, and their lengths.
 
     Args:
@@ -157,7 +162,7 @@ class _Program:
         self.factors = [np.linalg.cholesky(matrix[np.ix_(f, f)]) for f in free_nodes]
         self.rows, self.slack = np.zeros((0, sum(map(np.sum, free_nodes)))), np.zeros(0)
 
-    def add(self, piece: np.ndarray, u: Floats, normal: Floats, reach: Floats) -> None:
+    def add_half_spaces(self, piece: np.ndarray, u: Floats, normal: Floats, reach: Floats) -> None:
         """Add half-spaces: ``normal . pos <= reach`` at one time ``u`` within each piece. (n,), (n,), (n, 3), (n,)"""
         n = len(piece)
         weights = u[:, None] ** np.arange(2 * self.order) @ interpolation.hermite_basis(self.order)
@@ -169,12 +174,12 @@ class _Program:
             np.linalg.solve(factor, rows[..., axis].reshape(n, -1)[:, self.is_free[..., axis].ravel()].T)
             for axis, factor in enumerate(self.factors)
         ]
-        new = np.concatenate(columns, axis=0).T
-        size = np.linalg.norm(new, axis=-1)
+        new_rows = np.concatenate(columns, axis=0).T
+        size = np.linalg.norm(new_rows, axis=-1)
         if np.any((size < 1e-9) & (slack < 0)):
             raise _infeasible_error()
         size = np.maximum(size, 1e-9)
-        self.rows = np.concatenate([self.rows, new / size[:, None]])
+        self.rows = np.concatenate([self.rows, new_rows / size[:, None]])
         self.slack = np.concatenate([self.slack, slack / size])
 
     def solve(self) -> Floats:

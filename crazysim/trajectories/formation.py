@@ -1,4 +1,4 @@
-"""Formations: places of several drones, to use as starts, targets or offsets of trajectories. (n, 3) each"""
+"""Formations: positions of several drones, as starts, targets or offsets of trajectories. (n, 3) each"""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ CENTER = (0.0, 0.0, 1.0)
 
 
 def line(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 0.0) -> np.ndarray:
-    """Return places on a level line, along x at a yaw of zero, m. (n, 3)
+    """Return positions on a level line, along x at a yaw of zero, m. (n, 3)
 
     Args:
-        n: Number of places.
+        n: Number of drones.
         spacing: Distance between neighbours, m.
         center: Centre, world frame, m. (3,)
-        yaw: Angle by which the line is turned around its centre, rad.
+        yaw: Angle by which the line is rotated around its centre, rad.
     """
     x = require_positive("spacing", spacing) * (np.arange(positive_integer("n", n)) - (n - 1) / 2)
-    return _turn_and_move(np.stack([x, np.zeros(n)], axis=-1), center, yaw)
+    return _rotate_and_translate(np.stack([x, np.zeros(n)], axis=-1), center, yaw)
 
 
 def grid(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 0.0) -> np.ndarray:
-    """Return the places of a level square grid nearest to its centre, nearest first, m. (n, 3)
+    """Return the positions of a level square grid that are nearest to its centre, nearest first, m. (n, 3)
 
     Args:
-        n: Number of places.
+        n: Number of drones.
         spacing: Distance between neighbours, m.
         center: Centre, world frame, m. (3,)
-        yaw: Angle by which the grid is turned around its centre, rad.
+        yaw: Angle by which the grid is rotated around its centre, rad.
     """
-    return _turn_and_move(grid_2d(positive_integer("n", n), require_positive("spacing", spacing)), center, yaw)
+    return _rotate_and_translate(grid_2d(positive_integer("n", n), require_positive("spacing", spacing)), center, yaw)
 
 
 def circle(
@@ -48,14 +48,14 @@ def circle(
     center: ArrayLike = CENTER,
     yaw: float = 0.0,
 ) -> np.ndarray:
-    """Return places on a level circle, counterclockwise, the first along x at a yaw of zero, m. (n, 3)
+    """Return positions on a level circle, counterclockwise, the first along x at a yaw of zero, m. (n, 3)
 
     Args:
-        n: Number of places.
+        n: Number of drones.
         spacing: Distance between neighbours, m; None for 1 m, or for the distance that ``radius`` gives.
         radius: Radius, m, instead of the spacing.
         center: Centre, world frame, m. (3,)
-        yaw: Angle by which the circle is turned, rad.
+        yaw: Angle by which the circle is rotated, rad.
     """
     if spacing is not None and radius is not None:
         raise ConfigError(f"expected spacing or radius, got both: {spacing!r} and {radius!r} m. Leave one out.")
@@ -65,19 +65,19 @@ def circle(
         radius = side / (2 * math.sin(math.pi / n)) if n > 1 else 0.0
     else:
         radius = require_positive("radius", radius)
-    return _turn_and_move(radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1), center, yaw)
+    return _rotate_and_translate(radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1), center, yaw)
 
 
 def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
-    """Return the targets in an order in which straight flights of equal duration keep clear of each other, m. (n, 3)
+    """Return the targets ordered so that straight flights of equal duration keep clear of each other, m. (n, 3)
 
     The order minimises the sum of the squared distances. Drones that start and end together then never come closer than
     the smallest distance within either formation divided by the square root of two (Turpin, Michael and Kumar, "CAPT:
     concurrent assignment and planning of trajectories for multiple robots", IJRR 2014).
 
     Args:
-        starts: Places from which the drones start, m. (n, 3)
-        targets: Places to fly to, in any order, m. (n, 3)
+        starts: Positions from which the drones start, m. (n, 3)
+        targets: Positions to fly to, in any order, m. (n, 3)
     """
     a, b = np.asarray(starts, float), np.asarray(targets, float)
     if a.shape != b.shape or a.ndim != 2 or a.shape[1] != 3 or not np.all(np.isfinite(a) & np.isfinite(b)):
@@ -88,8 +88,8 @@ def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
     return b[linear_sum_assignment(squares)[1]]
 
 
-def _turn_and_move(level: np.ndarray, center: ArrayLike, yaw: ArrayLike) -> np.ndarray:
-    """Return level places, (n, 2), turned around the origin and moved to a centre. (n, 3)"""
+def _rotate_and_translate(level_pos: np.ndarray, center: ArrayLike, yaw: ArrayLike) -> np.ndarray:
+    """Return level positions, (n, 2), rotated around the origin and moved to a centre. (n, 3)"""
     angle, middle = float(require_vector("yaw", yaw, ())), require_vector("center", center)
     cos, sin = math.cos(angle), math.sin(angle)
-    return np.pad(level @ np.array([[cos, sin], [-sin, cos]]), ((0, 0), (0, 1))) + middle
+    return np.pad(level_pos @ np.array([[cos, sin], [-sin, cos]]), ((0, 0), (0, 1))) + middle

@@ -178,8 +178,7 @@ def check(
             trajectory with several ``starts`` is flown by as many drones.
         limits: Limits.
         airframe: Airframe whose thrusts are limits where ``limits`` has none; None for no such limits.
-        starts: Start of each drone, s, as in ``Follow``. A negative start means that it began before time zero. () or
-            (n_drones,)
+        starts: Start of each drone, s, as in ``Follow``; negative if it began before time zero. () or (n_drones,)
         duration: Duration, s; None for the time at which the last drone ends, where only the first round of a
             repeating trajectory counts.
         names: Names of the drones for the report; None for their numbers.

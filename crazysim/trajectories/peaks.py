@@ -15,7 +15,7 @@ from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 N_INTERVALS = 64
 """Number of intervals into which each piece is divided by the samples."""
 REFINED_PART = 0.05
-"""Fraction of the range of the samples by which a local maximum may be below the largest one and still be refined."""
+"""Local maxima are refined if they are at most this fraction of the samples' range below the largest sample."""
 N_SECTIONS = 40
 """Number of golden sections. They shorten two intervals to about 1e-10 of a piece."""
 BATCH_SIZES = (64, 4096)
@@ -35,7 +35,7 @@ class Quantity:
     compute: Callable[..., Floats]
     """Function of these derivatives of x, y, z and yaw, (..., 4) each. (...)"""
     sign: int = 1
-    """1 if the largest value counts, -1 if the smallest."""
+    """1 if the largest value is limited, -1 if the smallest is."""
 
 
 def _specific_thrust(acc: Floats) -> Floats:
@@ -84,7 +84,7 @@ QUANTITIES: dict[str, Quantity] = {
 
 @dataclass(frozen=True, eq=False)
 class Peak:
-    """Largest value of a quantity, or the smallest where that counts, for each drone."""
+    """Largest value of a quantity for each drone, or the smallest value if ``Quantity.sign`` is -1."""
 
     value: Floats
     """Value, in the unit of the quantity. (n_drones,)"""

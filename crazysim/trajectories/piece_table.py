@@ -41,7 +41,7 @@ class PieceTable:
 
         Args:
             trajectories: Trajectories, one for each drone.
-            starts: Start of each, s. A negative start means that it began before time zero. () or (n_drones,)
+            starts: Start of each trajectory, s; negative if it began before time zero. () or (n_drones,)
             duration: Duration, s; None for the time at which the last trajectory ends, where only the first round of a
                 repeating trajectory counts.
         """
@@ -52,14 +52,14 @@ class PieceTable:
         if start_times.shape not in ((), (n_drones,)) or not np.all(np.isfinite(start_times)):
             raise ConfigError(f"expected one finite start, s, or one for each of {n_drones} drones, got {starts!r}")
         starts = np.broadcast_to(start_times, (n_drones,))
-        host = [jax.tree.map(np.asarray, trajectory) for trajectory in trajectories]
-        ends = [start + float(t.ends[-1]) for start, t in zip(starts, host, strict=True)]
+        host_trajectories = [jax.tree.map(np.asarray, trajectory) for trajectory in trajectories]
+        ends = [start + float(t.ends[-1]) for start, t in zip(starts, host_trajectories, strict=True)]
         end = max(ends) if duration is None else float(duration)
         if not 0 < end < np.inf:
-            got = f"{duration!r}" if duration is not None else f"trajectories that end at {end:g} s"
-            raise ConfigError(f"expected a positive, finite duration, s, got {got}. Use for example duration=10.0.")
-        size = max(t.coefficients.shape[-1] for t in host)
-        parts = [_collect_pieces(t, start, end, size) for t, start in zip(host, starts, strict=True)]
+            actual = f"{duration!r}" if duration is not None else f"trajectories that end at {end:g} s"
+            raise ConfigError(f"expected a positive, finite duration, s, got {actual}. Use for example duration=10.0.")
+        size = max(t.coefficients.shape[-1] for t in host_trajectories)
+        parts = [_collect_pieces(t, start, end, size) for t, start in zip(host_trajectories, starts, strict=True)]
         drone = np.repeat(np.arange(n_drones), [len(part[0]) for part in parts])
         return PieceTable(end, drone, *(np.concatenate(x) for x in zip(*parts, strict=True)))
 
@@ -93,7 +93,7 @@ class PieceTable:
         return self._derivatives[order]
 
     def find_pieces(self, drone: Ints, t: NDArray) -> Ints:
-        """Return the piece that contains each drone's time; where two meet, the later one. (...)"""
+        """Return the piece that contains each drone's time; the later one where two pieces meet. (...)"""
         t = np.clip(t, 0.0, self.duration)
         index = np.searchsorted(self._keys, np.asarray(drone) * (self.duration + 1) + t, side="right") - 1
         return np.maximum(index, self.first_pieces[drone])
@@ -102,7 +102,7 @@ class PieceTable:
         """Return a derivative of x, y, z and yaw at times within pieces.
 
         Args:
-            piece: Numbers of pieces. (...)
+            piece: Indices of pieces. (...)
             u: Time since the start of the piece over its duration. (...)
             order: Order of the derivative.
 
@@ -136,12 +136,12 @@ def _collect_pieces(t: Trajectory, start: float, duration: float, size: int) -> 
     starts = (start + period * np.arange(n_rounds)[:, None] + starts).ravel()
     after_zero = _cut_at_zero(starts, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))
     parts = [after_zero]
-    first, last = c[0, :, :1], c[-1].sum(axis=-1, keepdims=True)
+    first_pose, last_pose = c[0, :, :1], c[-1].sum(axis=-1, keepdims=True)
     end = max(start + period * n_rounds, 0.0)
     if start > 0:
-        parts.insert(0, _resting_piece(0.0, start, first, size))
+        parts.insert(0, _resting_piece(0.0, start, first_pose, size))
     if end < duration:
-        parts.append(_resting_piece(end, duration - end, last, size))
+        parts.append(_resting_piece(end, duration - end, last_pose, size))
     starts, lengths, c = (np.concatenate(x) for x in zip(*parts, strict=True))
     is_before_end = starts < duration
     return starts[is_before_end], lengths[is_before_end], c[is_before_end]

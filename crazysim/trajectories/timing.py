@@ -15,21 +15,21 @@ from crazysim.trajectories.peaks import QUANTITIES, peaks
 from crazysim.trajectories.piece_table import PieceTable
 
 LIMIT_MARGIN = 1e-4
-"""Fraction of a limit that is left unused, for the rounding of trajectories in float32. Height limits may instead be
-exceeded by half of this fraction, since waypoints may lie on them."""
+"""Fraction of a limit that is left unused to allow for rounding in float32. Limits of height may be exceeded by half of
+this fraction instead, since waypoints may lie on them."""
 DURATION_TOLERANCE = 1e-5
 """Relative precision of the factor by which durations are scaled."""
 DURATION_FACTOR = 1.25
 """Factor by which the durations are changed until the limits are met, then until they are not."""
-N_STEPS = 50
-"""Largest number of such steps: a factor of 70,000."""
+MAX_SCALINGS = 50
+"""Largest number of such changes, which together are a factor of 70,000."""
 
 
 def trapezoid_durations(distances: Floats, limits: Limits) -> Floats:
     """Return the shortest durations from rest to rest over distances at bounded speed and acceleration. (n_pieces,)
 
-    Only the ratios matter, so a missing limit of speed is replaced by 1 m/s, and a missing limit of acceleration by one
-    that reaches the speed in one second.
+    Only the ratios matter. A missing limit of speed is therefore replaced by 1 m/s, and a missing limit of acceleration
+    by one that reaches the limit of speed in one second.
     """
     speed = limits.speed or 1.0
     acceleration = limits.acceleration or speed
@@ -38,7 +38,7 @@ def trapezoid_durations(distances: Floats, limits: Limits) -> Floats:
 
 
 def optimal_durations(nodes: Floats, durations: Floats) -> Floats:
-    """Return the durations with the same sum that minimise the cost.
+    """Return the durations that minimise the cost for the same total duration.
 
     A quasi-Newton method over the logarithms of the ratios, with the exact gradient (``interpolation.cost_gradient``),
     finds a local minimum.
@@ -51,12 +51,12 @@ def optimal_durations(nodes: Floats, durations: Floats) -> Floats:
 
     total = float(np.sum(durations))
 
-    def durations_of(ratios: Floats) -> Floats:
+    def durations_at_ratios(ratios: Floats) -> Floats:
         weights = np.exp(ratios - np.max(ratios))
         return total * weights / np.sum(weights)
 
     def logarithm_of_cost(ratios: Floats) -> tuple[float, Floats]:
-        trial_durations = durations_of(ratios)
+        trial_durations = durations_at_ratios(ratios)
         filled_nodes = interpolation.fill_derivatives(nodes, trial_durations)
         cost = interpolation.derivative_cost(filled_nodes, trial_durations)
         slope = interpolation.cost_gradient(filled_nodes, trial_durations) * trial_durations
@@ -65,7 +65,7 @@ def optimal_durations(nodes: Floats, durations: Floats) -> Floats:
     if len(durations) == 1:
         return durations
     result = minimize(logarithm_of_cost, np.log(durations / total), jac=True, method="L-BFGS-B")
-    return durations_of(result.x)
+    return durations_at_ratios(result.x)
 
 
 def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> list[str]:
@@ -77,13 +77,17 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
             (n_pieces, 4, degree + 1)
         limits: Limits; the separation concerns several trajectories and is not checked.
     """
-    checked = {name: limit for name, limit in limits.as_dict().items() if name in QUANTITIES}
+    checked_limits = {name: limit for name, limit in limits.as_dict().items() if name in QUANTITIES}
     ends = np.cumsum(durations)
     table = PieceTable(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
-    extremes = peaks(table, tuple(checked))
-    excesses = {name: QUANTITIES[name].sign * (extremes[name].value[0] - limit) for name, limit in checked.items()}
-    margins = {name: -LIMIT_MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * LIMIT_MARGIN for name in checked}
-    return [name for name, limit in checked.items() if excesses[name] > margins[name] * limit_size(name, limit)]
+    extremes = peaks(table, tuple(checked_limits))
+    excesses = {
+        name: QUANTITIES[name].sign * (extremes[name].value[0] - limit) for name, limit in checked_limits.items()
+    }
+    margins = {
+        name: -LIMIT_MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * LIMIT_MARGIN for name in checked_limits
+    }
+    return [name for name, limit in checked_limits.items() if excesses[name] > margins[name] * limit_size(name, limit)]
 
 
 def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:
@@ -109,7 +113,7 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
             return ["corridors or heights"]
 
     high = 1.0
-    for _ in range(N_STEPS):
+    for _ in range(MAX_SCALINGS):
         names = exceeded_limits(high)
         if not names:
             break
@@ -120,7 +124,7 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
             f"however slow the flight. Raise the limit, or change waypoints or fixed derivatives."
         )
     low = high / DURATION_FACTOR
-    for _ in range(N_STEPS):
+    for _ in range(MAX_SCALINGS):
         if exceeded_limits(low):
             break
         low, high = low / DURATION_FACTOR, low

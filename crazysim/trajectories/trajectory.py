@@ -100,12 +100,12 @@ class Trajectory(PyTree):
         Args:
             t: Time since the start of the trajectory, s. ()
         """
-        return _setpoint(self.derivatives(t, N_DERIVATIVES))
+        return _build_setpoint(self.derivatives(t, N_DERIVATIVES))
 
     def evaluate_one(self, index: Array | int, t: ArrayLike) -> Setpoint:
         """Return the setpoint of one of several trajectories at one time, with derivatives up to snap.
 
-        It reads only the coefficients of one piece and a few ends, so that its cost hardly depends on the number of
+        It reads only the coefficients of one piece and a few ends, so the cost hardly depends on the number of
         trajectories.
 
         Args:
@@ -127,20 +127,20 @@ class Trajectory(PyTree):
                 higher degrees are ignored. None for ``degree`` on every axis. (4,)
         """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
-        end, repeats = _entry_at(ends, index, ends.shape[1] - 1), _entry_at(jnp.asarray(self.repeats), index)
+        end, repeats = _clipped_entry(ends, index, ends.shape[1] - 1), _clipped_entry(jnp.asarray(self.repeats), index)
         local, is_active = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
-        piece = _piece(ends, index, local)
-        start = jnp.where(piece > 0, _entry_at(ends, index, piece - 1), 0.0)
-        inverse = _inverse(jnp, _entry_at(ends, index, piece) - start)
-        u, piece_coefficients = (local - start) * inverse, _entry_at(coefficients, index, piece)
+        piece = _find_piece(ends, index, local)
+        start = jnp.where(piece > 0, _clipped_entry(ends, index, piece - 1), 0.0)
+        inverse = _inverse_length(jnp, _clipped_entry(ends, index, piece) - start)
+        u, piece_coefficients = (local - start) * inverse, _clipped_entry(coefficients, index, piece)
         degrees = [self.degree] * 4 if degrees is None else degrees
         rows: dict[int, list[Array]] = {}
         for degree in sorted(set(degrees)):
             axes = [k for k, d in enumerate(degrees) if d == degree]
-            derivatives = _derivatives(piece_coefficients[np.array(axes), : degree + 1], u, N_DERIVATIVES)
+            derivatives = _polynomial_derivatives(piece_coefficients[np.array(axes), : degree + 1], u, N_DERIVATIVES)
             rows.update((axis, [x[k] for x in derivatives]) for k, axis in enumerate(axes))
         values = [jnp.stack([rows[axis][k] for axis in range(4)]) for k in range(N_DERIVATIVES + 1)]
-        return _setpoint(_per_second(values, jnp.where(is_active, inverse * rate, 0.0)))
+        return _build_setpoint(_per_second(values, jnp.where(is_active, inverse * rate, 0.0)))
 
     def derivatives(self, t: ArrayLike, order: int) -> list[Array]:
         """Return x, y, z, m, and yaw, rad, of one trajectory at one time, and their derivatives up to an order.
@@ -154,13 +154,13 @@ class Trajectory(PyTree):
         """
         xp, n = _array_module(self), self.n_pieces
         starts = xp.concatenate([xp.zeros_like(self.ends[:1]), self.ends[:-1]])
-        # One row of a table for each piece, so that a single lookup suffices; its parts begin at multiples of four.
-        numbers = [starts, _inverse(xp, self.ends - starts), xp.zeros((2, n), self.ends.dtype)]
+        # A table with one row for each piece needs a single lookup. The parts of a row begin at multiples of four.
+        numbers = [starts, _inverse_length(xp, self.ends - starts), xp.zeros((2, n), self.ends.dtype)]
         table = xp.concatenate([xp.vstack(numbers).T, self.coefficients.reshape(n, -1)], axis=1)
         local, is_active = _local_time(jnp.asarray(t, self.ends.dtype), self.ends[-1], self.repeats)
-        piece = _piece(jnp.asarray(self.ends)[None], 0, local)
+        piece = _find_piece(jnp.asarray(self.ends)[None], 0, local)
         row = jnp.asarray(table).at[piece].get(mode="promise_in_bounds")
-        derivatives = _derivatives(row[4:].reshape(4, -1), (local - row[0]) * row[1], order)
+        derivatives = _polynomial_derivatives(row[4:].reshape(4, -1), (local - row[0]) * row[1], order)
         return _per_second(derivatives, jnp.where(is_active, row[1], 0.0))
 
     def degrees(self) -> tuple[int, ...]:
@@ -211,8 +211,8 @@ class Trajectory(PyTree):
     def repeat(self, n: int | None = None) -> Trajectory:
         """Return this trajectory flown several times, one after the other; for one vehicle.
 
-        A closed curve such as a circle repeats without end. ``repeat(n)`` ends it after n rounds, so that ``then`` can
-        continue it; ``repeat()`` makes any trajectory start again after its end.
+        A closed curve such as a circle repeats without end. ``repeat(n)`` ends it after n rounds, so that another
+        trajectory can follow by ``then``; ``repeat()`` makes any trajectory start again after its end.
 
         Args:
             n: Number of rounds, after which the trajectory ends; None for no end.
@@ -232,8 +232,8 @@ class Trajectory(PyTree):
     def then(self, other: Trajectory, transition: float = 0.0) -> Trajectory:
         """Return this trajectory followed by another one, which starts when this one ends; for one vehicle.
 
-        Without a transition, any difference between this one's end and the other one's start is a jump: of the position
-        if they are in different places, or of the velocity if a drone at rest is to join a curve.
+        Without a transition, a difference between this trajectory's end and the other one's start is a jump of the
+        position, or of the velocity, for example from rest into a curve.
 
         Args:
             other: The trajectory that follows.
@@ -250,7 +250,7 @@ class Trajectory(PyTree):
         if not is_number or not 0 <= transition < np.inf:
             raise ConfigError(f"expected a transition of 0 s or more, got {transition!r}. Use for example 1.0.")
         if transition > 0:
-            before, after = self._edge(at_end=True), other._edge(at_end=False)
+            before, after = self._end_derivatives(at_end=True), other._end_derivatives(at_end=False)
             yaw_shift = 2 * np.pi * np.round((before[0, 3] - after[0, 3]) / (2 * np.pi))
             after[0, 3] += yaw_shift
             lengths = np.array([transition], float)
@@ -267,27 +267,27 @@ class Trajectory(PyTree):
             coefficients=xp.concatenate([first.coefficients, second.coefficients]),
         )
 
-    def _edge(self, at_end: bool) -> np.ndarray:
+    def _end_derivatives(self, at_end: bool) -> np.ndarray:
         """Return x, y, z and yaw at the start or the end, with derivatives up to jerk, on the host. (4, 4)"""
         lengths = np.diff(np.asarray(self.ends, float), prepend=0.0)
         nonempty = np.flatnonzero(lengths > 0)
         k, u = (nonempty[-1], 1.0) if at_end else (nonempty[0], 0.0)
-        c = np.polynomial.polynomial.Polynomial
-        polynomials = [c(x) for x in np.asarray(self.coefficients[k], float)]
+        Polynomial = np.polynomial.polynomial.Polynomial
+        polynomials = [Polynomial(x) for x in np.asarray(self.coefficients[k], float)]
         return np.array([[p.deriv(m)(u) / lengths[k] ** m for p in polynomials] for m in range(4)])
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), yaw: ArrayLike = 0.0) -> Trajectory:
-        """Return the trajectory turned around the z axis of the world, then moved, with any leading axes.
+        """Return the trajectory rotated around the z axis of the world, then translated, with any leading axes.
 
         Args:
             offset: Displacement, m. (3,)
-            yaw: Angle by which the curve and the yaw along it are turned, rad. ()
+            yaw: Angle by which the curve, and the yaw along it, are rotated, rad. ()
         """
         for name, value, shape in (("offset", offset, (3,)), ("yaw", yaw, ())):
-            is_known = not isinstance(value, jax.core.Tracer)
-            array = np.asarray(value) if is_known else value
-            finite = is_known and array.dtype.kind in "iuf" and np.all(np.isfinite(array))
-            if array.shape != shape or (is_known and not finite):
+            is_concrete = not isinstance(value, jax.core.Tracer)
+            array = np.asarray(value) if is_concrete else value
+            is_finite = is_concrete and array.dtype.kind in "iuf" and np.all(np.isfinite(array))
+            if array.shape != shape or (is_concrete and not is_finite):
                 raise ConfigError(f"expected {name} as finite numbers of shape {shape}, got {short_repr(value)}")
         xp = _array_module([self, offset, yaw])
         c, offset = self.coefficients, xp.asarray(offset, self.coefficients.dtype)
@@ -303,22 +303,22 @@ def _array_module(tree: object) -> Any:
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(tree)) else np
 
 
-def _entry_at(x: Array, *index: Array | int) -> Array:
-    """Return an entry of an array; an index that is too large or too small means the last or first one."""
+def _clipped_entry(x: Array, *index: Array | int) -> Array:
+    """Return an entry of an array; an index that is too large or too small selects the last or the first entry."""
     return x.at[index].get(mode="clip", wrap_negative_indices=False)
 
 
 def _local_time(t: Array, end: Array, repeats: Array) -> tuple[Array, Array]:
-    """Return a time mapped to between the start and end of a trajectory, s, and whether it is under way. () each"""
+    """Return a time mapped into the duration of a trajectory, s, and True if the trajectory is active then. () each"""
     local = jnp.where(t < 0, 0.0, t)
-    # A remainder by floor is a vector instruction; lax.rem is a call for each number.
+    # Computed with floor, which is a vector instruction, since lax.rem calls a function for each number.
     local = local - jnp.where(repeats, end * lax.floor(local / end), 0.0)
     local = jnp.where(local > end, end, jnp.where(local < 0, 0.0, local))
     return local, (t >= 0) & (repeats | (t <= end))
 
 
-def _inverse(xp: Any, length: Array) -> Array:
-    """Return the inverse of the length of a piece, 1/s; padding has no length. (...)"""
+def _inverse_length(xp: Any, length: Array) -> Array:
+    """Return the inverse of the length of a piece, 1/s; 1 for padding, whose length is zero. (...)"""
     return 1 / xp.where(length > 0, length, xp.ones_like(length))
 
 
@@ -333,7 +333,7 @@ def _per_second(derivatives: list[Array], rate: Array) -> list[Array]:
     return [derivatives[0], *(x * factor for x, factor in zip(derivatives[1:], factors, strict=True))]
 
 
-def _setpoint(derivatives: list[Array]) -> Setpoint:
+def _build_setpoint(derivatives: list[Array]) -> Setpoint:
     """Return the setpoint of x, y, z and yaw and their derivatives up to snap. (4,) each"""
     pos, vel, acc, jerk, snap = derivatives
     return Setpoint(
@@ -342,7 +342,7 @@ def _setpoint(derivatives: list[Array]) -> Setpoint:
     )  # fmt: skip
 
 
-def _piece(ends: Array, index: Array | int, t: Array) -> Array:
+def _find_piece(ends: Array, index: Array | int, t: Array) -> Array:
     """Return the index of the piece at a time: the number of ends up to it, at most the last index. ()"""
     n = ends.shape[1]
     if len(ends) == 1 and n <= MAX_COUNTED_PIECES:
@@ -350,11 +350,11 @@ def _piece(ends: Array, index: Array | int, t: Array) -> Array:
     low = jnp.zeros(jnp.shape(t), jnp.int32)
     for k in reversed(range((n - 1).bit_length())):
         middle = jnp.minimum(low + 2**k, n - 1)
-        low = jnp.where(_entry_at(ends, index, middle - 1) <= t, middle, low)
+        low = jnp.where(_clipped_entry(ends, index, middle - 1) <= t, middle, low)
     return low
 
 
-def _derivatives(coefficients: Array, u: Array, order: int) -> list[Array]:
+def _polynomial_derivatives(coefficients: Array, u: Array, order: int) -> list[Array]:
     """Return a polynomial and its derivatives up to an order, by Horner's scheme. (...) each
 
     The scheme, repeated on its own partial results, gives ``p^(k)(u) / k!``.

@@ -1,4 +1,4 @@
-"""Trajectories through waypoints: minimum snap and minimum jerk, with corridors, durations and limits, or in JAX."""
+"""Trajectories of minimum snap or jerk through waypoints, with corridors, durations and limits; a variant in JAX."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Traje
     unit = jnp.mean(durations)
     lengths = (durations / unit)[:, None]
     powers = jnp.concatenate([lengths**j for j in range(k)] * 2, axis=-1)  # (n_pieces, 2k)
-    scaled_nodes = (
+    cost_blocks = (
         jnp.asarray(interpolation.unit_cost(k), dtype)
         * powers[:, :, None]
         * powers[:, None]
@@ -120,18 +120,20 @@ def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Traje
     )
     entries = k * np.arange(n_pieces)[:, None] + np.arange(2 * k)
     size = k * (n_pieces + 1)
-    matrix = jnp.zeros((size, size), dtype).at[entries[:, :, None], entries[:, None, :]].add(scaled_nodes)
+    matrix = jnp.zeros((size, size), dtype).at[entries[:, :, None], entries[:, None, :]].add(cost_blocks)
 
-    position, inner_indices = np.arange(0, size, k), np.setdiff1d(np.arange(k, size - k), np.arange(0, size, k))
-    values = jnp.zeros((size, 3), dtype).at[position].set(waypoints)
+    position_indices, inner_indices = np.arange(0, size, k), np.setdiff1d(np.arange(k, size - k), np.arange(0, size, k))
+    values = jnp.zeros((size, 3), dtype).at[position_indices].set(waypoints)
     block = matrix[inner_indices[:, None], inner_indices]
-    weight = 1 / jnp.sqrt(jnp.diagonal(block))[:, None]  # to a diagonal of ones
-    right_side = -matrix[inner_indices[:, None], position] @ waypoints
-    values = values.at[inner_indices].set(weight * jnp.linalg.solve(weight * block * weight.T, weight * right_side))
+    row_scale = 1 / jnp.sqrt(jnp.diagonal(block))[:, None]  # gives the scaled matrix a diagonal of ones
+    rhs = -matrix[inner_indices[:, None], position_indices] @ waypoints
+    values = values.at[inner_indices].set(
+        row_scale * jnp.linalg.solve(row_scale * block * row_scale.T, row_scale * rhs)
+    )
 
-    ends = values[entries]  # (n_pieces, 2k, 3)
-    cost = jnp.sum(ends * jnp.einsum("pij,pja->pia", scaled_nodes, ends)) * unit ** (1 - 2 * k)
-    paths = jnp.einsum("cj,pj,pja->pac", jnp.asarray(interpolation.hermite_basis(k), dtype), powers, ends)
+    end_derivatives = values[entries]  # (n_pieces, 2k, 3)
+    cost = jnp.sum(end_derivatives * jnp.einsum("pij,pja->pia", cost_blocks, end_derivatives)) * unit ** (1 - 2 * k)
+    paths = jnp.einsum("cj,pj,pja->pac", jnp.asarray(interpolation.hermite_basis(k), dtype), powers, end_derivatives)
     coefficients = jnp.concatenate([paths, jnp.zeros_like(paths[:, :1])], axis=1)
     return Trajectory(jnp.cumsum(durations), coefficients, jnp.zeros((), bool)), cost
 
@@ -144,11 +146,11 @@ def _plan_trajectory(
     yaw: ArrayLike,
     corridors: ArrayLike | None,
 ) -> Trajectory:
-    nodes = _nodes(waypoints, fixed_derivatives)
+    nodes = _waypoint_nodes(waypoints, fixed_derivatives)
     n_pieces = len(nodes) - 1
     angles = np.full((n_pieces + 1, YAW_ORDER, 1), np.nan)
     angles[:, 0, 0], angles[[0, -1], 1:] = unwrap_yaw(yaw, n_pieces + 1), 0.0
-    radii, heights = _radii(corridors, n_pieces), _heights(limits, nodes[:, 0, 2])
+    radii, heights = _corridor_radii(corridors, n_pieces), _height_bounds(limits, nodes[:, 0, 2])
 
     def solve(lengths: Floats) -> Floats:
         try:
@@ -165,7 +167,7 @@ def _plan_trajectory(
         return np.concatenate([paths, interpolation.pad_degree(yaw_paths, paths.shape[-1] - 1)], axis=1)
 
     if durations is not None:
-        lengths = _piece_durations(durations, n_pieces)
+        lengths = _check_durations(durations, n_pieces)
         coefficients = solve(lengths)
         if limits is not None and (names := timing.violated_limits(lengths, coefficients, limits)):
             factor = timing.shortest_durations(solve, lengths, limits)[0] / lengths[0]
@@ -183,18 +185,18 @@ def _plan_trajectory(
             f"expected waypoints that differ from their neighbours, got {nodes[k, 0].tolist()} as number {k} and "
             f"{k + 1}. Remove one, or pass durations."
         )
-    guess = timing.optimal_durations(nodes, timing.trapezoid_durations(distances, limits))
+    initial_durations = timing.optimal_durations(nodes, timing.trapezoid_durations(distances, limits))
     is_scalable = np.all(np.nan_to_num(nodes[:, 1:]) == 0)  # then the path is the same at any speed
     if is_scalable:
-        coefficients = solve(guess)
+        coefficients = solve(initial_durations)
         return trajectory_from_unit_pieces(
-            timing.shortest_durations(lambda _: coefficients, guess, limits), coefficients
+            timing.shortest_durations(lambda _: coefficients, initial_durations, limits), coefficients
         )
-    lengths = timing.shortest_durations(solve, guess, limits)
+    lengths = timing.shortest_durations(solve, initial_durations, limits)
     return trajectory_from_unit_pieces(lengths, solve(lengths))
 
 
-def _nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike | None]) -> Floats:
+def _waypoint_nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike | None]) -> Floats:
     """Return the derivatives at each waypoint, NaN where free. (n, k, 3)"""
     positions = np.asarray(waypoints, float)
     if positions.ndim != 2 or positions.shape[1] != 3 or len(positions) < 2:
@@ -220,7 +222,7 @@ def _nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike | None]) 
     return nodes
 
 
-def _radii(corridors: ArrayLike | None, n_pieces: int) -> Floats:
+def _corridor_radii(corridors: ArrayLike | None, n_pieces: int) -> Floats:
     """Return the radius of the corridor of each piece, m. (n_pieces,)"""
     radii = np.asarray(np.inf if corridors is None else corridors, float)
     if radii.shape not in ((), (n_pieces,)) or not np.all(radii > 0):
@@ -228,7 +230,7 @@ def _radii(corridors: ArrayLike | None, n_pieces: int) -> Floats:
     return np.broadcast_to(radii, (n_pieces,))
 
 
-def _heights(limits: Limits | None, heights: Floats) -> tuple[float, float]:
+def _height_bounds(limits: Limits | None, heights: Floats) -> tuple[float, float]:
     """Return the smallest and the largest height, m, between which waypoints are; infinite for no limit."""
     low, high = (None, None) if limits is None else (limits.floor, limits.height)
     bounds = -np.inf if low is None else low, np.inf if high is None else high
@@ -242,7 +244,7 @@ def _heights(limits: Limits | None, heights: Floats) -> tuple[float, float]:
     return bounds
 
 
-def _piece_durations(durations: ArrayLike, n_pieces: int) -> Floats:
+def _check_durations(durations: ArrayLike, n_pieces: int) -> Floats:
     """Return the durations of the pieces, s. (n_pieces,)"""
     lengths = np.asarray(durations, float)
     if lengths.shape != (n_pieces,) or not np.all(np.isfinite(lengths)) or not np.all(lengths > 0):

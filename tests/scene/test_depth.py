@@ -514,7 +514,7 @@ def test_each_of_many_equal_geoms_is_known_by_name(forest, rng, platform):
         assert hits.distance[0, k] == pytest.approx(far, rel=1e-4, abs=1e-4)
         met.add(body.name)
     assert len(met) > 50
-    assert kernels.used.startswith("one kernel" if platform else "XLA")
+    assert kernels.last_used.startswith("one kernel" if platform else "XLA")
 
 
 def test_explain_says_what_cast_the_rays_of_an_image(forest):
@@ -541,6 +541,6 @@ def test_rays_whose_kernel_is_refused_are_cast_by_xla_with_a_warning(monkeypatch
         else:
             with pytest.warns(EngineWarning, match="rays have no kernel: a kernel of .* lines takes .* longer"):
                 found.append(sim.depth("fpv_cam", 13, 9))
-        assert sim.scene.ray_kernels.used.startswith("XLA, without a kernel")
+        assert sim.scene.ray_kernels.last_used.startswith("XLA, without a kernel")
     np.testing.assert_array_equal(*found)
     assert np.min(found) < 2

@@ -15,11 +15,11 @@ def renderer(monkeypatch):
 
     def rename(name):
         monkeypatch.setattr(GL, "glGetString", lambda _: name)
-        software.is_software.cache_clear()
+        software.has_software_renderer.cache_clear()
 
     monkeypatch.delenv(software.QUALITY_VARIABLE, raising=False)
     yield rename
-    software.is_software.cache_clear()
+    software.has_software_renderer.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -34,17 +34,17 @@ def renderer(monkeypatch):
 )
 def test_the_name_of_the_renderer_tells_a_cpu_from_a_gpu(opengl, renderer, name, expected):
     renderer(name)
-    assert software.is_fast() == expected
+    assert software.uses_cpu_quality() == expected
     assert software.film_size(960, 544) == ((640, 362) if expected else (960, 544))
 
 
 def test_the_variable_decides_first(opengl, renderer, monkeypatch):
     renderer(b"llvmpipe")
     monkeypatch.setenv(software.QUALITY_VARIABLE, "full")
-    assert not software.is_fast()
+    assert not software.uses_cpu_quality()
     renderer(b"NVIDIA H200/PCIe/SSE2")
     monkeypatch.setenv(software.QUALITY_VARIABLE, "fast")
-    assert software.is_fast()
+    assert software.uses_cpu_quality()
 
 
 def test_a_wrong_variable_is_an_error(monkeypatch):

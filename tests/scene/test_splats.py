@@ -193,7 +193,7 @@ def test_splax_gets_the_cameras_that_the_plain_renderer_has(sim, look, tmp_path,
     monkeypatch.setattr(splat_images, "_choose_renderer", lambda renderer, platform: choose(renderer, "gpu"))
     by_splax = sim.scene.splat_fn(**SIZE, background=(0.1, 0.2, 0.3), renderer="splax")(sim.data, g)
     (shape, focal, near, depth), expected = record[0], look(sim.data, g)
-    assert (shape, near, depth) == ((16, 24), splat_images.NEAR, True)
+    assert (shape, near, depth) == ((16, 24), splat_images.MIN_DEPTH, True)
     np.testing.assert_allclose(focal, focal_of(sim), rtol=1e-6)
     for x, y in zip(jax.tree.leaves(by_splax), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(x, y, atol=1e-3)

@@ -20,7 +20,7 @@ from crazysim.lab.live.loop import Live
 from crazysim.lab.live.picture import PictureSource
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
-from crazysim.media.access import LOOPBACK_ADDRESSES, Access, guarded_server
+from crazysim.media.access import LOOPBACK_ADDRESSES, Access, start_guarded_server
 from crazysim.media.web import FOV, free_port, import_viser
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
@@ -112,7 +112,7 @@ class Browser(Viewer[Live]):
         self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind)
         self._picture = self._source.take(live)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
-            self._server = guarded_server(viser, access, label="crazysim")
+            self._server = start_guarded_server(viser, access, label="crazysim")
         scene = self._server.scene
         scene.set_up_direction("+z")
         drones = self._picture.drone_pos

@@ -13,7 +13,7 @@ from crazysim.lab.live.browser_trails import Trails, finite_rows
 from crazysim.lab.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
 from crazysim.lab.live.scene_bodies import DRONE, MARK_RADIUS, SceneBodies, SceneBody
 from crazysim.media.trail import choose_drone_colors
-from crazysim.media.web import add_static, create_mesh, rgb
+from crazysim.media.web import add_geoms, create_mesh, rgb
 from crazysim.scene.visual_geoms import VisualGeom
 
 SETPOINT_RADIUS = 0.025
@@ -64,10 +64,10 @@ class BrowserScene:
             infinite = [s for s in fixed_shapes if s.kind == "plane" and not s.size[:2].any()]
             others = [s for s in fixed_shapes if not any(s is plane for plane in infinite)]
             if infinite:
-                add_static(scene, f"/world/floor/{k}", infinite, rgba)
+                add_geoms(scene, f"/world/floor/{k}", infinite, rgba)
             for w, offset in enumerate(self.offsets if others else []):
                 node = scene.add_frame(f"/world/fixed/{w}/{k}", position=offset, show_axes=False)
-                add_static(scene, node.name, others, rgba)
+                add_geoms(scene, node.name, others, rgba)
         self._batches: list[tuple[Any, NDArray]] = []
         for equal_bodies in _group_equal_bodies(by_body):
             self._add_bodies(np.array(equal_bodies), by_body[equal_bodies[0]], picture)

@@ -26,7 +26,7 @@ from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, sampling_period
 from crazysim.pytree import PyTree, device_array, leaf
-from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, View, check_image_memory
+from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory
 from crazysim.scene.ray_casting import body_names
 
 OUTPUTS: dict[str, tuple[int, ...]] = {"depth": (), "distance": (), "normal": (3,), "segmentation": ()}
@@ -131,7 +131,7 @@ class ImageSensor(Plugin):
 
         ``pos`` and ``rot`` are in the body frame of the first drone; the columns of ``rot`` are right, up and back.
         """
-        (height, width), camera = self.image_size, CarriedCamera.of_view(self._view(sim), 0)
+        (height, width), camera = self.image_size, CarriedCamera.on_drone(self._drone_camera(sim), 0)
         sensor = {"sensor": self.name, **self.optics, "pos": list(camera.pos), "rot": [list(x) for x in camera.rot]}
         sensor |= {"freq": self.freq, "latency": float(self.latency)}
         formats = {}
@@ -169,8 +169,8 @@ class ImageSensor(Plugin):
         It is for the scene as it is now.
         """
         self.check(sim)
-        rays, far, view = self.rays, self.far, self._view(sim)
-        cast_rays, rot = sim.scene.depth_fn(view, drones=self.drones, along="ray"), view.rot
+        rays, far, camera = self.rays, self.far, self._drone_camera(sim)
+        cast_rays, rot = sim.scene.depth_fn(camera, drones=self.drones, along="ray"), camera.rot
 
         def take_images(data: SimData) -> Images:
             hits, quat = cast_rays(data), data.states.quat[..., None, None, :]
@@ -286,10 +286,10 @@ class ImageSensor(Plugin):
         taken_step = self.read(data).taken_step
         return jnp.where(taken_step >= 0, (data.core.steps - 1 - taken_step) / data.core.freq, 0.0)
 
-    def _view(self, sim: Simulation) -> View:
+    def _drone_camera(self, sim: Simulation) -> DroneCamera:
         fpv_pos = [airframe.value("shape.fpv_camera") for airframe in sim.airframes]
         pos = np.asarray(fpv_pos if self.pos is None else [self.pos] * sim.n_drones, np.float64)
-        return View(self.rays, pos, np.asarray(self.rpy, np.float64))
+        return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64))
 
     def _latency_steps(self, data: SimData) -> int:
         return math.floor(self.latency * data.core.freq + 0.5)

@@ -75,9 +75,14 @@ def _fit_samples(rows: NDArray, location: str) -> Trajectory:
     rates = np.zeros_like(values)
     rates[1:-1] = (values[2:] - values[:-2]) / (times[2:] - times[:-2])[:, None]
     lengths = np.diff(times)[:, None]
-    start, end, first, last = values[:-1], values[1:], rates[:-1] * lengths, rates[1:] * lengths
+    start, end, start_slope, end_slope = values[:-1], values[1:], rates[:-1] * lengths, rates[1:] * lengths
     # Cubic Hermite polynomial of u in [0, 1].
-    c = [start, first, 3 * (end - start) - 2 * first - last, 2 * (start - end) + first + last]
+    c = [
+        start,
+        start_slope,
+        3 * (end - start) - 2 * start_slope - end_slope,
+        2 * (start - end) + start_slope + end_slope,
+    ]
     return trajectory_from_unit_pieces(np.diff(times), np.stack(c, axis=-1))
 
 

@@ -1,4 +1,4 @@
-"""The pieces of a trajectory on the host, without padding, as files need them."""
+"""Pieces of a trajectory on the host, without padding, for files."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
             degree + 1)
 
     Raises:
-        ConfigError: If a piece begins more than a millimetre or a tenth of a degree, plus rounding, from there.
+        ConfigError: If a piece begins further than a millimetre or a tenth of a degree, plus rounding, from that end.
     """
-    ends_at = coefficients[:-1].sum(axis=-1)
-    jumps = np.abs(coefficients[1:, :, 0] - ends_at)
-    is_jump = np.argwhere(jumps > MAX_JUMPS[: jumps.shape[1]] + ROUNDING * np.abs(ends_at))
+    end_values = coefficients[:-1].sum(axis=-1)
+    jumps = np.abs(coefficients[1:, :, 0] - end_values)
+    is_jump = np.argwhere(jumps > MAX_JUMPS[: jumps.shape[1]] + ROUNDING * np.abs(end_values))
     if len(is_jump):
         piece, axis = is_jump[0]
         size = jumps[piece, axis]
@@ -75,11 +75,11 @@ def split_pieces(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[
     cuts = np.union1d(ends, inner_times)
     cuts = cuts[np.diff(cuts, append=np.inf) > 1e-6]  # cuts within a microsecond are one cut
     cuts[-1] = ends[-1]
-    from_cuts = np.concatenate([[0.0], cuts[:-1]])
+    cut_starts = np.concatenate([[0.0], cuts[:-1]])
     starts, lengths = np.concatenate([[0.0], ends[:-1]]), np.diff(ends, prepend=0.0)
-    piece = np.minimum(np.searchsorted(ends, 0.5 * (from_cuts + cuts)), len(ends) - 1)
+    piece = np.minimum(np.searchsorted(ends, 0.5 * (cut_starts + cuts)), len(ends) - 1)
     parts = [
         restrict_interval(coefficients[k], (start - starts[k]) / lengths[k], (end - starts[k]) / lengths[k])
-        for k, start, end in zip(piece, from_cuts, cuts, strict=True)
+        for k, start, end in zip(piece, cut_starts, cuts, strict=True)
     ]
     return cuts, np.stack(parts)

@@ -33,6 +33,7 @@ MAX_PIECE_DURATION = 65.0
 STORED_DEGREES = (0, 1, 3, 7)
 """Degree of an axis for each two-bit code. All control points but the first are stored, as many as the degree."""
 AXIS_UNITS = np.array([DISTANCE_UNIT, DISTANCE_UNIT, DISTANCE_UNIT, ANGLE_UNIT])
+"""Units of compressed x, y, z, m, and yaw, rad. (4,)"""
 
 
 def pack_poly4d(trajectory: Trajectory) -> bytes:
@@ -91,8 +92,8 @@ def trajectory_from_rows(rows: NDArray, location: str) -> Trajectory:
     return Trajectory.of_pieces(lengths, c)
 
 
-def _checked_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
-    """Return the pieces of a trajectory, after a check that the Crazyflie can fly their degree."""
+def _crazyflie_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
+    """Return the pieces of a trajectory, after a check that the Crazyflie can fly polynomials of their degree."""
     ends, c = trajectory_pieces(trajectory)
     if c.shape[2] > 8:
         raise ConfigError(
@@ -103,7 +104,7 @@ def _checked_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
 
 def trajectory_rows(trajectory: Trajectory) -> NDArray:
     """Return the duration of each piece, s, and its coefficients for the time in seconds. (n_pieces, 33)"""
-    ends, c = _checked_pieces(trajectory)
+    ends, c = _crazyflie_pieces(trajectory)
     lengths = np.diff(ends, prepend=0.0)
     c = np.pad(c, ((0, 0), (0, 0), (0, 8 - c.shape[2]))) / lengths[:, None, None] ** np.arange(8)
     return np.concatenate([lengths[:, None], c.reshape(len(c), -1)], axis=1)
@@ -122,7 +123,7 @@ def pack_compressed(trajectory: Trajectory) -> bytes:
         ConfigError: If its degree is higher, a piece is shorter than 1 ms or does not begin where the one before ends,
             or a coordinate exceeds the 32.767 m or 3276.7 degrees that 16 bits can hold.
     """
-    ends, c = _checked_pieces(trajectory)
+    ends, c = _crazyflie_pieces(trajectory)
     require_no_jumps(ends, c)
     ends, c = split_pieces(ends, c, np.arange(MAX_PIECE_DURATION, ends[-1], MAX_PIECE_DURATION))
     c = c / AXIS_UNITS[:, None]
