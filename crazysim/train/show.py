@@ -199,7 +199,8 @@ def color_depth(depth: np.ndarray, far: float) -> np.ndarray:
 def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False) -> int:
     """Film one episode of a policy in several worlds side by side, and return the number of frames.
 
-    The first depth image among the observations of the first drone is drawn into each world, near pixels bright.
+    The first depth image among the observations of the first drone, or else the first segmentation that shows its
+    target, is drawn into each world: near pixels, or pixels of the target, are bright.
 
     Args:
         env: Environment to fly in.
@@ -229,12 +230,15 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
             distance = np.abs(target_pos[:, None] - np.asarray(sim.data.states.pos[world])).max()
             draw_points(sim, target_pos, TARGET_COLOR, max(TARGET_SIZE, 0.02 * float(distance)))
 
-    depth_formats = {name: x for name, x in env.image_formats().items() if x["unit"] == "m"}
+    formats = env.image_formats()
+    depths = [name for name, x in formats.items() if x["unit"] == "m"]
+    masks = [name for name, x in formats.items() if x["unit"] == "1" and x.get("output") == "segmentation"]
 
-    def draw_depth(_: Sim, world: int) -> np.ndarray | None:
-        for name, image in depth_formats.items():
+    def draw_image(_: Sim, world: int) -> np.ndarray | None:
+        for name in depths + masks:
+            image = formats[name]
             pixels = np.asarray(state.obs[name][world, 0]).reshape(image["height"], image["width"])
-            return color_depth(pixels, image["far"])
+            return color_depth(pixels, image["far"]) if name in depths else color_depth(1 - pixels, 1.0)
         return None
 
     targets, subjects = jax.jit(env.target), jax.jit(env.subjects)
@@ -258,7 +262,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         draw=draw_target,
         cam_config=camera,
         follow=camera.pop("follow", None),
-        inset=draw_depth,
+        inset=draw_image,
         hold=None if "distance" in camera else points_in_view,
         lag=0.6,
     )
