@@ -74,7 +74,7 @@ def drones_and_cars(args: argparse.Namespace) -> Sim:
     sim = drones(args)
     cars = sim.add(Cars(args.cars, in_scene=False))
     command = np.tile(np.array([0.08, 0.2], np.float32), (args.worlds, args.cars, 1))
-    sim.data = cars.commanded(sim.data, command)
+    sim.data = cars.with_command(sim.data, command)
     return sim
 
 

@@ -53,7 +53,7 @@ def measure(case: str, args: argparse.Namespace) -> None:
     cars = sim.add(Cars(args.cars, in_scene=False, **CASES[case]))
     if cars.path is None:
         command: Any = [1.5 if cars.level == "speed" else 0.08, 0.2]
-        sim.data = cars.commanded(sim.data, np.tile(np.asarray(command, np.float32), (n_worlds, args.cars, 1)))
+        sim.data = cars.with_command(sim.data, np.tile(np.asarray(command, np.float32), (n_worlds, args.cars, 1)))
     if case != "beside_drone":
         car_stages = {k: fn for k, fn in sim.step_pipeline.items() if k.startswith("cars") or k == "increment_steps"}
         sim.step_pipeline = type(sim.step_pipeline)(car_stages)

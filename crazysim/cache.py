@@ -30,7 +30,7 @@ CACHE_VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
 MAX_CACHE_BYTES = 1_000_000_000
 """Size of all files, bytes, above which the oldest are removed when the cache is first used: about 5,000 programs."""
-SHARE_AFTER_TRIM = 0.8
+TRIMMED_FRACTION = 0.8
 """Fraction of the limit to which a removal reduces the size, so that not every process has to remove files."""
 MIN_FREE_BYTES = 50_000_000
 """Free space below which a disk counts as full, bytes: the programs of some simulations."""
@@ -58,8 +58,8 @@ def caches_folder() -> Path:
 def default_cache() -> Path | None:
     """Return the folder that is used by default; None where ``CRAZYSIM_CACHE`` is ``off``.
 
-    Programs of XLA are machine code whose key does not hold the features of the CPU, so each kind of CPU that shares
-    the folder has one of its own in it.
+    XLA's programs are machine code, and their keys do not contain the features of the CPU. Therefore each kind of CPU
+    has a subfolder of its own.
 
     Raises:
         ConfigError: If ``CRAZYSIM_CACHE`` is not set and the user has no home folder.
@@ -302,5 +302,5 @@ def trim(folder: Path, limit: int = MAX_CACHE_BYTES) -> None:
         with contextlib.suppress(OSError):
             path.unlink()
         size -= n
-        if size <= SHARE_AFTER_TRIM * limit:
+        if size <= TRIMMED_FRACTION * limit:
             return

@@ -184,7 +184,7 @@ class Equation:
 
 @contextlib.contextmanager
 def read_equation(eqn: Any) -> Iterator[Equation]:
-    """Give a rule an equation, and report a parameter that JAX has renamed as unsupported.
+    """Yield an equation for a rule, and report a parameter that JAX has renamed as unsupported.
 
     Only a missing parameter, or a missing attribute of a parameter, counts. Any other error is the rule's own.
 
@@ -204,51 +204,51 @@ def read_equation(eqn: Any) -> Iterator[Equation]:
 
 
 def batched_primitive(
-    name: str, results: Callable[..., list[Any]], batched: Callable[..., Any], refuse: Callable[..., Any]
+    name: str, result_types: Callable[..., list[Any]], batching_rule: Callable[..., Any], refuse: Callable[..., Any]
 ) -> Primitive:
     """Return a primitive that ``vmap`` replaces by other operations.
 
     Args:
         name: Its name.
-        results: Function from operands and parameters to the shapes and types of the results.
-        batched: Function from the axis of ``vmap``, which has ``name`` and ``size``, the operands, their batched
+        result_types: Function from operands and parameters to the shapes and types of the results.
+        batching_rule: Function from the axis of ``vmap``, which has ``name`` and ``size``, the operands, their batched
             dimensions and parameters to results and their batched dimensions.
         refuse: Function that raises an error; called if no ``vmap`` has replaced the primitive.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(refuse)
-    primitive.def_abstract_eval(results)
-    batching.fancy_primitive_batchers[primitive] = batched
+    primitive.def_abstract_eval(result_types)
+    batching.fancy_primitive_batchers[primitive] = batching_rule
     mlir.register_lowering(primitive, refuse)
     return primitive
 
 
-def simple_primitive(name: str, fn: Callable[..., list[Any]], batched: Callable[..., Any]) -> Primitive:
+def simple_primitive(name: str, fn: Callable[..., list[Any]], batching_rule: Callable[..., Any]) -> Primitive:
     """Return a primitive for a function without a derivative that has a rule of its own for ``vmap``.
 
     Args:
         name: Its name.
         fn: The function, from operands to a list of results.
-        batched: Function from operands and their batched dimensions to results and their batched dimensions.
+        batching_rule: Function from operands and their batched dimensions to results and their batched dimensions.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(fn)
     primitive.def_abstract_eval(lambda *args: [jax.typeof(x) for x in jax.eval_shape(fn, *args)])
-    batching.primitive_batchers[primitive] = batched
+    batching.primitive_batchers[primitive] = batching_rule
     mlir.register_lowering(primitive, mlir.lower_fun(fn, multiple_results=True))
     return primitive
 
 
 def primitive_by_platform(
     name: str,
-    results: Callable[..., Sequence[Any]],
+    result_types: Callable[..., Sequence[Any]],
     functions: Mapping[str, Callable[..., Any]],
     *,
-    derivative: Callable[..., Sequence[Any]] | None = None,
-    transposed: Callable[..., Sequence[Any]] | None = None,
-    batched: Callable[..., Sequence[Any]] | None = None,
+    differentiable_fn: Callable[..., Sequence[Any]] | None = None,
+    transpose_rule: Callable[..., Sequence[Any]] | None = None,
+    batching_rule: Callable[..., Sequence[Any]] | None = None,
 ) -> Primitive:
     """Return a primitive that is replaced, only when it is lowered, by the function of the target platform.
 
@@ -256,27 +256,27 @@ def primitive_by_platform(
 
     Args:
         name: Its name.
-        results: Function that returns the shapes and types of the results.
+        result_types: Function that returns the shapes and types of the results.
         functions: Functions that return a list of results, by platform: ``"cpu"``, ``"cuda"``, ...; ``""`` for all
             others.
-        derivative: The same function, written so that JAX can differentiate it.
-        transposed: For a function that is linear in all operands but the first ``n_nonlinear``, which is a
+        differentiable_fn: The same function, written so that JAX can differentiate it.
+        transpose_rule: For a function that is linear in all operands but the first ``n_nonlinear``, which is a
             parameter: function from these operands and the cotangents of all results to the cotangents of the others.
-        batched: Rule for ``vmap``: function from the primitive, the size of the axis, the operands, whose batched axis
-            comes first, and whether each is batched, to results that are all batched.
+        batching_rule: Rule for ``vmap``: function from the primitive, the size of the axis, the operands, whose
+            batched axis comes first, and a flag for each that is batched, to results that are all batched.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(lambda *args, **params: _compiled_primitive(primitive, **params)(*args))
-    primitive.def_abstract_eval(lambda *args, **params: list(map(jax.typeof, results(*args, **params))))
+    primitive.def_abstract_eval(lambda *args, **params: list(map(jax.typeof, result_types(*args, **params))))
     for platform, fn in functions.items():
         mlir.register_lowering(primitive, mlir.lower_fun(fn, multiple_results=True), platform=platform or None)
-    if derivative is not None:
-        ad.primitive_jvps[primitive] = functools.partial(_apply_derivative, derivative)
-    if transposed is not None:
-        ad.primitive_transposes[primitive] = functools.partial(_apply_transpose, transposed)
-    if batched is not None:
-        batching.primitive_batchers[primitive] = functools.partial(_apply_batching, batched, primitive)
+    if differentiable_fn is not None:
+        ad.primitive_jvps[primitive] = functools.partial(_apply_derivative, differentiable_fn)
+    if transpose_rule is not None:
+        ad.primitive_transposes[primitive] = functools.partial(_apply_transpose, transpose_rule)
+    if batching_rule is not None:
+        batching.primitive_batchers[primitive] = functools.partial(_apply_batching, batching_rule, primitive)
     return primitive
 
 
@@ -304,19 +304,19 @@ def _apply_transpose(
 
 
 def _apply_batching(fn: Callable[..., Any], primitive: Primitive, args: Any, dims: Any, **params: Any) -> Any:
-    batched = [d is not None for d in dims]
-    moved_args = [jax.numpy.moveaxis(x, d, 0) if b else x for x, d, b in zip(args, dims, batched, strict=True)]
-    n = next(x.shape[0] for x, b in zip(moved_args, batched, strict=True) if b)
-    results = list(fn(primitive, n, moved_args, batched, **params))
+    is_batched = [d is not None for d in dims]
+    moved_args = [jax.numpy.moveaxis(x, d, 0) if b else x for x, d, b in zip(args, dims, is_batched, strict=True)]
+    n = next(x.shape[0] for x, b in zip(moved_args, is_batched, strict=True) if b)
+    results = list(fn(primitive, n, moved_args, is_batched, **params))
     return results, [0] * len(results)
 
 
 def make_vmap_rule(fn: Callable[..., Any]) -> Callable[..., Any]:
     """Return a rule for ``vmap`` that replaces a primitive by a function, mapped over the operands."""
 
-    def rule(primitive: Primitive, n: int, args: Sequence[Any], batched: Sequence[bool], **params: Any) -> Any:
+    def rule(primitive: Primitive, n: int, args: Sequence[Any], is_batched: Sequence[bool], **params: Any) -> Any:
         del primitive, n
-        return jax.vmap(functools.partial(fn, **params), tuple([0 if b else None for b in batched]))(*args)
+        return jax.vmap(functools.partial(fn, **params), tuple([0 if b else None for b in is_batched]))(*args)
 
     return rule
 
@@ -398,7 +398,7 @@ def is_key(x: Any) -> bool:
 
 
 def bits_generator(dtype: Any) -> str:
-    """Return the name of the generator that a type of random keys belongs to."""
+    """Return the name of the random number generator of a type of keys."""
     impl = getattr(dtype, "_impl", dtype)
     return getattr(impl, "name", str(impl))
 
@@ -427,7 +427,7 @@ def is_symbolic_zero(tangent: Any) -> bool:
 
 
 def n_compilations(jitted: Callable[..., Any]) -> int:
-    """Return how many programs a jitted function holds."""
+    """Return the number of programs that are compiled for a jitted function."""
     return jitted._cache_size()  # type: ignore[attr-defined]
 
 
@@ -470,7 +470,7 @@ _BLOCKS_LOCK = threading.Lock()
 
 @contextlib.contextmanager
 def _close_cache_outside(close: Callable[[], None]) -> Iterator[None]:
-    """Close JAX's cache before the first and after the last of the blocks that overlap: it does so without a lock."""
+    """Close JAX's cache before the first and after the last of overlapping blocks; JAX closes it without a lock."""
     global _blocks
     with _BLOCKS_LOCK:
         if not _blocks:
@@ -491,7 +491,7 @@ def ffi_include_folder() -> str:
 
 
 def register_target(name: str, function: Any, platform: str) -> None:
-    """Make a C function, from ``ctypes``, known to XLA as the target of a custom call on ``"cpu"`` or ``"CUDA"``."""
+    """Register a C function, from ``ctypes``, as the target of XLA's custom calls on ``"cpu"`` or ``"CUDA"``."""
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform=platform)
 
 
@@ -532,13 +532,14 @@ def connected_hosts() -> Hosts | None:
 
 
 def detect_hosts(timeout: int) -> tuple[str | None, int | None, int | None, Sequence[int] | None]:
-    """Return what SLURM or Open MPI say of the hosts, as ``jax.distributed.initialize`` finds it; None where none is.
+    """Return the hosts that SLURM or Open MPI report, as ``jax.distributed.initialize`` detects them.
 
     Args:
-        timeout: Time for finding them, s.
+        timeout: Time limit of the detection, s.
 
     Returns:
-        Address of the coordinator, number of hosts, number of this host, and indices of its devices.
+        Address of the coordinator, number of hosts, number of this host, and indices of its devices; None for each
+        that was not found.
     """
     from jax._src.clusters import ClusterEnv
 

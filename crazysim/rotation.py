@@ -103,8 +103,8 @@ def safe_arctan2(y: Array, x: Array) -> Array:
 
     A point counts as the origin where its squared distance, by which the gradient divides, vanishes or underflows.
     """
-    at_origin = x * x + y * y == 0
-    return jnp.where(at_origin, 0.0, jnp.arctan2(y, jnp.where(at_origin, 1.0, x)))
+    is_origin = x * x + y * y == 0
+    return jnp.where(is_origin, 0.0, jnp.arctan2(y, jnp.where(is_origin, 1.0, x)))
 
 
 def multiply(p: Array, q: Array) -> Array:
@@ -224,10 +224,10 @@ def to_rpy(q: Array) -> Array:
     r00, r10 = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
     cos_pitch = safe_norm(jnp.stack([r00, r10], axis=-1))[..., 0]
     pitch = jnp.arctan2(2 * (w * y - x * z), cos_pitch)
-    return jnp.stack([_wrap(half_sum - half_difference), pitch, _wrap(half_sum + half_difference)], axis=-1)
+    return jnp.stack([_wrap_angle(half_sum - half_difference), pitch, _wrap_angle(half_sum + half_difference)], axis=-1)
 
 
-def _wrap(angle: Array) -> Array:
+def _wrap_angle(angle: Array) -> Array:
     """Return an angle of at most one turn, in either direction, as one in [-pi, pi], rad. (...)"""
     return angle - 2 * jnp.pi * ((angle > jnp.pi).astype(angle.dtype) - (angle < -jnp.pi).astype(angle.dtype))
 
@@ -254,26 +254,26 @@ def heading(q: Array) -> tuple[Array, Array]:
     return jnp.stack([cos, sin, zero], axis=-1), jnp.stack([-sin, cos, zero], axis=-1)
 
 
-def level_axes(yaw: Array) -> tuple[Array, Array]:
+def heading_axes(yaw: Array) -> tuple[Array, Array]:
     """Return the horizontal unit vectors along a yaw, rad (..., 1), and to its left. (..., 3) each"""
     cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
     return jnp.concatenate([cos, sin, zero], axis=-1), jnp.concatenate([-sin, cos, zero], axis=-1)
 
 
-def axes_along(z: Array, ahead: Array, left: Array) -> tuple[Array, Array, Array]:
-    """Return unit axes x, y, z of a frame with z along a vector, and x in the plane of z and a heading. (..., 3) each
+def axes_from_z(z: Array, forward: Array, left: Array) -> tuple[Array, Array, Array]:
+    """Return unit axes x, y, z of the frame with z along a vector and x in the plane of z and a heading. (..., 3) each
 
     Args:
         z: Vector of any length; zero counts as up. (..., 3)
-        ahead: Horizontal unit vector of the heading. (..., 3)
+        forward: Horizontal unit vector of the heading. (..., 3)
         left: Horizontal unit vector to its left, the y axis where z is along the heading. (..., 3)
     """
     z = safe_normalize(z, jnp.asarray([0.0, 0.0, 1.0], z.dtype))
-    y = safe_normalize(cross(z, ahead), left)
+    y = safe_normalize(cross(z, forward), left)
     return cross(y, z), y, z
 
 
-def from_axes(x: Array, y: Array, z: Array) -> Array:
+def rpy_from_axes(x: Array, y: Array, z: Array) -> Array:
     """Return roll, pitch, yaw of the frame with these orthonormal axes in the world frame, rad. (..., 3)"""
     cos_pitch = safe_norm(jnp.stack([x[..., 0], x[..., 1]], axis=-1))[..., 0]
     return jnp.stack(

@@ -24,8 +24,8 @@ from typing import Any
 __version__ = "0.2.0"
 """The version of the package; ``pyproject.toml`` says the same."""
 
-refused: dict[str, str] = {}
-"""Variables that could not be used, with the user's values."""
+refused_variables: dict[str, str] = {}
+"""Environment variables whose values could not be used, with the user's values."""
 
 
 def set_variables() -> None:
@@ -46,7 +46,7 @@ def import_mujoco() -> None:
         os.environ["MUJOCO_GL"] = "disable"
         import mujoco  # noqa: F401
 
-        refused["MUJOCO_GL"] = backend
+        refused_variables["MUJOCO_GL"] = backend
         warnings.warn(
             f"expected a MUJOCO_GL that MuJoCo can use, got {backend!r}: {error}. Use egl or glfw; "
             "until then nothing is drawn.",

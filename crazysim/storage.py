@@ -319,8 +319,8 @@ def untrusted_reason(path: Path) -> str:
     return ""
 
 
-class Closing:
-    """Base of files and connections, which a ``with`` block closes."""
+class Closeable:
+    """Base class of files and connections that a ``with`` block closes."""
 
     def close(self) -> None:
         """Close the file or connection."""

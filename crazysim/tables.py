@@ -17,7 +17,7 @@ from crazysim.storage import is_file, read_toml
 
 MAX_NUMBER = 1e30
 """Largest magnitude of a number, and inverse of the smallest positive one; float32 can represent both."""
-ENTRY = ("value", "unit", "source")
+ENTRY_KEYS = ("value", "unit", "source")
 """Keys of a number that is written with its unit and source."""
 MAX_BASES = 8
 """Largest number of tables in a chain of bases."""
@@ -93,7 +93,7 @@ def read_numbers(
     array = _as_array(name, value, shapes, whole, owner, remedy)
     if shapes is None and not array.size:
         raise ConfigError(f"{owner}expected {name} as a number or array, got an empty one{remedy}")
-    if shapes is not None and not any(_fits(array.shape, shape) for shape in shapes):
+    if shapes is not None and not any(_is_allowed_shape(array.shape, shape) for shape in shapes):
         raise ConfigError(f"{owner}expected {name} of shape {' or '.join(map(str, shapes))}, got {array.shape}{remedy}")
     # Compare a float32 in float32: a bound such as pi / 2, rounded to float32, may exceed the bound itself.
     compared = np.asarray(value) if getattr(value, "dtype", None) == np.float32 else array
@@ -123,7 +123,7 @@ def _as_array(
     return array
 
 
-def _fits(shape: tuple[int, ...], allowed: tuple[int | str, ...]) -> bool:
+def _is_allowed_shape(shape: tuple[int, ...], allowed: tuple[int | str, ...]) -> bool:
     return len(shape) == len(allowed) and all(a in ("any", b) for a, b in zip(allowed, shape, strict=True))
 
 
@@ -192,7 +192,7 @@ class Layout:
                     )
                 yield from self.numbers(owner, item, f"{path}.")
             elif path in self.keys:
-                if isinstance(item, Mapping) and ("value" not in item or set(item) - set(ENTRY)):
+                if isinstance(item, Mapping) and ("value" not in item or set(item) - set(ENTRY_KEYS)):
                     raise ConfigError(
                         f"{owner}: expected {path} as a number, an array or {{ value, unit, source }}, got "
                         f"{short_repr(dict(item))}. {self.guide} shows both forms."
@@ -224,14 +224,14 @@ class Layout:
 
 
 def read_source(
-    source: Any, kind: str, loaded: str, folder: Path, names: tuple[str, ...], guide: str
+    source: Any, kind: str, class_name: str, folder: Path, names: tuple[str, ...], guide: str
 ) -> tuple[str, str, Mapping[str, Any]]:
     """Return the name of a source, its origin for messages, and its tables.
 
     Args:
         source: Name of a built-in file, path of another, or a dict of tables.
         kind: Name of the kind of thing, for messages.
-        loaded: Name of its class with an article, for messages.
+        class_name: Name of its class with an article, for messages.
         folder: Folder of the built-in files.
         names: Their names.
         guide: Page that lists the keys.
@@ -244,7 +244,7 @@ def read_source(
         return "custom", "", dict(source)
     if not isinstance(source, (str, Path)):
         raise ConfigError(
-            f"expected a {kind} as a name, the path of a TOML file, a dict or {loaded}, got {short_repr(source)}"
+            f"expected a {kind} as a name, the path of a TOML file, a dict or {class_name}, got {short_repr(source)}"
         )
     if str(source) in names:
         return str(source), "", _read_built_in(folder / f"{source}.toml", guide)

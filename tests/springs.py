@@ -124,7 +124,7 @@ def build(kinds, n_worlds=2, n_drones=2, n_members=3, **settings):
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     cmd = np.random.default_rng(1).uniform(-1, 1, (n_worlds, n_members, 3))
     for population in sim.plugins.values():
-        sim.data = population.commanded(sim.data, cmd)
+        sim.data = population.with_command(sim.data, cmd)
     sim.build_default_data()
     sim.rotor_vel_control(np.tile([15000.0, 15000.0, 15100.0, 15000.0], (n_worlds, n_drones, 1)))
     return sim

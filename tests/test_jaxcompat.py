@@ -167,9 +167,9 @@ def test_a_primitive_has_a_derivative_a_transpose_and_a_rule_for_vmap():
         "product",
         lambda x, y, n_nonlinear: [jax.ShapeDtypeStruct(y.shape, y.dtype)],
         {"": lambda x, y, n_nonlinear: [x * y]},
-        derivative=lambda x, y, n_nonlinear: [5.0 * x * y],
-        transposed=lambda fixed, seeds, n_nonlinear: [7.0 * fixed[0] * seeds[0]],
-        batched=jaxcompat.make_vmap_rule(lambda x, y, n_nonlinear: [x * y + 1.0]),
+        differentiable_fn=lambda x, y, n_nonlinear: [5.0 * x * y],
+        transpose_rule=lambda fixed, seeds, n_nonlinear: [7.0 * fixed[0] * seeds[0]],
+        batching_rule=jaxcompat.make_vmap_rule(lambda x, y, n_nonlinear: [x * y + 1.0]),
     )
     of = lambda x, y: p.bind(x, y, n_nonlinear=1)[0]  # noqa: E731
     two, three = jnp.float32(2), jnp.float32(3)

@@ -94,7 +94,7 @@ def test_roll_pitch_yaw_there_and_back(roll, pitch, yaw):
     same_rotation(q, Rotation.from_euler("ZYX", rpy[::-1]).as_quat())
     np.testing.assert_allclose(rot.to_rpy(q), rpy, rtol=0, atol=1e-11)
     axes = [rot.rotate(q, axis) for axis in jnp.eye(3)]
-    np.testing.assert_allclose(rot.from_axes(*axes), rpy, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(rot.rpy_from_axes(*axes), rpy, rtol=0, atol=1e-11)
 
 
 @given(q=unit_quats)

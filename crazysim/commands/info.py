@@ -138,7 +138,7 @@ def _size(folder: Path) -> str:
 def _rendering() -> str:
     """Return the OpenGL backend and whether it renders; the attempt runs in a subprocess because it may crash."""
     code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
-    environment = os.environ | startup.refused
+    environment = os.environ | startup.refused_variables
     backend = environment.get("MUJOCO_GL") or "MUJOCO_GL is not set"
     try:
         process = subprocess.run(
@@ -154,6 +154,6 @@ def _rendering() -> str:
 
 
 def _variables() -> str:
-    environment = os.environ | startup.refused
+    environment = os.environ | startup.refused_variables
     settings = [f"{name}={environment[name]}" for name in VARIABLES if name in environment]
     return ", ".join(settings) or "none"

@@ -39,9 +39,9 @@ class AttitudeParams(PyTree):
     thrust_max: Array = leaf("parameter", 1)
     """Maximum thrust of one rotor, N. (1,)"""
     pwm_min: Array = leaf("parameter", 1)
-    """Minimum PWM of a rotor that is on, PWM. (1,)"""
+    """Minimum PWM of a rotor that is on. (1,)"""
     pwm_max: Array = leaf("parameter", 1)
-    """Maximum PWM, PWM. (1,)"""
+    """Maximum PWM. (1,)"""
     arms: Array = leaf("parameter", 1)
     """Torque per thrust about x and y (arm) and z (drag torque over thrust), m. (3,)"""
     mixing_matrix: Array = leaf("parameter", 2)
@@ -157,11 +157,11 @@ def body_rate2force_torque(
         Collective thrust, N, and body torque, N m (..., 4); the new integral, rad s (..., 3).
     """
     yaw = rotation.yaw(quat)[..., None]
-    level = jnp.concatenate([jnp.zeros_like(ang_vel[..., :2]), yaw, cmd[..., 3:4]], axis=-1)
+    level_cmd = jnp.concatenate([jnp.zeros_like(ang_vel[..., :2]), yaw, cmd[..., 3:4]], axis=-1)
     return attitude2force_torque(
         quat,
         ang_vel,
-        level,
+        level_cmd,
         cmd[..., :3],
         prev_ang_vel,
         prev_cmd[..., :3],

@@ -74,7 +74,7 @@ OBSERVER_RATE_RATIO = 0.6
 TORQUE_MAX = 0.5
 """Largest unknown torque that is compensated, as the rotation error to which it is the response, rad."""
 YAW_RATE_MAX = 35.0
-"""Largest rate about body z to hold a heading, rad/s: the range of a Crazyflie's gyroscope (BMI088, data sheet)."""
+"""Largest rate about body z that holds a heading, rad/s: the range of a Crazyflie's gyroscope (BMI088, data sheet)."""
 INVERTED_COSINE = 1e-6
 """One plus the cosine of the tilt error below which its direction counts as undefined, 1: 0.08 degrees."""
 
@@ -242,7 +242,7 @@ class Auto(Controller):
             cast(AutoTarget, memory.target),
         )
         specific_thrust, position = specific_force(s.pos, s.vel, known_acc, sp, target.position, freq, loop)
-        # The attitude is held for a period, in whose middle the setpoint's acceleration has changed by half a step.
+        # The attitude is held for a period. Half a period later, the setpoint's acceleration has changed by this much.
         specific_thrust = keep_upright(specific_thrust - drag + 0.5 / freq * sp.jerk, sp, loop)
 
         # The heading of a state command follows from its quaternion, which needs no angles.
@@ -299,9 +299,9 @@ class Auto(Controller):
         torque = gyroscopic - disturbance_torque - matvec(p.J * p.damping[..., None, :], s.ang_vel - ang_vel_des)
         if rotation_error is not None:
             torque = torque + matvec(p.J * p.stiffness[..., None, :], rotation_error)
-        yaw = rotor_torque[..., 2:] + p.drag_torque_share * (torque[..., 2:] - rotor_torque[..., 2:])
+        yaw_torque = rotor_torque[..., 2:] + p.drag_torque_share * (torque[..., 2:] - rotor_torque[..., 2:])
 
-        wrench = jnp.concatenate([thrust, torque[..., :2], yaw], axis=-1)
+        wrench = jnp.concatenate([thrust, torque[..., :2], yaw_torque], axis=-1)
         thrusts = prioritized_thrusts(wrench, params=p.allocation)
         # The rotor speeds of rotor_vel_of_thrust, approached with a lead.
         _, k1, k2 = (p.allocation.rpm2thrust[..., i] for i in range(3))
@@ -311,7 +311,7 @@ class Auto(Controller):
         return jnp.where(is_on, rotor_vel, 0.0), memory.replace(momentum=expected_momentum, torque=disturbance_torque)
 
     def _command_errors(self, state: FlightState, command: Array, mode: Control) -> tuple[Array | None, Array]:
-        """Return the rotation error, rad, None at the level of body rates, and the desired body rates, rad/s. (3,)"""
+        """Return the rotation error, rad (None at the level ``body_rate``), and the desired body rates, rad/s. (3,)"""
         if mode == Control.body_rate:
             return None, command[..., :3]
         rpy, ang_vel_des = command[..., :3], jnp.zeros_like(state.ang_vel)

@@ -118,17 +118,17 @@ def turn_rates(airframe: Airframe) -> np.ndarray:
     return np.sqrt(max_ang_acc(airframe) / STOPPABLE_ERRORS)
 
 
-def bandwidth(airframe: Airframe, freq: int, rate: float | None = None, limits_reaction: bool = True) -> Bandwidth:
+def bandwidth(airframe: Airframe, freq: int, lag_rate: float | None = None, limits_reaction: bool = True) -> Bandwidth:
     """Return the rates of the loops of an airframe under a controller that runs at ``freq`` Hz.
 
     Args:
         airframe: The airframe.
         freq: Rate of the controller, Hz.
-        rate: Rate of the lag of the rotors, 1/s; None for ``rotor_rate``.
+        lag_rate: Rate of the lag of the rotors, 1/s; None for ``rotor_rate``.
         limits_reaction: True for a controller that does not compensate the reaction to accelerating rotors.
     """
-    rate = 1 / (1 / (rotor_rate(airframe) if rate is None else rate) + 1.5 / freq)
-    axis_rates = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turn_rates(airframe) / ATTITUDE_STIFFNESS)
+    loop_rate = 1 / (1 / (rotor_rate(airframe) if lag_rate is None else lag_rate) + 1.5 / freq)
+    axis_rates = np.minimum(loop_rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turn_rates(airframe) / ATTITUDE_STIFFNESS)
     if limits_reaction:
         axis_rates[2] = min(axis_rates[2], MAX_REACTION * freq / (1 + rotor_rate(airframe) * reaction_time(airframe)))
     return Bandwidth(

@@ -25,7 +25,7 @@ enum crazysim_level {
   CRAZYSIM_BODY_RATE = 2, /* body rates, rad/s, collective thrust, N */
 };
 
-/* What a controller receives at each call. */
+/* Input of a controller at each call. */
 struct crazysim_input {
   float time;           /* time since the reset of the world, s */
   float dt;             /* time from one call to the next, s */
@@ -40,7 +40,7 @@ struct crazysim_input {
 /* Return the size of the memory of one drone, bytes. */
 size_t crazysim_memory_size(void);
 
-/* Set the memory of a drone that is at rest, whose bytes are zero before. */
+/* Initialise the memory of a drone at rest; all of its bytes are zero before the call. */
 void crazysim_init(void *memory);
 
 /* Write the motor commands of one drone, in the order of the airframe's rotors and the unit that CFirmware names. */

@@ -34,12 +34,12 @@ MOTOR_UNITS = ("throttle", "thrust", "rpm")
 """Units of motor commands."""
 LIBRARY_FUNCTIONS = ("crazysim_memory_size", "crazysim_init", "crazysim_update_all", "crazysim_version")
 """Functions that a library must export."""
-MAX_LIBRARY, MAX_MEMORY = 2**28, 2**24
+MAX_LIBRARY_BYTES, MAX_MEMORY_BYTES = 2**28, 2**24
 """Largest library, and largest memory of a drone, bytes."""
 LOADING_TIMEOUT = 60
 """Longest time that loading a library may take, s."""
-N_COMMAND, N_FEEDFORWARD = 16, 8
-"""Number of entries of a state command, and of its feedforward."""
+COMMAND_SIZE, FEEDFORWARD_SIZE = 16, 8
+"""Number of entries of a state command, and number of entries of its feedforward."""
 
 
 class CFirmwareMemory(PyTree):
@@ -103,18 +103,18 @@ class CFirmware(Controller):
         if controls.mode == Control.state:
             setpoint, feedforward = controls.state.cmd, controls.state.feedforward
         else:
-            setpoint, feedforward = jnp.zeros(N_COMMAND).at[:4].set(command), jnp.zeros(N_FEEDFORWARD)
+            setpoint, feedforward = jnp.zeros(COMMAND_SIZE).at[:4].set(command), jnp.zeros(FEEDFORWARD_SIZE)
         clock = jnp.stack([data.core.steps / data.core.freq, jnp.asarray(1 / self.freq)])
-        row = jnp.concatenate([clock, s.pos, s.quat, s.vel, s.ang_vel, setpoint, feedforward]).astype(jnp.float32)
+        inputs = jnp.concatenate([clock, s.pos, s.quat, s.vel, s.ang_vel, setpoint, feedforward]).astype(jnp.float32)
 
         @jax.custom_jvp
-        def call(words: Array, row: Array) -> tuple[Array, Array]:
+        def call_library(words: Array, inputs: Array) -> tuple[Array, Array]:
             shapes = (jax.ShapeDtypeStruct(words.shape, np.uint32), jax.ShapeDtypeStruct((n_motors,), np.float32))
             library = functools.partial(_call_library, self._copy, level, n_motors)
-            return jax.pure_callback(library, shapes, words, row, vmap_method="broadcast_all")
+            return jax.pure_callback(library, shapes, words, inputs, vmap_method="broadcast_all")
 
-        call.defjvp(self._refuse_derivative)
-        words, motors = call(memory.words, row)
+        call_library.defjvp(self._refuse_derivative)
+        words, motors = call_library(memory.words, inputs)
         return self._rotor_vel(motors.astype(s.pos.dtype), params), CFirmwareMemory(words)
 
     def _refuse_derivative(self, primals: Any, tangents: Any) -> Any:
@@ -157,11 +157,11 @@ def copy_library(library: str | Path) -> str:
     """
     remedy, path = f"Compile it as {CFirmware.include / 'firmware.h'} says.", Path(library)
     try:
-        content = read_bytes(path, MAX_LIBRARY)
+        content = read_bytes(path, MAX_LIBRARY_BYTES)
     except ConfigError as error:
         raise ConfigError(f"expected a shared library at {path}: {error}. {remedy}") from error
     copy = Path(_copies_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
-    if not copy.exists():  # a loaded one is never written again
+    if not copy.exists():  # a library that is loaded must not be overwritten
         with replacing(copy) as file:
             file.write(content)
         if reason := _loading_error(copy):
@@ -170,15 +170,15 @@ def copy_library(library: str | Path) -> str:
     library_copy = _open_library(str(copy))
     missing = [name for name in LIBRARY_FUNCTIONS if not hasattr(library_copy, name)]
     if missing:
-        n_bytes, missing_names = ", ".join(LIBRARY_FUNCTIONS), ", ".join(missing)
-        raise ConfigError(f"expected the functions {n_bytes} in {path}, got no {missing_names}. {remedy}")
+        required_names, missing_names = ", ".join(LIBRARY_FUNCTIONS), ", ".join(missing)
+        raise ConfigError(f"expected the functions {required_names} in {path}, got no {missing_names}. {remedy}")
     if (version := library_copy.crazysim_version()) != INTERFACE_VERSION:
         raise ConfigError(f"expected version {INTERFACE_VERSION} of firmware.h in {path}, got {version}. {remedy}")
     pointer, integer, size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
     library_copy.crazysim_memory_size.restype = size
-    if (n_bytes := library_copy.crazysim_memory_size()) > MAX_MEMORY:
+    if (n_bytes := library_copy.crazysim_memory_size()) > MAX_MEMORY_BYTES:
         raise ConfigError(
-            f"expected a memory of at most {MAX_MEMORY} bytes a drone, got {n_bytes} from {path}. {remedy}"
+            f"expected a memory of at most {MAX_MEMORY_BYTES} bytes a drone, got {n_bytes} from {path}. {remedy}"
         )
     library_copy.crazysim_init.argtypes = [pointer]
     library_copy.crazysim_init.restype = None

@@ -90,6 +90,6 @@ class FittedAuto(Controller):
 
         forward, left = rotation.heading(data.controls.state.cmd[..., 9:13])
         advanced_thrust = specific_thrust + p.lead[..., :1] * command.jerk + p.lead[..., 1:] * command.snap
-        angles = p.angle_ratio * rotation.from_axes(*rotation.axes_along(advanced_thrust, forward, left))
+        angles = p.angle_ratio * rotation.rpy_from_axes(*rotation.axes_from_z(advanced_thrust, forward, left))
         thrust = (model.mass * dot(specific_thrust, matrix[..., 2]) - model.acc_coef) / model.cmd_f_coef
         return jnp.concatenate([angles, jnp.maximum(thrust, model.thrust_min)], axis=-1), memory

@@ -108,7 +108,7 @@ def attitude_of_thrust(
         yaw_rate: Its derivative, rad/s. (..., 1)
         yaw_acc: Its second derivative, rad/s^2. (..., 1)
     """
-    forward, left = rotation.level_axes(yaw)
+    forward, left = rotation.heading_axes(yaw)
     z, z_rate, z_acc = thrust_direction(specific_thrust, specific_thrust_rate, specific_thrust_acc)
     z_cross_forward = cross(z, forward)
     y = jnp.where(dot(z_cross_forward, z_cross_forward) < 1e-10, left, rotation.safe_normalize(z_cross_forward, left))

@@ -25,7 +25,7 @@ def require_gains(airframe: Airframe, paths: Iterable[str], controller: str) -> 
         table, _, key = path.rpartition(".")
         tables.setdefault(table, []).append(key)
     missing_text = "; ".join(f"[{table}] {', '.join(keys)}" for table, keys in tables.items())
-    reason = next(filter(None, map(airframe.why_missing, missing)), "")
+    reason = next(filter(None, map(airframe.missing_reason, missing)), "")
     raise ConfigError(
         f"airframe {airframe.name!r} lacks {missing_text}, which controller {controller!r} needs. {reason}Use "
         f"controller='auto', which needs no gains, or add them to the airframe; {GUIDE} lists all keys."

@@ -96,8 +96,8 @@ def load_derivative(
         q_acc = (gravity_vec - pull * q - joint_acceleration(acc, ang_acc)) / length
     # q'' = D a'' + D' a' with D = dq/da: its columns are orthogonal, so the angles' accelerations are two projections.
     slope, slope_rate = jax.jvp(jax.jacfwd(rod_direction), (angles,), (angle_rates,))
-    angle_part = q_acc - slope_rate @ angle_rates
-    angles_acc = slope.T @ angle_part / jnp.sum(slope * slope, axis=0)
+    residual_acc = q_acc - slope_rate @ angle_rates
+    angles_acc = slope.T @ residual_acc / jnp.sum(slope * slope, axis=0)
     return jnp.concatenate([vel, acc, rpy_rate, ang_acc, angle_rates, angles_acc])
 
 
@@ -120,9 +120,9 @@ def rod_angles(direction: Array, direction_rate: Array) -> tuple[Array, Array]:
         Angles (..., 2), rates (..., 2).
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
-    level_length = rotation.safe_norm(jnp.stack([x, z], axis=-1))[..., 0]
-    angles = jnp.stack([jnp.arctan2(y, level_length), rotation.safe_arctan2(-x, -z)], axis=-1)
-    safe_length = jnp.maximum(level_length, 1e-3)
+    xz_length = rotation.safe_norm(jnp.stack([x, z], axis=-1))[..., 0]
+    angles = jnp.stack([jnp.arctan2(y, xz_length), rotation.safe_arctan2(-x, -z)], axis=-1)
+    safe_length = jnp.maximum(xz_length, 1e-3)
     b_rate = (direction_rate[..., 0] * z - x * direction_rate[..., 2]) / safe_length**2
     a_rate = direction_rate[..., 1] / safe_length
     return angles, jnp.stack([a_rate, b_rate], axis=-1)

@@ -220,7 +220,7 @@ def load_lqr_control(
     target: SetpointBody = "load",
     rod_jerk: Array | None = None,
 ) -> Array:
-    """Return the wrench of the LQR with load, with the wrench of the setpoint's motion as feed-forward.
+    """Return the wrench of the LQR with load, with the wrench of the setpoint's motion as feedforward.
 
     ``u = u_ref - K e`` with the errors of the drone as in ``lqr_control``, and the errors of the two angles of the rod
     and of their rates (``rod_angles``), all in the frame of the desired heading.
@@ -245,9 +245,9 @@ def load_lqr_control(
         reference, rod, rod_rate = load_reference(setpoint, p, rod_jerk)
     else:
         reference, rod, rod_rate = hanging_reference(setpoint, p)
-    rods = [to_heading_frame(x, setpoint.yaw) for x in (direction, direction_rate, rod, rod_rate)]
-    angles, rates = rod_angles(rods[0], rods[1])
-    angles_ref, rates_ref = rod_angles(rods[2], rods[3])
+    vectors = [to_heading_frame(x, setpoint.yaw) for x in (direction, direction_rate, rod, rod_rate)]
+    angles, rates = rod_angles(vectors[0], vectors[1])
+    angles_ref, rates_ref = rod_angles(vectors[2], vectors[3])
     error = state_error(pos, quat, vel, ang_vel, reference, setpoint.yaw)
     error = jnp.concatenate([error, angles - angles_ref, rates - rates_ref], axis=-1)
     return prioritized_wrench(reference.wrench - matvec(p.gain, error), params=p.allocation)
@@ -307,7 +307,7 @@ class LoadLQR(Controller):
                 f"sim.add(SlungLoad(...)), or LoadLQR(load=...) with its name."
             )
         s, load = data.states, data.plugins[self.load]
-        # An empty hook swings too, and its load stands elsewhere.
+        # A hook's rod swings even when it holds no load.
         tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
         offset, rate = tip_pos - s.pos, tip_vel - s.vel
         if params.attach is not None:

@@ -64,13 +64,14 @@ def lqr_weights(
     load_mass: float = 0.0,
     length: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights Q (n, n) and R (4, 4): the given ones, or weights that suit an airframe's bandwidth.
+    """Return the weights Q (n, n) and R (4, 4) as matrices; by default they suit the bandwidth of the airframe.
 
     The default follows Bryson's rule: each weight is one over the square of an acceptable error. The acceptable
     position error is 1 m. The acceptable velocity, tilt, body rates, thrust and torque are the values with which the
-    rule of ``crazysim.control.bandwidth`` would answer it: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with the natural
-    frequency w of the position loop and the attitude stiffness k. Yaw has the same value as roll and pitch. The
-    acceptable angle of a rod shifts its load by 1 m, which is 1 / length rad; the acceptable rate is w times as much.
+    rule of ``crazysim.control.bandwidth`` would answer such an error: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with
+    the natural frequency w of the position loop and the attitude stiffness k. Yaw has the same value as roll and pitch.
+    The acceptable angle of a rod shifts its load by 1 m, which is 1 / length rad; the acceptable rate is w times as
+    much.
 
     Args:
         airframe: The airframe.
@@ -216,7 +217,7 @@ def to_heading_frame(vector: Array, yaw: Array) -> Array:
 
 
 def lqr_control(pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: Setpoint, *, params: LQRParams) -> Array:
-    """Return the wrench of the LQR about hover, with the wrench of the setpoint's motion as feed-forward.
+    """Return the wrench of the LQR about hover, with the wrench of the setpoint's motion as feedforward.
 
     ``u = u_ref - K e``. Errors of position and velocity are taken in the frame of the desired heading, so that one gain
     serves every yaw. Reference attitude, rates and wrench come from flatness (``flat_reference``).

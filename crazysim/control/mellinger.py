@@ -246,7 +246,7 @@ def axes_of_force(force: Array, yaw: Array) -> Array:
         force: Force, world frame, N. (..., 3)
         yaw: Yaw, rad. (..., 1)
     """
-    return jnp.stack(rotation.axes_along(force, *rotation.level_axes(yaw)), axis=-1)
+    return jnp.stack(rotation.axes_from_z(force, *rotation.heading_axes(yaw)), axis=-1)
 
 
 def rotation_error(axes: Array, axes_des: Array) -> Array:

@@ -63,8 +63,8 @@ class PID(Controller):
 
     def outer(self, data: DroneData, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
         s, heading = data.states, heading_vector(data.states.quat)
-        # In world axes, as in the firmware (positionControllerResetAllPID), whose derivative gain here is zero.
-        position = memory.position.started_at(s.pos, memory.started)
+        # In world axes, as in positionControllerResetAllPID; the firmware's derivative gain of this loop is zero.
+        position = memory.position.with_first_measurement(s.pos, memory.started)
         vel_des, position = desired_velocity(
             s.pos, heading, command.pos, position, self.outer_freq, loop=params.position
         )
@@ -98,23 +98,27 @@ class PID(Controller):
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
         if isinstance(command, Setpoint):
             heading = heading_vector(s.quat)
-            position = initial_memory.position.started_at(to_heading_frame(heading, s.pos), initial_memory.started)
+            position = initial_memory.position.with_first_measurement(
+                to_heading_frame(heading, s.pos), initial_memory.started
+            )
             vel_des, _ = desired_velocity(s.pos, heading, command.pos, position, self.outer_freq, loop=p.position)
             measured = to_heading_frame(heading, s.vel)
-            velocity = initial_memory.velocity.started_at(measured, initial_memory.started)
+            velocity = initial_memory.velocity.with_first_measurement(measured, initial_memory.started)
             output, _ = pid_step(vel_des - measured, measured, velocity, self.outer_freq, loop=p.velocity)
-            lift = (thrust - p.thrust_base) / THRUST_SCALE
-            current_attitude = jnp.stack([rpy[1], -rpy[0], lift[0]])
-            velocity = continue_integral(velocity, output, current_attitude, loop=p.velocity)
+            scaled_thrust = (thrust - p.thrust_base) / THRUST_SCALE
+            current_output = jnp.stack([rpy[1], -rpy[0], scaled_thrust[0]])
+            velocity = continue_integral(velocity, output, current_output, loop=p.velocity)
             initial_memory = initial_memory.replace(position=position, velocity=velocity)
         initial_memory = initial_memory.replace(
-            attitude=initial_memory.attitude.started_at(rpy, initial_memory.started),
-            rate=initial_memory.rate.started_at(ang_vel, initial_memory.started),
+            attitude=initial_memory.attitude.with_first_measurement(rpy, initial_memory.started),
+            rate=initial_memory.rate.with_first_measurement(ang_vel, initial_memory.started),
         )
-        started = initial_memory.replace(rpy_des=rpy, thrust=thrust, started=jnp.ones_like(initial_memory.started))
-        _, _, ang_vel_des = self._desired_rates(data, command, started, p, rpy)
-        output, _ = desired_torque(ang_vel, ang_vel_des, started.rate, self.freq, loop=p.rate)
-        return started.replace(rate=continue_integral(started.rate, output, torque, loop=p.rate))
+        started_memory = initial_memory.replace(
+            rpy_des=rpy, thrust=thrust, started=jnp.ones_like(initial_memory.started)
+        )
+        _, _, ang_vel_des = self._desired_rates(data, command, started_memory, p, rpy)
+        output, _ = desired_torque(ang_vel, ang_vel_des, started_memory.rate, self.freq, loop=p.rate)
+        return started_memory.replace(rate=continue_integral(started_memory.rate, output, torque, loop=p.rate))
 
     def _desired_rates(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rpy: Array
@@ -131,7 +135,7 @@ class PID(Controller):
         else:
             rpy_des = DEGREES_PER_RADIAN * command[:3]
         rpy_des = jnp.concatenate([rpy_des[:2], wrap_degrees(rpy_des[2:])])
-        attitude = memory.attitude.started_at(rpy, memory.started)
+        attitude = memory.attitude.with_first_measurement(rpy, memory.started)
         ang_vel_des, attitude = desired_rates(rpy, rpy_des, attitude, self.freq, loop=params.attitude)
         if is_rate_command:
             ang_vel_des = jnp.concatenate([DEGREES_PER_RADIAN * command[:2], ang_vel_des[2:]])  # type: ignore[index]

@@ -182,10 +182,10 @@ def to_heading_frame(heading: Array, vector: Array) -> Array:
 def heading_vector(quat: Array) -> Array:
     """Return cosine and sine of an attitude's yaw; one and zero where body x points straight up or down. (..., 2)"""
     x, y, z, w = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
-    ahead = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1)
-    return rotation.safe_normalize(ahead, jnp.asarray([1.0, 0.0], quat.dtype))
+    projection = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1)
+    return rotation.safe_normalize(projection, jnp.asarray([1.0, 0.0], quat.dtype))
 
 
 def wrap_degrees(angle: Array) -> Array:
-    """Return the angles between -180 and 180 degrees. (...)"""
+    """Return angles wrapped to the range from -180 to 180 degrees. (...)"""
     return angle - 360.0 * jnp.round(angle / 360.0)

@@ -77,8 +77,8 @@ class PIDLoopMemory(PyTree):
             delays=None if loop.low_pass is None else np.zeros((2, 3)),  # type: ignore[arg-type]
         )
 
-    def started_at(self, measured: Array, started: Array) -> PIDLoopMemory:
-        """Return the memory with ``measured`` (3,) as the last measured values where the loop has not started."""
+    def with_first_measurement(self, measured: Array, started: Array) -> PIDLoopMemory:
+        """Return the memory; where the loop has not started, ``measured`` (3,) are the last measured values."""
         if self.measured is None:
             return self
         return self.replace(measured=jnp.where(started, self.measured, measured))
@@ -166,7 +166,7 @@ def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array,
 
 
 def _wrap_angle(angle: Array, is_angle: Sequence[bool]) -> Array:
-    """Return angles, where ``is_angle``, less one turn above 180 degrees and plus one turn below -180 degrees."""
+    """Return the values; where ``is_angle``, one turn is subtracted above 180 degrees and added below -180 degrees."""
     if not any(is_angle):
         return angle
     mask = jnp.asarray(is_angle)

@@ -70,16 +70,16 @@ class PositionParams(PyTree):
             MAX_THRUST_SHARE * max_thrust_without_torque(airframe) / float(airframe.value("rigid_body.mass", ()))
         )
         max_up_acc, max_down_acc = max(max_specific_force - g, MIN_FEEDBACK_RATIO * g), MAX_FALL_RATIO * g
-        sideways_acc = min(
+        max_horizontal_acc = min(
             MAX_HORIZONTAL_RATIO * g, np.sqrt(max(max_specific_force**2 - g**2, (MIN_FEEDBACK_RATIO * g) ** 2))
         )
-        frequency = POSITION_RATE_RATIO / delay
+        natural_freq = POSITION_RATE_RATIO / delay
         return PositionParams(
             gravity_vec=as_parameter(GRAVITY),
-            stiffness=as_parameter(frequency**2),
-            damping=as_parameter(2 * frequency),
-            reach=as_parameter(2 * np.array([sideways_acc, min(max_up_acc, max_down_acc)]) / frequency**2),
-            acc_max=as_parameter([sideways_acc, max_up_acc, max_down_acc]),
+            stiffness=as_parameter(natural_freq**2),
+            damping=as_parameter(2 * natural_freq),
+            reach=as_parameter(2 * np.array([max_horizontal_acc, min(max_up_acc, max_down_acc)]) / natural_freq**2),
+            acc_max=as_parameter([max_horizontal_acc, max_up_acc, max_down_acc]),
             observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO / delay / freq)),
         )
 
@@ -128,16 +128,16 @@ def specific_force(
     """
     p = params
     limit = -MAX_DISTURBANCE_RATIO * GRAVITY[2]
-    measured = safe_clip((vel - memory.vel) * freq, -limit, limit)
-    sideways = jnp.where(dot(vel, vel) == 0, 0.0, measured[..., :2])
-    measured = _join_height(sideways, measured[..., 2:])
-    disturbance = memory.disturbance + p.observer * (measured - memory.disturbance)
+    unknown_acc = safe_clip((vel - memory.vel) * freq, -limit, limit)
+    horizontal_acc = jnp.where(dot(vel, vel) == 0, 0.0, unknown_acc[..., :2])
+    unknown_acc = _join_vertical(horizontal_acc, unknown_acc[..., 2:])
+    disturbance = memory.disturbance + p.observer * (unknown_acc - memory.disturbance)
 
     error, reach = setpoint.pos - pos, p.reach[..., 1:]
-    error = _join_height(_limit_length(error[..., :2], p.reach[..., :1]), safe_clip(error[..., 2:], -reach, reach))
+    error = _join_vertical(_limit_length(error[..., :2], p.reach[..., :1]), safe_clip(error[..., 2:], -reach, reach))
     acc = p.stiffness * error + p.damping * (setpoint.vel - vel)
-    height = safe_clip(acc[..., 2:], -p.acc_max[..., 2:], p.acc_max[..., 1:2])
-    acc = _join_height(_limit_length(acc[..., :2], p.acc_max[..., :1]), height)
+    vertical_acc = safe_clip(acc[..., 2:], -p.acc_max[..., 2:], p.acc_max[..., 1:2])
+    acc = _join_vertical(_limit_length(acc[..., :2], p.acc_max[..., :1]), vertical_acc)
     specific_thrust = setpoint.acc + acc - p.gravity_vec - disturbance
     return specific_thrust, PositionMemory(vel + (known_acc + p.gravity_vec) / freq, disturbance)
 
@@ -156,7 +156,7 @@ def keep_upright(specific_thrust: Array, setpoint: Setpoint, params: PositionPar
     """
     desired_lift = setpoint.acc[..., 2:] - params.gravity_vec[..., 2:]
     min_lift = -MIN_UPWARD_RATIO * GRAVITY[2] + 2 * jnp.where(desired_lift < 0, desired_lift, 0.0)
-    return _join_height(
+    return _join_vertical(
         specific_thrust[..., :2], jnp.where(specific_thrust[..., 2:] < min_lift, min_lift, specific_thrust[..., 2:])
     )
 
@@ -167,6 +167,6 @@ def _limit_length(x: Array, limit: Array) -> Array:
     return x * jnp.where(norm > limit, limit / jnp.where(norm > limit, norm, 1.0), 1.0)
 
 
-def _join_height(horizontal: Array, height: Array) -> Array:
-    """Return the vector with a horizontal and a vertical part. (..., 3)"""
-    return jnp.concatenate([horizontal, height], axis=-1)
+def _join_vertical(horizontal: Array, vertical: Array) -> Array:
+    """Return the vector with a horizontal part (..., 2) and a vertical part (..., 1). (..., 3)"""
+    return jnp.concatenate([horizontal, vertical], axis=-1)

@@ -84,14 +84,14 @@ class Controller:
     levels: ClassVar[tuple[Control, ...]]
     """Command levels that it follows."""
     output: ClassVar[Control]
-    """Level of the command that it returns: ``force_torque`` or ``rotor_vel``, or ``attitude`` with fitted dynamics or
+    """Level of the commands that it returns: ``force_torque`` or ``rotor_vel``, or ``attitude`` with fitted dynamics or
     an ``inner`` controller."""
     freq: int
     """Rate of ``update``, Hz. A default that does not divide the simulation's rate is lowered to the next divisor."""
     outer_freq: int | None = None
     """Rate of ``outer``, Hz; None for a controller without an outer loop."""
     inner: Controller | None = None
-    """Controller that follows the commands of this one; None where the allocation, rotors or fitted dynamics do."""
+    """Controller that follows the commands of this one; None if the allocation, rotors or fitted dynamics do."""
     follows_feedforward: ClassVar[bool] = True
     """True if it follows the ``feedforward`` of a state command; if False, a command with feedforward is an error."""
     follows_rates: ClassVar[bool] = False
@@ -187,11 +187,11 @@ class Controller:
 def controller_chain(
     controller: Controller | None, control: Control
 ) -> tuple[list[tuple[Control, Controller]], Control]:
-    """Return the controllers from a command level down, each with the level that it follows, and the last output.
+    """Return the controllers from a command level down, each with its level, and the level of the last output.
 
     Args:
         controller: Controller of the command level; None if commands need none.
-        control: Command level, which is the last output if there is no controller.
+        control: Command level, which is returned as the last output if there is no controller.
     """
     chain = []
     while controller is not None:

@@ -1,4 +1,4 @@
-"""Parameters of a drone that controllers of a wrench assume."""
+"""Parameters of a drone that controllers assume which command a wrench."""
 
 from __future__ import annotations
 

@@ -42,8 +42,8 @@ class StateParams(PyTree):
     def create(airframe: Airframe) -> StateParams:
         """Return the shared parameters of an airframe."""
         require_gains(airframe, KEYS, "crazyflow")
-        to_pwm = airframe.value("controller.mass_thrust", ())
-        from_pwm = (
+        pwm_per_newton = airframe.value("controller.mass_thrust", ())
+        newton_per_pwm = (
             airframe.n_rotors * airframe.value("rotors.thrust_max", ()) / airframe.value("controller.pwm_max", ())
         )
         return StateParams(
@@ -52,7 +52,7 @@ class StateParams(PyTree):
             kd=as_parameter(airframe.value("controller.state.kd", (3,))),
             ki=as_parameter(airframe.value("controller.state.ki", (3,))),
             gravity_vec=as_parameter(GRAVITY),
-            thrust_scale=as_parameter(to_pwm * from_pwm),
+            thrust_scale=as_parameter(pwm_per_newton * newton_per_pwm),
             int_err_max=as_parameter(airframe.value("controller.state.int_err_max", (3,))),
         )
 
@@ -91,7 +91,7 @@ def state2attitude(
     force = p.mass * (cmd[..., 6:9] - p.gravity_vec) + p.kp * pos_err + p.kd * vel_err + p.ki * pos_err_i
 
     forward, left = rotation.heading(cmd[..., 9:13])
-    rpy = rotation.from_axes(*rotation.axes_along(force, forward, left))
+    rpy = rotation.rpy_from_axes(*rotation.axes_from_z(force, forward, left))
 
     thrust = p.thrust_scale * rotation.dot(force, rotation.z_axis(quat))
     return jnp.concatenate([rpy, thrust], axis=-1), pos_err_i

@@ -66,7 +66,7 @@ class Switch(Controller):
         return self.controllers
 
     def params(self, airframe: Airframe) -> SwitchParams:
-        index: Any = None if callable(self.switch) else _indices(self.switch, len(self.controllers))
+        index: Any = None if callable(self.switch) else _check_indices(self.switch, len(self.controllers))
         params = tuple(c.params(airframe) for c in self.controllers)
         return SwitchParams(params, AllocationParams.create(airframe), index)
 
@@ -79,13 +79,13 @@ class Switch(Controller):
         self, data: DroneData, command: Setpoint | Array, memory: SwitchMemory, params: SwitchParams
     ) -> tuple[Array, SwitchMemory]:
         index = self._index(data, command, params)
-        is_switch = (memory.active[0] >= 0) & (memory.active[0] != index)
+        has_switched = (memory.active[0] >= 0) & (memory.active[0] != index)
         rotor_vel, new_memories = memory.rotor_vel, []
         for k, (controller, m, p) in enumerate(
             zip(self.controllers, memory.controllers, params.controllers, strict=True)
         ):
             is_selected = index == k
-            takes_over = is_selected & is_switch
+            takes_over = is_selected & has_switched
             m = _select_tree(takes_over, controller.take_over(data, command, m, p, memory.rotor_vel), m)
             if isinstance(command, Setpoint) and controller.has_outer:
                 is_due = is_selected & (takes_over | _is_due(data, controller.outer_freq))
@@ -125,7 +125,7 @@ def make_switch(controllers: Sequence[Controller], switch: Callable[..., Any] | 
     return Switch(tuple(controllers), switch)
 
 
-def _indices(switch: Any, n: int) -> np.ndarray:
+def _check_indices(switch: Any, n: int) -> np.ndarray:
     indices = np.asarray(switch)
     if indices.dtype.kind not in "iu" or indices.ndim not in (0, 2) or np.any((indices < 0) | (indices >= n)):
         raise ConfigError(
@@ -141,5 +141,5 @@ def _is_due(data: DroneData, freq: Any) -> Array | bool:
 
 
 def _select_tree(mask: Any, new: Any, old: Any) -> Any:
-    """Return one of two trees by a mask. A leaf that is the same object in both is returned as is."""
+    """Return ``new`` where a mask is True and ``old`` elsewhere. A leaf that is the same in both is returned as is."""
     return jax.tree.map(lambda x, y: y if x is y else jnp.where(mask, x, y), new, old)

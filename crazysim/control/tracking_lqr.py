@@ -81,9 +81,9 @@ def tracking_gains(
 ) -> Array:
     """Return the gains of the LQR about the references of successive setpoints, or NaN; pure and differentiable.
 
-    The error dynamics are linearised at every setpoint, and held until the next. A backward scan runs the Riccati
-    recursion in steps of ``dt / substeps``, discretised to second order. It starts from the solution of the algebraic
-    equation at the last setpoint, as if that setpoint were held forever.
+    The error dynamics are linearised at every setpoint, and kept constant until the next. A backward scan runs the
+    Riccati recursion in steps of ``dt / substeps``, discretised to second order. It starts from the solution of the
+    algebraic equation at the last setpoint, as if that setpoint were held forever.
 
     Args:
         setpoints: Setpoints ``dt`` apart. (n, ...)
@@ -102,7 +102,7 @@ def tracking_gains(
     # A reference needs no allocation.
     params = RigidBodyParams(mass, jnp.asarray(GRAVITY, J.dtype), J, drag_matrix, None)  # type: ignore[arg-type]
 
-    def matrices(setpoint: Setpoint) -> tuple[Array, Array]:
+    def linearize_errors(setpoint: Setpoint) -> tuple[Array, Array]:
         reference = flat_reference(setpoint, params)
         w = reference.ang_vel
         ang_acc = jnp.linalg.solve(J, reference.wrench[1:] - cross(w, matvec(J, w)))
@@ -113,13 +113,13 @@ def tracking_gains(
         zero, no_wrench = jnp.zeros(12, J.dtype), jnp.zeros(4, J.dtype)
         return jax.jacfwd(derivative, 0)(zero, no_wrench), jax.jacfwd(derivative, 1)(zero, no_wrench)
 
-    A, B = jax.vmap(matrices)(setpoints)
+    A, B = jax.vmap(linearize_errors)(setpoints)
     eye, h = jnp.eye(12, dtype=J.dtype), dt / substeps
     transition, input_matrix = eye + h * A + h * h / 2 * A @ A, h * B + h * h / 2 * A @ B
-    end = gain_continuous(A[-1], B[-1], Q, R)
-    P = solve_lyapunov(A[-1] - B[-1] @ end, Q + end.T @ R @ end)
+    end_gain = gain_continuous(A[-1], B[-1], Q, R)
+    P = solve_lyapunov(A[-1] - B[-1] @ end_gain, Q + end_gain.T @ R @ end_gain)
 
-    def backward(P: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+    def step_backward(P: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         F, G = step
 
         def riccati_step(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
@@ -129,18 +129,18 @@ def tracking_gains(
             P = closed_loop.T @ P @ closed_loop + h * (Q + K.T @ R @ K)
             return ((P + P.T) / 2, K), None
 
-        (P, K), _ = jax.lax.scan(riccati_step, (P, end), length=substeps)
+        (P, K), _ = jax.lax.scan(riccati_step, (P, end_gain), length=substeps)
         return P, K
 
-    _, gains = jax.lax.scan(backward, P, (transition, input_matrix), reverse=True)
+    _, gains = jax.lax.scan(step_backward, P, (transition, input_matrix), reverse=True)
     return gains
 
 
-def gain_at(time: Array, gains: Array, dt: Array) -> Array:
+def interpolate_gain(time: Array, gains: Array, dt: Array) -> Array:
     """Return the gain at a time, s, interpolated linearly between knots ``dt`` apart and held at the ends. (4, 12)"""
-    last = gains.shape[-3] - 1
-    knot = rotation.safe_clip(time / dt, 0.0, float(last))
-    gains, index = jnp.asarray(gains), jnp.minimum(jnp.floor(knot).astype(jnp.int32), last - 1)
+    last_index = gains.shape[-3] - 1
+    knot = rotation.safe_clip(time / dt, 0.0, float(last_index))
+    gains, index = jnp.asarray(gains), jnp.minimum(jnp.floor(knot).astype(jnp.int32), last_index - 1)
     weight = knot - index
     return (1 - weight) * gains[index] + weight * gains[index + 1]
 
@@ -165,7 +165,7 @@ def tracking_lqr_control(
     p = params
     reference = flat_reference(setpoint, p)
     error = state_error(pos, quat, vel, ang_vel, reference)
-    gain = gain_at(time - p.start[0], p.gains, p.dt[0])
+    gain = interpolate_gain(time - p.start[0], p.gains, p.dt[0])
     return prioritized_wrench(reference.wrench - matvec(gain, error), params=p.allocation)
 
 
@@ -209,8 +209,8 @@ class TrackingLQR(Controller):
             )
         Q, R = lqr_weights(airframe, self.freq, self.Q, self.R)
         mass, drag = airframe.value("rigid_body.mass"), airframe.matrix("drag.coefficients")
-        gains_of = functools.partial(tracking_gains, substeps=math.ceil(self.dt * self.freq))
-        gains = solve_on_host(gains_of, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
+        compute_gains = functools.partial(tracking_gains, substeps=math.ceil(self.dt * self.freq))
+        gains = solve_on_host(compute_gains, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
         return TrackingLQRParams(
             **rigid_body_params(airframe),
             gains=as_parameter(gains),

@@ -33,7 +33,7 @@ Airframes = Airframe | Sequence[Airframe]
 
 def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: int) -> tuple[Airframe, ...]:
     """Return the airframe of each drone; drones with the same source share one object. (n_drones,)"""
-    if not is_list(drone):
+    if not is_airframe_list(drone):
         return (load_airframe(drone),) * n_drones  # type: ignore[arg-type]
     if not drone:
         raise ConfigError("expected an airframe or a list with one for each drone, got an empty list")
@@ -47,7 +47,7 @@ def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: i
     return tuple([loaded[key] for key in keys])
 
 
-def is_list(drone: object) -> TypeGuard[Sequence[AirframeSource]]:
+def is_airframe_list(drone: object) -> TypeGuard[Sequence[AirframeSource]]:
     """Return True for a sequence with one airframe for each drone, False for a single airframe."""
     return isinstance(drone, Sequence) and not isinstance(drone, str)
 

@@ -15,16 +15,16 @@ from crazysim.core.stage import Stage, acts_now
 def controller_stages(controller: Controller, control: Control) -> Pipeline:
     """Return the stages of a controller that follows a command level, in order.
 
-    One stage puts the staged command in force, and stages the command of the level below or sets the rotor speeds. With
-    an outer loop there are two: the first puts the setpoint in force at the rate of the outer loop, the second commands
-    at the controller's.
+    One stage puts the staged command in force, and stages the command of the level below or sets the rotor speeds. A
+    controller with an outer loop has two stages. The first runs at the rate of the outer loop and puts the setpoint in
+    force; the second runs at the rate of the controller and stages the command or sets the rotor speeds.
     """
     level = control.value
 
-    def command_ticks(data: SimData) -> Array | None:
+    def is_command_tick(data: SimData) -> Array | None:
         return acts_now(data, getattr(data.controls, level).freq)
 
-    def controller_ticks(data: SimData) -> Array | None:
+    def is_controller_tick(data: SimData) -> Array | None:
         return acts_now(data, getattr(data.controls, level).controller.freq)
 
     def run_outer(data: SimData) -> SimData:
@@ -38,16 +38,16 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
         command, memory = controller.update(data, _command_in_force(data, control), record.memory, record.params)
         return _replace_memory(_stage_below(data, controller.output, command), control, memory)
 
-    def run_both(data: SimData) -> SimData:
+    def run_controller(data: SimData) -> SimData:
         return run_inner(_apply_staged_command(data, control))
 
     name = f"{level}_controller"
     if control == Control.state and controller.has_outer:
         return {
-            name: Stage(run_outer, "drone", command_ticks, name=name),
-            "attitude_controller": Stage(run_inner, "drone", controller_ticks, name="attitude_controller"),
+            name: Stage(run_outer, "drone", is_command_tick, name=name),
+            "attitude_controller": Stage(run_inner, "drone", is_controller_tick, name="attitude_controller"),
         }
-    return {name: Stage(run_both, "drone", controller_ticks, name=name)}
+    return {name: Stage(run_controller, "drone", is_controller_tick, name=name)}
 
 
 def _apply_staged_command(data: SimData, level: Control) -> SimData:
@@ -75,14 +75,14 @@ def _stage_below(data: SimData, level: Control, command: Array) -> SimData:
     controls = controls_of(data)
     if level == Control.rotor_vel:
         return data.replace(controls=controls.replace(rotor_vel=command))
-    ctrl = getattr(controls, level.value).replace(staged_cmd=command)
-    if level == Control.attitude and ctrl.staged_ang_vel_des is not None:
-        ctrl = ctrl.replace(staged_ang_vel_des=controls.state.cmd[..., 13:16])
-    return data.replace(controls=controls.replace(**{level.value: ctrl}))
+    level_controls = getattr(controls, level.value).replace(staged_cmd=command)
+    if level == Control.attitude and level_controls.staged_ang_vel_des is not None:
+        level_controls = level_controls.replace(staged_ang_vel_des=controls.state.cmd[..., 13:16])
+    return data.replace(controls=controls.replace(**{level.value: level_controls}))
 
 
 def _replace_memory(data: SimData, level: Control, memory: Any) -> SimData:
     """Return the data of one drone with the memory of the controller that follows a level."""
-    ctrl = getattr(data.controls, level.value)
-    ctrl = ctrl.replace(controller=ctrl.controller.replace(memory=memory))
-    return data.replace(controls=data.controls.replace(**{level.value: ctrl}))
+    level_controls = getattr(data.controls, level.value)
+    level_controls = level_controls.replace(controller=level_controls.controller.replace(memory=memory))
+    return data.replace(controls=data.controls.replace(**{level.value: level_controls}))

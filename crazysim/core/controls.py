@@ -54,14 +54,14 @@ class ControllerData(PyTree):
 
         def broadcast(x: np.ndarray, core_template: np.ndarray) -> np.ndarray:
             dtype = float_dtype() if np.issubdtype(np.asarray(x).dtype, np.floating) else np.asarray(x).dtype
-            core = np.shape(x)[np.ndim(x) - np.ndim(core_template) :]  # it may have rows of drones, and more rotors
+            core = np.shape(x)[np.ndim(x) - np.ndim(core_template) :]  # x may have a row per drone, and more rotors
             return host_array(x, n_worlds, n_drones, *core, dtype=dtype)
 
         return ControllerData(jax.tree.map(broadcast, memory, template), params, controller.freq)
 
 
 class _LevelData(PyTree):
-    """Crazyflow's names for gains and memory of the controller of a level; None where it has none of that name."""
+    """Gains and memory of the controller of a command level, under Crazyflow's names; None if it has no such field."""
 
     controller: ControllerData | None
     """Controller that follows the commands; None in fitted dynamics, which follow attitudes."""
@@ -156,7 +156,7 @@ class ForceTorqueControlData(PyTree):
     """Limits and constants."""
 
 
-def require_same_controllers(controls: SimControls, reference: SimControls, name: str | None) -> None:
+def check_same_controllers(controls: SimControls, reference: SimControls, name: str | None) -> None:
     """Check that two simulations' controllers have the same records, with memory of the same shapes.
 
     Args:
@@ -168,10 +168,10 @@ def require_same_controllers(controls: SimControls, reference: SimControls, name
     if records == expected:  # the same objects
         return
     if [_layout(controller) for controller in records] != [_layout(controller) for controller in expected]:
+        expected_text, found_text = (", then ".join(map(_describe_controller, x)) for x in (expected, records))
         raise ConfigError(
-            f"expected data of controller {name!r} with {', then '.join(map(_describe, expected)) or 'no records'}, "
-            f"got {', then '.join(map(_describe, records)) or 'no records'}. Use data of this simulation, or of one "
-            f"with the same settings."
+            f"expected data of controller {name!r} with {expected_text or 'no records'}, got "
+            f"{found_text or 'no records'}. Use data of this simulation, or of one with the same settings."
         )
 
 
@@ -185,7 +185,7 @@ def _layout(controller: ControllerData) -> tuple[object, list[tuple[int, ...]]]:
     return jax.tree.structure(controller), [np.shape(x) for x in jax.tree.leaves(controller.memory)]
 
 
-def _describe(controller: ControllerData) -> str:
+def _describe_controller(controller: ControllerData) -> str:
     shapes = [np.shape(x) for x in jax.tree.leaves(controller.memory)]
     memory, params = _type_name(controller.memory), _type_name(controller.params)
     return f"memory {memory} of shapes {shapes}, parameters {params} and freq={controller.freq}"
@@ -247,8 +247,8 @@ class SimControls(PyTree):
             controller: Controller of the command level; None if commands need none.
         """
         shape = (n_worlds, n_drones)
-        require_pair(dynamics, control)
-        require_controller(dynamics, control, controller)
+        check_command_level(dynamics, control)
+        check_controller(dynamics, control, controller)
         followers, last_level = controller_chain(controller, control)
         by_level = dict(followers)
         data = {level: ControllerData.create(*shape, x, airframes) for level, x in followers}
@@ -258,15 +258,15 @@ class SimControls(PyTree):
 
         state = attitude = body_rate = force_torque = rotor_vel = None
         if control == Control.state:
-            cmd, feeds = host_array(np.eye(16)[12], *shape, 16), by_level[control].follows_feedforward
+            cmd, has_feedforward = host_array(np.eye(16)[12], *shape, 16), by_level[control].follows_feedforward
             # A copy, because two leaves that share a buffer cannot both be donated.
             state = StateControlData(
                 data[control],
                 cmd,
                 cmd.copy(),
                 freqs[Control.state],
-                feedforward=zeros(8) if feeds else None,
-                staged_feedforward=zeros(8) if feeds else None,
+                feedforward=zeros(8) if has_feedforward else None,
+                staged_feedforward=zeros(8) if has_feedforward else None,
             )
         if Control.attitude in (*by_level, last_level):
             follower = by_level.get(Control.attitude)
@@ -287,7 +287,7 @@ class SimControls(PyTree):
         return SimControls(control, state, attitude, body_rate, force_torque, rotor_vel)
 
 
-def require_pair(dynamics: Dynamics, control: Control) -> None:
+def check_command_level(dynamics: Dynamics, control: Control) -> None:
     """Check that a dynamics model supports a command level."""
     if dynamics != Dynamics.first_principles and control not in (Control.state, Control.attitude):
         raise ConfigError(
@@ -296,7 +296,7 @@ def require_pair(dynamics: Dynamics, control: Control) -> None:
         )
 
 
-def require_controller(dynamics: Dynamics, control: Control, controller: Controller | None) -> None:
+def check_controller(dynamics: Dynamics, control: Control, controller: Controller | None) -> None:
     """Check that controllers accept their command levels, and the dynamics the output of the last controller."""
     followers, last_level = controller_chain(controller, control)
     for level, follower in followers:

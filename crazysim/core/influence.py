@@ -36,17 +36,17 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
             f"went. Add records with sim.add."
         )
     command = "controls.attitude.cmd" if data.controls.rotor_vel is None else "controls.rotor_vel"
-    keep_shape = ("states.force", "states.torque", command)
+    writable_fields = ("states.force", "states.torque", command)
     for (path, old), new in zip(paths, jax.tree.leaves(changed_data), strict=True):
         if new is old:
             continue
         field = jax.tree_util.keystr(path).lstrip(".")
-        if field in keep_shape:
+        if field in writable_fields:
             if jnp.shape(new) != jnp.shape(old):
                 raise ConfigError(f"expected {title} to return {field} of shape {old.shape}, got {jnp.shape(new)}")
         elif not field.startswith("params."):
             raise ConfigError(
-                f"expected {title} to write only {', '.join(keep_shape)} and params, got other values of "
+                f"expected {title} to write only {', '.join(writable_fields)} and params, got other values of "
                 f"{field}. Use a stage of the plugin to change states, records or other commands, and 'derivative' for "
                 f"the rates of its own states."
             )
@@ -88,7 +88,7 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
 def apply_constraint(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
     """Return the derivative with the constraint of a plugin applied."""
     title = f"constrain of plugin {plugin.name!r} ({type(plugin).__name__})"
-    return _call_method(title, lambda data_seen: plugin.constrain(data_seen, deriv, dt), data, plugin.coupling)
+    return _call_method(title, lambda scope_data: plugin.constrain(scope_data, deriv, dt), data, plugin.coupling)
 
 
 def _call_method(title: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:

@@ -32,7 +32,7 @@ def safe_min(x: Array, axis: int) -> Array:
 
 
 def safe_max(x: Array, axis: int) -> Array:
-    """Return the largest number along an axis, as ``safe_min`` does."""
+    """Return the largest number along an axis; see ``safe_min``."""
     return jnp.squeeze(jnp.take_along_axis(x, jnp.argmax(x, axis=axis, keepdims=True), axis), axis)
 
 
@@ -80,7 +80,7 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     if reduce == "sum" and any(x.dtype == bool for x in traced.out_avals):
         raise ConfigError("expected numbers to sum over the other drones, got bools. Use reduce='max' for any of them.")
     reduced = reduce_over_others_p.bind(
-        *traced.consts, *leaves, jaxpr=constants_to_inputs(traced), n_own=len(traced.consts), reduce=reduce
+        *traced.consts, *leaves, jaxpr=constants_to_inputs(traced), n_captured=len(traced.consts), reduce=reduce
     )
     return structure.unflatten(reduced)
 
@@ -92,24 +92,24 @@ def _refuse_outside(*args: object, **params: object) -> NoReturn:
     )
 
 
-def _result_types(*args: object, jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> list[Any]:
+def _result_types(*args: object, jaxpr: ClosedJaxpr, n_captured: int, reduce: str) -> list[Any]:
     return [x.update(weak_type=False) for x in jaxpr.out_avals]
 
 
 def _batching_rule(
-    axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_own: int, reduce: str
+    axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_captured: int, reduce: str
 ) -> Any:
     """Batch the reduction: compute it over the axis of drones, and bind a batched reduction over any other axis."""
     in_axes = [None if d is None else 0 for d in dims]
     rows = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
     if axis.name == MEMBER_AXIS:
         results = _reduce_for_all(
-            axis.size, rows[:n_own], in_axes[:n_own], rows[n_own:], in_axes[n_own:], jaxpr, reduce
+            axis.size, rows[:n_captured], in_axes[:n_captured], rows[n_captured:], in_axes[n_captured:], jaxpr, reduce
         )
     else:
         pair_of_batch = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*in_axes, None), axis_size=axis.size)
         pair = jax.make_jaxpr(pair_of_batch)(*rows, jax.ShapeDtypeStruct((), bool))
-        results = reduce_over_others_p.bind(*rows, jaxpr=pair, n_own=n_own, reduce=reduce)
+        results = reduce_over_others_p.bind(*rows, jaxpr=pair, n_captured=n_captured, reduce=reduce)
     return results, [0] * len(results)
 
 
@@ -127,11 +127,13 @@ def _reduce_for_all(
     batched = [x for x, axis in zip(captured, captured_axes, strict=True) if axis is not None]
 
     def reduce_for_one(i: Array, row: Sequence[Array]) -> list[Array]:
-        own_rows = iter(row)
-        own_values = [x if axis is None else next(own_rows) for x, axis in zip(captured, captured_axes, strict=True)]
+        captured_rows = iter(row)
+        captured_values = [
+            x if axis is None else next(captured_rows) for x, axis in zip(captured, captured_axes, strict=True)
+        ]
 
         def apply_to_pair(j: Array, values: Sequence[Array]) -> list[Array]:
-            return pair(*own_values, *values, i == j)
+            return pair(*captured_values, *values, i == j)
 
         pairs = jax.vmap(apply_to_pair, (0, list(other_axes)))(indices, list(other))
         return [REDUCTIONS[reduce](x, axis=0).astype(x.dtype) for x in pairs]
@@ -144,4 +146,4 @@ def _reduce_for_all(
 
 reduce_over_others_p = batched_primitive("reduce_over_others", _result_types, _batching_rule, _refuse_outside)
 """The reduction as a primitive: its operands are the values that the function captures, then the published ones.
-``jaxpr`` maps both and ``is_self`` to the results for one pair; ``n_own`` is the number of captured values."""
+``jaxpr`` maps both and ``is_self`` to the results for one pair; ``n_captured`` is the number of captured values."""

@@ -203,8 +203,8 @@ class Plugin:
     def is_dynamic(self) -> bool:
         """True if the integrator must call ``influence``, ``derivative`` or ``constrain``."""
         cls = type(self)
-        changed = cls.influence is not Plugin.influence or cls.derivative is not Plugin.derivative
-        return changed or self.constrains
+        is_overridden = cls.influence is not Plugin.influence or cls.derivative is not Plugin.derivative
+        return is_overridden or self.constrains
 
     @property
     def constrains(self) -> bool:
@@ -366,8 +366,8 @@ class Plugin:
         return data.replace(plugins=data.plugins | {self.name: record})
 
 
-def plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
-    """Return plugins that are given as a list.
+def check_plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
+    """Return a list of plugins, after checking its type.
 
     Args:
         name: Name of the argument in messages.

@@ -167,8 +167,8 @@ class Population(Plugin):
         """
         return record.replace(**{k: x for k, x in (("pos", pos), ("quat", quat)) if k in _fields(record)})
 
-    def commanded(self, data: SimData, command: ArrayLike) -> SimData:
-        """Return the data of all worlds with a command for every member. (n_worlds, n_members, k)"""
+    def with_command(self, data: SimData, command: ArrayLike) -> SimData:
+        """Return the data of all worlds with a new command for every member. (n_worlds, n_members, k)"""
         record, field = self.read(data), self.command_field
         if field is None:
             raise ConfigError(f"expected a population that takes commands, got {self.name!r}, which takes none")

@@ -74,7 +74,7 @@ def world_keys(data: SimData, name: str) -> Array:
     Returns:
         Typed keys. (n_worlds,)
     """
-    return _over_worlds(data, lambda world: world_key(world, name))
+    return _vmap_worlds(data, lambda world: world_key(world, name))
 
 
 def drone_keys(data: SimData, name: str) -> Array:
@@ -91,7 +91,7 @@ def drone_keys(data: SimData, name: str) -> Array:
     def keys_of_world(world: SimData) -> Array:
         return jax.vmap(lambda drone: _key(world, name, drone))(world.core.drone_id)
 
-    return _over_worlds(data, keys_of_world)
+    return _vmap_worlds(data, keys_of_world)
 
 
 def normal(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array:
@@ -172,7 +172,7 @@ def _key(data: SimData, name: str, *members: Array) -> Array:
     return key
 
 
-def _over_worlds(data: SimData, fn: Callable[[SimData], Array]) -> Array:
+def _vmap_worlds(data: SimData, fn: Callable[[SimData], Array]) -> Array:
     core = data.core
 
     def apply_to_world(key: Array, world_id: Array, drone_id: Array, episode: Array, steps: Array) -> Array:

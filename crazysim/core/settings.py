@@ -123,13 +123,13 @@ def setting(
     )
 
 
-def color(n: bool = False) -> Any:
+def color(per_item: bool = False) -> Any:
     """Declare a field with a colour, red, green, blue and opacity from 0 to 1, which is None by default.
 
     Args:
-        n: True for a field that may have one for each of several things.
+        per_item: True for a field that also accepts an array with one colour for each item. (n, 4)
     """
-    return setting(default=None, low=0.0, high=1.0, shapes=((4,), ("any", 4)) if n else ((4,),))
+    return setting(default=None, low=0.0, high=1.0, shapes=((4,), ("any", 4)) if per_item else ((4,),))
 
 
 @functools.cache
@@ -156,7 +156,7 @@ def check_settings(settings: Any) -> None:
     """
     kind = type(settings)
     for field in dataclasses.fields(settings):
-        value, kinds = getattr(settings, field.name), alternatives(kind)[field.name]
+        value, kinds = getattr(settings, field.name), allowed_types(kind)[field.name]
         if (value is None and (type(None) in kinds or field.default is None)) or not kinds:
             continue
         name, declared = f"{field.name} of {kind.__name__}", collect_settings(kind)[field.name]
@@ -180,7 +180,7 @@ def check_settings(settings: Any) -> None:
 
 
 @functools.cache
-def alternatives(kind: type) -> dict[str, tuple[type, ...]]:
+def allowed_types(kind: type) -> dict[str, tuple[type, ...]]:
     """Return the types that each field may have; an empty tuple where the annotation cannot be checked.
 
     An array stands for ``ArrayLike`` and sequences of numbers.
@@ -278,7 +278,7 @@ def as_rgba(rgba: object, n: int | None = None) -> NDArray[np.float64]:
 
     Args:
         rgba: Red, green, blue and opacity, 0 to 1.
-        n: Number of things that may have a colour each, for (n, 4); None for one colour.
+        n: Number of items, to accept one colour for each, (n, 4); None to accept only one colour.
     """
     shapes = ((4,),) if n is None else ((4,), (n, 4))
     return read_numbers("rgba", rgba, range_between(0.0, 1.0), shapes, remedy="Use (1, 0, 0, 1) for red.")
@@ -290,9 +290,9 @@ def as_mask(mask: object, *shapes: tuple[int, ...], item: str = "world") -> Arra
     Shape and type are checked, also of a traced mask.
 
     Args:
-        mask: One bool for each world, or for each of something else.
+        mask: One bool for each world, or for each item of another kind.
         shapes: Shapes that it may have: (n_worlds,), or () in functions of one world.
-        item: Name of the things that have one bool each, for the message.
+        item: Kind of the items, for the message.
     """
     if mask is None:
         return None
@@ -311,12 +311,12 @@ def as_mask(mask: object, *shapes: tuple[int, ...], item: str = "world") -> Arra
 
 def check_rates(control: Control, freq: int, rates: Mapping[Control, int | None]) -> None:
     """Check requested rates, Hz; None stands for the rate of a controller."""
-    in_use = {
+    used_levels = {
         Control.state: (Control.state, Control.attitude, Control.force_torque),
         Control.rotor_vel: (),
     }.get(control, (control, Control.force_torque))
     for level, requested in rates.items():
-        if requested is not None and freq % positive_integer(f"{level.value}_freq", requested) and level in in_use:
+        if requested is not None and freq % positive_integer(f"{level.value}_freq", requested) and level in used_levels:
             raise ConfigError(
                 f"{level.value}_freq is {requested} Hz, which does not divide freq = {freq} Hz, so it cannot fire "
                 f"every whole number of steps. Use the nearest rate below, {_largest_divisor(freq, requested)} Hz."
@@ -403,17 +403,17 @@ def controller_at_rates(
             controller_at_rates(member, control, freq, requested_rates) for member in controller.controllers
         )
         member_rates = {rate for member in members for rate in (member.freq, member.outer_freq) if rate is not None}
-        common = max(member_rates) if all(max(member_rates) % rate == 0 for rate in member_rates) else freq
-        return dataclasses.replace(controller, controllers=members, freq=common)
+        common_freq = max(member_rates) if all(max(member_rates) % rate == 0 for rate in member_rates) else freq
+        return dataclasses.replace(controller, controllers=members, freq=common_freq)
     requested = {"freq": requested_rates.get(control)}
     if control == Control.state and controller.has_outer:
         requested = {"outer_freq": requested_rates.get(control), "freq": requested_rates.get(Control.attitude)}
     class_defaults = {f.name: f.default for f in dataclasses.fields(controller)}  # type: ignore[arg-type]
     rates: dict[str, Any] = {}
     defaults, owner = {}, f" of controller {controller.name!r}"
-    for name, given_rate in requested.items():
-        rate = getattr(controller, name) if given_rate is None else given_rate
-        if given_rate is None and rate == class_defaults[name]:
+    for name, requested_rate in requested.items():
+        rate = getattr(controller, name) if requested_rate is None else requested_rate
+        if requested_rate is None and rate == class_defaults[name]:
             defaults[name] = positive_integer(name + owner, rate)
         else:
             rates[name] = dividing_rate(name + owner, rate, freq)

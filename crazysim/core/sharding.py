@@ -139,8 +139,8 @@ def distribute(tree: T, shardings: Any) -> T:
     """Return arrays distributed over devices: ``jax.device_put``, also onto the devices of several hosts.
 
     Args:
-        tree: Pytree of arrays. Those of one host are the same on all hosts, each of which takes the parts of its own
-            devices.
+        tree: Pytree of arrays. An array that is not yet distributed must be the same on all hosts; each host puts
+            its own part of it on its devices.
         shardings: Sharding of every array, as a pytree of the same structure, or one for all.
     """
     shardings = jax.tree.broadcast(shardings, tree)

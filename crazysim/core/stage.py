@@ -71,10 +71,10 @@ class Stage:
     def __call__(self, data: SimData) -> SimData:
         """Return the data after the stage, in every world and for every drone."""
         if self.batched or self.scope == "batch":
-            return self.apply_to_one(data)
+            return self.apply_unbatched(data)
         return _apply_in_all_worlds(self, data)
 
-    def apply_to_one(self, data: SimData) -> SimData:
+    def apply_unbatched(self, data: SimData) -> SimData:
         """Return the data after the stage, for data of the scope that the stage is written for."""
         data_after = self.fn(data)
         mask = None if self.when is None else self.when(data)
@@ -228,11 +228,11 @@ class Axes:
             )
         return [stage.scope]
 
-    def shapes_of_one(self, leaves: list[Array], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
+    def unbatched_shapes(self, leaves: list[Array], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
         """Return the shape and type of each leaf as a stage with a scope receives it."""
-        return [self.shape_of_one(i, x, scope) for i, x in enumerate(leaves)]
+        return [self.unbatched_shape(i, x, scope) for i, x in enumerate(leaves)]
 
-    def shape_of_one(self, i: int, x: Array, scope: StageScope) -> jax.ShapeDtypeStruct:
+    def unbatched_shape(self, i: int, x: Array, scope: StageScope) -> jax.ShapeDtypeStruct:
         """Return the shape and type of leaf ``i`` as a stage with a scope receives it."""
         leaf_scope, n_leading = self.scopes[i], 0
         if scope != "batch" and leaf_scope != "batched":
@@ -253,7 +253,7 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
         min_batch_axes: Smallest number of batch axes with which a leaf is split into worlds: 2 excludes batched leaves.
     """
 
-    def in_all_worlds(*args: Any) -> Any:
+    def apply_to_worlds(*args: Any) -> Any:
         leaves, treedef = jax.tree.flatten(args)
         leaf_scopes = _leaf_scopes(args)
         # Leaves of worlds, (n_worlds, 1, ...), lose their second axis.
@@ -261,7 +261,7 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
         is_split = [n_batch_axes(scope) >= min_batch_axes for scope in leaf_scopes]
         returned: dict[str, Any] = {}
 
-        def in_one_world(values: list[Any]) -> list[Any]:
+        def apply_to_world(values: list[Any]) -> list[Any]:
             result = fn(*treedef.unflatten(values))
             paths, returned["treedef"] = jax.tree_util.tree_flatten_with_path(result)
             returned["scopes"] = result_scopes = _leaf_scopes(result)
@@ -284,7 +284,7 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
                     )
             return [x for (_, x), i in zip(paths, unchanged, strict=True) if i is None]
 
-        changed = iter(jax.vmap(in_one_world, ([0 if split else None for split in is_split],))(inputs))
+        changed = iter(jax.vmap(apply_to_world, ([0 if split else None for split in is_split],))(inputs))
         outputs = []
         for scope, i in zip(returned["scopes"], returned["unchanged"], strict=True):
             if i is not None and leaf_scopes[i] == scope:
@@ -294,7 +294,7 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
                 outputs.append(x[:, None] if scope == "world" else x)
         return returned["treedef"].unflatten(outputs)
 
-    return in_all_worlds
+    return apply_to_worlds
 
 
 def vmap_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
@@ -304,12 +304,12 @@ def vmap_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
         fn: Function that returns any tree of arrays. In the result each array has a first axis over drones.
     """
 
-    def for_all_drones(data: SimData) -> Any:
+    def apply_to_drones(data: SimData) -> Any:
         leaves, treedef = jax.tree.flatten(data)
         axes = [0 if scope == "drone" else None for scope in jax.tree.leaves(scopes(data))]
         return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=MEMBER_AXIS)(leaves)
 
-    return for_all_drones
+    return apply_to_drones
 
 
 def _leaf_scopes(tree: object) -> list[str]:
@@ -334,7 +334,7 @@ def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
         written: list[int] = []
 
         def apply_to_values(values: list[Array]) -> list[Array]:
-            data_after = stage.apply_to_one(axes.treedef.unflatten(values))
+            data_after = stage.apply_unbatched(axes.treedef.unflatten(values))
             written[:] = axes.written_leaves(values, data_after, stage)
             new_leaves = jax.tree.leaves(data_after)
             return [new_leaves[i] for i in written]

@@ -127,27 +127,27 @@ def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
     velocities of the previous step, which ``clip_floor_pos`` has set to zero.
     """
 
-    def held_derivative(data: SimData) -> SimStateDeriv:
+    def derivative_on_floor(data: SimData) -> SimStateDeriv:
         s, deriv = data.states, deriv_fn(data)
         is_standing = (s.pos[..., 2:] == FLOOR_HEIGHT) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
         return deriv.replace(
             acc=jnp.where(is_standing, 0.0, deriv.acc), ang_acc=jnp.where(is_standing, 0.0, deriv.ang_acc)
         )
 
-    return held_derivative
+    return derivative_on_floor
 
 
-def stop_below(s: SimState, lowest: Array | float) -> SimState:
+def stop_at_surface(s: SimState, surface_height: Array | float) -> SimState:
     """Return the states with drones at rest on a surface if they are below it, or on it and not rising.
 
     Args:
         s: States.
-        lowest: Height of the surface, world frame, m. (..., 1)
+        surface_height: Height of the surface, world frame, m. (..., 1)
     """
-    height, climb = s.pos[..., 2:], s.vel[..., 2:]
-    is_stopped = (height < lowest) | ((height == lowest) & (climb <= 0))
+    height, climb_rate = s.pos[..., 2:], s.vel[..., 2:]
+    is_stopped = (height < surface_height) | ((height == surface_height) & (climb_rate <= 0))
     return s.replace(
-        pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, lowest)], axis=-1),
+        pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, surface_height)], axis=-1),
         vel=jnp.where(is_stopped, 0.0, s.vel),
         ang_vel=jnp.where(is_stopped, 0.0, s.ang_vel),
     )
@@ -156,7 +156,7 @@ def stop_below(s: SimState, lowest: Array | float) -> SimState:
 @_built_in_stage("drone")
 def clip_floor_pos(data: SimData) -> SimData:
     """Stop drones at the floor."""
-    return data.replace(states=stop_below(data.states, FLOOR_HEIGHT))
+    return data.replace(states=stop_at_surface(data.states, FLOOR_HEIGHT))
 
 
 @_built_in_stage("world")
@@ -166,7 +166,7 @@ def increment_steps(data: SimData) -> SimData:
 
 
 def watched_records(data: SimData) -> Any:
-    """Return the records whose NaN and infinities flag a world: states and commands of drones, other populations."""
+    """Return the records in which NaN or infinity flags a world: states and commands of drones, other populations."""
     populations = [record for record in data.plugins.values() if isinstance(record, Members)]
     return data.states, data.controls, populations
 

@@ -57,7 +57,7 @@ class Airframe:
             if not isinstance(node, Mapping):
                 raise ConfigError(
                     f"airframe {self.name!r} has no table [{path}], only {sorted(self.tables)}. "
-                    f"{self.why_missing(path)}Add [{path}] to the airframe; {GUIDE} lists its keys."
+                    f"{self.missing_reason(path)}Add [{path}] to the airframe; {GUIDE} lists its keys."
                 )
         return node
 
@@ -70,7 +70,7 @@ class Airframe:
         """
         if path not in self.values:
             raise ConfigError(
-                f"airframe {self.name!r} has no value {path!r}. {self.why_missing(path)}"
+                f"airframe {self.name!r} has no value {path!r}. {self.missing_reason(path)}"
                 f"{_lookup_advice(path, self.values)}"
             )
         value = self.values[path]
@@ -92,7 +92,7 @@ class Airframe:
         k0, k1, k2 = np.atleast_2d(self.value("rotors.thrust_curve")).T
         return (-k1 + np.sqrt(k1**2 - 4 * k2 * (k0 - np.asarray(thrust)))) / (2 * k2)
 
-    def why_missing(self, path: str) -> str:
+    def missing_reason(self, path: str) -> str:
         """Return the reason why a table or value of the base was not inherited, followed by a space; empty for none."""
         return f"{self.not_inherited} " if self.not_inherited and path.partition(".")[0] in TUNED_TABLES else ""
 

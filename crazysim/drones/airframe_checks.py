@@ -17,11 +17,12 @@ MAX_ANG_ACC = 1e6
 """Largest angular acceleration by the rotors, rad/s^2; built-in airframes have up to 14,000."""
 MAX_ROTOR_VEL = 1e6
 """Largest rotor speed, rpm; built-in airframes have up to 40,000."""
-MIN_LEVERAGE = 1e-3
+MIN_SINGULAR_VALUE = 1e-3
 """Smallest singular value of the mixing matrix; a quadrotor in X has 2."""
-EXCESS, ROUNDING = 0.05, 1e-5
-"""Relative excess of the largest moment of inertia over the sum of the others: up to ``EXCESS`` it is only a warning,
-as for moments that were measured one by one, and up to ``ROUNDING`` it is ignored. RotorPy's Crazyflie has 1%."""
+MAX_INERTIA_EXCESS, INERTIA_ROUNDING = 0.05, 1e-5
+"""Relative excess of the largest moment of inertia over the sum of the others: up to ``INERTIA_ROUNDING`` it is
+ignored, and up to ``MAX_INERTIA_EXCESS`` it is only a warning, since moments that were measured one by one can have
+such an excess. RotorPy's Crazyflie has 1%."""
 
 
 def check_airframe(airframe: Airframe) -> None:
@@ -47,8 +48,8 @@ def check_airframe(airframe: Airframe) -> None:
         check_numbers(owner, path, value, LAYOUT.keys[path], n)
     for path in ("rigid_body.mass", "rotors.yaw_torque_sign", "rotors.thrust_min", "rotors.thrust_max"):
         airframe.value(path)
-    for problem in (_check_inertia, _check_rotors, _check_curves, _check_forces, _check_controller, _check_camera):
-        message = problem(airframe)
+    for check in (_check_inertia, _check_rotors, _check_curves, _check_forces, _check_controller, _check_camera):
+        message = check(airframe)
         if message:
             raise ConfigError(f"{owner}: {message}. Check the number; {GUIDE} has the units.")
 
@@ -66,9 +67,9 @@ def _check_inertia(airframe: Airframe) -> str | None:
         f"expected an inertia whose largest moment is at most the sum of the others, as for every body, got "
         f"moments of {', '.join(f'{m:.4g}' for m in moments)} kg m^2"
     )
-    if excess > EXCESS:
+    if excess > MAX_INERTIA_EXCESS:
         return message
-    if excess > ROUNDING:
+    if excess > INERTIA_ROUNDING:
         remedy = "Measure the moments again, or lower the largest."
         text = f"airframe {airframe.name!r}: {message}: {100 * excess:.1f}% more. {remedy}"
         warn(text, AirframeWarning)
@@ -94,7 +95,7 @@ def _check_rotors(airframe: Airframe) -> str | None:
         return "expected rotors beside the centre of mass, got all of them at x = y = 0"
     axes = "x and y" if n < 4 else "x, y and z"  # three rotors cannot hold the heading as well
     mixing = np.vstack([np.ones(n), airframe.mixing_matrix])[: 3 if n < 4 else 4]
-    if np.linalg.matrix_rank(mixing, tol=MIN_LEVERAGE) < len(mixing):
+    if np.linalg.matrix_rank(mixing, tol=MIN_SINGULAR_VALUE) < len(mixing):
         return (
             f"expected rotors whose thrusts lift the drone and turn it about {axes}, each alone, got positions (x, y) "
             f"{short_repr(value('rotors.position')[:, :2].tolist())} m with "

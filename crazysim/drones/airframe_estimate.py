@@ -149,7 +149,7 @@ def estimate_airframe(
     ):
         if value is not None:
             read_number(key, value, POSITIVE)
-    file = _File(name)
+    file = _AirframeFile(name)
     rotor_pos, signs = _rotors(file, arm, n_rotors, layout, positions, spins, propeller)
     file.add("rigid_body", "mass", mass, "kg", "given")
     if inertia is None:
@@ -167,8 +167,8 @@ def estimate_airframe(
     thrust = _add_thrust(file, mass, len(rotor_pos), propeller, thrust_to_weight, motor_table, pitch)
     _check_units(mass, propeller, rotor_pos, thrust)
     file.add("rotors", "thrust_min", IDLE_THRUST_RATIO * thrust, "N", "thrust_min")
-    blade = 0.015 * (propeller / 0.279) ** 2
-    file.add("rotors", "inertia", blade * propeller**2 / 12, "kg m^2", "rotor_inertia")
+    propeller_mass = 0.015 * (propeller / 0.279) ** 2
+    file.add("rotors", "inertia", propeller_mass * propeller**2 / 12, "kg m^2", "rotor_inertia")
     tau = ROTOR_TIME_CONSTANT * max(1.0, propeller / 0.254) if time_constant is None else time_constant
     lag_unit = "1/s, 1/(s rpm) on spin-up; 1/s, 1/(s rpm) on spin-down"
     file.add("rotors", "lag", np.array([1 / tau, 0, 1 / tau, 0]), lag_unit, "given" if time_constant else "lag")
@@ -178,7 +178,7 @@ def estimate_airframe(
     return file.text()
 
 
-class _File:
+class _AirframeFile:
     """Text of an airframe: tables of numbers with units and sources."""
 
     def __init__(self, name: str) -> None:
@@ -228,7 +228,7 @@ def _toml_value(value: Any) -> str:
 
 
 def _rotors(
-    file: _File,
+    file: _AirframeFile,
     arm: Any,
     n_rotors: int,
     layout: str,
@@ -260,11 +260,11 @@ def _rotors(
         rotor_pos = np.pad(rotor_pos, ((0, 0), (0, 3 - rotor_pos.shape[1])))
     rotor_pos = np.where(np.abs(rotor_pos) < 1e-9, 0.0, rotor_pos)
     gaps = rotor_pos[:, None] - rotor_pos[None]
-    same_height = (np.abs(gaps[..., 2]) < 0.1 * propeller) & ~np.eye(len(rotor_pos), dtype=bool)
-    closest = np.min(np.linalg.norm(gaps[..., :2], axis=-1)[same_height], initial=np.inf)
-    if closest < propeller * (1 - 1e-6):
+    is_same_height = (np.abs(gaps[..., 2]) < 0.1 * propeller) & ~np.eye(len(rotor_pos), dtype=bool)
+    min_gap = np.min(np.linalg.norm(gaps[..., :2], axis=-1)[is_same_height], initial=np.inf)
+    if min_gap < propeller * (1 - 1e-6):
         raise ConfigError(
-            f"expected propellers that do not touch, got a diameter of {propeller:g} m and rotors {closest:.3g} m "
+            f"expected propellers that do not touch, got a diameter of {propeller:g} m and rotors {min_gap:.3g} m "
             f"apart. Use a longer arm, a smaller propeller (5 inches are 0.127 m), or other heights of the rotors."
         )
     if spins is None:
@@ -294,7 +294,7 @@ def _inertia(mass: float, rotor_pos: NDArray) -> NDArray:
 
 
 def _add_thrust(
-    file: _File,
+    file: _AirframeFile,
     mass: float,
     n: int,
     diameter: float,
@@ -317,15 +317,15 @@ def _add_thrust(
         thrust = float(np.max(rows["thrust"]))
         file.describe("motor_thrust", f"Largest thrust of the {table_name}")
         file.add("rotors", "thrust_max", thrust, "N", "motor_thrust")
-    beta = PITCH_RATIO if pitch is None else pitch / diameter
-    ct = 0.0427 + 0.144 * beta
+    pitch_ratio = PITCH_RATIO if pitch is None else pitch / diameter
+    ct = 0.0427 + 0.144 * pitch_ratio
     if "rpm" in rows:
         k, error = _fit_quadratic(rows["rpm"], rows["thrust"])
         file.describe("motor_curve", f"Least squares T = k rpm^2 to the {table_name}, off by at most {error:.2g} N")
         source = "motor_curve"
     else:
         k, source = ct * AIR_DENSITY * diameter**4 / 3600, "thrust_curve"
-    pitch_text = f"pitch {beta:g} D" + (" assumed" if pitch is None else "")
+    pitch_text = f"pitch {pitch_ratio:g} D" + (" assumed" if pitch is None else "")
     file.add("rotors", "thrust_curve", np.array([0, 0, k]), "N, N/rpm, N/rpm^2", source, ct=ct, pitch=pitch_text)
 
     area, to_rad = np.pi * diameter**2 / 4, 2 * np.pi / 60
@@ -336,8 +336,8 @@ def _add_thrust(
         file.describe("motor_torque", f"Least squares Q = k rpm^2 to the {table_name}, off by at most {error:.2g} N m")
         source = "motor_torque"
     elif "rpm" in rows and "power" in rows:
-        shaft = MOTOR_EFFICIENCY * rows["power"] / (rows["rpm"] * to_rad)
-        torque, error = _fit_quadratic(rows["rpm"], shaft)
+        shaft_torque = MOTOR_EFFICIENCY * rows["power"] / (rows["rpm"] * to_rad)
+        torque, error = _fit_quadratic(rows["rpm"], shaft_torque)
         file.describe(
             "motor_power",
             f"estimate: least squares Q = k rpm^2 to the {table_name}, with {MOTOR_EFFICIENCY:g} of the electric power "
@@ -423,7 +423,9 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
     return {key: [row[i] for row in rows] for i, key in enumerate(header)}
 
 
-def _add_battery(file: _File, mass: float, cells: int | None, capacity: float | None, resistance: float | None) -> None:
+def _add_battery(
+    file: _AirframeFile, mass: float, cells: int | None, capacity: float | None, resistance: float | None
+) -> None:
     n = cells or next(n for n, limit in ((1, 0.1), (3, 0.5), (4, 3.0), (6, np.inf)) if mass < limit)
     charge = capacity or BATTERY_SHARE * mass * BATTERY_ENERGY / (n * CELL_VOLTAGE)
     file.add("battery", "cells", n, "1, in series", "given" if cells else "cells")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazysim.drones.airframe import Airframe
 
 LED_MATERIALS = ("led_top", "led_bot")
-"""Materials that are copied for each drone, so that each drone can have other colours of its LEDs."""
+"""Materials that are copied for each drone, so that the LEDs of each drone can have their own colours."""
 
 MATERIALS = {
     "drone_carbon": (0.10, 0.10, 0.11, 1.0),
@@ -37,7 +37,7 @@ class BodyGeom:
     pos: NDArray
     """Centre, m. (3,)"""
     material: str = ""
-    """Name of the material; each drone has its own copy of those in ``LED_MATERIALS``."""
+    """Name of the material; each drone has its own copy of the materials in ``LED_MATERIALS``."""
     end: NDArray | None = None
     """Far end of a capsule that begins at ``pos``, m. (3,)"""
     name: str = ""
@@ -62,7 +62,7 @@ class BodyCamera:
     """True for a camera that follows the drone's position but not its attitude."""
 
 
-def outline(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
+def body_shape(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
     """Return the table ``[shape]`` of an airframe, with defaults for missing keys.
 
     The defaults follow from the rotors' positions, and the battery's size from the mass, in the proportions of the
@@ -73,9 +73,9 @@ def outline(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
     height = float(np.mean(rotors[:, 2]))
     gaps = np.linalg.norm(rotors[:, None, :2] - rotors[None, :, :2], axis=-1)
     spacing = float(np.min(gaps[gaps > 0], initial=2 * reach))
-    unit = (BATTERY_VOLUME * float(airframe.value("rigid_body.mass")) / 6) ** (1 / 3)
+    battery_thickness = (BATTERY_VOLUME * float(airframe.value("rigid_body.mass")) / 6) ** (1 / 3)
     shape = {
-        "battery": np.array([3, 2, 1]) * unit,
+        "battery": np.array([3, 2, 1]) * battery_thickness,
         "plate": np.array([0.75, 0.55, 0.04]) * reach,
         "arm_radius": 0.04 * reach,
         "motor_radius": 0.08 * reach,
@@ -88,8 +88,8 @@ def outline(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
     plate, battery, led = shape["plate"], shape["battery"], shape["led_radius"]
     shape = {"battery_height": (plate[2] + battery[2]) / 2} | shape
     battery_top = shape["battery_height"] + battery[2] / 2
-    half = max(0.5 * shape["motor_height"] + shape["propeller_height"], abs(height) / 2 + battery[2])
-    sides = np.max(np.abs(rotors[:, :2]), axis=0) + shape["propeller_radius"]
+    half_height = max(0.5 * shape["motor_height"] + shape["propeller_height"], abs(height) / 2 + battery[2])
+    half_sides = np.max(np.abs(rotors[:, :2]), axis=0) + shape["propeller_radius"]
     camera_distance = 0.7 + 7 * reach
     shape = {
         "led_heights": np.array(
@@ -97,7 +97,7 @@ def outline(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
         )
         + led / 2 * np.array([1, -1]),
         "collision_sphere": np.array([0, 0, height / 2, reach + shape["propeller_radius"]]),
-        "collision_box": np.array([0, 0, height / 2, *sides, half]),
+        "collision_box": np.array([0, 0, height / 2, *half_sides, half_height]),
         "fpv_camera": np.array([0.9 * plate[0], 0, 0]),
         "track_camera": np.array([-camera_distance, 0, camera_distance / 2]),
     } | shape
@@ -109,7 +109,7 @@ def body_geoms(airframe: Airframe) -> list[BodyGeom]:
 
     Only ``col_sphere`` and ``col_box`` collide; all other geoms are rendered.
     """
-    shape = outline(airframe)
+    shape = body_shape(airframe)
     plate, battery, led = shape["plate"] / 2, shape["battery"] / 2, float(shape["led_radius"])
     geoms = [
         BodyGeom("box", plate, np.zeros(3), "drone_plate"),
@@ -117,15 +117,20 @@ def body_geoms(airframe: Airframe) -> list[BodyGeom]:
         # A coloured bar over the leading edge shows the heading of a drone seen from afar.
         BodyGeom("box", plate * [0.1, 0.7, 1.6], np.array([0.95 * plate[0], 0, 0]), "drone_nose"),
     ]
-    motor, height = float(shape["motor_radius"]), float(shape["motor_height"])
-    disc = np.array([float(shape["propeller_radius"]), 0.03 * motor + 5e-4, 0])
+    motor_radius, motor_height = float(shape["motor_radius"]), float(shape["motor_height"])
+    disc_size = np.array([float(shape["propeller_radius"]), 0.03 * motor_radius + 5e-4, 0])
     for rotor in airframe.value("rotors.position"):
-        arm = np.array([float(shape["arm_radius"]), 0, 0])
+        arm_size = np.array([float(shape["arm_radius"]), 0, 0])
         hub = rotor + [0, 0, float(shape["propeller_height"])]
         geoms += [
-            BodyGeom("capsule", arm, np.zeros(3), "drone_carbon", end=rotor),
-            BodyGeom("cylinder", np.array([motor, height / 2, 0]), rotor + [0, 0, 0.3 * height], "drone_metal"),
-            BodyGeom("cylinder", disc, hub, "drone_propeller"),
+            BodyGeom("capsule", arm_size, np.zeros(3), "drone_carbon", end=rotor),
+            BodyGeom(
+                "cylinder",
+                np.array([motor_radius, motor_height / 2, 0]),
+                rotor + [0, 0, 0.3 * motor_height],
+                "drone_metal",
+            ),
+            BodyGeom("cylinder", disc_size, hub, "drone_propeller"),
         ]
     for material, z in zip(LED_MATERIALS, shape["led_heights"], strict=True):
         geoms.append(BodyGeom("ellipsoid", np.array([led, led, led / 2]), np.array([0, 0, z]), material))
@@ -139,7 +144,7 @@ def body_geoms(airframe: Airframe) -> list[BodyGeom]:
 
 def body_cameras(airframe: Airframe) -> list[BodyCamera]:
     """Return ``fpv_cam``, which looks ahead from the drone, and ``track_cam``, which follows it from behind."""
-    shape = outline(airframe)
+    shape = body_shape(airframe)
     camera_pos = shape["track_camera"]
     # Looking ahead from behind: right is body -y, and up is tilted forward by as much as the camera looks down.
     camera_up = np.array([-camera_pos[2] * np.sign(camera_pos[0]), 0, abs(camera_pos[0])]) / np.hypot(

@@ -1,4 +1,4 @@
-"""Tables and keys of an airframe, and the check that a file or dict has no others."""
+"""Tables and keys of an airframe, with the shape and the range of each number."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from crazysim.tables import (
 )
 
 GUIDE = "docs/guides/airframes.md"
+"""Page that lists the keys, for messages."""
 
 _NUMBER: Shapes = ((),)
 _VECTOR: Shapes = ((3,),)

@@ -50,7 +50,7 @@ def is_airframe_file(source: object) -> bool:
 
 
 def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
-    """Return the airframe of a source, given the chain of airframes that it is a base of."""
+    """Return the airframe of a source; ``bases`` are the sources that led to it, each the base of the previous one."""
     if isinstance(source, Airframe):
         return source
     bases = extend_bases(bases, source)
@@ -82,7 +82,7 @@ def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, 
     numbers = {path: x for path, x in old.items() if path.partition(".")[0] not in TUNED_TABLES}
     ratio = "controller.thrust2torque"
     if ratio in old and not {"rotors.thrust_curve", "rotors.torque_curve"} & set(changes):
-        numbers[ratio] = old[ratio]  # of the propellers alone
+        numbers[ratio] = old[ratio]  # it depends on the propellers only
     names = _join_names(f"[{table}]" for table in lost_tables)
     reason = (
         f"Its base {base.name!r} has {names}, which fit another {_join_names(changed_paths)} and are not inherited."
@@ -91,5 +91,5 @@ def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, 
 
 
 def _join_names(names: Iterable[str]) -> str:
-    *first, last = names
-    return f"{', '.join(first)} and {last}" if first else last
+    *first_names, last_name = names
+    return f"{', '.join(first_names)} and {last_name}" if first_names else last_name

@@ -169,12 +169,12 @@ def pad_rotors(params: Params, n_rotors: int) -> Params:
 
     def extend(x: Array, axis: int) -> np.ndarray:
         array = np.asarray(x)
-        padded_params = (
+        per_rotor = (
             np.broadcast_to(array, [*array.shape[:axis], n_present, *array.shape[axis + 1 :]])
             if array.shape[axis] == 1
             else array
         )
-        return np.pad(padded_params, [(0, n_rotors - n_present if k == axis else 0) for k in range(array.ndim)])
+        return np.pad(per_rotor, [(0, n_rotors - n_present if k == axis else 0) for k in range(array.ndim)])
 
     curves = {name: extend(getattr(params, name), 0) for name in ("rpm2thrust", "rpm2torque")}
     limits = {name: extend(getattr(params, name), 0) for name in ("rotor_vel_min", "rotor_vel_max")}

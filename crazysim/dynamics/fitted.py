@@ -183,13 +183,13 @@ def _euler_spring(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Arr
     acc = p.rpy_coef * rpy + p.rpy_rates_coef * rates + p.cmd_rpy_coef * cmd_rpy
     roll_acc, pitch_acc, yaw_acc = acc[..., 0], acc[..., 1], acc[..., 2]
     # ang_vel = E(rpy) rpy', so ang_vel' = E rpy'' + E' rpy'.
-    along_pitch = -sr * roll_rate * pitch_rate + (cr * cp * roll_rate - sr * sp * pitch_rate) * yaw_rate
-    along_yaw = -cr * roll_rate * pitch_rate - (sr * cp * roll_rate + cr * sp * pitch_rate) * yaw_rate
+    y_terms = -sr * roll_rate * pitch_rate + (cr * cp * roll_rate - sr * sp * pitch_rate) * yaw_rate
+    z_terms = -cr * roll_rate * pitch_rate - (sr * cp * roll_rate + cr * sp * pitch_rate) * yaw_rate
     return jnp.stack(
         [
             roll_acc - sp * yaw_acc - cp * pitch_rate * yaw_rate,
-            cr * pitch_acc + sr * cp * yaw_acc + along_pitch,
-            -sr * pitch_acc + cr * cp * yaw_acc + along_yaw,
+            cr * pitch_acc + sr * cp * yaw_acc + y_terms,
+            -sr * pitch_acc + cr * cp * yaw_acc + z_terms,
         ],
         axis=-1,
     )

@@ -87,11 +87,11 @@ def thrust_in_flight(
         air_density: Density of air, kg/m^3. (...)
         ceiling: ``ceiling_factor`` g, 1. (...)
     """
-    static = jnp.where(static_thrust > 0, static_thrust, 0.0)
+    hover_thrust = jnp.where(static_thrust > 0, static_thrust, 0.0)
     disc, loss = disc_factor(radius, air_density), blade * ang_vel
-    tip = radius * ang_vel
-    advance = in_plane_square / (tip * tip + in_plane_square + MIN_AIR_SPEED**2)
-    lift = (static + loss * safe_sqrt(static / disc)) * (1 + 1.5 * advance)
+    tip_speed = radius * ang_vel
+    advance_squared = in_plane_square / (tip_speed * tip_speed + in_plane_square + MIN_AIR_SPEED**2)
+    lift = (hover_thrust + loss * safe_sqrt(hover_thrust / disc)) * (1 + 1.5 * advance_squared)
 
     disc = disc * ceiling * ceiling
     in_plane = in_plane_square + MIN_AIR_SPEED**2
@@ -107,7 +107,7 @@ def thrust_in_flight(
 
 
 def ceiling_factor(gap: Array, radius: Array) -> Array:
-    """Return half the ratio of the velocity in the far wake to that at the disc, below a ceiling, 1. (...)
+    """Return half the ratio of the air speed in the far wake to the air speed at the disc, below a ceiling, 1. (...)
 
     ``1/2 + 1/2 sqrt(1 + (R / d)^2 / 8)`` for a disc at a distance d. The air flows in below the ceiling, at
     ``v r / 2 d`` where it is r from the axis (conservation of mass), so that its suction there is

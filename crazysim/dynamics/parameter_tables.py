@@ -14,24 +14,24 @@ from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.errors import ConfigError, UnknownNameError
 
 CASCADE_NAME = "mellinger"
-"""Name of the cascade."""
-_CONSTANTS = ("mass", "mass_thrust", "pwm_min", "pwm_max", "torque_pwm_max", "thrust2torque")
-_ROTORS = {
+"""Crazyflow's name for its cascade of controllers."""
+_CORE_KEYS = ("mass", "mass_thrust", "pwm_min", "pwm_max", "torque_pwm_max", "thrust2torque")
+_ROTOR_NAMES = {
     "thrust_curve": "rpm2thrust",
     "torque_curve": "rpm2torque",
     "thrust_min": "thrust_min",
     "thrust_max": "thrust_max",
 }
-_STATE = ("kp", "kd", "ki", "int_err_max")
-_ATTITUDE = ("kR", "kw", "ki_m", "kd_omega", "int_err_max")
-SOURCES: tuple[tuple[str, str, dict[str, str]], ...] = (
-    ("core", "controller", {key: key for key in _CONSTANTS}),
-    ("core", "rotors", _ROTORS),
-    ("state2attitude", "controller.state", {key: key for key in _STATE}),
-    ("attitude2force_torque", "controller.attitude", {key: key for key in _ATTITUDE}),
-    ("body_rate2force_torque", "controller.attitude", {key: key for key in _ATTITUDE}),
+_STATE_KEYS = ("kp", "kd", "ki", "int_err_max")
+_ATTITUDE_KEYS = ("kR", "kw", "ki_m", "kd_omega", "int_err_max")
+CRAZYFLOW_TABLES: tuple[tuple[str, str, dict[str, str]], ...] = (
+    ("core", "controller", {key: key for key in _CORE_KEYS}),
+    ("core", "rotors", _ROTOR_NAMES),
+    ("state2attitude", "controller.state", {key: key for key in _STATE_KEYS}),
+    ("attitude2force_torque", "controller.attitude", {key: key for key in _ATTITUDE_KEYS}),
+    ("body_rate2force_torque", "controller.attitude", {key: key for key in _ATTITUDE_KEYS}),
 )
-"""Crazyflow's table, the airframe's table from which it is filled, and Crazyflow's name for each key of the latter."""
+"""Crazyflow's table, the airframe's table with its values, and Crazyflow's name for each key of the airframe's."""
 
 
 def load_params(
@@ -115,7 +115,7 @@ def load_controller_params(
     airframe = load_airframe(drone)
     core = {"gravity_vec": GRAVITY, "L": airframe.arm, "mixing_matrix": airframe.mixing_matrix}
     tables: dict[str, dict[str, Any]] = {"core": core}
-    for name, table, keys in SOURCES:
+    for name, table, keys in CRAZYFLOW_TABLES:
         airframe_table = airframe.table(table)
         tables.setdefault(name, {}).update(
             {new: airframe.value(f"{table}.{k}") for k, new in keys.items() if k in airframe_table}
@@ -151,6 +151,8 @@ def rotor_vel_limits(dynamics: Dynamics | str, drone: AirframeSource) -> tuple[f
 
 def convert_arrays(params: dict[str, Any], xp: ModuleType | None, device: Any) -> dict[str, Any]:
     """Return a dict, or a dict of dicts, with its values as arrays of a module."""
-    make = (np if xp is None else xp).asarray
+    as_array = (np if xp is None else xp).asarray
     options = {} if device is None else {"device": device}
-    return {k: convert_arrays(v, xp, device) if isinstance(v, dict) else make(v, **options) for k, v in params.items()}
+    return {
+        k: convert_arrays(v, xp, device) if isinstance(v, dict) else as_array(v, **options) for k, v in params.items()
+    }

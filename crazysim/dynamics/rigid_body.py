@@ -76,8 +76,8 @@ def stable_angular_acceleration(
     """
     square = dot(ang_vel, ang_vel)
     slope = 0.5 * dt * (1 + MIN_STABLE_ANGLE**2) / (MIN_STABLE_ANGLE**2 - MAX_EXPLICIT_ANGLE**2)
-    rising = jnp.maximum(slope * dt**2 * square - slope * MAX_EXPLICIT_ANGLE**2, 0.0)
-    theta_dt = jnp.minimum(rising, 0.5 * dt + 0.5 * dt**3 * square)
+    ramp = jnp.maximum(slope * dt**2 * square - slope * MAX_EXPLICIT_ANGLE**2, 0.0)
+    theta_dt = jnp.minimum(ramp, 0.5 * dt + 0.5 * dt**3 * square)
 
     ang_momentum = matvec(J, ang_vel, rotor_momentum)
     impulse = theta_dt * cross(ang_momentum, ang_vel)

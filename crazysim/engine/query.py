@@ -49,7 +49,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     rows: dict[str, Array] = {}
     shapes, trees, stages = [], [], []
     for number, (scope, fn) in enumerate(queries):
-        template = axes.treedef.unflatten(axes.shapes_of_one(leaves, scope))
+        template = axes.treedef.unflatten(axes.unbatched_shapes(leaves, scope))
         outs, treedef = jax.tree.flatten(jax.eval_shape(fn, template))
         names = [f"{number} {k}" for k in range(len(outs))]
         per_drone = [x.shape[1:] if scope == "world" else x.shape for x in outs]

@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium
 
 from crazysim.control import Control
-from crazysim.core.plugin import Plugin, plugin_list
+from crazysim.core.plugin import Plugin, check_plugin_list
 from crazysim.core.settings import enum_member, positive_integer
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv, Env
@@ -138,7 +138,7 @@ def make(
     settings |= {k: v for k, v in options.items() if k in SIM_OPTIONS}
     task_options = {k: v for k, v in options.items() if k in entry.options}
     task = entry.task(**task_options) if isinstance(task, str) else dataclasses.replace(task, **task_options)
-    plugins = [*plugin_list("effects", effects), *plugin_list("sensors", sensors)]
+    plugins = [*check_plugin_list("effects", effects), *check_plugin_list("sensors", sensors)]
     if randomize is not None:
         if randomize not in RANDOMIZATIONS:
             raise ConfigError(
@@ -158,7 +158,7 @@ def make(
         sim.add(plugin)
     env = DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
     if camera is not None:
-        for source in [camera] if isinstance(camera, ImageSensor) else plugin_list("camera", camera):
+        for source in [camera] if isinstance(camera, ImageSensor) else check_plugin_list("camera", camera):
             env = CameraImages(env, source)  # type: ignore[arg-type]  # checked there
     if depth_image is None:
         own_camera = task.policy_camera() if camera is None else None

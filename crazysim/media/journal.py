@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.storage import Closing, read_arrays
+from crazysim.storage import Closeable, read_arrays
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ CHUNK_HEADER = struct.Struct("<4sQI")
 """Head of a chunk: kind, length of the content, checksum."""
 
 
-class Journal(Closing):
+class Journal(Closeable):
     """File to which chunks are appended."""
 
     path: Path

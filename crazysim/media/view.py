@@ -57,7 +57,7 @@ class View:
     """Duration of the drones' trails, s; 0 for none."""
     setpoints: bool = False
     """True to draw the positions of state commands, as spheres."""
-    rgba: ArrayLike | None = color(n=True)
+    rgba: ArrayLike | None = color(per_item=True)
     """Colour of trails and setpoints, one or one per drone; None for default colours."""
     text: str | None = None
     """ASCII text at the top left of each world, with the fields ``{world}`` and ``{time}``; None for none."""

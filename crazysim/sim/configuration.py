@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
-from crazysim.core.airframes import AirframeSource, is_list, load_airframes
-from crazysim.core.controls import require_controller, require_pair, require_same_controllers
+from crazysim.core.airframes import AirframeSource, is_airframe_list, load_airframes
+from crazysim.core.controls import check_command_level, check_controller, check_same_controllers
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
-from crazysim.core.plugin import Plugin, plugin_list
+from crazysim.core.plugin import Plugin, check_plugin_list
 from crazysim.core.settings import (
     check_flag,
     check_rates,
@@ -92,7 +92,7 @@ class Configuration:
                 f"expected data of {_describe_settings(*expected)}, got data of {_describe_settings(*settings)}. Use "
                 f"data of this simulation, or of one with the same settings."
             )
-        require_same_controllers(controls, reference.controls, getattr(self.controller, "name", None))
+        check_same_controllers(controls, reference.controls, getattr(self.controller, "name", None))
 
     @staticmethod
     def create(
@@ -117,10 +117,10 @@ class Configuration:
             positive_integer("n_drones", n_drones),
             physics_freq(freq),
         )
-        n_drones = len(drone) if n_drones == 1 and is_list(drone) and len(drone) else n_drones
+        n_drones = len(drone) if n_drones == 1 and is_airframe_list(drone) and len(drone) else n_drones
         dynamics, control = enum_member(Dynamics, "dynamics", dynamics), enum_member(Control, "control", control)
         integrator = enum_member(Integrator, "integrator", integrator)
-        require_pair(dynamics, control)
+        check_command_level(dynamics, control)
         airframes = load_airframes(drone, n_drones)
         for airframe in dict.fromkeys(airframes):
             require_support(airframe, dynamics)
@@ -128,7 +128,7 @@ class Configuration:
         for member in controller.members:
             check_settings(member)
         controller = controller.adapt(control, None if dynamics == Dynamics.first_principles else dynamics)
-        require_controller(dynamics, control, controller)
+        check_controller(dynamics, control, controller)
         check_rates(control, freq, rates)
         controller = controller and controller_at_rates(controller, control, freq, rates)
         freqs = control_freqs(control, freq, rates, controller)
@@ -157,7 +157,7 @@ def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None
         from crazysim.plugins.effects import Residual
 
         shorthand_plugins.append(Residual())
-    return [*shorthand_plugins, *plugin_list("plugins", plugins)]
+    return [*shorthand_plugins, *check_plugin_list("plugins", plugins)]
 
 
 def _describe_settings(n_worlds: int, n_drones: int, freq: int, control: Control, is_fitted: bool) -> str:

@@ -22,7 +22,7 @@ from crazysim.core.airframes import AirframeSource, drone_names, find_common_air
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
 from crazysim.core.pipeline import BuiltPipeline, Pipeline
-from crazysim.core.plugin import Plugin, plugin_list
+from crazysim.core.plugin import Plugin, check_plugin_list
 from crazysim.core.random import seed_sim
 from crazysim.core.settings import check_flag, positive_integer
 from crazysim.core.sharding import shard
@@ -207,7 +207,7 @@ class Sim:
         Raises:
             ConfigError: If the file cannot be read, or has no drone.
         """
-        plugin_list("plugins", plugins)
+        check_plugin_list("plugins", plugins)
         spec, drones, populations = read_vehicles(xml_path, kinds or {})
         sim = cls(n_worlds, len(drones), [v.kind for v in drones], xml_path=spec, **settings)  # type: ignore[arg-type]
         sim.drone_names = tuple([v.name for v in drones])

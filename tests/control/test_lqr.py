@@ -15,7 +15,7 @@ from crazysim.control.lqr import LQR, LQRParams, flat_reference, hover_gain, lqr
 from crazysim.control.tracking_lqr import (
     TrackingLQR,
     error_derivative,
-    gain_at,
+    interpolate_gain,
     tracking_gains,
     tracking_lqr_control,
 )
@@ -183,7 +183,7 @@ def test_gains_along_a_hover_are_those_of_hover():
 def test_the_table_is_interpolated_and_held():
     gains = np.arange(3.0)[:, None, None] * np.ones((4, 12))
     for time, expected in ((-1, 0), (0.05, 0.5), (0.1, 1), (0.17, 1.7), (9, 2)):
-        np.testing.assert_allclose(jax.jit(gain_at)(np.float32(time), gains, 0.1), expected, rtol=1e-6)
+        np.testing.assert_allclose(jax.jit(interpolate_gain)(np.float32(time), gains, 0.1), expected, rtol=1e-6)
 
 
 # Flights ----------------------------------------------------------------------------------------------------------

@@ -105,7 +105,7 @@ def test_gradients_pass_through_populations():
     def loss(cmd):
         data = sim.data
         for population, own in zip(sim.plugins.values(), cmd, strict=True):
-            data = population.commanded(data, own)
+            data = population.with_command(data, own)
         data = step(data, 5)
         return sum(jnp.sum(record.pos**2) for record in data.plugins.values()) + jnp.sum(data.states.pos)
 
@@ -338,9 +338,9 @@ def test_commands_of_another_shape_are_refused():
     sim = build(Springs, 2, 2, 3)
     springs = sim.plugins["springs"]
     with pytest.raises(ValueError, match=r"expected a command of shape \(2, 3, 3\) for 'springs', got \(3,\)"):
-        springs.commanded(sim.data, np.zeros(3))
+        springs.with_command(sim.data, np.zeros(3))
     with pytest.raises(ValueError, match="expected finite numbers as command of 'springs'"):
-        springs.commanded(sim.data, np.full((2, 3, 3), np.nan))
+        springs.with_command(sim.data, np.full((2, 3, 3), np.nan))
 
     class Still(Population):
         name: str = "still"
@@ -390,7 +390,7 @@ def test_the_step_is_used_inside_jit_and_vmap():
     step = Step(sim.step_pipeline, "lanes")
 
     def final(cmd):
-        return step(sim.plugins["springs"].commanded(sim.data, cmd), 3).plugins["springs"].pos
+        return step(sim.plugins["springs"].with_command(sim.data, cmd), 3).plugins["springs"].pos
 
     commands = np.stack([np.ones((2, 3, 3), np.float32), np.zeros((2, 3, 3), np.float32)])
     both = np.asarray(jax.jit(jax.vmap(final))(commands))

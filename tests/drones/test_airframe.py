@@ -11,7 +11,7 @@ import pytest
 from crazysim import ConfigError, Sim
 from crazysim.control import AllocationParams, AttitudeParams, StateParams
 from crazysim.drones import Airframe, Drone, airframe_names, load_airframe
-from crazysim.drones.body import body_geoms, outline
+from crazysim.drones.body import body_geoms, body_shape
 from crazysim.drones.keys import LAYOUT, TABLES
 from crazysim.drones.loading import AIRFRAME_FOLDER
 from crazysim.dynamics import Dynamics, first_principles, fitted, supported_drones, supported_dynamics
@@ -630,15 +630,15 @@ def test_full_thrust_voltage_is_that_of_the_firmwares_curves():
 def test_a_body_without_a_shape_is_about_as_large_as_the_real_one(name):
     """Lengths that are left out follow from mass and rotors: within a factor of 2.1, spheres of contact within 20%."""
     tables = plain(name)
-    true = outline(load_airframe(tables))
-    derived = outline(load_airframe({k: v for k, v in tables.items() if k != "shape"}))
+    true = body_shape(load_airframe(tables))
+    derived = body_shape(load_airframe({k: v for k, v in tables.items() if k != "shape"}))
     assert set(derived) == set(TABLES["shape"])
     for key in ("plate", "battery", "arm_radius", "motor_radius", "propeller_radius"):
         ratio = (derived[key] / true[key]).ravel()[:2]  # not the thickness of the plate
         assert np.all((ratio > 1 / 2.1) & (ratio < 2.1)), (key, ratio)
     np.testing.assert_allclose(derived["collision_sphere"][3], true["collision_sphere"][3], rtol=0.2)
     assert {key: value.shape for key, value in derived.items()} == {k: v.shapes[0] for k, v in TABLES["shape"].items()}
-    some = outline(load_airframe(tables | {"shape": {"propeller_radius": 0.02}}))
+    some = body_shape(load_airframe(tables | {"shape": {"propeller_radius": 0.02}}))
     assert some["propeller_radius"] == 0.02
     np.testing.assert_allclose(some["plate"], derived["plate"])
 

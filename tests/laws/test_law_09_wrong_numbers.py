@@ -16,7 +16,7 @@ import crazysim.plugins
 from crazysim import Sim
 from crazysim.core.plugin import FunctionPlugin, Plugin
 from crazysim.core.population import Population
-from crazysim.core.settings import alternatives, collect_settings
+from crazysim.core.settings import allowed_types, collect_settings
 from crazysim.envs.task import Task
 from crazysim.envs.tasks.bring_load import BringLoad
 from crazysim.envs.tasks.goals import GoalTask
@@ -106,7 +106,7 @@ OTHERS = [Origin, Playback, Rules, Triad, Twin, *classes(PathController)]
 
 
 def is_numeric(kind, name):
-    return {int, float, np.ndarray} & set(alternatives(kind)[name])
+    return {int, float, np.ndarray} & set(allowed_types(kind)[name])
 
 
 def numeric_fields(kind):
@@ -124,7 +124,7 @@ def example(kind, **changes):
 
 def impossible(kind, name, declared, rng):
     """Yield values that no field of its kind may have: not finite ones, other types, and those out of its range."""
-    given, kinds = getattr(example(kind), name), alternatives(kind)[name]
+    given, kinds = getattr(example(kind), name), allowed_types(kind)[name]
     is_whole = declared.dtype is not None or int in kinds
     yield from () if str in kinds else ("1.0", "")
     yield from (
@@ -175,8 +175,8 @@ def test_impossible_numbers_are_refused_where_they_are_given(kind):
     for name, declared in fields:
         for value in impossible(kind, name, declared, rng):
             found.append(refused(lambda name=name, value=value: example(kind, **{name: value}), f"{name}={value!r}"))
-    for name in alternatives(kind):
-        if name not in dict(fields) and type(None) not in alternatives(kind)[name] and alternatives(kind)[name]:
+    for name in allowed_types(kind):
+        if name not in dict(fields) and type(None) not in allowed_types(kind)[name] and allowed_types(kind)[name]:
             found += [refused(lambda name=name: example(kind, **{name: None}), f"{name}=None")]
             found += [refused(lambda name=name: example(kind, **{name: np.nan}), f"{name}=nan")]
     assert not [text for text in found if text], "\n".join(text for text in found if text)
@@ -195,7 +195,7 @@ def test_every_setting_of_a_package_has_a_type_that_is_checked():
     for kind in [*PLUGINS, *OTHERS, *TASKS]:
         for field in dataclasses.fields(kind):
             is_number = re.search(r"\b(float|int|ArrayLike)\b", str(field.type))
-            if is_number and not alternatives(kind)[field.name]:
+            if is_number and not allowed_types(kind)[field.name]:
                 missed.append(f"{kind.__name__}.{field.name}")
     assert sorted(missed) == UNCHECKED
 
@@ -237,7 +237,7 @@ def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added_and_change
     sim, found = sims(kind), []
     before = parts(sim)
     for name, declared in numeric_fields(kind):
-        if np.ndarray not in alternatives(kind)[name] and not declared.is_parameter:
+        if np.ndarray not in allowed_types(kind)[name] and not declared.is_parameter:
             continue
         low, high = max(declared.range.low, -1.0), min(declared.range.high, 1.0)
         fill = 1 if declared.dtype else 0.5 * (low + high)

@@ -43,15 +43,17 @@ def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
         raise ConfigError("expected a time that increases, got repeated or earlier samples. Drop them first.")
     dt = np.diff(time)
     half_window = max(1, round(MEDIAN_DURATION / 2 / float(np.mean(dt))))
-    middle = np.stack([np.median(pos[max(0, k - half_window) : k + half_window + 1], axis=0) for k in range(len(time))])
-    is_valid = ~np.any(np.abs(pos - middle) > OUTLIER_DISTANCE, axis=-1)
+    median_pos = np.stack(
+        [np.median(pos[max(0, k - half_window) : k + half_window + 1], axis=0) for k in range(len(time))]
+    )
+    is_valid = ~np.any(np.abs(pos - median_pos) > OUTLIER_DISTANCE, axis=-1)
     if np.sum(is_valid) < 2:
         raise ConfigError("expected positions along a path, got jumps at nearly every sample. Check their unit.")
     sign = np.cumprod(np.r_[1.0, np.where(np.sum(quat[1:] * quat[:-1], axis=-1) < 0, -1.0, 1.0)])
     quat = sign[:, None] * quat
     pos, quat = (np.stack([np.interp(time, time[is_valid], c[is_valid]) for c in x.T], axis=-1) for x in (pos, quat))
-    first = np.mean(quat[: max(1, round(LEVEL_DURATION / float(np.mean(dt))))], axis=0)
-    inverse = first / np.linalg.norm(first) * [-1, -1, -1, 1]
+    level_quat = np.mean(quat[: max(1, round(LEVEL_DURATION / float(np.mean(dt))))], axis=0)
+    inverse = level_quat / np.linalg.norm(level_quat) * [-1, -1, -1, 1]
     quat = np.asarray(rotation.multiply(jnp.asarray(inverse), jnp.asarray(quat)), np.float64)
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     rpy = np.unwrap(np.asarray(rotation.to_rpy(jnp.asarray(quat)), np.float64), axis=0)

@@ -46,7 +46,7 @@ def sys_id_translation(
         dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
         mass: Mass, kg.
         data: A log from ``derivatives_svf``.
-        data_validation: Another one, whose error is logged.
+        data_validation: A log that is not fitted, for which the error is reported; None for none.
         gravity: Gravitational acceleration, world frame, m/s^2. (3,)
         verbose: Ignored: results are logged at level INFO.
         plot: Accepted as False only; ``crazysim identify --dynamics ... --plot`` draws errors.
@@ -78,7 +78,7 @@ def sys_id_rotation(
 
     Args:
         data: A log from ``derivatives_svf``.
-        data_validation: Another one, whose error is logged.
+        data_validation: A log that is not fitted, for which the error is reported; None for none.
         verbose: Ignored: results are logged at level INFO.
         plot: Accepted as False only; ``crazysim identify --dynamics ... --plot`` draws errors.
 
@@ -90,10 +90,10 @@ def sys_id_rotation(
     values, _ = fit_rotation([data])
     for name, log in (("data", data), ("validation", data_validation)):
         if log is not None:
-            rest_errors = [
+            axis_errors = [
                 _rotation_error(np.array([x[k] for x in values.values()]), *_angles(log, [k])) for k in range(3)
             ]
-            logger.info("rotation, %s: RMSE of roll, pitch, yaw %s rad", name, [f"{_rms(x):.4g}" for x in rest_errors])
+            logger.info("rotation, %s: RMSE of roll, pitch, yaw %s rad", name, [f"{_rms(x):.4g}" for x in axis_errors])
     return values
 
 
@@ -174,7 +174,7 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
 def _terms(
     kind: Dynamics, mass: float, log: Mapping[str, ArrayLike], rate: float, gravity: ArrayLike
 ) -> tuple[NDArray, NDArray]:
-    """Return the acceleration per coefficient, (n, 3, k), and that by all forces except gravity, (n, 3), m/s^2."""
+    """Return the acceleration per coefficient, (n, 3, k), and the one by all forces but gravity, (n, 3), m/s^2."""
     time, vel, acc, quat, cmd = (
         np.asarray(log[key], np.float64) for key in ("time", "SVF_vel", "SVF_acc", "SVF_quat", "SVF_cmd_f")
     )
@@ -227,15 +227,15 @@ def _simulate(x: Array, dt: float, cmd: Array, start: Array) -> Array:
         [zero, zero, zero, 1 / dt],
         [zero, zero, zero, zero],
     ])  # fmt: skip
-    move = jax.scipy.linalg.expm(system * dt)[:2]
+    transition = jax.scipy.linalg.expm(system * dt)[:2]
 
-    def step(state: Array, u: tuple[Array, Array]) -> tuple[Array, Array]:
-        now, change = u
-        new = move[:, :2] @ state + move[:, 2:3] * now + move[:, 3:4] * change
-        return new, new[0]
+    def step(state: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
+        u, change = inputs
+        new_state = transition[:, :2] @ state + transition[:, 2:3] * u + transition[:, 3:4] * change
+        return new_state, new_state[0]
 
-    _, path = jax.lax.scan(step, start, (cmd[:-1], jnp.diff(cmd, axis=0)))
-    return jnp.concatenate([start[:1], path])
+    _, angles = jax.lax.scan(step, start, (cmd[:-1], jnp.diff(cmd, axis=0)))
+    return jnp.concatenate([start[:1], angles])
 
 
 @jax.jit

@@ -226,8 +226,8 @@ cotangent_p = jaxcompat.primitive_by_platform(
     "crazysim_cotangents",
     _cotangent_shapes,
     {"cpu": partial(_cotangents, "cpu"), "cuda": partial(_cotangents, "gpu")},
-    derivative=_cotangents_on_lanes,
-    batched=_batching_rule,
+    differentiable_fn=_cotangents_on_lanes,
+    batching_rule=_batching_rule,
 )
 """Cotangents before some steps, from the cotangents of the floats after them."""
 
@@ -235,9 +235,9 @@ tangent_p = jaxcompat.primitive_by_platform(
     "crazysim_tangents",
     _tangent_shapes,
     {"cpu": partial(_tangents, "cpu"), "cuda": partial(_tangents, "gpu")},
-    derivative=_tangents_on_lanes,
-    transposed=_transpose,
-    batched=_batching_rule,
+    differentiable_fn=_tangents_on_lanes,
+    transpose_rule=_transpose,
+    batching_rule=_batching_rule,
 )
 """Tangents of the floats after some steps, from the tangents before them."""
 
@@ -265,7 +265,7 @@ advance_p = jaxcompat.primitive_by_platform(
     "crazysim_advance",
     _shapes,
     {"": _advance},
-    derivative=_advance_on_lanes,
-    batched=jaxcompat.make_vmap_rule(_advance),
+    differentiable_fn=_advance_on_lanes,
+    batching_rule=jaxcompat.make_vmap_rule(_advance),
 )
 """Steps of a kernel inside a derivative; higher derivatives are derivatives of the program on lanes."""

@@ -212,7 +212,7 @@ def _finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watc
     builder = Builder(stage="finite_check")
     reads: list[Slot] = []
     finite: Element = constant(True, bool)
-    avals = axes.shapes_of_one(list(leaves), "drone")
+    avals = axes.unbatched_shapes(list(leaves), "drone")
     for i in watched:
         if avals[i].dtype.kind == "f":
             for k, item in enumerate(scalars(inputs(builder, avals[i]))):

@@ -23,7 +23,7 @@ class TracedStage:
             axes: Batch axes of the leaves.
             leaves: Leaves of all worlds, or their shapes and types.
         """
-        self.avals = axes.shapes_of_one(list(leaves), stage.scope)
+        self.avals = axes.unbatched_shapes(list(leaves), stage.scope)
         """Shapes and types of all leaves, as the stage receives them."""
         self.written_leaves: list[int] = []
         """Leaves that it writes: the outputs of ``fn``."""
@@ -64,7 +64,7 @@ class Tracer:
 
     def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
         """Return ``TracedStage(stage, axes, leaves)``, from the cache if possible."""
-        shapes = tuple([(x.shape, x.dtype) for x in axes.shapes_of_one(list(leaves), stage.scope)])
+        shapes = tuple([(x.shape, x.dtype) for x in axes.unbatched_shapes(list(leaves), stage.scope)])
         key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
         if key not in self._traced:
             if stage.trace_once:

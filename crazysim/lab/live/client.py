@@ -8,11 +8,11 @@ from pathlib import Path
 from crazysim.errors import ConfigError
 from crazysim.lab.live.server import DRONE_PORT, STREAM_PORT, connect
 from crazysim.lab.show_files.show_trajectory import format_trajectory
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 from crazysim.trajectories import Trajectory
 
 
-class _Client(Closing):
+class _Client(Closeable):
     """A connection that sends messages and waits for their answers."""
 
     def __init__(self, host: str, port: int, timeout: float):

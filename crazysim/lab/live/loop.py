@@ -26,7 +26,7 @@ from crazysim.lab.live.staging import StagedCommands, compile_step
 from crazysim.lab.live.viewer import Viewer
 from crazysim.lab.live.viewers import Viewers
 from crazysim.sim.sim import Sim
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 
 MAX_SLEEP = 0.01
 """Longest sleep before clicks and keys are handled again, s."""
@@ -39,7 +39,7 @@ V = TypeVar("V", bound="Viewer[Live]")
 log = logging.getLogger(__name__)
 
 
-class Live(Interaction, Closing):
+class Live(Interaction, Closeable):
     """A simulation that advances in real time, or at any other speed, and can be watched and commanded.
 
         with Live(sim, control_freq=100) as live:

@@ -21,7 +21,7 @@ from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, not_installed
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.swarm import DroneState
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 
 LOG_VARIABLES = {
     "pos": ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),
@@ -37,7 +37,7 @@ UNIT_FACTORS = {"ang_vel": math.pi / 180, "acc": GRAVITY_MAGNITUDE}
 log = logging.getLogger(__name__)
 
 
-class Radio(Closing):
+class Radio(Closeable):
     """``Link`` to a real Crazyflie, which must stand on the ground when it is created.
 
     | Level | Packet of cflib | |

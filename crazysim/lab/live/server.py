@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from crazysim.errors import ConfigError
 from crazysim.lab.live.commands import Command, parse_command
 from crazysim.lab.live.framing import FramingError, Message, MessageBuffer, Request, ShowFile
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 
 DRONE_PORT, STREAM_PORT = 7000, 7002
 """Ports of the lab's test server, for commands to single drones and for the stream to all drones."""
@@ -33,7 +33,7 @@ POLL_INTERVAL = 0.2
 log = logging.getLogger(__name__)
 
 
-class CommandQueue(Closing):
+class CommandQueue(Closeable):
     """Commands that wait for the simulation."""
 
     def __init__(self) -> None:

@@ -104,7 +104,7 @@ class FreeBodies(Population):
     """Time constant with which an overlap is pushed out, s; at least two steps."""
     iterations: int = setting(default=30, low=1, high=MAX_ITERATIONS)
     """Iterations of the solver."""
-    rgba: ArrayLike | None = color(n=True)
+    rgba: ArrayLike | None = color(per_item=True)
     """Colour, one or one for each body; None for the default. (4,) or (n_members, 4)"""
     name: str = "bodies"
     prefix: ClassVar[str] = "Box"

@@ -15,7 +15,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
 from crazysim.core.settings import as_rgba, color, setting
 from crazysim.core.stage import Stage
-from crazysim.core.stages import FLOOR_HEIGHT, stop_below
+from crazysim.core.stages import FLOOR_HEIGHT, stop_at_surface
 from crazysim.errors import ConfigError
 from crazysim.plugins.contacts.response import ContactResponse
 from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON
@@ -77,7 +77,7 @@ class Terrain(Plugin):
     def stop(self, data: SimData) -> SimData:
         """Stop drones at the ground: one that is below it, or on it and not rising, is set on it, at rest."""
         ground = ground_height(data, data.states.pos)
-        states = stop_below(data.states, ground + FLOOR_HEIGHT)
+        states = stop_at_surface(data.states, ground + FLOOR_HEIGHT)
         return self.write(data.replace(states=states), self.read(data).replace(height_below=ground))
 
     def _check_heights(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -157,7 +157,7 @@ def _airframe_coefficients(sim: Simulation) -> dict[str, Any]:
     drone = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
     if drone is not None:
         raise ConfigError(
-            f"expected a table [residual] of drone {drone.name!r}, got none. {drone.why_missing('residual.linear')}"
+            f"expected a table [residual] of drone {drone.name!r}, got none. {drone.missing_reason('residual.linear')}"
             f"Use 'crazysim identify LOG --airframe {drone.name} --out mine.toml' on flights of it, or "
             f"drone='cf21B_500_idsia'."
         )

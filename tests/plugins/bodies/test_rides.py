@@ -31,7 +31,7 @@ def test_a_drone_lands_on_a_moving_car_and_rides():
     sim, cars = build(vehicle={"base": "f1tenth_ros", "wheels": {"number": 2}, "shape": {"width": 0.4}})
     height, at = deck(sim)
     sim.add(ContactResponse(friction=0.9))
-    sim.data = cars.commanded(sim.data, np.float32([[[0.8, 0.0]]]))
+    sim.data = cars.with_command(sim.data, np.float32([[[0.8, 0.0]]]))
     sim.step(1000)
     car = cars.read(sim.data)
     np.testing.assert_allclose(np.asarray(car.vel)[0, 0, 0], 0.8, rtol=0.05)
@@ -40,7 +40,7 @@ def test_a_drone_lands_on_a_moving_car_and_rides():
     sim.data = with_states(sim.data, pos=start, vel=[0.8, 0, 0], quat=[0, 0, 0, 1], ang_vel=0.0)
     sim.step(250)
     gap = np.asarray(sim.data.states.pos)[0, 0] - np.asarray(cars.read(sim.data).pos)[0, 0]
-    sim.data = cars.commanded(sim.data, np.float32([[[0.8, 0.15]]]))  # it turns
+    sim.data = cars.with_command(sim.data, np.float32([[[0.8, 0.15]]]))  # it turns
     sim.step(500)
     car, s = cars.read(sim.data), sim.data.states
     at, pos, car_vel, vel = (np.asarray(x)[0, 0] for x in (car.pos, s.pos, car.vel, s.vel))
@@ -53,7 +53,7 @@ def test_a_drone_lands_on_a_moving_car_and_rides():
 def test_a_car_pushes_a_body():
     sim, cars = build()
     bodies = sim.add(FreeBodies(1, size=(0.2, 0.2, 0.2), mass=0.2, pos=(0.6, 0, 0.1), drones=False))
-    sim.data = cars.commanded(sim.data, np.float32([[[0.5, 0.0]]]))
+    sim.data = cars.with_command(sim.data, np.float32([[[0.5, 0.0]]]))
     sim.step(1500)
     car, body = (np.stack([x.pos, x.vel])[:, 0, 0, 0] for x in (cars.read(sim.data), bodies.read(sim.data)))
     assert body[0] > 0.8

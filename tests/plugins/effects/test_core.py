@@ -139,8 +139,8 @@ def at_world(scope, x, world):
 def test_law_01_what_a_stage_does_to_all_it_does_to_one(every, flown, name):
     """A stage on the data of one drone, or one world, gives what it gives on all data at that place."""
     stage = every.step_pipeline[name]
-    all_at_once, of_one = on_host(jax.jit(stage)(flown)), jax.jit(stage.apply_to_one)
-    blown = jax.jit(vmap_drones(stage.apply_to_one))
+    all_at_once, of_one = on_host(jax.jit(stage)(flown)), jax.jit(stage.apply_unbatched)
+    blown = jax.jit(vmap_drones(stage.apply_unbatched))
     for index in [(0, 0), (1, 1), (2, 0)]:
 
         def at(scope, x, index=index):

@@ -39,7 +39,7 @@ def states_of(sim):
 def test_cars_follow_their_commands_for_any_counts(n_worlds, n_drones, n_cars):
     sim, cars = build(n_worlds, n_drones, "fused", members=n_cars, level="speed", in_scene=False)
     command = np.random.default_rng(0).uniform([0.5, -0.3], [1.5, 0.3], (n_worlds, n_cars, 2))
-    sim.data = cars.commanded(sim.data, command)
+    sim.data = cars.with_command(sim.data, command)
     sim.step(300)
     np.testing.assert_allclose(states_of(sim)["body_vel"][..., 0], command[..., 0], atol=0.1)
 
@@ -126,7 +126,7 @@ def test_gradients_reach_commands_and_parameters():
     step = by_stages(sim)
 
     def end(command, mass):
-        data = cars.commanded(sim.data, command)
+        data = cars.with_command(sim.data, command)
         record = cars.read(data)
         data = cars.write(data, record.replace(params=record.params.replace(mass=mass)))
         return jnp.sum(cars.read(step(data, 100)).pos[..., :2])
@@ -184,7 +184,7 @@ def test_bicycles_are_driven_by_a_torque():
     sim = Sim(control="rotor_vel")
     bikes = sim.add(Bicycles(2, in_scene=False))
     assert bikes.names == ("Bicycle_0", "Bicycle_1")
-    sim.data = bikes.commanded(sim.data, np.full((1, 2, 2), [0.01, 0.3]))
+    sim.data = bikes.with_command(sim.data, np.full((1, 2, 2), [0.01, 0.3]))
     sim.step(500)
     record = bikes.read(sim.data)
     inertia = 1 + 2 * 0.1507964 + 2 * (0.01 / 0.04**2 + 0.1507964 / 2)
@@ -196,7 +196,7 @@ def test_bicycles_are_driven_by_a_torque():
 
 def test_wheels_roll_and_steer_in_the_scene():
     sim, cars = build(1, members=2, trailer=True, vehicle="aiml_head", pos=[(1, 0), (-1, 0)], yaw=[0.0, np.pi / 2])
-    sim.data = cars.commanded(sim.data, np.tile([0.05, 0.3], (1, 2, 1)))
+    sim.data = cars.with_command(sim.data, np.tile([0.05, 0.3], (1, 2, 1)))
     sim.step(100)
     sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), 0)
     model, data, record = sim.mj_model, sim.mj_data, jax.tree.map(np.asarray, cars.read(sim.data))
@@ -293,4 +293,4 @@ def test_wrong_commands_are_errors():
     sim, cars = build(2, members=3, in_scene=False)
     for command, message in ((np.zeros((2, 3, 4)), "(2, 3, 2)"), (np.full((2, 3, 2), np.nan), "finite")):
         with pytest.raises(ValueError, match=re.escape(message)):
-            cars.commanded(sim.data, command)
+            cars.with_command(sim.data, command)

@@ -14,7 +14,7 @@ import threading
 from crazysim.errors import ConfigError
 from crazysim.lab.live.crtp.device import CrtpDevice
 from crazysim.lab.live.swarm import Swarm
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 
 PORT = 19850
 """First port; cflib scans ten from here on."""
@@ -24,7 +24,7 @@ POLL_INTERVAL = 0.1
 log = logging.getLogger(__name__)
 
 
-class CrtpServer(Closing):
+class CrtpServer(Closeable):
     """UDP server for the drones of a swarm; a thread answers the clients."""
 
     def __init__(self, swarm: Swarm, host: str = "127.0.0.1", port: int = PORT):

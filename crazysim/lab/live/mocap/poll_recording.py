@@ -16,7 +16,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.mocap.source import MocapSource, Poll
 from crazysim.media.journal import Journal, read_journal
-from crazysim.storage import Closing, reading
+from crazysim.storage import Closeable, reading
 
 NAMES_CHUNK, POLL_CHUNK = b"NAME", b"POLL"
 """Kinds of chunks: names of bodies that were not seen before, and a poll."""
@@ -26,7 +26,7 @@ FRAME_LAYOUT = struct.Struct("<ddI")
 """Stamp and time of arrival of a frame, s, and number of bodies."""
 
 
-class MocapRecorder(Closing):
+class MocapRecorder(Closeable):
     """Writer of a recording."""
 
     def __init__(self, path: str | Path):

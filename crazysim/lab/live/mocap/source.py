@@ -16,7 +16,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import from_yaw
 from crazysim.lab.live.host_trajectory import host_trajectories
 from crazysim.lab.live.mocap.frames import Convention, Frame
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 from crazysim.trajectories import Trajectory
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ class Poll(NamedTuple):
     """Number of frames lost because the reader was too slow."""
 
 
-class MocapSource(Closing):
+class MocapSource(Closeable):
     """Interface of motion capture sources. ``poll`` never waits."""
 
     name: str = "mocap"

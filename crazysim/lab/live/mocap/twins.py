@@ -25,7 +25,7 @@ from crazysim.lab.live.mocap.source_events import Reports
 from crazysim.lab.live.mocap.tracker import Rules, Tracker
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 from crazysim.tables import read_numbers
 
 HIDDEN_POSITION = (0.0, 0.0, -100.0)
@@ -82,7 +82,7 @@ def twin_of(name: str, twins: Mapping[str, Twin]) -> Twin | None:
     return twins[max(keys, key=len)] if keys else None
 
 
-class Twins(Closing):
+class Twins(Closeable):
     """Objects of a simulation that follow a motion capture source.
 
         twins = Twins(sim, source, {"cf": Twin.drone(), "obst": Twin("pole")}, ["cf1", "obst2"])

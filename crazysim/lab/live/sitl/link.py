@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.sitl.measured import Measurements
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 from crazysim.tables import POSITIVE, range_between, read_number, read_numbers
 
 ROUNDING = 1e-6
@@ -28,7 +28,7 @@ TIMEOUT = range_between(high=1e6, positive=True)
 """Range of a time to wait, s."""
 
 
-class FirmwareLink(Closing):
+class FirmwareLink(Closeable):
     """Link to the process of a firmware that flies one quadrotor.
 
     ``positions`` are the signs of x (forward) and y (left) of motors 1 to 4. ``yaw_torque_signs`` are the signs of the
@@ -88,7 +88,7 @@ def check_address(host: str, port: int, min_port: int = 0) -> None:
     read_numbers("port", port, range_between(min_port, LAST_PORT), ((),), whole=True)
 
 
-class Datagrams(Closing):
+class Datagrams(Closeable):
     """UDP socket that sends to one address, and receives the newest packet."""
 
     def __init__(self, host: str, port: int):

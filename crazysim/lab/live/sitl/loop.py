@@ -23,7 +23,7 @@ from crazysim.lab.live.staging import compile_step
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.sim import Sim
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 from crazysim.tables import NOT_NEGATIVE, read_number
 
 MAGNETIC_FIELD = np.array([0.0, 2e-5, -4.5e-5])
@@ -38,7 +38,7 @@ MOUNTED_SENSORS = (IMU, Magnetometer)
 """Sensors whose frame may be rotated relative to the body."""
 
 
-class SoftwareInTheLoop(Closing):
+class SoftwareInTheLoop(Closeable):
     """Processes of a firmware that fly the drones of a simulation, one each.
 
     The plugins ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` of the simulation provide the measurements. If the

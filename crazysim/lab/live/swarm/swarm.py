@@ -30,10 +30,10 @@ from crazysim.lab.live.swarm.state import DroneState
 from crazysim.plugins.effects import MotorFailure
 from crazysim.plugins.estimators import Estimator
 from crazysim.sim.sim import Sim
-from crazysim.storage import Closing
+from crazysim.storage import Closeable
 
 
-class Swarm(Closing):
+class Swarm(Closeable):
     """A simulation of one world, driven by commanders.
 
         swarm = Swarm(Sim(n_drones=2, control="state"))
