@@ -15,13 +15,13 @@ from crazysim.core.data import command_shape
 from crazysim.errors import ConfigError
 
 
-def sim_of(dynamics, control):
+def get_sim(dynamics, control):
     return shared_sim(n_worlds=2, n_drones=2, dynamics=dynamics, control=control)
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_a_command_is_staged_and_nothing_else_changes(dynamics, control):
-    data = sim_of(dynamics, control).data
+    data = get_sim(dynamics, control).data
     command = np.arange(np.prod(command_shape(data, control)), dtype=np.float32).reshape(command_shape(data, control))
     after = send(data, command)
     if control == "rotor_vel":
@@ -47,7 +47,7 @@ PARTS = [
 @pytest.mark.parametrize("parts", PARTS, ids=lambda parts: "-".join(parts))
 def test_a_setpoint_in_parts_is_the_vector_of_these_parts(parts, on_device):
     """NumPy broadcasts, on the host and on the device alike; other parts and the body rates are zero."""
-    data = sim_of("first_principles", "state").data
+    data = get_sim("first_principles", "state").data
     expected = np.zeros((2, 2, 16))
     for name, where in (("pos", slice(0, 3)), ("vel", slice(3, 6)), ("acc", slice(6, 9))):
         expected[..., where] = parts.get(name, 0.0)
@@ -56,14 +56,14 @@ def test_a_setpoint_in_parts_is_the_vector_of_these_parts(parts, on_device):
     given = {name: jnp.asarray(x) for name, x in parts.items()} if on_device else parts
     staged = F.state_control(data, **given).controls.state.staged_cmd
     np.testing.assert_allclose(staged, expected, atol=2e-7)  # rounding of float32
-    sim = sim_of("first_principles", "state")
+    sim = get_sim("first_principles", "state")
     sim.state_control(**parts)
     np.testing.assert_allclose(sim.data.controls.state.staged_cmd, expected, atol=2e-7)
     sim.data = data
 
 
 def test_a_setpoint_in_parts_has_a_gradient():
-    data = sim_of("first_principles", "state").data
+    data = get_sim("first_principles", "state").data
     gradient = jax.grad(lambda x: F.state_control(data, pos=x).controls.state.staged_cmd.sum())(jnp.zeros(3))
     np.testing.assert_array_equal(gradient, [4.0, 4.0, 4.0])  # four drones
 
@@ -88,16 +88,16 @@ def test_a_setpoint_in_parts_has_a_gradient():
     ],
 )
 def test_law_09_wrong_parts_of_a_setpoint_are_named(parts, message):
-    data = sim_of("first_principles", "state").data
+    data = get_sim("first_principles", "state").data
     with pytest.raises(ConfigError, match=message):
         F.state_control(data, **parts)
     with pytest.raises(ValueError, match="takes 'attitude' commands, not 'state'"):
-        F.state_control(sim_of("first_principles", "attitude").data, pos=(0, 0, 1))
+        F.state_control(get_sim("first_principles", "attitude").data, pos=(0, 0, 1))
 
 
 def test_law_09_a_number_too_large_for_the_state_is_reported_as_infinite():
     """1e300 is finite in float64 and infinite in the float32 of the state."""
-    data = sim_of("first_principles", "attitude").data
+    data = get_sim("first_principles", "attitude").data
     command = np.zeros((2, 2, 4))
     command[1, 0, 3] = 1e300
     with pytest.raises(ValueError, match=r"NaN or infinite in world\(s\) \[1\], as float32"):
@@ -105,7 +105,7 @@ def test_law_09_a_number_too_large_for_the_state_is_reported_as_infinite():
 
 
 def test_device_arrays_of_any_real_type_are_cast():
-    data = sim_of("first_principles", "attitude").data
+    data = get_sim("first_principles", "attitude").data
     for dtype in (jnp.int32, jnp.float16, jnp.bfloat16, jnp.uint8):
         staged = F.attitude_control(data, jnp.ones((2, 2, 4), dtype)).controls.attitude.staged_cmd
         assert staged.dtype == data.states.pos.dtype
@@ -113,7 +113,7 @@ def test_device_arrays_of_any_real_type_are_cast():
 
 
 def test_check_finite_does_nothing_inside_jit():
-    data = sim_of("first_principles", "attitude").data
+    data = get_sim("first_principles", "attitude").data
     command = jnp.full((2, 2, 4), jnp.nan)
     staged = jax.jit(lambda c: F.attitude_control(data, c, check_finite=True).controls.attitude.staged_cmd)(command)
     assert np.all(np.isnan(staged))
@@ -121,7 +121,7 @@ def test_check_finite_does_nothing_inside_jit():
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_controllable_is_per_world(dynamics, control):
-    data = sim_of(dynamics, control).data
+    data = get_sim(dynamics, control).data
     freq = 500 if control == "rotor_vel" else getattr(data.controls, control).freq
     period = 500 // freq
     for steps in ([0, 1], [period, period + 1], [7 * period, 7 * period - 1]):
@@ -140,5 +140,5 @@ def test_commands_are_staged_in_one_function():
 
 
 def test_controllable_works_inside_jit():
-    data = sim_of("first_principles", "state").data
+    data = get_sim("first_principles", "state").data
     np.testing.assert_array_equal(jax.jit(F.controllable)(data), [[True], [True]])

@@ -51,7 +51,7 @@ def with_fields(**parts):
     return act
 
 
-def of_record(**fields):
+def with_record_fields(**fields):
     """Return an influence that replaces fields of the plugin's own record."""
 
     def act(data):
@@ -62,7 +62,7 @@ def of_record(**fields):
     return act
 
 
-def staged(data):
+def halve_staged_command(data):
     attitude = data.controls.attitude
     attitude = attitude.replace(staged_cmd=0.5 * attitude.staged_cmd)
     return data.replace(controls=data.controls.replace(attitude=attitude))
@@ -75,8 +75,8 @@ WRITES = {
     "ang_vel": (with_fields(states={"ang_vel": lambda x: x + 1}), "got other values of states.ang_vel"),
     "rotor_vel": (with_fields(states={"rotor_vel": lambda x: 2 * x}), "got other values of states.rotor_vel"),
     "steps": (with_fields(core={"steps": lambda x: x + 1}), "got other values of core.steps"),
-    "own record": (of_record(angle=lambda x: x + 1), r"got other values of plugins\['tilt'\].angle"),
-    "higher command": (staged, "got other values of controls.attitude.staged_cmd"),
+    "own record": (with_record_fields(angle=lambda x: x + 1), r"got other values of plugins\['tilt'\].angle"),
+    "higher command": (halve_staged_command, "got other values of controls.attitude.staged_cmd"),
     "force of three drones": (
         with_fields(states={"force": lambda x: jnp.zeros((3, 3))}),
         r"to return states.force of shape \(3,\), got \(3, 3\)",

@@ -39,7 +39,7 @@ def fly(data, freq, n_steps, integrator, deriv_fn):
     return jax.lax.fori_loop(0, jnp.max(n_steps), step, data.states)
 
 
-def flown(data, integrator, deriv_fn=first_principles_derivative):
+def fly_all(data, integrator, deriv_fn=first_principles_derivative):
     n_steps = STEPS[None, :, None]
     return jax.device_get(fly(data, n_steps / DURATION, n_steps, Integrator(integrator), deriv_fn))
 
@@ -51,7 +51,7 @@ def slope(errors):
     return np.polyfit(np.log(1 / STEPS), np.log(errors), 1)[0]
 
 
-def prepared(data, params=None, **states):
+def prepare_data(data, params=None, **states):
     new = {k: np.broadcast_to(np.asarray(v, float), getattr(data.states, k).shape) for k, v in states.items()}
     p = data.params
     params = {k: np.asarray(v, float) for k, v in (params or {}).items()}
@@ -69,8 +69,8 @@ def test_law_08_order_of_position_and_velocity_under_drag(integrator, data, x64)
     """v' = -k v + g, with v(t) = g/k + (v0 - g/k) exp(-k t)."""
     k, g, v0 = 4.0, np.array([0, 0, -9.81]), np.array([3.0, -2.0, 5.0])
     mass = float(data.params.mass[0])
-    start = prepared(data, {"drag_matrix": -k * mass * np.eye(3)}, pos=[0, 0, 10], vel=v0)
-    states = flown(start, integrator)
+    start = prepare_data(data, {"drag_matrix": -k * mass * np.eye(3)}, pos=[0, 0, 10], vel=v0)
+    states = fly_all(start, integrator)
     decay = np.exp(-k * DURATION)
     vel = g / k + (v0 - g / k) * decay
     pos = np.array([0, 0, 10]) + g / k * DURATION + (v0 - g / k) * (1 - decay) / k
@@ -89,7 +89,7 @@ def test_law_08_order_of_attitude_with_an_axis_that_turns(integrator, data, x64)
     q0 = Rotation.from_euler("ZYX", [0.5, -0.4, 0.3])
     inertia = np.diag([A, A, C])
     params = {"J": inertia, "J_inv": np.linalg.inv(inertia)}
-    states = flown(prepared(data, params, pos=[0, 0, 10], quat=q0.as_quat(), ang_vel=ang_vel), integrator)
+    states = fly_all(prepare_data(data, params, pos=[0, 0, 10], quat=q0.as_quat(), ang_vel=ang_vel), integrator)
     momentum = q0.apply(inertia @ ang_vel)
     body = Rotation.from_rotvec([0, 0, ang_vel[2] * (1 - C / A) * DURATION])
     exact = Rotation.from_rotvec(momentum / A * DURATION) * q0 * body
@@ -99,7 +99,7 @@ def test_law_08_order_of_attitude_with_an_axis_that_turns(integrator, data, x64)
     assert abs(slope(np.linalg.norm(states.ang_vel[0] - wanted, axis=-1)) - integrator.order) < 0.3
 
 
-def swaying(data):
+def swaying_derivative(data):
     """Return a derivative whose body rate depends on the attitude: feedback through the middle of the step."""
     s = data.states
     ang_vel = jnp.stack([3 + 4 * s.quat[..., 1], 2 - 5 * s.quat[..., 0], 1 + 6 * s.quat[..., 3]], axis=-1)
@@ -120,7 +120,7 @@ def test_law_08_rk4_has_order_4_where_rates_depend_on_the_attitude(data, x64):
 
     q0 = Rotation.from_euler("ZYX", [0.5, -0.4, 0.3]).as_quat()
     exact = solve_ivp(rate, (0, DURATION), q0, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
-    states = flown(prepared(data, quat=q0), "rk4", swaying)
+    states = fly_all(prepare_data(data, quat=q0), "rk4", swaying_derivative)
     assert abs(slope(rotation_error(states.quat, Rotation.from_quat(exact))) - 4) < 0.3
 
 
@@ -128,14 +128,14 @@ def test_law_08_rk4_has_order_4_where_rates_depend_on_the_attitude(data, x64):
 def test_law_08_order_of_rotor_speed(integrator, data, x64):
     """Spin-up with a linear lag a: r(t) = c (1 - exp(-a t))."""
     lag = {"rotor_dyn_coef": [[8.0, 0.0, 8.0, 0.0]]}
-    start = prepared(data, lag, pos=[0, 0, 10])
+    start = prepare_data(data, lag, pos=[0, 0, 10])
     start = start.replace(controls=start.controls.replace(rotor_vel=np.full((1, 3, 4), 1000.0)))
-    errors = flown(start, integrator).rotor_vel[0, :, 0] - 1000 * (1 - np.exp(-8 * DURATION))
+    errors = fly_all(start, integrator).rotor_vel[0, :, 0] - 1000 * (1 - np.exp(-8 * DURATION))
     assert abs(slope(np.abs(errors)) - integrator.order) < 0.3
 
 
 def test_symplectic_euler_moves_with_the_new_velocities_and_euler_with_the_old(data, x64):
-    start = prepared(data, pos=[0, 0, 10], vel=[1, 0, 0], ang_vel=[0, 0, 1])
+    start = prepare_data(data, pos=[0, 0, 10], vel=[1, 0, 0], ang_vel=[0, 0, 1])
     start = start.replace(states=start.states.replace(force=np.full((1, 3, 3), 0.0434)))
     dt, deriv_fn = 1 / 500, first_principles_derivative
     both = jax.jit(lambda data: [INTEGRATORS[name](data, deriv_fn).states for name in ("euler", "symplectic_euler")])

@@ -111,9 +111,9 @@ def test_the_order_of_the_drones_does_not_matter():
     """What the drones of a world get is permuted along with them."""
     order = np.random.default_rng(1).permutation(17)
     sim = simulation(2, 17)
-    turned = with_states(sim.data, pos=np.asarray(sim.data.states.pos)[:, order])
+    permuted_data = with_states(sim.data, pos=np.asarray(sim.data.states.pos)[:, order])
     step = Step(sim.step_pipeline)
-    a, b = step(sim.data, jnp.int32(1)), step(turned, jnp.int32(1))
+    a, b = step(sim.data, jnp.int32(1)), step(permuted_data, jnp.int32(1))
     np.testing.assert_allclose(b.states.force, np.asarray(a.states.force)[:, order], rtol=2e-5, atol=1e-9)
 
 
@@ -133,17 +133,17 @@ def test_law_07_a_bad_world_does_not_touch_another(n_drones):
 def test_a_condition_selects_what_a_stage_computes():
     """Drones publish at every step; a stage that acts at every third changes the others' numbers then alone."""
     sim = simulation(2, 9)
-    rare = stage("drone", when=lambda data: data.core.steps % 3 == 0)(crowd.fn)
-    rare.__name__ = "crowd"
-    sim.step_pipeline["crowd"] = rare
-    data, step, seen = sim.data, Step(sim.step_pipeline), []
+    rare_crowd = stage("drone", when=lambda data: data.core.steps % 3 == 0)(crowd.fn)
+    rare_crowd.__name__ = "crowd"
+    sim.step_pipeline["crowd"] = rare_crowd
+    data, step, forces = sim.data, Step(sim.step_pipeline), []
     for _ in range(4):
         before, data = data, step(data, jnp.int32(1))
-        seen.append(np.asarray(data.states.force))
-    np.testing.assert_array_equal(seen[0], seen[2])
-    assert np.any(seen[3] != seen[2])
+        forces.append(np.asarray(data.states.force))
+    np.testing.assert_array_equal(forces[0], forces[2])
+    assert np.any(forces[3] != forces[2])
     expected = np.stack([crowd_by_hand(pos) for pos in np.asarray(before.states.pos, np.float64)])
-    np.testing.assert_allclose(seen[3], expected, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(forces[3], expected, rtol=1e-4, atol=1e-9)
 
 
 class Push(Plugin):

@@ -53,10 +53,10 @@ def pipeline():
     ],
 )
 def test_every_change_keeps_the_order_of_the_rest(pipeline, change, order):
-    held = pipeline
+    original = pipeline
     assert change(pipeline) is None
     assert " ".join(pipeline) == order
-    assert held is pipeline, "changed in place"
+    assert original is pipeline, "changed in place"
 
 
 def test_replace_keeps_the_place_and_exchanges_the_function(pipeline):
