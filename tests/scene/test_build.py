@@ -1,4 +1,4 @@
-"""The scene is a spec that users edit: what is in it, what may be added, and what is refused."""
+"""The spec of the scene: its contents, bodies that users add, and invalid edits."""
 
 import struct
 
@@ -48,7 +48,7 @@ SCENE = """
 
 @pytest.fixture
 def scene_file(tmp_path):
-    """A scene with a mesh and a texture beside it, found by relative paths."""
+    """A scene file with a mesh and a texture, which it names by relative paths."""
     for folder in ("meshes", "textures"):
         (tmp_path / folder).mkdir()
     write_stl(tmp_path / "meshes" / "rock.stl", 0.3)
@@ -58,11 +58,11 @@ def scene_file(tmp_path):
     return path
 
 
-def attach_boxes(sim, places):
+def attach_boxes(sim, positions):
     """Add boxes as the documentation does."""
     obstacle_spec = mujoco.MjSpec.from_string(BOX)
     frame = sim.spec.worldbody.add_frame()
-    for i, pos in enumerate(places):
+    for i, pos in enumerate(positions):
         body = obstacle_spec.body("obstacle")
         attached = frame.attach_body(body, "", f":{i}")
         attached.pos = pos
@@ -71,8 +71,8 @@ def attach_boxes(sim, places):
 # The drones -----------------------------------------------------------------------------------------------------
 
 
-def test_drones_are_mocap_bodies_that_weigh_nothing(sim):
-    """MuJoCo moves nothing here: drones are placed, not simulated, and the one joint is a dummy."""
+def test_drones_are_mocap_bodies_without_mass(sim):
+    """MuJoCo does not simulate the drones: their poses are set, and the only joint is a dummy."""
     model = sim.mj_model
     for i in range(2):
         body = model.body(f"drone:{i}")
@@ -84,24 +84,24 @@ def test_drones_are_mocap_bodies_that_weigh_nothing(sim):
 
 @pytest.mark.parametrize("name", airframe_names())
 def test_every_airframe_has_a_body(name):
-    """Each built-in airframe gives a body of primitives: a disc over each rotor, two LEDs, cameras, shapes to touch."""
+    """The body of an airframe has primitives only: a disc over each rotor, two LEDs, cameras and collision shapes."""
     airframe = load_airframe(name)
     model = compile_spec(build_spec(None, [airframe], 500, -1))
-    of_drone = model.geom_bodyid == model.body("drone:0").id
-    assert not np.isin(model.geom_type[of_drone], [mujoco.mjtGeom.mjGEOM_MESH]).any()
-    discs = of_drone & (model.geom_matid == model.material("drone_propeller").id)
+    belongs_to_drone = model.geom_bodyid == model.body("drone:0").id
+    assert not np.isin(model.geom_type[belongs_to_drone], [mujoco.mjtGeom.mjGEOM_MESH]).any()
+    discs = belongs_to_drone & (model.geom_matid == model.material("drone_propeller").id)
     rotors = airframe.value("rotors.position")
     np.testing.assert_allclose(model.geom_pos[discs][:, :2], rotors[:, :2], atol=1e-6)
     for led in ("led_top:0", "led_bot:0"):
         assert np.sum(model.geom_matid == model.material(led).id) == 1
     assert {model.camera(i).name for i in range(model.ncam)} == {"fpv_cam:0", "track_cam:0"}
-    touching = of_drone & ((model.geom_contype | model.geom_conaffinity) > 0)
-    assert [model.geom(i).name for i in np.flatnonzero(touching)] == ["col_sphere:0"]
+    touches = belongs_to_drone & ((model.geom_contype | model.geom_conaffinity) > 0)
+    assert [model.geom(i).name for i in np.flatnonzero(touches)] == ["col_sphere:0"]
     assert model.geom("col_sphere:0").size[0] >= np.linalg.norm(rotors[:, :2], axis=-1).max()
 
 
 def test_the_tracking_camera_looks_at_its_drone():
-    """It stands behind and above, its view goes through the drone, and up is up."""
+    """The camera is behind and above the drone, its axis goes through the drone, and the image is upright."""
     model = compile_spec(build_spec(None, [load_airframe("cf21B_500")], 500, -1))
     data = mujoco.MjData(model)
     data.mocap_pos[0], data.mocap_quat[0] = [1, 2, 3], [np.cos(0.4), 0, np.sin(0.4), 0]
@@ -119,16 +119,16 @@ def test_the_tracking_camera_looks_at_its_drone():
     np.testing.assert_allclose(-data.cam_xmat[forward].reshape(3, 3)[:, 2], [np.cos(0.8), 0, -np.sin(0.8)], atol=1e-6)
 
 
-def test_a_swarm_built_in_chunks_is_the_swarm_built_one_by_one(monkeypatch):
-    """How bodies come into the spec leaves no trace in the model: every array of it is the same."""
+def test_a_swarm_built_in_chunks_equals_one_built_one_by_one(monkeypatch):
+    """Every array of the compiled model is the same."""
     airframe = load_airframe("cf21B_500")
-    whole = compile_spec(build_spec(None, [airframe] * 7, 500, -1))
+    one_by_one = compile_spec(build_spec(None, [airframe] * 7, 500, -1))
     monkeypatch.setattr(build, "DRONES_PER_CHUNK", 3)
-    parts = compile_spec(build_spec(None, [airframe] * 7, 500, -1))
-    arrays = [name for name in dir(whole) if isinstance(getattr(whole, name), np.ndarray)]
+    in_chunks = compile_spec(build_spec(None, [airframe] * 7, 500, -1))
+    arrays = [name for name in dir(one_by_one) if isinstance(getattr(one_by_one, name), np.ndarray)]
     assert len(arrays) > 100
     for name in arrays:
-        np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(one_by_one, name), getattr(in_chunks, name), err_msg=name)
     assert mujoco.get_mju_user_warning() is None
 
 
@@ -136,19 +136,19 @@ def test_a_swarm_built_in_chunks_is_the_swarm_built_one_by_one(monkeypatch):
 
 
 def test_boxes_attached_from_a_string_are_touched():
-    """The documentation's example: two boxes, attached from one body, each at its place."""
+    """The documentation's example: two boxes, attached from one body, at different positions."""
     sim = Sim(n_worlds=1, n_drones=1)
     attach_boxes(sim, [[1.0, 0.0, 0.5], [2.0, 0.0, 0.5]])
     sim.build_mjx()
     sim.reset()
     np.testing.assert_allclose(sim.mj_model.body("obstacle:1").pos, [2, 0, 0.5])
-    for place, touched in ([0, 0, 0.5], [0, 0]), ([1, 0, 0.5], [1, 0]), ([2, 0, 0.62], [0, 1]), ([1.5, 0, 0.5], [0, 0]):
-        sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.array([[place]], np.float32)))
-        assert [bool(sim.contacts(f"obstacle:{i}").any()) for i in range(2)] == touched, place
+    for pos, touched in ([0, 0, 0.5], [0, 0]), ([1, 0, 0.5], [1, 0]), ([2, 0, 0.62], [0, 1]), ([1.5, 0, 0.5], [0, 0]):
+        sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.array([[pos]], np.float32)))
+        assert [bool(sim.contacts(f"obstacle:{i}").any()) for i in range(2)] == touched, pos
 
 
-def test_a_body_from_a_file_brings_its_own_meshes(tmp_path, scene_file):
-    """A gate's MJCF lies in a folder of its own, with a mesh and a texture by relative path, as in racing."""
+def test_bodies_of_a_file_keep_their_meshes(tmp_path, scene_file):
+    """An MJCF of a gate is in another folder, with a mesh and a texture by relative path, as in racing."""
     (tmp_path / "gate.xml").write_text("""
         <mujoco>
           <asset>
@@ -174,16 +174,16 @@ def test_a_body_from_a_file_brings_its_own_meshes(tmp_path, scene_file):
     assert sim.mjx_data.mocap_pos.shape == (1, 3, 3)
 
 
-def test_a_rebuild_leaves_the_drones_where_they_are():
-    """State, time and seed go on; a reset still returns to the default data."""
+def test_a_rebuild_keeps_the_state_of_the_drones():
+    """State and time continue; a reset still returns to the default data."""
     sim = Sim(n_worlds=2, n_drones=2)
     sim.step(3)
-    before = sim.data
+    original_data = sim.data
     attach_boxes(sim, [[1.0, 0.0, 0.5]])
     sim.build_mjx()
     for part in ("states", "params", "controls"):
-        jax.tree.map(np.testing.assert_array_equal, getattr(sim.data, part), getattr(before, part))
-    np.testing.assert_array_equal(sim.data.core.steps, before.core.steps)
+        jax.tree.map(np.testing.assert_array_equal, getattr(sim.data, part), getattr(original_data, part))
+    np.testing.assert_array_equal(sim.data.core.steps, original_data.core.steps)
     sim.step(2)
     np.testing.assert_array_equal(sim.data.core.steps, 5)
     sim.reset()
@@ -191,7 +191,7 @@ def test_a_rebuild_leaves_the_drones_where_they_are():
 
 
 def test_mocap_ids_follow_when_bodies_are_added_before_the_drones():
-    """Ids are looked up by name at every rebuild, so drones stay drones when other mocap bodies come first."""
+    """Ids are looked up by name at every rebuild, so they stay right if other mocap bodies come before the drones."""
     sim = Sim(n_drones=2)
     tower = sim.spec.worldbody.add_body(name="tower")
     tower.mocap = True
@@ -206,8 +206,8 @@ def test_mocap_ids_follow_when_bodies_are_added_before_the_drones():
 
 
 @pytest.mark.parametrize("as_type", [str, lambda path: path], ids=["str", "Path"])
-def test_a_scene_of_ones_own_finds_its_files(scene_file, as_type):
-    """Meshes and textures are looked for beside the scene file, wherever the program runs."""
+def test_a_scene_file_finds_its_meshes_and_textures(scene_file, as_type):
+    """Meshes and textures are read from the folder of the scene file, whatever the working directory."""
     sim = Sim(xml_path=as_type(scene_file))
     assert sim.mj_model.mesh("rock").vertnum.item() == 4
     np.testing.assert_array_equal(sim.mj_model.tex_data[:3], [255, 0, 0])
@@ -267,32 +267,32 @@ def test_a_missing_scene_is_refused_at_construction(path):
         Sim(xml_path=path)
 
 
-def test_a_scene_may_not_take_the_drones_names(tmp_path):
-    """Names of the drones' materials and cameras, too, are the drones'."""
-    for taken in (
+def test_a_scene_with_names_of_the_drones_is_refused(tmp_path):
+    """Names of the drones' materials, cameras and geoms are reserved, too."""
+    for mjcf in (
         "<mujoco><asset><material name='led_top:0'/></asset></mujoco>",
         WORLD.format("<camera name='fpv_cam:0'/>"),
         WORLD.format("<geom name='col_sphere:0' size='1'/>"),
     ):
         with pytest.raises(ValueError):
-            Sim(xml_path=broken_scene(tmp_path, taken))
+            Sim(xml_path=broken_scene(tmp_path, mjcf))
 
 
 # Rebuilds that cannot be ----------------------------------------------------------------------------------------
 
 
-def test_a_spec_that_does_not_compile_leaves_the_old_scene(sim):
-    """After a refused rebuild the simulation goes on with the scene it had, and with one mended it takes the new."""
+def test_after_a_spec_that_does_not_compile_the_old_scene_stays(sim):
+    """After a refused rebuild the simulation continues with the old scene, and a corrected spec replaces it."""
     sim = Sim(n_worlds=3)
     model, data = sim.mj_model, sim.data
-    wrong = sim.spec.worldbody.add_geom(name="wrong", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0, 0, 0])
+    geom = sim.spec.worldbody.add_geom(name="wrong", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0, 0, 0])
     with pytest.raises(ValueError, match="expected a scene that compiles"):
         sim.build_mjx()
     assert sim.mj_model is model
     assert sim.data is data
     sim.step()
     assert np.asarray(sim.contacts()).all()
-    wrong.size = [0.1, 0, 0]
+    geom.size = [0.1, 0, 0]
     sim.build_mjx()
     assert sim.mj_model.geom("wrong").size[0] == 0.1
 
@@ -307,7 +307,7 @@ def test_a_spec_that_has_lost_a_drone_is_refused():
 
 
 @pytest.fixture(scope="module")
-def not_for_mjx():
+def unsupported_by_mjx():
     """A world that MJX cannot check for contacts: a box and a cylinder that are moved through mjx_data."""
     sim = Sim()
     shapes = [(mujoco.mjtGeom.mjGEOM_BOX, [0.1, 0.1, 0.1]), (mujoco.mjtGeom.mjGEOM_CYLINDER, [0.1, 0.1, 0])]
@@ -318,13 +318,13 @@ def not_for_mjx():
     return sim
 
 
-def test_contacts_are_refused_for_geoms_that_mjx_does_not_support(not_for_mjx):
+def test_contacts_are_refused_for_geoms_that_mjx_does_not_support(unsupported_by_mjx):
     """MJX does not support a box against a cylinder: stepping works, and contacts raise an error."""
-    not_for_mjx.step()
+    unsupported_by_mjx.step()
     with pytest.raises(ValueError, match="expected a scene that MJX supports"):
-        not_for_mjx.contacts()
+        unsupported_by_mjx.contacts()
 
 
-def test_geoms_that_mjx_does_not_support_are_drawn(not_for_mjx, opengl):
-    assert not_for_mjx.render("rgb_array", width=32, height=24).shape == (24, 32, 3)
-    not_for_mjx.close()
+def test_geoms_that_mjx_does_not_support_are_drawn(unsupported_by_mjx, opengl):
+    assert unsupported_by_mjx.render("rgb_array", width=32, height=24).shape == (24, 32, 3)
+    unsupported_by_mjx.close()

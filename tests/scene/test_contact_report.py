@@ -13,11 +13,11 @@ from crazysim.scene.contact_report import DRONES_PER_CHUNK
 from crazysim.sim.sim import use_box_collision
 
 N_WORLDS, N_DRONES = 40, 3
-SPHERE = 1e-5
-"""Between a sphere and what has a closed form: float32 at a few metres, m."""
+SPHERE_TOLERANCE = 1e-5
+"""Tolerance of distances between a sphere and shapes with a closed form: float32 at a few metres, m."""
 
 
-def course():
+def build_course():
     """Return a simulation with objects of every kind, movable and fixed, and the handles."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
     handles = {
@@ -34,9 +34,9 @@ def course():
 
 
 @pytest.fixture(scope="module")
-def flown(request):
-    """Return the course with drones and boxes anywhere, in close quarters."""
-    sim, handles = course()
+def scattered(request):
+    """Return the course with drones and boxes at random poses, close to each other."""
+    sim, handles = build_course()
     rng = np.random.default_rng(5)
     pos = rng.uniform([-1.5, -1.5, 0], [2.5, 1.5, 1.8], (N_WORLDS, N_DRONES, 3))
     pos[:8, 1] = pos[:8, 0] + rng.normal(scale=0.08, size=(8, 3))  # drones that overlap
@@ -49,44 +49,46 @@ def flown(request):
     return sim, handles
 
 
-def oracle(sim, world, names, geom):
+def mujoco_distances(sim, world, names, geom):
     """Return distances of each drone to the floor, to every object and to the nearest drone, by C MuJoCo."""
     sim.scene.sync_one(sim.data, world)
     model, data = sim.mj_model, sim.mj_data
     root = model.body_rootid[model.geom_bodyid]
 
-    def gap(a, b):
+    def distance(a, b):
         return mujoco.mj_geomDistance(model, data, a, b, 100.0, None)
 
-    own = [model.geom(f"{geom}:{i}").id for i in range(sim.n_drones)]
-    floor = [gap(model.geom("floor").id, g) for g in own]
-    objects = [[min(gap(g, o) for o in np.flatnonzero(root == model.body(n).id)) for n in names] for g in own]
-    drones = [[gap(a, b) if a != b else np.inf for b in own] for a in own]
+    drone_geoms = [model.geom(f"{geom}:{i}").id for i in range(sim.n_drones)]
+    floor = [distance(model.geom("floor").id, g) for g in drone_geoms]
+    objects = [
+        [min(distance(g, o) for o in np.flatnonzero(root == model.body(n).id)) for n in names] for g in drone_geoms
+    ]
+    drones = [[distance(a, b) if a != b else np.inf for b in drone_geoms] for a in drone_geoms]
     return np.array(floor), np.array(objects), np.array(drones)
 
 
-def test_every_distance_is_that_of_c_mujoco(flown):
-    sim, _ = flown
+def test_every_distance_equals_that_of_c_mujoco(scattered):
+    sim, _ = scattered
     report = jax.device_get(sim.contact_report())
     for world in range(N_WORLDS):
-        floor, objects, drones = oracle(sim, world, report.object_names, "col_sphere")
-        np.testing.assert_allclose(report.floor_distance[world], floor, atol=SPHERE)
-        np.testing.assert_allclose(report.object_distance[world], objects, atol=SPHERE)
-        np.testing.assert_allclose(report.drone_distance[world], drones.min(axis=-1), atol=SPHERE)
+        floor, objects, drones = mujoco_distances(sim, world, report.object_names, "col_sphere")
+        np.testing.assert_allclose(report.floor_distance[world], floor, atol=SPHERE_TOLERANCE)
+        np.testing.assert_allclose(report.object_distance[world], objects, atol=SPHERE_TOLERANCE)
+        np.testing.assert_allclose(report.drone_distance[world], drones.min(axis=-1), atol=SPHERE_TOLERANCE)
         np.testing.assert_array_equal(report.nearest_drone[world], drones.argmin(axis=-1))
         np.testing.assert_array_equal(report.nearest_object[world], objects.argmin(axis=-1))
-    for touches, gap in (
+    for touches, distance in (
         (report.floor, report.floor_distance),
         (report.objects, report.object_distance),
         (report.drones, report.drone_distance),
     ):
-        np.testing.assert_array_equal(touches, gap < 0)
-        assert 2 < int(touches.sum()) < touches.size - 2, "both answers must be there"
+        np.testing.assert_array_equal(touches, distance < 0)
+        assert 2 < int(touches.sum()) < touches.size - 2, "both outcomes must occur"
     np.testing.assert_array_equal(report.any, report.floor | report.drones | report.objects.any(axis=-1))
 
 
-def test_a_report_allocates_nothing_of_mujoco(flown):
-    sim, _ = flown
+def test_a_report_allocates_nothing_of_mujoco(scattered):
+    sim, _ = scattered
     sim.contact_report()
     assert not sim.scene.is_allocated
 
@@ -95,65 +97,65 @@ def test_box_collision_changes_the_distances():
     sim = Sim(n_worlds=2, control="attitude")
     sim.scene.add("box", pos=[0, 0, 1.0], size=(1, 1, 1))
     half = np.asarray(sim.airframe.value("shape.collision_box"))[5]
-    at = np.float32([[[0, 0, 1.5 + half + 0.01]], [[0, 0, 1.5 + half - 0.01]]])
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=at))
+    pos = np.float32([[[0, 0, 1.5 + half + 0.01]], [[0, 0, 1.5 + half - 0.01]]])
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     touches = np.asarray(sim.contact_report(drones=False).objects)[:, 0, 0]
     np.testing.assert_array_equal(touches, [True, True])  # the sphere is taller
     use_box_collision(sim)
     offset = float(np.asarray(sim.airframe.value("shape.collision_box"))[2])
-    found = np.asarray(sim.contact_report(drones=False).object_distance)[:, 0, 0]
-    np.testing.assert_allclose(found, [0.01 + offset, offset - 0.01], atol=1e-5)
+    distance = np.asarray(sim.contact_report(drones=False).object_distance)[:, 0, 0]
+    np.testing.assert_allclose(distance, [0.01 + offset, offset - 0.01], atol=1e-5)
 
 
-def test_fields_that_were_not_requested_are_none(flown):
-    sim, handles = flown
-    all_of_it, some = sim.contact_report(), sim.contact_report(handles["box"], floor=False, drones=False)
-    assert some.object_names == ("box:0", "box:1")
-    assert some.floor is None
-    assert some.drone_distance is None
-    columns = [all_of_it.object_names.index(n) for n in some.object_names]
-    expected = np.asarray(all_of_it.object_distance)[..., columns]
-    np.testing.assert_allclose(some.object_distance, expected, atol=1e-6)
-    one = sim.contact_report(("box:1", handles["pad"]), drones=False)
-    assert one.object_names == ("box:1", "pad:0")
+def test_fields_that_were_not_requested_are_none(scattered):
+    sim, handles = scattered
+    full_report, box_report = sim.contact_report(), sim.contact_report(handles["box"], floor=False, drones=False)
+    assert box_report.object_names == ("box:0", "box:1")
+    assert box_report.floor is None
+    assert box_report.drone_distance is None
+    columns = [full_report.object_names.index(n) for n in box_report.object_names]
+    expected = np.asarray(full_report.object_distance)[..., columns]
+    np.testing.assert_allclose(box_report.object_distance, expected, atol=1e-6)
+    mixed_report = sim.contact_report(("box:1", handles["pad"]), drones=False)
+    assert mixed_report.object_names == ("box:1", "pad:0")
     assert sim.contact_report((), drones=False).objects is None
 
 
-def test_one_drone_one_world_and_all_worlds_get_the_same(flown):
-    sim, _ = flown
-    everything = jax.device_get(sim.contact_report())
-    of_world = sim.scene.contact_fn()
-    alone = sim.scene.contact_fn(drones=False)
-    seen = {}
+def test_reports_of_one_drone_one_world_and_all_worlds_agree(scattered):
+    sim, _ = scattered
+    full_report = jax.device_get(sim.contact_report())
+    contacts_in_world = sim.scene.contact_fn()
+    contacts_of_drone = sim.scene.contact_fn(drones=False)
+    states = {}
 
     @stage("world")
     def world(data):
-        report = of_world(data)
+        report = contacts_in_world(data)
         return data.replace(states=data.states.replace(force=jnp.stack(
             [report.drone_distance, report.floor_distance, report.object_distance[:, 1]], axis=-1)))  # fmt: skip
 
     @stage("drone")
     def drone(data):
-        report = alone(data)
+        report = contacts_of_drone(data)
         return data.replace(states=data.states.replace(torque=report.object_distance[:3]))
 
-    seen = Step({"world": world, "drone": drone})(sim.data, 1).states
+    states = Step({"world": world, "drone": drone})(sim.data, 1).states
     expected = np.stack(
-        [everything.drone_distance, everything.floor_distance, everything.object_distance[..., 1]], axis=-1
+        [full_report.drone_distance, full_report.floor_distance, full_report.object_distance[..., 1]], axis=-1
     )
-    np.testing.assert_allclose(seen.force, expected, atol=1e-5)
-    np.testing.assert_allclose(seen.torque, everything.object_distance[..., :3], atol=1e-5)
+    np.testing.assert_allclose(states.force, expected, atol=1e-5)
+    np.testing.assert_allclose(states.torque, full_report.object_distance[..., :3], atol=1e-5)
 
 
-def test_the_distance_has_the_slope_of_the_way_to_the_object(flown):
-    sim, handles = flown
+def test_the_gradient_of_the_distance_is_a_unit_vector(scattered):
+    sim, handles = scattered
     contacts = sim.scene.contact_fn(handles["ball"], floor=False, drones=False)
 
-    def gap(pos):
+    def distance(pos):
         return contacts(sim.data.replace(states=sim.data.states.replace(pos=pos))).object_distance
 
-    slope = jax.jit(jax.grad(lambda pos: jnp.sum(gap(pos))))(sim.data.states.pos)
-    np.testing.assert_allclose(np.linalg.norm(slope, axis=-1), 1.0, atol=1e-4)
+    gradient = jax.jit(jax.grad(lambda pos: jnp.sum(distance(pos))))(sim.data.states.pos)
+    np.testing.assert_allclose(np.linalg.norm(gradient, axis=-1), 1.0, atol=1e-4)
 
 
 def test_large_swarms_are_computed_in_chunks():
@@ -164,15 +166,15 @@ def test_large_swarms_are_computed_in_chunks():
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     report = sim.contact_report(())
     centres = pos.astype(np.float64) + np.asarray(sim.airframe.value("shape.collision_sphere"))[:3]
-    apart = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) + 1e9 * np.eye(n)
+    distances = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) + 1e9 * np.eye(n)
     radius = float(np.asarray(sim.airframe.value("shape.collision_sphere"))[3])
-    np.testing.assert_allclose(report.drone_distance, apart.min(axis=-1) - 2 * radius, atol=SPHERE)
-    np.testing.assert_array_equal(report.nearest_drone, apart.argmin(axis=-1))
+    np.testing.assert_allclose(report.drone_distance, distances.min(axis=-1) - 2 * radius, atol=SPHERE_TOLERANCE)
+    np.testing.assert_array_equal(report.nearest_drone, distances.argmin(axis=-1))
 
 
 @pytest.mark.long("builds a scene of 4,096 drones")
 def test_a_swarm_of_4096_finds_the_two_that_touch_without_quadratic_memory():
-    """MuJoCo goes through the whole spec for every geom it is given: built one by one, this would take minutes."""
+    """Built one by one, this scene would take minutes, since MuJoCo traverses the whole spec for every added geom."""
     n, rows = 4096, 64
     sim = Sim(n_drones=n, control="attitude")
     assert sim.mj_model.nmocap == n
@@ -187,33 +189,33 @@ def test_a_swarm_of_4096_finds_the_two_that_touch_without_quadratic_memory():
     np.testing.assert_array_equal(report.nearest_drone[0, [7, 4000]], [4000, 7])
     radius = np.asarray(sim.airframe.value("shape.collision_sphere"))[3]
     gap = np.hypot(0.1, 0.05) - 2 * radius
-    np.testing.assert_allclose(report.drone_distance[0, [7, 4000]], gap, atol=SPHERE)
+    np.testing.assert_allclose(report.drone_distance[0, [7, 4000]], gap, atol=SPHERE_TOLERANCE)
     others = np.delete(report.drone_distance[0], [4000, 7, 8])
-    np.testing.assert_allclose(others, 0.5 - 2 * radius, atol=SPHERE)
+    np.testing.assert_allclose(others, 0.5 - 2 * radius, atol=SPHERE_TOLERANCE)
     assert not report.floor.any()
 
 
-def test_contacts_are_logged_at_the_step_they_begin():
-    """Drones fly past a pole in the first world and into it in the second; the third stands still next to another."""
+def test_contacts_are_logged_at_the_step_at_which_they_begin():
+    """In the first world a drone flies past a pole, in the second into it; in the third two drones rest in contact."""
     sim = Sim(n_worlds=3, n_drones=2, control="rotor_vel")
     pole = sim.scene.add("pole", pos=[0.5, 0, 0], height=3.0, radius=0.02)
     sim.add(ContactLog(pole, floor=False))
     pos = np.float32([[[0, 0.5, 1], [5, 0, 1]], [[0, 0, 1], [5, 0, 1]], [[0, 5, 1], [0, 5.1, 1]]])
     vel = np.float32([[[1, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 0]]])
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos, vel=vel))
-    apart, seen = sim.data, []
+    initial_data, touches = sim.data, []
     for _ in range(250):
         sim.step()
-        seen.append(jax.device_get(sim.contact_report(pole, floor=False)))
-    seen = np.array([report.objects.any(axis=-1) | report.drones for report in seen])
-    sim.data = apart
+        touches.append(jax.device_get(sim.contact_report(pole, floor=False)))
+    touches = np.array([report.objects.any(axis=-1) | report.drones for report in touches])
+    sim.data = initial_data
     sim.step(250)
-    touched = jax.device_get(sim.data.plugins["contacts"])
-    np.testing.assert_array_equal(touched.first, np.where(seen.any(axis=0), seen.argmax(axis=0) + 1, -1))
-    np.testing.assert_array_equal(touched.objects[..., 0], [[False, False], [True, False], [False, False]])
-    np.testing.assert_array_equal(touched.drones, [[False, False], [False, False], [True, True]])
-    assert touched.first[2].tolist() == [1, 1]
-    assert touched.any.tolist() == [[False, False], [True, False], [True, True]]
+    log = jax.device_get(sim.data.plugins["contacts"])
+    np.testing.assert_array_equal(log.first, np.where(touches.any(axis=0), touches.argmax(axis=0) + 1, -1))
+    np.testing.assert_array_equal(log.objects[..., 0], [[False, False], [True, False], [False, False]])
+    np.testing.assert_array_equal(log.drones, [[False, False], [False, False], [True, True]])
+    assert log.first[2].tolist() == [1, 1]
+    assert log.any.tolist() == [[False, False], [True, False], [True, True]]
     sim.reset(np.array([False, True, False]))
     assert sim.data.plugins["contacts"].any.tolist() == [[False, False], [False, False], [True, True]]
 
@@ -238,7 +240,7 @@ def attached():
 
 
 def move_rocks(sim, shift):
-    """Shift and turn the rocks that can move through mjx_data, in each world otherwise."""
+    """Move and rotate the movable rocks through mjx_data, in each world in another way."""
     ids = np.array([sim.mj_model.body(f"rock:{k}").mocapid[0] for k in (0, 2)])
     pos = np.float32([[[0, 0, 1], [2, 0, 1]], [[0.2, 0, 1], [2, 0.3, 1]]]) + np.float32(shift)
     half = np.float32([np.cos(0.3), 0, 0, np.sin(0.3)])  # wxyz, by 0.6 rad about z
@@ -248,39 +250,41 @@ def move_rocks(sim, shift):
     sim.mjx_data = data.replace(mocap_pos=mocap_pos, mocap_quat=mocap_quat)
 
 
-def test_bodies_moved_through_mjx_data_are_reported_where_they_are(attached):
-    """Distances follow every move, in every world, as C MuJoCo has them; nothing is compiled anew for a move."""
+def test_bodies_moved_through_mjx_data_are_reported_at_their_poses(attached):
+    """After every move, distances in every world equal those of C MuJoCo; a move compiles nothing."""
     sim, ball = attached
-    touches = []
+    n_touches = []
     for shift in ([0, 0, 0], [0.3, -0.2, 0.1], [0, 1.0, 0]):
         move_rocks(sim, shift)
         report = jax.device_get(sim.contact_report())
         assert set(report.object_names) == {"ball:0", "rock:0", "rock:1", "rock:2"}
         for world in range(2):
-            _, objects, _ = oracle(sim, world, report.object_names, "col_sphere")
-            np.testing.assert_allclose(report.object_distance[world], objects, atol=SPHERE)
-        touches.append(int(report.objects.sum()))
-    assert touches[0] > 0
-    assert touches[2] == 0
-    one = sim.contact_report(["rock:2", ball], floor=False, drones=False)
+            _, objects, _ = mujoco_distances(sim, world, report.object_names, "col_sphere")
+            np.testing.assert_allclose(report.object_distance[world], objects, atol=SPHERE_TOLERANCE)
+        n_touches.append(int(report.objects.sum()))
+    assert n_touches[0] > 0
+    assert n_touches[2] == 0
+    report_of_two = sim.contact_report(["rock:2", ball], floor=False, drones=False)
     columns = [report.object_names.index(name) for name in ("rock:2", "ball:0")]
-    np.testing.assert_allclose(one.object_distance, report.object_distance[..., columns], atol=1e-6)
-    jitted = [fn._cache_size() for fn in sim._queries._compiled[1].values()]
-    assert jitted == [1] * len(jitted), "a move compiles nothing"
+    np.testing.assert_allclose(report_of_two.object_distance, report.object_distance[..., columns], atol=1e-6)
+    cache_sizes = [fn._cache_size() for fn in sim._queries._compiled[1].values()]
+    assert cache_sizes == [1] * len(cache_sizes), "a move compiles nothing"
 
 
-def test_before_mjx_data_is_read_such_bodies_are_where_the_spec_has_them():
+def test_before_mjx_data_is_read_bodies_are_at_their_poses_in_the_spec():
     sim = Sim(n_worlds=2)
     body = sim.spec.worldbody.add_body(name="rock", pos=[0, 0, 2], mocap=True)
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
     sim.build_mjx()
     centre = np.asarray(sim.airframe.value("shape.collision_sphere"))
-    np.testing.assert_allclose(sim.contact_report("rock").object_distance, 2 - centre[2] - centre[3] - 0.1, atol=SPHERE)
+    np.testing.assert_allclose(
+        sim.contact_report("rock").object_distance, 2 - centre[2] - centre[3] - 0.1, atol=SPHERE_TOLERANCE
+    )
     assert not sim.scene.is_allocated
 
 
-def test_a_pure_function_takes_poses_of_such_bodies(attached):
-    """Race code that keeps poses of its own passes them, as mjx_data or as a pair, to all worlds or to one."""
+def test_a_pure_function_takes_poses_of_bodies_moved_through_mjx_data(attached):
+    """Poses are passed as mjx_data or as a pair, for all worlds or for one."""
     sim, _ = attached
     move_rocks(sim, [0.1, 0.1, 0])
     expected = np.asarray(sim.contact_report().object_distance)
@@ -288,19 +292,19 @@ def test_a_pure_function_takes_poses_of_such_bodies(attached):
     pair = jax.device_get((mjx_data.mocap_pos, mjx_data.mocap_quat))
     for mocap in (mjx_data, pair):
         np.testing.assert_allclose(contacts(sim.data, mocap).object_distance, expected, atol=1e-6)
-    moved = contacts(sim.data, (pair[0] + np.float32([0, 0, 5]), pair[1]))
-    column = moved.object_names.index("rock:0")
-    assert (np.asarray(moved.object_distance)[..., column] > expected[..., column] + 1).all()
-    alone = sim.scene.contact_fn(["rock:0"], floor=False, drones=False)
+    raised_report = contacts(sim.data, (pair[0] + np.float32([0, 0, 5]), pair[1]))
+    column = raised_report.object_names.index("rock:0")
+    assert (np.asarray(raised_report.object_distance)[..., column] > expected[..., column] + 1).all()
+    contacts_of_rock = sim.scene.contact_fn(["rock:0"], floor=False, drones=False)
 
-    def gap(pos):
-        return alone(sim.data, (jnp.broadcast_to(pos, pair[0].shape), pair[1])).object_distance[0, 0, 0]
+    def distance(pos):
+        return contacts_of_rock(sim.data, (jnp.broadcast_to(pos, pair[0].shape), pair[1])).object_distance[0, 0, 0]
 
-    slope = np.asarray(jax.jit(jax.grad(gap))(pair[0][0, 0]))
-    assert np.abs(slope).sum() > 0.5, "the distance has a slope by the body's position"
+    gradient = np.asarray(jax.jit(jax.grad(distance))(pair[0][0, 0]))
+    assert np.abs(gradient).sum() > 0.5, "the distance has a slope by the body's position"
     seen = Step({"one": stage("world")(
         lambda d: d.replace(states=d.states.replace(force=d.states.force.at[:, 0].set(
-            alone(d, (pair[0][0], pair[1][0])).object_distance[:, 0])))
+            contacts_of_rock(d, (pair[0][0], pair[1][0])).object_distance[:, 0])))
     )}, "lanes")(sim.data, 1).states.force  # fmt: skip
     np.testing.assert_allclose(np.asarray(seen)[0, :, 0], expected[0, :, column], atol=1e-5)
 
@@ -340,10 +344,10 @@ def test_law_09_wrong_queries_are_refused(attached):
 @pytest.mark.long("compiles contacts in the step and in a report")
 @pytest.mark.parametrize("box", [False, True])
 @pytest.mark.parametrize("n_drones", [1, 3, 9])
-def test_the_log_has_the_contacts_between_drones_of_a_report(n_drones, box, rng):
+def test_the_log_and_a_report_have_the_same_contacts_between_drones(n_drones, box, rng):
     """In the step one drone loops over the others; a report has all pairs of a world.
 
-    Boxes are kernels of nine drones, which loop; all pairs of three, written out, would take g++ 18 s.
+    With boxes, nine drones loop in a kernel; all pairs of three drones, unrolled, would take g++ 18 s.
     """
     engine = "interpret" if box and n_drones == 3 else "auto"
     sim = Sim(n_worlds=4, n_drones=n_drones, control="rotor_vel", engine=engine)
@@ -360,18 +364,18 @@ def test_the_log_has_the_contacts_between_drones_of_a_report(n_drones, box, rng)
 
 
 @pytest.mark.parametrize("n_drones", [1, 3, 9])
-def test_one_kernel_reports_what_xla_does(n_drones, rng):
-    """Of more than eight drones the others of a world are no kernel's; what is left out stays out."""
+def test_one_kernel_reports_the_same_as_xla(n_drones, rng):
+    """Distances between more than eight drones have no kernel; fields that are not requested are None in both."""
     sims = [Sim(n_worlds=5, n_drones=n_drones, engine=engine) for engine in ("auto", "lanes")]
     pos = np.float32(rng.uniform(-0.5, 1, (5, n_drones, 3)))
     for sim in sims:
         sim.scene.add("box", count=2, pos=[[1, 0, 0.5], [0, 1, 0.5]])
         sim.scene.add("pole", pos=[0.2, 0.2, 0])
         sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
-    for asked in ({}, {"floor": False}, {"objects": (), "drones": False}, {"objects": "pole:0", "floor": False}):
-        found, expected = (sim.contact_report(**asked) for sim in sims)
-        assert jax.tree.structure(found) == jax.tree.structure(expected)
-        for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    for options in ({}, {"floor": False}, {"objects": (), "drones": False}, {"objects": "pole:0", "floor": False}):
+        report, expected = (sim.contact_report(**options) for sim in sims)
+        assert jax.tree.structure(report) == jax.tree.structure(expected)
+        for x, y in zip(jax.tree.leaves(report), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(x, y, atol=1e-5)
 
 
@@ -381,31 +385,33 @@ BALL = "<geom type='sphere' size='.1' pos='{} {} {}' conaffinity='2'/>"
 @pytest.mark.long("builds a scene of 3,031 objects, and another program to compare")
 @pytest.mark.parametrize("box", [False, True])
 def test_thousands_of_objects_are_reported_by_a_small_program(box, rng):
-    """Balls that move and that do not, boxes in any attitude, and a body of forty balls.
+    """Movable and fixed balls, boxes in any attitude, and a body of forty balls.
 
     The distances of few objects are computed one by one, and compared with those of C MuJoCo above.
     """
     sim = Sim(n_worlds=1, n_drones=1)
     if box:
         use_box_collision(sim)
-    n, places, places_of_one = 1500, rng.uniform(-3, 3, (2, 1500, 3)), rng.uniform(-3, 3, (40, 3))
-    sim.scene.add("sphere", "moves", count=n, pos=places[0])
-    sim.scene.add("sphere", "stays", count=n, pos=places[1], mocap=False)
-    sim.scene.add("box", "turned", count=30, pos=places[0, :30], quat=rng.normal(size=(30, 4)), mocap=False)
-    balls = "".join(BALL.format(*place) for place in places_of_one)
+    n, positions, positions_in_body = 1500, rng.uniform(-3, 3, (2, 1500, 3)), rng.uniform(-3, 3, (40, 3))
+    sim.scene.add("sphere", "moves", count=n, pos=positions[0])
+    sim.scene.add("sphere", "stays", count=n, pos=positions[1], mocap=False)
+    sim.scene.add("box", "turned", count=30, pos=positions[0, :30], quat=rng.normal(size=(30, 4)), mocap=False)
+    balls = "".join(BALL.format(*pos) for pos in positions_in_body)
     sim.scene.add(f"<mujoco><worldbody>{balls}</worldbody></mujoco>", "many", mocap=False)
     program = str(jax.make_jaxpr(sim.scene.contact_fn())(sim.data))
-    assert program.count("\n") < 20_000, "it grows with the number of objects, and takes minutes to compile"
+    assert program.count("\n") < 20_000, "the program grows with the number of objects, and takes minutes to compile"
     report = sim.contact_report()
-    found = np.asarray(report.object_distance)[0, 0]
-    assert found.shape == (2 * n + 31,)
-    assert report.nearest_object[0, 0] == np.argmin(found)
-    chosen = [f"{name}:{k}" for name in ("moves", "stays", "turned") for k in (0, 7, 29)]
-    few = np.asarray(sim.contact_report(chosen).object_distance)[0, 0]
-    np.testing.assert_allclose(found[[report.object_names.index(name) for name in chosen]], few, atol=1e-5)
+    distances = np.asarray(report.object_distance)[0, 0]
+    assert distances.shape == (2 * n + 31,)
+    assert report.nearest_object[0, 0] == np.argmin(distances)
+    chosen_names = [f"{name}:{k}" for name in ("moves", "stays", "turned") for k in (0, 7, 29)]
+    chosen_distances = np.asarray(sim.contact_report(chosen_names).object_distance)[0, 0]
+    np.testing.assert_allclose(
+        distances[[report.object_names.index(name) for name in chosen_names]], chosen_distances, atol=1e-5
+    )
     if not box:
         centre, reach = np.array([0, 0, 0.02]), 0.086 + 0.1
-        expected = np.linalg.norm(np.concatenate(places) - centre, axis=-1) - reach
-        np.testing.assert_allclose(found[: 2 * n], expected, atol=1e-5)
-        nearest = np.linalg.norm(places_of_one - centre, axis=-1).min() - reach
-        np.testing.assert_allclose(found[report.object_names.index("many:0")], nearest, atol=1e-5)
+        expected = np.linalg.norm(np.concatenate(positions) - centre, axis=-1) - reach
+        np.testing.assert_allclose(distances[: 2 * n], expected, atol=1e-5)
+        nearest = np.linalg.norm(positions_in_body - centre, axis=-1).min() - reach
+        np.testing.assert_allclose(distances[report.object_names.index("many:0")], nearest, atol=1e-5)

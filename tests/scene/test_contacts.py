@@ -36,14 +36,14 @@ def random_quats(rng, *shape):
     return quat / np.linalg.norm(quat, axis=-1, keepdims=True)
 
 
-def rotate(quat_xyzw, vector):
+def rotate_vector(quat_xyzw, vector):
     xyz, w = quat_xyzw[..., :3], quat_xyzw[..., 3:]
     t = 2 * np.cross(xyz, vector)
     return vector + w * t + np.cross(xyz, t)
 
 
-def scatter(sim):
-    """Give every drone and the pole of every world another pose, near enough for half of them to touch something."""
+def scatter_poses(sim):
+    """Give the drones and the pole of every world random poses, so close that about half of them touch something."""
     rng = np.random.default_rng(7)
     pos = rng.uniform([-0.25, -0.25, 0], [0.25, 0.25, 0.5], (sim.n_worlds, sim.n_drones, 3))
     quat = random_quats(rng, sim.n_worlds, sim.n_drones)
@@ -58,27 +58,27 @@ def scatter(sim):
 
 
 @pytest.fixture(scope="module")
-def crowd():
-    """Worlds of two drones, a ball that is part of the scene and a pole that is placed anew in every world."""
+def scattered():
+    """Worlds of two drones, a fixed ball, and a pole with another pose in every world."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=2)
     add_obstacles(sim)
-    return sim, *scatter(sim)
+    return sim, *scatter_poses(sim)
 
 
-def touching(sim):
-    """Return for every pair of geom names in how many worlds it touches, as one bool per world."""
+def touching_pairs(sim):
+    """Return for every pair of geom names True for the worlds in which it touches."""
     flags = np.asarray(sim.contacts())
     contact = jax.device_get(sim.mjx_data._impl.contact)
-    found = {}
+    flags_by_pair = {}
     for world in range(sim.n_worlds):
         for slot in range(flags.shape[1]):
             ids = int(contact.geom1[world, slot]), int(contact.geom2[world, slot])
             pair = frozenset(sim.mj_model.geom(i).name for i in ids)
-            found.setdefault(pair, np.zeros(sim.n_worlds, bool))[world] |= flags[world, slot]
-    return found
+            flags_by_pair.setdefault(pair, np.zeros(sim.n_worlds, bool))[world] |= flags[world, slot]
+    return flags_by_pair
 
 
-def to_segment(point, middle, half):
+def distance_to_segment(point, middle, half):
     """Return the distance from points to segments that reach ``half`` (n, 3) to both sides of their middle."""
     t = np.sum((point - middle) * half, -1) / np.sum(half * half, -1)
     return np.linalg.norm(point - middle - np.clip(t, -1, 1)[:, None] * half, axis=-1)
@@ -93,41 +93,45 @@ def test_contacts_of_mocap_bodies_are_not_empty():
     assert np.asarray(contacts).all(), "a drone that stands on the floor touches it"
 
 
-def test_touching_is_a_distance_below_zero(crowd):
+def test_geoms_touch_where_their_distance_is_negative(scattered):
     """Every pair of spheres, capsules and floor touches where the distance from its formula is negative."""
-    sim, pos, quat, pole_pos, pole_quat = crowd
-    spheres = pos + rotate(quat, OFFSET)
-    half = rotate(pole_quat, np.array([0.0, 0.0, POLE_HALF]))
+    sim, pos, quat, pole_pos, pole_quat = scattered
+    spheres = pos + rotate_vector(quat, OFFSET)
+    half = rotate_vector(pole_quat, np.array([0.0, 0.0, POLE_HALF]))
     distances = {
         ("col_sphere:0", "col_sphere:1"): np.linalg.norm(spheres[:, 0] - spheres[:, 1], axis=-1) - 2 * RADIUS,
         ("floor", "pole"): pole_pos[:, 2] - np.abs(half[:, 2]) - POLE_RADIUS,
-        ("ball", "pole"): to_segment(np.broadcast_to(BALL, (N_WORLDS, 3)), pole_pos, half) - POLE_RADIUS - BALL_RADIUS,
+        ("ball", "pole"): distance_to_segment(np.broadcast_to(BALL, (N_WORLDS, 3)), pole_pos, half)
+        - POLE_RADIUS
+        - BALL_RADIUS,
     }
     for i in range(2):
         sphere = f"col_sphere:{i}"
         distances["floor", sphere] = spheres[:, i, 2] - RADIUS
         distances["ball", sphere] = np.linalg.norm(spheres[:, i] - BALL, axis=-1) - RADIUS - BALL_RADIUS
-        distances["pole", sphere] = to_segment(spheres[:, i], pole_pos, half) - RADIUS - POLE_RADIUS
+        distances["pole", sphere] = distance_to_segment(spheres[:, i], pole_pos, half) - RADIUS - POLE_RADIUS
 
-    found = touching(sim)
-    assert set(found) == {frozenset(pair) for pair in distances}
+    flags_by_pair = touching_pairs(sim)
+    assert set(flags_by_pair) == {frozenset(pair) for pair in distances}
     for pair, distance in distances.items():
-        clear = np.abs(distance) > 1e-5  # nearer to touching than float32 can tell
-        np.testing.assert_array_equal(found[frozenset(pair)][clear], distance[clear] < 0, err_msg=str(pair))
+        is_clear = np.abs(distance) > 1e-5  # closer cases are undecided in float32
+        np.testing.assert_array_equal(
+            flags_by_pair[frozenset(pair)][is_clear], distance[is_clear] < 0, err_msg=str(pair)
+        )
         assert 3 < np.sum(distance < 0) < N_WORLDS - 3, f"{pair}: both outcomes must occur for this to test anything"
 
 
 @pytest.mark.long("compiles MJX's contacts of boxes")
-def test_boxes_touch_where_c_mujoco_says_so():
-    """With box collision drones touch the floor, the ball, the pole and each other as C MuJoCo's distances have it."""
+def test_boxes_touch_where_c_mujocos_distances_are_negative():
+    """With box collision drones touch floor, ball, pole and each other where C MuJoCo's distances are negative."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=2)
     add_obstacles(sim)
     use_box_collision(sim)
-    pos, quat, pole_pos, pole_quat = scatter(sim)
-    found = touching(sim)
+    pos, quat, pole_pos, pole_quat = scatter_poses(sim)
+    flags_by_pair = touching_pairs(sim)
     pairs = [("col_box:0", "col_box:1"), ("floor", "col_box:0"), ("ball", "col_box:1"), ("pole", "col_box:0")]
-    assert {frozenset(pair) for pair in pairs} < set(found)
-    assert not any("col_sphere" in name for pair in found for name in pair)
+    assert {frozenset(pair) for pair in pairs} < set(flags_by_pair)
+    assert not any("col_sphere" in name for pair in flags_by_pair for name in pair)
 
     data, drones = mujoco.MjData(sim.mj_model), np.asarray(sim.data.core.drone_mocap_ids)
     pole = sim.mj_model.body("pole").mocapid.item()
@@ -141,35 +145,37 @@ def test_boxes_touch_where_c_mujoco_says_so():
             a, b = (sim.mj_model.geom(name).id for name in pair)
             distances[world, k] = mujoco.mj_geomDistance(sim.mj_model, data, a, b, 1.0, None)
     for k, pair in enumerate(pairs):
-        clear = np.abs(distances[:, k]) > 2e-3
+        is_clear = np.abs(distances[:, k]) > 2e-3
         np.testing.assert_array_equal(
-            found[frozenset(pair)][clear], distances[clear, k] < 0, err_msg=f"{pair} {distances[:, k]}"
+            flags_by_pair[frozenset(pair)][is_clear], distances[is_clear, k] < 0, err_msg=f"{pair} {distances[:, k]}"
         )
         assert 3 < np.sum(distances[:, k] < 0) < N_WORLDS - 3
 
     use_box_collision(sim, False)
-    assert {frozenset(("floor", "col_sphere:0")), frozenset(("col_sphere:0", "col_sphere:1"))} <= set(touching(sim))
+    assert {frozenset(("floor", "col_sphere:0")), frozenset(("col_sphere:0", "col_sphere:1"))} <= set(
+        touching_pairs(sim)
+    )
 
 
 @pytest.mark.parametrize("body", ["drone:0", "drone:1", "pole", "ball", "world"])
-def test_a_body_filters_its_own_slots(crowd, body):
+def test_contacts_of_a_body_are_its_own_slots(scattered, body):
     """Contacts of a body keep the slots of its geoms and clear the others, in every world."""
-    sim = crowd[0]
-    sim.contacts()  # which geoms a slot is of, the first sync says
+    sim = scattered[0]
+    sim.contacts()  # the first sync determines the geoms of each slot
     contact = jax.device_get(sim.mjx_data._impl.contact)
     bodies = sim.mj_model.geom_bodyid[np.stack([contact.geom1, contact.geom2])]
-    of_body = (bodies == sim.mj_model.body(body).id).any(0)
-    assert 0 < of_body.sum() < of_body.size
-    np.testing.assert_array_equal(sim.contacts(body), np.asarray(sim.contacts()) & of_body)
+    belongs_to_body = (bodies == sim.mj_model.body(body).id).any(0)
+    assert 0 < belongs_to_body.sum() < belongs_to_body.size
+    np.testing.assert_array_equal(sim.contacts(body), np.asarray(sim.contacts()) & belongs_to_body)
 
 
-def test_a_body_without_geoms_touches_nothing(crowd):
-    assert not np.asarray(crowd[0].contacts("_dummy")).any()
+def test_a_body_without_geoms_touches_nothing(scattered):
+    assert not np.asarray(scattered[0].contacts("_dummy")).any()
 
 
-def test_a_closed_over_scene_gives_the_same_contacts(crowd):
+def test_a_closed_over_scene_gives_the_same_contacts(scattered):
     """The contact check for tight loops: the scene is a constant of the compiled function, the poles an argument."""
-    sim = crowd[0]
+    sim = scattered[0]
     expected = np.asarray(sim.contacts())
     _mjx_data, mjx_model = sim.mjx_data, sim.mjx_model
     traces = []
@@ -183,37 +189,37 @@ def test_a_closed_over_scene_gives_the_same_contacts(crowd):
 
     mocap_pos = np.array(sim.mjx_data.mocap_pos)
     np.testing.assert_array_equal(check_contacts(sim.data, mocap_pos), expected)
-    away = mocap_pos.copy()
-    away[:, sim.mj_model.body("pole").mocapid.item()] = 9.0
-    far = check_contacts(sim.data, away)
+    far_mocap_pos = mocap_pos.copy()
+    far_mocap_pos[:, sim.mj_model.body("pole").mocapid.item()] = 9.0
+    far_contacts = check_contacts(sim.data, far_mocap_pos)
     contact = jax.device_get(sim.mjx_data._impl.contact)
-    of_pole = (contact.geom1 == sim.mj_model.geom("pole").id) | (contact.geom2 == sim.mj_model.geom("pole").id)
-    assert expected[of_pole].any()
-    np.testing.assert_array_equal(far, expected & ~of_pole)
+    belongs_to_pole = (contact.geom1 == sim.mj_model.geom("pole").id) | (contact.geom2 == sim.mj_model.geom("pole").id)
+    assert expected[belongs_to_pole].any()
+    np.testing.assert_array_equal(far_contacts, expected & ~belongs_to_pole)
     assert len(traces) == 1
     assert sim.mjx_data is _mjx_data, "the check is pure"
 
 
-def test_spread_worlds_have_the_same_contacts(crowd):
-    """Contacts on two devices equal those on one, whether spread from the start or later, poles that moved included."""
-    expected = np.asarray(crowd[0].contacts())
+def test_worlds_on_two_devices_have_the_same_contacts(scattered):
+    """Contacts on two devices equal those on one, whether sharded at construction or later, after poles have moved."""
+    expected = np.asarray(scattered[0].contacts())
     mesh = world_mesh(jax.devices()[:2])
-    born = Sim(n_worlds=N_WORLDS, n_drones=2, mesh=mesh)
-    add_obstacles(born)
-    scatter(born)
-    np.testing.assert_array_equal(born.contacts(), expected)
-    assert len(born.contacts().sharding.device_set) == 2
+    built_on_mesh = Sim(n_worlds=N_WORLDS, n_drones=2, mesh=mesh)
+    add_obstacles(built_on_mesh)
+    scatter_poses(built_on_mesh)
+    np.testing.assert_array_equal(built_on_mesh.contacts(), expected)
+    assert len(built_on_mesh.contacts().sharding.device_set) == 2
 
-    later = Sim(n_worlds=N_WORLDS, n_drones=2)
-    add_obstacles(later)
-    scatter(later)
-    later.shard(mesh)
-    np.testing.assert_array_equal(later.contacts(), expected)
-    assert len(later.mjx_data.mocap_pos.sharding.device_set) == 2
+    sharded_later = Sim(n_worlds=N_WORLDS, n_drones=2)
+    add_obstacles(sharded_later)
+    scatter_poses(sharded_later)
+    sharded_later.shard(mesh)
+    np.testing.assert_array_equal(sharded_later.contacts(), expected)
+    assert len(sharded_later.mjx_data.mocap_pos.sharding.device_set) == 2
 
 
 def test_a_large_swarm_keeps_the_nearest_pairs():
-    """From 64 drones on slots are fewer than pairs; drones that touch are near, so they keep theirs."""
+    """With 64 drones there are fewer slots than pairs; drones that touch are among the nearest, so they keep a slot."""
     sim = Sim(n_worlds=1, n_drones=64)
     pos = np.asarray(sim.data.states.pos).copy()
     pos[..., 2] = 1.0
@@ -234,21 +240,21 @@ def test_a_large_swarm_keeps_the_nearest_pairs():
         ("mocap_pos", np.full((64, 3, 3), np.nan), "expected finite numbers"),
     ],
 )
-def test_invalid_poses_are_refused(crowd, name, value, message):
+def test_invalid_poses_are_refused(scattered, name, value, message):
     """Poses without a world axis, for another number of bodies, or not finite raise, and change nothing."""
-    sim = crowd[0]
+    sim = scattered[0]
     before = sim.mjx_data
     with pytest.raises(ValueError, match=message):
         sim.mjx_data = sim.mjx_data.replace(**{name: value})
     assert sim.mjx_data is before
 
 
-def test_poses_may_be_numpy_arrays_of_any_number(crowd):
+def test_poses_may_be_numpy_arrays_of_any_dtype(scattered):
     """Positions written as integers or float64 are cast; drones do not snap to whole metres."""
-    sim, pos, _quat, *_ = crowd
+    sim, pos, _quat, *_ = scattered
     expected = np.asarray(sim.contacts())
-    mocap_pos, far = np.asarray(sim.mjx_data.mocap_pos), sim.mjx_data
-    sim.mjx_data = far.replace(mocap_pos=np.rint(mocap_pos).astype(int))
+    mocap_pos, mjx_data = np.asarray(sim.mjx_data.mocap_pos), sim.mjx_data
+    sim.mjx_data = mjx_data.replace(mocap_pos=np.rint(mocap_pos).astype(int))
     sim.contacts()
     np.testing.assert_allclose(np.asarray(sim.mjx_data.mocap_pos)[:, sim.data.core.drone_mocap_ids], pos, rtol=1e-6)
     sim.mjx_data = sim.mjx_data.replace(mocap_pos=mocap_pos.astype(np.float64))

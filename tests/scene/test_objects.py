@@ -1,4 +1,4 @@
-"""Objects with handles: their poses are part of SimData, and the scene is compiled at its next use."""
+"""Objects with handles, whose poses are part of SimData; the scene is compiled at its next use."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ TOWER = """
 
 @pytest.fixture(scope="module")
 def course():
-    """Three worlds with two gates that move, a pole that stands, and a tower that moves."""
+    """Three worlds with two movable gates, a fixed pole, and a movable tower."""
     sim = Sim(n_worlds=3, n_drones=2, control="attitude")
     gates = sim.scene.add("gate", count=2, pos=[[1, 0, 1], [2, 0, 1]])
     pole = sim.scene.add("pole", pos=[0, 1, 0], mocap=False)
@@ -33,23 +33,23 @@ def course():
     return sim, gates, pole, tower
 
 
-def test_a_handle_stays_valid_when_more_is_added(course):
+def test_a_handle_stays_valid_when_objects_are_added(course):
     sim, gates, _, tower = course
     assert sim.data.objects.names == ("gate:0", "gate:1", "tower:0")
     np.testing.assert_allclose(gates.pose(sim.data)[0], np.tile([[1, 0, 1], [2, 0, 1]], (3, 1, 1)))
     np.testing.assert_allclose(np.asarray(tower.pose(sim.data)[0])[:, 0, 2], [1, 2, 3])
     data = gates[1].set_pose(sim.data, [5, 5, 5])
-    more = sim.scene.add("sphere", f"ball-{len(sim.scene.object_names)}", pos=[7, 0, 0])
-    data2 = sim.data
-    np.testing.assert_allclose(more.pose(data2)[0], np.tile([[7, 0, 0]], (3, 1, 1)))
+    ball = sim.scene.add("sphere", f"ball-{len(sim.scene.object_names)}", pos=[7, 0, 0])
+    later_data = sim.data
+    np.testing.assert_allclose(ball.pose(later_data)[0], np.tile([[7, 0, 0]], (3, 1, 1)))
     np.testing.assert_allclose(np.asarray(gates[1].pose(data)[0])[0], [[5, 5, 5]])
-    np.testing.assert_allclose(np.asarray(tower.pose(data2)[0])[:, 0, 2], [1, 2, 3])
+    np.testing.assert_allclose(np.asarray(tower.pose(later_data)[0])[:, 0, 2], [1, 2, 3])
 
 
 def test_everything_is_compiled_once_at_the_next_use(monkeypatch):
     sim, compiled = Sim(), []
-    real = build.compile_spec
-    monkeypatch.setattr(build, "compile_spec", lambda spec: (compiled.append(1), real(spec))[1])
+    compile_spec = build.compile_spec
+    monkeypatch.setattr(build, "compile_spec", lambda spec: (compiled.append(1), compile_spec(spec))[1])
     for k in range(4):
         sim.scene.add("box", f"box-{k}")
     assert not compiled
@@ -58,8 +58,8 @@ def test_everything_is_compiled_once_at_the_next_use(monkeypatch):
     assert len(compiled) == 1
 
 
-def test_poses_are_those_that_mujoco_has(course, rng):
-    """In the drawn world and in MJX, with quaternions converted and children moved along."""
+def test_poses_equal_those_in_mujoco(course, rng):
+    """In the drawn world and in MJX, quaternions are converted and children move with their parents."""
     sim, gates, _, tower = course
     pos, quat = rng.normal(size=(3, 2, 3)), rng.normal(size=(3, 2, 4))
     sim.data = tower.set_pose(gates.set_pose(sim.data, pos, quat), pos[:, :1] + 1, quat[:, 1:])
@@ -68,27 +68,27 @@ def test_poses_are_those_that_mujoco_has(course, rng):
     model, mjx_data = sim.mj_model, jax.device_get(sim.mjx_data)
     for world in range(3):
         sim.scene.sync_one(sim.data, world)
-        for found in (sim.mj_data, jax.tree.map(lambda x, w=world: x[w], mjx_data)):
+        for state in (sim.mj_data, jax.tree.map(lambda x, w=world: x[w], mjx_data)):
             for k in range(2):
                 body = model.body(f"gate:{k}").id
-                np.testing.assert_allclose(found.xpos[body], pos[world, k], atol=1e-6)
-                np.testing.assert_allclose(found.xquat[body], np.roll(quat[world, k], 1), atol=1e-6)
+                np.testing.assert_allclose(state.xpos[body], pos[world, k], atol=1e-6)
+                np.testing.assert_allclose(state.xquat[body], np.roll(quat[world, k], 1), atol=1e-6)
             tip = next(g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH)
-            own = mujoco.MjData(model)
-            own.mocap_pos[model.body("tower:0").mocapid] = pos[world, 0] + 1
-            own.mocap_quat[model.body("tower:0").mocapid] = np.roll(quat[world, 1], 1)
-            mujoco.mj_kinematics(model, own)
-            np.testing.assert_allclose(found.geom_xpos[tip], own.geom_xpos[tip], atol=2e-6)
+            expected = mujoco.MjData(model)
+            expected.mocap_pos[model.body("tower:0").mocapid] = pos[world, 0] + 1
+            expected.mocap_quat[model.body("tower:0").mocapid] = np.roll(quat[world, 1], 1)
+            mujoco.mj_kinematics(model, expected)
+            np.testing.assert_allclose(state.geom_xpos[tip], expected.geom_xpos[tip], atol=2e-6)
 
 
-def test_a_reset_brings_objects_back_and_a_mask_only_its_worlds(course):
+def test_a_reset_moves_objects_back_in_the_worlds_of_its_mask(course):
     sim, gates, _, _ = course
-    start = np.asarray(gates.pose(sim.default_data)[0])
+    default_pos = np.asarray(gates.pose(sim.default_data)[0])
     sim.data = gates.set_pose(sim.data, [9, 9, 9])
     sim.reset(np.array([True, False, True]))
-    now = np.asarray(gates.pose(sim.data)[0])
-    np.testing.assert_array_equal(now[[0, 2]], start[[0, 2]])
-    np.testing.assert_array_equal(now[1], 9.0)
+    pos = np.asarray(gates.pose(sim.data)[0])
+    np.testing.assert_array_equal(pos[[0, 2]], default_pos[[0, 2]])
+    np.testing.assert_array_equal(pos[1], 9.0)
 
 
 def test_set_pose_is_pure_masked_and_differentiable(course):
@@ -99,11 +99,11 @@ def test_set_pose_is_pure_masked_and_differentiable(course):
     before, after = (np.asarray(gates.pose(d)[0]) for d in (data, moved))
     np.testing.assert_allclose(after[0], 4.0)
     np.testing.assert_array_equal(after[1:], before[1:])
-    slope = jax.jit(jax.grad(lambda z: jnp.sum(gates.set_pose(data, jnp.zeros(3) + z).objects.pos ** 2)))(2.0)
-    assert slope == pytest.approx(2 * 2.0 * 3 * 2 * 3)  # d/dz of z^2 over 3 worlds, 2 gates, 3 components
+    gradient = jax.jit(jax.grad(lambda z: jnp.sum(gates.set_pose(data, jnp.zeros(3) + z).objects.pos ** 2)))(2.0)
+    assert gradient == pytest.approx(2 * 2.0 * 3 * 2 * 3)  # d/dz of z^2 over 3 worlds, 2 gates, 3 components
 
 
-def test_a_stage_of_one_world_moves_them():
+def test_a_stage_of_one_world_moves_objects():
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     pad = sim.scene.add("landing_pad", pos=np.array([[[0, 0, 0.5]], [[1, 0, 0.5]]]))
 
@@ -120,18 +120,18 @@ def test_a_stage_of_one_world_moves_them():
     np.testing.assert_allclose(np.asarray(pad.pose(sim.data)[0])[:, 0, 0], [0.1, 1.1], atol=1e-5)
 
 
-@pytest.mark.parametrize("what", PRIMITIVES)
-def test_every_primitive_is_there_and_touched_by_drones_only(what):
+@pytest.mark.parametrize("primitive", PRIMITIVES)
+def test_every_primitive_is_touched_by_drones_only(primitive):
     sim = Sim()
-    sim.scene.add(what, pos=[0, 0, 0.3], rgba=(1, 0, 0, 1))
+    sim.scene.add(primitive, pos=[0, 0, 0.3], rgba=(1, 0, 0, 1))
     model = sim.mj_model
-    geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body(f"{what}:0").id]
+    geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body(f"{primitive}:0").id]
     assert geoms
     drone, floor = model.geom("col_sphere:0").id, model.geom("floor").id
-    kind, aff = model.geom_contype, model.geom_conaffinity
+    contype, conaffinity = model.geom_contype, model.geom_conaffinity
     for g in geoms:
-        assert (kind[drone] & aff[g]) | (kind[g] & aff[drone])
-        assert not (kind[floor] & aff[g]) | (kind[g] & aff[floor])
+        assert (contype[drone] & conaffinity[g]) | (contype[g] & conaffinity[drone])
+        assert not (contype[floor] & conaffinity[g]) | (contype[g] & conaffinity[floor])
         np.testing.assert_allclose(model.geom_rgba[g], (1, 0, 0, 1))
 
 
@@ -164,19 +164,19 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_law_09_invalid_objects_are_refused(name):
-    act, words = BAD[name]
+    call, message = BAD[name]
     sim = Sim()
     sim.scene.add("gate")
     with pytest.raises(ConfigError) as error:
-        act(sim)
-    assert words in str(error.value)
+        call(sim)
+    assert message in str(error.value)
     assert [body.name for body in sim.spec.worldbody.bodies] == ["drone:0", "_dummy", "gate:0"]
     sim.step()  # and the simulation goes on
 
 
 def test_law_09_invalid_poses_are_refused(course):
     sim, gates, pole, _ = course
-    for act, words in (
+    for call, message in (
         (lambda: gates.set_pose(sim.data, [0, 0]), "expected pos of shape (3,) or (2, 3) or (3, 2, 3), got (2,)"),
         (lambda: gates.set_pose(sim.data, [0, 0, np.nan]), "finite numbers"),
         (lambda: gates.set_pose(sim.data, None, [0, 0, 0, 0]), "not all zero"),
@@ -185,12 +185,12 @@ def test_law_09_invalid_poses_are_refused(course):
         (lambda: gates.set_pose(Sim().data, [0, 0, 0]), "expected a handle of this simulation"),
     ):
         with pytest.raises(ConfigError) as error:
-            act()
-        assert words in str(error.value)
+            call()
+        assert message in str(error.value)
 
 
-def test_a_scene_loads_whole_with_mesh_texture_and_height_field(tmp_path):
-    """A user's own MJCF, its files beside it, with objects added on top."""
+def test_a_scene_loads_with_mesh_texture_and_height_field(tmp_path):
+    """An MJCF of a user with files in its folder, to which an object is added."""
     (tmp_path / "hill.png").write_bytes(encode_png(np.arange(16).reshape(4, 4) * 16))
     scene = tmp_path / "scene.xml"
     scene.write_text("""

@@ -1,4 +1,4 @@
-"""What a sync writes: the poses SimData owns, and all that MuJoCo derives from them; nothing else."""
+"""A sync writes the poses in SimData, and the transforms that MuJoCo computes from them; nothing else."""
 
 import jax
 import jax.numpy as jnp
@@ -61,11 +61,11 @@ def sim(request):
     pos, quat = rng.normal(size=(3, 2, 3)), rng.normal(size=(3, 2, 4))
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.float32(pos), quat=np.float32(quat)))
-    turned = rng.normal(size=(3, 4))
-    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+    tower_quat = rng.normal(size=(3, 4))
+    tower_quat /= np.linalg.norm(tower_quat, axis=-1, keepdims=True)
     tower = sim.mj_model.body("tower").mocapid.item()
     mocap_pos, mocap_quat = np.array(sim.mjx_data.mocap_pos), np.array(sim.mjx_data.mocap_quat)
-    mocap_pos[:, tower], mocap_quat[:, tower] = rng.normal(size=(3, 3)), turned
+    mocap_pos[:, tower], mocap_quat[:, tower] = rng.normal(size=(3, 3)), tower_quat
     sim.mjx_data = sim.mjx_data.replace(mocap_pos=mocap_pos, mocap_quat=mocap_quat)
     return sim
 
@@ -77,8 +77,8 @@ def synced(sim):
     return data, jax.device_get(mjx_data)
 
 
-def reference(sim, world):
-    """Return the world as C MuJoCo computes it from poses that are written here, one by one."""
+def c_mujoco_state(sim, world):
+    """Return the state of a world as C MuJoCo computes it from the poses."""
     data = mujoco.MjData(sim.mj_model)
     pos, quat = np.asarray(sim.data.states.pos)[world], np.asarray(sim.data.states.quat)[world]
     for i in range(sim.n_drones):
@@ -96,19 +96,19 @@ def reference(sim, world):
 
 @pytest.mark.long("compiles MJX's kinematics, for the tests after it")
 @pytest.mark.parametrize("world", range(3))
-def test_every_transform_is_that_of_c_mujoco(sim, synced, world):
-    """Bodies, geoms and cameras of every world are where C MuJoCo has them, quaternions converted to wxyz."""
+def test_every_transform_equals_that_of_c_mujoco(sim, synced, world):
+    """Bodies, geoms and cameras of every world have the poses of C MuJoCo, with quaternions as wxyz."""
     _, mjx_data = synced
-    expected = reference(sim, world)
+    expected = c_mujoco_state(sim, world)
     for name in DERIVED:
-        found = getattr(mjx_data, name)[world].reshape(getattr(expected, name).shape)
-        np.testing.assert_allclose(found, getattr(expected, name), atol=2e-6, err_msg=name)
+        value = getattr(mjx_data, name)[world].reshape(getattr(expected, name).shape)
+        np.testing.assert_allclose(value, getattr(expected, name), atol=2e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("world", range(3))
-def test_a_world_to_be_drawn_is_that_of_c_mujoco(sim, world):
+def test_a_world_to_draw_equals_that_of_c_mujoco(sim, world):
     """The sync of one world for an image gives the same poses, and the lights, without MJX."""
-    expected = reference(sim, world)
+    expected = c_mujoco_state(sim, world)
     data = mujoco.MjData(sim.mj_model)
     poses = tuple(np.asarray(getattr(sim.mjx_data, name))[world] for name in ("mocap_pos", "mocap_quat", "qpos"))
     sync_one_world(sim.data, world, poses, sim.mj_model, data)
@@ -116,8 +116,8 @@ def test_a_world_to_be_drawn_is_that_of_c_mujoco(sim, world):
         np.testing.assert_allclose(getattr(data, name), getattr(expected, name), atol=1e-6, err_msg=name)
 
 
-def test_only_what_the_simulation_owns_is_written(sim, synced):
-    """Poses of bodies that a user attached stay as they were; so do positions and speeds of joints."""
+def test_a_sync_leaves_bodies_of_users_unchanged(sim, synced):
+    """Poses of attached bodies, and positions and velocities of joints, stay as they were."""
     _, mjx_data = synced
     tower = sim.mj_model.body("tower").mocapid.item()
     for name in ("mocap_pos", "mocap_quat"):
@@ -127,39 +127,39 @@ def test_only_what_the_simulation_owns_is_written(sim, synced):
         np.testing.assert_array_equal(getattr(mjx_data, name), getattr(sim.mjx_data, name), err_msg=name)
 
 
-def test_the_data_comes_back_with_its_flag_set_and_nothing_else_changed(sim, synced):
+def test_a_sync_only_sets_the_flag_in_the_data(sim, synced):
     data, _ = synced
     assert bool(data.core.mjx_synced)
-    assert not bool(sim.data.core.mjx_synced), "the data that went in is as it was"
+    assert not bool(sim.data.core.mjx_synced), "the original data are unchanged"
     before, after = (d.replace(core=d.core.replace(mjx_synced=None, rng_key=None)) for d in (sim.data, data))
     jax.tree.map(np.testing.assert_array_equal, before, after)
 
 
 @pytest.mark.long("compiles MJX's kinematics and contacts in a scan")
-def test_a_sync_works_within_transformations(sim, synced):
-    """Within jit and scan it gives what it gives alone: rollouts may look for contacts at every step."""
+def test_a_sync_works_in_jit_and_scan(sim, synced):
+    """In jit and scan a sync has the same result, so that rollouts may query contacts at every step."""
 
     @jax.jit
-    def twice(data, mjx_data):
+    def sync_twice(data, mjx_data):
         def body(carry, _):
             data, mjx_data = sync_sim2mjx(*carry, sim.mjx_model)
             return (data, mjx_data), mjx_data._impl.contact.dist
 
         return jax.lax.scan(body, (data, mjx_data), length=2)
 
-    (data, _), dist = twice(sim.data, sim.mjx_data)
+    (data, _), dist = sync_twice(sim.data, sim.mjx_data)
     assert bool(data.core.mjx_synced)
     for k in range(2):
         np.testing.assert_allclose(np.asarray(dist)[k], synced[1]._impl.contact.dist, atol=1e-6)
 
 
-def test_syncs_compile_once(sim):
+def test_a_sync_compiles_once(sim):
     """A scene written with NumPy or JAX arrays, on any data, is synced by one compilation."""
     sim.contacts()
-    before = sync_sim2mjx._cache_size()
+    n_programs = sync_sim2mjx._cache_size()
     mocap_pos = np.asarray(sim.mjx_data.mocap_pos)
     for poses in (mocap_pos, mocap_pos.astype(np.float64), jnp.asarray(mocap_pos)):
         sim.mjx_data = sim.mjx_data.replace(mocap_pos=poses)
         sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.asarray(sim.data.states.pos) + 0.0))
         sim.contacts()
-    assert sync_sim2mjx._cache_size() == before
+    assert sync_sim2mjx._cache_size() == n_programs
