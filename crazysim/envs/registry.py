@@ -29,6 +29,7 @@ from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
 from crazysim.envs.tasks.land_on_marker import LandOnMarker
 from crazysim.envs.tasks.race import Race
+from crazysim.envs.tasks.race_by_camera import RaceByCamera
 from crazysim.envs.tasks.reach_vel import ReachVel
 from crazysim.envs.tasks.recover import Recover
 from crazysim.envs.tasks.swarm import Swarm
@@ -73,6 +74,7 @@ TASKS: dict[str, Entry] = {
     "deliver": Entry(Deliver, "crazysim/Deliver-v0"),
     "race": Entry(Race, "crazysim/Race-v0"),
     "multi_race": Entry(Race, "crazysim/MultiRace-v0", n_drones=2),
+    "race_by_camera": Entry(RaceByCamera, "crazysim/RaceByCamera-v0", "body_rate"),
     "avoid": Entry(Avoid, "crazysim/Avoid-v0"),
     "forest": Entry(Forest, "crazysim/Forest-v0"),
     "transport": Entry(Transport, "crazysim/Transport-v0"),

@@ -70,6 +70,17 @@ RECIPES: dict[str, Recipe] = {
         },
         practice={"practice": True},
     ),
+    "race_by_camera": Recipe(
+        n_worlds=4096,
+        config={
+            **_LONG_ROLLOUTS,
+            "iterations": 400,
+            "entropy": 0.003,
+            "convolution": (8, 16, 16),
+            "critic": "privileged",
+        },
+        practice={"practice": True},
+    ),
     "avoid": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400, "minibatches": 64, "entropy": 0.003}),
     "forest": Recipe(
         n_worlds=4096,

@@ -1,0 +1,81 @@
+"""Race through gates, seeing them by a depth image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.envs import terms
+from crazysim.envs.spawn import flying
+from crazysim.envs.tasks.goals import pick_entry
+from crazysim.envs.tasks.race import Race
+from crazysim.envs.tasks.race_observations import observe
+from crazysim.envs.tasks.race_rules import gates_of, next_gate, race_of
+from crazysim.plugins.sensors.camera import Camera
+
+AWAY_COST = 0.03
+"""Cost of an environment step for 1 minus the cosine of the angle between the camera's axis and the next gate."""
+PRIVILEGED = ("gate_corners", "obstacles_near")
+"""Observations of the race that a privileged critic gets, and with ``gates_observed`` the policy."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaceByCamera(Race):
+    """Race by the rules of ``race``, seeing gates and obstacles in the depth image of a camera, which ``make`` adds.
+
+    Policies observe neither positions of gates and obstacles nor their own position over ground. The reward has one
+    more term, a cost of looking away from the next gate. Drones begin facing the first gate, and in practice along the
+    axis of the gate that they have passed. The setting ``sensor_range`` has no effect.
+    """
+
+    name = "race_by_camera"
+
+    gates_observed: bool = False
+    """True for true positions of gates and obstacles among the observations, for a teacher."""
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        data = super().spawn(data, key)
+        passed, (gates_pos, gates_quat) = race_of(data).passed, gates_of(data)
+        axis = rotation.rotate(gates_quat, jnp.asarray([1.0, 0.0, 0.0], gates_pos.dtype))
+        s, last_axis = data.states, pick_entry(axis, jnp.maximum(passed - 1, 0))
+        ahead = jnp.where(passed[..., None] > 0, last_axis, gates_pos[0] - s.pos)
+        yaw = rotation.safe_arctan2(ahead[..., 1], ahead[..., 0])
+        turn = rotation.from_rpy(rotation.along_z(yaw))
+        return flying(data, s.pos, rotation.multiply(turn, s.quat), s.vel)
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return attitude, velocity and angular velocity in the body frame, height, and which gate is the next.
+
+        ``next_gate`` has a 1 for the next gate and 0 for the others; it is zero where all are passed.
+        """
+        s, record = data.states, race_of(data)
+        matrix = rotation.matrix(s.quat)
+        is_next = record.passed[..., None] == np.arange(self.track.n_gates, dtype=np.int32)
+        obs = {
+            "ang_vel": s.ang_vel,
+            "height": s.pos[..., 2:],
+            "next_gate": is_next.astype(s.pos.dtype),
+            "rot": matrix.reshape(*matrix.shape[:-2], 9),
+            "vel_body": rotation.rotate_inverse(s.quat, s.vel),
+        }
+        return obs | (self.privileged(data) if self.gates_observed else {})
+
+    def privileged(self, data: SimData) -> dict[str, Array]:
+        """Return true vectors to the corners of the next two gates and to the nearest two obstacles, body frame, m."""
+        obs = observe(data, np.inf)
+        return {name: obs[name] for name in PRIVILEGED}
+
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        s, (gate_pos, _) = data.states, next_gate(data)
+        to_gate = rotation.rotate_inverse(s.quat, gate_pos - s.pos)
+        cosine = to_gate[..., 0] / jnp.maximum(rotation.safe_norm(to_gate)[..., 0], 0.1)
+        away = terms.only_where(~race_of(data).flight_over_before, {"away": AWAY_COST * (cosine - 1)})
+        return super().rewards(data, action, last_action) | away
+
+    def policy_camera(self) -> Camera:
+        return Camera(32, 24)
