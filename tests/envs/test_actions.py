@@ -63,22 +63,22 @@ def test_the_map_is_affine_and_ends_at_one(control):
     n = 3 if control == "state" else 4
     assert actions.size == n
 
-    def at(x):
+    def command_at(x):
         return np.asarray(actions.command(jnp.full(n, x)))[:n]
 
-    np.testing.assert_allclose(at(0.5), (at(0.0) + at(1.0)) / 2, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(at(-1.0), 2 * at(0.0) - at(1.0), rtol=1e-6, atol=1e-4)
-    np.testing.assert_array_equal(at(1.7), at(1.0))
-    np.testing.assert_array_equal(at(-9.0), at(-1.0))
+    np.testing.assert_allclose(command_at(0.5), (command_at(0.0) + command_at(1.0)) / 2, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(command_at(-1.0), 2 * command_at(0.0) - command_at(1.0), rtol=1e-6, atol=1e-4)
+    np.testing.assert_array_equal(command_at(1.7), command_at(1.0))
+    np.testing.assert_array_equal(command_at(-9.0), command_at(-1.0))
     most = 4 * airframe.value("rotors.thrust_max", ())
     ends = {
         "state": np.array([0, 0, 1]) + MAX_OFFSET,
         "attitude": [MAX_TILT, MAX_TILT, MAX_YAW, most],
         "body_rate": [*MAX_BODY_RATES, most],
-        "force_torque": [most, *at(1.0)[1:]],
+        "force_torque": [most, *command_at(1.0)[1:]],
         "rotor_vel": np.broadcast_to(first_principles.Params.create(airframe).rotor_vel_max, 4),
     }[control]
-    np.testing.assert_allclose(at(1.0), ends, rtol=1e-6)
+    np.testing.assert_allclose(command_at(1.0), ends, rtol=1e-6)
 
 
 def test_torques_at_one_are_a_quarter_of_what_the_rotors_can_do():
@@ -97,8 +97,8 @@ def test_any_leading_axes_and_gradients_everywhere():
     commands = actions.command(jax.device_put(action))
     assert (commands.shape, commands.dtype) == ((3, 2, 4), jnp.float32)
     np.testing.assert_array_equal(np.asarray(commands)[1, 1], actions.command(action[1, 1]))
-    at = np.float32([-2, -1, 0, 1, 2])
-    slopes = np.asarray(jax.jit(jax.vmap(jax.jacobian(actions.command)))(np.tile(at[:, None], 4)))
+    command_at = np.float32([-2, -1, 0, 1, 2])
+    slopes = np.asarray(jax.jit(jax.vmap(jax.jacobian(actions.command)))(np.tile(command_at[:, None], 4)))
     assert np.isfinite(slopes).all()
     assert not slopes[:, ~np.eye(4, dtype=bool)].any()
     np.testing.assert_allclose(np.diag(slopes[2]), actions.scale, rtol=1e-6)

@@ -30,7 +30,7 @@ def reset(env):
 
 
 @pytest.fixture(scope="module")
-def flown(env, reset):
+def recorded_flight(env, reset):
     """A scan over more than two episodes: the states from the first one on."""
 
     @jax.jit
@@ -77,34 +77,36 @@ def test_keys_of_any_kind_are_the_same_seed(env, reset):
         env.reset(jax.random.split(jax.random.PRNGKey(0), 4))
 
 
-def test_steps_return_the_same_kind_of_state(env, reset, flown):
+def test_steps_return_the_same_kind_of_state(env, reset, recorded_flight):
     state = reset(jax.random.key(0))
-    first = jax.eval_shape(lambda states: jax.tree.map(lambda x: x[0], states), flown)
+    first = jax.eval_shape(lambda states: jax.tree.map(lambda x: x[0], states), recorded_flight)
     assert kind(first) == kind(state)
 
 
-def test_episodes_end_and_begin_as_brax_wraps_them(flown):
+def test_episodes_end_and_begin_as_brax_wraps_them(recorded_flight):
     ends = np.zeros((2 * N_STEPS + 1, N_WORLDS))
     ends[[N_STEPS - 1, 2 * N_STEPS - 1]] = 1
-    np.testing.assert_array_equal(flown.done, ends)
-    np.testing.assert_array_equal(flown.info["episode_done"], ends)
-    np.testing.assert_array_equal(flown.info["truncation"], ends)
+    np.testing.assert_array_equal(recorded_flight.done, ends)
+    np.testing.assert_array_equal(recorded_flight.info["episode_done"], ends)
+    np.testing.assert_array_equal(recorded_flight.info["truncation"], ends)
     counts = np.array([1, 2, 3, 4, 5] * 2 + [1], float)
-    np.testing.assert_array_equal(flown.info["steps"], np.tile(counts[:, None], N_WORLDS))
-    np.testing.assert_array_equal(flown.info["episode_metrics"]["length"], flown.info["steps"])
-    sums = np.asarray(flown.reward[:N_STEPS]).sum(axis=0)
-    np.testing.assert_allclose(flown.info["episode_metrics"]["sum_reward"][N_STEPS - 1], sums, rtol=1e-5)
-    np.testing.assert_allclose(flown.info["episode_metrics"]["sum_reward"][N_STEPS], flown.reward[N_STEPS], rtol=1e-5)
-    jumps = np.abs(np.diff(flown.obs, axis=0)).max(axis=(1, 2))
+    np.testing.assert_array_equal(recorded_flight.info["steps"], np.tile(counts[:, None], N_WORLDS))
+    np.testing.assert_array_equal(recorded_flight.info["episode_metrics"]["length"], recorded_flight.info["steps"])
+    sums = np.asarray(recorded_flight.reward[:N_STEPS]).sum(axis=0)
+    np.testing.assert_allclose(recorded_flight.info["episode_metrics"]["sum_reward"][N_STEPS - 1], sums, rtol=1e-5)
+    np.testing.assert_allclose(
+        recorded_flight.info["episode_metrics"]["sum_reward"][N_STEPS], recorded_flight.reward[N_STEPS], rtol=1e-5
+    )
+    jumps = np.abs(np.diff(recorded_flight.obs, axis=0)).max(axis=(1, 2))
     assert set(np.argsort(jumps)[-2:]) == {N_STEPS - 2, 2 * N_STEPS - 2}, "new episodes begin in the step that ends one"
 
 
-def test_the_step_is_that_of_the_environment(functional, env, reset, flown):
+def test_the_step_is_that_of_the_environment(functional, env, reset, recorded_flight):
     state = reset(jax.random.key(0)).pipeline_state
     state = jax.jit(env.env.step)(state, np.full(state.action.shape, 0.1, np.float32))
-    np.testing.assert_allclose(flown.obs[0], flatten(state.obs).reshape(N_WORLDS, -1), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(flown.reward[0], state.reward.mean(axis=1), rtol=1e-5)
-    np.testing.assert_allclose(flown.metrics["error"][0], state.info["error"].mean(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(recorded_flight.obs[0], flatten(state.obs).reshape(N_WORLDS, -1), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(recorded_flight.reward[0], state.reward.mean(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(recorded_flight.metrics["error"][0], state.info["error"].mean(axis=1), rtol=1e-5)
 
 
 def test_what_wrappers_add_is_kept(env, reset):

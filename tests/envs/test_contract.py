@@ -36,11 +36,11 @@ from crazysim.pytree import map_batched
 N_WORLDS = 4
 N_FLYING, N_STEPS = 32, 1250
 """Worlds and environment steps of the random flight: 40,000 steps, and at least two episodes in each world."""
-ENDS = np.array([True, False, True, False])
+IS_ENDING = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
 
 SAME_CLASS = pytest.mark.slow("another task of its class does it")
-FLOWN = [x if x in entries(classes_once=True) else pytest.param(x, marks=SAME_CLASS) for x in entries()]
+FLIGHT_TASKS = [x if x in entries(classes_once=True) else pytest.param(x, marks=SAME_CLASS) for x in entries()]
 """Names of the tasks of the random flights."""
 
 
@@ -55,12 +55,12 @@ def env(name):
 
 
 @pytest.fixture(scope="module")
-def begun(env):
+def start_state(env):
     """All worlds at the beginning of an episode."""
     return env.reset(jax.random.key(0))
 
 
-def test_goals_that_are_positions_can_be_set(env, begun, name):
+def test_goals_that_are_positions_can_be_set(env, start_state, name):
     """One for each world; the others are an error that says what to do."""
     pos = jnp.asarray(np.linspace([0.0, 0.5, 1.0], [0.3, -0.5, 1.5], N_WORLDS), jnp.float32)
     if type(env.task).set_goal is Task.set_goal:
@@ -68,12 +68,12 @@ def test_goals_that_are_positions_can_be_set(env, begun, name):
         with pytest.raises(
             ConfigError, match=rf"expected a task whose goals are positions, got '{env.task.name}'.*hover"
         ):
-            env.set_goal(begun, pos)
+            env.set_goal(start_state, pos)
         return
-    state = env.set_goal(begun, pos)
-    np.testing.assert_array_equal(env.target(state), np.broadcast_to(pos[:, None], begun.data.states.pos.shape))
-    assert jax.tree.structure(state) == jax.tree.structure(begun)
-    trees_equal(jax.jit(env.set_goal)(begun, pos), state)
+    state = env.set_goal(start_state, pos)
+    np.testing.assert_array_equal(env.target(state), np.broadcast_to(pos[:, None], start_state.data.states.pos.shape))
+    assert jax.tree.structure(state) == jax.tree.structure(start_state)
+    trees_equal(jax.jit(env.set_goal)(start_state, pos), state)
 
 
 class Flight(NamedTuple):
@@ -100,22 +100,22 @@ def vector(name):
 @functools.cache
 def flight(name):
     """Return a random flight with new episodes as they end. Its steps are one kernel."""
-    vec = DroneVectorEnv(EpisodeStatistics(vector(name).unwrapped.env.env), "SameStep")
-    obs, info = vec.reset(seed=0)
-    actions = np.random.default_rng(1).uniform(-1.2, 1.2, (N_STEPS, *vec.action_space.shape)).astype(np.float32)
-    steps = [vec.step(action) for action in actions]
+    vector_env = DroneVectorEnv(EpisodeStatistics(vector(name).unwrapped.env.env), "SameStep")
+    obs, info = vector_env.reset(seed=0)
+    actions = np.random.default_rng(1).uniform(-1.2, 1.2, (N_STEPS, *vector_env.action_space.shape)).astype(np.float32)
+    steps = [vector_env.step(action) for action in actions]
     structure = jax.tree.structure(steps[0])
     columns = zip(*(jax.tree.leaves(step) for step in steps), strict=True)
     results = structure.unflatten([np.stack([np.asarray(x) for x in column]) for column in columns])
-    return Flight(vec, (obs, info), actions, results, vec.state)
+    return Flight(vector_env, (obs, info), actions, results, vector_env.state)
 
 
 @pytest.fixture(scope="module")
-def flown(name):
+def random_flight(name):
     return flight(name)
 
 
-def close(a, b):
+def assert_close(a, b):
     """Compare two trees of different programs, up to rounding."""
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), a, b)
 
@@ -126,14 +126,14 @@ def first_worlds(state, n=N_WORLDS):
     return state.replace(data=state.data.replace(core=state.data.core.replace(n_worlds=n)))
 
 
-def test_shapes_and_types_are_those_of_the_spaces(name, env, begun):
+def test_shapes_and_types_are_those_of_the_spaces(name, env, start_state):
     spaces = vector(name)
     single = env.sim.n_drones == 1
-    for state in (begun, env.step(begun, random_action(begun))):
+    for state in (start_state, env.step(start_state, random_action(start_state))):
         assert set(state.obs) == set(spaces.single_observation_space.spaces)
-        for which, x in state.obs.items():
+        for obs_name, x in state.obs.items():
             assert x.shape[:2] == (N_WORLDS, env.sim.n_drones)
-            box = spaces.single_observation_space[which]
+            box = spaces.single_observation_space[obs_name]
             assert (
                 (box.shape, box.dtype) == (x.shape[2:] if single else x.shape[1:], np.float32) == (box.shape, x.dtype)
             )
@@ -148,22 +148,22 @@ def test_shapes_and_types_are_those_of_the_spaces(name, env, begun):
     np.testing.assert_array_equal([space.low, space.high], [-np.ones(space.shape), np.ones(space.shape)])
 
 
-def test_an_episode_begins_with_nothing_done(env, begun):
-    assert not begun.done.any()
-    assert not begun.action.any()
-    assert not begun.reward.any()
-    assert not begun.data.core.steps.any()
-    assert np.isfinite(begun.info["error"]).all()
-    ahead = env.step(begun, jnp.zeros_like(begun.action))
-    assert not ahead.done.any(), "no episode may end before a policy could do anything about it"
-    assert int(ahead.data.core.steps[0, 0]) == env.n_substeps
+def test_an_episode_begins_with_nothing_done(env, start_state):
+    assert not start_state.done.any()
+    assert not start_state.action.any()
+    assert not start_state.reward.any()
+    assert not start_state.data.core.steps.any()
+    assert np.isfinite(start_state.info["error"]).all()
+    next_state = env.step(start_state, jnp.zeros_like(start_state.action))
+    assert not next_state.done.any(), "no episode may end before a policy could do anything about it"
+    assert int(next_state.data.core.steps[0, 0]) == env.n_substeps
 
 
-def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(name, begun):
+def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(name, start_state):
     """Whichever device the environment was made for: JAX runs what is compiled where its arguments are."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
-    step = jax.jit(make(name, N_WORLDS).step).trace(begun, begun.action)
+    step = jax.jit(make(name, N_WORLDS).step).trace(start_state, start_state.action)
     kernels = {"cpu": "crazysim_advance", "cuda": cuda.PTX_TARGET}
     for platform in kernels:
         text = step.lower(lowering_platforms=(platform,)).as_text()
@@ -204,78 +204,85 @@ def test_every_step_is_one_kernel_where_x64_is_enabled(names):
     subprocess.run([sys.executable, "-c", PLANNED_IN_FLOAT64, *names], check=True, env=env)
 
 
-def test_repeated_steps_are_traced_once(env, begun):
+def test_repeated_steps_are_traced_once(env, start_state):
     """Law 6: reset, restart and step return the same kind of state, for NumPy, JAX and float64 actions alike."""
-    state = begun
-    for action in (random_action(begun), random_action(begun).astype(np.float64), jnp.zeros_like(begun.action)):
+    state = start_state
+    for action in (
+        random_action(start_state),
+        random_action(start_state).astype(np.float64),
+        jnp.zeros_like(start_state.action),
+    ):
         state = env.step(state, action)
-        assert kind(state) == kind(begun)
-        state = env.restart(state, jnp.asarray(ENDS))
-        assert kind(state) == kind(begun)
-        state = env.restart(state, np.array(ENDS))
+        assert kind(state) == kind(start_state)
+        state = env.restart(state, jnp.asarray(IS_ENDING))
+        assert kind(state) == kind(start_state)
+        state = env.restart(state, np.array(IS_ENDING))
     assert {name: env.traces[name] for name in ("reset", "restart", "step")} == {"reset": 1, "restart": 1, "step": 1}
 
 
-def test_the_same_seed_gives_the_same_numbers(env, begun):
+def test_the_same_seed_gives_the_same_numbers(env, start_state):
     """Law 10, for worlds at their beginning and for those that begin anew beside others."""
-    assert trees_equal(env.reset(jax.random.key(0)), begun)
+    assert trees_equal(env.reset(jax.random.key(0)), start_state)
     other = env.reset(jax.random.key(5))
-    assert not trees_equal(other.obs, begun.obs)
-    all_anew, some_anew = env.restart(begun, jnp.ones(N_WORLDS, bool)), env.restart(begun, jnp.asarray(ENDS))
-    assert trees_equal(select_state(all_anew, ENDS), select_state(some_anew, ENDS))
-    assert trees_equal(select_state(some_anew, ~ENDS), select_state(begun, ~ENDS))
+    assert not trees_equal(other.obs, start_state.obs)
+    all_anew, some_anew = (
+        env.restart(start_state, jnp.ones(N_WORLDS, bool)),
+        env.restart(start_state, jnp.asarray(IS_ENDING)),
+    )
+    assert trees_equal(select_state(all_anew, IS_ENDING), select_state(some_anew, IS_ENDING))
+    assert trees_equal(select_state(some_anew, ~IS_ENDING), select_state(start_state, ~IS_ENDING))
 
 
 def test_gymnasium_makes_it(name):
-    vec = vector(name)
-    assert isinstance(vec.unwrapped, DroneVectorEnv)
-    assert (vec.spec.id, vec.num_envs) == (TASKS[name].id, N_FLYING)
-    assert vec.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
-    assert vec.observation_space == batch_space(vec.single_observation_space, N_FLYING)
-    assert vec.action_space == batch_space(vec.single_action_space, N_FLYING)
+    vector_env = vector(name)
+    assert isinstance(vector_env.unwrapped, DroneVectorEnv)
+    assert (vector_env.spec.id, vector_env.num_envs) == (TASKS[name].id, N_FLYING)
+    assert vector_env.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
+    assert vector_env.observation_space == batch_space(vector_env.single_observation_space, N_FLYING)
+    assert vector_env.action_space == batch_space(vector_env.single_action_space, N_FLYING)
 
 
 @pytest.mark.long("compiles the vector environment of each task")
-@pytest.mark.parametrize("name", FLOWN, indirect=True)
-def test_the_number_of_worlds_changes_nothing(env, begun, flown):
+@pytest.mark.parametrize("name", FLIGHT_TASKS, indirect=True)
+def test_the_number_of_worlds_changes_nothing(env, start_state, random_flight):
     """Law 10 again: the first of many worlds fly as a few do."""
-    (obs, info), state = flown.start, begun
+    (obs, info), state = random_flight.start, start_state
     for step in range(4):
-        assert {k: np.asarray(x) for k, x in obs.items()} in flown.env.observation_space
-        for which, x in state.obs.items():
-            found = np.asarray(obs[which])[:N_WORLDS]
+        assert {k: np.asarray(x) for k, x in obs.items()} in random_flight.env.observation_space
+        for obs_name, x in state.obs.items():
+            found = np.asarray(obs[obs_name])[:N_WORLDS]
             np.testing.assert_allclose(found, np.reshape(x, found.shape), rtol=1e-4, atol=1e-5)
         error = np.asarray(info["error"])[:N_WORLDS]
         np.testing.assert_allclose(error.ravel(), np.ravel(state.info["error"]), rtol=1e-4, atol=1e-5)
-        obs, reward, terminated, truncated, info = jax.tree.map(lambda x: x[step], flown.results)  # noqa: B023
+        obs, reward, terminated, truncated, info = jax.tree.map(lambda x: x[step], random_flight.results)  # noqa: B023
         assert (reward.shape, reward.dtype) == ((N_FLYING,), np.float32)
         assert terminated.dtype == truncated.dtype == bool
-        state = env.step(state, flown.actions[step][:N_WORLDS].reshape(state.action.shape))
+        state = env.step(state, random_flight.actions[step][:N_WORLDS].reshape(state.action.shape))
         if state.done.any():  # there the two part: the vector environment begins a new episode
             break
         np.testing.assert_allclose(reward[:N_WORLDS], np.asarray(state.reward).mean(axis=1), rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", FLOWN, indirect=True)
-def test_random_steps_are_finite_and_within_the_spaces(flown):
-    obs, reward, _, _, info = flown.results
-    space = flown.env.single_observation_space
-    for which, x in obs.items():
+@pytest.mark.parametrize("name", FLIGHT_TASKS, indirect=True)
+def test_random_steps_are_finite_and_within_the_spaces(random_flight):
+    obs, reward, _, _, info = random_flight.results
+    space = random_flight.env.single_observation_space
+    for obs_name, x in obs.items():
         assert x.shape[:2] == (N_STEPS, N_FLYING)
-        assert np.isfinite(x).all(), which
-        assert np.isfinite(info["final_obs"][which]).all(), which
-        low, high = space[which].low, space[which].high
-        assert (x >= low).all(), which
-        assert (x <= high).all(), which
+        assert np.isfinite(x).all(), obs_name
+        assert np.isfinite(info["final_obs"][obs_name]).all(), obs_name
+        low, high = space[obs_name].low, space[obs_name].high
+        assert (x >= low).all(), obs_name
+        assert (x <= high).all(), obs_name
     assert np.isfinite(reward).all()
     assert np.isfinite(info["error"]).all()
     assert not info["nonfinite"].any()
 
 
-@pytest.mark.parametrize("name", FLOWN, indirect=True)
-def test_episodes_end_in_time_and_are_counted(env, flown):
+@pytest.mark.parametrize("name", FLIGHT_TASKS, indirect=True)
+def test_episodes_end_in_time_and_are_counted(env, random_flight):
     """Law 4: the time is over after ``max_steps`` steps, and never else."""
-    _, reward, terminated, truncated, info = flown.results
+    _, reward, terminated, truncated, info = random_flight.results
     done = terminated | truncated
     assert done.any(axis=0).all(), "1,250 random steps end an episode in every world"
     returns = info["episode_return"].reshape(N_STEPS, N_FLYING, -1).mean(axis=-1)
@@ -299,22 +306,27 @@ BY_STAGES = pytest.mark.slow("other tasks have all operations, and tests/gpu com
     [x if x in WITH_INDICES else pytest.param(x, marks=BY_STAGES) for x in entries()],
     indirect=True,
 )
-def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, flown):
+def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, random_flight):
     """Actions, physics, task and new episodes as one kernel equal the reference, where random flight leads."""
-    vec, plain = flown.env, AutoReset(EpisodeStatistics(make(name, N_WORLDS, engine="plain")), "SameStep")
-    assert "engine: fused\n" in vec.explain()
-    assert vec.explain().count("splits the step") == len(env.image_formats())
-    before = one_step_to_go(env, flown.end, np.resize(ENDS, N_FLYING))
-    vec._stepper.state = before
-    obs, reward, terminated, truncated, info = vec.step(flown.actions[0])
-    end = first_worlds(vec.state)
+    vector_env, plain = (
+        random_flight.env,
+        AutoReset(EpisodeStatistics(make(name, N_WORLDS, engine="plain")), "SameStep"),
+    )
+    assert "engine: fused\n" in vector_env.explain()
+    assert vector_env.explain().count("splits the step") == len(env.image_formats())
+    before = one_step_to_go(env, random_flight.end, np.resize(IS_ENDING, N_FLYING))
+    vector_env._stepper.state = before
+    obs, reward, terminated, truncated, info = vector_env.step(random_flight.actions[0])
+    end = first_worlds(vector_env.state)
     found = {"data": end.data, "action": end.action, "memory": end.memory}
     info = {name: info[name] for name in before.info}
     outputs = {"obs": obs, "reward": reward, "terminated": terminated, "truncated": truncated, "info": info}
     found |= jax.tree.map(lambda x: np.asarray(x)[:N_WORLDS], outputs)
 
-    after = plain.step(first_worlds(before), flown.actions[0][:N_WORLDS].reshape(N_WORLDS, *before.action.shape[1:]))
-    np.testing.assert_array_equal(after.done, ENDS | np.asarray(after.terminated))
+    after = plain.step(
+        first_worlds(before), random_flight.actions[0][:N_WORLDS].reshape(N_WORLDS, *before.action.shape[1:])
+    )
+    np.testing.assert_array_equal(after.done, IS_ENDING | np.asarray(after.terminated))
     expected = {name: getattr(after, name) for name in found} | {"reward": np.asarray(after.reward).mean(axis=1)}
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for (path, x), y in zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True):
@@ -332,64 +344,66 @@ def two(request):
 
 def test_next_step_begins_with_the_step_after_the_last(two):
     env, auto = compiled(two, N_WORLDS), compiled(two, N_WORLDS, "NextStep")
-    begun = env.reset(jax.random.key(0))
-    last = auto.step(one_step_to_go(env, begun, ENDS), random_action(begun))
-    np.testing.assert_array_equal(last.done, ENDS)
-    assert trees_equal(last, env.step(one_step_to_go(env, begun, ENDS), random_action(begun)))
-    ignored, other = random_action(begun, 1), random_action(begun, 2)
-    after, again = auto.step(last, ignored), auto.step(last, np.where(ENDS[:, None, None], other, ignored))
-    assert trees_equal(select_state(after, ENDS), select_state(again, ENDS)), "the action is heeded"
-    assert not after.done[ENDS].any()
-    assert not after.reward[ENDS].any()
-    assert not after.data.core.steps[ENDS].any()
-    np.testing.assert_array_equal(after.data.core.episode[:, 0] - begun.data.core.episode[:, 0], ENDS)
-    close(select_obs(after, ENDS), select_obs(env.restart(begun, jnp.asarray(ENDS)), ENDS))
-    assert trees_equal(select_state(after, ~ENDS), select_state(env.step(last, ignored), ~ENDS))
+    start_state = env.reset(jax.random.key(0))
+    last = auto.step(one_step_to_go(env, start_state, IS_ENDING), random_action(start_state))
+    np.testing.assert_array_equal(last.done, IS_ENDING)
+    assert trees_equal(last, env.step(one_step_to_go(env, start_state, IS_ENDING), random_action(start_state)))
+    ignored, other = random_action(start_state, 1), random_action(start_state, 2)
+    after, again = auto.step(last, ignored), auto.step(last, np.where(IS_ENDING[:, None, None], other, ignored))
+    assert trees_equal(select_state(after, IS_ENDING), select_state(again, IS_ENDING)), "the action is heeded"
+    assert not after.done[IS_ENDING].any()
+    assert not after.reward[IS_ENDING].any()
+    assert not after.data.core.steps[IS_ENDING].any()
+    np.testing.assert_array_equal(after.data.core.episode[:, 0] - start_state.data.core.episode[:, 0], IS_ENDING)
+    assert_close(select_obs(after, IS_ENDING), select_obs(env.restart(start_state, jnp.asarray(IS_ENDING)), IS_ENDING))
+    assert trees_equal(select_state(after, ~IS_ENDING), select_state(env.step(last, ignored), ~IS_ENDING))
 
 
 def test_same_step_begins_within_the_last_step(two):
     env, auto = compiled(two, N_WORLDS), compiled(two, N_WORLDS, "SameStep")
-    begun, also = env.reset(jax.random.key(0)), auto.reset(jax.random.key(0))
-    assert trees_equal(also.final_obs, begun.obs)
-    action = random_action(begun)
-    ended, state = (x.step(one_step_to_go(env, y, ENDS), action) for x, y in ((env, begun), (auto, also)))
-    np.testing.assert_array_equal(ended.done, ENDS)
+    start_state, also = env.reset(jax.random.key(0)), auto.reset(jax.random.key(0))
+    assert trees_equal(also.final_obs, start_state.obs)
+    action = random_action(start_state)
+    ended, state = (x.step(one_step_to_go(env, y, IS_ENDING), action) for x, y in ((env, start_state), (auto, also)))
+    np.testing.assert_array_equal(ended.done, IS_ENDING)
     for field in ("reward", "terminated", "truncated"):
         assert trees_equal(getattr(state, field), getattr(ended, field)), field
     assert trees_equal(state.final_obs, ended.obs)
     assert trees_equal(ended.final_obs, ended.obs)
     assert trees_equal(state.info["error"], ended.info["error"])
-    new = env.restart(begun, jnp.asarray(ENDS))
-    close(select_obs(state, ENDS), select_obs(new, ENDS))
-    assert not state.data.core.steps[ENDS].any()
-    assert not state.action[ENDS].any()
-    assert trees_equal(select_state(state, ~ENDS, without=("info",)), select_state(ended, ~ENDS, without=("info",)))
-    assert not auto.step(state, action).done[ENDS].any()
+    new = env.restart(start_state, jnp.asarray(IS_ENDING))
+    assert_close(select_obs(state, IS_ENDING), select_obs(new, IS_ENDING))
+    assert not state.data.core.steps[IS_ENDING].any()
+    assert not state.action[IS_ENDING].any()
+    assert trees_equal(
+        select_state(state, ~IS_ENDING, without=("info",)), select_state(ended, ~IS_ENDING, without=("info",))
+    )
+    assert not auto.step(state, action).done[IS_ENDING].any()
 
 
 def test_disabled_begins_where_and_when_it_is_said(two):
     env = auto = compiled(two, N_WORLDS, "Disabled")
-    begun = env.reset(jax.random.key(0))
-    action = random_action(begun)
-    ended = auto.step(one_step_to_go(env, begun, ENDS), action)
-    np.testing.assert_array_equal(ended.done, ENDS)
+    start_state = env.reset(jax.random.key(0))
+    action = random_action(start_state)
+    ended = auto.step(one_step_to_go(env, start_state, IS_ENDING), action)
+    np.testing.assert_array_equal(ended.done, IS_ENDING)
     on = auto.step(ended, action)
-    assert on.truncated[ENDS].all(), "nothing begins by itself"
-    assert trees_equal(on.data.core.episode, begun.data.core.episode)
+    assert on.truncated[IS_ENDING].all(), "nothing begins by itself"
+    assert trees_equal(on.data.core.episode, start_state.data.core.episode)
     some = np.array([True, True, False, False])
     state = auto.restart(on, jnp.asarray(some))
-    np.testing.assert_array_equal(state.data.core.episode[:, 0] - begun.data.core.episode[:, 0], some)
+    np.testing.assert_array_equal(state.data.core.episode[:, 0] - start_state.data.core.episode[:, 0], some)
     assert not state.done[some].any()
     assert not state.reward[some].any()
     assert trees_equal(select_state(state, ~some), select_state(on, ~some))
 
 
-def test_a_world_that_is_lost_ends_alone(env, begun):
+def test_a_world_that_is_lost_ends_alone(env, start_state):
     """Law 7: it says so, is observed as zeros, and is whole again in its next episode."""
-    action = random_action(begun)
+    action = random_action(start_state)
     bad = np.array(action)
     bad[1] = np.nan
-    lost, fine = env.step(begun, bad), env.step(begun, action)
+    lost, fine = env.step(start_state, bad), env.step(start_state, action)
     is_lost = np.arange(N_WORLDS) == 1
     np.testing.assert_array_equal(lost.info["nonfinite"], is_lost)
     assert lost.terminated[1]
@@ -400,11 +414,11 @@ def test_a_world_that_is_lost_ends_alone(env, begun):
 def test_a_world_that_is_lost_is_whole_again_in_its_next_episode(two, mode):
     """Law 7, within the step."""
     auto = compiled(two, N_WORLDS, mode)
-    begun = auto.reset(jax.random.key(0))
-    action = random_action(begun)
+    start_state = auto.reset(jax.random.key(0))
+    action = random_action(start_state)
     bad = np.array(action)
     bad[1] = np.nan
-    state = auto.step(begun, bad)
+    state = auto.step(start_state, bad)
     assert state.terminated[1]
     assert all(not x[1].any() for x in jax.tree.leaves(state.final_obs)), mode
     assert not state.reward[1].any()
@@ -415,7 +429,7 @@ def test_a_world_that_is_lost_is_whole_again_in_its_next_episode(two, mode):
 
 @pytest.mark.long("compiles the gradient of each task")
 @pytest.mark.parametrize("name", entries(classes_once=True), indirect=True)
-def test_the_gradient_of_the_reward_is_finite(env, begun, flown):
+def test_the_gradient_of_the_reward_is_finite(env, start_state, random_flight):
     """Law 7, for actions and states, at the beginning of an episode and where random flight leads.
 
     One physics step, stage by stage: what is differentiated here is the task; the engine has tests of its own.
@@ -433,9 +447,9 @@ def test_the_gradient_of_the_reward_is_finite(env, begun, flown):
             data = stage(data)
         return env.phases.observe(state.replace(data=data), action, vectorize_over_worlds).reward.sum()
 
-    end = first_worlds(flown.end.replace(info=flown.end.info | {}, memory={}))
-    end = end.replace(info={name: end.info[name] for name in begun.info})
-    for state in (begun, end):
+    end = first_worlds(random_flight.end.replace(info=random_flight.end.info | {}, memory={}))
+    end = end.replace(info={name: end.info[name] for name in start_state.info})
+    for state in (start_state, end):
         grads = slope((np.full(state.action.shape, 0.1, np.float32), state.data.states), state)
         assert all(np.isfinite(g).all() for g in jax.tree.leaves(grads))
         assert any(np.any(g) for g in jax.tree.leaves(grads))

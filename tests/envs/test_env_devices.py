@@ -54,7 +54,7 @@ def wrapped(env):
 def test_law_10_worlds_on_four_devices_are_those_of_one(task, wrap, options, mesh):
     """Episodes, steps, wrappers and statistics: random numbers depend on the world, not on the device."""
 
-    def flown(mesh):
+    def fly_on_mesh(mesh):
         env = AutoReset(wrap(make(task, N_WORLDS, seconds=0.1, mesh=mesh, **options)))
         reset, step, restart = jax.jit(env.reset), jax.jit(env.step), jax.jit(env.restart)
         state = reset(jax.random.key(0))
@@ -67,7 +67,7 @@ def test_law_10_worlds_on_four_devices_are_those_of_one(task, wrap, options, mes
         assert jax.eval_shape(env.flatten, state).plan.rows  # a rollout updates them in place
 
     n_over = 0
-    for one, several in zip(flown(None), flown(mesh), strict=True):
+    for one, several in zip(fly_on_mesh(None), fly_on_mesh(mesh), strict=True):
         assert_equal(one, several)
         assert several.obs["vel"].sharding.is_equivalent_to(several.reward.sharding, several.reward.ndim)
         assert several.reward.addressable_shards[0].data.shape[0] == N_WORLDS // 4

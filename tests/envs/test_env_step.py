@@ -23,10 +23,10 @@ pytestmark = pytest.mark.skipif(fused.unavailable_reason("cpu") is not None, rea
 N = 6
 
 
-def close(found, expected, tolerance=2e-5):
+def assert_close(actual, expected, tolerance=2e-5):
     """Compare two trees: engines may contract a product and a sum, and each step multiplies what that does."""
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for (path, x), y in zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True):
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for (path, x), y in zip(jax.tree_util.tree_flatten_with_path(actual)[0], jax.tree.leaves(expected), strict=True):
         name = jax.tree_util.keystr(path)
         assert (x.shape, x.dtype) == (y.shape, y.dtype), name
         if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -90,7 +90,7 @@ def test_an_engine_steps_an_environment_as_the_reference_does(make, engine):
     for k in range(40):
         action = jax.random.uniform(jax.random.key(k), state.action.shape, minval=-1, maxval=1)
         after = step(state, action)
-        close(after, expected(state, action))
+        assert_close(after, expected(state, action))
         state, ended = after, ended + int(after.done.sum())
     assert ended or make is swarm, "no episode has ended"
 
@@ -128,8 +128,8 @@ def test_a_rollout_is_a_loop_of_steps(hover):
         (state, memory), kept = jax.lax.scan(step, (start, jnp.zeros(N)), jax.random.split(key, 20))
         return state, memory, kept
 
-    found, expected = jax.jit(fly)(1.0), jax.jit(loop)(1.0)
-    close(found, expected)
+    actual, expected = jax.jit(fly)(1.0), jax.jit(loop)(1.0)
+    assert_close(actual, expected)
     assert expected[2][1].any(), "no episode has ended"
     slopes = [jax.jit(jax.grad(lambda gain, f=f: f(gain)[2][0].sum()))(1.0) for f in (fly, loop)]
     np.testing.assert_allclose(*slopes, rtol=1e-3)
@@ -389,9 +389,9 @@ class Begun(Wrapper):
 @pytest.mark.parametrize("mode", ["Disabled", "SameStep"])
 def test_info_that_only_a_reset_sets_stays(mode):
     vec = envs.DroneVectorEnv(Begun(envs.make("hover", 2, engine="interpret")), mode)
-    _, begun = vec.reset(seed=0)
+    _, start_state = vec.reset(seed=0)
     _, _, _, _, info = vec.step(np.zeros((2, 4), np.float32))
-    np.testing.assert_array_equal(info["start"], begun["start"])
+    np.testing.assert_array_equal(info["start"], start_state["start"])
 
 
 def test_a_restart_observes_the_episodes_that_it_begins():
@@ -433,25 +433,25 @@ def test_a_rollout_in_rows_takes_commands_of_every_level():
             step.platform = platform  # which decides on rows alone
             fly = lambda data: rollout(step, data, lambda params, data: command, None, 4, 5)[0].states  # noqa: B023, E731
             ends.append(jax.jit(fly)(sim.data))
-        close(*ends)
+        assert_close(*ends)
 
 
 @pytest.mark.long("compiles a step for one device and for two")
 def test_law_10_worlds_over_devices_step_by_the_same_kernel_to_the_same_numbers():
-    def flown(**devices):
+    def fly_on(**devices):
         sim, task = Sim(4, control="attitude", **devices), Hover(seconds=0.06)
         task.install(sim)
         env = AutoReset(envs.DroneEnv(sim, task))
-        begun = state = jax.jit(env.reset)(jax.random.key(0))
+        start_state = state = jax.jit(env.reset)(jax.random.key(0))
         step, action = jax.jit(env.step), np.random.default_rng(0).uniform(-1, 1, (4, 1, 4)).astype(np.float32)
         for _ in range(5):
             state = step(state, action)
         policy = lambda obs, memory, key: (jnp.asarray(action), memory, ())  # noqa: E731
         _, _, kept = jax.jit(lambda state: envs.rollout(env, state, policy, jax.random.key(1), 3))(state)
         assert env.explain().startswith("engine: fused")
-        return begun, state, kept
+        return start_state, state, kept
 
-    one, several = flown(), flown(mesh=world_mesh(jax.devices()[:2]))
+    one, several = fly_on(), fly_on(mesh=world_mesh(jax.devices()[:2]))
     assert all(len(x.devices()) == 2 for x in (several[0].obs["pos"], several[1].obs["pos"]))
     for x, y in zip(*map(jax.tree.leaves, (one, several)), strict=True):
         if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):

@@ -31,7 +31,7 @@ def pair():
 
 
 @pytest.fixture(scope="module")
-def flown(pair):
+def recorded_flight(pair):
     """Return the states of both environments after a reset and three random steps; the second one ends the episodes."""
     states = [[jax.jit(env.reset)(jax.random.key(3))] for env in pair]
     for env, reached in zip(pair, states, strict=True):
@@ -41,33 +41,33 @@ def flown(pair):
     return states
 
 
-def test_images_are_those_of_the_state_after_the_step_and_after_new_episodes(pair, flown):
+def test_images_are_those_of_the_state_after_the_step_and_after_new_episodes(pair, recorded_flight):
     look = jax.jit(pair[0].sim.scene.depth_fn("fpv_cam", 8, 6))
-    for state in flown[0]:
+    for state in recorded_flight[0]:
         seen = np.minimum(look(state.data).distance, 5.0).reshape(3, 1, -1)
         np.testing.assert_allclose(state.obs["depth"], seen, rtol=1e-6)
-    assert flown[0][2].done.all()
-    assert np.asarray(flown[0][2].obs["depth"]).std() > 0.1, "nothing is in view"
+    assert recorded_flight[0][2].done.all()
+    assert np.asarray(recorded_flight[0][2].obs["depth"]).std() > 0.1, "nothing is in view"
 
 
-def test_final_observations_of_episodes_have_the_images_of_the_step_before(flown):
-    for before, after in zip(flown[0], flown[0][1:], strict=False):
+def test_final_observations_of_episodes_have_the_images_of_the_step_before(recorded_flight):
+    for before, after in zip(recorded_flight[0], recorded_flight[0][1:], strict=False):
         expected = (before if after.done.all() else after).obs["depth"]
         np.testing.assert_array_equal(after.final_obs["depth"], expected)
         assert after.final_obs.keys() == after.obs.keys()
 
 
-def test_restarted_worlds_have_images_of_their_new_episodes(pair, flown):
-    restarted = pair[0].restart(flown[0][1], np.array([True, False, False]))
-    assert jax.tree.structure(restarted) == jax.tree.structure(flown[0][1])
+def test_restarted_worlds_have_images_of_their_new_episodes(pair, recorded_flight):
+    restarted = pair[0].restart(recorded_flight[0][1], np.array([True, False, False]))
+    assert jax.tree.structure(restarted) == jax.tree.structure(recorded_flight[0][1])
     for obs in (restarted.obs, restarted.final_obs):
-        np.testing.assert_array_equal(obs["depth"][1:], flown[0][1].obs["depth"][1:])
+        np.testing.assert_array_equal(obs["depth"][1:], recorded_flight[0][1].obs["depth"][1:])
     np.testing.assert_array_equal(restarted.final_obs["depth"], restarted.obs["depth"])
-    assert not np.array_equal(restarted.obs["depth"][0], flown[0][1].obs["depth"][0])
+    assert not np.array_equal(restarted.obs["depth"][0], recorded_flight[0][1].obs["depth"][0])
 
 
-def test_nothing_else_depends_on_images(flown):
-    for with_images, without in zip(*flown, strict=True):
+def test_nothing_else_depends_on_images(recorded_flight):
+    for with_images, without in zip(*recorded_flight, strict=True):
         record = with_images.record
         info = {k: x for k, x in record.drone_info["final_obs"].items() if k != "depth"}
         record = record.replace(images={}, drone_info=record.drone_info | {"final_obs": info})

@@ -50,10 +50,10 @@ def numbers(data):
     return {"pos": states.pos, "vel": states.vel, "quat": states.quat, "ang_vel": states.ang_vel}
 
 
-def apart(found, expected):
+def relative_difference(actual, expected):
     """Return the largest difference, relative to the largest number of its kind."""
     sizes = {name: max(np.abs(x).max(), 1e-3) for name, x in expected.items()}
-    return max(float(np.abs(np.asarray(found[name]) - x).max() / sizes[name]) for name, x in expected.items())
+    return max(float(np.abs(np.asarray(actual[name]) - x).max() / sizes[name]) for name, x in expected.items())
 
 
 @pytest.mark.long("compiles every path of two environments")
@@ -63,7 +63,7 @@ def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_val
     env = hovering(control)
     auto, sim, n = envs.AutoReset(env), env.sim, env.n_substeps
     key = jax.random.key(0)
-    start, begun, before = env.reset(key), auto.reset(key), sim.data
+    start, start_state, before = env.reset(key), auto.reset(key), sim.data
     plain = jax.jit(by_stages(sim), static_argnums=1)
     step = sim.step_fn
     paths = {
@@ -77,14 +77,17 @@ def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_val
         data = drawn(start.data, rng)
         sent = stage_command(data, env.actions.command(action))
         expected = numbers(plain(sent, n))
-        assert apart(numbers(plain(stage_command(start.data, env.actions.command(action)), n)), expected) > 1e-3
-        starts = {name: start if name == "env.step" else begun for name in paths}
-        found = {name: fly(starts[name].replace(data=data), action).data for name, fly in paths.items()}
-        found["step_fn"], found["traced"] = step(sent, jnp.int32(n)), jax.jit(step)(sent, jnp.int32(n))
+        assert (
+            relative_difference(numbers(plain(stage_command(start.data, env.actions.command(action)), n)), expected)
+            > 1e-3
+        )
+        starts = {name: start if name == "env.step" else start_state for name in paths}
+        actual = {name: fly(starts[name].replace(data=data), action).data for name, fly in paths.items()}
+        actual["step_fn"], actual["traced"] = step(sent, jnp.int32(n)), jax.jit(step)(sent, jnp.int32(n))
         sim.data = sent
         sim.step(n)
-        found["sim.step"], sim.data = sim.data, before
-        differences = {name: apart(numbers(x), expected) for name, x in found.items()}
+        actual["sim.step"], sim.data = sim.data, before
+        differences = {name: relative_difference(numbers(x), expected) for name, x in actual.items()}
         assert max(differences.values()) < 2e-5, differences
 
 
@@ -96,11 +99,11 @@ def test_gravity_that_is_tilted_pulls_the_drones_of_an_environment(hover_of_tilt
     """In ``sim.default_data`` alone before it is made, which episodes begin from; then in the data of a state."""
     upright = hover_of_tilted.sim.data.params
     for env in (hover_of_tilted, envs.AutoReset(hover_of_tilted)):
-        begun = jax.jit(env.reset)(jax.random.key(0))
-        np.testing.assert_array_equal(begun.data.params.gravity_vec, TILTED)
+        start_state = jax.jit(env.reset)(jax.random.key(0))
+        np.testing.assert_array_equal(start_state.data.params.gravity_vec, TILTED)
         step, speeds = jax.jit(env.step), []
-        for params in (begun.data.params, upright):
-            state = begun.replace(data=begun.data.replace(params=params))
+        for params in (start_state.data.params, upright):
+            state = start_state.replace(data=start_state.data.replace(params=params))
             for _ in range(5):
                 state = step(state, jnp.zeros_like(state.action))
             speeds.append(np.asarray(state.data.states.vel)[..., 0])
@@ -146,6 +149,6 @@ def test_gradients_of_an_environment_step_by_parameters_that_are_zero():
     expected = slopes(as_written)
     assert all(np.all(x != 0) for x in expected.values())
     for one in (env, auto):
-        found = slopes(lambda state, one=one: one.step(state, action), one.reset(jax.random.key(0)))
+        actual = slopes(lambda state, one=one: one.step(state, action), one.reset(jax.random.key(0)))
         for name, x in expected.items():
-            np.testing.assert_allclose(found[name], x, rtol=2e-4, atol=1e-6 * np.abs(x).max(), err_msg=name)
+            np.testing.assert_allclose(actual[name], x, rtol=2e-4, atol=1e-6 * np.abs(x).max(), err_msg=name)

@@ -13,7 +13,7 @@ N_WORLDS = 2048
 
 
 @pytest.fixture(scope="module")
-def begun():
+def start_state():
     """Return the environment, two drones in every world, the state where episodes begin, and the step."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=2, control="attitude")
     task = Avoid()
@@ -32,8 +32,8 @@ def put(state, pos, **changes):
     return state.replace(data=data.replace(states=states, plugins=data.plugins | {"task": record}))
 
 
-def test_starts_and_goals_are_clear_of_contact(begun):
-    env, state, _ = begun
+def test_starts_and_goals_are_clear_of_contact(start_state):
+    env, state, _ = start_state
     data = state.data
     env.sim.data = data
     report = env.sim.contact_report()
@@ -46,8 +46,8 @@ def test_starts_and_goals_are_clear_of_contact(begun):
     assert report.object_distance.min() > 0.2
 
 
-def test_obstacles_stand_elsewhere_in_every_world_and_leave_room(begun):
-    _, state, _ = begun
+def test_obstacles_stand_elsewhere_in_every_world_and_leave_room(start_state):
+    _, state, _ = start_state
     pos = np.asarray(state.data.objects.pos)[:, 0]
     apart = np.linalg.norm(pos[:, :, None, :2] - pos[:, None, :, :2], axis=-1) + 9 * np.eye(12)
     assert apart.min() >= CELL - 2 * CELL_JITTER - 1e-5
@@ -61,8 +61,8 @@ def test_obstacles_stand_elsewhere_in_every_world_and_leave_room(begun):
     assert np.ptp(boxes) > 1
 
 
-def test_what_is_seen_are_the_nearest_points_of_the_nearest_obstacles(begun):
-    env, state, _ = begun
+def test_what_is_seen_are_the_nearest_points_of_the_nearest_obstacles(start_state):
+    env, state, _ = start_state
     rng = np.random.default_rng(0)
     inside = put(state, rng.uniform([-1.6, -2, 0.2], [1.6, 2, 1.8], (N_WORLDS, 2, 3))).data
     env.sim.data = inside
@@ -88,8 +88,8 @@ def test_what_is_seen_are_the_nearest_points_of_the_nearest_obstacles(begun):
     assert np.abs(gaps[..., 0] - nearer - 0.1)[gaps[..., 0] > 0.15].max() < 0.022
 
 
-def test_hits_disable_and_arriving_is_a_success(begun):
-    env, state, step = begun
+def test_hits_disable_and_arriving_is_a_success(start_state):
+    env, state, step = start_state
     goal, obstacles = np.asarray(state.data.plugins["task"].goal), np.asarray(state.data.objects.pos)[:, 0]
     free = np.array([-2.4, 0.0, 1.0])
     pos = np.broadcast_to([free, free + [0, 0.8, 0]], (N_WORLDS, 2, 3)).copy()
@@ -121,8 +121,8 @@ def test_hits_disable_and_arriving_is_a_success(begun):
     assert np.linalg.norm(near[9, 1]) > 0.7
 
 
-def test_time_ends_an_episode(begun):
-    env, state, step = begun
+def test_time_ends_an_episode(start_state):
+    env, state, step = start_state
     core = state.data.core
     late = core.replace(steps=np.full_like(core.steps, (env.max_steps - 1) * env.n_substeps))
     after = step(state.replace(data=state.data.replace(core=late)), state.action)

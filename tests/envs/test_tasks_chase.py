@@ -33,7 +33,7 @@ def env():
 
 
 @pytest.fixture(scope="module")
-def begun(env):
+def start_state(env):
     return jax.jit(env.reset)(jax.random.key(0))
 
 
@@ -49,9 +49,9 @@ def place(env):
 
 
 @pytest.fixture(scope="module")
-def flown(begun, step, place):
+def recorded_flight(start_state, step, place):
     """Return the state after a step from all cases, over cars at their full speed."""
-    data = begun.data
+    data = start_state.data
     car = data.plugins["cars"]
     ahead = {name: np.zeros_like(getattr(car, name)) for name in ("yaw", "yaw_rate", "steer", "command", "body_vel")}
     for name in ("command", "body_vel"):
@@ -63,7 +63,7 @@ def flown(begun, step, place):
     np.testing.assert_allclose(along, np.broadcast_to([0.8, 0, 0], along.shape), atol=1e-6)
     level = np.broadcast_to(np.float32([0, 0, 0, 1]), data.states.quat.shape)
     states = data.states.replace(pos=roof + offset, vel=along + vel, quat=level, ang_vel=np.zeros_like(roof))
-    state = begun.replace(data=data.replace(states=states))
+    state = start_state.replace(data=data.replace(states=states))
     return step(state, state.action)
 
 
@@ -71,35 +71,37 @@ def names(mask):
     return {name for name, x in zip(CASES, np.asarray(mask)[:, 0], strict=True) if x}
 
 
-def test_landed_is_who_touches_the_roof_softly_from_above(flown):
-    assert names(flown.info["landed"]) == LANDED
+def test_landed_is_who_touches_the_roof_softly_from_above(recorded_flight):
+    assert names(recorded_flight.info["landed"]) == LANDED
 
 
-def test_everything_else_that_touches_or_gets_away_crashes(flown):
-    assert names(flown.info["crashed"]) == set(CASES) - LANDED - IN_FLIGHT
-    np.testing.assert_array_equal(flown.terminated, [name not in IN_FLIGHT for name in CASES])
+def test_everything_else_that_touches_or_gets_away_crashes(recorded_flight):
+    assert names(recorded_flight.info["crashed"]) == set(CASES) - LANDED - IN_FLIGHT
+    np.testing.assert_array_equal(recorded_flight.terminated, [name not in IN_FLIGHT for name in CASES])
 
 
-def test_the_reward_is_for_landing(flown):
-    paid = dict(zip(CASES, np.asarray(flown.reward)[:, 0], strict=True))
+def test_the_reward_is_for_landing(recorded_flight):
+    paid = dict(zip(CASES, np.asarray(recorded_flight.reward)[:, 0], strict=True))
     assert min(paid[name] for name in LANDED) > 9 > 0 > -3 > max(paid[name] for name in ("fast", "hood", "far"))
 
 
-def test_the_roof_moves_with_the_car(env, begun, step, place):
+def test_the_roof_moves_with_the_car(env, start_state, step, place):
     """Its velocity is that of its place, also in a turn, and the drone observes both."""
-    before, after = begun.data, step(begun, begun.action).data
+    before, after = start_state.data, step(start_state, start_state.action).data
     (pos, vel), (later, _) = (jax.device_get(place(data)) for data in (before, after))
     dt = env.n_substeps / env.sim.freq
     np.testing.assert_allclose((later - pos) / dt, vel, atol=0.05)
-    np.testing.assert_allclose(begun.obs["difference_to_roof"] + np.asarray(before.states.pos), pos, atol=1e-5)
-    np.testing.assert_allclose(begun.obs["difference_to_roof_vel"] + np.asarray(before.states.vel), vel, atol=1e-5)
+    np.testing.assert_allclose(start_state.obs["difference_to_roof"] + np.asarray(before.states.pos), pos, atol=1e-5)
+    np.testing.assert_allclose(
+        start_state.obs["difference_to_roof_vel"] + np.asarray(before.states.vel), vel, atol=1e-5
+    )
     assert np.ptp(np.linalg.norm(vel, axis=-1)) > 0.2, "each car has a speed of its own"
 
 
-def test_the_roof_is_the_top_of_the_car(env, begun, place):
+def test_the_roof_is_the_top_of_the_car(env, start_state, place):
     body = next(b for b in env.sim.scene.collision_model.objects if b.name == "cars:0")
     top = max(body.geoms, key=lambda geom: geom.pos[2] + geom.shape.size[2])
-    data = begun.data
+    data = start_state.data
     height = (np.asarray(place(data)[0]) - data.plugins["cars"].pos)[..., 2]
     np.testing.assert_allclose(height, top.pos[2] + top.shape.size[2], atol=1e-6)
 

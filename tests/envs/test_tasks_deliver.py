@@ -24,11 +24,11 @@ def step(env):
 
 
 @pytest.fixture(scope="module")
-def begun(env):
+def start_state(env):
     return jax.jit(env.reset)(jax.random.key(0))
 
 
-def moved(state, pos, vel, load=None):
+def move_drone(state, pos, vel, load=None):
     """Return a state with drones and hooks elsewhere, level, and other fields of the loads."""
     data = state.data
     s = data.states
@@ -38,14 +38,14 @@ def moved(state, pos, vel, load=None):
     return state.replace(data=data.replace(states=states, plugins=data.plugins | {"load": hook}))
 
 
-def test_a_load_rides_on_its_trailer(begun, step):
-    state = begun
+def test_a_load_rides_on_its_trailer(start_state, step):
+    state = start_state
     for _ in range(10):
         state = step(state, state.action)
     data = state.data
     load = data.plugins["load"]
     np.testing.assert_allclose(load.pos, vmap_worlds(ring_positions)(data.plugins["cars"]), atol=1e-6)
-    assert np.linalg.norm(load.pos - begun.data.plugins["load"].pos, axis=-1).min() > 0.02
+    assert np.linalg.norm(load.pos - start_state.data.plugins["load"].pos, axis=-1).min() > 0.02
     ahead = step(state, state.action).data.plugins["load"]
     np.testing.assert_allclose((ahead.pos - load.pos) * 50, load.vel, atol=0.02)
     with jax.enable_x64(True):  # a difference of positions in float32 would be off by 2e-4 m/s
@@ -55,34 +55,34 @@ def test_a_load_rides_on_its_trailer(begun, step):
     np.testing.assert_allclose(load.vel, exact, atol=2e-6)
 
 
-def test_a_hook_takes_it_only_if_it_is_near_and_as_fast(begun, step):
+def test_a_hook_takes_it_only_if_it_is_near_and_as_fast(start_state, step):
     """Above the ring with the trailer's velocity, at rest, 10 cm away, 5 cm away, and too fast upwards."""
-    load = begun.data.plugins["load"]
+    load = start_state.data.plugins["load"]
     aside = np.array([0.0, 0.0, 0.10, 0.05, 0.0], np.float32)[:, None, None] * np.array([0, 0, 1], np.float32)
     faster = np.array([0.0, 0.0, 0.0, 0.0, 0.7], np.float32)[:, None, None] * np.array([0, 0, 1], np.float32)
     vel = load.vel.at[1].multiply(0.0)
-    state = moved(begun, load.pos + aside + np.array([0, 0, 0.3], np.float32), vel + faster)
+    state = move_drone(start_state, load.pos + aside + np.array([0, 0, 0.3], np.float32), vel + faster)
     after = step(state, state.action)
     assert float(jnp.linalg.norm(load.vel[1])) < 0.6
     np.testing.assert_array_equal(after.info["taken"][:, 0], [True, True, False, True, False])
     assert after.reward[0, 0] > after.reward[2, 0] + 0.3
 
 
-def test_a_load_is_delivered_after_half_a_second_at_its_goal(env, begun, step):
-    goal = begun.data.plugins["task"].goal
+def test_a_load_is_delivered_after_half_a_second_at_its_goal(env, start_state, step):
+    goal = start_state.data.plugins["task"].goal
     pos = goal + jnp.array([0.0, 0, 0.3])
-    held = jnp.ones_like(begun.data.plugins["load"].attached)
-    state, at = begun, {"pos": goal, "vel": jnp.zeros_like(pos), "attached": held}
+    held = jnp.ones_like(start_state.data.plugins["load"].attached)
+    state, at = start_state, {"pos": goal, "vel": jnp.zeros_like(pos), "attached": held}
     for k in range(26):  # put back before every step: at zero action a drone sinks with its load
-        state = step(moved(state, pos, jnp.zeros_like(pos), at), state.action)
+        state = step(move_drone(state, pos, jnp.zeros_like(pos), at), state.action)
         assert np.asarray(env.succeeded(state)).all() == (k >= 24), "half a second is 25 steps"
     assert state.info["taken"].all()
     assert float(state.info["error"].max()) < env.task.tolerance
 
 
-def test_too_low_is_a_crash(begun, step):
-    pos = begun.data.states.pos.at[0, 0, 2].set(MIN_HEIGHT - 0.01)
-    state = step(moved(begun, pos, jnp.zeros_like(pos)), begun.action)
+def test_too_low_is_a_crash(start_state, step):
+    pos = start_state.data.states.pos.at[0, 0, 2].set(MIN_HEIGHT - 0.01)
+    state = step(move_drone(start_state, pos, jnp.zeros_like(pos)), start_state.action)
     np.testing.assert_array_equal(state.terminated, np.arange(N_WORLDS) == 0)
     assert float(state.reward[0, 0]) < -3
 

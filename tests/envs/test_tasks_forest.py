@@ -14,7 +14,7 @@ N_WORLDS, SEEN = 64, 6
 
 
 @pytest.fixture(scope="module")
-def begun():
+def start_state():
     """Return the environment without images, the state where episodes begin, and the step."""
     env = make("forest", N_WORLDS, camera=(), trees_seen=SEEN, engine="interpret")
     return env, jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
@@ -42,8 +42,8 @@ def standing_trees(env, data):
     return np.stack([trees.x, trees.y], axis=-1), radius, np.asarray(trees.is_standing)
 
 
-def test_every_world_has_a_forest_of_its_own_with_clear_starts(begun):
-    env, state, _ = begun
+def test_every_world_has_a_forest_of_its_own_with_clear_starts(start_state):
+    env, state, _ = start_state
     xy, radius, stands = standing_trees(env, state.data)
     assert stands.mean() > 0.98
     assert np.ptp(xy, axis=0).min() > 2.0, "trees stand elsewhere in every world"
@@ -64,8 +64,8 @@ def test_every_world_has_a_forest_of_its_own_with_clear_starts(begun):
     assert np.abs(standing_trees(env, other.data)[0] - xy).max(axis=(1, 2)).min() > 0.5
 
 
-def test_nearest_trees_are_those_of_the_forest(begun):
-    env, state, _ = begun
+def test_nearest_trees_are_those_of_the_forest(start_state):
+    env, state, _ = start_state
     rng = np.random.default_rng(0)
     data = put(state, rng.uniform([0, -6, 0.5], [28, 6, 3], (N_WORLDS, 1, 3)), yaw=0.7).data
     xy, radius, _ = standing_trees(env, data)
@@ -91,8 +91,8 @@ def test_nearest_trees_are_those_of_the_forest(begun):
     np.testing.assert_allclose(lengths[:, 0], np.minimum(clearance[:, 0], VIEW_RANGE)[outside], atol=1e-4)
 
 
-def test_vectors_turn_with_the_heading_and_the_critic_sees_trees(begun):
-    env, state, _ = begun
+def test_vectors_turn_with_the_heading_and_the_critic_sees_trees(start_state):
+    env, state, _ = start_state
     observe = jax.jit(vmap_worlds(env.task.observe))
     pos, goal = np.array([5.0, 1.0, 1.5]), np.array([32.0, 1.0, 1.5], np.float32)
     goals = jnp.broadcast_to(goal, state.data.states.pos.shape)
@@ -107,8 +107,8 @@ def test_vectors_turn_with_the_heading_and_the_critic_sees_trees(begun):
     assert privileged.shape[-1] - hover.shape[-1] == 3 * PRIVILEGED_TREES
 
 
-def test_hits_disable_and_crossing_the_line_is_a_success(begun):
-    env, state, step = begun
+def test_hits_disable_and_crossing_the_line_is_a_success(start_state):
+    env, state, step = start_state
     xy, radius, _ = standing_trees(env, state.data)
     pos = np.tile([-0.5, 0.0, HEIGHT], (N_WORLDS, 1))
     side = radius[1, 7] + np.array([0.06, 0.10])  # the ball around a Crazyflie has 7 to 9 cm
@@ -135,8 +135,8 @@ def test_hits_disable_and_crossing_the_line_is_a_success(begun):
     assert env.task.error(put(state, [4.0, 0, 1]).data).max() == env.task.length - 4
 
 
-def test_speed_pays_up_to_the_set_one_and_trees_nearby_cost(begun):
-    env, state, _ = begun
+def test_speed_pays_up_to_the_set_one_and_trees_nearby_cost(start_state):
+    env, state, _ = start_state
     goals = jnp.broadcast_to(jnp.asarray([32.0, 0.0, HEIGHT]), state.data.states.pos.shape)
     action = state.action
 

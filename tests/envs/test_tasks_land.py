@@ -41,7 +41,7 @@ def environment(n_worlds, n_drones=1, **options):
 
 
 @pytest.fixture(scope="module")
-def still():
+def touch_downs():
     """Return the environment of all cases, their names to worlds, the state before, after a step, and the step."""
     env, step = environment(len(CASES)), None
     state = jax.jit(env.reset)(jax.random.key(0))
@@ -54,21 +54,21 @@ def still():
     return env, {name: k for k, name in enumerate(CASES)}, before, step(before, before.action), step
 
 
-def test_landed_is_who_touches_the_pad_softly_upright_and_within_it(still):
-    env, world, _, after, _ = still
+def test_landed_is_who_touches_the_pad_softly_upright_and_within_it(touch_downs):
+    env, world, _, after, _ = touch_downs
     landed = np.asarray(env.succeeded(after))[:, 0]
     assert {name for name, k in world.items() if landed[k]} == {"soft", "edge"}
 
 
-def test_every_other_touch_and_flying_away_is_a_crash(still):
-    _, world, _, after, _ = still
+def test_every_other_touch_and_flying_away_is_a_crash(touch_downs):
+    _, world, _, after, _ = touch_downs
     crashed = np.asarray(after.info["crashed"])[:, 0]
     assert {name for name, k in world.items() if crashed[k]} == set(CASES) - {"soft", "edge", "hover"}
     np.testing.assert_array_equal(after.terminated, [name != "hover" for name in CASES])
 
 
-def test_landing_pays_and_crashing_costs_once(still):
-    _, world, _, after, step = still
+def test_landing_pays_and_crashing_costs_once(touch_downs):
+    _, world, _, after, step = touch_downs
     reward = np.asarray(after.reward)[:, 0]
     assert reward[world["soft"]] > 9
     assert -3 < reward[world["fast"]] < -1, "less than a landing pays, or none is tried"
@@ -107,8 +107,8 @@ def test_a_moving_pad_moves_in_the_data_at_its_speed(moving):
     np.testing.assert_allclose(np.linalg.norm(after.objects.vel, axis=-1), SPEED, rtol=1e-4)
     along = (after.objects.pos - data.objects.pos) * 500 / steps
     np.testing.assert_allclose(along, after.objects.vel, atol=0.01)
-    seen = jax.jit(vmap_worlds(env.task.observe))(after)["difference_to_pad"] + np.asarray(after.states.pos)
-    np.testing.assert_allclose(seen, after.objects.pos[:, 0], atol=1e-5)
+    observed_pos = jax.jit(vmap_worlds(env.task.observe))(after)["difference_to_pad"] + np.asarray(after.states.pos)
+    np.testing.assert_allclose(observed_pos, after.objects.pos[:, 0], atol=1e-5)
 
 
 def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes():
@@ -132,9 +132,9 @@ def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes
         return jnp.concatenate([roll / (jnp.pi / 4), pitch / (jnp.pi / 4), 0 * roll, down], axis=-1)
 
     env = DroneEnv(env.sim, Above(speed=SPEED, seconds=3.0))
-    judged = evaluate(env, jax.tree_util.Partial(follow))
-    assert judged["success"] == judged["crashed"] == 0.5
-    assert judged["error"] < 0.27
+    metrics = evaluate(env, jax.tree_util.Partial(follow))
+    assert metrics["success"] == metrics["crashed"] == 0.5
+    assert metrics["error"] < 0.27
 
 
 @pytest.mark.parametrize(

@@ -156,9 +156,9 @@ def test_drones_out_of_the_race_do_not_matter_to_others():
     np.testing.assert_array_equal(after.info["disabled"], expected)
     np.testing.assert_array_equal(after.terminated, [True, False, False, True])
     assert np.all(np.asarray(after.reward)[1:, 0] == 0)
-    seen = np.asarray(after.obs["drones_near"])[2]
-    assert np.linalg.norm(seen[0]) > 0.04  # the one that flies on is seen by the other
-    np.testing.assert_array_equal(seen[1], 0)  # and does not see the one that has finished
+    observed_drones = np.asarray(after.obs["drones_near"])[2]
+    assert np.linalg.norm(observed_drones[0]) > 0.04  # the one that flies on is seen by the other
+    np.testing.assert_array_equal(observed_drones[1], 0)  # and does not see the one that has finished
 
 
 @pytest.fixture(scope="module")
@@ -240,21 +240,21 @@ def test_poses_are_nominal_until_the_drone_was_near(drawn):
     def at(data, pos):
         return data.replace(states=data.states.replace(pos=jnp.asarray(np.broadcast_to(np.float32(pos), gate.shape))))
 
-    def seen(data):
+    def observed_drones(data):
         obs = observe(data)
         return np.asarray(obs["gates_pos"])[..., :3], np.asarray(obs["gates_visited"])[..., 0]
 
-    observed, visited = seen(at(data, far))
+    observed, visited = observed_drones(at(data, far))
     np.testing.assert_allclose(observed, np.broadcast_to(said, observed.shape), atol=1e-6)
     assert not visited.any()
     # High over the gate is near too: distances are in the plane.
     near = at(data, gate + [0.6, 0.3, 0.5])
-    observed, visited = seen(near)
+    observed, visited = observed_drones(near)
     np.testing.assert_allclose(observed, gate, atol=1e-6)
     assert visited.all()
-    observed, _ = seen(at(data, gate + [0.6, 0.4, 0.0]))
+    observed, _ = observed_drones(at(data, gate + [0.6, 0.4, 0.0]))
     np.testing.assert_allclose(observed, np.broadcast_to(said, observed.shape), atol=1e-6)
-    observed, visited = seen(at(jax.jit(vmap_worlds(env.task.before_step))(near), far))
+    observed, visited = observed_drones(at(jax.jit(vmap_worlds(env.task.before_step))(near), far))
     np.testing.assert_allclose(observed, gate, atol=1e-6)
     assert visited.all()
 
@@ -339,10 +339,10 @@ def test_a_given_track_is_flown_and_judged():
             return data.replace(states=states, plugins=data.plugins | {"task": record})
 
     env = DroneEnv(env.sim, Thrown(track=track, seconds=1.2))
-    judged = evaluate(env, jax.tree_util.Partial(lambda obs: jnp.zeros((3, 1, 4))))
-    np.testing.assert_allclose(judged["success"], 2 / 3, rtol=1e-6)
-    np.testing.assert_allclose(judged["crashed"], 1 / 3, rtol=1e-6)
-    assert judged["error"] == 0
+    metrics = evaluate(env, jax.tree_util.Partial(lambda obs: jnp.zeros((3, 1, 4))))
+    np.testing.assert_allclose(metrics["success"], 2 / 3, rtol=1e-6)
+    np.testing.assert_allclose(metrics["crashed"], 1 / 3, rtol=1e-6)
+    assert metrics["error"] == 0
 
 
 @pytest.mark.parametrize(

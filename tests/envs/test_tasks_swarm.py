@@ -14,7 +14,7 @@ N_WORLDS, N_DRONES = 2048, 4
 
 
 @pytest.fixture(scope="module")
-def begun():
+def start_state():
     """Return the environment, the state where episodes begin, and the step."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
     task = Swarm()
@@ -43,8 +43,8 @@ def test_separation_is_that_of_an_ellipsoid_longer_in_z():
     assert np.all(np.isfinite(at_one_point))
 
 
-def test_starts_are_clear_and_places_are_exchanged(begun):
-    env, state, _ = begun
+def test_starts_are_clear_and_places_are_exchanged(start_state):
+    env, state, _ = start_state
     data = state.data
     env.sim.data = data
     report = env.sim.contact_report()
@@ -61,8 +61,8 @@ def test_starts_are_clear_and_places_are_exchanged(begun):
     np.testing.assert_allclose(state.info["error"], np.linalg.norm(goal - data.states.pos, axis=-1), rtol=1e-5)
 
 
-def test_coming_too_near_ends_and_costs(begun):
-    _, state, step = begun
+def test_coming_too_near_ends_and_costs(start_state):
+    _, state, step = start_state
     goal = np.asarray(state.data.plugins["task"].goal)
     pos = goal.copy()
     pos[1, 1] = pos[1, 0] + [0.2, 0, 0]  # beside each other
@@ -84,8 +84,8 @@ def test_coming_too_near_ends_and_costs(begun):
     assert np.all(np.diff(np.linalg.norm(ways, axis=-1), axis=-1) > -1e-6)
 
 
-def test_separation_is_kept_at_every_physics_step(begun):
-    _, state, step = begun
+def test_separation_is_kept_at_every_physics_step(start_state):
+    _, state, step = start_state
     # One flies past another at 40 m/s within one environment step: too near only in between.
     pos = np.asarray(state.data.plugins["task"].goal).copy()
     pos[0, 0], pos[0, 1] = [-0.4, 0, 1.2], [0.0, 0.05, 1.2]

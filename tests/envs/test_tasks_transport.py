@@ -67,7 +67,7 @@ def placed(state, drone, load, vel, goal=GOAL):
 
 
 @pytest.fixture(scope="module")
-def flown():
+def recorded_flight():
     """Return names of all cases to worlds, and the state after a step."""
     env = environment(len(CASES))
     place, hang, vel = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
@@ -75,16 +75,16 @@ def flown():
     return {name: k for k, name in enumerate(CASES)}, jax.jit(env.step)(before, before.action)
 
 
-def test_touching_and_missing_the_gate_or_leaving_the_lane_is_a_crash(flown):
-    world, after = flown
+def test_touching_and_missing_the_gate_or_leaving_the_lane_is_a_crash(recorded_flight):
+    world, after = recorded_flight
     crashed = np.asarray(after.info["crashed"])[:, 0]
     assert {name for name, k in world.items() if crashed[k]} == set(CASES) - SAFE
     np.testing.assert_array_equal(after.terminated, crashed)
     np.testing.assert_array_equal(np.asarray(after.reward)[:, 0] < -5, crashed)
 
 
-def test_a_gate_is_passed_where_the_load_is_behind_it_without_a_crash(flown):
-    world, after = flown
+def test_a_gate_is_passed_where_the_load_is_behind_it_without_a_crash(recorded_flight):
+    world, after = recorded_flight
     passed = np.asarray(after.info["passed"])[:, 0]
     assert {name for name, k in world.items() if passed[k]} - {"load just inside"} == {"through", "behind"}
 
@@ -181,10 +181,10 @@ class Pilot(PyTree):
 
 def test_a_pilot_that_aims_at_the_opening_and_damps_the_swing_delivers_and_one_that_idles_does_not():
     env = environment(64, seconds=9.0)
-    judged, idle = (evaluate(env, Pilot(jnp.float32(gain))) for gain in (1.0, 0.0))
-    assert judged["success"] > 0.95
-    assert judged["crashed"] < 0.05
-    assert judged["error"] < 0.1
+    metrics, idle = (evaluate(env, Pilot(jnp.float32(gain))) for gain in (1.0, 0.0))
+    assert metrics["success"] > 0.95
+    assert metrics["crashed"] < 0.05
+    assert metrics["error"] < 0.1
     assert idle["success"] == 0
 
 

@@ -69,11 +69,11 @@ def test_episodes_stay_on_the_device_that_was_asked_for():
     action, both = np.zeros(state.action.shape, np.float32), np.array([True, False, True])
     after = jax.jit(env.step)(state, jnp.asarray(action))
     vec = gymnasium.make_vec(ID, num_envs=3, device="cpu:1")
-    begun = vec.reset(seed=0)
+    start_state = vec.reset(seed=0)
     uncompiled = env.reset(jax.random.key(0)), env.step(state, action), env.restart(after, both)
     auto = AutoReset(env)
     again = auto.step(auto.reset(jax.random.key(0)), action)
-    for tree in (state, after, begun, vec.step(zeros(vec)), uncompiled, again):
+    for tree in (state, after, start_state, vec.step(zeros(vec)), uncompiled, again):
         assert {x.device for x in jax.tree.leaves(tree)} == {device}
     moved = env.step(jax.device_put(state, default), action)
     assert {x.device for x in jax.tree.leaves(moved)} == {default}
@@ -140,8 +140,8 @@ def test_one_dispatch_a_step_and_arrays_stay_where_they_are(next_step):
         obs, reward, terminated, truncated, info = next_step.step(action)
     assert all(isinstance(x, jax.Array) for x in jax.tree.leaves((obs, reward, terminated, truncated, info)))
     traces = next_step._stepper.compiled._cache_size()
-    for given in (zeros(next_step), zeros(next_step).astype(np.float64), zeros(next_step).tolist()):
-        next_step.step(given)
+    for actions in (zeros(next_step), zeros(next_step).astype(np.float64), zeros(next_step).tolist()):
+        next_step.step(actions)
     # NumPy comes in by another door than JAX, and is traced once
     assert next_step._stepper.compiled._cache_size() <= traces + 1
 

@@ -184,15 +184,15 @@ def test_an_unknown_mode_names_those_there_are(env):
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_episode_statistics(env, mode):
     auto = AutoReset(EpisodeStatistics(env), mode)
-    begun = auto.reset(jax.random.key(0))
-    assert not begun.info["episode_length"].any()
-    one, two = steps(auto, begun, 2)
-    last = auto.step(one_step_to_go(env, two, FIRST), random_action(begun, 7))
+    start_state = auto.reset(jax.random.key(0))
+    assert not start_state.info["episode_length"].any()
+    one, two = steps(auto, start_state, 2)
+    last = auto.step(one_step_to_go(env, two, FIRST), random_action(start_state, 7))
     np.testing.assert_array_equal(last.done, FIRST)
     np.testing.assert_array_equal(last.info["episode_length"], [3, 0, 0, 0])
     total = one.reward + two.reward + last.reward
     np.testing.assert_allclose(last.info["episode_return"], total * FIRST[:, None], rtol=1e-5)
-    after = auto.step(last, random_action(begun, 8))
+    after = auto.step(last, random_action(start_state, 8))
     if mode == "Disabled":  # the episode goes on and ends again
         np.testing.assert_array_equal(after.info["episode_length"], [1, 0, 0, 0])
         again = auto.restart(after, jnp.asarray(FIRST))
@@ -221,8 +221,8 @@ def test_observe_changes_what_is_seen_at_all_times(env):
 
 def test_normalised_over_all_that_was_seen(env):
     wrapped = AutoReset(Normalize(env), "NextStep")
-    begun = wrapped.reset(jax.random.key(0))
-    states = [begun, *steps(wrapped, begun, 9)]
+    start_state = wrapped.reset(jax.random.key(0))
+    states = [start_state, *steps(wrapped, start_state, 9)]
     plain = env.reset(jax.random.key(0))
     seen = [s.obs["pos"] for s in (plain, *steps(env, plain, 9))]
     stats = states[-1].memory["Normalize"]["pos"]

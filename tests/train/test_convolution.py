@@ -176,7 +176,7 @@ def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
     np.testing.assert_allclose(frame[np.ix_(rows, columns)], expected, atol=40)
 
 
-def trained(folder, iterations=2, **options):
+def train_quietly(folder, iterations=2, **options):
     """Train hover with images, a tiny convolution and a privileged critic."""
     config = SHORT | {"iterations": iterations, "memory": 3, "critic": "privileged"}
     config = TrainConfig.create("hover", n_worlds=8, options=OPTIONS, config=config)
@@ -185,18 +185,18 @@ def trained(folder, iterations=2, **options):
 
 @pytest.mark.long("compiles a training")
 def test_a_run_with_a_convolution_resumes_bit_for_bit_and_its_policy_comes_back(tmp_path):
-    whole = trained(tmp_path / "whole")
+    whole = train_quietly(tmp_path / "whole")
 
     def interrupt(i, _):
         if i == 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        trained(tmp_path / "cut", on_iteration=interrupt)
-    trained(tmp_path / "cut", resume=True)
-    mine, others = (read(tmp_path / name / CHECKPOINT_FILE)[0] for name in ("cut", "whole"))
-    for name, x in mine.items():
-        np.testing.assert_array_equal(x, others[name], err_msg=name)
+        train_quietly(tmp_path / "cut", on_iteration=interrupt)
+    train_quietly(tmp_path / "cut", resume=True)
+    actual, reference = (read(tmp_path / name / CHECKPOINT_FILE)[0] for name in ("cut", "whole"))
+    for name, x in actual.items():
+        np.testing.assert_array_equal(x, reference[name], err_msg=name)
     policy, config, meta = load_policy(tmp_path / "whole")
     assert config.config["convolution"] == [2, 3]
     assert meta["images"]["depth"]["width"] == 5

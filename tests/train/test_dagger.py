@@ -66,8 +66,8 @@ def test_the_teacher_observes_the_truth_and_the_student_what_is_measured():
 @pytest.mark.long("trains and resumes by the command")
 def test_the_command_trains_a_student_and_resumes(teacher, tmp_path, capsys):
     arguments = ["train", "hover", "--worlds", "4", "--set", "seconds=0.2", "--out", str(tmp_path / "run"), "--no-film"]
-    few = ["--config", "n_steps=4", "minibatches=2", "epochs=1", "hidden=[8]"]
-    assert main([*arguments, "--teacher", str(teacher), "--iterations", "2", *few]) == 0
+    small_options = ["--config", "n_steps=4", "minibatches=2", "epochs=1", "hidden=[8]"]
+    assert main([*arguments, "--teacher", str(teacher), "--iterations", "2", *small_options]) == 0
     assert "hover by dagger, seed 0: 2 iterations" in capsys.readouterr().out
     assert main([*arguments, "--resume", "--iterations", "3"]) == 0
     assert "continues after iteration 2" in capsys.readouterr().out

@@ -55,9 +55,9 @@ class Training:
         self.learner = learner
 
 
-def assert_same(mine, others, atol):
+def assert_same(actual, others, atol):
     """Assert that two trees agree; keys, integers and flags exactly."""
-    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(mine), jax.tree.leaves(others), strict=True):
+    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(actual), jax.tree.leaves(others), strict=True):
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
             x, y = jax.random.key_data(x), jax.random.key_data(y)
         name = jax.tree_util.keystr(path)
@@ -125,7 +125,7 @@ def test_a_run_continues_on_another_number_of_devices(tmp_path, monkeypatch):
     options, lines = {"seconds": 0.2}, []
     settings = {"n_worlds": 16, "options": options, "config": dataclasses.asdict(PPO)}
 
-    def trained(devices, **others):
+    def train_quietly(devices, **others):
         config = TrainConfig.create("hover", devices=devices, **settings)
         train(config, tmp_path, evaluation_worlds=8, log=lines.append, progress=False, **others)
 
@@ -134,10 +134,10 @@ def test_a_run_continues_on_another_number_of_devices(tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        trained("all", on_iteration=interrupt)
+        train_quietly("all", on_iteration=interrupt)
     assert re.search(r"in 16 worlds, 4 on each of 4 devices, which exchange [\d,]{5,} bytes an iteration", lines[0])
     lines.clear()
-    trained("2,0", resume=True)
+    train_quietly("2,0", resume=True)
     assert re.search(r"in 16 worlds, 8 on each of 2 devices, .*; continues after iteration 2", lines[0])
     arrays, meta = checkpoint.read(tmp_path / CHECKPOINT_FILE)
     one = Training(ppo, PPO, 1, 16, 1).learner

@@ -77,10 +77,10 @@ def iteration(out):
     return int(checkpoint.read(path)[0]["['learner'].iteration"]) if path.exists() else -1
 
 
-def assert_same_files(mine, others):
+def assert_same_files(actual_folder, others):
     """Assert that the checkpoints and policies of two runs agree to rounding."""
     for name in (CHECKPOINT_FILE, POLICY_FILE):
-        (x, _), (y, _) = (checkpoint.read(out / name) for out in (mine, others))
+        (x, _), (y, _) = (checkpoint.read(out / name) for out in (actual_folder, others))
         assert x.keys() == y.keys()
         for key in x:
             np.testing.assert_allclose(x[key], y[key], rtol=1e-4, atol=1e-5, err_msg=key)

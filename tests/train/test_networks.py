@@ -45,7 +45,7 @@ def shared_environments():
         yield
 
 
-def trained(folder, config, network=None, iterations=2, **options):
+def train_quietly(folder, config, network=None, iterations=2, **options):
     """Train hover with a tiny network."""
     config = TrainConfig.create("hover", **SIZES, config=SHORT | {"iterations": iterations} | config, network=network)
     return train(config, folder, evaluation_worlds=8, log=lambda line: None, progress=False, **options)
@@ -136,20 +136,20 @@ def test_a_memory_learns_what_a_policy_without_cannot():
 @pytest.mark.long("compiles a training and renders a film")
 def test_a_run_with_memory_resumes_is_evaluated_filmed_and_exported(tmp_path):
     config = {"memory": 4, "critic": "privileged"}
-    whole = trained(tmp_path / "whole", config, iterations=4)
+    whole = train_quietly(tmp_path / "whole", config, iterations=4)
 
     def interrupt(i, _):
         if i == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        trained(tmp_path / "cut", config, iterations=4, on_iteration=interrupt)
-    trained(tmp_path / "cut", config, iterations=4, resume=True)
-    mine, others = (read(tmp_path / name / CHECKPOINT_FILE)[0] for name in ("cut", "whole"))
-    assert mine.keys() == others.keys()
-    for name, x in mine.items():
-        np.testing.assert_array_equal(x, others[name], err_msg=name)
-    memories = [x for name, x in mine.items() if name.startswith("['learner'].memory")]
+        train_quietly(tmp_path / "cut", config, iterations=4, on_iteration=interrupt)
+    train_quietly(tmp_path / "cut", config, iterations=4, resume=True)
+    actual, reference = (read(tmp_path / name / CHECKPOINT_FILE)[0] for name in ("cut", "whole"))
+    assert actual.keys() == reference.keys()
+    for name, x in actual.items():
+        np.testing.assert_array_equal(x, reference[name], err_msg=name)
+    memories = [x for name, x in actual.items() if name.startswith("['learner'].memory")]
     assert [x.shape for x in memories] == [(16, 1, 4)] * 2
     assert all(np.abs(x).max() > 0 for x in memories)
     policy, loaded, meta = load_policy(tmp_path / "whole")
@@ -321,7 +321,7 @@ def equinox_network():
 )
 def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_network):
     network = make_network()
-    result = trained(tmp_path, {}, network)
+    result = train_quietly(tmp_path, {}, network)
     policy, config, meta = load_policy(tmp_path, network=network)
     assert config.own_network
     for x, y in zip(jax.tree.leaves(policy), jax.tree.leaves(result.policy), strict=True):
@@ -337,20 +337,20 @@ def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_networ
     with pytest.raises(ConfigError, match=r"expected the arrays of this task and version|expected .* in .* as float32"):
         load_policy(tmp_path, network=Network(lambda key, n: jnp.zeros((n, 3)), lambda w, x, m: (x @ w, m)))
     with pytest.raises(ConfigError, match=r"to be resumed with its custom network. Use network=network"):
-        trained(tmp_path, {}, resume=True)
+        train_quietly(tmp_path, {}, resume=True)
     with pytest.raises(ConfigError, match="expected a policy with the built-in network, got one with a custom network"):
         to_c(policy, tmp_path / "policy.h", meta)
 
 
 def test_wrong_networks_are_refused():
     network = plain_network()
-    given = {"task": "hover", **SIZES}
+    settings = {"task": "hover", **SIZES}
     with pytest.raises(ConfigError, match="expected memory=0 with a custom network, got 8"):
-        TrainConfig.create(**given, config={"memory": 8}, network=network)
+        TrainConfig.create(**settings, config={"memory": 8}, network=network)
     with pytest.raises(ConfigError, match=r"expected no custom network for apg, got one\. Use algorithm='ppo'"):
-        TrainConfig.create(**given, algorithm="apg", network=network)
+        TrainConfig.create(**settings, algorithm="apg", network=network)
     with pytest.raises(ConfigError, match=r"expected a Network, got <function"):
-        TrainConfig.create(**given, network=plain_network)
+        TrainConfig.create(**settings, network=plain_network)
     for apply, memory, message in (
         (lambda w, x, m: x @ w, (), "features .* and the memory, got ShapeDtypeStruct"),
         (lambda w, x, m: ((x @ w)[None], m), (), "features .* and the memory, got"),

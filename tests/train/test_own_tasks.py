@@ -72,9 +72,22 @@ def another_process(monkeypatch):
 def test_a_file_is_trained_evaluated_resumed_and_exported(file, tmp_path, monkeypatch, capsys):
     """By the commands alone, from the folder of the run."""
     monkeypatch.chdir(tmp_path)
-    few = [f"{k}={list(v) if isinstance(v, tuple) else v}" for k, v in SMALL.items()]
+    small_options = [f"{k}={list(v) if isinstance(v, tuple) else v}" for k, v in SMALL.items()]
     assert (
-        main(["train", "my_tasks.py:High", "--worlds", "4", "--set", "seconds=0.4", "--no-film", "--config", *few]) == 0
+        main(
+            [
+                "train",
+                "my_tasks.py:High",
+                "--worlds",
+                "4",
+                "--set",
+                "seconds=0.4",
+                "--no-film",
+                "--config",
+                *small_options,
+            ]
+        )
+        == 0
     )
     assert "high by ppo, seed 0: 2 iterations" in capsys.readouterr().out
     another_process(monkeypatch)

@@ -57,12 +57,12 @@ def test_a_seed_trains_beside_others_as_it_does_alone(algorithm, hyperparameters
     for _ in range(3):
         many, metrics = algorithm.iterate(many, both, tuple(hyperparameters))
         for i in range(2):
-            alone[i], others = algorithm.iterate(alone[i], one, (hyperparameters[i],))
+            alone[i], reference = algorithm.iterate(alone[i], one, (hyperparameters[i],))
             for name in metrics:
-                np.testing.assert_allclose(metrics[name][i], others[name][0], rtol=1e-3, atol=1e-5, err_msg=name)
+                np.testing.assert_allclose(metrics[name][i], reference[name][0], rtol=1e-3, atol=1e-5, err_msg=name)
     for i in range(2):
-        mine, others = (jax.tree.leaves(take_seed(x.agents, j)) for x, j in ((many, i), (alone[i], 0)))
-        for x, y in zip(mine, others, strict=True):
+        actual, reference = (jax.tree.leaves(take_seed(x.agents, j)) for x, j in ((many, i), (alone[i], 0)))
+        for x, y in zip(actual, reference, strict=True):
             if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
                 x, y = map(jax.random.key_data, (x, y))
             np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4)
@@ -97,7 +97,7 @@ def test_keys_must_divide_the_worlds():
 SMALL = {"n_steps": 4, "minibatches": 1, "epochs": 1, "hidden": (8,), "iterations": 3}
 
 
-def trained(folder, log=lambda line: None, **settings):
+def train_quietly(folder, log=lambda line: None, **settings):
     """Train in 4 worlds for each seed."""
     given = {"n_worlds": 4, "options": {"seconds": 0.2}, "config": SMALL} | settings
     return run_many("hover", folder, evaluation_worlds=8, log=log, progress=False, **given)
@@ -116,7 +116,7 @@ def shared_environments():
 def swept(tmp_path_factory):
     """Return a run of two seeds with two learning rates, one of which is too large, and its lines."""
     folder, lines = tmp_path_factory.mktemp("run") / "swept", []
-    return trained(folder, lines.append, seeds=(3, 5), sweep={"learning_rate": [1e-3, 1e38]}), folder, lines
+    return train_quietly(folder, lines.append, seeds=(3, 5), sweep={"learning_rate": [1e-3, 1e38]}), folder, lines
 
 
 @pytest.mark.long("compiles a training of four seeds")
@@ -148,7 +148,7 @@ def test_a_seed_of_a_run_is_that_of_a_run_alone_and_resumes(tmp_path, monkeypatc
     """An interrupted run resumes bit for bit; its learning curves are those of runs of one seed, to rounding."""
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     seen = []
-    trained(whole, seeds=range(2), on_iteration=lambda *call: seen.append(call))
+    train_quietly(whole, seeds=range(2), on_iteration=lambda *call: seen.append(call))
     assert [i for i, _ in seen] == [1, 2, 3]
     assert seen[0][1]["reward"].shape == seen[-1][1]["evaluation success"].shape == (2,)
 
@@ -157,22 +157,22 @@ def test_a_seed_of_a_run_is_that_of_a_run_alone_and_resumes(tmp_path, monkeypatc
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        trained(cut, seeds=range(2), on_iteration=interrupt)
+        train_quietly(cut, seeds=range(2), on_iteration=interrupt)
     with pytest.raises(
         ConfigError, match=r"expected the seeds and the sweep of .*, seed-0, seed-1, got seed-1; resume"
     ):
-        trained(cut, seeds=[1], resume=True)
+        train_quietly(cut, seeds=[1], resume=True)
     assert main(["train", "hover", "--resume", "--out", str(cut)]) == 2
-    trained(cut, seeds=range(2), resume=True)
-    mine, others = (checkpoint.read(folder / "checkpoint.npz")[0] for folder in (cut, whole))
-    assert mine.keys() == others.keys()
-    for name, x in mine.items():
-        np.testing.assert_array_equal(x, others[name], err_msg=name)
+    train_quietly(cut, seeds=range(2), resume=True)
+    actual, reference = (checkpoint.read(folder / "checkpoint.npz")[0] for folder in (cut, whole))
+    assert actual.keys() == reference.keys()
+    for name, x in actual.items():
+        np.testing.assert_array_equal(x, reference[name], err_msg=name)
     alone = tmp_path / "alone"
-    trained(alone, seeds=[1])
-    for mine, other in zip(read_curve(whole / "seed-1"), read_curve(alone / "seed-1"), strict=True):
+    train_quietly(alone, seeds=[1])
+    for actual, other in zip(read_curve(whole / "seed-1"), read_curve(alone / "seed-1"), strict=True):
         for name in ("success", "error", "reward", "check"):
-            np.testing.assert_allclose(mine[name], other[name], rtol=1e-3, err_msg=name)
+            np.testing.assert_allclose(actual[name], other[name], rtol=1e-3, err_msg=name)
 
 
 @pytest.mark.long("compiles a training of two seeds")
@@ -188,14 +188,14 @@ def test_seeds_that_are_interrupted_before_the_first_iteration_have_files_and_al
     with monkeypatch.context() as patch:
         patch.setattr(trainings, "_iteration_bar", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path, sweep=sweep)
+            train_quietly(tmp_path, sweep=sweep)
     first, second = "learning_rate-1e+38-seed-0", "learning_rate-2e+38-seed-0"
     assert [row["iteration"] for row in json.loads((tmp_path / "seeds.json").read_text())] == [0, 0]
     assert [point["kept"] for point in read_curve(tmp_path / first)] == [True]
     where = rf"2 \({re.escape(first)}\), 2 \({re.escape(second)}\)"
     expected = rf"NaN or infinity in iteration {where} of hover .*policy\.npz of iteration 0 \("
     with pytest.raises(DivergedError, match=expected):
-        trained(tmp_path, sweep=sweep, resume=True)
+        train_quietly(tmp_path, sweep=sweep, resume=True)
 
 
 def test_wrong_seeds_and_sweeps_are_refused(capsys, tmp_path):

@@ -42,16 +42,16 @@ SMALL = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (16, 16)}
 
 def small_config(iterations=4, **changes):
     config = {**SMALL, "iterations": iterations}
-    given = {"task": "hover", "n_worlds": 8, "options": {"seconds": 0.4}, "config": config} | changes
-    return TrainConfig.create(**given)
+    settings = {"task": "hover", "n_worlds": 8, "options": {"seconds": 0.4}, "config": config} | changes
+    return TrainConfig.create(**settings)
 
 
-def quiet(*_):
+def discard_line(*_):
     pass
 
 
-def trained(folder, config, **options):
-    return train(config, folder, evaluation_worlds=8, log=quiet, progress=False, **options)
+def train_quietly(folder, config, **options):
+    return train(config, folder, evaluation_worlds=8, log=discard_line, progress=False, **options)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -64,13 +64,13 @@ def shared_environments():
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def uninterrupted_run(tmp_path_factory):
     """Return an uninterrupted run of four iterations."""
     folder = tmp_path_factory.mktemp("run") / "whole"
-    return trained(folder, small_config())
+    return train_quietly(folder, small_config())
 
 
-def arrays(folder):
+def checkpoint_arrays(folder):
     with np.load(folder / CHECKPOINT_FILE) as file:
         return {name: file[name] for name in file.files if name != checkpoint.META_ENTRY}
 
@@ -78,13 +78,13 @@ def arrays(folder):
 @contextlib.contextmanager
 def interrupted_after(iterations, monkeypatch, by=KeyboardInterrupt):
     """Press Ctrl-C after some iterations, or raise another exception."""
-    shown = [0]
+    n_shown = [0]
 
     @contextlib.contextmanager
     def bar(*_):
         def show(*_):
-            shown[0] += 1
-            if shown[0] == iterations:
+            n_shown[0] += 1
+            if n_shown[0] == iterations:
                 raise by
 
         yield show
@@ -94,7 +94,7 @@ def interrupted_after(iterations, monkeypatch, by=KeyboardInterrupt):
         yield
 
 
-def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
+def test_an_interrupted_run_resumes_bit_for_bit(uninterrupted_run, tmp_path, monkeypatch):
     """Interrupted after two of four iterations and resumed, a run ends with the arrays of an uninterrupted one."""
     lines = []
     with interrupted_after(2, monkeypatch), pytest.raises(KeyboardInterrupt):
@@ -102,25 +102,25 @@ def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
     assert "interrupted after iteration 2" in lines[-1]
     assert str(tmp_path / CHECKPOINT_FILE) in lines[-1]
     assert "--resume" in lines[-1]
-    trained(tmp_path, small_config(), resume=True)
-    mine, others = arrays(tmp_path), arrays(whole.folder)
-    assert mine.keys() == others.keys()
-    for name, x in mine.items():
-        np.testing.assert_array_equal(x, others[name], err_msg=name)
+    train_quietly(tmp_path, small_config(), resume=True)
+    actual, reference = checkpoint_arrays(tmp_path), checkpoint_arrays(uninterrupted_run.folder)
+    assert actual.keys() == reference.keys()
+    for name, x in actual.items():
+        np.testing.assert_array_equal(x, reference[name], err_msg=name)
     assert [p["iteration"] for p in json.loads((tmp_path / "curve.json").read_text())][-1] == 4
 
 
-def test_a_checkpoint_between_evaluations_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
+def test_a_checkpoint_between_evaluations_resumes_bit_for_bit(uninterrupted_run, tmp_path, monkeypatch):
     """A run that is killed after three of four iterations, which writes nothing any more, goes on from the second."""
     with interrupted_after(3, monkeypatch, by=MemoryError), pytest.raises(MemoryError):
-        trained(tmp_path, small_config(), checkpoint_every=1e-6)
-    assert arrays(tmp_path)["['learner'].iteration"] == 2
+        train_quietly(tmp_path, small_config(), checkpoint_every=1e-6)
+    assert checkpoint_arrays(tmp_path)["['learner'].iteration"] == 2
     lines = []
     train(small_config(), tmp_path, resume=True, evaluation_worlds=8, log=lines.append, progress=False)
     assert "continues after iteration 2" in lines[0]
-    mine, others = arrays(tmp_path), arrays(whole.folder)
-    for name, x in mine.items():
-        np.testing.assert_array_equal(x, others[name], err_msg=name)
+    actual, reference = checkpoint_arrays(tmp_path), checkpoint_arrays(uninterrupted_run.folder)
+    for name, x in actual.items():
+        np.testing.assert_array_equal(x, reference[name], err_msg=name)
     assert [p["iteration"] for p in read_curve(tmp_path)] == [0, 4]
 
 
@@ -142,13 +142,15 @@ def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path):
     command = [sys.executable, "-m", "crazysim", "train", "hover", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert "hover by ppo" in process.stdout.readline()
-        wait_for(lambda: (tmp_path / CHECKPOINT_FILE).exists() and arrays(tmp_path)["['learner'].iteration"] > 0)
+        wait_for(
+            lambda: (tmp_path / CHECKPOINT_FILE).exists() and checkpoint_arrays(tmp_path)["['learner'].iteration"] > 0
+        )
         process.terminate()
         process.terminate()
         out = process.stdout.read()
     assert process.returncode == 143
     ended = int(re.search(r"interrupted after iteration (\d+); wrote", out)[1])
-    assert arrays(tmp_path)["['learner'].iteration"] == ended > 0
+    assert checkpoint_arrays(tmp_path)["['learner'].iteration"] == ended > 0
 
 
 def test_a_later_policy_within_two_standard_errors_is_kept():
@@ -190,37 +192,37 @@ def test_the_policy_that_did_best_on_the_check_set_is_kept(tmp_path, monkeypatch
         assert evaluate(result.env, policy)["success"] == result.metrics["success"]
     assert 0 < best < 8
     monkeypatch.setitem(configs.RECIPES, "hover", configs.Recipe(evaluate_every=8))
-    whole, cut = (tmp_path / name for name in ("whole", "cut"))
-    train(config, whole, evaluation_worlds=64, log=quiet, progress=False)
+    whole_folder, cut_folder = (tmp_path / name for name in ("whole", "cut"))
+    train(config, whole_folder, evaluation_worlds=64, log=discard_line, progress=False)
     with interrupted_after(best, monkeypatch), pytest.raises(KeyboardInterrupt):
-        train(config, cut, evaluation_worlds=64, log=quiet, progress=False)
-    assert evaluate(result.env, load_policy(cut)[0], jax.random.key(runs.CHECK_SEED))["success"] == checks[best]
-    train(config, cut, resume=True, evaluation_worlds=64, log=quiet, progress=False)
-    mine, others = arrays(cut), arrays(whole)
-    for name, x in mine.items():
-        np.testing.assert_array_equal(x, others[name], err_msg=name)
+        train(config, cut_folder, evaluation_worlds=64, log=discard_line, progress=False)
+    assert evaluate(result.env, load_policy(cut_folder)[0], jax.random.key(runs.CHECK_SEED))["success"] == checks[best]
+    train(config, cut_folder, resume=True, evaluation_worlds=64, log=discard_line, progress=False)
+    actual, reference = checkpoint_arrays(cut_folder), checkpoint_arrays(whole_folder)
+    for name, x in actual.items():
+        np.testing.assert_array_equal(x, reference[name], err_msg=name)
 
 
-def test_iterations_change_the_policy_and_seeds_differ(whole, tmp_path):
-    other = trained(tmp_path, small_config(seed=1))
-    first, second = (jax.tree.leaves(r.policy.layers) for r in (whole, other))
+def test_iterations_change_the_policy_and_seeds_differ(uninterrupted_run, tmp_path):
+    other = train_quietly(tmp_path, small_config(seed=1))
+    first, second = (jax.tree.leaves(r.policy.layers) for r in (uninterrupted_run, other))
     assert all(np.any(a != b) for a, b in zip(first[::2], second[::2], strict=True))
 
 
-def test_resuming_with_another_configuration_is_an_error(whole, tmp_path):
+def test_resuming_with_another_configuration_is_an_error(uninterrupted_run, tmp_path):
     with pytest.raises(ConfigError, match=r"expected a folder without a run.*--resume.*--out"):
-        trained(whole.folder, small_config())
+        train_quietly(uninterrupted_run.folder, small_config())
     with pytest.raises(ConfigError, match=r"expected seed = 0 .*, got 5; resume"):
-        trained(whole.folder, small_config(seed=5), resume=True)
+        train_quietly(uninterrupted_run.folder, small_config(seed=5), resume=True)
     other = small_config(config=SMALL | {"iterations": 9, "hidden": (8,)})
     with pytest.raises(
         ConfigError, match=r"expected hidden = \[16, 16\] as in .*, got \[8\].*may change iterations, le"
     ):
-        trained(whole.folder, other, resume=True)
+        train_quietly(uninterrupted_run.folder, other, resume=True)
     with pytest.raises(ConfigError, match=r"expected seconds = 0\.4 as in .*, got 'its default'"):
-        trained(whole.folder, small_config(options={}), resume=True)
+        train_quietly(uninterrupted_run.folder, small_config(options={}), resume=True)
     with pytest.raises(ConfigError, match=r"expected an existing file with a checkpoint .*crazysim train"):
-        trained(tmp_path / "nothing", small_config(), resume=True)
+        train_quietly(tmp_path / "nothing", small_config(), resume=True)
     with pytest.raises(UnknownNameError, match="expected an algorithm of ppo, apg, dagger, got 'sac'"):
         small_config(algorithm="sac")
     with pytest.raises(UnknownNameError, match="task 'juggle' does not exist; there are hover"):
@@ -229,51 +231,52 @@ def test_resuming_with_another_configuration_is_an_error(whole, tmp_path):
         small_config(config={"learning_speed": 1})
 
 
-def test_a_finished_run_resumes_with_more_iterations(whole, tmp_path):
+def test_a_finished_run_resumes_with_more_iterations(uninterrupted_run, tmp_path):
     """What is given changes; everything else, the number of worlds too, is that of the run."""
-    shutil.copy(whole.folder / CHECKPOINT_FILE, tmp_path)
+    shutil.copy(uninterrupted_run.folder / CHECKPOINT_FILE, tmp_path)
     lines = []
-    quiet = {"film": False, "evaluation_worlds": 8, "progress": False, "log": lines.append}
-    result = run("hover", tmp_path, resume=True, config={"iterations": 6, "learning_rate": 1e-4}, **quiet)
+    quiet_options = {"film": False, "evaluation_worlds": 8, "progress": False, "log": lines.append}
+    result = run("hover", tmp_path, resume=True, config={"iterations": 6, "learning_rate": 1e-4}, **quiet_options)
     assert [point["iteration"] for point in read_curve(tmp_path)] == [0, 4, 6]
     config = load_policy(tmp_path)[1]
     assert config == small_config(config=SMALL | {"iterations": 6, "learning_rate": 1e-4})
     assert "continues after iteration 4" in lines[0]
     assert any(
-        np.any(a != b) for a, b in zip(jax.tree.leaves(result.policy), jax.tree.leaves(whole.policy), strict=True)
+        np.any(a != b)
+        for a, b in zip(jax.tree.leaves(result.policy), jax.tree.leaves(uninterrupted_run.policy), strict=True)
     )
-    run("hover", tmp_path, resume=True, **quiet)
+    run("hover", tmp_path, resume=True, **quiet_options)
     assert "nothing is left to train after 6 iterations; continue with more: --iterations 12" in lines
 
 
-def test_metrics_of_each_iteration_are_passed_on(whole, tmp_path, monkeypatch):
+def test_metrics_of_each_iteration_are_passed_on(uninterrupted_run, tmp_path, monkeypatch):
     """Those of evaluations too, in an interrupted and a resumed run as well; the run is the same."""
     recipe = dataclasses.replace(configs.RECIPES["hover"], evaluate_every=2)
     monkeypatch.setitem(configs.RECIPES, "hover", recipe)
     seen = []
     with interrupted_after(4, monkeypatch), pytest.raises(KeyboardInterrupt):  # an evaluation shows metrics as well
-        trained(tmp_path, small_config(), on_iteration=lambda *call: seen.append(call))
-    trained(tmp_path, small_config(), resume=True, on_iteration=lambda *call: seen.append(call))
+        train_quietly(tmp_path, small_config(), on_iteration=lambda *call: seen.append(call))
+    train_quietly(tmp_path, small_config(), resume=True, on_iteration=lambda *call: seen.append(call))
     assert [i for i, _ in seen] == [1, 2, 4]
     assert {"reward", "crashed", "error", "std", "value_error", "ratio_off"} == seen[0][1].keys()
     point = read_curve(tmp_path)[-1]
     assert {"evaluation success", "evaluation kept"} < seen[1][1].keys()
     assert seen[-1][1]["evaluation reward"] == point["reward"]
     assert all(type(x) is float for _, metrics in seen for x in metrics.values())
-    mine, others = arrays(tmp_path), arrays(whole.folder)
-    for name in (name for name in mine if "learner" in name):
-        np.testing.assert_array_equal(mine[name], others[name], err_msg=name)
-    trained(tmp_path, small_config(), resume=True, on_iteration=lambda *call: seen.append(call))
+    actual, reference = checkpoint_arrays(tmp_path), checkpoint_arrays(uninterrupted_run.folder)
+    for name in (name for name in actual if "learner" in name):
+        np.testing.assert_array_equal(actual[name], reference[name], err_msg=name)
+    train_quietly(tmp_path, small_config(), resume=True, on_iteration=lambda *call: seen.append(call))
     assert len(seen) == 3
 
 
-def test_evaluations_hold_the_terms_of_the_reward(whole, tmp_path):
+def test_evaluations_hold_the_terms_of_the_reward(uninterrupted_run, tmp_path):
     """They add up to the return, and the plot of an episode returns them over time."""
-    point = read_curve(whole.folder)[-1]
+    point = read_curve(uninterrupted_run.folder)[-1]
     terms = [x for name, x in point.items() if name.startswith("reward ")]
     assert len(terms) == 4
     np.testing.assert_allclose(sum(terms), point["reward"], rtol=1e-5)
-    over_time = plot_episode(whole.env, whole.policy, tmp_path / "episode.png")
+    over_time = plot_episode(uninterrupted_run.env, uninterrupted_run.policy, tmp_path / "episode.png")
     assert (tmp_path / "episode.png").stat().st_size > 5000
     assert {name: x.shape for name, x in over_time.items()} == dict.fromkeys(
         ("proximity", "spin", "action_rate", "crash"), (20,)
@@ -286,12 +289,12 @@ def test_evaluations_hold_the_terms_of_the_reward(whole, tmp_path):
     np.testing.assert_allclose(fallen["crash"].sum(), -10.0, rtol=1e-6)
 
 
-def test_a_checkpoint_of_another_version_is_refused(whole, tmp_path):
-    _, meta = checkpoint.read(whole.folder / CHECKPOINT_FILE)
+def test_a_checkpoint_of_another_version_is_refused(uninterrupted_run, tmp_path):
+    _, meta = checkpoint.read(uninterrupted_run.folder / CHECKPOINT_FILE)
     learner = {"x": np.zeros(2, np.float32)}
     checkpoint.save(tmp_path / CHECKPOINT_FILE, learner, meta | {"crazysim": "0.0.1"})
     with pytest.raises(ConfigError, match=r"expected a checkpoint of crazysim .*, got .* of 0\.0\.1"):
-        trained(tmp_path, small_config(), resume=True)
+        train_quietly(tmp_path, small_config(), resume=True)
     stored, _ = checkpoint.read(tmp_path / CHECKPOINT_FILE)
     with pytest.raises(ConfigError, match="expected the arrays of this task and version"):
         checkpoint.restore(tmp_path / CHECKPOINT_FILE, stored, {"y": np.zeros(2, np.float32)})
@@ -299,7 +302,7 @@ def test_a_checkpoint_of_another_version_is_refused(whole, tmp_path):
         checkpoint.restore(tmp_path / CHECKPOINT_FILE, stored, {"x": np.zeros(3, np.float32)})
 
 
-def cut(content):
+def truncate(content):
     return content[: len(content) // 2]
 
 
@@ -310,29 +313,31 @@ def flipped(content):
 
 def other_meta(content):
     with np.load(io.BytesIO(content)) as file:
-        arrays = dict(file)
+        stored_arrays = dict(file)
     changed = io.BytesIO()
-    np.savez(changed, **arrays | {checkpoint.META_ENTRY: np.array(json.dumps({"crazysim": crazysim.__version__}))})
+    np.savez(
+        changed, **stored_arrays | {checkpoint.META_ENTRY: np.array(json.dumps({"crazysim": crazysim.__version__}))}
+    )
     return changed.getvalue()
 
 
-@pytest.mark.parametrize("damage", [cut, flipped, other_meta, lambda _: b"", lambda _: b"nothing", np.random.bytes],
+@pytest.mark.parametrize("damage", [truncate, flipped, other_meta, lambda _: b"", lambda _: b"nothing", np.random.bytes],
                          ids=["cut", "flipped", "other", "empty", "text", "random"])  # fmt: skip
-def test_a_damaged_run_is_refused_with_the_name_of_the_file(whole, tmp_path, damage):
+def test_a_damaged_run_is_refused_with_the_name_of_the_file(uninterrupted_run, tmp_path, damage):
     """At once: nothing is compiled for it, and the file stays as it is."""
     for name in (CHECKPOINT_FILE, POLICY_FILE):
-        content = (whole.folder / name).read_bytes()
+        content = (uninterrupted_run.folder / name).read_bytes()
         (tmp_path / name).write_bytes(damage(content) if damage is not np.random.bytes else damage(1000))
     with pytest.raises(
         DamagedFileError, match=r"expected a checkpoint .*checkpoint\.npz', which is damaged.*train again"
     ):
-        trained(tmp_path, small_config(), resume=True)
+        train_quietly(tmp_path, small_config(), resume=True)
     with pytest.raises(DamagedFileError, match=r"expected a checkpoint .*policy\.npz', which is damaged.*train again"):
         load_policy(tmp_path)
 
 
-def test_a_run_without_its_learning_curve_resumes(whole, tmp_path):
-    shutil.copy(whole.folder / CHECKPOINT_FILE, tmp_path)
+def test_a_run_without_its_learning_curve_resumes(uninterrupted_run, tmp_path):
+    shutil.copy(uninterrupted_run.folder / CHECKPOINT_FILE, tmp_path)
     with pytest.raises(ConfigError, match=r"expected an existing file with a learning curve, got .*curve\.json"):
         read_curve(tmp_path)
     (tmp_path / "curve.json").write_text('[{"iteration": 0, "env')
@@ -340,7 +345,7 @@ def test_a_run_without_its_learning_curve_resumes(whole, tmp_path):
         read_curve(tmp_path)
     (tmp_path / "curve.json").write_text('[{"round": 4, "success": 0.5}]')  # of an earlier version
     assert read_curve(tmp_path) == [{"iteration": 4, "success": 0.5}]
-    trained(tmp_path, small_config(), resume=True)
+    train_quietly(tmp_path, small_config(), resume=True)
     assert [point["iteration"] for point in read_curve(tmp_path)] == [0, 4]
     assert not list(tmp_path.glob("*.part"))
 
@@ -391,15 +396,15 @@ def test_invalid_settings_of_a_run_are_refused(tmp_path):
             small_config(**{name: value})
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"expected a folder for the run, got .*file'.* Use another --out"):
-        trained(tmp_path / "file", small_config())
+        train_quietly(tmp_path / "file", small_config())
     with pytest.raises(ConfigError, match=r"expected minibatches that divide the 8 worlds, got 7. Use for example 8"):
-        trained(tmp_path / "run", small_config(config={"n_steps": 16, "minibatches": 7}))
+        train_quietly(tmp_path / "run", small_config(config={"n_steps": 16, "minibatches": 7}))
     with pytest.raises(ConfigError, match="expected options that a checkpoint can hold"):
-        trained(tmp_path / "run", small_config(options={"seconds": 0.4, "pos": np.zeros(3)}))
+        train_quietly(tmp_path / "run", small_config(options={"seconds": 0.4, "pos": np.zeros(3)}))
     with pytest.raises(ConfigError, match=r"not JSON serializable.* add plugins in install of a custom task"):
-        trained(tmp_path / "run", small_config(options={"effects": [Randomize.crazyflie()]}))
+        train_quietly(tmp_path / "run", small_config(options={"effects": [Randomize.crazyflie()]}))
     with pytest.raises(ConfigError, match="expected checkpoint_every to be positive, got 0"):
-        trained(tmp_path / "run", small_config(), checkpoint_every=0)
+        train_quietly(tmp_path / "run", small_config(), checkpoint_every=0)
     with pytest.raises(ConfigError, match="evaluation_worlds is 0"):
         train(small_config(), tmp_path / "run", evaluation_worlds=0)
     with pytest.raises(ConfigError, match="n_worlds is 0"):
@@ -412,11 +417,11 @@ def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(tmp_path):
     with pytest.raises(
         DivergedError, match=r"NaN or infinity in iteration \d of hover by ppo; .*iteration 0\. Use a sm"
     ):
-        trained(tmp_path, config)
+        train_quietly(tmp_path, config)
     assert [point["iteration"] for point in read_curve(tmp_path)] == [0]
     policy, _, _ = load_policy(tmp_path)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(policy))
-    assert all(np.isfinite(x).all() for name, x in arrays(tmp_path).items() if ".policy" in name)
+    assert all(np.isfinite(x).all() for name, x in checkpoint_arrays(tmp_path).items() if ".policy" in name)
 
 
 def interrupting(name, count):
@@ -446,9 +451,9 @@ def test_an_interrupt_before_nan_is_found_keeps_the_last_checkpoint(tmp_path, tr
     config = small_config(config=SMALL | {"iterations": 4, "learning_rate": 1e38})
     traced(interrupting("mark_diverged", 2))  # the first call is that of the evaluation before the training
     with pytest.raises(DivergedError, match=r"NaN or infinity in iteration 1 of hover .*iteration 0\. Use a sm"):
-        trained(tmp_path, config)
+        train_quietly(tmp_path, config)
     assert [point["iteration"] for point in read_curve(tmp_path)] == [0]
-    assert all(np.isfinite(x).all() for name, x in arrays(tmp_path).items() if ".policy" in name)
+    assert all(np.isfinite(x).all() for name, x in checkpoint_arrays(tmp_path).items() if ".policy" in name)
 
 
 def test_an_interrupt_during_a_planned_evaluation_leaves_the_curve_of_an_uninterrupted_run(
@@ -457,18 +462,18 @@ def test_an_interrupt_during_a_planned_evaluation_leaves_the_curve_of_an_uninter
     """Before, its point was marked as not kept, so that the resumed run could end with another policy."""
     recipe = dataclasses.replace(configs.RECIPES["hover"], evaluate_every=2)
     monkeypatch.setattr(runs, "find_recipe", lambda *_: recipe)
-    trained(tmp_path / "whole", small_config())
+    train_quietly(tmp_path / "whole", small_config())
     traced(interrupting("add_evaluation", 2))
     with pytest.raises(KeyboardInterrupt):
-        trained(tmp_path / "cut", small_config())
+        train_quietly(tmp_path / "cut", small_config())
     sys.settrace(None)
-    trained(tmp_path / "cut", small_config(), resume=True)
-    mine, others = (
+    train_quietly(tmp_path / "cut", small_config(), resume=True)
+    actual, reference = (
         [{k: x for k, x in point.items() if "seconds" not in k} for point in read_curve(tmp_path / name)]
         for name in ("cut", "whole")
     )
-    assert [point["iteration"] for point in mine] == [0, 2, 4]
-    np.testing.assert_equal(mine, others)  # NaN equals NaN
+    assert [point["iteration"] for point in actual] == [0, 2, 4]
+    np.testing.assert_equal(actual, reference)  # NaN equals NaN
 
 
 def test_a_full_disk_leaves_the_last_checkpoint_and_nothing_else(tmp_path):
@@ -480,11 +485,11 @@ def test_a_full_disk_leaves_the_last_checkpoint_and_nothing_else(tmp_path):
     assert checkpoint.read(path)[1] == {"iteration": 1}
 
 
-def test_a_policy_comes_back_as_it_was(whole):
-    policy, config, meta = load_policy(whole.folder)
+def test_a_policy_comes_back_as_it_was(uninterrupted_run):
+    policy, config, meta = load_policy(uninterrupted_run.folder)
     assert config == small_config()
     assert sum(meta["observations"].values()) == policy.layers[0][0].shape[0]
-    for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(whole.policy), strict=True):
+    for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(uninterrupted_run.policy), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -621,9 +626,9 @@ def test_analytic_gradients_follow_the_eight():
 
 def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
     folder = str(tmp_path / "hover")
-    few = [f"{k}={json.dumps(v)}" for k, v in SMALL.items()]
+    small_options = [f"{k}={json.dumps(v)}" for k, v in SMALL.items()]
     done = main(["train", "hover", "--worlds", "8", "--iterations", "2", "--set", "seconds=0.4", "--out", folder,
-                 "--no-film", "--config", *few])  # fmt: skip
+                 "--no-film", "--config", *small_options])  # fmt: skip
     out = capsys.readouterr().out
     assert done == 0
     assert re.search(r"success \d+\.\d% of 1,000 held-out starts", out)
@@ -648,13 +653,13 @@ def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
     assert "did you mean seconds?" in capsys.readouterr().err
 
 
-def test_a_film_shows_the_drone_and_its_goal(whole, tmp_path):
+def test_a_film_shows_the_drone_and_its_goal(uninterrupted_run, tmp_path):
     """The green target is in the image, and the image changes from the first frame to the last."""
     from crazysim.train.show import TARGET_COLOR, film
 
     env = small_config().make_env(2)
     path = tmp_path / "film.gif"
-    assert film(env, whole.policy, path, worlds=1) == 11
+    assert film(env, uninterrupted_run.policy, path, worlds=1) == 11
     env.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
     images = read_frames(path, 360, 480, "-vf", "scale=480:360").astype(int)
     green = (images[0][..., 1] - images[0][..., 0] > 40) & (images[0][..., 1] - images[0][..., 2] > 20)
