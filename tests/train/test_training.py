@@ -321,7 +321,8 @@ def other_meta(content):
     return changed.getvalue()
 
 
-@pytest.mark.parametrize("damage", [truncate, flipped, other_meta, lambda _: b"", lambda _: b"nothing", np.random.bytes],
+@pytest.mark.parametrize("damage",
+                         [truncate, flipped, other_meta, lambda _: b"", lambda _: b"nothing", np.random.bytes],
                          ids=["cut", "flipped", "other", "empty", "text", "random"])  # fmt: skip
 def test_a_damaged_run_is_refused_with_the_name_of_the_file(uninterrupted_run, tmp_path, damage):
     """At once: nothing is compiled for it, and the file stays as it is."""
