@@ -242,7 +242,9 @@ def cuda_source(sizes: tuple[int, ...], gradient: bool) -> tuple[str, int]:
         memory += [(f"u16* below{i}", 2 * 16 * n_warps * (padded[i + 1] + 8)) for i in layers]
     ends = list(itertools.accumulate((size for _, size in memory), initial=0))
     setup = ["int n = *count;", f"x += (size_t)blockIdx.y * n * {sizes[0]};"]
-    setup += [f"{name} = ({name.split()[0]})(memory + {at});" for (name, _), at in zip(memory, ends, strict=False)]
+    setup += [
+        f"{name} = ({name.split()[0]})(memory + {offset});" for (name, _), offset in zip(memory, ends, strict=False)
+    ]
     body = [f"u32 a0[{padded[0] // 16}][4]; load_rows<{padded[0]}>(a0, x, row, n, {sizes[0]}, 1.0f);"]
     for i in layers:
         shape, k, n = f"{padded[i]}, {padded[i + 1]}", sizes[i], sizes[i + 1]
@@ -250,16 +252,16 @@ def cuda_source(sizes: tuple[int, ...], gradient: bool) -> tuple[str, int]:
         setup += [f"load_layer<{shape}>(w{i}, b{i}, weight{i}, bias{i}, {k}, {n});"]
         if i < layers[-1]:
             body += [f"u32 a{i + 1}[{padded[i + 1] // 16}][4]; apply_hidden<{shape}>(a{i + 1}, a{i}, w{i}, b{i});"]
-    end, (inner, outer), width, last = [], padded[-2:], sizes[-1], layers[-1]
+    epilogue, (inner, outer), width, last = [], padded[-2:], sizes[-1], layers[-1]
     if gradient:
         n_weights = sum((k + 1) * n for k, n in itertools.pairwise(sizes))
         setup += [f"cotangent += (size_t)blockIdx.y * n * {width};"]
         body += [f"u32 d{last}[{outer // 16}][4];"]
         body += [f"load_rows<{outer}>(d{last}, cotangent, row, n, {width}, scale[blockIdx.y]);"]
-        end = [f"out += ((size_t)blockIdx.y * gridDim.x + blockIdx.x) * {n_weights};"]
+        epilogue = [f"out += ((size_t)blockIdx.y * gridDim.x + blockIdx.x) * {n_weights};"]
         for i in layers:
             setup += [f"Sums<{padded[i]}, {padded[i + 1]}> sums{i} = {{}};"]
-            end += [f"sums{i}.write(out, {sizes[i]}, {sizes[i + 1]}); out += {(sizes[i] + 1) * sizes[i + 1]};"]
+            epilogue += [f"sums{i}.write(out, {sizes[i]}, {sizes[i + 1]}); out += {(sizes[i] + 1) * sizes[i + 1]};"]
         for i in reversed(layers):
             k, n = padded[i], padded[i + 1]
             body += [f"store_rows<{k}>(rows{i}, a{i}); store_rows<{n}>(below{i}, d{i});"]
@@ -277,20 +279,20 @@ def cuda_source(sizes: tuple[int, ...], gradient: bool) -> tuple[str, int]:
         f"{KERNEL_NAMES[gradient]}({', '.join(names)}) {{",
         "extern __shared__ __align__(16) unsigned char memory[];", *setup, "__syncthreads();",
         "for (int first = blockIdx.x * 16 * WARPS; first < n; first += gridDim.x * 16 * WARPS) {",
-        "int row = first + 16 * WARP;", *body, "}", *end, "}",
+        "int row = first + 16 * WARP;", *body, "}", *epilogue, "}",
     ]  # fmt: skip
     return "\n".join(text), ends[-1]
 
 
 def choose_mlp(network: Network, device: jax.Device, mesh: Mesh | None = None, n_seeds: int = 1) -> ApplyLayers:
-    """Return a function that runs the kernels, on each device for its own samples; ``mlp`` where they cannot be used.
+    """Return a function that runs the kernels, on each device for its own samples, or ``mlp`` if they cannot be used.
 
     Args:
         network: Network before the layers; one with weights needs gradients with respect to its features, which kernels
             do not give.
         device: Device of the training.
-        mesh: Devices of a training on several.
-        n_seeds: Number of seeds. Of several that cannot be divided among the devices, XLA computes the networks.
+        mesh: Devices of the training; None for one device.
+        n_seeds: Number of seeds. If there are several that cannot be divided among the devices, XLA computes the networks.
     """
     is_usable = network is MEMORYLESS and not jaxcompat.FALLBACKS and device.platform == "gpu"
     is_usable = is_usable and jaxcompat.compute_capability(device) == CAPABILITY and cuda.nvrtc() is not None
@@ -382,7 +384,7 @@ _apply.defvjp(_forward, _backward)
 
 
 def _add_seed_axis(n_seeds: int, batched: Any, *args: Any) -> Any:
-    """Return the arguments with a first axis of seeds; those that ``batched`` marks, a tree like them, have it."""
+    """Return the arguments with a first axis of seeds. Arguments for which the tree ``batched`` is True already have it."""
 
     def stack(x: Array, is_stacked: bool = False) -> Array:
         return x if is_stacked else jnp.broadcast_to(x, (n_seeds, *x.shape))
