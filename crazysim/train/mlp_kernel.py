@@ -292,7 +292,7 @@ def choose_mlp(network: Network, device: jax.Device, mesh: Mesh | None = None, n
             do not give.
         device: Device of the training.
         mesh: Devices of the training; None for one device.
-        n_seeds: Number of seeds. If there are several that cannot be divided among the devices, XLA computes the networks.
+        n_seeds: Number of seeds. If several cannot be divided among the devices, XLA computes the networks.
     """
     is_usable = network is MEMORYLESS and not jaxcompat.FALLBACKS and device.platform == "gpu"
     is_usable = is_usable and jaxcompat.compute_capability(device) == CAPABILITY and cuda.nvrtc() is not None
@@ -384,7 +384,7 @@ _apply.defvjp(_forward, _backward)
 
 
 def _add_seed_axis(n_seeds: int, batched: Any, *args: Any) -> Any:
-    """Return the arguments with a first axis of seeds. Arguments for which the tree ``batched`` is True already have it."""
+    """Return the arguments with a first axis of seeds, which those already have where the tree ``batched`` is True."""
 
     def stack(x: Array, is_stacked: bool = False) -> Array:
         return x if is_stacked else jnp.broadcast_to(x, (n_seeds, *x.shape))
