@@ -1,4 +1,4 @@
-"""What tests of environments share: environments compiled once, states near an episode's end, parts of a state."""
+"""Helpers of tests of environments: environments compiled once, states near an episode's end, parts of a state."""
 
 import collections
 import functools
@@ -12,7 +12,7 @@ from crazysim.envs import TASKS, AutoReset, make
 from crazysim.pytree import map_batched
 
 
-class Compiled:
+class CompiledEnv:
     """An environment whose functions are compiled once, for tests that call them from Python and compare bits."""
 
     def __init__(self, env):
@@ -34,13 +34,13 @@ class Compiled:
 
 
 @functools.cache
-def compiled(name="hover", n_worlds=4, mode=None):
+def make_compiled_env(name="hover", n_worlds=4, mode=None):
     """Return an environment of a task with its usual settings, with automatic resets if there is a mode.
 
     Its steps are interpreted: a kernel would take longer to compile than the tests take.
     """
     env = make(name, n_worlds, engine="interpret")
-    return Compiled(env if mode is None else AutoReset(env, mode))
+    return CompiledEnv(env if mode is None else AutoReset(env, mode))
 
 
 def random_action(state, seed=0):
@@ -48,15 +48,15 @@ def random_action(state, seed=0):
     return np.random.default_rng(seed).uniform(-1.2, 1.2, state.action.shape).astype(np.float32)
 
 
-def one_step_to_go(env, state, mask):
+def set_last_step(env, state, mask):
     """Return the state with the clock of some worlds set to one step before the time runs out."""
     core = state.data.core
     steps = jnp.where(jnp.asarray(mask)[:, None], (env.max_steps - 1) * env.n_substeps, core.steps)
     return state.replace(data=state.data.replace(core=core.replace(steps=steps.astype(core.steps.dtype))))
 
 
-def kind(tree):
-    """Return structure, shapes and types of a tree, weak types told apart."""
+def array_types(tree):
+    """Return structure, shapes and types of a tree, including weak types."""
     leaves, structure = jax.tree.flatten(tree)
     return structure, [(x.shape, x.dtype, getattr(x, "weak_type", False)) for x in leaves]
 
@@ -70,10 +70,10 @@ def select_state(state, mask, without=()):
 
 
 def select_obs(state, mask):
-    """Return what is observed of some worlds."""
+    """Return the observations of some worlds."""
     return jax.tree.map(lambda x: as_numbers(x)[mask], state.obs)
 
 
-def entries(classes_once=False):
+def task_names(classes_once=False):
     """Return the names of all tasks, or one for each class of tasks."""
     return list({TASKS[name].task: name for name in reversed(TASKS)}.values() if classes_once else TASKS)

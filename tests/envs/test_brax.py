@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env_cases import kind
+from env_cases import array_types
 
 from crazysim import ConfigError
 from crazysim.envs import AutoReset, make
@@ -80,7 +80,7 @@ def test_keys_of_any_kind_are_the_same_seed(env, reset):
 def test_steps_return_the_same_kind_of_state(env, reset, recorded_flight):
     state = reset(jax.random.key(0))
     first = jax.eval_shape(lambda states: jax.tree.map(lambda x: x[0], states), recorded_flight)
-    assert kind(first) == kind(state)
+    assert array_types(first) == array_types(state)
 
 
 def test_episodes_end_and_begin_as_brax_wraps_them(recorded_flight):

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from cases import LEVELS, trees_equal
 from env_cases import (
-    compiled,
-    entries,
-    kind,
-    one_step_to_go,
+    array_types,
+    make_compiled_env,
     random_action,
     select_obs,
     select_state,
+    set_last_step,
+    task_names,
 )
 from gymnasium.vector.utils import batch_space
 
@@ -40,18 +40,18 @@ IS_ENDING = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
 
 SAME_CLASS = pytest.mark.slow("another task of its class does it")
-FLIGHT_TASKS = [x if x in entries(classes_once=True) else pytest.param(x, marks=SAME_CLASS) for x in entries()]
+FLIGHT_TASKS = [x if x in task_names(classes_once=True) else pytest.param(x, marks=SAME_CLASS) for x in task_names()]
 """Names of the tasks of the random flights."""
 
 
-@pytest.fixture(scope="module", params=entries())
+@pytest.fixture(scope="module", params=task_names())
 def name(request):
     return request.param
 
 
 @pytest.fixture(scope="module")
 def env(name):
-    return compiled(name, N_WORLDS)
+    return make_compiled_env(name, N_WORLDS)
 
 
 @pytest.fixture(scope="module")
@@ -213,9 +213,9 @@ def test_repeated_steps_are_traced_once(env, start_state):
         jnp.zeros_like(start_state.action),
     ):
         state = env.step(state, action)
-        assert kind(state) == kind(start_state)
+        assert array_types(state) == array_types(start_state)
         state = env.restart(state, jnp.asarray(IS_ENDING))
-        assert kind(state) == kind(start_state)
+        assert array_types(state) == array_types(start_state)
         state = env.restart(state, np.array(IS_ENDING))
     assert {name: env.traces[name] for name in ("reset", "restart", "step")} == {"reset": 1, "restart": 1, "step": 1}
 
@@ -303,7 +303,7 @@ BY_STAGES = pytest.mark.slow("other tasks have all operations, and tests/gpu com
 @pytest.mark.long("compiles the batched step of each task")
 @pytest.mark.parametrize(
     "name",
-    [x if x in WITH_INDICES else pytest.param(x, marks=BY_STAGES) for x in entries()],
+    [x if x in WITH_INDICES else pytest.param(x, marks=BY_STAGES) for x in task_names()],
     indirect=True,
 )
 def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, random_flight):
@@ -314,7 +314,7 @@ def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, random_fligh
     )
     assert "engine: fused\n" in vector_env.explain()
     assert vector_env.explain().count("splits the step") == len(env.image_formats())
-    before = one_step_to_go(env, random_flight.end, np.resize(IS_ENDING, N_FLYING))
+    before = set_last_step(env, random_flight.end, np.resize(IS_ENDING, N_FLYING))
     vector_env._stepper.state = before
     obs, reward, terminated, truncated, info = vector_env.step(random_flight.actions[0])
     end = first_worlds(vector_env.state)
@@ -343,11 +343,11 @@ def two(request):
 
 
 def test_next_step_begins_with_the_step_after_the_last(two):
-    env, auto = compiled(two, N_WORLDS), compiled(two, N_WORLDS, "NextStep")
+    env, auto = make_compiled_env(two, N_WORLDS), make_compiled_env(two, N_WORLDS, "NextStep")
     start_state = env.reset(jax.random.key(0))
-    last = auto.step(one_step_to_go(env, start_state, IS_ENDING), random_action(start_state))
+    last = auto.step(set_last_step(env, start_state, IS_ENDING), random_action(start_state))
     np.testing.assert_array_equal(last.done, IS_ENDING)
-    assert trees_equal(last, env.step(one_step_to_go(env, start_state, IS_ENDING), random_action(start_state)))
+    assert trees_equal(last, env.step(set_last_step(env, start_state, IS_ENDING), random_action(start_state)))
     ignored, other = random_action(start_state, 1), random_action(start_state, 2)
     after, again = auto.step(last, ignored), auto.step(last, np.where(IS_ENDING[:, None, None], other, ignored))
     assert trees_equal(select_state(after, IS_ENDING), select_state(again, IS_ENDING)), "the action is heeded"
@@ -360,11 +360,11 @@ def test_next_step_begins_with_the_step_after_the_last(two):
 
 
 def test_same_step_begins_within_the_last_step(two):
-    env, auto = compiled(two, N_WORLDS), compiled(two, N_WORLDS, "SameStep")
+    env, auto = make_compiled_env(two, N_WORLDS), make_compiled_env(two, N_WORLDS, "SameStep")
     start_state, also = env.reset(jax.random.key(0)), auto.reset(jax.random.key(0))
     assert trees_equal(also.final_obs, start_state.obs)
     action = random_action(start_state)
-    ended, state = (x.step(one_step_to_go(env, y, IS_ENDING), action) for x, y in ((env, start_state), (auto, also)))
+    ended, state = (x.step(set_last_step(env, y, IS_ENDING), action) for x, y in ((env, start_state), (auto, also)))
     np.testing.assert_array_equal(ended.done, IS_ENDING)
     for field in ("reward", "terminated", "truncated"):
         assert trees_equal(getattr(state, field), getattr(ended, field)), field
@@ -382,10 +382,10 @@ def test_same_step_begins_within_the_last_step(two):
 
 
 def test_disabled_begins_where_and_when_it_is_said(two):
-    env = auto = compiled(two, N_WORLDS, "Disabled")
+    env = auto = make_compiled_env(two, N_WORLDS, "Disabled")
     start_state = env.reset(jax.random.key(0))
     action = random_action(start_state)
-    ended = auto.step(one_step_to_go(env, start_state, IS_ENDING), action)
+    ended = auto.step(set_last_step(env, start_state, IS_ENDING), action)
     np.testing.assert_array_equal(ended.done, IS_ENDING)
     on = auto.step(ended, action)
     assert on.truncated[IS_ENDING].all(), "nothing begins by itself"
@@ -413,7 +413,7 @@ def test_a_world_that_is_lost_ends_alone(env, start_state):
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_world_that_is_lost_is_whole_again_in_its_next_episode(two, mode):
     """Law 7, within the step."""
-    auto = compiled(two, N_WORLDS, mode)
+    auto = make_compiled_env(two, N_WORLDS, mode)
     start_state = auto.reset(jax.random.key(0))
     action = random_action(start_state)
     bad = np.array(action)
@@ -428,7 +428,7 @@ def test_a_world_that_is_lost_is_whole_again_in_its_next_episode(two, mode):
 
 
 @pytest.mark.long("compiles the gradient of each task")
-@pytest.mark.parametrize("name", entries(classes_once=True), indirect=True)
+@pytest.mark.parametrize("name", task_names(classes_once=True), indirect=True)
 def test_the_gradient_of_the_reward_is_finite(env, start_state, random_flight):
     """Law 7, for actions and states, at the beginning of an episode and where random flight leads.
 

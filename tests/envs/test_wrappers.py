@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import as_numbers, trees_equal
-from env_cases import one_step_to_go, random_action, select_state
+from env_cases import random_action, select_state, set_last_step
 
 from crazysim import ConfigError
 from crazysim.core.stage import vmap_worlds
@@ -187,7 +187,7 @@ def test_episode_statistics(env, mode):
     start_state = auto.reset(jax.random.key(0))
     assert not start_state.info["episode_length"].any()
     one, two = steps(auto, start_state, 2)
-    last = auto.step(one_step_to_go(env, two, FIRST), random_action(start_state, 7))
+    last = auto.step(set_last_step(env, two, FIRST), random_action(start_state, 7))
     np.testing.assert_array_equal(last.done, FIRST)
     np.testing.assert_array_equal(last.info["episode_length"], [3, 0, 0, 0])
     total = one.reward + two.reward + last.reward
