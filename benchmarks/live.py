@@ -58,10 +58,10 @@ def measure(case: str, n_drones: int, seconds: float) -> None:
         n_drones=n_drones,
         seconds=seconds,
         factor=round_digits(result.factor),
-        pictures_per_s=round_digits(result.pictures / result.wall_s),
-        late=result.late,
+        pictures_per_s=round_digits(result.n_pictures / result.wall_s),
+        late=result.n_late_steps,
         lateness_999_ms=round_digits(1e3 * result.lateness_999),
-        worst_ms=round_digits(1e3 * result.worst),
+        worst_ms=round_digits(1e3 * result.max_lateness),
     )
 
 

@@ -12,7 +12,7 @@ import pytest
 import crazysim
 from crazysim.__main__ import main
 from crazysim.cache import default_cache
-from crazysim.commands.info import OPTIONAL, PACKAGES, VARIABLES
+from crazysim.commands.info import OPTIONAL_PACKAGES, REQUIRED_PACKAGES, VARIABLES
 
 
 def lines(text):
@@ -26,7 +26,7 @@ def test_it_prints_versions_devices_compiler_and_caches(capsys):
     assert found["crazysim"].startswith(crazysim.__version__)
     assert found["Python"].startswith(".".join(map(str, sys.version_info[:3])))
     assert "CPU cores" in found["system"]
-    for name in PACKAGES:
+    for name in REQUIRED_PACKAGES:
         assert found[name] == importlib.metadata.version(name)
     assert found["devices"].count("cpu") >= len(jax.devices("cpu"))
     if shutil.which("g++"):
@@ -52,7 +52,7 @@ def test_missing_parts_are_lines_with_the_reason(tmp_path):
     assert "JAX_PLATFORMS=cpu" in found["variables"]
 
 
-@pytest.mark.parametrize("missing", [OPTIONAL, (*OPTIONAL, "mujoco-mjx")])
+@pytest.mark.parametrize("missing", [OPTIONAL_PACKAGES, (*OPTIONAL_PACKAGES, "mujoco-mjx")])
 def test_missing_packages_are_named(monkeypatch, capsys, missing):
     def version(name, real=importlib.metadata.version):
         if name in missing:

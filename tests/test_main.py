@@ -112,12 +112,12 @@ def test_wrong_arguments_are_one_line(arguments, word, capsys):
 
 def test_the_poles_are_where_drones_can_hit_them():
     """Contacts are found in some worlds and not in all: the check would be worthless otherwise."""
-    sim = demo_flight.build(64, 4, "cpu")
+    sim = demo_flight.build_sim(64, 4, "cpu")
     fly = demo_flight.build_fly_frame(sim)
     touched = np.zeros(64, bool)
     for _ in range(75):
         sim.data, _ = fly(sim.data)
-        touched |= demo_flight.find_touches(sim).any((1, 2))
+        touched |= demo_flight.find_pole_contacts(sim).any((1, 2))
     assert 0 < touched.sum() < 64
 
 

@@ -1,4 +1,4 @@
-"""Commands of the command line: each module has ``add``, which adds parsers, and the functions that these run.
+"""Commands of the command line. Each module has ``add_parsers`` and the functions that its commands run.
 
-What a command needs is imported when it runs, so that ``crazysim --help`` is quick.
+Most modules import what a command needs when it runs, so that ``crazysim --help`` is quick.
 """

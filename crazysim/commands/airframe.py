@@ -8,7 +8,7 @@ from pathlib import Path
 from crazysim.commands.options import DefaultsFormatter
 from crazysim.storage import check_writable, write_file
 
-NUMBERS = (
+ESTIMATE_OPTIONS = (
     "mass", "propeller", "arm", "n_rotors", "layout", "thrust_to_weight", "motor_table", "pitch", "inertia",
     "time_constant", "cells", "capacity", "resistance",
 )  # fmt: skip
@@ -78,7 +78,7 @@ def estimate(options: argparse.Namespace) -> None:
     except ValueError:
         raise ValueError(f"expected --positions such as '0.1,-0.1 0.1,0.1', got {options.positions!r}") from None
     text = estimate_airframe(
-        **{name: getattr(options, name) for name in NUMBERS},
+        **{name: getattr(options, name) for name in ESTIMATE_OPTIONS},
         positions=positions,
         spins=options.spins and [SPINS[x.lower()] for x in options.spins],
         name=options.name or path.stem,

@@ -26,7 +26,7 @@ from crazysim.storage import replacing
 STATE_CONTROLLERS = ("auto", "geometric", "indi", "lqr", "pid", "mellinger")
 """Controllers that follow state commands, besides Crazyflow's cascade."""
 QUARTER_TURN = np.pi / 2
-"""Angle of the turn whose largest rate and duration are stated, rad."""
+"""Angle of the turn whose duration and largest rate are printed, rad."""
 MIN_THRUST_TO_WEIGHT = 1.5
 """Thrust over weight below which a warning is given (dimensionless)."""
 MIN_AUTHORITY = {"roll": 4.0, "pitch": 4.0, "yaw": 0.2}
@@ -41,18 +41,18 @@ MAX_PRECESSION_SHARE = 0.25
 warning is given (dimensionless)."""
 MAX_TIME_CONSTANT = 0.2
 """Time constant of rotors above which a warning is given, s: the longest of the airframes in the tests."""
-FREQ = 500
+DEFAULT_FREQ = 500
 """Default rate of the physics, Hz."""
 
 
 def describe_airframe(airframe: Airframe) -> str:
     """Return a report on an airframe: capabilities, missing parameters of each controller, and warnings."""
-    rows = [("airframe", airframe.name), *_body(airframe)]
+    rows = [("airframe", airframe.name), *_body_rows(airframe)]
     dynamics = supported_dynamics(airframe)
     rows.append(("dynamics", ", ".join(dynamics) or "none"))
     if Dynamics.first_principles in dynamics:
-        rows += _rotors(airframe)
-    rows += [("battery", _battery(airframe)), *_controllers(airframe, dynamics)]
+        rows += _rotor_rows(airframe)
+    rows += [("battery", _battery_text(airframe)), *_controller_rows(airframe, dynamics)]
     rows += [("warning", text) for text in _warnings(airframe, dynamics)]
     return "\n".join(f"{name:22}{text}" for name, text in rows)
 
@@ -89,7 +89,7 @@ def _thrust_to_weight(airframe: Airframe) -> float:
     return max_thrust_without_torque(airframe) / float(airframe.value("rigid_body.mass") * GRAVITY_MAGNITUDE)
 
 
-def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
+def _body_rows(airframe: Airframe) -> Iterator[tuple[str, str]]:
     """Yield mass, thrust, and quantities that follow from them and the rotors' positions."""
     mass, ratio = float(airframe.value("rigid_body.mass")), _thrust_to_weight(airframe)
     max_thrust, min_thrust = (float(airframe.value(f"rotors.thrust_{limit}")) for limit in ("max", "min"))
@@ -122,7 +122,7 @@ def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
         )
 
 
-def _rotors(airframe: Airframe) -> Iterator[tuple[str, str]]:
+def _rotor_rows(airframe: Airframe) -> Iterator[tuple[str, str]]:
     """Yield speeds, lag and the rates of the default controller."""
     hover, max_speed = float(np.max(hover_rotor_vel(airframe))), float(np.max(airframe.rotor_vel_limits))
     yield "rotor speed", f"{hover:,.0f} rpm in hover, {hover / max_speed:.0%} of {max_speed:,.0f} rpm"
@@ -135,7 +135,7 @@ def _rotors(airframe: Airframe) -> Iterator[tuple[str, str]]:
     )
 
 
-def _battery(airframe: Airframe) -> str:
+def _battery_text(airframe: Airframe) -> str:
     missing = [key for key in ("cells", "capacity", "resistance") if f"battery.{key}" not in airframe.values]
     if missing:
         return f"[battery] lacks {', '.join(missing)}, which Battery() needs unless they are passed"
@@ -143,7 +143,7 @@ def _battery(airframe: Airframe) -> str:
     return f"{cells:.0f} cell{'s' * (cells != 1)}, {capacity:.3g} A h, {resistance:.3g} ohm"
 
 
-def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+def _controller_rows(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tuple[str, str]]:
     """Yield the command levels that each controller follows, or the parameters that it lacks."""
     yield "controllers", "command levels that each of them follows"
     if Dynamics.first_principles not in dynamics:
@@ -151,22 +151,22 @@ def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tupl
             yield "  auto", "state, above the response of the fitted model"
             yield (
                 f"  {Crazyflow.name}",
-                _levels({"state": _missing_parameters(lambda: StateParams.create(airframe)), "attitude": ""}),
+                _levels_text({"state": _missing_parameters(lambda: StateParams.create(airframe)), "attitude": ""}),
             )
         return
     for name in STATE_CONTROLLERS:
         controller: Any = find_controller(name)
         missing = _missing_parameters(functools.partial(controller.params, airframe))
-        yield f"  {name}", _levels({", ".join(level.value for level in controller.levels): missing})
+        yield f"  {name}", _levels_text({", ".join(level.value for level in controller.levels): missing})
     params_by_level = {"state": StateParams, "attitude, body_rate": AttitudeParams, "force_torque": AllocationParams}
     missing_by_level = {
         levels: _missing_parameters(functools.partial(params.create, airframe))
         for levels, params in params_by_level.items()
     }
-    yield f"  {Crazyflow.name}", _levels(missing_by_level)
+    yield f"  {Crazyflow.name}", _levels_text(missing_by_level)
 
 
-def _levels(missing_by_level: Mapping[str, str]) -> str:
+def _levels_text(missing_by_level: Mapping[str, str]) -> str:
     """Return the levels for which nothing is missing, and the reasons why others are not followed."""
     followed = ", ".join(levels for levels, missing in missing_by_level.items() if not missing)
     reasons = [f"not {levels}: {missing}" for levels, missing in missing_by_level.items() if missing]
@@ -225,6 +225,6 @@ def _agility_warnings(airframe: Airframe) -> Iterator[str]:
     if rotor_rate(airframe) * MAX_TIME_CONSTANT < 1:
         yield f"rotors lag by {1 / rotor_rate(airframe):.2g} s: a drone that is thrown takes long to recover"
     try:
-        require_freq(airframe, Dynamics.first_principles, FREQ)
+        require_freq(airframe, Dynamics.first_principles, DEFAULT_FREQ)
     except ConfigError as error:
         yield str(error)

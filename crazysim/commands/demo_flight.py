@@ -59,7 +59,7 @@ def run_demo_flight(
     if seconds < 1 / FPS:
         raise ValueError(f"expected --seconds of at least {1 / FPS}, got {seconds}; use a longer flight")
     n_frames = round(seconds * FPS)
-    sim = build(n_worlds, n_drones, device)
+    sim = build_sim(n_worlds, n_drones, device)
     fly_frame = build_fly_frame(sim)
     engine = sim.explain().splitlines()[0]
     fleet = f"{count_text(n_worlds, 'world')} of {count_text(n_drones, 'drone')}"
@@ -69,7 +69,7 @@ def run_demo_flight(
     compiled_frame = fly_frame.lower(sim.data).compile()
     compile_s = perf_counter() - start_time
     start_time = perf_counter()
-    find_touches(sim)
+    find_pole_contacts(sim)
     contacts_compile_s = perf_counter() - start_time
 
     recorder = Recorder(sim, worlds=[0])
@@ -81,7 +81,7 @@ def run_demo_flight(
         step_s += perf_counter() - start_time
         sim.data = data
         start_time = perf_counter()
-        touched.append(find_touches(sim))
+        touched.append(find_pole_contacts(sim))
         contacts_s += perf_counter() - start_time
         recorder.add()
         errors.append(np.asarray(error))
@@ -105,12 +105,12 @@ def count_text(n: int, noun: str) -> str:
     return f"{n:,} {noun}{'s' * (n != 1)}"
 
 
-def build(n_worlds: int, n_drones: int, device: str) -> Sim:
+def build_sim(n_worlds: int, n_drones: int, device: str) -> Sim:
     """Return a simulation with two randomly placed poles per world and drones already on the figure eight."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, drone="cf2x_L250", control="state", device=device)
     offset = np.random.default_rng(0).uniform(-0.4, 0.4, (n_worlds, 2, 3)) * [1, 1, 0]
-    places = offset + [[-0.6 * WIDTH, 0, 0], [0.6 * WIDTH, 0, 0]]
-    sim.scene.add("pole", count=2, pos=places, height=1.7, radius=POLE_RADIUS)
+    pole_pos = offset + [[-0.6 * WIDTH, 0, 0], [0.6 * WIDTH, 0, 0]]
+    sim.scene.add("pole", count=2, pos=pole_pos, height=1.7, radius=POLE_RADIUS)
 
     start = figure_eight_setpoints(device_array(np.zeros((n_worlds, 1))), n_drones)
     rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(sim.data.params), (n_worlds, n_drones, 4))
@@ -120,7 +120,7 @@ def build(n_worlds: int, n_drones: int, device: str) -> Sim:
     return sim
 
 
-def find_touches(sim: Sim) -> np.ndarray:
+def find_pole_contacts(sim: Sim) -> np.ndarray:
     """Return True where a drone touches a pole. (n_worlds, n_drones, n_poles)"""
     return np.asarray(sim.contact_report(floor=False, drones=False).objects)
 
@@ -177,14 +177,14 @@ def build_fly_frame(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
     It returns the data, and the distance from the setpoint at every tick, m. (n_ticks, n_worlds, n_drones)
     """
     step = sim.build_step_fn()
-    per_tick = sim.freq // sim.control_freq
+    steps_per_tick = sim.freq // sim.control_freq
 
     def tick(data: SimData, _: None) -> tuple[SimData, Array]:
         time, n_drones = data.core.steps / data.core.freq, data.core.n_drones
         setpoint = figure_eight_setpoints(time, n_drones)
         error = jnp.linalg.norm(data.states.pos - setpoint[..., :3], axis=-1)
         data = F.state_control(data, setpoint, feedforward=jerk_feedforward(time, n_drones))
-        return step(data, per_tick), error
+        return step(data, steps_per_tick), error
 
     return jax.jit(lambda data: jax.lax.scan(tick, data, length=sim.control_freq // FPS))
 
@@ -200,10 +200,11 @@ def print_report(errors: np.ndarray, touched: np.ndarray, n_steps: int, step_s: 
         contact_s: Time of one contact query, s.
     """
     start = round(SETTLING_TIME * FPS * len(errors) / len(touched))
-    settled = 100 * (errors[start:] if start < len(errors) else errors)
+    settled_errors = 100 * (errors[start:] if start < len(errors) else errors)
     contact_starts = touched[1:] & ~touched[:-1]
     print(f"steps per second  {n_steps / step_s / 1e6:.1f} M ({n_steps / 1e6:.1f} M drone steps in {step_s:.1f} s)")
-    print(f"tracking error    {settled.mean():.1f} cm mean, {np.percentile(settled, 95):.1f} cm 95th percentile")
+    mean, percentile = settled_errors.mean(), np.percentile(settled_errors, 95)
+    print(f"tracking error    {mean:.1f} cm mean, {percentile:.1f} cm 95th percentile")
     n_begun, n_worlds = int(contact_starts.sum() + touched[0].sum()), int(touched.any((0, 2, 3)).sum())
     print(
         f"contacts          {n_begun:,} begun, in {n_worlds:,} of {count_text(touched.shape[1], 'world')}; "
@@ -230,14 +231,14 @@ def plot_tracks(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) ->
         tracks_axis.add_patch(plt.Circle(pole_pos[:2], POLE_RADIUS, color="0.2"))
     tracks_axis.set(title="Tracks in world 0, seen from above", xlabel="x, m", ylabel="y, m", aspect="equal")
     tracks_axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-    flat = 100 * errors.reshape(len(errors), -1)
-    seconds = np.arange(len(flat)) / sim.control_freq
+    errors_cm = 100 * errors.reshape(len(errors), -1)
+    seconds = np.arange(len(errors_cm)) / sim.control_freq
     error_axis.fill_between(
-        seconds, *np.percentile(flat, [5, 95], axis=1), color="0.85", label="5th to 95th percentile"
+        seconds, *np.percentile(errors_cm, [5, 95], axis=1), color="0.85", label="5th to 95th percentile"
     )
-    error_axis.plot(seconds, np.median(flat, axis=1), color=COLORS[1], label="median")
+    error_axis.plot(seconds, np.median(errors_cm, axis=1), color=COLORS[1], label="median")
     error_axis.set(
-        title=f"Tracking error of {flat.shape[1]:,} drones", xlabel="time, s", ylabel="error, cm", ylim=(0, None)
+        title=f"Tracking error of {errors_cm.shape[1]:,} drones", xlabel="time, s", ylabel="error, cm", ylim=(0, None)
     )
     error_axis.legend(fontsize=8)
     write_figure(fig, path, dpi=110)

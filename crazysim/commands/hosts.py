@@ -23,18 +23,18 @@ from typing import Any
 
 from crazysim.errors import ConfigError, DivergedError
 
-VARIABLE = "CRAZYSIM_HOST"
+HOST_VARIABLE = "CRAZYSIM_HOST"
 """Environment variable of the process of a host: its ``Host`` as JSON."""
 STOP_KEY = "crazysim/stop"
 """Folder of the coordinator's store in which a host writes why it stops."""
 STOP_SECONDS = 10
-"""Time that a host that stops waits for the others to stop, s."""
+"""Time for which a host that stops waits for the others, s."""
 POLL_SECONDS = 0.5
-"""Time between two looks for a host that stops, s."""
+"""Time between two checks whether another host stops, s."""
 END_SECONDS = 24 * 3600
 """Time that hosts wait for the last one to end, s: host 0 draws and films when the others have finished."""
-EXPLAINED = "crazysim: the end of this host is explained"
-"""Line by which the process of a host tells the one that started it to print nothing more."""
+EXPLAINED_LINE = "crazysim: the end of this host is explained"
+"""Line that the process of a host writes when it has printed why it ends, so that its parent prints nothing more."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +49,15 @@ class Host:
     """Number of hosts."""
     devices: list[int] | None
     """Indices of its devices; None for all."""
-    heartbeat: int
+    heartbeat_timeout: int
     """Time without a heartbeat after which a host counts as lost, s."""
-    connect: int
+    connect_timeout: int
     """Time within which all hosts must have connected, s."""
 
 
 def add_options(add: Callable[..., Any]) -> None:
     """Add the options of a command that can run on several hosts."""
-    coordinator = "address of host 0, at which hosts that train together meet; auto: as SLURM or Open MPI say"
+    coordinator = "address of host 0, with which the other hosts connect; auto to read it from SLURM or Open MPI"
     add("--coordinator", metavar="HOST:PORT|auto", help=coordinator)
     add("--host-id", type=int, metavar="I", help="number of this host, from 0")
     add("--hosts", type=int, metavar="N", help="number of hosts")
@@ -67,7 +67,7 @@ def add_options(add: Callable[..., Any]) -> None:
     add("--connect-timeout", type=int, default=300, metavar="SECONDS", help=connect)
 
 
-def are_several(options: argparse.Namespace) -> bool:
+def has_several_hosts(options: argparse.Namespace) -> bool:
     """Return True if a command runs on several hosts.
 
     Raises:
@@ -91,14 +91,14 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
     Raises:
         ConfigError: If the options are invalid, or no hosts are found.
     """
-    if VARIABLE in os.environ:
-        return _run_host(Host(**json.loads(os.environ.pop(VARIABLE))), command, options)
-    host = _find_host(options) if options.coordinator == "auto" else _given_host(options)
+    if HOST_VARIABLE in os.environ:
+        return _run_host(Host(**json.loads(os.environ.pop(HOST_VARIABLE))), command, options)
+    host = _host_from_scheduler(options) if options.coordinator == "auto" else _host_from_options(options)
     return _start_host(host, options.arguments)
 
 
-def _given_host(options: argparse.Namespace) -> Host:
-    """Return the host of the options."""
+def _host_from_options(options: argparse.Namespace) -> Host:
+    """Return the host that the options describe."""
     if not re.fullmatch(r".+:\d+", options.coordinator):
         raise ConfigError(
             f"expected HOST:PORT or auto as --coordinator, got {options.coordinator!r}. Use for example 10.0.0.1:1234."
@@ -112,8 +112,8 @@ def _given_host(options: argparse.Namespace) -> Host:
     return Host(options.coordinator, i, n, None, options.heartbeat_timeout, options.connect_timeout)
 
 
-def _find_host(options: argparse.Namespace) -> Host:
-    """Return the host that SLURM or Open MPI say."""
+def _host_from_scheduler(options: argparse.Namespace) -> Host:
+    """Return the host that the variables of SLURM or Open MPI describe."""
     from crazysim.jaxcompat import detect_hosts
 
     coordinator, n_hosts, host_id, devices = detect_hosts(options.connect_timeout)
@@ -128,35 +128,35 @@ def _find_host(options: argparse.Namespace) -> Host:
 
 def _start_host(host: Host, arguments: Sequence[str]) -> int:
     """Run the process of a host, pass signals on to it, explain its end, and return its exit status."""
-    received: list[int] = []
+    signals: list[int] = []
 
-    def pass_on(number: int, frame: object) -> None:
+    def forward_signal(number: int, frame: object) -> None:
         del frame
-        received.append(number)
-        child.send_signal(signal.SIGTERM if len(received) == 1 else signal.SIGKILL)
+        signals.append(number)
+        child.send_signal(signal.SIGTERM if len(signals) == 1 else signal.SIGKILL)
 
     with tempfile.TemporaryFile() as log:
-        environment = os.environ | {VARIABLE: json.dumps(asdict(host)), "CRAZYSIM_HOST_LOG": str(log.fileno())}
+        environment = os.environ | {HOST_VARIABLE: json.dumps(asdict(host)), "CRAZYSIM_HOST_LOG": str(log.fileno())}
         child = subprocess.Popen(
             [sys.executable, "-m", "crazysim", *arguments],
             env=environment,
             pass_fds=[log.fileno()],
             start_new_session=True,  # Ctrl-C goes to this process, which passes it on as SIGTERM
         )
-        before = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
+        old_handlers = {number: signal.signal(number, forward_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             status = child.wait()
         finally:
-            for number, handler in before.items():
+            for number, handler in old_handlers.items():
                 signal.signal(number, handler)
         log.seek(0)
         text = log.read().decode(errors="replace")
-    if status != 0 and not received and EXPLAINED not in text:
-        print(f"crazysim: {_explain(text, status, host, arguments)}", file=sys.stderr)
-    return 128 + received[0] if received and status else status if status >= 0 else 128 - status
+    if status != 0 and not signals and EXPLAINED_LINE not in text:
+        print(f"crazysim: {_explain_end(text, status, host, arguments)}", file=sys.stderr)
+    return 128 + signals[0] if signals and status else status if status >= 0 else 128 - status
 
 
-def _explain(log: str, status: int, host: Host, arguments: Sequence[str]) -> str:
+def _explain_end(log: str, status: int, host: Host, arguments: Sequence[str]) -> str:
     """Return why the process of a host has ended.
 
     Args:
@@ -169,8 +169,8 @@ def _explain(log: str, status: int, host: Host, arguments: Sequence[str]) -> str
         others = "the other hosts" if host.host_id == 0 else f"host 0 at {host.coordinator}"
         return (
             f"host {host.host_id}: expected {host.n_hosts} hosts to connect with {host.coordinator} within "
-            f"{host.connect} s, got no connection with {others}. Start a process on every host, and check the address "
-            f"and the firewall; --connect-timeout is the time."
+            f"{host.connect_timeout} s, got no connection with {others}. Start a process on every host, check the "
+            f"address and the firewall, or wait longer with --connect-timeout."
         )
     resume = shlex.join(["crazysim", *arguments, *(["--resume"] if "--resume" not in arguments else [])])
     remedy = f"The last checkpoint continues the training: start all hosts again, this one with\n  {resume}"
@@ -178,7 +178,7 @@ def _explain(log: str, status: int, host: Host, arguments: Sequence[str]) -> str
     lost = sorted({int(line.rpartition(":")[2]) for line in unhealthy[1].split()} - {host.host_id}) if unhealthy else []
     if lost:
         names = f"host{'s' if len(lost) > 1 else ''} {', '.join(map(str, lost))}"
-        return f"host {host.host_id}: {names} lost: no heartbeat for {host.heartbeat} s. {remedy}"
+        return f"host {host.host_id}: {names} lost: no heartbeat for {host.heartbeat_timeout} s. {remedy}"
     if "coordination" in log and host.host_id != 0:
         return f"host {host.host_id}: host 0 lost: {host.coordinator} does not answer. {remedy}"
     last = "\n".join(log.strip().splitlines()[-20:])
@@ -205,12 +205,12 @@ def _run_host(host: Host, command: Callable[[argparse.Namespace], int | None], o
             host.host_id,
             host.devices,
             cluster_detection_method="deactivate",
-            initialization_timeout=host.connect,
-            heartbeat_timeout_seconds=host.heartbeat,
+            initialization_timeout=host.connect_timeout,
+            heartbeat_timeout_seconds=host.heartbeat_timeout,
             shutdown_timeout_seconds=END_SECONDS,
         )
     except RuntimeError as error:
-        _tell_parent()
+        _notify_parent()
         print(f"crazysim: expected an address to listen at as {host.coordinator}, got: {error}", file=sys.stderr)
         return 2
     threading.Thread(target=_stop_with_others, args=(host, parent), daemon=True).start()
@@ -220,11 +220,11 @@ def _run_host(host: Host, command: Callable[[argparse.Namespace], int | None], o
         print(f"host {host.host_id} of {host.n_hosts}: {len(devices)} {devices[0].device_kind}", flush=True)
         status = command(options) or 0
     except SystemExit as end:  # all hosts have agreed on it
-        _tell_parent()
+        _notify_parent()
         status = int(end.code or 0)
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):  # probably a host is lost: JAX's runtime then ends this process
-            time.sleep(host.heartbeat + STOP_SECONDS)
+            time.sleep(host.heartbeat_timeout + STOP_SECONDS)
         _stop_others(host, error)
     except BaseException as error:
         _stop_others(host, error)
@@ -234,28 +234,28 @@ def _run_host(host: Host, command: Callable[[argparse.Namespace], int | None], o
 
 
 def _stop_others(host: Host, error: BaseException) -> None:
-    """Print an error, tell it the other hosts, and end the process when they have ended."""
+    """Print an error, send it to the other hosts, and end the process when they have ended."""
     expected = isinstance(error, (ValueError, ImportError, OSError, DivergedError))
     text = str(error) if expected else f"{type(error).__name__}: {error}"
     if not expected:
         import traceback
 
         traceback.print_exception(error)
-    _end(host, f"crazysim: {text}" if host.host_id == 0 else f"crazysim: host {host.host_id}: {text}", text)
+    _end_process(host, f"crazysim: {text}" if host.host_id == 0 else f"crazysim: host {host.host_id}: {text}", text)
 
 
-_ending = threading.Lock()
+_end_lock = threading.Lock()
 """Held by the thread that ends the process."""
 
 
-def _end(host: Host, line: str, reason: str | None) -> None:
+def _end_process(host: Host, line: str, reason: str | None) -> None:
     """Print a line, write the reason for the other hosts if there is one, wait until they end, and end the process."""
     from crazysim.jaxcompat import connected_hosts
 
-    if not _ending.acquire(blocking=False):
+    if not _end_lock.acquire(blocking=False):
         time.sleep(2 * STOP_SECONDS)
     print(line, file=sys.stderr)
-    _tell_parent()
+    _notify_parent()
     hosts = connected_hosts()
     with suppress(Exception):  # the process ends in any case
         if hosts is not None:
@@ -283,9 +283,9 @@ def _stop_with_others(host: Host, parent: int) -> None:
             for name, reason in others:
                 other = int(name.rpartition("/")[2])
                 if other != host.host_id:
-                    _end(host, f"crazysim: host {host.host_id} stops: host {other} ended: {reason}", None)
+                    _end_process(host, f"crazysim: host {host.host_id} stops: host {other} ended: {reason}", None)
 
 
-def _tell_parent() -> None:
-    """Tell the process that started this one that the reason of its end has been printed."""
-    os.write(2, f"{EXPLAINED}\n".encode())
+def _notify_parent() -> None:
+    """Write the line for the process that started this one: the reason of the end has been printed."""
+    os.write(2, f"{EXPLAINED_LINE}\n".encode())

@@ -153,14 +153,14 @@ def _split_interval(text: str) -> tuple[str, tuple[float, float]]:
 
 def _read_columns(texts: Sequence[str]) -> Columns:
     """Return the columns of FIELD=NAMES pairs."""
-    names_of_columns = Columns.__dataclass_fields__
+    column_fields = Columns.__dataclass_fields__
     fields: dict[str, Any] = {}
     for text in texts:
-        name, mark, names = text.partition("=")
-        if name not in names_of_columns or not mark:
+        name, equals, names = text.partition("=")
+        if name not in column_fields or not equals:
             raise ConfigError(
                 f"expected FIELD=NAMES without spaces, such as pos=px,py,pz, got {text!r}. "
-                f"Fields are {', '.join(names_of_columns)}."
+                f"Fields are {', '.join(column_fields)}."
             )
         if "_per_" not in name:
             fields[name] = names if name == "time" else tuple(filter(None, names.split(",")))

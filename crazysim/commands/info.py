@@ -1,4 +1,4 @@
-"""``crazysim info``: everything about an installation that a report of a bug needs, as plain text."""
+"""``crazysim info``: a description of the installation for bug reports, as plain text."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from pathlib import Path
 import crazysim
 from crazysim import startup
 
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "gymnasium")
+REQUIRED_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "gymnasium")
 """Packages that crazysim needs."""
-OPTIONAL = ("optax", "viser", "websockets", "matplotlib", "imageio-ffmpeg", "casadi", "onnx", "pettingzoo", "warp-lang",
-            "cflib", "motioncapture", "pymavlink", "rosbags", "splax", "ziglang", "tqdm", "trimesh")  # fmt: skip
+OPTIONAL_PACKAGES = ("optax", "viser", "websockets", "matplotlib", "imageio-ffmpeg", "casadi", "onnx", "pettingzoo",
+                     "warp-lang", "cflib", "motioncapture", "pymavlink", "rosbags", "splax", "ziglang", "tqdm",
+                     "trimesh")  # fmt: skip
 """Packages of the extras."""
 VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XLA_FLAGS", "CUDA_VISIBLE_DEVICES",
              "CXX", "CXXFLAGS", "CRAZYSIM_CACHE", "CRAZYSIM_COMPILE_TIMEOUT", "CRAZYSIM_JAX_FALLBACKS",
@@ -39,7 +40,7 @@ def run(options: argparse.Namespace) -> None:
     For a part that is missing or broken, its line gives the reason.
     """
     del options
-    text = "\n".join(f"{name + ':':<14}{_or_reason(value)}" for name, value in _info_lines())
+    text = "\n".join(f"{name + ':':<14}{_value_or_reason(value)}" for name, value in _info_lines())
     home = os.path.expanduser("~")
     # Bug reports are public, so they do not contain the path of the home folder.
     print(text.replace(f"{home}{os.sep}", f"~{os.sep}") if home != "~" else text)
@@ -49,8 +50,8 @@ def _info_lines() -> Iterator[tuple[str, Callable[[], str]]]:
     """Yield the name of each line and a function that returns the rest of it."""
     yield "crazysim", lambda: f"{crazysim.__version__}, {Path(crazysim.__file__).parent}"
     yield "Python", lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}"
-    yield "system", lambda: f"{platform.platform()}, {_cores()} CPU cores"
-    for name in PACKAGES:
+    yield "system", lambda: f"{platform.platform()}, {_n_cores()} CPU cores"
+    for name in REQUIRED_PACKAGES:
         yield name, lambda name=name: importlib.metadata.version(name)
     yield "extras", _extras
     yield "devices", _devices
@@ -61,7 +62,7 @@ def _info_lines() -> Iterator[tuple[str, Callable[[], str]]]:
     yield "variables", _variables
 
 
-def _or_reason(value: Callable[[], str]) -> str:
+def _value_or_reason(value: Callable[[], str]) -> str:
     """Return the value of a line, or the reason why it is missing."""
     try:
         return value()
@@ -75,14 +76,14 @@ def _first_line(text: str) -> str:
     return text.strip().partition("\n")[0][:300]
 
 
-def _cores() -> int:
+def _n_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _extras() -> str:
     versions = []
-    for name in OPTIONAL:
+    for name in OPTIONAL_PACKAGES:
         try:
             versions.append(f"{name} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:
@@ -125,11 +126,11 @@ def _cache() -> str:
     if folder is None:
         return "off"
     reason = untrusted_reason(folder / "crazysim") if (folder / "crazysim").is_dir() else ""
-    size = _size(folder) if folder.is_dir() else "not there yet"
+    size = _size_text(folder) if folder.is_dir() else "not there yet"
     return f"{folder}: {size}" + (f", kernels refused: {reason}" if reason else "")
 
 
-def _size(folder: Path) -> str:
+def _size_text(folder: Path) -> str:
     """Return the total size and the number of the files in a folder, as text."""
     sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
     return f"{sum(sizes) / 1e6:.1f} MB in {len(sizes)} files"

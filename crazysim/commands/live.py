@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
         raise ConfigError("expected --seconds with --headless, got none. Use --seconds 20, for example.")
     if not options.headless and not viewers:
         viewers = ["window" if _has_screen() else "browser"]
-    speed, piloted = _speed(options.speed), options.pilot or options.gamepad
+    speed, piloted = _parse_speed(options.speed), options.pilot or options.gamepad
     if options.commands and piloted:
         raise ConfigError(
             "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad."
@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
     with contextlib.ExitStack() as stack:
         live = stack.enter_context(Live(sim, control_freq, speed, options.fps))
         if policy_pilot is not None:
-            policy_pilot.join(live)
+            policy_pilot.add_to(live)
             policy_pilot.listen(live, typed_lines())
             print(f"type a goal as x y z, m{policy_pilot.arena and ': '}{policy_pilot.arena}", flush=True)
         elif options.commands:
@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> None:
             print(f"recording to {live.record(options.record)}", flush=True)
         print(live.run(options.seconds))
         if options.goals is not None and policy_pilot is not None:
-            print(f"points passed: {', '.join(str(n) for n in policy_pilot.passed.ravel())}")
+            print(f"points passed: {', '.join(str(n) for n in policy_pilot.n_passed.ravel())}")
 
 
 def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
@@ -118,7 +118,7 @@ def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
     return PolicyPilot(config.with_device(options.device).make_env(options.worlds), policy, points)
 
 
-def _speed(text: str) -> float | Literal["max"]:
+def _parse_speed(text: str) -> float | Literal["max"]:
     """Return a speed: a number, or ``max``."""
     try:
         return "max" if text == "max" else float(text)

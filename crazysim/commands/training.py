@@ -36,7 +36,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     iterations = "number of rollouts, each with its updates; by default the recipe's"
     add("--iterations", type=int, help=iterations)
     add("--out", type=Path, help="folder of the run; by default out/TASK")
-    resume = "continue from the checkpoint in that folder, with its settings where none are given"
+    resume = "continue from the checkpoint in that folder; settings that you leave out are the checkpoint's"
     add("--resume", action="store_true", help=resume)
     checkpoint_every = "write a checkpoint every so many seconds, in addition to the one at each evaluation"
     add("--checkpoint-every", type=float, metavar="SECONDS", help=checkpoint_every)
@@ -135,17 +135,17 @@ def train(options: argparse.Namespace) -> int | None:
         for name, entry in TASKS.items():
             print(f"{name:12} {(entry.task.__doc__ or '').splitlines()[0]}")
         return None
-    if hosts.are_several(options):
+    if hosts.has_several_hosts(options):
         return hosts.run_on_hosts(partial(_train, devices="all"), options)
-    before = signal.signal(signal.SIGTERM, _exit)
+    old_handler = signal.signal(signal.SIGTERM, _exit)
     try:
         return _train(options)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, old_handler)
 
 
 def _train(options: argparse.Namespace, devices: str | None = None) -> None:
-    """Train a policy in this process, on these devices if the options name none."""
+    """Train a policy in this process, on ``devices`` if the options name none."""
     from crazysim.train.runs import run, run_many
 
     settings: dict[str, Any] = {

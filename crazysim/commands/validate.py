@@ -47,14 +47,14 @@ def run(options: argparse.Namespace) -> int:
     if (pictures := options.out.parent / PICTURES).exists():
         check_writable(pictures / options.out.name)
     rows = validate(options.data, options.only)
-    selected = [section for section in sections(options.data) if section.name in options.only]
-    for section in selected:
+    selected_sections = [section for section in sections(options.data) if section.name in options.only]
+    for section in selected_sections:
         if section.problem:
             print(f"left out {section.name}: {section.problem}")
         elif section.missing_peers:
             print(f"left out rows of {section.name}: {section.missing_peers}")
-    pictures = _draw(selected, rows, options.out.parent)
-    write_file(options.out, format_page(selected, rows, _provenance(selected), pictures))
+    pictures = _draw_sections(selected_sections, rows, options.out.parent)
+    write_file(options.out, format_page(selected_sections, rows, _provenance(selected_sections), pictures))
     for row in rows:
         if row.failed:
             print(f"failed: {row.quantity}: {row.problem or f'{row.text}, {bound_text(row.bound)} passes'}")
@@ -62,10 +62,10 @@ def run(options: argparse.Namespace) -> int:
     return int(any(row.failed for row in rows))
 
 
-def _draw(selected: Sequence[Section], rows: Sequence[Row], folder: Path) -> dict[str, str]:
+def _draw_sections(selected_sections: Sequence[Section], rows: Sequence[Row], folder: Path) -> dict[str, str]:
     """Write the pictures, and return their paths relative to the page by the names of the sections."""
     pictures = {}
-    for section in selected:
+    for section in selected_sections:
         section_rows = [row for row in rows if row.section == section.name]
         if not any(row.series for row in section_rows):
             continue
@@ -78,7 +78,7 @@ def _draw(selected: Sequence[Section], rows: Sequence[Row], folder: Path) -> dic
     return pictures
 
 
-def _provenance(selected: Sequence[Section]) -> str:
+def _provenance(selected_sections: Sequence[Section]) -> str:
     """Return a sentence with the date and the versions of the programs that made the page."""
     command = ["git", "-C", str(Path(crazysim.__file__).parent), "describe", "--always", "--dirty"]
     try:
@@ -87,7 +87,7 @@ def _provenance(selected: Sequence[Section]) -> str:
     except OSError:
         commit = ""
     packages: dict[str, str] = {}
-    for section in selected:
+    for section in selected_sections:
         if not section.problem:
             packages |= section.packages
             packages |= {k: name for k, name in section.peers.items() if importlib.util.find_spec(k) is not None}

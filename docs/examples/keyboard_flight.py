@@ -46,8 +46,8 @@ def main():
             print(live.run())
             return None
         for key, pressed, released in KEYS:
-            live.at(pressed, lambda live, key=key: live.keyboard.press(key))
-            live.at(released, lambda live, key=key: live.keyboard.release(key))
+            live.call_at(pressed, lambda live, key=key: live.keyboard.press(key))
+            live.call_at(released, lambda live, key=key: live.keyboard.release(key))
         report = live.run(9.0)
         pos = np.asarray(live.sim.data.states.pos[0, 0])
         print(f"flown to {np.round(pos, 1)}, {report.factor:.0f} times as fast as real time")

@@ -180,4 +180,4 @@ def test_slurm_says_which_host_this_is(monkeypatch):
     for name, value in variables.items():
         monkeypatch.setenv(f"SLURM_{name}", value)
     options = argparse.Namespace(heartbeat_timeout=7, connect_timeout=30)
-    assert hosts._find_host(options) == hosts.Host("gpu07:61441", 5, 8, [1], 7, 30)
+    assert hosts._host_from_scheduler(options) == hosts.Host("gpu07:61441", 5, 8, [1], 7, 30)

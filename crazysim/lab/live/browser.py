@@ -110,7 +110,7 @@ class Browser(Viewer[Live]):
         shapes = visual_geoms(sim.mj_model, sim.mj_data)
         bodies = SceneBodies(sim, shapes)
         self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind)
-        self._picture = self._source.take(live)
+        self._picture = self._source.take_picture(live)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
             self._server = start_guarded_server(viser, access, label="crazysim")
         scene = self._server.scene
@@ -146,7 +146,7 @@ class Browser(Viewer[Live]):
     def update(self, live: Live) -> None:
         if not self._server.get_clients():
             return
-        self._picture = picture = self._source.take(live, self._panel.plot)
+        self._picture = picture = self._source.take_picture(live, self._panel.plot)
         with self._server.atomic():
             self._scene.update(picture, self._panel.follow)
         self._panel.update(picture, time.perf_counter())

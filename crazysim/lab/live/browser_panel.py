@@ -62,7 +62,7 @@ class BrowserPanel:
         self.follow, self.plot = follow, plot if plot in names else ""
         gui.configure_theme(control_width="medium")
         self._text = gui.add_markdown("")
-        self._text_at = self._plot_at = -np.inf
+        self._text_time = self._plot_time = -np.inf
         self._samples: deque[tuple[float, np.ndarray]] = deque(maxlen=PLOT_LENGTH)
         self._chart: Any = None
         self._plotted: tuple[Any, ...] = ()
@@ -93,8 +93,8 @@ class BrowserPanel:
             picture: Picture that is shown.
             now: Present time (``time.perf_counter``), s.
         """
-        if now - self._text_at >= TEXT_PERIOD:
-            self._text_at = now
+        if now - self._text_time >= TEXT_PERIOD:
+            self._text_time = now
             self._text.content = f"**{picture.status}**"
             if picture.selected is not None and self._drone.value != picture.selected[1]:
                 self._drone.value = picture.selected[1]
@@ -111,8 +111,8 @@ class BrowserPanel:
             return
         if not self._samples or picture.time - self._samples[-1][0] >= PLOT_SAMPLE:
             self._samples.append((picture.time, picture.plot[:MAX_LINES]))
-        if len(self._samples) > 1 and now - self._plot_at >= PLOT_PERIOD:
-            self._plot_at = now
+        if len(self._samples) > 1 and now - self._plot_time >= PLOT_PERIOD:
+            self._plot_time = now
             self._draw_chart()
 
     def _draw_chart(self) -> None:
@@ -134,11 +134,11 @@ class BrowserPanel:
             self._chart = None
 
     def _add_time(self, gui: Any, live: Live) -> None:
-        calls = {
+        callbacks = {
             "pause": Live.toggle_pause, "step": Live.advance, "reset": Live.reset, "record": Live.toggle_recording,
         }  # fmt: skip
-        buttons = gui.add_button_group("", tuple(calls))
-        buttons.on_click(lambda _: live.post(calls[buttons.value]))
+        buttons = gui.add_button_group("", tuple(callbacks))
+        buttons.on_click(lambda _: live.post(callbacks[buttons.value]))
         speed = gui.add_dropdown("speed", SPEEDS, initial_value=_nearest_speed(live.speed))
 
         @speed.on_update
@@ -214,9 +214,9 @@ class BrowserPanel:
             live.post(lambda live: live.set_value(widget.name, value))
 
 
-def _post_on_click(button: Any, live: Live, call: Callable[[Live], object]) -> None:
+def _post_on_click(button: Any, live: Live, callback: Callable[[Live], object]) -> None:
     """Make a button post a function to the loop."""
-    button.on_click(lambda _: live.post(call))
+    button.on_click(lambda _: live.post(callback))
 
 
 def _nearest_speed(speed: Speed) -> str:

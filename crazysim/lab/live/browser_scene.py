@@ -85,10 +85,10 @@ class BrowserScene:
         )
         self._label = scene.add_label("/world/followed/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
         self._wind = None
-        self._tracked = bodies.tracked
-        tracked = self._to_grid(picture.pos[:, self._tracked]).reshape(-1, 3)
-        trail_colors = np.tile(choose_drone_colors(len(self._tracked), None)[:, :3], (n_worlds, 1))
-        self._trail = Trails(scene, tracked, trail_colors, trail) if trail > 0 else None
+        self._trail_mocap_ids = bodies.trail_mocap_ids
+        trail_pos = self._to_grid(picture.pos[:, self._trail_mocap_ids]).reshape(-1, 3)
+        trail_colors = np.tile(choose_drone_colors(len(self._trail_mocap_ids), None)[:, :3], (n_worlds, 1))
+        self._trail = Trails(scene, trail_pos, trail_colors, trail) if trail > 0 else None
         self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind", "lights"), True)
 
     def update(self, picture: Picture, follow: bool) -> None:
@@ -115,7 +115,9 @@ class BrowserScene:
         self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * visible["lights"])
         self._show_wind(drones, picture)
         if self._trail is not None:
-            self._trail.update(picture.time, finite_rows(pos[:, self._tracked].reshape(-1, 3)), visible["trails"])
+            self._trail.update(
+                picture.time, finite_rows(pos[:, self._trail_mocap_ids].reshape(-1, 3)), visible["trails"]
+            )
         self._show_followed(pos, picture, follow)
 
     def pick(

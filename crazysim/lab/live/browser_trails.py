@@ -17,7 +17,7 @@ FLOOR_GREY = 0.8
 
 
 class Trails:
-    """The recent positions of all bodies, as one set of line segments of constant size."""
+    """The recent positions of all bodies, as one set of a fixed number of line segments."""
 
     def __init__(self, scene: Any, pos: NDArray, colors: NDArray, seconds: float):
         """Create trails of length zero.
@@ -30,7 +30,7 @@ class Trails:
         """
         self._length = max(round(seconds / TRAIL_PERIOD), 1)
         self._samples: deque[NDArray] = deque(maxlen=self._length)
-        self._last = -np.inf
+        self._last_time = -np.inf
         pos = finite_rows(pos)
         fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # to the floor's grey; lines are opaque
         shades = np.round(255 * (FLOOR_GREY - fade * (FLOOR_GREY - colors))).astype(np.uint8)
@@ -42,13 +42,13 @@ class Trails:
     def update(self, time: float, pos: NDArray, visible: bool) -> None:
         """Add a sample and redraw the trails if a sample is due; a jump back in time clears them."""
         self._handle.visible = visible
-        if time < self._last:
+        if time < self._last_time:
             self._samples.clear()
-            self._last = -np.inf
-        if time - self._last < TRAIL_PERIOD:
+            self._last_time = -np.inf
+        if time - self._last_time < TRAIL_PERIOD:
             return
         self._samples.append(pos)
-        self._last = time
+        self._last_time = time
         if visible:
             self._handle.points = self._segments(pos)
 

@@ -113,7 +113,7 @@ def parse_command(frame: Message | ShowFile, drone: int | None = None) -> Comman
     if frame.payload is not None:
         raise ConfigError(f"expected no JSON after {name!r}, got one")
     if name == "takeoff":
-        return TakeOff(drone, _number(argument, 0.0, MAX_HEIGHT))
+        return TakeOff(drone, _parse_number(argument, 0.0, MAX_HEIGHT))
     if name == "start":
         if argument.lower() not in ("absolute", "abs", "relative", "rel", ""):
             raise ConfigError(f"expected start_absolute or start_relative, got {argument!r}")
@@ -122,16 +122,16 @@ def parse_command(frame: Message | ShowFile, drone: int | None = None) -> Comman
         parameter, equals, value = argument.partition("=")
         if not equals or not parameter:
             raise ConfigError(f"expected param_NAME=VALUE, got {argument!r}")
-        return SetParameter(drone, parameter, _number(value, -math.inf, math.inf))
-    motionless = {"land": Land, "hover": Hover}
-    if name in motionless:
-        return motionless[name](drone)
+        return SetParameter(drone, parameter, _parse_number(value, -math.inf, math.inf))
+    commands_without_argument = {"land": Land, "hover": Hover}
+    if name in commands_without_argument:
+        return commands_without_argument[name](drone)
     if name == "show":
         return StartShow()
     raise ConfigError(f"expected takeoff, land, hover, upload, start, param or show, got {name!r}")
 
 
-def _number(text: str, low: float, high: float) -> float:
+def _parse_number(text: str, low: float, high: float) -> float:
     try:
         value = float(text)
     except ValueError:

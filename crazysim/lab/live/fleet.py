@@ -62,8 +62,7 @@ class Fleet:
             sim: Simulation of one world with state commands.
             ids: Index of the drone of each ID that is in use; None if no ID is in use yet.
             max_pieces: Largest number of pieces of a trajectory.
-            teleport: True to move a drone to the start of the first trajectory that it receives before any command
-                that moves it.
+            teleport: True to move a drone to the start of its first trajectory, if no command has moved it before.
             name: Name of the plugin that follows the trajectories.
         """
         if sim.n_worlds != 1:
@@ -123,7 +122,7 @@ class Fleet:
 
     def setpoint(self, drone: int) -> NDArray:
         """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
-        return HostTrajectory.of(self._active[drone]).at(self._current_time() - self._starts[drone])
+        return HostTrajectory.from_trajectory(self._active[drone]).at(self._current_time() - self._starts[drone])
 
     def _current_time(self) -> float:
         return float(self.sim.time[0, 0])
@@ -174,7 +173,7 @@ class Fleet:
             self._assign_trajectory(drone, _vertical_trajectory(setpoint, 0.0))
 
     def _drones(self, drone_id: int | None) -> list[int]:
-        """Return the drones of an ID; a new one gets the next free drone."""
+        """Return the indices of the drones with an ID; a new ID is assigned to the next free drone."""
         if drone_id is None:
             return list(range(self.sim.n_drones))
         if drone_id not in self.ids:
@@ -201,7 +200,7 @@ class Fleet:
     def _receive_trajectory(self, drone: int, trajectory: Trajectory) -> None:
         self._uploaded[drone] = trajectory
         if self.teleport and self._awaits_first_trajectory[drone]:
-            start_point = HostTrajectory.of(trajectory).at(0.0)
+            start_point = HostTrajectory.from_trajectory(trajectory).at(0.0)
             states = self.sim.data.states
             pos = states.pos.at[0, drone].set(jnp.asarray(start_point[:3], states.pos.dtype))
             quat = states.quat.at[0, drone].set(jnp.asarray(from_yaw(start_point[3]), states.quat.dtype))
@@ -212,7 +211,9 @@ class Fleet:
     def _start_trajectory(self, drone: int, relative: bool) -> None:
         trajectory = self._uploaded[drone]
         if relative:
-            trajectory = trajectory.moved((self.setpoint(drone) - HostTrajectory.of(trajectory).at(0.0))[:3])
+            trajectory = trajectory.moved(
+                (self.setpoint(drone) - HostTrajectory.from_trajectory(trajectory).at(0.0))[:3]
+            )
         self._assign_trajectory(drone, trajectory)
 
     def _assign_trajectory(self, drone: int, trajectory: Trajectory) -> None:

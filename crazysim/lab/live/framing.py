@@ -1,8 +1,8 @@
 """Framing of a stream of bytes: where each message begins and ends, however the stream is split.
 
 The stream has the lab's messages ``<ID>_CMDSTART_<command>_<argument>_EOF`` and ``CMDSTART_<command>_<argument>_EOF``,
-whose argument may be a JSON object with any characters, ``REQ_<ID>``, ``START``, and shows: a zip archive followed by
-``SKYC``. End markers inside JSON and archives are ignored: where these end follows from their own structure.
+whose argument may be a JSON object with any characters; ``REQ_<ID>``; ``START``; and shows, each a zip archive followed
+by ``SKYC``. JSON and archives end where their own structure says, so end markers inside them are ignored.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class MessageBuffer:
         self._in_string = False
 
     @property
-    def pending(self) -> bool:
+    def has_partial_message(self) -> bool:
         """True if the buffer holds the start of a message."""
         return bool(self._buffer)
 
@@ -129,10 +129,10 @@ class MessageBuffer:
             return not front.startswith(b"CMDSTART_") or bool(
                 re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", command_text)
             )
-        after = re.sub(rb"^\d{1,4}", b"", front)
-        if after == front or not b"_CMDSTART_".startswith(after[:10]):
+        rest = re.sub(rb"^\d{1,4}", b"", front)
+        if rest == front or not b"_CMDSTART_".startswith(rest[:10]):
             return False
-        return bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", after[10:]))
+        return bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", rest[10:]))
 
     def _read_message(self, head: re.Match[bytes]) -> Message | None:
         """Return the text message at the front of the buffer."""
@@ -194,7 +194,7 @@ class MessageBuffer:
         return end
 
     def _read_show(self) -> ShowFile | None:
-        """Return the show at the front of the buffer: an archive ends with its directory, and then comes SKYC."""
+        """Return the show at the front of the buffer: a zip archive, which ends with its directory, and then SKYC."""
         buffer = self._buffer
         while (zip_end := buffer.find(ZIP_END, self._scan_position)) >= 0:
             if zip_end + 22 > len(buffer):

@@ -42,7 +42,7 @@ class Gamepad:
         if not gamepads:
             raise ConfigError("expected a gamepad, got none. Connect it before the program starts.")
         self._number = gamepads[0]
-        self._calls: dict[int, Callable[[Live], object]] = {}
+        self._callbacks: dict[int, Callable[[Live], object]] = {}
         self._last_buttons: list[int] = []
 
     @property
@@ -51,18 +51,18 @@ class Gamepad:
         name = self._glfw.get_gamepad_name(self._number)
         return name.decode(errors="replace") if isinstance(name, bytes) else str(name or "disconnected")
 
-    def bind(self, button: str, call: Callable[[Live], object]) -> None:
+    def bind(self, button: str, callback: Callable[[Live], object]) -> None:
         """Make a button call a function of the loop.
 
         Args:
             button: ``"a"``, ``"b"``, ``"x"``, ``"y"``, ``"left_bumper"``, ``"right_bumper"``, ``"back"``, ``"start"``,
                 ``"guide"``, ``"dpad_up"``, ...: GLFW's names.
-            call: Function of the loop.
+            callback: Function of the loop.
         """
         index = getattr(self._glfw, f"GAMEPAD_BUTTON_{button.upper()}", None)
         if index is None:
             raise ConfigError(f"expected the name of a button, such as 'a' or 'start', got {button!r}")
-        self._calls[index] = call
+        self._callbacks[index] = callback
 
     def __call__(self, live: Live) -> NDArray:
         """Return forward, left, up and turn left, -1 to 1, and post the functions of newly pressed buttons. (4,)"""
@@ -72,9 +72,9 @@ class Gamepad:
             self._last_buttons = []
             return np.zeros(4)
         buttons, axes = list(state.buttons), state.axes
-        for index, call in self._calls.items():
+        for index, callback in self._callbacks.items():
             if buttons[index] and not (self._last_buttons and self._last_buttons[index]):
-                live.post(call)
+                live.post(callback)
         self._last_buttons = buttons
         right_y, right_x = axes[glfw.GAMEPAD_AXIS_RIGHT_Y], axes[glfw.GAMEPAD_AXIS_RIGHT_X]
         left_y, left_x = axes[glfw.GAMEPAD_AXIS_LEFT_Y], axes[glfw.GAMEPAD_AXIS_LEFT_X]

@@ -26,7 +26,7 @@ class HostTrajectory(NamedTuple):
     """True if the trajectory starts again after its end."""
 
     @staticmethod
-    def of(trajectory: Trajectory) -> HostTrajectory:
+    def from_trajectory(trajectory: Trajectory) -> HostTrajectory:
         """Return one trajectory on the host."""
         ends, coefficients = (np.asarray(x, float) for x in (trajectory.ends, trajectory.coefficients))
         return HostTrajectory(ends, coefficients, bool(trajectory.repeats))
@@ -65,9 +65,9 @@ def _powers(n: int, size: int) -> tuple[NDArray, NDArray, NDArray]:
 def host_trajectories(trajectories: Trajectory | Sequence[Trajectory]) -> list[HostTrajectory]:
     """Return the trajectories of a record, with or without a leading axis, or of a sequence of records, on the host."""
     if not isinstance(trajectories, Trajectory):
-        return [HostTrajectory.of(t) for t in trajectories]
+        return [HostTrajectory.from_trajectory(t) for t in trajectories]
     if np.ndim(trajectories.ends) == 1:
-        return [HostTrajectory.of(trajectories)]
+        return [HostTrajectory.from_trajectory(trajectories)]
     t = trajectories
     leaves = [np.asarray(x) for x in (t.ends, t.coefficients, t.repeats)]
     return [HostTrajectory(e.astype(float), c.astype(float), bool(r)) for e, c, r in zip(*leaves, strict=True)]

@@ -29,7 +29,8 @@ class Interaction:
     slider_values: dict[str, float]
     """Present values of the sliders, by name."""
     selected: tuple[int, int] | None
-    """World and drone that are plotted, piloted and, unless ``follow`` chose another body, followed; None for none."""
+    """World and index of the drone that is plotted and piloted, and followed unless ``follow`` chose another body; None
+    for none."""
     lights: NDArray
     """Colours of the drones' LEDs, red, green and blue from 0 to 1, which viewers draw; zero for off.
     (n_worlds, n_drones, 3)"""
@@ -38,8 +39,8 @@ class Interaction:
     quantities: dict[str, Callable[[Self], ArrayLike]]
     """Further quantities that viewers can plot, by name: functions of the loop that return numbers. (k,)"""
     on_click: Callable[[Self, int, NDArray], object] | None
-    """Function that is called with the loop, the world and the point of its ground, m, when a viewer is
-    clicked; None for none."""
+    """Function that is called with the loop, the world and the point, m, when the ground is clicked in a viewer; None
+    for none."""
 
     def __init__(self, sim: Sim):
         self.sim = sim
@@ -48,15 +49,17 @@ class Interaction:
         self.lights = np.zeros((sim.n_worlds, sim.n_drones, 3))
         self._followed_body: tuple[int, str, int] | None = None
         self._slider = 0
-        self._posted_calls: deque[Callable[[Self], object]] = deque()
+        self._posted_callbacks: deque[Callable[[Self], object]] = deque()
 
-    def button(self, name: str, call: Callable[[Self], object], key: str | None = None) -> None:
+    def button(self, name: str, callback: Callable[[Self], object], key: str | None = None) -> None:
         """Add a button to viewers that are shown from now on, and optionally a key that calls the same function."""
-        self.widgets.append(Button(name, partial(call, self), key))
+        self.widgets.append(Button(name, partial(callback, self), key))
         if key is not None:
-            self.keyboard.bind(key, call)
+            self.keyboard.bind(key, callback)
 
-    def slider(self, name: str, low: float, high: float, value: float, call: Callable[[Self, float], object]) -> None:
+    def slider(
+        self, name: str, low: float, high: float, value: float, callback: Callable[[Self, float], object]
+    ) -> None:
         """Add a slider to viewers that are shown from now on; the function is called with the loop and the value."""
         if not (np.isfinite([low, high]).all() and low < high and low <= value <= high):
             raise ConfigError(
@@ -65,7 +68,7 @@ class Interaction:
             )
         if name in self.slider_values:
             raise ConfigError(f"expected a new name of a slider, got {name!r} twice. Use another name.")
-        self.widgets.append(Slider(name, low, high, value, partial(call, self)))
+        self.widgets.append(Slider(name, low, high, value, partial(callback, self)))
         self.slider_values[name] = float(value)
 
     def set_value(self, name: str, value: float) -> None:
@@ -151,6 +154,6 @@ class Interaction:
         if self.on_click is not None:
             self.on_click(self, world, point)
 
-    def post(self, call: Callable[[Self], object]) -> None:
+    def post(self, callback: Callable[[Self], object]) -> None:
         """Make the loop call a function between two steps; may be called from any thread."""
-        self._posted_calls.append(call)
+        self._posted_callbacks.append(callback)

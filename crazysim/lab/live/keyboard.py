@@ -25,7 +25,7 @@ class Keyboard(Generic[L]):
     def __init__(self) -> None:
         self._hold_times: dict[str, float] = {}
         self._pressed_keys: deque[str] = deque(maxlen=100)
-        self._calls: dict[str, Callable[[L], object]] = {}
+        self._callbacks: dict[str, Callable[[L], object]] = {}
 
     def press(self, key: str) -> None:
         """Press a key."""
@@ -52,15 +52,15 @@ class Keyboard(Generic[L]):
         """Return 1, -1 or 0 for two opposite keys."""
         return float(self.is_held(positive)) - float(self.is_held(negative))
 
-    def bind(self, key: str, call: Callable[[L], object]) -> None:
+    def bind(self, key: str, callback: Callable[[L], object]) -> None:
         """Make a key call a function of the loop when it is pressed, instead of its previous function."""
         if key not in KEY_NAMES and (len(key) != 1 or key != key.lower()):
             raise ConfigError(f"expected a lower-case character or one of {', '.join(KEY_NAMES)} as a key, got {key!r}")
-        self._calls[key] = call
+        self._callbacks[key] = callback
 
     def run(self, live: L) -> None:
         """Call the functions of the keys that were pressed since the last call."""
         while self._pressed_keys:
-            call = self._calls.get(self._pressed_keys.popleft())
-            if call is not None:
-                call(live)
+            callback = self._callbacks.get(self._pressed_keys.popleft())
+            if callback is not None:
+                callback(live)

@@ -22,7 +22,7 @@ class Link(Protocol):
     """Name of the drone."""
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Send a command to the drone: the numbers that ``sim.state_control``, ``attitude_control``, ... take. (k,)"""
+        """Send a command to the drone, one of the arrays that ``sim.state_control``, ... take for each drone. (k,)"""
         ...
 
     def state(self) -> DroneState:

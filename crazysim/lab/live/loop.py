@@ -96,11 +96,11 @@ class Live(Interaction, Closeable):
         self._viewers = Viewers[Live](fps, self.stop)
         self._recordings = Recordings(sim, control_freq)
         self._paused = self._is_stopped = self._in_step = False
-        self._refused = 0
+        self._n_refused = 0
         self._factor = (perf_counter(), 0, 0.0)
         self._may_warn = RateLimit(WARNING_PERIOD)
-        for key, call in KEYS.items():
-            self.keyboard.bind(key, call)
+        for key, callback in KEYS.items():
+            self.keyboard.bind(key, callback)
 
     # Time -----------------------------------------------------------------------------------------------------------
 
@@ -133,18 +133,20 @@ class Live(Interaction, Closeable):
         self.paused = not self.paused
 
     def advance(self, n_steps: int = 1) -> None:
-        """Advance by control steps as fast as possible, even while paused, for single steps."""
+        """Advance by control steps as fast as possible, even while paused."""
         n_steps = positive_integer("n_steps", n_steps)
         self._between_steps(lambda _: self._advance(n_steps))
 
     def reset(self) -> None:
-        """Return to the default data; timed events become due again."""
+        """Return to the default data. Timed events are called again when their time comes."""
         self._between_steps(lambda _: self._reset())
 
     def go_to(self, time: float) -> None:
-        """Go to a time since the last reset, s: forwards as fast as possible, backwards from the snapshot before it.
+        """Go to a time since the last reset, s.
 
-        Processes and events are called on the way. After a jump backwards, ``reset(live)`` of the processes is called.
+        Forwards, the loop advances as fast as possible. Backwards, it restores the latest snapshot before that time and
+        advances from there. Processes and events are called on the way. After a jump backwards, ``reset(live)`` of the
+        processes is called first.
         """
         if not np.isfinite(time) or time < 0:
             raise ConfigError(f"expected a time of 0 s or more, got {time!r}")
@@ -188,12 +190,12 @@ class Live(Interaction, Closeable):
         self._processes.append(Process(label, partial(process, self), partial(reset, self), period, on_error))
         return self._processes[-1]
 
-    def at(self, time: float, call: Callable[[Live], object], name: str | None = None) -> None:
-        """Call a function of the loop when the simulation reaches a time, s, and again after every reset."""
+    def call_at(self, time: float, callback: Callable[[Live], object], name: str | None = None) -> None:
+        """Call a function with the loop when the simulation reaches a time, s, and again after every reset."""
         step = int(np.ceil(time * self.control_freq - 1e-6)) if np.isfinite(time) else -1
         if step < self.step:
             raise ConfigError(f"expected a time of {self.time:g} s or later, got {time!r}")
-        self._events[step].append(Event(step, partial(call, self), name or getattr(call, "__name__", "event")))
+        self._events[step].append(Event(step, partial(callback, self), name or getattr(callback, "__name__", "event")))
 
     def show(self, viewer: V) -> V:
         """Show the simulation in a viewer, and return the viewer; ``run`` ends when all viewers have been closed.
@@ -231,7 +233,7 @@ class Live(Interaction, Closeable):
         self._recordings.close()
 
     def toggle_recording(self) -> None:
-        """Start a recording with the name of the last one, or finish the present one."""
+        """Finish the present recording, or start one with the name of the last."""
         if self.is_recording:
             self.stop_recording()
         else:
@@ -258,7 +260,7 @@ class Live(Interaction, Closeable):
         jax.block_until_ready(self.sim.data.states.pos)
         wall_s = perf_counter() - start_time - paused_s
         simulated_s = (self.n_steps_run - first_step) * self._dt
-        failures = self._refused + self._viewers.failures + self._recordings.failures
+        failures = self._n_refused + self._viewers.failures + self._recordings.failures
         n_pictures = self._viewers.n_pictures - pictures
         return self._pace.report(self._processes, simulated_s, wall_s, n_pictures, failures)
 
@@ -285,13 +287,13 @@ class Live(Interaction, Closeable):
             return 0.0
         if self._paused:
             start_time = perf_counter()
-            viewers.draw(self, viewers.next_at)
+            viewers.draw(self, viewers.next_picture_time)
             sleep(MAX_SLEEP)
             return perf_counter() - start_time
-        wait = self._pace.due_in()
+        wait = self._pace.time_until_due()
         if wait > 0:
-            if not viewers.draw(self, viewers.next_at):
-                until_picture = viewers.next_at - perf_counter() if viewers else MAX_SLEEP
+            if not viewers.draw(self, viewers.next_picture_time):
+                until_picture = viewers.next_picture_time - perf_counter() if viewers else MAX_SLEEP
                 sleep(max(min(wait, until_picture, MAX_SLEEP), 0.0))
             return 0.0
         lateness = self._pace.record_step(self.time)
@@ -299,7 +301,7 @@ class Live(Interaction, Closeable):
             log.warning("real time missed at %.2f s: %.0f ms late", self.time, 1e3 * lateness)
         self._control_step()
         # At real-time speeds a picture waits for idle time, but at most until the next picture is due.
-        viewers.draw(self, viewers.next_at + (0.0 if self.speed == "max" else viewers.period))
+        viewers.draw(self, viewers.next_picture_time + (0.0 if self.speed == "max" else viewers.period))
         return 0.0
 
     def _control_step(self) -> None:
@@ -312,7 +314,7 @@ class Live(Interaction, Closeable):
                     process.run(self.time)
             for event in self._events.get(self.step, ()):
                 log.info("%s at %.2f s", event.name, self.time)
-                event.call()
+                event.callback()
             self._commands.stage()
             self.sim.step(self.n_substeps)
         finally:
@@ -324,18 +326,18 @@ class Live(Interaction, Closeable):
     def _run_posted(self) -> None:
         try:
             self.keyboard.run(self)
-            while self._posted_calls:
-                self._posted_calls.popleft()(self)
+            while self._posted_callbacks:
+                self._posted_callbacks.popleft()(self)
         except ConfigError as error:
-            self._refused += 1
+            self._n_refused += 1
             log.warning("refused at %.2f s: %s", self.time, error)
 
-    def _between_steps(self, call: Callable[[Live], object]) -> None:
+    def _between_steps(self, callback: Callable[[Live], object]) -> None:
         """Call a function now, or after the control step that is under way."""
         if self._in_step:
-            self.post(call)
+            self.post(callback)
         else:
-            call(self)
+            callback(self)
 
     def _advance(self, n_steps: int) -> None:
         for _ in range(n_steps):
@@ -347,7 +349,7 @@ class Live(Interaction, Closeable):
         self.step = 0
         self._history.clear()
         self._commands.restore(None)
-        self._jumped()
+        self._reset_processes()
 
     def _go_to(self, step: int) -> None:
         if step < self.step:
@@ -359,10 +361,10 @@ class Live(Interaction, Closeable):
                 )
             self.sim.data, self.step = snapshot.data, snapshot.step
             self._commands.restore(snapshot.commands)
-            self._jumped()
+            self._reset_processes()
         self._advance(step - self.step)
 
-    def _jumped(self) -> None:
+    def _reset_processes(self) -> None:
         for process in self._processes:
             process.reset()
         self._pace.restart()
@@ -372,18 +374,18 @@ class Live(Interaction, Closeable):
         self._commands.stage()
         compile_step(self.sim, self.n_substeps)
         self._viewers.update(self)
-        self._viewers.next_at = perf_counter()
+        self._viewers.next_picture_time = perf_counter()
 
 
 KEY_FRACTION = 0.05
 """Fraction of a slider's range by which a key moves it."""
 
 
-def _scale(factor: float) -> Callable[[Live], None]:
-    def call(live: Live) -> None:
+def _scale_speed(factor: float) -> Callable[[Live], None]:
+    def scale(live: Live) -> None:
         live.speed = factor * (1.0 if live.speed == "max" else live.speed)
 
-    return call
+    return scale
 
 
 KEYS: dict[str, Callable[[Live], object]] = {
@@ -391,8 +393,8 @@ KEYS: dict[str, Callable[[Live], object]] = {
     ".": Live.advance,
     "backspace": Live.reset,
     "tab": Live.select_next,
-    "+": _scale(2.0),
-    "-": _scale(0.5),
+    "+": _scale_speed(2.0),
+    "-": _scale_speed(0.5),
     "r": Live.toggle_recording,
     "[": lambda live: live.move_slider(-KEY_FRACTION),
     "]": lambda live: live.move_slider(KEY_FRACTION),

@@ -52,21 +52,21 @@ class LiveReport:
     """Simulated time, s."""
     wall_s: float
     """Wall-clock time without pauses, s."""
-    steps: int
+    n_steps: int
     """Number of control steps."""
-    late: int
+    n_late_steps: int
     """Number of control steps that began more than ``LATE_TOLERANCE`` late."""
     lateness_999: float
     """Lateness that 99.9% of the control steps did not exceed, s; 0 at ``speed="max"``."""
-    worst: float
+    max_lateness: float
     """Greatest lateness, s."""
-    worst_at: float
+    max_lateness_time: float
     """Simulated time at which it occurred, s."""
     lost_s: float
     """Time that was given up because the simulation could not catch up, s."""
-    pictures: int
+    n_pictures: int
     """Number of pictures sent to viewers."""
-    slowest: str
+    slowest_processes: str
     """Processes with the longest calls, the longest first; empty without processes."""
     failures: int
     """Number of errors that were logged without ending the run."""
@@ -79,17 +79,18 @@ class LiveReport:
     def __str__(self) -> str:
         """Return the report as text."""
         lines = [f"{self.simulated_s:.2f} s in {self.wall_s:.2f} s: {self.factor:.2f} times real time"]
-        if self.worst > 0:
+        if self.max_lateness > 0:
             lines.append(
-                f"control steps     {self.steps}, {self.late} more than {1e3 * LATE_TOLERANCE:g} ms late; 99.9% within "
-                f"{1e3 * self.lateness_999:.1f} ms, worst {1e3 * self.worst:.1f} ms at {self.worst_at:.2f} s"
+                f"control steps     {self.n_steps}, {self.n_late_steps} more than {1e3 * LATE_TOLERANCE:g} ms late; "
+                f"99.9% within {1e3 * self.lateness_999:.1f} ms, worst {1e3 * self.max_lateness:.1f} ms at "
+                f"{self.max_lateness_time:.2f} s"
             )
         if self.lost_s > 0:
             lines.append(f"real time missed  {self.lost_s:.2f} s were given up; use a lower speed or fewer pictures")
-        if self.pictures:
-            lines.append(f"pictures          {self.pictures}, {self.pictures / self.wall_s:.1f} per second")
-        if self.slowest:
-            lines.append(f"longest calls     {self.slowest}")
+        if self.n_pictures:
+            lines.append(f"pictures          {self.n_pictures}, {self.n_pictures / self.wall_s:.1f} per second")
+        if self.slowest_processes:
+            lines.append(f"longest calls     {self.slowest_processes}")
         if self.failures:
             lines.append(f"failures          {self.failures}, see the log")
         return "\n".join(lines)
@@ -98,15 +99,15 @@ class LiveReport:
 class Pace:
     """Due times of control steps, and statistics of their lateness in constant memory."""
 
-    steps: int
+    n_steps: int
     """Number of control steps so far."""
-    late: int
+    n_late_steps: int
     """Number of control steps that began more than ``LATE_TOLERANCE`` late."""
-    worst: float
+    max_lateness: float
     """Greatest lateness, s."""
-    worst_at: float
+    max_lateness_time: float
     """Simulated time at which it occurred, s."""
-    lost: float
+    lost_s: float
     """Time given up, s."""
 
     def __init__(self, dt: float, speed: Speed, clock: Callable[[], float] = perf_counter):
@@ -120,8 +121,8 @@ class Pace:
         self._dt, self._clock = dt, clock
         self._speed: Speed = check_speed(speed)
         self._counts = np.zeros(N_BINS, np.int64)
-        self.steps = self.late = 0
-        self.worst = self.worst_at = self.lost = 0.0
+        self.n_steps = self.n_late_steps = 0
+        self.max_lateness = self.max_lateness_time = self.lost_s = 0.0
         self._due = clock()
 
     @property
@@ -138,7 +139,7 @@ class Pace:
         """Make the next control step due now, after a pause or a jump in time."""
         self._due = self._clock()
 
-    def due_in(self) -> float:
+    def time_until_due(self) -> float:
         """Return the time until the next control step is due, s; zero or negative if it is due already."""
         return 0.0 if self._speed == "max" else self._due - self._clock()
 
@@ -148,16 +149,16 @@ class Pace:
         Args:
             time: Simulated time, s.
         """
-        self.steps += 1
+        self.n_steps += 1
         if self._speed == "max":
             return 0.0
         lateness = max(self._clock() - self._due, 0.0)
         self._counts[min(int(lateness / BIN_WIDTH), N_BINS - 1)] += 1
-        self.late += lateness > LATE_TOLERANCE
-        if lateness > self.worst:
-            self.worst, self.worst_at = lateness, time
+        self.n_late_steps += lateness > LATE_TOLERANCE
+        if lateness > self.max_lateness:
+            self.max_lateness, self.max_lateness_time = lateness, time
         if lateness > MAX_LAG:
-            self.lost += lateness
+            self.lost_s += lateness
             self.restart()
         self._due += self._dt / float(self._speed)
         return lateness
@@ -168,10 +169,10 @@ class Pace:
         if not total:
             return 0.0
         k = int(np.searchsorted(np.cumsum(self._counts), fraction * total))
-        return min((k + 1) * BIN_WIDTH, self.worst) if k < N_BINS - 1 else self.worst
+        return min((k + 1) * BIN_WIDTH, self.max_lateness) if k < N_BINS - 1 else self.max_lateness
 
     def report(
-        self, processes: Sequence[Process], simulated_s: float, wall_s: float, pictures: int, failures: int
+        self, processes: Sequence[Process], simulated_s: float, wall_s: float, n_pictures: int, failures: int
     ) -> LiveReport:
         """Return the figures of a run.
 
@@ -179,15 +180,18 @@ class Pace:
             processes: Processes of the loop.
             simulated_s: Simulated time, s.
             wall_s: Wall-clock time without pauses, s.
-            pictures: Number of pictures.
+            n_pictures: Number of pictures.
             failures: Number of logged errors of requests, viewers and recordings; errors of the processes are added.
         """
-        longest = sorted(processes, key=lambda process: -process.longest)[:N_LISTED]
-        slowest = ", ".join(f"{p.name} {1e3 * p.longest:.1f} ms at {p.longest_at:.2f} s" for p in longest)
+        slowest = sorted(processes, key=lambda process: -process.longest_call)[:N_LISTED]
+        slowest_processes = ", ".join(
+            f"{p.name} {1e3 * p.longest_call:.1f} ms at {p.longest_call_time:.2f} s" for p in slowest
+        )
         failures += sum(process.failures for process in processes)
         return LiveReport(
-            simulated_s, wall_s, self.steps, self.late, self.quantile(0.999), self.worst, self.worst_at, self.lost,
-            pictures, slowest, failures,
+            simulated_s, wall_s, self.n_steps, self.n_late_steps, self.quantile(0.999), self.max_lateness,
+            self.max_lateness_time, self.lost_s,
+            n_pictures, slowest_processes, failures,
         )  # fmt: skip
 
 

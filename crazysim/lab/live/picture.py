@@ -81,7 +81,7 @@ class PictureSource:
         self._contacts, self._wind = contacts, wind
         self._wind_fn = jax.jit(vmap_worlds(vmap_drones(_air_velocity)))
 
-    def take(self, live: Live, plot: str = "") -> Picture:
+    def take_picture(self, live: Live, plot: str = "") -> Picture:
         """Return a picture of the simulation as it is now.
 
         Args:

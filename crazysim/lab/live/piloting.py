@@ -18,8 +18,8 @@ Sticks = Callable[[Live], NDArray]
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"), ("a", "d"))
 """Pairs of keys: forward and back, left and right, up and down, turn left and turn right."""
 MAX_LEAD = 0.7
-"""Longest time by which the setpoint leads the drone at full speed, s. It keeps the setpoint close after a stick is
-released or while the drone is held back."""
+"""Longest time by which the setpoint leads the drone at full speed, s. The limit keeps the setpoint close when a stick
+is released or the drone is held back."""
 
 
 def keyboard_sticks(live: Live) -> NDArray:

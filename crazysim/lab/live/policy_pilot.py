@@ -27,7 +27,7 @@ from crazysim.storage import reading
 from crazysim.train.evaluation import act, initial_memory
 
 ARRIVAL_DISTANCE = 0.15
-"""Distance from a listed goal at which a drone gets the next one, m."""
+"""Distance from a listed goal at which a drone continues to the next one, m."""
 MIN_HEIGHT = 0.5
 """Least height of a clicked goal, m."""
 
@@ -38,14 +38,14 @@ class PolicyPilot:
         env = config.make_env(1)
         pilot = PolicyPilot(env, policy)
         live = Live(env.sim, env.base.freq)
-        pilot.join(live)
+        pilot.add_to(live)
 
-    The loop begins with the first episode of the environment, which does not end: a drone that crashes stays down until
-    the loop is reset. Policies of tasks without goals fly as well, but refuse goals.
+    The loop starts with the first episode of the environment. The episode does not end: a drone that crashes stays
+    down until the loop is reset. Policies of tasks without goals fly as well, but refuse goals.
     """
 
     def __init__(self, env: Env, policy: Callable[[Obs], Array], points: ArrayLike | None = None, seed: int = 0):
-        """Begin an episode in the simulation of the environment.
+        """Start an episode in the simulation of the environment.
 
         Args:
             env: Environment of the policy; its wrappers may only add images.
@@ -69,9 +69,9 @@ class PolicyPilot:
         shape = self._start.states.pos.shape
         self.goals = np.full(shape, np.nan)
         """Goals of the drones, world frame, m; NaN if the task has none. (n_worlds, n_drones, 3)"""
-        self.passed = np.zeros(shape[:2], int)
+        self.n_passed = np.zeros(shape[:2], int)
         """Number of listed points that each drone has passed. (n_worlds, n_drones)"""
-        self._follows = np.full(shape[:2], self._points is not None)
+        self._follows_points = np.full(shape[:2], self._points is not None)
         if type(env.task).set_goal is not Task.set_goal:
             self.goals[:] = self._target(self._start)
         if self._points is not None:
@@ -82,7 +82,7 @@ class PolicyPilot:
         env.sim.data = self._start
         self._command(self._start, self._memory)  # compiles it before the clock starts
 
-    def join(self, live: Live) -> None:
+    def add_to(self, live: Live) -> None:
         """Fly in a loop from now on; clicks set goals, and viewers mark them."""
         live.add(self, name="policy")
         live.on_click, live.goals = self.click, self.goals
@@ -94,7 +94,7 @@ class PolicyPilot:
         live.command[:], self._memory = self._command(live.sim.data, self._memory)
 
     def reset(self, live: Live) -> None:
-        """Begin the episode again after a reset, or take the goals of the time to which the loop went back.
+        """Restart the episode after a reset, or restore the goals after a jump back in time.
 
         The memory of the policy is reset in both cases.
         """
@@ -105,7 +105,7 @@ class PolicyPilot:
             self.goals[:] = self._target(live.sim.data)
         if self._points is not None:  # the goals of that time show how many points had been passed
             is_goal = np.isclose(self.goals[..., None, :], self._points, atol=1e-5).all(axis=-1)
-            self._follows[:], self.passed[:] = is_goal.any(axis=-1), is_goal.argmax(axis=-1)
+            self._follows_points[:], self.n_passed[:] = is_goal.any(axis=-1), is_goal.argmax(axis=-1)
 
     def go_to(self, live: Live, pos: ArrayLike) -> None:
         """Set the goal of the selected drone, which then no longer follows the listed points.
@@ -122,7 +122,7 @@ class PolicyPilot:
             raise ConfigError("expected a selected drone, got none. Click on one, or press tab.")
         pos = np.asarray(pos, float)
         self._check_goal(pos)
-        self._follows[live.selected] = False
+        self._follows_points[live.selected] = False
         self.goals[live.selected] = pos
         live.sim.data = self._set_goal(live.sim.data, self.goals)
 
@@ -133,9 +133,9 @@ class PolicyPilot:
             self.go_to(live, [x, y, max(self.goals[live.selected][2], MIN_HEIGHT)])
 
     def listen(self, live: Live, lines: Iterable[str]) -> threading.Thread:
-        """Set goals of the selected drone that are typed, such as ``0.5 0 1.2``, and return the thread that reads them.
+        """Read goals of the selected drone from lines, such as ``0.5 0 1.2``, in a thread, and return the thread.
 
-        Lines that are not goals are logged, and change nothing.
+        Lines that are not goals are logged and change nothing.
         """
 
         def read() -> None:
@@ -172,14 +172,14 @@ class PolicyPilot:
             raise ConfigError(f"{prefix}expected x y z, m,{arena_text}, got {' '.join(f'{x:g}' for x in pos.ravel())}")
 
     def _pass_points(self, live: Live) -> None:
-        """Give drones that are close to their listed goal the next one."""
+        """Set the next listed goal of drones that are close to their present one."""
         points: Any = self._points
         distance = np.linalg.norm(self.goals - np.asarray(live.sim.data.states.pos), axis=-1)
-        is_near = self._follows & (distance < ARRIVAL_DISTANCE) & (self.passed < len(points))
+        is_near = self._follows_points & (distance < ARRIVAL_DISTANCE) & (self.n_passed < len(points))
         if is_near.any():
-            self.passed += is_near
-            has_next = is_near & (self.passed < len(points))
-            self.goals[has_next] = points[self.passed[has_next]]
+            self.n_passed += is_near
+            has_next = is_near & (self.n_passed < len(points))
+            self.goals[has_next] = points[self.n_passed[has_next]]
             live.sim.data = self._set_goal(live.sim.data, self.goals)
 
 

@@ -45,7 +45,7 @@ class Process:
 
     name: str
     """Name in messages."""
-    call: Callable[[], object]
+    callback: Callable[[], object]
     """The function; it must return at once, as the loop waits for it."""
     reset: Callable[[], object]
     """Function that is called after a reset or a jump in time."""
@@ -53,9 +53,9 @@ class Process:
     """Control steps from one call to the next."""
     on_error: OnError = "raise"
     """``"raise"`` or ``"report"``."""
-    longest: float = 0.0
+    longest_call: float = 0.0
     """Duration of the longest call, s."""
-    longest_at: float = 0.0
+    longest_call_time: float = 0.0
     """Simulated time at which it began, s."""
     failures: int = 0
     """Number of errors that were reported."""
@@ -65,7 +65,7 @@ class Process:
         """Call the function and measure the duration; ``now`` is the simulated time, s."""
         start_time = time.perf_counter()
         try:
-            self.call()
+            self.callback()
         except Exception as error:
             if self.on_error == "raise":
                 raise
@@ -73,8 +73,8 @@ class Process:
             if self._may_warn():
                 log.warning("%s failed at %.3f s (%d in all): %s", self.name, now, self.failures, error)
         duration = time.perf_counter() - start_time
-        if duration > self.longest:
-            self.longest, self.longest_at = duration, now
+        if duration > self.longest_call:
+            self.longest_call, self.longest_call_time = duration, now
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Event:
 
     step: int
     """Control step before which it is called."""
-    call: Callable[[], object]
+    callback: Callable[[], object]
     """The function."""
     name: str
     """Name in messages."""

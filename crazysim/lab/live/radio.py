@@ -1,6 +1,6 @@
 """Real Crazyflies over ``cflib``, with the commands of the simulator.
 
-Nothing is sent without ``Radio(..., arm=True)``: otherwise the link opens no radio, and it checks commands but then
+Nothing is sent without ``Radio(..., arm=True)``. A link that is not armed opens no radio; it checks commands, and then
 refuses them.
 """
 
@@ -69,17 +69,17 @@ class Radio(Closeable):
             timeout: Longest time until the first state arrives, s.
 
         Raises:
-            ConfigError: If it is to be armed, and cflib is not installed or the drone does not answer.
+            ConfigError: If ``arm`` is True, and cflib is not installed or the drone does not answer.
         """
         self.name, self.armed, self.max_height = uri, bool(arm), max_height
         loaded_airframe = load_airframe(airframe)
         self._max_thrust = loaded_airframe.n_rotors * float(np.max(loaded_airframe.value("rotors.thrust_max")))
-        self._lock, self._arrived = threading.Lock(), threading.Event()
+        self._lock, self._state_arrived = threading.Lock(), threading.Event()
         self._values = {part: np.zeros(len(names)) for part, names in LOG_VARIABLES.items()}
         self._received_names: set[str] = set()
         self._stamp, self._mode = 0.0, None
         self._sync: Any = None
-        self._configs: list[Any] = []
+        self._log_configs: list[Any] = []
         if self.armed:
             self._connect(uri, period_ms, crazyflie, timeout)
         else:
@@ -109,8 +109,8 @@ class Radio(Closeable):
             config.data_received_cb.add_callback(self._receive_block)
             self._cf.log.add_config(config)
             config.start()
-            self._configs.append(config)
-        if not self._arrived.wait(timeout):
+            self._log_configs.append(config)
+        if not self._state_arrived.wait(timeout):
             self.close()
             raise ConfigError(f"expected log variables of {uri} within {timeout:g} s, got none. Use a newer firmware.")
         self._cf.supervisor.send_arming_request(True)
@@ -126,7 +126,7 @@ class Radio(Closeable):
             return DroneState(self._stamp, v["pos"], quat, v["vel"], v["ang_vel"], v["acc"])
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Send a command to one drone, as for ``sim.state_control``, ``attitude_control`` or ``body_rate_control``."""
+        """Send a command: the numbers that ``sim.state_control``, ``attitude_control``, ``body_rate_control`` take."""
         level = Control(level)
         sizes = {Control.state: 16, Control.attitude: 4, Control.body_rate: 4}
         if level not in sizes:
@@ -175,7 +175,7 @@ class Radio(Closeable):
         """Stop the motors and disconnect."""
         if self._sync is not None:
             self.stop()
-            for config in self._configs:
+            for config in self._log_configs:
                 config.stop()
             self._sync.close_link()
             self._sync = None
@@ -203,4 +203,4 @@ class Radio(Closeable):
                         self._values[part], self._stamp = x, stamp / 1000
                         self._received_names.add(part)
         if len(self._received_names) == len(LOG_VARIABLES):
-            self._arrived.set()
+            self._state_arrived.set()

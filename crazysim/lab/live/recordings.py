@@ -37,7 +37,7 @@ class Recordings:
         return self._recorder is not None
 
     def start(self, path: str | Path, period: int) -> Path:
-        """Finish the present recording, begin another with a first sample, and return its path.
+        """Finish the present recording, start another with its first sample, and return its path.
 
         Args:
             path: Path; numbered if it exists, so that no earlier recording is lost.
@@ -48,7 +48,7 @@ class Recordings:
         """
         self.close()
         self.last_path, unused_path = Path(path), free_path(Path(path))
-        self._recorder, self._period, self._steps = Recorder(self._sim, path=unused_path), period, 0
+        self._recorder, self._period, self._n_steps = Recorder(self._sim, path=unused_path), period, 0
         self.add()
         return unused_path
 
@@ -59,7 +59,7 @@ class Recordings:
         """
         if self._recorder is None:
             return
-        step, self._steps = self._steps, self._steps + 1
+        step, self._n_steps = self._n_steps, self._n_steps + 1
         if step % self._period:
             return
         try:

@@ -101,8 +101,8 @@ class RosBridge:
         for name in objects:
             if name not in names:
                 raise ConfigError(f"expected one of the movable objects {list(names)}, got {name!r}")
-        self._rows = {name: names.index(name) for name in objects}
-        self._period, self._due = 1 / freq, 0.0
+        self._object_rows = {name: names.index(name) for name in objects}
+        self._period, self._next_time = 1 / freq, 0.0
         self._clock = node.create_publisher(m.Clock, "/clock", QUEUE_LENGTH)
         kinds = {"pose": m.PoseStamped, "odom": m.Odometry, "imu": m.Imu}
         self._publishers = [
@@ -116,10 +116,10 @@ class RosBridge:
         self._thrust = np.zeros(len(swarm.names))
         for k, name in enumerate(swarm.names):
             for topic, kind, callback in (
-                ("cmd_vel", m.Twist, self._velocity),
-                ("cmd_pose", m.PoseStamped, self._pose),
+                ("cmd_vel", m.Twist, self._command_velocity),
+                ("cmd_pose", m.PoseStamped, self._command_pose),
                 ("cmd_thrust", m.Float64, self._set_thrust),
-                ("cmd_attitude", m.QuaternionStamped, self._attitude),
+                ("cmd_attitude", m.QuaternionStamped, self._command_attitude),
             ):
                 node.create_subscription(kind, f"/{name}/{topic}", self._guard_callback(k, callback), QUEUE_LENGTH)
 
@@ -131,9 +131,9 @@ class RosBridge:
     def update(self) -> None:
         """Publish clock and states, if they are due."""
         now = self.swarm.time
-        if now < self._due - 1e-9 and self._due - now <= self._period:
+        if now < self._next_time - 1e-9 and self._next_time - now <= self._period:
             return
-        self._due = now + self._period
+        self._next_time = now + self._period
         stamp = self._stamp(now)
         clock = self.messages.Clock()
         clock.clock = stamp
@@ -143,10 +143,10 @@ class RosBridge:
             publishers["pose"].publish(self._pose_message(stamp, state.pos, state.quat))
             publishers["odom"].publish(self._odometry(stamp, state, self.swarm.names[k]))
             publishers["imu"].publish(self._imu(stamp, state, self.swarm.names[k]))
-        if self._rows:
+        if self._object_rows:
             objects = self.swarm.sim.data.objects
             pos, quat = (np.asarray(x[0, 0], float) for x in (objects.pos, objects.quat))
-            for name, row in self._rows.items():
+            for name, row in self._object_rows.items():
                 self._object_publishers[name].publish(self._pose_message(stamp, pos[row], quat[row]))
 
     # Messages -------------------------------------------------------------------------------------------------------
@@ -160,25 +160,25 @@ class RosBridge:
     def _pose_message(self, stamp: Any, pos: NDArray, quat: NDArray) -> Any:
         message = self.messages.PoseStamped()
         message.header.stamp, message.header.frame_id = stamp, self.frame
-        _set(message.pose.position, pos)
-        _set(message.pose.orientation, quat)
+        _write_fields(message.pose.position, pos)
+        _write_fields(message.pose.orientation, quat)
         return message
 
     def _odometry(self, stamp: Any, state: DroneState, name: str) -> Any:
         message = self.messages.Odometry()
         message.header.stamp, message.header.frame_id, message.child_frame_id = stamp, self.frame, name
-        _set(message.pose.pose.position, state.pos)
-        _set(message.pose.pose.orientation, state.quat)
-        _set(message.twist.twist.linear, rotate(state.quat * (-1, -1, -1, 1), state.vel))
-        _set(message.twist.twist.angular, state.ang_vel)
+        _write_fields(message.pose.pose.position, state.pos)
+        _write_fields(message.pose.pose.orientation, state.quat)
+        _write_fields(message.twist.twist.linear, rotate(state.quat * (-1, -1, -1, 1), state.vel))
+        _write_fields(message.twist.twist.angular, state.ang_vel)
         return message
 
     def _imu(self, stamp: Any, state: DroneState, name: str) -> Any:
         message = self.messages.Imu()
         message.header.stamp, message.header.frame_id = stamp, name
-        _set(message.orientation, state.quat)
-        _set(message.angular_velocity, state.ang_vel)
-        _set(message.linear_acceleration, state.acc)
+        _write_fields(message.orientation, state.quat)
+        _write_fields(message.angular_velocity, state.ang_vel)
+        _write_fields(message.linear_acceleration, state.acc)
         return message
 
     # Commands -------------------------------------------------------------------------------------------------------
@@ -195,14 +195,14 @@ class RosBridge:
 
         return callback
 
-    def _velocity(self, drone: int, message: Any) -> None:
-        self.swarm.commanders[drone].velocity(_get(message.linear), float(message.angular.z))
+    def _command_velocity(self, drone: int, message: Any) -> None:
+        self.swarm.commanders[drone].velocity(_read_fields(message.linear), float(message.angular.z))
 
-    def _pose(self, drone: int, message: Any) -> None:
+    def _command_pose(self, drone: int, message: Any) -> None:
         if message.header.frame_id not in ("", self.frame):
             raise ConfigError(f"expected a pose in the frame {self.frame!r}, got {message.header.frame_id!r}")
-        quat = _get(message.pose.orientation, "xyzw")
-        self.swarm.commanders[drone].position(_get(message.pose.position), _unit_rpy(quat)[2])
+        quat = _read_fields(message.pose.orientation, "xyzw")
+        self.swarm.commanders[drone].position(_read_fields(message.pose.position), _unit_rpy(quat)[2])
 
     def _set_thrust(self, drone: int, message: Any) -> None:
         thrust = float(message.data)
@@ -210,24 +210,24 @@ class RosBridge:
             raise ConfigError(f"expected a collective thrust of 0 N or more, got {thrust}")
         self._thrust[drone] = thrust
 
-    def _attitude(self, drone: int, message: Any) -> None:
-        rpy = _unit_rpy(_get(message.quaternion, "xyzw"))
+    def _command_attitude(self, drone: int, message: Any) -> None:
+        rpy = _unit_rpy(_read_fields(message.quaternion, "xyzw"))
         self.swarm.commanders[drone].command(Control.attitude, [*rpy, self._thrust[drone]])
 
 
-def _set(part: Any, values: NDArray) -> None:
+def _write_fields(part: Any, values: NDArray) -> None:
     """Write numbers into the fields x, y, z and w of a part of a message."""
     for name, value in zip("xyzw", values.tolist(), strict=False):
         setattr(part, name, value)
 
 
-def _get(part: Any, names: str = "xyz") -> NDArray:
+def _read_fields(part: Any, names: str = "xyz") -> NDArray:
     """Return fields of a part of a message."""
     return np.array([getattr(part, name) for name in names], float)
 
 
 def _unit_rpy(quat: NDArray) -> NDArray:
-    """Return roll, pitch and yaw, rad, of a quaternion, xyzw, whose length is finite and above 1e-3."""
+    """Return roll, pitch and yaw, rad, of a quaternion, xyzw, after it is normalized. (3,)"""
     norm = float(np.linalg.norm(quat))
     if not 1e-3 < norm < math.inf:
         raise ConfigError(f"expected a unit quaternion, xyzw, got {quat.tolist()}")

@@ -20,7 +20,7 @@ DRONE = "drone"
 MARK_RADIUS = 0.12
 """Radius of the sphere that marks a drone, and smallest radius of the spheres that mark other bodies, m."""
 MAX_TRAILS = 256
-"""Largest number of bodies of a world up to which all have trails; with more bodies, only drones have them."""
+"""Largest number of bodies of a world for which all have trails; with more bodies, only drones have them."""
 
 
 class SceneBody(NamedTuple):
@@ -56,7 +56,7 @@ class SceneBodies:
             shapes: Visible geoms, for the sizes of the bodies.
         """
         names = _mocap_names(sim)
-        parts = {part: base for plugin in sim.plugins.values() for part, base in _parts(plugin.moved_kinds or ())}
+        parts = {part: base for plugin in sim.plugins.values() for part, base in _find_parts(plugin.moved_kinds or ())}
         counts = Counter(kind for kind, _ in names)
         members = {plugin.name: sim.plugins.members_of(plugin) for plugin in sim.plugins.values()}
         items = [SceneBody(DRONE, k, name, mocap) for k, (name, mocap) in enumerate(_drones(sim))]
@@ -67,17 +67,17 @@ class SceneBodies:
                 name = member_names[k] if k < len(member_names) else kind if counts[kind] == 1 else f"{kind} {k}"
                 items.append(SceneBody(kind, k, name, mocap))
         self.items = tuple(items)
-        places = {(body.kind, body.index): i for i, body in enumerate(items)}
-        of_mocap = {body.mocap: i for i, body in enumerate(items)}
-        self.owner = np.array([of_mocap.get(mocap, -1) for mocap in range(len(names))], int)
+        item_indices = {(body.kind, body.index): i for i, body in enumerate(items)}
+        index_of_mocap = {body.mocap: i for i, body in enumerate(items)}
+        self.owner = np.array([index_of_mocap.get(mocap, -1) for mocap in range(len(names))], int)
         for mocap in np.flatnonzero(self.owner < 0):
             kind, k = names[mocap]
             base = parts[kind]  # parts are in the order of their bodies, with the same number for each
-            self.owner[mocap] = places[base, k * counts[base] // counts[kind]]
-        self.low, self.high = _boxes(len(names), shapes)
+            self.owner[mocap] = item_indices[base, k * counts[base] // counts[kind]]
+        self.low, self.high = _bounding_boxes(len(names), shapes)
 
     @property
-    def tracked(self) -> NDArray:
+    def trail_mocap_ids(self) -> NDArray:
         """Mocap ids of the bodies that have trails, drones first. (n,)"""
         drones = [body.mocap for body in self.items if body.kind == DRONE]
         others = [body.mocap for body in self.items if body.kind != DRONE]
@@ -103,8 +103,8 @@ class SceneBodies:
         match = next((body for body in self.items if (body.kind, body.index) == (kind, index)), None)
         if match is None:
             counts = Counter(body.kind for body in self.items)
-            listed = ", ".join(f"{kind!r} (0 to {n - 1})" for kind, n in counts.items())
-            raise ConfigError(f"expected a body to follow, got {kind!r} {index!r}. Use one of {listed}.")
+            choices = ", ".join(f"{kind!r} (0 to {n - 1})" for kind, n in counts.items())
+            raise ConfigError(f"expected a body to follow, got {kind!r} {index!r}. Use one of {choices}.")
         return match
 
 
@@ -123,8 +123,8 @@ def _mocap_names(sim: Sim) -> list[tuple[str, int]]:
     return names
 
 
-def _parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the kinds of a plugin that are parts of another, as ``cars_wheel`` of ``cars``, each with the other."""
+def _find_parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
+    """Return pairs of kinds of a plugin, a part and the body that it belongs to, as ``cars_wheel`` and ``cars``."""
     parts = []
     for kind in kinds:
         bases = [base for base in kinds if kind.startswith(f"{base}_")]
@@ -132,7 +132,7 @@ def _parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
     return parts
 
 
-def _boxes(n: int, shapes: Sequence[VisualGeom]) -> tuple[NDArray, NDArray]:
+def _bounding_boxes(n: int, shapes: Sequence[VisualGeom]) -> tuple[NDArray, NDArray]:
     """Return the bounding boxes of mocap bodies in their frames, m; zero without geoms. (n, 3), (n, 3)"""
     low, high = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
     for shape in shapes:

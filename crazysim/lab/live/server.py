@@ -93,7 +93,7 @@ class CommandServer(CommandQueue):
         """
         super().__init__()
         self.drones, self.timeout = frozenset(drones), timeout
-        self._flown_drones: set[int] = set()
+        self._claimed_drones: set[int] = set()
         self._lock = threading.Lock()
         self._stop_event = threading.Event()
         self._listeners = []
@@ -141,13 +141,13 @@ class CommandServer(CommandQueue):
                     raise FramingError("expected commands after the request, got another request or a show")
         finally:
             with self._lock:
-                self._flown_drones.discard(drone)  # type: ignore[arg-type]
+                self._claimed_drones.discard(drone)  # type: ignore[arg-type]
 
     def _claim_drone(self, drone: int) -> bool:
         with self._lock:
-            if drone not in self.drones or drone in self._flown_drones:
+            if drone not in self.drones or drone in self._claimed_drones:
                 return False
-            self._flown_drones.add(drone)
+            self._claimed_drones.add(drone)
             return True
 
     def _serve_stream(self, peer: socket.socket, name: str) -> None:
@@ -173,8 +173,8 @@ class StreamListener(CommandQueue):
     """Client of a server's stream of commands, such as port 7002 of the lab's test server, in another thread.
 
     The simulation may be one of many receivers. Every valid command is answered by ``ACK``; others are logged. When
-    the server disconnects or sends bytes that are not a message, the listener stops and ``alive`` becomes False; the
-    fleet keeps flying.
+    the server disconnects or sends bytes that are not a message, the listener stops and ``is_connected`` becomes
+    False; the fleet keeps flying.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = STREAM_PORT, timeout: float = TIMEOUT):
@@ -196,7 +196,7 @@ class StreamListener(CommandQueue):
         self._thread.start()
 
     @property
-    def alive(self) -> bool:
+    def is_connected(self) -> bool:
         """True while the connection is open."""
         return self._thread.is_alive()
 
@@ -235,19 +235,19 @@ class _Listener(socketserver.ThreadingTCPServer):
     allow_reuse_address, daemon_threads, block_on_close = True, True, False
 
     def __init__(self, address: tuple[str, int], serve: Callable[[socket.socket, str], None]):
-        self._serve, self._n_peers = serve, threading.BoundedSemaphore(MAX_PEERS)
+        self._serve, self._free_connections = serve, threading.BoundedSemaphore(MAX_PEERS)
         super().__init__(address, socketserver.BaseRequestHandler)
 
     def finish_request(self, request: socket.socket, client_address: tuple[str, int]) -> None:
         name = f"{client_address[0]}:{client_address[1]}"
-        if not self._n_peers.acquire(blocking=False):
+        if not self._free_connections.acquire(blocking=False):
             log.warning("%s refused: %d clients are connected already", name, MAX_PEERS)
             return
         try:
             with _log_errors(name):
                 self._serve(request, name)
         finally:
-            self._n_peers.release()
+            self._free_connections.release()
 
 
 @contextlib.contextmanager
@@ -263,7 +263,7 @@ def _log_errors(name: str) -> Iterator[None]:
 
 
 def _read_messages(
-    peer: socket.socket, stopped: threading.Event, timeout: float
+    peer: socket.socket, stop_event: threading.Event, timeout: float
 ) -> Iterator[Message | Request | ShowFile]:
     """Yield the messages of a connection until it ends, or the server stops.
 
@@ -273,7 +273,7 @@ def _read_messages(
     """
     buffer, deadline = MessageBuffer(), None
     peer.settimeout(POLL_INTERVAL)
-    while not stopped.is_set():
+    while not stop_event.is_set():
         if deadline is not None and time.monotonic() > deadline:
             raise TimeoutError(f"expected a complete message within {timeout:g} s")
         try:
@@ -281,7 +281,7 @@ def _read_messages(
         except TimeoutError:
             continue
         if not received:
-            if buffer.pending:
+            if buffer.has_partial_message:
                 raise FramingError("expected a complete message, got the end of the connection")
             return
         for message in buffer.feed(received):
@@ -289,7 +289,7 @@ def _read_messages(
             peer.settimeout(timeout)  # for the answer
             yield message
             peer.settimeout(POLL_INTERVAL)
-        if not buffer.pending:
+        if not buffer.has_partial_message:
             deadline = None
         elif deadline is None:
             deadline = time.monotonic() + timeout

@@ -24,7 +24,7 @@ class Viewers(Generic[L]):
     """Number of pictures sent so far; one sent to several viewers counts once."""
     failures: int
     """Number of viewers that failed."""
-    next_at: float
+    next_picture_time: float
     """Time at which the next picture is due, s, by ``time.perf_counter``."""
 
     def __init__(self, fps: float, on_last_closed: Callable[[], object]):
@@ -36,7 +36,7 @@ class Viewers(Generic[L]):
         """
         self.period = 1.0 / fps
         self.n_pictures = self.failures = 0
-        self.next_at = 0.0
+        self.next_picture_time = 0.0
         self._open: list[Viewer[L]] = []
         self._on_last_closed = on_last_closed
 
@@ -63,7 +63,7 @@ class Viewers(Generic[L]):
         now = time.perf_counter()
         if not self._open or now < due:
             return False
-        self.next_at = max(self.next_at + self.period, now - self.period)
+        self.next_picture_time = max(self.next_picture_time + self.period, now - self.period)
         self.update(live)
         return True
 

@@ -113,7 +113,7 @@ class Window(Viewer[Live]):
         threading.Thread(target=self._write, args=(process,), daemon=True).start()
 
     def update(self, live: Live) -> None:
-        picture = self._source.take(live, self.plot)
+        picture = self._source.take_picture(live, self.plot)
         with self._picture_changed:
             self._next_picture = picture
             self._picture_changed.notify()

@@ -44,13 +44,13 @@ class Inbox:
     def __init__(self, stream: BinaryIO):
         self._stream = stream
         self.picture: Picture | None = None
-        self.ended = False
+        self.has_ended = False
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
         while (message := read_message(self._stream)) is not None:
             self.picture = message
-        self.ended = True
+        self.has_ended = True
 
 
 def read_message(stream: BinaryIO) -> Any:
@@ -75,7 +75,7 @@ class Leds:
         self._materials, self._drones = np.array(leds, int).reshape(-1, 2).T
         self._unlit_colors = model.mat_rgba[self._materials].copy(), model.mat_emission[self._materials].copy()
 
-    def color(self, colors: np.ndarray) -> None:
+    def set_colors(self, colors: np.ndarray) -> None:
         """Set the colours of the drones of one world, 0 to 1; zero for off. (n_drones, 3)"""
         drone_colors = colors[self._drones]
         brightest = drone_colors.max(-1, initial=0.0)
@@ -101,7 +101,7 @@ class Program:
         """
         self._model, self._data, self._bodies, self._settings = model, mujoco.MjData(model), bodies, settings
         self._out = out
-        self._tracked, self._leds = bodies.tracked, Leds(model)
+        self._trail_mocap_ids, self._leds = bodies.trail_mocap_ids, Leds(model)
         self._trail = Trail(settings["trail"]) if settings["trail"] > 0 else None
         self._overlays = Overlays(limit=100_000)
         self._camera = mujoco.MjvCamera()
@@ -116,22 +116,22 @@ class Program:
         self.window.on_key = lambda key, down: self._send("press" if down else "release", key)
         self._chart = Chart(settings["plot"])
         self.window.on_drawn = self._chart.draw
-        self._was_down, self._click = False, (-np.inf, (0.0, 0.0))
+        self._was_down, self._last_click = False, (-np.inf, (0.0, 0.0))
 
     def run(self, inbox: Inbox) -> None:
         """Draw until the input ends or the user closes the window."""
-        last_picture, drawn_at = None, -np.inf
+        last_picture, last_draw_time = None, -np.inf
         self._send("ready")
-        while self.window.is_open and not inbox.ended:
+        while self.window.is_open and not inbox.has_ended:
             picture, now = inbox.picture, time.perf_counter()
-            if picture is None or (picture is last_picture and now - drawn_at < REDRAW_TIME):
+            if picture is None or (picture is last_picture and now - last_draw_time < REDRAW_TIME):
                 time.sleep(IDLE_TIME)
                 continue
             if picture is not last_picture and self._trail is not None:
-                self._trail.add(np.full(len(picture.worlds), picture.time), picture.pos[:, self._tracked])
+                self._trail.add(np.full(len(picture.worlds), picture.time), picture.pos[:, self._trail_mocap_ids])
             if picture is not last_picture:
                 self._chart.add(picture)
-            last_picture, drawn_at = picture, now
+            last_picture, last_draw_time = picture, now
             self.draw(picture)
         self.window.close()
 
@@ -143,11 +143,13 @@ class Program:
             if np.isfinite(point).all():
                 self.window.look_at(point)
         n, settings = len(picture.worlds), self._settings
-        self.window.draw_tiles(n, lambda k: self._tile(picture, k), self._camera, settings["width"], settings["height"])
-        if self.window.is_open and self._double_clicked():
-            self._report(picture, self.window.pick(n, lambda k: self._tile(picture, k)))
+        self.window.draw_tiles(
+            n, lambda k: self._compose_tile(picture, k), self._camera, settings["width"], settings["height"]
+        )
+        if self.window.is_open and self._is_double_click():
+            self._report_click(picture, self.window.pick(n, lambda k: self._compose_tile(picture, k)))
 
-    def _tile(self, picture: Picture, k: int) -> tuple[mujoco.MjData, Overlays]:
+    def _compose_tile(self, picture: Picture, k: int) -> tuple[mujoco.MjData, Overlays]:
         """Return the state of the k-th world, and its overlays."""
         data, overlays, settings = self._data, self._overlays, self._settings
         data.mocap_pos[:], data.mocap_quat[:] = picture.pos[k], np.roll(picture.quat[k], 1, axis=-1)
@@ -166,7 +168,7 @@ class Program:
         for pos, air in zip(drones, picture.wind[k], strict=False):
             if air.any():
                 overlays.capsule(pos, pos + WIND_SCALE * air, 0.006, WIND_COLOR, cylinder=True)
-        self._leds.color(picture.lights[k])
+        self._leds.set_colors(picture.lights[k])
         lit = picture.lights[k].any(-1)
         if lit.any():
             overlays.points(drones[lit], np.insert(picture.lights[k, lit], 3, 0.6, axis=1), LIGHT_RADIUS, emission=1.0)
@@ -183,21 +185,21 @@ class Program:
             overlays.text(_ascii("\n".join(picture.widget_lines)), "bottom left")
         return data, overlays
 
-    def _double_clicked(self) -> bool:
+    def _is_double_click(self) -> bool:
         """Return True if the left button has just been pressed for the second time."""
         is_down, was_down = self.window.is_pressed("left"), self._was_down
         self._was_down = is_down
         if not is_down or was_down:
             return False
-        (last_time, last_cursor), cursor, now = self._click, self.window.cursor, time.perf_counter()
+        (last_time, last_cursor), cursor, now = self._last_click, self.window.cursor, time.perf_counter()
         is_double = (
             now - last_time < DOUBLE_CLICK_TIME
             and max(abs(a - b) for a, b in zip(last_cursor, cursor, strict=True)) < MAX_CLICK_MOVE
         )
-        self._click = (-np.inf if is_double else now, cursor)
+        self._last_click = (-np.inf if is_double else now, cursor)
         return is_double
 
-    def _report(self, picture: Picture, hit: tuple[int, int, np.ndarray] | None) -> None:
+    def _report_click(self, picture: Picture, hit: tuple[int, int, np.ndarray] | None) -> None:
         """Write which body, or which point, was clicked."""
         if hit is None:
             return

@@ -330,7 +330,7 @@ def test_a_picture_has_what_is_drawn():
     sim.scene.compile_if_edited()
     bodies = SceneBodies(sim)
     source = PictureSource(sim, bodies, [1, 2], contacts=True, wind=True)
-    picture = source.take(live, "states.pos")
+    picture = source.take_picture(live, "states.pos")
     np.testing.assert_allclose(picture.drone_pos[0, 0], [0.3, 0.2, 1.0], atol=1e-6)
     np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.core.drone_mocap_ids)], picture.drone_pos)
     np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.objects.mocap_ids)], [[[0, 0, 3]]] * 2)
@@ -338,17 +338,17 @@ def test_a_picture_has_what_is_drawn():
     np.testing.assert_allclose(picture.wind, np.broadcast_to([1, 2, 0], (2, 2, 3)))
     np.testing.assert_array_equal(picture.has_contact, [[False, True], [False, False]])  # one stands on the floor
     np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)
-    np.testing.assert_allclose(source.take(live, "double").plot, [2.0])
+    np.testing.assert_allclose(source.take_picture(live, "double").plot, [2.0])
     assert "0.00 s" in picture.status
     assert picture.followed_name == sim.drone_names[0]
     np.testing.assert_allclose(picture.lights[0], [[1.0, 0.5, 0.0], [0.0, 0.0, 0.0]])
     live.follow(2, "ball", 0)
-    picture = source.take(live, "states.pos")
+    picture = source.take_picture(live, "states.pos")
     assert (picture.followed, picture.followed_name) == ((2, bodies.find("ball", 0).mocap), "ball")
     assert picture.selected == (1, 0)
     np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)  # of the selected drone
     live.select(1, 0)
-    assert source.take(live).followed == (1, bodies.find("drone", 0).mocap)
+    assert source.take_picture(live).followed == (1, bodies.find("drone", 0).mocap)
     assert {"states.pos", "states.rotor_vel", "controls.state.cmd", "core.steps"} <= set(quantities(sim))
     np.testing.assert_allclose(quantity(sim.data, "states.pos", 2, 1)[2], 5.0)
     with pytest.raises(KeyError):

@@ -38,7 +38,7 @@ EXPECTED = [expected for _, expected in STREAM]
 def test_every_message(message, expected):
     buffer = MessageBuffer()
     assert list(buffer.feed(message)) == [expected]
-    assert not buffer.pending or message.endswith(b"\n")
+    assert not buffer.has_partial_message or message.endswith(b"\n")
 
 
 def test_joined_and_byte_by_byte():

@@ -38,7 +38,7 @@ def test_the_loop_drives_twins_and_swarms_and_waits_for_no_source():
     with Live(sim, control_freq=100) as live:
         for part in [*twins, swarm]:
             live.add(part, on_error="report")
-        live.at(0.2, lambda _: swarm["cf1"].take_off(0.5, 1.0))
+        live.call_at(0.2, lambda _: swarm["cf1"].take_off(0.5, 1.0))
         report = live.run(seconds=2.0)  # a wait for the silent source would not end
     assert swarm.state("cf1").pos[2] == pytest.approx(0.5, abs=0.15)
     assert swarm.state("cf2").pos[2] < 0.01
@@ -89,7 +89,7 @@ def test_everything_that_a_source_does_wrong_is_reported_by_name_and_time(caplog
         live.add(twins, on_error="report")
         live.add(lambda _: xs.append(twins.pose("a")[0][0]))
         report = live.run(seconds=2.0)
-    assert report.steps == 200
+    assert report.n_steps == 200
     assert report.failures == 0
     found = [(r.kind, r.name, round(r.time, 2)) for r in twins.reports.latest if r.kind not in ("dropped", "late")]
     assert found == [

@@ -23,13 +23,13 @@ def clock():
 def test_steps_are_due_at_their_times_whatever_the_work_takes(clock):
     pace = Pace(0.01, 0.5, clock)
     for k in range(5):
-        np.testing.assert_allclose(10.0 + 0.02 * k - clock.now, pace.due_in(), atol=1e-12)
-        clock.now += max(pace.due_in(), 0.0)
+        np.testing.assert_allclose(10.0 + 0.02 * k - clock.now, pace.time_until_due(), atol=1e-12)
+        clock.now += max(pace.time_until_due(), 0.0)
         pace.record_step(0.01 * k)
         clock.now += 0.013
-    assert pace.steps == 5
-    assert pace.late == 0
-    assert pace.worst < 1e-9
+    assert pace.n_steps == 5
+    assert pace.n_late_steps == 0
+    assert pace.max_lateness < 1e-9
 
 
 def test_a_late_step_is_counted_and_caught_up(clock):
@@ -37,11 +37,11 @@ def test_a_late_step_is_counted_and_caught_up(clock):
     pace.record_step(0.0)
     clock.now += 0.025
     np.testing.assert_allclose(pace.record_step(0.01), 0.015)
-    assert pace.due_in() < 0, "the next one is due at once"
+    assert pace.time_until_due() < 0, "the next one is due at once"
     np.testing.assert_allclose(pace.record_step(0.02), 0.005)
-    assert pace.due_in() > 0
-    assert (pace.late, pace.lost) == (2, 0.0)
-    np.testing.assert_allclose((pace.worst, pace.worst_at), (0.015, 0.01))
+    assert pace.time_until_due() > 0
+    assert (pace.n_late_steps, pace.lost_s) == (2, 0.0)
+    np.testing.assert_allclose((pace.max_lateness, pace.max_lateness_time), (0.015, 0.01))
 
 
 def test_a_long_lag_is_given_up(clock):
@@ -49,8 +49,8 @@ def test_a_long_lag_is_given_up(clock):
     pace.record_step(0.0)
     clock.now += 1.01
     pace.record_step(0.01)
-    np.testing.assert_allclose(pace.lost, 1.0)
-    np.testing.assert_allclose(pace.due_in(), 0.01)
+    np.testing.assert_allclose(pace.lost_s, 1.0)
+    np.testing.assert_allclose(pace.time_until_due(), 0.01)
     assert MAX_LAG < 1.0
 
 
@@ -67,10 +67,10 @@ def test_quantiles_of_lateness(clock):
 def test_as_fast_as_possible_nothing_is_late(clock):
     pace = Pace(0.01, "max", clock)
     for k in range(10):
-        assert pace.due_in() == 0
+        assert pace.time_until_due() == 0
         clock.now += 1.0
         pace.record_step(k)
-    assert (pace.late, pace.worst, pace.quantile(0.999)) == (0, 0.0, 0.0)
+    assert (pace.n_late_steps, pace.max_lateness, pace.quantile(0.999)) == (0, 0.0, 0.0)
 
 
 def test_a_change_of_speed_begins_now(clock):
@@ -78,9 +78,9 @@ def test_a_change_of_speed_begins_now(clock):
     pace.record_step(0.0)
     clock.now += 0.004
     pace.speed = 0.1
-    assert pace.due_in() == 0
+    assert pace.time_until_due() == 0
     pace.record_step(0.01)
-    np.testing.assert_allclose(pace.due_in(), 0.1)
+    np.testing.assert_allclose(pace.time_until_due(), 0.1)
 
 
 @pytest.mark.parametrize("speed", [0, -1, float("nan"), float("inf"), "fast", True])

@@ -30,7 +30,7 @@ def flying(env):
     """Return a loop with a pilot that flies from the start."""
     pilot = PolicyPilot(env, steer)
     with Live(env.sim, env.freq, speed="max") as live:
-        pilot.join(live)
+        pilot.add_to(live)
         yield live, pilot
 
 
@@ -66,7 +66,7 @@ def test_typed_lines_set_the_goal_and_wrong_ones_change_nothing(flying, caplog):
     assert "expected x y z, m, got 'home'" in refused[0]
     assert "within the arena of 'hover', x and y from -3 to 3 m, z from 0.02 to 3 m, got 4 0 1" in refused[2]
     source = PictureSource(live.sim, SceneBodies(live.sim), [0, 1], contacts=False, wind=False)
-    np.testing.assert_array_equal(source.take(live).setpoint, pilot.goals)
+    np.testing.assert_array_equal(source.take_picture(live).setpoint, pilot.goals)
     live.selected = None
     pilot.listen(live, ["0 0 1"]).join()
     live.run(0.1)
@@ -91,18 +91,18 @@ def test_a_click_sets_the_goal_of_the_selected_drone_at_its_height(flying):
 def test_listed_points_are_passed_in_order(env):
     pilot = PolicyPilot(env, steer, POINTS)
     with Live(env.sim, env.freq, speed="max") as live:
-        pilot.join(live)
+        pilot.add_to(live)
         np.testing.assert_array_equal(pilot.goals[:, 0], [POINTS[0]] * 2)
         live.run(6.0)
-        assert pilot.passed.tolist() == [[2], [2]]
+        assert pilot.n_passed.tolist() == [[2], [2]]
         np.testing.assert_array_equal(pilot.goals[:, 0], [POINTS[1]] * 2)
         assert np.linalg.norm(positions(live) - POINTS[1], axis=-1).max() < ARRIVAL_DISTANCE
         live.go_to(0.1)
-        assert pilot.passed.tolist() == [[0], [0]]
+        assert pilot.n_passed.tolist() == [[0], [0]]
         live.go_to(6.0)
-        assert pilot.passed.tolist() == [[2], [2]]
+        assert pilot.n_passed.tolist() == [[2], [2]]
         live.reset()
-        assert pilot.passed.tolist() == [[0], [0]]
+        assert pilot.n_passed.tolist() == [[0], [0]]
         np.testing.assert_array_equal(pilot.goals[:, 0], [POINTS[0]] * 2)
 
 

@@ -54,8 +54,8 @@ def test_sizes_and_marks(bodies):
     assert bodies.radius(gate) == pytest.approx(np.sqrt(0.01 + 0.04 + 0.09))
     assert bodies.radius(drone) == MARK_RADIUS
     assert bodies.radius(bodies.find("load", 0).mocap) >= MARK_RADIUS
-    assert len(bodies.tracked) == len(bodies.items)
-    assert bodies.tracked[:2].tolist() == [bodies.items[0].mocap, bodies.items[1].mocap]
+    assert len(bodies.trail_mocap_ids) == len(bodies.items)
+    assert bodies.trail_mocap_ids[:2].tolist() == [bodies.items[0].mocap, bodies.items[1].mocap]
 
 
 def test_what_is_followed(sim):

@@ -243,7 +243,7 @@ def test_listener_at_the_servers_stream(caplog):
     with lab_server(b"07_CMDSTART_take", b"off_0.5_EOF00_CMDST", b"ART_show_EOF") as (port, answers):
         listener = StreamListener(port=port)
         assert arrived(listener, 2) == [TakeOff(7, 0.5), StartShow()]
-        assert listener.alive
+        assert listener.is_connected
         listener.close()
     assert bytes(answers) == b"ACKACK"
 
@@ -251,7 +251,7 @@ def test_listener_at_the_servers_stream(caplog):
 def test_listener_stops_at_garbage_and_at_the_end(caplog):
     for message, reason in ((b"garbage", "refused"), (b"07_CMDSTART_la", "end of the connection")):
         with lab_server(message, leaves=True) as (port, _), StreamListener(port=port) as listener:
-            wait_for(lambda: not listener.alive)
+            wait_for(lambda: not listener.is_connected)
             assert listener.commands() == []
         assert reason in caplog.text
     with pytest.raises(ConfigError, match="got none"):

@@ -49,7 +49,7 @@ def test_a_move_begins_and_ends_as_it_must():
 
 
 def test_a_reversed_slow_plan():
-    path = HostTrajectory.of(line([0, 0, 1], [2, 0, 1], 4.0))
+    path = HostTrajectory.from_trajectory(line([0, 0, 1], [2, 0, 1], 4.0))
     plan = PlannedMotion(path, 1.0, timescale=2.0, reversed=True)
     np.testing.assert_allclose(plan.at(1.0)[0, :3], [2, 0, 1], atol=1e-6)
     np.testing.assert_allclose(plan.at(5.0)[0, :3], [1, 0, 1], atol=1e-6)
@@ -188,7 +188,7 @@ def test_groups():
 
 
 def test_trajectories_start_where_they_must():
-    path = HostTrajectory.of(line([0, 0, 1], [2, 0, 1], 4.0))
+    path = HostTrajectory.from_trajectory(line([0, 0, 1], [2, 0, 1], 4.0))
     commander = flying(upload=(3, path), take_off=(1.0, 1.0))
     tick(commander, 12.0)
     commander.start_trajectory(3)
@@ -306,7 +306,7 @@ calls = st.one_of(
 @settings(max_examples=200, deadline=None)
 @given(sequence=st.lists(st.tuples(st.floats(0.01, 3.0), calls), max_size=8))
 def test_setpoints_stay_finite_whatever_is_commanded(sequence):
-    commander = flying(upload=(1, HostTrajectory.of(circle(radius=0.5, period=2.0))))
+    commander = flying(upload=(1, HostTrajectory.from_trajectory(circle(radius=0.5, period=2.0))))
     now = 10.0
     for dt, (name, arguments) in sequence:
         with contextlib.suppress(ConfigError):

@@ -254,7 +254,7 @@ def test_a_live_show_has_lights():
     seen = {}
     with live_show(SHOW, speed="max") as live:
         for at in (0.5, 1.5):
-            live.at(at, lambda live: seen.update({live.step: live.lights[0].copy()}))
+            live.call_at(at, lambda live: seen.update({live.step: live.lights[0].copy()}))
         live.run(SHOW.duration)
         expected = SHOW.lights.colors([0.5, 1.5])
         np.testing.assert_allclose([seen[50], seen[150]], expected, atol=1e-6)

@@ -119,7 +119,7 @@ class SoftwareInTheLoop(Closeable):
         self._heard = [start_time] * len(self.links)
         pace = Pace(dt, speed)
         for k in range(round(seconds / dt)):
-            if (due := pace.due_in()) > 0:
+            if (due := pace.time_until_due()) > 0:
                 time.sleep(due)
             pace.record_step(k * dt)
             self.exchange()
