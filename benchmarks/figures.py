@@ -433,6 +433,9 @@ FIGURES: dict[str, Figure] = {
     "depth-small": Figure(
         PAGE, (*ENGINE, *SCENE), gpu="depth.py --worlds 4096 --size 16 12 --poles 30", table=tables.depths
     ),
+    "sight": Figure(
+        PAGE, (*ENVS, *SCENE, "crazysim/plugins", "crazysim/train/convolution.py"), gpu="sight.py", table=tables.sight
+    ),
     "range-finder": Figure(
         PAGE,
         (*STEP, *SCENE, "crazysim/plugins/sensors"),

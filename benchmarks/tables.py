@@ -158,6 +158,16 @@ depths = columns(
     Rays_per_second=lambda x: si_text(x["rays_per_s"]),
     First_image=lambda x: duration_text(x["first_s"]),
 )
+sight = columns(
+    Case=lambda x: {
+        "policy": "`forest` with its convolution, environment steps a second",
+        "lidar": "a lidar at 10 Hz, times real time of one world",
+    }[x["case"]],
+    Image=lambda x: f"{x['image'][0]} x {x['image'][1]}, {x['n_worlds']:,} worlds",
+    Rate=lambda x: si_text(x["env_steps_per_s"] if x["case"] == "policy" else x["realtime"]),
+    Rays_per_second=lambda x: si_text(x["rays_per_s"]),
+    First_call=lambda x: duration_text(x["first_s"]),
+)
 range_finders = columns(
     Poles=poles_of,
     Worlds=worlds_of,
