@@ -31,12 +31,16 @@ class PackCache:
         cached_arrays, packed = self._cached
         if packed is None or not _are_same(arrays, cached_arrays):
             with jax.ensure_compile_time_eval():  # inside a user's trace too: a cached value must be an array
-                packed = _pack_arrays(arrays) if packed is None and _on_one_cpu(arrays) else _compiled(arrays)
+                packed = (
+                    _pack_arrays(arrays)
+                    if packed is None and _are_on_one_cpu(arrays)
+                    else _compiled_concatenate(arrays)
+                )
             self._cached = _without_numpy(arrays), packed
         return packed
 
 
-def _on_one_cpu(arrays: list[Any]) -> bool:
+def _are_on_one_cpu(arrays: list[Any]) -> bool:
     """Return True if all arrays are on the same device, and it is a CPU."""
     devices = {device for x in arrays if isinstance(x, jax.Array) for device in x.devices()}
     return len(devices) <= 1 and all(device.platform == "cpu" for device in devices)
@@ -44,21 +48,21 @@ def _on_one_cpu(arrays: list[Any]) -> bool:
 
 def _pack_arrays(arrays: list[Any]) -> Array:
     """Concatenate arrays of one device to an array on it, which is committed if one of them is."""
-    committed = next((x.sharding for x in arrays if isinstance(x, jax.Array) and x.committed), None)
-    return jax.device_put(np.concatenate([np.ravel(x) for x in arrays]), committed)
+    committed_sharding = next((x.sharding for x in arrays if isinstance(x, jax.Array) and x.committed), None)
+    return jax.device_put(np.concatenate([np.ravel(x) for x in arrays]), committed_sharding)
 
 
 def _concatenate(arrays: list[Any]) -> Array:
     return jnp.concatenate([x.ravel() for x in arrays])
 
 
-_compiled = jax.jit(_concatenate)
+_compiled_concatenate = jax.jit(_concatenate)
 
 
 class ZerosCache:
-    """Elements of shared parameters that are zero: an inertia without products, a force without a component.
+    """Elements of shared parameters that are zero, such as the products of an inertia.
 
-    These are parameters of drones and controllers, and parameters of plugins that are declared sparse.
+    Only parameters of drones and controllers, and parameters of plugins that are declared sparse, are examined.
 
     Values are read once for each array. Under a trace they are unknown, and no element counts as zero.
     """
@@ -75,10 +79,10 @@ class ZerosCache:
             return zeros
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return ()
-        by_leaf = [
+        zeros_by_leaf = [
             (i, frozenset(np.flatnonzero(np.asarray(x) == 0).tolist())) for i, x in zip(indices, arrays, strict=True)
         ]
-        zeros = tuple([(i, zeros_of_leaf) for i, zeros_of_leaf in by_leaf if zeros_of_leaf])
+        zeros = tuple([(i, indices_of_zeros) for i, indices_of_zeros in zeros_by_leaf if indices_of_zeros])
         self._cached = _without_numpy(arrays), zeros
         return zeros
 

@@ -102,40 +102,40 @@ class _Layout:
         rounded = [
             -(-math.prod(shape) * dtype.itemsize // ALIGNMENT_BYTES) * ALIGNMENT_BYTES for _, shape, dtype in results
         ]
-        self.shared = sum(rounded) <= MAX_SHARED_BYTES
+        self.shares_memory = sum(rounded) <= MAX_SHARED_BYTES
         for (_, shape, dtype), size in zip(results, rounded, strict=True):
-            if self.shared and self.sizes:
+            if self.shares_memory and self.sizes:
                 self.offsets.append(_Offset(0, self.sizes[0], shape, dtype))
                 self.sizes[0] += size
             else:
                 self.offsets.append(_Offset(len(self.sizes), 0, shape, dtype))
                 self.sizes.append(size)
-        self.by_key = dict(zip((key for key, _, _ in results), self.offsets, strict=True))
-        self.begins = [(x.piece, x.offset) for x in self.offsets]
+        self.offset_by_key = dict(zip((key for key, _, _ in results), self.offsets, strict=True))
+        self.offset_by_result = [(x.piece, x.offset) for x in self.offsets]
 
 
 class CallResults:
     """Arrays that one call wrote."""
 
-    __slots__ = ("_layout", "_memory", "_starts", "addresses")
+    __slots__ = ("_layout", "_memory", "_paddings", "addresses")
 
     def __init__(self, layout: _Layout):
         self._layout = layout
         self._memory = [np.empty(size + ALIGNMENT_BYTES, np.uint8) for size in layout.sizes]
         addresses = [_address(x) for x in self._memory]
-        self._starts = [-begin % ALIGNMENT_BYTES for begin in addresses]
-        aligned_addresses = [begin + start for begin, start in zip(addresses, self._starts, strict=True)]
-        self.addresses = [aligned_addresses[piece] + offset for piece, offset in layout.begins]
+        self._paddings = [-address % ALIGNMENT_BYTES for address in addresses]
+        aligned_addresses = [address + padding for address, padding in zip(addresses, self._paddings, strict=True)]
+        self.addresses = [aligned_addresses[piece] + offset for piece, offset in layout.offset_by_result]
 
     def array(self, key: Any) -> NDArray:
         """Return the array of a key; a copy if several share memory, so that keeping it keeps no other array alive."""
-        piece, offset, shape, dtype = self._layout.by_key[key]
-        x = np.ndarray(shape, dtype, self._memory[piece], self._starts[piece] + offset)
-        return x.copy() if self._layout.shared else x
+        piece, offset, shape, dtype = self._layout.offset_by_key[key]
+        x = np.ndarray(shape, dtype, self._memory[piece], self._paddings[piece] + offset)
+        return x.copy() if self._layout.shares_memory else x
 
 
 class _Launch(NamedTuple):
-    """Call of a kernel, prepared."""
+    """Prepared call of a kernel."""
 
     kernel: Any
     """The kernel, from ``HostLaunch.on_memory``."""
@@ -145,7 +145,7 @@ class _Launch(NamedTuple):
     """Leaves that it reads."""
     outputs: slice
     """Its results among the results of all kernels."""
-    packed: struct.Struct
+    address_format: struct.Struct
     """Format in which the addresses of inputs and outputs are packed."""
 
 
@@ -175,17 +175,19 @@ class HostCall:
                 results.append((key, leaves[i].shape, np.dtype(leaves[i].dtype)))
             results.append((("flags", k), (n_worlds, n_drones), np.dtype(bool)))
             outputs = slice(first_result, len(results))
-            form = struct.Struct(f"{len(kernel.inputs) + len(results) - first_result}P")
+            address_format = struct.Struct(f"{len(kernel.inputs) + len(results) - first_result}P")
             self._launches.append(
-                _Launch(kernel.get_launch("cpu").on_memory(), n_worlds * n_drones, kernel.inputs, outputs, form)
+                _Launch(
+                    kernel.get_launch("cpu").on_memory(), n_worlds * n_drones, kernel.inputs, outputs, address_format
+                )
             )
-        self._flags = [key for key, _, _ in results if isinstance(key, tuple) and key[0] == "flags"]
-        if self._flags == [("flags", 0)] and results[-1][1][1] == 1:  # the flags are the leaf
+        self._flag_keys = [key for key, _, _ in results if isinstance(key, tuple) and key[0] == "flags"]
+        if self._flag_keys == [("flags", 0)] and results[-1][1][1] == 1:  # the flags are the leaf
             results[-1] = (nonfinite, *results[-1][1:])
-            self._flags = []
+            self._flag_keys = []
         self._layout = _Layout(results)
         written_pairs = [(i, k) for k, (i, _, _) in enumerate(results) if isinstance(i, int)]
-        self._written_leaves, self._positions = [i for i, _ in written_pairs], [k for _, k in written_pairs]
+        self._written_leaves, self._result_positions = [i for i, _ in written_pairs], [k for _, k in written_pairs]
         self._read_leaves = sorted({i for launch in self._launches for i in launch.inputs})
 
     def make_host_leaves(self, leaves: Sequence[Any], sharding: Any) -> HostLeaves:
@@ -214,15 +216,17 @@ class HostCall:
         """Return the leaves some steps later."""
         self.was_called = True
         results, addresses = CallResults(self._layout), leaves.addresses
-        for kernel, n_lanes, inputs, outputs, packed in self._launches:
-            pointers = packed.pack(*[addresses[i] for i in inputs], *results.addresses[outputs])
-            if not kernel(n_lanes, n_steps, pointers, len(inputs)):
+        for kernel, n_lanes, inputs, outputs, address_format in self._launches:
+            packed_addresses = address_format.pack(*[addresses[i] for i in inputs], *results.addresses[outputs])
+            if not kernel(n_lanes, n_steps, packed_addresses, len(inputs)):
                 raise MemoryError("there is no memory for a step")
-        result_addresses = [results.addresses[k] for k in self._positions]
+        result_addresses = [results.addresses[k] for k in self._result_positions]
         leaves_after = leaves.replace_items(self._written_leaves, [results] * len(result_addresses), result_addresses)
-        if not self._flags:
+        if not self._flag_keys:
             return leaves_after
-        flagged = functools.reduce(np.logical_or, (results.array(k).any(axis=1, keepdims=True) for k in self._flags))
+        flagged = functools.reduce(
+            np.logical_or, (results.array(k).any(axis=1, keepdims=True) for k in self._flag_keys)
+        )
         return leaves_after.replace([self._nonfinite], [flagged])
 
 

@@ -125,7 +125,7 @@ def write_map(block: Block, target: str) -> Kernel:
     inputs, outputs = ([type_name(x.dtype) for x in values_of_kind] for values_of_kind in (tables, block.outputs))
     pointers = [f"const {ctype}* __restrict__ p{k}" for k, ctype in enumerate(inputs)]
     pointers += [f"{ctype}* __restrict__ q{k}" for k, ctype in enumerate(outputs)]
-    values = writer.block(block, ["LANE", *(f"p{k}" for k in range(len(tables)))], 2)
+    values = writer.write_block(block, ["LANE", *(f"p{k}" for k in range(len(tables)))], 2)
     for k, (ctype, x) in enumerate(zip(outputs, values, strict=True)):
         write_results(writer, f"q{k}", ctype, 1, [x], 2)
     input_indices, output_indices = tuple(range(len(inputs))), tuple(range(len(outputs)))

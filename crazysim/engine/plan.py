@@ -34,7 +34,7 @@ from crazysim.engine.errors import LimitError, UnsupportedError, report_unsuppor
 from crazysim.engine.host_call import HostCall, is_possible
 from crazysim.engine.ir.program import Leaf, Program, Zeros
 from crazysim.engine.lowering.groups import Group, independent_groups
-from crazysim.engine.lowering.relative import on_data_leaves
+from crazysim.engine.lowering.relative import adapt_to_data_leaves
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.lowering.tracing import Tracer
 from crazysim.engine.optimise import optimise
@@ -237,16 +237,16 @@ class Planner(NamedTuple):
     ) -> Plan:
         indices, inputs = leaf_indices(data), tuple(sorted(read_leaves))
         # If a stage writes the flags itself, no check is added.
-        checks = (
+        has_check = (
             any(p.check_segment is not None for p in programs)
             if programs
             else indices.core.nonfinite not in written_leaves
         )
-        flags = (indices.core.nonfinite,) if checks else ()
+        flags = (indices.core.nonfinite,) if has_check else ()
         written_leaves = (*written_leaves, *flags)
-        main = programs[0] if programs else None
-        packed = main.packed if main is not None else ()
-        rows = tuple(packed_rows(main)) if main is not None else ()
+        drone_program = programs[0] if programs else None
+        packed = drone_program.packed if drone_program is not None else ()
+        rows = tuple(packed_rows(drone_program)) if drone_program is not None else ()
 
         def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
             leaves = replace_leaves([None] * n_leaves, inputs, values)
@@ -254,14 +254,14 @@ class Planner(NamedTuple):
             return [*outputs, flagged] if flags else list(outputs)
 
         if programs and self.location.mesh is not None:
-            advance = self._over_mesh(advance, data, programs[0].leaves, inputs, written_leaves)
+            advance = self._shard_over_mesh(advance, data, programs[0].leaves, inputs, written_leaves)
         plan = Plan(
             engine, reason, programs, self.location, inputs, packed, rows, written_leaves, indices, *_jit_step(advance)
         )
         in_numpy = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
-        return dataclasses.replace(plan, numpy_step=_results_on_device(advance)) if in_numpy else plan
+        return dataclasses.replace(plan, numpy_step=_put_results_on_device(advance)) if in_numpy else plan
 
-    def _over_mesh(
+    def _shard_over_mesh(
         self,
         advance: Callable[..., Any],
         data: SimData,
@@ -272,19 +272,19 @@ class Planner(NamedTuple):
         """Return a step in which every device advances its own worlds."""
         over_worlds, shared = PartitionSpec(self.location.axis), PartitionSpec()
         specs = [over_worlds if n_batch_axes(scope) == 2 else shared for scope in jax.tree.leaves(scopes(data))]
-        added = program_leaves[len(specs) :]  # the packed array, and rows, in which worlds are the last axis
-        specs += [PartitionSpec(None, self.location.axis) if leaf.row_leaves else shared for leaf in added]
+        added_leaves = program_leaves[len(specs) :]  # the packed array, and rows, in which worlds are the last axis
+        specs += [PartitionSpec(None, self.location.axis) if leaf.row_leaves else shared for leaf in added_leaves]
 
         def sharded_step(values: list[Any], n_steps: int | Array) -> list[Any]:
             count = [] if isinstance(n_steps, int) else [n_steps]
-            local = jax.shard_map(
+            local_step = jax.shard_map(
                 lambda values, *count: advance(values, *(count or [n_steps])),
                 mesh=self.location.mesh,
                 in_specs=([specs[i] for i in inputs], *[shared for _ in count]),
                 out_specs=[specs[i] for i in outputs],
                 check_vma=False,
             )
-            return local(values, *count)
+            return local_step(values, *count)
 
         return sharded_step
 
@@ -329,12 +329,12 @@ def _jit_step(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
 
-def _results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
+def _put_results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
     """Return a step in NumPy that puts its results on the device of its arguments."""
 
     def step(values: list[Any], n_steps: int | Array) -> list[Any]:
-        committed = next((x for x in values if getattr(x, "committed", False)), None)
-        device = None if committed is None else next(iter(committed.devices()))
+        committed_array = next((x for x in values if getattr(x, "committed", False)), None)
+        device = None if committed_array is None else next(iter(committed_array.devices()))
         return jax.device_put(advance(values, n_steps), device)
 
     return step
@@ -344,7 +344,7 @@ def _join_runs(
     groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Run]
 ) -> tuple[Run, tuple[int, ...]]:
     """Return a function that runs all of the independent programs, and the indices of the leaves that it writes."""
-    runs = [on_data_leaves(program, run) for program, run in zip(programs, runs, strict=True)]
+    runs = [adapt_to_data_leaves(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:
         return runs[0], tuple(programs[0].written_leaves)
     owned = [group.owned for group in groups]

@@ -13,7 +13,7 @@ from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Axes, Stage
 from crazysim.engine.backends import fused
-from crazysim.engine.lowering.relative import on_data_leaves
+from crazysim.engine.lowering.relative import adapt_to_data_leaves
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
 from crazysim.pytree import PyTree, leaf, replace_leaves
@@ -52,21 +52,21 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         template = axes.treedef.unflatten(axes.unbatched_shapes(leaves, scope))
         outs, treedef = jax.tree.flatten(jax.eval_shape(fn, template))
         names = [f"{number} {k}" for k in range(len(outs))]
-        per_drone = [x.shape[1:] if scope == "world" else x.shape for x in outs]
-        for name, x, shape in zip(names, outs, per_drone, strict=True):
+        drone_shapes = [x.shape[1:] if scope == "world" else x.shape for x in outs]
+        for name, x, shape in zip(names, outs, drone_shapes, strict=True):
             rows[name] = jnp.zeros((n_worlds, n_drones, *shape), x.dtype).reshape(n_worlds, n_drones, -1)
-        shapes.append(dict(zip(names, per_drone, strict=True)))
+        shapes.append(dict(zip(names, drone_shapes, strict=True)))
         trees.append(treedef)
-        stages.append(Stage(_writing(fn, names, scope), scope, name=f"query {number}", phase="after"))
-    prepared = data.replace(plugins={RECORD_NAME: QueryResults(rows)})
-    prepared_leaves, treedef = jax.tree.flatten(prepared)
-    program = optimise(lower_stages(stages, prepared))
+        stages.append(Stage(_make_writer(fn, names, scope), scope, name=f"query {number}", phase="after"))
+    extended_data = data.replace(plugins={RECORD_NAME: QueryResults(rows)})
+    extended_leaves, treedef = jax.tree.flatten(extended_data)
+    program = optimise(lower_stages(stages, extended_data))
     if program.unfused_stages:
         raise program.unfused_stages[0].error
-    packed = [jnp.concatenate([prepared_leaves[i].ravel() for i in program.packed])] if program.packed else []
-    written, _ = on_data_leaves(program, fused.build(program, Location(platform)))([*prepared_leaves, *packed], 0)
+    packed = [jnp.concatenate([extended_leaves[i].ravel() for i in program.packed])] if program.packed else []
+    written, _ = adapt_to_data_leaves(program, fused.build(program, Location(platform)))([*extended_leaves, *packed], 0)
     results = (
-        treedef.unflatten(replace_leaves(prepared_leaves, program.written_leaves, written)).plugins[RECORD_NAME].rows
+        treedef.unflatten(replace_leaves(extended_leaves, program.written_leaves, written)).plugins[RECORD_NAME].rows
     )
     return [
         tree.unflatten([results[name].reshape(n_worlds, n_drones, *shape) for name, shape in query_shapes.items()])
@@ -74,7 +74,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     ]
 
 
-def _writing(fn: Callable[[SimData], Any], names: list[str], scope: str) -> Callable[[SimData], SimData]:
+def _make_writer(fn: Callable[[SimData], Any], names: list[str], scope: str) -> Callable[[SimData], SimData]:
     """Return the stage that writes the results of a function to the data."""
 
     def write(data: SimData) -> SimData:

@@ -106,13 +106,13 @@ def run(
     zeros = step.zeros(data)
     if not progress:
         return compiled_rollout(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)
-    piece = max(n_control_steps // every // 100, 1) * every
-    pieces, remainder = divmod(n_control_steps, piece)
-    chunks = []
+    steps_per_piece = max(n_control_steps // every // 100, 1) * every
+    n_pieces, remainder = divmod(n_control_steps, steps_per_piece)
+    records_by_piece = []
     with progress_bar(unit="control steps", required=True, total=n_control_steps) as bar:
-        for n in [piece] * pieces + [remainder] * (remainder > 0):
+        for n in [steps_per_piece] * n_pieces + [remainder] * (remainder > 0):
             data, records = compiled_rollout(step, data, policy, params, n, every=every, zeros=zeros, **settings)
             jax.block_until_ready(records)
-            chunks.append(records)
+            records_by_piece.append(records)
             bar.update(n)
-    return data, jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
+    return data, jax.tree.map(lambda *parts: jnp.concatenate(parts), *records_by_piece)

@@ -20,7 +20,7 @@ from crazysim.engine.plan import Plan
 from crazysim.engine.step import FlatData, Step
 from crazysim.errors import ConfigError
 
-ANNOUNCED_AFTER = 5.0
+ANNOUNCEMENT_DELAY = 5.0
 """Time after which the compilation of a step is announced, s: most take less, filters with many states take more."""
 
 
@@ -34,7 +34,7 @@ class Stepper:
     """The compiled step, from ``build``."""
 
     def __init__(self, device: jax.Device, mesh: Mesh | None, engine: str, strict: bool):
-        """Create a stepper without data and step, which ``assign`` and ``build`` set.
+        """Create a stepper that has neither data nor a step; ``assign`` and ``build`` set them.
 
         Args:
             device: Device of the data.
@@ -45,11 +45,11 @@ class Stepper:
         self.device, self.mesh, self.engine, self.strict = device, mesh, engine, strict
         self._data: SimData | FlatData | None = None
         self._shapes: tuple[Plan, SimData] | None = None
-        self._counts: dict[int, Array] = {}
-        self._unsynced: object = None
-        self._most_steps: int | None = None
-        self._counted_steps: tuple[object, int] = (None, 0)
-        self._compiled: Step | None = None
+        self._step_counts: dict[int, Array] = {}
+        self._unsynced_flag: object = None
+        self._max_step_count: int | None = None
+        self._last_count: tuple[object, int] = (None, 0)
+        self._compiled_step: Step | None = None
 
     @property
     def data(self) -> SimData:
@@ -64,7 +64,7 @@ class Stepper:
 
     @property
     def data_or_shapes(self) -> SimData:
-        """The data as a record, or its shapes, types and devices if the data is flattened."""
+        """The data as a record, or a record of its shapes, types and devices if the data is flattened."""
         flat = self._data
         if not isinstance(flat, FlatData):
             return self.data
@@ -75,7 +75,7 @@ class Stepper:
             self._shapes = flat.plan, jax.tree.map(_without_values, data)
         return self._shapes[1]
 
-    def stage(self, command: Any, feedforward: Any = None) -> None:
+    def stage_command(self, command: Any, feedforward: Any = None) -> None:
         """Stage a command that was checked with ``data_or_shapes``; flattened data stays flattened.
 
         Args:
@@ -99,20 +99,20 @@ class Stepper:
         """
         data = self._data
         flag = data.leaves[data.plan.synced] if isinstance(data, FlatData) else self.data.core.mjx_synced
-        return flag is not self._unsynced
+        return flag is not self._unsynced_flag
 
     def assign(self, data: SimData) -> None:
         """Replace the data by data of the caller: put it on the device, and clear ``core.mjx_synced``."""
         if self._data is None or data.core.steps is not self.data.core.steps:
-            self._most_steps = None
-        if data.core.mjx_synced is not self._unsynced:
+            self._max_step_count = None
+        if data.core.mjx_synced is not self._unsynced_flag:
             # A new array: a user may donate data that was read from here, which must not share arrays with other data.
             data = data.replace(core=data.core.replace(mjx_synced=np.False_))
         self.accept(self.put_on_device(data))
 
     def accept(self, data: SimData) -> None:
         """Replace the data by data on the device with ``core.mjx_synced`` false, as compiled calls return it."""
-        self.data, self._unsynced = data, data.core.mjx_synced
+        self.data, self._unsynced_flag = data, data.core.mjx_synced
 
     def put_on_device(self, data: SimData) -> SimData:
         """Return the data with every leaf on the device, or distributed over the mesh.
@@ -130,17 +130,17 @@ class Stepper:
 
     def advance(self, n_steps: int) -> None:
         """Advance the data; any number of steps uses the same compilation."""
-        self.count(n_steps)
-        compiles, self._compiled = self._compiled is not self.step, self.step
-        with announce_if_slow("compiling the step", "5 to 40 s", ANNOUNCED_AFTER) if compiles else nullcontext():
+        self.count_steps(n_steps)
+        compiles, self._compiled_step = self._compiled_step is not self.step, self.step
+        with announce_if_slow("compiling the step", "5 to 40 s", ANNOUNCEMENT_DELAY) if compiles else nullcontext():
             flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
             if flat.plan.host_call is None:
                 flat_after = self.step.advance(flat, self._as_array(n_steps))
             else:
                 flat_after = self.step.advance_on_host(flat, n_steps)
-        self._data, self._unsynced = flat_after, flat_after.leaves[flat.plan.synced]
+        self._data, self._unsynced_flag = flat_after, flat_after.leaves[flat.plan.synced]
 
-    def count(self, n_steps: int, times: int = 1) -> None:
+    def count_steps(self, n_steps: int, times: int = 1) -> None:
         """Count steps that are about to be taken.
 
         Args:
@@ -151,25 +151,25 @@ class Stepper:
             ConfigError: If a world would have taken more than ``MAX_STEPS`` since its last reset.
         """
         n_steps *= times
-        if self._most_steps is None or self._most_steps + n_steps > MAX_STEPS:
+        if self._max_step_count is None or self._max_step_count + n_steps > MAX_STEPS:
             steps = self.data.core.steps
-            if self._counted_steps[0] is not steps:  # the same data may be assigned repeatedly
-                self._counted_steps = steps, int(np.asarray(steps).max())  # waits for the device, so not in every call
-            self._most_steps = self._counted_steps[1]
-        if self._most_steps + n_steps > MAX_STEPS:
+            if self._last_count[0] is not steps:  # the same data may be assigned repeatedly
+                self._last_count = steps, int(np.asarray(steps).max())  # waits for the device, so not in every call
+            self._max_step_count = self._last_count[1]
+        if self._max_step_count + n_steps > MAX_STEPS:
             freq = self.data.core.freq
             raise ConfigError(
                 f"expected at most {MAX_STEPS} steps between two resets, {MAX_STEPS / freq / 86400:.1f} days at {freq} "
-                f"Hz, got {n_steps} after {self._most_steps}. Use sim.reset(), or a lower freq."
+                f"Hz, got {n_steps} after {self._max_step_count}. Use sim.reset(), or a lower freq."
             )
-        self._most_steps += n_steps
+        self._max_step_count += n_steps
 
     def _as_array(self, n_steps: int) -> Array:
         """Return a number of steps as an array; arrays are cached, because making one takes longer than a step."""
-        if n_steps not in self._counts:
+        if n_steps not in self._step_counts:
             with jax.default_device(self.device):
-                self._counts[n_steps] = jnp.int32(n_steps)
-        return self._counts[n_steps]
+                self._step_counts[n_steps] = jnp.int32(n_steps)
+        return self._step_counts[n_steps]
 
 
 def _without_values(x: Any) -> jax.ShapeDtypeStruct:

@@ -246,7 +246,7 @@ class Sim:
         Raises:
             UnknownNameError: If there is none of that name.
         """
-        return find_member(self, self.plugins, name, self._stepper.stage)  # type: ignore[arg-type]  # as in __init__
+        return find_member(self, self.plugins, name, self._stepper.stage_command)  # type: ignore[arg-type]  # as in __init__
 
     # Data -------------------------------------------------------------------------------------------------------------
 
@@ -387,7 +387,7 @@ class Sim:
     ) -> None:
         """Stage a full-state setpoint: (n_worlds, n_drones, 16), or ``pos`` and other parts, which broadcast."""
         data = self._stepper.data_or_shapes
-        self._stepper.stage(
+        self._stepper.stage_command(
             *F.check_setpoint(data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward)
         )
 
@@ -412,7 +412,7 @@ class Sim:
         self._stage(Control.rotor_vel, controls, check_finite)
 
     def _stage(self, control: Control, command: ArrayLike, check_finite: bool) -> None:
-        self._stepper.stage(F.check_command(self._stepper.data_or_shapes, control, command, check_finite))
+        self._stepper.stage_command(F.check_command(self._stepper.data_or_shapes, control, command, check_finite))
 
     # Pipelines --------------------------------------------------------------------------------------------------------
 
@@ -500,7 +500,7 @@ class Sim:
             The results of ``keep``, with time in front. (n_control_steps // every, ...)
         """
         n_substeps = self.freq // self.control_freq
-        self._stepper.count(n_substeps, positive_integer("n_control_steps", n_control_steps))
+        self._stepper.count_steps(n_substeps, positive_integer("n_control_steps", n_control_steps))
         data, records = run_rollout(
             self.step_fn, self.data, policy, params, n_control_steps, check_flag("progress", progress), every,
             n_substeps=n_substeps, keep=keep,

@@ -194,6 +194,6 @@ def test_a_reduction_in_a_loop_is_not_fused():
 
     sim = Sim(n_worlds=2, n_drones=3)
     insert_fn_before(sim.step_pipeline, "integration", looped)
-    with pytest.warns(match="stands in a loop"):
+    with pytest.warns(match="is in a loop"):
         (unfused,) = Step(sim.step_pipeline, "lanes").plan(sim.data).program.unfused_stages
     assert isinstance(unfused, UnfusedStage)

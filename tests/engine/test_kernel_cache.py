@@ -23,7 +23,7 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files aw
 def cache(tmp_path, monkeypatch):
     """JAX's compilation cache, and no folder that was refused or swept before."""
     monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path))
-    kernel_cache._refuse.cache_clear()
+    kernel_cache._warn_once.cache_clear()
     kernel_cache._sweep_once.cache_clear()
     return tmp_path
 
@@ -137,7 +137,7 @@ def kept(tmp_path):
 def test_remains_of_killed_processes_are_removed(tmp_path, kept):
     here, other, gone = kernel_cache.process_name(), "0" * 8, finished_process()
     machine = here.split("-")[0]
-    day = 1.01 * kernel_cache.ABANDONED_AFTER
+    day = 1.01 * kernel_cache.ABANDONMENT_AGE
     remains = [
         kept(f"key.{machine}-{gone}-140.tmp"),
         kept(f"crazysim-{machine}-{gone}-abc"),
@@ -163,7 +163,7 @@ def test_no_process_is_asked_for_on_windows(monkeypatch):
     with monkeypatch.context() as faked:
         faked.setattr(kernel_cache.os, "kill", None)
         faked.setattr(kernel_cache.os, "name", "nt")
-        found = [kernel_cache._is_abandoned(name, age * kernel_cache.ABANDONED_AFTER) for age in (0.9, 1.1)]
+        found = [kernel_cache._is_abandoned(name, age * kernel_cache.ABANDONMENT_AGE) for age in (0.9, 1.1)]
     assert found == [False, True]
 
 

@@ -57,7 +57,7 @@ def again(source):
     """Return the kernel's name in a process that has loaded nothing yet."""
     native._LIBRARIES.clear()
     native.toolchain.cache_clear()
-    return native.target(source)
+    return native.register_kernel(source)
 
 
 def fake_compiler(folder, monkeypatch, version="1.0", march="znver3"):
@@ -72,7 +72,7 @@ def fake_compiler(folder, monkeypatch, version="1.0", march="znver3"):
 
 
 def test_a_kernel_is_compiled_once_for_all_processes(source, place, compilations):
-    name = native.target(source)
+    name = native.register_kernel(source)
     assert again(source) == name
     assert compilations() == 1
     (library,) = place.iterdir()
@@ -149,7 +149,7 @@ def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
 @pytest.mark.parametrize("damage", [lambda raw: raw[: len(raw) // 2], lambda raw: b"", lambda raw: raw[:-8] + b"x" * 8])
 def test_a_damaged_file_is_compiled_again(source, place, compilations, damage):
     """Loading half of a library can end the process, so it is found out before."""
-    native.target(source)
+    native.register_kernel(source)
     (library,) = place.iterdir()
     raw = library.read_bytes()
     library.unlink()  # it is loaded: its memory must stay as it is
@@ -161,7 +161,7 @@ def test_a_damaged_file_is_compiled_again(source, place, compilations, damage):
 
 def test_a_library_that_does_not_load_here_is_compiled_again(source, place, compilations):
     """Such as one that another machine wrote, which stays for it."""
-    key = native.target(source).removeprefix("crazysim_advance_")
+    key = native.register_kernel(source).removeprefix("crazysim_advance_")
     (library,) = place.iterdir()
     library.unlink()
     foreign = kernel_cache.store(place, key, b"\x7fELF of another machine", ".so")
@@ -175,7 +175,7 @@ def test_a_library_that_does_not_load_here_is_compiled_again(source, place, comp
 def test_a_folder_that_forbids_execution_does_no_harm(source, place, compilations, monkeypatch):
     real = native._load_library
     monkeypatch.setattr(native, "_load_library", lambda path: None if path.is_relative_to(place) else real(path))
-    native.target(source)
+    native.register_kernel(source)
     assert compilations() == 1
 
 
@@ -185,7 +185,7 @@ def test_a_kernel_that_cannot_be_written_says_so(source, place, compilations, mo
 
     monkeypatch.setattr(kernel_cache, "store", full)
     with pytest.raises(KernelError, match=r"cannot be written: .*No space left on device; make room, or set TMPDIR"):
-        native.target(source)
+        native.register_kernel(source)
 
 
 def test_a_file_of_the_key_without_a_kernel_is_not_used(place, monkeypatch):
@@ -207,7 +207,7 @@ def test_nothing_partial_is_ever_seen(source, place, monkeypatch, tmp_path_facto
         return real(self, target)
 
     monkeypatch.setattr(Path, "replace", replace)
-    native.target(source)
+    native.register_kernel(source)
     assert listed == [[".tmp"]]
     assert [p.suffix for p in place.iterdir()] == [".so"]
 
@@ -270,7 +270,7 @@ def test_a_kernel_that_would_take_longer_than_the_limit_is_refused_by_its_size(
     native.toolchain(tuple(native.compiler_command()))
     monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "0.001")
     with pytest.raises(KernelError, match=r"a kernel of [\d,]+ lines takes .* longer than 0.001 s; use loops"):
-        native.target(source)
+        native.register_kernel(source)
     assert not list(place.iterdir())
     assert compilations() == 0
 
@@ -282,7 +282,7 @@ def test_lines_that_select_count_for_more(place, monkeypatch):
         raise LookupError
 
     monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "1")
-    monkeypatch.setattr(native, "_run", begin)
+    monkeypatch.setattr(native, "_run_compiler", begin)
     for line, n_lines, error in (
         ("x = mul_(a, b);", 9_999, LookupError),
         ("x = max_(a, b);", 4_000, LookupError),
@@ -298,7 +298,7 @@ def test_a_compiler_is_a_command_with_options(source, place, monkeypatch):
     monkeypatch.setenv("CXX", "g++ -DOTHER")
     try:
         assert native.compiler_command()[1] == "-DOTHER"
-        assert native.target(source)
+        assert native.register_kernel(source)
     finally:
         native.compiler.cache_clear()
 
@@ -313,7 +313,7 @@ def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, place
     native.compiler.cache_clear()
     try:
         assert Path(native.compiler_command()[0]).name.startswith("zig")
-        name = native.target(source)
+        name = native.register_kernel(source)
         monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
         assert again(source) == name
         assert len(list(place.iterdir())) == 1

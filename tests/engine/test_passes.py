@@ -226,9 +226,9 @@ BROKEN = {
         "type that the engine",
     ),
     "too few inputs": (broken(reads=()), "1 further inputs for 0 hoisted"),
-    "too many outputs": (broken(writes=(Y, Z)), "1 outputs for 2 places"),
-    "place read twice": (broken(reads=(X, X)), "1 inputs for 2 places"),
-    "place out of range": (broken(writes=((1, 1),)), "output 1 of y, which has 1 numbers"),
+    "too many outputs": (broken(writes=(Y, Z)), "1 outputs for 2 slots"),
+    "slot read twice": (broken(reads=(X, X)), "1 inputs for 2 slots"),
+    "slot out of range": (broken(writes=((1, 1),)), "output 1 of y, which has 1 numbers"),
     "hoisted number changes": (
         broken(writes=(X,), hoisted_reads=(X,), hoisted=WELL_FORMED.block),
         "further inputs for 1 hoisted",

@@ -27,7 +27,7 @@ from crazysim import jaxcompat
 from crazysim.engine.backends import ffi_handlers, kernel_cache
 from crazysim.engine.backends.exchange import WARP_THREADS
 from crazysim.engine.backends.ffi_handlers import check_driver
-from crazysim.engine.backends.frame import ANY_NUMBER_OF_BLOCKS, Kernel, steps_per_interval
+from crazysim.engine.backends.frame import MIN_BLOCKS_PLACEHOLDER, Kernel, steps_per_interval
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
@@ -65,9 +65,9 @@ class Resources:
 
     registers: int
     """Number of registers."""
-    spilled: int
+    spilled_bytes: int
     """Local memory, bytes: variables that did not fit into registers."""
-    code: int
+    code_bytes: int
     """Size of the compiled kernel, bytes."""
 
 
@@ -163,13 +163,17 @@ def fit_registers(kernel: Kernel, device: jax.Device) -> Kernel:
 
     More blocks hide more latency, but leave fewer registers to each thread. Spilled variables soon cost more time.
     """
-    numbers = dict.fromkeys(n // kernel.threads for n in THREADS_TO_TRY if n > kernel.threads)
-    candidates = [kernel, *(kernel.with_blocks(n) for n in numbers)]
+    block_counts = dict.fromkeys(n // kernel.threads for n in THREADS_TO_TRY if n > kernel.threads)
+    candidates = [kernel, *(kernel.with_blocks(n) for n in block_counts)]
     with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
         original, *others = pool.map(lambda c: resources(c, device), candidates)
     # Measured on an H200: docs/concepts/engine.md. Gradients are slower with 168 registers and 248 bytes than with 255.
     spill_margin = 16 if original.registers <= 224 or kernel.state_bytes else 256
-    suitable = (c for c, r in zip(candidates[1:], others, strict=True) if r.spilled <= original.spilled + spill_margin)
+    suitable = (
+        c
+        for c, r in zip(candidates[1:], others, strict=True)
+        if r.spilled_bytes <= original.spilled_bytes + spill_margin
+    )
     return next(suitable, kernel)
 
 
@@ -178,10 +182,10 @@ def widen_blocks(kernel: Kernel, device: jax.Device) -> Kernel:
 
     Kernels of gradients, of large worlds, and with few registers for each thread stay as they are.
     """
-    keeps_size = kernel.state_bytes or kernel.group_size > WARP_THREADS or ANY_NUMBER_OF_BLOCKS not in kernel.text
+    keeps_size = kernel.state_bytes or kernel.group_size > WARP_THREADS or MIN_BLOCKS_PLACEHOLDER not in kernel.text
     return (
         kernel
-        if keeps_size or resources(kernel, device).code <= INSTRUCTION_CACHE_BYTES
+        if keeps_size or resources(kernel, device).code_bytes <= INSTRUCTION_CACHE_BYTES
         else kernel.with_threads(LARGE_KERNEL_THREADS)
     )
 
@@ -219,8 +223,8 @@ def resources(kernel: Kernel, device: jax.Device) -> Resources:
     finally:
         driver.cuCtxPopCurrent_v2(ctypes.byref(context))
         driver.cuDevicePrimaryCtxRelease(handle)
-    registers, spilled = values
-    return Resources(registers, spilled, code=len(image))
+    registers, spilled_bytes = values
+    return Resources(registers, spilled_bytes, code_bytes=len(image))
 
 
 @functools.cache
@@ -262,14 +266,14 @@ def compile_source(source: str, arch: str, kind: str) -> bytes:
     for path in kernel_cache.find(cache_folder, key):
         with contextlib.suppress(OSError):  # another process has removed it
             return path.read_bytes()
-    image = _run(library, source, arch, kind)
+    image = _compile_with_nvrtc(library, source, arch, kind)
     if cache_folder != kernel_cache.temporary_folder():
         with contextlib.suppress(OSError):  # its disk is full
             kernel_cache.store(cache_folder, key, image, f".{kind.lower()}")
     return image
 
 
-def _run(library: ctypes.CDLL, source: str, arch: str, kind: str) -> bytes:
+def _compile_with_nvrtc(library: ctypes.CDLL, source: str, arch: str, kind: str) -> bytes:
     """Compile a source by NVRTC, and return the image."""
     program = ctypes.c_void_p()
     library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"advance.cu", 0, None, None)

@@ -31,15 +31,15 @@ Leaves = dict[int, Any]
 class DerivativeKernels:
     """Kernels of the derivatives of one program, each compiled when it is first used."""
 
-    def __init__(self, program: Program, location: Location, on_lanes: Run):
+    def __init__(self, program: Program, location: Location, run_on_lanes: Run):
         """Prepare the kernels, without compiling any.
 
         Args:
             program: The program.
             location: Devices that it is planned for.
-            on_lanes: The program on lanes, for derivatives without a kernel.
+            run_on_lanes: The program on lanes, for derivatives without a kernel.
         """
-        self.program, self.location, self.on_lanes = program, location, on_lanes
+        self.program, self.location, self.run_on_lanes = program, location, run_on_lanes
         self.descriptions: dict[str, None] = {}
         """Ways in which derivatives were computed so far, for ``explain``."""
         self.floats = tuple(i for i in program.written_leaves if program.leaves[i].number_type.kind == "f")
@@ -100,7 +100,7 @@ class DerivativeKernels:
         return None if launch is None else (self._programs[key], launch)
 
 
-def _inputs(values: Sequence[Any], leaves: Sequence[int]) -> list[Array]:
+def _kernel_inputs(values: Sequence[Any], leaves: Sequence[int]) -> list[Array]:
     """Return the leaves that a kernel reads; random keys as their 32-bit integers."""
     arrays = [values[i] for i in leaves]
     return [jax.random.key_data(x) if jaxcompat.is_key(x) else x for x in arrays]
@@ -113,8 +113,8 @@ def _launch_tangents(
     values: Sequence[Any],
     tangents: Leaves,
     n_steps: int,
-    size: int,
-    results: Sequence[jax.ShapeDtypeStruct],
+    n_batches: int,
+    result_shapes: Sequence[jax.ShapeDtypeStruct],
 ) -> list[Array]:
     n = len(kernels.program.leaves)
     n_worlds, n_drones = lanes.batch_counts(kernels.program, list(values))
@@ -123,17 +123,17 @@ def _launch_tangents(
         """Return the tangent of a leaf, repeated for each world if all drones share the leaf."""
         if kernels.is_own(i):
             return x
-        return jnp.broadcast_to(x[:, None, None], (size, n_worlds // size, 1, *x.shape[1:])).reshape(
+        return jnp.broadcast_to(x[:, None, None], (n_batches, n_worlds // n_batches, 1, *x.shape[1:])).reshape(
             n_worlds, 1, *x.shape[1:]
         )
 
     leaves = [*values, *(broadcast_tangent(i, tangents[i]) if i in tangents else None for i in range(n))]
-    inputs = _inputs(leaves, kernel.needed_leaves(program))
+    inputs = _kernel_inputs(leaves, kernel.needed_leaves(program))
     outputs = [lanes.leaf_shape(program, i, n_worlds) for i in program.written_leaves]
-    results_of_kernel = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
-    by_leaf = dict(zip(program.written_leaves, results_of_kernel, strict=True))
-    return [by_leaf[n + i] if n + i in by_leaf else jnp.zeros(x.shape, x.dtype)
-            for i, x in zip(kernels.floats, results, strict=True)]  # fmt: skip
+    results = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
+    result_by_leaf = dict(zip(program.written_leaves, results, strict=True))
+    return [result_by_leaf[n + i] if n + i in result_by_leaf else jnp.zeros(x.shape, x.dtype)
+            for i, x in zip(kernels.floats, result_shapes, strict=True)]  # fmt: skip
 
 
 def _launch_cotangents(
@@ -143,24 +143,24 @@ def _launch_cotangents(
     values: Sequence[Any],
     cotangents: Leaves,
     n_steps: int,
-    size: int,
+    n_batches: int,
 ) -> Leaves:
     program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, list(values))
 
-    def seed(i: int) -> Array:
+    def pad_seed(i: int) -> Array:
         x = cotangents[i].reshape(n_worlds, -1, program.leaves[i].size)
         return x if x.shape[1] == n_drones else jnp.pad(x, ((0, 0), (0, n_drones - 1), (0, 0)))
 
-    inputs = [*_inputs(values, reverse.needed_leaves(cotangent_program)), *map(seed, kernels.floats)]
+    inputs = [*_kernel_inputs(values, reverse.needed_leaves(cotangent_program)), *map(pad_seed, kernels.floats)]
     leaves = [program.leaves[i] for i in cotangent_program.perturbed]
     outputs = [jax.ShapeDtypeStruct((n_worlds, n_drones, x.size), x.number_type) for x in leaves]
-    sums_of_lanes = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
+    lane_cotangents = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
 
     def sum_cotangent(i: int, x: Array) -> Array:
         """Return the cotangent of a leaf, summed over the drones that share it."""
         if program.leaves[i].scope == "world":
             return jnp.sum(x, axis=1)
-        return x if kernels.is_own(i) else jnp.sum(x.reshape(size, n_worlds * n_drones // size, -1), axis=1)
+        return x if kernels.is_own(i) else jnp.sum(x.reshape(n_batches, n_worlds * n_drones // n_batches, -1), axis=1)
 
-    return {i: sum_cotangent(i, x) for i, x in zip(cotangent_program.perturbed, sums_of_lanes, strict=True)}
+    return {i: sum_cotangent(i, x) for i, x in zip(cotangent_program.perturbed, lane_cotangents, strict=True)}

@@ -41,14 +41,14 @@ def make_differentiable(run: CountedRun, run_on_lanes: Run, kernels: DerivativeK
             return run(leaves, count)
 
         def derivative(primals: Any, tangents: Any) -> Any:
-            (values, count), (slopes, _) = primals, tangents
-            perturbed = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
+            (values, count), (leaf_tangents, _) = primals, tangents
+            perturbed = [i for i, t in enumerate(leaf_tangents) if not jaxcompat.is_symbolic_zero(t)]
             if kernels is not None and isinstance(n_steps, int) and perturbed:
                 array_leaves = tuple([i for i, x in enumerate(values) if x is not None])
                 case = Case(kernels, n_steps, array_leaves, tuple(perturbed), len(values))
                 operands = [values[i] for i in array_leaves]
                 *written, flagged = advance_p.bind(*operands, run=run, case=case)
-                in_tangents = [slopes[i] if kernels.is_own(i) else slopes[i][None] for i in perturbed]
+                in_tangents = [leaf_tangents[i] if kernels.is_own(i) else leaf_tangents[i][None] for i in perturbed]
                 out_tangents = tangent_p.bind(*operands, *in_tangents, case=case, n_nonlinear=len(operands))
                 tangent_by_leaf = dict(zip(kernels.floats, out_tangents, strict=True))
                 written_leaves = kernels.program.written_leaves
@@ -65,7 +65,7 @@ def make_differentiable(run: CountedRun, run_on_lanes: Run, kernels: DerivativeK
             def advance_floats(floats: list[Any]) -> Any:
                 return run_on_lanes(replace_leaves(values, perturbed, floats), count_or_array)
 
-            return jax.jvp(advance_floats, ([values[i] for i in perturbed],), ([slopes[i] for i in perturbed],))
+            return jax.jvp(advance_floats, ([values[i] for i in perturbed],), ([leaf_tangents[i] for i in perturbed],))
 
         advance.defjvp(derivative, symbolic_zeros=True)  # to skip the tangents of constant leaves
         return advance(leaves, jnp.asarray(n_steps, jnp.int32))
@@ -91,16 +91,16 @@ class Case(NamedTuple):
     n_steps: int
     """Number of steps."""
     array_leaves: tuple[int, ...]
-    """Leaves that are given."""
+    """Leaves that are arrays; the others are None."""
     perturbed: tuple[int, ...]
-    """Leaves whose tangents are given, or whose cotangents are computed."""
+    """Leaves whose tangents are operands, or whose cotangents are results."""
     n_leaves: int
     """Number of all leaves."""
-    size: int = 1
+    n_batches: int = 1
     """Number of batches."""
 
     def values(self, args: Sequence[Any]) -> list[Any]:
-        """Return all leaves from the operands; None for one that is not given."""
+        """Return all leaves, taken from the operands; None for a leaf that is not in ``array_leaves``."""
         return replace_leaves([None] * self.n_leaves, self.array_leaves, args[: len(self.array_leaves)])
 
     def linear_operands(self, args: Sequence[Any]) -> list[Any]:
@@ -116,19 +116,23 @@ class Case(NamedTuple):
         """Apply a function of the leaves and linear operands of one batch to all batches, and return the results."""
         leaves_batched, linear_batched = self.is_own(self.array_leaves), self.is_own(linear_leaves)
 
-        def split(x: Any) -> Any:
-            return x.reshape(self.size, -1, *x.shape[1:])
+        def split_batches(x: Any) -> Any:
+            return x.reshape(self.n_batches, -1, *x.shape[1:])
 
         def run_batch(values: Sequence[Any], operands: Sequence[Any]) -> list[Array]:
             return fn(self.values(values), list(operands))
 
-        if self.size == 1:
-            slopes = [x if o else x[0] for x, o in zip(self.linear_operands(args), linear_batched, strict=True)]
-            outs = run_batch(args, slopes)
+        if self.n_batches == 1:
+            linear_operands = [
+                x if o else x[0] for x, o in zip(self.linear_operands(args), linear_batched, strict=True)
+            ]
+            outs = run_batch(args, linear_operands)
             return [x if o else x[None] for x, o in zip(outs, self.is_own(result_leaves), strict=True)]
-        values = [split(x) if o else x for x, o in zip(args, leaves_batched, strict=False)]
-        slopes = [split(x) if o else x for x, o in zip(self.linear_operands(args), linear_batched, strict=True)]
-        outs = jax.vmap(run_batch, ([0 if o else None for o in leaves_batched], 0))(values, slopes)
+        values = [split_batches(x) if o else x for x, o in zip(args, leaves_batched, strict=False)]
+        linear_operands = [
+            split_batches(x) if o else x for x, o in zip(self.linear_operands(args), linear_batched, strict=True)
+        ]
+        outs = jax.vmap(run_batch, ([0 if o else None for o in leaves_batched], 0))(values, linear_operands)
         return [x.reshape(-1, *x.shape[2:]) if o else x for x, o in zip(outs, self.is_own(result_leaves), strict=True)]
 
 
@@ -145,9 +149,9 @@ def _tangent_shapes(*args: Any, case: Case, **params: Any) -> list[jax.ShapeDtyp
 def _tangents_on_lanes(*args: Any, case: Case, **params: Any) -> list[Array]:
     del params
 
-    def tangents(values: list[Any], slopes: list[Any]) -> list[Array]:
+    def tangents(values: list[Any], leaf_tangents: list[Any]) -> list[Array]:
         fn = partial(_advance_floats, case, values)
-        return jax.jvp(fn, ([values[i] for i in case.perturbed],), (slopes,))[1]
+        return jax.jvp(fn, ([values[i] for i in case.perturbed],), (leaf_tangents,))[1]
 
     return case.map_batches(tangents, args, case.perturbed, case.kernels.floats)
 
@@ -158,7 +162,7 @@ def _tangents(platform: str, *args: Any, case: Case, **params: Any) -> list[Arra
     if kernel is None:
         return _tangents_on_lanes(*args, case=case)
     in_tangents = dict(zip(case.perturbed, case.linear_operands(args), strict=True))
-    return kernel(case.values(args), in_tangents, case.n_steps, case.size, _tangent_shapes(*args, case=case))
+    return kernel(case.values(args), in_tangents, case.n_steps, case.n_batches, _tangent_shapes(*args, case=case))
 
 
 # Cotangents --------------------------------------------------------------------------------------------------------
@@ -166,7 +170,7 @@ def _tangents(platform: str, *args: Any, case: Case, **params: Any) -> list[Arra
 
 def _cotangent_shapes(*args: Any, case: Case) -> list[jax.ShapeDtypeStruct]:
     leaves = [case.values(args)[i] for i in case.perturbed]
-    shapes = [x.shape if is_own else (case.size, *x.shape)
+    shapes = [x.shape if is_own else (case.n_batches, *x.shape)
               for x, is_own in zip(leaves, case.is_own(case.perturbed), strict=True)]  # fmt: skip
     return [jax.ShapeDtypeStruct(shape, x.dtype) for shape, x in zip(shapes, leaves, strict=True)]
 
@@ -183,7 +187,7 @@ def _cotangents(platform: str, *args: Any, case: Case) -> list[Array]:
     if kernel is None:
         return _cotangents_on_lanes(*args, case=case)
     seeds = dict(zip(case.kernels.floats, case.linear_operands(args), strict=True))
-    cotangents = kernel(case.values(args), seeds, case.n_steps, case.size)
+    cotangents = kernel(case.values(args), seeds, case.n_steps, case.n_batches)
     return [cotangents[i].reshape(x.shape) if i in cotangents else jnp.zeros(x.shape, x.dtype)
             for i, x in zip(case.perturbed, _cotangent_shapes(*args, case=case), strict=True)]  # fmt: skip
 
@@ -197,9 +201,9 @@ def _transpose(operands: Sequence[Any], seeds: Sequence[Any], case: Case, **para
     return cotangent_p.bind(*operands, *seeds, case=case)
 
 
-def _advance_floats(case: Case, values: Sequence[Any], changed: Sequence[Any]) -> list[Array]:
+def _advance_floats(case: Case, values: Sequence[Any], floats: Sequence[Any]) -> list[Array]:
     kernels = case.kernels
-    written, _ = kernels.on_lanes(replace_leaves(values, case.perturbed, changed), case.n_steps)
+    written, _ = kernels.run_on_lanes(replace_leaves(values, case.perturbed, floats), case.n_steps)
     return [x for i, x in zip(kernels.program.written_leaves, written, strict=True) if i in kernels.floats]
 
 
@@ -213,12 +217,12 @@ def _batching_rule(
         broadcast_args = [x if b else jnp.broadcast_to(x, (n, *x.shape)) for x, b in zip(args, batched, strict=True)]
         return jax.lax.map(lambda xs: list(primitive.bind(*xs, case=case, **params)), broadcast_args)
 
-    def join(x: Any, b: bool) -> Any:
+    def join_batches(x: Any, b: bool) -> Any:
         x = x if b else jnp.broadcast_to(x, (n, *x.shape))
         return x.reshape(-1, *x.shape[2:])
 
-    operands = [join(x, b) if o else x for x, b, o in zip(args, batched, is_own, strict=True)]
-    outs = primitive.bind(*operands, case=case._replace(size=n * case.size), **params)
+    operands = [join_batches(x, b) if o else x for x, b, o in zip(args, batched, is_own, strict=True)]
+    outs = primitive.bind(*operands, case=case._replace(n_batches=n * case.n_batches), **params)
     return [x.reshape(n, -1, *x.shape[1:]) for x in outs]
 
 
@@ -252,7 +256,7 @@ def _advance(*args: Any, run: CountedRun, case: Case) -> list[Any]:
 
 def _advance_on_lanes(*args: Any, run: CountedRun, case: Case) -> list[Any]:
     del run
-    written, flagged = case.kernels.on_lanes(case.values(args), case.n_steps)
+    written, flagged = case.kernels.run_on_lanes(case.values(args), case.n_steps)
     return [*written, flagged]
 
 

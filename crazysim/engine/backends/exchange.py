@@ -9,13 +9,13 @@ from typing import Protocol
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Value
 
-Read = Callable[[str], str]
+ReadFunction = Callable[[str], str]
 """Function from the index of a drone in its world to the expression of its published number."""
 
-Published = Sequence[tuple[str, str]]
+PublishedNumbers = Sequence[tuple[str, str]]
 """Pairs of the name of a type in the source and the expression of a number of that type."""
 
-Live = Sequence[tuple[Value, str]]
+LiveValues = Sequence[tuple[Value, str]]
 """Pairs of a value and the name of its type in the source."""
 
 TYPE_BYTES = {"f64": 8, "f32": 4, "i32": 4, "u32": 4, "b1": 1}
@@ -33,7 +33,7 @@ MAX_THREADS = 1024
 SHARED_MEMORY_BYTES = 48 * 1024
 """Memory that the threads of a block share, bytes."""
 
-MAX_IN_VECTOR = 8
+MAX_DRONES_IN_VECTOR = 8
 """Maximum number of drones of a world that are lanes of one vector on the host."""
 
 
@@ -43,7 +43,7 @@ class LineWriter(Protocol):
     names: dict[Value, str]
     """Expression of each value."""
 
-    def line(self, text: str, depth: int) -> None:
+    def write_line(self, text: str, depth: int) -> None:
         """Write a line."""
         ...
 
@@ -51,8 +51,8 @@ class LineWriter(Protocol):
         """Return an unused name."""
         ...
 
-    def forget(self) -> None:
-        """Forget shared intermediate results: their variables are not defined after this line."""
+    def forget_intermediate_results(self) -> None:
+        """Do not reuse earlier intermediate results: their variables are not defined after this line."""
         ...
 
 
@@ -62,7 +62,7 @@ class Exchange(Protocol):
     depth: int
     """Number of loops in the source around the code of a lane."""
 
-    def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
+    def publish(self, writer: LineWriter, values: PublishedNumbers, live: LiveValues, depth: int) -> list[ReadFunction]:
         """Write the code that passes numbers to the other drones of a world, and return functions that read them.
 
         Args:
@@ -82,11 +82,11 @@ class Exchange(Protocol):
         ...
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
-        """Write the beginning of the code of each lane."""
+        """Write the beginning of the loop over lanes."""
         ...
 
     def close_loop(self, writer: LineWriter, depth: int) -> None:
-        """End the code of a lane."""
+        """Write the end of the loop over lanes."""
         ...
 
     @property
@@ -101,11 +101,11 @@ class UnsplitLane(Exchange):
     depth = 0
 
     def define_variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
-        writer.line(f"auto {name} = {value};", depth)
+        writer.write_line(f"auto {name} = {value};", depth)
         return name
 
     def define_constant(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
-        writer.line(f"const auto {name} = {value};", depth)
+        writer.write_line(f"const auto {name} = {value};", depth)
         return name
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
@@ -118,11 +118,11 @@ class UnsplitLane(Exchange):
 class Registers(UnsplitLane):
     """Lanes of one warp or vector, which read each other's registers."""
 
-    def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
+    def publish(self, writer: LineWriter, values: PublishedNumbers, live: LiveValues, depth: int) -> list[ReadFunction]:
         names = []
         for kind, value in values:
             names.append(writer.new_name())
-            writer.line(f"const auto {names[-1]} = {kind}_lanes({value});", depth)
+            writer.write_line(f"const auto {names[-1]} = {kind}_lanes({value});", depth)
         return [lambda j, x=x: f"of_drone({x}, {j})" for x in names]
 
     @property
@@ -140,11 +140,11 @@ class SharedMemory(UnsplitLane):
         self.lanes = lanes
         self._records: dict[str, int] = {}
 
-    def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
+    def publish(self, writer: LineWriter, values: PublishedNumbers, live: LiveValues, depth: int) -> list[ReadFunction]:
         order = sorted(range(len(values)), key=lambda k: -TYPE_BYTES[values[k][0]])
         text = "".join(f"{values[k][0]} x{n}; " for n, k in enumerate(order))
         record = f"Record{self._records.setdefault(text, len(self._records))}"
-        size = sum(math.ceil(_size(text) / 16) * 16 for text in self._records) * self.lanes
+        size = sum(math.ceil(_record_bytes(text) / 16) * 16 for text in self._records) * self.lanes
         if size > SHARED_MEMORY_BYTES:
             raise UnsupportedError(
                 f"the drones of a world publish {size} bytes for each other, and a GPU's block has "
@@ -152,9 +152,9 @@ class SharedMemory(UnsplitLane):
             )
         array = f"shared_{record}"
         numbers = ", ".join(values[k][1] for k in order)
-        writer.line("__syncthreads();", depth)
-        writer.line(f"if (threadIdx.x < {self.lanes}) {array}[threadIdx.x] = {record}{{{numbers}}};", depth)
-        writer.line("__syncthreads();", depth)
+        writer.write_line("__syncthreads();", depth)
+        writer.write_line(f"if (threadIdx.x < {self.lanes}) {array}[threadIdx.x] = {record}{{{numbers}}};", depth)
+        writer.write_line("__syncthreads();", depth)
         position = {k: n for n, k in enumerate(order)}
         return [lambda j, n=position[k]: f"{array}[world + {j}].x{n}" for k in range(len(values))]
 
@@ -180,7 +180,7 @@ class HostMemory(Exchange):
     def __init__(self) -> None:
         self._fields: list[str] = []
 
-    def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
+    def publish(self, writer: LineWriter, values: PublishedNumbers, live: LiveValues, depth: int) -> list[ReadFunction]:
         arrays = []
         for kind, value in values:
             arrays.append(writer.new_name("g"))
@@ -189,22 +189,22 @@ class HostMemory(Exchange):
             writer.names[x] = self.define_constant(writer, writer.new_name("m"), kind, writer.names[x], depth)
         self.close_loop(writer, depth - 1)
         self.open_loop(writer, depth - 1)
-        writer.forget()
+        writer.forget_intermediate_results()
         return [lambda j, x=x: f"of_place(w.{x}, {j})" for x in arrays]
 
     def define_variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         self._fields.append(f"{kind}v {name}[VECTORS];")
-        writer.line(f"w.{name}[v] = {kind}_lanes({value});", depth)
+        writer.write_line(f"w.{name}[v] = {kind}_lanes({value});", depth)
         return f"w.{name}[v]"
 
     def define_constant(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         return self.define_variable(writer, name, kind, value, depth)
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
-        writer.line("SWEEP {", depth)
+        writer.write_line("SWEEP {", depth)
 
     def close_loop(self, writer: LineWriter, depth: int) -> None:
-        writer.line("}", depth)
+        writer.write_line("}", depth)
 
     @property
     def declarations(self) -> list[str]:
@@ -215,7 +215,7 @@ def make_exchange(target: str, group_size: int) -> Exchange:
     """Return the way in which the drones of a world read each other's numbers on a target."""
     if target == "cuda":
         return Registers() if group_size <= WARP_THREADS else SharedMemory(lanes_of_block(group_size)[1])
-    return Registers() if group_size <= MAX_IN_VECTOR else HostMemory()
+    return Registers() if group_size <= MAX_DRONES_IN_VECTOR else HostMemory()
 
 
 def lanes_of_block(group_size: int) -> tuple[int, int]:
@@ -234,5 +234,5 @@ def lanes_of_block(group_size: int) -> tuple[int, int]:
     return max(((n, n // group_size * group_size) for n in sizes), key=lambda x: (round(x[1] / x[0], 2), -x[0]))
 
 
-def _size(record: str) -> int:
+def _record_bytes(record: str) -> int:
     return sum(TYPE_BYTES.get(word, 0) for word in record.split())

@@ -10,10 +10,10 @@ from importlib import resources
 from crazysim.engine.backends.exchange import BLOCK_SIZE, lanes_of_block
 from crazysim.engine.ir.blocks import Block
 
-ANY_NUMBER_OF_BLOCKS = "1 /* blocks at least */"
+MIN_BLOCKS_PLACEHOLDER = "1 /* blocks at least */"
 """Text in a kernel for a GPU that ``Kernel.with_blocks`` replaces by a number of blocks."""
 
-BLOCK_THREADS = "#define BLOCK_THREADS {}\n"
+BLOCK_THREADS_DEFINITION = "#define BLOCK_THREADS {}\n"
 """Text in a kernel for a GPU that ``Kernel.with_threads`` replaces."""
 
 
@@ -48,11 +48,11 @@ class Kernel:
 
     def with_blocks(self, n: int) -> Kernel:
         """Return the kernel with few enough registers for ``n`` blocks on a multiprocessor of a GPU at once."""
-        return dataclasses.replace(self, text=self.text.replace(ANY_NUMBER_OF_BLOCKS, f"{n}"))
+        return dataclasses.replace(self, text=self.text.replace(MIN_BLOCKS_PLACEHOLDER, f"{n}"))
 
     def with_threads(self, n: int) -> Kernel:
         """Return the kernel with blocks of ``n`` threads on a GPU, a multiple of its present number."""
-        text = self.text.replace(BLOCK_THREADS.format(self.threads), BLOCK_THREADS.format(n))
+        text = self.text.replace(BLOCK_THREADS_DEFINITION.format(self.threads), BLOCK_THREADS_DEFINITION.format(n))
         return dataclasses.replace(self, text=text, threads=n, lanes=self.lanes * n // self.threads)
 
 
@@ -87,10 +87,10 @@ def _epilogue(target: str) -> str:
 def make_kernel(
     target: str,
     pointers: Sequence[str],
-    shared: Sequence[str],
-    code: Sequence[str],
+    shared_lines: Sequence[str],
+    lane_lines: Sequence[str],
     blocks: Sequence[Block],
-    declared: Sequence[str],
+    declarations: Sequence[str],
     *,
     inputs: tuple[int, ...],
     outputs: tuple[int, ...],
@@ -104,10 +104,10 @@ def make_kernel(
     Args:
         target: ``"cuda"`` or ``"host"``.
         pointers: Declarations of inputs and outputs.
-        shared: Lines that compute what all lanes share.
-        code: Lines of a lane.
+        shared_lines: Lines that compute the numbers that all lanes share.
+        lane_lines: Lines that compute the numbers of a lane.
         blocks: Blocks of a step, whose operations are counted.
-        declared: Lines before the kernel.
+        declarations: Lines before the kernel.
         inputs: Leaves that it reads.
         outputs: Leaves that it writes.
         in_place: Leaves that it updates in place.
@@ -116,19 +116,21 @@ def make_kernel(
         n_stored: Numbers that a lane stores for each step; None for a kernel without backward pass.
     """
     threads, lanes = lanes_of_block(group_size)
-    lines, body = "\n".join(shared), "\n".join(code)
+    lines, body = "\n".join(shared_lines), "\n".join(lane_lines)
     if target == "cuda":
-        frame = _cuda(pointers, lines, body, n_stored is not None)
+        frame = _cuda_function(pointers, lines, body, n_stored is not None)
     else:
-        frame = _host(pointers, lines, body, in_memory, n_stored is not None)
-    widest = 8 if any("f64*" in pointer for pointer in pointers) else 4
-    defines = f"#define WIDEST {widest}\n#define GROUP {group_size}\n" + BLOCK_THREADS.format(threads)
+        frame = _host_function(pointers, lines, body, in_memory, n_stored is not None)
+    max_number_bytes = 8 if any("f64*" in pointer for pointer in pointers) else 4
+    defines = f"#define WIDEST {max_number_bytes}\n#define GROUP {group_size}\n" + BLOCK_THREADS_DEFINITION.format(
+        threads
+    )
     defines += f"#define OPERATIONS {sum(map(_n_operations, blocks))}\n"
-    prefix = "".join(f"{line}\n" for line in declared)
+    prefix = "".join(f"{line}\n" for line in declarations)
     if n_stored is not None:
         prefix = f"#define N_KEPT {n_stored}\n{_preamble(target + '_kept')}{prefix}"
     text = defines + _preamble(target) + prefix + frame + _epilogue(target)
-    return Kernel(text, inputs, outputs, in_place, threads, lanes, group_size, (n_stored or 0) * widest)
+    return Kernel(text, inputs, outputs, in_place, threads, lanes, group_size, (n_stored or 0) * max_number_bytes)
 
 
 def _n_operations(block: Block) -> int:
@@ -137,7 +139,7 @@ def _n_operations(block: Block) -> int:
     return len(block.operations) + sum(inner)
 
 
-def _cuda(pointers: Sequence[str], shared: str, body: str, stores_states: bool) -> str:
+def _cuda_function(pointers: Sequence[str], shared: str, body: str, stores_states: bool) -> str:
     """Return the CUDA kernel: each thread computes the numbers that all lanes share once, and the rest for its lane.
 
     In a kernel with backward pass, a thread may process several lanes one after the other, to bound the memory.
@@ -149,7 +151,7 @@ def _cuda(pointers: Sequence[str], shared: str, body: str, stores_states: bool) 
         loop = "for (int first = blockIdx.x * BLOCK_LANES; first < n_lanes; first += gridDim.x * BLOCK_LANES)"
         interval = ", interval = count[1]"
     return f"""
-extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {ANY_NUMBER_OF_BLOCKS}) advance({arguments}) {{
+extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {MIN_BLOCKS_PLACEHOLDER}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0]{interval};
   const int nothing = n_steps >> 31;
   const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;
@@ -166,7 +168,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {ANY_NUMBER_OF_BLOCK
 """
 
 
-def _host(pointers: Sequence[str], shared: str, body: str, in_memory: bool, stores_states: bool) -> str:
+def _host_function(pointers: Sequence[str], shared: str, body: str, in_memory: bool, stores_states: bool) -> str:
     """Return the function of a range of lanes: shared numbers are computed once, the rest per block of lanes."""
     n_in = sum(p.startswith("const") for p in pointers)
     buffers = [f"in[{k}]" if k < n_in else f"out[{k - n_in}]" for k in range(len(pointers))]
@@ -174,7 +176,7 @@ def _host(pointers: Sequence[str], shared: str, body: str, in_memory: bool, stor
     for pointer, buffer in zip(pointers, buffers, strict=True):
         kind, name = pointer.split("* __restrict__ ")
         definitions.append(f"  {kind}* __restrict__ const {name} = ({kind}*){buffer};")
-    pointed, memory, free_line = "\n".join(definitions), "", ""
+    pointer_definitions, memory, free_line = "\n".join(definitions), "", ""
     if stores_states:  # the number of steps, which XLA passes before the inputs, is followed by the interval
         memory = """
   const int interval = ((int*)in[-1])[1];
@@ -189,7 +191,7 @@ def _host(pointers: Sequence[str], shared: str, body: str, in_memory: bool, stor
         free_line = "\n  free(memory);"
     return f"""
 static bool advance_range(int64_t from, int64_t to, int64_t n_lanes, int n_steps, void** in, void** out) {{
-{pointed}{memory}
+{pointer_definitions}{memory}
 {shared}
   {"EACH_WORLD" if in_memory else "EACH_BLOCK"} {{
 {body}

@@ -133,15 +133,15 @@ def build(program: Program, location: Location, unpacked_program: Program | None
         KernelError: If the compiler refuses a kernel or takes too long.
     """
     kernels = Kernels(program, location) if program.fused else None
-    run = _run_parts(program, location) if kernels is None else _one_kernel(kernels)
+    run = _run_parts(program, location) if kernels is None else _make_kernel_run(kernels)
     if unpacked_program is not None:
         return FusedRun(
             make_differentiable(_make_batchable(program, run), _run_without_rows(program, unpacked_program, location)),
             kernels,
         )
-    on_lanes = lanes.build(program, location)
-    derivatives = DERIVATIVE_KERNELS[program] = DerivativeKernels(program, location, on_lanes)
-    return FusedRun(make_differentiable(_make_batchable(program, run), on_lanes, derivatives), kernels)
+    run_on_lanes = lanes.build(program, location)
+    derivatives = DERIVATIVE_KERNELS[program] = DerivativeKernels(program, location, run_on_lanes)
+    return FusedRun(make_differentiable(_make_batchable(program, run), run_on_lanes, derivatives), kernels)
 
 
 DERIVATIVE_KERNELS: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weakref.WeakKeyDictionary()
@@ -174,24 +174,24 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
             counts = count if count_batched else jnp.broadcast_to(count, (size,))
             return jax.lax.map(lambda xs: run(*xs), (broadcast_leaves, counts)), out_batched
 
-        def join(x: Any, b: bool, in_rows: bool) -> Any:
+        def join_batches(x: Any, b: bool, in_rows: bool) -> Any:
             x = x if b else jnp.broadcast_to(x, (size, *x.shape))
             return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1) if in_rows else x.reshape(-1, *x.shape[2:])
 
-        def split(x: Any, in_rows: bool) -> Any:
+        def split_batches(x: Any, in_rows: bool) -> Any:
             if in_rows:
                 return jnp.moveaxis(x.reshape(x.shape[0], size, -1), 1, 0)
             return x.reshape(size, -1, *x.shape[1:])
 
         rows = [i in program.rows for i in range(len(leaves))]
         merged = [
-            join(x, b, in_rows) if o and x is not None else x
+            join_batches(x, b, in_rows) if o and x is not None else x
             for x, b, o, in_rows in zip(leaves, leaves_batched, is_own, rows, strict=True)
         ]
         written, flagged = run(merged, count)
         return (
-            [split(x, rows[i]) for i, x in zip(program.written_leaves, written, strict=True)],
-            split(flagged, False),
+            [split_batches(x, rows[i]) for i, x in zip(program.written_leaves, written, strict=True)],
+            split_batches(flagged, False),
         ), out_batched
 
     return jaxcompat.batched_rule(run, batching_rule)
@@ -203,21 +203,21 @@ def _run_without_rows(program: Program, unpacked_program: Program, location: Loc
 
     def run(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         built_runs[:] = built_runs or [build(unpacked_program, location)]
-        row_leaves, unpacked = packed_rows(program), list(leaves)
-        for rows in row_leaves:
+        packed, unpacked_leaves = packed_rows(program), list(leaves)
+        for rows in packed:
             for i in rows.members:
-                unpacked[i] = rows.unpack(leaves[rows.leaf], i)
-        results, flagged = built_runs[0](unpacked[: len(unpacked_program.leaves)], n_steps)
-        leaves_after = replace_leaves(unpacked, unpacked_program.written_leaves, results)
+                unpacked_leaves[i] = rows.unpack(leaves[rows.leaf], i)
+        results, flagged = built_runs[0](unpacked_leaves[: len(unpacked_program.leaves)], n_steps)
+        leaves_after = replace_leaves(unpacked_leaves, unpacked_program.written_leaves, results)
         leaves_after = replace_leaves(
-            leaves_after, [rows.leaf for rows in row_leaves], [rows.pack(leaves_after) for rows in row_leaves]
+            leaves_after, [rows.leaf for rows in packed], [rows.pack(leaves_after) for rows in packed]
         )
         return [leaves_after[i] for i in program.written_leaves], flagged
 
     return run
 
 
-def _one_kernel(kernels: Kernels) -> CountedRun:
+def _make_kernel_run(kernels: Kernels) -> CountedRun:
     return partial(_call_kernel, kernels)
 
 
@@ -230,12 +230,12 @@ def _run_parts(program: Program, location: Location) -> CountedRun:
     """Return the run of a step that unfused stages split: in each phase, one kernel for the stages between them."""
     parts = _parts(program)
     with native.compiling_threads() as pool:
-        runs = list(pool.map(lambda part: _one_kernel(Kernels(part, location)) if part.fused else None, parts))
+        runs = list(pool.map(lambda part: _make_kernel_run(Kernels(part, location)) if part.fused else None, parts))
     runs_by_phase: dict[Phase, list[Any]] = {
         phase: [(part, run) for part, run in zip(parts, runs, strict=True) if part.segments[0].phase == phase]
         for phase in PHASES
     }
-    in_loop = sorted({i for part, _ in runs_by_phase["each"] for i in part.written_leaves})
+    loop_leaves = sorted({i for part, _ in runs_by_phase["each"] for i in part.written_leaves})
 
     def run_phase(phase: Phase, leaves: list[Any], count: Array) -> list[Any]:
         for part, run in runs_by_phase[phase]:
@@ -251,12 +251,12 @@ def _run_parts(program: Program, location: Location) -> CountedRun:
         elif runs_by_phase["each"]:
 
             def body(_: Any, values: list[Any]) -> list[Any]:
-                stepped = run_phase("each", replace_leaves(leaves_before, in_loop, values), one_step)
-                return [stepped[i] for i in in_loop]
+                leaves_after = run_phase("each", replace_leaves(leaves_before, loop_leaves, values), one_step)
+                return [leaves_after[i] for i in loop_leaves]
 
             leaves_before = leaves
             leaves = replace_leaves(
-                leaves_before, in_loop, jax.lax.fori_loop(0, count, body, [leaves_before[i] for i in in_loop])
+                leaves_before, loop_leaves, jax.lax.fori_loop(0, count, body, [leaves_before[i] for i in loop_leaves])
             )
         flagged = lanes.nonfinite_worlds(program, lanes.LeafValues(program, leaves))
         leaves = run_phase("after", leaves, one_step)

@@ -145,11 +145,11 @@ def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _Pr
         blocks = [_prepare(inner, indices, constants) for inner in op.blocks]
         results = [get_index(x) for x in op.results]
         dtype = op.dtype if op.results else np.dtype(bool)
-        calls.append(_Call(op, _numpy(op), args, results, dtype, blocks))
+        calls.append(_Call(op, _numpy_function(op), args, results, dtype, blocks))
     return _Prepared(inputs, calls, [get_index(x) for x in block.outputs])
 
 
-def _numpy(op: Operation) -> Callable[..., Any] | None:
+def _numpy_function(op: Operation) -> Callable[..., Any] | None:
     """Return the NumPy function of an operation; None for a structured one."""
     row = ops.TABLE[op.name]
     if row.structured:
@@ -163,7 +163,7 @@ def _numpy(op: Operation) -> Callable[..., Any] | None:
 
 
 def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Sequence[_Run]) -> list[Any]:
-    """Return the results of an operation that runs blocks, looks something up, or has several results.
+    """Return the results of a structured operation, which runs blocks, reads a table, or has several results.
 
     Args:
         op: The operation.
@@ -207,16 +207,16 @@ def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs
 def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], run: _Run) -> list[np.ndarray]:
     """Run a block for each drone of the world in turn, and combine the results."""
     n = op.param("n_members")
-    member = np.arange(shape[0]) % n
-    combine: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
+    member_number = np.arange(shape[0]) % n
+    combining_functions: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
     reduced = [
         np.full(shape, ops.neutral_number(name, x.dtype))
         for name, x in zip(op.param("reduce"), op.results, strict=True)
     ]
     for j in range(n):
-        other = [np.repeat(np.broadcast_to(x, shape).reshape(-1, n)[:, j], n) for x in args]
-        new = run([*other, member == j])
-        reduced = [fn(x, y) for fn, x, y in zip(combine, reduced, new, strict=True)]
+        other_numbers = [np.repeat(np.broadcast_to(x, shape).reshape(-1, n)[:, j], n) for x in args]
+        new = run([*other_numbers, member_number == j])
+        reduced = [fn(x, y) for fn, x, y in zip(combining_functions, reduced, new, strict=True)]
     return reduced
 
 
@@ -266,32 +266,35 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
     if not program.fused:
         return lanes.steps(program, leaves, n_steps, call)
     n_worlds, _ = lanes.batch_counts(program, leaves)
-    present = [i for i, x in enumerate(leaves) if x is not None]
+    array_leaves = [i for i, x in enumerate(leaves) if x is not None]
     written = [lanes.leaf_shape(program, i, n_worlds) for i in program.written_leaves]
     flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
 
     def run_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
-        arrays = replace_leaves([None] * len(leaves), present, [np.asarray(x) for x in values])
+        arrays = replace_leaves([None] * len(leaves), array_leaves, [np.asarray(x) for x in values])
         with flush_subnormals() if on_cpu else contextlib.nullcontext():
             return _steps(program, arrays, int(n_steps))
 
-    values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in present]
+    values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in array_leaves]
     if any(isinstance(x, jax.core.Tracer) for x in (n_steps, *values)):
         out, flags = jax.pure_callback(run_arrays, (written, flagged), n_steps, *values, vmap_method="sequential")
     else:
         out, flags = run_arrays(n_steps, *values)
-    keys = [is_key(program.leaves[i]) for i in program.written_leaves]
-    return [jax.random.wrap_key_data(jnp.asarray(x)) if key else x for x, key in zip(out, keys, strict=True)], flags
+    are_random_keys = [is_key(program.leaves[i]) for i in program.written_leaves]
+    return [
+        jax.random.wrap_key_data(jnp.asarray(x)) if is_random_key else x
+        for x, is_random_key in zip(out, are_random_keys, strict=True)
+    ], flags
 
 
 def _steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.ndarray], Any]:
-    now = lanes.LeafValues(program, leaves, run, np)
-    constants = lanes.prepare(program, now)
+    values = lanes.LeafValues(program, leaves, run, np)
+    constants = lanes.prepare(program, values)
     for _ in range(n_steps):
-        lanes.run(program, now, "each", constants)
-    flagged = lanes.nonfinite_worlds(program, now)
-    lanes.run(program, now, "after", {})
-    return [np.ascontiguousarray(now.array(i)) for i in program.written_leaves], flagged
+        lanes.run(program, values, "each", constants)
+    flagged = lanes.nonfinite_worlds(program, values)
+    lanes.run(program, values, "after", {})
+    return [np.ascontiguousarray(values.array(i)) for i in program.written_leaves], flagged
 
 
 @contextlib.contextmanager

@@ -54,7 +54,7 @@ class Body:
         self._depth = 1 + self.exchange.depth
         self.names: dict[Slot, str] = {}
         """Expression of each number."""
-        self.starts: dict[Slot, str] = {}
+        self.initial_values: dict[Slot, str] = {}
         """Expression of the initial value of each number that stages write."""
         self._n_shared = 0
 
@@ -67,7 +67,7 @@ class Body:
         """
         program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
         written, slots = self._slots()
-        at_use = registers is not None and len(slots) > registers
+        is_read_at_use = registers is not None and len(slots) > registers
         loaded, rank = _loaded_slots(program), program.ranks
         deferred = set() if exchange.depth else _deferred_slots(program)
         names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
@@ -75,24 +75,26 @@ class Body:
         for slot in shared:
             if slot[1] == TABLE_INDEX:
                 names[slot] = f"p{rank[slot[0]]}"
-            elif slot in self.stored or not (at_use or slot in deferred):
-                writer.line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
+            elif slot in self.stored or not (is_read_at_use or slot in deferred):
+                writer.write_line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
             else:
-                names[slot] = f"SHARED(p{rank[slot[0]]}, {slot[1]})" if at_use else _load(program, slot)
+                names[slot] = f"SHARED(p{rank[slot[0]]}, {slot[1]})" if is_read_at_use else _load(program, slot)
         self._n_shared = len(writer.lines)
         exchange.open_loop(writer, 1)
-        per_lane = [slot for slot in slots if slot not in shared and (slot not in written or slot in loaded)]
-        for i in dict.fromkeys(i for i, _ in per_lane if i not in program.rows):
-            size, drones = program.leaves[i].size, _drones(program, i)
-            writer.line(rows(f"p{rank[i]}", _type(program, i), size, drones), self._depth)
+        lane_slots = [slot for slot in slots if slot not in shared and (slot not in written or slot in loaded)]
+        for i in dict.fromkeys(i for i, _ in lane_slots if i not in program.rows):
+            size, drones = program.leaves[i].size, _n_sharing_lanes(program, i)
+            writer.write_line(rows_line(f"p{rank[i]}", _type(program, i), size, drones), self._depth)
         for slot in slots:
             kind, access = _type(program, slot[0]), _load(program, slot)
             if slot in shared:
                 continue
             if slot in written:
                 initial = access if slot in loaded else f"{kind}(0)"
-                self.starts[slot] = f"{kind}_lanes({initial})"
-                names[slot] = exchange.define_variable(writer, names[slot], kind, self.starts[slot], self._depth)
+                self.initial_values[slot] = f"{kind}_lanes({initial})"
+                names[slot] = exchange.define_variable(
+                    writer, names[slot], kind, self.initial_values[slot], self._depth
+                )
             elif slot not in self.stored and slot in deferred:
                 names[slot] = access
             else:
@@ -104,19 +106,19 @@ class Body:
 
     def write_loop(self, hoisted: list[list[str]]) -> None:
         """Write the steps."""
-        self.writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
+        self.writer.write_line("for (int step = 0; step < n_steps; ++step) {", 1)
         self.exchange.open_loop(self.writer, 2)
         for segment, constants in zip(self.step_segments, hoisted, strict=True):
             write_segment(self.writer, self.program, segment, self.names, constants, 1 + self._depth)
         self.exchange.close_loop(self.writer, 2)
-        self.writer.line("}", 1)
+        self.writer.write_line("}", 1)
 
     def write_stores(self) -> None:
         """Write the check, the stages after the steps, and the stores."""
         program, writer, check = self.program, self.writer, self.program.check_segment
         self.exchange.open_loop(writer, 1)
         if check is not None:
-            (flagged,) = writer.block(check.block, [self.names[slot] for slot in check.reads], self._depth)
+            (flagged,) = writer.write_block(check.block, [self.names[slot] for slot in check.reads], self._depth)
             write_results(writer, "flagged", "b1", 1, [flagged], self._depth)
         self._write_phase("after")
         for leaf in program.written_leaves:
@@ -124,9 +126,9 @@ class Body:
             values = [self.names[leaf, k] for k in range(program.leaves[leaf].size)]
             if leaf in program.rows:
                 for k, x in enumerate(values):
-                    writer.line(f"STORE_ROW({pointer}, {k}, {kind}_lanes({x}))", self._depth)
+                    writer.write_line(f"STORE_ROW({pointer}, {k}, {kind}_lanes({x}))", self._depth)
             else:
-                write_results(writer, pointer, kind, _drones(program, leaf), values, self._depth)
+                write_results(writer, pointer, kind, _n_sharing_lanes(program, leaf), values, self._depth)
         self.exchange.close_loop(writer, 1)
 
     def kernel(
@@ -158,15 +160,15 @@ class Body:
     def _slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
         """Return the numbers that the stages write, and all that the kernel uses."""
         program, segments = self.program, self.program.fused_segments
-        written = dict.fromkeys(slot for s in segments for slot in program.per_drone(s, s.writes))
-        read = dict.fromkeys(slot for s in segments for slot in [*program.per_drone(s, s.reads), *s.hoisted_reads])
+        written = dict.fromkeys(slot for s in segments for slot in program.drone_slots(s, s.writes))
+        read = dict.fromkeys(slot for s in segments for slot in [*program.drone_slots(s, s.reads), *s.hoisted_reads])
         checked = program.check_segment.reads if program.check_segment else ()
         return written, dict.fromkeys([*read, *written, *checked, *self.stored])
 
     def _write_hoisted(self, segment: Segment) -> list[str]:
         """Write the hoisted block of a segment, and return the names of the results."""
         writer, define_constant = self.writer, self.exchange.define_constant
-        outs = writer.block(segment.hoisted, [self.names[slot] for slot in segment.hoisted_reads], self._depth)
+        outs = writer.write_block(segment.hoisted, [self.names[slot] for slot in segment.hoisted_reads], self._depth)
         kinds = [type_name(x.dtype) for x in segment.hoisted.outputs]
         return [
             define_constant(writer, writer.new_name("h"), kind, x, self._depth)
@@ -209,9 +211,9 @@ def _loaded_slots(program: Program) -> set[Slot]:
         loaded.update(slot for slot in slots if slot not in written)
 
     def run_segment(segment: Segment) -> None:
-        use_slots(program.per_drone(segment, segment.reads))
+        use_slots(program.drone_slots(segment, segment.reads))
         drones: dict[Slot, int] = {}
-        for (leaf, _), slot in zip(segment.writes, program.per_drone(segment, segment.writes), strict=True):
+        for (leaf, _), slot in zip(segment.writes, program.drone_slots(segment, segment.writes), strict=True):
             is_one_drone = segment.scope == "world" and program.leaves[leaf].scope == "drone"
             drones[slot] = drones.get(slot, 0) + (1 if is_one_drone else program.n_drones)
         written.update(slot for slot, n in drones.items() if n >= program.n_drones)
@@ -219,7 +221,7 @@ def _loaded_slots(program: Program) -> set[Slot]:
     for segment in program.phase_segments("before"):
         run_segment(segment)
     for segment in program.phase_segments("each"):  # there may be no step
-        use_slots([*program.per_drone(segment, [*segment.reads, *segment.writes]), *segment.hoisted_reads])
+        use_slots([*program.drone_slots(segment, [*segment.reads, *segment.writes]), *segment.hoisted_reads])
     if program.check_segment is not None:
         use_slots(program.check_segment.reads)
     for segment in program.phase_segments("after"):
@@ -241,26 +243,28 @@ def write_segment(
         constants: Expressions of the hoisted numbers.
         depth: Depth of the lines.
     """
-    inputs = [names[slot] for slot in program.per_drone(segment, segment.reads)]
+    inputs = [names[slot] for slot in program.drone_slots(segment, segment.reads)]
     if segment.scope == "world":  # the numbers of each drone are read from its lane
         for k, (leaf, number) in enumerate(segment.reads):
             if program.leaves[leaf].scope == "drone":
                 name = writer.new_name()
-                writer.line(f"const auto {name} = of_drone({inputs[k]}, {number // program.leaves[leaf].size});", depth)
+                writer.write_line(
+                    f"const auto {name} = of_drone({inputs[k]}, {number // program.leaves[leaf].size});", depth
+                )
                 inputs[k] = name
-    outs = writer.block(segment.block, [*inputs, *constants], depth)
+    outs = writer.write_block(segment.block, [*inputs, *constants], depth)
     new_names = [writer.new_name() for _ in outs]
     for name, value in zip(new_names, outs, strict=True):
-        writer.line(f"const auto {name} = {value};", depth)
+        writer.write_line(f"const auto {name} = {value};", depth)
     for (leaf, number), slot, new_name in zip(
-        segment.writes, program.per_drone(segment, segment.writes), new_names, strict=True
+        segment.writes, program.drone_slots(segment, segment.writes), new_names, strict=True
     ):
         kind, name = _type(program, leaf), names[slot]
         if segment.scope == "world" and program.leaves[leaf].scope == "drone":  # every lane computes all of them
             is_own_drone = f"eq_(own, i32({number // program.leaves[leaf].size}))"
-            writer.line(f"{name} = select_n_({is_own_drone}, {name}, {kind}_lanes({new_name}));", depth)
+            writer.write_line(f"{name} = select_n_({is_own_drone}, {name}, {kind}_lanes({new_name}));", depth)
         else:
-            writer.line(f"{name} = {kind}_lanes({new_name});", depth)
+            writer.write_line(f"{name} = {kind}_lanes({new_name});", depth)
 
 
 def _deferred_slots(program: Program) -> set[Slot]:
@@ -268,17 +272,19 @@ def _deferred_slots(program: Program) -> set[Slot]:
 
     Unless a stage writes them, they are loaded where they are used, and take no register in between.
     """
-    below_rate: set[Slot] = set()
-    at_each_step: set[Slot] = set()
+    slots_of_ticks: set[Slot] = set()
+    slots_of_each_step: set[Slot] = set()
     for segment in program.fused_segments:
         block = segment.block
-        used_now = {x for op in block.operations for x in op.args} | set(block.outputs)
-        used_now = used_now.union(*(x.uses() for op in block.operations if op.name == "over_others" for x in op.blocks))
-        at_each_step.update(segment.hoisted_reads)
-        for x, slot in zip(block.inputs, program.per_drone(segment, segment.reads), strict=False):
-            (at_each_step if segment.scope == "world" or x in used_now else below_rate).add(slot)
-    in_check = set(program.check_segment.reads) if program.check_segment is not None else set()
-    return (below_rate ^ in_check) - at_each_step
+        used_at_each_step = {x for op in block.operations for x in op.args} | set(block.outputs)
+        used_at_each_step = used_at_each_step.union(
+            *(x.uses() for op in block.operations if op.name == "over_others" for x in op.blocks)
+        )
+        slots_of_each_step.update(segment.hoisted_reads)
+        for x, slot in zip(block.inputs, program.drone_slots(segment, segment.reads), strict=False):
+            (slots_of_each_step if segment.scope == "world" or x in used_at_each_step else slots_of_ticks).add(slot)
+    slots_of_check = set(program.check_segment.reads) if program.check_segment is not None else set()
+    return (slots_of_ticks ^ slots_of_check) - slots_of_each_step
 
 
 def _type(program: Program, leaf: int) -> str:
@@ -291,10 +297,10 @@ def _load(program: Program, slot: Slot) -> str:
         return f"p{rank}[{k}]"
     if leaf in program.rows:
         return f"LOAD_ROW({'q' if leaf in program.written_leaves else 'p'}{rank}, {k})"
-    return f"LOAD({program.leaves[leaf].size}, {_drones(program, leaf)}, p{rank}, {k})"
+    return f"LOAD({program.leaves[leaf].size}, {_n_sharing_lanes(program, leaf)}, p{rank}, {k})"
 
 
-def rows(pointer: str, kind: str, size: int, drones: int = 1) -> str:
+def rows_line(pointer: str, kind: str, size: int, drones: int = 1) -> str:
     """Return the line that finds the rows of an input, one for each lane; it comes before the loads.
 
     Args:
@@ -318,12 +324,12 @@ def write_results(writer: Writer, pointer: str, kind: str, drones: int, values: 
         depth: Depth of the lines.
     """
     size = len(values)
-    writer.line(f"RESULT({kind}, {size}, {pointer})", depth)
+    writer.write_line(f"RESULT({kind}, {size}, {pointer})", depth)
     for k, x in enumerate(values):
-        writer.line(f"STORE({size}, {drones}, {pointer}, {k}, {kind}_lanes({x}))", depth)
-    writer.line(f"PUT({size}, {drones}, {pointer})", depth)
+        writer.write_line(f"STORE({size}, {drones}, {pointer}, {k}, {kind}_lanes({x}))", depth)
+    writer.write_line(f"PUT({size}, {drones}, {pointer})", depth)
 
 
-def _drones(program: Program, leaf: int) -> int:
+def _n_sharing_lanes(program: Program, leaf: int) -> int:
     """Return the number of lanes that share each number of a leaf."""
     return program.n_drones if program.leaves[leaf].scope == "world" else 1

@@ -34,7 +34,7 @@ from crazysim.storage import FOLDER_REMEDY, make_private, untrusted_reason
 DIGEST_LENGTH = 24
 """Hexadecimal digits of a hash in a name: 96 bits."""
 
-ABANDONED_AFTER = 86400.0
+ABANDONMENT_AGE = 86400.0
 """Age at which remains of processes on other machines are removed, s."""
 
 
@@ -51,31 +51,31 @@ def folder() -> Path:
     """Return the folder of compiled kernels: inside the folder of compiled programs, or a temporary one."""
     programs = cache.folder()
     if programs is not None:
-        shared = programs / "crazysim"
+        kernel_folder = programs / "crazysim"
         with contextlib.suppress(OSError):
-            make_private(shared)
-        if shared.is_dir():
-            if reason := untrusted_reason(shared):
-                _refuse(shared, reason)
-            elif os.access(shared, os.W_OK | os.R_OK):
-                _sweep_once(shared)
-                return shared
+            make_private(kernel_folder)
+        if kernel_folder.is_dir():
+            if reason := untrusted_reason(kernel_folder):
+                _warn_once(kernel_folder, reason)
+            elif os.access(kernel_folder, os.W_OK | os.R_OK):
+                _sweep_once(kernel_folder)
+                return kernel_folder
     return temporary_folder()
 
 
 @functools.cache
-def _refuse(shared: Path, reason: str) -> None:
+def _warn_once(kernel_folder: Path, reason: str) -> None:
     """Warn, once, that a folder is not used."""
     warn(
-        f"expected a folder of kernels that only this user can write, got {str(shared)!r}: {reason}, so kernels are "
-        f"compiled again in every process. {FOLDER_REMEDY}"
+        f"expected a folder of kernels that only this user can write, got {str(kernel_folder)!r}: {reason}, so kernels "
+        f"are compiled again in every process. {FOLDER_REMEDY}"
     )
 
 
 @functools.cache
-def _sweep_once(shared: Path) -> None:
+def _sweep_once(kernel_folder: Path) -> None:
     """Remove the remains in a folder, once."""
-    sweep(shared, "*.tmp")
+    sweep(kernel_folder, "*.tmp")
 
 
 def temporary_folder() -> Path:
@@ -141,10 +141,10 @@ def _is_abandoned(name: str, age: float) -> bool:
     """
     match = re.search(r"[.-]([0-9a-f]{8})-(\d+)-", name)
     if match is None:
-        return name.endswith(".tmp") and age > ABANDONED_AFTER
+        return name.endswith(".tmp") and age > ABANDONMENT_AGE
     machine, pid = match.groups()
     if machine != _machine() or os.name == "nt":  # on Windows the call below would end the process
-        return age > ABANDONED_AFTER
+        return age > ABANDONMENT_AGE
     try:
         os.kill(int(pid), 0)
     except OSError:  # there is no such process, or it belongs to another user

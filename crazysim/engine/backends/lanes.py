@@ -79,17 +79,17 @@ class LeafValues:
     def array(self, leaf: int) -> Any:
         """Return a leaf as an array, in the form in which the program takes and returns it."""
         if leaf not in self.arrays:
-            example = self.program.leaves[leaf]
-            items = [self.vectors[leaf, k] for k in range(example.size)]
-            self.arrays[leaf] = self.library.stack(items) if example.row_leaves else self._stack(leaf, items)
+            description = self.program.leaves[leaf]
+            items = [self.vectors[leaf, k] for k in range(description.size)]
+            self.arrays[leaf] = self.library.stack(items) if description.row_leaves else self._stack(leaf, items)
         return self.arrays[leaf]
 
     def _stack(self, leaf: int, items: list[Any]) -> Any:
-        example, key = self.program.leaves[leaf], is_key(self.program.leaves[leaf])
-        shape = (*example.shape[2:], 2) if key else example.shape[2:]
+        description, is_random_key = self.program.leaves[leaf], is_key(self.program.leaves[leaf])
+        shape = (*description.shape[2:], 2) if is_random_key else description.shape[2:]
         array = self.library.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
-        array = jax.random.wrap_key_data(array) if key and self.library is jnp else array
-        return array[:, :1] if example.scope == "world" else array
+        array = jax.random.wrap_key_data(array) if is_random_key and self.library is jnp else array
+        return array[:, :1] if description.scope == "world" else array
 
     def set_array(self, leaf: int, value: Any) -> None:
         """Write a leaf as an array."""
@@ -98,16 +98,16 @@ class LeafValues:
             self.vectors.pop((leaf, k), None)
 
     def _split(self, leaf: int) -> None:
-        x, example = self.arrays[leaf], self.program.leaves[leaf]
-        size = example.size
-        if example.row_leaves or x is None:  # a leaf of None is written before it is read
+        x, description = self.arrays[leaf], self.program.leaves[leaf]
+        size = description.size
+        if description.row_leaves or x is None:  # a leaf of None is written before it is read
             self.vectors.update(((leaf, k), self.library.zeros(self.shape) if x is None else x[k]) for k in range(size))
             return
         if is_key(x):
             x = jax.random.key_data(x)
-        if example.scope == "world":
+        if description.scope == "world":
             x = self.library.broadcast_to(x, (self.n_worlds, self.n_drones, *x.shape[2:]))
-        batch_axes = self.shape if example.scope in ("drone", "world") else ()
+        batch_axes = self.shape if description.scope in ("drone", "world") else ()
         x = x.reshape(*batch_axes, size)
         self.vectors.update(((leaf, k), x[..., k]) for k in range(size))
 
@@ -124,11 +124,11 @@ def batch_counts(program: Program, leaves: list[Any]) -> tuple[int, int]:
 
 def leaf_shape(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct:
     """Return the shape and type of a leaf that a program writes, for all worlds; random keys as integers."""
-    example = program.leaves[leaf]
-    shape = (n_worlds, *example.shape[1:])
+    description = program.leaves[leaf]
+    shape = (n_worlds, *description.shape[1:])
     if leaf in program.rows:
         shape = (program.rows[leaf], n_worlds * program.n_drones)
-    return jax.ShapeDtypeStruct((*shape, *([2] if is_key(example) else [])), example.number_type)
+    return jax.ShapeDtypeStruct((*shape, *([2] if is_key(description) else [])), description.number_type)
 
 
 MIN_CHECKPOINTED_STEPS = 256
@@ -172,7 +172,7 @@ def _run_worlds(segment: Segment, values: LeafValues) -> None:
     """
     leaves, shape, library = values.program.leaves, (values.n_worlds, values.n_drones), values.library
 
-    def get_per_world(slot: Slot) -> Any:
+    def get_world_value(slot: Slot) -> Any:
         leaf, k = slot
         if leaves[leaf].scope == "drone":
             drone, k = divmod(k, leaves[leaf].size)
@@ -180,7 +180,7 @@ def _run_worlds(segment: Segment, values: LeafValues) -> None:
         value = values.get(slot)
         return value.reshape(shape)[:, 0] if library.ndim(value) and k != TABLE_INDEX else value
 
-    outs = values.execute(segment.block, [get_per_world(slot) for slot in segment.reads], shape[:1])
+    outs = values.execute(segment.block, [get_world_value(slot) for slot in segment.reads], shape[:1])
     written: dict[Slot, dict[int, Any]] = {}  # by slot of a drone and index of the drone
     for (leaf, k), value in zip(segment.writes, outs, strict=True):
         value = library.broadcast_to(value, shape[:1])
@@ -189,10 +189,10 @@ def _run_worlds(segment: Segment, values: LeafValues) -> None:
             written.setdefault((leaf, k), {})[drone] = value
         else:
             written[leaf, k] = dict.fromkeys(range(values.n_drones), value)
-    for slot, by_drone in written.items():
+    for slot, values_by_drone in written.items():
         old = values.get(slot)
         old = library.broadcast_to(old, values.shape).reshape(shape)
-        columns = [by_drone.get(d, old[:, d]) for d in range(values.n_drones)]
+        columns = [values_by_drone.get(d, old[:, d]) for d in range(values.n_drones)]
         values.set(slot, library.stack(columns, axis=-1).reshape(values.shape))
 
 
@@ -225,7 +225,7 @@ def steps(
     segments = program.phase_segments("each")
     carried_leaves = sorted({i for s in segments if isinstance(s, UnfusedStage) for i in s.written_leaves})
     fused = [s for s in segments if isinstance(s, Segment)]
-    written_slots = {slot for s in fused for slot in program.per_drone(s, s.writes)}
+    written_slots = {slot for s in fused for slot in program.drone_slots(s, s.writes)}
     carried_slots = sorted(slot for slot in written_slots if slot[0] not in carried_leaves)
 
     def advance(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
@@ -244,7 +244,7 @@ def steps(
     carry = ([jnp.broadcast_to(initial_values.get(slot), initial_values.shape) for slot in carried_slots],
              [initial_values.array(leaf) for leaf in carried_leaves])  # fmt: skip
     for segment in fused:  # leaves that are only read are split into vectors once, outside the loop
-        for slot in program.per_drone(segment, segment.reads):
+        for slot in program.drone_slots(segment, segment.reads):
             initial_values.get(slot)
     if isinstance(n_steps, int):
         carry = repeat(advance, carry, n_steps)
@@ -270,10 +270,10 @@ def repeat(iterate: Callable[[Any], Any], carry: Any, n: int) -> Any:
 
     if n < MIN_CHECKPOINTED_STEPS:
         return scan(carry, n)
-    inner = math.isqrt(n)
-    outer = jax.checkpoint(lambda c: scan(c, inner), prevent_cse=False)
-    carry, _ = jax.lax.scan(lambda c, _: (outer(c), None), carry, length=n // inner)
-    return scan(carry, n % inner) if n % inner else carry
+    n_inner = math.isqrt(n)
+    inner_scan = jax.checkpoint(lambda c: scan(c, n_inner), prevent_cse=False)
+    carry, _ = jax.lax.scan(lambda c, _: (inner_scan(c), None), carry, length=n // n_inner)
+    return scan(carry, n % n_inner) if n % n_inner else carry
 
 
 def nonfinite_worlds(program: Program, values: LeafValues) -> Array:

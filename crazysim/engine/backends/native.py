@@ -85,7 +85,7 @@ class HostLaunch:
     """A compiled kernel, which traced functions can call."""
 
     def __init__(self, kernel: Kernel):
-        self._name, self._aliases, self._state_bytes = target(kernel), kernel.aliases(), kernel.state_bytes
+        self._name, self._aliases, self._state_bytes = register_kernel(kernel), kernel.aliases(), kernel.state_bytes
 
     def __call__(self, n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
         if self._state_bytes:
@@ -110,7 +110,7 @@ class HostLaunch:
 @functools.cache
 def compiler() -> str | None:
     """Return the C++ compiler: CXX if it is set, else g++, clang++ or zig; None without any."""
-    words = _words("CXX")
+    words = _split_variable("CXX")
     if not words:
         return next((path for name in ("g++", "clang++") if (path := shutil.which(name))), None) or _zig()
     path = shutil.which(words[0])
@@ -140,13 +140,13 @@ def compiler_command(options: bool = True) -> list[str]:
     return [
         *shlex.split(program),
         *COMPILER_FLAGS,
-        *_words("CXXFLAGS" if options else ""),
+        *_split_variable("CXXFLAGS" if options else ""),
         "-I",
         jaxcompat.ffi_include_folder(),
     ]
 
 
-def _words(variable: str) -> list[str]:
+def _split_variable(variable: str) -> list[str]:
     """Return the words of an environment variable, none if it is not set."""
     text = os.environ.get(variable, "")
     try:
@@ -167,7 +167,7 @@ def time_limit() -> float:
     return seconds
 
 
-def target(kernel: Kernel) -> str:
+def register_kernel(kernel: Kernel) -> str:
     """Compile a kernel, unless it was compiled before, and return the name by which XLA calls it.
 
     The name contains the key, so that a program in JAX's compilation cache never calls a kernel for another machine.
@@ -204,7 +204,7 @@ def toolchain(words: tuple[str, ...]) -> str:
     # With -###, a compiler prints its version and the options that replace -march=native.
     with tempfile.TemporaryDirectory(dir=kernel_cache.temporary_folder(), ignore_cleanup_errors=True) as work:
         # Clang prints the working directory, too.
-        steps = _run([*words, "-E", "-x", "c++", os.devnull, "-###"], Path(work), time_limit(), cwd=os.sep)
+        steps = _run_compiler([*words, "-E", "-x", "c++", os.devnull, "-###"], Path(work), time_limit(), cwd=os.sep)
     libc = " ".join(platform.libc_ver())
     return "\n".join([steps.stdout, steps.stderr, cpu_features(), libc, jaxcompat.versions(), __version__])
 
@@ -255,7 +255,7 @@ def _compile(words: Sequence[str], source: str) -> bytes:
         work, library = Path(name), Path(name) / "kernel.so"
         try:
             (work / "kernel.cpp").write_text(source)
-            process = _run([*words, str(work / "kernel.cpp"), "-o", str(library)], work, seconds)
+            process = _run_compiler([*words, str(work / "kernel.cpp"), "-o", str(library)], work, seconds)
             if process.returncode:
                 _check_settings(work)
                 raise KernelError(f"{words[0]} refused the kernel: {process.stderr.strip()[:2000]}")
@@ -274,7 +274,7 @@ def _check_settings(work: Path) -> None:
 
     def compile_empty_file(options: bool) -> str:
         words = [*compiler_command(options), str(work / "empty.cpp"), "-o", str(work / "empty.so")]
-        process = _run(words, work, time_limit())
+        process = _run_compiler(words, work, time_limit())
         return (process.stderr.strip()[:500] or f"exit status {process.returncode}") if process.returncode else ""
 
     message = compile_empty_file(options=True)
@@ -309,7 +309,9 @@ _COMPILER_PIPES: set[IO[str]] = set()
 """Pipes of the running compilers; closing a pipe kills its compiler."""
 
 
-def _run(words: Sequence[str], work: Path, seconds: float, cwd: str | None = None) -> subprocess.CompletedProcess[str]:
+def _run_compiler(
+    words: Sequence[str], work: Path, seconds: float, cwd: str | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run the compiler; it is killed with all its children when its time is over or this process ends.
 
     Args:

@@ -50,18 +50,18 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         leaves = run_jaxprs["before"](*leaves)
-        in_loop = written["each"]
+        loop_leaves = written["each"]
 
         def advance(values: list[Any]) -> list[Any]:
-            leaves_after = run_jaxprs["each"](*replace_leaves(leaves, in_loop, values))
-            return [leaves_after[i] for i in in_loop]
+            leaves_after = run_jaxprs["each"](*replace_leaves(leaves, loop_leaves, values))
+            return [leaves_after[i] for i in loop_leaves]
 
-        loop_values = [leaves[i] for i in in_loop]
-        if in_loop and isinstance(n_steps, int):
+        loop_values = [leaves[i] for i in loop_leaves]
+        if loop_leaves and isinstance(n_steps, int):
             loop_values, _ = jax.lax.scan(lambda x, _: (advance(x), None), loop_values, length=n_steps)
-        elif in_loop:
+        elif loop_leaves:
             loop_values = jax.lax.fori_loop(0, n_steps, lambda _, x: advance(x), loop_values)
-        leaves = replace_leaves(leaves, in_loop, loop_values)
+        leaves = replace_leaves(leaves, loop_leaves, loop_values)
         flagged = nonfinite_worlds(axes.treedef.unflatten(leaves))
         leaves = run_jaxprs["after"](*leaves)
         return [leaves[i] for i in written_leaves], flagged

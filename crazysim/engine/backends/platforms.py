@@ -1,4 +1,4 @@
-"""Kernels of the platforms that have any: GPUs of NVIDIA, and CPUs with a C++ compiler."""
+"""Compilation of kernels for the platforms that have them: NVIDIA GPUs, and CPUs with a C++ compiler."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def describe_kernel(kernel: Kernel, platform: str, devices: Sequence[jax.Device]
     if device is None:
         return f"compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
     fitted_kernel = cuda.fit_registers(kernel, device)
-    widened_kernel, needs = cuda.widen_blocks(fitted_kernel, device), cuda.resources(fitted_kernel, device)
+    widened_kernel, resources = cuda.widen_blocks(fitted_kernel, device), cuda.resources(fitted_kernel, device)
     is_widened = widened_kernel is not fitted_kernel
     widened_text = f", {widened_kernel.threads} from {cuda.RESIDENT_LANES:,} drones on" if is_widened else ""
     return (
-        f"{fitted_kernel.threads} threads a block{widened_text}, {needs.registers} registers, "
-        f"{needs.spilled} bytes spilled"
+        f"{fitted_kernel.threads} threads a block{widened_text}, {resources.registers} registers, "
+        f"{resources.spilled_bytes} bytes spilled"
     )

@@ -14,7 +14,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from crazysim.engine.backends import kernel
-from crazysim.engine.backends.exchange import MAX_IN_VECTOR
+from crazysim.engine.backends.exchange import MAX_DRONES_IN_VECTOR
 from crazysim.engine.backends.frame import Kernel
 from crazysim.engine.backends.kernel import Body
 from crazysim.engine.backends.source import type_name
@@ -35,13 +35,13 @@ class ReverseProgram:
     """Number of its leaves without cotangents."""
     perturbed: tuple[int, ...]
     """Leaves whose cotangents are computed."""
-    backward: dict[Segment, Segment]
+    backward_segments: dict[Segment, Segment]
     """Segments of the backward pass, by the forward segment."""
-    backward_hoisted: dict[Segment, Segment]
+    backward_hoisted_segments: dict[Segment, Segment]
     """The same for hoisted blocks."""
     carry: tuple[Slot, ...]
     """State of the loop over the steps: numbers that a step uses and that steps change."""
-    read_back: frozenset[Slot]
+    restored: frozenset[Slot]
     """Members of ``carry`` that the backward pass through a step needs."""
 
     @property
@@ -53,8 +53,8 @@ class ReverseProgram:
         """Return the slots of all cotangents."""
         numbers = [(i, k) for i in {*self.seeds, *self.perturbed} for k in range(self.program.leaves[i].size)]
         ct_slots = {(self.n_leaves + i, k) for i, k in numbers}
-        for s in (*self.backward.values(), *self.backward_hoisted.values()):
-            slots = self.program.per_drone(s, [*s.reads, *s.writes])
+        for s in (*self.backward_segments.values(), *self.backward_hoisted_segments.values()):
+            slots = self.program.drone_slots(s, [*s.reads, *s.writes])
             ct_slots.update(slot for slot in slots if slot[0] >= self.n_leaves)
         return sorted(ct_slots)
 
@@ -79,29 +79,37 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     ]
     extended = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
     changed, constants = changed_slots(program, perturbed)
-    backward = {}
+    backward_segments = {}
     for s in program.fused_segments:
         constant_leaf = 2 * n + step_segments.index(s) if s in step_segments else -1
-        backward[s] = _reverse_segment(extended, n, s, changed, constants.get(s, ()), constant_leaf)
-    backward_hoisted = {
+        backward_segments[s] = _reverse_segment(extended, n, s, changed, constants.get(s, ()), constant_leaf)
+    backward_hoisted_segments = {
         s: _reverse_hoisted(n, s, changed, constants[s], 2 * n + k) for k, s in enumerate(step_segments) if constants[s]
     }
-    used_by_steps = {slot for s in step_segments for slot in program.per_drone(s, [*s.reads, *s.writes])}
+    used_by_steps = {slot for s in step_segments for slot in program.drone_slots(s, [*s.reads, *s.writes])}
     changing = program.changing_slots()
     if len(step_segments) == 1 and step_segments[0].scope == "drone":
         used_by_steps = set(step_segments[0].reads)
     carry = tuple(sorted(used_by_steps & changing))
-    read_back = {
-        slot for s in (*(backward[s] for s in step_segments), *step_segments[:-1]) for slot in _used_slots(extended, s)
+    restored = {
+        slot
+        for s in (*(backward_segments[s] for s in step_segments), *step_segments[:-1])
+        for slot in _used_slots(extended, s)
     }
     return ReverseProgram(
-        extended, n, perturbed, backward, backward_hoisted, carry, frozenset(read_back.intersection(carry))
+        extended,
+        n,
+        perturbed,
+        backward_segments,
+        backward_hoisted_segments,
+        carry,
+        frozenset(restored.intersection(carry)),
     )
 
 
 def _used_slots(program: Program, s: Segment) -> list[Slot]:
     """Return the slots of the inputs that a segment uses."""
-    used, slots = s.block.uses(), program.per_drone(s, s.reads)
+    used, slots = s.block.uses(), program.drone_slots(s, s.reads)
     return [slot for x, slot in zip(s.block.inputs, slots, strict=False) if x in used]
 
 
@@ -119,11 +127,11 @@ def _reverse_segment(
     cotangents of the numbers that are written over the drones, and adds its results to the copy of the first drone.
     """
     n_drones, is_world_segment = program.n_drones, s.scope == "world"
-    reads = program.per_drone(s, s.reads)
+    reads = program.drone_slots(s, s.reads)
     input_indices = [k for k, (x, slot) in enumerate(zip(s.block.inputs, reads, strict=False))
               if slot in changed and x.dtype.kind == "f" and not x.size]  # fmt: skip
     constant_indices = [len(reads) + k for k in constants]
-    outs = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
+    float_outputs = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
     pullback = transpose_block(s.block, [s.block.inputs[k] for k in (*input_indices, *constant_indices)])
     n_inputs = len(s.block.inputs)
 
@@ -154,9 +162,11 @@ def _reverse_segment(
         return result
 
     primal = [builder.input(x.dtype, x.size) for x in s.block.inputs]
-    seeds = [sum_copies(s.writes[k], s.block.outputs[k].dtype) for k in outs]
+    seeds = [sum_copies(s.writes[k], s.block.outputs[k].dtype) for k in float_outputs]
     parts = inline(builder, pullback, dict(zip(pullback.inputs, [*primal, *seeds], strict=True)))
-    for k in outs:  # a segment overwrites these numbers, so the outputs do not depend on their old values directly
+    for (
+        k
+    ) in float_outputs:  # a segment overwrites these numbers, so the outputs do not depend on their old values directly
         zero = constant(0, s.block.outputs[k].dtype)
         ct_outputs.update(dict.fromkeys(cotangent_slots(s.writes[k]), zero))
     for k, part in zip(input_indices, parts, strict=False):
@@ -198,7 +208,7 @@ def _reverse_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence
 
 
 def needed_leaves(reverse: ReverseProgram) -> tuple[int, ...]:
-    """Return the leaves that the kernel reads; behind them come the cotangents of ``seeds``."""
+    """Return the leaves that the kernel reads. Its further inputs are the cotangents of ``seeds``."""
     return kernel.needed_leaves(reverse.program)
 
 
@@ -213,11 +223,11 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         target: ``"cuda"`` or ``"host"``.
     """
     program, n = reverse.program, reverse.n_leaves
-    if target == "host" and program.group_size > MAX_IN_VECTOR:
+    if target == "host" and program.group_size > MAX_DRONES_IN_VECTOR:
         raise LimitError(
-            f"gradients of worlds of more than {MAX_IN_VECTOR} drones that act on each other have no kernel"
+            f"gradients of worlds of more than {MAX_DRONES_IN_VECTOR} drones that act on each other have no kernel"
         )
-    checked = dataclasses.replace(program, segments=(*program.segments, *reverse.backward.values()))
+    checked = dataclasses.replace(program, segments=(*program.segments, *reverse.backward_segments.values()))
     kernel.require_source(checked)
     body = Body(program, target)
     writer, rank = body.writer, program.ranks
@@ -231,14 +241,16 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         return type_name(program.leaves[slot[0]].number_type)
 
     for i in reverse.seeds:
-        writer.line(kernel.rows(f"s{rank[i]}", type_name(program.leaves[i].number_type), program.leaves[i].size), 1)
+        writer.write_line(
+            kernel.rows_line(f"s{rank[i]}", type_name(program.leaves[i].number_type), program.leaves[i].size), 1
+        )
     for i, k in reverse.slots():
         primal = i - n
         name = f"g{i - 2 * n}_{k}" if i >= 2 * n else f"c{rank[primal]}_{k}"
         seed = f"{kind((i, k))}(0)"
         if i < 2 * n and primal in reverse.seeds:
             seed = f"LOAD({program.leaves[primal].size}, 1, s{rank[primal]}, {k})"
-        writer.line(f"auto {name} = {kind((i, k))}_lanes({seed});", 1)
+        writer.write_line(f"auto {name} = {kind((i, k))}_lanes({seed});", 1)
         names[i, k] = name
 
     carry = reverse.carry
@@ -247,49 +259,51 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
     def write_states(state: str, slots: Collection[Slot], depth: int) -> None:
         for k, (slot, t) in enumerate(zip(carry, types, strict=True)):
             if slot in slots:
-                writer.line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
+                writer.write_line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
 
     last_segments, step_segments, first_segments = (
         program.phase_segments(phase) for phase in ("after", "each", "before")
     )
-    writer.line("const int n_intervals = n_steps > 0 ? (n_steps + interval - 1) / interval : 1;", 1)
-    writer.line("for (int turn = 0; turn < 2 * n_intervals - 1; ++turn) {", 1)
-    writer.line("const bool back = turn >= n_intervals - 1;", 2)
-    writer.line("const int part = back ? 2 * (n_intervals - 1) - turn : turn;", 2)
-    writer.line("const int n_here = n_steps - part * interval < interval ? n_steps - part * interval : interval;", 2)
-    writer.line("if (turn < n_intervals) {", 2)
+    writer.write_line("const int n_intervals = n_steps > 0 ? (n_steps + interval - 1) / interval : 1;", 1)
+    writer.write_line("for (int turn = 0; turn < 2 * n_intervals - 1; ++turn) {", 1)
+    writer.write_line("const bool back = turn >= n_intervals - 1;", 2)
+    writer.write_line("const int part = back ? 2 * (n_intervals - 1) - turn : turn;", 2)
+    writer.write_line(
+        "const int n_here = n_steps - part * interval < interval ? n_steps - part * interval : interval;", 2
+    )
+    writer.write_line("if (turn < n_intervals) {", 2)
     write_states("interval + part", carry, 3)
-    writer.line("}", 2)
-    writer.line("for (int step = 0; step < n_here; ++step) {", 2)
-    write_states("step", reverse.read_back, 3)
+    writer.write_line("}", 2)
+    writer.write_line("for (int step = 0; step < n_here; ++step) {", 2)
+    write_states("step", reverse.restored, 3)
     if not last_segments:  # without stages after the steps, the result of the last step is not needed
-        writer.line("if (back && step == n_here - 1) break;", 3)
+        writer.write_line("if (back && step == n_here - 1) break;", 3)
     for segment, segment_constants in zip(step_segments, constants, strict=True):
         kernel.write_segment(writer, program, segment, names, segment_constants, 3)
-    writer.line("}", 2)
-    writer.line("if (!back) continue;", 2)
+    writer.write_line("}", 2)
+    writer.write_line("if (!back) continue;", 2)
     if last_segments:
-        writer.line("if (part == n_intervals - 1) {", 2)
+        writer.write_line("if (part == n_intervals - 1) {", 2)
         _write_backward(body, reverse, last_segments, [()] * len(last_segments), dict(names), 3)
-        writer.line("}", 2)
-    writer.line("for (int step = n_here - 1; step >= 0; --step) {", 2)
+        writer.write_line("}", 2)
+    writer.write_line("for (int step = n_here - 1; step >= 0; --step) {", 2)
     names_before = dict(names)
     for k, (slot, t) in enumerate(zip(carry, types, strict=True)):
-        if slot not in reverse.read_back:
+        if slot not in reverse.restored:
             continue
         names_before[slot] = writer.new_name("b")
-        writer.line(f"const auto {names_before[slot]} = KEPT({t}, step, {k});", 3)
+        writer.write_line(f"const auto {names_before[slot]} = KEPT({t}, step, {k});", 3)
     _write_backward(body, reverse, step_segments, constants, names_before, 3)
-    writer.line("}", 2)
-    writer.line("const int before = interval + (part > 0 ? part - 1 : 0);", 2)
+    writer.write_line("}", 2)
+    writer.write_line("const int before = interval + (part > 0 ? part - 1 : 0);", 2)
     for k, (slot, t) in enumerate(zip(carry, types, strict=True)):
-        writer.line(f"{names[slot]} = KEPT({t}, before, {k});", 2)
-    writer.line("}", 1)
+        writer.write_line(f"{names[slot]} = KEPT({t}, before, {k});", 2)
+    writer.write_line("}", 1)
     for s in step_segments:
-        if s in reverse.backward_hoisted:
-            kernel.write_segment(writer, program, reverse.backward_hoisted[s], names, (), 1)
+        if s in reverse.backward_hoisted_segments:
+            kernel.write_segment(writer, program, reverse.backward_hoisted_segments[s], names, (), 1)
     if first_segments:
-        _write_backward(body, reverse, first_segments, [()] * len(first_segments), names | body.starts, 1)
+        _write_backward(body, reverse, first_segments, [()] * len(first_segments), names | body.initial_values, 1)
     pointers = [f"const {type_name(program.leaves[i].number_type)}* __restrict__ "
                 f"p{rank[i]}"
                 for i in kernel.needed_leaves(program)]  # fmt: skip
@@ -299,7 +313,10 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         pointers.append(f"{number}* __restrict__ {pointer}")
         values = [names[n + i, k] for k in range(program.leaves[i].size)]
         kernel.write_results(writer, pointer, number, 1, values, 1)
-    blocks = [*(s.block for s in step_segments for _ in range(2)), *(reverse.backward[s].block for s in step_segments)]
+    blocks = [
+        *(s.block for s in step_segments for _ in range(2)),
+        *(reverse.backward_segments[s].block for s in step_segments),
+    ]
     return body.kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carry))
 
 
@@ -326,10 +343,10 @@ def _write_backward(
     for s, segment_constants in zip(segments, constants, strict=True):
         names_by_segment.append(dict(names))
         if s is not segments[-1]:
-            for slot in dict.fromkeys(program.per_drone(s, s.writes)):
+            for slot in dict.fromkeys(program.drone_slots(s, s.writes)):
                 name, kind = writer.new_name("a"), type_name(program.leaves[slot[0]].number_type)
-                writer.line(f"auto {name} = {kind}_lanes({names[slot]});", depth)
+                writer.write_line(f"auto {name} = {kind}_lanes({names[slot]});", depth)
                 names[slot] = name
             kernel.write_segment(writer, program, s, names, segment_constants, depth)
     for s, segment_constants, names_before in reversed(list(zip(segments, constants, names_by_segment, strict=True))):
-        kernel.write_segment(writer, program, reverse.backward[s], names_before, segment_constants, depth)
+        kernel.write_segment(writer, program, reverse.backward_segments[s], names_before, segment_constants, depth)

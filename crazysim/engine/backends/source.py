@@ -74,10 +74,10 @@ class Writer(LineWriter):
         self._count += 1
         return f"{prefix}{self._count}"
 
-    def line(self, text: str, depth: int) -> None:
+    def write_line(self, text: str, depth: int) -> None:
         self.lines.append(INDENT * depth + text)
 
-    def block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
+    def write_block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
         """Write a block's operations, and return the names of its outputs."""
         self.names.update(zip(block.inputs, inputs, strict=True))
         outer_names = dict(self.sin_cos_names), self.entry_groups  # variables of a block are not defined outside it
@@ -92,7 +92,7 @@ class Writer(LineWriter):
         self.sin_cos_names, self.entry_groups = outer_names
         return [self.element(x) for x in block.outputs]
 
-    def forget(self) -> None:
+    def forget_intermediate_results(self) -> None:
         self.sin_cos_names, self.entry_groups = {}, dict.fromkeys(self.entry_groups, "")
 
     def element(self, x: Element) -> str:
@@ -111,32 +111,32 @@ class Writer(LineWriter):
             case "while":
                 self._while(op, args, depth)
             case "threefry2x32":
-                name = self._results(op)
-                self.line(f"auto {name}_0 = u32_lanes({args[2]}), {name}_1 = u32_lanes({args[3]});", depth)
-                self.line(f"threefry2x32({args[0]}, {args[1]}, {name}_0, {name}_1);", depth)
+                name = self._name_results(op)
+                self.write_line(f"auto {name}_0 = u32_lanes({args[2]}), {name}_1 = u32_lanes({args[3]});", depth)
+                self.write_line(f"threefry2x32({args[0]}, {args[1]}, {name}_0, {name}_1);", depth)
             case "table":
                 self._table(op)
             case "lookup":
                 self._lookup(op, args, depth)
             case "any_lane":
                 name = self.names[op.results[0]] = self.new_name()
-                self.line(f"const auto {name} = any_lane({args[0]});", depth)
+                self.write_line(f"const auto {name} = any_lane({args[0]});", depth)
             case "sin" | "cos":
                 self._sin_cos(op, args[0], depth)
             case "custom_jvp":  # its derivative is a kernel of its own
-                outs = self.block(op.blocks[0], args, depth)
-                name = self._results(op)
+                outs = self.write_block(op.blocks[0], args, depth)
+                name = self._name_results(op)
                 for k, out in enumerate(outs):
-                    self.line(f"const auto {name}_{k} = {out};", depth)
+                    self.write_line(f"const auto {name}_{k} = {out};", depth)
             case _:
                 if op.name in ("lt", "gt"):
                     self.comparisons[op.results[0]] = op
                 function = _limiting_function(op, self.comparisons)
                 text = expression(op, args) if function is None else f"{function}({args[1]}, {args[2]})"
                 name = self.names[op.results[0]] = self.new_name()
-                self.line(f"const auto {name} = {text};", depth)
+                self.write_line(f"const auto {name} = {text};", depth)
 
-    def _results(self, op: Operation, name: str | None = None) -> str:
+    def _name_results(self, op: Operation, name: str | None = None) -> str:
         """Name the results of an operation with several results, and return the prefix of their names."""
         name = name or self.new_name()
         self.names.update((x, f"{name}_{k}") for k, x in enumerate(op.results))
@@ -153,11 +153,11 @@ class Writer(LineWriter):
         offset, key = op.param("offset"), _entry_group(op)
         if key not in self.entry_groups:
             name = self.names[op.results[0]] = self.new_name()
-            self.line(f"const auto {name} = lookup({args[0]}, {args[1]}, {offset});", depth)
+            self.write_line(f"const auto {name} = lookup({args[0]}, {args[1]}, {offset});", depth)
             return
         if not self.entry_groups[key]:
             name = self.entry_groups[key] = self.new_name()
-            self.line(f"const auto {name} = lookup_four({args[0]}, {args[1]}, {offset // 4 * 4});", depth)
+            self.write_line(f"const auto {name} = lookup_four({args[0]}, {args[1]}, {offset // 4 * 4});", depth)
         self.names[op.results[0]] = f"{self.entry_groups[key]}.x[{offset % 4}]"
 
     def _sin_cos(self, op: Operation, x: str, depth: int) -> None:
@@ -165,27 +165,27 @@ class Writer(LineWriter):
         if x not in self.sin_cos_names:
             pair = self.sin_cos_names[x] = self.new_name()
             kind = "auto" if isinstance(op.args[0], Value) else type_name(op.dtype)
-            self.line(f"{kind} {pair}_0 = {x}, {pair}_1 = {x};", depth)
-            self.line(f"sin_cos({x}, {pair}_0, {pair}_1);", depth)
+            self.write_line(f"{kind} {pair}_0 = {x}, {pair}_1 = {x};", depth)
+            self.write_line(f"sin_cos({x}, {pair}_0, {pair}_1);", depth)
         self.names[op.results[0]] = f"{self.sin_cos_names[x]}_{0 if op.name == 'sin' else 1}"
 
     def _when(self, op: Operation, args: list[str], depth: int) -> None:
         mask, *old_values = args
-        name = self._carry(op, old_values, [False] * len(old_values), depth)
-        self.line(f"if (any({mask})) {{", depth)
-        for k, value in enumerate(self.block(op.blocks[0], [], depth + 1)):
-            self.line(f"{name}_{k} = select_n_({mask}, {name}_{k}, {value});", depth + 1)
-        self.line("}", depth)
+        name = self._define_carry(op, old_values, [False] * len(old_values), depth)
+        self.write_line(f"if (any({mask})) {{", depth)
+        for k, value in enumerate(self.write_block(op.blocks[0], [], depth + 1)):
+            self.write_line(f"{name}_{k} = select_n_({mask}, {name}_{k}, {value});", depth + 1)
+        self.write_line("}", depth)
 
     def _loop(self, op: Operation, args: list[str], depth: int) -> None:
         (body,) = op.blocks
         shared = self._shared_carry(op)
-        name = self._carry(op, args, shared, depth)
+        name = self._define_carry(op, args, shared, depth)
         counter = self.new_name("n")
-        self.line(f"for (int {counter} = 0; {counter} < {op.param('length')}; ++{counter}) {{", depth)
-        outs = self.block(body, [f"{name}_{k}" for k in range(len(args))], depth + 1)
-        self._assign(op, name, outs, shared, None, depth + 1)
-        self.line("}", depth)
+        self.write_line(f"for (int {counter} = 0; {counter} < {op.param('length')}; ++{counter}) {{", depth)
+        outs = self.write_block(body, [f"{name}_{k}" for k in range(len(args))], depth + 1)
+        self._assign_carry(op, name, outs, shared, None, depth + 1)
+        self.write_line("}", depth)
 
     def _over_others(self, op: Operation, depth: int, live: Sequence[tuple[Value, str]]) -> None:
         """Write a loop over the drones of the world, which reads their published numbers."""
@@ -193,41 +193,43 @@ class Writer(LineWriter):
         published = [(type_name(x.dtype), self.element(x)) for x in op.args]
         reads = self.exchange.publish(self, published, live, depth)
         neutral = [ops.neutral_number(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
-        name = self._carry(op, [literal(x) for x in neutral], [False] * len(neutral), depth)
+        name = self._define_carry(op, [literal(x) for x in neutral], [False] * len(neutral), depth)
         best_numbers: dict[int, str] = {}
         for k, (combine, x) in enumerate(zip(op.param("reduce"), body.outputs, strict=True)):
             if combine in ops.INDEX_REDUCTIONS:
                 best_numbers[k], start = self.new_name(), literal(ops.neutral_number(combine[3:], x.dtype))
-                self.line(f"auto {best_numbers[k]} = {type_name(x.dtype)}_lanes({start});", depth)
+                self.write_line(f"auto {best_numbers[k]} = {type_name(x.dtype)}_lanes({start});", depth)
         counter = self.new_name("j")
-        self.line(f"UNROLL for (int {counter} = 0; {counter} < GROUP; ++{counter}) {{", depth)
+        self.write_line(f"UNROLL for (int {counter} = 0; {counter} < GROUP; ++{counter}) {{", depth)
         inputs = [self.new_name() for _ in body.inputs]
         for variable, read in zip(inputs, reads, strict=False):
-            self.line(f"const auto {variable} = {read(counter)};", depth + 1)
-        self.line(f"const auto {inputs[-1]} = eq_(own, i32({counter}));", depth + 1)
-        outs = self.block(body, inputs, depth + 1)
+            self.write_line(f"const auto {variable} = {read(counter)};", depth + 1)
+        self.write_line(f"const auto {inputs[-1]} = eq_(own, i32({counter}));", depth + 1)
+        outs = self.write_block(body, inputs, depth + 1)
         for k, (combine, value) in enumerate(zip(op.param("reduce"), outs, strict=True)):
             if k in best_numbers:
                 is_better = self.new_name()
                 test = f"{ops.INDEX_REDUCTIONS[combine]}_({value}, {best_numbers[k]})"
-                self.line(f"const auto {is_better} = or_({test}, ne_({value}, {value}));", depth + 1)
-                self.line(f"{name}_{k} = select_n_({is_better}, {name}_{k}, i32_lanes(i32({counter})));", depth + 1)
-                self.line(f"{best_numbers[k]} = select_n_({is_better}, {best_numbers[k]}, {value});", depth + 1)
+                self.write_line(f"const auto {is_better} = or_({test}, ne_({value}, {value}));", depth + 1)
+                self.write_line(
+                    f"{name}_{k} = select_n_({is_better}, {name}_{k}, i32_lanes(i32({counter})));", depth + 1
+                )
+                self.write_line(f"{best_numbers[k]} = select_n_({is_better}, {best_numbers[k]}, {value});", depth + 1)
             else:
-                self.line(f"{name}_{k} = {combine}_({name}_{k}, {value});", depth + 1)
-        self.line("}", depth)
+                self.write_line(f"{name}_{k} = {combine}_({name}_{k}, {value});", depth + 1)
+        self.write_line("}", depth)
 
     def _while(self, op: Operation, args: list[str], depth: int) -> None:
         test, body = op.blocks
         shared = self._shared_carry(op)
-        name = self._carry(op, args, shared, depth)
+        name = self._define_carry(op, args, shared, depth)
         carry = [f"{name}_{k}" for k in range(len(args))]
-        self.line("for (;;) {", depth)
-        (continues,) = self.block(test, carry, depth + 1)
-        self.line(f"if (!any({continues})) break;", depth + 1)
+        self.write_line("for (;;) {", depth)
+        (continues,) = self.write_block(test, carry, depth + 1)
+        self.write_line(f"if (!any({continues})) break;", depth + 1)
         mask = None if is_shared(test.outputs[0], self.shared) else continues
-        self._assign(op, name, self.block(body, carry, depth + 1), shared, mask, depth + 1)
-        self.line("}", depth)
+        self._assign_carry(op, name, self.write_block(body, carry, depth + 1), shared, mask, depth + 1)
+        self.write_line("}", depth)
 
     def _shared_carry(self, op: Operation) -> list[bool]:
         """Return which carried numbers of a loop are shared by all lanes, and mark them as such in its iterations."""
@@ -236,28 +238,28 @@ class Writer(LineWriter):
             self.shared.update(x for x, is_shared_number in zip(block.inputs, shared, strict=True) if is_shared_number)
         return shared
 
-    def _carry(self, op: Operation, initial: Sequence[str], shared: Sequence[bool], depth: int) -> str:
+    def _define_carry(self, op: Operation, initial: Sequence[str], shared: Sequence[bool], depth: int) -> str:
         """Write a variable with its initial number for each result of an operation that updates them."""
-        name = self._results(op)
+        name = self._name_results(op)
         for k, (x, value, is_shared_number) in enumerate(zip(op.results, initial, shared, strict=True)):
             kind = type_name(x.dtype)
-            self.line(
+            self.write_line(
                 f"{kind} {name}_{k} = {value};" if is_shared_number else f"auto {name}_{k} = {kind}_lanes({value});",
                 depth,
             )
         return name
 
-    def _assign(
+    def _assign_carry(
         self, op: Operation, name: str, outs: Sequence[str], shared: Sequence[bool], mask: str | None, depth: int
     ) -> None:
         """Assign all results of an iteration after computing all of them, as one may be the old value of another."""
         new_names = [self.new_name() for _ in outs]
         for k, (new_name, result) in enumerate(zip(new_names, outs, strict=True)):
             text = result if mask is None or shared[k] else f"select_n_({mask}, {name}_{k}, {result})"
-            self.line(f"const auto {new_name} = {text};", depth)
+            self.write_line(f"const auto {new_name} = {text};", depth)
         for k, (new_name, x, is_shared_number) in enumerate(zip(new_names, op.results, shared, strict=True)):
             value = new_name if is_shared_number else f"{type_name(x.dtype)}_lanes({new_name})"
-            self.line(f"{name}_{k} = {value};", depth)
+            self.write_line(f"{name}_{k} = {value};", depth)
 
 
 def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:

@@ -1,4 +1,4 @@
-"""Values that all lanes of a vector share, in blocks with loops: a scalar variable is enough for such a value."""
+"""Values that all lanes of a vector share, in blocks with loops. The source holds such a value in a scalar variable."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ def shared_results(op: Operation, shared: Set[Value]) -> list[Value]:
         case "any_lane":
             return list(op.results)
         case "loop" | "while":
-            return [x for x, same in zip(op.results, shared_carry(op, shared), strict=True) if same]
+            return [
+                x for x, is_shared_number in zip(op.results, shared_carry(op, shared), strict=True) if is_shared_number
+            ]
         case "custom_jvp":
             (body,) = op.blocks
-            inside = _shared_in_body(body, [is_shared(x, shared) for x in op.args], shared)
-            return [x for x, out in zip(op.results, body.outputs, strict=True) if is_shared(out, inside)]
+            shared_inside = _shared_in_body(body, [is_shared(x, shared) for x in op.args], shared)
+            return [x for x, out in zip(op.results, body.outputs, strict=True) if is_shared(out, shared_inside)]
         case "when" | "over_others" | "threefry2x32":
             return []
     return list(op.results) if all(is_shared(x, shared) for x in op.args) else []
@@ -31,21 +33,27 @@ def shared_results(op: Operation, shared: Set[Value]) -> list[Value]:
 def shared_carry(op: Operation, shared: Set[Value]) -> list[bool]:
     """Return for each number that a loop carries whether all lanes share it in every iteration."""
     *tests, body = op.blocks
-    is_same = [is_shared(x, shared) for x in op.args]
+    carry_is_shared = [is_shared(x, shared) for x in op.args]
     while True:
-        inside = _shared_in_body(body, is_same, shared)
-        after = [same and is_shared(x, inside) for same, x in zip(is_same, body.outputs, strict=True)]
+        shared_inside = _shared_in_body(body, carry_is_shared, shared)
+        still_shared = [
+            was_shared and is_shared(x, shared_inside)
+            for was_shared, x in zip(carry_is_shared, body.outputs, strict=True)
+        ]
         for test in tests:  # if lanes may stop at different iterations, they share no number that the loop carries
-            if not all(is_shared(x, _shared_in_body(test, is_same, shared)) for x in test.outputs):
-                after = [False] * len(is_same)
-        if after == is_same:
-            return is_same
-        is_same = after
+            if not all(is_shared(x, _shared_in_body(test, carry_is_shared, shared)) for x in test.outputs):
+                still_shared = [False] * len(carry_is_shared)
+        if still_shared == carry_is_shared:
+            return carry_is_shared
+        carry_is_shared = still_shared
 
 
-def _shared_in_body(block: Block, inputs: list[bool], shared: Set[Value]) -> set[Value]:
+def _shared_in_body(block: Block, inputs_are_shared: list[bool], shared: Set[Value]) -> set[Value]:
     """Return the values that lanes share at the end of a block, given which of its inputs they share."""
-    inside = {*shared, *(x for x, same in zip(block.inputs, inputs, strict=True) if same)}
+    shared_inside = {
+        *shared,
+        *(x for x, is_shared_input in zip(block.inputs, inputs_are_shared, strict=True) if is_shared_input),
+    }
     for op in block.operations:
-        inside.update(shared_results(op, inside))
-    return inside
+        shared_inside.update(shared_results(op, shared_inside))
+    return shared_inside

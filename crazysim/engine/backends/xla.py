@@ -34,37 +34,39 @@ def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: Env 
     """
     env = dict(env or {})
     env.update(zip(block.inputs, inputs, strict=True))
-    last_use = _last_uses(block)
+    last_uses = _last_uses(block)
     for position, op in enumerate(block.operations):
         if op.name == "barrier":
-            _separate(env, block, position, last_use)
+            _add_barrier(env, block, position, last_uses)
         else:
-            env.update(zip(op.results, _apply(op, [_get(env, a) for a in op.args], shape, env), strict=True))
-    return [_get(env, x) for x in block.outputs]
+            env.update(
+                zip(op.results, _apply_operation(op, [_get_array(env, a) for a in op.args], shape, env), strict=True)
+            )
+    return [_get_array(env, x) for x in block.outputs]
 
 
-def _get(env: Env, x: Element) -> Any:
+def _get_array(env: Env, x: Element) -> Any:
     return env[x] if isinstance(x, Value) else x
 
 
 def _last_uses(block: Block) -> dict[Value, int]:
     """Return the position of the last operation that uses each value; an output is used after the end."""
-    last: dict[Value, int] = {}
+    last_uses: dict[Value, int] = {}
     for position, op in enumerate(block.operations):
         used = {x for x in op.args if isinstance(x, Value)}.union(*(b.uses() for b in op.blocks))
-        last.update(dict.fromkeys(used, position))
-    last.update((x, len(block.operations)) for x in block.outputs if isinstance(x, Value))
-    return last
+        last_uses.update(dict.fromkeys(used, position))
+    last_uses.update((x, len(block.operations)) for x in block.outputs if isinstance(x, Value))
+    return last_uses
 
 
-def _separate(env: Env, block: Block, position: int, last_use: dict[Value, int]) -> None:
+def _add_barrier(env: Env, block: Block, position: int, last_uses: dict[Value, int]) -> None:
     """Put a barrier on all values that are used later; else XLA's CPU backend recomputes them for every result."""
     results = [x for op in block.operations[:position] for x in op.results]
-    live = [x for x in results if last_use.get(x, -1) > position and not x.size and np.ndim(env[x])]
+    live = [x for x in results if last_uses.get(x, -1) > position and not x.size and np.ndim(env[x])]
     env.update(zip(live, lax.optimization_barrier([env[x] for x in live]), strict=True))
 
 
-def _apply(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> Sequence[Any]:
+def _apply_operation(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> Sequence[Any]:
     if op.name in STRUCTURED_RULES:
         return STRUCTURED_RULES[op.name](op, args, shape, env)
     if op.name in ("convert_element_type", "bitcast_convert_type"):
@@ -78,16 +80,16 @@ def _broadcast(args: Sequence[Any]) -> list[Array]:
     return [x if isinstance(x, jax.Array) and x.shape == shape else jnp.full(shape, jnp.asarray(x)) for x in args]
 
 
-def _lanes(x: Any, shape: tuple[int, ...]) -> Array:
+def _broadcast_to_lanes(x: Any, shape: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(x, shape)
 
 
 def _loop(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     (body,) = op.blocks
-    carry = [_lanes(x, shape) for x in args]
+    carry = [_broadcast_to_lanes(x, shape) for x in args]
 
     def iterate(carry: list[Any], _: Any) -> tuple[list[Any], None]:
-        return [_lanes(x, shape) for x in run(body, carry, shape, env)], None
+        return [_broadcast_to_lanes(x, shape) for x in run(body, carry, shape, env)], None
 
     return lax.scan(iterate, carry, length=op.param("length"))[0]
 
@@ -96,32 +98,34 @@ def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> 
     """Repeat until no lane continues; lanes that are finished keep their values."""
     test, body = op.blocks
 
-    def continues(carry: list[Any]) -> Array:
-        return _lanes(run(test, carry, shape, env)[0], shape)
+    def is_continuing(carry: list[Any]) -> Array:
+        return _broadcast_to_lanes(run(test, carry, shape, env)[0], shape)
 
     def iterate(carry: list[Any]) -> list[Any]:
-        mask = continues(carry)
+        mask = is_continuing(carry)
         new = run(body, carry, shape, env)
-        return [jnp.where(mask, _lanes(x, shape), old) for x, old in zip(new, carry, strict=True)]
+        return [jnp.where(mask, _broadcast_to_lanes(x, shape), old) for x, old in zip(new, carry, strict=True)]
 
-    return lax.while_loop(lambda carry: jnp.any(continues(carry)), iterate, [_lanes(x, shape) for x in args])
+    return lax.while_loop(
+        lambda carry: jnp.any(is_continuing(carry)), iterate, [_broadcast_to_lanes(x, shape) for x in args]
+    )
 
 
 def _when(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     """Compute a block only if some lane needs it."""
     (body,) = op.blocks
-    mask, old = args[0], [_lanes(x, shape) for x in args[1:]]
+    mask, old = args[0], [_broadcast_to_lanes(x, shape) for x in args[1:]]
 
-    def act(mask: Array, old: list[Array]) -> list[Array]:
+    def run_body(mask: Array, old: list[Array]) -> list[Array]:
         new = run(body, [], shape, env)
-        return [jnp.where(mask, _lanes(x, shape), o) for x, o in zip(new, old, strict=True)]
+        return [jnp.where(mask, _broadcast_to_lanes(x, shape), o) for x, o in zip(new, old, strict=True)]
 
-    return lax.cond(jnp.any(mask), act, lambda _, old: old, mask, old)
+    return lax.cond(jnp.any(mask), run_body, lambda _, old: old, mask, old)
 
 
 def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     (body,) = op.blocks
-    slope = op.param("slope")
+    derivative = op.param("derivative")
 
     @jax.custom_jvp
     def call(*args: Any) -> list[Any]:
@@ -130,8 +134,8 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
     @call.defjvp
     def _(primals: Any, tangents: Any) -> Any:
         outs = call(*primals)
-        changes = run(slope(), [*primals, *tangents], shape)
-        return outs, [_lanes(t, np.shape(o)) for t, o in zip(changes, outs, strict=True)]
+        out_tangents = run(derivative(), [*primals, *tangents], shape)
+        return outs, [_broadcast_to_lanes(t, np.shape(o)) for t, o in zip(out_tangents, outs, strict=True)]
 
     return call(*(jnp.asarray(x) for x in args))
 
@@ -145,45 +149,49 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
     (block,), n = op.blocks, op.param("n_members")
     n_worlds = shape[0] // n
     used = [v for v in block.uses() if v in env]
-    per_lane = {v: env[v] for v in used if not v.size and np.ndim(env[v])}
-    fixed = {v: env[v] for v in used if v not in per_lane}
+    lane_values = {v: env[v] for v in used if not v.size and np.ndim(env[v])}
+    shared_values = {v: env[v] for v in used if v not in lane_values}
     rows = [jnp.reshape(x, (n_worlds, n)) if np.ndim(x) else x for x in args]
     if n <= MAX_UNROLLED:
-        number = lax.broadcasted_iota(np.int32, (n_worlds, n), 1)
-        own_values = {v: jnp.reshape(x, (n_worlds, n)) for v, x in per_lane.items()}
+        drone_number = lax.broadcasted_iota(np.int32, (n_worlds, n), 1)
+        own_values = {v: jnp.reshape(x, (n_worlds, n)) for v, x in lane_values.items()}
         results_by_drone = []
         for j in range(n):
-            other = [x[:, j : j + 1] if np.ndim(x) else x for x in rows]
-            results_by_drone.append(run(block, [*other, number == j], (n_worlds, n), fixed | own_values))
-        combine = [COMBINE[name] for name in op.param("reduce")]
-        reduced = [functools.reduce(fn, [_lanes(x, (n_worlds, n)) for x in results])
-                 for fn, results in zip(combine, zip(*results_by_drone, strict=True), strict=True)]  # fmt: skip
+            other_numbers = [x[:, j : j + 1] if np.ndim(x) else x for x in rows]
+            results_by_drone.append(
+                run(block, [*other_numbers, drone_number == j], (n_worlds, n), shared_values | own_values)
+            )
+        combining_functions = [COMBINING_FUNCTIONS[name] for name in op.param("reduce")]
+        reduced = [functools.reduce(fn, [_broadcast_to_lanes(x, (n_worlds, n)) for x in results])
+                   for fn, results in zip(combining_functions, zip(*results_by_drone, strict=True), strict=True)
+                   ]  # fmt: skip
         return [jnp.reshape(x, shape) for x in reduced]
-    columns = [jnp.reshape(x, (n_worlds, n)).T[..., None] for x in per_lane.values()]  # (n, n_worlds, 1)
+    columns = [jnp.reshape(x, (n_worlds, n)).T[..., None] for x in lane_values.values()]  # (n, n_worlds, 1)
 
-    def reduce_for_one(xs: tuple[Array, list[Array]]) -> list[Array]:
+    def reduce_for_drone(xs: tuple[Array, list[Array]]) -> list[Array]:
         i, column = xs
-        own_values = dict(zip(per_lane, column, strict=True))
-        outs = run(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), fixed | own_values)
+        own_values = dict(zip(lane_values, column, strict=True))
+        outs = run(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), shared_values | own_values)
         return [
-            REDUCE[name](_lanes(x, (n_worlds, n)), axis=1) for name, x in zip(op.param("reduce"), outs, strict=True)
+            REDUCING_FUNCTIONS[name](_broadcast_to_lanes(x, (n_worlds, n)), axis=1)
+            for name, x in zip(op.param("reduce"), outs, strict=True)
         ]
 
     numbers = jnp.arange(n)
     if n_worlds * n * n <= MAX_PAIRS:
-        reduced = jax.vmap(reduce_for_one)((numbers, columns))
+        reduced = jax.vmap(reduce_for_drone)((numbers, columns))
     else:
-        at_once = max(1, MAX_PAIRS // (n_worlds * n))
-        reduced = lax.map(jax.checkpoint(reduce_for_one), (numbers, columns), batch_size=at_once)
+        batch_size = max(1, MAX_PAIRS // (n_worlds * n))
+        reduced = lax.map(jax.checkpoint(reduce_for_drone), (numbers, columns), batch_size=batch_size)
     return [x.T.reshape(shape) for x in reduced]
 
 
-COMBINE: dict[str, Callable[..., Array]] = {
+COMBINING_FUNCTIONS: dict[str, Callable[..., Array]] = {
     "add": lax.add, "min": lax.min, "max": lax.max, "or": lax.bitwise_or, "and": lax.bitwise_and,
 }  # fmt: skip
 """Operations on two numbers by which reductions combine results."""
 
-REDUCE: dict[str, Callable[..., Array]] = {
+REDUCING_FUNCTIONS: dict[str, Callable[..., Array]] = {
     "add": jnp.sum,
     "min": safe_min,
     "max": safe_max,

@@ -4,8 +4,8 @@ Only identities that hold for every number are used: ``x * 1``, ``x / 1``, ``x -
 it loses the sign of a zero. ``x * 0`` is kept, because it is NaN where x is infinite.
 
 Zeros of shared parameters are an exception (``known_zero``): terms that they multiply are removed, such as terms of a
-diagonal inertia or of an absent drag. If a state in such a term is infinite or NaN, the sum of the other terms results,
-where plain XLA would return NaN. The world is flagged either way.
+diagonal inertia or of an absent drag. If a state in such a term is infinite or NaN, the result is the sum of the other
+terms, where plain XLA would return NaN. The world is flagged either way.
 """
 
 from __future__ import annotations

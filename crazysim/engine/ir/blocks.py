@@ -131,9 +131,9 @@ class Builder:
     def add(self, name: str, args: Sequence[Element], dtype: DTypeLike, params: tuple = ()) -> Element:
         """Return the result of an operation: a new value, one that is known already, or a constant."""
         args, dtype = tuple(args), np.dtype(dtype)
-        simple = simplify(name, args, dtype, params)
-        if simple is not None:
-            return simple
+        simplified = simplify(name, args, dtype, params)
+        if simplified is not None:
+            return simplified
         if name == "sub" and is_known_zero(args[0]):  # a negative operand costs nothing in a product or a sum
             name, args = "neg", args[1:]
         return self._add(name, args, (dtype,), params)[0]
@@ -235,17 +235,17 @@ def _drop_results(op: Operation, used_values: Collection[Value]) -> Operation:
 def substitute(block: Block, replacements: Mapping[Value, Element]) -> Block:
     """Return a block in which operands and outputs are replaced; the operations that define the old ones stay."""
 
-    def replaced(x: Element) -> Element:
+    def map_element(x: Element) -> Element:
         return replacements.get(x, x) if isinstance(x, Value) else x
 
     operations = [
         op._replace(
-            args=tuple([replaced(x) for x in op.args]),
+            args=tuple([map_element(x) for x in op.args]),
             blocks=tuple([substitute(inner, replacements) for inner in op.blocks]),
         )
         for op in block.operations
     ]
-    return Block(block.inputs, tuple(operations), tuple([replaced(x) for x in block.outputs]))
+    return Block(block.inputs, tuple(operations), tuple([map_element(x) for x in block.outputs]))
 
 
 def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
@@ -257,11 +257,11 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
         values: Elements for the block's inputs and for values of enclosing blocks. The block's own values are added.
     """
 
-    def replaced(x: Element) -> Element:
+    def map_element(x: Element) -> Element:
         return values.get(x, x) if isinstance(x, Value) else x
 
     for op in block.operations:
-        args = [replaced(x) for x in op.args]
+        args = [map_element(x) for x in op.args]
         if op.name == "barrier":
             builder.barrier()
         elif len(op.results) == 1 and not op.blocks:
@@ -275,10 +275,10 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
             blocks = tuple([_inline_block(builder, inner, values) for inner in op.blocks])
             results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, blocks)
             values.update(zip(op.results, results, strict=True))
-    return [replaced(x) for x in block.outputs]
+    return [map_element(x) for x in block.outputs]
 
 
 def _inline_block(outer: Builder, block: Block, values: dict[Value, Element]) -> Block:
     builder = Builder(outer)
-    inside = values | {x: builder.input(x.dtype) for x in block.inputs}
-    return builder.finish(inline(builder, block, inside))
+    inner_values = values | {x: builder.input(x.dtype) for x in block.inputs}
+    return builder.finish(inline(builder, block, inner_values))

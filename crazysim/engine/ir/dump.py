@@ -12,11 +12,11 @@ from crazysim.storage import write_file
 DUMP_VARIABLE = "CRAZYSIM_DUMP"
 """Environment variable that names the folder; nothing is written where it is not set."""
 
-_numbers = itertools.count()
+_file_numbers = itertools.count()
 
 
 def is_enabled() -> bool:
-    """Return True where a folder is set, so that text worth time to make is made."""
+    """Return True if a folder is set. Callers then make the texts, which takes time."""
     return bool(os.environ.get(DUMP_VARIABLE))
 
 
@@ -35,6 +35,6 @@ def write(name: str, text: str) -> Path | None:
         return None
     folder = Path(os.environ[DUMP_VARIABLE])
     folder.mkdir(parents=True, exist_ok=True)
-    file = folder / f"{os.getpid()}-{next(_numbers):03d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}"
+    file = folder / f"{os.getpid()}-{next(_file_numbers):03d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}"
     write_file(file, text)
     return file

@@ -44,18 +44,18 @@ def round_away(x: Any) -> Any:
     return np.copysign(np.where(np.abs(x - whole) >= 0.5, np.abs(whole) + 1, np.abs(whole)), x)
 
 
-def shift(shift: Callable[[Any, Any], Any], fill: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+def total_shift(shift: Callable[[Any, Any], Any], fill: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
     """Return a shift that is defined for any number of bits.
 
     Args:
         shift: Shift by fewer bits than the type has.
-        fill: Function of the operand that gives the result for other numbers of bits.
+        fill: Function from the operand to the result for other numbers of bits.
     """
 
     def shifted(x: Any, n: Any) -> Any:
         bits = 8 * x.dtype.itemsize
-        inside = (n >= 0) & (n < bits) if n.dtype.kind == "i" else n < bits
-        return np.where(inside, shift(x, np.where(inside, n, n.dtype.type(0))), fill(x))
+        is_in_range = (n >= 0) & (n < bits) if n.dtype.kind == "i" else n < bits
+        return np.where(is_in_range, shift(x, np.where(is_in_range, n, n.dtype.type(0))), fill(x))
 
     return shifted
 
@@ -83,10 +83,10 @@ def convert(x: Any, dtype: DTypeLike) -> Any:
     if x.dtype.kind == "f" and dtype.kind in "iu":
         limits = np.iinfo(dtype)
         low, high = float(limits.min), float(limits.max) + 1  # both are exact, powers of two or 0
-        inside = (x > low - 1) & (x < high) if dtype.itemsize < 8 else (x >= low) & (x < high)
-        whole = np.where(inside, x, 0).astype(dtype)
-        outside = np.where(np.isnan(x), 0, np.where(x >= high, limits.max, limits.min)).astype(dtype)
-        return np.where(inside, whole, outside)
+        is_in_range = (x > low - 1) & (x < high) if dtype.itemsize < 8 else (x >= low) & (x < high)
+        whole = np.where(is_in_range, x, 0).astype(dtype)
+        saturated = np.where(np.isnan(x), 0, np.where(x >= high, limits.max, limits.min)).astype(dtype)
+        return np.where(is_in_range, whole, saturated)
     return x != 0 if dtype.kind == "b" else x.astype(dtype)
 
 
@@ -97,8 +97,8 @@ def bitcast(x: Any, dtype: DTypeLike) -> Any:
 
 def power(a: Any, b: Any) -> Any:
     """Raise to a power; for an exponent of 0.5 NumPy takes the square root, which is wrong at -inf and -0."""
-    root = (b == 0.5) & ((a == 0) | np.isneginf(a))
-    return np.where(root, np.abs(a), np.power(a, b))
+    is_root = (b == 0.5) & ((a == 0) | np.isneginf(a))
+    return np.where(is_root, np.abs(a), np.power(a, b))
 
 
 def integer_pow(x: Any, y: int) -> Any:

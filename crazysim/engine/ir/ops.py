@@ -32,9 +32,9 @@ class OperationForm:
     name: str
     """Name in programs, and of JAX's primitive if there is one."""
     operands: str
-    """A letter for each operand: T for one type, the same wherever it stands, b for bool, u for uint32, * for any."""
+    """One letter for each operand: T for a type that all T share, b for bool, u for uint32, * for any type."""
     results: str = "T"
-    """The same for each result."""
+    """One letter for each result, as for ``operands``."""
     kinds: str = "f"
     """Kinds that T may be: f for float, i and u for signed and unsigned integer, b for bool."""
     numpy: Callable[..., Any] | None = None
@@ -44,8 +44,8 @@ class OperationForm:
     xla: str | Callable[..., Any] = ""
     """Name in ``jax.lax``, or a function of the operands. By default the name of the row."""
     source: str | Mapping[str, str] = "{name}_({all})"
-    """Expression in C++ and CUDA, by kind where that matters: {0}, {1}, ... and {all} are operands, {type} is the
-    result's type, and static parameters go by their names. The functions are in ``targets/``."""
+    """Expression in C++ and CUDA, or expressions by kind. {0}, {1}, ... and {all} stand for the operands, {type} for
+    the type of the result, and the name of a static parameter for its value. The functions are in ``targets/``."""
     casadi: str | Callable[..., Any] | None = None
     """Name in ``casadi``, or a function of that module and the operands; None where it has no form."""
     casadi_kinds: str = "fib"
@@ -56,7 +56,7 @@ class OperationForm:
     """True where each target implements the operation separately, because it runs blocks or has several results."""
 
     def accepts(self, dtypes: Sequence[np.dtype]) -> bool:
-        """Return True where operands of these types fit."""
+        """Return True if the operation is defined for operands of these types."""
         if "..." in self.operands:
             return True
         kinds = {x for x, letter in zip(dtypes, self.operands, strict=False) if letter == "T"}
@@ -114,7 +114,7 @@ def _rows() -> list[OperationForm]:
         return OperationForm(name=name, operands="TT", numpy=numpy, kinds=kinds, cost=cost, **more)
 
     def comparison(name: str, numpy: Any, casadi: Any, kinds: str = any_number) -> OperationForm:
-        # Its cost is counted with the selection.
+        # The cost is counted with the selection that uses the result.
         return binary(name, numpy, kinds, 0, results="b", exact=True, casadi=casadi, casadi_kinds="fiub")
 
     arithmetic = [
@@ -195,15 +195,16 @@ def _rows() -> list[OperationForm]:
         binary("xor", np.bitwise_xor, "iub", exact=True, xla="bitwise_xor",
                casadi=lambda _, a, b: a != b, casadi_kinds="b"),
         unary("not", np.invert, 1, "logic_not", kinds="iub", exact=True, xla="bitwise_not", casadi_kinds="b"),
-        binary("shift_left", forms.shift(np.left_shift, np.zeros_like), integer, exact=True),
-        binary("shift_right_logical", forms.shift(forms.shift_logical, np.zeros_like), integer, exact=True),
-        binary("shift_right_arithmetic", forms.shift(forms.shift_arithmetic, forms.sign_bits), integer, exact=True),
+        binary("shift_left", forms.total_shift(np.left_shift, np.zeros_like), integer, exact=True),
+        binary("shift_right_logical", forms.total_shift(forms.shift_logical, np.zeros_like), integer, exact=True),
+        binary("shift_right_arithmetic", forms.total_shift(forms.shift_arithmetic, forms.sign_bits), integer,
+               exact=True),
         OperationForm(name="convert_element_type", operands="*", results="*", numpy=forms.convert, exact=True,
             source="to_{type}({0})"),
         OperationForm(name="bitcast_convert_type", operands="*", results="*", numpy=forms.bitcast, exact=True,
             source="bits_{type}({0})"),
-        OperationForm(name="again", operands="T", cost=0, numpy=lambda x, **_: x, xla=lambda x, **_: x,
-            source="AGAIN({0})"),
+        OperationForm(name="opaque_copy", operands="T", cost=0, numpy=lambda x, **_: x, xla=lambda x, **_: x,
+            source="OPAQUE_COPY({0})"),
     ]  # fmt: skip
     structured = [
         OperationForm(name="barrier", operands="", results="", cost=0, structured=True),
@@ -229,19 +230,19 @@ TABLE: Mapping[str, OperationForm] = {row.name: row for row in _rows()}
 ``barrier`` separates stages: values that are used after it are computed once, before it. ``when(mask, *old)`` returns
 the outputs of its block where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)`` runs its block
 ``length`` times; ``while(*carry)`` runs its second block as long as its first returns true. ``custom_jvp(*args,
-slope=)`` runs its block, and has a custom derivative. ``over_others(*published, reduce=, n_members=)`` runs its block
-for each drone of the world: the inputs of the block are the numbers that this drone published, and whether it is the
-reading drone itself; ``reduce`` names the operation that combines each output. It never occurs in an inner block.
-``threefry2x32`` is the cipher of JAX's random numbers. ``again(x, part=)`` is x as a new value in each part, so that
-the numbers that depend on it are recomputed; compilers on the host may still merge them.
+derivative=)`` runs its block, and has a custom derivative. ``over_others(*published, reduce=, n_members=)`` runs its
+block for each drone of the world: the inputs of the block are the numbers that this drone published, and whether it is
+the reading drone itself; ``reduce`` names the operation that combines each output. It never occurs in an inner block.
+``threefry2x32`` is the cipher of JAX's random numbers. ``opaque_copy(x, part=)`` is x as a new value in each part, so
+that the numbers that depend on it are recomputed; compilers on the host may still merge them.
 ``table(numbers=)`` is a table of constants. ``lookup(table, index, offset=, aligned=)`` is its entry at the sum of an
 int32 index (a multiple of four if ``aligned``) and a constant offset, which must be in bounds.
 ``any_lane`` is true at least where its operand is; a target may return true in all lanes of a vector if any is true.
 
-Comparisons cost nothing, as they are counted with selections; nor do changes of sign, as part of other operations. A
-function costs as much as a hardware approximation and a step that refines it, or as the shortest polynomial that is
-exact to float32. A random number takes twenty rounds of add, rotate and xor. An operation that runs a block costs as
-much as the block.
+Comparisons and changes of sign cost nothing: comparisons are counted with the selections that use them, and a change of
+sign is part of another operation. A function costs as much as a hardware approximation and a step that refines it, or
+as the shortest polynomial that is exact to float32. A random number takes twenty rounds of add, rotate and xor. An
+operation that runs a block costs as much as the block.
 """
 
 REDUCTIONS: Mapping[str, str] = {"sum": "add", "min": "min", "max": "max"}
@@ -268,4 +269,5 @@ BOOLEAN_FORM: Mapping[str, tuple[str, int | None]] = {
     "max": ("or", None),
     "min": ("and", None),
 }
-"""Logical operations that replace operations of order on bools, and the index of the operand to negate, if any."""
+"""Logical operations that replace comparisons, maxima and minima of bools, and the index of the operand to negate, or
+None."""

@@ -20,7 +20,8 @@ from crazysim.engine.ir.blocks import Block
 from crazysim.jaxcompat import is_key
 
 Slot = tuple[int, int]
-"""Index of a number: of its leaf, and of the element in the part of the leaf that belongs to one drone (or world)."""
+"""Place of a number: the index of its leaf, and the index of the element in the part of the leaf that belongs to one
+drone (or world)."""
 
 TABLE_INDEX = -1
 """Element index of a slot that stands for a whole leaf, read as a table. Only shared leaves are tables."""
@@ -209,7 +210,7 @@ class Program:
         """Return the segments that run in a phase."""
         return [segment for segment in self.segments if segment.phase == phase]
 
-    def per_drone(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
+    def drone_slots(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
         """Return the slots of a segment as slots of one drone; a segment of worlds has slots for each of its drones."""
         if segment.scope == "drone":
             return list(slots)
@@ -220,7 +221,7 @@ class Program:
         slots: set[Slot] = set()
         for segment in self.phase_segments("each"):
             if isinstance(segment, Segment):
-                slots.update(self.per_drone(segment, segment.writes))
+                slots.update(self.drone_slots(segment, segment.writes))
             else:
                 slots.update(
                     (leaf, k) for leaf in segment.written_leaves for k in range(TABLE_INDEX, self.leaves[leaf].size)
@@ -228,7 +229,10 @@ class Program:
         return slots
 
     def parts(self) -> Iterator[Program]:
-        """Iterate over programs of one phase each: what one kernel can run, and each unfused stage, in order."""
-        kinds = itertools.groupby(self.segments, lambda s: (s.phase, id(s) if isinstance(s, UnfusedStage) else 0))
-        for _, segments in kinds:
+        """Iterate over parts of the program in order: fused segments that one kernel can run, or one unfused stage.
+
+        All segments of a part have the same phase.
+        """
+        runs = itertools.groupby(self.segments, lambda s: (s.phase, id(s) if isinstance(s, UnfusedStage) else 0))
+        for _, segments in runs:
             yield dataclasses.replace(self, segments=tuple(segments), check_segment=None, scratch=frozenset())

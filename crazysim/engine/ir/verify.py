@@ -49,9 +49,9 @@ def _require(condition: bool, message: str) -> None:
 
 def _verify_segment(program: Program, segment: Segment, changing: set[Slot]) -> None:
     if segment is not program.check_segment:
-        _slots(program, segment, segment.writes, segment.block.outputs, "output")
-    _slots(program, segment, segment.reads, segment.block.inputs[: len(segment.reads)], "input")
-    _slots(program, segment, segment.hoisted_reads, segment.hoisted.inputs, "input of the hoisted block")
+        _verify_slots(program, segment, segment.writes, segment.block.outputs, "output")
+    _verify_slots(program, segment, segment.reads, segment.block.inputs[: len(segment.reads)], "input")
+    _verify_slots(program, segment, segment.hoisted_reads, segment.hoisted.inputs, "input of the hoisted block")
     constants = segment.block.inputs[len(segment.reads) :]
     _require(
         [x.dtype for x in constants] == [x.dtype for x in segment.hoisted.outputs],
@@ -62,11 +62,11 @@ def _verify_segment(program: Program, segment: Segment, changing: set[Slot]) -> 
     verify_block(segment.block)
 
 
-def _slots(
+def _verify_slots(
     program: Program, segment: Segment, slots: tuple[Slot, ...], elements: tuple[Element, ...], role: str
 ) -> None:
-    _require(len(slots) == len(elements), f"{len(elements)} {role}s for {len(slots)} places")
-    _require(len(set(slots)) == len(slots), f"a place is there twice as {role}")
+    _require(len(slots) == len(elements), f"{len(elements)} {role}s for {len(slots)} slots")
+    _require(len(set(slots)) == len(slots), f"a slot occurs twice as {role}")
     for (i, k), x in zip(slots, elements, strict=True):
         leaf = program.leaves[i]
         if k == TABLE_INDEX:
@@ -114,42 +114,42 @@ def _definitions(block: Block) -> list[Value]:
 def _verify_types(op: Operation) -> None:
     _require(op.name in ops.TABLE, f"operation {op.name!r} is not in the table")
     row, dtypes, results = ops.TABLE[op.name], [x.dtype for x in op.args], [x.dtype for x in op.results]
-    text = f"operation {op.name!r} of {', '.join(map(str, dtypes))} to {', '.join(map(str, results))}"
-    _require(all(x in ops.DTYPES for x in (*dtypes, *results)), f"{text}: a type that the engine does not have")
+    description = f"operation {op.name!r} of {', '.join(map(str, dtypes))} to {', '.join(map(str, results))}"
+    _require(all(x in ops.DTYPES for x in (*dtypes, *results)), f"{description}: a type that the engine does not have")
     tables = [x for x in op.args[op.name == "lookup" :] if isinstance(x, Value) and x.size]
-    _require(not tables, f"{text}: a table, which only 'lookup' reads")
+    _require(not tables, f"{description}: a table, which only 'lookup' reads")
     match op.name:
         case "table":
             numbers = op.param("numbers").array
-            _require((numbers.dtype, numbers.size) == (results[0], op.results[0].size), text)
+            _require((numbers.dtype, numbers.size) == (results[0], op.results[0].size), description)
         case "lookup":
             table, offset = op.args[0], op.param("offset")
-            _require(isinstance(table, Value) and 0 <= offset < table.size, f"{text}: no entry {offset}")
-            _require(dtypes[1] == np.dtype(np.int32) and results == [table.dtype], text)
+            _require(isinstance(table, Value) and 0 <= offset < table.size, f"{description}: no entry {offset}")
+            _require(dtypes[1] == np.dtype(np.int32) and results == [table.dtype], description)
         case "when":
             (block,) = op.blocks
             outs = [x.dtype for x in block.outputs]
-            _require(dtypes[:1] == [np.dtype(bool)] and dtypes[1:] == results == outs and not block.inputs, text)
+            _require(dtypes[:1] == [np.dtype(bool)] and dtypes[1:] == results == outs and not block.inputs, description)
         case "loop" | "while":
             *test, body = op.blocks
-            _require(len(test) == (op.name == "while"), text)
+            _require(len(test) == (op.name == "while"), description)
             carried = [[x.dtype for x in values] for values in (body.inputs, body.outputs, *(t.inputs for t in test))]
-            _require(all(x == dtypes == results for x in carried), text)
-            _require(all([x.dtype for x in t.outputs] == [np.dtype(bool)] for t in test), text)
+            _require(all(x == dtypes == results for x in carried), description)
+            _require(all([x.dtype for x in t.outputs] == [np.dtype(bool)] for t in test), description)
         case "over_others":
             (block,) = op.blocks
-            _require([x.dtype for x in block.inputs] == [*dtypes, np.dtype(bool)], text)
+            _require([x.dtype for x in block.inputs] == [*dtypes, np.dtype(bool)], description)
             names = op.param("reduce")
             outs = [np.dtype(np.int32) if name in ops.INDEX_REDUCTIONS else x.dtype
                     for name, x in zip(names, block.outputs, strict=False)]  # fmt: skip
-            _require(outs == results and len(names) == len(results) == len(block.outputs), text)
+            _require(outs == results and len(names) == len(results) == len(block.outputs), description)
         case "custom_jvp":
             (block,) = op.blocks
-            _require([x.dtype for x in block.inputs] == dtypes, text)
-            _require([x.dtype for x in block.outputs] == results, text)
+            _require([x.dtype for x in block.inputs] == dtypes, description)
+            _require([x.dtype for x in block.outputs] == results, description)
         case _:
-            _require(not op.blocks and row.accepts(dtypes), text)
+            _require(not op.blocks and row.accepts(dtypes), description)
             shared = next((x for x, letter in zip(dtypes, row.operands, strict=True) if letter == "T"), None)
             expected = {"T": shared, "b": np.dtype(bool), "u": np.dtype(np.uint32)}
             fits = [letter == "*" or x == expected[letter] for x, letter in zip(results, row.results, strict=False)]
-            _require(len(results) == len(row.results) and all(fits), text)
+            _require(len(results) == len(row.results) and all(fits), description)

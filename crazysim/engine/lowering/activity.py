@@ -46,8 +46,8 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
         return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in active]
 
     def propagate(s: Segment) -> None:
-        written_slots = program.per_drone(s, s.writes)
-        reads = program.per_drone(s, s.reads)
+        written_slots = program.drone_slots(s, s.writes)
+        reads = program.drone_slots(s, s.reads)
         changed.update(written_slots[k] for k in active_outputs(s.block, reads, constants.get(s, ())))
 
     for s in program.phase_segments("before"):
@@ -65,9 +65,9 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
     return changed, constants
 
 
-def active_values(block: Block, targets: Collection[Value]) -> set[Value]:
+def active_values(block: Block, perturbed: Collection[Value]) -> set[Value]:
     """Return the values of a block and of its inner blocks that depend differentiably on some of its inputs."""
-    active = set(targets)
+    active = set(perturbed)
     _propagate(block, active)
     return active
 

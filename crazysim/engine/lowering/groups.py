@@ -50,24 +50,24 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     axes, leaves = Axes(data), jax.tree.leaves(data)
     if all(scope == "drone" or not has_members(scope) for scope in axes.scopes):
         return [Group("drone", tuple(stages), None)]
-    access = [_access(tracer(stage, axes, leaves), stage, axes) for stage in stages]
-    clocks = _clocks(access, axes)
-    members = {scope: x.shape[1] for scope, x in zip(axes.scopes, leaves, strict=True) if has_members(scope)}
-    components = _components([k for k in range(len(stages)) if k not in clocks], access)
-    components = [(indices, frozenset().union(*(access[k].populations for k in indices))) for indices in components]
+    accesses = [_access(tracer(stage, axes, leaves), stage, axes) for stage in stages]
+    clocks = _find_clocks(accesses, axes)
+    n_members = {scope: x.shape[1] for scope, x in zip(axes.scopes, leaves, strict=True) if has_members(scope)}
+    components = _find_components([k for k in range(len(stages)) if k not in clocks], accesses)
+    components = [(indices, frozenset().union(*(accesses[k].populations for k in indices))) for indices in components]
     components.sort(key=lambda part: "drone" not in part[1])
     if not components or "drone" not in components[0][1]:
         components.insert(0, (set(), frozenset({"drone"})))
-    components = [(_add_clocks(indices, clocks, access), populations) for indices, populations in components]
+    components = [(_add_clocks(indices, clocks, accesses), populations) for indices, populations in components]
     components[0] = (
         components[0][0] | clocks,
         components[0][1],
     )  # the drones run all clocks, as without other populations
     groups, owned_leaves = [], frozenset()
     for indices, populations in components:
-        written = frozenset().union(*(access[k].written_leaves for k in indices))
-        main = "drone" if "drone" in populations else max(sorted(populations), key=members.__getitem__)
-        groups.append(Group(main, tuple([stages[k] for k in sorted(indices)]), written - owned_leaves))
+        written = frozenset().union(*(accesses[k].written_leaves for k in indices))
+        main_population = "drone" if "drone" in populations else max(sorted(populations), key=n_members.__getitem__)
+        groups.append(Group(main_population, tuple([stages[k] for k in sorted(indices)]), written - owned_leaves))
         owned_leaves |= written
     return groups
 
@@ -78,24 +78,24 @@ def _access(traced: TracedStage, stage: Stage, axes: Axes) -> _Access:
     return _Access(frozenset(traced.input_leaves), frozenset(traced.written_leaves), frozenset(populations))
 
 
-def _clocks(access: Sequence[_Access], axes: Axes) -> set[int]:
-    """Return the stages that use no leaf of a population, and no leaf that a stage outside this set writes."""
-    clocks = {k for k, a in enumerate(access) if not any(has_members(axes.scopes[i]) for i in a.touched)}
+def _find_clocks(accesses: Sequence[_Access], axes: Axes) -> set[int]:
+    """Return the stages that use no leaf of a population, and no leaf that a stage outside the returned set writes."""
+    clocks = {k for k, a in enumerate(accesses) if not any(has_members(axes.scopes[i]) for i in a.touched)}
     while True:
-        others = frozenset().union(*(a.written_leaves for k, a in enumerate(access) if k not in clocks))
-        depending = {k for k in clocks if access[k].touched & others}
+        others = frozenset().union(*(a.written_leaves for k, a in enumerate(accesses) if k not in clocks))
+        depending = {k for k in clocks if accesses[k].touched & others}
         if not depending:
             return clocks
         clocks -= depending
 
 
-def _components(stages: Iterable[int], access: Sequence[_Access]) -> list[set[int]]:
+def _find_components(stages: Iterable[int], accesses: Sequence[_Access]) -> list[set[int]]:
     """Return sets of stages that depend on each other, or write the same populations."""
     parts: list[set[int]] = []
     for k in stages:
         component, other_parts = {k}, []
         for part in parts:
-            if any(_depend(access[k], access[j]) for j in part):
+            if any(_are_dependent(accesses[k], accesses[j]) for j in part):
                 component |= part
             else:
                 other_parts.append(part)
@@ -103,18 +103,18 @@ def _components(stages: Iterable[int], access: Sequence[_Access]) -> list[set[in
     return parts
 
 
-def _depend(a: _Access, b: _Access) -> bool:
+def _are_dependent(a: _Access, b: _Access) -> bool:
     # A stage without a population counts as a stage of the drones.
     populations = (a.populations or {"drone"}) & (b.populations or {"drone"})
     return bool(populations or a.written_leaves & b.touched or b.written_leaves & a.touched)
 
 
-def _add_clocks(stages: Collection[int], clocks: Collection[int], access: Sequence[_Access]) -> set[int]:
+def _add_clocks(stages: Collection[int], clocks: Collection[int], accesses: Sequence[_Access]) -> set[int]:
     """Return stages with the clocks whose results they read."""
     result = set(stages)
     while True:
-        read = frozenset().union(*(access[k].read_leaves for k in result))
-        added = {k for k in clocks if access[k].written_leaves & read} - result
+        read = frozenset().union(*(accesses[k].read_leaves for k in result))
+        added = {k for k in clocks if accesses[k].written_leaves & read} - result
         if not added:
             return result
         result |= added

@@ -75,6 +75,7 @@ class Lowering:
         self.entries = {} if entries is None else entries
         self.n_members = n_members
         self.shared: set[Value] = set()
+        """Inputs that are the same for all drones."""
 
     def lower(self, jaxpr: ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
         """Return the results of a jaxpr for arrays of elements.
@@ -84,16 +85,16 @@ class Lowering:
         """
         env: dict[Any, Elements] = {}
 
-        def value(v: Any) -> Elements:
+        def read(v: Any) -> Elements:
             return constants(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
 
         inner = jaxpr.jaxpr
         env.update(zip(inner.constvars, (constants(x, x.dtype) for x in jaxpr.consts), strict=True))
         env.update(zip(inner.invars, args, strict=True))
         for eqn in inner.eqns:
-            outs = self.lower_eqn(eqn, [value(v) for v in eqn.invars])
+            outs = self.lower_eqn(eqn, [read(v) for v in eqn.invars])
             env.update(zip(eqn.outvars, outs, strict=True))
-        return [value(v) for v in inner.outvars]
+        return [read(v) for v in inner.outvars]
 
     def lower_eqn(self, eqn: Any, args: list[Elements]) -> Sequence[Elements]:
         """Return the results of one equation of a jaxpr."""
@@ -113,11 +114,11 @@ class Lowering:
         rows = [(x if x.shape == shape else np.broadcast_to(x, shape)).reshape(-1) for x in args]
         if not rows[-1].size:
             return np.empty(shape, object)
-        first = [row[0] for row in rows]
-        if isinstance(first[-1], tuple):  # keys: both halves alike
+        first_operands = [row[0] for row in rows]
+        if isinstance(first_operands[-1], tuple):  # keys: both halves alike
             halves = [[self.scalar(op, c[0], *(k[i] for k in c[1:])) for i in (0, 1)] for c in zip(*rows, strict=True)]
             return as_elements([(a, b) for a, b in halves], shape)
-        dtypes = [x.dtype for x in first]
+        dtypes = [x.dtype for x in first_operands]
         if op in ops.BOOLEAN_FORM and dtypes[0].kind == "b":
             op, negated = ops.BOOLEAN_FORM[op]
             args = [self.elementwise("not", [x], bool) if k == negated else x for k, x in enumerate(args)]
@@ -131,7 +132,7 @@ class Lowering:
         """Return the result of an operation on single elements; its default type is the type of the last operand."""
         return self.builder.add(op, args, args[-1].dtype if dtype is None else dtype)
 
-    def inner(self) -> Lowering:
+    def make_inner(self) -> Lowering:
         """Return a lowering into a new block inside this one."""
         return Lowering(Builder(self.builder), self.entries, self.n_members)
 

@@ -79,7 +79,7 @@ def view_leaves(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
 
 
 def restore_leaves(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
-    """Undo ``view_leaves``. (n_worlds, n_members, ...)"""
+    """Return leaves with the shapes that they had before ``view_leaves``. (n_worlds, n_members, ...)"""
     return [_reshape(x, (x.shape[0], *x.shape[2:])) if i in views and x is not None else x
             for i, x in enumerate(leaves)]  # fmt: skip
 
@@ -88,7 +88,7 @@ def _reshape(x: Any, shape: tuple[int, ...]) -> Any:
     return jax.ShapeDtypeStruct(shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x.reshape(shape)
 
 
-def on_data_leaves(program: Program, run: Callable[..., Any]) -> Callable[..., Any]:
+def adapt_to_data_leaves(program: Program, run: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a function of leaves from ``view_leaves`` as a function of the leaves of the data."""
     views, written = program.views, program.written_leaves
     if not views:

@@ -18,20 +18,22 @@ def add_selections(block: Block) -> Block:
 
     The first finds the drones that have them. The second selects the numbers of these drones.
     """
-    if not any(map(_selecting_results, block.operations)):
+    if not any(map(_selected_results, block.operations)):
         return block
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
     for op in block.operations:
         builder.stage = op.stage
         inline(builder, Block((), (op,), ()), values)
-        if indices := _selecting_results(op):
-            values.update(zip([op.results[k] for k in indices], _select_own(builder, op, indices, values), strict=True))
+        if indices := _selected_results(op):
+            values.update(
+                zip([op.results[k] for k in indices], _add_selection(builder, op, indices, values), strict=True)
+            )
     outputs = [values.get(x, x) if isinstance(x, Value) else x for x in block.outputs]
     return Block(tuple([values[x] for x in block.inputs]), tuple(builder.operations), tuple(outputs))
 
 
-def _selecting_results(op: Operation) -> list[int]:
+def _selected_results(op: Operation) -> list[int]:
     """Return the indices of the results of an operation that are a minimum or maximum of floats."""
     if op.name != "over_others":
         return []
@@ -39,32 +41,34 @@ def _selecting_results(op: Operation) -> list[int]:
     return [k for k, (name, x) in enumerate(pairs) if name in INDEX_REDUCTION_OF and x.dtype.kind == "f"]
 
 
-def _select_own(builder: Builder, op: Operation, indices: list[int], values: dict[Value, Element]) -> tuple[Value, ...]:
+def _add_selection(
+    builder: Builder, op: Operation, indices: list[int], values: dict[Value, Element]
+) -> tuple[Value, ...]:
     (body,) = op.blocks
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
     dtypes, n_members = [op.results[k].dtype for k in indices], ("n_members", op.param("n_members"))
 
-    def copy_body(n_more: int) -> tuple[Builder, list[Value], list[Element]]:
+    def copy_body(n_extra: int) -> tuple[Builder, list[Value], list[Element]]:
         """Return a copy of the body with further published integers, which follow the other inputs."""
         inner = Builder(builder)
-        fresh = [inner.input(x.dtype) for x in body.inputs[:-1]] + [inner.input("int32") for _ in range(n_more)]
+        new_inputs = [inner.input(x.dtype) for x in body.inputs[:-1]] + [inner.input("int32") for _ in range(n_extra)]
         is_self = inner.input(bool)
-        pair_inputs = [*fresh[: len(args)], is_self]
+        pair_inputs = [*new_inputs[: len(args)], is_self]
         outs = inline(inner, body, values | dict(zip(body.inputs, pair_inputs, strict=True)))
-        return inner, [*fresh[len(args) :], is_self], [outs[k] for k in indices]
+        return inner, [*new_inputs[len(args) :], is_self], [outs[k] for k in indices]
 
     inner, (is_self,), candidates = copy_body(0)
     one_number, zero = (constant(x, dtypes[0]) for x in (1, 0))
     is_largest = inner.add(
         "select_n", (is_self, zero, one_number), dtypes[0]
     )  # its argmax is the index of the drone itself
-    names = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in indices), "argmax")
+    reductions = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in indices), "argmax")
     block = prune(inner.finish([*candidates, is_largest]))
-    *selected, number = builder.add_many("over_others", args, ["int32"] * len(names), (("reduce", names), n_members),
-                                       (block,))  # fmt: skip
+    params = (("reduce", reductions), n_members)
+    *selected, number = builder.add_many("over_others", args, ["int32"] * len(reductions), params, (block,))
 
-    inner, (other, _), candidates = copy_body(1)
-    terms = [inner.add("select_n", (inner.add("eq", (other, which), bool), constant(0, x.dtype), x), x.dtype)
+    inner, (other_index, _), candidates = copy_body(1)
+    terms = [inner.add("select_n", (inner.add("eq", (other_index, which), bool), constant(0, x.dtype), x), x.dtype)
              for which, x in zip(selected, candidates, strict=True)]  # fmt: skip
     params = (("reduce", ("add",) * len(indices)), n_members)
     return builder.add_many("over_others", [*args, number], dtypes, params, (prune(inner.finish(terms)),))

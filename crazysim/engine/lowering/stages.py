@@ -55,15 +55,19 @@ def lower_stages(
     n_drones = next(x.shape[1] for x, scope in zip(leaves, axes.scopes, strict=True) if scope == "drone")
     segments = []
     for phase in PHASES:
-        in_phase = [stage for stage in stages if stage.phase == phase]
-        lowered = [_lower_stage(axes.stage(x), phase, axes, leaves, known_zeros, n_drones, tracer) for x in in_phase]
-        segments += _move_before_steps(lowered, in_phase, axes.leaf_indices.core.steps) if phase == "each" else lowered
-    described = tuple([
+        phase_stages = [stage for stage in stages if stage.phase == phase]
+        lowered = [
+            _lower_stage(axes.stage(x), phase, axes, leaves, known_zeros, n_drones, tracer) for x in phase_stages
+        ]
+        segments += (
+            _move_before_steps(lowered, phase_stages, axes.leaf_indices.core.steps) if phase == "each" else lowered
+        )
+    program_leaves = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
     ])  # fmt: skip
     scratch = frozenset(i for i, x in enumerate(jax.tree.leaves(leaf_flags(data, "scratch"))) if x)
-    program = Program(described, n_drones, tuple(segments), None, scratch, (), population, axes.views)
+    program = Program(program_leaves, n_drones, tuple(segments), None, scratch, (), population, axes.views)
     changed = known_zeros.keys() & set(program.written_leaves)
     if changed:  # an element is only known to be zero while no stage writes it
         zeros = tuple([(i, indices) for i, indices in zeros if i not in changed])
@@ -73,7 +77,9 @@ def lower_stages(
         return program
     members = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
     checked = sorted((members | axes.views & set(program.written_leaves)) & set(watched(axes.leaf_indices)))
-    return dataclasses.replace(program, check_segment=_finite_check(axes, leaves, core.nonfinite, core.steps, checked))
+    return dataclasses.replace(
+        program, check_segment=_make_finite_check(axes, leaves, core.nonfinite, core.steps, checked)
+    )
 
 
 def _move_before_steps(
@@ -89,9 +95,9 @@ def _move_before_steps(
     runs_first = [
         stage.when is is_first_step and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)
     ]
-    n = (*runs_first, False).index(False)
-    first = [dataclasses.replace(s, phase="before") for s in segments[:n] if isinstance(s, Segment)]
-    return [*first, *segments[n:]]
+    n_moved = (*runs_first, False).index(False)
+    moved = [dataclasses.replace(s, phase="before") for s in segments[:n_moved] if isinstance(s, Segment)]
+    return [*moved, *segments[n_moved:]]
 
 
 def _lower_stage(
@@ -112,15 +118,17 @@ def _lower_stage(
         scope: Literal["drone", "world"] = "world" if stage.scope == "world" and uses_drones else "drone"
         if scope == "world" and n_drones > MAX_UNROLLED_DRONES:
             raise LimitError(f"a stage of one world is unrolled for at most {MAX_UNROLLED_DRONES} drones")
-        others = [leaves[i].shape[2] for i in (*traced.input_leaves, *traced.written_leaves) if i in axes.views]
-        if max(others, default=0) > MAX_UNROLLED_DRONES:
+        population_sizes = [
+            leaves[i].shape[2] for i in (*traced.input_leaves, *traced.written_leaves) if i in axes.views
+        ]
+        if max(population_sizes, default=0) > MAX_UNROLLED_DRONES:
             raise LimitError(f"other populations are unrolled for at most {MAX_UNROLLED_DRONES} members")
         shared = [i for i in traced.input_leaves if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
         known_zeros = {i: zeros[i] for i in traced.input_leaves if i in zeros}
         n_members = n_drones if scope == "drone" else 0
         key = (stage.__name__, scope, phase, n_members, frozenset(known_zeros.items()))
         if key not in traced.segments:
-            traced.segments[key] = _segment(stage, scope, phase, traced, known_zeros, shared, n_members)
+            traced.segments[key] = _make_segment(stage, scope, phase, traced, known_zeros, shared, n_members)
         return traced.segments[key]
     except UnsupportedError as error:
         traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
@@ -131,7 +139,7 @@ def _lower_stage(
         )
 
 
-def _segment(
+def _make_segment(
     stage: Stage,
     scope: Literal["drone", "world"],
     phase: Phase,
@@ -142,7 +150,7 @@ def _segment(
 ) -> Segment:
     lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
     before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.input_leaves}
-    tables = {_table(lowering, before[i]): (i, TABLE_INDEX) for i in shared if i in before and before[i].size > 1}
+    tables = {_add_table(lowering, before[i]): (i, TABLE_INDEX) for i in shared if i in before and before[i].size > 1}
     lowering.shared.update(x for i in shared for x in scalars(before[i]) if isinstance(x, Value))
     args = [before[i] for i in traced.input_leaves]
     if traced.when is None:
@@ -162,7 +170,7 @@ def _segment(
     return Segment(scope, (stage.__name__,), phase, block, tuple([slots[x] for x in block.inputs]), tuple(writes))
 
 
-def _table(lowering: Lowering, elements: Elements) -> Value:
+def _add_table(lowering: Lowering, elements: Elements) -> Value:
     """Return a table of the elements of a shared array, and register the entry of each element in it."""
     items = elements.reshape(-1)
     table = lowering.builder.input(items[0].dtype, len(items))
@@ -179,11 +187,11 @@ def _lower_guarded(
     A stage that reduces over other drones is computed at every step, and its results are selected by the mask, because
     drones need each other's values even if their stages act at different steps.
     """
-    together = any(eqn.primitive is reduce_over_others_p for eqn in equations(traced.fn))
-    inner = lowering if together else lowering.inner()
+    reads_other_drones = any(eqn.primitive is reduce_over_others_p for eqn in equations(traced.fn))
+    inner = lowering if reads_other_drones else lowering.make_inner()
     new = inner.lower(traced.fn, args)
     pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(scalars(x), scalars(y), strict=True)]
-    if together:
+    if reads_other_drones:
         results = iter([a if a is b else lowering.scalar("select_n", mask, a, b) for a, b in pairs])
         return [_replace_scalars(x, [next(results) for _ in scalars(x)]) for x in old]
     changed = [(a, b) for a, b in pairs if a is not b]
@@ -203,7 +211,7 @@ def _replace_scalars(template: Elements, items: Sequence[Element]) -> Elements:
     return as_elements(pairs, template.shape)
 
 
-def _finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watched: Sequence[int]) -> Segment:
+def _make_finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watched: Sequence[int]) -> Segment:
     """Return a segment that flags a drone if its world was flagged or one of its watched numbers is not finite.
 
     It also flags drones of worlds that took more than ``MAX_STEPS`` steps. A call takes at most that many steps, so the
@@ -211,15 +219,15 @@ def _finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watc
     """
     builder = Builder(stage="finite_check")
     reads: list[Slot] = []
-    finite: Element = constant(True, bool)
+    is_finite: Element = constant(True, bool)
     avals = axes.unbatched_shapes(list(leaves), "drone")
     for i in watched:
         if avals[i].dtype.kind == "f":
             for k, item in enumerate(scalars(inputs(builder, avals[i]))):
                 reads.append((i, k))
-                finite = builder.add("and", (finite, builder.add("is_finite", (item,), bool)), bool)
+                is_finite = builder.add("and", (is_finite, builder.add("is_finite", (item,), bool)), bool)
     reads += [(steps, 0), (flag, 0)]
-    too_long = builder.add("lt", (builder.input(avals[steps].dtype), constant(0, avals[steps].dtype)), bool)
-    bad = builder.add("or", (too_long, builder.add("not", (finite,), bool)), bool)
-    flagged = builder.add("or", (builder.input(bool), bad), bool)
+    has_overflowed = builder.add("lt", (builder.input(avals[steps].dtype), constant(0, avals[steps].dtype)), bool)
+    is_invalid = builder.add("or", (has_overflowed, builder.add("not", (is_finite,), bool)), bool)
+    flagged = builder.add("or", (builder.input(bool), is_invalid), bool)
     return Segment("drone", ("finite_check",), "after", builder.finish([flagged]), tuple(reads), ())

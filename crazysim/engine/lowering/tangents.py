@@ -45,21 +45,21 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     n = len(program.leaves)
     changed, constants = changed_slots(program, perturbed)
     segments = [_add_segment_tangents(program, n, s, changed, constants.get(s, ())) for s in program.fused_segments]
-    zero = dict.fromkeys((i, k) for s in segments for i in s.written_leaves if i >= n and i - n not in perturbed
+    zero_slots = dict.fromkeys((i, k) for s in segments for i in s.written_leaves if i >= n and i - n not in perturbed
                          for k in range(program.leaves[i - n].size))  # fmt: skip
-    zeros = [constant(0, program.leaves[i - n].number_type) for i, _ in zero]
-    zero_segment = Segment("drone", ("tangents",), "before", Block((), (), tuple(zeros)), (), tuple(zero))
+    zeros = [constant(0, program.leaves[i - n].number_type) for i, _ in zero_slots]
+    zero_segment = Segment("drone", ("tangents",), "before", Block((), (), tuple(zeros)), (), tuple(zero_slots))
     return dataclasses.replace(
         program,
         leaves=(*program.leaves, *map(_tangent_leaf, program.leaves)),
-        segments=(zero_segment, *segments) if zero else tuple(segments),
+        segments=(zero_segment, *segments) if zero_slots else tuple(segments),
         scratch=program.scratch | set(program.written_leaves),
     )
 
 
 def _tangent_leaf(leaf: Leaf) -> Leaf:
-    is_own = leaf.scope in ("drone", "world")
-    scope, shape = (leaf.scope, leaf.shape) if is_own else ("world", (1, 1, *leaf.shape))
+    is_batched = leaf.scope in ("drone", "world")
+    scope, shape = (leaf.scope, leaf.shape) if is_batched else ("world", (1, 1, *leaf.shape))
     return Leaf(f"tangent of {leaf.name}", scope, shape, leaf.dtype)
 
 
@@ -67,7 +67,7 @@ def _add_segment_tangents(
     program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int]
 ) -> Segment:
     """Return a segment with the tangents of its outputs."""
-    reads, n_reads = program.per_drone(s, s.reads), len(s.reads)
+    reads, n_reads = program.drone_slots(s, s.reads), len(s.reads)
     input_indices = [k for k, slot in enumerate(reads) if slot in changed and s.block.inputs[k].dtype.kind == "f"]
     input_indices = [k for k in input_indices if not s.block.inputs[k].size]
     block = add_block_tangents(
@@ -82,7 +82,7 @@ def _add_segment_tangents(
     )
     floats = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
     output_tangents = [(k, x) for k, x in zip(floats, block.outputs[len(s.writes) :], strict=True)
-              if program.per_drone(s, [s.writes[k]])[0] in changed]  # fmt: skip
+              if program.drone_slots(s, [s.writes[k]])[0] in changed]  # fmt: skip
     hoisted_slots = [slot for slot, x in zip(s.hoisted_reads, s.hoisted.inputs, strict=True)
               if slot in changed and x.dtype.kind == "f" and not x.size]  # fmt: skip
     hoisted, n_hoisted = s.hoisted, len(s.hoisted.outputs)
@@ -178,8 +178,8 @@ def _derivative_block(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, 
     def tangent(*args: Any) -> Any:
         operands, tangents = args[: len(dtypes)], args[len(dtypes) :]
 
-        def primal(*floats_now: Any) -> Any:
-            return apply_operation(name, replace_leaves(operands, floats, floats_now), dtype, params)
+        def primal(*float_operands: Any) -> Any:
+            return apply_operation(name, replace_leaves(operands, floats, float_operands), dtype, params)
 
         return jax.jvp(primal, tuple([operands[k] for k in floats]), tangents)[1]
 
@@ -195,8 +195,8 @@ def _when(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
     before = [_tangent(x, tangents) for x in old]
     indices = [k for k, pair in enumerate(zip(before, after, strict=True)) if any(isinstance(x, Value) for x in pair)]
     args = [_map_element(mask, values), *(_map_element(x, values) for x in old), *(before[k] for k in indices)]
-    inside = inner.finish([*outputs, *(after[k] for k in indices)])
-    results = builder.add_many("when", args, [x.dtype for x in args[1:]], op.params, (inside,))
+    inner_values = inner.finish([*outputs, *(after[k] for k in indices)])
+    results = builder.add_many("when", args, [x.dtype for x in args[1:]], op.params, (inner_values,))
     values.update(zip(op.results, results, strict=False))
     _record_tangents([op.results[k] for k in indices], results[len(old) :], tangents)
 
@@ -209,7 +209,7 @@ def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Value
     values.update(zip(op.results, results, strict=True))
     if not any(isinstance(x, Value) and x in tangents for x in op.args):
         return
-    derivative = op.param("slope")()
+    derivative = op.param("derivative")()
     arg_tangents = [_tangent(x, tangents) if x.dtype.kind == "f" else constant(0, x.dtype) for x in op.args]
     parts = inline(builder, derivative, dict(zip(derivative.inputs, [*args, *arg_tangents], strict=True)))
     parts = [x for x, out in zip(parts, derivative.outputs, strict=True) if out.dtype.kind == "f"]
@@ -223,17 +223,17 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
         inline(builder, Block((), (op,), ()), values)
         return
     inner = Builder(builder)
-    inside = values | {x: inner.input(x.dtype) for x in body.inputs}
+    inner_values = values | {x: inner.input(x.dtype) for x in body.inputs}
     inner_tangents = tangents | {x: inner.input(x.dtype) for x in body.inputs if x.dtype.kind == "f"}
-    outputs = _add_with_tangents(inner, body, inside, inner_tangents)
+    outputs = _add_with_tangents(inner, body, inner_values, inner_tangents)
     blocks = [inner.finish([*outputs, *_collect_tangents(body.outputs, inner_tangents)])]
     args = [*(_map_element(x, values) for x in op.args), *_collect_tangents(op.args, tangents)]
     for block in test:
         inner = Builder(builder)
-        inside = values | {x: inner.input(x.dtype) for x in block.inputs}
+        inner_values = values | {x: inner.input(x.dtype) for x in block.inputs}
         for x in args[len(op.args) :]:
             inner.input(x.dtype)
-        blocks.insert(0, inner.finish(inline(inner, block, inside)))
+        blocks.insert(0, inner.finish(inline(inner, block, inner_values)))
     results = builder.add_many(op.name, args, [x.dtype for x in args], op.params, tuple(blocks))
     values.update(zip(op.results, results, strict=False))
     _record_tangents([x for x in op.results if x.dtype.kind == "f"], results[len(op.args) :], tangents)
@@ -244,11 +244,11 @@ def _over_others(builder: Builder, op: Operation, values: Values, tangents: Valu
     (body,) = op.blocks
     *others, is_self = body.inputs
     inner = Builder(builder)
-    inside = values | {x: inner.input(x.dtype) for x in others}
+    inner_values = values | {x: inner.input(x.dtype) for x in others}
     published = [(x, y) for x, y in zip(op.args, others, strict=True) if isinstance(x, Value) and x in tangents]
     inner_tangents = tangents | {y: inner.input(y.dtype) for _, y in published}
-    inside[is_self] = inner.input(is_self.dtype)
-    outputs = _add_with_tangents(inner, body, inside, inner_tangents)
+    inner_values[is_self] = inner.input(is_self.dtype)
+    outputs = _add_with_tangents(inner, body, inner_values, inner_tangents)
     names = op.param("reduce")
     body_tangents = [_tangent(x, inner_tangents) for x in body.outputs]
     summed = [k for k, x in enumerate(body_tangents) if names[k] == "add" and isinstance(x, Value)]

@@ -31,8 +31,8 @@ class TracedStage:
         def apply(values: list[Any]) -> list[Any]:
             after = stage.fn(axes.treedef.unflatten(values))
             self.written_leaves = axes.written_leaves(values, after, stage)
-            new = jax.tree.leaves(after)
-            return [new[i] for i in self.written_leaves]
+            leaves_after = jax.tree.leaves(after)
+            return [leaves_after[i] for i in self.written_leaves]
 
         def condition(values: list[Any]) -> list[Any]:
             mask = stage.when(axes.treedef.unflatten(values)) if stage.when is not None else None
@@ -48,10 +48,10 @@ class TracedStage:
         self.fn = jaxcompat.select_inputs(fn, self.input_leaves)
         self.when = jaxcompat.select_inputs(when, self.input_leaves) if when is not None else None
         self.segments: dict[Any, Any] = {}
-        """Segments that it was lowered to, by all else that they depend on."""
+        """Segments that it was lowered to, by everything else that lowering depends on."""
 
     def dump(self, name: str) -> None:
-        """Write the jaxprs to the folder of dumps, if there is one."""
+        """Write the jaxprs into the folder that ``CRAZYSIM_DUMP`` names, if it is set."""
         if dump.is_enabled():
             dump.write(f"{name}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if self.when else ""))
 

@@ -75,19 +75,19 @@ def _parts(block: Block) -> list[Block]:
 
 
 def _recompute(
-    builder: Builder, part: Block, number: int, values: dict[Value, Element], on_path: set[Value]
+    builder: Builder, part: Block, part_number: int, values: dict[Value, Element], on_path: set[Value]
 ) -> dict[Value, Element]:
     """Recompute a part of a block from the values that it uses, and return the new elements by value.
 
     Otherwise all results of the forward pass would take registers until the backward pass needs them. Reductions over
     other drones and loops are not recomputed.
     """
-    repeated = [op for op in part.operations if op.name not in ("over_others", "loop", "while")]
-    recomputed, used = {x for op in repeated for x in op.results}, part.uses()
-    before = [x for x in values if x in used and x in on_path and x not in recomputed and isinstance(values[x], Value)]
-    fresh = {x: builder.add("again", (values[x],), x.dtype, (("part", number),)) for x in before}
-    elements = values | fresh
-    inline(builder, Block((), tuple(repeated)), elements)
+    operations = [op for op in part.operations if op.name not in ("over_others", "loop", "while")]
+    recomputed, used = {x for op in operations for x in op.results}, part.uses()
+    inputs = [x for x in values if x in used and x in on_path and x not in recomputed and isinstance(values[x], Value)]
+    copies = {x: builder.add("opaque_copy", (values[x],), x.dtype, (("part", part_number),)) for x in inputs}
+    elements = values | copies
+    inline(builder, Block((), tuple(operations)), elements)
     return elements
 
 
@@ -118,9 +118,9 @@ def _add_cotangents(
             continue
         if ops.TABLE[op.name].structured:
             raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
-        slope = _derivative_block(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
+        derivative = _derivative_block(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
         operands = [*map(map_element, op.args), result_cts[0]]
-        parts = inline(builder, slope, dict(zip(slope.inputs, operands, strict=True)))
+        parts = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
         floats = [x for x in op.args if x.dtype.kind == "f"]
         for x, part in zip(floats, parts, strict=True):
             if isinstance(x, Value) and x in on_path:
@@ -139,8 +139,8 @@ def _derivative_block(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, 
     def cotangents(*args: Any) -> list[Any]:
         *operands, ct = args
 
-        def primal(floats_now: list[Any]) -> Any:
-            return apply_operation(name, replace_leaves(operands, floats, floats_now), dtype, params)
+        def primal(float_operands: list[Any]) -> Any:
+            return apply_operation(name, replace_leaves(operands, floats, float_operands), dtype, params)
 
         return jax.vjp(primal, [operands[k] for k in floats])[1](ct)[0]
 
@@ -158,8 +158,8 @@ def _when(
     mask, *old = op.args
     mask = values.get(mask, mask)
     (block,) = op.blocks
-    inner, inside, inner_cts = Builder(builder), dict(values), Cotangents()
-    inline(inner, block, inside)
+    inner, inner_values, inner_cts = Builder(builder), dict(values), Cotangents()
+    inline(inner, block, inner_values)
     for x, before, ct in zip(block.outputs, old, result_cts, strict=True):
         if ct is None:
             continue
@@ -168,7 +168,7 @@ def _when(
             _accumulate(builder, cts, before, rest)
         if isinstance(x, Value) and x in on_path:
             _accumulate(inner, inner_cts, x, ct)
-    _add_cotangents(inner, block, inside, on_path, inner_cts)
+    _add_cotangents(inner, block, inner_values, on_path, inner_cts)
     before = [cts.get(x, constant(0, x.dtype)) for x in inner_cts]
     sums = [inner.add("add", (a, inner_cts[x]), x.dtype) for a, x in zip(before, inner_cts, strict=True)]
     if inner_cts:
@@ -180,21 +180,21 @@ def _custom_jvp(
     builder: Builder, op: Operation, values: dict, on_path: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
     """Transpose the function's custom derivative."""
-    slope = _transpose_slope(op.param("slope")())
+    derivative = _transpose_derivative(op.param("derivative")())
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
     seeds = [constant(0, x.dtype) if ct is None else ct for x, ct in zip(op.results, result_cts, strict=True)
              if x.dtype.kind == "f"]  # fmt: skip
     operands = [*args, *(constant(0, x.dtype) for x in args), *seeds]
-    parts = inline(builder, slope, dict(zip(slope.inputs, operands, strict=True)))
+    parts = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
     for x, part in zip([x for x in op.args if x.dtype.kind == "f"], parts, strict=True):
         if isinstance(x, Value) and x in on_path:
             _accumulate(builder, cts, x, part)
 
 
 @functools.lru_cache(maxsize=256)
-def _transpose_slope(slope: Block) -> Block:
-    tangents = slope.inputs[len(slope.inputs) // 2 :]
-    return transpose_block(slope, [x for x in tangents if x.dtype.kind == "f"])
+def _transpose_derivative(derivative: Block) -> Block:
+    tangents = derivative.inputs[len(derivative.inputs) // 2 :]
+    return transpose_block(derivative, [x for x in tangents if x.dtype.kind == "f"])
 
 
 def _over_others(
@@ -211,26 +211,26 @@ def _over_others(
     captured = [x for x in values if x in uses and not x.size and isinstance(values[x], Value)]
     published = [values.get(x, x) for x in op.args]
 
-    def backwards(
+    def add_reverse_loop(
         inputs: Sequence[Value], own_values: dict, perturbed: Sequence[Value], shared: Sequence[Element]
     ) -> None:
         """Add a loop over the other drones for the cotangents of some values."""
-        inner, inside, local = Builder(builder), dict(values), Cotangents()
-        fresh = [inner.input(x.dtype) for x in (*inputs, body.inputs[-1])]
-        inside.update(own_values)
-        inside.update(zip((*inputs, body.inputs[-1]), fresh, strict=True))
-        inline(inner, body, inside)
+        inner, inner_values, inner_cts = Builder(builder), dict(values), Cotangents()
+        new_inputs = [inner.input(x.dtype) for x in (*inputs, body.inputs[-1])]
+        inner_values.update(own_values)
+        inner_values.update(zip((*inputs, body.inputs[-1]), new_inputs, strict=True))
+        inline(inner, body, inner_values)
         for x, ct in zip(body.outputs, result_cts, strict=True):
             if ct is not None and isinstance(x, Value) and x in on_path:
-                _accumulate(inner, local, x, inside.get(ct, ct) if isinstance(ct, Value) else ct)
-        _add_cotangents(inner, body, inside, on_path, local)
-        perturbed = [x for x in perturbed if x in local]
+                _accumulate(inner, inner_cts, x, inner_values.get(ct, ct) if isinstance(ct, Value) else ct)
+        _add_cotangents(inner, body, inner_values, on_path, inner_cts)
+        perturbed = [x for x in perturbed if x in inner_cts]
         if not perturbed:
             return
-        block = prune(inner.finish([local[x] for x in perturbed]))
+        block = prune(inner.finish([inner_cts[x] for x in perturbed]))
         read = block.uses()
-        pairs = [(y, s) for y, s in zip(fresh, shared, strict=False) if y in read]
-        block = Block((*(y for y, _ in pairs), fresh[-1]), block.operations, block.outputs)
+        pairs = [(y, s) for y, s in zip(new_inputs, shared, strict=False) if y in read]
+        block = Block((*(y for y, _ in pairs), new_inputs[-1]), block.operations, block.outputs)
         params = (("reduce", ("add",) * len(perturbed)), ("n_members", op.param("n_members")))
         sums = builder.add_many("over_others", [s for _, s in pairs], [x.dtype for x in perturbed], params, (block,))
         for x, part in zip(perturbed, sums, strict=True):
@@ -239,9 +239,9 @@ def _over_others(
                 _accumulate(builder, cts, target, part)
 
     others = body.inputs[:-1]
-    backwards(others, {}, [x for x in captured if x in on_path], published)
+    add_reverse_loop(others, {}, [x for x in captured if x in on_path], published)
     seeds = [ct for ct in used if isinstance(ct, Value)]
-    backwards(
+    add_reverse_loop(
         (*captured, *seeds),
         dict(zip(others, published, strict=True)),
         [x for x in others if x in on_path],
@@ -258,7 +258,7 @@ def _unroll_loops(block: Block) -> Block:
 
     Loops that carry no float have no derivative, and stay.
     """
-    if not any(_is_reversed(op) for inner in block.blocks() for op in inner.operations):
+    if not any(_is_differentiable_loop(op) for inner in block.blocks() for op in inner.operations):
         return block
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
@@ -266,7 +266,7 @@ def _unroll_loops(block: Block) -> Block:
     return Block(tuple(values[x] for x in block.inputs), tuple(builder.operations), tuple(outputs))
 
 
-def _is_reversed(op: Operation) -> bool:
+def _is_differentiable_loop(op: Operation) -> bool:
     return op.name == "loop" and any(x.dtype.kind == "f" for x in op.results)
 
 
@@ -276,21 +276,21 @@ def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> lis
 
     for op in block.operations:
         builder.stage = op.stage
-        if _is_reversed(op):
+        if _is_differentiable_loop(op):
             (body,) = op.blocks
             length, carry = op.param("length"), [map_element(x) for x in op.args]
             if length * sum(1 for _ in body.walk()) > MAX_UNROLLED:
                 raise UnsupportedError(f"a loop of {length} iterations is too long to be reversed", op.name, op.stage)
             for _ in range(length):
-                inside = values | dict(zip(body.inputs, carry, strict=True))
-                carry = _unroll(builder, body, inside)
+                inner_values = values | dict(zip(body.inputs, carry, strict=True))
+                carry = _unroll(builder, body, inner_values)
             values.update(zip(op.results, carry, strict=True))
         elif op.name in ("when", "over_others"):
             blocks = []
             for inner in op.blocks:
-                fresh = Builder(builder)
-                inside = values | {x: fresh.input(x.dtype) for x in inner.inputs}
-                blocks.append(fresh.finish(_unroll(fresh, inner, inside)))
+                inner_builder = Builder(builder)
+                inner_values = values | {x: inner_builder.input(x.dtype) for x in inner.inputs}
+                blocks.append(inner_builder.finish(_unroll(inner_builder, inner, inner_values)))
             args = [map_element(x) for x in op.args]
             results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, tuple(blocks))
             values.update(zip(op.results, results, strict=True))

@@ -33,11 +33,11 @@ def pack_shared(program: Program) -> Program:
     for i in shared:
         starts[i] = size
         size += leaves[i].size
-    packed = Leaf(PACKED_LEAF_NAME, "shared", (size,), leaves[0].dtype)
+    packed_leaf = Leaf(PACKED_LEAF_NAME, "shared", (size,), leaves[0].dtype)
     moved_program = _move_slots(
         program, lambda slot: (len(leaves), starts[slot[0]] + slot[1]) if slot[0] in starts else slot
     )
-    return dataclasses.replace(moved_program, leaves=(*leaves, packed), packed=tuple(shared))
+    return dataclasses.replace(moved_program, leaves=(*leaves, packed_leaf), packed=tuple(shared))
 
 
 def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Program:
@@ -57,22 +57,22 @@ def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Pro
     for row_type in dict.fromkeys(row_types.values()):
         members = tuple([i for i in row_leaves if row_types[i] == row_type])
         n_rows = sum(leaves[i].size for i in members)
-        first = 0
+        first_row = 0
         for i in members:
-            positions[i] = (len(leaves), first, n_rows)
-            first += leaves[i].size
+            positions[i] = (len(leaves), first_row, n_rows)
+            first_row += leaves[i].size
         n_lanes = leaves[members[0]].shape[0] * program.n_drones
         leaves.append(Leaf("rows", row_type[0], (n_rows, n_lanes), row_type[1], members))
 
-    def move(slot: Slot) -> Slot:
+    def move_slot(slot: Slot) -> Slot:
         leaf, k = slot
         if leaf not in positions:
             return slot
-        new_leaf, first, n_rows = positions[leaf]
+        new_leaf, first_row, n_rows = positions[leaf]
         drone, k = divmod(k, program.leaves[leaf].size)
-        return new_leaf, drone * n_rows + first + k
+        return new_leaf, drone * n_rows + first_row + k
 
-    return dataclasses.replace(_move_slots(program, move), leaves=tuple(leaves))
+    return dataclasses.replace(_move_slots(program, move_slot), leaves=tuple(leaves))
 
 
 class PackedRows(NamedTuple):
@@ -111,11 +111,11 @@ def packed_rows(program: Program) -> list[PackedRows]:
     return [PackedRows(program, i) for i, leaf in enumerate(program.leaves) if leaf.row_leaves]
 
 
-def _move_slots(program: Program, move: Callable[[Slot], Slot]) -> Program:
+def _move_slots(program: Program, new_slot: Callable[[Slot], Slot]) -> Program:
     """Return a program in which all slots are replaced."""
 
     def move_segment(s: Segment) -> Segment:
-        reads, writes, hoisted = ([move(slot) for slot in x] for x in (s.reads, s.writes, s.hoisted_reads))
+        reads, writes, hoisted = ([new_slot(slot) for slot in x] for x in (s.reads, s.writes, s.hoisted_reads))
         return dataclasses.replace(s, reads=tuple(reads), writes=tuple(writes), hoisted_reads=tuple(hoisted))
 
     segments = tuple([move_segment(s) if isinstance(s, Segment) else s for s in program.segments])

@@ -79,7 +79,7 @@ def first_difference(
             index = _largest_difference(x, y, tolerance)
             if index is not None:
                 values = (np.asarray(x)[index], np.asarray(y)[index])
-                operation = _operation(pipeline[name], name, data, engines, tolerance)
+                operation = _find_operation(pipeline[name], name, data, engines, tolerance)
                 return Difference(name, axes.names[i], index, values, engines, operation)
         data = results[0]
     return None
@@ -105,7 +105,7 @@ def _largest_difference(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | N
     return tuple(int(k) for k in np.unravel_index(int(difference.argmax()), difference.shape))
 
 
-def _operation(stage: Any, name: str, data: Any, engines: Sequence[str], tolerance: float) -> str:
+def _find_operation(stage: Any, name: str, data: Any, engines: Sequence[str], tolerance: float) -> str:
     """Return the first operation of a stage whose result in an engine of programs differs from the interpreter's."""
     program = fuse(lower_stages(as_stages({name: stage}), data))
     builds: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "auto": fused.build}
@@ -126,13 +126,15 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
         build: Function that builds the run of a program.
         tolerance: As in ``first_difference``.
     """
-    exposed, operations = expose_values(program)
+    exposed_program, operations = expose_values(program)
     n_worlds = lanes.batch_counts(program, leaves)[0]
-    zero_leaves = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in exposed.leaves[len(leaves) :]]
+    zero_leaves = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in exposed_program.leaves[len(leaves) :]]
     location = Location("cpu" if jax.default_backend() == "cpu" else "gpu")
-    written = [builder(exposed, location)([*leaves, *zero_leaves], 1)[0] for builder in (interpret.build, build)]
-    results = [dict(zip(exposed.written_leaves, arrays, strict=True)) for arrays in written]
-    (segment,) = exposed.fused_segments
+    written = [
+        builder(exposed_program, location)([*leaves, *zero_leaves], 1)[0] for builder in (interpret.build, build)
+    ]
+    results = [dict(zip(exposed_program.written_leaves, arrays, strict=True)) for arrays in written]
+    (segment,) = exposed_program.fused_segments
     for op, (leaf, _) in zip(operations, segment.writes, strict=True):
         expected, actual = (np.asarray(result[leaf]) for result in results)
         index = _largest_difference(expected, actual, tolerance)
@@ -154,9 +156,11 @@ def expose_values(program: Program) -> tuple[Program, list[Operation]]:
     shape = (n_worlds, program.n_drones if segment.scope == "drone" else 1)
     value_leaves = [Leaf(f"value {k}", segment.scope, shape, x.dtype) for k, x in enumerate(values)]
     n_leaves = len(program.leaves)
-    exposed = dataclasses.replace(
+    exposed_segment = dataclasses.replace(
         segment,
         block=Block(segment.block.inputs, segment.block.operations, tuple(values)),
         writes=tuple([(n_leaves + k, 0) for k in range(len(values))]),
     )
-    return dataclasses.replace(program, leaves=(*program.leaves, *value_leaves), segments=(exposed,)), operations
+    return dataclasses.replace(
+        program, leaves=(*program.leaves, *value_leaves), segments=(exposed_segment,)
+    ), operations

@@ -41,7 +41,7 @@ def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | Non
                 lines.append(f"fused, for one {owner}: {names} ({segment.n_operations} operations)")
     unfused_names = [stage.name for program in plan.programs for stage in program.unfused_stages]
     if unfused_names and measure:
-        lines.append(_cost_of_split(step, data, unfused_names))
+        lines.append(_measure_split_cost(step, data, unfused_names))
     if plan.engine == "fused":
         location = plan.location.platform, plan.location.devices
         lines += dict.fromkeys(line for program in plan.programs for line in fused.describe(program, *location))
@@ -51,17 +51,17 @@ def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | Non
     return "\n".join(lines)
 
 
-def _cost_of_split(step: Step, data: SimData, unfused_names: list[str]) -> str:
+def _measure_split_cost(step: Step, data: SimData, unfused_names: list[str]) -> str:
     """Return the cost of the stages that split a step, measured against the same step without them."""
 
-    def seconds(step: Step, n: int = 64) -> float:
+    def measure_seconds(step: Step, n: int = 64) -> float:
         jax.block_until_ready(step(data, jnp.int32(n)))  # compiles
         start_time = time.perf_counter()
         jax.block_until_ready(step(data, jnp.int32(n)))
         return (time.perf_counter() - start_time) / n
 
-    with_them, without = seconds(step), seconds(step.without_stages(unfused_names))
+    split_seconds, unsplit_seconds = measure_seconds(step), measure_seconds(step.without_stages(unfused_names))
     return (
-        f"cost of the split, measured: a step takes {1e6 * with_them:.0f} us, and {1e6 * without:.0f} us without "
-        f"{', '.join(unfused_names)}"
+        f"cost of the split, measured: a step takes {1e6 * split_seconds:.0f} us, and {1e6 * unsplit_seconds:.0f} us "
+        f"without {', '.join(unfused_names)}"
     )

@@ -25,20 +25,20 @@ MAX_ITERATIONS = 256
 """Maximum number of iterations of a loop that is unrolled."""
 
 
-def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, Expression]:
+def step(segment: Segment, get_number: Callable[[Slot], Expression]) -> dict[Slot, Expression]:
     """Return the expressions that a step writes.
 
     Args:
         segment: A segment of one drone.
-        number: Function that returns the number in a slot before the step.
+        get_number: Function that returns the number in a slot before the step.
 
     Raises:
         UnsupportedError: If CasADi has no form for an operation; the error names the stage.
     """
     require_casadi(segment.hoisted)
     require_casadi(segment.block)
-    hoisted = run(segment.hoisted, [number(slot) for slot in segment.hoisted_reads])
-    outputs = run(segment.block, [*(number(slot) for slot in segment.reads), *hoisted])
+    hoisted = run(segment.hoisted, [get_number(slot) for slot in segment.hoisted_reads])
+    outputs = run(segment.block, [*(get_number(slot) for slot in segment.reads), *hoisted])
     return dict(zip(segment.writes, outputs, strict=True))
 
 

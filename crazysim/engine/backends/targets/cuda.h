@@ -23,9 +23,9 @@
 #include "scalar.h"
 
 // A number as another one to the compiler: what is computed from it is computed again.
-#define AGAIN(x) again_(x, nothing)
-FN f32 again_(f32 x, int nothing) { return bits_f32(bits_u32(x) | u32(nothing)); }
-FN f64 again_(f64 x, int nothing) { return __longlong_as_double(__double_as_longlong(x) | (long long)nothing); }
+#define OPAQUE_COPY(x) opaque_copy_(x, nothing)
+FN f32 opaque_copy_(f32 x, int nothing) { return bits_f32(bits_u32(x) | u32(nothing)); }
+FN f64 opaque_copy_(f64 x, int nothing) { return __longlong_as_double(__double_as_longlong(x) | (long long)nothing); }
 
 FN b1 any(b1 x) { return x; }
 FN b1 any_lane(b1 x) { return x; }  // threads go their own ways

@@ -87,7 +87,7 @@ template <class T> FN i32v i32_lanes(T x) { return lift(x); }
 template <class T> FN u32v u32_lanes(T x) { return lift(x); }
 template <class T> FN b1v b1_lanes(T x) { return lift(x); }
 
-#define AGAIN(x) (x)  // computed again where it is written, unless the compiler prefers to keep it
+#define OPAQUE_COPY(x) (x)  // computed again where it is written, unless the compiler prefers to keep it
 FN i32v numbers() { i32v x; for (int i = 0; i < W; ++i) x[i] = i; return x; }
 // A number of the drone with number d of the same world.
 template <class V> FN V of_drone(V x, int d) {

@@ -1,4 +1,4 @@
-"""Meaning of each JAX primitive on scalars; importing this package fills the table of rules in ``lower``."""
+"""Meaning of each JAX primitive on scalars; importing this package fills ``RULES`` of ``lowering.jaxprs``."""
 
 from crazysim.engine.lowering.rules import (
     control_flow,

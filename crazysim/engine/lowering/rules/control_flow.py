@@ -36,7 +36,7 @@ def _host_call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Eleme
 
 @rule("custom_jvp_call")
 def _custom_jvp(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    return _with_derivative(ctx, eqn, args, close_jaxpr(eqn.params["call_jaxpr"]))
+    return _lower_with_derivative(ctx, eqn, args, close_jaxpr(eqn.params["call_jaxpr"]))
 
 
 @rule("stop_gradient")
@@ -46,11 +46,11 @@ def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
     if not jax.numpy.issubdtype(aval.dtype, np.inexact) or all(map(is_constant, args[0].reshape(-1))):
         return args
     called = jax.make_jaxpr(lambda x: x)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
-    return _with_derivative(ctx, eqn, args, called)
+    return _lower_with_derivative(ctx, eqn, args, called)
 
 
 @rule("call_hi_primitive")
-def _high_level(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _expand(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     """Expand a primitive that is defined in terms of other primitives (JAX 0.12 and later).
 
     If the results have no derivative, such as the indices from ``jnp.searchsorted``, the expansion is lowered like any
@@ -60,33 +60,33 @@ def _high_level(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elem
     called = jax.make_jaxpr(expand_primitive(eqn))(*avals)
     if not any(jax.numpy.issubdtype(v.aval.dtype, np.inexact) for v in eqn.outvars):
         return ctx.lower(called, args)
-    return _with_derivative(ctx, eqn, args, called)
+    return _lower_with_derivative(ctx, eqn, args, called)
 
 
-def _with_derivative(ctx: Lowering, eqn: JaxprEqn, args: list[Elements], called: ClosedJaxpr) -> list[Elements]:
+def _lower_with_derivative(ctx: Lowering, eqn: JaxprEqn, args: list[Elements], called: ClosedJaxpr) -> list[Elements]:
     """Lower a call with a custom derivative. The derivative itself is lowered only when it is requested."""
-    body = ctx.inner()
-    block = body.finish(body.lower(called, [_inputs(body, x) for x in args]))
+    body = ctx.make_inner()
+    block = body.finish(body.lower(called, [_add_inputs(body, x) for x in args]))
 
     @functools.cache
-    def slope() -> Block:
+    def derivative() -> Block:
         """Return the block from operands and their tangents to the tangents of the results."""
         call_fn = as_function(eqn)
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         traced = jax.make_jaxpr(lambda x, dx: jax.jvp(call_fn, x, dx)[1])(avals, avals)
         tangents = Lowering()
-        inputs = [_inputs(tangents, x) for x in (*args, *args)]
+        inputs = [_add_inputs(tangents, x) for x in (*args, *args)]
         return tangents.finish(tangents.lower(traced, inputs))
 
-    return _results(ctx, "custom_jvp", eqn, scalars(*args), (block,), (("slope", slope),))
+    return _add_operation(ctx, "custom_jvp", eqn, scalars(*args), (block,), (("derivative", derivative),))
 
 
 @rule("custom_linear_solve")
 def _linear_solve(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
-    first = lengths.matvec + lengths.vecmat
-    solve_consts = args[first : first + lengths.solve]
-    n_consts = first + lengths.solve + lengths.transpose_solve
+    n_before_solve = lengths.matvec + lengths.vecmat
+    solve_consts = args[n_before_solve : n_before_solve + lengths.solve]
+    n_consts = n_before_solve + lengths.solve + lengths.transpose_solve
     return ctx.lower(close_jaxpr(jaxprs.solve), [*solve_consts, *args[n_consts:]])
 
 
@@ -133,10 +133,10 @@ def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     n_consts = len(eqn.invars) - n_carry - n_stacked
     consts, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
     if len(body.jaxpr.outvars) == n_carry and not xs and length > 1:
-        inner = ctx.inner()
-        inputs = [_inputs(inner, x) for x in carry]
+        inner = ctx.make_inner()
+        inputs = [_add_inputs(inner, x) for x in carry]
         block = inner.finish(inner.lower(body, [*consts, *inputs]))
-        return _results(ctx, "loop", eqn, scalars(*carry), (block,), (("length", length),))
+        return _add_operation(ctx, "loop", eqn, scalars(*carry), (block,), (("length", length),))
     if length > MAX_UNROLL:
         raise UnsupportedError(
             f"primitive 'scan' with operands for each of {length} iterations; at most {MAX_UNROLL} are unrolled"
@@ -159,12 +159,12 @@ def _while(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
     p = eqn.params
     n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
     cond_consts, body_consts, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
-    cond, body = ctx.inner(), ctx.inner()
-    cond_args = [*cond_consts, *(_inputs(cond, x) for x in carry)]
+    cond, body = ctx.make_inner(), ctx.make_inner()
+    cond_args = [*cond_consts, *(_add_inputs(cond, x) for x in carry)]
     cond_block = cond.finish(cond.lower(close_jaxpr(p["cond_jaxpr"]), cond_args))
-    body_args = [*body_consts, *(_inputs(body, x) for x in carry)]
+    body_args = [*body_consts, *(_add_inputs(body, x) for x in carry)]
     body_block = body.finish(body.lower(close_jaxpr(p["body_jaxpr"]), body_args))
-    return _results(ctx, "while", eqn, scalars(*carry), (cond_block, body_block))
+    return _add_operation(ctx, "while", eqn, scalars(*carry), (cond_block, body_block))
 
 
 @rule("any_lane")
@@ -173,7 +173,7 @@ def _any_lane(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
     return [condition if is_constant(condition[()]) else as_elements([ctx.scalar("any_lane", condition[()])], ())]
 
 
-def _inputs(ctx: Lowering, template: Elements) -> Elements:
+def _add_inputs(ctx: Lowering, template: Elements) -> Elements:
     """Return new inputs of a block, with the shape and types of an array of elements."""
 
     def new_input(x: Any) -> Any:
@@ -182,7 +182,7 @@ def _inputs(ctx: Lowering, template: Elements) -> Elements:
     return as_elements([new_input(x) for x in template.reshape(-1)], template.shape)
 
 
-def _results(
+def _add_operation(
     ctx: Lowering, op: str, eqn: JaxprEqn, args: list[Element], blocks: tuple[Block, ...], params: tuple = ()
 ) -> list[Elements]:
     """Add an operation with the results of an equation, and return the results as arrays of elements."""

@@ -33,9 +33,9 @@ def _pow(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
 def _digamma(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     """Return the digamma function, whose value at zero depends on the version of JAX."""
     dtype = eqn.outvars[0].aval.dtype
-    at_zero = ctx.elementwise("eq", [args[0], constants(0, dtype)], bool)
+    is_zero = ctx.elementwise("eq", [args[0], constants(0, dtype)], bool)
     regular = ctx.elementwise("digamma", args, dtype)
-    return [ctx.elementwise("select_n", [at_zero, regular, constants(jaxcompat.DIGAMMA_AT_ZERO, dtype)], dtype)]
+    return [ctx.elementwise("select_n", [is_zero, regular, constants(jaxcompat.DIGAMMA_AT_ZERO, dtype)], dtype)]
 
 
 @rule("round")
@@ -65,12 +65,12 @@ def _select_n(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
 
 @rule("bitcast_convert_type")
 def _bitcast(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    before, after = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
-    if before == after:
+    old_dtype, new_dtype = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
+    if old_dtype == new_dtype:
         return args
-    if before.itemsize != np.dtype(after).itemsize:
-        raise UnsupportedError(f"primitive 'bitcast_convert_type' from {before} to {after}, of another size")
-    return [ctx.elementwise("bitcast_convert_type", args, after)]
+    if old_dtype.itemsize != np.dtype(new_dtype).itemsize:
+        raise UnsupportedError(f"primitive 'bitcast_convert_type' from {old_dtype} to {new_dtype}, of another size")
+    return [ctx.elementwise("bitcast_convert_type", args, new_dtype)]
 
 
 @rule("square")
@@ -104,13 +104,13 @@ def _total_order(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Ele
     name = eqn.primitive.name.removesuffix("_to")
     if eqn.invars[0].aval.dtype.kind != "f":
         return [ctx.elementwise(name, args, bool)]
-    a_nan, b_nan = (ctx.elementwise("ne", [x, x], bool) for x in args)
-    with_nan = {
-        "lt": lambda: ctx.elementwise("and", [b_nan, ctx.elementwise("not", [a_nan], bool)], bool),
-        "le": lambda: b_nan,
-        "eq": lambda: ctx.elementwise("and", [a_nan, b_nan], bool),
+    a_is_nan, b_is_nan = (ctx.elementwise("ne", [x, x], bool) for x in args)
+    result_for_nan = {
+        "lt": lambda: ctx.elementwise("and", [b_is_nan, ctx.elementwise("not", [a_is_nan], bool)], bool),
+        "le": lambda: b_is_nan,
+        "eq": lambda: ctx.elementwise("and", [a_is_nan, b_is_nan], bool),
     }[name]()
-    return [ctx.elementwise("or", [ctx.elementwise(name, args, bool), with_nan], bool)]
+    return [ctx.elementwise("or", [ctx.elementwise(name, args, bool), result_for_nan], bool)]
 
 
 @rule("optimization_barrier")
@@ -187,19 +187,19 @@ def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> lis
         raise UnsupportedError(f"numbers of type {dtype.name}")
     info, bits = np.finfo(dtype), _Bits(ctx, dtype)
     x = bits.from_number(args[0])
-    dropped = info.nmant - mantissa
-    if dropped > 0:
-        odd = bits.apply("and", bits.apply("shift_right_logical", x, dropped), 1)
-        x = bits.apply("add", x, bits.apply("add", odd, (1 << (dropped - 1)) - 1))
-        x = bits.apply("and", x, (1 << bits.n_bits) - (1 << dropped))
+    n_dropped = info.nmant - mantissa
+    if n_dropped > 0:
+        last_bit = bits.apply("and", bits.apply("shift_right_logical", x, n_dropped), 1)
+        x = bits.apply("add", x, bits.apply("add", last_bit, (1 << (n_dropped - 1)) - 1))
+        x = bits.apply("and", x, (1 << bits.n_bits) - (1 << n_dropped))
     if exponent < info.nexp:
         bias, largest = (1 << (info.nexp - 1)) - 1, (1 << (exponent - 1)) - 1
-        infinite = ((1 << info.nexp) - 1) << info.nmant
+        infinity = ((1 << info.nexp) - 1) << info.nmant
         sign = bits.apply("and", x, 1 << (bits.n_bits - 1))
-        size = bits.apply("and", x, infinite)
+        size = bits.apply("and", x, infinity)
         overflows = ctx.elementwise("gt", [size, constants((bias + largest) << info.nmant, bits.dtype)], bool)
         underflows = ctx.elementwise("le", [size, constants((bias - largest) << info.nmant, bits.dtype)], bool)
-        x = ctx.elementwise("select_n", [overflows, x, bits.apply("or", sign, infinite)], bits.dtype)
+        x = ctx.elementwise("select_n", [overflows, x, bits.apply("or", sign, infinity)], bits.dtype)
         x = ctx.elementwise("select_n", [underflows, x, sign], bits.dtype)
     rounded = ctx.elementwise("bitcast_convert_type", [x], dtype)
     is_nan = ctx.elementwise("ne", [args[0], args[0]], bool)

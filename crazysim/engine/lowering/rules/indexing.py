@@ -22,7 +22,7 @@ from crazysim.engine.lowering.jaxprs import (
     rule,
 )
 from crazysim.engine.lowering.rules import tables
-from crazysim.engine.lowering.rules.movement import move_many, run_now
+from crazysim.engine.lowering.rules.movement import evaluate, move_many
 from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn
 
 
@@ -48,11 +48,11 @@ def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> E
         return table.look_up(offsets, [table.get_base([start], [last])] * offsets.size)
     _check_range(last + 1)
     pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
-    taken = pieces[last]
+    selected = pieces[last]
     for k in range(last - 1, -1, -1):
         is_start = as_elements([ctx.scalar("le", start, constant(k, start.dtype), dtype=bool)], ())
-        taken = _select(ctx, is_start, pieces[k], taken)
-    return taken
+        selected = _select(ctx, is_start, pieces[k], selected)
+    return selected
 
 
 @rule("dynamic_update_slice")
@@ -66,11 +66,11 @@ def _dynamic_update_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) ->
     _check_range(int(np.prod([len(options) for options in ranges])))
     out = x
     for corner in itertools.product(*ranges):
-        inside = _all(ctx, (_is_at(ctx, s, k, options[-1]) for s, k, options in zip(starts, corner, ranges, strict=True)
-                        if len(options) > 1))  # fmt: skip
+        axes = zip(starts, corner, ranges, strict=True)
+        is_here = _conjunction(ctx, (_is_at(ctx, s, k, options[-1]) for s, k, options in axes if len(options) > 1))
         window_index = tuple(slice(k, k + size) for k, size in zip(corner, update.shape, strict=True))
         out = out.copy()
-        out[window_index] = update if inside is None else _select(ctx, inside, update, out[window_index])
+        out[window_index] = update if is_here is None else _select(ctx, is_here, update, out[window_index])
     return [out]
 
 
@@ -80,11 +80,11 @@ def _is_at(ctx: Lowering, index: Element, k: int, last: int) -> Elements:
     return as_elements([ctx.scalar(op, index, constant(k, index.dtype), dtype=bool)], ())
 
 
-def _all(ctx: Lowering, conditions: Iterable[Elements]) -> Elements | None:
-    out = None
+def _conjunction(ctx: Lowering, conditions: Iterable[Elements]) -> Elements | None:
+    result = None
     for condition in conditions:
-        out = condition if out is None else ctx.elementwise("and", [out, condition], bool)
-    return out
+        result = condition if result is None else ctx.elementwise("and", [result, condition], bool)
+    return result
 
 
 def _select(ctx: Lowering, condition: Elements, yes: Elements, no: Elements) -> Elements:
@@ -96,7 +96,7 @@ def _select(ctx: Lowering, condition: Elements, yes: Elements, no: Elements) -> 
 def _check_range(n: int) -> None:
     if n > MAX_UNROLL:
         raise UnsupportedError(
-            f"an index that is computed at run time, into {n} places; selected from are at most {MAX_UNROLL}"
+            f"an index that is computed at run time and has {n} possible values; at most {MAX_UNROLL} are supported"
         )
 
 
@@ -130,10 +130,10 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
     else:
         result = _select_windows(ctx, eqn, x, indices.shape, rows, row_by_element, limits)
     if mode == GatherScatterMode.FILL_OR_DROP:
-        inside = [_inside(ctx, row, limits) for row in rows]
+        is_inside = [_is_inside(ctx, row, limits) for row in rows]
         fill = eqn.params["fill_value"]
         fill = _fill_value(out.dtype) if fill is None else fill
-        result = [_select(ctx, inside[row_by_element[o]], as_elements([item], ()), constants(fill, out.dtype))[()]
+        result = [_select(ctx, is_inside[row_by_element[o]], as_elements([item], ()), constants(fill, out.dtype))[()]
                   for o, item in enumerate(result)]  # fmt: skip
     return [as_elements(result, out.shape)]
 
@@ -151,13 +151,13 @@ def _select_windows(
     _check_range(int(np.prod([limit + 1 for limit in limits])))
     result: list[Element] = []
     for corner in itertools.product(*(range(limit + 1) for limit in limits)):
-        static = np.broadcast_to(np.array(corner, np.int32), shape)
-        window = move_many(eqn, [x], [static])[0].reshape(-1)
+        corner_indices = np.broadcast_to(np.array(corner, np.int32), shape)
+        window = move_many(eqn, [x], [corner_indices])[0].reshape(-1)
         if not result:
             result = list(window)
             continue
         is_window = [
-            _all(ctx, (_is_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0))
+            _conjunction(ctx, (_is_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0))
             for row in rows
         ]
         for o, item in enumerate(window):
@@ -170,11 +170,13 @@ def _select_windows(
 def _gather_filled(eqn: JaxprEqn, x: Elements, indices: np.ndarray) -> Elements:
     """Gather at known indices; elements at indices outside the array have the fill value."""
     numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
-    (positions,) = run_now(eqn, [numbers, indices], fill_value=-1)
+    (positions,) = evaluate(eqn, [numbers, indices], fill_value=-1)
     fill = eqn.params["fill_value"]
-    outside = constants(_fill_value(eqn.outvars[0].aval.dtype) if fill is None else fill, eqn.outvars[0].aval.dtype)[()]
+    fill_element = constants(
+        _fill_value(eqn.outvars[0].aval.dtype) if fill is None else fill, eqn.outvars[0].aval.dtype
+    )[()]
     flat = x.reshape(-1)
-    return as_elements([outside if i < 0 else flat[i] for i in positions.reshape(-1)], positions.shape)
+    return as_elements([fill_element if i < 0 else flat[i] for i in positions.reshape(-1)], positions.shape)
 
 
 def _fill_value(dtype: DTypeLike) -> Any:
@@ -185,13 +187,13 @@ def _fill_value(dtype: DTypeLike) -> Any:
     return np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
 
 
-def _inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:
+def _is_inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:
     tests = []
     for i, limit in zip(row, limits, strict=True):
         tests.append(as_elements([ctx.scalar("ge", i, constant(0, i.dtype), dtype=bool)], ()))
         tests.append(as_elements([ctx.scalar("le", i, constant(limit, i.dtype), dtype=bool)], ()))
-    inside = _all(ctx, tests)
-    return constants(True, bool) if inside is None else inside
+    is_inside = _conjunction(ctx, tests)
+    return constants(True, bool) if is_inside is None else is_inside
 
 
 @rule("scatter", *(f"scatter{mark}{op}" for mark in "-_" for op in ("add", "sub", "mul", "min", "max")))
@@ -214,7 +216,7 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
     out = x.copy()
     for row in np.ndindex(indices.shape[:-1]):
         start, block = indices[row], blocks[(*row, ...)]
-        options = [_options(i, limit, clip) for i, limit in zip(start, limits, strict=True)]
+        options = [_window_positions(i, limit, clip) for i, limit in zip(start, limits, strict=True)]
         _check_range(int(np.prod([len(positions) for positions in options])))
         corner = [0] * x.ndim
         for axis, batch_axis in zip(dims.operand_batching_dims, dims.scatter_indices_batching_dims, strict=True):
@@ -222,7 +224,7 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
         for positions in itertools.product(*options):
             for axis, k in zip(start_axes, positions, strict=True):
                 corner[axis] = k
-            is_here = _all(
+            is_here = _conjunction(
                 ctx,
                 (
                     _is_at(ctx, i, k, limit)
@@ -239,7 +241,7 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
     return [out]
 
 
-def _options(index: Element, limit: int, clip: bool) -> Sequence[int]:
+def _window_positions(index: Element, limit: int, clip: bool) -> Sequence[int]:
     """Return the positions that a window may have along an axis; none if it is known to be outside."""
     if not is_constant(index):
         return range(limit + 1)

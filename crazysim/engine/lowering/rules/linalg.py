@@ -31,19 +31,21 @@ def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
     zero = constant(0, dtype)
     out = []
     for a in _matrices(args[0]):
-        low, fails = np.full((n, n), zero, object), constant(False, bool)
+        factor, fails = np.full((n, n), zero, object), constant(False, bool)
         for j in range(n):
             for i in range(j, n):
                 rest = a[i, j]
                 for k in range(j):
-                    rest = ctx.scalar("sub", rest, ctx.scalar("mul", low[i, k], low[j, k]))
-                low[i, j] = ctx.builder.add("sqrt", (rest,), dtype) if i == j else ctx.scalar("div", rest, low[j, j])
+                    rest = ctx.scalar("sub", rest, ctx.scalar("mul", factor[i, k], factor[j, k]))
+                factor[i, j] = (
+                    ctx.builder.add("sqrt", (rest,), dtype) if i == j else ctx.scalar("div", rest, factor[j, j])
+                )
                 if i == j:
                     fails = ctx.scalar("or", fails, ctx.scalar("le", rest, zero, dtype=bool))
         for j, i in itertools.combinations_with_replacement(range(n), 2):
-            low[i, j] = ctx.scalar("select_n", fails, low[i, j], constant(np.nan, dtype))
-        out.append(low)
-    return [as_elements([x for low in out for x in low.reshape(-1)], args[0].shape)]
+            factor[i, j] = ctx.scalar("select_n", fails, factor[i, j], constant(np.nan, dtype))
+        out.append(factor)
+    return [as_elements([x for factor in out for x in factor.reshape(-1)], args[0].shape)]
 
 
 @rule("triangular_solve")
@@ -90,9 +92,9 @@ def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
             pivot, largest = constant(j, np.int32), ctx.scalar("abs", a[j, j])
             for i in range(j + 1, n):
                 size = ctx.scalar("abs", a[i, j])
-                wins = ctx.scalar("gt", size, largest, dtype=bool)
-                pivot = ctx.scalar("select_n", wins, pivot, constant(i, np.int32))
-                largest = ctx.scalar("select_n", wins, largest, size)
+                is_larger = ctx.scalar("gt", size, largest, dtype=bool)
+                pivot = ctx.scalar("select_n", is_larger, pivot, constant(i, np.int32))
+                largest = ctx.scalar("select_n", is_larger, largest, size)
             pivots.append(pivot)
             for i in range(j + 1, n):
                 is_pivot = ctx.scalar("eq", pivot, constant(i, np.int32), dtype=bool)

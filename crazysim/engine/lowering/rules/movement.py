@@ -47,23 +47,23 @@ def move(eqn: JaxprEqn, args: list[Elements]) -> Elements:
     return move_many(eqn, args)[0]
 
 
-def move_many(eqn: JaxprEqn, args: list[Elements], fixed: Sequence[Any] = ()) -> list[Elements]:
+def move_many(eqn: JaxprEqn, args: list[Elements], known_operands: Sequence[Any] = ()) -> list[Elements]:
     """Return the results of a primitive that only moves elements, by running it on their indices.
 
     Args:
         eqn: The operation.
         args: The arrays whose elements are moved.
-        fixed: Further operands that are known, such as indices.
+        known_operands: Further operands, such as indices, that are known.
     """
     numbers, elements = [], []
     for x in args:
         numbers.append(np.arange(len(elements), len(elements) + x.size, dtype=np.int32).reshape(x.shape))
         elements.extend(x.reshape(-1))
-    positions = _sources(eqn, [*numbers, *fixed])
+    positions = _source_indices(eqn, [*numbers, *known_operands])
     return [as_elements([elements[i] for i in p.reshape(-1)], p.shape) for p in positions]
 
 
-def _sources(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
+def _source_indices(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
     """Return, for each result, the indices of the elements that it takes; NumPy avoids a compilation where possible."""
     p, x = eqn.params, args[0]
     match eqn.primitive.name:
@@ -76,8 +76,8 @@ def _sources(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
         case "pad":
             return [_pad(x, args[1], p["padding_config"])]
         case "gather":
-            return run_now(eqn, args, fill_value=0)  # never used: all indices are in bounds
-    return run_now(eqn, args)
+            return evaluate(eqn, args, fill_value=0)  # never used: all indices are in bounds
+    return evaluate(eqn, args)
 
 
 def _pad(x: np.ndarray, value: np.ndarray, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
@@ -86,14 +86,14 @@ def _pad(x: np.ndarray, value: np.ndarray, config: Sequence[tuple[int, int, int]
         n = x.shape[axis]
         length = max(low + n + max(n - 1, 0) * interior + high, 0)
         positions = low + np.arange(n) * (interior + 1)
-        inside = (positions >= 0) & (positions < length)
+        is_kept = (positions >= 0) & (positions < length)
         padded = np.full((length, *np.delete(x.shape, axis)), value)
-        padded[positions[inside]] = np.moveaxis(x, axis, 0)[inside]
+        padded[positions[is_kept]] = np.moveaxis(x, axis, 0)[is_kept]
         x = np.moveaxis(padded, 0, axis)
     return x
 
 
-def run_now(eqn: JaxprEqn, args: Sequence[Any], **params: Any) -> list[np.ndarray]:
+def evaluate(eqn: JaxprEqn, args: Sequence[Any], **params: Any) -> list[np.ndarray]:
     """Return the results of an operation on known numbers."""
     with jax.ensure_compile_time_eval(), jax.default_device(jax.local_devices(backend="cpu")[0]):
         return [np.asarray(x) for x in bind(eqn, *(jax.numpy.asarray(x) for x in args), **params)]
@@ -101,5 +101,5 @@ def run_now(eqn: JaxprEqn, args: Sequence[Any], **params: Any) -> list[np.ndarra
 
 @rule("iota", "iota_2x32_shape")
 def _iota(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    outs = run_now(eqn, [])
+    outs = evaluate(eqn, [])
     return [constants(x, x.dtype) for x in outs]

@@ -16,18 +16,18 @@ def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> l
     """Add a loop over the drones of the world; numbers that all drones share are not published."""
     n_captured, n = eqn.params["n_captured"], ctx.n_members
     if not n:
-        raise UnsupportedError("it needs a stage of one drone")
+        raise UnsupportedError("it needs a stage with scope 'drone'")
     if ctx.builder.outer is not None:
-        raise UnsupportedError("it stands in a loop, or in a function with a derivative of its own")
+        raise UnsupportedError("it is in a loop, or in a function with a custom derivative")
     if n == 1:
         return ctx.lower(eqn.params["jaxpr"], [*args, as_elements([constant(True, bool)], ())])
     published = [x for x in scalars(*args[n_captured:]) if not is_constant(x)]
     shared = _shared_numbers(ctx)
-    inner = ctx.inner()
+    inner = ctx.make_inner()
     others = {x: inner.builder.input(x.dtype) for x in dict.fromkeys(published) if x not in shared}
     is_self = inner.builder.input(bool)
-    other = [_replace_elements(x, others) for x in args[n_captured:]]
-    results = inner.lower(eqn.params["jaxpr"], [*args[:n_captured], *other, as_elements([is_self], ())])
+    other_elements = [_replace_elements(x, others) for x in args[n_captured:]]
+    results = inner.lower(eqn.params["jaxpr"], [*args[:n_captured], *other_elements, as_elements([is_self], ())])
     block = inner.finish(results)
     used = block.uses()  # numbers that the block does not use are not published
     pairs = [(x, y) for x, y in others.items() if y in used]

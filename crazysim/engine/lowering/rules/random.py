@@ -9,7 +9,7 @@ import numpy as np
 
 from crazysim.engine.ir.blocks import is_constant
 from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError, as_elements, rule
-from crazysim.engine.lowering.rules.movement import run_now
+from crazysim.engine.lowering.rules.movement import evaluate
 from crazysim.jaxcompat import JaxprEqn, bits_generator, threefry_prng_impl
 
 
@@ -38,10 +38,10 @@ def _check_generator(impl: Any) -> None:
 def _random(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     """Lower the functions of JAX's generator, which are integer arithmetic and a cipher on the two halves of a key."""
     name, p, impl = eqn.primitive.name, eqn.params, threefry_prng_impl
-    keys = name != "random_seed"
-    if keys:
+    takes_keys = name != "random_seed"
+    if takes_keys:
         _check_generator(eqn.invars[0].aval.dtype._impl)
-    single = {
+    random_function = {
         "random_fold_in": lambda key, data: impl.fold_in(key, data),
         "random_split": lambda key: impl.split(key, p["shape"]),
         "random_bits": lambda key: impl.random_bits(key, p["bit_width"], p["shape"]),
@@ -53,7 +53,7 @@ def _random(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
     for items in zip(*columns, strict=True):
         inputs = [as_elements(list(x), (2,)) if isinstance(x, tuple) else as_elements([x], ()) for x in items]
         avals = [jax.ShapeDtypeStruct(x.shape, x.reshape(-1)[0].dtype) for x in inputs]
-        outs.append(ctx.lower(jax.make_jaxpr(single)(*avals), inputs)[0])
+        outs.append(ctx.lower(jax.make_jaxpr(random_function)(*avals), inputs)[0])
     aval = eqn.outvars[0].aval
     flat = [x for out in outs for x in out.reshape(-1)]
     if name == "random_bits":
@@ -68,7 +68,7 @@ def _threefry(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
     first, second = [], []
     for operands in zip(*rows, strict=True):
         if all(map(is_constant, operands)):
-            a, b = (np.uint32(x) for x in run_now(eqn, [np.asarray(w) for w in operands]))
+            a, b = (np.uint32(x) for x in evaluate(eqn, [np.asarray(w) for w in operands]))
         else:
             a, b = ctx.builder.add_many("threefry2x32", operands, (np.uint32, np.uint32))
         first.append(a)

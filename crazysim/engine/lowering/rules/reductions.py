@@ -20,23 +20,23 @@ from crazysim.engine.lowering.jaxprs import (
     constants,
     rule,
 )
-from crazysim.engine.lowering.rules.movement import run_now
+from crazysim.engine.lowering.rules.movement import evaluate
 from crazysim.jaxcompat import JaxprEqn
 
-COMBINE = {
+OPERATION_OF_REDUCTION = {
     "reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min",
     "reduce_and": "and", "reduce_or": "or", "reduce_xor": "xor",
 }  # fmt: skip
 
 
-@rule(*COMBINE)
+@rule(*OPERATION_OF_REDUCTION)
 def _reduce(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    op, dtype, axes = COMBINE[eqn.primitive.name], eqn.outvars[0].aval.dtype, eqn.params["axes"]
+    op, dtype, axes = OPERATION_OF_REDUCTION[eqn.primitive.name], eqn.outvars[0].aval.dtype, eqn.params["axes"]
     x = np.moveaxis(args[0], axes, range(len(axes)))
-    rest = x.shape[len(axes) :]
-    rows = list(x.reshape(math.prod(x.shape[: len(axes)]), *rest))
+    result_shape = x.shape[len(axes) :]
+    rows = list(x.reshape(math.prod(x.shape[: len(axes)]), *result_shape))
     if not rows:
-        return [constants(run_now(eqn, [np.zeros(args[0].shape, dtype)])[0], dtype)]
+        return [constants(evaluate(eqn, [np.zeros(args[0].shape, dtype)])[0], dtype)]
     return [
         functools.reduce(lambda a, b: ctx.elementwise(op, [a, b], dtype), [np.asarray(row, object) for row in rows])
     ]
@@ -47,15 +47,15 @@ def _reduce_by(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Eleme
     """Reduce by a function of accumulated and new operands, starting from the initial values."""
     axes, n = eqn.params["dimensions"], len(args) // 2
     arrays = [np.moveaxis(x, axes, range(len(axes))) for x in args[:n]]
-    rest = arrays[0].shape[len(axes) :]
-    rows = [x.reshape(math.prod(x.shape[: len(axes)]), *rest) for x in arrays]
-    results = [np.empty(rest, object) for _ in arrays]
-    for rest_index in np.ndindex(rest):
+    result_shape = arrays[0].shape[len(axes) :]
+    rows = [x.reshape(math.prod(x.shape[: len(axes)]), *result_shape) for x in arrays]
+    results = [np.empty(result_shape, object) for _ in arrays]
+    for result_index in np.ndindex(result_shape):
         reduced = args[n:]
         for k in range(len(rows[0])):
-            reduced = ctx.lower(eqn.params["jaxpr"], [*reduced, *(x[(k, *rest_index, ...)] for x in rows)])
+            reduced = ctx.lower(eqn.params["jaxpr"], [*reduced, *(x[(k, *result_index, ...)] for x in rows)])
         for result, value in zip(results, reduced, strict=True):
-            result[rest_index] = value[()]
+            result[result_index] = value[()]
     return results
 
 
@@ -73,18 +73,18 @@ def _cumulate(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
 def _argmax(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     """Return the index of the first extreme element, or of the first NaN, as XLA does."""
     (axis,), index = eqn.params["axes"], eqn.params["index_dtype"]
-    better = "gt" if eqn.primitive.name == "argmax" else "lt"
+    comparison = "gt" if eqn.primitive.name == "argmax" else "lt"
     rows = [np.asarray(row, object) for row in np.moveaxis(args[0], axis, 0)]
-    best, where = rows[0], np.broadcast_to(constants(0, index), rows[0].shape)
+    best, best_index = rows[0], np.broadcast_to(constants(0, index), rows[0].shape)
     for i, row in enumerate(rows[1:], 1):
         best_is_number = ctx.elementwise("eq", [best, best], bool)
-        wins = ctx.elementwise(
-            "or", [ctx.elementwise(better, [row, best], bool), ctx.elementwise("ne", [row, row], bool)], bool
+        is_better = ctx.elementwise(
+            "or", [ctx.elementwise(comparison, [row, best], bool), ctx.elementwise("ne", [row, row], bool)], bool
         )
-        wins = ctx.elementwise("and", [wins, best_is_number], bool)
-        best = ctx.elementwise("select_n", [wins, best, row], eqn.invars[0].aval.dtype)
-        where = ctx.elementwise("select_n", [wins, where, constants(i, index)], index)
-    return [where]
+        is_better = ctx.elementwise("and", [is_better, best_is_number], bool)
+        best = ctx.elementwise("select_n", [is_better, best, row], eqn.invars[0].aval.dtype)
+        best_index = ctx.elementwise("select_n", [is_better, best_index, constants(i, index)], index)
+    return [best_index]
 
 
 @rule("sort")
@@ -106,9 +106,9 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
         ctx.builder.barrier()  # without it, XLA may recompute a NaN for another exchange, with the other sign
         integer = np.dtype(f"i{dtype.itemsize}")
         key = ctx.elementwise("bitcast_convert_type", [x], integer)
-        turned = ctx.elementwise("xor", [key, constants(np.iinfo(integer).max, integer)], integer)
-        negative = ctx.elementwise("lt", [key, constants(0, integer)], bool)
-        key = ctx.elementwise("select_n", [negative, key, turned], integer)
+        flipped = ctx.elementwise("xor", [key, constants(np.iinfo(integer).max, integer)], integer)
+        is_negative = ctx.elementwise("lt", [key, constants(0, integer)], bool)
+        key = ctx.elementwise("select_n", [is_negative, key, flipped], integer)
     columns = _sort_rows(ctx, eqn, [key, x, positions], axis, 1, descending=True)
     return [np.take(y, range(k), axis) for y in columns[1:]]
 
@@ -130,17 +130,17 @@ def _sort_rows(
     n = len(columns[0])
     if n > MAX_UNROLL:
         raise UnsupportedError(f"primitive {eqn.primitive.name!r} of {n} elements; at most {MAX_UNROLL} are unrolled")
-    for turn in range(n):
-        for i in range(turn % 2, n - 1, 2):
+    for pass_number in range(n):
+        for i in range(pass_number % 2, n - 1, 2):
             first = [c[i, ...].copy() for c in columns]
             second = [c[i + 1, ...].copy() for c in columns]
             low, high = (first, second) if descending else (second, first)
-            swap = _precedes(ctx, low[:n_keys], high[:n_keys]) if first[0].size else constants(False, bool)
+            must_swap = _precedes(ctx, low[:n_keys], high[:n_keys]) if first[0].size else constants(False, bool)
             for c, a, b in zip(columns, first, second, strict=True):
                 if a.size:
                     dtype = a.reshape(-1)[0].dtype
-                    c[i, ...] = ctx.elementwise("select_n", [swap, a, b], dtype)
-                    c[i + 1, ...] = ctx.elementwise("select_n", [swap, b, a], dtype)
+                    c[i, ...] = ctx.elementwise("select_n", [must_swap, a, b], dtype)
+                    c[i + 1, ...] = ctx.elementwise("select_n", [must_swap, b, a], dtype)
     return [np.moveaxis(c, 0, axis) for c in columns]
 
 
@@ -148,14 +148,14 @@ def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Element
     """Return where the first of two sets of keys precedes the second in ascending order, in which NaN is last."""
     precedes, is_tied = constants(False, bool), constants(True, bool)
     for a, b in zip(first, second, strict=True):
-        less, equal = ctx.elementwise("lt", [a, b], bool), ctx.elementwise("eq", [a, b], bool)
+        is_less, is_equal = ctx.elementwise("lt", [a, b], bool), ctx.elementwise("eq", [a, b], bool)
         if a.reshape(-1)[0].dtype.kind == "f":
-            a_nan, b_nan = ctx.elementwise("ne", [a, a], bool), ctx.elementwise("ne", [b, b], bool)
-            only_b = ctx.elementwise("and", [b_nan, ctx.elementwise("not", [a_nan], bool)], bool)
-            less = ctx.elementwise("or", [less, only_b], bool)
-            equal = ctx.elementwise("or", [equal, ctx.elementwise("and", [a_nan, b_nan], bool)], bool)
-        precedes = ctx.elementwise("or", [precedes, ctx.elementwise("and", [is_tied, less], bool)], bool)
-        is_tied = ctx.elementwise("and", [is_tied, equal], bool)
+            a_is_nan, b_is_nan = ctx.elementwise("ne", [a, a], bool), ctx.elementwise("ne", [b, b], bool)
+            is_only_b_nan = ctx.elementwise("and", [b_is_nan, ctx.elementwise("not", [a_is_nan], bool)], bool)
+            is_less = ctx.elementwise("or", [is_less, is_only_b_nan], bool)
+            is_equal = ctx.elementwise("or", [is_equal, ctx.elementwise("and", [a_is_nan, b_is_nan], bool)], bool)
+        precedes = ctx.elementwise("or", [precedes, ctx.elementwise("and", [is_tied, is_less], bool)], bool)
+        is_tied = ctx.elementwise("and", [is_tied, is_equal], bool)
     return precedes
 
 

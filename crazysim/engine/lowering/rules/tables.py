@@ -31,7 +31,7 @@ class TableView:
         """
         self.ctx, self.table, self.base, self.offsets, self.strides = ctx, entry.table, entry.base, offsets, strides
         self.aligned = entry.aligned and all(stride % 4 == 0 for stride in strides.values())
-        self.same: dict[int, Element] = {}
+        self.constants_by_offset: dict[int, Element] = {}
         """Constants that are equal along the indexed axes, by the offset of the first; they are not looked up."""
 
     def get_base(self, index: Sequence[Element], limits: Sequence[int]) -> Element:
@@ -51,16 +51,18 @@ class TableView:
         """Return the entries at some offsets, each relative to its base."""
         flat = [int(k) for k in offsets.reshape(-1)]
         numbers = [
-            self.same[k] if k in self.same else self.ctx.lookup(self.table, base, k, self.aligned)
+            self.constants_by_offset[k]
+            if k in self.constants_by_offset
+            else self.ctx.lookup(self.table, base, k, self.aligned)
             for k, base in zip(flat, bases, strict=True)
         ]
         return as_elements(numbers, offsets.shape)
 
 
 def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) -> TableView | None:
-    """Return an array as a table in which an index along some axes shifts all entries alike.
+    """Return an array as a view of a table in which an index along some axes moves all entries by the same offset.
 
-    Return None if it is not one, or if it has so few elements that selecting among them is better.
+    Return None if it is not such a view, or if it has so few elements that selecting among them is faster.
 
     Args:
         ctx: The lowering.
@@ -97,7 +99,7 @@ def _table_of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> Tabl
     first_rows = tuple([slice(0, 1) if axis in axes else slice(None) for axis in range(x.ndim)])
     bits = numbers.view(f"u{numbers.itemsize}").reshape(x.shape)
     is_equal = np.all(bits == bits[first_rows], tuple(axes), keepdims=True)
-    table.same = {int(k): x.reshape(-1)[k] for k in offsets[first_rows][is_equal]}
+    table.constants_by_offset = {int(k): x.reshape(-1)[k] for k in offsets[first_rows][is_equal]}
     return table
 
 
