@@ -15,7 +15,9 @@ def main(picture=False):
     sim.step(3000)
     car = cars.read(sim.data)
     paths, pos = car.path, car.pos[0, :, :2]
-    nearest = jax.jit(jax.vmap(lambda pos, arc: paths.at(0, paths.project(0, pos, arc)).pos))(pos, car.arc[0, :, 0])
+    nearest = jax.jit(jax.vmap(lambda pos, arc: paths.point_at(0, paths.project(0, pos, arc)).pos))(
+        pos, car.arc[0, :, 0]
+    )
     print("errors", np.linalg.norm(pos - nearest, axis=-1), "m; speeds", car.body_vel[0, :, 0], "m/s")
     if picture:
         view = {"lookat": car.pos[0, 0], "distance": 2.0, "azimuth": 120, "elevation": -25}

@@ -84,7 +84,7 @@ def tracking_errors(data):
     body = data.states.pos.at[:, 2].set(data.plugins["load"].pos[:, 2])
 
     def off_path(car, index, arc, pos):
-        return jnp.linalg.norm(pos - car.path.at(index, car.path.project(index, pos, arc)).pos)
+        return jnp.linalg.norm(pos - car.path.point_at(index, car.path.project(index, pos, arc)).pos)
 
     cars = [data.plugins[name] for name in CARS]
     errors = [

@@ -211,10 +211,10 @@ def test_contacts_are_logged_at_the_step_at_which_they_begin():
     sim.data = initial_data
     sim.step(250)
     log = jax.device_get(sim.data.plugins["contacts"])
-    np.testing.assert_array_equal(log.first, np.where(touches.any(axis=0), touches.argmax(axis=0) + 1, -1))
+    np.testing.assert_array_equal(log.first_step, np.where(touches.any(axis=0), touches.argmax(axis=0) + 1, -1))
     np.testing.assert_array_equal(log.objects[..., 0], [[False, False], [True, False], [False, False]])
     np.testing.assert_array_equal(log.drones, [[False, False], [False, False], [True, True]])
-    assert log.first[2].tolist() == [1, 1]
+    assert log.first_step[2].tolist() == [1, 1]
     assert log.any.tolist() == [[False, False], [True, False], [True, True]]
     sim.reset(np.array([False, True, False]))
     assert sim.data.plugins["contacts"].any.tolist() == [[False, False], [False, False], [True, True]]

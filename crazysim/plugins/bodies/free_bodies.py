@@ -34,7 +34,7 @@ START_SPACING = 0.5
 """Distance between neighbours that start in a row, m."""
 
 
-SURFACE_SETTINGS = ("mass", "friction", "restitution")
+BODY_SETTINGS = ("mass", "friction", "restitution")
 """Settings with a number for each body."""
 
 
@@ -97,7 +97,7 @@ class FreeBodies(Population):
     (n_worlds, n_members)"""
     objects: ObjectSelection = None
     """Handles, or names of objects that the bodies touch; None for all that are in the scene when the plugin is added,
-    () for the ground."""
+    () for the ground alone."""
     drones: bool = True
     """True for contact with drones."""
     softness: float = setting(default=0.03, positive=True, high=MAX_SOFTNESS)
@@ -115,10 +115,10 @@ class FreeBodies(Population):
         n, size = self.n_members, self.size
         if n > MAX_BODIES:
             raise ConfigError(f"expected at most {MAX_BODIES} bodies in a world, got {n}. Use fewer, and more worlds.")
-        listed = isinstance(size, list) or np.ndim(size) == 2
-        if listed and len(size) != n:
+        is_list = isinstance(size, list) or np.ndim(size) == 2
+        if is_list and len(size) != n:
             raise ConfigError(f"expected one size for all {n} bodies or a list of {n}, got a list of {len(size)}")
-        return tuple(load_shape(tuple(s) if np.ndim(s) else s) for s in (size if listed else [size] * n))
+        return tuple(load_shape(tuple(s) if np.ndim(s) else s) for s in (size if is_list else [size] * n))
 
     @property
     def pushes_drones(self) -> bool:
@@ -139,7 +139,7 @@ class FreeBodies(Population):
             )
         check_softness(sim.data.core.freq, self.softness)
         pos = row_positions(shapes) if self.pos is None else self.pos
-        numbers = {name: np.asarray(getattr(self, name), np.float64)[..., None] for name in SURFACE_SETTINGS}
+        numbers = {name: np.asarray(getattr(self, name), np.float64)[..., None] for name in BODY_SETTINGS}
         quat = np.asarray(self.quat, np.float64)
         if quat.shape[-1:] != (4,) or not np.all(np.linalg.norm(quat, axis=-1) > 0):
             raise ConfigError(f"expected quat as quaternions xyzw, not zero, got {self.quat!r}")
@@ -166,9 +166,9 @@ class FreeBodies(Population):
         return record.replace(inertia=record.mass * np.stack([inertia_per_mass(shape) for shape in shapes]))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        touching = BodyContacts(sim, self)
+        body_contacts = BodyContacts(sim, self)
         name, reason = f"{self.name}_contacts", "it solves the contacts of all worlds at once"
-        contact = Stage(lambda data: touching.respond(data), "batch", name=name, unfused_reason=reason)
+        contact = Stage(lambda data: body_contacts.respond(data), "batch", name=name, unfused_reason=reason)
         return [*super().stages(sim), StagePlacement(contact, before="increment_steps", name=name)]
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
@@ -188,13 +188,13 @@ class FreeBodies(Population):
 
         def integrate_motion(body: FreeBodiesData, rates: Rates, dt: float) -> FreeBodiesData:
             if integrator == Integrator.rk4:
-                after = scheme(body, rates, dt)
-                return after.replace(ang_vel=limit_ang_vel(after.ang_vel, 1 / dt))
-            after = scheme(body, lambda state: {name: rates(state)[name] for name in ("pos", "vel")}, dt)
+                new_body = scheme(body, rates, dt)
+                return new_body.replace(ang_vel=limit_ang_vel(new_body.ang_vel, 1 / dt))
+            new_body = scheme(body, lambda state: {name: rates(state)[name] for name in ("pos", "vel")}, dt)
             torque = rotation.rotate_inverse(body.quat, body.torque)
             ang_vel = limit_ang_vel(body.ang_vel + dt * torque / body.inertia, 1 / dt)
             quat, ang_vel = free_rotation(body.quat, ang_vel, body.inertia, dt)
-            return after.replace(quat=quat, ang_vel=ang_vel)
+            return new_body.replace(quat=quat, ang_vel=ang_vel)
 
         return integrate_motion
 

@@ -26,7 +26,7 @@ class ContactLogData(PyTree):
     """True where it has touched an object. (n_worlds, n_drones, n_objects)"""
     drones: Array = leaf("drone", 0)
     """True where it has touched another drone. (n_worlds, n_drones)"""
-    first: Array = leaf("drone", 0)
+    first_step: Array = leaf("drone", 0)
     """Step in which it first touched anything; -1 before. (n_worlds, n_drones)"""
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
@@ -34,7 +34,7 @@ class ContactLogData(PyTree):
     @property
     def any(self) -> Array:
         """True where it has touched anything. (n_worlds, n_drones)"""
-        return self.first >= 0
+        return self.first_step >= 0
 
 
 class ContactLog(Plugin):
@@ -60,7 +60,7 @@ class ContactLog(Plugin):
             floor=device_array(np.zeros(shape), bool),
             objects=device_array(np.zeros((*shape, len(names))), bool),
             drones=device_array(np.zeros(shape), bool),
-            first=device_array(np.full(shape, -1), np.int32),
+            first_step=device_array(np.full(shape, -1), np.int32),
             object_names=names,
         )
 
@@ -86,13 +86,13 @@ class ContactLog(Plugin):
     def _stage(self, contacts: Callable[[SimData], ContactReport], scope: StageScope) -> Stage:
         def check(data: SimData) -> SimData:
             log, report = self.read(data), contacts(data)
-            new = log.replace(
+            new_log = log.replace(
                 floor=_logical_or(log.floor, report.floor),
                 objects=_with_objects(log, report),
                 drones=_logical_or(log.drones, report.drones),
-                first=jnp.where((log.first < 0) & report.any, data.core.steps + 1, log.first),
+                first_step=jnp.where((log.first_step < 0) & report.any, data.core.steps + 1, log.first_step),
             )
-            return self.write(data, new)
+            return self.write(data, new_log)
 
         return Stage(check, scope)
 
@@ -105,5 +105,5 @@ def _with_objects(log: ContactLogData, report: ContactReport) -> Array:
     return log.objects | jnp.zeros_like(log.objects).at[..., columns].set(report.objects)
 
 
-def _logical_or(before: Array, now: Array | None) -> Array:
-    return before if now is None else before | now
+def _logical_or(old: Array, new: Array | None) -> Array:
+    return old if new is None else old | new

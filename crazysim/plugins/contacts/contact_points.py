@@ -87,8 +87,8 @@ def find_surfaces(sim: Simulation, objects: ObjectSelection) -> list[Surface]:
         sim: Simulation.
         objects: Handles, or names of objects; None for all.
     """
-    pushing = [plugin.name for plugin in sim.scene.plugins() if getattr(plugin, "pushes_drones", False)]
-    carriers = find_carriers(sim, objects, pushing)
+    pushing_plugins = [plugin.name for plugin in sim.scene.plugins() if getattr(plugin, "pushes_drones", False)]
+    carriers = find_carriers(sim, objects, pushing_plugins)
     return [Surface(geom, x.row, x.population) for x in carriers for geom in x.geoms]
 
 
@@ -127,20 +127,22 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
         jnp.asarray(box[:3] + np.array([0, 0, side * (1 - PLATE_SHARE) * box[5]]), dtype) for side in (-1, 1)
     ]
     drone_quat = quat[..., None, :]
-    in_world = pos[..., None, :] + rotation.rotate(drone_quat, corners)
+    world_corners = pos[..., None, :] + rotation.rotate(drone_quat, corners)
     points = []
     for surface in surfaces:
         geom = surface.geom
         to_geom, to_world, vel = _geom_frame(data, surface)
-        surface_vel = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(drone_quat, vel(in_world))
+        surface_vel = (
+            jnp.zeros_like(world_corners) if vel is None else rotation.rotate_inverse(drone_quat, vel(world_corners))
+        )
         if geom.shape.kind == "hfield":
-            gap, normal = _height_above_field(data, geom, in_world, to_geom, to_world)
+            gap, normal = _height_above_field(data, geom, world_corners, to_geom, to_world)
             normal = rotation.rotate_inverse(drone_quat, normal)
             points.append(
                 ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, surface_vel)))
             )
         if geom.shape.kind in FLAT_KINDS:
-            gap, pull_back = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), to_geom(in_world, True))
+            gap, pull_back = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), to_geom(world_corners, True))
             normal = rotation.rotate_inverse(drone_quat, to_world(pull_back(jnp.ones_like(gap))[0]))
             points.append(
                 ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, surface_vel)))
@@ -274,9 +276,9 @@ def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Ca
         return x if object_quat is None else rotation.rotate(object_quat[..., None, :], x)
 
     def velocity_at(x: Array) -> Array:
-        out = jnp.broadcast_to(vel[..., None, :], x.shape)  # type: ignore[index]
+        point_vel = jnp.broadcast_to(vel[..., None, :], x.shape)  # type: ignore[index]
         if spin is None or object_pos is None:
-            return out
-        return out + rotation.cross(jnp.broadcast_to(spin[..., None, :], x.shape), x - object_pos[..., None, :])
+            return point_vel
+        return point_vel + rotation.cross(jnp.broadcast_to(spin[..., None, :], x.shape), x - object_pos[..., None, :])
 
     return to_geom, to_world, None if vel is None else velocity_at

@@ -82,10 +82,10 @@ class DroneCollisions(Plugin):
             record = self.read(data)
             pos, rot = drones_as_boxes(data, boxes)
             solids = Solids(np.arange(n), np.zeros(n, bool), boxes[:, 3:], pos, rot)
-            surface = (jnp.broadcast_to(x, (n,)) for x in (record.friction, record.restitution))
-            contacts = join_contacts(contacts_between(solids, pairs), *surface)
-            before, dt = Impulses(record.normal_impulse, record.friction_impulse), 1 / data.core.freq
-            solved = solve_contacts(drones_as_bodies(data), contacts, before, dt, self.softness, self.iterations)
+            materials = (jnp.broadcast_to(x, (n,)) for x in (record.friction, record.restitution))
+            contacts = join_contacts(contacts_between(solids, pairs), *materials)
+            old_impulses, dt = Impulses(record.normal_impulse, record.friction_impulse), 1 / data.core.freq
+            solved = solve_contacts(drones_as_bodies(data), contacts, old_impulses, dt, self.softness, self.iterations)
             changes: Any = {
                 "impulse": solved.impulse,
                 "normal_impulse": solved.contact_impulses.normal,

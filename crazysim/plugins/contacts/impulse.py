@@ -55,24 +55,24 @@ def velocity_after_contact(
         iterations: Iterations of the solver.
     """
     n, p, s = points.normal, points.point, points.vel
-    active = points.gap < 0
+    is_active = points.gap < 0
     stiffness = PENALTY_STIFFNESS * mass
     row = _with_torque(n, p)
     surface_speed = jnp.sum(n * s, axis=-1)
 
-    def slip(u: Array) -> tuple[Array, Array]:
+    def point_speeds(u: Array) -> tuple[Array, Array]:
         """Return the speed of each point out of its surface, and its slip speed, m/s."""
         vel = u[..., None, :3] - s
         vel = vel if p is None else vel + rotation.cross(u[..., None, 3:], p)
         normal_speed = jnp.sum(vel * n, axis=-1)
         return normal_speed, rotation.safe_norm(vel - normal_speed[..., None] * n)[..., 0]
 
-    is_impact = active & (-slip(initial_vel)[0] > BOUNCE_SPEED)
+    is_impact = is_active & (-point_speeds(initial_vel)[0] > BOUNCE_SPEED)
     target_speed = jnp.where(is_impact, 0.0, jnp.minimum(-points.gap / material.softness, MAX_PUSH_SPEED))
 
     def iterate(k: Array, u: Array) -> Array:
-        normal_speed, slip_speed = slip(u)
-        is_pressed = active & (normal_speed < target_speed)
+        normal_speed, slip_speed = point_speeds(u)
+        is_pressed = is_active & (normal_speed < target_speed)
         normal_impulse = jnp.where(is_pressed, stiffness * (target_speed - normal_speed), 0.0)
         w_n = jnp.where(is_pressed, stiffness, 0.0)
         # In the first iteration every point by itself stops the whole fall: the normal force, and so the friction
@@ -90,7 +90,7 @@ def velocity_after_contact(
         )
 
     new_vel = jax.lax.fori_loop(0, iterations, iterate, initial_vel)
-    normal_impulse = jnp.where(active, stiffness * jnp.maximum(target_speed - slip(new_vel)[0], 0.0), 0.0)
+    normal_impulse = jnp.where(is_active, stiffness * jnp.maximum(target_speed - point_speeds(new_vel)[0], 0.0), 0.0)
     new_vel = new_vel + material.restitution * solve_symmetric(
         inertia, jnp.sum(jnp.where(is_impact, normal_impulse, 0.0)[..., None] * row, axis=-2)
     )
@@ -108,7 +108,7 @@ def velocity_after_contact(
         + (new_vel - surface_vel) * rotation.safe_sqrt(max_energy / jnp.where(energy_after > 0, energy_after, 1.0)),
         new_vel,
     )
-    return jnp.where(jnp.any(active, axis=-1, keepdims=True), new_vel, initial_vel)
+    return jnp.where(jnp.any(is_active, axis=-1, keepdims=True), new_vel, initial_vel)
 
 
 def inertia_matrix(mass: Array, inertia: Array | None = None) -> Array:

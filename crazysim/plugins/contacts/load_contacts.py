@@ -43,7 +43,7 @@ def load_names(sim: Simulation, plugins: Sequence[CollidingPlugin]) -> set[str]:
     return {name for name in (sim.data.objects.names if plugins else ()) if name.rpartition(":")[0] in kinds}
 
 
-def stop_loads(
+def resolve_surface_contacts(
     data: SimData, collider: Collider, surfaces: list[Surface], material: Material, iterations: int
 ) -> SimData:
     """Return the data of one drone or one world with the velocities of bodies after the impulses of surfaces.
@@ -60,7 +60,9 @@ def stop_loads(
     return collider.with_vel(data, vel)
 
 
-def hit_drones(data: SimData, collider: Collider, material: Material, boxes: DroneBoxes) -> tuple[SimData, Array]:
+def resolve_drone_contacts(
+    data: SimData, collider: Collider, material: Material, boxes: DroneBoxes
+) -> tuple[SimData, Array]:
     """Return one world after the impulses between loads or hooks and drones, and the impulses on the drones, N s.
 
     The impulse acts at the load's centre, on both, which conserves momentum and angular momentum. The normal impulse,
@@ -150,7 +152,7 @@ class _PairContacts(NamedTuple):
     """Change of each body of the second group, m/s. (n, m, 3)"""
 
 
-def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Material) -> SimData:
+def resolve_load_contacts(data: SimData, colliders: Sequence[Collider], material: Material) -> SimData:
     """Return one world after the impulses of loads and hooks on each other.
 
     They are point masses, so an impulse changes velocities only. Momentum is conserved. The impulse has a

@@ -74,13 +74,13 @@ def contacts_between(solids: Solids, pairs: np.ndarray) -> list[PairContacts]:
 
 
 def contacts_on_surface(
-    solids: Solids, number: int, geom: CollisionGeom, carrier: int, pose: tuple[Array, Array]
+    solids: Solids, solid_index: int, geom: CollisionGeom, carrier: int, pose: tuple[Array, Array]
 ) -> PairContacts:
     """Return the contact points of a solid with a geom of any kind: corners and the nearest point.
 
     Args:
         solids: The solids.
-        number: Index of the solid.
+        solid_index: Index of the solid.
         geom: The geom.
         carrier: Index of the body that carries it.
         pose: Position, m (3,), and rotation matrix (3, 3) of the geom, world frame.
@@ -91,28 +91,30 @@ def contacts_on_surface(
         gap, normal = _distance_and_normal(shape, matvec(surface_rot.T, points - surface_pos))
         return gap, matvec(surface_rot, normal)
 
-    contacts = contacts_on_ground(solids, number, carrier, gap_at)
-    if solids.is_ball[number] or shape.kind == "plane":
+    contacts = contacts_on_ground(solids, solid_index, carrier, gap_at)
+    if solids.is_ball[solid_index] or shape.kind == "plane":
         return contacts
-    box = Shape("box", tuple(map(float, solids.size[number])))
-    nearest_point = _nearest_point(box, solids.pos[number], solids.rot[number], shape, surface_pos, surface_rot)
+    box = Shape("box", tuple(map(float, solids.size[solid_index])))
+    nearest_point = _nearest_point(
+        box, solids.pos[solid_index], solids.rot[solid_index], shape, surface_pos, surface_rot
+    )
     return contacts._replace(
         points=Manifold(*(jnp.concatenate(x) for x in zip(contacts.points, nearest_point, strict=True)))
     )
 
 
-def contacts_on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> PairContacts:
+def contacts_on_ground(solids: Solids, solid_index: int, carrier: int, gap_at: GapFn) -> PairContacts:
     """Return the contact points of a solid with terrain; ``gap_at(points)`` returns its gaps and normals."""
-    pos, rot = solids.pos[number], solids.rot[number]
-    if solids.is_ball[number]:
-        radius = float(solids.size[number, 0])
+    pos, rot = solids.pos[solid_index], solids.rot[solid_index]
+    if solids.is_ball[solid_index]:
+        radius = float(solids.size[solid_index, 0])
         gap, normal = gap_at(pos[None])
         gap = gap - radius
         manifold = Manifold(gap, normal, pos - normal * (radius + 0.5 * gap[:, None]))
     else:
-        corners = pos + matvec(rot, jnp.asarray(CORNERS * solids.size[number], pos.dtype))
+        corners = pos + matvec(rot, jnp.asarray(CORNERS * solids.size[solid_index], pos.dtype))
         manifold = Manifold(*gap_at(corners), corners)
-    return PairContacts(solids.body[number : number + 1], np.array([carrier]), manifold)
+    return PairContacts(solids.body[solid_index : solid_index + 1], np.array([carrier]), manifold)
 
 
 def join_contacts(pairs: list[PairContacts], friction: Array, restitution: Array) -> Contacts:

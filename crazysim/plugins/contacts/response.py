@@ -22,7 +22,13 @@ from crazysim.core.stage import Stage
 from crazysim.plugins.contacts.contact_points import Surface, contact_points, find_surfaces, is_ground
 from crazysim.plugins.contacts.drone_boxes import DroneBoxes, collision_boxes, select_airframe
 from crazysim.plugins.contacts.impulse import Material, inertia_matrix, velocity_after_contact
-from crazysim.plugins.contacts.load_contacts import hit_drones, hit_each_other, load_names, load_plugins, stop_loads
+from crazysim.plugins.contacts.load_contacts import (
+    load_names,
+    load_plugins,
+    resolve_drone_contacts,
+    resolve_load_contacts,
+    resolve_surface_contacts,
+)
 from crazysim.plugins.payloads.colliders import CollidingPlugin
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.contact_report import ObjectSelection, select_bodies
@@ -94,9 +100,9 @@ class ContactResponse(Plugin):
 
         placements = [StagePlacement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
         obstacles = [surface for surface in surfaces if not is_ground(surface)]
-        touch_drones = any(body.name in names for body in select_bodies(sim.scene.collision_model, self.objects))
+        can_touch_drones = any(body.name in names for body in select_bodies(sim.scene.collision_model, self.objects))
         for plugin in plugins:
-            placements += self._load_stages(plugin, obstacles, boxes if touch_drones else [], sim.n_drones)
+            placements += self._load_stages(plugin, obstacles, boxes if can_touch_drones else [], sim.n_drones)
         return placements
 
     def _load_stages(
@@ -111,37 +117,37 @@ class ContactResponse(Plugin):
             n_drones: Number of drones in a world.
         """
         colliders = plugin.colliders()
-        touch_each_other = len(colliders) > 1 or (plugin.coupling == "drone" and n_drones > 1)
+        can_touch_each_other = len(colliders) > 1 or (plugin.coupling == "drone" and n_drones > 1)
 
-        def stop(data: SimData) -> SimData:
+        def respond_to_surfaces(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
                 return data
             for collider in colliders:
-                data = stop_loads(data, collider, obstacles, self.read(data).material, self.iterations)
+                data = resolve_surface_contacts(data, collider, obstacles, self.read(data).material, self.iterations)
             return data
 
-        def bounce_loads(data: SimData) -> SimData:
+        def respond_to_drones(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
                 return data
             record = self.read(data)
             impulse = record.impulse
             for collider in colliders:
-                data, part = hit_drones(data, collider, record.material, boxes)
-                impulse = impulse + part
+                data, load_impulse = resolve_drone_contacts(data, collider, record.material, boxes)
+                impulse = impulse + load_impulse
             return self.write(data, record.replace(impulse=impulse))
 
-        def hit_others(data: SimData) -> SimData:
+        def respond_to_loads(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
                 return data
-            return hit_each_other(data, colliders, self.read(data).material)
+            return resolve_load_contacts(data, colliders, self.read(data).material)
 
         stages = []
         if obstacles:
-            stages.append((Stage(stop, plugin.coupling), f"{self.name}_of_{plugin.name}"))
+            stages.append((Stage(respond_to_surfaces, plugin.coupling), f"{self.name}_of_{plugin.name}"))
         if boxes:
-            stages.append((Stage(bounce_loads, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
-            if touch_each_other:
-                stages.append((Stage(hit_others, "world"), f"{self.name}_between_{plugin.name}"))
+            stages.append((Stage(respond_to_drones, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
+            if can_touch_each_other:
+                stages.append((Stage(respond_to_loads, "world"), f"{self.name}_between_{plugin.name}"))
         return [StagePlacement(stage, before="increment_steps", name=name) for stage, name in stages]
 
 
@@ -150,9 +156,9 @@ def _respond_to_contacts(
 ) -> tuple[SimState, ContactResponseData]:
     """Return the states with the velocity after contact, and the record with the impulse."""
     states, params = data.states, data.params
-    before = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)
+    old_vel = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)
     points, inertia = contact_points(data, surfaces, box), inertia_matrix(params.mass, params.J)
-    after = velocity_after_contact(points, before, params.mass, inertia, record.material, iterations)
-    impulse = params.mass * rotation.rotate(states.quat, after[..., :3] - before[..., :3])
-    states = states.replace(vel=rotation.rotate(states.quat, after[..., :3]), ang_vel=after[..., 3:])
+    new_vel = velocity_after_contact(points, old_vel, params.mass, inertia, record.material, iterations)
+    impulse = params.mass * rotation.rotate(states.quat, new_vel[..., :3] - old_vel[..., :3])
+    states = states.replace(vel=rotation.rotate(states.quat, new_vel[..., :3]), ang_vel=new_vel[..., 3:])
     return states, record.replace(impulse=impulse)

@@ -86,8 +86,8 @@ class BodyContacts:
             jnp.concatenate([x[:, 0], jnp.zeros(size - n_free, x.dtype)]) for x in (record.friction, record.restitution)
         )
         contacts = join_contacts(groups, friction, restitution)
-        before = Impulses(record.normal_impulse, record.friction_impulse)
-        solved = solve_contacts(bodies, contacts, before, 1 / data.core.freq, plugin.softness, plugin.iterations)
+        old_impulses = Impulses(record.normal_impulse, record.friction_impulse)
+        solved = solve_contacts(bodies, contacts, old_impulses, 1 / data.core.freq, plugin.softness, plugin.iterations)
         record = states_after_contact(record, solved, slice(n_free))
         changes: Any = {
             "impulse": solved.impulse[:n_free],
@@ -142,7 +142,7 @@ class BodyContacts:
         return np.array(pairs, np.int64).reshape(-1, 2)
 
     def _contacts_on_carrier(
-        self, data: SimData, solids: Solids, dynamic: list[int], carrier: Carrier, number: int
+        self, data: SimData, solids: Solids, dynamic: list[int], carrier: Carrier, carrier_index: int
     ) -> list[PairContacts]:
         """Return the contacts of free bodies with the geoms of a carrier that are neither balls nor boxes."""
         contacts = []
@@ -150,10 +150,12 @@ class BodyContacts:
             terrain = data.plugins.get(geom.name) if carrier.row is None else None
             for k in dynamic if geom.shape.kind not in EXACT_KINDS else ():
                 if isinstance(terrain, TerrainData):
-                    contacts.append(contacts_on_ground(solids, k, number, terrain.gap_at))
+                    contacts.append(contacts_on_ground(solids, k, carrier_index, terrain.gap_at))
                 else:
                     contacts.append(
-                        contacts_on_surface(solids, k, geom, number, _geom_pose(data, carrier, geom, solids.pos.dtype))
+                        contacts_on_surface(
+                            solids, k, geom, carrier_index, _geom_pose(data, carrier, geom, solids.pos.dtype)
+                        )
                     )
         return contacts
 

@@ -266,8 +266,8 @@ def _energy_share(impulse: Array, initial_vel: Array, vel_change: Array) -> Arra
         vel_change: Their changes by the impulses, m/s. (k, 3)
     """
     first, second = jnp.sum(impulse * initial_vel), jnp.sum(impulse * vel_change)
-    gains = first + 0.5 * second > 0
-    return jnp.where(gains, jnp.maximum(-2 * first, 0.0) / jnp.where(gains, second, 1.0), 1.0)
+    adds_energy = first + 0.5 * second > 0
+    return jnp.where(adds_energy, jnp.maximum(-2 * first, 0.0) / jnp.where(adds_energy, second, 1.0), 1.0)
 
 
 def _sum_for_bodies(sums: Array, values: Array) -> Array:

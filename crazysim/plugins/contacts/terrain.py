@@ -71,10 +71,10 @@ class Terrain(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         scope = "drone" if self._check_heights(sim)[0].size <= MAX_FUSED_VALUES else "batch"
-        stop = Stage(self.stop, scope, batched=True, unfused_reason=UNFUSED_REASON)
-        return [StagePlacement(stop, before="increment_steps", replaces="clip_floor_pos")]
+        stop_stage = Stage(self.stop_drones, scope, batched=True, unfused_reason=UNFUSED_REASON)
+        return [StagePlacement(stop_stage, before="increment_steps", replaces="clip_floor_pos")]
 
-    def stop(self, data: SimData) -> SimData:
+    def stop_drones(self, data: SimData) -> SimData:
         """Stop drones at the ground: one that is below it, or on it and not rising, is set on it, at rest."""
         ground = ground_height(data, data.states.pos)
         states = stop_at_surface(data.states, ground + FLOOR_HEIGHT)
@@ -138,7 +138,7 @@ def _set_height_field(scene: Any, plugin: Terrain, heights: np.ndarray, size: np
     """Add the height field to the scene, or change it if it exists already."""
     spec, lowest = scene.spec, float(heights.min())
     rise = max(float(np.ptp(heights)), MIN_HEIGHT_RANGE)
-    shares = ((heights - lowest) / rise).astype(np.float32)
+    fractions = ((heights - lowest) / rise).astype(np.float32)
     field, geom = spec.hfield(plugin.name), spec.geom(plugin.name)
     if (field is None) != (geom is None):
         raise ConfigError(f"expected a new name, got {plugin.name!r}, which the scene has. Use name=.")
@@ -147,13 +147,13 @@ def _set_height_field(scene: Any, plugin: Terrain, heights: np.ndarray, size: np
         geom = spec.worldbody.add_geom(name=plugin.name, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=plugin.name)
     field.size = [*(size / 2), rise, BASE_THICKNESS]
     field.nrow, field.ncol = heights.shape
-    field.userdata = shares.ravel()
+    field.userdata = fractions.ravel()
     geom.pos = [pos[0], pos[1], pos[2] + lowest]
     if plugin.rgba is not None:
         geom.rgba = as_rgba(plugin.rgba)
     elif spec.material("floor") is not None:
         geom.material = "floor"
     if not plugin.floor:
-        for other in [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
-            spec.delete(other)
+        for plane in [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+            spec.delete(plane)
     scene.revision += 1

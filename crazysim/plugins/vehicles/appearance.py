@@ -30,10 +30,10 @@ N_SPOKES = 5
 def part_names(cars: Any) -> tuple[str, ...]:
     """Return the names of the objects of cars, without their numbers."""
     parts = ("body", "wheel", "drawbar", "trailer", "trailer_wheel") if cars.trailer else ("body", "wheel")
-    return tuple(_kind(cars, part) for part in parts)
+    return tuple(_object_name(cars, part) for part in parts)
 
 
-def _kind(cars: Any, part: str) -> str:
+def _object_name(cars: Any, part: str) -> str:
     """Return the name of the objects of a part; objects of bodies have the name of the cars alone."""
     return cars.name if part == "body" else f"{cars.name}_{part}"
 
@@ -53,7 +53,7 @@ def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
         parts["trailer"] = (_deck(vehicle), n)
         parts["trailer_wheel"] = (trailer_wheel, 4 * n)
     for part, (geoms, count) in parts.items():
-        sim.scene.add_once(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", _kind(cars, part), count)
+        sim.scene.add_once(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", _object_name(cars, part), count)
 
 
 def wheel_positions(vehicle: VehicleModel) -> np.ndarray:
@@ -76,7 +76,7 @@ def with_poses(objects: Objects, cars: Any, car: CarData) -> Objects:
     rows = {"body": (car.pos, car.quat), "wheel": _wheels(vehicle, car)}
     if cars.trailer:
         rows |= _trailers(vehicle, car)
-    return objects.with_poses({_kind(cars, part): row for part, row in rows.items()})
+    return objects.with_poses({_object_name(cars, part): row for part, row in rows.items()})
 
 
 def _wheels(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
@@ -123,11 +123,16 @@ def _rolling_quat(angle: Array) -> Array:
 
 
 def _geom(
-    kind: str, size: Iterable[float], pos: Iterable[float], rgba: Iterable[float], bits: str, attributes: str = ""
+    kind: str,
+    size: Iterable[float],
+    pos: Iterable[float],
+    rgba: Iterable[float],
+    contact_attributes: str,
+    attributes: str = "",
 ) -> str:
     text = " ".join(f"{float(x):.6g}" for x in size), " ".join(f"{float(x):.6g}" for x in pos)
     colour = " ".join(f"{float(x):.3g}" for x in rgba)
-    return f'<geom type="{kind}" size="{text[0]}" pos="{text[1]}" rgba="{colour}" {bits} {attributes}/>'
+    return f'<geom type="{kind}" size="{text[0]}" pos="{text[1]}" rgba="{colour}" {contact_attributes} {attributes}/>'
 
 
 def _body(vehicle: VehicleModel, rgba: Iterable[float]) -> str:

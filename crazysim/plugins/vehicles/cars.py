@@ -100,8 +100,8 @@ class Cars(Population):
         return load_vehicle(self.vehicle)
 
     @property
-    def follows(self) -> PathController | None:
-        """The path controller, or None."""
+    def path_controller(self) -> PathController | None:
+        """The controller that follows the path; None without a path."""
         if self.path is None:
             return None
         return PurePursuit() if self.controller is None else self.controller
@@ -116,17 +116,17 @@ class Cars(Population):
         self.check(sim)
         vehicle, freq, counts = self.model, sim.data.core.freq, (sim.n_worlds, self.n_members)
         self._check_settings(vehicle)
-        paths, follows = self._paths(), self.follows
+        paths, controller = self._paths(), self.path_controller
         index = start = arc = gains = memory = None
         params = CarParams.create(vehicle, freq, self.trailer)
         pos, yaw = starts.row_positions(self.n_members), np.zeros((self.n_members, 1))
-        if paths is not None and follows is not None:
-            follows.check(vehicle, paths)
+        if paths is not None and controller is not None:
+            controller.check(vehicle, paths)
             index = starts.member_numbers("index", self._indices(paths), counts, paths.n_paths)
             start_times = starts.spread_start_times(paths, index, self.n_members) if self.start is None else self.start
             start = starts.member_numbers("start", start_times, counts)
             pos, yaw, arc = starts.path_poses(paths, index, start, counts)
-            gains, memory = follows.gains(vehicle, params, self.control_freq_in(freq)), follows.memory()
+            gains, memory = controller.gains(vehicle, params, self.control_freq_in(freq)), controller.memory()
         if self.pos is not None:
             pos = starts.member_array("pos", self.pos, counts, (2,))
         if self.yaw is not None:
@@ -138,7 +138,7 @@ class Cars(Population):
         z = np.asarray(height) + vehicle.number("wheels.radius")
         zero = np.zeros((*counts, 1))
         zeros_2, zeros_3 = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)
-        is_held = self.level == "drive" and follows is None
+        needs_controller = self.level != "drive" or controller is not None
         record = self.create(
             sim,
             CarData,
@@ -151,7 +151,7 @@ class Cars(Population):
             distance=zero,
             joints=np.concatenate([yaw, yaw], axis=-1) if self.trailer else None,
             command=zeros_2,
-            applied_command=None if is_held else zeros_2,
+            applied_command=zeros_2 if needs_controller else None,
             force=zeros_3,
             torque=zeros_3,
             params=params,
@@ -169,7 +169,7 @@ class Cars(Population):
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of controller and integration; commands of the level ``drive`` need no controller."""
         placements = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
-        if self.follows is None and self.level == "drive":
+        if self.path_controller is None and self.level == "drive":
             return placements
         name, condition = (
             f"{self.name}_control",
@@ -179,29 +179,29 @@ class Cars(Population):
 
     def control(self, data: SimData) -> CarData:
         car = self.read(data)
-        follows = self.follows
-        if follows is None:
+        controller = self.path_controller
+        if controller is None:
             acc = SPEED_GAIN * (car.command[:1] - car.body_vel[:1])
             drive = motor_reference(car.command[:1], acc, car.params)
             return car.replace(applied_command=jnp.concatenate([drive, car.command[1:]]))
         time = data.core.steps / data.core.freq - car.start_time[0] if self.reference == "time" else None
-        path_point = path_state(car.state, car.path, car.index[0], car.arc, follows.ahead(car.params), time)
-        applied_command, memory = follows.update(car.state, path_point, car.memory, car.gains, car.params)
-        return car.replace(applied_command=applied_command, arc=path_point.arc, memory=memory)
+        tracking = path_state(car.state, car.path, car.index[0], car.arc, controller.reference_offset(car.params), time)
+        applied_command, memory = controller.update(car.state, tracking, car.memory, car.gains, car.params)
+        return car.replace(applied_command=applied_command, arc=tracking.arc, memory=memory)
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
         car = self.read(data)
         model = kinematic if self.model.dynamics == "kinematic" else single_track
         command = car.command if car.applied_command is None else car.applied_command
-        force, settling = car.force[:2], {}
+        force, terrain_rates = car.force[:2], {}
         if any(isinstance(record, TerrainData) for record in data.plugins.values()):
             force = force - GRAVITY[2] * car.params.mass * car.normal[2:] * car.normal[:2]
-            settling = self._settling(data, car)
-        push = jnp.concatenate([to_body_frame(car.yaw, force), car.torque[2:]])
-        rates = model(car.state, command, car.params, push)._asdict() | settling
+            terrain_rates = self._terrain_rates(data, car)
+        wrench = jnp.concatenate([to_body_frame(car.yaw, force), car.torque[2:]])
+        rates = model(car.state, command, car.params, wrench)._asdict() | terrain_rates
         return {name: rate for name, rate in rates.items() if rate is not None}
 
-    def _settling(self, data: SimData, car: CarData) -> dict[str, Array]:
+    def _terrain_rates(self, data: SimData, car: CarData) -> dict[str, Array]:
         """Return the rates of position and normal of one car that follows terrain."""
         height, normal = ground_at(data, car.pos)
         vel, rate = car.vel, 1 / max(SETTLING_TIME, 2 / data.core.freq)

@@ -10,7 +10,7 @@ from jax import Array
 from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
 
-KINEMATIC_BELOW = 0.5
+MAX_KINEMATIC_SPEED = 0.5
 """Speed below which the model is kinematic, m/s."""
 
 
@@ -89,7 +89,7 @@ def commonroad_single_track(state: CommonRoadState, command: Array, params: Comm
         params: Parameters.
     """
     p, v, d, g = params, state.speed, state.steer, -GRAVITY[2]
-    turn = limited_steer_rate(d, command[..., :1], p)
+    steer_rate = limited_steer_rate(d, command[..., :1], p)
     acc = limited_acceleration(v, command[..., 1:], p)
     front, rear = p.arms[..., :1], p.arms[..., 1:]
     wheelbase = front + rear
@@ -97,20 +97,20 @@ def commonroad_single_track(state: CommonRoadState, command: Array, params: Comm
     # angle.
     grip_front = p.friction * p.stiffness[..., :1] * (g * rear - acc * p.height) / wheelbase
     grip_rear = p.friction * p.stiffness[..., 1:] * (g * front + acc * p.height) / wheelbase
-    is_slow = jnp.abs(v) < KINEMATIC_BELOW
-    safe = jnp.where(is_slow, 1.0, v)
-    push_front = grip_front * (d - state.slip - front * state.yaw_rate / safe)
-    push_rear = grip_rear * (rear * state.yaw_rate / safe - state.slip)
+    is_slow = jnp.abs(v) < MAX_KINEMATIC_SPEED
+    safe_speed = jnp.where(is_slow, 1.0, v)
+    push_front = grip_front * (d - state.slip - front * state.yaw_rate / safe_speed)
+    push_rear = grip_rear * (rear * state.yaw_rate / safe_speed - state.slip)
     yaw_acc = p.mass / p.yaw_inertia * (front * push_front - rear * push_rear)
-    slip_rate = (push_front + push_rear) / safe - state.yaw_rate
+    slip_rate = (push_front + push_rear) / safe_speed - state.yaw_rate
     tan = jnp.tan(d)
     course = state.yaw + jnp.where(is_slow, 0.0, state.slip)
     return CommonRoadState(
         pos=jnp.concatenate([v * jnp.cos(course), v * jnp.sin(course)], axis=-1),
-        steer=turn,
+        steer=steer_rate,
         speed=acc,
         yaw=jnp.where(is_slow, v * tan / wheelbase, state.yaw_rate),
-        yaw_rate=jnp.where(is_slow, (acc * tan + v * turn * (1 + tan * tan)) / wheelbase, yaw_acc),
+        yaw_rate=jnp.where(is_slow, (acc * tan + v * steer_rate * (1 + tan * tan)) / wheelbase, yaw_acc),
         slip=jnp.where(is_slow, 0.0, slip_rate),
     )
 
@@ -125,7 +125,7 @@ def limited_steer_rate(steer: Array, rate: Array, params: CommonRoadParams) -> A
 def limited_acceleration(speed: Array, acc: Array, params: CommonRoadParams) -> Array:
     """Return the acceleration within the power of the motor, zero at a limit of the speed, m/s^2. (..., 1)"""
     p = params
-    fast = speed > p.switch_speed
-    high = jnp.where(fast, p.acc_max * p.switch_speed / jnp.where(fast, speed, 1.0), p.acc_max)
+    is_fast = speed > p.switch_speed
+    acc_limit = jnp.where(is_fast, p.acc_max * p.switch_speed / jnp.where(is_fast, speed, 1.0), p.acc_max)
     is_at_limit = ((speed <= p.speed[..., :1]) & (acc <= 0)) | ((speed >= p.speed[..., 1:]) & (acc >= 0))
-    return jnp.where(is_at_limit, 0.0, jnp.clip(acc, -p.acc_max, high))
+    return jnp.where(is_at_limit, 0.0, jnp.clip(acc, -p.acc_max, acc_limit))

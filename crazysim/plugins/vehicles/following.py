@@ -49,7 +49,9 @@ class PathState(NamedTuple):
         return jnp.where(self.speed < 0, -1.0, 1.0)
 
 
-def path_state(state: CarState, path: Path, index: Array, guess: Array, ahead: Array, time: Array | None) -> PathState:
+def path_state(
+    state: CarState, path: Path, index: Array, guess: Array, reference_offset: Array, time: Array | None
+) -> PathState:
     """Return where a vehicle is relative to its path.
 
     Args:
@@ -57,23 +59,24 @@ def path_state(state: CarState, path: Path, index: Array, guess: Array, ahead: A
         path: Paths.
         index: Index of its path. ()
         guess: Arc length near its projection, m. (1,)
-        ahead: Distance from the centre of mass to the point of the vehicle that is projected, forwards, m. (1,)
+        reference_offset: Distance from the centre of mass forwards to the point of the vehicle that is projected, m.
+            (1,)
         time: Time since the start for a reference by time, s; None for a reference by arc length. ()
     """
     heading = jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
-    lookahead_pos = state.pos[:2] + ahead * heading
-    arc = path.project(index, lookahead_pos, guess[0])
-    point = path.at(index, arc)
-    backwards = path.speed_at(index, jnp.zeros_like(arc)) < 0
-    sign = jnp.where(backwards, -1.0, 1.0)
-    tangent, offset = sign * point.tangent, lookahead_pos - point.pos
+    reference_pos = state.pos[:2] + reference_offset * heading
+    arc = path.project(index, reference_pos, guess[0])
+    point = path.point_at(index, arc)
+    is_backwards = path.speed_at(index, jnp.zeros_like(arc)) < 0
+    sign = jnp.where(is_backwards, -1.0, 1.0)
+    tangent, offset = sign * point.tangent, reference_pos - point.pos
     cross = tangent[0] * heading[1] - tangent[1] * heading[0]
     dot = tangent[0] * heading[0] + tangent[1] * heading[1]
     if time is None:
-        speed, lag = path.speed_at(index, (arc - sign * ahead)[0]), jnp.zeros_like(guess)
+        speed, lag = path.speed_at(index, (arc - sign * reference_offset)[0]), jnp.zeros_like(guess)
     else:
-        reference, speed = path.time_reference(index, time)
-        lag = sign * (reference - arc) + ahead  # of the centre of mass
+        reference_arc, speed = path.time_reference(index, time)
+        lag = sign * (reference_arc - arc) + reference_offset  # of the centre of mass
     return PathState(
         path=path,
         index=index,
@@ -109,7 +112,7 @@ class PathController:
     dataclass. Its methods are pure and written for one vehicle.
     """
 
-    backwards: ClassVar[bool] = True
+    can_reverse: ClassVar[bool] = True
     """True if it can drive backwards."""
     position_gain: float = setting(default=4.0, low=0.0)
     """Acceleration per distance from a reference by time, 1/s^2."""
@@ -130,7 +133,7 @@ class PathController:
     def check(self, vehicle: VehicleModel, path: Path) -> None:
         """Check that the controller suits vehicle and path."""
         name = type(self).__name__
-        if path.goes_backwards and not self.backwards:
+        if path.goes_backwards and not self.can_reverse:
             raise ConfigError(
                 f"expected a path that {name} can drive forwards, got negative speeds. Use PurePursuit() or PathLQR()."
             )
@@ -151,7 +154,7 @@ class PathController:
         """Return the memory of one vehicle at the start, in a record of leaves of scope ``member``, or None."""
         return None
 
-    def ahead(self, car: CarParams) -> Array:
+    def reference_offset(self, car: CarParams) -> Array:
         """Return the distance from the centre of mass to the point of the vehicle that follows the path, m. (1,)"""
         return jnp.zeros_like(car.front)
 
@@ -196,14 +199,14 @@ class PurePursuit(PathController):
     lookahead_time: float = setting(default=0.25, low=0.0)
     """Growth of the look-ahead distance with speed, s."""
 
-    def ahead(self, car: CarParams) -> Array:
+    def reference_offset(self, car: CarParams) -> Array:
         return -car.rear
 
     def steering(
         self, state: CarState, tracking: PathState, memory: Any, gains: Any, car: CarParams
     ) -> tuple[Array, Any]:
         distance = self.lookahead + self.lookahead_time * jnp.abs(state.body_vel[0])
-        goal = tracking.path.at(tracking.index, tracking.arc[0] + distance).pos
+        goal = tracking.path.point_at(tracking.index, tracking.arc[0] + distance).pos
         axle = state.pos[:2] - car.rear * jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
         offset = to_world_frame(-state.yaw, goal - axle)
         square = offset[:1] * offset[:1] + offset[1:] * offset[1:]
@@ -219,13 +222,13 @@ class Stanley(PathController):
     Automobile Trajectory Tracking for Off-Road Driving", 2007). Forwards only.
     """
 
-    backwards: ClassVar[bool] = False
+    can_reverse: ClassVar[bool] = False
     gain: float = setting(default=2.5, low=0.0)
     """Gain k, 1/s."""
     soft_speed: float = setting(default=0.5, positive=True)
     """Speed v_0 that is added, so that slow vehicles steer gently, m/s."""
 
-    def ahead(self, car: CarParams) -> Array:
+    def reference_offset(self, car: CarParams) -> Array:
         return car.front
 
     def steering(

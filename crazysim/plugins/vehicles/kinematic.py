@@ -13,7 +13,7 @@ RETURN_RATE = 50.0
 """Rate at which velocities that are incompatible with rolling wheels decay, 1/s."""
 
 
-def kinematic(state: CarState, command: Array, params: CarParams, push: Array | None = None) -> CarState:
+def kinematic(state: CarState, command: Array, params: CarParams, wrench: Array | None = None) -> CarState:
     """Return the time derivative of the state of a vehicle that rolls without slip.
 
     The yaw rate is ``w = v_x tan(d) / L`` and the velocity of the centre of mass to the left ``l_r w`` (Rajamani,
@@ -24,18 +24,18 @@ def kinematic(state: CarState, command: Array, params: CarParams, push: Array | 
         state: State.
         command: Motor reference, 1, and steering angle, rad. (..., 2)
         params: Parameters.
-        push: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None for
-            no external force. (..., 3)
+        wrench: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None
+            for no external force. (..., 3)
     """
     p, speed, wheelbase = params, state.body_vel[..., :1], params.front + params.rear
     drive, grip = drive_force(command[..., :1], speed, p), p.grip[..., :1] + p.grip[..., 1:]
     force = drive * lax.rsqrt(1 + drive * drive / (grip * grip))
-    if push is not None:
-        force = force + push[..., :1]
-    forward = force / p.mass
-    tan, turn = jnp.tan(state.steer), steer_rate(state, command, p)
+    if wrench is not None:
+        force = force + wrench[..., :1]
+    forward_acc = force / p.mass
+    tan, steer_vel = jnp.tan(state.steer), steer_rate(state, command, p)
     yaw_rate = speed * tan / wheelbase
-    yaw_acc = (forward * tan + speed * turn * (1 + tan * tan)) / wheelbase
-    side = p.rear * yaw_acc + RETURN_RATE * (p.rear * yaw_rate - state.body_vel[..., 1:])
-    acc = jnp.concatenate([forward, side], axis=-1)
-    return state_rates(state, acc, yaw_acc + RETURN_RATE * (yaw_rate - state.yaw_rate), turn, p)
+    yaw_acc = (forward_acc * tan + speed * steer_vel * (1 + tan * tan)) / wheelbase
+    lateral_acc = p.rear * yaw_acc + RETURN_RATE * (p.rear * yaw_rate - state.body_vel[..., 1:])
+    acc = jnp.concatenate([forward_acc, lateral_acc], axis=-1)
+    return state_rates(state, acc, yaw_acc + RETURN_RATE * (yaw_rate - state.yaw_rate), steer_vel, p)

@@ -26,7 +26,7 @@ AIMotionLab-Virtual, commit ea392436, aiml_virtual/controller/car_controller.py,
 aiml_virtual/controller/car_lpv_controller.py."""
 LONGITUDINAL_GAINS = ((0.0010, -0.0132, 0.4243), (-0.0044, 0.0563, 0.0959))
 """Gains of distance and speed as polynomials of the model's parameter p, highest power first. Sources: the same."""
-RATE, INTEGRAL_MAX, SMOOTHING = 40, 0.1, 0.5
+INTEGRAL_FREQ, INTEGRAL_MAX, RATE_WEIGHT = 40, 0.1, 0.5
 """Rate of the controller to which the integral's gain refers, Hz, limit of the integral, m, and weight of the newest
 difference in the rate of the offset. Sources: the same."""
 
@@ -44,7 +44,7 @@ class LPVMemory(PyTree):
     """Memory of ``LPV``."""
 
     integral: Array = leaf("member", 1)
-    """Sum of the offsets at the ticks, scaled to ``RATE``, m. (n_worlds, n_members, 1)"""
+    """Sum of the offsets at the ticks, scaled to ``INTEGRAL_FREQ``, m. (n_worlds, n_members, 1)"""
     offset: Array = leaf("member", 1)
     """Offset at the last tick, m. (n_worlds, n_members, 1)"""
     offset_rate: Array = leaf("member", 1)
@@ -68,7 +68,7 @@ class LPV(PathController):
     which steers the wrong way in one direction of turning; here it has one. Forwards only, for the F1TENTH cars.
     """
 
-    backwards: ClassVar[bool] = False
+    can_reverse: ClassVar[bool] = False
     lateral: Sequence[Sequence[float]] = LATERAL_GAINS["aiml_head"]
     """Gains k1, k2, k3 as polynomials of the speed, highest power first."""
     longitudinal: Sequence[Sequence[float]] = LONGITUDINAL_GAINS
@@ -95,9 +95,9 @@ class LPV(PathController):
         self, state: CarState, tracking: PathState, memory: LPVMemory, gains: LPVGains, car: CarParams
     ) -> tuple[Array, LPVMemory]:
         right_offset, speed = -tracking.offset, state.body_vel[:1]
-        integral = safe_clip(memory.integral + RATE * gains.period * right_offset, -INTEGRAL_MAX, INTEGRAL_MAX)
+        integral = safe_clip(memory.integral + INTEGRAL_FREQ * gains.period * right_offset, -INTEGRAL_MAX, INTEGRAL_MAX)
         raw_offset_rate = (right_offset - memory.offset) / gains.period
-        offset_rate = memory.started * (memory.offset_rate + SMOOTHING * (raw_offset_rate - memory.offset_rate))
+        offset_rate = memory.started * (memory.offset_rate + RATE_WEIGHT * (raw_offset_rate - memory.offset_rate))
         terms = (integral, right_offset, offset_rate)
         feedback = sum(polynomial(c, speed) * x for c, x in zip(self.lateral, terms, strict=True))
         steer = -tracking.heading_error + feedback + gains.feedforward * tracking.curvature
@@ -110,9 +110,9 @@ class LPV(PathController):
         p = jnp.maximum(jnp.abs(jnp.cos(tracking.heading_error + slip)) / (jnp.cos(slip) * curvature_factor), 0.2)
         speed = tracking.speed / p
         sign = speed / jnp.sqrt(speed * speed + car.slip_speed * car.slip_speed)
-        hold = (car.drive[1:2] * speed + car.drive[2:] * sign) / car.drive[:1]
-        by_lag, by_speed = (polynomial(c, p) for c in self.longitudinal)
-        return hold + by_lag * tracking.lag + by_speed * (speed - vx)
+        holding_reference = (car.drive[1:2] * speed + car.drive[2:] * sign) / car.drive[:1]
+        lag_gain, speed_gain = (polynomial(c, p) for c in self.longitudinal)
+        return holding_reference + lag_gain * tracking.lag + speed_gain * (speed - vx)
 
 
 def polynomial(coefficients: Sequence[float], x: Array) -> Array:

@@ -85,7 +85,7 @@ class Path(PyTree):
             trajectory: Trajectory of one vehicle.
             backwards: True to drive along it in reverse gear.
         """
-        pieces, curve = _level_curve(trajectory)
+        pieces, curve = _horizontal_curve(trajectory)
 
         times = np.linspace(0.0, pieces.duration, N_SAMPLES)
         speed = np.hypot(*curve(times, 1).T)
@@ -126,7 +126,7 @@ class Path(PyTree):
         knots = np.concatenate([[0.0], np.cumsum(chords)])
         trajectory = spline(knots, np.pad(xy, ((0, 0), (0, 1))), at_rest=False)
         start, end = (knots[N_REPEATED_POINTS], knots[-1 - N_REPEATED_POINTS]) if closed else (0.0, knots[-1])
-        _, curve = _level_curve(trajectory)
+        _, curve = _horizontal_curve(trajectory)
 
         parameters = np.linspace(start, end, N_SAMPLES)
         parametric_speed = np.hypot(*curve(parameters, 1).T)
@@ -164,7 +164,7 @@ class Path(PyTree):
         """True if any path is driven backwards; computed on the host."""
         return bool(np.any(np.asarray(self.speeds) < 0))
 
-    def at(self, index: Array | int, s: Array) -> PathPoint:
+    def point_at(self, index: Array | int, s: Array) -> PathPoint:
         """Return the point of a path at an arc length; closed paths start again, open ones stay at their ends.
 
         Args:
@@ -229,7 +229,7 @@ class Path(PyTree):
         """
         s, length, is_closed = guess, _entry_at(self.length, index), _entry_at(self.closed, index)
         for _ in range(NEWTON_STEPS):
-            point = self.at(index, s)
+            point = self.point_at(index, s)
             offset = pos - point.pos
             along_error = offset[0] * point.tangent[0] + offset[1] * point.tangent[1]
             lateral = point.tangent[0] * offset[1] - point.tangent[1] * offset[0]
@@ -239,7 +239,7 @@ class Path(PyTree):
             s = jnp.where(is_closed, s, safe_clip(s, 0.0, length))
         return s
 
-    def nearest(self, index: int, pos: ArrayLike) -> float:
+    def nearest_arc(self, index: int, pos: ArrayLike) -> float:
         """Return the arc length, m, of the sample of a path nearest to a position, anywhere on it, on the host.
 
         Args:
@@ -253,7 +253,7 @@ class Path(PyTree):
         k = int(np.argmin(np.sum((points - np.asarray(pos, float)[:2]) ** 2, axis=1)))
         return k / 8 * float(self.spacing[index])
 
-    def at_time(self, index: int, start: float) -> tuple[Floats, float, float]:
+    def initial_pose(self, index: int, start: float) -> tuple[Floats, float, float]:
         """Return position, m (2,), heading of the vehicle, rad, and arc length, m, at time zero, on the host.
 
         Args:
@@ -275,12 +275,12 @@ class Path(PyTree):
 
 @jax.jit
 def _point_at_time(path: Path, index: Array, t: Array) -> tuple[PathPoint, Array]:
-    """Return a point at a time since the start, s, and its arc length, m (1,)."""
+    """Return the point of a path at a time since the start, s, and its arc length, m (1,)."""
     arc, _ = path.time_reference(index, t)
-    return path.at(index, arc[0]), arc
+    return path.point_at(index, arc[0]), arc
 
 
-def _level_curve(trajectory: Trajectory) -> tuple[PieceTable, Callable[[Floats, int], Floats]]:
+def _horizontal_curve(trajectory: Trajectory) -> tuple[PieceTable, Callable[[Floats, int], Floats]]:
     """Return the pieces of a trajectory, and its derivatives along x and y as a function of times and order."""
     pieces = PieceTable.create([trajectory])
     return pieces, lambda t, order: pieces.evaluate(np.zeros(len(t), int), t, order)[:, :2]

@@ -68,16 +68,22 @@ class PathLQR(PathController):
     ) -> tuple[Array, Any]:
         cell = safe_clip(jnp.abs(state.body_vel[0]) / SPEED_STEP - 1, 0.0, N_SPEEDS - 1.001)
         k = lax.floor(cell)
-        side, node = (tracking.speed[0] < 0).astype(jnp.int32), k.astype(jnp.int32)
+        direction, node = (tracking.speed[0] < 0).astype(jnp.int32), k.astype(jnp.int32)
         table = jnp.asarray(gains.table)
-        low, high = (table.at[side, node + i].get(mode="clip") for i in range(2))
+        low, high = (table.at[direction, node + i].get(mode="clip") for i in range(2))
         row = low + (cell - k) * (high - low)
         x = jnp.concatenate([tracking.offset, state.body_vel[1:], tracking.heading_error, state.yaw_rate])
         return row[4:] * tracking.curvature - jnp.sum(row[:4] * x, keepdims=True), memory
 
 
 def lateral_model(model: Callable[..., CarState], car: CarParams, speed: Array) -> tuple[Array, Array]:
-    """Return matrices A (4, 4) and B (4, 1) of offset, sideways velocity, heading and yaw rate at a speed, m/s. ()"""
+    """Return the matrices A (4, 4) and B (4, 1) of offset, sideways velocity, heading and yaw rate.
+
+    Args:
+        model: Dynamics of the vehicle.
+        car: Its parameters.
+        speed: Speed about which the dynamics are linearised, m/s. ()
+    """
     reference = motor_reference(speed[None], jnp.zeros(1, speed.dtype), car)
 
     def rates(x: Array, steer: Array) -> Array:
@@ -103,8 +109,8 @@ def lateral_gains(
     # Without slip both rates are multiples of the tangent of the steering angle, and the matrix is still regular.
     rows = jnp.array([1, 3])
     balance = jnp.stack([A[rows, 1], B[rows, 0]], axis=1)
-    side, steer = jnp.linalg.solve(balance, -A[rows, 3] * speed)
-    row = jnp.stack([jnp.zeros_like(speed), side, -side / speed, speed])
+    side_vel, steer = jnp.linalg.solve(balance, -A[rows, 3] * speed)
+    row = jnp.stack([jnp.zeros_like(speed), side_vel, -side_vel / speed, speed])
     return jnp.concatenate([K, (steer + K @ row)[None]])
 
 
@@ -127,8 +133,8 @@ def matrix_exponential(matrix: Array) -> Array:
 
     In float64 its relative error is below 1e-12 for norms up to 100.
     """
-    eye, small = jnp.eye(len(matrix), dtype=matrix.dtype), matrix / 2**N_SQUARINGS
+    eye, scaled = jnp.eye(len(matrix), dtype=matrix.dtype), matrix / 2**N_SQUARINGS
     total = eye
     for k in range(6, 0, -1):
-        total = eye + small @ total / k
+        total = eye + scaled @ total / k
     return lax.fori_loop(0, N_SQUARINGS, lambda _, x: x @ x, total)

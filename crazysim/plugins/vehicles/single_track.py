@@ -12,7 +12,7 @@ from crazysim.rotation import safe_clip
 
 
 def drive_force(reference: Array, speed: Array, params: CarParams) -> Array:
-    """Return the force with which the wheels push the vehicle forwards on ground with enough grip, N. (..., 1)
+    """Return the force with which the wheels wrench the vehicle forwards on ground with enough grip, N. (..., 1)
 
     The motor's force ``gain d - damping v - friction sgn(v)``, limited, minus the resistance of the wheels. A share of
     it accelerates wheels, motors and a trailer; the rest acts on the vehicle. The sign of the speed changes smoothly
@@ -60,7 +60,7 @@ def steer_rate(state: CarState, command: Array, params: CarParams) -> Array:
     return safe_clip(p.steer_bandwidth * (target - state.steer), -p.steer_rate_max, p.steer_rate_max)
 
 
-def single_track(state: CarState, command: Array, params: CarParams, push: Array | None = None) -> CarState:
+def single_track(state: CarState, command: Array, params: CarParams, wrench: Array | None = None) -> CarState:
     """Return the time derivative of the state of a vehicle whose axles have one tyre each.
 
     Newton's equations in the body frame, with the forces of ``tyre_force`` on both axles:
@@ -75,8 +75,8 @@ def single_track(state: CarState, command: Array, params: CarParams, push: Array
         state: State.
         command: Motor reference, 1, and steering angle, rad. (..., 2)
         params: Parameters.
-        push: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None for
-            no external force. (..., 3)
+        wrench: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None
+            for no external force. (..., 3)
     """
     p, vx, vy, w = params, state.body_vel[..., :1], state.body_vel[..., 1:], state.yaw_rate
     drive = drive_force(command[..., :1], vx, p)
@@ -86,11 +86,11 @@ def single_track(state: CarState, command: Array, params: CarParams, push: Array
     front = tyre_force(p.front_share * drive, wheel_vel, p.stiffness[..., :1], p.grip[..., :1], p.slip_speed)
     rear_vel = jnp.concatenate([vx, rear_vy], axis=-1)
     rear = tyre_force((1 - p.front_share) * drive, rear_vel, p.stiffness[..., 1:], p.grip[..., 1:], p.slip_speed)
-    side = sin * front[0] + cos * front[1]
-    force_x, force_y = rear[0] + cos * front[0] - sin * front[1], rear[1] + side
-    torque = p.front * side - p.rear * rear[1]
-    if push is not None:
-        force_x, force_y, torque = force_x + push[..., :1], force_y + push[..., 1:2], torque + push[..., 2:]
+    front_side_force = sin * front[0] + cos * front[1]
+    force_x, force_y = rear[0] + cos * front[0] - sin * front[1], rear[1] + front_side_force
+    torque = p.front * front_side_force - p.rear * rear[1]
+    if wrench is not None:
+        force_x, force_y, torque = force_x + wrench[..., :1], force_y + wrench[..., 1:2], torque + wrench[..., 2:]
     acc = jnp.concatenate([force_x / p.mass + vy * w, force_y / p.mass - vx * w], axis=-1)
     return state_rates(state, acc, torque / p.yaw_inertia, steer_rate(state, command, p), p)
 

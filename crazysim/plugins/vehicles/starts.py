@@ -83,7 +83,7 @@ def path_poses(
     for member in np.ndindex(counts):
         key = int(index[member][0]), float(start[member][0])
         if key not in poses:
-            poses[key] = paths.at_time(*key)
+            poses[key] = paths.initial_pose(*key)
         pos[member], yaw[member], arc[member] = poses[key]
     return pos, yaw, arc
 
@@ -101,9 +101,9 @@ def project_arcs(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
     index, projections = np.broadcast_to(index, arc.shape), np.empty_like(arc)
     for member in np.ndindex(arc.shape[:2]):
         k = int(index[member][0])
-        nearest_arc, length = paths.nearest(k, pos[member]), float(paths.length[k])
-        rounds = round((float(arc[member][0]) - nearest_arc) / length) if paths.closed[k] else 0
-        projections[member] = nearest_arc + rounds * length
+        nearest_arc, length = paths.nearest_arc(k, pos[member]), float(paths.length[k])
+        laps = round((float(arc[member][0]) - nearest_arc) / length) if paths.closed[k] else 0
+        projections[member] = nearest_arc + laps * length
     return projections
 
 

@@ -13,8 +13,8 @@ from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
 def trailer_rates(state: CarState, params: CarParams) -> Array:
     """Return the rates of the headings of drawbar and deck, whose axles roll without slip, rad/s. (..., 2)
 
-    The hitch moves with the vehicle. Its velocity across the drawbar turns the drawbar, that along it moves the front
-    axle, and the front axle's velocity across the deck turns the deck.
+    The hitch moves with the vehicle. The component of its velocity across the drawbar turns the drawbar, and the
+    component along it moves the front axle. The front axle's velocity across the deck turns the deck.
     """
     if params.trailer is None or state.joints is None:
         raise ConfigError(
@@ -22,11 +22,11 @@ def trailer_rates(state: CarState, params: CarParams) -> Array:
         )
     hitch, drawbar, axles = (params.trailer[..., k : k + 1] for k in range(3))
     vx, vy = state.body_vel[..., :1], state.body_vel[..., 1:] - hitch * state.yaw_rate
-    to_bar = state.yaw - state.joints[..., :1]
-    cos, sin = jnp.cos(to_bar), jnp.sin(to_bar)
+    bar_angle = state.yaw - state.joints[..., :1]
+    cos, sin = jnp.cos(bar_angle), jnp.sin(bar_angle)
     longitudinal, lateral = cos * vx - sin * vy, sin * vx + cos * vy
-    to_deck = state.joints[..., :1] - state.joints[..., 1:]
-    return jnp.concatenate([lateral / drawbar, longitudinal * jnp.sin(to_deck) / axles], axis=-1)
+    deck_angle = state.joints[..., :1] - state.joints[..., 1:]
+    return jnp.concatenate([lateral / drawbar, longitudinal * jnp.sin(deck_angle) / axles], axis=-1)
 
 
 def trailer_axles(state: CarState, params: CarParams) -> tuple[Array, Array]:

@@ -307,7 +307,7 @@ def test_the_log_has_the_step_in_which_a_load_touches():
     first = int(np.ceil((0.5 - reach) * 500))
     assert record.object_names == ("load:0", "load:1", "sphere:0")
     np.testing.assert_array_equal(np.asarray(record.objects)[0], [[False, True, False], [True, False, False]])
-    assert np.abs(np.asarray(record.first) - first).max() <= 1
+    assert np.abs(np.asarray(record.first_step) - first).max() <= 1
     sim.data = pole.set_pose(sim.data, np.asarray(sim.data.states.pos)[:, :1])
     sim.step()
     assert np.asarray(log.read(sim.data).objects)[0, 0, 2]

@@ -51,7 +51,7 @@ def deviations(record, time):
     def of_one(pos, arc, start):
         arc = record.path.project(0, pos[:2], arc[0])
         reference = record.path.time_reference(0, time - start[0])[0]
-        return jnp.linalg.norm(pos[:2] - record.path.at(0, arc).pos), reference[0] - arc
+        return jnp.linalg.norm(pos[:2] - record.path.point_at(0, arc).pos), reference[0] - arc
 
     return jax.vmap(of_one)(record.pos[0], record.arc[0], record.start_time[0])
 

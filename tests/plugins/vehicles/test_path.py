@@ -22,7 +22,7 @@ def along(path, n=200, index=0):
 
 @jax.jit
 def points_at(path, index, s):
-    return jax.vmap(lambda x: path.at(index, x))(s)
+    return jax.vmap(lambda x: path.point_at(index, x))(s)
 
 
 def test_a_circle_is_a_circle():
@@ -58,11 +58,13 @@ def test_closed_paths_continue_and_open_ones_end():
     closed, open_ = Path.of_points(SQUARE, closed=True), Path.of_points(SQUARE)
     length = closed.length[0]
     for s in (-0.3, 0.0, 1.7):
-        there, again = closed.at(0, jnp.float32(s)), closed.at(0, jnp.float32(s + 2 * length))
+        there, again = closed.point_at(0, jnp.float32(s)), closed.point_at(0, jnp.float32(s + 2 * length))
         np.testing.assert_allclose(there.pos, again.pos, atol=1e-4)
-    np.testing.assert_allclose(closed.at(0, jnp.float32(0)).curvature, closed.at(0, length - 1e-4).curvature, atol=0.01)
-    np.testing.assert_allclose(open_.at(0, jnp.float32(99.0)).pos, SQUARE[-1], atol=1e-5)
-    np.testing.assert_allclose(open_.at(0, jnp.float32(-1.0)).pos, SQUARE[0], atol=1e-6)
+    np.testing.assert_allclose(
+        closed.point_at(0, jnp.float32(0)).curvature, closed.point_at(0, length - 1e-4).curvature, atol=0.01
+    )
+    np.testing.assert_allclose(open_.point_at(0, jnp.float32(99.0)).pos, SQUARE[-1], atol=1e-5)
+    np.testing.assert_allclose(open_.point_at(0, jnp.float32(-1.0)).pos, SQUARE[0], atol=1e-6)
     assert float(open_.speed_at(0, open_.length[0])[0]) == 0
     assert float(closed.speed_at(0, closed.length[0])[0]) == 1
 
@@ -72,11 +74,11 @@ def test_projection_finds_the_nearest_point(trajectory):
     path, rng = Path.of_trajectory(trajectory), np.random.default_rng(0)
     for _ in range(20):
         s = rng.uniform(0, float(path.length[0]))
-        point = path.at(0, jnp.float32(s))
+        point = path.point_at(0, jnp.float32(s))
         normal = jnp.array([-point.tangent[1], point.tangent[0]])
         pos = point.pos + rng.uniform(-0.1, 0.1) * normal
         assert float(path.project(0, pos, jnp.float32(s + rng.uniform(-0.1, 0.1)))) == pytest.approx(s, abs=2e-3)
-        nearest = path.nearest(0, pos)
+        nearest = path.nearest_arc(0, pos)
         assert abs((nearest - s + path.length[0] / 2) % path.length[0] - path.length[0] / 2) < 0.03
 
 
@@ -93,7 +95,7 @@ def test_timing_is_that_of_the_trajectory():
     for t in (0.5, 2.0, 3.3, 4.9):
         arc, speed = path.time_reference(0, jnp.float32(t))
         setpoint = trajectory.evaluate(t)
-        np.testing.assert_allclose(path.at(0, arc[0]).pos, setpoint.pos[:2], atol=2e-3)
+        np.testing.assert_allclose(path.point_at(0, arc[0]).pos, setpoint.pos[:2], atol=2e-3)
         np.testing.assert_allclose(speed[0], jnp.linalg.norm(setpoint.vel), atol=5e-3)
     for t, s in ((-1.0, 0.0), (9.0, float(path.length[0]))):
         arc, speed = path.time_reference(0, jnp.float32(t))
@@ -118,7 +120,7 @@ def test_slots_hold_paths_of_any_length():
     assert slots.n_paths == 3
     for k, path in enumerate(paths):
         for s in (0.0, 0.7, 2.9, 5.0):
-            for a, b in zip(slots.at(k, jnp.float32(s)), path.at(0, jnp.float32(s)), strict=True):
+            for a, b in zip(slots.point_at(k, jnp.float32(s)), path.point_at(0, jnp.float32(s)), strict=True):
                 np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(slots.speed_at(k, jnp.float32(1.0)), path.speed_at(0, jnp.float32(1.0)))
 
