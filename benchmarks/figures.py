@@ -252,26 +252,27 @@ def changed_files(commit: str, spec: Iterable[str]) -> list[str]:
         raise RuntimeError(f"measured with changes beyond commit {commit[:-1]}")
     paths = git("diff", "--name-only", "--no-renames", commit, "--", *spec).split()
     pairs = {path: pair for path in paths if (pair := versions(commit, path)) is not None}
-    defined = [{name for pair in pairs.values() for name in pair[k].defined} for k in (0, 1)]
-    old_names, new_names, renamed = defined[0] - defined[1], defined[1] - defined[0], {}
-
-    def is_same(old: Iterable[str], new: Iterable[str]) -> bool:
-        """Return True if two sequences differ only in defined names, each always replaced by the same one."""
-        return all(x == y or (x in old_names and y in new_names and renamed.setdefault(x, y) == y)
-                   for x, y in zip(old, new, strict=True))  # fmt: skip
+    old_names, new_names = ({name for pair in pairs.values() for name in pair[k].defined} for k in (0, 1))
+    new_names -= old_names
 
     def is_unchanged(path: str) -> bool:
+        """Return True if a file differs only in names, of which each is replaced by the same new one in all of it.
+
+        A new name is one that was not defined before. The file that defines it has changed if it names new code.
+        """
         if path not in pairs:
             return False
-        old, new = pairs[path]
+        (old, new), renamed = pairs[path], {}
         return (
             len(old.atoms) == len(new.atoms)
-            and is_same(old.atoms, new.atoms)
+            and all(
+                x == y or (x in old_names and y in new_names and renamed.setdefault(x, y) == y)
+                for x, y in zip(old.atoms, new.atoms, strict=True)
+            )
             and {tuple(renamed.get(x, x) for x in names) for names in old.imports} == new.imports
         )
 
-    changed_paths = [path for path in paths if not is_unchanged(path)]
-    return changed_paths if len(set(renamed.values())) == len(renamed) else paths
+    return [path for path in paths if not is_unchanged(path)]
 
 
 class Code(NamedTuple):
