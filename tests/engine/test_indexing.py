@@ -140,5 +140,5 @@ def test_too_many_places_are_refused_when_the_step_is_planned(sim):
         far = jnp.zeros(100).at[data.core.steps].set(1.0)
         return data.replace(states=data.states.replace(vel=far[:3]))
 
-    with pytest.warns(EngineWarning, match="stage 'write' is not fused: .* into 100 places"):
+    with pytest.warns(EngineWarning, match="stage 'write' is not fused: .* has 100 possible values"):
         Step({"write": write}, "lanes").plan(sim.data)

@@ -125,13 +125,13 @@ def test_leds_have_the_colours_of_the_picture():
     model = Sim(n_drones=2).mj_model
     before = model.mat_rgba.copy()
     leds = Leds(model)
-    leds.color(np.array([[0.0, 0.0, 0.0], [0.2, 0.6, 0.0]]))
+    leds.set_colors(np.array([[0.0, 0.0, 0.0], [0.2, 0.6, 0.0]]))
     for name in ("led_top", "led_bot"):
         np.testing.assert_allclose(model.material(f"{name}:1").rgba, [0.2, 0.6, 0.0, 1.0])
         assert model.material(f"{name}:1").emission[0] == pytest.approx(0.6)
     changed = np.flatnonzero((model.mat_rgba != before).any(-1))
     assert {model.material(int(k)).name for k in changed} == {"led_top:1", "led_bot:1"}
-    leds.color(np.zeros((2, 3)))
+    leds.set_colors(np.zeros((2, 3)))
     np.testing.assert_array_equal(model.mat_rgba, before)
 
 
@@ -149,9 +149,9 @@ def test_a_double_click_reports_the_body_below_it():
         return int(sim.mj_model.body_geomadr[sim.mj_model.body(body).id])
 
     for body in ("cars_wheel:7", "cars:0", "drone:1"):
-        program._report(picture, (1, geom_of(body), np.zeros(3)))
-    program._report(picture, (0, geom_of("world"), np.array([1.0, 2.0, 0.0])))
-    program._report(picture, None)
+        program._report_click(picture, (1, geom_of(body), np.zeros(3)))
+    program._report_click(picture, (0, geom_of("world"), np.array([1.0, 2.0, 0.0])))
+    program._report_click(picture, None)
     assert said == [
         ("follow", 5, "cars", 1), ("follow", 5, "cars", 0), ("follow", 5, "drone", 1), ("click", 3, [1.0, 2.0, 0.0]),
     ]  # fmt: skip
