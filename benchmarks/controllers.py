@@ -47,7 +47,7 @@ COMMAND_STEPS = {
 START_HEIGHT = 100.0
 """Height of the flights that may fall, m."""
 TAKE_OFF_WORLD, TRACKING_WORLD, PUSHED_WORLD, HEAVY_WORLD, INVERTED_WORLD, FIRST_TUMBLING_WORLD = range(6)
-"""Worlds of the flights; the last is the first of many."""
+"""Index of the world of each flight; the tumbling drones have all worlds from the last index on."""
 
 
 def generic_airframe(
@@ -139,12 +139,12 @@ def fly_airframes(
     name: str,
     airframes: list[Airframe],
     speed: float,
-    n: int,
+    n_attitudes: int,
     dynamics: str = "first_principles",
     device: str = "cpu",
 ) -> dict[str, dict[str, float]]:
-    """Return the figures of a controller for each airframe; all fly at once, one drone each in every world."""
-    worlds, drones = FIRST_TUMBLING_WORLD + n, len(airframes)
+    """Return the metrics of a controller for each airframe; all fly at once, one drone each in every world."""
+    worlds, drones = FIRST_TUMBLING_WORLD + n_attitudes, len(airframes)
     controller = make_controller(name, speed)
     sim = Sim(worlds, drone=airframes, dynamics=dynamics, control="state", controller=controller, device=device)
     path, s, params = figure_eight(2.0, 1.0, speed=speed, height=1.0), sim.data.states, sim.data.params
@@ -157,8 +157,8 @@ def fly_airframes(
     pos[TRACKING_WORLD], vel[TRACKING_WORLD] = start_setpoint.pos, start_setpoint.vel
     quat[INVERTED_WORLD] = [np.sin(np.radians(89)), 0, 0, np.cos(np.radians(89))]
     quat[FIRST_TUMBLING_WORLD:], ang_vel[FIRST_TUMBLING_WORLD:] = (
-        rng.normal(size=(n, drones, 4)),
-        rng.normal(size=(n, drones, 3)),
+        rng.normal(size=(n_attitudes, drones, 4)),
+        rng.normal(size=(n_attitudes, drones, 3)),
     )
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     ang_vel[FIRST_TUMBLING_WORLD:] *= 5 / np.linalg.norm(ang_vel[FIRST_TUMBLING_WORLD:], axis=-1, keepdims=True)
@@ -192,7 +192,7 @@ def step_response_metrics(
 
 
 def step_responses(name: str, airframes: list[Airframe], level: str, device: str = "cpu") -> np.ndarray:
-    """Return angles or body rates over 3 s after steps of the command, over their sizes.
+    """Return angles or body rates during the 3 s after a step of the command, divided by the step's size.
 
     One every 0.02 s. (n_times, n_command_steps, n_airframes)
     """
@@ -220,7 +220,7 @@ def step_responses(name: str, airframes: list[Airframe], level: str, device: str
 
 
 def fly_positions(sim: Sim, path: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions of all drones after each step of 15 s, and of the figure eight, m."""
+    """Return the positions of all drones, m, and those of the figure eight, m, after each step of a flight of 15 s."""
     step, takes_feedforward = sim.build_step_fn(), sim.data.controls.state.staged_feedforward is not None
     zeros, command = step.zeros(sim.data), np.zeros((*target.shape[:2], 16), np.float32)
     command[..., :3], command[..., 12] = target, 1
@@ -240,7 +240,7 @@ def fly_positions(sim: Sim, path: Any, target: np.ndarray, force: jax.Array) -> 
 
 
 def flight_metrics(pos: np.ndarray, path_pos: np.ndarray, name: str) -> dict[str, float]:
-    """Return the figures of one airframe from its positions. (n_steps, n_worlds, 3)"""
+    """Return the metrics of one airframe from its positions. (n_steps, n_worlds, 3)"""
     steps_per_s, setpoint_pos = len(pos) // 15, np.array([0, 0, 1.0])
     distance = np.linalg.norm(pos - setpoint_pos, axis=-1)
     results = {

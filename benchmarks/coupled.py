@@ -1,7 +1,8 @@
-"""Steps per second of worlds whose drones act on each other, compared with the same worlds without an effect.
+"""Drone steps per second of worlds whose drones act on each other, compared with the same worlds without an effect.
 
-One JSON line for each number of drones a world, at a constant total. ``downwash`` adds up the jets of all drones
-of a world at each of them; ``uncoupled`` is the same simulation without an effect. The two are measured alternately.
+One JSON line for each number of drones per world, with the same number of drones in all. ``downwash`` adds up the
+jets of all drones of a world at each of them; ``uncoupled`` is the same simulation without an effect. The two are
+measured alternately.
 
     python benchmarks/coupled.py [--device gpu] [--total 262144] [--drones 4 8 16 64 256] [--check]
 """
@@ -42,13 +43,13 @@ def main() -> None:
 
 
 def measure(case: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
-    """Return the steps per second with and without downwash."""
+    """Return the drone steps per second with and without downwash."""
     sims = {name: Sim(**case, device=args.device) for name in ("uncoupled", "downwash")}
     sims["downwash"].add(Downwash())
     flights = {name: Flight(sim, args.control, args.steps, args.device) for name, sim in sims.items()}
     durations = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
-    n_steps = case["n_worlds"] * case["n_drones"] * args.steps
-    rates = {name: round_digits(n_steps / seconds) for name, seconds in durations.items()}
+    n_drone_steps = case["n_worlds"] * case["n_drones"] * args.steps
+    rates = {name: round_digits(n_drone_steps / seconds) for name, seconds in durations.items()}
     return {"engine": engine_name(sims["downwash"]), "steps_per_s": rates}
 
 

@@ -71,7 +71,7 @@ def has_several_hosts(options: argparse.Namespace) -> bool:
     """Return True if a command runs on several hosts.
 
     Raises:
-        ConfigError: If some options of ``add_options`` lack others.
+        ConfigError: If ``--host-id`` or ``--hosts`` is given without ``--coordinator``.
     """
     if options.coordinator is None and (options.host_id is not None or options.hosts is not None):
         raise ConfigError(

@@ -25,7 +25,7 @@ from crazysim.sim import Sim
 START, END = np.array([-0.5, 0.0, 0.8]), np.array([0.5, 0.0, 1.2])
 """Where the drone of world 1 begins and ends, m."""
 BOX = np.array([0.25, 0.0, 0.05])
-"""Where the obstacle of world 0 is, m; it stands on edge in the model, and lies along x in that world."""
+"""Where the obstacle of world 0 is, m; it stands upright in the model, and lies along x in that world."""
 MAGENTA, GREEN = (1, 0, 1), (0, 1, 0)
 
 
@@ -59,18 +59,18 @@ def open_flight(browser, url):
     scrub(browser, 0.5)  # from here on it stands still
 
 
-def scrub(browser, part):
-    """Click into the bar of a flight of one second until the page shows that time.
+def scrub(browser, fraction):
+    """Click at a fraction of the bar of a flight of one second until the page shows that time.
 
-    The first click may be one too few: it ends the playing, a frame late.
+    The first click may only stop the playback, one frame late; then another one is needed.
     """
     left, top, width, height = browser.box(".mantine-Slider-track")
-    where = {"x": left + part * width, "y": top + height / 2, "button": "left", "clickCount": 1}
+    where = {"x": left + fraction * width, "y": top + height / 2, "button": "left", "clickCount": 1}
 
     def shown():
-        return abs(float(browser.value("document.querySelector('input').value")) - part) < 0.06
+        return abs(float(browser.value("document.querySelector('input').value")) - fraction) < 0.06
 
-    def stays():
+    def click_and_check():
         for event in ("mousePressed", "mouseReleased"):
             browser.call("Input.dispatchMouseEvent", type=event, **where)
         deadline = time.monotonic() + 0.5
@@ -79,7 +79,7 @@ def scrub(browser, part):
         time.sleep(0.1)
         return shown()
 
-    wait_for(stays)
+    wait_for(click_and_check)
 
 
 def pixel(browser, flight, point, world):
@@ -107,9 +107,9 @@ def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
     try:
         url = program.stdout.readline().split()[4].rstrip(";")
         open_flight(chromium, url)
-        for part in (0.1, 0.9, 0.3):
-            scrub(chromium, part)
-            wanted = pixel(chromium, flight, START + part * (END - START), 1)
+        for fraction in (0.1, 0.9, 0.3):
+            scrub(chromium, fraction)
+            wanted = pixel(chromium, flight, START + fraction * (END - START), 1)
             np.testing.assert_allclose(chromium.find(MAGENTA, wanted), wanted, atol=MAX_PIXEL_DISTANCE)
     finally:
         program.send_signal(signal.SIGINT)
@@ -124,8 +124,8 @@ def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, caps
     assert main(["replay", str(tmp_path / "flight.npz"), "--export", str(out)]) == 0
     assert capsys.readouterr().out == f"wrote {out}\n"
     open_flight(chromium, out.as_uri())
-    for part in (0.2, 0.8):
-        scrub(chromium, part)
+    for fraction in (0.2, 0.8):
+        scrub(chromium, fraction)
         for color, place in ((MAGENTA, np.zeros(3)), (GREEN, BOX)):
             wanted = pixel(chromium, flight, place, 0)
             np.testing.assert_allclose(chromium.find(color, wanted), wanted, atol=MAX_PIXEL_DISTANCE)

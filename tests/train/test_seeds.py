@@ -32,7 +32,7 @@ PPO = [
 APG = [apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=rate) for rate in (1e-3, 5e-3)]
 
 
-def worlds_of(state, i):
+def block_observations(state, i):
     """Observations of a block of four worlds."""
     return {name: np.asarray(x[4 * i : 4 * i + 4]) for name, x in state.obs.items()}
 
@@ -43,32 +43,32 @@ def test_a_seed_trains_beside_others_as_it_does_alone(algorithm, hyperparameters
     """Initial states are equal; agents, metrics and worlds agree to rounding after three iterations, with episodes that
     end in between. Hyperparameters of the seeds differ."""
     wrap = AutoReset if algorithm is ppo else lambda env: env
-    one, both = (wrap(make("hover", n, randomize="crazyflie", **SECONDS)) for n in (4, 8))
+    env_of_one, env_of_both = (wrap(make("hover", n, randomize="crazyflie", **SECONDS)) for n in (4, 8))
     keys = jax.random.split(jax.random.key(3), 2)
     init = jax.jit(algorithm.init, static_argnums=(0, 1))
-    many, alone = (
-        init(both, tuple(hyperparameters), keys),
-        [init(one, (hyperparameters[i],), keys[i : i + 1]) for i in range(2)],
+    together, alone = (
+        init(env_of_both, tuple(hyperparameters), keys),
+        [init(env_of_one, (hyperparameters[i],), keys[i : i + 1]) for i in range(2)],
     )
     for i in range(2):
-        for name, x in worlds_of(alone[i].env, 0).items():
-            np.testing.assert_array_equal(worlds_of(many.env, i)[name], x, err_msg=name)
-    assert np.any(worlds_of(many.env, 0)["pos"] != worlds_of(many.env, 1)["pos"])
+        for name, x in block_observations(alone[i].env, 0).items():
+            np.testing.assert_array_equal(block_observations(together.env, i)[name], x, err_msg=name)
+    assert np.any(block_observations(together.env, 0)["pos"] != block_observations(together.env, 1)["pos"])
     for _ in range(3):
-        many, metrics = algorithm.iterate(many, both, tuple(hyperparameters))
+        together, metrics = algorithm.iterate(together, env_of_both, tuple(hyperparameters))
         for i in range(2):
-            alone[i], reference = algorithm.iterate(alone[i], one, (hyperparameters[i],))
+            alone[i], reference = algorithm.iterate(alone[i], env_of_one, (hyperparameters[i],))
             for name in metrics:
                 np.testing.assert_allclose(metrics[name][i], reference[name][0], rtol=1e-3, atol=1e-5, err_msg=name)
     for i in range(2):
-        actual, reference = (jax.tree.leaves(take_seed(x.agents, j)) for x, j in ((many, i), (alone[i], 0)))
+        actual, reference = (jax.tree.leaves(take_seed(x.agents, j)) for x, j in ((together, i), (alone[i], 0)))
         for x, y in zip(actual, reference, strict=True):
             if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
                 x, y = map(jax.random.key_data, (x, y))
             np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4)
-        for name, x in worlds_of(alone[i].env, 0).items():
-            np.testing.assert_allclose(worlds_of(many.env, i)[name], x, rtol=1e-3, atol=1e-3, err_msg=name)
-    policies = many.as_policy()
+        for name, x in block_observations(alone[i].env, 0).items():
+            np.testing.assert_allclose(block_observations(together.env, i)[name], x, rtol=1e-3, atol=1e-3, err_msg=name)
+    policies = together.as_policy()
     found = evaluate_blocks(make("hover", 16, **SECONDS), Policies(policies), n_blocks=2)
     for i in range(2):
         expected = evaluate(make("hover", 8, **SECONDS), take_seed(policies, i))
@@ -77,15 +77,16 @@ def test_a_seed_trains_beside_others_as_it_does_alone(algorithm, hyperparameters
 
 
 def test_the_random_numbers_of_a_block_are_those_of_its_key_alone():
-    """Several drones share the key of their world; keys of worlds and drones are the same in batched functions."""
+    """Resets, ``world_keys`` and ``drone_keys`` give a block the same numbers beside another block as alone. All drones
+    of a world draw from its key."""
     keys = jax.random.split(jax.random.key(5), 2)
-    two, four = (jax.jit(make("swarm", n, engine="plain").reset) for n in (2, 4))
-    many, alone = four(keys), [two(key) for key in keys]
-    for i, one in enumerate(alone):
-        for name, x in one.obs.items():
-            np.testing.assert_array_equal(many.obs[name][2 * i : 2 * i + 2], x, err_msg=name)
+    reset_two, reset_four = (jax.jit(make("swarm", n, engine="plain").reset) for n in (2, 4))
+    together, alone = reset_four(keys), [reset_two(key) for key in keys]
+    for i, state_alone in enumerate(alone):
+        for name, x in state_alone.obs.items():
+            np.testing.assert_array_equal(together.obs[name][2 * i : 2 * i + 2], x, err_msg=name)
         for draw in (world_keys, drone_keys):
-            x, y = (jax.random.key_data(draw(state.full_data, "gusts")) for state in (many, one))
+            x, y = (jax.random.key_data(draw(state.full_data, "gusts")) for state in (together, state_alone))
             np.testing.assert_array_equal(x[2 * i : 2 * i + 2], y)
 
 
@@ -133,18 +134,18 @@ def test_each_training_has_a_policy_and_a_row_and_one_that_diverges_ends_alone(s
         assert (row["name"], texts["name"], float(texts["success"])) == (name, name, row["success"])
         assert row["success"] == results[name].metrics["success"]
         curve = read_curve(folder / name)
-        lost = config.config["learning_rate"] > 1
-        assert [point["iteration"] for point in curve] == ([0] if lost else [0, 3])
-        assert (row["diverged"] is not None) == (texts["diverged"] != "") == lost
+        diverges = config.config["learning_rate"] > 1
+        assert [point["iteration"] for point in curve] == ([0] if diverges else [0, 3])
+        assert (row["diverged"] is not None) == (texts["diverged"] != "") == diverges
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(policy))
-        assert sum(line.startswith(f"{name} diverged: NaN or infinity in iteration") for line in lines) == lost
+        assert sum(line.startswith(f"{name} diverged: NaN or infinity in iteration") for line in lines) == diverges
     first = [load_policy(folder / name)[0].layers[0][0] for name in names]
     assert np.any(first[0] != first[1])
     assert (folder / "curve.png").stat().st_size > 5000
 
 
 @pytest.mark.long("compiles a training of two seeds, and two of one")
-def test_a_seed_of_a_run_is_that_of_a_run_alone_and_resumes(tmp_path, monkeypatch):
+def test_a_seed_trains_in_a_run_of_several_as_alone_and_an_interrupted_run_resumes(tmp_path, monkeypatch):
     """An interrupted run resumes bit for bit; its learning curves are those of runs of one seed, to rounding."""
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     seen = []
@@ -179,7 +180,7 @@ def test_a_seed_of_a_run_is_that_of_a_run_alone_and_resumes(tmp_path, monkeypatc
 def test_seeds_that_are_interrupted_before_the_first_iteration_have_files_and_all_that_diverged_are_named(
     tmp_path, monkeypatch
 ):
-    """Before, the interrupt ended in StopIteration, and the error named one iteration of one seed."""
+    """Regression: the interrupt raised StopIteration, and the error named only one iteration of one seed."""
 
     def interrupt(*_):
         raise KeyboardInterrupt

@@ -84,13 +84,13 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     rows = [[parse_number(row[k]) for k in indices] for row in cells]
     data = dict(zip(names_read, without_huge_numbers(np.array(rows)).T, strict=True))
 
-    high = 10.0 if parse_number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
-    per_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(unit["gyroADC[0]"], math.pi / 180 / high)
+    resolution_factor = 10.0 if parse_number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
+    gyro_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(unit["gyroADC[0]"], math.pi / 180 / resolution_factor)
     poles = parse_number(settings.get("motor_poles", str(MOTOR_POLES)))
     if not 2 <= poles < math.inf:
         raise ConfigError(f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.")
     table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(unit["time"], 1e-6)}
-    table |= {f"w{axis}": per_unit * data[f"gyroADC[{k}]"] for k, axis in enumerate("xyz")}
+    table |= {f"w{axis}": gyro_unit * data[f"gyroADC[{k}]"] for k, axis in enumerate("xyz")}
     table |= {f"command{k + 1}": data[f"motor[{k}]"] for k in range(n_rotors)}
     rotors = [k for k in range(n_rotors) if f"eRPM[{k}]" in data]
     table |= {f"rpm{k + 1}": 200 / poles * data[f"eRPM[{k}]"] for k in rotors}

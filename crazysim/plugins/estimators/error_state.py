@@ -64,7 +64,7 @@ class Estimate(PyTree):
 
 
 def covariance(upper: Array) -> Array:
-    """Return the covariance, (..., n, n), from its upper triangle, row by row. (..., n (n + 1) / 2)"""
+    """Return the covariance whose upper triangle, row by row, is given as (..., n (n + 1) / 2). (..., n, n)"""
     n = _n_errors(upper)
     # Unsigned, because JAX 0.10 adds the axis size to signed indices, with an integer type that depends on whether
     # float32 or float64 was indexed first.

@@ -23,6 +23,9 @@ class PathState(NamedTuple):
 
     Offset, heading error and curvature refer to the path in the direction in which the vehicle points. If the path is
     driven backwards, that is opposite to the path's own direction.
+
+    A reference by time prescribes the position along the path and the speed at each time. A reference by arc length
+    prescribes only the speed, at the position where the vehicle is.
     """
 
     path: Path
@@ -40,7 +43,7 @@ class PathState(NamedTuple):
     speed: Array
     """Reference speed, m/s; negative backwards. (1,)"""
     lag: Array
-    """Distance by which the vehicle is behind a reference by time, m, positive if it has to go faster in the direction
+    """Distance that the vehicle is behind where it should be at this time, m, positive if it is behind in the direction
     in which it points; zero for a reference by arc length. (1,)"""
 
     @property
@@ -173,7 +176,9 @@ class PathController:
         raise NotImplementedError(f"{type(self).__name__} does not define steering")
 
     def driving(self, state: CarState, tracking: PathState, gains: Any, car: CarParams) -> Array:
-        """Return the motor reference that follows the reference speed, and the position of a reference by time. (1,)"""
+        """Return the motor reference that makes the vehicle follow the reference speed and, for a reference by time,
+        the reference position. (1,)
+        """
         acc = self.position_gain * tracking.lag + self.speed_gain * (tracking.speed - state.body_vel[:1])
         return motor_reference(tracking.speed, acc, car)
 
@@ -216,7 +221,8 @@ class PurePursuit(PathController):
 
 
 class Stanley(PathController):
-    """Stanley's law: the front wheels point along the path, and to it in proportion to the front axle's offset.
+    """Stanley's law: the front wheels point along the path, and turn towards it by an angle that grows with the front
+    axle's offset.
 
     ``d = -heading_error - arctan(k offset / (v_0 + v))`` (Hoffmann, Tomlin, Montemerlo and Thrun, "Autonomous
     Automobile Trajectory Tracking for Off-Road Driving", 2007). Forwards only.

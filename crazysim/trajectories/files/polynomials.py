@@ -73,27 +73,29 @@ def trajectory_from_rows(rows: NDArray, location: str) -> Trajectory:
             (n_pieces, 25) without yaw.
         location: File, for messages.
     """
-    lengths, c = rows[:, 0], rows[:, 1:].reshape(len(rows), -1, 8)
+    durations, c = rows[:, 0], rows[:, 1:].reshape(len(rows), -1, 8)
     if not np.all(np.isfinite(rows)):
         checks.raise_error("finite numbers", "others", f"{location}, piece {int(np.argmin(np.isfinite(rows).all(1)))}")
-    if not np.all(lengths >= checks.MIN_LENGTH * (1 - 1e-6)) or lengths.sum() > checks.MAX_TIME:
-        k = int(np.argmin(lengths))
+    if not np.all(durations >= checks.MIN_LENGTH * (1 - 1e-6)) or durations.sum() > checks.MAX_TIME:
+        k = int(np.argmin(durations))
         checks.raise_error(
             f"durations of at least {checks.MIN_LENGTH:g} s and at most {checks.MAX_TIME:g} s in all",
-            f"{lengths[k]:g} s and {lengths.sum():g} s",
+            f"{durations[k]:g} s and {durations.sum():g} s",
             f"{location}, piece {k}",
         )
-    magnitudes = np.abs(c) * lengths[:, None, None] ** np.arange(8)
+    magnitudes = np.abs(c) * durations[:, None, None] ** np.arange(8)
     if not np.all(magnitudes < checks.MAX_COORDINATE):
         k = int(np.argmax(magnitudes.max((1, 2))))
         checks.raise_error(
             f"coordinates up to {checks.MAX_COORDINATE:g}", f"{magnitudes[k].max():g}", f"{location}, piece {k}"
         )
-    return Trajectory.of_pieces(lengths, c)
+    return Trajectory.of_pieces(durations, c)
 
 
 def _crazyflie_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
-    """Return the pieces of a trajectory, after a check that the Crazyflie can fly polynomials of their degree."""
+    """Return ends, s (n_pieces,), and coefficients for each piece's time scaled to [0, 1] (n_pieces, 4, degree + 1),
+    after a check that the Crazyflie can fly polynomials of their degree.
+    """
     ends, c = trajectory_pieces(trajectory)
     if c.shape[2] > 8:
         raise ConfigError(
@@ -105,9 +107,9 @@ def _crazyflie_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
 def trajectory_rows(trajectory: Trajectory) -> NDArray:
     """Return the duration of each piece, s, and its coefficients for the time in seconds. (n_pieces, 33)"""
     ends, c = _crazyflie_pieces(trajectory)
-    lengths = np.diff(ends, prepend=0.0)
-    c = np.pad(c, ((0, 0), (0, 0), (0, 8 - c.shape[2]))) / lengths[:, None, None] ** np.arange(8)
-    return np.concatenate([lengths[:, None], c.reshape(len(c), -1)], axis=1)
+    durations = np.diff(ends, prepend=0.0)
+    c = np.pad(c, ((0, 0), (0, 0), (0, 8 - c.shape[2]))) / durations[:, None, None] ** np.arange(8)
+    return np.concatenate([durations[:, None], c.reshape(len(c), -1)], axis=1)
 
 
 def pack_compressed(trajectory: Trajectory) -> bytes:

@@ -1,4 +1,5 @@
-"""Motors: what weak and failed rotors push and twist, worked out from the airframe; when they fail."""
+"""Motors: forces and torques of weak and failed rotors, calculated from the airframe's numbers, and the times at which
+rotors fail."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ def build(n_worlds=3, n_drones=2, **kwargs):
     return sim
 
 
-def left(sim):
+def effectiveness(sim):
     return np.asarray(sim.data.plugins["motors"].effectiveness)
 
 
@@ -38,8 +39,9 @@ def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak):
     """One step from hover: v = g dt (mean effectiveness - 1), and J w' = the torque of what is left."""
     sim, before = weak, weak.data
     sim.step()
-    states, sim.data = jax.device_get(sim.data.states), before
-    e = left(sim)
+    after, sim.data = sim.data, before
+    states = jax.device_get(after.states)
+    e = effectiveness(sim)
     np.testing.assert_allclose(states.vel[..., 2], 9.81 * DT * (e.mean(axis=-1) - 1), rtol=1e-5, atol=1e-7)  # float32
     p, speed = before.params, np.asarray(before.states.rotor_vel, np.float64)
     thrust = e * 0.0434 * 9.81 / 4
@@ -52,11 +54,12 @@ def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak):
     slow_down = np.where(e > 0, 0.0, -5.933168530682111 * speed - 0.00031951312393561264 * speed**2)
     torque = (spin * (drag + 38.93e-9 * 2 * np.pi / 60 * slow_down)).sum(-1)
     np.testing.assert_allclose(states.ang_vel[..., 2], DT / J[2] * torque, rtol=1e-4, atol=1e-5)
-    assert np.array_equal(p.rpm2thrust, sim.data.params.rpm2thrust)
+    assert np.array_equal(p.rpm2thrust, after.params.rpm2thrust)
 
 
 def test_a_drone_without_rotors_falls_like_a_stone(weak):
-    """Free fall of explicit Euler with linear drag, whatever its rotors still turn; commands are left alone."""
+    """It falls as explicit Euler with linear drag computes, however fast its rotors still turn; commands do not
+    change."""
     sim, before = weak, weak.data
     sim.step(100)
     states, controls, sim.data = *jax.device_get((sim.data.states, sim.data.controls)), before
@@ -75,10 +78,10 @@ def test_rotors_fail_in_their_step_and_come_back_with_a_reset():
     sim = build(fail_step=fail_step)
     for step in range(12):
         sim.step()
-        np.testing.assert_array_equal(left(sim), np.where((fail_step >= 0) & (fail_step <= step), 0.0, 1.0))
+        np.testing.assert_array_equal(effectiveness(sim), np.where((fail_step >= 0) & (fail_step <= step), 0.0, 1.0))
     sim.reset(np.array([False, True, False]))
-    np.testing.assert_array_equal(left(sim)[1], 1.0)
-    assert left(sim)[0, 0, 1] == 0
+    np.testing.assert_array_equal(effectiveness(sim)[1], 1.0)
+    assert effectiveness(sim)[0, 0, 1] == 0
 
 
 def test_rotors_fail_by_chance_at_their_rate():
@@ -86,15 +89,15 @@ def test_rotors_fail_by_chance_at_their_rate():
     n = 2048
     sim = build(n_worlds=n, n_drones=1, rate=[0.0, 5.0, 20.0, 5.0])
     sim.step(20)
-    early = left(sim)
+    early = effectiveness(sim)
     sim.step(30)
-    for steps, found in ((20, early), (50, left(sim))):
+    for steps, found in ((20, early), (50, effectiveness(sim))):
         works = np.exp(-np.array([0.0, 5.0, 20.0, 5.0]) * steps * DT)
         # four standard errors of a binomial fraction
         np.testing.assert_array_less(np.abs((found == 1).mean(axis=(0, 1)) - works), 4 * np.sqrt(0.25 / n))
-    assert np.all(left(sim) <= early)
-    assert set(np.unique(left(sim))) == {0.0, 1.0}
-    pairs = (left(sim)[:, 0, 1] == 1) & (left(sim)[:, 0, 3] == 1)
+    assert np.all(effectiveness(sim) <= early)
+    assert set(np.unique(effectiveness(sim))) == {0.0, 1.0}
+    pairs = (effectiveness(sim)[:, 0, 1] == 1) & (effectiveness(sim)[:, 0, 3] == 1)
     assert abs(pairs.mean() - np.exp(-1.0)) < 4 * np.sqrt(0.25 / n), "rotors fail independently"
 
 
@@ -103,8 +106,8 @@ def test_rotors_fail_when_told(weak):
     mask = np.zeros((3, 2, 4), bool)
     mask[2, 1, 3] = True
     weak.data = weak.plugins["motors"].fail(weak.data, mask)
-    changed, weak.data = left(weak), before
-    np.testing.assert_array_equal(changed != left(weak), mask)
+    changed, weak.data = effectiveness(weak), before
+    np.testing.assert_array_equal(changed != effectiveness(weak), mask)
     assert changed[2, 1, 3] == 0
 
 
@@ -126,7 +129,7 @@ def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak):
     ({"fail_step": 1.5}, "fail_step of MotorFailure as a whole number or array, got 1.5"),
     ({"rate": -1.0}, "rate of MotorFailure to be finite and at least 0"),
 ])  # fmt: skip
-def test_law_09_motors_that_cannot_be_are_told(kwargs, message):
+def test_law_09_impossible_motors_are_refused(kwargs, message):
     with pytest.raises(ConfigError, match=message):
         Sim(n_worlds=2, n_drones=3).add(MotorFailure(**kwargs))
 

@@ -78,7 +78,9 @@ class Trajectory:
         if not len(rows) or not np.isfinite(rows).all() or not (rows[:, 0] > 0).all():
             raise ConfigError(f"expected finite numbers and positive durations in {str(filename)!r}")
         parts = [[Polynomial(row[1 + 8 * k : 9 + 8 * k]) for k in range(4)] for row in rows]
-        self.polynomials = [Polynomial4D(float(row[0]), *of_piece) for row, of_piece in zip(rows, parts, strict=True)]
+        self.polynomials = [
+            Polynomial4D(float(row[0]), *polynomials) for row, polynomials in zip(rows, parts, strict=True)
+        ]
         self.duration = float(rows[:, 0].sum())
 
     def n_pieces(self) -> int:
@@ -99,16 +101,18 @@ class Trajectory:
 
     def path(self) -> HostTrajectory:
         """Return the trajectory for ``Commander.upload``."""
-        axes = [[p.px.p, p.py.p, p.pz.p, p.pyaw.p] for p in self.polynomials]
+        pieces = [[p.px.p, p.py.p, p.pz.p, p.pyaw.p] for p in self.polynomials]
         durations = np.array([p.duration for p in self.polynomials], float)
-        n = max((len(c) for piece in axes for c in piece), default=0)
-        coefficients = np.array([[np.pad(c, (0, n - len(c))) for c in piece] for piece in axes], float)
+        n = max((len(c) for piece in pieces for c in piece), default=0)
+        coefficients = np.array([[np.pad(c, (0, n - len(c))) for c in piece] for piece in pieces], float)
         if (
             not n
             or not np.isfinite(coefficients).all()
             or not (durations > 0).all()
             or not np.isfinite(durations).all()
         ):
-            raise ConfigError(f"expected pieces of finite coefficients and positive durations, got {len(axes)} pieces")
+            raise ConfigError(
+                f"expected pieces of finite coefficients and positive durations, got {len(pieces)} pieces"
+            )
         scaled_coefficients = coefficients * durations[:, None, None] ** np.arange(n)
-        return HostTrajectory(np.cumsum(durations), scaled_coefficients, False)
+        return HostTrajectory(np.cumsum(durations), scaled_coefficients, repeats=False)

@@ -1,4 +1,4 @@
-"""Crazyflies at the other end of CRTP, the protocol of ``cflib``: scripts run with their URI changed.
+"""Simulated Crazyflies that speak CRTP, the protocol of ``cflib``: scripts run unchanged, except for the URI.
 
 ``CrtpServer`` answers on UDP, which ``cflib`` reaches by ``udp://127.0.0.1:19850``, from any process.
 ``add_cflib_driver`` adds ``sim://`` to ``cflib`` within this one.

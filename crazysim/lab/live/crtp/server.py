@@ -48,17 +48,17 @@ class CrtpServer(Closeable):
         self._selector = selectors.DefaultSelector()
         self._stop_event = threading.Event()
         for k in range(len(self.devices)):
-            peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            self._sockets.append(peer)
+            server_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._sockets.append(server_socket)
             try:
-                peer.bind((host, port + k if port else 0))
+                server_socket.bind((host, port + k if port else 0))
             except (OSError, OverflowError) as error:
                 self._close_sockets()
                 raise ConfigError(
                     f"expected a free address, got {host}:{port + k}: {error}. Use another port."
                 ) from error
-            peer.setblocking(False)
-            self._selector.register(peer, selectors.EVENT_READ, k)
+            server_socket.setblocking(False)
+            self._selector.register(server_socket, selectors.EVENT_READ, k)
         swarm.listeners.append(self._send_due)
         self._thread = threading.Thread(target=self._serve, name="crtp", daemon=True)
         self._thread.start()
@@ -66,7 +66,7 @@ class CrtpServer(Closeable):
     @property
     def uris(self) -> list[str]:
         """URIs of the drones for cflib."""
-        addresses = [peer.getsockname() for peer in self._sockets]
+        addresses = [server_socket.getsockname() for server_socket in self._sockets]
         return [f"udp://{host if host != '0.0.0.0' else '127.0.0.1'}:{port}" for host, port in addresses]
 
     def close(self) -> None:
@@ -76,8 +76,8 @@ class CrtpServer(Closeable):
         self._close_sockets()
 
     def _close_sockets(self) -> None:
-        for peer in self._sockets:
-            peer.close()
+        for server_socket in self._sockets:
+            server_socket.close()
         self._selector.close()
 
     def _serve(self) -> None:
@@ -97,8 +97,8 @@ class CrtpServer(Closeable):
 
     def _send_due(self) -> None:
         """Send the log and console packets that are due; the swarm calls it after every control step."""
-        for device, peer, client in zip(self.devices, self._sockets, self._clients, strict=True):
+        for device, server_socket, client in zip(self.devices, self._sockets, self._clients, strict=True):
             if client is not None:
                 for packet in device.due_packets():
                     with contextlib.suppress(OSError):
-                        peer.sendto(packet, client)
+                        server_socket.sendto(packet, client)
