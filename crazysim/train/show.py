@@ -47,7 +47,8 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
         success = [100 * point["success"] for point in curve]
         axes[0].plot(steps, success, label=name)
         axes[1].plot(seconds, success)
-        axes[2].semilogy(steps, [point["error"] for point in curve])
+        axes[2].plot(steps, [point["error"] for point in curve])
+    _use_log_scale(axes[2])
     first_curve = next(iter(curves.values()))
     steps = np.array([point["env_steps"] for point in first_curve]) / 1e6
     for name in (name for name in first_curve[-1] if name.startswith(TERM_PREFIX)):
@@ -90,7 +91,7 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> 
             )
             axis.fill_between(plotted_steps, quartile_1, quartile_3, color=line.get_color(), alpha=0.3, linewidth=0)
             axis.fill_between(plotted_steps, minimum, maximum, color=line.get_color(), alpha=0.12, linewidth=0)
-    axes[1].set_yscale("log")
+    _use_log_scale(axes[1])
     for axis, label in zip(axes, ("success, %", "mean error", "reward in an episode"), strict=True):
         axis.set(xlabel="environment steps, millions", ylabel=label)
     axes[0].legend(fontsize="small")
@@ -136,6 +137,12 @@ def plot_episode(
     )
     _save_figure(figure, Path(path))
     return terms
+
+
+def _use_log_scale(axis: Any) -> None:
+    """Scale the ordinate logarithmically if any of its values is positive; the error of a finished race is zero."""
+    if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axis.lines):
+        axis.set_yscale("log")
 
 
 def _make_figure(n: int) -> Any:

@@ -34,7 +34,7 @@ from crazysim.train.evaluation import describe_outcome, evaluate
 from crazysim.train.networks import Policies
 from crazysim.train.runs import run
 from crazysim.train.seeds import stack_rates, take_seed
-from crazysim.train.show import plot_episode, read_curve
+from crazysim.train.show import plot_curve, plot_episode, plot_spread, read_curve
 from crazysim.train.training import CHECKPOINT_FILE, POLICY_FILE, load_policy, train
 
 SMALL = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (16, 16)}
@@ -677,3 +677,12 @@ def test_a_run_finds_its_airframe_from_any_folder(tmp_path, monkeypatch):
     assert TrainConfig.create("hover", options={"drone": "cf2x_L250"}).options == {"drone": "cf2x_L250"}
     monkeypatch.chdir("/")
     assert config.make_env(1).sim.drone == "mine"
+
+
+def test_curves_of_a_race_without_an_error_are_plotted_without_a_warning(tmp_path):
+    """The error is undefined while all drones crash, and zero once all have finished."""
+    point = {"env_steps": 1.0, "seconds": 1.0, "success": 0.0, "reward": 1.0, "error": np.nan}
+    curve = [point, point | {"env_steps": 2.0, "seconds": 2.0, "success": 1.0, "error": 0.0}]
+    plot_curve({"race": curve}, tmp_path / "curve.png")
+    plot_spread({"race": [curve, curve]}, tmp_path / "spread.png")
+    assert (tmp_path / "curve.png").stat().st_size > 1000 < (tmp_path / "spread.png").stat().st_size
