@@ -10,6 +10,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import pick_entry
@@ -20,6 +21,9 @@ from crazysim.plugins.sensors.camera import Camera
 
 AWAY_COST = 0.03
 """Cost of an environment step for 1 minus the cosine of the angle between the camera's axis and the next gate."""
+HASTE_COST = 0.1
+"""Cost of an environment step for each m/s beyond the task's speed. It exceeds the reward for faster progress: without
+it policies at body rates reach the side of a gate faster than they can turn, and end there."""
 PRIVILEGED = ("gate_corners", "obstacles_near")
 """Observations of the race that a privileged critic gets, and with ``gates_observed`` the policy."""
 
@@ -28,13 +32,16 @@ PRIVILEGED = ("gate_corners", "obstacles_near")
 class RaceByCamera(Race):
     """Race by the rules of ``race``, seeing gates and obstacles in the depth image of a camera, which ``make`` adds.
 
-    Policies observe neither positions of gates and obstacles nor their own position over ground. The reward has one
-    more term, a cost of looking away from the next gate. Drones begin facing the first gate, and in practice along the
-    axis of the gate that they have passed. The setting ``sensor_range`` has no effect.
+    Policies observe neither positions of gates and obstacles nor their own position over ground. The reward has two
+    more terms, costs of looking away from the next gate and of flying faster than ``speed``. Drones begin facing the
+    first gate, and in practice along the axis of the gate that they have passed. The setting ``sensor_range`` has no
+    effect.
     """
 
     name = "race_by_camera"
 
+    speed: float = setting(default=1.5, positive=True)
+    """Speed up to which flying costs nothing, m/s."""
     gates_observed: bool = False
     """True for true positions of gates and obstacles among the observations, for a teacher."""
 
@@ -74,8 +81,10 @@ class RaceByCamera(Race):
         s, (gate_pos, _) = data.states, next_gate(data)
         to_gate = rotation.rotate_inverse(s.quat, gate_pos - s.pos)
         cosine = to_gate[..., 0] / jnp.maximum(rotation.safe_norm(to_gate)[..., 0], 0.1)
-        away = terms.only_where(~race_of(data).flight_over_before, {"away": AWAY_COST * (cosine - 1)})
-        return super().rewards(data, action, last_action) | away
+        speed = rotation.safe_norm(s.vel)[..., 0]
+        costs = {"away": AWAY_COST * (cosine - 1), "haste": -HASTE_COST * jnp.maximum(speed - self.speed, 0)}
+        costs = terms.only_where(~race_of(data).flight_over_before, costs)
+        return super().rewards(data, action, last_action) | costs
 
     def policy_camera(self) -> Camera:
         return Camera(32, 24)
