@@ -15,6 +15,7 @@ from crazysim.core.settings import find_device
 from crazysim.core.sharding import WORLD_AXIS, shardings_of, world_mesh
 from crazysim.errors import ConfigError
 from crazysim.sim.sim import Sim
+from crazysim.train.seeds import are_seeds_divided
 
 Learner = TypeVar("Learner", bound=Any)
 Devices = str | int | Sequence[int]
@@ -115,7 +116,7 @@ def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
         on_one_device = SingleDeviceSharding(sim.device)
         return jax.tree.map(lambda _: on_one_device, shapes)
     replicated, over_worlds = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
-    agents = replicated if n_seeds % mesh.size else over_worlds
+    agents = over_worlds if are_seeds_divided(n_seeds, mesh) else replicated
 
     def sharding(name: str, tree: Any) -> Any:
         if name == "env":

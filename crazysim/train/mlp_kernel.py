@@ -29,6 +29,7 @@ from crazysim import jaxcompat
 from crazysim.core.sharding import WORLD_AXIS
 from crazysim.engine.backends import cuda
 from crazysim.train.networks import MEMORYLESS, ApplyLayers, Layers, Network, mlp
+from crazysim.train.seeds import are_seeds_divided
 
 MAX_WIDTH, MAX_UNITS, MAX_LAYERS = 128, 64, 4
 """Largest number of inputs or outputs, of units of a hidden layer, and of layers."""
@@ -296,7 +297,7 @@ def choose_mlp(network: Network, device: jax.Device, mesh: Mesh | None = None, n
     """
     is_usable = network is MEMORYLESS and not jaxcompat.FALLBACKS and device.platform == "gpu"
     is_usable = is_usable and jaxcompat.compute_capability(device) == CAPABILITY and cuda.nvrtc() is not None
-    if mesh is None or n_seeds % mesh.size == 0:
+    if mesh is None or are_seeds_divided(n_seeds, mesh):
         return apply_mlp if is_usable else mlp
     return DistributedMlp(mesh) if is_usable and n_seeds == 1 else mlp
 

@@ -39,6 +39,11 @@ def join_blocks(tree: T) -> T:
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tree)
 
 
+def are_seeds_divided(n_seeds: int, mesh: Mesh) -> bool:
+    """Return True if each device of a mesh trains its own seeds."""
+    return n_seeds % mesh.size == 0
+
+
 def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | int = 0, mesh: Mesh | None = None) -> Any:
     """Return the results of a function of one seed for all seeds, stacked along their first axis.
 
@@ -53,7 +58,7 @@ def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | in
     """
     axes = (axes,) * len(args) if isinstance(axes, int) else axes
     n_seeds = jax.tree.leaves(args[0])[0].shape[axes[0]]
-    if mesh is not None and n_seeds % mesh.size == 0:
+    if mesh is not None and are_seeds_divided(n_seeds, mesh):
         specs = tuple(PartitionSpec(*[None] * axis, WORLD_AXIS) for axis in axes)
         fn_of_device = partial(for_each_seed, fn, axes=axes)
         out_specs = PartitionSpec(WORLD_AXIS)
