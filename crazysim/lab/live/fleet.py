@@ -122,7 +122,7 @@ class Fleet:
 
     def setpoint(self, drone: int) -> NDArray:
         """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
-        return HostTrajectory.from_trajectory(self._active[drone]).at(self._current_time() - self._starts[drone])
+        return HostTrajectory.from_trajectory(self._active[drone]).setpoint(self._current_time() - self._starts[drone])
 
     def _current_time(self) -> float:
         return float(self.sim.time[0, 0])
@@ -200,7 +200,7 @@ class Fleet:
     def _receive_trajectory(self, drone: int, trajectory: Trajectory) -> None:
         self._uploaded[drone] = trajectory
         if self.teleport and self._awaits_first_trajectory[drone]:
-            start_point = HostTrajectory.from_trajectory(trajectory).at(0.0)
+            start_point = HostTrajectory.from_trajectory(trajectory).setpoint(0.0)
             states = self.sim.data.states
             pos = states.pos.at[0, drone].set(jnp.asarray(start_point[:3], states.pos.dtype))
             quat = states.quat.at[0, drone].set(jnp.asarray(from_yaw(start_point[3]), states.quat.dtype))
@@ -212,7 +212,7 @@ class Fleet:
         trajectory = self._uploaded[drone]
         if relative:
             trajectory = trajectory.moved(
-                (self.setpoint(drone) - HostTrajectory.from_trajectory(trajectory).at(0.0))[:3]
+                (self.setpoint(drone) - HostTrajectory.from_trajectory(trajectory).setpoint(0.0))[:3]
             )
         self._assign_trajectory(drone, trajectory)
 

@@ -36,7 +36,7 @@ class HostTrajectory(NamedTuple):
         """Time from the start to the end, s."""
         return float(self.ends[-1])
 
-    def at(self, t: float) -> NDArray:
+    def setpoint(self, t: float) -> NDArray:
         """Return position, m, and yaw, rad, at a time since the start, s. (4,)"""
         return self.derivatives(t, 0)[0]
 

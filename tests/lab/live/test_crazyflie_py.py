@@ -217,7 +217,7 @@ def test_wrong_files(tmp_path):
     with pytest.raises(ConfigError, match="positive durations"):
         Trajectory().loadcsv(csv(tmp_path / "b.csv", [0.0], [0.0]))
     with pytest.raises(ConfigError, match="got 0 pieces"):
-        Trajectory().path()
+        Trajectory().host_trajectory()
 
 
 class Lamp(Viewer):

@@ -284,7 +284,7 @@ def test_the_range_finder_is_a_multi_ranger():
     swarm = Swarm(sim)
     device = CrtpDevice(swarm, 0)
     swarm.advance(0.02)
-    assert device.values["deck.bcMultiranger"] == 1
+    assert device.param_values["deck.bcMultiranger"] == 1
     assert sorted(name for name in device.log.ids if name.startswith("range.")) == ["range.front", "range.zrange"]
     state = swarm.state(0)
     assert device.readings["range.zrange"][1](state, swarm["cf1"]) == pytest.approx(1250, abs=5)

@@ -45,17 +45,19 @@ def test_a_move_begins_and_ends_as_it_must():
     np.testing.assert_allclose(end, [goal, [0] * 4, [0] * 4, [0] * 4], atol=1e-10)
     np.testing.assert_allclose(path.derivatives(0.0, 3)[3], 0, atol=1e-10)
     straight = move(begin, goal, 2.5, linear=True)
-    np.testing.assert_allclose(straight.at(1.25), (begin[0] + goal) / 2)
+    np.testing.assert_allclose(straight.setpoint(1.25), (begin[0] + goal) / 2)
 
 
 def test_a_reversed_slow_plan():
     path = HostTrajectory.from_trajectory(line([0, 0, 1], [2, 0, 1], 4.0))
     plan = PlannedMotion(path, 1.0, timescale=2.0, reversed=True)
-    np.testing.assert_allclose(plan.at(1.0)[0, :3], [2, 0, 1], atol=1e-6)
-    np.testing.assert_allclose(plan.at(5.0)[0, :3], [1, 0, 1], atol=1e-6)
-    ahead = (plan.at(5.01)[0] - plan.at(4.99)[0]) / 0.02
-    np.testing.assert_allclose(plan.at(5.0)[1], ahead, atol=1e-5)
-    np.testing.assert_allclose(plan.at(5.0)[2], (plan.at(5.01)[1] - plan.at(4.99)[1]) / 0.02, atol=1e-5)
+    np.testing.assert_allclose(plan.evaluate(1.0)[0, :3], [2, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(plan.evaluate(5.0)[0, :3], [1, 0, 1], atol=1e-6)
+    ahead = (plan.evaluate(5.01)[0] - plan.evaluate(4.99)[0]) / 0.02
+    np.testing.assert_allclose(plan.evaluate(5.0)[1], ahead, atol=1e-5)
+    np.testing.assert_allclose(
+        plan.evaluate(5.0)[2], (plan.evaluate(5.01)[1] - plan.evaluate(4.99)[1]) / 0.02, atol=1e-5
+    )
     assert not plan.finished(8.9)
     assert plan.finished(9.0)
 

@@ -63,23 +63,23 @@ class Crazyflie:
 
     def emergency(self) -> None:
         """Stop the motors, and refuse all commands."""
-        self._command(lambda c: c.emergency())
+        self._run_command(lambda c: c.emergency())
 
     def takeoff(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
         """Rise to a height, m, within a time, s."""
-        self._command(lambda c: c.take_off(targetHeight, duration), groupMask)
+        self._run_command(lambda c: c.take_off(targetHeight, duration), groupMask)
 
     def land(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
         """Descend to a height, m, within a time, s, and stop the motors."""
-        self._command(lambda c: c.land(targetHeight, duration), groupMask)
+        self._run_command(lambda c: c.land(targetHeight, duration), groupMask)
 
     def goTo(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, groupMask: int = 0) -> None:
         """Move to a position, m, and yaw, rad, within a time, s."""
-        self._command(lambda c: c.go_to(goal, yaw, duration, relative), groupMask)
+        self._run_command(lambda c: c.go_to(goal, yaw, duration, relative), groupMask)
 
     def uploadTrajectory(self, trajectoryId: int, pieceOffset: int, trajectory: Trajectory) -> None:
         """Store a trajectory; the offset is ignored, since each trajectory is stored under its number."""
-        self._command(lambda c: c.upload(trajectoryId, trajectory.path()))
+        self._run_command(lambda c: c.upload(trajectoryId, trajectory.host_trajectory()))
 
     def startTrajectory(
         self,
@@ -90,11 +90,11 @@ class Crazyflie:
         groupMask: int = 0,
     ) -> None:
         """Follow a stored trajectory, stretched by ``timescale``, from the present setpoint if relative."""
-        self._command(lambda c: c.start_trajectory(trajectoryId, timescale, relative, reverse), groupMask)
+        self._run_command(lambda c: c.start_trajectory(trajectoryId, timescale, relative, reverse), groupMask)
 
     def notifySetpointsStop(self, remainValidMillisecs: float = 100, groupMask: int = 0) -> None:
         """Return from streamed setpoints to high-level commands after a time, ms."""
-        self._command(lambda c: c.notify_setpoints_stop(remainValidMillisecs / 1000), groupMask)
+        self._run_command(lambda c: c.notify_setpoints_stop(remainValidMillisecs / 1000), groupMask)
 
     def arm(self, arm: bool = True) -> None:
         """Arm or disarm."""
@@ -102,19 +102,19 @@ class Crazyflie:
 
     def cmdFullState(self, pos: ArrayLike, vel: ArrayLike, acc: ArrayLike, yaw: float, omega: ArrayLike) -> None:
         """Stream a state: position, m, velocity, m/s, acceleration, m/s^2, yaw, rad, body rates, rad/s."""
-        self._command(lambda c: c.full_state(pos, vel, acc, from_yaw(float(yaw)), omega))
+        self._run_command(lambda c: c.full_state(pos, vel, acc, from_yaw(float(yaw)), omega))
 
     def cmdPosition(self, pos: ArrayLike, yaw: float = 0.0) -> None:
         """Stream a position, m, and yaw, rad."""
-        self._command(lambda c: c.position(pos, yaw))
+        self._run_command(lambda c: c.position(pos, yaw))
 
     def cmdVelocityWorld(self, vel: ArrayLike, yawRate: float) -> None:
         """Stream a velocity, world frame, m/s, and yaw rate, degrees/s."""
-        self._command(lambda c: c.velocity(vel, float(np.deg2rad(yawRate))))
+        self._run_command(lambda c: c.velocity(vel, float(np.deg2rad(yawRate))))
 
     def cmdHover(self, vx: float, vy: float, yaw_rate: float, z_distance: float) -> None:
         """Stream a horizontal velocity in the axes of the drone's yaw, m/s, yaw rate, rad/s, and height, m."""
-        self._command(lambda c: c.hover(vx, vy, yaw_rate, z_distance))
+        self._run_command(lambda c: c.hover(vx, vy, yaw_rate, z_distance))
 
     def setLEDColor(self, r: float, g: float, b: float) -> None:
         """Set the colour of the LEDs, 0 to 1, and choose the solid-colour effect by ``ring.effect``."""
@@ -127,8 +127,8 @@ class Crazyflie:
         return self._swarm.parameters[self._index].get_value(name)
 
     def setParam(self, name: str, value: float) -> None:
-        """Set a parameter; one that the simulation lacks, or whose effect it does not simulate, is reported."""
-        self._command(lambda _: self._swarm.set_parameter(self._index, name, value))
+        """Set a parameter; a parameter that the simulation lacks or does not simulate is reported."""
+        self._run_command(lambda _: self._swarm.set_parameter(self._index, name, value))
 
     def position(self) -> NDArray:
         """Return the position, m. (3,)"""
@@ -163,13 +163,13 @@ class Crazyflie:
             **dict.fromkeys(("num_rx_broadcast", "num_tx_broadcast", "num_rx_unicast", "num_tx_unicast"), 0),
         }
 
-    def _command(self, call: Callable[[Commander], object], group: int = 0) -> None:
-        """Carry out a command; a refused one is reported and the drone continues, as over the radio."""
+    def _run_command(self, command: Callable[[Commander], object], group: int = 0) -> None:
+        """Run a function of the commander; a refused command is reported and the drone continues, as over radio."""
         with self._swarm.lock:
             if not self._commander.in_group(group):
                 return
             try:
-                call(self._commander)
+                command(self._commander)
             except ConfigError as error:
                 self._swarm.reports.add("refused", self.prefix[1:], self._swarm.time, str(error))
 
@@ -188,7 +188,9 @@ class CrazyflieServer:
         self._swarm = swarm
         self.crazyflies = [Crazyflie(swarm, name) for name in swarm.names]
         self.crazyfliesByName = {cf.prefix[1:]: cf for cf in self.crazyflies}
-        self.crazyfliesById = {_number(name, k + 1): cf for k, (name, cf) in enumerate(self.crazyfliesByName.items())}
+        self.crazyfliesById = {
+            _id_from_name(name, k + 1): cf for k, (name, cf) in enumerate(self.crazyfliesByName.items())
+        }
 
     def emergency(self) -> None:
         """Stop all motors, and refuse all commands."""
@@ -229,12 +231,14 @@ class CrazyflieServer:
         """Stream one state to all."""
         self._call_all(lambda cf: cf.cmdFullState(pos, vel, acc, yaw, omega))
 
-    def _call_all(self, call: Callable[[Crazyflie], object]) -> None:
+    def _call_all(self, function: Callable[[Crazyflie], object]) -> None:
+        """Call a function with every drone."""
         with self._swarm.lock:
             for cf in self.crazyflies:
-                call(cf)
+                function(cf)
 
 
-def _number(name: str, default: int) -> int:
+def _id_from_name(name: str, default: int) -> int:
+    """Return the number at the end of a name, or the default if there is none."""
     digits = name[len(name.rstrip("0123456789")) :]
     return int(digits) if digits else default

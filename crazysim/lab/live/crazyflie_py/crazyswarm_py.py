@@ -13,7 +13,7 @@ from crazysim.lab.live.crazyflie_py.crazyflie import CrazyflieServer, TimeHelper
 from crazysim.lab.live.swarm import Swarm
 from crazysim.sim.sim import Sim
 
-CONFIGURATION = Path("crazyflies.yaml")
+CONFIGURATION_FILE = Path("crazyflies.yaml")
 """File in the working directory that describes the drones of ``Crazyswarm()``; optional."""
 
 _chosen_swarm: Swarm | None = None
@@ -50,13 +50,13 @@ class Crazyswarm:
         if swarm is None:
             swarm, _chosen_swarm = _chosen_swarm, None
         if swarm is None:
-            swarm = CONFIGURATION if CONFIGURATION.is_file() else {}
-        self.swarm = swarm if isinstance(swarm, Swarm) else Swarm(*_simulation(swarm))
+            swarm = CONFIGURATION_FILE if CONFIGURATION_FILE.is_file() else {}
+        self.swarm = swarm if isinstance(swarm, Swarm) else Swarm(*_create_simulation(swarm))
         self.allcfs = CrazyflieServer(self.swarm)
         self.timeHelper = TimeHelper(self.swarm)
 
 
-def _simulation(configuration: str | Path | Mapping[str, Any]) -> tuple[Sim, list[str]]:
+def _create_simulation(configuration: str | Path | Mapping[str, Any]) -> tuple[Sim, list[str]]:
     """Return the simulation and the names of a configuration's enabled robots."""
     if isinstance(configuration, (str, Path)):
         try:

@@ -66,7 +66,7 @@ class Trajectory:
         self.duration = 0.0
 
     def loadcsv(self, filename: str | FilePath, skip_first_row: bool = True) -> None:
-        """Read pieces: in each row the duration and eight coefficients each of x, y, z and yaw.
+        """Read pieces from a CSV file; each row has the duration, and eight coefficients each of x, y, z and yaw.
 
         Raises:
             ConfigError: If the file has another format.
@@ -89,8 +89,7 @@ class Trajectory:
 
     def eval(self, t: float) -> TrajectoryOutput:
         """Return the point at a time, s; before the start and after the end, the nearest end point."""
-        path = self.path()
-        derivatives = path.derivatives(t, 2)
+        derivatives = self.host_trajectory().derivatives(t, 2)
         return TrajectoryOutput(
             derivatives[0, :3],
             derivatives[1, :3],
@@ -99,7 +98,7 @@ class Trajectory:
             derivatives[0, 3],
         )
 
-    def path(self) -> HostTrajectory:
+    def host_trajectory(self) -> HostTrajectory:
         """Return the trajectory for ``Commander.upload``."""
         pieces = [[p.px.p, p.py.p, p.pz.p, p.pyaw.p] for p in self.polynomials]
         durations = np.array([p.duration for p in self.polynomials], float)

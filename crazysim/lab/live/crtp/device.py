@@ -1,4 +1,4 @@
-"""A simulated Crazyflie at the other end of CRTP: answers to packets, and packets that it sends unasked.
+"""A simulated Crazyflie as cflib sees it: it answers packets, and sends logs and console text by itself.
 
 Ports, channels and layouts are as in cflib 0.1.34 and crazyflie-firmware, protocol version 12. A packet is a header
 byte with port and channel, then up to 30 bytes of data. Malformed packets are reported and ignored.
@@ -30,27 +30,27 @@ from crazysim.lab.live.crtp.tables import (
 )
 from crazysim.lab.live.swarm import Swarm
 
-PROTOCOL = 12
+PROTOCOL_VERSION = 12
 """Version of the protocol."""
-MAX_DATA = 30
+MAX_DATA_BYTES = 30
 """Largest number of bytes after the header."""
-MAX_BLOCKS, MAX_VARIABLES = 16, 128
+MAX_LOG_BLOCKS, MAX_LOG_VARIABLES = 16, 128
 """Largest numbers of log blocks and of their variables (``Log`` of cflib)."""
-MAX_LOG = 26
+MAX_LOG_BYTES = 26
 """Largest number of bytes of the values of a log block."""
 MEMORY_SIZE = 4096
 """Size of the memory of trajectories, bytes."""
 TRAJECTORY_MEMORY, LED_MEMORY, DECK_MEMORY = 0x12, 0x10, 0x19
 """Types of the memories of trajectories, of the LED ring and of decks (``MemoryElement`` of cflib)."""
-DECKS = bytes([3]) + bytes(8 * 32)
-"""Memory of decks: its version, and eight invalid descriptions, since no deck has memory."""
-MAX_LINES = 256
-"""Largest number of packets of console text that wait for a client; beyond it, the oldest are dropped."""
+DECK_MEMORY_CONTENT = bytes([3]) + bytes(8 * 32)
+"""Content of the memory of decks: its version, and eight invalid descriptions, since no deck has memory."""
+MAX_CONSOLE_PACKETS = 256
+"""Largest number of packets of console text that wait for a client; if there are more, the oldest are dropped."""
 
 CONSOLE, PARAM, COMMANDER, MEM, LOGGING, LOCALIZATION, GENERIC, HIGH_LEVEL, SUPERVISOR, PLATFORM, LINK = (
     0, 2, 3, 4, 5, 6, 7, 8, 9, 13, 15,
 )  # fmt: skip
-"""Ports."""
+"""Ports of CRTP."""
 
 Packet = tuple[int, int, bytes]
 """Port, channel and data."""
@@ -87,25 +87,29 @@ class CrtpDevice:
         self.drone = swarm.index(drone) if isinstance(drone, str) else drone
         self.name, self.commander = swarm.names[self.drone], swarm.commanders[self.drone]
         self.readings = create_log_table(swarm, self.drone) | (log or {})
-        self.log = Table([Variable(name, kind) for name, (kind, _) in self.readings.items()], LOG_TYPES)
-        self.values = swarm.parameters[self.drone]
-        definitions = self.values.definitions.items()
+        self.log = Table([Variable(name, ctype) for name, (ctype, _) in self.readings.items()], LOG_TYPES)
+        self.param_values = swarm.parameters[self.drone]
+        definitions = self.param_values.definitions.items()
         self.params = Table([Variable(name, x.ctype, x.read_only) for name, x in definitions], PARAM_TYPES)
         self.memory = bytearray(MEMORY_SIZE)
-        self.memories = [(TRAJECTORY_MEMORY, self.memory), (LED_MEMORY, bytearray(24)), (DECK_MEMORY, DECKS)]
-        self._console: deque[bytes] = deque(maxlen=MAX_LINES)
+        self.memories = [
+            (TRAJECTORY_MEMORY, self.memory),
+            (LED_MEMORY, bytearray(24)),
+            (DECK_MEMORY, DECK_MEMORY_CONTENT),
+        ]
+        self._console: deque[bytes] = deque(maxlen=MAX_CONSOLE_PACKETS)
         self.blocks: dict[int, LogBlock] = {}
         self._ports: dict[int, Callable[[int, bytes], list[Packet]]] = {
             PARAM: self._handle_param, COMMANDER: self._handle_setpoint, MEM: self._handle_memory,
             LOGGING: self._handle_logging, LOCALIZATION: self._handle_localization, GENERIC: self._handle_generic,
-            HIGH_LEVEL: self._high_level, SUPERVISOR: self._handle_supervisor, PLATFORM: self._handle_platform,
+            HIGH_LEVEL: self._handle_high_level, SUPERVISOR: self._handle_supervisor, PLATFORM: self._handle_platform,
             LINK: self._handle_link,
         }  # fmt: skip
 
     # Packets --------------------------------------------------------------------------------------------------------
 
     def handle(self, packet: bytes) -> list[bytes]:
-        """Return the answers to any packet."""
+        """Return the answers to a packet of any content."""
         if not packet:
             return []
         if packet == b"\xff":  # probe of a scan
@@ -113,7 +117,7 @@ class CrtpDevice:
         port, channel, data = packet[0] >> 4, packet[0] & 3, bytes(packet[1:])
         handler = self._ports.get(port)
         with self.swarm.lock:
-            if handler is None or len(data) > MAX_DATA:
+            if handler is None or len(data) > MAX_DATA_BYTES:
                 self._report(f"packet to port {port} with {len(data)} bytes")
                 return []
             try:
@@ -125,24 +129,24 @@ class CrtpDevice:
             return []
 
     def due_packets(self) -> list[bytes]:
-        """Return the packets that have become due at the swarm's time: lines of the console, and logs."""
+        """Return the packets that are due at the swarm's time: console text and logs."""
         now, packets = self.swarm.time, []
         with self.swarm.lock:
             while self._console:
                 packets.append(bytes([CONSOLE << 4 | 0x0C]) + self._console.popleft())
             state = self.commander.estimate(self.swarm.state(self.drone))
-            for identity, block in self.blocks.items():
+            for block_id, block in self.blocks.items():
                 if block.period is None or now < block.next_time - 1e-9:
                     if block.period is not None and block.next_time - now > block.period:  # after a reset
                         block.next_time = now
                     continue
                 block.next_time = max(block.next_time + block.period, now)
                 stamp = struct.pack("<I", round(now * 1000) & 0xFFFFFF)[:3]
-                values = b"".join(self._value(k, layout, state) for k, layout in block.variables)
-                packets.append(bytes([LOGGING << 4 | 0x0C | 2, identity]) + stamp + values)
+                values = b"".join(self._pack_value(k, layout, state) for k, layout in block.variables)
+                packets.append(bytes([LOGGING << 4 | 0x0C | 2, block_id]) + stamp + values)
         return packets
 
-    def _value(self, k: int, layout: str, state: object) -> bytes:
+    def _pack_value(self, k: int, layout: str, state: object) -> bytes:
         name = self.log.variables[k].name
         try:
             value = float(self.readings[name][1](state, self.commander))  # type: ignore[arg-type]
@@ -155,18 +159,18 @@ class CrtpDevice:
         """Report a refused command, also on the drone's console."""
         self.swarm.reports.add("refused", self.name, self.swarm.time, text)
         line = f"{text}\n".encode("ascii", "replace")
-        self._console.extend(line[k : k + MAX_DATA] for k in range(0, len(line), MAX_DATA))
+        self._console.extend(line[k : k + MAX_DATA_BYTES] for k in range(0, len(line), MAX_DATA_BYTES))
 
     # Connection -----------------------------------------------------------------------------------------------------
 
     def _handle_link(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 0:
             return [(LINK, 0, data)]
-        return [(LINK, 1, b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0"))] if channel == 1 else []
+        return [(LINK, 1, b"Bitcraze Crazyflie".ljust(MAX_DATA_BYTES, b"\0"))] if channel == 1 else []
 
     def _handle_platform(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 1 and data[0] == 0:
-            return [(PLATFORM, 1, bytes([0, PROTOCOL]))]
+            return [(PLATFORM, 1, bytes([0, PROTOCOL_VERSION]))]
         if channel == 1 and data[0] == 1:
             return [(PLATFORM, 1, b"\x01crazysim\0")]
         if channel == 0 and data[0] == 1:
@@ -202,9 +206,9 @@ class CrtpDevice:
         roll, pitch, yaw, thrust = struct.unpack("<fffH", data)
         if thrust == 0:
             self.commander.stop()
-        elif any(self.values[f"flightmode.stabMode{axis}"] == 0 for axis in ("Roll", "Pitch")):
+        elif any(self.param_values[f"flightmode.stabMode{axis}"] == 0 for axis in ("Roll", "Pitch")):
             self.commander.command(Control.body_rate, [*_radians(roll, -pitch, -yaw), self._thrust_force(thrust)])
-        elif self.values["flightmode.stabModeYaw"]:
+        elif self.param_values["flightmode.stabModeYaw"]:
             self.commander.command(Control.attitude, [*_radians(roll, -pitch, yaw), self._thrust_force(thrust)])
         else:
             self.commander.attitude(*_radians(roll, -pitch, -yaw), self._thrust_force(thrust))
@@ -229,7 +233,7 @@ class CrtpDevice:
             handle_generic(self.commander, data)
         return []
 
-    def _high_level(self, channel: int, data: bytes) -> list[Packet]:
+    def _handle_high_level(self, channel: int, data: bytes) -> list[Packet]:
         try:
             handle_high_level(self.commander, data, bytes(self.memory))
             code = 0
@@ -240,47 +244,47 @@ class CrtpDevice:
 
     # Tables ---------------------------------------------------------------------------------------------------------
 
-    def _answer_contents(self, port: int, table: Table, data: bytes) -> list[Packet]:
+    def _answer_table_request(self, port: int, table: Table, data: bytes) -> list[Packet]:
         """Answer a request to a table of contents, version 2 of its protocol."""
         if data[0] == 3:
             head = struct.pack("<BHI", 3, len(table.variables), table.checksum)
-            return [(port, 0, head + (bytes([MAX_BLOCKS, MAX_VARIABLES]) if port == LOGGING else b""))]
+            return [(port, 0, head + (bytes([MAX_LOG_BLOCKS, MAX_LOG_VARIABLES]) if port == LOGGING else b""))]
         (k,) = struct.unpack("<H", data[1:3])
-        return [(port, 0, data[:3] + table.item(k))] if data[0] == 2 and k < len(table.variables) else []
+        return [(port, 0, data[:3] + table.describe(k))] if data[0] == 2 and k < len(table.variables) else []
 
     def _handle_logging(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 0:
-            return self._answer_contents(LOGGING, self.log, data)
+            return self._answer_table_request(LOGGING, self.log, data)
         if channel != 1:
             return []
-        command, identity = data[0], data[1] if len(data) > 1 else 0
+        command, block_id = data[0], data[1] if len(data) > 1 else 0
         if command == 5:
             self.blocks.clear()
             return [(LOGGING, 1, bytes([5, 0, 0]))]
         if command in (6, 7):
-            code = self._define_block(command, identity, data[2:])
-        elif identity not in self.blocks:
+            code = self._define_block(command, block_id, data[2:])
+        elif block_id not in self.blocks:
             code = errno.ENOENT
         elif command == 2:
-            del self.blocks[identity]
+            del self.blocks[block_id]
             code = 0
         elif command in (3, 8):
             period_ms = 10 * data[2] if command == 3 else struct.unpack("<H", data[2:4])[0]
-            block = self.blocks[identity]
+            block = self.blocks[block_id]
             code = 0 if period_ms > 0 else errno.ENOEXEC
             if period_ms > 0:
                 block.period, block.next_time = period_ms / 1000, self.swarm.time + period_ms / 1000
         elif command == 4:
-            self.blocks[identity].period, code = None, 0
+            self.blocks[block_id].period, code = None, 0
         else:
             code = errno.ENOEXEC
-        return [(LOGGING, 1, bytes([command, identity, code]))]
+        return [(LOGGING, 1, bytes([command, block_id, code]))]
 
-    def _define_block(self, command: int, identity: int, data: bytes) -> int:
+    def _define_block(self, command: int, block_id: int, data: bytes) -> int:
         """Create a log block or append to it, and return an error code, or 0 for success."""
-        if command == 6 and identity in self.blocks:
+        if command == 6 and block_id in self.blocks:
             return errno.EEXIST
-        if command == 7 and identity not in self.blocks:
+        if command == 7 and block_id not in self.blocks:
             return errno.ENOENT
         formats = {number: layout for number, layout in LOG_TYPES.values()}
         new_variables = []
@@ -288,50 +292,50 @@ class CrtpDevice:
             if k >= len(self.log.variables) or kind & 15 not in formats:
                 return errno.ENOENT
             new_variables.append((k, formats[kind & 15]))
-        block = self.blocks.get(identity, LogBlock([]))
+        block = self.blocks.get(block_id, LogBlock([]))
         variables = block.variables + new_variables
-        if sum(struct.calcsize(layout) for _, layout in variables) > MAX_LOG:
+        if sum(struct.calcsize(layout) for _, layout in variables) > MAX_LOG_BYTES:
             return errno.E2BIG
-        n_others = sum(len(other.variables) for i, other in self.blocks.items() if i != identity)
-        if len(self.blocks | {identity: block}) > MAX_BLOCKS or n_others + len(variables) > MAX_VARIABLES:
+        n_others = sum(len(other.variables) for i, other in self.blocks.items() if i != block_id)
+        if len(self.blocks | {block_id: block}) > MAX_LOG_BLOCKS or n_others + len(variables) > MAX_LOG_VARIABLES:
             return errno.ENOMEM
         block.variables = variables
-        self.blocks[identity] = block
+        self.blocks[block_id] = block
         return 0
 
     def _handle_param(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 0:
-            return self._answer_contents(PARAM, self.params, data)
+            return self._answer_table_request(PARAM, self.params, data)
         if channel == 3:
-            return self._param_misc(data)
+            return self._handle_param_misc(data)
         (k,) = struct.unpack("<H", data[:2])
         if k >= len(self.params.variables):
             return [(PARAM, channel, data[:2] + bytes([errno.ENOENT]))]
         name, layout = self.params.variables[k].name, self.params.format(k)
         if channel == 1:
-            return [(PARAM, 1, data[:2] + b"\0" + pack(layout, self.values[name]))]
+            return [(PARAM, 1, data[:2] + b"\0" + pack(layout, self.param_values[name]))]
         self._set_parameter(name, struct.unpack(layout, data[2:])[0])
-        return [(PARAM, 2, data[:2] + pack(layout, self.values[name]))]
+        return [(PARAM, 2, data[:2] + pack(layout, self.param_values[name]))]
 
-    def _param_misc(self, data: bytes) -> list[Packet]:
+    def _handle_param_misc(self, data: bytes) -> list[Packet]:
         command = data[0]
         if command == 0:
             group, name, payload = data[1:].split(b"\0", 2)
             full_name = f"{group.decode()}.{name.decode()}"
             code = errno.ENOENT
             formats = {number: layout for number, layout in PARAM_TYPES.values()}
-            if full_name in self.values and payload[0] in formats:
+            if full_name in self.param_values and payload[0] in formats:
                 self._set_parameter(full_name, struct.unpack(formats[payload[0]], payload[1:])[0])
                 code = 0
             return [(PARAM, 3, data[: len(data) - len(payload)] + bytes([code]))]
         (k,) = struct.unpack("<H", data[1:3])
         if command == 8 and k < len(self.params.variables):
-            value = self.values.definitions[self.params.variables[k].name].value
+            value = self.param_values.definitions[self.params.variables[k].name].value
             return [(PARAM, 3, data[:3] + b"\0" + pack(self.params.format(k), value))]
         return [(PARAM, 3, data[:3] + bytes([errno.ENOENT]))]
 
     def _set_parameter(self, name: str, value: float) -> None:
-        """Set a parameter; if that is refused, it is reported and the parameter keeps its value."""
+        """Set a parameter; a refused value is reported, and the parameter keeps its value."""
         try:
             self.swarm.set_parameter(self.drone, name, value)
         except ConfigError as error:
@@ -345,23 +349,23 @@ class CrtpDevice:
                 kind, content = self.memories[data[1]]
                 return [(MEM, 0, data[:2] + struct.pack("<BI8x", kind, len(content)))]
             return [(MEM, 0, data[:2])]
-        identity, address = struct.unpack("<BI", data[:5])
-        kind, memory = self.memories[identity] if identity < len(self.memories) else (0, b"")
+        memory_id, address = struct.unpack("<BI", data[:5])
+        kind, memory = self.memories[memory_id] if memory_id < len(self.memories) else (0, b"")
         content = data[5:]
         length = content[0] if channel == 1 else len(content)
-        ok = address + length <= len(memory) and length <= 24
+        is_valid = address + length <= len(memory) and length <= 24
         if channel == 1:
-            contents = bytes(memory[address : address + length]) if ok else b""
-            return [(MEM, 1, data[:5] + bytes([0 if ok else errno.EIO]) + contents)]
+            contents = bytes(memory[address : address + length]) if is_valid else b""
+            return [(MEM, 1, data[:5] + bytes([0 if is_valid else errno.EIO]) + contents)]
         if channel != 2:
             return []
         if not isinstance(memory, bytearray):
-            ok = False
-        elif ok:
+            is_valid = False
+        elif is_valid:
             memory[address : address + length] = content
             if kind == LED_MEMORY:
                 self.swarm.set_leds(self.drone, np.frombuffer(memory, ">u2"))
-        return [(MEM, 2, data[:5] + bytes([0 if ok else errno.EIO]))]
+        return [(MEM, 2, data[:5] + bytes([0 if is_valid else errno.EIO]))]
 
 
 def _radians(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:

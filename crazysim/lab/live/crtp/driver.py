@@ -10,14 +10,14 @@ from crazysim.errors import ConfigError, not_installed
 from crazysim.lab.live.crtp.device import CrtpDevice
 from crazysim.lab.live.swarm import Swarm
 
-_drivers: dict[int, type] = {}
+_driver_classes: dict[int, type] = {}
 
 
 def add_cflib_driver(swarm: Swarm) -> list[str]:
-    """Make the drones of a swarm in this process available to ``cflib``; return their URIs, ``sim://cf1`` and so on.
+    """Make the drones of a swarm in this process available to ``cflib``; return their URIs, such as ``sim://cf1``.
 
-    It may be called before or after ``cflib.crtp.init_drivers()``. Where names of drones are equal, the swarm that was
-    added last takes precedence.
+    It may be called before or after ``cflib.crtp.init_drivers()``. If two swarms have drones of the same name, the
+    swarm that was added last takes precedence.
 
     Raises:
         ConfigError: If cflib is not installed.
@@ -27,8 +27,8 @@ def add_cflib_driver(swarm: Swarm) -> list[str]:
     except ImportError as error:
         raise ConfigError(not_installed("links of cflib need", "cflib", "radio")) from error
     remove_cflib_driver(swarm)
-    _drivers[id(swarm)] = _driver(swarm)
-    cflib.crtp.CLASSES.insert(0, _drivers[id(swarm)])
+    _driver_classes[id(swarm)] = _create_driver(swarm)
+    cflib.crtp.CLASSES.insert(0, _driver_classes[id(swarm)])
     return [f"sim://{name}" for name in swarm.names]
 
 
@@ -36,12 +36,12 @@ def remove_cflib_driver(swarm: Swarm) -> None:
     """Remove a swarm from ``cflib``."""
     import cflib.crtp
 
-    driver = _drivers.pop(id(swarm), None)
+    driver = _driver_classes.pop(id(swarm), None)
     if driver in cflib.crtp.CLASSES:
         cflib.crtp.CLASSES.remove(driver)
 
 
-def _driver(swarm: Swarm) -> type:
+def _create_driver(swarm: Swarm) -> type:
     """Return a cflib driver class for links to a swarm."""
     from cflib.crtp.crtpdriver import CRTPDriver
     from cflib.crtp.crtpstack import CRTPPacket
@@ -62,7 +62,7 @@ def _driver(swarm: Swarm) -> type:
             if parts.scheme != "sim" or parts.netloc not in swarm.names:
                 raise WrongUriType(f"expected one of {[f'sim://{name}' for name in swarm.names]}, got {uri!r}")
             self._device = CrtpDevice(swarm, parts.netloc)
-            swarm.listeners.append(self._send_due)
+            swarm.listeners.append(self._enqueue_due_packets)
 
         def send_packet(self, pk: CRTPPacket) -> None:
             """Hand a packet to the drone, and queue its answers."""
@@ -82,7 +82,7 @@ def _driver(swarm: Swarm) -> type:
             return "simulated"
 
         def get_name(self) -> str:
-            """Return the name of the kind of link."""
+            """Return the name of this kind of link."""
             return "sim"
 
         def scan_interface(self, address: Any = None) -> list[list[str]]:
@@ -93,9 +93,9 @@ def _driver(swarm: Swarm) -> type:
             """Disconnect."""
             if self._device is not None:
                 self._device = None
-                swarm.listeners.remove(self._send_due)
+                swarm.listeners.remove(self._enqueue_due_packets)
 
-        def _send_due(self) -> None:
+        def _enqueue_due_packets(self) -> None:
             device = self._device
             if device is not None:
                 for packet in device.due_packets():

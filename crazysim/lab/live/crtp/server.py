@@ -59,7 +59,7 @@ class CrtpServer(Closeable):
                 ) from error
             server_socket.setblocking(False)
             self._selector.register(server_socket, selectors.EVENT_READ, k)
-        swarm.listeners.append(self._send_due)
+        swarm.listeners.append(self._send_due_packets)
         self._thread = threading.Thread(target=self._serve, name="crtp", daemon=True)
         self._thread.start()
 
@@ -72,7 +72,7 @@ class CrtpServer(Closeable):
     def close(self) -> None:
         self._stop_event.set()
         self._thread.join()
-        self.swarm.listeners.remove(self._send_due)
+        self.swarm.listeners.remove(self._send_due_packets)
         self._close_sockets()
 
     def _close_sockets(self) -> None:
@@ -95,7 +95,7 @@ class CrtpServer(Closeable):
                 except Exception:  # the other drones still get answers
                     log.exception("%s: a packet was not answered", self.swarm.names[k])
 
-    def _send_due(self) -> None:
+    def _send_due_packets(self) -> None:
         """Send the log and console packets that are due; the swarm calls it after every control step."""
         for device, server_socket, client in zip(self.devices, self._sockets, self._clients, strict=True):
             if client is not None:

@@ -15,7 +15,7 @@ from crazysim.trajectories.bezier import power_coefficients
 
 PIECE_SIZE = 132
 """Size of an uncompressed piece, bytes: 8 coefficients each of x, y, z and yaw, and the duration."""
-N_POINTS = (0, 1, 3, 7)
+N_CONTROL_POINTS = (0, 1, 3, 7)
 """Number of control points after the first, for each type of compressed coordinate (``CompressedSegment`` of cflib)."""
 
 
@@ -48,11 +48,11 @@ def handle_generic(commander: Commander, data: bytes) -> None:
 
 
 def unpack_quat(packed: int) -> NDArray:
-    """Return a quaternion, xyzw, from 32 bits: index of the largest component, then the others in 10 bits each. (4,)"""
+    """Return a quaternion, xyzw, from 32 bits: index of the largest component, then 10 bits for each other one. (4,)"""
     largest, quat = packed >> 30, np.zeros(4)
     for i in (i for i in (3, 2, 1, 0) if i != largest):
-        size = (packed & 0x1FF) / 0x1FF / math.sqrt(2)
-        quat[i] = -size if packed >> 9 & 1 else size
+        magnitude = (packed & 0x1FF) / 0x1FF / math.sqrt(2)
+        quat[i] = -magnitude if packed >> 9 & 1 else magnitude
         packed >>= 10
     quat[largest] = math.sqrt(max(1 - float((quat**2).sum()), 0.0))
     return quat
@@ -70,13 +70,13 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
         (commander.group,) = struct.unpack("<B", content)
         return
     if kind == 6:
-        identity, location, encoding, offset, n = struct.unpack("<BBBIB", content)
+        trajectory_id, location, encoding, offset, n_pieces = struct.unpack("<BBBIB", content)
         if location != 1 or encoding not in (0, 1):
             raise ConfigError(
                 f"expected a trajectory in memory of type 0 or 1, got location {location}, type {encoding}"
             )
-        path = _bezier_trajectory(memory, offset) if encoding else _polynomial_trajectory(memory, offset, n)
-        commander.upload(identity, path, compressed=bool(encoding))
+        path = _bezier_trajectory(memory, offset) if encoding else _polynomial_trajectory(memory, offset, n_pieces)
+        commander.upload(trajectory_id, path, compressed=bool(encoding))
         return
     if not commander.in_group(content[0]):
         return
@@ -85,8 +85,8 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
         height, duration = struct.unpack("<ff", content)
         (commander.take_off if kind == 1 else commander.land)(height, duration, 0.0)
     elif kind in (7, 8):
-        height, yaw, current, duration = struct.unpack("<ff?f", content)
-        (commander.take_off if kind == 7 else commander.land)(height, duration, None if current else yaw)
+        height, yaw, use_current_yaw, duration = struct.unpack("<ff?f", content)
+        (commander.take_off if kind == 7 else commander.land)(height, duration, None if use_current_yaw else yaw)
     elif kind == 3:
         commander.stop()
     elif kind == 4:
@@ -96,11 +96,11 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
         relative, linear, x, y, z, yaw, duration = struct.unpack("<??fffff", content)
         commander.go_to([x, y, z], yaw, duration, relative, linear)
     elif kind == 5:
-        relative, backwards, identity, scale = struct.unpack("<??Bf", content)
-        commander.start_trajectory(identity, scale, relative, backwards)
+        relative, is_reversed, trajectory_id, timescale = struct.unpack("<??Bf", content)
+        commander.start_trajectory(trajectory_id, timescale, relative, is_reversed)
     elif kind == 13:
-        relative, relative_yaw, backwards, identity, scale = struct.unpack("<???Bf", content)
-        commander.start_trajectory(identity, scale, relative, backwards, relative_yaw)
+        relative, relative_yaw, is_reversed, trajectory_id, timescale = struct.unpack("<???Bf", content)
+        commander.start_trajectory(trajectory_id, timescale, relative, is_reversed, relative_yaw)
     else:
         raise ConfigError(f"expected a high-level command of type 0 to 8, 12 or 13, got {kind}")
 
@@ -120,32 +120,35 @@ def _polynomial_trajectory(memory: bytes, offset: int, n: int) -> HostTrajectory
 def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
     """Return the trajectory of Bezier curves in memory: a start, then segments of control points.
 
-    A segment of duration 0 ends it; the number of pieces in its definition is ignored (pptraj_compressed.c).
-    Positions are in mm, yaw in tenths of degrees, durations in ms.
+    A segment of duration 0 ends the trajectory; the number of pieces in its definition is ignored
+    (pptraj_compressed.c). Positions are in mm, yaw in tenths of degrees, durations in ms.
     """
     units = np.array([0.001, 0.001, 0.001, math.radians(0.1)])
     durations, pieces = [], []
     try:
-        last, position = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
+        last_point, position = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
         while (head := struct.unpack_from("<BH", memory, position))[1] > 0:
-            kinds, ms = head
+            kinds, duration_ms = head
             position += 3
             rows = []
             for axis in range(4):
-                n_points = N_POINTS[kinds >> (2 * axis) & 3]
-                points = [last[axis], *np.array(struct.unpack_from(f"<{n_points}h", memory, position)) * units[axis]]
+                n_points = N_CONTROL_POINTS[kinds >> (2 * axis) & 3]
+                points = [
+                    last_point[axis],
+                    *np.array(struct.unpack_from(f"<{n_points}h", memory, position)) * units[axis],
+                ]
                 position += 2 * n_points
                 c = power_coefficients(np.array(points)[:, None])[0]
                 rows.append(np.pad(c, (0, 8 - len(c))))
-                last[axis] = points[-1]
-            durations.append(ms / 1000)
+                last_point[axis] = points[-1]
+            durations.append(duration_ms / 1000)
             pieces.append(rows)
     except struct.error:
         raise ConfigError(
             f"expected a compressed trajectory that a segment of duration 0 ends within {len(memory)} bytes, got none"
         ) from None
     if not pieces:  # the firmware stays at the start
-        durations, pieces = [0.001], [[[x] + [0.0] * 7 for x in last]]
+        durations, pieces = [0.001], [[[x] + [0.0] * 7 for x in last_point]]
     return _checked_trajectory(np.array(durations), np.array(pieces))
 
 

@@ -28,9 +28,9 @@ PARAM_TYPES = {
 READ_ONLY_BIT = 0x40
 """Bit of the type of a parameter that cannot be written."""
 OUT_OF_RANGE_DISTANCE = 32767
-"""Distance if no object is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
+"""Reading if no object is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
 RANGE_VARIABLES = {"down": "zrange"}
-"""Name of the log variable in the group ``range``, for each direction with a different name."""
+"""Names of log variables in the group ``range`` that differ from the name of their direction."""
 
 Reading = Callable[[DroneState, Commander], float]
 """Function that returns the value of a log variable from a drone's state and commander."""
@@ -51,7 +51,7 @@ class Table:
     """Variables with consecutive numbers, as the protocol transfers them."""
 
     def __init__(self, variables: list[Variable], types: Mapping[str, tuple[int, str]]):
-        """Create a table with numbered variables."""
+        """Create a table that numbers variables in their order."""
         self.variables, self.types = variables, types
         self.ids = {variable.name: k for k, variable in enumerate(variables)}
         for variable in variables:
@@ -59,9 +59,9 @@ class Table:
                 raise ConfigError(f"expected group.name of up to 24 letters and one of {list(types)}, got {variable}")
         if len(self.ids) < len(variables):
             raise ConfigError("expected different names of variables, got one twice")
-        self.checksum = zlib.crc32(b"".join(self.item(k) for k in range(len(variables))))
+        self.checksum = zlib.crc32(b"".join(self.describe(k) for k in range(len(variables))))
 
-    def item(self, k: int) -> bytes:
+    def describe(self, k: int) -> bytes:
         """Return the description of a variable: type, group and name."""
         variable = self.variables[k]
         group, name = variable.name.split(".")
@@ -74,7 +74,7 @@ class Table:
 
 
 def pack(struct_format: str, value: float) -> bytes:
-    """Return a packed number, clipped to the range of its format; for integers it is rounded, and 0 if not finite."""
+    """Return a number as bytes, clipped to the range of its format; integers are rounded, and 0 if it is not finite."""
     if struct_format in ("<f", "<e"):
         largest = 3.4e38 if struct_format == "<f" else 65504.0
         return struct.pack(struct_format, value if math.isnan(value) else min(max(value, -largest), largest))
@@ -84,7 +84,7 @@ def pack(struct_format: str, value: float) -> bytes:
     return struct.pack(struct_format, min(max(round(value) if math.isfinite(value) else 0, low), high))
 
 
-def _axes(group: str, names: str, field: str, scale: float = 1.0) -> dict[str, tuple[str, Reading]]:
+def _component_variables(group: str, names: str, field: str, scale: float = 1.0) -> dict[str, tuple[str, Reading]]:
     """Return log variables of the components of a field of the state."""
 
     def reading(k: int) -> Reading:
@@ -93,7 +93,7 @@ def _axes(group: str, names: str, field: str, scale: float = 1.0) -> dict[str, t
     return {f"{group}.{name}": ("float", reading(k)) for k, name in enumerate(names.split())}
 
 
-def _angles(group: str) -> dict[str, tuple[str, Reading]]:
+def _angle_variables(group: str) -> dict[str, tuple[str, Reading]]:
     """Return log variables of roll, pitch and yaw in degrees; the firmware's pitch has the opposite sign."""
     index_and_sign = {"roll": (0, 1), "pitch": (1, -1), "yaw": (2, 1)}
 
@@ -103,7 +103,7 @@ def _angles(group: str) -> dict[str, tuple[str, Reading]]:
     return {f"{group}.{name}": ("float", reading(*pair)) for name, pair in index_and_sign.items()}
 
 
-def _acceleration(k: int) -> Reading:
+def _acceleration_reading(k: int) -> Reading:
     """Return the reading of a component of the acceleration without gravity, world frame, in units of g.
 
     As in ``kalmanCoreExternalizeState``.
@@ -117,24 +117,24 @@ def _acceleration(k: int) -> Reading:
     return reading
 
 
-def _goal(row: int, k: int) -> Reading:
+def _goal_reading(row: int, k: int) -> Reading:
     """Return the reading of an entry of the goal: its row and its index in the row."""
     return lambda _s, commander: float(commander.goal()[row, k])
 
 
 LOG_VARIABLES: dict[str, tuple[str, Reading]] = {
-    **_axes("stateEstimate", "x y z", "pos"),
-    **_axes("stateEstimate", "vx vy vz", "vel"),
-    **{f"stateEstimate.a{axis}": ("float", _acceleration(k)) for k, axis in enumerate("xyz")},
-    **_axes("stateEstimate", "qx qy qz qw", "quat"),
-    **_angles("stateEstimate"),
-    **_angles("stabilizer"),
-    **_axes("kalman", "stateX stateY stateZ", "pos"),
+    **_component_variables("stateEstimate", "x y z", "pos"),
+    **_component_variables("stateEstimate", "vx vy vz", "vel"),
+    **{f"stateEstimate.a{axis}": ("float", _acceleration_reading(k)) for k, axis in enumerate("xyz")},
+    **_component_variables("stateEstimate", "qx qy qz qw", "quat"),
+    **_angle_variables("stateEstimate"),
+    **_angle_variables("stabilizer"),
+    **_component_variables("kalman", "stateX stateY stateZ", "pos"),
     **{f"kalman.varP{axis}": ("float", lambda _s, _c: 1e-6) for axis in "XYZ"},
-    **_axes("gyro", "x y z", "ang_vel", 180 / math.pi),
-    **_axes("acc", "x y z", "acc", 1 / GRAVITY_MAGNITUDE),
-    **{f"ctrltarget.{axis}": ("float", _goal(0, k)) for k, axis in enumerate("xyz")},
-    **{f"ctrltarget.v{axis}": ("float", _goal(1, k)) for k, axis in enumerate("xyz")},
+    **_component_variables("gyro", "x y z", "ang_vel", 180 / math.pi),
+    **_component_variables("acc", "x y z", "acc", 1 / GRAVITY_MAGNITUDE),
+    **{f"ctrltarget.{axis}": ("float", _goal_reading(0, k)) for k, axis in enumerate("xyz")},
+    **{f"ctrltarget.v{axis}": ("float", _goal_reading(1, k)) for k, axis in enumerate("xyz")},
     "ctrltarget.yaw": ("float", lambda _s, commander: math.degrees(commander.goal()[0, 3])),
     "radio.rssi": ("uint8_t", lambda _s, _c: 0),
     "colorLedBot.deckTemp": ("uint8_t", lambda _s, _c: 25),
@@ -151,15 +151,16 @@ def create_log_table(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]
     """Return the log variables of a drone, including its battery and its range finder."""
     sim = swarm.sim
 
-    def distance(name: str) -> Reading:
-        def millimetres(_state: DroneState, _commander: Commander) -> float:
+    def distance_reading(name: str) -> Reading:
+        def distance_mm(_state: DroneState, _commander: Commander) -> float:
             value = 1000 * read_ranges(sim, drone)[name]
             return value if math.isfinite(value) else OUT_OF_RANGE_DISTANCE
 
-        return millimetres
+        return distance_mm
 
     ranges = {
-        f"range.{RANGE_VARIABLES.get(name, name)}": ("uint16_t", distance(name)) for name in read_ranges(sim, drone)
+        f"range.{RANGE_VARIABLES.get(name, name)}": ("uint16_t", distance_reading(name))
+        for name in read_ranges(sim, drone)
     }
     battery: dict[str, tuple[str, Reading]] = {
         "pm.vbat": ("float", lambda _s, _c: read_battery(sim, drone).voltage),

@@ -120,7 +120,7 @@ def show_source(
         )
 
     def bodies(stamp: float) -> dict[str, tuple[ArrayLike, ArrayLike]]:
-        points = [path.at(stamp) for path in paths]
+        points = [path.setpoint(stamp) for path in paths]
         return {n: (p[:3], from_yaw(p[3])) for n, p in zip(names, points, strict=True)}
 
     return FunctionSource(bodies, freq, name="show")

@@ -23,15 +23,15 @@ from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.lab.live.swarm.motion import PlannedMotion, move, nearest_yaw
 from crazysim.lab.live.swarm.state import DroneState, EstimateFrame
 
-STABILIZE, SHUTDOWN = 0.5, 2.0
+STABILIZE_TIMEOUT, SHUTDOWN_TIMEOUT = 0.5, 2.0
 """Time without a streamed setpoint after which the drone holds its position, and after which its motors stop, s."""
 MAX_COORDINATE = 1e3
 """Largest magnitude of a coordinate, m, and of most other numbers in commands."""
 SINK_SPEED, MAX_SINK = 0.3, 1.0
-"""Speed, m/s, and largest distance, m, of the setpoint's further descent if a landing ends above its height."""
+"""Speed, m/s, and largest distance, m, by which the setpoint descends further if a landing ends above its target."""
 LANDED_HEIGHT, RESTING_SPEED, REST_TIME = 0.01, 0.02, 0.5
-"""The motors stop at or below this height above the target of a landing, m, or if the vertical speed is below this
-limit, m/s, more than this time after the planned end of the landing, s."""
+"""A landing stops the motors at or below this height above its target, m. It also stops them if the vertical speed is
+below this limit, m/s, later than this time after its planned end, s."""
 MIN_DURATION, MAX_DURATION = 1e-3, 1e4
 """Limits of durations, s, and of factors of durations, 1."""
 N_TRAJECTORIES = 256
@@ -61,12 +61,12 @@ class Commander:
         self.pos, self.vel, self.yaw = np.zeros(3), np.zeros(3), 0.0
         self.armed, self.locked = True, False
         self._plan: PlannedMotion | None = None
-        self._held_plan: tuple[PlannedMotion, NDArray] | None = None
+        self._cached_hover: tuple[PlannedMotion, NDArray] | None = None
         self.estimate_frame: EstimateFrame | None = None
         self._stream: tuple[str, NDArray] | None = None
         self._stream_time, self._release_time = 0.0, math.inf
-        self._reference = np.zeros(4)  # position and yaw that velocity setpoints move
-        self._last = np.zeros((3, 4))
+        self._reference = np.zeros(4)  # position, m, and yaw, rad, that velocity setpoints move
+        self._last_goal = np.zeros((3, 4))
 
     # State ----------------------------------------------------------------------------------------------------------
 
@@ -83,13 +83,13 @@ class Commander:
     def goal(self) -> NDArray:
         """Return position, yaw and their derivatives of the active setpoint, or else of the drone. (3, 4)"""
         if self._stream is not None:
-            return self._last
+            return self._last_goal
         if self._plan is not None:
-            point = self._plan.at(self.now)
-            if self._plan.lands and self._plan.finished(self.now):  # the setpoint sinks until the drone has landed
-                point[:2, 2] += -min(SINK_SPEED * (self.now - self._plan.end), MAX_SINK), -SINK_SPEED
+            point = self._plan.evaluate(self.now)
+            if self._plan.is_landing and self._plan.finished(self.now):  # the setpoint sinks until the drone has landed
+                point[:2, 2] += -min(SINK_SPEED * (self.now - self._plan.end_time), MAX_SINK), -SINK_SPEED
             return point
-        return self._motion()
+        return self._drone_motion()
 
     def in_group(self, mask: int) -> bool:
         """Return True if a command with this group mask, 0 for all drones, addresses this one."""
@@ -111,33 +111,35 @@ class Commander:
 
     def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:
         """Move to a position, m (3,), and yaw, rad; relative ones are added to the present setpoint."""
-        goal, (yaw,) = _numbers("goal", goal, 3), _numbers("yaw", [yaw], 1)
+        goal, (yaw,) = _check_numbers("goal", goal, 3), _check_numbers("yaw", [yaw], 1)
         start = self._motion_start("go_to")
         if relative:
             goal, yaw = goal + start[0, :3], yaw + start[0, 3]
         end = [*goal, nearest_yaw(start[0, 3], yaw)]
-        self._plan = PlannedMotion(move(start, end, _duration(duration), linear), self.now)
+        self._plan = PlannedMotion(move(start, end, _check_duration(duration), linear), self.now)
 
     def stop(self) -> None:
         """Stop the motors."""
         self._plan = self._stream = None
 
-    def upload(self, identity: int, path: HostTrajectory, compressed: bool = False) -> None:
+    def upload(self, trajectory_id: int, trajectory: HostTrajectory, compressed: bool = False) -> None:
         """Receive a trajectory.
 
         Args:
-            identity: Number of the trajectory.
-            path: Its path.
+            trajectory_id: ID of the trajectory.
+            trajectory: Trajectory.
             compressed: True for one that the firmware stores compressed, which it can neither stretch nor reverse.
         """
-        if not 0 <= identity < N_TRAJECTORIES:
-            raise ConfigError(f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {identity}")
-        self.trajectories[identity] = path
-        (self._compressed.add if compressed else self._compressed.discard)(identity)
+        if not 0 <= trajectory_id < N_TRAJECTORIES:
+            raise ConfigError(
+                f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {trajectory_id}"
+            )
+        self.trajectories[trajectory_id] = trajectory
+        (self._compressed.add if compressed else self._compressed.discard)(trajectory_id)
 
     def start_trajectory(
         self,
-        identity: int,
+        trajectory_id: int,
         timescale: float = 1.0,
         relative: bool = True,
         reversed: bool = False,
@@ -146,29 +148,29 @@ class Commander:
         """Follow a trajectory that was uploaded.
 
         Args:
-            identity: Number of the trajectory.
+            trajectory_id: ID of the trajectory.
             timescale: Factor of its duration, 1.
             relative: True to begin at the present setpoint.
             reversed: True to follow it from its end to its start.
-            relative_yaw: True to begin at the present yaw too.
+            relative_yaw: True to begin at the present yaw as well.
         """
-        if identity not in self.trajectories:
+        if trajectory_id not in self.trajectories:
             raise ConfigError(
-                f"expected one of the trajectories {sorted(self.trajectories)}, got {identity}. Upload it."
+                f"expected one of the trajectories {sorted(self.trajectories)}, got {trajectory_id}. Upload it."
             )
         if not MIN_DURATION <= timescale <= MAX_DURATION:
             raise ConfigError(f"expected a timescale from {MIN_DURATION:g} to {MAX_DURATION:g}, got {timescale}")
-        if identity in self._compressed and (timescale != 1 or reversed):
+        if trajectory_id in self._compressed and (timescale != 1 or reversed):
             raise ConfigError(
                 f"expected a compressed trajectory at its own speed and direction, got timescale {timescale:g}, "
                 f"reversed {bool(reversed)}. The firmware supports others for uncompressed trajectories alone."
             )
-        plan = PlannedMotion(self.trajectories[identity], self.now, timescale, bool(reversed))
-        start, first = self._motion_start("start_trajectory")[0], plan.at(self.now)[0]
+        plan = PlannedMotion(self.trajectories[trajectory_id], self.now, timescale, bool(reversed))
+        start, first = self._motion_start("start_trajectory")[0], plan.evaluate(self.now)[0]
         shift = np.zeros(4)
         if relative:
             shift[:3] = start[:3] - first[:3]
-            if relative_yaw and identity not in self._compressed:
+            if relative_yaw and trajectory_id not in self._compressed:
                 shift[3] = start[3] - nearest_yaw(start[3], first[3])
         self._plan = plan._replace(shift=shift)
 
@@ -179,11 +181,11 @@ class Commander:
         level = Control(level)
         self._require_level(level)
         size = {Control.state: 16, Control.rotor_vel: np.size(values)}.get(level, 4)
-        self._stream_setpoint("command", _numbers(f"{level.value} command", values, size, limit=math.inf))
+        self._stream_setpoint("command", _check_numbers(f"{level.value} command", values, size, limit=math.inf))
 
     def full_state(self, pos: ArrayLike, vel: ArrayLike, acc: ArrayLike, quat: ArrayLike, ang_vel: ArrayLike) -> None:
         """Stream a state: position, m, velocity, m/s, acceleration, m/s^2, attitude, xyzw, body rates, rad/s."""
-        parts = [_numbers("full state", x, n) for x, n in ((pos, 3), (vel, 3), (acc, 3), (quat, 4), (ang_vel, 3))]
+        parts = [_check_numbers("full state", x, n) for x, n in ((pos, 3), (vel, 3), (acc, 3), (quat, 4), (ang_vel, 3))]
         norm = np.linalg.norm(parts[3])
         if norm < 1e-3:
             raise ConfigError(f"expected a unit quaternion, xyzw, got {list(parts[3])}")
@@ -194,31 +196,35 @@ class Commander:
     def position(self, pos: ArrayLike, yaw: float) -> None:
         """Stream a position, m (3,), and yaw, rad."""
         self._require_level(Control.state)
-        self._stream_setpoint("position", np.append(_numbers("position", pos, 3), _numbers("yaw", [yaw], 1)))
+        self._stream_setpoint(
+            "position", np.append(_check_numbers("position", pos, 3), _check_numbers("yaw", [yaw], 1))
+        )
 
     def velocity(self, vel: ArrayLike, yaw_rate: float) -> None:
         """Stream a velocity, world frame, m/s (3,), and yaw rate, rad/s; a reference position moves with it."""
         self._require_level(Control.state)
-        self._stream_setpoint("velocity", np.append(_numbers("velocity", vel, 3), _numbers("yaw rate", [yaw_rate], 1)))
+        self._stream_setpoint(
+            "velocity", np.append(_check_numbers("velocity", vel, 3), _check_numbers("yaw rate", [yaw_rate], 1))
+        )
 
     def hover(self, vx: float, vy: float, yaw_rate: float, height: float) -> None:
         """Stream a horizontal velocity in the axes of the drone's yaw, m/s, yaw rate, rad/s, and height, m."""
         self._require_level(Control.state)
-        self._stream_setpoint("hover", _numbers("hover setpoint", [vx, vy, yaw_rate, height], 4))
+        self._stream_setpoint("hover", _check_numbers("hover setpoint", [vx, vy, yaw_rate, height], 4))
 
     def attitude(self, roll: float, pitch: float, yaw_rate: float, thrust: float) -> None:
         """Stream roll, pitch, rad, yaw rate, rad/s, and collective thrust, N."""
         self._require_level(Control.attitude)
-        self._stream_setpoint("attitude", _numbers("attitude setpoint", [roll, pitch, yaw_rate, thrust], 4))
+        self._stream_setpoint("attitude", _check_numbers("attitude setpoint", [roll, pitch, yaw_rate, thrust], 4))
 
     def notify_setpoints_stop(self, remain_valid: float = 0.0) -> None:
-        """Return to high-level commands after a time, s, in which the last setpoint stays active."""
+        """Return to high-level commands after a time, s, during which the last setpoint stays active."""
         self._release_time = self.now + max(float(remain_valid), 0.0)
 
     # Safety ---------------------------------------------------------------------------------------------------------
 
     def arm(self, armed: bool = True) -> None:
-        """Arm, or stop the motors and refuse commands."""
+        """Arm the drone; or disarm it, which stops the motors and makes it refuse commands."""
         if not armed:
             self.stop()
         self.armed = bool(armed)
@@ -242,7 +248,7 @@ class Commander:
 
     def estimate(self, state: DroneState) -> DroneState:
         """Return the drone's estimate of its state."""
-        return state if self.estimate_frame is None else self.estimate_frame.state(state)
+        return state if self.estimate_frame is None else self.estimate_frame.state_to_estimate(state)
 
     # The loop -------------------------------------------------------------------------------------------------------
 
@@ -258,8 +264,8 @@ class Commander:
         frame = self.estimate_frame
         if frame is None:
             return self._command(now, pos, vel, yaw)
-        command = self._command(now, *frame.motion(pos, vel, yaw))
-        return None if command is None else frame.command(self.control, command)
+        command = self._command(now, *frame.motion_to_estimate(pos, vel, yaw))
+        return None if command is None else frame.command_to_world(self.control, command)
 
     def _command(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
         """Return the active command in the frame of the estimate."""
@@ -269,35 +275,43 @@ class Commander:
             age = now - self._stream_time
             if now >= self._release_time and self._plan is not None:
                 self._stream = None
-            elif age > SHUTDOWN:
+            elif age > SHUTDOWN_TIMEOUT:
                 self.stop()
-            elif age > STABILIZE and self._stream[0] != "stay":
+            elif age > STABILIZE_TIMEOUT and self._stream[0] != "stay":
                 self._stream = ("stay", np.append(pos, yaw))
         plan = self._plan
-        if self._stream is None and plan is not None and plan.lands and plan.finished(now) and self._has_landed(plan):
+        if (
+            self._stream is None
+            and plan is not None
+            and plan.is_landing
+            and plan.finished(now)
+            and self._has_landed(plan)
+        ):
             self.stop()
         if not self.motors_on:
             return None
         if self._stream is not None:
             return self._streamed_command(dt)
-        if plan is None or not plan.finished(now) or plan.lands:
+        if plan is None or not plan.finished(now) or plan.is_landing:
             return _state_command(*self.goal())
-        if self._held_plan is None or self._held_plan[0] is not plan:  # evaluated only once while the drone hovers
-            self._held_plan = plan, _state_command(plan.at(now)[0], np.zeros(4), np.zeros(4))
-        return self._held_plan[1]
+        if (
+            self._cached_hover is None or self._cached_hover[0] is not plan
+        ):  # evaluated only once while the drone hovers
+            self._cached_hover = plan, _state_command(plan.evaluate(now)[0], np.zeros(4), np.zeros(4))
+        return self._cached_hover[1]
 
     def _has_landed(self, plan: PlannedMotion) -> bool:
         """Return True if the drone has reached the height of its landing, or stands on a surface."""
-        is_standing = self.now > plan.end + REST_TIME and abs(self.vel[2]) < RESTING_SPEED
-        return is_standing or self.pos[2] <= plan.at(self.now)[0, 2] + LANDED_HEIGHT
+        is_standing = self.now > plan.end_time + REST_TIME and abs(self.vel[2]) < RESTING_SPEED
+        return is_standing or self.pos[2] <= plan.evaluate(self.now)[0, 2] + LANDED_HEIGHT
 
     def _streamed_command(self, dt: float) -> NDArray:
         kind, x = self._stream  # type: ignore[misc]
         if self.control != Control.state:
             return self._streamed_attitude(kind, x, dt)
         if kind == "command":
-            self._last = np.array([[*x[:3], yaw_from_quat(x[9:13])], [*x[3:6], x[15]], [*x[6:9], 0.0]])
-            self._reference = self._last[0].copy()
+            self._last_goal = np.array([[*x[:3], yaw_from_quat(x[9:13])], [*x[3:6], x[15]], [*x[6:9], 0.0]])
+            self._reference = self._last_goal[0].copy()
             return x
         rate = np.zeros(4)
         if kind in ("position", "stay"):
@@ -308,8 +322,8 @@ class Commander:
             self._reference = self._reference + dt * rate
             if kind == "hover":
                 self._reference[2] = x[3]
-        self._last = np.array([self._reference, rate, np.zeros(4)])
-        return _state_command(*self._last)
+        self._last_goal = np.array([self._reference, rate, np.zeros(4)])
+        return _state_command(*self._last_goal)
 
     def _streamed_attitude(self, kind: str, x: NDArray, dt: float) -> NDArray:
         if kind == "attitude":
@@ -321,27 +335,27 @@ class Commander:
 
     def _stream_setpoint(self, kind: str, values: NDArray) -> None:
         if self._stream is None:
-            self._last = self.goal()
-            self._reference = self._last[0].copy()
+            self._last_goal = self.goal()
+            self._reference = self._last_goal[0].copy()
         self._stream, self._stream_time, self._release_time, self._plan = (kind, values), self.now, math.inf, None
         self._thrust = float(values[3]) if kind in ("command", "attitude") else 0.0
 
     def _move_vertically(self, height: float, duration: float, yaw: float | None, is_landing: bool) -> None:
-        (height,) = _numbers("height", [height], 1)
+        (height,) = _check_numbers("height", [height], 1)
         start_pos = self._motion_start("land" if is_landing else "take_off")[0]
         goal = start_pos.copy()
         goal[2] = height
         if yaw is not None:
-            goal[3] = nearest_yaw(start_pos[3], _numbers("yaw", [yaw], 1)[0])
+            goal[3] = nearest_yaw(start_pos[3], _check_numbers("yaw", [yaw], 1)[0])
         start = np.array([start_pos, np.zeros(4), np.zeros(4)])
-        self._plan = PlannedMotion(move(start, goal, _duration(duration)), self.now, lands=is_landing)
+        self._plan = PlannedMotion(move(start, goal, _check_duration(duration)), self.now, is_landing=is_landing)
 
-    def _motion(self) -> NDArray:
+    def _drone_motion(self) -> NDArray:
         """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""
         return np.array([[*self.pos, self.yaw], [*self.vel, 0.0], [0.0] * 4])
 
     def _motion_start(self, command: str) -> NDArray:
-        """Return where a high-level command begins: at the setpoint in force, or at the drone while setpoints stream.
+        """Return the start of a high-level command: the setpoint in force, or the drone while setpoints stream. (3, 4)
 
         A command that has no effect because of the stream is reported.
         """
@@ -353,7 +367,7 @@ class Commander:
                 f"expected no streamed setpoints in force before {command}, got some: it begins after "
                 f"notify_setpoints_stop, and the next streamed setpoint discards it. Call notify_setpoints_stop first."
             )
-        return self._motion()
+        return self._drone_motion()
 
     def _require_level(self, level: Control) -> None:
         if self.locked or not self.armed:
@@ -367,7 +381,7 @@ class Commander:
             )
 
 
-def _numbers(name: str, values: ArrayLike, n: int, limit: float = MAX_COORDINATE) -> NDArray:
+def _check_numbers(name: str, values: ArrayLike, n: int, limit: float = MAX_COORDINATE) -> NDArray:
     """Return finite numbers within a limit. (n,)"""
     try:
         x = np.array(values, float)
@@ -378,16 +392,27 @@ def _numbers(name: str, values: ArrayLike, n: int, limit: float = MAX_COORDINATE
     return x
 
 
-def _duration(value: float) -> float:
-    (value,) = _numbers("duration", [value], 1, MAX_DURATION)
+def _check_duration(value: float) -> float:
+    (value,) = _check_numbers("duration", [value], 1, MAX_DURATION)
     if value < MIN_DURATION:
         raise ConfigError(f"expected a positive duration of at least {MIN_DURATION:g} s, got {value} s")
     return value
 
 
-def _state_command(point: NDArray, rate: NDArray, second: NDArray) -> NDArray:
+def _state_command(point: NDArray, rate: NDArray, second_derivative: NDArray) -> NDArray:
     """Return the state command of position and yaw, their rates and second derivatives. (16,)"""
     half_yaw = point[3] / 2
     return np.array(
-        [*point[:3], *rate[:3], *second[:3], 0.0, 0.0, math.sin(half_yaw), math.cos(half_yaw), 0.0, 0.0, rate[3]]
+        [
+            *point[:3],
+            *rate[:3],
+            *second_derivative[:3],
+            0.0,
+            0.0,
+            math.sin(half_yaw),
+            math.cos(half_yaw),
+            0.0,
+            0.0,
+            rate[3],
+        ]
     )

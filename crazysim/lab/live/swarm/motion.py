@@ -16,11 +16,11 @@ NO_JERK_INVERSE = np.linalg.inv(
 
 
 class PlannedMotion(NamedTuple):
-    """A trajectory with its start time, speed, direction and offset."""
+    """A trajectory that is flown from a time on, at a speed, in a direction and with an offset."""
 
-    path: HostTrajectory
-    """Path."""
-    start: float
+    trajectory: HostTrajectory
+    """Trajectory."""
+    start_time: float
     """Time at which it starts, s."""
     timescale: float = 1.0
     """Factor of its duration, 1."""
@@ -28,23 +28,23 @@ class PlannedMotion(NamedTuple):
     """True if it is followed from its end to its start."""
     shift: NDArray = np.zeros(4)
     """Offset of position, m, and yaw, rad. (4,)"""
-    lands: bool = False
+    is_landing: bool = False
     """True if the motors stop at its end."""
 
     @property
-    def end(self) -> float:
+    def end_time(self) -> float:
         """Time at which it ends, s."""
-        return self.start + self.path.duration * self.timescale
+        return self.start_time + self.trajectory.duration * self.timescale
 
     def finished(self, t: float) -> bool:
         """Return True from the end of the plan on."""
-        return not self.path.repeats and t >= self.end
+        return not self.trajectory.repeats and t >= self.end_time
 
-    def at(self, t: float) -> NDArray:
+    def evaluate(self, t: float) -> NDArray:
         """Return position and yaw, their rates and second derivatives at a time, s. (3, 4)"""
-        elapsed = (t - self.start) / self.timescale
+        elapsed = (t - self.start_time) / self.timescale
         rate = (-1.0 if self.reversed else 1.0) / self.timescale
-        derivatives = self.path.derivatives(self.path.duration - elapsed if self.reversed else elapsed, 2)
+        derivatives = self.trajectory.derivatives(self.trajectory.duration - elapsed if self.reversed else elapsed, 2)
         derivatives = derivatives * np.array([1.0, rate, rate * rate])[:, None]
         derivatives[0] += self.shift
         return derivatives
@@ -75,5 +75,5 @@ def move(start: ArrayLike, goal: ArrayLike, duration: float, linear: bool = Fals
 
 
 def nearest_yaw(yaw: float, goal: float) -> float:
-    """Return the angle equal to a goal that is nearest to a yaw, rad."""
+    """Return the angle nearest to a yaw, rad, that differs from a goal by whole turns."""
     return yaw + (goal - yaw + np.pi) % (2 * np.pi) - np.pi

@@ -63,14 +63,14 @@ PARAMETERS: dict[str, Parameter] = {
 """Parameters that every simulated drone has."""
 
 
-def create_parameters(airframe: Airframe, multi_ranger: bool) -> dict[str, Parameter]:
+def create_parameters(airframe: Airframe, has_multi_ranger: bool) -> dict[str, Parameter]:
     """Return the parameters of a drone, including its multi-ranger deck and its attitude gains.
 
     Args:
         airframe: Airframe; one without the gains of ``controller="pid"`` has no group ``pid_attitude``.
-        multi_ranger: True for a drone with a multi-ranger deck.
+        has_multi_ranger: True for a drone with a multi-ranger deck.
     """
-    parameters = PARAMETERS | {"deck.bcMultiranger": Parameter("uint8_t", multi_ranger, read_only=True)}
+    parameters = PARAMETERS | {"deck.bcMultiranger": Parameter("uint8_t", has_multi_ranger, read_only=True)}
     if "pid.attitude.kp" in airframe.values:
         for gain in ("kp", "ki", "kd"):
             values = np.asarray(airframe.value(f"pid.attitude.{gain}"), float)
@@ -106,7 +106,7 @@ class Parameters(Mapping[str, float]):
         return np.array([self._values[name] for name in INITIAL_POSE])
 
     def get_value(self, name: str) -> float:
-        """Return a value."""
+        """Return the value of a parameter; a name that the simulation lacks is a ``ConfigError``."""
         self._require_parameter(name)
         return self._values[name]
 
@@ -122,8 +122,8 @@ class Parameters(Mapping[str, float]):
             raise ConfigError(f"expected a finite value of a parameter that can be written, got {name} = {value:g}")
         # Clients read values in their format, so 0.0045 comes back with the rounding of float32.
         is_same = math.isclose(value, self._values[name], rel_tol=1e-6)
-        is_effect = name != "ring.effect" or value in (LED_OFF, LED_SOLID, LED_MEMORY, LED_FADE)
-        if not (is_effect and (definition.simulated or is_same)):
+        is_known_effect = name != "ring.effect" or value in (LED_OFF, LED_SOLID, LED_MEMORY, LED_FADE)
+        if not (is_known_effect and (definition.simulated or is_same)):
             raise ConfigError(
                 f"expected a value whose effect is simulated, got {name} = {value:g}; it stays {self._values[name]:g}. "
                 f"{GUIDE_REMARK}"
@@ -138,21 +138,21 @@ GUIDE_REMARK = 'The guide "Real drones and their scripts" lists the parameters.'
 
 
 class Light:
-    """Colour of the LED ring or of the colour LED deck, whichever was set last."""
+    """Colour of a drone's light: of the LED ring or the colour LED deck, whichever was set last."""
 
     def __init__(self) -> None:
         self.memory = np.zeros((12, 3))
-        self._begin, self._target = np.zeros(3), np.zeros(3)
-        self._start, self._duration = 0.0, 0.0
+        self._start_color, self._target_color = np.zeros(3), np.zeros(3)
+        self._start_time, self._duration = 0.0, 0.0
 
     def color(self, now: float) -> NDArray:
         """Return the colour at a time, s: red, green, blue from 0 to 1. (3,)"""
-        fraction = (now - self._start) / self._duration if self.fades(now) and self._duration > 0 else 1.0
-        return self._begin + fraction * (self._target - self._begin)
+        fraction = (now - self._start_time) / self._duration if self.is_fading(now) and self._duration > 0 else 1.0
+        return self._start_color + fraction * (self._target_color - self._start_color)
 
-    def fades(self, now: float) -> bool:
-        """Return True until the end of a fade; a reset of the time ends it too."""
-        return self._start <= now < self._start + self._duration
+    def is_fading(self, now: float) -> bool:
+        """Return True while a fade is in progress; a reset of the time ends it."""
+        return self._start_time <= now < self._start_time + self._duration
 
     def update_color(self, values: Mapping[str, float], name: str, now: float) -> None:
         """Update the colour from new values of parameters.
@@ -179,4 +179,4 @@ class Light:
             duration = max(values["ring.fadeTime"], 0.0)
         else:
             target = self.memory.mean(axis=0) if effect == LED_MEMORY else np.zeros(3)
-        self._begin, self._target, self._start, self._duration = self.color(now), target, now, duration
+        self._start_color, self._target_color, self._start_time, self._duration = self.color(now), target, now, duration

@@ -35,7 +35,7 @@ class BatteryState(NamedTuple):
 
 def read_battery(sim: Sim, drone: int) -> BatteryState:
     """Return the state of a drone's ``Battery``; without the plugin, of a battery that is never empty."""
-    plugin = _plugin(sim, Battery)
+    plugin = _find_plugin(sim, Battery)
     if plugin is None:
         return BatteryState(IDEAL_VOLTAGE, 1.0, ON_BATTERY)
     record = plugin.read(sim.data)
@@ -44,13 +44,13 @@ def read_battery(sim: Sim, drone: int) -> BatteryState:
 
 
 def read_ranges(sim: Sim, drone: int) -> dict[str, float]:
-    """Return the distances that a ``MultiRanger``, or a ``RangeFinder``, measures along ``MULTI_RANGER_DIRECTIONS``, m.
+    """Return distances from a ``MultiRanger`` or ``RangeFinder``, m, by direction (``MULTI_RANGER_DIRECTIONS``).
 
-    They are infinite if no object is within range. Other directions, and drones without the sensor, are missing.
-    Before the first measurement of a ``MultiRanger`` they are the true distances.
+    A distance is infinite if no object is within range. Directions that the sensor does not have are missing; without a
+    sensor the result is empty. Before the first measurement of a ``MultiRanger`` the distances are the true ones.
     """
-    ranger = _plugin(sim, MultiRanger)
-    plugin = _plugin(sim, RangeFinder) if ranger is None else sim.plugins[ranger.range_finder]
+    ranger = _find_plugin(sim, MultiRanger)
+    plugin = _find_plugin(sim, RangeFinder) if ranger is None else sim.plugins[ranger.range_finder]
     if plugin is None:
         return {}
     record = plugin.read(sim.data)
@@ -69,6 +69,6 @@ def read_ranges(sim: Sim, drone: int) -> dict[str, float]:
     return ranges
 
 
-def _plugin(sim: Sim, kind: type[P]) -> P | None:
+def _find_plugin(sim: Sim, kind: type[P]) -> P | None:
     """Return the plugin of a class, or None."""
     return next((plugin for plugin in sim.plugins.values() if isinstance(plugin, kind)), None)

@@ -34,41 +34,47 @@ class DroneState(NamedTuple):
 
 
 class EstimateFrame(NamedTuple):
-    """Turn about the vertical and shift from the world to the frame of a drone's estimate.
+    """Frame of a drone's estimate, turned about the vertical and shifted against the world.
 
-    Without absolute positioning, as with a Flow deck, the estimate is the pose at which the estimator was started
-    (``kalmanCoreInit`` in kalman_core.c of crazyflie-firmware) and the motion since then; commands are relative to it.
+    Without absolute positioning, as with a Flow deck, the estimate starts at an initial pose (``kalmanCoreInit`` in
+    kalman_core.c of crazyflie-firmware) and adds the motion since then. Commands are in the frame of the estimate.
     """
 
-    turn: float
-    """Angle about the vertical, rad."""
-    shift: NDArray
-    """Position of the world's origin in the frame of the estimate, m. (3,)"""
+    yaw_offset: float
+    """Yaw in this frame minus yaw in the world, rad."""
+    origin: NDArray
+    """Position of the world's origin in this frame, m. (3,)"""
 
     @staticmethod
     def from_pose(pos: NDArray, yaw: float, pose: NDArray) -> EstimateFrame:
-        """Return the frame in which a drone at a position, m, and yaw, rad, of the world has a pose (4,)."""
-        turn = float(pose[3]) - yaw
-        return EstimateFrame(turn, pose[:3] - rotate(from_yaw(turn), pos))
+        """Return the frame in which a drone has a pose.
 
-    def state(self, state: DroneState) -> DroneState:
+        Args:
+            pos: Position, world frame, m. (3,)
+            yaw: Yaw, world frame, rad.
+            pose: Position, m, and yaw, rad, in the new frame. (4,)
+        """
+        yaw_offset = float(pose[3]) - yaw
+        return EstimateFrame(yaw_offset, pose[:3] - rotate(from_yaw(yaw_offset), pos))
+
+    def state_to_estimate(self, state: DroneState) -> DroneState:
         """Return the state of a drone in this frame."""
-        quat = from_yaw(self.turn)
+        quat = from_yaw(self.yaw_offset)
         return state._replace(
-            pos=rotate(quat, state.pos) + self.shift, quat=multiply(quat, state.quat), vel=rotate(quat, state.vel)
+            pos=rotate(quat, state.pos) + self.origin, quat=multiply(quat, state.quat), vel=rotate(quat, state.vel)
         )
 
-    def motion(self, pos: NDArray, vel: NDArray, yaw: float) -> tuple[NDArray, NDArray, float]:
+    def motion_to_estimate(self, pos: NDArray, vel: NDArray, yaw: float) -> tuple[NDArray, NDArray, float]:
         """Return position, m, velocity, m/s, and yaw, rad, in this frame."""
-        quat = from_yaw(self.turn)
-        return rotate(quat, pos) + self.shift, rotate(quat, vel), yaw + self.turn
+        quat = from_yaw(self.yaw_offset)
+        return rotate(quat, pos) + self.origin, rotate(quat, vel), yaw + self.yaw_offset
 
-    def command(self, level: Control, command: NDArray) -> NDArray:
-        """Return a command in the world's frame."""
+    def command_to_world(self, level: Control, command: NDArray) -> NDArray:
+        """Return a command in the world's frame, from a command in this frame."""
         if level == Control.attitude:
-            return command - [0.0, 0.0, self.turn, 0.0]
+            return command - [0.0, 0.0, self.yaw_offset, 0.0]
         if level != Control.state:
             return command
-        inverse_turn = from_yaw(-self.turn)
-        pos, vel, acc = (rotate(inverse_turn, x) for x in (command[:3] - self.shift, command[3:6], command[6:9]))
-        return np.concatenate([pos, vel, acc, multiply(inverse_turn, command[9:13]), command[13:]])
+        inverse_quat = from_yaw(-self.yaw_offset)
+        pos, vel, acc = (rotate(inverse_quat, x) for x in (command[:3] - self.origin, command[3:6], command[6:9]))
+        return np.concatenate([pos, vel, acc, multiply(inverse_quat, command[9:13]), command[13:]])

@@ -1,4 +1,4 @@
-"""A simulation whose drones take the commands of Crazyflies, each through a commander."""
+"""A simulation whose drones accept the commands of real Crazyflies; each drone has a commander."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ class Swarm(Closeable):
         swarm["cf1"].take_off(1.0, 2.0)
         swarm.advance(3.0)
 
-    States come from the filter of ``Sim(estimator=...)`` and its ``IMU``; without a filter they are the true states.
+    States are estimates of the filter of ``Sim(estimator=...)`` and its ``IMU``; without a filter they are the true
+    states.
     Commands may come from any thread; hold ``lock`` while another thread advances. The simulation advances by
     ``advance``, by ``start`` in real time, by a loop that calls the swarm, such as ``Live.add(swarm)``, or by a loop
     that ``advance`` runs, after ``run_in(live)``.
@@ -68,25 +69,27 @@ class Swarm(Closeable):
             raise ConfigError(f"expected {sim.n_drones} different names, got {names}")
         self.sim, self.names, self.lock = sim, tuple(names), threading.RLock()
         self.commanders = [Commander(sim.control, functools.partial(self._report_refusal, name)) for name in names]
-        ranged = "front" in read_ranges(sim, 0)
-        self.parameters = [Parameters(create_parameters(airframe, ranged)) for airframe in sim.airframes]
+        has_ranger = "front" in read_ranges(sim, 0)
+        self.parameters = [Parameters(create_parameters(airframe, has_ranger)) for airframe in sim.airframes]
         self.colors, self.reports = np.zeros((len(names), 3)), Reports()
         self.listeners: list[Callable[[], object]] = []
-        self._period = sim.freq // sim.control_freq
-        self._size = {Control.state: 16, Control.rotor_vel: sim.data.controls.rotor_vel.shape[-1]}.get(sim.control, 4)
-        self._motors = self._add_motors()
+        self._n_substeps = sim.freq // sim.control_freq
+        self._command_size = {Control.state: 16, Control.rotor_vel: sim.data.controls.rotor_vel.shape[-1]}.get(
+            sim.control, 4
+        )
+        self._motor_switch = self._add_motor_switch()
         estimators = [plugin for plugin in sim.plugins.values() if isinstance(plugin, Estimator)]
         self._estimator = next((estimator for estimator in estimators if estimator.control), None)
-        self._estimate = jax.jit(vmap_worlds(vmap_drones(self._estimated)))
+        self._estimate_fn = jax.jit(vmap_worlds(vmap_drones(self._estimate_drone)))
         self._motors_on = np.ones(len(names), bool)
         self._states: list[DroneState] = []
         self._yaws: list[float] = []
-        self._home = np.asarray(sim.data.states.pos[0], float)
+        self._home_pos = np.asarray(sim.data.states.pos[0], float)
         self._thread: threading.Thread | None = None
         self._stop_event = threading.Event()
         self._live: Live | None = None
-        self._read()
-        self._write()
+        self._read_states()
+        self._stage_commands()
 
     def __getitem__(self, name: str) -> Commander:
         """Return the commander of a drone."""
@@ -109,7 +112,7 @@ class Swarm(Closeable):
 
     def home(self, drone: int | str) -> NDArray:
         """Return the position of a drone when the swarm was made, m. (3,)"""
-        return self._home[self.index(drone) if isinstance(drone, str) else drone].copy()
+        return self._home_pos[self.index(drone) if isinstance(drone, str) else drone].copy()
 
     # Parameters -----------------------------------------------------------------------------------------------------
 
@@ -148,7 +151,7 @@ class Swarm(Closeable):
         live.lights[0] = self.colors
 
     def run_in(self, live: Live) -> None:
-        """Make ``advance`` and ``sleep`` run a live loop, with its speed and its viewers."""
+        """Make ``advance`` and ``sleep`` run a live loop, at its speed and with its viewers."""
         self._check_loop(live)
         if self._thread is not None:
             raise ConfigError("expected a swarm that no thread advances, got a running one. Call close first.")
@@ -164,27 +167,27 @@ class Swarm(Closeable):
     def update(self) -> None:
         """Read the states and stage the active commands, between two control steps."""
         with self.lock:
-            self._read()
-            self._write()
+            self._read_states()
+            self._stage_commands()
             for k, parameters in enumerate(self.parameters):
-                if parameters.light.fades(self.time - self._period / self.sim.freq):
+                if parameters.light.is_fading(self.time - self._n_substeps / self.sim.freq):
                     self.colors[k] = parameters.light.color(self.time)
             for listener in self.listeners:
                 listener()
 
     def advance(self, seconds: float) -> None:
-        """Advance by a time, s, rounded to control steps, at the speed of the loop of ``run_in`` if it runs in one."""
+        """Advance by a time, s, rounded to control steps, at the speed of its live loop after ``run_in``."""
         if self._thread is not None:
             raise ConfigError("expected a swarm that no thread advances, got a running one. Use sleep.")
         if self._live is not None:
             if seconds > 0:
                 self._live.run(seconds)
         else:
-            for _ in range(max(round(seconds * self.sim.freq / self._period), 0)):
+            for _ in range(max(round(seconds * self.sim.freq / self._n_substeps), 0)):
                 self.update()
-                self.sim.step(self._period)
+                self.sim.step(self._n_substeps)
         with self.lock:
-            self._read()
+            self._read_states()
 
     def sleep(self, seconds: float) -> None:
         """Wait for simulated time to pass, s: advance, or wait for the thread that advances."""
@@ -198,7 +201,7 @@ class Swarm(Closeable):
     def compile_step(self) -> None:
         """Compile a control step before programs wait for answers, as compilation takes longer than their timeouts."""
         with self.lock:
-            compile_step(self.sim, self._period)
+            compile_step(self.sim, self._n_substeps)
 
     def start(self, speed: float = 1.0) -> Swarm:
         """Compile a step, then advance in a thread, in real time or at another speed, and return the swarm."""
@@ -218,12 +221,12 @@ class Swarm(Closeable):
             self._thread = None
 
     def _run(self, speed: float) -> None:
-        dt = self._period / self.sim.freq / speed
+        dt = self._n_substeps / self.sim.freq / speed
         due = time.perf_counter()
         while not self._stop_event.is_set():
             with self.lock:
                 self.update()
-                self.sim.step(self._period)
+                self.sim.step(self._n_substeps)
             due = max(due + dt, time.perf_counter() - 0.1)
             self._stop_event.wait(max(due - time.perf_counter(), 0.0))
 
@@ -233,43 +236,45 @@ class Swarm(Closeable):
 
     # State and commands ---------------------------------------------------------------------------------------------
 
-    def _add_motors(self) -> MotorFailure | None:
+    def _add_motor_switch(self) -> MotorFailure | None:
         """Return the plugin that switches motors; None if the dynamics have no rotors."""
         if self.sim.dynamics != Dynamics.first_principles:
             return None
         return self.sim.add(MotorFailure(name="motor_switch"))
 
-    def _read(self) -> None:
+    def _read_states(self) -> None:
+        """Read the states of all drones; if time has gone back, reset the commanders first."""
         data, states = self.sim.data, self.sim.data.states
         values = [states.pos, states.quat, states.vel, states.ang_vel]
         if self._estimator is not None:
-            values = self._estimate(data)
+            values = self._estimate_fn(data)
         pos, quat, vel, ang_vel, *measured = (np.asarray(x)[0].astype(float) for x in values)
         now = float(np.asarray(data.core.steps)[0, 0]) / self.sim.freq
-        before = self._states
-        if before and now < before[0].time:
+        last_states = self._states
+        if last_states and now < last_states[0].time:
             for commander in self.commanders:
                 commander.reset()
-            before, self._motors_on = [], np.ones(len(self.names), bool)
-        dt = now - before[0].time if before else 0.0
-        vel_before = np.stack([state.vel for state in before]) if before else vel
-        force = (vel - vel_before) / dt if dt > 0 else np.zeros_like(vel)
-        acc = rotate(quat * (-1, -1, -1, 1), force + [0.0, 0.0, GRAVITY_MAGNITUDE])
-        if before and dt == 0:
-            acc = np.stack([state.acc for state in before])
+            last_states, self._motors_on = [], np.ones(len(self.names), bool)
+        dt = now - last_states[0].time if last_states else 0.0
+        last_vel = np.stack([state.vel for state in last_states]) if last_states else vel
+        world_acc = (vel - last_vel) / dt if dt > 0 else np.zeros_like(vel)
+        acc = rotate(quat * (-1, -1, -1, 1), world_acc + [0.0, 0.0, GRAVITY_MAGNITUDE])
+        if last_states and dt == 0:
+            acc = np.stack([state.acc for state in last_states])
         acc = measured[0] if measured else acc
         self._yaws = to_rpy(quat)[:, 2].tolist()
         self._states = [DroneState(now, *x) for x in zip(pos, quat, vel, ang_vel, acc, strict=True)]
 
-    def _estimated(self, data: SimData) -> list[Array]:
+    def _estimate_drone(self, data: SimData) -> list[Array]:
         """Return the estimate of one drone and the reading of its accelerometer, as fields of ``DroneState``."""
         estimator, s = self._estimator, data.states
         states = {"pos": s.pos, "quat": s.quat, "vel": s.vel, "ang_vel": s.ang_vel} | estimator.measured_states(data)
         return [states[name] for name in ("pos", "quat", "vel", "ang_vel")] + [estimator.inertial(data)[1]]
 
-    def _write(self) -> None:
+    def _stage_commands(self) -> None:
+        """Stage the active command of every drone, and switch motors on or off."""
         sim = self.sim
-        command = np.zeros((1, len(self.names), self._size))
+        command = np.zeros((1, len(self.names), self._command_size))
         motors_on = np.ones(len(self.names), bool)
         drones = zip(self.commanders, self._states, self._yaws, strict=True)
         for k, (commander, state, yaw) in enumerate(drones):
@@ -280,9 +285,9 @@ class Swarm(Closeable):
             elif sim.control == Control.state:
                 command[0, k, :3], command[0, k, 9:13] = state.pos, from_yaw(yaw)
         getattr(sim, f"{sim.control.value}_control")(command)
-        if self._motors is not None and (motors_on != self._motors_on).any():
+        if self._motor_switch is not None and (motors_on != self._motors_on).any():
             self._motors_on = motors_on
-            record = self._motors.read(sim.data)
+            record = self._motor_switch.read(sim.data)
             shape = record.effectiveness.shape
-            switched = jnp.asarray(np.broadcast_to(motors_on[None, :, None], shape), record.effectiveness.dtype)
-            sim.data = self._motors.write(sim.data, record.replace(effectiveness=switched))
+            effectiveness = jnp.asarray(np.broadcast_to(motors_on[None, :, None], shape), record.effectiveness.dtype)
+            sim.data = self._motor_switch.write(sim.data, record.replace(effectiveness=effectiveness))
