@@ -72,7 +72,7 @@ class Browser(Viewer[Live]):
             contacts: True to mark drones that touch something, which is computed for every picture.
             wind: True to draw the wind at every drone.
             follow: True to keep the followed body in the middle at first.
-            plot: Quantity plotted at first.
+            plot: Quantity that is plotted at first.
         """
         for name, value in (("trail", trail), ("spacing", 1.0 if spacing is None else spacing)):
             if not np.isfinite(value) or value < 0:
@@ -101,7 +101,7 @@ class Browser(Viewer[Live]):
         viser, sim = import_viser(), live.sim
         worlds = world_indices(sim, range(min(sim.n_worlds, MAX_WORLDS)) if self._worlds is None else self._worlds)
         access = self._access
-        access.port = _require_free(access.host, access.port)
+        access.port = _require_free_port(access.host, access.port)
         if access.host not in LOOPBACK_ADDRESSES:
             log.warning("listening at %s:%d: every machine of that network that has the address with its token can "
                         "watch and command the simulation", access.host, access.port)  # fmt: skip
@@ -115,8 +115,8 @@ class Browser(Viewer[Live]):
             self._server = start_guarded_server(viser, access, label="crazysim")
         scene = self._server.scene
         scene.set_up_direction("+z")
-        drones = self._picture.drone_pos
-        extent = float(np.nanmax(np.ptp(drones, axis=1)[..., :2])) + 2 * WORLD_MARGIN
+        drone_pos = self._picture.drone_pos
+        extent = float(np.nanmax(np.ptp(drone_pos, axis=1)[..., :2])) + 2 * WORLD_MARGIN
         spacing = extent if self._spacing is None else self._spacing
         self._scene = BrowserScene(self._server, shapes, bodies, self._picture, spacing, self._trail)
         camera = self._server.initial_camera
@@ -136,12 +136,12 @@ class Browser(Viewer[Live]):
 
         @scene.on_click()
         def _(event: Any) -> None:
-            world, body, point = self._scene.pick(self._picture, event.ray_origin, event.ray_direction)
-            number = int(self._picture.worlds[world])
+            k, body, point = self._scene.pick(self._picture, event.ray_origin, event.ray_direction)
+            world = int(self._picture.worlds[k])
             if body is not None:
-                live.post(lambda live: live.follow(number, body.kind, body.index))
+                live.post(lambda live: live.follow(world, body.kind, body.index))
             elif point is not None:
-                live.post(lambda live: live.click(number, point))
+                live.post(lambda live: live.click(world, point))
 
     def update(self, live: Live) -> None:
         if not self._server.get_clients():
@@ -157,12 +157,12 @@ class Browser(Viewer[Live]):
             server, self._server = self._server, None
             with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it stops
                 # viser waits for 6 s for connections that a browser has opened in advance and not used.
-                stop = threading.Thread(target=server.stop, daemon=True)
-                stop.start()
-                stop.join(CLOSE_TIMEOUT)
+                stop_thread = threading.Thread(target=server.stop, daemon=True)
+                stop_thread.start()
+                stop_thread.join(CLOSE_TIMEOUT)
 
 
-def _require_free(host: str, port: int) -> int:
+def _require_free_port(host: str, port: int) -> int:
     """Return a port that is free, or any free one for 0; viser itself would silently take another.
 
     Raises:

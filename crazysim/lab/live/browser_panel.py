@@ -11,7 +11,7 @@ import numpy as np
 from crazysim.lab.live.browser_scene import BrowserScene
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.pace import Speed
-from crazysim.lab.live.picture import Picture, quantities
+from crazysim.lab.live.picture import Picture, list_quantities
 from crazysim.lab.live.scene_bodies import DRONE, SceneBodies
 from crazysim.lab.live.viewer import Slider, Widget
 
@@ -19,17 +19,17 @@ SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "max")
 """Speeds to choose from."""
 TEXT_PERIOD, PLOT_PERIOD = 0.2, 0.1
 """Time between updates of the text and of the plot, s."""
-PLOT_SAMPLE = 0.02
+PLOT_SAMPLE_PERIOD = 0.02
 """Shortest simulated time between two samples of a plot, s."""
 PLOT_LENGTH = 500
 """Number of samples of a plot."""
-COLORS = ("#d6452f", "#2a7fd9", "#37a35a", "#d99a1c", "#8a4fbf", "#444444")
+LINE_COLORS = ("#d6452f", "#2a7fd9", "#37a35a", "#d99a1c", "#8a4fbf", "#444444")
 """Colours of the lines of a plot, repeated in this order."""
 MAX_LINES = 16
 """Largest number of lines of a plot."""
-KEY_TIME = 0.25
+KEY_HOLD_TIME = 0.25
 """Time for which a button or key of the browser holds a key of the loop, s: browsers report presses only."""
-KEYS = {
+MOVEMENT_KEYS = {
     "forward": ("up", "arrowup"), "back": ("down", "arrowdown"), "left": ("left", "arrowleft"),
     "right": ("right", "arrowright"), "climb": ("w", "W"), "sink": ("s", "S"), "turn left": ("a", "A"),
     "turn right": ("d", "D"),
@@ -58,18 +58,18 @@ class BrowserPanel:
         """
         self._gui = gui = server.gui
         self._scene, self._live = scene, live
-        names = list(dict.fromkeys(["", *live.quantities, *quantities(live.sim)]))
+        names = list(dict.fromkeys(["", *live.quantities, *list_quantities(live.sim)]))
         self.follow, self.plot = follow, plot if plot in names else ""
         gui.configure_theme(control_width="medium")
         self._text = gui.add_markdown("")
         self._text_time = self._plot_time = -np.inf
         self._samples: deque[tuple[float, np.ndarray]] = deque(maxlen=PLOT_LENGTH)
         self._chart: Any = None
-        self._plotted: tuple[Any, ...] = ()
+        self._plot_key: tuple[Any, ...] = ()
         with gui.add_folder("Time"):
-            self._add_time(gui, live)
+            self._add_time_controls(gui, live)
         with gui.add_folder("Drone"):
-            self._add_drone(gui, live, bodies)
+            self._add_drone_controls(gui, live, bodies)
         if live.widgets:
             with gui.add_folder("Controls"):
                 for widget in live.widgets:
@@ -77,8 +77,8 @@ class BrowserPanel:
         with gui.add_folder("Layers", expand_by_default=False):
             for layer in scene.visible:
                 self._add_layer(gui, layer)
-        self._plots = gui.add_folder("Plot")
-        with self._plots:
+        self._plot_folder = gui.add_folder("Plot")
+        with self._plot_folder:
             choice = gui.add_dropdown("quantity", names, initial_value=self.plot)
 
             @choice.on_update
@@ -96,20 +96,20 @@ class BrowserPanel:
         if now - self._text_time >= TEXT_PERIOD:
             self._text_time = now
             self._text.content = f"**{picture.status}**"
-            if picture.selected is not None and self._drone.value != picture.selected[1]:
-                self._drone.value = picture.selected[1]
-            if picture.followed is not None and self._world.value != picture.followed[0]:
-                self._world.value = picture.followed[0]
-            if self._body is not None and self._body.value != picture.followed_name:
-                self._body.value = picture.followed_name
-        plotted = (self.plot, picture.selected, len(picture.plot))
-        if plotted != self._plotted or (self._samples and picture.time < self._samples[-1][0]):
-            self._plotted = plotted
+            if picture.selected is not None and self._drone_input.value != picture.selected[1]:
+                self._drone_input.value = picture.selected[1]
+            if picture.followed is not None and self._world_input.value != picture.followed[0]:
+                self._world_input.value = picture.followed[0]
+            if self._body_input is not None and self._body_input.value != picture.followed_name:
+                self._body_input.value = picture.followed_name
+        plot_key = (self.plot, picture.selected, len(picture.plot))
+        if plot_key != self._plot_key or (self._samples and picture.time < self._samples[-1][0]):
+            self._plot_key = plot_key
             self._samples.clear()
             self._remove_chart()
         if not len(picture.plot):
             return
-        if not self._samples or picture.time - self._samples[-1][0] >= PLOT_SAMPLE:
+        if not self._samples or picture.time - self._samples[-1][0] >= PLOT_SAMPLE_PERIOD:
             self._samples.append((picture.time, picture.plot[:MAX_LINES]))
         if len(self._samples) > 1 and now - self._plot_time >= PLOT_PERIOD:
             self._plot_time = now
@@ -122,8 +122,10 @@ class BrowserPanel:
         if self._chart is not None:
             self._chart.data = data
             return
-        lines = [{"label": str(k), "stroke": COLORS[k % len(COLORS)], "width": 1.5} for k in range(values.shape[1])]
-        with self._plots:
+        lines = [
+            {"label": str(k), "stroke": LINE_COLORS[k % len(LINE_COLORS)], "width": 1.5} for k in range(values.shape[1])
+        ]
+        with self._plot_folder:
             self._chart = self._gui.add_uplot(
                 data, ({"label": "s"}, *lines), title=self.plot, scales={"x": {"time": False}}, aspect=1.3
             )
@@ -133,7 +135,7 @@ class BrowserPanel:
             self._chart.remove()
             self._chart = None
 
-    def _add_time(self, gui: Any, live: Live) -> None:
+    def _add_time_controls(self, gui: Any, live: Live) -> None:
         callbacks = {
             "pause": Live.toggle_pause, "step": Live.advance, "reset": Live.reset, "record": Live.toggle_recording,
         }  # fmt: skip
@@ -149,56 +151,56 @@ class BrowserPanel:
         target_time = gui.add_number("go to, s", 0.0, min=0.0, step=0.1)
         _post_on_click(gui.add_button("Go"), live, lambda live: live.go_to(float(target_time.value)))
 
-    def _add_drone(self, gui: Any, live: Live, bodies: SceneBodies) -> None:
+    def _add_drone_controls(self, gui: Any, live: Live, bodies: SceneBodies) -> None:
         sim = live.sim
         world, drone = live.selected or (0, 0)
-        self._world = worlds = gui.add_number(
+        self._world_input = world_input = gui.add_number(
             "world", world, min=0, max=sim.n_worlds - 1, step=1, visible=sim.n_worlds > 1
         )
-        self._drone = gui.add_number("drone", drone, min=0, max=sim.n_drones - 1, step=1)
-        for number in (worlds, self._drone):
+        self._drone_input = gui.add_number("drone", drone, min=0, max=sim.n_drones - 1, step=1)
+        for element in (world_input, self._drone_input):
 
-            @number.on_update
+            @element.on_update
             def _(event: Any) -> None:
                 if event.client is not None:  # a change by a user
-                    selection = int(worlds.value), int(self._drone.value)
+                    selection = int(world_input.value), int(self._drone_input.value)
                     live.post(lambda live: live.select(*selection))
 
-        self._body = None
+        self._body_input = None
         if any(body.kind != DRONE for body in bodies.items):
-            self._add_body(gui, live, worlds, bodies)
+            self._add_body_choice(gui, live, world_input, bodies)
         follow = gui.add_checkbox("follow", self.follow)
 
         @follow.on_update
         def _(_: Any) -> None:
             self.follow = follow.value
 
-        for name, (key, hotkey) in KEYS.items():
+        for name, (key, hotkey) in MOVEMENT_KEYS.items():
             self._add_key(gui, live, name, key, hotkey)
 
-    def _add_body(self, gui: Any, live: Live, worlds: Any, bodies: SceneBodies) -> None:
+    def _add_body_choice(self, gui: Any, live: Live, world_input: Any, bodies: SceneBodies) -> None:
         """Add the choice of the followed body, which may be a vehicle, a load or an object."""
         body_of_name = {body.name: body for body in bodies.items}
-        self._body = choice = gui.add_dropdown("body", ("", *body_of_name))
+        self._body_input = choice = gui.add_dropdown("body", ("", *body_of_name))
 
         @choice.on_update
         def _(event: Any) -> None:
             body = body_of_name.get(choice.value)
             if event.client is not None and body is not None:  # a change by a user
-                world = int(worlds.value)
+                world = int(world_input.value)
                 live.post(lambda live: live.follow(world, body.kind, body.index))
 
     def _add_key(self, gui: Any, live: Live, name: str, key: str, hotkey: str) -> None:
         """Add a hotkey that holds a key of the loop for a moment."""
         command = gui.add_command(f"Fly: {name}", hotkey=hotkey)
-        command.on_trigger(lambda _: live.keyboard.hold(key, KEY_TIME))
+        command.on_trigger(lambda _: live.keyboard.hold(key, KEY_HOLD_TIME))
 
     def _add_layer(self, gui: Any, layer: str) -> None:
-        box = gui.add_checkbox(layer, True)
+        checkbox = gui.add_checkbox(layer, True)
 
-        @box.on_update
+        @checkbox.on_update
         def _(_: Any) -> None:
-            self._scene.visible[layer] = box.value
+            self._scene.visible[layer] = checkbox.value
 
     @staticmethod
     def _add_widget(gui: Any, live: Live, widget: Widget) -> None:

@@ -61,24 +61,24 @@ class BrowserScene:
             elif shape.kind != "plane":
                 by_body[shape.mocap].append(shape)
         for k, (rgba, fixed_shapes) in enumerate(by_color.items()):
-            infinite = [s for s in fixed_shapes if s.kind == "plane" and not s.size[:2].any()]
-            others = [s for s in fixed_shapes if not any(s is plane for plane in infinite)]
-            if infinite:
-                add_geoms(scene, f"/world/floor/{k}", infinite, rgba)
-            for w, offset in enumerate(self.offsets if others else []):
+            infinite_planes = [s for s in fixed_shapes if s.kind == "plane" and not s.size[:2].any()]
+            finite_shapes = [s for s in fixed_shapes if not any(s is plane for plane in infinite_planes)]
+            if infinite_planes:
+                add_geoms(scene, f"/world/floor/{k}", infinite_planes, rgba)
+            for w, offset in enumerate(self.offsets if finite_shapes else []):
                 node = scene.add_frame(f"/world/fixed/{w}/{k}", position=offset, show_axes=False)
-                add_geoms(scene, node.name, others, rgba)
+                add_geoms(scene, node.name, finite_shapes, rgba)
         self._batches: list[tuple[Any, NDArray]] = []
         for equal_bodies in _group_equal_bodies(by_body):
             self._add_bodies(np.array(equal_bodies), by_body[equal_bodies[0]], picture)
 
         colors = np.tile(choose_drone_colors(n_drones, None)[:, :3], (n_worlds, 1))
-        drones = self._to_grid(picture.drone_pos).reshape(-1, 3)
-        self._setpoints = self._add_balls("setpoints", SETPOINT_RADIUS, picture.setpoint, to_rgb_bytes(colors), 0.8)
-        self._contacts = self._add_balls("contacts", MARK_RADIUS, picture.drone_pos, CONTACT_COLOR, 0.45)
-        self._contacts.batched_scales = np.full(len(drones), HIDDEN_SCALE, np.float32)
-        self._lights = self._add_balls("lights", LIGHT_RADIUS, picture.drone_pos, to_rgb_bytes(0 * colors), 0.7)
-        self._lights.batched_scales = np.full(len(drones), HIDDEN_SCALE, np.float32)
+        drone_pos = self._to_grid(picture.drone_pos).reshape(-1, 3)
+        self._setpoints = self._add_spheres("setpoints", SETPOINT_RADIUS, picture.setpoint, to_rgb_bytes(colors), 0.8)
+        self._contacts = self._add_spheres("contacts", MARK_RADIUS, picture.drone_pos, CONTACT_COLOR, 0.45)
+        self._contacts.batched_scales = np.full(len(drone_pos), HIDDEN_SCALE, np.float32)
+        self._lights = self._add_spheres("lights", LIGHT_RADIUS, picture.drone_pos, to_rgb_bytes(0 * colors), 0.7)
+        self._lights.batched_scales = np.full(len(drone_pos), HIDDEN_SCALE, np.float32)
         self._led_colors = np.zeros_like(colors)
         self._followed_mark = scene.add_icosphere(
             "/world/followed", radius=MARK_RADIUS, color=FOLLOWED_COLOR, opacity=0.25, visible=False
@@ -104,16 +104,16 @@ class BrowserScene:
             handle.batched_wxyzs = finite_rows(
                 np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4), (1, 0, 0, 0)
             )
-        drones = self._to_grid(picture.drone_pos)
+        drone_pos = self._to_grid(picture.drone_pos)
         if self._setpoints is not None:
             self._setpoints.visible = visible["setpoints"]
             self._setpoints.batched_positions = finite_rows(self._to_grid(picture.setpoint).reshape(-1, 3))
         has_contact = picture.has_contact.ravel() & visible["contacts"]
         self._contacts.batched_scales = np.where(has_contact, 1.0, HIDDEN_SCALE).astype(np.float32)
         if has_contact.any():
-            self._contacts.batched_positions = finite_rows(drones.reshape(-1, 3))
-        self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * visible["lights"])
-        self._show_wind(drones, picture)
+            self._contacts.batched_positions = finite_rows(drone_pos.reshape(-1, 3))
+        self._show_lights(drone_pos.reshape(-1, 3), picture.lights.reshape(-1, 3) * visible["lights"])
+        self._show_wind(drone_pos, picture)
         if self._trail is not None:
             self._trail.update(
                 picture.time, finite_rows(pos[:, self._trail_mocap_ids].reshape(-1, 3)), visible["trails"]
@@ -125,8 +125,8 @@ class BrowserScene:
     ) -> tuple[int, SceneBody | None, NDArray | None]:
         """Return what a ray from the camera hits: the index of a world, and a body or a point of its floor.
 
-        The point is in the frame of the world, m. (3,) The body or the point is None; both are, with index 0, if the
-        ray hits nothing.
+        The point is in the frame of the world, m. (3,) Either the body or the point is None. If the ray hits nothing,
+        both are None and the index is 0.
 
         Args:
             picture: Picture that the user has seen.
@@ -159,8 +159,8 @@ class BrowserScene:
         start = origin - self._to_grid(picture.pos)
         distance = np.linalg.norm(start, axis=-1, keepdims=True)
         low, high = self._bodies.low, self._bodies.high
-        drones = np.array([self._bodies.items[k].kind == DRONE for k in self._bodies.owner])
-        min_radius = np.maximum(np.where(drones, MARK_RADIUS, 0.0)[:, None], CLICK_SIZE * distance)
+        is_drone = np.array([self._bodies.items[k].kind == DRONE for k in self._bodies.owner])
+        min_radius = np.maximum(np.where(is_drone, MARK_RADIUS, 0.0)[:, None], CLICK_SIZE * distance)
         to_body = picture.quat * (-1, -1, -1, 1)
         local_start, ray = rotate(to_body, start), rotate(to_body, np.broadcast_to(direction, start.shape))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -180,8 +180,8 @@ class BrowserScene:
             by_color[tuple(np.round(shape.rgba, 3))].append(shape)
         pos = self._to_grid(picture.pos)[:, bodies].reshape(-1, 3)
         quat = np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4)
-        for k, (rgba, same_color) in enumerate(by_color.items()):
-            mesh = create_mesh(same_color)
+        for k, (rgba, same_color_shapes) in enumerate(by_color.items()):
+            mesh = create_mesh(same_color_shapes)
             handle = self._scene.add_batched_meshes_simple(
                 f"/world/bodies/{bodies[0]}/{k}", np.asarray(mesh.vertices, np.float32),
                 np.asarray(mesh.faces, np.uint32), finite_rows(quat, (1, 0, 0, 0)), finite_rows(pos),
@@ -190,23 +190,23 @@ class BrowserScene:
             )  # fmt: skip
             self._batches.append((handle, bodies))
 
-    def _add_balls(self, name: str, radius: float, pos: NDArray, colors: Any, opacity: float) -> Any:
+    def _add_spheres(self, name: str, radius: float, pos: NDArray, colors: Any, opacity: float) -> Any:
         """Add a sphere at each point of all worlds, and return their node, or None if there are no points."""
         if not pos.size:
             return None
         import trimesh
 
-        ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+        sphere = trimesh.creation.icosphere(subdivisions=2, radius=radius)
         points = finite_rows(self._to_grid(pos).reshape(-1, 3))
         return self._scene.add_batched_meshes_simple(
-            f"/world/{name}", np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32),
+            f"/world/{name}", np.asarray(sphere.vertices, np.float32), np.asarray(sphere.faces, np.uint32),
             np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), points, batched_colors=colors, opacity=opacity, lod="off",
         )  # fmt: skip
 
-    def _show_wind(self, drones: NDArray, picture: Picture) -> None:
+    def _show_wind(self, drone_pos: NDArray, picture: Picture) -> None:
         if not picture.wind.size:
             return
-        arrow_start = finite_rows(drones.reshape(-1, 3))
+        arrow_start = finite_rows(drone_pos.reshape(-1, 3))
         ends = np.stack([arrow_start, arrow_start + WIND_SCALE * finite_rows(picture.wind.reshape(-1, 3))], axis=1)
         ends = ends.astype(np.float32)
         if self._wind is None:
@@ -216,11 +216,11 @@ class BrowserScene:
         self._wind.visible = self.visible["wind"]
         self._wind.points = ends
 
-    def _show_lights(self, drones: NDArray, colors: NDArray) -> None:
+    def _show_lights(self, drone_pos: NDArray, colors: NDArray) -> None:
         """Show the LEDs of all drones; colours are sent only when they change.
 
         Args:
-            drones: Positions, m. (n, 3)
+            drone_pos: Positions, m. (n, 3)
             colors: Colours, 0 to 1; zero for off. (n, 3)
         """
         if not np.array_equal(colors, self._led_colors):
@@ -228,9 +228,9 @@ class BrowserScene:
             self._lights.batched_colors = to_rgb_bytes(colors)
             self._lights.batched_scales = np.where(colors.any(-1), 1.0, HIDDEN_SCALE).astype(np.float32)
         if colors.any():
-            self._lights.batched_positions = finite_rows(drones)
+            self._lights.batched_positions = finite_rows(drone_pos)
 
-    def _show_followed(self, bodies: NDArray, picture: Picture, follow: bool) -> None:
+    def _show_followed(self, body_pos: NDArray, picture: Picture, follow: bool) -> None:
         k = None
         if picture.followed is not None:
             k = next((i for i, world in enumerate(picture.worlds) if world == picture.followed[0]), None)
@@ -238,7 +238,7 @@ class BrowserScene:
         if k is None or picture.followed is None:
             self._root.position = (0.0, 0.0, 0.0)
             return
-        pos = finite_rows(bodies[k, picture.followed[1]])
+        pos = finite_rows(body_pos[k, picture.followed[1]])
         radius = self._bodies.radius(picture.followed[1])
         self._followed_mark.position = pos
         if radius != self._followed_mark.radius:  # only on a change, because browsers rebuild the sphere

@@ -32,7 +32,8 @@ class Trails:
         self._samples: deque[NDArray] = deque(maxlen=self._length)
         self._last_time = -np.inf
         pos = finite_rows(pos)
-        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # to the floor's grey; lines are opaque
+        # Lines are opaque, so they fade to the grey of the floor.
+        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]
         shades = np.round(255 * (FLOOR_GREY - fade * (FLOOR_GREY - colors))).astype(np.uint8)
         self._handle = scene.add_line_segments(
             "/world/trails", self._segments(pos), np.repeat(shades.reshape(-1, 1, 3), 2, axis=1), thickness=2.0,

@@ -38,8 +38,8 @@ class Chart:
     def add(self, picture: Picture) -> None:
         """Add the values of a picture; the chart restarts for another drone or after a jump back in time."""
         values = picture.plot[:MAX_LINES]
-        restarts = self._times and (picture.time < self._times[-1] or len(values) != len(self._values[-1]))
-        if restarts or picture.selected != self._selected_drone:
+        must_restart = self._times and (picture.time < self._times[-1] or len(values) != len(self._values[-1]))
+        if must_restart or picture.selected != self._selected_drone:
             self._times.clear()
             self._values.clear()
         self._selected_drone = picture.selected

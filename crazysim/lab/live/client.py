@@ -1,4 +1,4 @@
-"""Clients: scripts that command drones over TCP, at this package's server or the lab's."""
+"""Clients that command drones over TCP, through this package's server or the lab's."""
 
 from __future__ import annotations
 

@@ -91,26 +91,26 @@ class LoadShow:
 Command = TakeOff | Land | Hover | Upload | Start | SetParameter | StartShow | LoadShow
 
 
-def parse_command(frame: Message | ShowFile, drone: int | None = None) -> Command:
+def parse_command(message: Message | ShowFile, drone: int | None = None) -> Command:
     """Return the command in a message.
 
     Args:
-        frame: Message.
+        message: Message.
         drone: ID of the drone if the message has none; None for all.
 
     Raises:
         ConfigError: If the command does not exist, or its argument is invalid.
     """
-    if isinstance(frame, ShowFile):
-        return LoadShow(parse_show(frame.content, "a received show"))
-    drone = drone if frame.drone is None else frame.drone or None  # ID 00 addresses all drones
-    name, argument = frame.command, frame.argument
+    if isinstance(message, ShowFile):
+        return LoadShow(parse_show(message.content, "a received show"))
+    drone = drone if message.drone is None else message.drone or None  # ID 00 addresses all drones
+    name, argument = message.command, message.argument
     if name in ("upload", "traj"):
-        if frame.payload is None:
+        if message.payload is None:
             raise ConfigError(f"expected a trajectory in JSON after {name!r}, got none")
-        value = checks.parse_json(frame.payload, "a received trajectory")
+        value = checks.parse_json(message.payload, "a received trajectory")
         return Upload(drone, parse_trajectory(value, "a received trajectory")[0])
-    if frame.payload is not None:
+    if message.payload is not None:
         raise ConfigError(f"expected no JSON after {name!r}, got one")
     if name == "takeoff":
         return TakeOff(drone, _parse_number(argument, 0.0, MAX_HEIGHT))
@@ -119,8 +119,8 @@ def parse_command(frame: Message | ShowFile, drone: int | None = None) -> Comman
             raise ConfigError(f"expected start_absolute or start_relative, got {argument!r}")
         return Start(drone, argument.lower().startswith("rel"))
     if name == "param":
-        parameter, equals, value = argument.partition("=")
-        if not equals or not parameter:
+        parameter, separator, value = argument.partition("=")
+        if not separator or not parameter:
             raise ConfigError(f"expected param_NAME=VALUE, got {argument!r}")
         return SetParameter(drone, parameter, _parse_number(value, -math.inf, math.inf))
     commands_without_argument = {"land": Land, "hover": Hover}

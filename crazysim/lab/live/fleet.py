@@ -23,7 +23,7 @@ from crazysim.trajectories import Trajectory, hover, line
 
 VERTICAL_SPEED = 0.5
 """Mean speed of take-off and landing, m/s."""
-MIN_TIME = 1.0
+MIN_VERTICAL_DURATION = 1.0
 """Shortest duration of take-off and landing, s."""
 MAX_PIECES = 256
 """Default largest number of pieces of a trajectory."""
@@ -74,16 +74,16 @@ class Fleet:
         if len(set(self.ids.values())) < len(self.ids) or not all(0 <= i < sim.n_drones for i in self.ids.values()):
             raise ConfigError(f"expected one drone of {sim.n_drones} for each ID, got {self.ids}")
         pos = np.asarray(sim.data.states.pos[0], float)
-        self._active = [_hover_trajectory(np.append(p, 0.0)) for p in pos]
-        self._starts = np.zeros(sim.n_drones)
-        self._uploaded: dict[int, Trajectory] = {}
+        self._active_trajectories = [_hover_trajectory(np.append(p, 0.0)) for p in pos]
+        self._start_times = np.zeros(sim.n_drones)
+        self._uploaded_trajectories: dict[int, Trajectory] = {}
         self._awaits_first_trajectory = [True] * sim.n_drones
         self.parameters = [{} for _ in range(sim.n_drones)]
         self._lights: Lights | None = None
         self._show_start: float | None = None
         drones = np.arange(sim.n_drones)[None]
         self.follow = Follow(
-            self._active, index=drones, start=np.zeros((1, sim.n_drones)), n_slots=sim.n_drones,
+            self._active_trajectories, index=drones, start=np.zeros((1, sim.n_drones)), n_slots=sim.n_drones,
             max_pieces=max_pieces, visible=False, name=name,
         )  # fmt: skip
         sim.add(self.follow)
@@ -95,14 +95,14 @@ class Fleet:
         Args:
             commands: Commands, in order; one that cannot be carried out is logged.
         """
-        n = 0
+        n_succeeded = 0
         for command in commands:
             try:
                 self._apply_command(command)
-                n += 1
+                n_succeeded += 1
             except ConfigError as error:
                 log.warning("%s refused: %s", type(command).__name__, error)
-        return n
+        return n_succeeded
 
     def reset(self) -> None:
         """Make every drone hover at its position; received trajectories stay. Call it after ``sim.reset()``."""
@@ -110,7 +110,7 @@ class Fleet:
         self._show_start = None
         for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
             self._assign_trajectory(drone, _hover_trajectory(np.append(pos, 0.0)))
-            self._awaits_first_trajectory[drone] = drone not in self._uploaded
+            self._awaits_first_trajectory[drone] = drone not in self._uploaded_trajectories
 
     def colors(self) -> NDArray:
         """Return the present colours of the LEDs, from the received show once it has started. (n_drones, 3)"""
@@ -122,7 +122,9 @@ class Fleet:
 
     def setpoint(self, drone: int) -> NDArray:
         """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
-        return HostTrajectory.from_trajectory(self._active[drone]).setpoint(self._current_time() - self._starts[drone])
+        return HostTrajectory.from_trajectory(self._active_trajectories[drone]).setpoint(
+            self._current_time() - self._start_times[drone]
+        )
 
     def _current_time(self) -> float:
         return float(self.sim.time[0, 0])
@@ -132,28 +134,28 @@ class Fleet:
             show = command.show
             if show.n_drones > self.sim.n_drones:
                 raise ConfigError(f"expected a show of at most {self.sim.n_drones} drones, got {show.n_drones}")
-            received = [_without_padding(show.trajectory(i)) for i in range(show.n_drones)]
-            for trajectory in received:
+            trajectories = [_without_padding(show.trajectory(i)) for i in range(show.n_drones)]
+            for trajectory in trajectories:
                 self._check_trajectory(trajectory)
-            for drone, trajectory in enumerate(received):
+            for drone, trajectory in enumerate(trajectories):
                 self._receive_trajectory(drone, trajectory)
             self._lights, self._show_start = show.lights, None
         elif isinstance(command, StartShow):
-            if not self._uploaded:
+            if not self._uploaded_trajectories:
                 raise ConfigError("expected trajectories to start, got none. Upload some first.")
-            for drone in self._uploaded:
+            for drone in self._uploaded_trajectories:
                 self._start_trajectory(drone, relative=False)
             self._show_start = self._current_time()
         else:
             if isinstance(command, Upload):
                 self._check_trajectory(command.trajectory)
-            drones = self._drones(command.drone)
-            if isinstance(command, Start) and any(drone not in self._uploaded for drone in drones):
+            drones = self._find_drones(command.drone)
+            if isinstance(command, Start) and any(drone not in self._uploaded_trajectories for drone in drones):
                 raise ConfigError("expected a trajectory to start, got none. Upload one first.")
             for drone in drones:
-                self._apply_to(command, drone)
+                self._apply_to_drone(command, drone)
 
-    def _apply_to(self, command: Command, drone: int) -> None:
+    def _apply_to_drone(self, command: Command, drone: int) -> None:
         """Carry out a command to one drone."""
         if isinstance(command, Upload):
             self._receive_trajectory(drone, command.trajectory)
@@ -172,7 +174,7 @@ class Fleet:
         elif isinstance(command, Land):
             self._assign_trajectory(drone, _vertical_trajectory(setpoint, 0.0))
 
-    def _drones(self, drone_id: int | None) -> list[int]:
+    def _find_drones(self, drone_id: int | None) -> list[int]:
         """Return the indices of the drones with an ID; a new ID is assigned to the next free drone."""
         if drone_id is None:
             return list(range(self.sim.n_drones))
@@ -198,7 +200,7 @@ class Fleet:
             )
 
     def _receive_trajectory(self, drone: int, trajectory: Trajectory) -> None:
-        self._uploaded[drone] = trajectory
+        self._uploaded_trajectories[drone] = trajectory
         if self.teleport and self._awaits_first_trajectory[drone]:
             start_point = HostTrajectory.from_trajectory(trajectory).setpoint(0.0)
             states = self.sim.data.states
@@ -209,7 +211,7 @@ class Fleet:
         self._awaits_first_trajectory[drone] = False
 
     def _start_trajectory(self, drone: int, relative: bool) -> None:
-        trajectory = self._uploaded[drone]
+        trajectory = self._uploaded_trajectories[drone]
         if relative:
             trajectory = trajectory.moved(
                 (self.setpoint(drone) - HostTrajectory.from_trajectory(trajectory).setpoint(0.0))[:3]
@@ -222,7 +224,8 @@ class Fleet:
         record, now = self.follow.read(data), self._current_time()
         start = record.start.at[0, drone, 0].set(jnp.asarray(now, record.start.dtype))
         self.sim.data = self.follow.write(data, record.replace(start=start))
-        self._active[drone], self._starts[drone], self._awaits_first_trajectory[drone] = trajectory, now, False
+        self._active_trajectories[drone], self._start_times[drone] = trajectory, now
+        self._awaits_first_trajectory[drone] = False
 
 
 def _hover_trajectory(point: NDArray) -> Trajectory:
@@ -232,7 +235,7 @@ def _hover_trajectory(point: NDArray) -> Trajectory:
 
 def _vertical_trajectory(point: NDArray, height: float) -> Trajectory:
     """Return the vertical move from a position, m, and yaw, rad, to a height, m, at rest at both ends."""
-    seconds = max(abs(height - float(point[2])) / VERTICAL_SPEED, MIN_TIME)
+    seconds = max(abs(height - float(point[2])) / VERTICAL_SPEED, MIN_VERTICAL_DURATION)
     return line(point[:3], [point[0], point[1], height], seconds, yaw=float(point[3]))
 
 

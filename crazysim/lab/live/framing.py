@@ -19,8 +19,8 @@ MAX_JSON = 4 * 2**20
 MAX_SHOW = 64 * 2**20
 """Largest show, bytes."""
 
-ZIP, ZIP_END = b"PK\x03\x04", b"PK\x05\x06"
-MESSAGE_STARTS = (b"CMDSTART_", b"REQ_", b"START", ZIP)
+ZIP_START, ZIP_END = b"PK\x03\x04", b"PK\x05\x06"
+MESSAGE_STARTS = (b"CMDSTART_", b"REQ_", b"START", ZIP_START)
 HEAD_PATTERN = re.compile(rb"(?:(\d{1,4})_)?CMDSTART_(?:(\d{1,4})_)?([a-z]{1,20})_")
 TOKEN_PATTERN = re.compile(rb'["\\{}]')
 SPACE_BYTES = b" \r\n\t\0"
@@ -102,7 +102,7 @@ class MessageBuffer:
         buffer = self._buffer
         if not buffer:
             return None
-        if buffer.startswith(ZIP):
+        if buffer.startswith(ZIP_START):
             return self._read_show()
         if buffer.startswith(b"START"):
             self._discard_bytes(5)
@@ -118,11 +118,11 @@ class MessageBuffer:
         head = HEAD_PATTERN.match(buffer)
         if head is not None:
             return self._read_message(head)
-        if not self._may_begin(bytes(buffer[: MAX_TEXT + 1])):
+        if not self._may_start_message(bytes(buffer[: MAX_TEXT + 1])):
             raise FramingError(f"expected a message such as 07_CMDSTART_land_EOF, got {_excerpt(buffer)}")
         return None
 
-    def _may_begin(self, front: bytes) -> bool:
+    def _may_start_message(self, front: bytes) -> bool:
         """Return True if these bytes may be the start of a message."""
         if any(start.startswith(front[: len(start)]) for start in MESSAGE_STARTS) and len(front) <= MAX_TEXT:
             command_text = front[len(b"CMDSTART_") :]
@@ -140,7 +140,7 @@ class MessageBuffer:
         brace = buffer.find(b"{", head.end() - 1, MAX_TEXT)
         end = buffer.find(b"_EOF", head.end() - 1, MAX_TEXT)
         if brace >= 0 and (end < 0 or brace < end):
-            return self._json_message(head, brace)
+            return self._read_json_message(head, brace)
         if end < 0:
             if len(buffer) >= MAX_TEXT:
                 raise FramingError(f"expected _EOF or JSON within {MAX_TEXT} bytes, got {_excerpt(buffer)}")
@@ -149,10 +149,10 @@ class MessageBuffer:
         self._discard_bytes(end + 4)
         return message
 
-    def _json_message(self, head: re.Match[bytes], brace: int) -> Message | None:
+    def _read_json_message(self, head: re.Match[bytes], brace: int) -> Message | None:
         """Return the message at the front of the buffer, whose JSON begins at ``brace``."""
         buffer = self._buffer
-        end = self._end_of_json(brace)
+        end = self._find_json_end(brace)
         if end is None:
             if len(buffer) > MAX_JSON:
                 raise FramingError(f"expected JSON of at most {MAX_JSON} bytes, got more")
@@ -166,7 +166,7 @@ class MessageBuffer:
         self._discard_bytes(buffer.index(b"_EOF", end) + 4)
         return message
 
-    def _end_of_json(self, brace: int) -> int | None:
+    def _find_json_end(self, brace: int) -> int | None:
         """Return the end of a JSON object; each byte is examined only once, however the bytes arrive."""
         self._scan_position = max(self._scan_position, brace)
         while (token := TOKEN_PATTERN.search(self._buffer, self._scan_position)) is not None:

@@ -36,7 +36,7 @@ class Gamepad:
         Raises:
             ConfigError: If no gamepad is connected.
         """
-        self._glfw = _glfw() if glfw is None else glfw
+        self._glfw = _import_glfw() if glfw is None else glfw
         numbers = range(N_JOYSTICKS) if number is None else [number]
         gamepads = [k for k in numbers if 0 <= k < N_JOYSTICKS and self._glfw.joystick_is_gamepad(k)]
         if not gamepads:
@@ -83,11 +83,11 @@ class Gamepad:
 
 def remove_deadband(sticks: NDArray) -> NDArray:
     """Return deflections without their dead band, stretched to -1 to 1 again; non-finite ones count as released."""
-    finite = np.where(np.isfinite(sticks), sticks, 0.0)
-    return np.sign(finite) * np.clip((np.abs(finite) - DEADBAND) / (1 - DEADBAND), 0.0, 1.0)
+    finite_sticks = np.where(np.isfinite(sticks), sticks, 0.0)
+    return np.sign(finite_sticks) * np.clip((np.abs(finite_sticks) - DEADBAND) / (1 - DEADBAND), 0.0, 1.0)
 
 
-def _glfw() -> Any:
+def _import_glfw() -> Any:
     import glfw  # comes with mujoco
 
     with warnings.catch_warnings(action="ignore"):

@@ -49,13 +49,13 @@ class HostTrajectory(NamedTuple):
         start = float(self.ends[k - 1]) if k else 0.0
         length = float(self.ends[k]) - start
         u, rate = ((t - start) / length, 1 / length) if length > 0 else (1.0, 0.0)
-        factors, exponents, orders = _powers(n, self.coefficients.shape[2])
+        factors, exponents, orders = _derivative_terms(n, self.coefficients.shape[2])
         scale = (rate if is_inside else 0.0) ** orders
         return (factors * u**exponents * scale[:, None]) @ self.coefficients[k].T
 
 
 @lru_cache
-def _powers(n: int, size: int) -> tuple[NDArray, NDArray, NDArray]:
+def _derivative_terms(n: int, size: int) -> tuple[NDArray, NDArray, NDArray]:
     """Return factors and exponents of the terms of a polynomial's derivatives, (n + 1, size) each, and their orders."""
     orders, powers = np.arange(n + 1), np.arange(size)
     factors = np.array([[math.perm(k, j) for k in range(size)] for j in range(n + 1)], float)

@@ -48,7 +48,7 @@ class Interaction:
         self.selected, self.on_click, self.goals = (0, 0), None, None
         self.lights = np.zeros((sim.n_worlds, sim.n_drones, 3))
         self._followed_body: tuple[int, str, int] | None = None
-        self._slider = 0
+        self._slider_index = 0
         self._posted_callbacks: deque[Callable[[Self], object]] = deque()
 
     def button(self, name: str, callback: Callable[[Self], object], key: str | None = None) -> None:
@@ -84,7 +84,7 @@ class Interaction:
     @property
     def widget_lines(self) -> tuple[str, ...]:
         """Buttons with their keys, and sliders with their values, for viewers without a panel."""
-        selected_name = self._sliders[self._slider].name if self._sliders else None
+        selected_name = self._sliders[self._slider_index].name if self._sliders else None
         return tuple(
             f"{w.name}: {self.slider_values[w.name]:.3g}" + ("  [ ]" if w.name == selected_name else "")
             if isinstance(w, Slider)
@@ -99,12 +99,12 @@ class Interaction:
     def move_slider(self, fraction: float) -> None:
         """Move the chosen slider by a fraction of its range, as the keys do."""
         if self._sliders:
-            slider = self._sliders[self._slider]
+            slider = self._sliders[self._slider_index]
             self.set_value(slider.name, self.slider_values[slider.name] + fraction * (slider.high - slider.low))
 
     def choose_next_slider(self) -> None:
         """Choose the next slider for ``move_slider``."""
-        self._slider = (self._slider + 1) % max(len(self._sliders), 1)
+        self._slider_index = (self._slider_index + 1) % max(len(self._sliders), 1)
 
     def select(self, world: int, drone: int) -> None:
         """Select a drone to follow, plot and pilot."""

@@ -74,7 +74,7 @@ def fly_policy(
 ) -> list[DroneState]:
     """Fly a policy over a link, and return the states that it acted on.
 
-    Any exception, Ctrl-C too, stops the motors; after the last command they keep running.
+    Any exception, including Ctrl-C, stops the motors. After the last command they keep running.
 
     Args:
         link: Link to a simulated or a real drone.
@@ -104,7 +104,7 @@ class TrainedPolicy:
     """A trained policy as a function of the state of a drone, for ``fly_policy``.
 
     ``crazysim.train.load_policy`` returns the policy and its ``meta``, whose actions name the level of its commands.
-    The memory of a policy that has one is kept between calls; ``reset`` begins a new flight.
+    The memory of a recurrent policy is kept between calls; call ``reset`` before a new flight.
     """
 
     def __init__(
@@ -121,20 +121,20 @@ class TrainedPolicy:
         self.reset()
         self._names = list(meta["observations"])
         self._centre, self._scale = (np.asarray(meta["actions"][key], float) for key in ("centre", "scale"))
-        unknown_names = sorted(set(self._names) - set(self._observations(_rest_state())))
+        unknown_names = sorted(set(self._names) - set(self._compute_observations(_rest_state())))
         if unknown_names:
             raise ConfigError(
                 f"expected observations of a drone's state, got {', '.join(unknown_names)}. Use a policy without them."
             )
 
     def reset(self) -> None:
-        """Begin a new flight, with the initial memory of a policy that has one."""
+        """Restore the initial memory of a recurrent policy, before a new flight."""
         has_memory = getattr(self.policy, "has_memory", False)
         self._memory: Any = self.policy.initial_memory() if has_memory else None  # type: ignore[attr-defined]
 
     def __call__(self, state: DroneState) -> NDArray:
         """Return the command for a state. (k,)"""
-        observations = self._observations(state)
+        observations = self._compute_observations(state)
         obs = {name: observations[name].astype(np.float32) for name in self._names}
         if self._memory is None:
             action = self.policy(obs)
@@ -142,7 +142,7 @@ class TrainedPolicy:
             action, self._memory = self.policy.act(obs, self._memory)  # type: ignore[attr-defined]
         return self._centre + self._scale * np.clip(np.asarray(action, float), -1.0, 1.0)
 
-    def _observations(self, state: DroneState) -> dict[str, NDArray]:
+    def _compute_observations(self, state: DroneState) -> dict[str, NDArray]:
         rows = rotate(np.tile(state.quat, (3, 1)), np.eye(3)).T  # columns are the body's axes
         return {
             "pos": state.pos,

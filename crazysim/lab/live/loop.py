@@ -97,9 +97,9 @@ class Live(Interaction, Closeable):
         self._recordings = Recordings(sim, control_freq)
         self._paused = self._is_stopped = self._in_step = False
         self._n_refused = 0
-        self._factor = (perf_counter(), 0, 0.0)
+        self._factor_sample = (perf_counter(), 0, 0.0)
         self._may_warn = RateLimit(WARNING_PERIOD)
-        for key, callback in KEYS.items():
+        for key, callback in KEY_CALLBACKS.items():
             self.keyboard.bind(key, callback)
 
     # Time -----------------------------------------------------------------------------------------------------------
@@ -160,7 +160,10 @@ class Live(Interaction, Closeable):
 
     @property
     def command(self) -> NDArray:
-        """Command of every drone, staged at every control step once it has been read. (n_worlds, n_drones, k)"""
+        """Command of every drone, which processes write; every control step stages it after the first access.
+
+        (n_worlds, n_drones, k)
+        """
         return self._commands.array
 
     def add(
@@ -253,7 +256,8 @@ class Live(Interaction, Closeable):
         self._is_stopped = False
         self._warm_up()
         self._pace = Pace(self._dt, self._pace.speed)
-        first_step, pictures, paused_s, start_time = self.n_steps_run, self._viewers.n_pictures, 0.0, perf_counter()
+        first_step, first_picture = self.n_steps_run, self._viewers.n_pictures
+        paused_s, start_time = 0.0, perf_counter()
         with protect_loop(), contextlib.suppress(KeyboardInterrupt):
             while not self._is_stopped and (end is None or self.n_steps_run < end):
                 paused_s += self._run_once()
@@ -261,7 +265,7 @@ class Live(Interaction, Closeable):
         wall_s = perf_counter() - start_time - paused_s
         simulated_s = (self.n_steps_run - first_step) * self._dt
         failures = self._n_refused + self._viewers.failures + self._recordings.failures
-        n_pictures = self._viewers.n_pictures - pictures
+        n_pictures = self._viewers.n_pictures - first_picture
         return self._pace.report(self._processes, simulated_s, wall_s, n_pictures, failures)
 
     def close(self) -> None:
@@ -271,13 +275,13 @@ class Live(Interaction, Closeable):
     @property
     def status(self) -> str:
         """State of the loop for viewers: time, speed, pause, recording."""
-        now, (last_time, n_steps_run, factor) = perf_counter(), self._factor
+        now, (last_time, n_steps_run, factor) = perf_counter(), self._factor_sample
         if now - last_time > 0.5:
             factor = (self.n_steps_run - n_steps_run) * self._dt / (now - last_time)
-            self._factor = (now, self.n_steps_run, factor)
-        marks = [f"{self.time:.2f} s", f"{factor:.2f} x real time"]
-        marks += ["paused"] * self._paused + ["recording"] * self.is_recording
-        return ", ".join(marks)
+            self._factor_sample = (now, self.n_steps_run, factor)
+        parts = [f"{self.time:.2f} s", f"{factor:.2f} x real time"]
+        parts += ["paused"] * self._paused + ["recording"] * self.is_recording
+        return ", ".join(parts)
 
     def _run_once(self) -> float:
         """Run the tasks that are due, or sleep; return the time spent in a pause, s."""
@@ -388,7 +392,7 @@ def _scale_speed(factor: float) -> Callable[[Live], None]:
     return scale
 
 
-KEYS: dict[str, Callable[[Live], object]] = {
+KEY_CALLBACKS: dict[str, Callable[[Live], object]] = {
     "space": Live.toggle_pause,
     ".": Live.advance,
     "backspace": Live.reset,

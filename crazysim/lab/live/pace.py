@@ -18,16 +18,16 @@ from crazysim.lab.live.process import Process
 Speed = float | Literal["max"]
 """Simulated seconds per second, or ``"max"`` for as fast as possible."""
 LATE_TOLERANCE = 2e-3
-"""Delay above which a control step counts as late, s."""
+"""Lateness above which a control step counts as late, s."""
 MAX_LAG = 0.25
-"""Lag above which the loop drops the lost time instead of catching up, s."""
+"""Lateness above which the loop gives up the lost time instead of catching up, s."""
 BIN_WIDTH = 1e-4
 """Width of the bins of the statistics of lateness, s."""
 SWITCH_INTERVAL = 5e-4
 """Time after which another Python thread yields to the loop, s."""
 N_BINS = 5000
 """Number of bins of the statistics of lateness; the last one also holds everything above."""
-N_LISTED = 3
+MAX_LISTED_PROCESSES = 3
 """Largest number of processes that a report lists."""
 
 
@@ -108,7 +108,7 @@ class Pace:
     max_lateness_time: float
     """Simulated time at which it occurred, s."""
     lost_s: float
-    """Time given up, s."""
+    """Time that was given up because the simulation could not catch up, s."""
 
     def __init__(self, dt: float, speed: Speed, clock: Callable[[], float] = perf_counter):
         """Create a pace whose first control step is due now.
@@ -123,7 +123,7 @@ class Pace:
         self._counts = np.zeros(N_BINS, np.int64)
         self.n_steps = self.n_late_steps = 0
         self.max_lateness = self.max_lateness_time = self.lost_s = 0.0
-        self._due = clock()
+        self._due_time = clock()
 
     @property
     def speed(self) -> Speed:
@@ -137,11 +137,11 @@ class Pace:
 
     def restart(self) -> None:
         """Make the next control step due now, after a pause or a jump in time."""
-        self._due = self._clock()
+        self._due_time = self._clock()
 
     def time_until_due(self) -> float:
         """Return the time until the next control step is due, s; zero or negative if it is due already."""
-        return 0.0 if self._speed == "max" else self._due - self._clock()
+        return 0.0 if self._speed == "max" else self._due_time - self._clock()
 
     def record_step(self, time: float) -> float:
         """Record the start of a control step, and return its lateness, s.
@@ -152,7 +152,7 @@ class Pace:
         self.n_steps += 1
         if self._speed == "max":
             return 0.0
-        lateness = max(self._clock() - self._due, 0.0)
+        lateness = max(self._clock() - self._due_time, 0.0)
         self._counts[min(int(lateness / BIN_WIDTH), N_BINS - 1)] += 1
         self.n_late_steps += lateness > LATE_TOLERANCE
         if lateness > self.max_lateness:
@@ -160,7 +160,7 @@ class Pace:
         if lateness > MAX_LAG:
             self.lost_s += lateness
             self.restart()
-        self._due += self._dt / float(self._speed)
+        self._due_time += self._dt / float(self._speed)
         return lateness
 
     def quantile(self, fraction: float) -> float:
@@ -183,7 +183,7 @@ class Pace:
             n_pictures: Number of pictures.
             failures: Number of logged errors of requests, viewers and recordings; errors of the processes are added.
         """
-        slowest = sorted(processes, key=lambda process: -process.longest_call)[:N_LISTED]
+        slowest = sorted(processes, key=lambda process: -process.longest_call)[:MAX_LISTED_PROCESSES]
         slowest_processes = ", ".join(
             f"{p.name} {1e3 * p.longest_call:.1f} ms at {p.longest_call_time:.2f} s" for p in slowest
         )

@@ -86,7 +86,7 @@ class PictureSource:
 
         Args:
             live: Loop of the simulation.
-            plot: Quantity to plot, one of ``live.quantities`` or of the paths of ``quantities``; empty for none.
+            plot: Quantity to plot, one of ``live.quantities`` or of the paths of ``list_quantities``; empty for none.
         """
         sim, worlds = self._sim, self._worlds
         data = sim.data
@@ -107,7 +107,7 @@ class PictureSource:
         if plot and live.selected is not None:
             quantity_fn = live.quantities.get(plot)
             plotted = (
-                quantity(data, plot, *live.selected)
+                read_quantity(data, plot, *live.selected)
                 if quantity_fn is None
                 else np.ravel(np.asarray(quantity_fn(live), float))
             )
@@ -142,14 +142,14 @@ def _air_velocity(data: SimData) -> jax.Array:
     return sum((record.velocity_at(data.states.pos) for record in _find_winds(data)), jnp.zeros_like(data.states.pos))
 
 
-def quantities(sim: Sim) -> list[str]:
+def list_quantities(sim: Sim) -> list[str]:
     """Return the paths of all quantities that can be plotted.
 
     These are leaves of drones and worlds, such as ``states.vel``, and leaves of each member of another population, such
     as ``plugins.cars.pos[1]``.
     """
     names = []
-    for path, scope, x in _leaves(sim.data):
+    for path, scope, x in _numeric_leaves(sim.data):
         if scope in ("drone", "world"):
             names.append(path)
         elif has_members(scope) and scope not in ("shared", "opaque", "batched"):
@@ -157,29 +157,31 @@ def quantities(sim: Sim) -> list[str]:
     return names
 
 
-def quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
+def read_quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
     """Return the current values of a quantity in one world. (k,)
 
     Args:
         data: Data of a simulation.
-        path: One of ``quantities``.
+        path: One of ``list_quantities``.
         world: Index of the world.
         drone: Index of the drone; used only for quantities of drones.
     """
     wanted_path, _, member = path.rstrip("]").partition("[")
-    for leaf_path, scope, x in _leaves(data):
+    for leaf_path, scope, x in _numeric_leaves(data):
         if leaf_path == wanted_path:
             index = (world,) if scope == "world" else (world, int(member) if member else drone)
             return np.asarray(x)[index].ravel().astype(float)
     raise KeyError(path)
 
 
-def _leaves(data: SimData) -> list[tuple[str, str, jax.Array]]:
+def _numeric_leaves(data: SimData) -> list[tuple[str, str, jax.Array]]:
     """Return the path, scope and value of every numeric leaf."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(data)
     leaf_scopes = zip(leaves, jax.tree.leaves(scopes(data)), strict=True)
-    return [(_path(path), scope, x) for (path, x), scope in leaf_scopes if getattr(x.dtype, "kind", "O") in "fiub"]
+    return [
+        (_format_path(path), scope, x) for (path, x), scope in leaf_scopes if getattr(x.dtype, "kind", "O") in "fiub"
+    ]
 
 
-def _path(path: jax.tree_util.KeyPath) -> str:
+def _format_path(path: jax.tree_util.KeyPath) -> str:
     return ".".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)

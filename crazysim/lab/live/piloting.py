@@ -15,7 +15,7 @@ from crazysim.lab.live.loop import Live
 Sticks = Callable[[Live], NDArray]
 """Function of the loop that returns forward, left, up and turn left, each from -1 to 1. (4,)"""
 
-KEYS = (("up", "down"), ("left", "right"), ("w", "s"), ("a", "d"))
+STICK_KEYS = (("up", "down"), ("left", "right"), ("w", "s"), ("a", "d"))
 """Pairs of keys: forward and back, left and right, up and down, turn left and turn right."""
 MAX_LEAD = 0.7
 """Longest time by which the setpoint leads the drone at full speed, s. The limit keeps the setpoint close when a stick
@@ -24,7 +24,7 @@ is released or the drone is held back."""
 
 def keyboard_sticks(live: Live) -> NDArray:
     """Return the deflections of the sticks that the arrow keys and W, S, A, D represent. (4,)"""
-    return np.array([live.keyboard.axis(*keys) for keys in KEYS])
+    return np.array([live.keyboard.axis(*keys) for keys in STICK_KEYS])
 
 
 def move_setpoint(setpoint: ArrayLike, sticks: ArrayLike, dt: float, speed: float, yaw_rate: float) -> NDArray:

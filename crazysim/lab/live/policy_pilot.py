@@ -41,7 +41,7 @@ class PolicyPilot:
         pilot.add_to(live)
 
     The loop starts with the first episode of the environment. The episode does not end: a drone that crashes stays
-    down until the loop is reset. Policies of tasks without goals fly as well, but refuse goals.
+    down until the loop is reset. A policy of a task without goals flies too, but its pilot refuses goals.
     """
 
     def __init__(self, env: Env, policy: Callable[[Obs], Array], points: ArrayLike | None = None, seed: int = 0):
@@ -65,22 +65,22 @@ class PolicyPilot:
         self._command = jax.jit(partial(_compute_command, env, policy))
         self._memory = self._initial_memory = initial_memory(policy, env)
         self._target = jax.jit(vectorize_over_worlds(env.task.target, env.task.batched))
-        self._start = jax.jit(env.reset)(jax.random.key(seed)).data
-        shape = self._start.states.pos.shape
+        self._start_data = jax.jit(env.reset)(jax.random.key(seed)).data
+        shape = self._start_data.states.pos.shape
         self.goals = np.full(shape, np.nan)
         """Goals of the drones, world frame, m; NaN if the task has none. (n_worlds, n_drones, 3)"""
         self.n_passed = np.zeros(shape[:2], int)
         """Number of listed points that each drone has passed. (n_worlds, n_drones)"""
         self._follows_points = np.full(shape[:2], self._points is not None)
         if type(env.task).set_goal is not Task.set_goal:
-            self.goals[:] = self._target(self._start)
+            self.goals[:] = self._target(self._start_data)
         if self._points is not None:
             for i, point in enumerate(self._points):
                 self._check_goal(point, f"point {i + 1}: ")
             self.goals[:] = self._points[0]
-            self._start = self._set_goal(self._start, self.goals)
-        env.sim.data = self._start
-        self._command(self._start, self._memory)  # compiles it before the clock starts
+            self._start_data = self._set_goal(self._start_data, self.goals)
+        env.sim.data = self._start_data
+        self._command(self._start_data, self._memory)  # compiles it before the clock starts
 
     def add_to(self, live: Live) -> None:
         """Fly in a loop from now on; clicks set goals, and viewers mark them."""
@@ -100,7 +100,7 @@ class PolicyPilot:
         """
         self._memory = self._initial_memory
         if live.step == 0:
-            live.sim.data = self._start
+            live.sim.data = self._start_data
         if np.isfinite(self.goals).all():
             self.goals[:] = self._target(live.sim.data)
         if self._points is not None:  # the goals of that time show how many points had been passed

@@ -28,14 +28,14 @@ class RateLimit:
         Args:
             period: Time from one message to the next, s.
         """
-        self._period, self._last = period, -math.inf
+        self._period, self._last_time = period, -math.inf
 
     def __call__(self) -> bool:
         """Return True if a message may be logged now."""
         now = time.monotonic()
-        if now - self._last < self._period:
+        if now - self._last_time < self._period:
             return False
-        self._last = now
+        self._last_time = now
         return True
 
 

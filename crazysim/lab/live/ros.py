@@ -32,7 +32,7 @@ from crazysim.lab.live.attitude import rotate, to_rpy
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.swarm import DroneState, Swarm
 
-MESSAGES = {
+MESSAGE_MODULES = {
     "Clock": "rosgraph_msgs.msg",
     "Time": "builtin_interfaces.msg",
     "PoseStamped": "geometry_msgs.msg",
@@ -47,10 +47,10 @@ QUEUE_LENGTH = 10
 """Length of the queues of publishers and subscriptions."""
 
 
-def ros_messages() -> Any:
+def import_message_classes() -> Any:
     """Return the message classes of the ROS installation."""
     try:
-        messages = {name: getattr(importlib.import_module(package), name) for name, package in MESSAGES.items()}
+        messages = {name: getattr(importlib.import_module(package), name) for name, package in MESSAGE_MODULES.items()}
     except ImportError as error:
         raise ConfigError(
             f"messages need ROS 2, which is not installed ({error}). Source its setup file, or pass messages=."
@@ -59,7 +59,7 @@ def ros_messages() -> Any:
 
 
 class RosBridge:
-    """Topics of the drones of a swarm, and of objects of the scene.
+    """Bridge between ROS topics and the drones of a swarm; it also publishes poses of objects.
 
         rclpy.init()
         bridge = RosBridge(swarm, rclpy.create_node("crazysim"))
@@ -85,7 +85,7 @@ class RosBridge:
         Args:
             swarm: Swarm.
             node: Node, ``rclpy.node.Node`` or an object with its ``create_publisher`` and ``create_subscription``.
-            messages: Object with the classes of ``MESSAGES`` as attributes; None to import them from ROS.
+            messages: Object with the classes of ``MESSAGE_MODULES`` as attributes; None to import them from ROS.
             objects: Names of movable objects of the scene, such as ``"cf1:0"``, whose poses are published too.
             freq: Messages per second of simulated time, Hz.
             frame: Name of the world frame.
@@ -96,7 +96,7 @@ class RosBridge:
         if not 0 < freq < math.inf:
             raise ConfigError(f"expected a positive rate of messages, got {freq} Hz")
         self.swarm, self.node, self.frame = swarm, node, frame
-        self.messages = m = ros_messages() if messages is None else messages
+        self.messages = m = import_message_classes() if messages is None else messages
         names = swarm.sim.data.objects.names if swarm.sim.data.objects is not None else ()
         for name in objects:
             if name not in names:
@@ -104,9 +104,12 @@ class RosBridge:
         self._object_rows = {name: names.index(name) for name in objects}
         self._period, self._next_time = 1 / freq, 0.0
         self._clock = node.create_publisher(m.Clock, "/clock", QUEUE_LENGTH)
-        kinds = {"pose": m.PoseStamped, "odom": m.Odometry, "imu": m.Imu}
+        message_types = {"pose": m.PoseStamped, "odom": m.Odometry, "imu": m.Imu}
         self._publishers = [
-            {topic: node.create_publisher(kind, f"/{name}/{topic}", QUEUE_LENGTH) for topic, kind in kinds.items()}
+            {
+                topic: node.create_publisher(message_type, f"/{name}/{topic}", QUEUE_LENGTH)
+                for topic, message_type in message_types.items()
+            }
             for name in swarm.names
         ]
         self._object_publishers = {
@@ -115,13 +118,15 @@ class RosBridge:
         }
         self._thrust = np.zeros(len(swarm.names))
         for k, name in enumerate(swarm.names):
-            for topic, kind, callback in (
+            for topic, message_type, callback in (
                 ("cmd_vel", m.Twist, self._command_velocity),
                 ("cmd_pose", m.PoseStamped, self._command_pose),
                 ("cmd_thrust", m.Float64, self._set_thrust),
                 ("cmd_attitude", m.QuaternionStamped, self._command_attitude),
             ):
-                node.create_subscription(kind, f"/{name}/{topic}", self._guard_callback(k, callback), QUEUE_LENGTH)
+                node.create_subscription(
+                    message_type, f"/{name}/{topic}", self._guard_callback(k, callback), QUEUE_LENGTH
+                )
 
     def __call__(self, live: Live) -> None:
         """Publish messages that are due; for a bridge that is added to a live loop as a process."""
@@ -141,8 +146,8 @@ class RosBridge:
         for k, publishers in enumerate(self._publishers):
             state = self.swarm.state(k)
             publishers["pose"].publish(self._pose_message(stamp, state.pos, state.quat))
-            publishers["odom"].publish(self._odometry(stamp, state, self.swarm.names[k]))
-            publishers["imu"].publish(self._imu(stamp, state, self.swarm.names[k]))
+            publishers["odom"].publish(self._odometry_message(stamp, state, self.swarm.names[k]))
+            publishers["imu"].publish(self._imu_message(stamp, state, self.swarm.names[k]))
         if self._object_rows:
             objects = self.swarm.sim.data.objects
             pos, quat = (np.asarray(x[0, 0], float) for x in (objects.pos, objects.quat))
@@ -164,7 +169,7 @@ class RosBridge:
         _write_fields(message.pose.orientation, quat)
         return message
 
-    def _odometry(self, stamp: Any, state: DroneState, name: str) -> Any:
+    def _odometry_message(self, stamp: Any, state: DroneState, name: str) -> Any:
         message = self.messages.Odometry()
         message.header.stamp, message.header.frame_id, message.child_frame_id = stamp, self.frame, name
         _write_fields(message.pose.pose.position, state.pos)
@@ -173,7 +178,7 @@ class RosBridge:
         _write_fields(message.twist.twist.angular, state.ang_vel)
         return message
 
-    def _imu(self, stamp: Any, state: DroneState, name: str) -> Any:
+    def _imu_message(self, stamp: Any, state: DroneState, name: str) -> Any:
         message = self.messages.Imu()
         message.header.stamp, message.header.frame_id = stamp, name
         _write_fields(message.orientation, state.quat)

@@ -59,7 +59,7 @@ class SceneBodies:
         parts = {part: base for plugin in sim.plugins.values() for part, base in _find_parts(plugin.moved_kinds or ())}
         counts = Counter(kind for kind, _ in names)
         members = {plugin.name: sim.plugins.members_of(plugin) for plugin in sim.plugins.values()}
-        items = [SceneBody(DRONE, k, name, mocap) for k, (name, mocap) in enumerate(_drones(sim))]
+        items = [SceneBody(DRONE, k, name, mocap) for k, (name, mocap) in enumerate(_list_drones(sim))]
         mocap_ids = {body.mocap for body in items}
         for mocap, (kind, k) in enumerate(names):
             if mocap not in mocap_ids and kind not in parts:
@@ -108,12 +108,13 @@ class SceneBodies:
         return match
 
 
-def _drones(sim: Sim) -> list[tuple[str, int]]:
+def _list_drones(sim: Sim) -> list[tuple[str, int]]:
+    """Return name and mocap id of every drone."""
     return list(zip(sim.drone_names, np.asarray(sim.data.core.drone_mocap_ids).tolist(), strict=True))
 
 
 def _mocap_names(sim: Sim) -> list[tuple[str, int]]:
-    """Return kind and number of every mocap body, by mocap id; bodies of MJCF without a number have the number 0."""
+    """Return kind and number of every mocap body, by mocap id; a body of MJCF whose name has no number gets 0."""
     model = sim.mj_model
     names: list[tuple[str, int]] = [("", 0)] * model.nmocap
     for body in np.flatnonzero(model.body_mocapid >= 0):
@@ -124,7 +125,7 @@ def _mocap_names(sim: Sim) -> list[tuple[str, int]]:
 
 
 def _find_parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
-    """Return pairs of kinds of a plugin, a part and the body that it belongs to, as ``cars_wheel`` and ``cars``."""
+    """Return the kinds of a plugin that are parts, each with the kind of its body: ``cars_wheel`` with ``cars``."""
     parts = []
     for kind in kinds:
         bases = [base for base in kinds if kind.startswith(f"{base}_")]

@@ -25,7 +25,7 @@ MAX_QUEUE = 10_000
 """Largest number of commands that wait for the simulation."""
 MAX_PEERS = 64
 """Largest number of simultaneous connections to a port."""
-TIMEOUT = 10.0
+MESSAGE_TIMEOUT = 10.0
 """Time in which a message that has begun must be complete, s."""
 POLL_INTERVAL = 0.2
 """Interval at which a thread that waits for bytes checks if it must stop, s."""
@@ -76,7 +76,7 @@ class CommandServer(CommandQueue):
         host: str = "127.0.0.1",
         drone_port: int = DRONE_PORT,
         stream_port: int = STREAM_PORT,
-        timeout: float = TIMEOUT,
+        timeout: float = MESSAGE_TIMEOUT,
     ):
         """Listen.
 
@@ -127,16 +127,16 @@ class CommandServer(CommandQueue):
     def _serve_drone(self, peer: socket.socket, name: str) -> None:
         drone = None
         try:
-            for frame in _read_messages(peer, self._stop_event, self.timeout):
+            for message in _read_messages(peer, self._stop_event, self.timeout):
                 if drone is None:
-                    if not isinstance(frame, Request) or not self._claim_drone(frame.drone):
-                        log.warning("%s refused: drone %s is not free", name, getattr(frame, "drone", None))
+                    if not isinstance(message, Request) or not self._claim_drone(message.drone):
+                        log.warning("%s refused: drone %s is not free", name, getattr(message, "drone", None))
                         peer.sendall(b"ACK_00")
                         return
-                    drone = frame.drone
+                    drone = message.drone
                     peer.sendall(f"ACK_{drone:02d}".encode())
-                elif isinstance(frame, Message):
-                    self._answer(peer, name, frame, drone)
+                elif isinstance(message, Message):
+                    self._answer_message(peer, name, message, drone)
                 else:
                     raise FramingError("expected commands after the request, got another request or a show")
         finally:
@@ -151,17 +151,17 @@ class CommandServer(CommandQueue):
             return True
 
     def _serve_stream(self, peer: socket.socket, name: str) -> None:
-        for frame in _read_messages(peer, self._stop_event, self.timeout):
-            if isinstance(frame, Request):
+        for message in _read_messages(peer, self._stop_event, self.timeout):
+            if isinstance(message, Request):
                 raise FramingError("expected messages with the ID of a drone, got a request")
-            self._answer(peer, name, frame, None)
+            self._answer_message(peer, name, message, None)
 
-    def _answer(self, peer: socket.socket, name: str, frame: Message | ShowFile, drone: int | None) -> None:
+    def _answer_message(self, peer: socket.socket, name: str, message: Message | ShowFile, drone: int | None) -> None:
         """Queue the command of a message and answer it."""
         try:
-            if drone is not None and isinstance(frame, Message) and frame.drone not in (None, drone):
-                raise ConfigError(f"expected commands to drone {drone}, got one to drone {frame.drone}")
-            self._enqueue(parse_command(frame, drone))
+            if drone is not None and isinstance(message, Message) and message.drone not in (None, drone):
+                raise ConfigError(f"expected commands to drone {drone}, got one to drone {message.drone}")
+            self._enqueue(parse_command(message, drone))
         except ConfigError as error:
             log.warning("%s: command refused: %s", name, error)
             peer.sendall(b"ERR")
@@ -177,7 +177,7 @@ class StreamListener(CommandQueue):
     False; the fleet keeps flying.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = STREAM_PORT, timeout: float = TIMEOUT):
+    def __init__(self, host: str = "127.0.0.1", port: int = STREAM_PORT, timeout: float = MESSAGE_TIMEOUT):
         """Connect.
 
         Args:
@@ -207,11 +207,11 @@ class StreamListener(CommandQueue):
 
     def _listen(self, name: str) -> None:
         with _log_errors(name), contextlib.closing(self._peer):
-            for frame in _read_messages(self._peer, self._stop_event, self._timeout):
-                if isinstance(frame, Request):
+            for message in _read_messages(self._peer, self._stop_event, self._timeout):
+                if isinstance(message, Request):
                     raise FramingError("expected commands, got a request")
                 try:
-                    self._enqueue(parse_command(frame))
+                    self._enqueue(parse_command(message))
                     self._peer.sendall(b"ACK")
                 except ConfigError as error:
                     log.warning("%s: command refused: %s", name, error)

@@ -10,12 +10,12 @@ from crazysim.control import Control
 from crazysim.core.functional import staged_leaves
 from crazysim.sim.sim import Sim
 
-DEFAULT_COMMAND = np.eye(16)[12]
+DEFAULT_STATE_COMMAND = np.eye(16)[12]
 """State command of a drone that has not received one: level at the origin. (16,)"""
 
 
 class StagedCommands:
-    """The command of every drone, at the simulation's command level; staged once ``array`` has been read."""
+    """The command of every drone, at the simulation's command level; nothing is staged before ``array`` is accessed."""
 
     def __init__(self, sim: Sim):
         """Start from the commands of the simulation; a drone without a state command hovers at its position."""
@@ -42,7 +42,7 @@ class StagedCommands:
         return None if self._array is None else self._array.copy()
 
     def restore(self, array: NDArray | None) -> None:
-        """Return to commands that ``copy`` returned, or to those staged in the data if None."""
+        """Restore commands that ``copy`` returned; None restores the commands that are staged in the data."""
         self._staged_copy = None
         if array is not None:
             self.array[:] = array
@@ -63,6 +63,6 @@ def _initial_commands(sim: Sim) -> NDArray:
     """Return the staged commands; drones without a state command hover at their positions."""
     command = np.array(staged_leaves(sim.data)[0], float)
     if sim.control == Control.state:
-        unset = (command == DEFAULT_COMMAND).all(-1)
-        command[unset, :3] = np.asarray(sim.data.states.pos, float)[unset]
+        is_unset = (command == DEFAULT_STATE_COMMAND).all(-1)
+        command[is_unset, :3] = np.asarray(sim.data.states.pos, float)[is_unset]
     return command

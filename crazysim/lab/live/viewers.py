@@ -53,15 +53,15 @@ class Viewers(Generic[L]):
         viewer.open(live)
         self._open.append(viewer)
 
-    def draw(self, live: L, due: float) -> bool:
+    def draw(self, live: L, due_time: float) -> bool:
         """Send a picture to every viewer if one is due; return True if so.
 
         Args:
             live: Loop.
-            due: Earliest time at which to send a picture, s, by ``time.perf_counter``.
+            due_time: Earliest time at which to send a picture, s, by ``time.perf_counter``.
         """
         now = time.perf_counter()
-        if not self._open or now < due:
+        if not self._open or now < due_time:
             return False
         self.next_picture_time = max(self.next_picture_time + self.period, now - self.period)
         self.update(live)

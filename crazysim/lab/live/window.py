@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 import crazysim
 from crazysim.errors import ConfigError, RenderError
 from crazysim.lab.live.loop import Live
-from crazysim.lab.live.picture import Picture, PictureSource, quantities
+from crazysim.lab.live.picture import Picture, PictureSource, list_quantities
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
 from crazysim.media.worlds import world_indices
@@ -92,7 +92,7 @@ class Window(Viewer[Live]):
         sim = live.sim
         worlds = world_indices(sim, self.worlds).tolist()
         camera_id(sim.mj_model, self.camera)
-        if self.plot and self.plot not in (names := [*live.quantities, *quantities(sim)]):
+        if self.plot and self.plot not in (names := [*live.quantities, *list_quantities(sim)]):
             raise ConfigError(f"expected a quantity to plot, one of {', '.join(names)}, got {self.plot!r}")
         sim.scene.compile_if_edited()
         sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
@@ -104,13 +104,13 @@ class Window(Viewer[Live]):
             env=os.environ | {"PYTHONPATH": path},
         )  # fmt: skip
         settings = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        _send(process, {"model": model_bytes(sim.mj_model), "bodies": bodies, "settings": settings})
-        ready = threading.Event()
-        threading.Thread(target=self._listen, args=(live, process, ready), daemon=True).start()
-        if not ready.wait(OPEN_TIMEOUT) or not self.is_open:
+        _send_message(process, {"model": serialize_model(sim.mj_model), "bodies": bodies, "settings": settings})
+        ready_event = threading.Event()
+        threading.Thread(target=self._read_actions, args=(live, process, ready_event), daemon=True).start()
+        if not ready_event.wait(OPEN_TIMEOUT) or not self.is_open:
             self.close()
             raise RenderError("expected a screen that can open a window, got none. Use Browser() without one.")
-        threading.Thread(target=self._write, args=(process,), daemon=True).start()
+        threading.Thread(target=self._send_pictures, args=(process,), daemon=True).start()
 
     def update(self, live: Live) -> None:
         picture = self._source.take_picture(live, self.plot)
@@ -132,7 +132,7 @@ class Window(Viewer[Live]):
             process.kill()
             process.wait()
 
-    def _write(self, process: subprocess.Popen[bytes]) -> None:
+    def _send_pictures(self, process: subprocess.Popen[bytes]) -> None:
         """Write the latest picture to the process whenever it has read the previous one."""
         while True:
             with self._picture_changed:
@@ -141,16 +141,16 @@ class Window(Viewer[Live]):
             if self._process is not process or picture is None:
                 return
             try:
-                _send(process, picture)
+                _send_message(process, picture)
             except (OSError, ValueError):
                 return  # the window was closed
 
-    def _listen(self, live: Live, process: subprocess.Popen[bytes], ready: threading.Event) -> None:
+    def _read_actions(self, live: Live, process: subprocess.Popen[bytes], ready_event: threading.Event) -> None:
         """Pass the actions of the user in the window to the loop."""
         for line in process.stdout:
             kind, *values = json.loads(line)
             if kind == "ready":
-                ready.set()
+                ready_event.set()
             elif kind == "press":
                 live.keyboard.press(*values)
             elif kind == "release":
@@ -162,17 +162,17 @@ class Window(Viewer[Live]):
         process.stdout.close()
         process.wait()
         live.keyboard.release_all()
-        ready.set()
+        ready_event.set()
 
 
-def model_bytes(model: mujoco.MjModel) -> bytes:
+def serialize_model(model: mujoco.MjModel) -> bytes:
     """Return a compiled model as the content of an ``.mjb`` file."""
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
 
 
-def _send(process: subprocess.Popen[bytes], message: object) -> None:
+def _send_message(process: subprocess.Popen[bytes], message: object) -> None:
     content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
     process.stdin.write(LENGTH_PREFIX.pack(len(content)) + content)
     process.stdin.flush()

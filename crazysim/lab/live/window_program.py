@@ -105,9 +105,9 @@ class Program:
         self._trail = Trail(settings["trail"]) if settings["trail"] > 0 else None
         self._overlays = Overlays(limit=100_000)
         self._camera = mujoco.MjvCamera()
-        number = camera_id(model, settings["camera"])
-        if number >= 0:
-            self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, number
+        fixed_camera_id = camera_id(model, settings["camera"])
+        if fixed_camera_id >= 0:
+            self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, fixed_camera_id
         else:
             mujoco.mjv_defaultFreeCamera(model, self._camera)
             for key, value in (settings["cam_config"] or {}).items():
@@ -165,13 +165,15 @@ class Program:
             overlays.points(picture.setpoint[k], colors, SETPOINT_RADIUS)
         if picture.has_contact[k].any():
             overlays.points(drones[picture.has_contact[k]], CONTACT_COLOR, MARK_RADIUS)
-        for pos, air in zip(drones, picture.wind[k], strict=False):
-            if air.any():
-                overlays.capsule(pos, pos + WIND_SCALE * air, 0.006, WIND_COLOR, cylinder=True)
+        for pos, wind in zip(drones, picture.wind[k], strict=False):
+            if wind.any():
+                overlays.capsule(pos, pos + WIND_SCALE * wind, 0.006, WIND_COLOR, cylinder=True)
         self._leds.set_colors(picture.lights[k])
-        lit = picture.lights[k].any(-1)
-        if lit.any():
-            overlays.points(drones[lit], np.insert(picture.lights[k, lit], 3, 0.6, axis=1), LIGHT_RADIUS, emission=1.0)
+        is_lit = picture.lights[k].any(-1)
+        if is_lit.any():
+            overlays.points(
+                drones[is_lit], np.insert(picture.lights[k, is_lit], 3, 0.6, axis=1), LIGHT_RADIUS, emission=1.0
+            )
         if picture.followed is not None and picture.followed[0] == picture.worlds[k]:
             followed_pos, radius = picture.pos[k, picture.followed[1]], self._bodies.radius(picture.followed[1])
             overlays.points(followed_pos[None], FOLLOWED_COLOR, radius)

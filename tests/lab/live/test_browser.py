@@ -16,7 +16,7 @@ from crazysim import SlungLoad, Wind
 from crazysim.errors import ConfigError, RenderError
 from crazysim.lab.live import Browser, Live, Pilot
 from crazysim.lab.live.browser_scene import grid_offsets
-from crazysim.lab.live.picture import PictureSource, quantities, quantity
+from crazysim.lab.live.picture import PictureSource, list_quantities, read_quantity
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.media.web import FOV
 from crazysim.plugins.vehicles import Cars
@@ -349,18 +349,18 @@ def test_a_picture_has_what_is_drawn():
     np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)  # of the selected drone
     live.select(1, 0)
     assert source.take_picture(live).followed == (1, bodies.find("drone", 0).mocap)
-    assert {"states.pos", "states.rotor_vel", "controls.state.cmd", "core.steps"} <= set(quantities(sim))
-    np.testing.assert_allclose(quantity(sim.data, "states.pos", 2, 1)[2], 5.0)
+    assert {"states.pos", "states.rotor_vel", "controls.state.cmd", "core.steps"} <= set(list_quantities(sim))
+    np.testing.assert_allclose(read_quantity(sim.data, "states.pos", 2, 1)[2], 5.0)
     with pytest.raises(KeyError):
-        quantity(sim.data, "states.nothing", 0, 0)
+        read_quantity(sim.data, "states.nothing", 0, 0)
 
 
 def test_quantities_of_members():
     """Two cars beside two drones: scopes, not counts, say which numbers are whose."""
     sim = Sim(n_drones=2, control="state")
     sim.add(Cars(["Fleet1Tenth_0", "Fleet1Tenth_1"]))
-    names = quantities(sim)
+    names = list_quantities(sim)
     assert "plugins.cars.pos[1]" in names
     assert "plugins.cars.pos" not in names
     pos = np.asarray(sim.data.plugins["cars"].pos)[0, 1]
-    np.testing.assert_allclose(quantity(sim.data, "plugins.cars.pos[1]", 0, 0), pos)
+    np.testing.assert_allclose(read_quantity(sim.data, "plugins.cars.pos[1]", 0, 0), pos)

@@ -9,7 +9,7 @@ import pytest
 from crazysim import Sim, rotation
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import from_rpy
-from crazysim.lab.live.ros import MESSAGES, RosBridge, ros_messages
+from crazysim.lab.live.ros import MESSAGE_MODULES, RosBridge, import_message_classes
 from crazysim.lab.live.swarm import Swarm
 
 
@@ -108,9 +108,9 @@ def bridge(swarm):
 
 
 def test_the_stand_in_has_the_classes_of_ros():
-    assert set(vars(STAND_IN)) == set(MESSAGES)
+    assert set(vars(STAND_IN)) == set(MESSAGE_MODULES)
     with pytest.raises(ConfigError, match="need ROS 2, which is not installed"):
-        ros_messages()
+        import_message_classes()
 
 
 def test_poses_speeds_and_clock(swarm, bridge):
