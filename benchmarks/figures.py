@@ -19,14 +19,14 @@ from __future__ import annotations
 import argparse
 import ast
 import functools
+import itertools
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
-import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -253,33 +253,63 @@ def changed_files(commit: str, spec: Iterable[str]) -> list[str]:
     paths = git("diff", "--name-only", "--no-renames", commit, "--", *spec).split()
     pairs = {path: pair for path in paths if (pair := versions(commit, path)) is not None}
     old_names, new_names = ({name for pair in pairs.values() for name in pair[k].defined} for k in (0, 1))
-    new_names -= old_names
+
+    def is_same_name(old: str, new: str) -> bool:
+        """Return True if two names are equal, or if the new one replaced the old one.
+
+        A name replaced another one if both are defined in the changed files, and the old one is no longer defined, or
+        the new one was not defined before. The file that defines it has changed if it names new code.
+        """
+        is_renamed = old in old_names and new in new_names and (new not in old_names or old not in new_names)
+        return old == new or is_renamed
 
     def is_unchanged(path: str) -> bool:
-        """Return True if a file differs only in names, of which each is replaced by the same new one in all of it.
-
-        A new name is one that was not defined before. The file that defines it has changed if it names new code.
-        """
+        """Return True if a file differs only in names; local variables are renamed one to one within a function."""
         if path not in pairs:
             return False
-        (old, new), renamed = pairs[path], {}
+        old, new = pairs[path]
+        renamed: dict[tuple[int, str], str] = {}
+        old_name_of: dict[tuple[int, str], str] = {}
+
+        def is_same(x: Atom, y: Atom) -> bool:
+            if (x.function, x.is_name) != (y.function, y.is_name):
+                return False
+            if x.function is None:
+                return x.text == y.text or (x.is_name and is_same_name(x.text, y.text))
+            return (
+                renamed.setdefault((x.function, x.text), y.text) == y.text
+                and old_name_of.setdefault((x.function, y.text), x.text) == x.text
+            )
+
+        def are_among(imports: set[tuple[str, ...]], others: set[tuple[str, ...]], is_same_part: Any) -> bool:
+            return all(any(len(x) == len(y) and all(map(is_same_part, x, y)) for y in others) for x in imports - others)
+
         return (
             len(old.atoms) == len(new.atoms)
-            and all(
-                x == y or (x in old_names and y in new_names and renamed.setdefault(x, y) == y)
-                for x, y in zip(old.atoms, new.atoms, strict=True)
-            )
-            and {tuple(renamed.get(x, x) for x in names) for names in old.imports} == new.imports
+            and all(map(is_same, old.atoms, new.atoms))
+            and are_among(old.imports, new.imports, is_same_name)
+            and are_among(new.imports, old.imports, lambda x, y: is_same_name(y, x))
         )
 
     return [path for path in paths if not is_unchanged(path)]
 
 
+class Atom(NamedTuple):
+    """The smallest part of a Python source: a kind of node, a constant or a name."""
+
+    text: str
+    """The kind, the constant or the name."""
+    is_name: bool = False
+    """True for a name, or for a constant that may be one."""
+    function: int | None = None
+    """For a local variable, number of the function in the module that binds it; else None."""
+
+
 class Code(NamedTuple):
     """Parts of a Python source that can change a measurement."""
 
-    atoms: list[str]
-    """Instructions, names and constants, without docstrings, annotations of functions, error messages and imports."""
+    atoms: list[Atom]
+    """Nodes, names and constants, without docstrings, annotations of functions, error messages and imports."""
     imports: set[tuple[str, ...]]
     """Modules and names that it imports."""
     defined: set[str]
@@ -305,45 +335,81 @@ def code_at(commit: str, path: str) -> Code:
 @functools.cache
 def code_of(source: str) -> Code:
     """Return the code of a Python source."""
-    tree, imports, defined = ast.parse(source), set(), set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.arg):
-            node.annotation = None
-            defined.add(node.arg)
-        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            defined.add(node.name)
-            if not isinstance(node, ast.ClassDef):
-                node.returns = None
-        elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
-            defined.add(node.id if isinstance(node, ast.Name) else node.attr)
-        elif isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-            node.exc.args, node.exc.keywords = [], []
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            module = getattr(node, "module", None) or ""
-            imports |= {(*module.split("."), name.name, name.asname or "") for name in node.names}
+    code = Code([], set(), set())
+    _add_atoms(code, ast.parse(source), itertools.count(), {})
+    return code
 
-    for node in ast.walk(tree):
-        for statements in (
-            getattr(node, "body", None),
-            getattr(node, "orelse", None),
-            getattr(node, "finalbody", None),
-        ):
-            if isinstance(statements, list):
-                statements[:] = [
-                    ast.copy_location(ast.Pass(), x) if isinstance(x, ast.Import | ast.ImportFrom) else x
-                    for x in statements
-                ]
 
-    def atoms_of(value: Any) -> list[str]:
-        """Return the atoms of a constant, or of code all but the names of local variables and the numbers of lines."""
-        if isinstance(value, types.CodeType):
-            parts = [repr(value.co_code), repr(value.co_exceptiontable), *value.co_names]
-            return [*parts, *(atom for x in value.co_consts for atom in atoms_of(x))]
-        if isinstance(value, tuple):
-            return ["(", *(atom for x in value for atom in atoms_of(x)), ")"]
-        return value.split(".") if isinstance(value, str) else [repr(value)]
+FUNCTIONS = (
+    ast.FunctionDef,
+    ast.AsyncFunctionDef,
+    ast.Lambda,
+    ast.ListComp,
+    ast.SetComp,
+    ast.DictComp,
+    ast.GeneratorExp,
+)
+"""Kinds of nodes that have local variables."""
 
-    return Code(atoms_of(compile(tree, "source", "exec", dont_inherit=True, optimize=2)), imports, defined)
+
+def _add_atoms(code: Code, node: ast.AST, counter: Iterator[int], functions: dict[str, int]) -> None:
+    """Add the atoms of a node.
+
+    Args:
+        code: Code of the source so far.
+        node: The node.
+        counter: Number of the next function.
+        functions: Number of the function that binds each local variable of the functions around the node.
+    """
+    if isinstance(node, ast.Import | ast.ImportFrom):
+        module = getattr(node, "module", None) or ""
+        code.imports.update((*module.split("."), name.name, name.asname or "") for name in node.names)
+        return
+    if isinstance(node, FUNCTIONS):
+        functions = functions | dict.fromkeys(_local_variables(node), next(counter))
+    code.atoms.append(Atom(type(node).__name__))
+    is_documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+    for field, value in ast.iter_fields(node):
+        if field in ("returns", "type_comment", "kind", "ctx") or (field == "annotation" and isinstance(node, ast.arg)):
+            continue
+        values = list(value) if isinstance(value, list) else [value]
+        if field == "body" and is_documented and ast.get_docstring(node, clean=False) is not None:  # type: ignore[arg-type]
+            values = values[1:]
+        if field == "exc" and isinstance(value, ast.Call):
+            values = [value.func]
+        code.atoms.append(Atom(f"{field} {len(values)}" if isinstance(value, list) and field != "body" else field))
+        for x in values:
+            if isinstance(x, ast.Expr) and isinstance(x.value, ast.Constant):
+                continue  # the docstring of a field or of a constant
+            if isinstance(x, ast.AST):
+                _add_atoms(code, x, counter, functions)
+            elif isinstance(x, str) and field in ("id", "arg", "name", "attr", "rest"):
+                is_attribute = isinstance(node, ast.Attribute | ast.keyword)
+                code.atoms.append(Atom(x, True, None if is_attribute else functions.get(x)))
+                if _defines(node):
+                    code.defined.add(x)
+            elif isinstance(x, str) and isinstance(node, ast.Constant):
+                code.atoms.extend(Atom(word, word.isidentifier()) for word in x.split("."))
+            else:
+                code.atoms.append(Atom(repr(x)))
+
+
+def _local_variables(function: ast.AST) -> set[str]:
+    """Return the names that a function binds as parameters or variables, without the functions in it."""
+    names, nodes = set(), list(ast.iter_child_nodes(function))
+    while nodes:
+        node = nodes.pop()
+        if _defines(node) and not isinstance(node, ast.Attribute):
+            names.add(next(getattr(node, field) for field in ("arg", "id", "name") if hasattr(node, field)))
+        nodes += [] if isinstance(node, FUNCTIONS) else ast.iter_child_nodes(node)
+    return names
+
+
+def _defines(node: ast.AST) -> bool:
+    """Return True if a node gives a meaning to its name."""
+    return isinstance(node, ast.arg | ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.ExceptHandler) or (
+        isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store)
+    )
 
 
 def training_commits() -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -102,6 +103,8 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(repository
     assert repository.stale_records() == []
     source.write_text(MEASURED.replace("sin", "cos"))
     assert "thrust.py changed after" in repository.stale_records()[0]
+    source.write_text(MEASURED.replace("return 2.0 * squared", "return 2.0 * speed"))
+    assert "thrust.py changed after" in repository.stale_records()[0]
     source.write_text(MEASURED.replace("2.0", "3.0"))
     (found,) = repository.stale_records()
     assert found == f"speed, 2 cores of EPYC (AVX2): thrust.py changed after {commit}"
@@ -111,6 +114,37 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(repository
     assert "benchmarks/speed.py changed after" in repository.stale_records()[0]
     repository.store_records([record(repository, "0123abc")])
     assert "0123abc" in repository.stale_records()[0]
+
+
+VARIABLES = """
+def move(start, change):
+    def add(x):
+        return [start + x for x in change]
+
+    end = add(1) + [x for x in change]
+    return start, end
+"""
+
+
+@pytest.mark.parametrize(
+    ("renamings", "is_same"),
+    [
+        ({"start": "end", "end": "start"}, True),  # all uses of two variables
+        ({"def add(x)": "def add(y)", "start + x for": "start + y for"}, False),  # a variable that the list binds
+        ({"add": "sum_of", "end": "last", "change": "all_changes"}, True),  # of a function within, and in its closure
+        ({"return start, end": "return end, start"}, False),
+        ({"+ [x for x in": "+ [y for y in"}, True),
+        ({"[start + x for": "[end + x for"}, False),
+    ],
+)
+def test_local_variables_are_renamed_one_to_one(repository, renamings, is_same):
+    source = repository.ROOT / "thrust.py"
+    source.write_text(VARIABLES)
+    repository.store_records([record(repository, commit_all(repository))])
+    text = re.sub("|".join(map(re.escape, renamings)), lambda found: renamings[found[0]], VARIABLES)
+    assert text != VARIABLES
+    source.write_text(text)
+    assert (repository.stale_records() == []) == is_same
 
 
 def test_a_written_table_keeps_the_rows_of_other_machines(repository):

@@ -91,7 +91,14 @@ RECIPES: dict[str, Recipe] = {
     "deliver": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 800}),
     "swarm": Recipe(
         n_worlds=2048,
-        config={**_LONG_ROLLOUTS, "iterations": 200, "minibatches": 64, "discount": 0.98, "entropy": 0.003},
+        config={
+            **_LONG_ROLLOUTS,
+            "iterations": 200,
+            "minibatches": 64,
+            "discount": 0.98,
+            "entropy": 0.003,
+            "critic": "all_drones",
+        },
     ),
     "chase": Recipe(n_worlds=2048, config={"iterations": 300, "n_steps": 64, "minibatches": 16, "discount": 0.99}),
     "land": Recipe(
@@ -100,7 +107,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "land_on_marker": Recipe(n_worlds=4096, config={**_BY_CAMERA, "iterations": 150}),
     "follow_car": Recipe(n_worlds=2048, config={**_BY_CAMERA, "iterations": 100}),
-    "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
+    "track": Recipe("apg", n_worlds=64, config={"iterations": 150}),
 }
 """Recipes by task."""
 
