@@ -114,8 +114,8 @@ def identify_attitude(
         ConfigError: If a log has no attitude commands or has gaps, or the fitted numbers are not valid.
     """
     base = load_airframe(airframe)
-    mass_of_base = float(base.value("rigid_body.mass"))
-    flight_mass = mass_of_base if mass is None else float(mass)
+    base_mass = float(base.value("rigid_body.mass"))
+    flight_mass = base_mass if mass is None else float(mass)
     check_turning(logs)
     data = [derivatives_svf(preprocessing(_columns(log))) for log in logs]
     force, force_spread = fit_translation(dynamics, flight_mass, data)
@@ -128,7 +128,7 @@ def identify_attitude(
     table |= {name: x.tolist() for name, x in rotation_params.items()}
     tables: dict = {"name": f"{base.name}_identified", "base": str(airframe), "fitted": {dynamics: table}}
     lines = [f"base = {json.dumps(str(airframe))}", "", "[sources]", f"flights = {json.dumps(source)}"]
-    if flight_mass != mass_of_base:
+    if flight_mass != base_mass:
         tables["rigid_body"] = {"mass": flight_mass}
         lines += ["", "[rigid_body]", f'mass = {{ value = {flight_mass}, unit = "kg", source = "flights" }}']
     lines += ["", f"[fitted.{dynamics}]"]

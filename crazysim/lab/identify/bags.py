@@ -33,7 +33,7 @@ POSE_FIELDS = {
 ROTOR_FIELDS = {"actuator_msgs/msg/Actuators": "velocity", "mav_msgs/msg/Actuators": "angular_velocities"}
 """Fields of rotor speeds, rad/s, by message type."""
 
-MAX_METADATA = 2**24
+MAX_METADATA_BYTES = 2**24
 """Largest ``metadata.yaml``, bytes."""
 
 
@@ -48,7 +48,7 @@ class _BagFile(io.BufferedReader):
 
 
 class _BagPath(type(Path())):
-    """Path whose files are opened as ``_BagFile``, and whose text has at most ``MAX_METADATA`` bytes."""
+    """Path whose files are opened as ``_BagFile``, and whose text has at most ``MAX_METADATA_BYTES`` bytes."""
 
     def open(self, *args: Any, **kwargs: Any) -> Any:
         """Open the file for reading."""
@@ -58,7 +58,7 @@ class _BagPath(type(Path())):
     def read_text(self, *args: Any, **kwargs: Any) -> str:
         """Return the text of ``metadata.yaml``, in UTF-8 in every locale."""
         del args, kwargs
-        return read_text(self, MAX_METADATA)
+        return read_text(self, MAX_METADATA_BYTES)
 
 
 def is_bag(path: Path) -> bool:
@@ -114,14 +114,14 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
 
 def _split_column(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
     """Return the topic and the field of a column."""
-    fitting = [topic for topic in topics if column.startswith(f"{topic}/")]
-    if not fitting:
+    matches = [topic for topic in topics if column.startswith(f"{topic}/")]
+    if not matches:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
         raise ConfigError(
             f"{name}: expected a topic and a field, such as /odom/pose/pose/position/x, got {column!r}. "
             f"The bag has {listed}."
         )
-    topic = max(fitting, key=len)
+    topic = max(matches, key=len)
     return topic, column[len(topic) + 1 :]
 
 
@@ -168,7 +168,7 @@ def _default_columns(name: str, topics: dict[str, str]) -> dict[str, tuple[str, 
 
 def _read_stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, str]) -> Stream:
     """Return the messages of a topic as a stream."""
-    get = {column: _getter(field) for column, field in fields.items()}
+    field_readers = {column: _field_reader(field) for column, field in fields.items()}
     times, rows = [], []
     for connection, stamp, packed_message in bag.messages([c for c in bag.connections if c.topic == topic]):
         message = bag.deserialize(packed_message, connection.msgtype)
@@ -176,7 +176,7 @@ def _read_stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, s
         seconds = 0.0 if header is None else header.stamp.sec + 1e-9 * header.stamp.nanosec
         times.append(seconds or 1e-9 * stamp)
         try:
-            rows.append([get[column](message) for column in fields])
+            rows.append([field_readers[column](message) for column in fields])
         except (AttributeError, IndexError, TypeError) as error:
             raise ConfigError(
                 f"{name}: expected fields {', '.join(fields.values())} of {topic} ({kind}), got {error}. "
@@ -196,16 +196,16 @@ def _read_stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, s
     return Stream(np.array(times), columns)
 
 
-def _getter(field: str) -> Callable[[Any], Any]:
+def _field_reader(field: str) -> Callable[[Any], Any]:
     """Return the function that reads a field, such as ``pose/position/x`` or ``data[0]``."""
     parts = re.findall(r"[^/\[\]]+", field)
 
-    def get(message: Any) -> Any:
+    def read_field(message: Any) -> Any:
         for part in parts:
             message = message[int(part)] if part.isdigit() else attrgetter(part)(message)
         return message
 
-    return get
+    return read_field
 
 
 def _with_world_velocity(stream: Stream) -> Stream:
@@ -214,5 +214,5 @@ def _with_world_velocity(stream: Stream) -> Stream:
     if "vx" not in c:
         return stream
     q, v = np.stack([c[f"q{k}"] for k in XYZW], -1), np.stack([c[f"v{k}"] for k in XYZ], -1)
-    world = np.asarray(rotation.rotate(jnp.asarray(q), jnp.asarray(v)), np.float64)
-    return Stream(stream.t, c | dict(zip(("vx", "vy", "vz"), world.T, strict=True)))
+    world_vel = np.asarray(rotation.rotate(jnp.asarray(q), jnp.asarray(v)), np.float64)
+    return Stream(stream.t, c | dict(zip(("vx", "vy", "vz"), world_vel.T, strict=True)))

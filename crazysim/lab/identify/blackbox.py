@@ -15,7 +15,7 @@ from crazysim.lab.identify.readers import decimate
 
 MOTOR_POLES = 14
 """Magnetic poles of the motors where the file does not state ``motor_poles``: Betaflight's default."""
-HEADER_WITHIN = 1000
+MAX_HEADER_LINES = 1000
 """Number of lines in which the column names are sought; the Blackbox Explorer writes settings before them."""
 
 
@@ -23,7 +23,7 @@ def find_header(path: Path) -> tuple[int, list[str], dict[str, str]] | None:
     """Return the index and cells of the line of column names, and the settings before it; None if there is none."""
     settings: dict[str, str] = {}
     with path.open(encoding="utf-8", errors="replace") as file:
-        for number, line in zip(range(HEADER_WITHIN), file, strict=False):
+        for number, line in zip(range(MAX_HEADER_LINES), file, strict=False):
             cells = [x.strip().strip('"') for x in line.split(",")]
             if any(x.startswith("time") for x in cells) and any(x.startswith("gyroADC[") for x in cells):
                 return number, cells, settings
@@ -53,7 +53,7 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     header = find_header(path)
     if header is None:
         raise ConfigError(
-            f"{path.name}: expected columns time and gyroADC[0] in the first {HEADER_WITHIN} lines, got none. "
+            f"{path.name}: expected columns time and gyroADC[0] in the first {MAX_HEADER_LINES} lines, got none. "
             "Convert the log with blackbox_decode or the Blackbox Explorer."
         )
     start, names, settings = header

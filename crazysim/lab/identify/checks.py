@@ -99,7 +99,7 @@ def check_motion(
         ConfigError: If the columns contradict each other; the message names a change that would help, if any.
     """
     is_kept = np.ones(len(t), bool)
-    for pair, width in _rates(t, data, derived_keys):
+    for pair, width in _rate_pairs(t, data, derived_keys):
         is_diverged = _diverged_windows(pair, round(PIECE_DURATION / float(np.median(np.diff(t)))))
         if 0 < np.sum(is_diverged) <= len(is_diverged) / 2:
             is_kept[np.flatnonzero(is_diverged)[:, None] + np.arange(width + 1)] = False
@@ -163,7 +163,7 @@ def _check_laws(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str
         "a thrust that points up in most samples, got",
     )
     laws = [Law("" if upward_share > 0 else f"{problem} {upward_share:.2f} as the median of its z component", True)]
-    for pair in (*(pair for pair, _ in _rates(t, data, derived_keys)), _thrust(t, data)):
+    for pair in (*(pair for pair, _ in _rate_pairs(t, data, derived_keys)), _thrust_pair(t, data)):
         ratios = pair.ratios()
         listed = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in ratios)
         text = (
@@ -173,19 +173,19 @@ def _check_laws(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str
     return laws
 
 
-def _rates(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
+def _rate_pairs(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
     """Yield a pair of changes for each measured rate, and the samples per window."""
     if "vel" not in derived_keys:
-        width, (change, expected) = _changes(t, 0.2, data["pos"], integrate(data["vel"], t))
+        width, (change, expected) = _window_changes(t, 0.2, data["pos"], integrate(data["vel"], t))
         yield Pair("a velocity that moves the position", change, expected, 0.01), width
     if "ang_vel" not in derived_keys:
         angles = np.cumsum(body_rates(t, data["quat"]) * np.diff(t)[:, None], axis=0)
         angles = np.concatenate([np.zeros((1, 3)), angles])
-        width, (change, expected) = _changes(t, 0.1, angles, integrate(data["ang_vel"], t))
+        width, (change, expected) = _window_changes(t, 0.1, angles, integrate(data["ang_vel"], t))
         yield Pair("an angular velocity that turns the attitude", change, expected, 0.01), width
 
 
-def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
+def _thrust_pair(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
     """Return measured changes of the acceleration, and expected ones from attitude, rotor speeds and gravity.
 
     The thrust is proportional to the sum of the squared rotor speeds, scaled so that the median of its vertical
@@ -202,7 +202,7 @@ def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
         thrust, flying = GRAVITY_MAGNITUDE / np.maximum(axis[:, 2], 0.3), np.ones(len(t), bool)
     expected = integrate(thrust[:, None] * axis - [0, 0, GRAVITY_MAGNITUDE], t)
     ground = np.cumsum(~flying)[:, None] * np.ones(3)
-    width, (measured, expected, ground) = _changes(t, 0.25, data["vel"], expected, ground)
+    width, (measured, expected, ground) = _window_changes(t, 0.25, data["vel"], expected, ground)
     is_airborne = (ground[width:, 0] == 0) & (ground[:-width, 0] == 0)
     if not np.any(is_airborne):
         return Pair("", np.zeros((1, 3)), np.zeros((1, 3)), 0.1)
@@ -212,7 +212,7 @@ def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
     return Pair("accelerations that follow from thrust and gravity", measured, expected, 0.1)
 
 
-def _changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[NDArray]]:
+def _window_changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[NDArray]]:
     """Return the samples per window, and the changes of series over all windows; zero for windows across a gap."""
     dt = float(np.median(np.diff(t)))
     width = min(max(1, round(duration / dt)), len(t) - 1)

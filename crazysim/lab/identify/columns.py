@@ -129,7 +129,7 @@ def stack_columns(name: str, table: Mapping[str, NDArray], names: Sequence[str],
         raise ConfigError(
             f"{name}: expected columns {', '.join(missing)}, got {', '.join(sorted(table))}. Name them in a Columns."
         )
-    columns = [_numbers(name, unsigned_name(x), table[unsigned_name(x)]) for x in names]
+    columns = [_as_numbers(name, unsigned_name(x), table[unsigned_name(x)]) for x in names]
     lengths = {unsigned_name(x): len(c) for x, c in zip(names, columns, strict=True)}
     if len(set(lengths.values())) > 1:
         raise ConfigError(
@@ -140,7 +140,7 @@ def stack_columns(name: str, table: Mapping[str, NDArray], names: Sequence[str],
     return np.stack([s * c for s, c in zip(signs, columns, strict=True)], axis=-1)
 
 
-def _numbers(name: str, key: str, values: NDArray) -> NDArray:
+def _as_numbers(name: str, key: str, values: NDArray) -> NDArray:
     """Return one column as numbers."""
     x = np.asarray(values)
     if x.dtype.kind not in "fiub" or x.ndim != 1:

@@ -35,8 +35,10 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         raise ConfigError(f"{path.name}: expected at most {MAX_COLUMNS} columns, got {width}. Export fewer of them.")
     names = [x.strip().strip('"') for x in header.split(",")]
     if len(names) < 2:
-        other = next((separator for mark, separator in ((";", "semicolons"), ("\t", "tabs")) if mark in header), None)
-        got = f"{other} between them" if other else repr(header.strip()[:40])
+        other_separator = next(
+            (separator for mark, separator in ((";", "semicolons"), ("\t", "tabs")) if mark in header), None
+        )
+        got = f"{other_separator} between them" if other_separator else repr(header.strip()[:40])
         raise ConfigError(
             f"{path.name}: expected names of columns in the first line, with commas between them, got {got}. "
             "Export the log with commas, decimal points and a header."
@@ -51,11 +53,11 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             f"{path.name}: expected columns of different names, got {duplicates[0][:60]!r} twice. Rename one."
         )
     rows = split_rows(path.name, lines, len(names), 2, repairs, "Export the log again.")
-    return {key: _column(cells) for key, cells in zip(names, zip(*rows, strict=True), strict=True)}
+    return {key: _parse_column(cells) for key, cells in zip(names, zip(*rows, strict=True), strict=True)}
 
 
 def split_rows(
-    name: str, lines: Iterable[str], width: int, first: int, repairs: list[str], remedy: str
+    name: str, lines: Iterable[str], width: int, first_line: int, repairs: list[str], remedy: str
 ) -> list[list[str]]:
     """Return the cells of the rows with as many cells as the header; up to ``MAX_REPAIRED_SHARE`` others are dropped.
 
@@ -63,24 +65,26 @@ def split_rows(
         name: Name of the file, for messages.
         lines: Lines after the header.
         width: Number of cells in the header.
-        first: Number of the first of these lines in the file, from 1.
+        first_line: Line number of the first of these lines in the file, from 1.
         repairs: List that descriptions of repairs are appended to.
         remedy: Last sentence of the error.
     """
-    rows, damaged = [], []
-    for number, line in enumerate(lines, first):
+    rows, damaged_rows = [], []
+    for number, line in enumerate(lines, first_line):
         cells = line.split(",")
         if len(cells) == width:
             rows.append(cells)
         elif line.strip():
-            damaged.append(f"{len(cells)} in line {number}")
-    if len(damaged) > MAX_REPAIRED_SHARE * (len(rows) + len(damaged)) or not rows:
+            damaged_rows.append(f"{len(cells)} in line {number}")
+    if len(damaged_rows) > MAX_REPAIRED_SHARE * (len(rows) + len(damaged_rows)) or not rows:
         raise ConfigError(
-            f"{name}: expected rows of {width} cells, as in the header, got {len(rows)} such rows and {len(damaged)} "
-            f"others{f', the first with {damaged[0]}' if damaged else ''}. {remedy}"
+            f"{name}: expected rows of {width} cells, as in the header, got {len(rows)} such rows and "
+            f"{len(damaged_rows)} others{f', the first with {damaged_rows[0]}' if damaged_rows else ''}. {remedy}"
         )
-    if damaged:
-        repairs.append(f"dropped {len(damaged)} rows that have another number of cells, the first {damaged[0]}")
+    if damaged_rows:
+        repairs.append(
+            f"dropped {len(damaged_rows)} rows that have another number of cells, the first {damaged_rows[0]}"
+        )
     return rows
 
 
@@ -92,7 +96,7 @@ def parse_number(text: str) -> float:
         return math.nan
 
 
-def _column(cells: Sequence[str]) -> NDArray:
+def _parse_column(cells: Sequence[str]) -> NDArray:
     """Return the numbers of a column, NaN where a cell has none; its text unless most cells have finite numbers."""
     try:
         return np.array(cells, np.float64)

@@ -178,12 +178,12 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
             shifted_torque = _fit_torques(logs, params, float(force[0]), fast.values + step * (np.arange(5) == k))[0]
             torque_spread = np.hypot(torque_spread, shifted_torque - torque)
 
-    def named(force: NDArray, torque: NDArray, fast: NDArray) -> dict[str, float]:
+    def name_parameters(force: NDArray, torque: NDArray, fast: NDArray) -> dict[str, float]:
         numbers = [*force, *torque, *fast]
         return dict(zip((*FORCE_TERMS, *TORQUE_TERMS, *FACTOR_NAMES[1:]), map(float, numbers), strict=True))
 
-    values = named(force, torque, fast.values)
-    deviations = named(force_spread, torque_spread, fast.deviations)
+    values = name_parameters(force, torque, fast.values)
+    deviations = name_parameters(force_spread, torque_spread, fast.deviations)
     if unphysical := [
         f"{name} {values[name]:.3g}"
         for name in FACTOR_NAMES
@@ -363,7 +363,7 @@ def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
     _, ang_acc, vel, thrust = [np.concatenate(x) for x in zip(*pieces, strict=True)]
     mixing = airframe.mixing_matrix
 
-    def explained(order: tuple[int, ...]) -> float:
+    def explained_variance(order: tuple[int, ...]) -> float:
         total = 0.0
         for axis in range(2):
             regressors = np.c_[vel, np.ones(len(vel))]
@@ -377,13 +377,13 @@ def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
         return total
 
     index_order = tuple(range(airframe.n_rotors))
-    best_order = max(itertools.permutations(index_order), key=explained)
-    if explained(best_order) > explained(index_order) + 0.2:
+    best_order = max(itertools.permutations(index_order), key=explained_variance)
+    if explained_variance(best_order) > explained_variance(index_order) + 0.2:
         raise ConfigError(
             f"expected rotors in the order of airframe {airframe.name!r}; the angular accelerations fit "
             f"the order {[k + 1 for k in best_order]} much better "
-            f"({explained(best_order):.2f} against {explained(index_order):.2f}, of at most 2). Name the columns of "
-            "rotor_vel, and of command, in that order."
+            f"({explained_variance(best_order):.2f} against {explained_variance(index_order):.2f}, of at most 2). Name "
+            "the columns of rotor_vel, and of command, in that order."
         )
 
 

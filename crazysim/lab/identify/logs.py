@@ -103,8 +103,8 @@ def read_log(
         columns = KNOWN_COLUMNS[columns]
     name, table = read_table(path, repairs, columns)
     if motion is not None:
-        _, other = read_table(motion, repairs, columns)
-        table = capture.join_motion_capture(name, table, other, columns or KNOWN_COLUMNS["crazysim"], repairs)
+        _, motion_table = read_table(motion, repairs, columns)
+        table = capture.join_motion_capture(name, table, motion_table, columns or KNOWN_COLUMNS["crazysim"], repairs)
     if columns is None:
         columns = next(
             (c for c in reversed(KNOWN_COLUMNS.values()) if not missing_columns(table, c)), KNOWN_COLUMNS["crazysim"]

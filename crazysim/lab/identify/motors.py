@@ -56,19 +56,21 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     window = np.hanning(2 * half_window + 3)[1:-1]
     volts = np.convolve(np.pad(voltage, half_window, mode="edge"), window / window.sum(), "valid")[:, None] * command
     thrust = np.maximum(np.polynomial.polynomial.polyval(volts, airframe.value("battery.thrust_over_voltage")), 0.0)
-    total = thrust.sum(axis=1)
-    means = thrust[total > np.median(total) / 2].mean(axis=0)
-    commanded = np.asarray(airframe.rotor_vel(thrust * means.mean() / means), np.float64)
+    total_thrust = thrust.sum(axis=1)
+    mean_thrusts = thrust[total_thrust > np.median(total_thrust) / 2].mean(axis=0)
+    commanded = np.asarray(airframe.rotor_vel(thrust * mean_thrusts.mean() / mean_thrusts), np.float64)
     repairs = [*log.repairs, "modelled the rotor speeds from commands and voltage"]
     if not np.all(is_valid):
         repairs.append(f"interpolated {np.sum(~is_valid)} commands that were not from 0 to 1")
     speeds = _lagged_speeds(commanded, np.diff(log.t), np.atleast_2d(airframe.value("rotors.lag")))
-    flying, margin = np.flatnonzero(total > 0.75 * np.median(total)), round(GROUND_MARGIN / log.dt)
-    air = slice(flying[0] + margin, max(flying[-1] - margin, flying[0] + margin))
-    repairs.append(f"left out {air.start} samples at the start and {len(log.t) - air.stop} at the end, near the ground")
-    data = {key: x[air] for key, x in vars(log).items() if isinstance(x, np.ndarray) and key != "gaps"}
-    data |= {"command": command[air], "rotor_vel": speeds[air]}
-    gaps = log.gaps[(log.gaps > air.start) & (log.gaps < air.stop)] - air.start
+    flying, margin = np.flatnonzero(total_thrust > 0.75 * np.median(total_thrust)), round(GROUND_MARGIN / log.dt)
+    airborne = slice(flying[0] + margin, max(flying[-1] - margin, flying[0] + margin))
+    repairs.append(
+        f"left out {airborne.start} samples at the start and {len(log.t) - airborne.stop} at the end, near the ground"
+    )
+    data = {key: x[airborne] for key, x in vars(log).items() if isinstance(x, np.ndarray) and key != "gaps"}
+    data |= {"command": command[airborne], "rotor_vel": speeds[airborne]}
+    gaps = log.gaps[(log.gaps > airborne.start) & (log.gaps < airborne.stop)] - airborne.start
     return replace(log, **data, modelled=True, gaps=gaps, repairs=tuple(repairs))
 
 
@@ -79,12 +81,12 @@ def _lagged_speeds(commanded: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
         cmd, duration = x
         gap = cmd - speed
         rate = rotor_acceleration(cmd, speed, jnp.asarray(lag)) / jnp.where(gap == 0, 1.0, gap)
-        new = speed - gap * jnp.expm1(-rate * duration)
-        return new, new
+        new_speed = speed - gap * jnp.expm1(-rate * duration)
+        return new_speed, new_speed
 
-    first = jnp.asarray(commanded[0])
-    _, path = jax.jit(lambda *x: jax.lax.scan(step, first, x))(jnp.asarray(commanded[:-1]), jnp.asarray(dt))
-    return np.concatenate([commanded[:1], np.asarray(path, np.float64)])
+    first_speed = jnp.asarray(commanded[0])
+    _, speeds = jax.jit(lambda *x: jax.lax.scan(step, first_speed, x))(jnp.asarray(commanded[:-1]), jnp.asarray(dt))
+    return np.concatenate([commanded[:1], np.asarray(speeds, np.float64)])
 
 
 def motor_lag(logs: Sequence[Log]) -> NDArray:

@@ -21,7 +21,7 @@ WINDOW_DURATION = 0.5
 """Duration of the predictions, s."""
 WINDOW_STRIDE = 0.05
 """Time between the starts of training windows, s."""
-FORCE, TORQUE = 0.1, 0.03
+FORCE_SCALE, TORQUE_SCALE = 0.1, 0.03
 """Scales of force and torque, which make the weights of order one: shares of the weight, and of weight times arm."""
 
 
@@ -73,7 +73,7 @@ def fit_residual(
     )
     input_std = jnp.std(inputs, axis=0).at[0].set(1.0)
     weight = float(params.mass[0]) * float(jnp.linalg.norm(params.gravity_vec))
-    scale = weight * jnp.repeat(jnp.array([FORCE, TORQUE * float(params.L[0])]), 3)
+    scale = weight * jnp.repeat(jnp.array([FORCE_SCALE, TORQUE_SCALE * float(params.L[0])]), 3)
 
     def residual(weights: dict[str, Array]) -> ResidualData:
         """Return the residual from weights of order one."""

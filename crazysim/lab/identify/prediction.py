@@ -233,18 +233,18 @@ def prediction_errors(
     """
     batch, dt = windows([model.prepare_log(log) for log in logs], max(horizons), 0.05), logs[0].dt
     pos, quat = _predict_all(model, batch, dt)
-    pos_turning, quat_turning = _predict_all(model, batch, dt, constant_rates=True)
+    constant_rate_pos, constant_rate_quat = _predict_all(model, batch, dt, constant_rates=True)
     samples = np.asarray([round(h / dt) for h in horizons])
     times = jnp.asarray(samples * dt, jnp.float32)[:, None]
     true_pos, true_quat = batch.pos[:, samples], batch.quat[:, samples]
     positions = {
         "position": pos[:, samples],
-        "position at constant body rates": pos_turning[:, samples],
+        "position at constant body rates": constant_rate_pos[:, samples],
         "position at constant velocity": batch.pos[:, :1] + times * batch.vel[:, :1],
     }
     attitudes = {
         "attitude": quat[:, samples],
-        "attitude at constant body rates": quat_turning[:, samples],
+        "attitude at constant body rates": constant_rate_quat[:, samples],
         "attitude unchanged": jnp.broadcast_to(batch.quat[:, :1], true_quat.shape),
     }
     errors: dict[str, NDArray] = {}
@@ -287,11 +287,11 @@ def plot_errors(logs: Sequence[Log], models: Mapping[str, Predictor], path: str 
     errors = {name: prediction_errors(logs, model, horizons) for name, model in models.items()}
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.subplots(1, 2)
-    naive = {"position": "at constant velocity", "attitude": "unchanged"}
-    for ax, (key, other), unit in zip(axes, naive.items(), ("m", "degrees"), strict=True):
+    baselines = {"position": "at constant velocity", "attitude": "unchanged"}
+    for ax, (key, baseline), unit in zip(axes, baselines.items(), ("m", "degrees"), strict=True):
         for name, values in errors.items():
             ax.plot(horizons, values[key], label=name)
-        for kind, style in ((other, "k:"), ("at constant body rates", "k--")):
+        for kind, style in ((baseline, "k:"), ("at constant body rates", "k--")):
             ax.plot(horizons, values[f"{key} {kind}"], style, label=kind)
         ax.set(xlabel="horizon, s", ylabel=f"RMSE of {key}, {unit}", xlim=(0, None), ylim=(0, None))
         ax.grid(alpha=0.3)

@@ -95,11 +95,11 @@ def resample(
     t = start + dt * np.arange(int((end - start) / dt) + 1)
     is_covered = np.ones(len(t), bool)
     for key, s in sorted_streams.items():
-        before = np.clip(np.searchsorted(s.t, t, side="right") - 1, 0, len(s.t) - 2)
-        is_covered &= s.t[before + 1] - s.t[before] <= MAX_HOLD * steps[key]
+        previous_index = np.clip(np.searchsorted(s.t, t, side="right") - 1, 0, len(s.t) - 2)
+        is_covered &= s.t[previous_index + 1] - s.t[previous_index] <= MAX_HOLD * steps[key]
     t = t[is_covered]
-    columns_at = {c: np.interp(t, s.t, x) for s in sorted_streams.values() for c, x in s.columns.items()}
-    return {"t": t - start} | columns_at
+    resampled_columns = {c: np.interp(t, s.t, x) for s in sorted_streams.values() for c, x in s.columns.items()}
+    return {"t": t - start} | resampled_columns
 
 
 def decimate(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArray]:
@@ -209,18 +209,18 @@ def _read_events(data: bytes, n_events: int) -> tuple[dict[int, tuple[str, list[
     """Return name, variables and layout of each event, and the offset of the first record, bytes."""
     events, offset = {}, 5
 
-    def text(offset: int) -> tuple[str, int]:
+    def read_string(offset: int) -> tuple[str, int]:
         stop = data.index(0, offset)
         return data[offset:stop].decode(), stop + 1
 
     for _ in range(n_events):
         (key,) = struct.unpack_from("<H", data, offset)
-        name, offset = text(offset + 2)
+        name, offset = read_string(offset + 2)
         (count,) = struct.unpack_from("<H", data, offset)
         offset += 2
         variables, layout = [], "<"
         for _ in range(count):
-            entry, offset = text(offset)
+            entry, offset = read_string(offset)
             if (match := VARIABLE_PATTERN.fullmatch(entry)) is None:
                 raise struct.error(f"{entry[:60]!r} in place of one such as 'gyro.x(f)'")
             variables.append(match[1])

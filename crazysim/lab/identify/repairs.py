@@ -84,17 +84,17 @@ def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
 
 def _longest_increasing_sequence(t: NDArray) -> NDArray:
     """Return True for the samples of the longest increasing sequence: patience sorting. (n,)"""
-    ends: list[float] = []
-    last: list[int] = []
-    before = np.full(len(t), -1)
+    end_times: list[float] = []
+    last_indices: list[int] = []
+    predecessors = np.full(len(t), -1)
     for k, x in enumerate(t):
         if np.isfinite(x):
-            length = bisect_left(ends, x)
-            before[k] = last[length - 1] if length else -1
-            ends[length : length + 1], last[length : length + 1] = [float(x)], [k]
-    is_kept, k = np.zeros(len(t), bool), last[-1] if last else -1
+            length = bisect_left(end_times, x)
+            predecessors[k] = last_indices[length - 1] if length else -1
+            end_times[length : length + 1], last_indices[length : length + 1] = [float(x)], [k]
+    is_kept, k = np.zeros(len(t), bool), last_indices[-1] if last_indices else -1
     while k >= 0:
-        is_kept[k], k = True, int(before[k])
+        is_kept[k], k = True, int(predecessors[k])
     return is_kept
 
 
@@ -136,7 +136,7 @@ def interpolate_missing(
     A value is missing where it is not finite, an attitude also where its quaternion is zero, as motion capture gives
     for a lost body.
     """
-    is_kept, lost, columns = np.ones(len(t), bool), [], {}
+    is_kept, lost_keys, columns = np.ones(len(t), bool), [], {}
     for key, x in data.items():
         is_valid = np.all(np.isfinite(x), axis=-1)
         if key == "quat":
@@ -158,7 +158,7 @@ def interpolate_missing(
         for k in pauses:
             is_known[indices[k] + 1 : indices[k + 1]] = False
         if not np.all(is_known):
-            lost.append(key)
+            lost_keys.append(key)
             is_kept &= is_known
         n_filled = int(np.sum(is_known & ~is_valid))
         if n_filled > MAX_REPAIRED_SHARE * len(t):
@@ -174,9 +174,9 @@ def interpolate_missing(
             x = np.stack([np.interp(t, t[is_valid], c[is_valid]) for c in x.T], axis=-1)
             x = x / np.linalg.norm(x, axis=-1, keepdims=True) if key == "quat" else x
         columns[key] = x
-    if lost:
+    if lost_keys:
         repairs.append(
-            f"dropped {np.sum(~is_kept)} samples, in which {', '.join(lost)} were missing for over "
+            f"dropped {np.sum(~is_kept)} samples, in which {', '.join(lost_keys)} were missing for over "
             f"{MAX_INTERPOLATION:g} s"
         )
     return t[is_kept], {key: x[is_kept] for key, x in columns.items()}
@@ -203,8 +203,8 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
         raise ConfigError(
             f"{name}: expected a flight, got rotors at rest. Check rotor_vel or attitude_command, or take another log."
         )
-    low = np.r_[False, smoothed < CARRIED_SHARE * median_thrust, False]
-    starts, ends = np.flatnonzero(np.diff(low.astype(int)) == 1), np.flatnonzero(np.diff(low.astype(int)) == -1)
+    is_low = np.r_[False, smoothed < CARRIED_SHARE * median_thrust, False]
+    starts, ends = np.flatnonzero(np.diff(is_low.astype(int)) == 1), np.flatnonzero(np.diff(is_low.astype(int)) == -1)
     is_kept = np.ones(len(t), bool)
     for start, end in zip(starts, ends, strict=True):
         is_inner = start > 0 and end < len(t)

@@ -96,10 +96,10 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     )
     yaw_changes = [weighted_median(delayed_columns[:, k], delayed_columns[:, k + 5])[0] - medians[k][0] for k in (2, 3)]
     inertia = moments * values[:3]
-    tilt = np.array(deviations[:2]) / [roll, pitch]
-    mean_tilt_deviation = np.hypot(*(tilt * inertia[:2])) / np.sum(inertia[:2])
+    relative_deviations = np.array(deviations[:2]) / [roll, pitch]
+    mean_tilt_deviation = np.hypot(*(relative_deviations * inertia[:2])) / np.sum(inertia[:2])
     deviation = np.hypot(
-        [*tilt * [x, y], mean_tilt_deviation * z, *inertia[2] * np.hypot(deviations[2:], yaw_changes)],
+        [*relative_deviations * [x, y], mean_tilt_deviation * z, *inertia[2] * np.hypot(deviations[2:], yaw_changes)],
         SAMPLING_ERROR * values,
     )
     overall_delay = weighted_median(estimates[:, 4], np.ones(len(estimates)))[0]
@@ -120,8 +120,8 @@ def weighted_median(x: NDArray, variance: NDArray) -> tuple[float, float]:
     """
     weight = 1 / np.maximum(variance, 0.25 * np.median(variance))  # so that no single block decides
     order = np.argsort(x)
-    share = (np.cumsum(weight[order]) - 0.5 * weight[order]) / np.sum(weight)
-    center = float(np.interp(0.5, share, x[order]))
+    cumulative_weight = (np.cumsum(weight[order]) - 0.5 * weight[order]) / np.sum(weight)
+    center = float(np.interp(0.5, cumulative_weight, x[order]))
     if len(x) < MIN_BLOCKS:
         return center, math.nan
     count = np.sum(weight) ** 2 / np.sum(weight**2)
@@ -169,10 +169,10 @@ class _LogTerms(NamedTuple):
             # The drag of the air on rotors and their acceleration turn the body the same way.
             reaction = _centred_change((rotor_inertia * speed) @ mixing[2])
             return _Rotors(
-                _integral_over_two(torque, log.dt),
+                _two_interval_integral(torque, log.dt),
                 _centred_change(torque),
                 reaction,
-                _integral_over_two(thrust.sum(axis=1), log.dt),
+                _two_interval_integral(thrust.sum(axis=1), log.dt),
             )
 
         w, dt = log.ang_vel, log.dt
@@ -183,8 +183,8 @@ class _LogTerms(NamedTuple):
         return _LogTerms(
             dt,
             log.gaps,
-            _centred_change(w) + _integral_over_two(gyro, dt),
-            _integral_over_two(w, dt),
+            _centred_change(w) + _two_interval_integral(gyro, dt),
+            _two_interval_integral(w, dt),
             rotors(log.rotor_vel),
             rotors(speeds),
         )
@@ -221,7 +221,7 @@ def _centred_change(x: NDArray) -> NDArray:
     return change
 
 
-def _integral_over_two(x: NDArray, dt: float) -> NDArray:
+def _two_interval_integral(x: NDArray, dt: float) -> NDArray:
     """Return the integral over the two intervals around each sample, zero at the ends; exact up to degree 5."""
     total = np.zeros_like(x)
     total[2:-2] = (114 * x[2:-2] + 34 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) * (dt / 90)
@@ -257,12 +257,14 @@ def _solve_blocks(data: _LogTerms, extra_delay: float = 0.0) -> NDArray:
             continue
         delay = 0.0
         for _ in range(6):
-            tilt = [_solve_samples(data, axis, delay, indices) for axis in (0, 1)]
+            tilt_fits = [_solve_samples(data, axis, delay, indices) for axis in (0, 1)]
             # Torque and its rate over time: torque(t - e) = torque - e rate.
-            delay -= float(np.mean([x[1] / x[0] for x, _ in tilt]))
+            delay -= float(np.mean([x[1] / x[0] for x, _ in tilt_fits]))
             delay = float(np.clip(delay, -MAX_DELAY, MAX_DELAY))
-        yaw, variance = _solve_samples(data, 2, delay + extra_delay * data.dt, indices)
-        blocks.append([*(x[0] for x, _ in tilt), *yaw[:2], delay, *(v[0] for _, v in tilt), *variance[:2]])
+        yaw_fit, variance = _solve_samples(data, 2, delay + extra_delay * data.dt, indices)
+        blocks.append(
+            [*(x[0] for x, _ in tilt_fits), *yaw_fit[:2], delay, *(v[0] for _, v in tilt_fits), *variance[:2]]
+        )
     return np.reshape(blocks, (-1, 9))
 
 

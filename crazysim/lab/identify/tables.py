@@ -20,7 +20,7 @@ from crazysim.lab.identify.repairs import check_period
 from crazysim.lab.identify.ulog import read_ulog
 from crazysim.storage import read_arrays, reading
 
-MAX_LOG = 2**31
+MAX_LOG_BYTES = 2**31
 """Largest log file, bytes. ROS bags have no limit, since they are not read into memory as a whole."""
 
 
@@ -62,8 +62,10 @@ def _read_source(
             return path.stem, read_bag(path, repairs, columns)
     if not path.is_file():
         raise ConfigError(f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
-    if (size := path.stat().st_size) > MAX_LOG:
-        raise ConfigError(f"{path.name}: expected a log of at most {MAX_LOG} bytes, got {size}. Cut it into flights.")
+    if (size := path.stat().st_size) > MAX_LOG_BYTES:
+        raise ConfigError(
+            f"{path.name}: expected a log of at most {MAX_LOG_BYTES} bytes, got {size}. Cut it into flights."
+        )
     with reading(path.name, "a log of a flight", "Copy or export it again."):
         if path.suffix == ".ulg":
             return path.stem, read_ulog(path, repairs)

@@ -39,7 +39,7 @@ SCALAR_TYPES = {
     "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8", "bool": "<i1", "char": "<i1",
 }  # fmt: skip
 """Types of fields, as NumPy names them."""
-MAX_MESSAGE = 2**16 - 1
+MAX_MESSAGE_BYTES = 2**16 - 1
 """Largest message, bytes, which its 16 bits of length can state."""
 MAX_DEPTH = 8
 """Largest depth of nested formats; PX4 has two."""
@@ -67,20 +67,26 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         raise ConfigError(
             f"{path.name}: expected messages {' and '.join(missing)}, got {others}. Add them to PX4's logged topics."
         )
-    local_position, turn = topics["vehicle_local_position"], topics["vehicle_attitude"]
+    local_position, attitude = topics["vehicle_local_position"], topics["vehicle_attitude"]
     # PX4's quaternions are wxyz.
     columns = {
         "vehicle_local_position": {
             "x": local_position["x"], "y": -local_position["y"], "z": -local_position["z"],
             "vx": local_position["vx"], "vy": -local_position["vy"], "vz": -local_position["vz"],
         },
-        "vehicle_attitude": {"qw": turn["q[0]"], "qx": turn["q[1]"], "qy": -turn["q[2]"], "qz": -turn["q[3]"]},
+        "vehicle_attitude": {
+            "qw": attitude["q[0]"], "qx": attitude["q[1]"], "qy": -attitude["q[2]"], "qz": -attitude["q[3]"],
+        },
     }  # fmt: skip
     if "vehicle_angular_velocity" in topics:
         rates = [topics["vehicle_angular_velocity"][f"xyz[{k}]"] for k in range(3)]
         columns["vehicle_angular_velocity"] = {"wx": rates[0], "wy": -rates[1], "wz": -rates[2]}
-    elif "rollspeed" in turn:
-        columns["vehicle_attitude"] |= {"wx": turn["rollspeed"], "wy": -turn["pitchspeed"], "wz": -turn["yawspeed"]}
+    elif "rollspeed" in attitude:
+        columns["vehicle_attitude"] |= {
+            "wx": attitude["rollspeed"],
+            "wy": -attitude["pitchspeed"],
+            "wz": -attitude["yawspeed"],
+        }
     escs = topics.get("esc_status", {})
     n_rotors = int(np.max(escs["esc_count"])) if escs else 0
     if n_rotors:
@@ -95,8 +101,8 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         columns["actuator_outputs"] = {f"command{k + 1}": x for k, x in enumerate(outputs)}
     setpoint = topics.get("vehicle_attitude_setpoint", {})
     if "q_d[0]" in setpoint and "thrust_body[2]" in setpoint:
-        aim = np.stack([setpoint[f"q_d[{k}]"] for k in (1, 2, 3, 0)], axis=-1) * [1, -1, -1, 1]
-        angles = np.asarray(jax.jit(rotation.to_rpy)(aim), np.float64)
+        commanded_quat = np.stack([setpoint[f"q_d[{k}]"] for k in (1, 2, 3, 0)], axis=-1) * [1, -1, -1, 1]
+        angles = np.asarray(jax.jit(rotation.to_rpy)(commanded_quat), np.float64)
         names = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
         values = [*map(unwrap_angles, angles.T), -setpoint["thrust_body[2]"]]
         columns["vehicle_attitude_setpoint"] = dict(zip(names, values, strict=True))
@@ -138,14 +144,14 @@ def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dic
         raise DamagedFileError(
             f"{path.name}: expected a ULog, which begins with 'ULog', got another file. Copy the file again."
         )
-    head, formats, ids, parts = struct.Struct("<HB"), {}, {}, {}
-    offset, skipped, dropouts = HEADER_SIZE, 0, 0
-    while offset + head.size <= len(data):
-        size, kind = head.unpack_from(data, offset)
-        start, end = offset + head.size, offset + head.size + size
+    message_header, formats, ids, payloads = struct.Struct("<HB"), {}, {}, {}
+    offset, n_skipped_bytes, n_dropouts = HEADER_SIZE, 0, 0
+    while offset + message_header.size <= len(data):
+        size, kind = message_header.unpack_from(data, offset)
+        start, end = offset + message_header.size, offset + message_header.size + size
         if kind not in MESSAGE_LETTERS or end > len(data):
             sync = data.find(SYNC_BYTES, offset + 1)
-            skipped += (len(data) if sync < 0 else sync) - offset
+            n_skipped_bytes += (len(data) if sync < 0 else sync) - offset
             if sync < 0:
                 break
             offset = sync + len(SYNC_BYTES)
@@ -153,28 +159,28 @@ def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dic
         offset = end
         if kind == ord("D") and size > 2:
             key = data[start] | data[start + 1] << 8
-            if key in parts:
-                parts[key].append(data[start + 2 : end])
+            if key in payloads:
+                payloads[key].append(data[start + 2 : end])
         elif kind == ord("F"):
             name, _, fields = data[start:end].decode(errors="replace").partition(":")
             formats[name] = fields
         elif kind == ord("A") and size > 3:
-            number, key = struct.unpack_from("<BH", data, start)
+            instance, key = struct.unpack_from("<BH", data, start)
             name = data[start + 3 : end].decode(errors="replace")
-            if number == 0 and name in topics and name not in ids:
-                ids[name], parts[key] = key, []
+            if instance == 0 and name in topics and name not in ids:
+                ids[name], payloads[key] = key, []
         elif kind == ord("O"):
-            dropouts += 1
-    if skipped:
-        repairs.append(f"left out {skipped} damaged bytes")
-    if dropouts:
-        repairs.append(f"{dropouts} dropouts of the logger")
+            n_dropouts += 1
+    if n_skipped_bytes:
+        repairs.append(f"left out {n_skipped_bytes} damaged bytes")
+    if n_dropouts:
+        repairs.append(f"{n_dropouts} dropouts of the logger")
     tables: dict[str, Topic] = {}
     for name, key in ids.items():
         layout = np.dtype(_read_layout(path.name, formats, name))
-        whole_records = [part[: layout.itemsize] for part in parts[key] if len(part) >= layout.itemsize]
-        if len(whole_records) < len(parts[key]):
-            repairs.append(f"left out {len(parts[key]) - len(whole_records)} messages {name}, which are too short")
+        whole_records = [part[: layout.itemsize] for part in payloads[key] if len(part) >= layout.itemsize]
+        if len(whole_records) < len(payloads[key]):
+            repairs.append(f"left out {len(payloads[key]) - len(whole_records)} messages {name}, which are too short")
         if whole_records:
             table = np.frombuffer(b"".join(whole_records), layout)
             columns = {field: without_huge_numbers(table[field]) for field in layout.names or ()}
@@ -207,9 +213,9 @@ def _read_layout(
                 else _read_layout(file, formats, kind, f"{path}.", depth + 1)
             )
             fields += field_layout
-            if not field_layout or len(fields) > MAX_MESSAGE:
+            if not field_layout or len(fields) > MAX_MESSAGE_BYTES:
                 raise DamagedFileError(
-                    f"{file}: expected a format of 1 to {MAX_MESSAGE} bytes, got another of {quoted}. {remedy}"
+                    f"{file}: expected a format of 1 to {MAX_MESSAGE_BYTES} bytes, got another of {quoted}. {remedy}"
                 )
     while not depth and fields and fields[-1][0].startswith("_padding"):
         fields.pop()

@@ -14,11 +14,11 @@ from crazysim.trajectories.files import checks
 
 MAX_MEMBERS = 20_100
 """Most files of an archive: four for each of 5,000 drones, Skybrush's limit, and the show's own."""
-MAX_MEMBER = 16 * 2**20
+MAX_MEMBER_BYTES = 16 * 2**20
 """Largest file of an archive that is unpacked, bytes."""
-MAX_TOTAL = 512 * 2**20
+MAX_TOTAL_BYTES = 512 * 2**20
 """Most bytes that may be unpacked from an archive."""
-MIN_TOTAL, MAX_RATIO = 64 * 2**20, 100
+MIN_TOTAL_BYTES, MAX_RATIO = 64 * 2**20, 100
 """Bytes that may be unpacked from any archive, and the multiple of its size that may be unpacked from a larger one."""
 MAX_CHAIN = 8
 """Longest chain of references."""
@@ -42,9 +42,9 @@ class Archive:
         """
         self.location = location
         self._parsed: dict[str, Any] = {}
-        limit = min(MAX_TOTAL, max(MIN_TOTAL, MAX_RATIO * len(content)))
+        limit = min(MAX_TOTAL_BYTES, max(MIN_TOTAL_BYTES, MAX_RATIO * len(content)))
         with reading(location, "a zip archive", REMEDY):
-            self._zip = ZipReader(io.BytesIO(content), location, MAX_MEMBERS, MAX_MEMBER, limit)
+            self._zip = ZipReader(io.BytesIO(content), location, MAX_MEMBERS, MAX_MEMBER_BYTES, limit)
 
     def json(self, name: str) -> Any:
         """Return the contents of a JSON file of the archive.

@@ -18,7 +18,7 @@ TICK_DURATION = 0.02
 """Unit of durations, s."""
 MAX_BYTES = 2**20
 """Longest program, bytes."""
-MAX_REPEATED = 200_000
+MAX_REPEATED_COMMANDS = 200_000
 """Most commands that the loops and jumps of a program may repeat."""
 MAX_LOOPS = 4
 """Deepest nesting of loops, libskybrush's ``CONFIG_MAX_LOOP_DEPTH``."""
@@ -36,7 +36,10 @@ BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 
 def decode_lights(
-    program: bytes | str, until: float = 3600.0, location: str = "a light program", max_repeated: int = MAX_REPEATED
+    program: bytes | str,
+    until: float = 3600.0,
+    location: str = "a light program",
+    max_repeated: int = MAX_REPEATED_COMMANDS,
 ) -> Lights:
     """Return the lights of a light program.
 
@@ -134,7 +137,7 @@ class _Machine:
         return True
 
     def set_color(self, code: int) -> None:
-        fades = FADE_TO_COLOR <= code <= FADE_TO_WHITE or code == FADE_TO_COLOR_FROM_CHANNELS
+        is_fade = FADE_TO_COLOR <= code <= FADE_TO_WHITE or code == FADE_TO_COLOR_FROM_CHANNELS
         if code in (SET_COLOR, FADE_TO_COLOR):
             color = (self.read_byte(), self.read_byte(), self.read_byte())
         elif code in (SET_GRAY, FADE_TO_GRAY):
@@ -146,7 +149,7 @@ class _Machine:
                 _ = self.read_byte(), self.read_byte(), self.read_byte()
             color = BLACK
         duration = self.read_varint()
-        if fades and duration:
+        if is_fade and duration:
             self.pieces.append((self.now, self.color, color))
             self.now += duration
             self.pieces.append((self.now, color, color))
@@ -172,8 +175,8 @@ class _Machine:
 
     def lights(self) -> Lights:
         """Return the lights so far; of pieces that begin at the same time, only the last counts."""
-        last = {start: (a, b) for start, a, b in self.pieces}
-        starts, colors = list(last), np.array(list(last.values()), float) / 255
+        piece_colors = {start: (a, b) for start, a, b in self.pieces}
+        starts, colors = list(piece_colors), np.array(list(piece_colors.values()), float) / 255
         return Lights.of_pieces(TICK_DURATION * np.array(starts), colors[:, 0], colors[:, 1])
 
 
@@ -187,24 +190,24 @@ def encode_lights(lights: Lights) -> bytes:
     if times.ndim != 1:
         raise ConfigError(f"expected the lights of one drone, got shape {times.shape}. Encode one drone at a time.")
     ticks = np.maximum(np.round((times - min(times[0], 0.0)) / TICK_DURATION), 0).astype(int)
-    first, last = np.round(255 * starts).astype(int), np.round(255 * ends).astype(int)
+    start_colors, end_colors = np.round(255 * starts).astype(int), np.round(255 * ends).astype(int)
     code = bytearray()
     color = None
     if ticks[0] > 0:
-        code += _color_command(SET_COLOR, first[0], ticks[0])
+        code += _color_command(SET_COLOR, start_colors[0], ticks[0])
     for k, start in enumerate(ticks):
         duration = ticks[k + 1] - start if k + 1 < len(ticks) else 0
         if k + 1 < len(ticks) and not duration:
             continue  # padding, or a piece shorter than a tick
-        fades = duration and not np.array_equal(first[k], last[k])
-        if fades:
-            if color is None or not np.array_equal(color, first[k]):
-                code += _color_command(SET_COLOR, first[k], 0)
-            code += _color_command(FADE_TO_COLOR, last[k], duration)
-            color = last[k]
+        is_fade = duration and not np.array_equal(start_colors[k], end_colors[k])
+        if is_fade:
+            if color is None or not np.array_equal(color, start_colors[k]):
+                code += _color_command(SET_COLOR, start_colors[k], 0)
+            code += _color_command(FADE_TO_COLOR, end_colors[k], duration)
+            color = end_colors[k]
         else:
-            code += _color_command(SET_COLOR, first[k], duration)
-            color = first[k]
+            code += _color_command(SET_COLOR, start_colors[k], duration)
+            color = start_colors[k]
     code.append(END)
     return bytes(code)
 

@@ -49,7 +49,7 @@ def parse_trajectory(value: object, location: str, yaw_control: object = None) -
             checks.require_number(value[key], f"{location}, {key}", 0.0, checks.MAX_TIME)
     takeoff = float(value.get("takeoffTime") or 0.0)
 
-    times, curves, last = [], [], None
+    times, curves, last_point = [], [], None
     n_axes = len(points[0][1]) if _is_point(points[0]) else 3
     for i, point in enumerate(points):
         point_location = f"{location}, point {i}"
@@ -62,22 +62,22 @@ def parse_trajectory(value: object, location: str, yaw_control: object = None) -
             if len(point) > 2
             else []
         )
-        if last is None and handles:
+        if last_point is None and handles:
             checks.raise_error("no control points of the first point", f"{len(handles)}", point_location)
-        if last is not None:
+        if last_point is not None:
             handle_points = [
                 checks.require_numbers(x, [n_axes], checks.MAX_COORDINATE, point_location) for x in handles
             ]
-            curves.append(np.stack([last, *handle_points, end]))
-        last = end
+            curves.append(np.stack([last_point, *handle_points, end]))
+        last_point = end
     checks.require_ascending(np.array(times), checks.MIN_LENGTH, location)
     start = takeoff + times[0]
     if times[-1] + takeoff > checks.MAX_TIME:
         checks.raise_error(f"at most {checks.MAX_TIME:g} s", f"{times[-1] + takeoff:g} s", location)
-    first = curves[0][:1] if curves else np.asarray(last)[None]
+    first_curve = curves[0][:1] if curves else np.asarray(last_point)[None]
     ends = [takeoff + t for t in times[1:]]
     if start >= checks.MIN_LENGTH or not curves:  # a shorter rest belongs to the first curve
-        ends, curves = [max(start, checks.MIN_LENGTH), *ends], [first, *curves]
+        ends, curves = [max(start, checks.MIN_LENGTH), *ends], [first_curve, *curves]
     return _trajectory_of_curves(np.array(ends), curves, yaw_control, location), encoding
 
 
@@ -145,10 +145,10 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
 
     points: list[Any] = [[0.0, format_point(c[0, :, 0]), []]]
     for end, axes in zip(ends, c, strict=True):
-        n_degree = significant_degree(axes, COEFFICIENT_TOLERANCE)
-        if n_degree > MAX_DEGREE:
-            raise ConfigError(f"expected polynomials of degree {MAX_DEGREE} at most, got degree {n_degree}")
-        degree = min(d for d in degrees if d >= n_degree)
+        lowest_degree = significant_degree(axes, COEFFICIENT_TOLERANCE)
+        if lowest_degree > MAX_DEGREE:
+            raise ConfigError(f"expected polynomials of degree {MAX_DEGREE} at most, got degree {lowest_degree}")
+        degree = min(d for d in degrees if d >= lowest_degree)
         curve = control_points(axes[:, : degree + 1], degree)
         points.append([float(end), format_point(curve[-1]), [format_point(x) for x in curve[1:-1]]])
     return {

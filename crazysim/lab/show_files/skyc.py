@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.show_files.archive import Archive, write_archive
-from crazysim.lab.show_files.led import MAX_REPEATED, decode_lights, encode_lights
+from crazysim.lab.show_files.led import MAX_REPEATED_COMMANDS, decode_lights, encode_lights
 from crazysim.lab.show_files.lights import Lights
 from crazysim.lab.show_files.show import Cue, ParameterChange, Show
 from crazysim.lab.show_files.show_trajectory import format_trajectory, parse_trajectory
@@ -29,7 +29,7 @@ MAX_DRONES = 5000
 """Most drones of a show, Skybrush's limit."""
 MAX_PIECES = 2_000_000
 """Most pieces of all trajectories, or all lights, padded to the longest."""
-MAX_LOOPED = 10_000_000
+MAX_LOOPED_COMMANDS = 10_000_000
 """Most commands that the loops of all light programs may repeat."""
 
 log = logging.getLogger(__name__)
@@ -63,25 +63,25 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
     checks.require_version_one(show, file_location)
     settings, _ = archive.resolve(show.get("settings", {}), file_location)
     settings = checks.require_object(settings, f"{file_location}, settings")
-    swarm, swarm_at = archive.resolve(show.get("swarm"), f"{file_location}, swarm")
+    swarm, swarm_location = archive.resolve(show.get("swarm"), f"{file_location}, swarm")
     drones = checks.require_array(
-        checks.require_object(swarm, swarm_at).get("drones"), MAX_DRONES, f"{swarm_at}, drones"
+        checks.require_object(swarm, swarm_location).get("drones"), MAX_DRONES, f"{swarm_location}, drones"
     )
     if not drones:
-        checks.raise_error("at least one drone", "none", swarm_at)
+        checks.raise_error("at least one drone", "none", swarm_location)
     parsed = []
     for i, drone in enumerate(drones):
-        parsed.append(_parse_drone(archive, drone, f"{swarm_at}, drone {i}", i))
-        _bound(len(drones) * parsed[-1]["trajectory"].n_pieces, parsed[-1]["at"])
+        parsed.append(_parse_drone(archive, drone, f"{swarm_location}, drone {i}", i))
+        _check_piece_count(len(drones) * parsed[-1]["trajectory"].n_pieces, parsed[-1]["at"])
     trajectories = [drone["trajectory"] for drone in parsed]
     duration = max(float(x.duration) for x in trajectories)
     lights, decoded = [], {}
     for drone in parsed:
-        lights.append(_decode_lights(archive, drone, duration, MAX_LOOPED // len(parsed), decoded))
-        _bound(len(parsed) * len(lights[-1].times), f"{drone['at']}, lights")
+        lights.append(_decode_lights(archive, drone, duration, MAX_LOOPED_COMMANDS // len(parsed), decoded))
+        _check_piece_count(len(parsed) * len(lights[-1].times), f"{drone['at']}, lights")
     names = [drone["name"] for drone in parsed]
     if len(set(names)) < len(names):
-        checks.raise_error("different names of the drones", f"{short_repr(sorted(names))}", swarm_at)
+        checks.raise_error("different names of the drones", f"{short_repr(sorted(names))}", swarm_location)
     environment = show.get("environment") or {}
     kind = checks.require_object(environment, f"{file_location}, environment").get("type", "outdoor")
     if kind not in ("indoor", "outdoor"):
@@ -101,7 +101,7 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
     )
 
 
-def _bound(n_pieces: int, location: str) -> None:
+def _check_piece_count(n_pieces: int, location: str) -> None:
     if n_pieces > MAX_PIECES:
         checks.raise_error(f"at most {MAX_PIECES} pieces, padded to the longest", str(n_pieces), location)
 
@@ -183,7 +183,7 @@ def _decode_lights(
     if value.get("data") is not None:
         data = checks.require_text(value["data"], f"{location}, data", 2**22)
         if data not in decoded:
-            decoded[data] = decode_lights(data, until, location, min(max_looped, MAX_REPEATED))
+            decoded[data] = decode_lights(data, until, location, min(max_looped, MAX_REPEATED_COMMANDS))
         return decoded[data]
     if value.get("colors") is not None:
         return parse_colors(value["colors"], f"{location}, colors")
@@ -200,7 +200,7 @@ def parse_colors(value: object, location: str) -> Lights:
         value: The JSON array.
         location: File and location in it, for messages.
     """
-    entries = checks.require_array(value, MAX_REPEATED, location)
+    entries = checks.require_array(value, MAX_REPEATED_COMMANDS, location)
     times, colors, now = [], [], 0.0
     for i, entry in enumerate(entries):
         entry_location = f"{location}, entry {i}"

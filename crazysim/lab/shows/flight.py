@@ -23,7 +23,7 @@ from crazysim.trajectories import Trajectory
 
 RECORDING_RATES = (50, 25, 10, 5)
 """Rates at which a flight may be recorded, Hz; the first that divides the physics' rate and fits is used."""
-MAX_RECORDED = 20_000_000
+MAX_RECORDED_POSES = 20_000_000
 """Most poses of a recording, which take 28 bytes each."""
 CHUNK_SAMPLES = 250
 """Number of samples that one compiled call simulates."""
@@ -71,7 +71,7 @@ def fly_show(show: Show, seconds: float | None = None, progress: Progress | None
     if not np.isfinite(end) or end <= 0:
         raise ConfigError(f"expected a positive duration of the flight, s, got {seconds!r}")
     sim = start_simulation(show, settings)
-    rate = _rate(sim.freq, end, show.n_drones)
+    rate = _recording_rate(sim.freq, end, show.n_drones)
     n = max(int(np.ceil(end * rate - 1e-6)), 1)
     times = np.arange(n + 1) / rate
 
@@ -80,7 +80,7 @@ def fly_show(show: Show, seconds: float | None = None, progress: Progress | None
     show.lights.colors(times)
     start_time = time.perf_counter()
     data = sim.data
-    recorded = [[np.asarray(x)[None, 0] for x in _pose(data)]]
+    recorded = [[np.asarray(x)[None, 0] for x in _poses(data)]]
     chunks = range(0, n, CHUNK_SAMPLES)
     for _ in chunks if progress is None else progress(chunks, "flying"):
         data, samples = fly_chunk(data)
@@ -96,7 +96,7 @@ def start_simulation(show: Show, settings: dict[str, Any]) -> Sim:
     """Return a simulation of one world whose drones hover where their trajectories begin."""
     sim = Sim(n_worlds=1, n_drones=show.n_drones, control="state", **settings)
     sim.add(Follow(show.trajectories, index=np.arange(show.n_drones)[None], visible=False))
-    start = _start(show.trajectories)
+    start = _start_points(show.trajectories)
     states = sim.data.states
     pos = jnp.asarray(start[None, :, :3], states.pos.dtype)
     half_yaw = start[None, :, 3:] / 2
@@ -111,18 +111,18 @@ def start_simulation(show: Show, settings: dict[str, Any]) -> Sim:
     return sim
 
 
-def _start(trajectories: Trajectory) -> NDArray:
+def _start_points(trajectories: Trajectory) -> NDArray:
     """Return position, m, and yaw, rad, where each trajectory begins. (n_drones, 4)"""
     return np.asarray(trajectories.coefficients, float)[:, 0, :, 0]
 
 
-def _rate(freq: int, seconds: float, n_drones: int) -> int:
+def _recording_rate(freq: int, seconds: float, n_drones: int) -> int:
     """Return the rate of the recording, Hz."""
     for rate in RECORDING_RATES:
-        if freq % rate == 0 and seconds * rate * n_drones <= MAX_RECORDED:
+        if freq % rate == 0 and seconds * rate * n_drones <= MAX_RECORDED_POSES:
             return rate
     raise ConfigError(
-        f"expected at most {MAX_RECORDED} recorded poses and freq a multiple of {RECORDING_RATES[-1]} Hz, got "
+        f"expected at most {MAX_RECORDED_POSES} recorded poses and freq a multiple of {RECORDING_RATES[-1]} Hz, got "
         f"{seconds:g} s of {n_drones} drones at {freq} Hz. Fly a part of the show with seconds=..."
     )
 
@@ -133,12 +133,12 @@ def _compile_chunk(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData,
 
     def sample(data: SimData, _: None) -> tuple[SimData, tuple[Array, Array]]:
         data = step(data, n_steps, zeros)
-        return data, _pose(data)
+        return data, _poses(data)
 
     return jax.jit(lambda data: jax.lax.scan(sample, data, length=CHUNK_SAMPLES)).lower(sim.data).compile()
 
 
-def _pose(data: SimData) -> tuple[Array, Array]:
+def _poses(data: SimData) -> tuple[Array, Array]:
     """Return positions and attitudes of the drones."""
     return data.states.pos, data.states.quat
 
@@ -146,5 +146,5 @@ def _pose(data: SimData) -> tuple[Array, Array]:
 @jax.jit
 def planned_at(trajectories: Trajectory, times: Array) -> Array:
     """Return planned positions, m. (n, n_drones, 3)"""
-    of_all = jax.vmap(lambda trajectory, t: trajectory.derivatives(t, 0)[0][:3], in_axes=(0, None))
-    return jax.vmap(of_all, in_axes=(None, 0))(trajectories, times)
+    points_at = jax.vmap(lambda trajectory, t: trajectory.derivatives(t, 0)[0][:3], in_axes=(0, None))
+    return jax.vmap(points_at, in_axes=(None, 0))(trajectories, times)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.lab.shows.flight import ShowFlight
 
-N_LISTED = 5
+N_LISTED_COLLISIONS = 5
 """Most collisions that a summary lists."""
 
 
@@ -72,12 +72,12 @@ def tracking_rms(flight: ShowFlight) -> dict[str, float]:
 
 def collisions(flight: ShowFlight) -> list[dict[str, Any]]:
     """Return the pairs of drones whose collision spheres touched, each with the time of the first contact, by time."""
-    reach = 2 * collision_radius(flight)
+    contact_distance = 2 * collision_radius(flight)
     distance, _ = sampled_approaches(flight.times, flight.pos)
     pairs = []
-    for i, j in np.argwhere(np.triu(distance < reach, 1)):
+    for i, j in np.argwhere(np.triu(distance < contact_distance, 1)):
         distances = np.linalg.norm(flight.pos[:, i] - flight.pos[:, j], axis=-1)
-        first = int(np.argmax(distances <= max(reach, distances.min())))
+        first = int(np.argmax(distances <= max(contact_distance, distances.min())))
         pairs.append({"drones": [flight.show.names[i], flight.show.names[j]], "time": float(flight.times[first])})
     return sorted(pairs, key=lambda pair: pair["time"])
 
@@ -95,16 +95,16 @@ def report(flight: ShowFlight) -> dict[str, Any]:
     first, and ``duration``, s; the flight also has ``tracking_rms``, m, by name.
     """
     return {
-        "planned": {"closest": _pairs(flight, flight.planned), "duration": flight.duration},
+        "planned": {"closest": _closest_pairs(flight, flight.planned), "duration": flight.duration},
         "flown": {
-            "closest": _pairs(flight, flight.pos),
+            "closest": _closest_pairs(flight, flight.pos),
             "tracking_rms": tracking_rms(flight),
             "duration": flight.duration,
         },
     }
 
 
-def _pairs(flight: ShowFlight, pos: NDArray) -> list[dict[str, Any]]:
+def _closest_pairs(flight: ShowFlight, pos: NDArray) -> list[dict[str, Any]]:
     distance, closest_times = sampled_approaches(flight.times, pos)
     first, second = np.triu_indices(len(distance), 1)
     names = flight.show.names
@@ -144,7 +144,7 @@ def summary(flight: ShowFlight, figures: dict[str, Any]) -> str:
             lines.append(f"                  {n} of {len(pairs)} pairs closer than the show's {limit:g} m")
     collided_pairs = collisions(flight)
     collision_text = ", ".join(
-        f"{' and '.join(pair['drones'])} at {pair['time']:.1f} s" for pair in collided_pairs[:N_LISTED]
+        f"{' and '.join(pair['drones'])} at {pair['time']:.1f} s" for pair in collided_pairs[:N_LISTED_COLLISIONS]
     )
     lines.append(f"collisions        {len(collided_pairs)}{': ' + collision_text if collided_pairs else ''}")
     return "\n".join(lines)

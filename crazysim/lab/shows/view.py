@@ -87,10 +87,10 @@ def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
         camera.show(sim)
         start = time.perf_counter()  # opening the window can take longer than a short show
         while sim.viewer.has_window and (now := speed * (time.perf_counter() - start)) < flight.duration:
-            shown_time = time.perf_counter()
+            draw_time = time.perf_counter()
             show_flight_at(sim, recorded, now)
             camera.show(sim)
-            time.sleep(max(shown_time + 1 / MAX_FPS - time.perf_counter(), 0.0))
+            time.sleep(max(draw_time + 1 / MAX_FPS - time.perf_counter(), 0.0))
     finally:
         sim.data = data
 
@@ -134,7 +134,7 @@ def create_view(flight: ShowFlight, **settings: Any) -> View:
                 ids = [flight.show.names.index(name) for name in mark["drones"]]
                 point = pos[ids].mean(0)
                 draw_points(sim, point, COLLISION_COLOR, 4 * max(GLOW_RADIUS_SHARE * size, MIN_GLOW_RADIUS))
-                draw_label(sim, point, _ascii(" x ".join(mark["drones"])))
+                draw_label(sim, point, _to_ascii(" x ".join(mark["drones"])))
 
     defaults = {"width": 1280, "height": 720, "cam_config": camera, "text": "{time:.1f} s", "draw": draw}
     return View(**(defaults | settings))
@@ -181,7 +181,7 @@ def _led_materials(sim: Sim) -> tuple[str, ...]:
     )
 
 
-def _ascii(text: str) -> str:
+def _to_ascii(text: str) -> str:
     return text.encode("ascii", "replace").decode()[:99]
 
 

@@ -102,10 +102,10 @@ def replay_filter(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[A
 def estimate_errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float, float]:
     """Return the RMS differences of estimates from motion capture, of position, m, and of attitude, degrees."""
     settled_index = round(SETTLING_TIME / SAMPLE_PERIOD)
-    turn = np.asarray(rotation.multiply(rotation.conjugate(jnp.asarray(log["quat"])), jnp.asarray(quat)))[
+    rotation_error = np.asarray(rotation.multiply(rotation.conjugate(jnp.asarray(log["quat"])), jnp.asarray(quat)))[
         settled_index:
     ]
-    angle = 2 * np.arctan2(np.linalg.norm(turn[:, :3], axis=-1), np.abs(turn[:, 3]))
+    angle = 2 * np.arctan2(np.linalg.norm(rotation_error[:, :3], axis=-1), np.abs(rotation_error[:, 3]))
     distance = np.linalg.norm(pos - log["pos"], axis=-1)[settled_index:]
     return float(np.sqrt(np.mean(distance**2))), float(np.degrees(np.sqrt(np.mean(angle**2))))
 

@@ -194,15 +194,16 @@ def hold_in_crazysim(quadrotors: Quadrotors, delay: int, period: int) -> np.ndar
     """
     q, n, max_rotor_vel = quadrotors, len(quadrotors.mass), 20_000.0
     sim = Sim(n, drone="cf21B_500", control="rotor_vel", integrator="rk4")
-    params, world = sim.data.params, (n, 1)
-    square = np.zeros((n, 1, 1, 3))
-    square[..., 2] = (q.thrust / max_rotor_vel**2)[:, None, None]
+    params, per_world = sim.data.params, (n, 1)
+    thrust_curve = np.zeros((n, 1, 1, 3))
+    thrust_curve[..., 2] = (q.thrust / max_rotor_vel**2)[:, None, None]
     inertia = np.eye(3) * q.inertia[:, None, None]
     lag = np.zeros((n, 1, 1, 4))
     lag[..., ::2] = 1 / q.lag[:, None, None]
     changes = {
-        "mass": q.mass.reshape(*world, 1), "L": q.arm.reshape(*world, 1), "J": inertia, "J_inv": np.linalg.inv(inertia),
-        "rpm2thrust": square, "rpm2torque": square * q.torque[:, None, None, None], "rotor_dyn_coef": lag,
+        "mass": q.mass.reshape(*per_world, 1), "L": q.arm.reshape(*per_world, 1),
+        "J": inertia, "J_inv": np.linalg.inv(inertia), "rpm2thrust": thrust_curve,
+        "rpm2torque": thrust_curve * q.torque[:, None, None, None], "rotor_dyn_coef": lag,
         "drag_matrix": np.zeros((3, 3)), "prop_inertia": np.zeros(1), "rotor_vel_min": np.zeros(1),
         "rotor_vel_max": np.full(1, max_rotor_vel),
     }  # fmt: skip

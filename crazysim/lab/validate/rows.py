@@ -76,15 +76,15 @@ class Section:
     @property
     def problem(self) -> str:
         """Reason why the section cannot be measured, or an empty string if it can."""
-        return _install(self.packages) or self.data_problem
+        return _install_advice(self.packages) or self.data_problem
 
     @property
     def missing_peers(self) -> str:
         """Command that installs the simulators whose rows are left out, or an empty string if none are."""
-        return _install(self.peers)
+        return _install_advice(self.peers)
 
 
-def _install(packages: Mapping[str, str]) -> str:
+def _install_advice(packages: Mapping[str, str]) -> str:
     """Return advice to install the packages that are not importable, or an empty string if all are."""
     missing = [name for package, name in packages.items() if importlib.util.find_spec(package) is None]
     return f"run `pip install {shlex.join(missing)}`" if missing else ""

@@ -67,17 +67,17 @@ All airframes have the mass, the inertia and the largest thrust of `cf21B_500`. 
 """.strip()
 """Paragraphs of the section: method and differences of the simulators."""
 
-Act = Callable[[NDArray], NDArray]
+PolicyFunction = Callable[[NDArray], NDArray]
 """Policy: from observations (n, n_obs) to actions (n, k), float32."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Exported:
+class ExportedPolicy:
     """A trained policy, exported in both formats."""
 
-    c: Act
+    c: PolicyFunction
     """The C header, compiled."""
-    onnx: Act
+    onnx: PolicyFunction
     """The ONNX file."""
     centre: NDArray
     """Command at a zero action. (4,)"""
@@ -90,7 +90,7 @@ class Exported:
 
 
 @dataclasses.dataclass(frozen=True)
-class Result:
+class FlightResult:
     """Outcome of the flights of one policy in one simulator."""
 
     success: float
@@ -104,7 +104,7 @@ class Result:
 
 
 @functools.cache
-def export_policy(name: str, folder: Path | None = None) -> Exported:
+def export_policy(name: str, folder: Path | None = None) -> ExportedPolicy:
     """Return a policy of ``POLICIES``, trained with seed 0 on its recipe, and exported.
 
     Args:
@@ -126,10 +126,10 @@ def export_policy(name: str, folder: Path | None = None) -> Exported:
         actions, n_obs = meta["actions"], sum(meta["observations"].values())
         centre, scale = (np.asarray(actions[key], float) for key in ("centre", "scale"))
         c = compile_header(to_c(policy, Path(temporary) / "policy.h", meta), n_obs, len(centre))
-        return Exported(c, _load_onnx(to_onnx(policy, Path(temporary) / "policy.onnx", meta)), centre, scale)
+        return ExportedPolicy(c, _load_onnx(to_onnx(policy, Path(temporary) / "policy.onnx", meta)), centre, scale)
 
 
-def compile_header(header: Path, n_obs: int, n_actions: int) -> Act:
+def compile_header(header: Path, n_obs: int, n_actions: int) -> PolicyFunction:
     """Return the function of an exported C header, compiled next to it.
 
     Raises:
@@ -155,15 +155,15 @@ def compile_header(header: Path, n_obs: int, n_actions: int) -> Act:
     return actions
 
 
-def _load_onnx(path: Path) -> Act:
+def _load_onnx(path: Path) -> PolicyFunction:
     runtime: Any = importlib.import_module("onnxruntime")
     session = runtime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
     return lambda obs: session.run(None, {"observation": obs})[0]
 
 
 def fly_task(
-    task: str, command: Callable[[NDArray], NDArray], simulator: type[Simulator], starts: int = N_STARTS
-) -> Result:
+    task: str, command: Callable[[NDArray], NDArray], simulator: type[Simulator], n_starts: int = N_STARTS
+) -> FlightResult:
     """Fly a task from its held-out starts in another simulator.
 
     The task provides starts, goals, observations, errors and ends of episodes. It reads the states of the other
@@ -173,11 +173,11 @@ def fly_task(
         task: Name of the task.
         command: Policy: from observations (n, n_obs) to attitude commands (n, 4).
         simulator: The simulator.
-        starts: Number of starts.
+        n_starts: Number of starts.
     """
     from crazysim.train.evaluation import EVALUATION_SEED
 
-    env = make(task, n_worlds=starts, freq=round(1 / COMMAND_PERIOD))
+    env = make(task, n_worlds=n_starts, freq=round(1 / COMMAND_PERIOD))
     data = env.reset(jax.random.key(EVALUATION_SEED)).data
 
     def assess(world: SimData) -> tuple[Array, Array, Array]:
@@ -188,7 +188,7 @@ def fly_task(
         name: np.asarray(getattr(data.states, name), np.float64)[:, 0] for name in ("pos", "quat", "vel", "ang_vel")
     }
     flights = simulator(states)
-    is_done, errors, observed = np.zeros(starts, bool), [], []
+    is_done, errors, observed = np.zeros(n_starts, bool), [], []
     for _ in range(env.max_steps):
         obs = np.asarray(assess_all(data)[0])[:, 0]
         states = flights.fly_period(command(obs))
@@ -201,10 +201,10 @@ def fly_task(
         observed.append(obs)
         if is_done.all():
             break
-    last = np.stack(errors[-round(env.task.hold / COMMAND_PERIOD) :])
-    settled, landed = np.all(last < env.task.tolerance, axis=0) & ~is_done, last[:, ~is_done]
-    mean = float(landed.mean()) if landed.size else float("nan")
-    return Result(float(settled.mean()), float(is_done.mean()), mean, np.stack(observed))
+    last_errors = np.stack(errors[-round(env.task.hold / COMMAND_PERIOD) :])
+    is_settled, completed_errors = np.all(last_errors < env.task.tolerance, axis=0) & ~is_done, last_errors[:, ~is_done]
+    mean = float(completed_errors.mean()) if completed_errors.size else float("nan")
+    return FlightResult(float(is_settled.mean()), float(is_done.mean()), mean, np.stack(observed))
 
 
 def checks(data: Path | None) -> Sequence[Callable[[], Iterable[Row]]]:
@@ -214,10 +214,10 @@ def checks(data: Path | None) -> Sequence[Callable[[], Iterable[Row]]]:
         data: Folder in whose folder ``policies`` the trainings are kept; None to keep none.
     """
     folder = None if data is None else data / "policies"
-    return [partial(compare, name, simulator, folder) for name in POLICIES for simulator in SIMULATORS]
+    return [partial(compare_policy, name, simulator, folder) for name in POLICIES for simulator in SIMULATORS]
 
 
-def compare(name: str, simulator: str, folder: Path | None = None) -> Iterable[Row]:
+def compare_policy(name: str, simulator: str, folder: Path | None = None) -> Iterable[Row]:
     """Yield the success of an exported policy in one simulator, or nothing if the simulator is not installed.
 
     For crazysim itself, also yield the largest difference between the actions of the two exports on all observations of

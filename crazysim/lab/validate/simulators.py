@@ -60,7 +60,7 @@ class Crazysim(Simulator):
 
     def __init__(self, start: States) -> None:
         self._sim = Sim(len(start["pos"]), drone=AIRFRAME, control="attitude")
-        self._sim.data = with_states(self._sim.data, **_rows(start), rotor_vel=_hover_speed(self._sim))
+        self._sim.data = with_states(self._sim.data, **_world_rows(start), rotor_vel=_hover_speed(self._sim))
 
     def fly_period(self, commands: NDArray) -> States:
         self._sim.attitude_control(commands[:, None])
@@ -77,7 +77,7 @@ class Crazyflow(Simulator):
         package: Any = importlib.import_module("crazyflow.sim")
         self._sim = package.Sim(n_worlds=len(start["pos"]), drone=AIRFRAME, control="attitude", freq=500)
         ours = Sim(drone=AIRFRAME, control="attitude")
-        self._sim.data = with_states(self._sim.data, **_rows(start), rotor_vel=_hover_speed(ours))
+        self._sim.data = with_states(self._sim.data, **_world_rows(start), rotor_vel=_hover_speed(ours))
 
     def fly_period(self, commands: NDArray) -> States:
         self._sim.attitude_control(np.asarray(commands[:, None], np.float32))
@@ -124,7 +124,7 @@ class AttitudeController:
             states: Present states.
             thrusts: Present thrusts of the rotors, N. (n, 4)
         """
-        rows = {name: x.astype(np.float32) for name, x in _rows(states).items()}
+        rows = {name: x.astype(np.float32) for name, x in _world_rows(states).items()}
         self._data, commanded = self._control(self._data, rows, thrusts[:, None].astype(np.float32))
         return np.asarray(commanded, np.float64)[:, 0]
 
@@ -231,9 +231,9 @@ class PyBullet(Simulator):
             self._env = envs.CtrlAviary(model, physics=enums.Physics.PYB, pyb_freq=freq, ctrl_freq=freq)
             self._controllers = [control.DSLPIDControl(model) for _ in start["pos"]]
         airframe, pid = load_airframe(AIRFRAME), self._controllers[0]
-        top = pid.PWM2RPM_SCALE * pid.MAX_PWM + pid.PWM2RPM_CONST
-        self._env.KF = _thrust_max(airframe) / top**2
-        self._env.KM, self._env.MAX_RPM = self._env.KF * _torque_per_thrust(airframe), top
+        max_speed = pid.PWM2RPM_SCALE * pid.MAX_PWM + pid.PWM2RPM_CONST
+        self._env.KF = _thrust_max(airframe) / max_speed**2
+        self._env.KM, self._env.MAX_RPM = self._env.KF * _torque_per_thrust(airframe), max_speed
         self._body, self._client = int(self._env.DRONE_IDS[0]), self._env.CLIENT
         mass, inertia = airframe.value("rigid_body.mass", ()), airframe.value("rigid_body.inertia", (3,))
         self._p.changeDynamics(self._body, -1, mass=float(mass), localInertiaDiagonal=np.asarray(inertia).tolist(),
@@ -278,8 +278,8 @@ def rotorpy_params(airframe: Airframe) -> dict[str, Any]:
     """Return RotorPy's parameters of its brushless Crazyflie, with mass, inertia and rotors of an airframe."""
     theirs = importlib.import_module("rotorpy.vehicles.crazyfliebrushless_params").quad_params
     inertia = airframe.value("rigid_body.inertia", (3,))
-    hubs, top = airframe.value("rotors.position", (4, 3)), theirs["rotor_speed_max"]
-    k_eta = _thrust_max(airframe) / top**2
+    hubs, max_speed = airframe.value("rotors.position", (4, 3)), theirs["rotor_speed_max"]
+    k_eta = _thrust_max(airframe) / max_speed**2
     return theirs | {
         "mass": float(airframe.value("rigid_body.mass", ())),
         **dict(zip(("Ixx", "Iyy", "Izz"), map(float, inertia), strict=True)),
@@ -301,10 +301,10 @@ def _mjcf(airframe: Airframe, lag: float, timestep: float) -> str:
     """Return MuJoCo's model of an airframe; ``lag`` is the time constant of the thrusts, s."""
     inertia = " ".join(f"{x:.9g}" for x in airframe.value("rigid_body.inertia", (3,)))
     hubs, signs = airframe.value("rotors.position", (4, 3)), airframe.value("rotors.yaw_torque_sign", (4,))
-    top, arm = _thrust_max(airframe), _torque_per_thrust(airframe)
+    max_thrust, arm = _thrust_max(airframe), _torque_per_thrust(airframe)
     sites = "".join(f'<site name="{k}" pos="{x:.9g} {y:.9g} {z:.9g}"/>' for k, (x, y, z) in enumerate(hubs))
     motors = "".join(
-        f'<general site="{k}" gear="0 0 1 0 0 {sign * arm:.9g}" ctrllimited="true" ctrlrange="0 {top:.9g}" '
+        f'<general site="{k}" gear="0 0 1 0 0 {sign * arm:.9g}" ctrllimited="true" ctrlrange="0 {max_thrust:.9g}" '
         f'dyntype="filter" dynprm="{lag:.9g}"/>'
         for k, sign in enumerate(signs)
     )
@@ -320,11 +320,11 @@ def _thrust_max(airframe: Airframe) -> float:
 
 def _torque_per_thrust(airframe: Airframe) -> float:
     """Return the drag torque over the thrust of a rotor at its largest speed, m."""
-    top = airframe.rotor_vel_limits[1].max()
+    max_speed = airframe.rotor_vel_limits[1].max()
     thrust, torque = (
         np.asarray(airframe.value(f"rotors.{name}_curve", (3,)), np.float64) for name in ("thrust", "torque")
     )
-    powers = np.array([1.0, top, top**2])
+    powers = np.array([1.0, max_speed, max_speed**2])
     return float(torque @ powers / (thrust @ powers))
 
 
@@ -333,7 +333,7 @@ def _hover_speed(sim: Sim) -> NDArray:
     return np.asarray(hover_rotors(sim.data.params))
 
 
-def _rows(states: States) -> States:
+def _world_rows(states: States) -> States:
     """Return states of one drone per world. (n, 1, k) each"""
     return {name: x[:, None] for name, x in states.items()}
 

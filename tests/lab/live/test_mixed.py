@@ -13,15 +13,15 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 class Silent(ThreadSource):
     """A source that never answers."""
 
-    def stream(self, stopped):
-        stopped.wait()
+    def stream(self, stop_event):
+        stop_event.wait()
         yield from ()
 
 
 class Failing(ThreadSource):
     """A source that fails at once."""
 
-    def stream(self, stopped):
+    def stream(self, stop_event):
         raise OSError("unplugged")
         yield
 

@@ -16,7 +16,7 @@ from crazysim import IMU, ConfigError, Sim
 from crazysim.drones import load_airframe
 from crazysim.lab.live.sitl import ArduPilot, Betaflight, Measurements, Origin, Px4, SoftwareInTheLoop
 from crazysim.lab.live.sitl.loop import MAGNETIC_FIELD, motor_order
-from crazysim.lab.live.sitl.measured import quat_ned
+from crazysim.lab.live.sitl.measured import to_ned_quat
 from crazysim.plugins.sensors import GPS, Barometer, Magnetometer, Triad
 
 TO_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -242,7 +242,7 @@ def test_px4_turns_no_motor_while_it_is_disarmed_and_is_given_time_to_start():
         mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
         loop.exchange()  # without an answer
         client.sendall(common.MAVLink_hil_actuator_controls_message(0, [0.5] * 16, 0, 0).pack(mav))
-        wait_for(lambda: np.array_equal(link.receive(0.2), np.zeros(4)) and link._answers)
+        wait_for(lambda: np.array_equal(link.receive(0.2), np.zeros(4)) and link._has_answered)
         assert not link.armed
         loop.sim.step(1)
         with pytest.raises(ConfigError, match=r"expected motor commands of Px4 within 0\.2 s, got none"):
@@ -273,7 +273,7 @@ def test_betaflight_in_real_time_and_one_that_does_not_answer():
         loop.run(0.5)
         assert time.monotonic() - began > 0.49  # the last step begins 4 ms before the end
     thread.end()
-    command = np.asarray(sim.data.controls.rotor_vel[0, 0] / loop._fastest[0])[loop._orders[0]]
+    command = np.asarray(sim.data.controls.rotor_vel[0, 0] / loop._max_rotor_vel[0])[loop._orders[0]]
     assert len(sent) > 1
     assert min(np.abs(command - each).max() for each in sent) < 1e-6
 
@@ -282,7 +282,7 @@ def test_attitudes_in_the_axes_of_aviation():
     rng = np.random.default_rng(2)
     for quat in rng.normal(size=(20, 4)):
         quat /= np.linalg.norm(quat)
-        w, x, y, z = quat_ned(quat)
+        w, x, y, z = to_ned_quat(quat)
         np.testing.assert_allclose(matrix([x, y, z, w]), TO_NED @ matrix(quat) @ TO_FRD, atol=1e-12)
 
 

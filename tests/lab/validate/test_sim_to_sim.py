@@ -67,7 +67,7 @@ def test_simulators_that_are_not_installed_are_left_out(tmp_path, monkeypatch, c
     installed = [name for name in SIMULATORS if not SIMULATORS[name].module]
     assert installed == ["crazysim", "C MuJoCo"]
     for simulator in SIMULATORS.keys() - installed:
-        assert list(sim_to_sim.compare("hover", simulator)) == []
+        assert list(sim_to_sim.compare_policy("hover", simulator)) == []
     monkeypatch.setattr(sim_to_sim, "POLICIES", {})
     pytest.importorskip("onnxruntime")
     assert main(["validate", "--only", "sim2sim", "--out", str(tmp_path / "page.md")]) == 0
@@ -78,11 +78,11 @@ def test_simulators_that_are_not_installed_are_left_out(tmp_path, monkeypatch, c
 
 def test_a_row_has_success_error_and_the_difference_of_both_exports(monkeypatch):
     shift = np.float32(2e-6)
-    policy = sim_to_sim.Exported(lambda obs: obs[:, :4], lambda obs: obs[:, :4] + shift, np.zeros(4), np.ones(4))
+    policy = sim_to_sim.ExportedPolicy(lambda obs: obs[:, :4], lambda obs: obs[:, :4] + shift, np.zeros(4), np.ones(4))
     monkeypatch.setattr(sim_to_sim, "export_policy", lambda *_: policy)
-    result = sim_to_sim.Result(0.5, 0.25, 0.0123, np.linspace(-1, 1, 60).reshape(5, 3, 4))
+    result = sim_to_sim.FlightResult(0.5, 0.25, 0.0123, np.linspace(-1, 1, 60).reshape(5, 3, 4))
     monkeypatch.setattr(sim_to_sim, "fly_task", lambda *_: result)
-    flown, same = sim_to_sim.compare("hover_crazyflie", "crazysim")
+    flown, same = sim_to_sim.compare_policy("hover_crazyflie", "crazysim")
     assert (flown.quantity, flown.figure) == ("`hover`, trained with `randomize=crazyflie`: success", 50)
     assert flown.remark == "mean error 0.012 m, crashed 25 %"
     assert same.figure == pytest.approx(2e-6, rel=0.2)

@@ -26,7 +26,7 @@ SYSTEMS = ("optitrack", "vicon", "qualisys", "vrpn", "nokov", "motionanalysis")
 """Systems by their names in the package; a release may have been built without some of them."""
 WORKER_PROGRAM = Path(__file__).with_name("worker.py")
 """Program that runs the package."""
-MAX_LINE = 1 << 20
+MAX_LINE_BYTES = 1 << 20
 """Longest line of the worker, bytes."""
 
 
@@ -64,15 +64,15 @@ class MotionCaptureSource(ThreadSource):
         self._worker = subprocess.Popen([*command, system, hostname], stdout=subprocess.PIPE, stdin=subprocess.DEVNULL)
         self.start()
 
-    def stream(self, stopped: threading.Event) -> Iterator[Frame]:
-        while not stopped.is_set():
-            line = self._worker.stdout.readline(MAX_LINE)
+    def stream(self, stop_event: threading.Event) -> Iterator[Frame]:
+        while not stop_event.is_set():
+            line = self._worker.stdout.readline(MAX_LINE_BYTES)
             if not line:
                 raise ConnectionError(f"the worker ended with code {self._worker.wait()}")
             message = json.loads(line)
             if "error" in message:
                 raise ConnectionError(message["error"])
-            yield parse(message)
+            yield parse_frame(message)
 
     def close(self) -> None:
         self._stop_event.set()
@@ -83,7 +83,7 @@ class MotionCaptureSource(ThreadSource):
             self._worker.stdout.close()
 
 
-def parse(message: dict) -> Frame:
+def parse_frame(message: dict) -> Frame:
     """Return the frame of a worker's message: ``{"t": s, "bodies": [[name, x, y, z, qx, qy, qz, qw], ...]}``.
 
     Raises:

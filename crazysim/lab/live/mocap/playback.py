@@ -79,9 +79,9 @@ class Playback(Plugin):
         record = self.read(data)
         last = record.pos.shape[0] - 1
         sample = jnp.clip((data.core.steps / data.core.freq + record.start) * record.freq, 0, last)
-        before = jnp.minimum(jnp.floor(sample), last - 1)
-        share, k = sample - before, before.astype(jnp.int32)
-        pos, quat, vel = (x[k] + share * (x[k + 1] - x[k]) for x in (record.pos, record.quat, record.vel))
+        previous_sample = jnp.minimum(jnp.floor(sample), last - 1)
+        fraction, k = sample - previous_sample, previous_sample.astype(jnp.int32)
+        pos, quat, vel = (x[k] + fraction * (x[k + 1] - x[k]) for x in (record.pos, record.quat, record.vel))
         quat = quat / jnp.sqrt(jnp.sum(quat * quat, axis=-1, keepdims=True))
         objects = data.objects
         rows = {handle.rows[0]: i for i, handle in enumerate(self.handles)}

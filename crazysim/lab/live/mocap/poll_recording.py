@@ -40,11 +40,11 @@ class MocapRecorder(Closeable):
 
     def write(self, poll: Poll) -> None:
         """Append a poll with its frames, without keeping them in memory."""
-        new = [name for frame in poll.frames for name in frame.names if name not in self._ids]
-        if new:
-            new = list(dict.fromkeys(new))
-            self._ids.update({name: k for k, name in enumerate(new, start=len(self._ids))})
-            self._journal.append(NAMES_CHUNK, json.dumps(new).encode())
+        new_names = [name for frame in poll.frames for name in frame.names if name not in self._ids]
+        if new_names:
+            new_names = list(dict.fromkeys(new_names))
+            self._ids.update({name: k for k, name in enumerate(new_names, start=len(self._ids))})
+            self._journal.append(NAMES_CHUNK, json.dumps(new_names).encode())
         parts = [POLL_LAYOUT.pack(poll.now, len(poll.frames), poll.lost)]
         for frame in poll.frames:
             ids = np.array([self._ids[name] for name in frame.names], "<u4")
@@ -70,12 +70,12 @@ def read_polls(path: str | Path) -> Iterator[Poll]:
             if kind == NAMES_CHUNK:
                 names += json.loads(content)
             elif kind == POLL_CHUNK:
-                yield _poll(content, names)
+                yield _parse_poll(content, names)
             else:
                 raise ValueError(f"expected chunks of kinds {NAMES_CHUNK!r} and {POLL_CHUNK!r}, got {kind!r}")
 
 
-def _poll(content: bytes, names: list[str]) -> Poll:
+def _parse_poll(content: bytes, names: list[str]) -> Poll:
     now, n_frames, lost = POLL_LAYOUT.unpack_from(content)
     offset, frames = POLL_LAYOUT.size, []
     for _ in range(n_frames):

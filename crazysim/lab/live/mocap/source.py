@@ -119,11 +119,11 @@ def show_source(
             f"vcf1, ..."
         )
 
-    def bodies(stamp: float) -> dict[str, tuple[ArrayLike, ArrayLike]]:
+    def poses_at(stamp: float) -> dict[str, tuple[ArrayLike, ArrayLike]]:
         points = [path.setpoint(stamp) for path in paths]
         return {n: (p[:3], from_yaw(p[3])) for n, p in zip(names, points, strict=True)}
 
-    return FunctionSource(bodies, freq, name="show")
+    return FunctionSource(poses_at, freq, name="show")
 
 
 class ThreadSource(MocapSource):
@@ -142,7 +142,7 @@ class ThreadSource(MocapSource):
         """
         self.name, self._convention = name, convention or Convention()
         self._frames: deque[Frame] = deque(maxlen=MAX_QUEUED_FRAMES)
-        self._n_put = self._n_got = 0
+        self._n_received = self._n_polled = 0
         self._end_reason: str | None = None
         self._stop_event = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"mocap-{name}", daemon=True)
@@ -152,7 +152,7 @@ class ThreadSource(MocapSource):
         self._thread.start()
         return self
 
-    def stream(self, stopped: threading.Event) -> Iterator[Frame]:
+    def stream(self, stop_event: threading.Event) -> Iterator[Frame]:
         """Yield frames until there are no more, or the event is set."""
         raise NotImplementedError
 
@@ -160,9 +160,9 @@ class ThreadSource(MocapSource):
         frames = []
         while self._frames:
             frames.append(self._frames.popleft())
-        n_put = self._n_put  # read last, so that it counts at least the frames above
-        lost = max(n_put - self._n_got - len(frames) - len(self._frames), 0)
-        self._n_got += len(frames) + lost
+        n_received = self._n_received  # read last, so that it counts at least the frames above
+        lost = max(n_received - self._n_polled - len(frames) - len(self._frames), 0)
+        self._n_polled += len(frames) + lost
         return Poll(time.monotonic(), frames, lost)
 
     @property
@@ -179,7 +179,7 @@ class ThreadSource(MocapSource):
         try:
             for frame in self.stream(self._stop_event):
                 self._frames.append(self._convention.convert(frame))
-                self._n_put += 1
+                self._n_received += 1
                 if self._stop_event.is_set():
                     return
             self._end_reason = "the stream ended"
@@ -202,12 +202,12 @@ class RealTimeSource(ThreadSource):
         super().__init__(f"real-time {source.name}")
         self._source, self._speed = source, speed
 
-    def stream(self, stopped: threading.Event) -> Iterator[Frame]:
+    def stream(self, stop_event: threading.Event) -> Iterator[Frame]:
         start_time, k = time.monotonic(), 0
-        while not stopped.is_set():
+        while not stop_event.is_set():
             stamp = k / self._source.freq
             wait = start_time + stamp / self._speed - time.monotonic()
-            if wait > 0 and stopped.wait(wait):
+            if wait > 0 and stop_event.wait(wait):
                 return
             frame = self._source.frame(stamp)
             yield Frame(frame.stamp, frame.names, frame.pos, frame.quat, time.monotonic())

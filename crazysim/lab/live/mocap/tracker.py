@@ -84,18 +84,18 @@ class Tracker:
         self.quat = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
         self.seen = np.zeros(n, bool)
         self.n_frames = 0
-        self._rows_of = {name: k for k, name in enumerate(names)}
-        self._maps: dict[tuple[str, ...], tuple[NDArray, NDArray, list[str]]] = {}
+        self._row_by_name = {name: k for k, name in enumerate(names)}
+        self._mappings: dict[tuple[str, ...], tuple[NDArray, NDArray, list[str]]] = {}
         self._unknown_names: set[str] = set()
         self._stamps = np.full(n, -np.inf)
         self._is_lost = np.zeros(n, bool)
-        self._suspect, self._n_suspect = np.zeros((n, 3)), np.zeros(n, int)
+        self._suspect_pos, self._n_suspect_frames = np.zeros((n, 3)), np.zeros(n, int)
         self._stamp: float | None = None
         self._received: float | None = None
         self._is_stalled = self._has_ended = False
         self._intervals: list[float] = []
         self._period: float | None = None
-        self._least_delay, self._least_at = np.inf, -np.inf
+        self._least_delay, self._least_delay_time = np.inf, -np.inf
 
     @property
     def stalled(self) -> bool:
@@ -131,7 +131,7 @@ class Tracker:
         self._stamp = now
         self.n_frames += 1
         with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused below
-            self._take_bodies(frame, now)
+            self._update_bodies(frame, now)
         missing = self.seen & ~self._is_lost & (now - self._stamps > rules.lost) & np.isfinite(self._stamps)
         for k in np.flatnonzero(missing):
             self._is_lost[k], self.vel[k] = True, 0.0
@@ -141,7 +141,7 @@ class Tracker:
     def restart(self) -> None:
         """Accept the next frame with any time; poses stay, and velocities restart at zero."""
         self._stamps[self.seen] = -np.inf
-        self._least_delay, self._least_at, self._stamp, self._received = np.inf, -np.inf, None, None
+        self._least_delay, self._least_delay_time, self._stamp, self._received = np.inf, -np.inf, None, None
 
     def advance(self, now: float, lost: int = 0, ended: str | None = None) -> None:
         """Report, at the end of a poll, lost frames and a source that has stalled or ended.
@@ -179,23 +179,23 @@ class Tracker:
 
     def _watch_delay(self, now: float, delay: float) -> None:
         """Report frames that took much longer than the quickest one; the clocks may differ by any constant."""
-        if delay < self._least_delay or now - self._least_at > CLOCK_AGE:
-            self._least_delay, self._least_at = delay, now
+        if delay < self._least_delay or now - self._least_delay_time > CLOCK_AGE:
+            self._least_delay, self._least_delay_time = delay, now
         elif delay - self._least_delay > self.rules.late:
             self._report("late", self.source, now, f"{delay - self._least_delay:.3f} s after the quickest frame")
 
     def _find_rows(self, names: tuple[str, ...], now: float) -> tuple[NDArray, NDArray]:
         """Return the indices of the frame's entries that are used, and the rows of their bodies in the tracker."""
-        mapping = self._maps.get(names)
+        mapping = self._mappings.get(names)
         if mapping is None:
-            duplicates = sorted({name for name in names if names.count(name) > 1} & set(self._rows_of))
-            entries = [i for i, name in enumerate(names) if name in self._rows_of and name not in duplicates]
-            rows = np.array([self._rows_of[names[i]] for i in entries], int)
+            duplicates = sorted({name for name in names if names.count(name) > 1} & set(self._row_by_name))
+            entries = [i for i, name in enumerate(names) if name in self._row_by_name and name not in duplicates]
+            rows = np.array([self._row_by_name[names[i]] for i in entries], int)
             mapping = np.array(entries, int), rows, duplicates
-            if len(self._maps) > 1000:
-                self._maps.clear()
-            self._maps[names] = mapping
-            for name in set(names) - set(self._rows_of) - self._unknown_names:
+            if len(self._mappings) > 1000:
+                self._mappings.clear()
+            self._mappings[names] = mapping
+            for name in set(names) - set(self._row_by_name) - self._unknown_names:
                 if len(self._unknown_names) < 1000:
                     self._unknown_names.add(name)
                     self._report("unknown", name, now, "no object of the scene has this name; it is ignored")
@@ -204,7 +204,7 @@ class Tracker:
             self._report("duplicate", name, now, "name twice in a frame; it keeps its pose")
         return entries, rows
 
-    def _take_bodies(self, frame: Frame, now: float) -> None:
+    def _update_bodies(self, frame: Frame, now: float) -> None:
         entries, rows = self._find_rows(frame.names, now)
         pos, quat = frame.pos[entries], frame.quat[entries]
         norm = np.sqrt((quat * quat).sum(-1))
@@ -222,7 +222,7 @@ class Tracker:
         if not is_plausible.all():
             relocated = self._confirm_jumps(rows, pos, distance, is_plausible, now)
             is_plausible |= relocated
-        self._n_suspect[rows[is_plausible]] = 0
+        self._n_suspect_frames[rows[is_plausible]] = 0
         for k in rows[is_plausible & self._is_lost[rows]]:
             self._report("found", self.names[k], now, "valid pose again")
         rows, pos, quat, norm, dt, displacement = (
@@ -246,10 +246,10 @@ class Tracker:
         accepted = np.zeros(len(rows), bool)
         for i in np.flatnonzero(~is_plausible):
             k = rows[i]
-            is_near = np.linalg.norm(pos[i] - self._suspect[k]) <= self.rules.slack
-            self._n_suspect[k] = self._n_suspect[k] + 1 if is_near and self._n_suspect[k] else 1
-            self._suspect[k] = pos[i]
-            if self._n_suspect[k] >= self.rules.confirm:
+            is_near = np.linalg.norm(pos[i] - self._suspect_pos[k]) <= self.rules.slack
+            self._n_suspect_frames[k] = self._n_suspect_frames[k] + 1 if is_near and self._n_suspect_frames[k] else 1
+            self._suspect_pos[k] = pos[i]
+            if self._n_suspect_frames[k] >= self.rules.confirm:
                 accepted[i] = True
                 self._report(
                     "relocated", self.names[k], now, f"{distance[i]:.3f} m away in {self.rules.confirm} frames"

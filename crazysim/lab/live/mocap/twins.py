@@ -206,7 +206,7 @@ class Twins(Closeable):
         """
         if not 2 <= seconds * freq <= 1e7:
             raise ConfigError(f"expected a time of at least two samples, {2 / freq} s, got {seconds} s")
-        state_before = self.tracker, self._poses
+        saved_state = self.tracker, self._poses
         self.tracker = Tracker(self.names, self.tracker.rules, source.name)
         samples = []
         try:
@@ -217,7 +217,7 @@ class Twins(Closeable):
                 self._compute_poses()
                 samples.append(self._poses[:2])
         finally:
-            self.tracker, self._poses = state_before
+            self.tracker, self._poses = saved_state
         pos, quat = (np.stack(x) for x in zip(*samples, strict=True))
         return Playback(list(self.handles.values()), pos, quat, float(freq), start, name)
 

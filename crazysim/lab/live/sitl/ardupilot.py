@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink
-from crazysim.lab.live.sitl.measured import Measurements, frd, ned, quat_ned
+from crazysim.lab.live.sitl.measured import Measurements, to_frd, to_ned, to_ned_quat
 
 PORT = 9002
 """Port at which a simulation listens."""
-FORMATS = {18458: "<HHI16H", 29569: "<HHI32H"}
-"""Layouts of packets with 16 and 32 outputs, by first number; rate, count and pulse widths, us, follow it."""
+PACKET_LAYOUTS = {18458: "<HHI16H", 29569: "<HHI32H"}
+"""Layouts of packets with 16 and 32 outputs, by their first number. It is followed by the frame rate, the frame count
+and the pulse widths, us."""
 PULSE_MIN, PULSE_MAX = 1000.0, 2000.0
 """Pulse widths for a motor that is off and for one at full power, us: ``MOT_PWM_MIN`` and ``MOT_PWM_MAX``."""
 
@@ -49,26 +50,26 @@ class ArduPilot(FirmwareLink):
 
     def send(self, measured: Measurements) -> None:
         """Answer the last packet with the state, if there was one."""
-        line = {
+        message = {
             "timestamp": measured.time,
-            "imu": {"gyro": frd(measured.gyro).tolist(), "accel_body": frd(measured.accel).tolist()},
-            "position": ned(measured.pos).tolist(),
-            "quaternion": quat_ned(measured.quat).tolist(),
-            "velocity": ned(measured.vel).tolist(),
+            "imu": {"gyro": to_frd(measured.gyro).tolist(), "accel_body": to_frd(measured.accel).tolist()},
+            "position": to_ned(measured.pos).tolist(),
+            "quaternion": to_ned_quat(measured.quat).tolist(),
+            "velocity": to_ned(measured.vel).tolist(),
         }
-        self._link.answer(f"\n{json.dumps(line)}\n".encode())
+        self._link.answer(f"\n{json.dumps(message)}\n".encode())
 
     def receive(self, timeout: float) -> NDArray | None:
-        return self._link.newest(timeout, _commands)
+        return self._link.receive_newest(timeout, _parse_commands)
 
     def close(self) -> None:
         self._link.close()
 
 
-def _commands(packet: bytes) -> NDArray | None:
+def _parse_commands(packet: bytes) -> NDArray | None:
     """Return the motor commands of a packet, or None for another format. (4,)"""
-    form = FORMATS.get(int.from_bytes(packet[:2], "little"))
-    if form is None or len(packet) != struct.calcsize(form):
+    layout = PACKET_LAYOUTS.get(int.from_bytes(packet[:2], "little"))
+    if layout is None or len(packet) != struct.calcsize(layout):
         return None
-    pulses = np.array(struct.unpack(form, packet)[3:7], float)
+    pulses = np.array(struct.unpack(layout, packet)[3:7], float)
     return np.clip((pulses - PULSE_MIN) / (PULSE_MAX - PULSE_MIN), 0, 1)

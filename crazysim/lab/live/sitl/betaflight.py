@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
-from crazysim.lab.live.sitl.measured import COS_45_DEGREES, ZURICH, Measurements, Origin, check_origin, frd
+from crazysim.lab.live.sitl.measured import COS_45_DEGREES, ZURICH, Measurements, Origin, check_origin, to_frd
 from crazysim.tables import range_between, read_numbers
 
 PORTS = (9002, 9003, 9004)
 """Ports for motor packets, which Betaflight sends, and for state and remote-control packets, which it receives."""
 N_CHANNELS = 16
-LARGEST_PULSE = 65535
+MAX_PULSE = 65535
 """Largest pulse that a packet of the remote control holds, us."""
 
 
@@ -64,16 +64,16 @@ class Betaflight(FirmwareLink):
             check_origin(origin),
             Rate("rc_freq", rc_freq),
         )
-        self._start: tuple[float, float] | None = None
+        self._start_position: tuple[float, float] | None = None
         if not isinstance(ports, (tuple, list)) or len(ports) != len(PORTS):
             raise ConfigError(
                 f"expected ports of the motors, the state and the remote control, got {short_repr(ports)}. Use {PORTS}."
             )
-        motors, self._state, self._rc = ports
-        for port in (self._state, self._rc):
+        motor_port, self._state_port, self._rc_port = ports
+        for port in (self._state_port, self._rc_port):
             check_address(host, port, min_port=1)
         self._channels = np.array([1500.0, 1500.0, 1000.0, 1500.0, *[1000.0] * (N_CHANNELS - 4)])
-        self._link = Datagrams(host, motors)
+        self._link = Datagrams(host, motor_port)
 
     @property
     def channels(self) -> NDArray[np.float64]:
@@ -85,47 +85,50 @@ class Betaflight(FirmwareLink):
 
     @channels.setter
     def channels(self, values: ArrayLike) -> None:
-        self._channels = _pulses(values).astype(np.float64)
+        self._channels = _read_pulses(values).astype(np.float64)
 
     def send(self, measured: Measurements) -> None:
-        gyro, (x, y, z, w) = frd(measured.gyro), measured.quat
+        gyro, (x, y, z, w) = to_frd(measured.gyro), measured.quat
         latitude, longitude, altitude = self.origin.geodetic_position(measured.gps_pos)
         if self.gazebo:
             quat = (w, x, -y, -z)  # the Gazebo bridge conjugates with a half turn about x
-            self._start = self._start or (latitude, longitude)  # the bridge mirrors positions about the first one
-            latitude, longitude = (2 * x - y for x, y in zip(self._start, (latitude, longitude), strict=True))
+            # the bridge mirrors positions about the first one
+            self._start_position = self._start_position or (latitude, longitude)
+            latitude, longitude = (2 * x - y for x, y in zip(self._start_position, (latitude, longitude), strict=True))
         else:
             quat = COS_45_DEGREES * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
             gyro = gyro * [1, 1, -1]
         geodetic_position = (longitude, latitude, altitude)
         state = (
             *gyro,
-            *frd(measured.accel),
+            *to_frd(measured.accel),
             *quat,
             *measured.gps_vel,
             *geodetic_position,
             self.origin.pressure(measured.height),
         )
-        self._link.send(struct.pack("<18d", measured.time, *state), self._state)
+        self._link.send(struct.pack("<18d", measured.time, *state), self._state_port)
         if self._rc_rate.is_due(measured.time):
-            self._link.send(struct.pack(f"<d{N_CHANNELS}H", measured.time, *_pulses(self._channels)), self._rc)
+            self._link.send(
+                struct.pack(f"<d{N_CHANNELS}H", measured.time, *_read_pulses(self._channels)), self._rc_port
+            )
 
     def receive(self, timeout: float) -> NDArray | None:
-        return self._link.newest(timeout, _commands)
+        return self._link.receive_newest(timeout, _parse_commands)
 
     def close(self) -> None:
         self._link.close()
 
 
-def _pulses(channels: ArrayLike) -> NDArray[np.int64]:
+def _read_pulses(channels: ArrayLike) -> NDArray[np.int64]:
     """Return the pulses of a packet of the remote control, us. (16,)"""
-    pulses = read_numbers("channels", channels, range_between(0, LARGEST_PULSE), ((N_CHANNELS,),))
+    pulses = read_numbers("channels", channels, range_between(0, MAX_PULSE), ((N_CHANNELS,),))
     if np.any(pulses % 1):
         raise ConfigError(f"expected channels as whole numbers, us, got {short_repr(pulses.tolist())}. Round them.")
     return pulses.astype(np.int64)
 
 
-def _commands(packet: bytes) -> NDArray | None:
+def _parse_commands(packet: bytes) -> NDArray | None:
     """Return the motor commands of a packet, or None for another format. (4,)"""
     if len(packet) != struct.calcsize("<4f"):
         return None

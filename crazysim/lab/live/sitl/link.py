@@ -16,15 +16,15 @@ from crazysim.lab.live.sitl.measured import Measurements
 from crazysim.storage import Closeable
 from crazysim.tables import POSITIVE, range_between, read_number, read_numbers
 
-ROUNDING = 1e-6
+ROUNDING_TOLERANCE = 1e-6
 """Tolerance for rounding errors in sums of periods, s."""
 MAX_DATAGRAM = 65535
 """Longest datagram, bytes."""
-LAST_PORT = 65535
+MAX_PORT = 65535
 """Largest number of a port."""
 MAX_DRAIN_TIME = 0.1
 """Longest time for reading the waiting packets after the timeout, s, even if more keep arriving."""
-TIMEOUT = range_between(high=1e6, positive=True)
+TIMEOUT_RANGE = range_between(high=1e6, positive=True)
 """Range of a time to wait, s."""
 
 
@@ -69,7 +69,7 @@ class Rate:
 
     def is_due(self, time: float) -> bool:
         """Return True if the action is due at a simulated time, s, and then schedule the next one."""
-        if time < self._next_time - ROUNDING:
+        if time < self._next_time - ROUNDING_TOLERANCE:
             return False
         self._next_time = max(self._next_time + self._period, time)
         return True
@@ -85,7 +85,7 @@ def check_address(host: str, port: int, min_port: int = 0) -> None:
     """
     if not isinstance(host, str):
         raise ConfigError(f"expected host as text, got {short_repr(host)}. Use '127.0.0.1'.")
-    read_numbers("port", port, range_between(min_port, LAST_PORT), ((),), whole=True)
+    read_numbers("port", port, range_between(min_port, MAX_PORT), ((),), whole=True)
 
 
 class Datagrams(Closeable):
@@ -118,27 +118,27 @@ class Datagrams(Closeable):
             with contextlib.suppress(ConnectionRefusedError):
                 self._socket.sendto(packet, self._sender)
 
-    def newest(self, timeout: float, read: Callable[[bytes], NDArray | None]) -> NDArray | None:
+    def receive_newest(self, timeout: float, parse: Callable[[bytes], NDArray | None]) -> NDArray | None:
         """Return the contents of the newest valid packet, or None if none arrived in time.
 
         Args:
             timeout: Time to wait for one, s; 0 to read only what has arrived.
-            read: Function that returns the contents of a packet, or None for another format, which is skipped.
+            parse: Function that returns the contents of a packet, or None for another format, which is skipped.
         """
-        newest, now = None, time.monotonic()
+        newest_contents, now = None, time.monotonic()
         deadline, end = now + timeout, now + timeout + MAX_DRAIN_TIME
         while now < end:
-            self._socket.settimeout(max(deadline - now, 0.0) if newest is None else 0.0)
+            self._socket.settimeout(max(deadline - now, 0.0) if newest_contents is None else 0.0)
             try:
                 packet, sender = self._socket.recvfrom(MAX_DATAGRAM)
             except (TimeoutError, BlockingIOError):
                 break
             except ConnectionRefusedError:  # an earlier packet went to a program that does not listen
                 packet, sender = b"", self._sender
-            contents, now = read(packet), time.monotonic()
+            contents, now = parse(packet), time.monotonic()
             if contents is not None:
-                newest, self._sender = contents, sender
-        return newest
+                newest_contents, self._sender = contents, sender
+        return newest_contents
 
     def close(self) -> None:
         self._socket.close()

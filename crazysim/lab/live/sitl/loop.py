@@ -17,7 +17,7 @@ from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.pace import Pace, Speed
-from crazysim.lab.live.sitl.link import ROUNDING, TIMEOUT, FirmwareLink
+from crazysim.lab.live.sitl.link import ROUNDING_TOLERANCE, TIMEOUT_RANGE, FirmwareLink
 from crazysim.lab.live.sitl.measured import Measurements
 from crazysim.lab.live.staging import compile_step
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
@@ -67,7 +67,7 @@ class SoftwareInTheLoop(Closeable):
             reversed: True for a firmware that is set up for rotors that turn in the opposite senses.
             timeout: Time to wait for the motor commands of a firmware in lockstep, s.
         """
-        self.sim, self.timeout, self.motors = sim, read_number("timeout", timeout, TIMEOUT), motors
+        self.sim, self.timeout, self.motors = sim, read_number("timeout", timeout, TIMEOUT_RANGE), motors
         self.links = _check_links(links)
         freq = sim.freq if freq is None else dividing_rate("freq", freq, sim.freq)
         if sim.control != Control.rotor_vel:
@@ -86,7 +86,7 @@ class SoftwareInTheLoop(Closeable):
         self._n_steps = sim.freq // freq
         airframes = [*as_airframes(sim.airframes, sim.n_drones)] * sim.n_worlds
         self._orders = [motor_order(a, link, reversed) for a, link in zip(airframes, self.links, strict=True)]
-        self._airframes, self._fastest = airframes, [airframe.rotor_vel_limits[1] for airframe in airframes]
+        self._airframes, self._max_rotor_vel = airframes, [airframe.rotor_vel_limits[1] for airframe in airframes]
         self._sensors: dict[type, Any] = {
             kind: next((p for p in sim.plugins.values() if isinstance(p, kind)), None) for kind in SENSOR_KINDS
         }
@@ -94,9 +94,9 @@ class SoftwareInTheLoop(Closeable):
             self._sensors[IMU] = sim.add(IMU())
         self._rotor_vel = np.zeros((len(self.links), 4), np.float32)
         self._sample_numbers: NDArray | None = None
-        self._heard = [0.0] * len(self.links)
-        self._exchanges = 0
-        self._compiled = False
+        self._last_command_times = [0.0] * len(self.links)
+        self._n_exchanges = 0
+        self._is_compiled = False
 
     def run(self, seconds: float, speed: Speed | None = None) -> None:
         """Fly for a simulated time.
@@ -112,55 +112,55 @@ class SoftwareInTheLoop(Closeable):
         seconds = read_number("seconds", seconds, NOT_NEGATIVE)
         if speed is None:
             speed = "max" if all(link.lockstep for link in self.links) else 1.0
-        if not self._compiled:  # without lockstep, a firmware does not wait for compilation
+        if not self._is_compiled:  # without lockstep, a firmware does not wait for compilation
             compile_step(self.sim, self._n_steps)
-            self._compiled = True
+            self._is_compiled = True
         dt, start_time = self._n_steps / self.sim.freq, time.monotonic()
-        self._heard = [start_time] * len(self.links)
+        self._last_command_times = [start_time] * len(self.links)
         pace = Pace(dt, speed)
         for k in range(round(seconds / dt)):
-            if (due := pace.time_until_due()) > 0:
-                time.sleep(due)
+            if (wait := pace.time_until_due()) > 0:
+                time.sleep(wait)
             pace.record_step(k * dt)
             self.exchange()
-            self._check_heard(time.monotonic() - self.timeout, self.timeout)
+            self._check_commands_arrived(time.monotonic() - self.timeout, self.timeout)
             self.sim.step(self._n_steps)
         if seconds > SILENCE_LIMIT and (elapsed := time.monotonic() - start_time) > SILENCE_LIMIT:
-            self._check_heard(start_time, elapsed)
+            self._check_commands_arrived(start_time, elapsed)
 
     def exchange(self) -> None:
         """Send measurements, and apply the motor commands that come back."""
-        measured, self._sample_numbers = self._measurements()
+        measured, self._sample_numbers = self._read_measurements()
         for link, measurements in zip(self.links, measured, strict=True):
             link.send(measurements)
         for k, link in enumerate(self.links):
             command = link.receive(self.timeout if link.lockstep else 0.0)
             if command is not None:
-                self._rotor_vel[k] = self._speeds(k, command)
-                self._heard[k] = time.monotonic()
+                self._rotor_vel[k] = self._rotor_speeds(k, command)
+                self._last_command_times[k] = time.monotonic()
             elif link.lockstep:
                 raise _silence_error(link, self.timeout)
-        self._exchanges += 1
+        self._n_exchanges += 1
         sim = self.sim
         sim.rotor_vel_control(self._rotor_vel.reshape(sim.n_worlds, sim.n_drones, 4))
 
     def measure(self) -> list[Measurements]:
         """Return the measurements of every drone; ``new`` contains the sensors with data since the last exchange."""
-        return self._measurements()[0]
+        return self._read_measurements()[0]
 
-    def _measurements(self) -> tuple[list[Measurements], NDArray]:
+    def _read_measurements(self) -> tuple[list[Measurements], NDArray]:
         """Return the measurements of every drone, and counts of when they were taken. (n_links, n_kinds)"""
-        states, time_now = self.sim.data.states, self._exchanges * self._n_steps / self.sim.freq
+        states, time_now = self.sim.data.states, self._n_exchanges * self._n_steps / self.sim.freq
         pos, quat, vel, ang_vel = (_rows(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
-        values, steps_taken = zip(*map(self._latest, SENSOR_KINDS), strict=True)
+        values, steps_taken = zip(*map(self._latest_values, SENSOR_KINDS), strict=True)
         imu, height, field, gps = values
         if field is None:
             field = rotate(quat * [-1, -1, -1, 1], MAGNETIC_FIELD)
         gps = np.concatenate([pos, vel], axis=-1) if gps is None else gps
-        counts: dict[type[Sensor], int] = {GPS: math.floor(time_now * GPS_FREQ + ROUNDING)}
+        counts: dict[type[Sensor], int] = {GPS: math.floor(time_now * GPS_FREQ + ROUNDING_TOLERANCE)}
         sample_numbers = np.empty((len(self.links), len(SENSOR_KINDS)), np.int64)
         for k, kind in enumerate(SENSOR_KINDS):
-            sample_numbers[:, k] = counts.get(kind, self._exchanges) if steps_taken[k] is None else steps_taken[k]
+            sample_numbers[:, k] = counts.get(kind, self._n_exchanges) if steps_taken[k] is None else steps_taken[k]
         is_new = (
             np.ones_like(sample_numbers, bool)
             if self._sample_numbers is None
@@ -186,7 +186,7 @@ class SoftwareInTheLoop(Closeable):
             )
         return measurements, sample_numbers
 
-    def _latest(self, kind: type[Sensor]) -> tuple[Any, NDArray | None]:
+    def _latest_values(self, kind: type[Sensor]) -> tuple[Any, NDArray | None]:
         """Return the latest measurements of a sensor, vectors in the body frame, and the steps that took them.
 
         Before the first measurement, they are the values of a perfect sensor. Without the sensor, both are None.
@@ -204,24 +204,24 @@ class SoftwareInTheLoop(Closeable):
             value = rotate(np.asarray(record.quat, float)[..., None, :], vectors).reshape(value.shape)
         return _rows(value), taken
 
-    def _check_heard(self, start_time: float, seconds: float) -> None:
+    def _check_commands_arrived(self, start_time: float, seconds: float) -> None:
         """Check that every firmware has sent commands since a time (``time.monotonic``), ``seconds`` ago."""
-        for link, heard in zip(self.links, self._heard, strict=True):
-            if heard <= start_time:
+        for link, last_time in zip(self.links, self._last_command_times, strict=True):
+            if last_time <= start_time:
                 raise _silence_error(link, seconds)
 
     def close(self) -> None:
         for link in self.links:
             link.close()
 
-    def _speeds(self, k: int, command: NDArray) -> NDArray:
+    def _rotor_speeds(self, k: int, command: NDArray) -> NDArray:
         """Return the speeds of the rotors of a drone for the motor commands of its firmware, rpm. (4,)"""
-        of_rotors, airframe = np.zeros(4), self._airframes[k]
-        of_rotors[self._orders[k]] = command
+        rotor_commands, airframe = np.zeros(4), self._airframes[k]
+        rotor_commands[self._orders[k]] = command
         if self.motors == "speed":
-            return of_rotors * self._fastest[k]
-        speeds = airframe.rotor_vel(of_rotors * float(airframe.value("rotors.thrust_max")))
-        return np.where(of_rotors > 0, speeds, 0.0)
+            return rotor_commands * self._max_rotor_vel[k]
+        speeds = airframe.rotor_vel(rotor_commands * float(airframe.value("rotors.thrust_max")))
+        return np.where(rotor_commands > 0, speeds, 0.0)
 
 
 def _check_links(links: object) -> tuple[FirmwareLink, ...]:

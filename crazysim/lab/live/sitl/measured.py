@@ -102,17 +102,17 @@ ZURICH = Origin(47.397742, 8.545594, 488.0)
 """Default origin, at which simulations of PX4 start."""
 
 
-def frd(vector: NDArray) -> NDArray:
+def to_frd(vector: NDArray) -> NDArray:
     """Convert a vector from the body axes forward, left, up to forward, right, down. (3,)"""
     return vector * np.array([1.0, -1.0, -1.0])
 
 
-def ned(vector: NDArray) -> NDArray:
+def to_ned(vector: NDArray) -> NDArray:
     """Convert a vector from the world axes east, north, up to north, east, down. (3,)"""
     return np.array([vector[1], vector[0], -vector[2]])
 
 
-def quat_ned(quat: NDArray) -> NDArray:
+def to_ned_quat(quat: NDArray) -> NDArray:
     """Return the attitude of the body (forward, right, down) in the world (north, east, down), wxyz. (4,)
 
     The quaternion of ENU to NED, ``(x + y) / sqrt(2)``, times the attitude, times the quaternion of FRD to FLU, ``x``.

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, not_installed
-from crazysim.lab.live.sitl.link import MAX_DRAIN_TIME, TIMEOUT, FirmwareLink, check_address
-from crazysim.lab.live.sitl.measured import ZURICH, Measurements, Origin, check_origin, frd, ned, quat_ned
+from crazysim.lab.live.sitl.link import MAX_DRAIN_TIME, TIMEOUT_RANGE, FirmwareLink, check_address
+from crazysim.lab.live.sitl.measured import ZURICH, Measurements, Origin, check_origin, to_frd, to_ned, to_ned_quat
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.tables import read_number
@@ -70,7 +70,7 @@ class Px4(FirmwareLink):
         self._mavlink: Any = common
         check_address(host, port)
         self.origin = check_origin(origin)
-        self.connect_timeout = read_number("connect_timeout", connect_timeout, TIMEOUT)
+        self.connect_timeout = read_number("connect_timeout", connect_timeout, TIMEOUT_RANGE)
         self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -84,7 +84,7 @@ class Px4(FirmwareLink):
         self._mav.robust_parsing = True  # bytes that are not a message are skipped
         self._start_times: tuple[float, float] | None = None
         self._time = 0.0
-        self._is_asked = self._answers = False
+        self._expects_answer = self._has_answered = False
         self._motors = np.zeros(4)
         self.armed = False
         """True while PX4 is armed."""
@@ -97,28 +97,28 @@ class Px4(FirmwareLink):
     def send(self, measured: Measurements) -> None:
         """Send ``HIL_SENSOR``, ``HIL_GPS`` where there is a new position, and ``HIL_STATE_QUATERNION``."""
         origin, mav, micros = self.origin, self._mavlink, round(measured.time * 1e6)
-        field = frd(measured.field) / GAUSS
+        field = to_frd(measured.field) / GAUSS
         altitude = origin.altitude + measured.height
         pressure = origin.pressure(measured.height) / HECTOPASCAL
         updated = sum(UPDATED_BITS.get(kind, 0) for kind in measured.new)
         self._send(
             mav.MAVLink_hil_sensor_message(
-                micros, *frd(measured.accel), *frd(measured.gyro), *field, pressure, 0.0, altitude, TEMPERATURE,
+                micros, *to_frd(measured.accel), *to_frd(measured.gyro), *field, pressure, 0.0, altitude, TEMPERATURE,
                 updated,
             )
         )  # fmt: skip
-        self._time, self._is_asked = measured.time, IMU in measured.new
+        self._time, self._expects_answer = measured.time, IMU in measured.new
         if GPS in measured.new:
-            north, east, down = (round(100 * v) for v in ned(measured.gps_vel))
+            north, east, down = (round(100 * v) for v in to_ned(measured.gps_vel))
             speed = round(float(np.hypot(north, east)))
             course = round(100 * np.degrees(np.arctan2(east, north)) % 36000)
             geodetic_position = self._geodetic_integers(measured.gps_pos)
             self._send(
                 mav.MAVLink_hil_gps_message(micros, 3, *geodetic_position, 30, 40, speed, north, east, down, course, 10)
             )
-        vel = [round(100 * v) for v in ned(measured.vel)]
-        accel = [round(1e3 * v / 9.80665) for v in frd(measured.accel)]
-        quat, ang_vel = quat_ned(measured.quat).tolist(), frd(measured.ang_vel)
+        vel = [round(100 * v) for v in to_ned(measured.vel)]
+        accel = [round(1e3 * v / 9.80665) for v in to_frd(measured.accel)]
+        quat, ang_vel = to_ned_quat(measured.quat).tolist(), to_frd(measured.ang_vel)
         geodetic_position = self._geodetic_integers(measured.pos)
         self._send(
             mav.MAVLink_hil_state_quaternion_message(micros, quat, *ang_vel, *geodetic_position, *vel, 0, 0, *accel)
@@ -129,13 +129,13 @@ class Px4(FirmwareLink):
         if self._start_times is None:
             self._start_times = now, self._time
         elapsed, simulated_elapsed = now - self._start_times[0], self._time - self._start_times[1]
-        if self._answers:
-            must_answer, patience = self._is_asked, timeout * self._is_asked
+        if self._has_answered:
+            must_answer, wait = self._expects_answer, timeout * self._expects_answer
         else:
-            must_answer, patience = elapsed > timeout, min(max(simulated_elapsed + STARTUP_LAG - elapsed, 0.0), timeout)
-        motors = self._newest(now + patience)
+            must_answer, wait = elapsed > timeout, min(max(simulated_elapsed + STARTUP_LAG - elapsed, 0.0), timeout)
+        motors = self._newest_commands(now + wait)
         if motors is not None:
-            self._answers, self._motors = True, motors
+            self._has_answered, self._motors = True, motors
         return None if motors is None and must_answer else self._motors
 
     def close(self) -> None:
@@ -143,12 +143,12 @@ class Px4(FirmwareLink):
             if connection is not None:
                 connection.close()
 
-    def _newest(self, deadline: float) -> NDArray | None:
+    def _newest_commands(self, deadline: float) -> NDArray | None:
         """Return the newest motor commands, or None if none arrived until a time of ``time.monotonic``. (4,)"""
         motors, now = None, time.monotonic()
         end = max(deadline, now) + MAX_DRAIN_TIME
-        while now < end and self._readable(max(deadline - now, 0.0) if motors is None else 0.0):
-            for message in self._messages():
+        while now < end and self._has_data(max(deadline - now, 0.0) if motors is None else 0.0):
+            for message in self._read_messages():
                 if message.get_type() == "HIL_ACTUATOR_CONTROLS":
                     self.armed = bool(message.mode & self._mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
                     motors = np.clip(np.nan_to_num(message.controls[:4]), 0, 1) * self.armed  # NaN: no command
@@ -160,7 +160,7 @@ class Px4(FirmwareLink):
         latitude, longitude, altitude = self.origin.geodetic_position(pos)
         return round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
 
-    def _connected(self) -> socket.socket:
+    def _require_client(self) -> socket.socket:
         if self._client is None:
             self._server.settimeout(self.connect_timeout)
             try:
@@ -175,15 +175,15 @@ class Px4(FirmwareLink):
         return self._client
 
     def _send(self, message: Any) -> None:
-        client = self._connected()
+        client = self._require_client()
         client.settimeout(self.connect_timeout)
         try:
             client.sendall(message.pack(self._mav))
         except (ConnectionError, TimeoutError):
             raise _closed_error() from None
 
-    def _readable(self, timeout: float) -> bool:
-        client = self._connected()
+    def _has_data(self, timeout: float) -> bool:
+        client = self._require_client()
         client.settimeout(max(timeout, 1e-6))
         try:
             return bool(client.recv(1, socket.MSG_PEEK))
@@ -192,8 +192,8 @@ class Px4(FirmwareLink):
         except (TimeoutError, BlockingIOError):
             return False
 
-    def _messages(self) -> list[Any]:
-        client = self._connected()
+    def _read_messages(self) -> list[Any]:
+        client = self._require_client()
         client.settimeout(0)
         try:
             return self._mav.parse_buffer(client.recv(CHUNK_BYTES)) or []

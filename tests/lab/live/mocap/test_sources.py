@@ -78,7 +78,7 @@ def test_a_thread_sends_in_real_time():
 class Broken(ThreadSource):
     """A source that sends one frame and fails."""
 
-    def stream(self, stopped):
+    def stream(self, stop_event):
         yield Frame.of(0.0, moving(0.0))
         raise OSError("unplugged")
 
@@ -86,7 +86,7 @@ class Broken(ThreadSource):
 class Quick(ThreadSource):
     """A source that sends more frames than are kept."""
 
-    def stream(self, stopped):
+    def stream(self, stop_event):
         for k in range(source_module.MAX_QUEUED_FRAMES + 100):
             yield Frame.of(k, moving(0.0))
 
