@@ -18,7 +18,7 @@ from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
 from crazysim.pytree import Members, PyTree, leaf, static
 from crazysim.sim.sim import Sim
-from crazysim.startup import __version__, lazy
+from crazysim.startup import __version__, lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.core import functional as functional
@@ -120,7 +120,7 @@ __all__ = [
     "static",
 ]
 
-__getattr__ = lazy(
+__getattr__ = lazy_getattr(
     __name__,
     {
         "Battery": "crazysim.plugins.effects",

@@ -89,8 +89,8 @@ def cpu_features() -> str:
         lines = CPU_INFO.read_text().splitlines()
     except OSError:
         lines = []
-    listed = next((line for line in lines if line.split(":")[0].strip().lower() in ("flags", "features")), "")
-    return f"{platform.machine()} {listed}"
+    feature_line = next((line for line in lines if line.split(":")[0].strip().lower() in ("flags", "features")), "")
+    return f"{platform.machine()} {feature_line}"
 
 
 def folder() -> Path | None:
@@ -111,7 +111,7 @@ def _usable_default_folder() -> Path | None:
 @functools.cache
 def _prepared_default_folder(*environment: str | None) -> Path | None:
     """Return the default folder, prepared, if it can be used in this environment."""
-    del environment  # the folder follows from it
+    del environment  # the key under which the result is cached
     try:
         path = default_cache()
         if path is not None:
@@ -202,15 +202,15 @@ class keep_programs(contextlib.ContextDecorator):
     If JAX has a cache already, nothing changes. Programs that the thread compiles outside are not kept.
     """
 
-    _entered = threading.local()
+    _thread_state = threading.local()
 
     def __init__(self, enabled: bool = True):
         """Choose whether the block keeps programs."""
         self._enabled = enabled
 
     def __enter__(self) -> None:
-        """Open the cache, unless an outer block has."""
-        stack = self._entered.__dict__.setdefault("stack", [])
+        """Open the cache, unless an outer block has opened it."""
+        stack = self._thread_state.__dict__.setdefault("stack", [])
         context = None
         if self._enabled and not any(stack) and jaxcompat.cache_folder() is None and (path := folder()) is not None:
             context = jaxcompat.compilation_cache(str(path))
@@ -219,7 +219,7 @@ class keep_programs(contextlib.ContextDecorator):
 
     def __exit__(self, *error: Any) -> None:
         """Close the cache, if this block opened it."""
-        context = self._entered.stack.pop()
+        context = self._thread_state.stack.pop()
         if context is not None:
             context.__exit__(*error)
 
@@ -242,36 +242,36 @@ def enable_for_command() -> None:
         )
 
 
-ANNOUNCE_AFTER = 1.0
-"""Time after which unfinished work is announced, s."""
+ANNOUNCE_DELAY = 1.0
+"""Default time after which unfinished work is announced, s."""
 
-_announced: set[str] = set()
+_announced_work: set[str] = set()
 
 
-def announce(work: str, seconds: str) -> None:
+def announce(work: str, duration: str) -> None:
     """Print a line on stderr before work that takes long, once in a process for each kind of work.
 
     Args:
         work: Name of the work, such as ``"compiling the gradient"``.
-        seconds: Duration on two cores, such as ``"10 to 40 s"``.
+        duration: Duration on two cores, such as ``"10 to 40 s"``.
     """
-    if work in _announced:
+    if work in _announced_work:
         return
-    _announced.add(work)
+    _announced_work.add(work)
     suffix = "" if folder() is None else ", less in later runs"
-    print(f"{work}: {seconds} on two cores{suffix}", file=sys.stderr, flush=True)
+    print(f"{work}: {duration} on two cores{suffix}", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
-def announce_if_slow(work: str, seconds: str, announce_after: float = ANNOUNCE_AFTER) -> Iterator[None]:
-    """Keep the programs of long work, and announce it where it has not ended after some time.
+def announce_if_slow(work: str, duration: str, delay: float = ANNOUNCE_DELAY) -> Iterator[None]:
+    """Keep the programs of long work, and announce the work if it has not ended after some time.
 
     Args:
         work: Name of the work, such as ``"compiling the gradient"``.
-        seconds: Duration on two cores, such as ``"10 to 40 s"``.
-        announce_after: Time after which it is announced, s.
+        duration: Duration on two cores, such as ``"10 to 40 s"``.
+        delay: Time after which the work is announced, s.
     """
-    timer = threading.Timer(announce_after, announce, (work, seconds))
+    timer = threading.Timer(delay, announce, (work, duration))
     timer.daemon = True
     timer.start()
     try:

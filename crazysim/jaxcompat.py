@@ -438,7 +438,7 @@ def cache_folder() -> str | None:
 
 @contextlib.contextmanager
 def compilation_cache(folder: str) -> Iterator[None]:
-    """Let JAX keep the programs that this thread compiles in a block; its configuration stays as it is.
+    """Let JAX keep the programs that this thread compiles in a block, without a change of its configuration.
 
     JAX opens the cache once per process. The last of overlapping blocks, including blocks of other threads, closes it,
     so that a folder that is configured later is used. If JAX lacks the names used here, nothing is kept.
@@ -463,25 +463,25 @@ def compilation_cache(folder: str) -> Iterator[None]:
         yield
 
 
-_blocks = 0
+_n_cache_blocks = 0
 """Number of blocks with a compilation cache that are open now, of all threads."""
-_BLOCKS_LOCK = threading.Lock()
+_CACHE_LOCK = threading.Lock()
 
 
 @contextlib.contextmanager
 def _close_cache_outside(close: Callable[[], None]) -> Iterator[None]:
     """Close JAX's cache before the first and after the last of overlapping blocks; JAX closes it without a lock."""
-    global _blocks
-    with _BLOCKS_LOCK:
-        if not _blocks:
+    global _n_cache_blocks
+    with _CACHE_LOCK:
+        if not _n_cache_blocks:
             close()
-        _blocks += 1
+        _n_cache_blocks += 1
     try:
         yield
     finally:
-        with _BLOCKS_LOCK:
-            _blocks -= 1
-            if not _blocks:
+        with _CACHE_LOCK:
+            _n_cache_blocks -= 1
+            if not _n_cache_blocks:
                 close()
 
 

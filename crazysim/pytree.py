@@ -45,8 +45,8 @@ def leaf(
             for masses along three axes.
         sparse: True for a parameter whose zeros are absent terms, as in an offset along one axis. While it is
             shared, a step is compiled without these terms, and again after one of them changes.
-        scratch: True for an array that only carries numbers from one stage of a step to another: what a step writes
-            there is not kept.
+        scratch: True for an array that only carries numbers from one stage of a step to another. Its values are not
+            kept after the step.
         default: Value of the field where none is given.
     """
     metadata = {"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse, "scratch": scratch}
@@ -54,7 +54,7 @@ def leaf(
 
 
 def static(**kwargs: Any) -> Any:
-    """Declare a field that is part of the record's type: hashable, no array, a new value recompiles."""
+    """Declare a field that is part of the record's type: a hashable value, not an array. A new value recompiles."""
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
@@ -231,12 +231,12 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         if not has_axes or core not in (None, shape[len(batch) :]):
             is_parameter = metadata["scope"] == "parameter"
             batch = member_shape if is_parameter else batch
-            or_shared = f", or {core_ndim} if all {kinds} share it" if is_parameter else ""
+            shared_text = f", or {core_ndim} if all {kinds} share it" if is_parameter else ""
             ending = "" if core is None else f" and end with {core}"
             n_axes = len(batch) + (core_ndim or 0)
             raise ConfigError(
                 f"{name} has shape {shape}; needed are {n_axes} dimensions that begin with {batch}{ending}, for "
-                f"{n_worlds} worlds of {n} {kinds}{or_shared}. For one value per world, repeat it for every {kind} "
+                f"{n_worlds} worlds of {n} {kinds}{shared_text}. For one value per world, repeat it for every {kind} "
                 f"with jnp.broadcast_to."
             )
 

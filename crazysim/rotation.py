@@ -73,8 +73,8 @@ def safe_sqrt(x: Array) -> Array:
 def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     (x,), (x_dot,) = primals, tangents
     root = safe_sqrt(x)
-    positive = ~(x <= 0)
-    return root, jnp.where(positive, 0.5 / jnp.where(positive, root, 1.0), 0.0) * x_dot
+    is_positive = ~(x <= 0)
+    return root, jnp.where(is_positive, 0.5 / jnp.where(is_positive, root, 1.0), 0.0) * x_dot
 
 
 def safe_norm(x: Array) -> Array:

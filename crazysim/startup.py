@@ -38,7 +38,7 @@ def set_variables() -> None:
 
 
 def import_mujoco() -> None:
-    """Import MuJoCo, and warn where ``MUJOCO_GL`` must be ``disable`` for that."""
+    """Import MuJoCo, and warn if that only works with ``MUJOCO_GL=disable``."""
     try:
         import mujoco
     except Exception as error:  # OpenGL's libraries raise errors of many types
@@ -90,7 +90,7 @@ def import_required() -> None:
             raise ImportError(text, name=name) from error
 
 
-def lazy(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+def lazy_getattr(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
     """Return a ``__getattr__`` for a package that imports some of its names at their first use.
 
     Args:

@@ -224,7 +224,12 @@ class ZipReader:
             Exception: Of any type, if it is damaged; see ``reading``.
         """
         self._zip = zipfile.ZipFile(file)
-        self._name, self._max_file, self._max_total, self._unpacked = name, max_file_bytes, max_total_bytes, 0
+        self._name, self._max_file_bytes, self._max_total_bytes, self._n_unpacked_bytes = (
+            name,
+            max_file_bytes,
+            max_total_bytes,
+            0,
+        )
         members = self._zip.infolist()
         if len(members) > max_files:
             raise ConfigError(f"expected at most {max_files} files, got {len(members)} in {name}")
@@ -236,14 +241,14 @@ class ZipReader:
         """Return the contents of a file of the archive.
 
         Raises:
-            ConfigError: If the file, or all files until now, are too large.
+            ConfigError: If the file is too large, or all files that have been read are.
             Exception: Of any type, if it is damaged; see ``reading``.
         """
         member = self._members[name]
-        self._unpacked += member.file_size
-        if member.file_size > self._max_file or self._unpacked > self._max_total:
+        self._n_unpacked_bytes += member.file_size
+        if member.file_size > self._max_file_bytes or self._n_unpacked_bytes > self._max_total_bytes:
             raise ConfigError(
-                f"expected files of at most {self._max_file} bytes, {self._max_total} in all, got more in "
+                f"expected files of at most {self._max_file_bytes} bytes, {self._max_total_bytes} in all, got more in "
                 f"{self._name}: {name}"
             )
         with self._zip.open(member) as file:

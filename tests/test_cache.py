@@ -298,11 +298,11 @@ def test_long_work_is_announced_once_for_each_kind(settings, capsys):
 
 
 def test_work_that_lasts_is_announced_and_work_that_ends_at_once_is_not(settings, capsys, monkeypatch):
-    with announce_if_slow("compiling what is cached", "5 s", announce_after=3600.0):
+    with announce_if_slow("compiling what is cached", "5 s", delay=3600.0):
         pass
     assert capsys.readouterr().err == ""
     shown = threading.Event()
     monkeypatch.setattr(cache, "announce", lambda *args: (announce(*args), shown.set()))
-    with announce_if_slow("compiling what lasts", "5 s", announce_after=0.0):
+    with announce_if_slow("compiling what lasts", "5 s", delay=0.0):
         assert shown.wait(60), "the notice comes while the work is done"
     assert capsys.readouterr().err.startswith("compiling what lasts: 5 s on two cores")

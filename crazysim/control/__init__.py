@@ -13,7 +13,7 @@ from crazysim.control.state_controller import StateParams, state2attitude
 from crazysim.control.switch import Switch
 from crazysim.dynamics.parameter_tables import load_controller_fn_params as load_fn_params
 from crazysim.dynamics.parameter_tables import load_controller_params as load_params
-from crazysim.startup import lazy
+from crazysim.startup import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.control.auto import Auto
@@ -56,7 +56,7 @@ __all__ = [
     "tracking_lqr_control",
 ]
 
-__getattr__ = lazy(
+__getattr__ = lazy_getattr(
     __name__,
     {
         "Auto": "crazysim.control.auto",

@@ -36,7 +36,7 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
     def run_inner(data: SimData) -> SimData:
         record = getattr(data.controls, level).controller
         command, memory = controller.update(data, _command_in_force(data, control), record.memory, record.params)
-        return _replace_memory(_stage_below(data, controller.output, command), control, memory)
+        return _replace_memory(_stage_output(data, controller.output, command), control, memory)
 
     def run_controller(data: SimData) -> SimData:
         return run_inner(_apply_staged_command(data, control))
@@ -70,8 +70,8 @@ def _command_in_force(data: SimData, level: Control) -> Setpoint | Array:
     )
 
 
-def _stage_below(data: SimData, level: Control, command: Array) -> SimData:
-    """Return the data of one drone with the command of its controller staged; rotor speeds are in force at once."""
+def _stage_output(data: SimData, level: Control, command: Array) -> SimData:
+    """Return the data of one drone with its controller's command staged; rotor speeds take effect at once."""
     controls = controls_of(data)
     if level == Control.rotor_vel:
         return data.replace(controls=controls.replace(rotor_vel=command))

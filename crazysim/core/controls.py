@@ -35,12 +35,12 @@ class ControllerData(PyTree):
             create_per_drone(airframes, controller.memory, n_worlds),
             controller.memory(as_airframes(airframes)[0]),
         )
-        for record, allowed in ((memory, ("drone",)), (params, ("shared", "drone"))):
-            refused = set(jax.tree.leaves(scopes(record))) - set(allowed)
-            if refused:
+        for record, allowed_scopes in ((memory, ("drone",)), (params, ("shared", "drone"))):
+            refused_scopes = set(jax.tree.leaves(scopes(record))) - set(allowed_scopes)
+            if refused_scopes:
                 raise ConfigError(
-                    f"expected leaves of scope {' or '.join(allowed)} in {type(record).__name__} of controller "
-                    f"{controller.name!r}, got {sorted(refused)}. Declare memory with leaf('drone', ...), and "
+                    f"expected leaves of scope {' or '.join(allowed_scopes)} in {type(record).__name__} of controller "
+                    f"{controller.name!r}, got {sorted(refused_scopes)}. Declare memory with leaf('drone', ...), and "
                     f"parameters with leaf('parameter', ...)."
                 )
 
@@ -61,7 +61,7 @@ class ControllerData(PyTree):
 
 
 class _LevelData(PyTree):
-    """Gains and memory of the controller of a command level, under Crazyflow's names; None if it has no such field."""
+    """Base class with fields of the level's controller as properties, under Crazyflow's names; None if it lacks one."""
 
     controller: ControllerData | None
     """Controller that follows the commands; None in fitted dynamics, which follow attitudes."""
@@ -164,14 +164,14 @@ def check_same_controllers(controls: SimControls, reference: SimControls, name: 
         reference: Commands and controllers of the simulation.
         name: Name of the simulation's controller.
     """
-    records, expected = _controller_records(controls), _controller_records(reference)
-    if records == expected:  # the same objects
+    records, expected_records = _controller_records(controls), _controller_records(reference)
+    if records == expected_records:  # the same objects
         return
-    if [_layout(controller) for controller in records] != [_layout(controller) for controller in expected]:
-        expected_text, found_text = (", then ".join(map(_describe_controller, x)) for x in (expected, records))
+    if [_layout(controller) for controller in records] != [_layout(controller) for controller in expected_records]:
+        expected_text, actual_text = (", then ".join(map(_describe_controller, x)) for x in (expected_records, records))
         raise ConfigError(
-            f"expected data of controller {name!r} with {expected_text or 'no records'}, got "
-            f"{found_text or 'no records'}. Use data of this simulation, or of one with the same settings."
+            f"expected_records data of controller {name!r} with {expected_text or 'no records'}, got "
+            f"{actual_text or 'no records'}. Use data of this simulation, or of one with the same settings."
         )
 
 
@@ -250,7 +250,7 @@ class SimControls(PyTree):
         check_command_level(dynamics, control)
         check_controller(dynamics, control, controller)
         followers, last_level = controller_chain(controller, control)
-        by_level = dict(followers)
+        controller_by_level = dict(followers)
         data = {level: ControllerData.create(*shape, x, airframes) for level, x in followers}
 
         def zeros(n: int) -> Any:
@@ -258,7 +258,10 @@ class SimControls(PyTree):
 
         state = attitude = body_rate = force_torque = rotor_vel = None
         if control == Control.state:
-            cmd, has_feedforward = host_array(np.eye(16)[12], *shape, 16), by_level[control].follows_feedforward
+            cmd, has_feedforward = (
+                host_array(np.eye(16)[12], *shape, 16),
+                controller_by_level[control].follows_feedforward,
+            )
             # A copy, because two leaves that share a buffer cannot both be donated.
             state = StateControlData(
                 data[control],
@@ -268,8 +271,8 @@ class SimControls(PyTree):
                 feedforward=zeros(8) if has_feedforward else None,
                 staged_feedforward=zeros(8) if has_feedforward else None,
             )
-        if Control.attitude in (*by_level, last_level):
-            follower = by_level.get(Control.attitude)
+        if Control.attitude in (*controller_by_level, last_level):
+            follower = controller_by_level.get(Control.attitude)
             attitude = AttitudeControlData(
                 data.get(Control.attitude),
                 zeros(4),

@@ -107,11 +107,11 @@ def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | 
     """Return a part of a setpoint as an array that broadcasts to a shape."""
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value)
-        fits = np.broadcast_shapes(array.shape, shape) == shape
+        is_broadcastable = np.broadcast_shapes(array.shape, shape) == shape
     except ValueError:  # a list of lists of unequal lengths, or shapes that do not broadcast
-        array, fits = np.zeros(0), False
+        array, is_broadcastable = np.zeros(0), False
     is_numeric = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
-    if not (fits and is_numeric and (name == "yaw" or array.shape[-1:] == (3,))):
+    if not (is_broadcastable and is_numeric and (name == "yaw" or array.shape[-1:] == (3,))):
         raise ConfigError(f"expected {name} as numbers that broadcast to shape {shape}, got {short_repr(value)}")
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
         raise ConfigError(f"expected finite numbers as {name}, got {short_repr(value)}. Check its computation.")
@@ -250,9 +250,9 @@ def _as_command(
     data: SimData, name: str, shape: tuple[int, ...], fields: str, command: ArrayLike, check_finite: bool
 ) -> Array | NDArray:
     """Return a command of the given shape as an array of the state's dtype; see ``check_command``."""
-    on_host = not isinstance(command, jax.Array)
+    is_on_host = not isinstance(command, jax.Array)
     try:
-        array = np.asarray(command) if on_host else command
+        array = np.asarray(command) if is_on_host else command
     except ValueError as error:
         raise ValueError(f"expected the {name} command as a regular array, got {command!r}") from error
     if array.shape != shape:
@@ -264,7 +264,7 @@ def _as_command(
     dtype = data.states.pos.dtype
     # Host input of any type reaches the device with one dtype and placement, so nothing is traced or compiled again.
     if array.dtype == dtype:
-        array = array.copy() if on_host else array.astype(dtype)
+        array = array.copy() if is_on_host else array.astype(dtype)
     elif jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer):
         with np.errstate(over="ignore"):  # a number too large for the dtype becomes infinite, which is reported below
             array = array.astype(dtype)
@@ -272,7 +272,7 @@ def _as_command(
         raise ValueError(f"expected real numbers as {name} command, got type {array.dtype}; use float32")
     is_tracer = isinstance(array, jax.core.Tracer)
     check_finite = check_flag("check_finite", check_finite)
-    if (on_host or (check_finite and not is_tracer)) and not np.isfinite(array).all():
+    if (is_on_host or (check_finite and not is_tracer)) and not np.isfinite(array).all():
         worlds = np.unique(np.nonzero(~np.isfinite(np.asarray(array)))[0])[:8]
         raise ValueError(
             f"{name} command is NaN or infinite in world(s) {worlds.tolist()}, as {dtype}, which would last "

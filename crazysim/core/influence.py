@@ -64,9 +64,9 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
             f"Use 'return {{}}' for none."
         )
     record = data.plugins.get(plugin.name)
-    kinds = None if record is None else scopes(record)
+    field_scopes = None if record is None else scopes(record)
     fields = [] if record is None else [f.name for f in dataclasses.fields(record) if not f.metadata.get("static")]
-    states = [name for name in fields if getattr(kinds, name) == plugin.scope]
+    states = [name for name in fields if getattr(field_scopes, name) == plugin.scope]
     for field, rate in rates.items():
         if field not in states:
             owner = "drone" if plugin.scope == "drone" else "member"
@@ -76,8 +76,8 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
                 f"leaf({owner!r}, ...)."
             )
         x = getattr(record, field)
-        same_type = jnp.issubdtype(x.dtype, jnp.floating) and jnp.result_type(x, rate) == x.dtype
-        if jnp.shape(rate) != x.shape or not same_type:
+        has_same_type = jnp.issubdtype(x.dtype, jnp.floating) and jnp.result_type(x, rate) == x.dtype
+        if jnp.shape(rate) != x.shape or not has_same_type:
             raise ConfigError(
                 f"expected {title} to return a rate of {field!r} with its shape {x.shape} and floating type "
                 f"{x.dtype}, got shape {jnp.shape(rate)} and type {jnp.result_type(rate)}"

@@ -144,17 +144,17 @@ class Integration:
     def derivative(self, data: SimData) -> SimStateDeriv:
         """Return the derivative of the states of drones and plugins, under all influences and the constraint."""
         if self.couples_world:
-            influenced, deriv = data, vmap_drones(lambda drone_data: self._without_constraint(drone_data)[1])(data)
+            influenced_data, deriv = data, vmap_drones(lambda drone_data: self._without_constraint(drone_data)[1])(data)
         else:
-            influenced, deriv = self._without_constraint(data)
-        constraining = [plugin for plugin in self.plugins if plugin.constrains]
-        if not constraining:
+            influenced_data, deriv = self._without_constraint(data)
+        constraining_plugins = [plugin for plugin in self.plugins if plugin.constrains]
+        if not constraining_plugins:
             return deriv
         dt = 1 / data.core.freq
         if self.method is symplectic_euler:
             vel, ang_vel = deriv.vel + dt * deriv.acc, deriv.ang_vel + dt * deriv.ang_acc
             deriv = deriv.replace(vel=vel, ang_vel=ang_vel)
-        return apply_constraint(constraining[0], influenced, deriv, None if self.method is rk4 else dt)
+        return apply_constraint(constraining_plugins[0], influenced_data, deriv, None if self.method is rk4 else dt)
 
     def _without_constraint(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
         """Return the data with all influences applied, and the derivative without constraints."""

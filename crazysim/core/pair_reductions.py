@@ -50,7 +50,7 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     for each drone, and ``fn`` once for each pair.
 
         gap = reduce_over_others(
-            lambda other, is_self: jnp.where(is_self, jnp.inf, rotation.norm(pos - other)), pos, "min"
+            lambda other, is_self: jnp.where(is_self, jnp.inf, rotation.safe_norm(pos - other)), pos, "min"
         )
 
     Args:
@@ -67,7 +67,7 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     leaves, treedef = jax.tree.flatten(jax.tree.map(jnp.asarray, values))
     structure: Any = None
 
-    def pair(*args: Any) -> list[Array]:
+    def pair_fn(*args: Any) -> list[Array]:
         nonlocal structure
         *other_values, is_self = args
         values_of_pair, structure = jax.tree.flatten(
@@ -76,11 +76,15 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
         return values_of_pair
 
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
-    traced = jax.make_jaxpr(pair)(*avals, jax.ShapeDtypeStruct((), bool))
-    if reduce == "sum" and any(x.dtype == bool for x in traced.out_avals):
+    pair_jaxpr = jax.make_jaxpr(pair_fn)(*avals, jax.ShapeDtypeStruct((), bool))
+    if reduce == "sum" and any(x.dtype == bool for x in pair_jaxpr.out_avals):
         raise ConfigError("expected numbers to sum over the other drones, got bools. Use reduce='max' for any of them.")
     reduced = reduce_over_others_p.bind(
-        *traced.consts, *leaves, jaxpr=constants_to_inputs(traced), n_captured=len(traced.consts), reduce=reduce
+        *pair_jaxpr.consts,
+        *leaves,
+        jaxpr=constants_to_inputs(pair_jaxpr),
+        n_captured=len(pair_jaxpr.consts),
+        reduce=reduce,
     )
     return structure.unflatten(reduced)
 
@@ -107,9 +111,9 @@ def _batching_rule(
             axis.size, rows[:n_captured], in_axes[:n_captured], rows[n_captured:], in_axes[n_captured:], jaxpr, reduce
         )
     else:
-        pair_of_batch = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*in_axes, None), axis_size=axis.size)
-        pair = jax.make_jaxpr(pair_of_batch)(*rows, jax.ShapeDtypeStruct((), bool))
-        results = reduce_over_others_p.bind(*rows, jaxpr=pair, n_captured=n_captured, reduce=reduce)
+        batched_pair_fn = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*in_axes, None), axis_size=axis.size)
+        pair_jaxpr = jax.make_jaxpr(batched_pair_fn)(*rows, jax.ShapeDtypeStruct((), bool))
+        results = reduce_over_others_p.bind(*rows, jaxpr=pair_jaxpr, n_captured=n_captured, reduce=reduce)
     return results, [0] * len(results)
 
 
@@ -123,7 +127,7 @@ def _reduce_for_all(
     reduce: str,
 ) -> list[Array]:
     """Return the reduction for each drone of a world. (n, ...) each"""
-    pair, indices = jaxpr_as_fun(jaxpr), jnp.arange(n)
+    pair_fn, indices = jaxpr_as_fun(jaxpr), jnp.arange(n)
     batched = [x for x, axis in zip(captured, captured_axes, strict=True) if axis is not None]
 
     def reduce_for_one(i: Array, row: Sequence[Array]) -> list[Array]:
@@ -133,7 +137,7 @@ def _reduce_for_all(
         ]
 
         def apply_to_pair(j: Array, values: Sequence[Array]) -> list[Array]:
-            return pair(*captured_values, *values, i == j)
+            return pair_fn(*captured_values, *values, i == j)
 
         pairs = jax.vmap(apply_to_pair, (0, list(other_axes)))(indices, list(other))
         return [REDUCTIONS[reduce](x, axis=0).astype(x.dtype) for x in pairs]

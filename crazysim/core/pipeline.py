@@ -67,7 +67,7 @@ def remove_fn(pipeline: Pipeline, name: str) -> None:
 
 
 class BuiltPipeline(Generic[F]):
-    """A pipeline, and the function that runs it, which is built again after an edit."""
+    """A pipeline, and the function that runs it, which is built_stages again after an edit."""
 
     def __init__(self, name: str, stages: Pipeline, build: Callable[[Pipeline], F]):
         """Build the function for the first time.
@@ -77,8 +77,8 @@ class BuiltPipeline(Generic[F]):
             stages: Functions by name, in order; users may edit the dict.
             build: Returns the function that runs a pipeline.
         """
-        self._name, self._stages, self._build = name, stages, build
-        self._built: tuple[Sequence[Callable[..., Any]], F]
+        self._name, self._stages, self._build_fn = name, stages, build
+        self._last_build: tuple[Sequence[Callable[..., Any]], F]
         self.build()
 
     @property
@@ -92,15 +92,15 @@ class BuiltPipeline(Generic[F]):
 
     def fn(self) -> F:
         """Return the function of the pipeline as it is now. It is called in every step: 0.3 us without an edit."""
-        built, fn = self._built
-        unedited = len(self._stages) == len(built) and all(map(is_, self._stages.values(), built))
-        return fn if unedited else self.build()
+        built_stages, fn = self._last_build
+        is_unedited = len(self._stages) == len(built_stages) and all(map(is_, self._stages.values(), built_stages))
+        return fn if is_unedited else self.build()
 
     def build(self) -> F:
         """Return a new function of the pipeline as it is now, and keep it."""
         stages = dict(self._stages)
-        fn = self._build(stages)
-        self._built = list(stages.values()), fn
+        fn = self._build_fn(stages)
+        self._last_build = list(stages.values()), fn
         return fn
 
 

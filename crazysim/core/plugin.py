@@ -94,22 +94,22 @@ def parameter(
     ``derivative`` must read the number from the record, never from the field. Its range is checked as in
     ``setting``, and its shape by ``Plugin.fill_record`` or ``shapes``.
     """
-    declared = Setting(range_between(low, high, positive), True, per_axis, dtype, shapes)
-    return dataclasses.field(default=default, metadata={"setting": declared})
+    declaration = Setting(range_between(low, high, positive), True, per_axis, dtype, shapes)
+    return dataclasses.field(default=default, metadata={"setting": declaration})
 
 
-def airframe_numbers(sim: Simulation, number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
-    """Return a number of the airframes for ``check_parameter``: one for all drones, or one for each.
+def airframe_numbers(sim: Simulation, get_number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
+    """Return a get_number of the airframes for ``check_parameter``: one for all drones, or one for each.
 
     Args:
         sim: The simulation.
-        number: Function from an airframe to a number or array. (*core)
+        get_number: Function from an airframe to a get_number or array. (*core)
 
     Returns:
         (*core), or (n_worlds, n_drones, *core) where the drones have several airframes
     """
     kinds = {id(airframe): airframe for airframe in sim.airframes}
-    values = {key: np.asarray(number(airframe)) for key, airframe in kinds.items()}
+    values = {key: np.asarray(get_number(airframe)) for key, airframe in kinds.items()}
     first_value = next(iter(values.values()))
     if len(kinds) == 1:
         return first_value
@@ -173,7 +173,7 @@ class Plugin:
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
 
     A subclass lists its settings as annotated fields, including ``name``; it becomes a frozen dataclass. It
-    overrides what it needs of the methods below. All methods that take ``data`` are written for one drone: leaves of
+    overrides the methods below that it needs. All methods that take ``data`` are written for one drone: leaves of
     drones and worlds come without batch axes, ``data.states.pos`` is (3,).
     """
 
@@ -247,7 +247,9 @@ class Plugin:
             kind: Class of the record.
             fields: Values of fields. Where one is None, the setting of its name is still checked.
         """
-        settings = {name: declared for name, declared in collect_settings(type(self)).items() if declared.is_parameter}
+        settings = {
+            name: declaration for name, declaration in collect_settings(type(self)).items() if declaration.is_parameter
+        }
         values = dict(fields)
         for field in dataclasses.fields(kind):  # type: ignore[arg-type]
             name, scope, core = field.name, field.metadata.get("scope"), field.metadata.get("core")
@@ -272,9 +274,9 @@ class Plugin:
     def reset_episode(self, data: SimData) -> SimData:
         """Return the data of one drone, or of ``scope``, at the beginning of an episode.
 
-        It may write leaves of that scope, such as what is drawn for an episode. It is called at resets, and in the
-        first step of worlds that were not reset, before all other stages and with the same random numbers; with
-        ``reset_before`` in every first step instead, in front of that stage.
+        It may write leaves of that scope, such as values that are drawn for an episode. It is called at resets, and in
+        the first step of worlds that were not reset, before all other stages and with the same random numbers. With
+        ``reset_before``, it is called in every first step instead, in front of that stage.
         """
         return data
 

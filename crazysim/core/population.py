@@ -172,10 +172,10 @@ class Population(Plugin):
         record, field = self.read(data), self.command_field
         if field is None:
             raise ConfigError(f"expected a population that takes commands, got {self.name!r}, which takes none")
-        staged = getattr(record, field)
-        command = check_command(self.name, staged.shape, command, staged.dtype)
-        inside_jit = isinstance(staged, jax.core.Tracer) or isinstance(command, jax.core.Tracer)
-        device_command = jnp.asarray(command) if inside_jit else jax.device_put(command, staged.sharding)
+        old_command = getattr(record, field)
+        command = check_command(self.name, old_command.shape, command, old_command.dtype)
+        is_inside_jit = isinstance(old_command, jax.core.Tracer) or isinstance(command, jax.core.Tracer)
+        device_command = jnp.asarray(command) if is_inside_jit else jax.device_put(command, old_command.sharding)
         return self.write(data, record.replace(**{field: device_command}))
 
     def _run_controller(self, data: SimData) -> SimData:
@@ -215,10 +215,10 @@ def rk4(record: R, rates: Rates, dt: float) -> R:
 
 def choose_scheme(integrator: Integrator, positions: Sequence[str]) -> Callable[..., Any]:
     """Return the function ``(record, rates, dt) -> record`` of an integration scheme."""
-    semi_implicit = functools.partial(symplectic_euler, positions=positions)
+    semi_implicit_euler = functools.partial(symplectic_euler, positions=positions)
     return {
         Integrator.euler: euler,
-        Integrator.symplectic_euler: semi_implicit,
+        Integrator.symplectic_euler: semi_implicit_euler,
         Integrator.rk4: rk4,
     }[integrator]
 
@@ -234,14 +234,14 @@ def _fields(record: Members) -> set[str]:
 
 def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: Any) -> Array | np.ndarray:
     """Return a command as an array of the given shape and dtype."""
-    on_host = not isinstance(command, jax.Array)
-    array = np.asarray(command, dtype) if on_host else command
+    is_on_host = not isinstance(command, jax.Array)
+    array = np.asarray(command, dtype) if is_on_host else command
     if array.shape != shape:
         raise ValueError(
             f"expected a command of shape {shape} for {name!r}, got {array.shape}. For one command to all use "
             f"np.broadcast_to(command, {shape})."
         )
-    if on_host and not np.all(np.isfinite(array)):
+    if is_on_host and not np.all(np.isfinite(array)):
         raise ValueError(f"expected finite numbers as command of {name!r}, got NaN or infinity. Check its computation.")
     return array.astype(dtype)
 

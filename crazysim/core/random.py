@@ -19,7 +19,7 @@ from jax import Array
 from crazysim.core.data import SimData, as_key
 from crazysim.jaxcompat import bits_generator, threefry2x32_p, threefry_prng_impl
 
-STRIDE = np.uint32(0x9E3779B9)
+GOLDEN_STRIDE = np.uint32(0x9E3779B9)
 """2^32 divided by the golden ratio: its multiples modulo 2^32 are evenly distributed."""
 
 
@@ -125,7 +125,7 @@ def uniform_at(words: Array, index: Array | np.ndarray, dtype: Any = jnp.float32
         dtype: Type of the numbers.
     """
     with np.errstate(over="ignore"):
-        bits = mix_bits(mix_bits(words[..., 0] + index.astype(np.uint32) * STRIDE) ^ words[..., 1])
+        bits = mix_bits(mix_bits(words[..., 0] + index.astype(np.uint32) * GOLDEN_STRIDE) ^ words[..., 1])
     return (bits >> 8).astype(dtype) * 2.0**-24
 
 
@@ -147,7 +147,7 @@ def _fractions(key: Array, shape: Sequence[int], dtype: Any) -> Array | None:
     if dtype == jnp.float64:
         upper, lower = jnp.moveaxis(_words(key, (*shape, 2)), -1, 0)
         return upper.astype(dtype) * 2.0**-32 + (lower >> 12).astype(dtype) * 2.0**-52
-    # The floats from one to below two whose fractions are the upper bits of the words, less one.
+    # The upper bits of the words are the fractions of floats from one to below two; subtract one.
     return jax.lax.bitcast_convert_type((_words(key, shape) >> 9) | np.uint32(0x3F800000), jnp.float32) - 1
 
 
@@ -164,7 +164,7 @@ def _words(key: Array, shape: Sequence[int]) -> Array:
 def _key(data: SimData, name: str, *members: Array) -> Array:
     """Return the random key of a world, or of one of its members, at a step.
 
-    The step is hashed late, and the name last, so that all names share the hashes before.
+    The step is hashed late, and the name last, so that all names share the earlier hashes.
     """
     core, key = data.core, seed_key(data)
     for number in (core.world_id, core.episode, *members, core.steps, zlib.crc32(name.encode())):

@@ -37,9 +37,9 @@ MAX_SOFTNESS = 10.0
 NUMERIC_TYPES = frozenset((int, float, np.ndarray))
 """Types of fields with numbers; an array stands for ``ArrayLike``."""
 SLOW_FREQ = 200
-"""Rate of physics steps, Hz; with fewer steps, the default rate of a controller still must not fall below half of this
-rate. The cascades of small drones are stable from 100 Hz on, and none of them at 50 Hz (hover of ``cf21B_500``,
-euler)."""
+"""Rate of physics steps, Hz, that replaces a lower one in the check of default rates: a rate must be at least half of
+its default or of the rate of physics steps, whichever is smaller. The cascades of small drones are stable from 100 Hz
+on, and none of them at 50 Hz (hover of ``cf21B_500``, euler)."""
 
 
 def positive_integer(name: str, value: object, at_most: int | None = None) -> int:
@@ -67,6 +67,14 @@ def check_flag(name: str, value: object) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise ConfigError(f"expected {name} as True or False, got {short_repr(value)}")
     return bool(value)
+
+
+def check_image_size(width: object, height: object) -> tuple[int, int]:
+    """Return width and height of an image, pixels, after checking them."""
+    sizes = [int(n) for n in (width, height) if isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n > 0]
+    if len(sizes) < 2:
+        raise ConfigError(f"expected positive integers as width and height of an image, got {width} x {height} pixels")
+    return sizes[0], sizes[1]
 
 
 class Numbers:
@@ -138,11 +146,11 @@ def collect_settings(kind: type) -> dict[str, Setting]:
 
     A field that overrides a field of a base class inherits its declaration, unless it has one of its own.
     """
-    declared = {}
+    settings = {}
     for base in reversed(kind.__mro__):
         fields = vars(base).get("__dataclass_fields__", {})
-        declared |= {name: f.metadata["setting"] for name, f in fields.items() if "setting" in f.metadata}
-    return {field.name: declared.get(field.name, Setting()) for field in dataclasses.fields(kind)}
+        settings |= {name: f.metadata["setting"] for name, f in fields.items() if "setting" in f.metadata}
+    return {field.name: settings.get(field.name, Setting()) for field in dataclasses.fields(kind)}
 
 
 def check_settings(settings: Any) -> None:
@@ -159,7 +167,7 @@ def check_settings(settings: Any) -> None:
         value, kinds = getattr(settings, field.name), allowed_types(kind)[field.name]
         if (value is None and (type(None) in kinds or field.default is None)) or not kinds:
             continue
-        name, declared = f"{field.name} of {kind.__name__}", collect_settings(kind)[field.name]
+        name, declared_setting = f"{field.name} of {kind.__name__}", collect_settings(kind)[field.name]
         remedy = f"help({kind.__name__}) describes it."
         kinds = set(kinds) - {type(None)}
         classes = tuple(kinds - NUMERIC_TYPES)
@@ -169,11 +177,11 @@ def check_settings(settings: Any) -> None:
             if not isinstance(value, Mapping):
                 raise ConfigError(f"expected {name} as a dict of numbers by name, got {short_repr(value)}. {remedy}")
             for key, item in value.items():
-                read_numbers(f"{key!r} in {name}", item, declared.range, ((),), remedy=remedy)
+                read_numbers(f"{key!r} in {name}", item, declared_setting.range, ((),), remedy=remedy)
         elif kinds & NUMERIC_TYPES and not isinstance(value, classes):
-            shapes = declared.shapes if np.ndarray in kinds or declared.is_parameter else ((),)
-            is_whole = kinds & NUMERIC_TYPES == {int} or declared.dtype is not None
-            read_numbers(name, value, declared.range, shapes, whole=is_whole, remedy=remedy)
+            shapes = declared_setting.shapes if np.ndarray in kinds or declared_setting.is_parameter else ((),)
+            is_whole = kinds & NUMERIC_TYPES == {int} or declared_setting.dtype is not None
+            read_numbers(name, value, declared_setting.range, shapes, whole=is_whole, remedy=remedy)
         elif not isinstance(value, classes):
             names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in kinds))
             raise ConfigError(f"expected {name} as {names}, got {short_repr(value)}. {remedy}")
@@ -318,8 +326,8 @@ def check_rates(control: Control, freq: int, rates: Mapping[Control, int | None]
     for level, requested in rates.items():
         if requested is not None and freq % positive_integer(f"{level.value}_freq", requested) and level in used_levels:
             raise ConfigError(
-                f"{level.value}_freq is {requested} Hz, which does not divide freq = {freq} Hz, so it cannot fire "
-                f"every whole number of steps. Use the nearest rate below, {_largest_divisor(freq, requested)} Hz."
+                f"{level.value}_freq is {requested} Hz, which does not divide freq = {freq} Hz, so its period is "
+                f"not a whole number of steps. Use the nearest rate below, {_largest_divisor(freq, requested)} Hz."
             )
 
 
@@ -389,8 +397,8 @@ def controller_at_rates(
     """Return a controller with the rates that it has in a simulation, each a divisor of ``freq``.
 
     The requested rate of the command level is the rate of the outer loop if there is one; then the requested rate of
-    attitude is the rate of ``update``. A rate equal to the default of its class is replaced by
-    a rate from ``default_rates``.
+    attitude is the rate of ``update``. A rate equal to the default of its class is replaced by a rate
+    from ``default_rates``.
 
     Args:
         controller: The controller.

@@ -118,8 +118,8 @@ def shardings_of(data: SimData, mesh: Mesh) -> SimData:
 
 def shard(data: SimData, mesh: Mesh) -> SimData:
     """Return the data distributed over a mesh; under a trace, constrain the compiled function to distribute it."""
-    put = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else distribute
-    return put(data, shardings_of(data, mesh))
+    distribute_fn = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else distribute
+    return distribute_fn(data, shardings_of(data, mesh))
 
 
 def map_devices(fn: Callable[[SimData], R], data: SimData, mesh: Mesh) -> R:

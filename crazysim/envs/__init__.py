@@ -32,7 +32,7 @@ from crazysim.envs.wrappers import (
     RewardTerms,
     Wrapper,
 )
-from crazysim.startup import lazy
+from crazysim.startup import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.envs.brax import BraxEnv
@@ -76,7 +76,7 @@ __all__ = [
     "uniform",
 ]
 
-__getattr__ = lazy(
+__getattr__ = lazy_getattr(
     __name__,
     {
         "BraxEnv": "crazysim.envs.brax",

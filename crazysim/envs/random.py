@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.random import STRIDE, mix_bits, seed_key, uniform_at
+from crazysim.core.random import GOLDEN_STRIDE, mix_bits, seed_key, uniform_at
 from crazysim.errors import ConfigError, short_repr
 
 
@@ -47,7 +47,7 @@ def episode_key(data: SimData, name: str) -> Array:
     world, episode = core.world_id.astype(jnp.uint32), core.episode.astype(jnp.uint32)
     hash_1 = mix_bits(seed[0] ^ np.uint32(zlib.crc32(name.encode())))
     hash_2 = mix_bits(seed[1] + hash_1)
-    mixed = mix_bits(mix_bits(hash_1 + world * STRIDE) ^ (hash_2 + episode * STRIDE))
+    mixed = mix_bits(mix_bits(hash_1 + world * GOLDEN_STRIDE) ^ (hash_2 + episode * GOLDEN_STRIDE))
     return jax.random.wrap_key_data(jnp.stack([mixed, mix_bits(mixed ^ hash_2)], axis=-1), impl="threefry2x32")
 
 

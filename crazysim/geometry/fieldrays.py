@@ -94,7 +94,7 @@ def _wall_hits(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     for t, n, x, y in _face_hits(shape.size[:2], origin, direction):  # type: ignore[arg-type]
         z = origin.z + jnp.where(jnp.isfinite(t), t, 0.0) * direction.z
         x, y = jnp.clip(x, -shape.size[0], shape.size[0]), jnp.clip(y, -shape.size[1], shape.size[1])
-        hit = _nearer_hit((jnp.where((z >= 0) & (z <= height_at(shape, x, y, origin)), t, jnp.inf), n), hit)
+        hit = _nearer_hit((jnp.where((z >= 0) & (z <= height_at(shape, x, y)), t, jnp.inf), n), hit)
     return hit
 
 
@@ -114,7 +114,7 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
         start = jnp.where(is_moving & (entry_distance > start), entry_distance, start)
     column = jnp.clip(jnp.floor(u + start * du), 0, n_columns - 2).astype(jnp.int32)
     row = jnp.clip(jnp.floor(v + start * dv), 0, n_rows - 2).astype(jnp.int32)
-    slack = 1e-5 if origin.x.dtype == jnp.float32 else 1e-10
+    tolerance = 1e-5 if origin.x.dtype == jnp.float32 else 1e-10
 
     def visit_cell(carry: tuple[Array, Array, Hit], _: None) -> tuple[tuple[Array, Array, Hit], None]:
         column, row, hit = carry
@@ -122,7 +122,7 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
         i, j = jnp.clip(row, 0, n_rows - 2), jnp.clip(column, 0, n_columns - 2)
         a, b, c, e = heights[i, j], heights[i, j + 1], heights[i + 1, j + 1], heights[i + 1, j]
         x, y = u - j.astype(u.dtype), v - i.astype(v.dtype)
-        for rise_x, rise_y, goes_right in ((b - a, c - b, 1.0), (c - e, e - a, -1.0)):
+        for rise_x, rise_y, triangle_side in ((b - a, c - b, 1.0), (c - e, e - a, -1.0)):
             # Height of the ray's origin above the plane of the triangle, and its rate of descent towards it.
             origin_height, descent_rate = (
                 origin.z - a - rise_x * x - rise_y * y,
@@ -131,9 +131,11 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
             is_crossing = jnp.abs(descent_rate) > MIN_COMPONENT
             t = origin_height / jnp.where(is_crossing, descent_rate, 1.0)
             hit_x, hit_y = x + t * du, y + t * dv
-            is_on_triangle = (hit_x >= -slack) & (hit_x <= 1 + slack) & (hit_y >= -slack) & (hit_y <= 1 + slack)
             is_on_triangle = (
-                is_on_triangle & (goes_right * (hit_x - hit_y) >= -slack) & is_crossing & is_inside & (t >= 0)
+                (hit_x >= -tolerance) & (hit_x <= 1 + tolerance) & (hit_y >= -tolerance) & (hit_y <= 1 + tolerance)
+            )
+            is_on_triangle = (
+                is_on_triangle & (triangle_side * (hit_x - hit_y) >= -tolerance) & is_crossing & is_inside & (t >= 0)
             )
             n = Vector(-rise_x / side_x, -rise_y / side_y, jnp.ones_like(t))
             hit = _nearer_hit((jnp.where(is_on_triangle, t, jnp.inf), n), hit)
@@ -143,9 +145,9 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
         is_moving_x, is_moving_y = jnp.abs(du) > MIN_COMPONENT, jnp.abs(dv) > MIN_COMPONENT
         t_x = jnp.where(is_moving_x, (jnp.where(goes_right, 1.0, 0.0) - x) / jnp.where(is_moving_x, du, 1.0), jnp.inf)
         t_y = jnp.where(is_moving_y, (jnp.where(goes_up, 1.0, 0.0) - y) / jnp.where(is_moving_y, dv, 1.0), jnp.inf)
-        x_is_first = t_x <= t_y
-        column = jnp.where(is_inside & x_is_first, column + jnp.where(goes_right, step, -step), column)
-        row = jnp.where(is_inside & ~x_is_first, row + jnp.where(goes_up, step, -step), row)
+        is_x_first = t_x <= t_y
+        column = jnp.where(is_inside & is_x_first, column + jnp.where(goes_right, step, -step), column)
+        row = jnp.where(is_inside & ~is_x_first, row + jnp.where(goes_up, step, -step), row)
         return (column, row, hit), None
 
     zero = jnp.zeros_like(origin.x)

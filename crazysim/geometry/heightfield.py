@@ -45,7 +45,7 @@ def field_distance(shape: Shape, point: Array, radius: float = 0.0) -> Array:
     surface = triangles_distance(position, *triangles(grid))
     # The walls and the bottom can be nearer than the surface.
     qx, qy = safe_clip(position.x, -x_half, x_half), safe_clip(position.y, -y_half, y_half)
-    is_below = position.z < height_at(shape, lax.stop_gradient(qx), lax.stop_gradient(qy), position)
+    is_below = position.z < height_at(shape, lax.stop_gradient(qx), lax.stop_gradient(qy))
     dx, dy, dz = position.x - qx, position.y - qy, maximum(-base - position.z, 0.0)
     border_distance = safe_sqrt(dx * dx + dy * dy + dz * dz)
     wall = maximum(
@@ -61,8 +61,8 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
 
     For separated shapes the nearest points are a corner of the box and a point of the ground, or a point of the box
     and one on an edge of the ground. The result is exact up to half the diagonal of the box, and an upper bound beyond.
-    For overlapping shapes, the depth is the larger of the depths of the deepest corner and edge, which is not the
-    shortest translation out of all triangles at once.
+    For overlapping shapes, the depth is the larger of the depths of the deepest corner and edge. The shortest
+    translation out of all triangles at once can be longer.
 
     Args:
         half: Half lengths of the box, m; zeros for a segment. (3,)
@@ -141,21 +141,16 @@ def edges(grid: Vector) -> tuple[Vector, Vector]:
     )
 
 
-def height_at(shape: Shape, x: Array, y: Array, vector: Vector) -> Array:
+def height_at(shape: Shape, x: Array, y: Array) -> Array:
     """Return the height of the surface at positions within the field, m. (...)"""
-    grid_x, grid_y, along_x, along_y, origin = plane_at(shape, x, y, vector)
-    return origin + along_x * grid_x + along_y * grid_y
-
-
-def plane_at(shape: Shape, x: Array, y: Array, vector: Vector) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the position in its cell (0 to 1, x and y), the rises of its triangle and the height of its origin, m."""
-    heights = jnp.asarray(shape.array("heights"), vector.x.dtype)
+    heights = jnp.asarray(shape.array("heights"), x.dtype)
     side_x, side_y = cell_sides(shape)
-    return triangle_at(heights, (x + shape.size[0]) / side_x, (y + shape.size[1]) / side_y)
+    u, v, rise_x, rise_y, origin = triangle_at(heights, (x + shape.size[0]) / side_x, (y + shape.size[1]) / side_y)
+    return origin + rise_x * u + rise_y * v
 
 
 def surface_at(heights: Array, half: Array, point: Array) -> tuple[Array, Array, Array]:
-    """Return height and normal of the surface at a point, and whether it lies on the field.
+    """Return height and normal of the surface at a point, and True where the point lies on the field.
 
     Beyond its border the field continues with the heights of the border.
 
@@ -169,7 +164,7 @@ def surface_at(heights: Array, half: Array, point: Array) -> tuple[Array, Array,
     """
     n_rows, n_columns = heights.shape
     x, y = point[..., 0], point[..., 1]
-    is_inside = (jnp.abs(x) <= half[0]) & (jnp.abs(y) <= half[1])
+    is_on_field = (jnp.abs(x) <= half[0]) & (jnp.abs(y) <= half[1])
     side_x, side_y = 2 * half[0] / (n_columns - 1), 2 * half[1] / (n_rows - 1)
     cell_x = safe_clip((x + half[0]) / side_x, 0.0, float(n_columns - 1))
     cell_y = safe_clip((y + half[1]) / side_y, 0.0, float(n_rows - 1))
@@ -179,7 +174,7 @@ def surface_at(heights: Array, half: Array, point: Array) -> tuple[Array, Array,
     return (
         origin + rise_x * u + rise_y * v,
         jnp.stack([-slope_x * normal_z, -slope_y * normal_z, normal_z], axis=-1),
-        is_inside,
+        is_on_field,
     )
 
 
@@ -190,9 +185,9 @@ def field_gap(shape: Shape, point: Array) -> tuple[Array, Array]:
     ``field_distance``. Beyond the border and below the bottom of the ground, it is ``OUTSIDE_DISTANCE``.
     """
     half = jnp.asarray(shape.size[:2], point.dtype)
-    height, normal, is_inside = surface_at(jnp.asarray(shape.array("heights"), point.dtype), half, point)
-    is_inside = is_inside & (point[..., 2] > -shape.size[3])
-    return jnp.where(is_inside, (point[..., 2] - height) * normal[..., 2], OUTSIDE_DISTANCE), normal
+    height, normal, is_over_ground = surface_at(jnp.asarray(shape.array("heights"), point.dtype), half, point)
+    is_over_ground = is_over_ground & (point[..., 2] > -shape.size[3])
+    return jnp.where(is_over_ground, (point[..., 2] - height) * normal[..., 2], OUTSIDE_DISTANCE), normal
 
 
 def triangle_at(heights: Array, u: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:

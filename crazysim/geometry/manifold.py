@@ -107,14 +107,16 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
     length = rotation.safe_norm(axes)
     is_defined = length[..., 0] > MIN_EDGE_SINE
     axes = axes / jnp.where(length > MIN_EDGE_SINE, length, 1.0)
-    reach = jnp.sum(half_a * jnp.abs(jnp.sum(axes[..., None] * rot_a, axis=-2)), axis=-1)
-    reach = reach + jnp.sum(half_b * jnp.abs(jnp.sum(axes[..., None] * rot_b, axis=-2)), axis=-1)
-    edges = jnp.where(is_defined, jnp.abs(jnp.sum(axes * offset, axis=-1)) - reach, -OUTSIDE_DISTANCE).reshape(-1)
+    half_extent = jnp.sum(half_a * jnp.abs(jnp.sum(axes[..., None] * rot_a, axis=-2)), axis=-1)
+    half_extent = half_extent + jnp.sum(half_b * jnp.abs(jnp.sum(axes[..., None] * rot_b, axis=-2)), axis=-1)
+    edges = jnp.where(is_defined, jnp.abs(jnp.sum(axes * offset, axis=-1)) - half_extent, -OUTSIDE_DISTANCE).reshape(-1)
     pair = jnp.argmax(lax.stop_gradient(edges))
-    by_edge = edges[pair] > EDGE_SHARE * faces[best_face] + EDGE_BIAS * min_half
+    is_edge_contact = edges[pair] > EDGE_SHARE * faces[best_face] + EDGE_BIAS * min_half
     # If the boxes are apart, the axis with the largest distance counts, face or edge. Without the bias, rounding would
     # choose between level faces that touch.
-    by_edge = jnp.where(faces[best_face] > 0, edges[pair] > faces[best_face] + FACE_BIAS * min_half, by_edge)
+    is_edge_contact = jnp.where(
+        faces[best_face] > 0, edges[pair] > faces[best_face] + FACE_BIAS * min_half, is_edge_contact
+    )
 
     is_a = best_face < 3
     boxes = (half_a, pos_a, rot_a), (half_b, pos_b, rot_b)
@@ -123,7 +125,10 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
     gap, normal, point = _clip_face(face, best_face % 3, other)
     gap_edge, normal_edge, point_edge = _edge_contact(boxes, pair, axes.reshape(-1, 3)[pair], offset)
     gap = jnp.concatenate(
-        [jnp.where(by_edge, OUTSIDE_DISTANCE, gap), jnp.where(by_edge, gap_edge, OUTSIDE_DISTANCE)[None]]
+        [
+            jnp.where(is_edge_contact, OUTSIDE_DISTANCE, gap),
+            jnp.where(is_edge_contact, gap_edge, OUTSIDE_DISTANCE)[None],
+        ]
     )
     normal = jnp.where(is_a, -normal, normal)
     normal = jnp.concatenate([jnp.broadcast_to(normal, point.shape), normal_edge[None]])
@@ -136,7 +141,7 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     Args:
         face: Half lengths, position and attitude of the box with the face.
         axis: Axis of the face, 0 to 2.
-        other: The same of the other box.
+        other: Half lengths, position and attitude of the other box.
     """
     half, pos, rot = _renumber_axes(face, axis)
     offset = other[1] - pos
@@ -150,22 +155,22 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     frame = jnp.stack([rot[:, 1], rot[:, 2], normal])
     middle = matvec(frame, offset + sign * half_o[0] * rot_o[:, 0]) - jnp.stack([0 * side, 0 * side, half[0]])
     edge_1, edge_2 = half_o[1] * matvec(frame, rot_o[:, 1]), half_o[2] * matvec(frame, rot_o[:, 2])
-    ring = jnp.stack([middle + x * edge_1 + y * edge_2 for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
-    edges = jnp.roll(ring, -1, axis=0) - ring
+    other_corners = jnp.stack([middle + x * edge_1 + y * edge_2 for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+    edges = jnp.roll(other_corners, -1, axis=0) - other_corners
     limit = half[1:] * (2 - FACE_SHARE)
-    first, last = jnp.zeros(4, pos.dtype), jnp.ones(4, pos.dtype)
+    start, end = jnp.zeros(4, pos.dtype), jnp.ones(4, pos.dtype)
     for k in range(2):
-        speed = edges[:, k]
-        is_crossing = jnp.abs(speed) > 1e-9
-        inverse = 1 / jnp.where(is_crossing, speed, 1.0)
-        ends = (-limit[k] - ring[:, k]) * inverse, (limit[k] - ring[:, k]) * inverse
-        is_within = jnp.abs(ring[:, k]) <= limit[k]
-        first = jnp.maximum(first, jnp.where(is_crossing, jnp.minimum(*ends), jnp.where(is_within, 0.0, 2.0)))
-        last = jnp.minimum(last, jnp.where(is_crossing, jnp.maximum(*ends), 1.0))
-    is_clipped = first <= last
-    valid = [is_clipped, is_clipped & (last < 1)]  # the end of an edge is the beginning of the next
+        rate = edges[:, k]
+        is_crossing = jnp.abs(rate) > 1e-9
+        inverse = 1 / jnp.where(is_crossing, rate, 1.0)
+        bounds = (-limit[k] - other_corners[:, k]) * inverse, (limit[k] - other_corners[:, k]) * inverse
+        is_within = jnp.abs(other_corners[:, k]) <= limit[k]
+        start = jnp.maximum(start, jnp.where(is_crossing, jnp.minimum(*bounds), jnp.where(is_within, 0.0, 2.0)))
+        end = jnp.minimum(end, jnp.where(is_crossing, jnp.maximum(*bounds), 1.0))
+    is_clipped = start <= end
+    valid = [is_clipped, is_clipped & (end < 1)]  # the end of an edge is the beginning of the next
     # Clip to the edge: for an edge parallel to the border up to rounding, the computed ends can be kilometres away.
-    candidates = [ring + jnp.clip(x, 0.0, 1.0)[:, None] * edges for x in (first, last)]
+    candidates = [other_corners + jnp.clip(x, 0.0, 1.0)[:, None] * edges for x in (start, end)]
     # Corners of the face, projected along its normal onto the other's nearest face.
     face_corners = jnp.stack([jnp.stack([x * limit[0], y * limit[1]]) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     det = edge_1[0] * edge_2[1] - edge_1[1] * edge_2[0]
@@ -194,18 +199,18 @@ def _edge_contact(
         local = jnp.where(is_edge, 0.0, side * jnp.where(local_normal < 0, -1.0, 1.0) * half)
         direction = jnp.sum(jnp.where(is_edge, rot, 0.0), axis=-1)
         ends.append((pos + matvec(rot, local), direction, jnp.sum(jnp.where(is_edge, half, 0.0))))
-    (p, u, reach_p), (q, v, reach_q) = ends
+    (p, u, half_p), (q, v, half_q) = ends
     offset_pq = p - q
     c, d, e = (jnp.sum(x * y) for x, y in ((u, v), (u, offset_pq), (v, offset_pq)))
     det = jnp.maximum(1 - c * c, MIN_EDGE_SINE**2)
-    s = rotation.safe_clip((c * e - d) / det, -reach_p, reach_p)
-    t = rotation.safe_clip((e - c * d) / det, -reach_q, reach_q)
-    on_a, on_b = p + s * u, q + t * v
-    return jnp.sum((on_a - on_b) * normal), normal, 0.5 * (on_a + on_b)
+    s = rotation.safe_clip((c * e - d) / det, -half_p, half_p)
+    t = rotation.safe_clip((e - c * d) / det, -half_q, half_q)
+    point_a, point_b = p + s * u, q + t * v
+    return jnp.sum((point_a - point_b) * normal), normal, 0.5 * (point_a + point_b)
 
 
 def _renumber_axes(box: tuple[Array, ...], axis: Array) -> tuple[Array, ...]:
-    """Return half lengths, position and attitude of a box with its axes renumbered so that one comes first."""
+    """Return half lengths, position and attitude of a box with its axes renumbered so that ``axis`` comes first."""
     half, pos, rot = box
 
     def select_axis(options: list[Array]) -> Array:

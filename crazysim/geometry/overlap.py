@@ -25,7 +25,8 @@ SEPARATION_STEPS = 16
 TOUCH_STEPS = 24
 """Further steps from the best direction towards the nearest or touching points."""
 SEPARATION_SHARE = 0.02
-"""Distance to which overlapping shapes are separated for these steps, as a fraction of the moving half length."""
+"""Distance to which overlapping shapes are separated for these steps, as a fraction of the largest half length of the
+moving shape."""
 N_ARCS = 16
 """Number of arcs of a circle of directions, each searched for the smallest depth."""
 N_ARC_STEPS = 6
@@ -84,7 +85,7 @@ def find_overlap(pair: ShapePair, is_box: bool, best: BestDirection) -> BestDire
     if b.kind == "mesh":
         best = larger_gap(_best_face_normal(pair), best)
     best = _select_best(_best_perpendicular(pair, stack_vectors([*edges, *sides])), best)
-    return _best_end_normal(pair, best) if b.kind == "ellipsoid" else best
+    return _best_ellipsoid_normal(pair, best) if b.kind == "ellipsoid" else best
 
 
 def _select_best(candidates: BestDirection, best: BestDirection) -> BestDirection:
@@ -110,11 +111,11 @@ def _best_face_normal(pair: ShapePair) -> BestDirection:
     return pair.gap(n), n
 
 
-def _best_end_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
+def _best_ellipsoid_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
     """Return the best of a direction and the normals of an ellipsoid at its points nearest to corners of the other."""
     shortest = min(range(3), key=lambda k: pair.other.size[k])
 
-    def try_end(k: Array, best: BestDirection) -> BestDirection:
+    def try_corner(k: Array, best: BestDirection) -> BestDirection:
         point = pair.centre
         for bit, (edge, half) in enumerate(zip(pair.edges, pair.half, strict=True)):
             point = point + edge * jnp.where((k >> bit) & 1 == 1, -half, half)
@@ -123,7 +124,7 @@ def _best_end_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
         sign = [-1.0 if k == shortest else 1.0 for k in range(3)]
         return pair.with_candidate(Vector(n.x * sign[0], n.y * sign[1], n.z * sign[2]), pair.with_candidate(n, best))
 
-    return lax.fori_loop(0, 2 ** len(pair.edges), try_end, best)
+    return lax.fori_loop(0, 2 ** len(pair.edges), try_corner, best)
 
 
 def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
@@ -153,8 +154,8 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
         """Return the unit direction between two directions along which their support points are equally far."""
         u, v, middle = q[1] - p[1], p[0] - q[0], (n[0] + m[0], n[1] + m[1])
         sign = jnp.where(u * middle[0] + v * middle[1] < 0, -1.0, 1.0)
-        coincide = u * u + v * v <= 1e-10 * (p[0] * p[0] + p[1] * p[1])
-        u, v = jnp.where(coincide, middle[0], sign * u), jnp.where(coincide, middle[1], sign * v)
+        is_coincident = u * u + v * v <= 1e-10 * (p[0] * p[0] + p[1] * p[1])
+        u, v = jnp.where(is_coincident, middle[0], sign * u), jnp.where(is_coincident, middle[1], sign * v)
         scale = lax.rsqrt(u * u + v * v)
         return u * scale, v * scale
 

@@ -103,7 +103,7 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
     displaced = [p + jnp.where(p < 0, -e, e) for p, e in zip(point, displacements, strict=True)]
     scaled = [a * p for a, p in zip(shape.size, displaced, strict=True)]
 
-    def newton(s: Array, scaled: list[Array]) -> Array:
+    def newton_step(s: Array, scaled: list[Array]) -> Array:
         inverse = [1 / (s + gap) for gap in gaps]
         terms = [(x * i) ** 2 for x, i in zip(scaled, inverse, strict=True)]
         square = sum(terms)
@@ -114,8 +114,8 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
     start = constants[0] * 0
     for x, gap in zip(constants, gaps, strict=True):
         start = maximum(start, jnp.abs(x) - gap)
-    s = lax.fori_loop(0, ELLIPSOID_STEPS - 1, lambda _, s: newton(s, constants), start)
-    s = newton(s, scaled)  # the last step carries the derivative of the root
+    s = lax.fori_loop(0, ELLIPSOID_STEPS - 1, lambda _, s: newton_step(s, constants), start)
+    s = newton_step(s, scaled)  # the last step carries the derivative of the root
     x, y, z = (p / (s + gap) for p, gap in zip(displaced, gaps, strict=True))
     return x, y, z
 

@@ -63,7 +63,7 @@ def hit_distance(shape: Shape | SizedShapes, origin: Components, direction: Comp
     """
     if shape.kind != "plane":
         return first_distance(LINE_INTERVAL[shape.kind](shape, origin, direction))
-    t, is_hit = _plane(origin, direction)
+    t, is_hit = _plane_distance(origin, direction)
     return first_distance((t, t, is_hit))
 
 
@@ -82,7 +82,8 @@ def hit_normal(shape: Shape | SizedShapes, origin: Array, direction: Array, dist
     return jnp.where(is_hit[..., None], normal, 0.0)
 
 
-def _plane(origin: Components, direction: Components) -> tuple[Array, Array]:
+def _plane_distance(origin: Components, direction: Components) -> tuple[Array, Array]:
+    """Return the distance along rays to the plane z = 0, m, and True where they hit it from above. (...) each"""
     height, descent_rate = origin[2], -direction[2]
     is_hit = (descent_rate > MIN_COMPONENT) & (height >= 0)
     return height / jnp.where(is_hit, descent_rate, 1.0), is_hit
@@ -112,7 +113,8 @@ def union(p: Interval, q: Interval) -> Interval:
 def _ball_line(origin: Sequence[Array], direction: Sequence[Array], radius: Array | float) -> Interval:
     """Return the interval of a line in a ball, or in a cylinder if two components are given.
 
-    It uses the point of the line nearest to the centre, because the usual discriminant cancels far from the ball.
+    It uses the point of the line nearest to the centre, because the usual discriminant loses its
+    precision far from the ball.
     """
     square = sum(d * d for d in direction)
     is_parallel = square < MIN_COMPONENT

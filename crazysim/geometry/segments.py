@@ -71,7 +71,7 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
     t = low + (high - low) * jnp.where(is_between, -low_slope / jnp.where(is_between, rise, 1.0), 0.0)
     t = jnp.where(high_slope < 0, high, t)
     x, y, z = (maximum(magnitude(p + t * d) - h, 0.0) for p, d, h in zip(middle, axis, box, strict=True))
-    return jnp.where((overlap := _largest_gap(middle, axis, half, box)) > 0, safe_sqrt(x * x + y * y + z * z), overlap)
+    return jnp.where((gap := _largest_gap(middle, axis, half, box)) > 0, safe_sqrt(x * x + y * y + z * z), gap)
 
 
 def _largest_gap(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:

@@ -51,12 +51,12 @@ class Shape:
     def __post_init__(self) -> None:
         if self.kind not in N_SIZES:
             raise ConfigError(f"expected a shape of kind {', '.join(N_SIZES)}, got {self.kind!r}; use one of these")
-        needed = N_SIZES[self.kind]
+        n_sizes = N_SIZES[self.kind]
         numbers = np.asarray(self.size, np.float64).reshape(-1)
-        size = numbers[:needed]
-        if len(size) < needed or not np.all(np.isfinite(size)) or not np.all(size > 0):
+        size = numbers[:n_sizes]
+        if len(size) < n_sizes or not np.all(np.isfinite(size)) or not np.all(size > 0):
             raise ConfigError(
-                f"expected {needed} positive, finite numbers as the size of a {self.kind}, m, got "
+                f"expected {n_sizes} positive, finite numbers as the size of a {self.kind}, m, got "
                 f"{tuple(numbers.tolist())}; use MuJoCo's conventions"
             )
         for name, kind, maker in (("vertices", "mesh", "hull"), ("heights", "hfield", "hfield")):
@@ -108,9 +108,9 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     # A sliver has no normal; its neighbours close the hull.
     is_valid = area > 1e-12 * scale * scale
     triangles, normals = triangles[is_valid], normals[is_valid] / area[is_valid, None]
-    outward = np.sum(normals * (v[triangles[:, 0]] - v.mean(axis=0)), axis=1) > 0
-    normals = np.where(outward[:, None], normals, -normals)
-    triangles = np.where(outward[:, None], triangles, triangles[:, ::-1])
+    is_outward = np.sum(normals * (v[triangles[:, 0]] - v.mean(axis=0)), axis=1) > 0
+    normals = np.where(is_outward[:, None], normals, -normals)
+    triangles = np.where(is_outward[:, None], triangles, triangles[:, ::-1])
     offsets = np.sum(normals * v[triangles[:, 0]], axis=1)
     gap = float(np.max(v @ normals.T - offsets)) if len(offsets) else np.inf
     if gap > 1e-4 * scale or (is_valid.all() and not _is_closed(triangles)):
@@ -168,7 +168,7 @@ def bounding_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the triangles of a convex hull, which have no vertex above their plane; flat sides become fans."""
+    """Return the triangles of a convex hull, which have no vertex above their plane; a flat side is a triangle fan."""
     if len(v) > MAX_HULL_VERTICES:
         raise ConfigError(
             f"expected faces for more than {MAX_HULL_VERTICES} vertices, got {len(v)} vertices and no faces; pass the "
@@ -180,13 +180,13 @@ def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
     is_flat = length <= tolerance * np.max(np.ptp(v, axis=0))
     normals = normals / np.where(is_flat, 1.0, length)[:, None]
     heights = v @ normals.T - np.sum(normals * v[i], axis=1)
-    all_above, all_below = heights.min(axis=0) >= -tolerance, heights.max(axis=0) <= tolerance
-    outward = (
-        normals[(all_above | all_below) & ~is_flat]
-        * np.where(all_above[(all_above | all_below) & ~is_flat], -1.0, 1.0)[:, None]
+    is_above, is_below = heights.min(axis=0) >= -tolerance, heights.max(axis=0) <= tolerance
+    outward_normals = (
+        normals[(is_above | is_below) & ~is_flat]
+        * np.where(is_above[(is_above | is_below) & ~is_flat], -1.0, 1.0)[:, None]
     )
     triangles: list[tuple[int, int, int]] = []
-    for normal in _unique_normals(outward):
+    for normal in _unique_normals(outward_normals):
         heights_along = v @ normal
         side = np.flatnonzero(heights_along >= heights_along.max() - 2 * tolerance)
         axis = np.eye(3)[np.argmin(np.abs(normal))]

@@ -55,8 +55,8 @@ def _cylinder_function(shape: Shape, n: Vector) -> Array:
 def _cylinder_point(shape: Shape, n: Vector) -> Vector:
     radius, half = shape.size
     square = n.x * n.x + n.y * n.y
-    tie = 1 / sharpness(square.dtype) ** 2
-    scale = radius * lax.rsqrt(jnp.where(square > tie, square, tie))
+    tie_square = 1 / sharpness(square.dtype) ** 2
+    scale = radius * lax.rsqrt(jnp.where(square > tie_square, square, tie_square))
     return Vector(n.x * scale, n.y * scale, segment_support_point(half, n.z))
 
 
@@ -85,8 +85,8 @@ def _mesh_point(shape: Shape, n: Vector) -> Vector:
     products, columns = _mesh_products(shape, n)
     gaps = jnp.max(products, axis=-1, keepdims=True) - products
     weight = jnp.clip(1 - gaps * (sharpness(gaps.dtype) / float(abs(shape.array("vertices")).max())), 0.0, 1.0)
-    share = 1 / jnp.sum(weight, axis=-1)
-    return Vector(*(jnp.sum(weight * v, axis=-1) * share for v in columns))
+    scale = 1 / jnp.sum(weight, axis=-1)
+    return Vector(*(jnp.sum(weight * v, axis=-1) * scale for v in columns))
 
 
 SUPPORT_FUNCTION: dict[str, Callable[[Shape, Vector], Array]] = {

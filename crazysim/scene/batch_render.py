@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from crazysim.core.settings import check_image_size
 from crazysim.errors import ConfigError, not_installed
-from crazysim.scene.render import camera_id, require_size
+from crazysim.scene.render import camera_id
 
 INSTALL_MESSAGE = not_installed("images of many worlds at once need", "warp-lang", "warp")
 
@@ -45,7 +46,7 @@ class BatchRenderer:
         """
         if not is_installed():
             raise ImportError(INSTALL_MESSAGE)
-        require_size(width, height)
+        check_image_size(width, height)
         camera_index = camera_id(model, camera)
         if camera_index < 0:
             raise ConfigError("expected a camera of the scene, got the free camera, which MuJoCo Warp cannot render")

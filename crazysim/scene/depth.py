@@ -149,13 +149,6 @@ def pixel_directions(fovy: float, width: int, height: int) -> np.ndarray:
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def check_image_size(width: object, height: object) -> None:
-    """Check the numbers of pixels of an image."""
-    for name, n in (("width", width), ("height", height)):
-        if type(n) is not int or n < 1:
-            raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")
-
-
 def check_image_memory(
     n_images: int, width: int, height: int, bytes_per_pixel: float, device: jax.Device, n_devices: int = 1
 ) -> None:

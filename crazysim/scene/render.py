@@ -10,6 +10,7 @@ import numpy as np
 from mujoco.rendering.classic import gl_context
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.core.settings import check_image_size
 from crazysim.errors import ConfigError, RenderError, UnknownNameError, short_repr
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.scene_window import SceneWindow
@@ -44,7 +45,7 @@ class ModelRenderer:
         """Return or show an image; see ``Sim.render``."""
         if mode not in RENDER_MODES:
             raise UnknownNameError(f"expected mode {' or '.join(map(repr, RENDER_MODES))}, got {mode!r}")
-        require_size(width, height)
+        check_image_size(width, height)
         cam = self._camera(camera, cam_config)
         if mode == "human":
             if not self._windows:
@@ -139,12 +140,6 @@ def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
             f"expected a camera id from 0 to {model.ncam - 1}, or -1 for the free camera, got {camera!r}"
         )
     return int(camera)
-
-
-def require_size(width: ArrayLike, height: ArrayLike) -> None:
-    """Check the size of an image."""
-    if not all(isinstance(n, (int, np.integer)) and n > 0 for n in (width, height)):
-        raise ConfigError(f"expected positive integers as width and height of an image, got {width} x {height} pixels")
 
 
 def font_scale(height: int) -> mujoco.mjtFontScale:

@@ -16,6 +16,7 @@ from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import Objects, SimData
+from crazysim.core.settings import check_image_size
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
 from crazysim.scene import build, collision, contact_report, depth, mjx, splat_images
@@ -339,7 +340,7 @@ class Scene:
             height, width = camera.rays.shape[:2]
             cameras = [depth.CarriedCamera.on_drone(camera, drone) for drone in range(self.n_drones)]
         else:
-            depth.check_image_size(width, height)
+            width, height = check_image_size(width, height)
             objects = (*self.added_objects.movable, *self.visual_model.mocap_bodies)
             cameras = depth.find_cameras(self.mj_model, camera, objects)
         self._check_image_memory(len(cameras), (width, height), depth.BYTES_PER_RAY)
@@ -381,8 +382,8 @@ class Scene:
         objects = (*self.added_objects.movable, *self.visual_model.mocap_bodies)
         names = [camera] if isinstance(camera, (str, int, np.integer)) else list(camera)
         cameras = [match for name in names for match in depth.find_cameras(self.mj_model, name, objects)]
-        size = splat_images.check_size(width, height)
-        self._check_image_memory(len(cameras), size, splat_images.BYTES_PER_PIXEL)
+        width, height = check_image_size(width, height)
+        self._check_image_memory(len(cameras), (width, height), splat_images.BYTES_PER_PIXEL)
         return splat_images.build_splat_fn(
             self.visual_model, cameras, width, height, background, min_coverage, renderer, self.device.platform,
             self.plugins,

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError, not_installed
 from crazysim.pytree import PyTree
 from crazysim.scene.collision import CollisionModel
@@ -64,11 +63,6 @@ SplatFn = Callable[..., SplatImage]
 """``splats(data, gaussians, mocap=None) -> SplatImage``."""
 
 
-def check_size(width: object, height: object) -> tuple[int, int]:
-    """Return width and height of an image, checked, pixels."""
-    return positive_integer("width", width), positive_integer("height", height)
-
-
 def build_splat_fn(
     model: CollisionModel,
     cameras: Sequence[CarriedCamera],
@@ -81,7 +75,6 @@ def build_splat_fn(
     plugins: ListPlugins,
 ) -> SplatFn:
     """Return ``splats(data, gaussians, mocap=None) -> SplatImage``, pure; see ``Scene.splat_fn``."""
-    width, height = check_size(width, height)
     color = read_numbers("background", background, range_between(0.0, 1.0), ((3,),))
     min_coverage = read_number("min_coverage", min_coverage, range_between(0.0, 1.0))
     if len({camera.fovy for camera in cameras}) > 1:

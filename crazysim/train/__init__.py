@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from crazysim.startup import lazy
+from crazysim.startup import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.train.config import TrainConfig
@@ -25,7 +25,7 @@ __all__ = [
     "run_many",
 ]
 
-__getattr__ = lazy(
+__getattr__ = lazy_getattr(
     __name__,
     {
         "Network": "crazysim.train.networks",

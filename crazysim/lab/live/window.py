@@ -20,13 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import crazysim
+from crazysim.core.settings import check_image_size
 from crazysim.errors import ConfigError, RenderError
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.picture import Picture, PictureSource, list_quantities
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
 from crazysim.media.worlds import world_indices
-from crazysim.scene.render import camera_id, require_size
+from crazysim.scene.render import camera_id
 from crazysim.scene.scene_window import require_screen
 from crazysim.scene.visual_geoms import visual_geoms
 
@@ -76,7 +77,7 @@ class Window(Viewer[Live]):
 
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""
-        require_size(self.width, self.height)
+        check_image_size(self.width, self.height)
         if not np.isfinite(self.trail) or self.trail < 0:
             raise ConfigError(f"expected a trail of 0 s or more, got {self.trail!r}")
         self._process: subprocess.Popen[bytes] | None = None

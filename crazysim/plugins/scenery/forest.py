@@ -13,7 +13,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.random import STRIDE
+from crazysim.core.random import GOLDEN_STRIDE
 from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
@@ -185,7 +185,7 @@ class StandingObstacles(Scenery):
 
     def _size_index(self, cell: Any) -> Any:
         """Return the number of the size of the obstacles of cells, from 0 to 7. (...)"""
-        return (cell.astype(np.uint32) * STRIDE) >> (32 - SIZE_BITS)
+        return (cell.astype(np.uint32) * GOLDEN_STRIDE) >> (32 - SIZE_BITS)
 
     def _size(self, size_index: Any) -> Any:
         """Return the size with a number, m. (...)"""

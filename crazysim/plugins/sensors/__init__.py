@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from crazysim.startup import lazy
+from crazysim.startup import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.plugins.sensors.barometer import Barometer
@@ -48,7 +48,7 @@ __all__ = [
     "Triad",
 ]
 
-__getattr__ = lazy(
+__getattr__ = lazy_getattr(
     __name__,
     {
         "GPS": f"{__name__}.gps",

@@ -85,7 +85,7 @@ def _wheels(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
     shape = (car.pos.shape[0], len(positions))
     body = jnp.broadcast_to(car.quat[:, None], (*shape, 4))
     pos = car.pos[:, None] + rotation.rotate(body, jnp.asarray(np.pad(positions, ((0, 0), (0, 1))), car.pos.dtype))
-    front = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.track"))[:, : len(positions) // 2]
+    front = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.kingpin_track"))[:, : len(positions) // 2]
     steer = jnp.concatenate([front, jnp.zeros_like(front)], axis=-1)[..., None]
     roll_quat = _rolling_quat(jnp.broadcast_to((car.distance / vehicle.number("wheels.radius"))[:, None], steer.shape))
     quat = rotation.multiply(body, rotation.multiply(heading_quat(steer), roll_quat))

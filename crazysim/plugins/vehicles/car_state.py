@@ -62,7 +62,7 @@ def to_body_frame(yaw: Array, vector: Array) -> Array:
     return to_world_frame(-yaw, vector)
 
 
-def ackermann(steer: Array, wheelbase: float, track: float) -> Array:
+def ackermann(steer: Array, wheelbase: float, kingpin_track: float) -> Array:
     """Return the steering angles of the front wheels with which their axes meet on the axis of the rear wheels.
 
     ``tan(left) = L tan / (L - (t / 2) tan)`` and ``tan(right) = L tan / (L + (t / 2) tan)`` where tan is the tangent of
@@ -71,13 +71,13 @@ def ackermann(steer: Array, wheelbase: float, track: float) -> Array:
     Args:
         steer: Steering angle of a wheel in the middle, rad, positive to the left. (..., 1)
         wheelbase: Distance of the axles, m.
-        track: Distance of the kingpins, m.
+        kingpin_track: Distance of the kingpins, m.
 
     Returns:
         Steering angles of the left and the right wheel, rad. (..., 2)
     """
     tan = jnp.tan(steer)
-    wheelbase_rise, half_track_rise = wheelbase * tan, track / 2 * tan
+    wheelbase_rise, half_track_rise = wheelbase * tan, kingpin_track / 2 * tan
     return jnp.concatenate(
         [
             jnp.arctan2(wheelbase_rise, wheelbase - half_track_rise),

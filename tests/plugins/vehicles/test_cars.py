@@ -200,7 +200,7 @@ def test_wheels_roll_and_steer_in_the_scene():
     sim.step(100)
     sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), 0)
     model, data, record = sim.mj_model, sim.mj_data, jax.tree.map(np.asarray, cars.read(sim.data))
-    left, right = np.asarray(jax.jit(ackermann)(record.steer[0, 0], 0.32226, 0.24477))
+    left, right = np.asarray(jax.jit(ackermann)(record.steer[0, 0], 0.32226, 0.20032))
     for k, angle in ((0, left), (1, right), (2, 0.0), (3, 0.0)):
         axis = data.body(f"cars_wheel:{k}").xmat.reshape(3, 3)[:, 1]
         np.testing.assert_allclose(np.arctan2(-axis[0], axis[1]), angle + record.yaw[0, 0, 0], atol=1e-5)
