@@ -303,12 +303,12 @@ class Live(Interaction, Closeable):
         lateness = self._pace.record_step(self.time)
         if lateness > WARNING_LATENESS and self._may_warn():
             log.warning("real time missed at %.2f s: %.0f ms late", self.time, 1e3 * lateness)
-        self._control_step()
+        self._run_control_step()
         # At real-time speeds a picture waits for idle time, but at most until the next picture is due.
         viewers.draw(self, viewers.next_picture_time + (0.0 if self.speed == "max" else viewers.period))
         return 0.0
 
-    def _control_step(self) -> None:
+    def _run_control_step(self) -> None:
         self._in_step = True
         try:
             if self.step % self._snapshot_steps == 0:
@@ -345,7 +345,7 @@ class Live(Interaction, Closeable):
 
     def _advance(self, n_steps: int) -> None:
         for _ in range(n_steps):
-            self._control_step()
+            self._run_control_step()
         self._pace.restart()
 
     def _reset(self) -> None:

@@ -88,8 +88,8 @@ class Pilot:
         command = live.command[live.selected]
         point = move_setpoint(command_setpoint(command), sticks, 1.0 / live.control_freq, self._speed, self._yaw_rate)
         pos = np.asarray(live.sim.data.states.pos, float)[live.selected]
-        reach = MAX_LEAD * self._speed
-        point[:3] = np.clip(np.clip(point[:3], pos - reach, pos + reach), self._low, self._high)
+        max_distance = MAX_LEAD * self._speed
+        point[:3] = np.clip(np.clip(point[:3], pos - max_distance, pos + max_distance), self._low, self._high)
         hold_setpoint(command, point)
 
     def go_to(self, live: Live, world: int, point: ArrayLike) -> None:

@@ -61,10 +61,10 @@ class PolicyPilot:
         self._points = None if points is None else np.asarray(points, float)
         if self._points is not None and not len(self._points):
             raise ConfigError("expected at least one point, got none. Use points=None for the goal of the task.")
-        self._set_goal = jax.jit(lambda data, pos: env.set_goal(state_of_data(data), pos).data)
-        self._command = jax.jit(partial(_compute_command, env, policy))
+        self._set_goal_fn = jax.jit(lambda data, pos: env.set_goal(state_of_data(data), pos).data)
+        self._command_fn = jax.jit(partial(_compute_command, env, policy))
         self._memory = self._initial_memory = initial_memory(policy, env)
-        self._target = jax.jit(vectorize_over_worlds(env.task.target, env.task.batched))
+        self._target_fn = jax.jit(vectorize_over_worlds(env.task.target, env.task.batched))
         self._start_data = jax.jit(env.reset)(jax.random.key(seed)).data
         shape = self._start_data.states.pos.shape
         self.goals = np.full(shape, np.nan)
@@ -73,14 +73,14 @@ class PolicyPilot:
         """Number of listed points that each drone has passed. (n_worlds, n_drones)"""
         self._follows_points = np.full(shape[:2], self._points is not None)
         if type(env.task).set_goal is not Task.set_goal:
-            self.goals[:] = self._target(self._start_data)
+            self.goals[:] = self._target_fn(self._start_data)
         if self._points is not None:
             for i, point in enumerate(self._points):
                 self._check_goal(point, f"point {i + 1}: ")
             self.goals[:] = self._points[0]
-            self._start_data = self._set_goal(self._start_data, self.goals)
+            self._start_data = self._set_goal_fn(self._start_data, self.goals)
         env.sim.data = self._start_data
-        self._command(self._start_data, self._memory)  # compiles it before the clock starts
+        self._command_fn(self._start_data, self._memory)  # compiles it before the clock starts
 
     def add_to(self, live: Live) -> None:
         """Fly in a loop from now on; clicks set goals, and viewers mark them."""
@@ -91,7 +91,7 @@ class PolicyPilot:
         """Write the command of this control step."""
         if self._points is not None:
             self._pass_points(live)
-        live.command[:], self._memory = self._command(live.sim.data, self._memory)
+        live.command[:], self._memory = self._command_fn(live.sim.data, self._memory)
 
     def reset(self, live: Live) -> None:
         """Restart the episode after a reset, or restore the goals after a jump back in time.
@@ -102,7 +102,7 @@ class PolicyPilot:
         if live.step == 0:
             live.sim.data = self._start_data
         if np.isfinite(self.goals).all():
-            self.goals[:] = self._target(live.sim.data)
+            self.goals[:] = self._target_fn(live.sim.data)
         if self._points is not None:  # the goals of that time show how many points had been passed
             is_goal = np.isclose(self.goals[..., None, :], self._points, atol=1e-5).all(axis=-1)
             self._follows_points[:], self.n_passed[:] = is_goal.any(axis=-1), is_goal.argmax(axis=-1)
@@ -124,7 +124,7 @@ class PolicyPilot:
         self._check_goal(pos)
         self._follows_points[live.selected] = False
         self.goals[live.selected] = pos
-        live.sim.data = self._set_goal(live.sim.data, self.goals)
+        live.sim.data = self._set_goal_fn(live.sim.data, self.goals)
 
     def click(self, live: Live, world: int, point: ArrayLike) -> None:
         """Set the goal of the selected drone, if it is in that world, above a point on the ground, m. (3,)"""
@@ -165,9 +165,9 @@ class PolicyPilot:
             raise ConfigError(
                 f"{prefix}expected a policy whose goals are positions, got one of {task.name!r}. Use a policy of hover."
             )
-        limits = np.array([task.half_width] * 2 + [task.height]) if isinstance(task, GoalTask) else np.full(3, np.inf)
-        low = np.append(-limits[:2], FLOOR if self.arena else -np.inf)
-        if pos.shape != (3,) or not np.isfinite(pos).all() or not ((low <= pos) & (pos <= limits)).all():
+        high = np.array([task.half_width] * 2 + [task.height]) if isinstance(task, GoalTask) else np.full(3, np.inf)
+        low = np.append(-high[:2], FLOOR if self.arena else -np.inf)
+        if pos.shape != (3,) or not np.isfinite(pos).all() or not ((low <= pos) & (pos <= high)).all():
             arena_text = f" within the arena of {task.name!r}, {self.arena}" if self.arena else ""
             raise ConfigError(f"{prefix}expected x y z, m,{arena_text}, got {' '.join(f'{x:g}' for x in pos.ravel())}")
 
@@ -180,7 +180,7 @@ class PolicyPilot:
             self.n_passed += is_near
             has_next = is_near & (self.n_passed < len(points))
             self.goals[has_next] = points[self.n_passed[has_next]]
-            live.sim.data = self._set_goal(live.sim.data, self.goals)
+            live.sim.data = self._set_goal_fn(live.sim.data, self.goals)
 
 
 def typed_lines() -> Iterator[str]:

@@ -77,8 +77,8 @@ class Radio(Closeable):
         self._lock, self._state_arrived = threading.Lock(), threading.Event()
         self._values = {part: np.zeros(len(names)) for part, names in LOG_VARIABLES.items()}
         self._received_names: set[str] = set()
-        self._stamp, self._mode = 0.0, None
-        self._sync: Any = None
+        self._state_time, self._flight_mode = 0.0, None
+        self._sync_crazyflie: Any = None
         self._log_configs: list[Any] = []
         if self.armed:
             self._connect(uri, period_ms, crazyflie, timeout)
@@ -96,12 +96,12 @@ class Radio(Closeable):
             raise ConfigError(not_installed("real Crazyflies need", "cflib", "radio")) from error
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
-        self._sync = SyncCrazyflie(uri, cf=crazyflie or Crazyflie())
+        self._sync_crazyflie = SyncCrazyflie(uri, cf=crazyflie or Crazyflie())
         try:
-            self._sync.open_link()
+            self._sync_crazyflie.open_link()
         except Exception as error:
             raise ConfigError(f"expected a Crazyflie at {uri}, got: {error}. Check its address and battery.") from error
-        self._cf = self._sync.cf
+        self._cf = self._sync_crazyflie.cf
         for parts in (("pos", "vel"), ("quat",), ("ang_vel", "acc")):
             config = LogConfig("-".join(parts), period_ms)
             for name in (name for part in parts for name in LOG_VARIABLES[part]):
@@ -120,10 +120,10 @@ class Radio(Closeable):
         """Return the latest state that the drone has sent, with the time on the drone's clock."""
         self._require_armed()
         with self._lock:
-            v = {part: UNIT_FACTORS.get(part, 1.0) * x for part, x in self._values.items()}
-            norm = np.linalg.norm(v["quat"])
-            quat = v["quat"] / norm if norm > 0.1 else np.array([0.0, 0.0, 0.0, 1.0])
-            return DroneState(self._stamp, v["pos"], quat, v["vel"], v["ang_vel"], v["acc"])
+            parts = {part: UNIT_FACTORS.get(part, 1.0) * x for part, x in self._values.items()}
+            norm = np.linalg.norm(parts["quat"])
+            quat = parts["quat"] / norm if norm > 0.1 else np.array([0.0, 0.0, 0.0, 1.0])
+            return DroneState(self._state_time, parts["pos"], quat, parts["vel"], parts["ang_vel"], parts["acc"])
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
         """Send a command: the numbers that ``sim.state_control``, ``attitude_control``, ``body_rate_control`` take."""
@@ -147,7 +147,7 @@ class Radio(Closeable):
             # The firmware reads mrad/s, although the docstring of cflib 0.1.34 states degrees/s.
             commander.send_full_state_setpoint(x[0:3], x[3:6], x[6:9], x[9:13], *np.clip(x[13:16], -32, 32))
             return
-        self._set_mode(level)
+        self._set_flight_mode(level)
         thrust = round(65535 * min(max(x[3] / self._max_thrust, 0.0), 1.0))
         roll, pitch, yaw = np.degrees(x[:3])
         # In this packet, positive yaw rates turn right, but positive absolute yaw turns left.
@@ -168,17 +168,17 @@ class Radio(Closeable):
 
     def stop(self) -> None:
         """Stop the motors; a link that is not armed sends nothing."""
-        if self._sync is not None:
+        if self._sync_crazyflie is not None:
             self._cf.commander.send_stop_setpoint()
 
     def close(self) -> None:
         """Stop the motors and disconnect."""
-        if self._sync is not None:
+        if self._sync_crazyflie is not None:
             self.stop()
             for config in self._log_configs:
                 config.stop()
-            self._sync.close_link()
-            self._sync = None
+            self._sync_crazyflie.close_link()
+            self._sync_crazyflie = None
 
     def _require_armed(self) -> None:
         if not self.armed:
@@ -186,13 +186,13 @@ class Radio(Closeable):
                 f"expected a link that is armed, got one to {self.name} that is not. Use Radio(..., arm=True)."
             )
 
-    def _set_mode(self, level: Control) -> None:
+    def _set_flight_mode(self, level: Control) -> None:
         """Set whether the firmware reads angles or rates."""
-        if self._mode != level:
+        if self._flight_mode != level:
             value = "1" if level == Control.attitude else "0"
             for axis in ("Roll", "Pitch", "Yaw"):
                 self._cf.param.set_value(f"flightmode.stabMode{axis}", value)
-            self._mode = level
+            self._flight_mode = level
 
     def _receive_block(self, stamp: int, data: dict[str, float], config: Any) -> None:
         with self._lock:
@@ -200,7 +200,7 @@ class Radio(Closeable):
                 if names[0] in data:
                     x = np.array([data[name] for name in names])
                     if np.isfinite(x).all():
-                        self._values[part], self._stamp = x, stamp / 1000
+                        self._values[part], self._state_time = x, stamp / 1000
                         self._received_names.add(part)
         if len(self._received_names) == len(LOG_VARIABLES):
             self._state_arrived.set()

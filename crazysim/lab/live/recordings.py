@@ -79,4 +79,4 @@ class Recordings:
 def free_path(path: Path) -> Path:
     """Return the path, or, if it exists, the first path with a number after its name that does not."""
     candidates = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in count(2))
-    return path if not path.exists() else next(p for p in candidates if not p.exists())
+    return path if not path.exists() else next(candidate for candidate in candidates if not candidate.exists())

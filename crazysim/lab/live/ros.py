@@ -188,13 +188,13 @@ class RosBridge:
 
     # Commands -------------------------------------------------------------------------------------------------------
 
-    def _guard_callback(self, drone: int, receive: Callable[[int, Any], None]) -> Callable[[Any], None]:
+    def _guard_callback(self, drone: int, handler: Callable[[int, Any], None]) -> Callable[[Any], None]:
         """Return the callback of a subscription, which reports refused commands."""
 
         def callback(message: Any) -> None:
             with self.swarm.lock:
                 try:
-                    receive(drone, message)
+                    handler(drone, message)
                 except ConfigError as error:
                     self.swarm.reports.add("refused", self.swarm.names[drone], self.swarm.time, str(error))
 

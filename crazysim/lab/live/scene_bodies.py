@@ -151,5 +151,7 @@ def _corners(shape: VisualGeom) -> NDArray:
     if shape.kind == "mesh":
         return shape.vertices
     r, h, _ = shape.size
-    half = {"sphere": (r, r, r), "capsule": (r, r, r + h), "cylinder": (r, r, h)}.get(shape.kind, tuple(shape.size))
-    return np.array(half) * (2 * np.indices((2, 2, 2)).reshape(3, 8).T - 1)
+    half_size = {"sphere": (r, r, r), "capsule": (r, r, r + h), "cylinder": (r, r, h)}.get(
+        shape.kind, tuple(shape.size)
+    )
+    return np.array(half_size) * (2 * np.indices((2, 2, 2)).reshape(3, 8).T - 1)

@@ -1,4 +1,4 @@
-"""A live simulation in a real browser: seen, clicked, piloted, and left."""
+"""A live simulation in a real browser: pictures, clicks, piloting, and browsers that disconnect."""
 
 import logging
 import socket
@@ -64,7 +64,7 @@ class Running:
 
 
 def pixel(chromium, point, size):
-    """Return column and row at which the page's camera sees a point at first."""
+    """Return column and row of a point in the first view of the page's camera."""
     position, target = np.array([0.0, -0.9 * size, 0.6 * size + 0.5]), np.array([0, 0, 0.5])
     ahead = (target - position) / np.linalg.norm(target - position)
     right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
@@ -74,15 +74,15 @@ def pixel(chromium, point, size):
     return np.array([left + 0.5 * width + focal * x / z, top + 0.5 * height - focal * y / z])
 
 
-def click(chromium, place):
-    where = {"x": float(place[0]), "y": float(place[1]), "button": "left", "clickCount": 1}
-    chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=where["x"], y=where["y"])
+def click(chromium, pixel_pos):
+    mouse = {"x": float(pixel_pos[0]), "y": float(pixel_pos[1]), "button": "left", "clickCount": 1}
+    chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=mouse["x"], y=mouse["y"])
     for event in ("mousePressed", "mouseReleased"):
-        chromium.call("Input.dispatchMouseEvent", type=event, **where)
+        chromium.call("Input.dispatchMouseEvent", type=event, **mouse)
 
 
 def press(chromium, text):
-    """Press the button with a text, once it is there."""
+    """Wait for the button with a text, and press it."""
     find = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() === {text!r})"
     wait_for(lambda: chromium.value(f"!!{find}"))
     chromium.value(f"{find}.click()")
@@ -93,10 +93,10 @@ SIZE = 4.0
 
 
 MARKUP = "<img src=x onerror='window.hit = 1'> **bold** [link](javascript:alert())"
-"""A name that a page must show as it is."""
+"""A name that a page must show as plain text."""
 
 
-def test_a_page_is_watched_and_used(chromium, live, caplog):
+def test_a_page_shows_the_simulation_and_commands_it(chromium, live, caplog):
     pilot, clicked, values = Pilot(), [], []
     live.add(pilot)
     live.on_click = lambda live, world, point: clicked.append((world, point))
@@ -108,7 +108,7 @@ def test_a_page_is_watched_and_used(chromium, live, caplog):
         chromium.open(page.url, 1100, 360)
         wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
 
-        # The left drone is where it is.
+        # The left drone is drawn at its position.
         live.post(lambda live: live.select(0, 0))
         left, right = pixel(chromium, [-1, 0, 1], SIZE), pixel(chromium, [1, 0, 1], SIZE)
         wait_for(lambda: len(chromium.mask(MAGENTA)[0]) > 40)
@@ -139,21 +139,21 @@ def test_a_page_is_watched_and_used(chromium, live, caplog):
         assert chromium.value("!window.hit && !document.querySelector('img[src=x]')")
 
         # A key of the page flies the selected drone, upwards.
-        before = float(live.command[0, 1, 2])
+        last_height = float(live.command[0, 1, 2])
         for kind in ("keyDown", "keyUp"):
             chromium.call("Input.dispatchKeyEvent", type=kind, key="w", code="KeyW", windowsVirtualKeyCode=87)
-        wait_for(lambda: live.command[0, 1, 2] > before + 0.05)
+        wait_for(lambda: live.command[0, 1, 2] > last_height + 0.05)
         press(chromium, "pause")
         wait_for(lambda: live.paused)
 
-        # The browser leaves, which is reported, and comes back; the loop does not care.
+        # The browser disconnects, which is reported, and connects again; the loop continues.
         with caplog.at_level(logging.INFO):
             chromium.call("Page.navigate", url="about:blank")
             wait_for(lambda: page.n_clients == 0 and "disconnected" in caplog.text)
         assert f"browser 0 disconnected at {live.time:.2f} s" in caplog.text
-        press_again = live.step
+        last_step = live.step
         live.post(lambda live: live.advance(5))
-        wait_for(lambda: live.step == press_again + 5)
+        wait_for(lambda: live.step == last_step + 5)
         chromium.call("Page.navigate", url=page.url)
         wait_for(lambda: page.n_clients == 1 and len(chromium.mask(MAGENTA)[0]) > 40)
     assert not page.is_open
@@ -175,8 +175,8 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(chromium, plain_scene):
         wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
 
         def pick(point, expected):
-            place = pixel(chromium, point, size)
-            wait_for(lambda: (click(chromium, place), time.sleep(0.3), live.followed == expected)[-1])
+            pixel_pos = pixel(chromium, point, size)
+            wait_for(lambda: (click(chromium, pixel_pos), time.sleep(0.3), live.followed == expected)[-1])
 
         pick([2.5, -0.5, 0.08], (1, "cars", 0))
         wait_for(
@@ -188,19 +188,19 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(chromium, plain_scene):
         pick([1.5, 0.0, 1.5], (1, "drone", 0))
         assert live.selected == (1, 0)
 
-        # The right drone shines in magenta, and is off again.
+        # The light of the right drone is magenta, and then off again.
         assert len(chromium.mask(MAGENTA)[0]) == 0
         live.selected = None  # without the mark around it
         live.lights[1, 0] = [1.0, 0.0, 1.0]
-        place = pixel(chromium, [1.5, 0.0, 1.5], size)
-        np.testing.assert_allclose(chromium.find(MAGENTA, place), place, atol=MAX_PIXEL_DISTANCE)
+        pixel_pos = pixel(chromium, [1.5, 0.0, 1.5], size)
+        np.testing.assert_allclose(chromium.find(MAGENTA, pixel_pos), pixel_pos, atol=MAX_PIXEL_DISTANCE)
         live.lights[:] = 0.0
         wait_for(lambda: len(chromium.mask(MAGENTA)[0]) == 0)
 
 
 def test_a_port_in_use_is_named(viser, live, caplog):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as busy_socket:
+        port = busy_socket.getsockname()[1]
         with pytest.raises(RenderError, match=f"expected a free address, got 127.0.0.1:{port}"):
             live.show(Browser(port=port))
     with pytest.raises(RenderError, match="Choose another port"):
@@ -212,7 +212,7 @@ def test_a_port_in_use_is_named(viser, live, caplog):
     assert "every machine of that network" in caplog.text
 
 
-def test_closing_waits_for_no_unused_connection(viser, live, monkeypatch):
+def test_closing_does_not_wait_for_unused_connections(viser, live, monkeypatch):
     """Browsers open connections in advance, for which viser waits."""
     page = live.show(Browser(port=0))
     unused, ended = threading.Event(), []
@@ -235,7 +235,7 @@ def page(viser, live):
 
 
 def connect(page, path=None, **headers):
-    """Return a connection to a page as its script opens one, with other headers."""
+    """Return a connection to a page, as its script opens it, with changed headers."""
     from websockets.sync.client import connect as open_websocket
 
     parts = urlsplit(page.url)
@@ -266,7 +266,7 @@ def test_a_page_of_another_site_cannot_connect(page, caplog, change, message):
     assert page.n_clients == 0
 
 
-def test_the_page_itself_and_programs_connect(page):
+def test_the_page_and_other_programs_connect(page):
     for origin in (f"http://{urlsplit(page.url).netloc}", None):
         connect(page, origin=origin).close()
 
@@ -294,7 +294,7 @@ def test_the_page_is_served_under_names_of_this_machine(page, host, status):
     connection.close()
 
 
-def test_every_page_has_a_token_of_its_own():
+def test_every_page_has_a_new_token():
     assert Browser(port=1).url != Browser(port=1).url
     assert Browser(port=1, host="0.0.0.0").url.startswith("http://127.0.0.1:1/")
     assert Browser(port=1, host="::1").url.startswith("http://[::1]:1/")
@@ -315,7 +315,7 @@ def test_worlds_stand_in_a_grid():
     assert len(np.unique(grid_offsets(7, 1.0), axis=0)) == 7
 
 
-def test_a_picture_has_what_is_drawn():
+def test_a_picture_contains_all_that_viewers_draw():
     sim = Sim(n_worlds=3, n_drones=2, control="state")
     sim.scene.add("sphere", "ball", pos=[0, 0, 3])
     sim.add(Wind(velocity=(1.0, 2.0, 0.0)))
@@ -356,7 +356,7 @@ def test_a_picture_has_what_is_drawn():
 
 
 def test_quantities_of_members():
-    """Two cars beside two drones: scopes, not counts, say which numbers are whose."""
+    """With two cars and two drones, scopes distinguish their leaves, although the counts are equal."""
     sim = Sim(n_drones=2, control="state")
     sim.add(Cars(["Fleet1Tenth_0", "Fleet1Tenth_1"]))
     names = list_quantities(sim)

@@ -24,7 +24,7 @@ def swarm():
 
 @pytest.fixture
 def script(swarm):
-    """Return the swarm as a script gets it."""
+    """Return the swarm as scripts use it."""
     swarm.sim.reset()
     swarm.advance(0.02)
     for commander in swarm.commanders:
@@ -33,7 +33,7 @@ def script(swarm):
     return Crazyswarm()
 
 
-def csv(path, durations, starts):
+def write_csv(path, durations, starts):
     """Write a trajectory along x with constant speed 0.5 m/s at a height of 1 m."""
     rows = ["duration," + ",".join(f"c{k}" for k in range(32))]
     for duration, x in zip(durations, starts, strict=True):
@@ -71,7 +71,7 @@ def test_hover_and_land(script):
 def test_uploaded_trajectories(script, tmp_path):
     timeHelper, allcfs = script.timeHelper, script.allcfs
     trajectory = Trajectory()
-    trajectory.loadcsv(csv(tmp_path / "line.csv", [1.0, 1.0], [0.0, 0.5]))
+    trajectory.loadcsv(write_csv(tmp_path / "line.csv", [1.0, 1.0], [0.0, 0.5]))
     assert (trajectory.n_pieces(), trajectory.duration) == (2, 2.0)
     point = trajectory.eval(1.5)
     np.testing.assert_allclose([*point.pos, *point.vel], [0.75, 0, 1, 0.5, 0, 0])
@@ -123,8 +123,8 @@ def test_streamed_hover_setpoints(script):
     assert script.swarm.state(0).rpy[2] == pytest.approx(0.5, abs=0.1)
 
 
-def test_a_landing_ends_on_the_floor_with_an_offset_of_the_controller(script):
-    """The same for an offset of the default controller, and of one with a load."""
+def test_a_landing_ends_on_the_floor_although_the_controller_has_an_offset(script):
+    """The default controller has an offset, as has a controller with a load."""
     timeHelper, cf = script.timeHelper, script.allcfs.crazyflies[0]
     cf.takeoff(targetHeight=0.5, duration=1.5)
     timeHelper.sleep(2.0)
@@ -193,7 +193,7 @@ def test_refused_commands_are_reported_and_the_rest_continues(script):
     assert second.position()[2] < 0.1
 
 
-def test_a_configuration_gives_names_and_places(tmp_path):
+def test_a_configuration_sets_names_and_positions(tmp_path):
     robots = {
         "cf1": {"enabled": True, "initial_position": [0.0, 1.0, 0.0]},
         "cf2": {"enabled": False, "initial_position": [5.0, 5.0, 0.0]},
@@ -215,24 +215,24 @@ def test_wrong_files(tmp_path):
     with pytest.raises(ConfigError, match="33 numbers"):
         Trajectory().loadcsv(tmp_path / "a.csv")
     with pytest.raises(ConfigError, match="positive durations"):
-        Trajectory().loadcsv(csv(tmp_path / "b.csv", [0.0], [0.0]))
+        Trajectory().loadcsv(write_csv(tmp_path / "b.csv", [0.0], [0.0]))
     with pytest.raises(ConfigError, match="got 0 pieces"):
         Trajectory().host_trajectory()
 
 
-class Lamp(Viewer):
-    """A viewer that keeps what it has shown of the lights."""
+class LightRecorder(Viewer):
+    """A viewer that records the lights."""
 
     is_open = True
 
     def __init__(self):
-        self.seen = []
+        self.lights = []
 
     def open(self, live):
         pass
 
     def update(self, live):
-        self.seen.append(live.lights[0].copy())
+        self.lights.append(live.lights[0].copy())
 
     def close(self):
         pass
@@ -241,7 +241,7 @@ class Lamp(Viewer):
 def test_scripts_advance_a_live_loop_whose_viewers_show_the_lights():
     swarm = Swarm(Sim(n_drones=2, control="state"))
     with Live(swarm.sim, speed="max") as live:
-        lamp = live.show(Lamp())
+        recorder = live.show(LightRecorder())
         swarm.run_in(live)
         script = Crazyswarm(swarm)
         cfs, clock = script.allcfs.crazyflies, script.timeHelper
@@ -255,14 +255,14 @@ def test_scripts_advance_a_live_loop_whose_viewers_show_the_lights():
         np.testing.assert_allclose(cfs[1].position()[2], 1.0, atol=OFFSET + 0.05)
         assert clock.time() == pytest.approx(3.5)
         assert live.time == pytest.approx(3.5)
-    assert len(lamp.seen) > 5
-    np.testing.assert_allclose(lamp.seen[1], [[1.0, 127 / 255, 0.0], [0, 0, 0]])
+    assert len(recorder.lights) > 5
+    np.testing.assert_allclose(recorder.lights[1], [[1.0, 127 / 255, 0.0], [0, 0, 0]])
     np.testing.assert_allclose(live.lights[0], [[0.0, 1.0, 0.0], [0, 0, 0]])
     with pytest.raises(ConfigError, match="loop of the swarm's simulation"):
         swarm.run_in(Live(Sim(control="state")))
 
 
-def test_one_of_thread_and_live_loop_advances_a_swarm():
+def test_either_a_thread_or_a_live_loop_advances_a_swarm():
     swarm = Swarm(Sim(control="state"))
     with Live(swarm.sim, speed="max") as live:
         with swarm.start(), pytest.raises(ConfigError, match="no thread advances"):

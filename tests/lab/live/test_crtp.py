@@ -1,4 +1,4 @@
-"""Simulated Crazyflies at the other end of CRTP: scripts of cflib, and packets of any content."""
+"""Simulated Crazyflies that speak CRTP: scripts of cflib, and packets of any content."""
 
 import errno
 import math
@@ -16,7 +16,7 @@ from crazysim.core.pipeline import append_fn
 from crazysim.errors import ConfigError
 from crazysim.lab.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_cflib_driver
 from crazysim.lab.live.crtp.setpoints import unpack_quat
-from crazysim.lab.live.crtp.tables import LOG_TYPES, LOG_VARIABLES, Table, Variable, pack
+from crazysim.lab.live.crtp.tables import LOG_TYPES, LOG_VARIABLES, Table, Variable, pack_number
 from crazysim.lab.live.swarm import DroneState, Swarm
 from crazysim.plugins.estimators import Kalman
 from crazysim.plugins.sensors import IMU, MotionCapture, MultiRanger, Triad
@@ -98,13 +98,13 @@ def test_log_configurations_and_the_synchronous_logger(running, uri):
         scf.cf.log.add_config(other)
         other.start()
         with SyncLogger(scf, config) as logger:
-            found = [next(logger) for _ in range(6)]
+            entries = [next(logger) for _ in range(6)]
         other.stop()
         wrong = LogConfig(name="wrong", period_in_ms=50)
         wrong.add_variable("no.thing", "float")
         with pytest.raises(KeyError, match=r"no\.thing"):
             scf.cf.log.add_config(wrong)
-    stamps, data, _ = zip(*found, strict=True)
+    stamps, data, _ = zip(*entries, strict=True)
     np.testing.assert_array_equal(np.diff(stamps), 50)
     expected = {"stateEstimate.x": -0.5, "stateEstimate.z": -0.001, "stabilizer.yaw": 0.0, "pm.batteryLevel": 100}
     assert data[0] == pytest.approx(expected, abs=1e-3)
@@ -131,7 +131,7 @@ def test_parameters(running, uri):
     np.testing.assert_allclose(running.colors[0], [0.2, 1.0, 0.0])
 
 
-def test_a_parameter_that_is_not_simulated_keeps_its_value_and_says_so(running, uri):
+def test_a_parameter_that_is_not_simulated_keeps_its_value_and_is_reported(running, uri):
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
     with SyncCrazyflie(uri) as scf:
@@ -147,8 +147,8 @@ def test_a_parameter_that_is_not_simulated_keeps_its_value_and_says_so(running, 
     assert "pid_attitude.pitch_kd = 0.1234; it stays 0. The guide" in "".join(lines)
 
 
-def test_the_initial_pose_is_that_of_the_estimate(running, uri):
-    """A drone at (-0.5, -0.5), yaw 0, that is told to be at (1, 1), yaw 90 degrees: its x is the world's -y."""
+def test_a_reset_of_the_estimator_sets_the_initial_pose(running, uri):
+    """A drone at (-0.5, -0.5), yaw 0, whose estimate is reset to (1, 1), yaw 90 degrees: its x is the world's -y."""
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
     from cflib.utils.reset_estimator import reset_estimator
 
@@ -163,8 +163,8 @@ def test_the_initial_pose_is_that_of_the_estimate(running, uri):
         running.sleep(2.5)
         np.testing.assert_allclose(running.state(0).pos[:2], [-0.5, -0.1], atol=0.05)
         assert running.state(0).rpy[2] == pytest.approx(0.0, abs=0.05)
-        known = running["cf1"].estimate(running.state(0))
-        np.testing.assert_allclose(known.pos[:2], [0.6, 1.0], atol=0.05)
+        estimate = running["cf1"].estimate(running.state(0))
+        np.testing.assert_allclose(estimate.pos[:2], [0.6, 1.0], atol=0.05)
         commander.stop()
 
 
@@ -242,7 +242,7 @@ def test_motion_commander_and_streamed_setpoints(running, uri):
         assert not running["cf1"].motors_on
 
 
-def test_udp_needs_no_change_but_the_uri(running):
+def test_scripts_use_udp_with_a_changed_uri(running):
     import cflib.crtp
     from cflib.crazyflie.swarm import CachedCfFactory
     from cflib.crazyflie.swarm import Swarm as CfSwarm
@@ -306,12 +306,12 @@ def test_drones_fly_and_log_what_their_sensors_and_filter_measure():
 
     swarm["cf1"].take_off(0.5, 0.8)
     swarm.advance(1.2)
-    known, states = sim.plugins.observations(sim.data), sim.data.states
-    pos = [float(x) for x in known["kalman.pos"][0, 0]]
+    observations, states = sim.plugins.observations(sim.data), sim.data.states
+    pos = [float(x) for x in observations["kalman.pos"][0, 0]]
     assert logged("stateEstimate.x", "stateEstimate.y", "kalman.stateZ") == pytest.approx(pos, abs=1e-6)
-    assert 1e-5 < np.abs(states.pos[0, 0] - np.array(pos)).max() < 0.02  # the noise, and not the truth
+    assert 1e-5 < np.abs(states.pos[0, 0] - np.array(pos)).max() < 0.02  # the estimate has noise
     assert float(states.pos[0, 0, 2]) == pytest.approx(0.5, abs=0.1)
-    gyro, accel = (np.asarray(known[f"imu.{name}"][0, 0]) for name in ("gyro", "accel"))
+    gyro, accel = (np.asarray(observations[f"imu.{name}"][0, 0]) for name in ("gyro", "accel"))
     assert logged("gyro.x", "gyro.y", "gyro.z") == pytest.approx(np.rad2deg(gyro).tolist(), rel=1e-4)
     assert logged("acc.x", "acc.y", "acc.z") == pytest.approx((accel / 9.81).tolist(), abs=1e-5)
     measured = float(ranger.read(sim.data).samples.value[0, 0, 0])
@@ -323,7 +323,7 @@ def test_drones_fly_and_log_what_their_sensors_and_filter_measure():
 # Servers ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_server_answers_scans_and_says_when_it_is_open_to_a_network(swarm, caplog):
+def test_a_server_answers_scans_and_warns_if_a_network_can_reach_it(swarm, caplog):
     with CrtpServer(swarm, port=0) as server:
         assert not caplog.records
         peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -339,7 +339,7 @@ def test_a_server_answers_scans_and_says_when_it_is_open_to_a_network(swarm, cap
 
 @pytest.mark.parametrize("wait", ["server", "start"])
 def test_a_step_is_compiled_before_clients_wait(wait):
-    """``aiocflib`` gives up after 0.6 s without an answer, which no step compiles in."""
+    """``aiocflib`` gives up after 0.6 s without an answer; compilation of a step takes longer."""
     sim, traced = Sim(control="state", engine="interpret"), []
     append_fn(sim.step_pipeline, lambda data: (traced.append(1), data)[1], "traced")
     swarm = Swarm(sim)
@@ -347,7 +347,7 @@ def test_a_step_is_compiled_before_clients_wait(wait):
     n = len(traced)
     waiting.close()
     assert n > 0
-    assert float(sim.time[0, 0]) <= (0.0 if wait == "server" else 0.011)  # the thread may have taken its first
+    assert float(sim.time[0, 0]) <= (0.0 if wait == "server" else 0.011)  # the thread may have taken one step
     swarm.advance(0.02)
     assert len(traced) == n
 
@@ -369,15 +369,15 @@ def send(device, port, channel, data):
 
 def test_log_blocks_have_limits(device):
     x = device.log.ids["stateEstimate.x"]
-    one = struct.pack("<BH", 7, x)
-    assert send(device, 5, 1, b"\x06\x01" + one * 6) == [bytes([0x5D, 6, 1, 0])]
-    assert send(device, 5, 1, b"\x06\x01" + one) == [bytes([0x5D, 6, 1, errno.EEXIST])]
-    assert send(device, 5, 1, b"\x07\x01" + one) == [bytes([0x5D, 7, 1, errno.E2BIG])]
+    variable = struct.pack("<BH", 7, x)
+    assert send(device, 5, 1, b"\x06\x01" + variable * 6) == [bytes([0x5D, 6, 1, 0])]
+    assert send(device, 5, 1, b"\x06\x01" + variable) == [bytes([0x5D, 6, 1, errno.EEXIST])]
+    assert send(device, 5, 1, b"\x07\x01" + variable) == [bytes([0x5D, 7, 1, errno.E2BIG])]
     assert send(device, 5, 1, b"\x06\x02" + struct.pack("<BH", 7, 999)) == [bytes([0x5D, 6, 2, errno.ENOENT])]
     assert send(device, 5, 1, b"\x03\x09\x01") == [bytes([0x5D, 3, 9, errno.ENOENT])]
     for k in range(2, 17):
-        assert send(device, 5, 1, bytes([6, k]) + one) == [bytes([0x5D, 6, k, 0])]
-    assert send(device, 5, 1, bytes([6, 17]) + one) == [bytes([0x5D, 6, 17, errno.ENOMEM])]
+        assert send(device, 5, 1, bytes([6, k]) + variable) == [bytes([0x5D, 6, k, 0])]
+    assert send(device, 5, 1, bytes([6, 17]) + variable) == [bytes([0x5D, 6, 17, errno.ENOMEM])]
 
 
 def test_the_answer_to_setting_a_parameter_by_name_repeats_the_name(device):
@@ -402,23 +402,23 @@ def test_quaternions_are_unpacked_as_cflib_packs_them():
     rng = np.random.default_rng(0)
     for quat in rng.normal(size=(50, 4)):
         quat = quat / np.linalg.norm(quat)
-        found = unpack_quat(compress_quaternion(quat))
-        assert abs(found @ quat) > 1 - 1e-5
+        unpacked = unpack_quat(compress_quaternion(quat))
+        assert abs(unpacked @ quat) > 1 - 1e-5
 
 
-def test_numbers_are_limited_to_their_type():
-    assert pack("<B", 300.0) == b"\xff"
-    assert pack("<b", -300.0) == b"\x80"
-    assert pack("<H", float("nan")) == b"\0\0"
-    assert struct.unpack("<e", pack("<e", 1e9))[0] == 65504
-    assert np.isfinite(struct.unpack("<f", pack("<f", 1e300))[0])
+def test_numbers_are_clipped_to_the_range_of_their_type():
+    assert pack_number("<B", 300.0) == b"\xff"
+    assert pack_number("<b", -300.0) == b"\x80"
+    assert pack_number("<H", float("nan")) == b"\0\0"
+    assert struct.unpack("<e", pack_number("<e", 1e9))[0] == 65504
+    assert np.isfinite(struct.unpack("<f", pack_number("<f", 1e300))[0])
     with pytest.raises(ConfigError, match=r"group\.name"):
         Table([Variable("name", "float")], LOG_TYPES)
     with pytest.raises(ConfigError, match="one twice"):
         Table([Variable("a.b", "float")] * 2, LOG_TYPES)
 
 
-def test_own_log_variables(swarm):
+def test_log_variables_of_a_user(swarm):
     device = CrtpDevice(swarm, 1, log={"range.front": ("uint16_t", lambda state, commander: 1234.0)})
     k = device.log.ids["range.front"]
     send(device, 5, 1, b"\x06\x01" + struct.pack("<BH", 2, k))

@@ -1,4 +1,4 @@
-"""A fleet in a running simulation: every command moves its drone, at once and without compiling."""
+"""A fleet in a running simulation: every command takes effect at once and without compilation."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ slowly."""
 
 
 @pytest.fixture(scope="module")
-def flown():
+def sim_and_data():
     sim = Sim(n_drones=3, control="state")
     pos = sim.data.states.pos.at[0].set(np.array([[0, 0, 0.03], [1, 0, 0.03], [2, 0, 0.03]]))
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
@@ -38,11 +38,11 @@ def flown():
 
 
 @pytest.fixture
-def sim(flown):
-    sim, data, default = flown
+def sim(sim_and_data):
+    sim, data, default_data = sim_and_data
     for name in list(sim.plugins):
         sim.plugins.remove(name)
-    sim.data, sim.default_data = data, default
+    sim.data, sim.default_data = data, default_data
     return sim
 
 
@@ -58,21 +58,21 @@ def test_flight_by_commands(sim):
     sim.step(1500)
     np.testing.assert_allclose(pos(sim)[:, 2], 0.8, atol=SETTLED)
 
-    begin = pos(sim)[2]
+    start = pos(sim)[2]
     fleet.apply([Upload(7, line((5, 5, 5), (5, 6, 5), 2.0)), Start(7, relative=True)])
     sim.step(1500)
-    np.testing.assert_allclose(pos(sim)[2] - begin, [0, 1, 0], atol=SETTLED)
+    np.testing.assert_allclose(pos(sim)[2] - start, [0, 1, 0], atol=SETTLED)
     np.testing.assert_allclose(pos(sim)[:2], [[0, 0, 0.8], [1, 0, 0.8]], atol=SETTLED)
 
     fleet.apply([Upload(7, line((2, 1, 0.8), (2, 0, 0.8), 2.0)), Start(7)])
     sim.step(500)
-    staged = np.asarray(sim.data.controls.state.staged_cmd[0, 2, :3])
+    staged_pos = np.asarray(sim.data.controls.state.staged_cmd[0, 2, :3])
     fleet.apply([Hover(7)])
-    here = fleet.setpoint(2)
-    np.testing.assert_allclose(staged, here[:3], atol=0.03)  # up to a tick apart
-    assert 0.2 < here[1] < 0.8
+    setpoint = fleet.setpoint(2)
+    np.testing.assert_allclose(staged_pos, setpoint[:3], atol=0.03)  # at most a control step apart
+    assert 0.2 < setpoint[1] < 0.8
     sim.step(1000)
-    np.testing.assert_allclose(pos(sim)[2], here[:3], atol=SETTLED)
+    np.testing.assert_allclose(pos(sim)[2], setpoint[:3], atol=SETTLED)
     fleet.apply([Land(None), SetParameter(7, "stabilizer.controller", 2.0)])
     assert fleet.parameters == [{}, {}, {"stabilizer.controller": 2.0}]
     sim.step(1500)
@@ -104,7 +104,7 @@ def test_show_by_commands(sim):
 
 def test_commands_that_cannot_be_carried_out_change_nothing(sim, caplog):
     fleet = Fleet(sim, ids={1: 0, 2: 1, 3: 2}, max_pieces=2, teleport=False)
-    before = sim.data
+    last_data = sim.data
     c = np.zeros((3, 4, 1))
     long = Trajectory.of_pieces([1.0] * 3, c)
     high = Trajectory.of_pieces([1.0], np.zeros((1, 4, 9)))
@@ -114,9 +114,9 @@ def test_commands_that_cannot_be_carried_out_change_nothing(sim, caplog):
     wrong = [*uploads, Start(1), Start(None), Land(4), LoadShow(many), LoadShow(big)]
     assert fleet.apply(wrong) == 0
     assert caplog.text.count("refused: expected") == len(wrong)
-    assert sim.data is before
+    assert sim.data is last_data
     assert fleet.apply([Upload(1, line((9, 9, 9), (9, 9, 8), 2.0))]) == 1
-    np.testing.assert_allclose(pos(sim), np.asarray(before.states.pos[0]))  # not moved
+    np.testing.assert_allclose(pos(sim), np.asarray(last_data.states.pos[0]))  # not moved
 
 
 def test_new_ids_get_the_next_free_drone(sim):

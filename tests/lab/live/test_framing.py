@@ -1,4 +1,4 @@
-"""Messages in a stream: split, joined, and hostile."""
+"""Messages in a stream that is split anywhere, and bytes that are not messages."""
 
 import json
 import random
@@ -41,24 +41,24 @@ def test_every_message(message, expected):
     assert not buffer.has_partial_message or message.endswith(b"\n")
 
 
-def test_joined_and_byte_by_byte():
+def test_messages_together_and_byte_by_byte():
     assert list(MessageBuffer().feed(BYTES)) == EXPECTED
     buffer = MessageBuffer()
-    assert [frame for k in range(len(BYTES)) for frame in buffer.feed(BYTES[k : k + 1])] == EXPECTED
+    assert [message for k in range(len(BYTES)) for message in buffer.feed(BYTES[k : k + 1])] == EXPECTED
 
 
 @given(st.lists(st.integers(0, len(BYTES)), max_size=12), st.permutations(range(len(STREAM))))
 def test_any_split_and_order(cuts, order):
     stream = b"".join(STREAM[k][0] for k in order)
-    buffer, found, begin = MessageBuffer(), [], 0
+    buffer, messages, start = MessageBuffer(), [], 0
     for end in [*sorted(cuts), len(stream)]:
-        found += buffer.feed(stream[begin:end])
-        begin = end
-    assert found == [EXPECTED[k] for k in order]
+        messages += buffer.feed(stream[start:end])
+        start = end
+    assert messages == [EXPECTED[k] for k in order]
 
 
 def feed_all(buffer, parts):
-    return [frame for part in parts for frame in buffer.feed(part)]
+    return [message for part in parts for message in buffer.feed(part)]
 
 
 GARBAGE = {
@@ -84,7 +84,7 @@ def test_garbage_is_refused(garbage):
         feed_all(buffer, [garbage[k : k + 1] for k in range(len(garbage))])
 
 
-def test_messages_in_front_of_garbage_count():
+def test_messages_before_garbage_are_returned():
     buffer = MessageBuffer().feed(b"07_CMDSTART_land_EOFhello")
     assert next(buffer) == Message(7, "land", "")
     with pytest.raises(FramingError):
@@ -94,17 +94,17 @@ def test_messages_in_front_of_garbage_count():
 def test_sizes_are_bounded(monkeypatch):
     monkeypatch.setattr(framing, "MAX_JSON", 1000)
     monkeypatch.setattr(framing, "MAX_SHOW", 1000)
-    for begin in (b"07_CMDSTART_upload_{", b"PK\x03\x04"):
+    for start in (b"07_CMDSTART_upload_{", b"PK\x03\x04"):
         with pytest.raises(FramingError, match="at most 1000"):
-            feed_all(MessageBuffer(), [begin, *[b"a" * 50] * 30])
+            feed_all(MessageBuffer(), [start, *[b"a" * 50] * 30])
 
 
 def test_long_messages_in_small_parts():
     """A megabyte of brackets, quotes and false ends."""
     body = b'{"a": "' + b'_EOF\\"PK\x05\x06' * 100_000 + b'"}'
     message, buffer = b"07_CMDSTART_upload_" + body + b"_EOF", MessageBuffer()
-    found = [frame for k in range(0, len(message), 1000) for frame in buffer.feed(message[k : k + 1000])]
-    assert found == [Message(7, "upload", "", body)]
+    messages = [x for k in range(0, len(message), 1000) for x in buffer.feed(message[k : k + 1000])]
+    assert messages == [Message(7, "upload", "", body)]
 
 
 parts = st.sampled_from(
@@ -133,15 +133,15 @@ def test_any_bytes_are_messages_or_refused_however_they_are_split(pieces, seed):
     stream, pick = b"".join(pieces), random.Random(seed)
 
     def read(size):
-        buffer, found, begin = MessageBuffer(), [], 0
+        buffer, messages, start = MessageBuffer(), [], 0
         try:
-            while begin < len(stream):
+            while start < len(stream):
                 n = size()
-                for frame in buffer.feed(stream[begin : begin + n]):
-                    found.append(frame)
-                begin += n
+                for message in buffer.feed(stream[start : start + n]):
+                    messages.append(message)
+                start += n
         except FramingError:
-            found.append(FramingError)
-        return found
+            messages.append(FramingError)
+        return messages
 
     assert read(lambda: len(stream)) == read(lambda: pick.randint(1, 5))

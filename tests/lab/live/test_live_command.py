@@ -10,7 +10,7 @@ from crazysim.lab.live.circles import CIRCLE_DURATION, CLIMB_DURATION, HEIGHT, R
 from crazysim.media import Flight
 
 
-def test_headless_it_flies_and_prints_the_factor(tmp_path, capsys):
+def test_a_headless_flight_prints_the_factor(tmp_path, capsys):
     path = tmp_path / "f.journal"
     arguments = ["--drones", "3", "--seconds", "4", "--headless", "--speed", "max", "--record", str(path)]
     assert main(["live", *arguments]) == 0
@@ -19,20 +19,20 @@ def test_headless_it_flies_and_prints_the_factor(tmp_path, capsys):
     assert f"recording to {path}" in out
     flight = Flight.load(path)
     assert len(flight.time) == 201
-    late = flight.pos[100:, 0]
-    assert np.abs(late[..., 2] - HEIGHT).max() < 0.3
-    assert np.ptp(late[..., :2], axis=0).min() > 0.8 * RADIUS
+    circling_pos = flight.pos[100:, 0]
+    assert np.abs(circling_pos[..., 2] - HEIGHT).max() < 0.3
+    assert np.ptp(circling_pos[..., :2], axis=0).min() > 0.8 * RADIUS
 
 
 def test_circles_are_consistent():
     """Velocity and acceleration are derivatives of position once the drones have risen, and the start is at rest."""
-    places = np.array([[[1.0, 2.0, 0.0]]])
+    initial_pos = np.array([[[1.0, 2.0, 0.0]]])
     t, h = CLIMB_DURATION + 0.3 * CIRCLE_DURATION, 1e-4
-    before, now, after = (circle_commands(places, t + k * h)[0, 0] for k in (-1, 0, 1))
-    np.testing.assert_allclose(now[3:6], (after[:3] - before[:3]) / (2 * h), atol=1e-6)
-    np.testing.assert_allclose(now[6:9], (after[:3] - 2 * now[:3] + before[:3]) / h**2, atol=1e-5)
-    start = circle_commands(places, 0.0)[0, 0]
-    np.testing.assert_allclose(start[:3], places[0, 0])
+    earlier, now, later = (circle_commands(initial_pos, t + k * h)[0, 0] for k in (-1, 0, 1))
+    np.testing.assert_allclose(now[3:6], (later[:3] - earlier[:3]) / (2 * h), atol=1e-6)
+    np.testing.assert_allclose(now[6:9], (later[:3] - 2 * now[:3] + earlier[:3]) / h**2, atol=1e-5)
+    start = circle_commands(initial_pos, 0.0)[0, 0]
+    np.testing.assert_allclose(start[:3], initial_pos[0, 0])
     assert not start[3:9].any()
 
 
@@ -64,8 +64,8 @@ def test_wrong_options_are_refused_in_one_line(arguments, message, capsys):
 
 
 def test_a_port_in_use_is_refused_in_one_line(viser, capsys):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        assert main(["live", "--browser", "--seconds", "1", "--port", str(taken.getsockname()[1])]) == 2
+    with socket.create_server(("127.0.0.1", 0)) as busy_socket:
+        assert main(["live", "--browser", "--seconds", "1", "--port", str(busy_socket.getsockname()[1])]) == 2
     error = capsys.readouterr().err.strip()
     assert "expected a free address" in error
     assert "\n" not in error

@@ -1,4 +1,4 @@
-"""A live window on a virtual screen: what it shows, what keys and clicks do, and that it may be closed or killed."""
+"""A live window on a virtual screen: its picture, keys and clicks, and a window that is closed or killed."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ def screen(tmp_path_factory):
     yield from virtual_screen(tmp_path_factory.mktemp("screen"))
 
 
-WATCHED = textwrap.dedent("""
+WINDOW_PROGRAM = textwrap.dedent("""
     import sys, threading, time
     import numpy as np
     from crazysim import Sim
@@ -58,37 +58,37 @@ WATCHED = textwrap.dedent("""
 """)
 
 
-def marked(pixels):
-    """Return the columns of pixels, in the right tile, of the mark of the selected drone."""
+def mark_columns(pixels):
+    """Return the columns of the pixels that show the mark of the selected drone in the right tile."""
     tile = pixels[:200, 200:400].astype(int)
     return 200 + np.nonzero(tile[..., 2] > tile[..., 0] + 25)[1]
 
 
-def test_a_window_shows_worlds_and_its_end_is_no_end(screen, opengl):
+def test_a_window_shows_worlds_and_the_run_continues_when_it_is_killed(screen, opengl):
     display, path = screen
     environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": "egl", "PYTHONPATH": ":".join(sys.path)}
-    command = [sys.executable, "-c", WATCHED]
+    command = [sys.executable, "-c", WINDOW_PROGRAM]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
     ) as program:
 
-        def do(what):
-            program.stdin.write(what + "\n")
+        def send(line):
+            program.stdin.write(line + "\n")
             program.stdin.flush()
             return program.stdout.readline().split()
 
         assert program.stdout.readline().strip() == "shown"
         for _ in range(20):
-            do("select")
-            columns = marked(screen_pixels(path))
+            send("select")
+            columns = mark_columns(screen_pixels(path))
             if len(columns) > 50:
                 break
         # The right tile shows world 1, whose drone is 0.3 m beside the middle, and is selected. From 2 m with 45
         # degrees of height for 200 pixels a metre has 200 / (2 * 2 * tan 22.5) = 121 pixels: 36 beside the middle.
         assert len(columns) > 50, "no mark of the selected drone"
         np.testing.assert_allclose(columns.mean(), 200 + 100 + 36, atol=6)
-        assert do("kill") == ["kill", "0", "False"]
-        assert do("close")[0] == "close"
+        assert send("kill") == ["kill", "0", "False"]
+        assert send("close")[0] == "close"
         program.stdin.close()
         assert program.wait(300) == 0
 
@@ -123,26 +123,26 @@ def test_a_screen_that_cannot_be_reached_is_refused(monkeypatch):
 
 def test_leds_have_the_colours_of_the_picture():
     model = Sim(n_drones=2).mj_model
-    before = model.mat_rgba.copy()
+    initial_rgba = model.mat_rgba.copy()
     leds = Leds(model)
     leds.set_colors(np.array([[0.0, 0.0, 0.0], [0.2, 0.6, 0.0]]))
     for name in ("led_top", "led_bot"):
         np.testing.assert_allclose(model.material(f"{name}:1").rgba, [0.2, 0.6, 0.0, 1.0])
         assert model.material(f"{name}:1").emission[0] == pytest.approx(0.6)
-    changed = np.flatnonzero((model.mat_rgba != before).any(-1))
+    changed = np.flatnonzero((model.mat_rgba != initial_rgba).any(-1))
     assert {model.material(int(k)).name for k in changed} == {"led_top:1", "led_bot:1"}
     leds.set_colors(np.zeros((2, 3)))
-    np.testing.assert_array_equal(model.mat_rgba, before)
+    np.testing.assert_array_equal(model.mat_rgba, initial_rgba)
 
 
 def test_a_double_click_reports_the_body_below_it():
-    """A wheel is its car, and what does not move is the ground."""
+    """A click on a wheel reports its car; a click on a fixed geom reports the ground."""
     sim = Sim(n_drones=2, control="state")
     sim.add(Cars(2))
     sim.scene.compile_if_edited()
-    program, said = Program.__new__(Program), []
+    program, messages = Program.__new__(Program), []
     program._model, program._bodies = sim.mj_model, SceneBodies(sim)
-    program._send = lambda *message: said.append(message)
+    program._send = lambda *message: messages.append(message)
     picture = SimpleNamespace(worlds=np.array([3, 5]))
 
     def geom_of(body):
@@ -152,6 +152,6 @@ def test_a_double_click_reports_the_body_below_it():
         program._report_click(picture, (1, geom_of(body), np.zeros(3)))
     program._report_click(picture, (0, geom_of("world"), np.array([1.0, 2.0, 0.0])))
     program._report_click(picture, None)
-    assert said == [
+    assert messages == [
         ("follow", 5, "cars", 1), ("follow", 5, "cars", 0), ("follow", 5, "drone", 1), ("click", 3, [1.0, 2.0, 0.0]),
     ]  # fmt: skip

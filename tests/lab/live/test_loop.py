@@ -1,4 +1,4 @@
-"""The live loop: what it calls when, how it pauses, goes back and records, and what survives."""
+"""The live loop: its calls, pauses, jumps in time and recordings, and errors that it survives."""
 
 import logging
 import signal
@@ -30,7 +30,7 @@ def live(shared):
         yield live
 
 
-def test_each_at_its_own_rate_and_in_order(live):
+def test_processes_and_events_are_called_at_their_rates_and_in_order(live):
     calls = []
     live.add(lambda live: calls.append(("control", live.step)))
     live.add(lambda live: calls.append(("slow", live.step)), freq=25, name="slow")
@@ -46,7 +46,7 @@ def test_each_at_its_own_rate_and_in_order(live):
     assert "slow" in str(report)
 
 
-def test_commands_are_staged_and_held(live):
+def test_commands_stay_in_force(live):
     live.command[0, :, 2] = 1.0
     live.run(3.0)
     # The cascade of Crazyflow has an integral that overshoots, here by 11 cm.
@@ -62,12 +62,12 @@ def test_real_time_and_slow_motion(live):
     """An idle loop is never ahead of real time, at any speed."""
     for speed, seconds in ((1.0, 1.0), (4.0, 16.0), (0.25, 0.2)):
         live.speed = speed
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         report = live.run(seconds)
-        wall = time.perf_counter() - begin
-        assert wall > 0.9 * seconds / speed  # the last of 20 steps or more is not waited for
+        wall_s = time.perf_counter() - start_time
+        assert wall_s > 0.9 * seconds / speed  # the last of 20 steps or more is not waited for
         assert report.factor == pytest.approx(seconds / report.wall_s, rel=0.01)
-        assert report.wall_s <= wall
+        assert report.wall_s <= wall_s
 
 
 def test_speed_can_change_and_the_run_can_stop_from_within(live):
@@ -79,20 +79,20 @@ def test_speed_can_change_and_the_run_can_stop_from_within(live):
 
 def test_a_pause_stops_time_and_a_single_step_moves_it(live):
     live.paused = True
-    seen = []
+    steps = []
 
     def act():
         time.sleep(0.1)
-        live.post(lambda live: seen.append(live.step))
+        live.post(lambda live: steps.append(live.step))
         live.post(lambda live: live.advance(3))
-        live.post(lambda live: seen.append(live.step))
+        live.post(lambda live: steps.append(live.step))
         live.post(lambda live: setattr(live, "paused", False))
 
     thread = threading.Thread(target=act)
     thread.start()
     report = live.run(0.2)
     thread.join()
-    assert seen == [0, 3]
+    assert steps == [0, 3]
     assert report.simulated_s == pytest.approx(0.2)
 
 
@@ -180,7 +180,7 @@ def test_errors_of_scripts_end_the_run_and_those_of_sources_do_not(live, caplog)
     assert live.time == pytest.approx(0.3)
 
 
-def test_wrong_requests_are_reported_and_the_rest_goes_on(live, caplog):
+def test_wrong_requests_are_reported_and_the_run_continues(live, caplog):
     live.post(lambda live: live.go_to(-1.0))
     live.post(lambda live: live.select(0, 7))
     report = live.run(0.1)
@@ -248,20 +248,20 @@ class Equal(Counter):
     __hash__ = None
 
 
-def test_of_two_equal_viewers_only_the_closed_one_is_removed(live):
+def test_only_the_closed_one_of_two_equal_viewers_is_removed(live):
     live.speed = 1.0
-    open_one, closed_one = live.show(Equal()), live.show(Equal(until=2))
+    open_viewer, closed_viewer = live.show(Equal()), live.show(Equal(until=2))
     live.run(0.3)
-    assert closed_one.closed
-    assert not open_one.closed
-    assert open_one.n > 4
+    assert closed_viewer.closed
+    assert not open_viewer.closed
+    assert open_viewer.n > 4
 
 
 def test_missed_real_time_is_reported(live, caplog):
     live.speed = 1.0
     # The first delay is the longer one by more than a busy machine adds to the second.
-    for at, delay in ((0.1, 0.9), (0.2, 0.4)):
-        live.call_at(at, lambda live, delay=delay: time.sleep(delay))
+    for event_time, delay in ((0.1, 0.9), (0.2, 0.4)):
+        live.call_at(event_time, lambda live, delay=delay: time.sleep(delay))
     report = live.run(0.3)
     assert report.max_lateness > 0.3
     assert report.max_lateness_time == pytest.approx(0.11)
@@ -272,11 +272,11 @@ def test_missed_real_time_is_reported(live, caplog):
     assert "given up" in str(report)
 
 
-def test_a_recording_has_every_sample_and_goes_on_and_off(live, tmp_path):
+def test_a_recording_has_every_sample_and_is_switched_on_and_off(live, tmp_path):
     live.command[0, :, 2] = 1.0
     path = live.record(tmp_path / "a.journal")
     live.run(0.5)
-    live.reset()  # its time goes on
+    live.reset()  # the time of the recording continues
     live.run(0.5)
     live.toggle_recording()
     assert not live.is_recording
@@ -292,7 +292,7 @@ def test_a_recording_has_every_sample_and_goes_on_and_off(live, tmp_path):
     np.testing.assert_allclose(second.time[[0, -1]], [0, 0.1], atol=1e-9)
 
 
-def test_a_recording_that_cannot_be_written_ends_alone(live, tmp_path, monkeypatch, caplog):
+def test_a_recording_that_cannot_be_written_ends_and_the_run_continues(live, tmp_path, monkeypatch, caplog):
     live.record(tmp_path / "a.journal")
 
     def full(_file, _content):
@@ -307,7 +307,7 @@ def test_a_recording_that_cannot_be_written_ends_alone(live, tmp_path, monkeypat
     np.testing.assert_allclose(Flight.load(tmp_path / "a.journal").time, [0, 0.02, 0.04], atol=1e-9)
 
 
-KILLED = textwrap.dedent("""
+KILLED_PROGRAM = textwrap.dedent("""
     import os, signal, sys
     from crazysim import Sim
     from crazysim.lab.live import Live
@@ -321,15 +321,15 @@ KILLED = textwrap.dedent("""
 
 def test_a_killed_process_loses_no_sample(tmp_path):
     path = tmp_path / "killed.journal"
-    ended = subprocess.run([sys.executable, "-c", KILLED, path], check=False)
-    assert ended.returncode == -signal.SIGKILL
+    completed = subprocess.run([sys.executable, "-c", KILLED_PROGRAM, path], check=False)
+    assert completed.returncode == -signal.SIGKILL
     flight = Flight.load(path)
     np.testing.assert_allclose(flight.time, np.arange(51) / 50, atol=1e-9)
     assert np.isfinite(flight.pos).all()
     assert flight.pos[-1, 0, :, 2].min() > 0.3
 
 
-def test_commands_of_the_network_and_resets():
+def test_commands_from_the_network_and_resets():
     sim = Sim(n_drones=2, control="state")
     fleet, queue = Fleet(sim, teleport=False), CommandQueue()
     with Live(sim, speed="max") as live:
@@ -342,7 +342,7 @@ def test_commands_of_the_network_and_resets():
         live.run(1.0)
         assert np.asarray(sim.data.states.pos[0, :, 2]).max() < 0.15
         np.testing.assert_allclose(fleet.setpoint(0)[:3], [-0.5, -0.5, 0], atol=1e-6)
-        np.testing.assert_array_equal(live.lights, 0.0)  # of a fleet without a show
+        np.testing.assert_array_equal(live.lights, 0.0)  # a fleet without a show has no light
 
 
 def test_other_command_levels(live):
@@ -352,8 +352,8 @@ def test_other_command_levels(live):
         assert float(other.sim.data.states.pos[0, 0, 2]) > 0.1
 
 
-def test_memory_stays_where_it_is(live):
-    """Nothing grows with time but the snapshots, which are bounded; the first is kept, and jumps add none."""
+def test_memory_does_not_grow(live):
+    """The number of snapshots is bounded; the first is kept, and a second jump adds none."""
     live.run(70.0)
     assert len(live._history._latest) == 60
     live.go_to(65.0)

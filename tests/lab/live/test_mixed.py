@@ -1,4 +1,4 @@
-"""Twins, swarms and messages in the live loop, beside a source that never answers."""
+"""Twins and swarms in the live loop, together with sources that never answer, fail or are wrong."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from crazysim.lab.live.mocap import Frame, Poll
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
-class Silent(ThreadSource):
+class SilentSource(ThreadSource):
     """A source that never answers."""
 
     def stream(self, stop_event):
@@ -18,7 +18,7 @@ class Silent(ThreadSource):
         yield from ()
 
 
-class Failing(ThreadSource):
+class FailingSource(ThreadSource):
     """A source that fails at once."""
 
     def stream(self, stop_event):
@@ -30,7 +30,7 @@ def test_the_loop_drives_twins_and_swarms_and_waits_for_no_source():
     sim = Sim(n_drones=2, control="state")
     swarm = Swarm(sim)
     moving = RealTimeSource(FunctionSource(lambda t: {"cf1": ((1.0 + 0.1 * t, 0, 1), LEVEL)}, 200.0)).start()
-    silent, failing = Silent("silent").start(), Failing("failing").start()
+    silent, failing = SilentSource("silent").start(), FailingSource("failing").start()
     twins = [
         Twins(sim, source, {"": Twin("box")}, [name])
         for source, name in ((moving, "cf1"), (silent, "s"), (failing, "f"))
@@ -50,8 +50,8 @@ def test_the_loop_drives_twins_and_swarms_and_waits_for_no_source():
         part.close()
 
 
-class Hostile(MocapSource):
-    """A source that does, each once and at a time of its own, everything that a source should not do."""
+class HostileSource(MocapSource):
+    """A source that makes every mistake once, each at a different time."""
 
     name, simulated = "hostile", True
 
@@ -79,10 +79,10 @@ class Hostile(MocapSource):
 
 
 def test_everything_that_a_source_does_wrong_is_reported_by_name_and_time(caplog):
-    """And the rest continues: drones hold their setpoints, and bodies that are measured well follow."""
+    """The rest continues: drones hold their setpoints, and twins of valid bodies follow them."""
     sim = Sim(n_drones=1, control="state")
     sim.scene.add("box", "wall", pos=[5, 5, 0])
-    twins = Twins(sim, Hostile(), {"": Twin("box", {"size": (0.1, 0.1, 0.1)})}, ["a", "b"])
+    twins = Twins(sim, HostileSource(), {"": Twin("box", {"size": (0.1, 0.1, 0.1)})}, ["a", "b"])
     xs = []
     with Live(sim, control_freq=100, speed="max") as live:
         live.command[..., 2] = 1.0
@@ -91,14 +91,14 @@ def test_everything_that_a_source_does_wrong_is_reported_by_name_and_time(caplog
         report = live.run(seconds=2.0)
     assert report.n_steps == 200
     assert report.failures == 0
-    found = [(r.kind, r.name, round(r.time, 2)) for r in twins.reports.latest if r.kind not in ("dropped", "late")]
-    assert found == [
+    reports = [(r.kind, r.name, round(r.time, 2)) for r in twins.reports.latest if r.kind not in ("dropped", "late")]
+    assert reports == [
         ("repeated", "hostile", 0.49), ("backwards", "hostile", 0.55), ("jumped", "a", 0.70),
         ("invalid", "b", 0.80), ("invalid", "hostile", 0.90), ("unknown", "ghost", 1.00),
         ("duplicate", "b", 1.10), ("stalled", "hostile", 1.40),
     ]  # fmt: skip
-    for kind, name, at in found:
-        assert f"{name} {kind} at {at:.3f} s" in caplog.text
+    for kind, name, time in reports:
+        assert f"{name} {kind} at {time:.3f} s" in caplog.text
     np.testing.assert_allclose(xs[119], 0.119, atol=1e-6)
     assert np.abs(np.diff(xs)).max() < 0.01, "no jump and no NaN reaches the scene"
     np.testing.assert_allclose(xs[-1], 0.119, atol=1e-6)  # it stays where it was seen last

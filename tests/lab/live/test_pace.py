@@ -1,4 +1,4 @@
-"""When control steps are due, by a clock of the test, and what is said about how well that was kept."""
+"""Due times of control steps by a clock of the test, and statistics of their lateness."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def clock():
     return Clock()
 
 
-def test_steps_are_due_at_their_times_whatever_the_work_takes(clock):
+def test_due_times_do_not_depend_on_the_duration_of_steps(clock):
     pace = Pace(0.01, 0.5, clock)
     for k in range(5):
         np.testing.assert_allclose(10.0 + 0.02 * k - clock.now, pace.time_until_due(), atol=1e-12)
@@ -73,7 +73,7 @@ def test_as_fast_as_possible_nothing_is_late(clock):
     assert (pace.n_late_steps, pace.max_lateness, pace.quantile(0.999)) == (0, 0.0, 0.0)
 
 
-def test_a_change_of_speed_begins_now(clock):
+def test_a_change_of_speed_takes_effect_at_once(clock):
     pace = Pace(0.01, 1.0, clock)
     pace.record_step(0.0)
     clock.now += 0.004

@@ -1,4 +1,4 @@
-"""Sticks move setpoints in the drone's axes; keys, gamepads and clicks are sticks."""
+"""Sticks move setpoints in the drone's axes; keys and gamepads are sticks, and clicks set setpoints."""
 
 from types import SimpleNamespace
 
@@ -56,13 +56,13 @@ def test_keys_fly_the_selected_drone(live):
     live.run(2.0)
     live.keyboard.release("up")
     live.run(1.5)
-    flown = np.asarray(live.sim.data.states.pos[0]) - start
-    np.testing.assert_allclose(flown[1], [1.0, 0, 0], atol=0.1)
-    np.testing.assert_allclose(flown[0], 0, atol=0.05)
+    displacement = np.asarray(live.sim.data.states.pos[0]) - start
+    np.testing.assert_allclose(displacement[1], [1.0, 0, 0], atol=0.1)
+    np.testing.assert_allclose(displacement[0], 0, atol=0.05)
 
 
 def test_limits_and_the_lead_of_the_setpoint(live):
-    """Against the floor's limit the setpoint stays; far from the drone it waits."""
+    """The setpoint stays above the lower limit, and does not run far ahead of the drone."""
     live.add(Pilot(speed=1.0, low=(-np.inf, -np.inf, 0.4), high=(np.inf, np.inf, 2.0)))
     live.keyboard.press("s")
     live.run(2.0)
@@ -81,7 +81,7 @@ def test_a_click_sends_the_selected_drone(live):
     live.post(lambda live: live.click(0, np.array([0.5, 5.0, 0.0])))
     live.run(3.0)
     np.testing.assert_allclose(live.command[0, 0, :3], [0.5, 2.0, 1.0], atol=1e-6)
-    live.click(1, np.zeros(3))  # another world than that of the selected drone
+    live.click(1, np.zeros(3))  # the selected drone is in another world
     np.testing.assert_allclose(live.command[0, 0, :3], [0.5, 2.0, 1.0], atol=1e-6)
 
 
@@ -105,7 +105,7 @@ class FakeGlfw:
     """GLFW with one gamepad, number 3, that a test moves, with the names and numbers of the real module."""
 
     def __init__(self):
-        self.axes, self.buttons, self.there = [0.0] * 6, [0] * 15, True
+        self.axes, self.buttons, self.is_connected = [0.0] * 6, [0] * 15, True
 
     def __getattr__(self, name):
         if not name.startswith("GAMEPAD_"):
@@ -113,13 +113,13 @@ class FakeGlfw:
         return getattr(glfw, name)
 
     def joystick_is_gamepad(self, number):
-        return self.there and number == 3
+        return self.is_connected and number == 3
 
     def get_gamepad_name(self, number):
         return b"Stand-in"
 
     def get_gamepad_state(self, number):
-        return SimpleNamespace(axes=self.axes, buttons=self.buttons) if self.there else None
+        return SimpleNamespace(axes=self.axes, buttons=self.buttons) if self.is_connected else None
 
 
 def test_a_gamepad_is_sticks_and_buttons():
@@ -136,14 +136,14 @@ def test_a_gamepad_is_sticks_and_buttons():
     pad(live)
     pad(live)
     assert posted == [len], "once per press"
-    fake.there = False
+    fake.is_connected = False
     np.testing.assert_array_equal(pad(live), 0)
-    fake.there = True
+    fake.is_connected = True
     pad(live)
-    assert posted == [len, len], "pressed again after it came back"
+    assert posted == [len, len], "pressed again after it was connected again"
 
 
-def test_noise_of_sticks():
+def test_the_dead_band_of_sticks():
     np.testing.assert_array_equal(remove_deadband(np.array([DEADBAND, -DEADBAND, np.nan, np.inf])), 0)
     np.testing.assert_allclose(remove_deadband(np.array([1.0, -1.0, 1.2])), [1, -1, 1])
 

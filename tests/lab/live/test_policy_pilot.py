@@ -76,7 +76,7 @@ def test_typed_lines_set_the_goal_and_wrong_ones_change_nothing(flying, caplog):
 def test_a_click_sets_the_goal_of_the_selected_drone_at_its_height(flying):
     live, pilot = flying
     height = pilot.goals[0, 0, 2]
-    live.click(1, np.array([2.0, 2.0, 0.0]))  # another world than that of the selected drone
+    live.click(1, np.array([2.0, 2.0, 0.0]))  # the selected drone is in another world
     live.click(0, np.array([0.2, 0.4, 0.0]))
     np.testing.assert_allclose(pilot.goals[0, 0], [0.2, 0.4, height])
     assert pilot.goals[1, 0, 0] < 1.5
@@ -84,7 +84,7 @@ def test_a_click_sets_the_goal_of_the_selected_drone_at_its_height(flying):
     assert np.abs(positions(live)[0] - pilot.goals[0, 0]).max() < 0.05
     live.reset()
     live.run(0.02)
-    np.testing.assert_array_equal(pilot.goals, pilot._target(live.sim.data))
+    np.testing.assert_array_equal(pilot.goals, pilot._target_fn(live.sim.data))
     assert abs(pilot.goals[0, 0, 0] - 0.2) > 1e-3, "a reset begins the episode again"
 
 
@@ -134,18 +134,18 @@ def test_points_are_read_from_text(tmp_path):
 
 def test_the_command_flies_to_typed_and_to_listed_goals(folder, tmp_path, capsys):
     """Once with a goal on the standard input, recorded, and once with a file of points."""
-    given, typed = os.pipe()
-    os.write(typed, b"0.4 0.2 1.1\n")
-    os.close(typed)
-    before = os.dup(0)
-    os.dup2(given, 0)
+    read_end, write_end = os.pipe()
+    os.write(write_end, b"0.4 0.2 1.1\n")
+    os.close(write_end)
+    stdin_copy = os.dup(0)
+    os.dup2(read_end, 0)
     arguments = ["live", "--policy", str(folder), "--headless", "--speed", "max"]
     try:
         assert main([*arguments, "--seconds", "4", "--record", str(tmp_path / "f.journal")]) == 0
     finally:
-        os.dup2(before, 0)
-        os.close(before)
-        os.close(given)
+        os.dup2(stdin_copy, 0)
+        os.close(stdin_copy)
+        os.close(read_end)
     assert "x and y from -3 to 3 m" in capsys.readouterr().out
     assert np.abs(Flight.load(tmp_path / "f.journal").pos[-1, 0, 0] - [0.4, 0.2, 1.1]).max() < 0.05
     path = tmp_path / "points.csv"

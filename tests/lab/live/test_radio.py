@@ -1,4 +1,4 @@
-"""Links to real drones: the simulator's commands over cflib, and nothing at all without arm=True."""
+"""Links to real drones: the simulator's commands over cflib, and no packet without arm=True."""
 
 import socket
 
@@ -19,18 +19,18 @@ from crazysim.train.export import describe
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:cflib", "ignore::DeprecationWarning:usb")
 
 
-def swarm_of(control, **settings):
+def create_swarm(control, **settings):
     sim = Sim(control=control, drone="cf21B_500", **settings)
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos + np.array([0.0, 0.0, 1.0])))
     return Swarm(sim, ["cf1"])
 
 
-class Recorded:
+class RecordedRadio:
     """A swarm behind cflib whose packets are recorded, as a radio would send them."""
 
     def __init__(self, control):
-        self.swarm = swarm_of(control)
+        self.swarm = create_swarm(control)
         self.uri = add_cflib_driver(self.swarm)[0]
         self.packets = []
 
@@ -55,7 +55,7 @@ def test_nothing_is_sent_without_arming(monkeypatch):
     def refuse(*args):
         raise AssertionError("a connection was opened")
 
-    with Recorded("attitude") as radio:
+    with RecordedRadio("attitude") as radio:
         import cflib.crtp
 
         monkeypatch.setattr(cflib.crtp, "get_link_driver", refuse)
@@ -91,16 +91,16 @@ def test_wrong_commands_are_refused_before_they_are_sent(level, values, error):
 
 
 def test_state_commands_arrive_as_they_were_sent():
-    with Recorded("state") as radio, Radio(radio.uri, arm=True, crazyflie=radio.crazyflie) as link:
+    with RecordedRadio("state") as radio, Radio(radio.uri, arm=True, crazyflie=radio.crazyflie) as link:
         command = np.zeros(16)
         command[:9] = [-0.5, 0.123, 1.0, 0.4, -0.3, 0.2, 0.1, 0.0, -0.1]
         command[9:13], command[13:] = [0.0, 0.0, np.sin(0.4), np.cos(0.4)], [0.1, -0.2, 0.3]
         link.command("state", command)
-        kind, found = radio.swarm["cf1"]._stream
+        kind, values = radio.swarm["cf1"]._stream
         assert kind == "command"
-        np.testing.assert_allclose(found[:9], command[:9], atol=1e-3)
-        np.testing.assert_allclose(found[9:13], command[9:13], atol=2e-3)
-        np.testing.assert_allclose(found[13:], command[13:], atol=1e-3)
+        np.testing.assert_allclose(values[:9], command[:9], atol=1e-3)
+        np.testing.assert_allclose(values[9:13], command[9:13], atol=2e-3)
+        np.testing.assert_allclose(values[13:], command[13:], atol=1e-3)
         link.send_pose(Frame.of(0.0, {"cf1": ((0, 0, 1), (0, 0, 0, 1))}), "cf1")
         with pytest.raises(ConfigError, match="expected one of the bodies"):
             link.send_pose(Frame.of(0.0, {"cf1": ((0, 0, 1), (0, 0, 0, 1))}), "cf2")
@@ -110,7 +110,7 @@ def test_state_commands_arrive_as_they_were_sent():
 
 @pytest.mark.parametrize("level, values", [("attitude", [0.2, -0.1, 0.3, 0.4]), ("body_rate", [0.5, -0.4, 0.3, 0.4])])
 def test_signs_and_units_of_attitudes_and_rates(level, values):
-    with Recorded(level) as radio, Radio(radio.uri, arm=True, crazyflie=radio.crazyflie) as link:
+    with RecordedRadio(level) as radio, Radio(radio.uri, arm=True, crazyflie=radio.crazyflie) as link:
         for _ in range(200):  # until the modes have been set
             link.command(level, values)
             stream = radio.swarm["cf1"]._stream
@@ -131,21 +131,21 @@ def hover(state):
 
 
 def test_a_policy_flies_a_simulated_and_a_radio_link():
-    simulated = SimLink(swarm_of("attitude"))
+    simulated = SimLink(create_swarm("attitude"))
     states = fly_policy(simulated, hover, 2.0, 100)
     np.testing.assert_allclose(states[-1].pos, [0, 0, 1], atol=0.05)
-    with Recorded("attitude") as radio:
+    with RecordedRadio("attitude") as radio:
         radio.swarm.close()  # started again below, in real time
         radio.swarm.start(1.0)
         with Radio(radio.uri, arm=True, crazyflie=radio.crazyflie) as link:
             radio.swarm.sim.reset()
             fly_policy(link, hover, 1.5, 100)
-            there = link.state()
-    np.testing.assert_allclose(there.pos, [0, 0, 1], atol=0.3)
+            state = link.state()
+    np.testing.assert_allclose(state.pos, [0, 0, 1], atol=0.3)
 
 
 def test_a_failing_policy_stops_the_motors():
-    link = SimLink(swarm_of("attitude"))
+    link = SimLink(create_swarm("attitude"))
 
     def policy(state):
         if state.time > 0.1:
@@ -158,21 +158,21 @@ def test_a_failing_policy_stops_the_motors():
 
 
 def test_trained_policies_get_their_observations():
-    asked = {}
+    received = {}
 
     def policy(observations):
-        asked.update(observations)
+        received.update(observations)
         return np.array([2.0, 0.0, -0.5, 0.5])
 
     meta = {
         "observations": {"ang_vel": 3, "difference_to_goal": 3, "pos": 3, "rot": 9, "vel": 3},
         "actions": {"level": "attitude", "centre": [0, 0, 0, 0.4], "scale": [0.5, 0.5, 0.1, 0.2]},
     }
-    link = SimLink(swarm_of("attitude"))
+    link = SimLink(create_swarm("attitude"))
     command = TrainedPolicy(policy, meta, goal=[1, 2, 3])(link.state())
     np.testing.assert_allclose(command, [0.5, 0.0, -0.05, 0.5])
-    np.testing.assert_allclose(asked["difference_to_goal"], [1, 2, 2])
-    np.testing.assert_allclose(asked["rot"], np.eye(3).reshape(9))
+    np.testing.assert_allclose(received["difference_to_goal"], [1, 2, 2])
+    np.testing.assert_allclose(received["rot"], np.eye(3).reshape(9))
     with pytest.raises(ConfigError, match="got gates"):
         TrainedPolicy(policy, meta | {"observations": {"gates": 3}})
 
@@ -180,15 +180,15 @@ def test_trained_policies_get_their_observations():
 def test_observations_over_a_link_equal_those_of_the_task():
     env = make("hover", 1)
     step = jax.jit(env.reset)(jax.random.key(3))
-    states, seen = step.data.states, {}
+    states, received = step.data.states, {}
     values = [np.asarray(x[0, 0], float) for x in (states.pos, states.quat, states.vel, states.ang_vel)]
     goal = values[0] + np.asarray(step.obs["difference_to_goal"])[0, 0]
 
     def policy(observations):
-        seen.update(observations)
+        received.update(observations)
         return np.zeros(4)
 
     TrainedPolicy(policy, describe(env), goal)(DroneState(0.0, *values, np.zeros(3)))
-    assert sorted(seen) == sorted(step.obs)
-    for name, value in seen.items():
+    assert sorted(received) == sorted(step.obs)
+    for name, value in received.items():
         np.testing.assert_allclose(value, np.asarray(step.obs[name])[0, 0], atol=1e-5)

@@ -14,7 +14,7 @@ from crazysim.lab.live.swarm import Swarm
 
 
 class Part:
-    """Fields that exist, as those of a message: others cannot be set."""
+    """A part of a message: only existing fields can be set, with values of their type."""
 
     def __init__(self, **fields):
         object.__setattr__(self, "fields", fields)
@@ -71,7 +71,7 @@ STAND_IN = SimpleNamespace(
 
 
 class Node:
-    """A node that keeps what is published, and hands messages to subscriptions."""
+    """A node that records published messages, and passes messages to subscriptions."""
 
     def __init__(self):
         self.sent, self.callbacks = {}, {}
@@ -131,8 +131,8 @@ def test_poses_speeds_and_clock(swarm, bridge):
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("world", "cf2")
     speed = odometry.twist.twist.linear
     assert state.rpy[2] > 0.05
-    along_axes = np.asarray(rotation.matrix(state.quat)).T @ state.vel
-    np.testing.assert_allclose([speed.x, speed.y, speed.z], along_axes, atol=1e-4)
+    body_vel = np.asarray(rotation.matrix(state.quat)).T @ state.vel
+    np.testing.assert_allclose([speed.x, speed.y, speed.z], body_vel, atol=1e-4)
     assert abs(speed.y - state.vel[1]) > 0.01
     assert odometry.twist.twist.angular.z == state.ang_vel[2]
     force = sent["/cf1/imu"][-1].linear_acceleration
@@ -143,10 +143,10 @@ def test_poses_speeds_and_clock(swarm, bridge):
 
 
 def test_commands(swarm, bridge):
-    def up(message):
+    def climb(message):
         message.linear.z, message.angular.z = 0.5, 0.3
 
-    def place(message):
+    def hold_position(message):
         message.header.frame_id = "world"
         message.pose.position.z = 0.8
         message.pose.position.x = -0.5
@@ -154,8 +154,8 @@ def test_commands(swarm, bridge):
         message.pose.orientation.z, message.pose.orientation.w = 2 * math.sin(0.4), 2 * math.cos(0.4)
 
     for _ in range(100):
-        bridge.node.callbacks["/cf2/cmd_vel"](filled(up))
-        bridge.node.callbacks["/cf1/cmd_pose"](filled(place))
+        bridge.node.callbacks["/cf2/cmd_vel"](filled(climb))
+        bridge.node.callbacks["/cf1/cmd_pose"](filled(hold_position))
         swarm.advance(0.02)
     assert swarm.state("cf2").pos[2] > 0.7
     assert swarm.state("cf2").rpy[2] == pytest.approx(0.6, abs=0.1)

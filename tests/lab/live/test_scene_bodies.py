@@ -30,8 +30,8 @@ def bodies(sim):
 
 
 def test_bodies_have_kinds_numbers_and_names(bodies):
-    found = [(body.kind, body.index, body.name) for body in bodies.items]
-    assert found == [
+    listed = [(body.kind, body.index, body.name) for body in bodies.items]
+    assert listed == [
         ("drone", 0, "Bumblebee_0"), ("drone", 1, "Bumblebee_1"), ("load", 0, "load 0"), ("load", 1, "load 1"),
         ("cars", 0, "Fleet1Tenth_0"), ("cars", 1, "Fleet1Tenth_1"), ("ball", 0, "ball"), ("ball_gate", 0, "ball_gate"),
     ]  # fmt: skip
@@ -58,7 +58,7 @@ def test_sizes_and_marks(bodies):
     assert bodies.trail_mocap_ids[:2].tolist() == [bodies.items[0].mocap, bodies.items[1].mocap]
 
 
-def test_what_is_followed(sim):
+def test_the_followed_body(sim):
     live = Live(sim)
     assert live.followed == (0, "drone", 0)
     live.follow(1, "cars", 1)
@@ -89,7 +89,7 @@ class Scene:
         return self.handle
 
 
-def test_trails_follow_bodies_and_begin_again_after_a_reset():
+def test_trails_follow_bodies_and_restart_after_a_reset():
     scene = Scene()
     trails = Trails(scene, np.zeros((2, 3)), np.ones((2, 3)), 0.2)
     for k in range(5):

@@ -36,15 +36,15 @@ def server():
         yield server
 
 
-def arrived(source, n):
-    """The next commands, as soon as there are n."""
-    found = []
-    wait_for(lambda: found.extend(source.commands()) or len(found) >= n)
-    return found
+def wait_for_commands(source, n):
+    """Return the next commands as soon as there are n."""
+    commands = []
+    wait_for(lambda: commands.extend(source.commands()) or len(commands) >= n)
+    return commands
 
 
-def raw(port, *messages, more=False):
-    """All answers to messages that are sent as they are, until the server disconnects; more could come by default."""
+def exchange_bytes(port, *messages, more=False):
+    """Send bytes and return all answers until the server disconnects; if ``more``, the client does not end its side."""
     with socket.create_connection(("127.0.0.1", port), 300.0) as peer:
         answers = b""
         with contextlib.suppress(ConnectionError):
@@ -67,7 +67,7 @@ def test_every_command_of_a_drone(server):
         drone.hover()
         drone.set_parameter("stabilizer.controller", 2)
         drone.land()
-    takeoff, upload, *others = arrived(server, 7)
+    takeoff, upload, *others = wait_for_commands(server, 7)
     assert takeoff == TakeOff(7, 0.5)
     assert isinstance(upload, Upload)
     assert upload.drone == 7
@@ -84,7 +84,7 @@ def test_one_drone_has_one_client(server, caplog):
         DroneClient(2, port=server.drone_port).close()
     with pytest.raises(ConfigError, match="ACK_03"):
         DroneClient(3, port=server.drone_port)
-    wait_for(lambda: raw(server.drone_port, b"REQ_01") == b"ACK_01")
+    wait_for(lambda: exchange_bytes(server.drone_port, b"REQ_01") == b"ACK_01")
     assert "refused: drone 3 is not free" in caplog.text
     with pytest.raises(ConfigError, match="from 1 to 99"):
         DroneClient(0, port=server.drone_port)
@@ -101,7 +101,7 @@ def test_the_stream_of_all(server, tmp_path):
         stream.start_show()
         stream.send(b"START")
         stream.command(0, "land")
-    takeoff, upload, load, *others = arrived(server, 6)
+    takeoff, upload, load, *others = wait_for_commands(server, 6)
     assert takeoff == TakeOff(7, 0.5)
     assert upload.drone is None
     assert isinstance(load, LoadShow)
@@ -109,12 +109,12 @@ def test_the_stream_of_all(server, tmp_path):
     assert others == [StartShow(), StartShow(), Land(None)]
 
 
-def test_answers_are_those_of_the_protocol(server):
-    assert raw(server.drone_port, b"REQ_07", b"CMDSTART_takeoff_0.5_EOFCMDSTART_land_EOF") == b"ACK_07ACKACK"
-    assert raw(server.drone_port, b"REQ_05") == b"ACK_00"
-    assert raw(server.drone_port, b"CMDSTART_land_EOF") == b"ACK_00"
-    assert raw(server.stream_port, b"07_CMDSTART_takeoff_high_EOF07_CMDSTART_land_EOF") == b"ERRACK"
-    assert arrived(server, 3) == [TakeOff(7, 0.5), Land(7), Land(7)]
+def test_answers_follow_the_protocol(server):
+    assert exchange_bytes(server.drone_port, b"REQ_07", b"CMDSTART_takeoff_0.5_EOFCMDSTART_land_EOF") == b"ACK_07ACKACK"
+    assert exchange_bytes(server.drone_port, b"REQ_05") == b"ACK_00"
+    assert exchange_bytes(server.drone_port, b"CMDSTART_land_EOF") == b"ACK_00"
+    assert exchange_bytes(server.stream_port, b"07_CMDSTART_takeoff_high_EOF07_CMDSTART_land_EOF") == b"ERRACK"
+    assert wait_for_commands(server, 3) == [TakeOff(7, 0.5), Land(7), Land(7)]
 
 
 WRONG = [
@@ -132,36 +132,36 @@ def test_invalid_commands_are_refused_and_the_connection_stays(server, caplog):
             with pytest.raises(ConfigError, match="ERR"):
                 stream.send(message)
         stream.command(7, "hover")
-    assert arrived(server, 1) == [Hover(7)]
+    assert wait_for_commands(server, 1) == [Hover(7)]
     assert caplog.text.count("command refused: expected") == len(WRONG)
 
 
 def test_a_message_that_is_not_completed_is_refused(caplog):
     with CommandServer(drone_port=0, stream_port=0, timeout=0.2) as server:
-        assert raw(server.stream_port, b"07_CMDSTART_upload_{", more=True) == b""
+        assert exchange_bytes(server.stream_port, b"07_CMDSTART_upload_{", more=True) == b""
     assert "complete message within" in caplog.text
 
 
 def test_peers_that_misbehave_are_refused(server, caplog):
-    assert raw(server.stream_port, b"GET / HTTP/1.1\r\n\r\n") == b""
-    assert raw(server.stream_port, b"07_CMDSTART_takeoff_" + b"0" * 10_000) == b""
-    assert raw(server.drone_port, bytes(10**6)) == b""
+    assert exchange_bytes(server.stream_port, b"GET / HTTP/1.1\r\n\r\n") == b""
+    assert exchange_bytes(server.stream_port, b"07_CMDSTART_takeoff_" + b"0" * 10_000) == b""
+    assert exchange_bytes(server.drone_port, bytes(10**6)) == b""
     socket.create_connection(("127.0.0.1", server.stream_port)).close()
     with socket.create_connection(("127.0.0.1", server.stream_port)) as half:
         half.sendall(b"07_CMDSTART_la")
-    with StreamClient(port=server.stream_port) as stream:  # others are served
+    with StreamClient(port=server.stream_port) as stream:  # other clients are still served
         stream.command(1, "land")
-    assert arrived(server, 1) == [Land(1)]
+    assert wait_for_commands(server, 1) == [Land(1)]
     for reason in ("expected a message such as", "within 200 bytes"):
         assert reason in caplog.text, reason
 
 
 def test_a_drone_has_only_its_own_commands(server):
-    assert raw(server.drone_port, b"REQ_07", b"01_CMDSTART_land_EOF") == b"ACK_07ERR"
-    assert raw(server.drone_port, b"REQ_02REQ_01") == b"ACK_02"
+    assert exchange_bytes(server.drone_port, b"REQ_07", b"01_CMDSTART_land_EOF") == b"ACK_07ERR"
+    assert exchange_bytes(server.drone_port, b"REQ_02REQ_01") == b"ACK_02"
 
 
-def test_server_says_where_it_listens(caplog):
+def test_a_server_warns_if_a_network_can_reach_it(caplog):
     with CommandServer(host="127.0.0.1", drone_port=0, stream_port=0):
         assert "every machine" not in caplog.text
     with CommandServer(host="0.0.0.0", drone_port=0, stream_port=0) as server:
@@ -183,8 +183,8 @@ def test_waiting_commands_are_bounded(monkeypatch):
         stream.command(1, "land")
 
 
-def test_commands_that_arrive_while_others_are_taken_wait_for_the_next_call():
-    """A producer as fast as the consumer: each of the first nine commands that is taken is followed by another."""
+def test_commands_that_arrive_during_a_call_wait_for_the_next_call():
+    """A producer as fast as the consumer: it adds a command whenever one of the first nine is removed."""
     queue = CommandQueue()
     queue._enqueue(Land(1))
     take = queue._queue.get_nowait
@@ -209,10 +209,10 @@ def test_many_clients_at_once(server):
     threads = [threading.Thread(target=send, args=(drone,)) for drone in range(1, 9)]
     for thread in threads:
         thread.start()
-    found = arrived(server, 160)
+    commands = wait_for_commands(server, 160)
     for thread in threads:
         thread.join()
-    assert sorted(command.drone for command in found) == sorted(list(range(1, 9)) * 20)
+    assert sorted(command.drone for command in commands) == sorted(list(range(1, 9)) * 20)
 
 
 @contextlib.contextmanager
@@ -226,7 +226,7 @@ def lab_server(*messages, leaves=False):
             with peer:
                 for message in messages:
                     peer.sendall(message)
-                    time.sleep(0.02)  # in packets of their own
+                    time.sleep(0.02)  # in separate packets
                 if leaves:
                     peer.shutdown(socket.SHUT_WR)
                 with contextlib.suppress(OSError):
@@ -242,7 +242,7 @@ def lab_server(*messages, leaves=False):
 def test_listener_at_the_servers_stream(caplog):
     with lab_server(b"07_CMDSTART_take", b"off_0.5_EOF00_CMDST", b"ART_show_EOF") as (port, answers):
         listener = StreamListener(port=port)
-        assert arrived(listener, 2) == [TakeOff(7, 0.5), StartShow()]
+        assert wait_for_commands(listener, 2) == [TakeOff(7, 0.5), StartShow()]
         assert listener.is_connected
         listener.close()
     assert bytes(answers) == b"ACKACK"

@@ -1,4 +1,4 @@
-"""Swarms: commanders with the meaning of the firmware's commands, and the simulation that follows them."""
+"""Swarms: commanders that interpret commands as the firmware does, and the simulation that follows them."""
 
 import contextlib
 
@@ -13,7 +13,7 @@ from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.lab.live.host_trajectory import HostTrajectory, host_trajectories
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.swarm import Commander, DroneState, Swarm
-from crazysim.lab.live.swarm.motion import PlannedMotion, move, nearest_yaw
+from crazysim.lab.live.swarm.motion import PlannedMotion, nearest_yaw, plan_move
 from crazysim.trajectories import Trajectory, circle, line, minimum_snap
 
 OFFSET = 0.02
@@ -36,16 +36,16 @@ def tick(commander, now, pos=(1.0, 2.0, 1.0), yaw=0.5):
 # Plans --------------------------------------------------------------------------------------------------------------
 
 
-def test_a_move_begins_and_ends_as_it_must():
+def test_a_move_starts_at_its_state_and_ends_at_rest():
     rng = np.random.default_rng(0)
-    begin, goal = rng.normal(size=(3, 4)), rng.normal(size=4)
-    path = move(begin, goal, 2.5)
-    np.testing.assert_allclose(path.derivatives(0.0, 2), begin, atol=1e-12)
+    start, goal = rng.normal(size=(3, 4)), rng.normal(size=4)
+    path = plan_move(start, goal, 2.5)
+    np.testing.assert_allclose(path.derivatives(0.0, 2), start, atol=1e-12)
     end = path.derivatives(2.5, 3)
     np.testing.assert_allclose(end, [goal, [0] * 4, [0] * 4, [0] * 4], atol=1e-10)
     np.testing.assert_allclose(path.derivatives(0.0, 3)[3], 0, atol=1e-10)
-    straight = move(begin, goal, 2.5, linear=True)
-    np.testing.assert_allclose(straight.setpoint(1.25), (begin[0] + goal) / 2)
+    straight = plan_move(start, goal, 2.5, linear=True)
+    np.testing.assert_allclose(straight.setpoint(1.25), (start[0] + goal) / 2)
 
 
 def test_a_reversed_slow_plan():
@@ -91,8 +91,8 @@ def test_motors_are_off_before_take_off_and_after_landing():
     assert tick(commander, 3.0, pos=(1, 2, 0.1)) is None
 
 
-def test_a_landing_goes_on_where_the_drone_is_still_too_high():
-    """A controller with an offset, a load, or a pad that is higher than the target."""
+def test_a_landing_continues_if_the_drone_is_still_too_high():
+    """So it does with a controller that has an offset, with a load, or on a pad above the target."""
     commander = flying(land=(0.04, 1.0))
     above = np.array([1.0, 2.0, 0.13])
     heights = [commander.tick(now, above, np.array([0, 0, -0.2]), 0.5)[2] for now in (11.0, 11.1, 11.3, 20.0)]
@@ -113,13 +113,13 @@ def test_commands_are_in_the_frame_of_the_estimate():
     np.testing.assert_allclose(command[:3], [2.0, 2.0, 1.5], atol=1e-9)
     np.testing.assert_allclose(command[9:13], [0, 0, np.sin(0.25), np.cos(0.25)], atol=1e-9)
     state = DroneState(0.0, np.array([2.0, 2.0, 1.0]), command[9:13], np.array([1.0, 0, 0]), np.zeros(3), np.zeros(3))
-    found = commander.estimate(state)
-    np.testing.assert_allclose([*found.pos, *found.vel], [5, 6, 0, 0, 1, 0], atol=1e-9)
-    assert found.rpy[2] == pytest.approx(0.5 + np.pi / 2)
-    level = flying("attitude")
-    level.set_estimate(np.zeros(3), 0.0, np.array([0.0, 0.0, 0.0, 1.0]))
-    level.command("attitude", [0.1, 0.2, 1.3, 0.4])
-    np.testing.assert_allclose(tick(level, 10.1), [0.1, 0.2, 0.3, 0.4])
+    estimate = commander.estimate(state)
+    np.testing.assert_allclose([*estimate.pos, *estimate.vel], [5, 6, 0, 0, 1, 0], atol=1e-9)
+    assert estimate.rpy[2] == pytest.approx(0.5 + np.pi / 2)
+    tilted = flying("attitude")
+    tilted.set_estimate(np.zeros(3), 0.0, np.array([0.0, 0.0, 0.0, 1.0]))
+    tilted.command("attitude", [0.1, 0.2, 1.3, 0.4])
+    np.testing.assert_allclose(tick(tilted, 10.1), [0.1, 0.2, 0.3, 0.4])
     commander.reset()
     assert commander.estimate(state) is state
 
@@ -127,7 +127,7 @@ def test_commands_are_in_the_frame_of_the_estimate():
 def test_parameters_have_an_effect_or_are_refused():
     swarm = Swarm(Sim(control="state"))
     values = swarm.parameters[0]
-    kept = dict(values)
+    initial_values = dict(values)
     for name, value in {"stabilizer.controller": 2, "ring.effect": 6, "pid_attitude.pitch_kd": 0.1234}.items():
         with pytest.raises(ConfigError, match="expected a value whose effect is simulated"):
             swarm.set_parameter(0, name, value)
@@ -139,11 +139,11 @@ def test_parameters_have_an_effect_or_are_refused():
             swarm.set_parameter(0, name, 1)
         with pytest.raises(ConfigError, match="lists the parameters"):
             values.get_value(name)
-    for name, value in kept.items():
+    for name, value in initial_values.items():
         if not values.definitions[name].read_only:
             swarm.set_parameter(0, name, np.float32(value))
-    assert dict(values) == pytest.approx(kept)
-    assert {"pid_attitude.roll_kp": 6.0, "pid_attitude.yaw_kd": 0.35}.items() <= kept.items()
+    assert dict(values) == pytest.approx(initial_values)
+    assert {"pid_attitude.roll_kp": 6.0, "pid_attitude.yaw_kd": 0.35}.items() <= initial_values.items()
 
 
 def test_lights_fade_and_shine_by_their_effect():
@@ -159,12 +159,12 @@ def test_lights_fade_and_shine_by_their_effect():
     swarm.set_parameter(0, "ring.fadeColor", 0xFF3300)
     np.testing.assert_array_equal(swarm.colors[0], 0)
     swarm.advance(0.5)
-    np.testing.assert_allclose(swarm.colors[0], [0.5, 0.1, 0], atol=0.011)  # of a control step
+    np.testing.assert_allclose(swarm.colors[0], [0.5, 0.1, 0], atol=0.011)  # the error of a control step
     swarm.advance(1.0)
     np.testing.assert_allclose(swarm.colors[0], [1, 0.2, 0], atol=1e-12)
     swarm.set_parameter(0, "colorLedBot.wrgb8888", 0x10200000)
     np.testing.assert_allclose(swarm.colors[0], np.array([48, 16, 16]) / 255)
-    swarm.colors[0] = 0.5  # of a program
+    swarm.colors[0] = 0.5  # set by a program
     swarm.advance(0.1)
     np.testing.assert_array_equal(swarm.colors[0], 0.5)
     swarm.set_parameter(0, "ring.effect", 13)
@@ -178,8 +178,8 @@ def test_moves_continue_from_the_setpoint_in_force():
     velocity = command[3:6].copy()
     assert velocity[0] > 0.5
     commander.go_to([0, 0, 1], 0.0, 3.0, relative=True)
-    again = tick(commander, 11.0, pos=(9, 9, 9))
-    np.testing.assert_allclose(again[3:6], velocity)
+    later_command = tick(commander, 11.0, pos=(9, 9, 9))
+    np.testing.assert_allclose(later_command[3:6], velocity)
     assert tick(commander, 20.0)[0] == pytest.approx(command[0])
 
 
@@ -189,7 +189,7 @@ def test_groups():
     assert [commander.in_group(mask) for mask in (0, 1, 2, 4, 6)] == [True, True, False, True, True]
 
 
-def test_trajectories_start_where_they_must():
+def test_absolute_and_relative_trajectories_start_at_the_right_position():
     path = HostTrajectory.from_trajectory(line([0, 0, 1], [2, 0, 1], 4.0))
     commander = flying(upload=(3, path), take_off=(1.0, 1.0))
     tick(commander, 12.0)
@@ -201,7 +201,7 @@ def test_trajectories_start_where_they_must():
     assert commander.goal()[0, 3] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_streamed_setpoints_come_first_until_they_stop():
+def test_streamed_setpoints_take_precedence_until_they_stop():
     commander = flying(go_to=([5, 0, 1], 0.0, 1.0))
     commander.position([1, 1, 1], 0.1)
     np.testing.assert_allclose(tick(commander, 10.1)[:3], [1, 1, 1])
@@ -234,11 +234,11 @@ def test_high_level_commands_begin_at_the_drone_while_setpoints_stream():
     np.testing.assert_allclose(tick(commander, 13.2)[:3], [4, 0, 1], atol=1e-9)
 
 
-def test_a_stream_that_ends_keeps_the_place_and_then_stops_the_motors():
+def test_the_end_of_a_stream_holds_the_position_and_then_stops_the_motors():
     commander = flying(velocity=([1, 0, 0], 0.0))
     assert tick(commander, 10.4)[0] == pytest.approx(1.4)
-    stays = tick(commander, 10.6, pos=(3, 3, 3))
-    np.testing.assert_allclose(stays[:6], [3, 3, 3, 0, 0, 0])
+    hold_command = tick(commander, 10.6, pos=(3, 3, 3))
+    np.testing.assert_allclose(hold_command[:6], [3, 3, 3, 0, 0, 0])
     np.testing.assert_allclose(tick(commander, 11.9, pos=(4, 4, 4))[:3], [3, 3, 3])
     assert tick(commander, 12.1) is None
 
@@ -307,15 +307,15 @@ calls = st.one_of(
 
 @settings(max_examples=200, deadline=None)
 @given(sequence=st.lists(st.tuples(st.floats(0.01, 3.0), calls), max_size=8))
-def test_setpoints_stay_finite_whatever_is_commanded(sequence):
+def test_setpoints_stay_finite_after_any_commands(sequence):
     commander = flying(upload=(1, HostTrajectory.from_trajectory(circle(radius=0.5, period=2.0))))
     now = 10.0
     for dt, (name, arguments) in sequence:
         with contextlib.suppress(ConfigError):
             getattr(commander, name)(*arguments)
         now += dt
-        found = tick(commander, now)
-        assert found is None or np.isfinite(found.astype(np.float32)).all()
+        command = tick(commander, now)
+        assert command is None or np.isfinite(command.astype(np.float32)).all()
 
 
 # Swarm --------------------------------------------------------------------------------------------------------------
@@ -367,9 +367,9 @@ def test_a_thread_flies_in_real_time(swarm):
     swarm.sim.reset()
     swarm.advance(0.1)
     with swarm.start(speed=4.0):
-        before = swarm.time
+        start_time = swarm.time
         swarm.sleep(0.5)
-        assert swarm.time - before >= 0.5 - 1e-6
+        assert swarm.time - start_time >= 0.5 - 1e-6
         with pytest.raises(ConfigError, match="running one"):
             swarm.advance(0.1)
     swarm.advance(0.1)

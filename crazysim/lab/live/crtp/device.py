@@ -25,7 +25,7 @@ from crazysim.lab.live.crtp.tables import (
     Table,
     Variable,
     create_log_table,
-    pack,
+    pack_number,
     supervisor_bits,
 )
 from crazysim.lab.live.swarm import Swarm
@@ -99,7 +99,7 @@ class CrtpDevice:
         ]
         self._console: deque[bytes] = deque(maxlen=MAX_CONSOLE_PACKETS)
         self.blocks: dict[int, LogBlock] = {}
-        self._ports: dict[int, Callable[[int, bytes], list[Packet]]] = {
+        self._handlers: dict[int, Callable[[int, bytes], list[Packet]]] = {
             PARAM: self._handle_param, COMMANDER: self._handle_setpoint, MEM: self._handle_memory,
             LOGGING: self._handle_logging, LOCALIZATION: self._handle_localization, GENERIC: self._handle_generic,
             HIGH_LEVEL: self._handle_high_level, SUPERVISOR: self._handle_supervisor, PLATFORM: self._handle_platform,
@@ -115,7 +115,7 @@ class CrtpDevice:
         if packet == b"\xff":  # probe of a scan
             return [b"\xff"]
         port, channel, data = packet[0] >> 4, packet[0] & 3, bytes(packet[1:])
-        handler = self._ports.get(port)
+        handler = self._handlers.get(port)
         with self.swarm.lock:
             if handler is None or len(data) > MAX_DATA_BYTES:
                 self._report(f"packet to port {port} with {len(data)} bytes")
@@ -153,7 +153,7 @@ class CrtpDevice:
         except Exception as error:  # raised by a reading that a user has added
             self.swarm.reports.add("refused", self.name, self.swarm.time, f"log variable {name} failed: {error}")
             value = math.nan
-        return pack(layout, value)
+        return pack_number(layout, value)
 
     def _report(self, text: str) -> None:
         """Report a refused command, also on the drone's console."""
@@ -247,8 +247,8 @@ class CrtpDevice:
     def _answer_table_request(self, port: int, table: Table, data: bytes) -> list[Packet]:
         """Answer a request to a table of contents, version 2 of its protocol."""
         if data[0] == 3:
-            head = struct.pack("<BHI", 3, len(table.variables), table.checksum)
-            return [(port, 0, head + (bytes([MAX_LOG_BLOCKS, MAX_LOG_VARIABLES]) if port == LOGGING else b""))]
+            header = struct.pack("<BHI", 3, len(table.variables), table.checksum)
+            return [(port, 0, header + (bytes([MAX_LOG_BLOCKS, MAX_LOG_VARIABLES]) if port == LOGGING else b""))]
         (k,) = struct.unpack("<H", data[1:3])
         return [(port, 0, data[:3] + table.describe(k))] if data[0] == 2 and k < len(table.variables) else []
 
@@ -313,9 +313,9 @@ class CrtpDevice:
             return [(PARAM, channel, data[:2] + bytes([errno.ENOENT]))]
         name, layout = self.params.variables[k].name, self.params.format(k)
         if channel == 1:
-            return [(PARAM, 1, data[:2] + b"\0" + pack(layout, self.param_values[name]))]
+            return [(PARAM, 1, data[:2] + b"\0" + pack_number(layout, self.param_values[name]))]
         self._set_parameter(name, struct.unpack(layout, data[2:])[0])
-        return [(PARAM, 2, data[:2] + pack(layout, self.param_values[name]))]
+        return [(PARAM, 2, data[:2] + pack_number(layout, self.param_values[name]))]
 
     def _handle_param_misc(self, data: bytes) -> list[Packet]:
         command = data[0]
@@ -331,7 +331,7 @@ class CrtpDevice:
         (k,) = struct.unpack("<H", data[1:3])
         if command == 8 and k < len(self.params.variables):
             value = self.param_values.definitions[self.params.variables[k].name].value
-            return [(PARAM, 3, data[:3] + b"\0" + pack(self.params.format(k), value))]
+            return [(PARAM, 3, data[:3] + b"\0" + pack_number(self.params.format(k), value))]
         return [(PARAM, 3, data[:3] + bytes([errno.ENOENT]))]
 
     def _set_parameter(self, name: str, value: float) -> None:

@@ -114,7 +114,7 @@ def _polynomial_trajectory(memory: bytes, offset: int, n: int) -> HostTrajectory
     durations, c = numbers[:, 32], numbers[:, :32].reshape(n, 4, 8)
     _require_durations(durations)
     with np.errstate(over="ignore", invalid="ignore"):
-        return _checked_trajectory(durations, c * durations[:, None, None] ** np.arange(8))
+        return _create_trajectory(durations, c * durations[:, None, None] ** np.arange(8))
 
 
 def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
@@ -127,12 +127,12 @@ def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
     durations, pieces = [], []
     try:
         last_point, position = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
-        while (head := struct.unpack_from("<BH", memory, position))[1] > 0:
-            kinds, duration_ms = head
+        while (header := struct.unpack_from("<BH", memory, position))[1] > 0:
+            coordinate_types, duration_ms = header
             position += 3
             rows = []
             for axis in range(4):
-                n_points = N_CONTROL_POINTS[kinds >> (2 * axis) & 3]
+                n_points = N_CONTROL_POINTS[coordinate_types >> (2 * axis) & 3]
                 points = [
                     last_point[axis],
                     *np.array(struct.unpack_from(f"<{n_points}h", memory, position)) * units[axis],
@@ -149,7 +149,7 @@ def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
         ) from None
     if not pieces:  # the firmware stays at the start
         durations, pieces = [0.001], [[[x] + [0.0] * 7 for x in last_point]]
-    return _checked_trajectory(np.array(durations), np.array(pieces))
+    return _create_trajectory(np.array(durations), np.array(pieces))
 
 
 def _require_durations(durations: NDArray) -> None:
@@ -157,7 +157,8 @@ def _require_durations(durations: NDArray) -> None:
         raise ConfigError(f"expected pieces of positive durations, got {durations.tolist()} s")
 
 
-def _checked_trajectory(durations: NDArray, coefficients: NDArray) -> HostTrajectory:
+def _create_trajectory(durations: NDArray, coefficients: NDArray) -> HostTrajectory:
+    """Return a trajectory of pieces after checking their coefficients."""
     if not np.isfinite(coefficients).all() or np.abs(coefficients).max() > 1e6:
         raise ConfigError("expected a trajectory of finite coefficients, got others")
     return HostTrajectory(np.cumsum(durations), coefficients, False)

@@ -73,7 +73,7 @@ class Table:
         return self.types[self.variables[k].ctype][1]
 
 
-def pack(struct_format: str, value: float) -> bytes:
+def pack_number(struct_format: str, value: float) -> bytes:
     """Return a number as bytes, clipped to the range of its format; integers are rounded, and 0 if it is not finite."""
     if struct_format in ("<f", "<e"):
         largest = 3.4e38 if struct_format == "<f" else 65504.0

@@ -20,7 +20,7 @@ from crazysim.control import Control
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import yaw_from_quat
 from crazysim.lab.live.host_trajectory import HostTrajectory
-from crazysim.lab.live.swarm.motion import PlannedMotion, move, nearest_yaw
+from crazysim.lab.live.swarm.motion import PlannedMotion, nearest_yaw, plan_move
 from crazysim.lab.live.swarm.state import DroneState, EstimateFrame
 
 STABILIZE_TIMEOUT, SHUTDOWN_TIMEOUT = 0.5, 2.0
@@ -52,7 +52,7 @@ class Commander:
         self._report = report
         self.group = 0
         self.trajectories: dict[int, HostTrajectory] = {}
-        self._compressed: set[int] = set()
+        self._compressed_ids: set[int] = set()
         self.reset()
 
     def reset(self) -> None:
@@ -116,7 +116,7 @@ class Commander:
         if relative:
             goal, yaw = goal + start[0, :3], yaw + start[0, 3]
         end = [*goal, nearest_yaw(start[0, 3], yaw)]
-        self._plan = PlannedMotion(move(start, end, _check_duration(duration), linear), self.now)
+        self._plan = PlannedMotion(plan_move(start, end, _check_duration(duration), linear), self.now)
 
     def stop(self) -> None:
         """Stop the motors."""
@@ -135,7 +135,7 @@ class Commander:
                 f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {trajectory_id}"
             )
         self.trajectories[trajectory_id] = trajectory
-        (self._compressed.add if compressed else self._compressed.discard)(trajectory_id)
+        (self._compressed_ids.add if compressed else self._compressed_ids.discard)(trajectory_id)
 
     def start_trajectory(
         self,
@@ -160,19 +160,19 @@ class Commander:
             )
         if not MIN_DURATION <= timescale <= MAX_DURATION:
             raise ConfigError(f"expected a timescale from {MIN_DURATION:g} to {MAX_DURATION:g}, got {timescale}")
-        if trajectory_id in self._compressed and (timescale != 1 or reversed):
+        if trajectory_id in self._compressed_ids and (timescale != 1 or reversed):
             raise ConfigError(
                 f"expected a compressed trajectory at its own speed and direction, got timescale {timescale:g}, "
                 f"reversed {bool(reversed)}. The firmware supports others for uncompressed trajectories alone."
             )
         plan = PlannedMotion(self.trajectories[trajectory_id], self.now, timescale, bool(reversed))
-        start, first = self._motion_start("start_trajectory")[0], plan.evaluate(self.now)[0]
-        shift = np.zeros(4)
+        start, first_point = self._motion_start("start_trajectory")[0], plan.evaluate(self.now)[0]
+        offset = np.zeros(4)
         if relative:
-            shift[:3] = start[:3] - first[:3]
-            if relative_yaw and trajectory_id not in self._compressed:
-                shift[3] = start[3] - nearest_yaw(start[3], first[3])
-        self._plan = plan._replace(shift=shift)
+            offset[:3] = start[:3] - first_point[:3]
+            if relative_yaw and trajectory_id not in self._compressed_ids:
+                offset[3] = start[3] - nearest_yaw(start[3], first_point[3])
+        self._plan = plan._replace(offset=offset)
 
     # Streamed setpoints ---------------------------------------------------------------------------------------------
 
@@ -263,11 +263,11 @@ class Commander:
         """
         frame = self.estimate_frame
         if frame is None:
-            return self._command(now, pos, vel, yaw)
-        command = self._command(now, *frame.motion_to_estimate(pos, vel, yaw))
+            return self._active_command(now, pos, vel, yaw)
+        command = self._active_command(now, *frame.motion_to_estimate(pos, vel, yaw))
         return None if command is None else frame.command_to_world(self.control, command)
 
-    def _command(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
+    def _active_command(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
         """Return the active command in the frame of the estimate."""
         dt, self.now = now - self.now, now
         self.pos, self.vel, self.yaw = pos, vel, yaw
@@ -348,7 +348,7 @@ class Commander:
         if yaw is not None:
             goal[3] = nearest_yaw(start_pos[3], _check_numbers("yaw", [yaw], 1)[0])
         start = np.array([start_pos, np.zeros(4), np.zeros(4)])
-        self._plan = PlannedMotion(move(start, goal, _check_duration(duration)), self.now, is_landing=is_landing)
+        self._plan = PlannedMotion(plan_move(start, goal, _check_duration(duration)), self.now, is_landing=is_landing)
 
     def _drone_motion(self) -> NDArray:
         """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""

@@ -26,7 +26,7 @@ class PlannedMotion(NamedTuple):
     """Factor of its duration, 1."""
     reversed: bool = False
     """True if it is followed from its end to its start."""
-    shift: NDArray = np.zeros(4)
+    offset: NDArray = np.zeros(4)
     """Offset of position, m, and yaw, rad. (4,)"""
     is_landing: bool = False
     """True if the motors stop at its end."""
@@ -46,12 +46,12 @@ class PlannedMotion(NamedTuple):
         rate = (-1.0 if self.reversed else 1.0) / self.timescale
         derivatives = self.trajectory.derivatives(self.trajectory.duration - elapsed if self.reversed else elapsed, 2)
         derivatives = derivatives * np.array([1.0, rate, rate * rate])[:, None]
-        derivatives[0] += self.shift
+        derivatives[0] += self.offset
         return derivatives
 
 
-def move(start: ArrayLike, goal: ArrayLike, duration: float, linear: bool = False) -> HostTrajectory:
-    """Return the move to rest at a goal.
+def plan_move(start: ArrayLike, goal: ArrayLike, duration: float, linear: bool = False) -> HostTrajectory:
+    """Return the trajectory of a move that ends at rest at a goal.
 
     It is the polynomial of degree 7 with the given position, velocity and acceleration at its start, at rest at its
     end, and without jerk at both (crazyflie-firmware, ``piecewise_plan_7th_order_no_jerk``); or the straight line at

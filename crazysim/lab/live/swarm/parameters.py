@@ -169,14 +169,15 @@ class Light:
         }
         if name.startswith("colorLedBot."):
             white, *color = int(values["colorLedBot.wrgb8888"]).to_bytes(4, "big")
-            target = np.minimum(np.array(color) + white, 255) / 255
+            target_color = np.minimum(np.array(color) + white, 255) / 255
         elif name not in ("ring.effect", *parameters_by_effect.get(int(effect), ("memory",))):
             return
         elif effect == LED_SOLID:
-            target = np.array([values[color] for color in parameters_by_effect[LED_SOLID]]) / 255
+            target_color = np.array([values[color] for color in parameters_by_effect[LED_SOLID]]) / 255
         elif effect == LED_FADE:
-            target = np.array(list((int(values["ring.fadeColor"]) & 0xFFFFFF).to_bytes(3, "big"))) / 255
+            target_color = np.array(list((int(values["ring.fadeColor"]) & 0xFFFFFF).to_bytes(3, "big"))) / 255
             duration = max(values["ring.fadeTime"], 0.0)
         else:
-            target = self.memory.mean(axis=0) if effect == LED_MEMORY else np.zeros(3)
-        self._start_color, self._target_color, self._start_time, self._duration = self.color(now), target, now, duration
+            target_color = self.memory.mean(axis=0) if effect == LED_MEMORY else np.zeros(3)
+        self._start_color, self._target_color = self.color(now), target_color
+        self._start_time, self._duration = now, duration

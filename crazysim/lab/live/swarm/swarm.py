@@ -222,13 +222,13 @@ class Swarm(Closeable):
 
     def _run(self, speed: float) -> None:
         dt = self._n_substeps / self.sim.freq / speed
-        due = time.perf_counter()
+        due_time = time.perf_counter()
         while not self._stop_event.is_set():
             with self.lock:
                 self.update()
                 self.sim.step(self._n_substeps)
-            due = max(due + dt, time.perf_counter() - 0.1)
-            self._stop_event.wait(max(due - time.perf_counter(), 0.0))
+            due_time = max(due_time + dt, time.perf_counter() - 0.1)
+            self._stop_event.wait(max(due_time - time.perf_counter(), 0.0))
 
     def _report_refusal(self, name: str, text: str) -> None:
         """Report that a command to a drone has no effect."""
