@@ -59,9 +59,9 @@ class AttitudeParams(PyTree):
         # The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the
         # least-norm allocation of a quadrotor in X. Other layouts get the same factors.
         allocation = allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0]
-        gain = {key: as_parameter(airframe.value(f"controller.attitude.{key}", (3,))) for key in _GAINS}
+        gains = {key: as_parameter(airframe.value(f"controller.attitude.{key}", (3,))) for key in _GAINS}
         return AttitudeParams(
-            **gain,
+            **gains,
             torque_pwm_max=as_parameter(airframe.value("controller.torque_pwm_max", (3,))),
             thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
             pwm_min=as_parameter(airframe.value("controller.pwm_min", ())),

@@ -61,8 +61,8 @@ class CrazyflowState(Controller):
         self, data: DroneData, command: Setpoint | Array, memory: StateMemory, params: StateParams
     ) -> tuple[Array, StateMemory]:
         s, cmd = data.states, data.controls.state.cmd
-        commanded, pos_err_i = state2attitude(s.pos, s.quat, s.vel, cmd, memory.pos_err_i, self.freq, params=params)
-        return commanded, StateMemory(pos_err_i)
+        attitude_cmd, pos_err_i = state2attitude(s.pos, s.quat, s.vel, cmd, memory.pos_err_i, self.freq, params=params)
+        return attitude_cmd, StateMemory(pos_err_i)
 
 
 class Crazyflow(Controller):

@@ -79,10 +79,10 @@ class CFirmware(Controller):
         """
         if self.motors not in MOTOR_UNITS:
             raise ConfigError(f"expected motors as one of {', '.join(MOTOR_UNITS)}, got {self.motors!r}")
-        _ = self._copy
+        _ = self._copy_path
 
     @functools.cached_property
-    def _copy(self) -> str:
+    def _copy_path(self) -> str:
         """Path of the copy that is loaded."""
         return copy_library(self.library)
 
@@ -90,7 +90,7 @@ class CFirmware(Controller):
         return AllocationParams.create(airframe)
 
     def memory(self, airframe: Airframe) -> CFirmwareMemory:
-        library = _open_library(self._copy)
+        library = _open_library(self._copy_path)
         words: Any = np.zeros(-(-library.crazysim_memory_size() // 4) or 1, np.uint32)
         library.crazysim_init(words.ctypes.data)
         return CFirmwareMemory(words)
@@ -110,7 +110,7 @@ class CFirmware(Controller):
         @jax.custom_jvp
         def call_library(words: Array, inputs: Array) -> tuple[Array, Array]:
             shapes = (jax.ShapeDtypeStruct(words.shape, np.uint32), jax.ShapeDtypeStruct((n_motors,), np.float32))
-            library = functools.partial(_call_library, self._copy, level, n_motors)
+            library = functools.partial(_call_library, self._copy_path, level, n_motors)
             return jax.pure_callback(library, shapes, words, inputs, vmap_method="broadcast_all")
 
         call_library.defjvp(self._refuse_derivative)

@@ -158,8 +158,8 @@ def attitude_torque(matrix: Array, ang_vel: Array, desired: Attitude, *, params:
     """
     p = params
     rotation_error, rate_error, ang_acc = attitude_errors(matrix, ang_vel, desired)
-    inertial = cross(ang_vel, matvec(p.J, ang_vel)) + matvec(p.J, ang_acc)
-    return inertial - p.kR * rotation_error - p.kw * rate_error
+    inertial_torque = cross(ang_vel, matvec(p.J, ang_vel)) + matvec(p.J, ang_acc)
+    return inertial_torque - p.kR * rotation_error - p.kw * rate_error
 
 
 def attitude_errors(matrix: Array, ang_vel: Array, desired: Attitude) -> tuple[Array, Array, Array]:

@@ -85,10 +85,10 @@ def lqr_weights(
     w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
     tilt = w**2 / g
     angle = [] if length is None else [1 / length, 1 / length, w / length, w / length]
-    errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w), angle])
-    inputs = np.array([(mass + load_mass) * w**2, *(moments * rates.stiffness * tilt)])
-    Q, R = errors**-2 if Q is None else Q, inputs**-2 if R is None else R
-    return weight_matrix("Q", Q, len(errors)), weight_matrix("R", R, 4)
+    acceptable_errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w), angle])
+    acceptable_inputs = np.array([(mass + load_mass) * w**2, *(moments * rates.stiffness * tilt)])
+    Q, R = acceptable_errors**-2 if Q is None else Q, acceptable_inputs**-2 if R is None else R
+    return weight_matrix("Q", Q, len(acceptable_errors)), weight_matrix("R", R, 4)
 
 
 def weight_matrix(name: str, weights: ArrayLike, n: int) -> np.ndarray:
@@ -102,8 +102,8 @@ def weight_matrix(name: str, weights: ArrayLike, n: int) -> np.ndarray:
     array = read_numbers(f"weights {name}", weights, shapes=((n,), (n, n)), remedy=f"Give a diagonal of {n} numbers.")
     array = np.diag(array) if array.ndim == 1 else array
     is_symmetric = np.allclose(array, array.T)
-    min_eigenvalue, rounding = np.linalg.eigvalsh(array)[0], 1e-12 * np.abs(array).max()
-    if not is_symmetric or (min_eigenvalue <= 0 if name == "R" else min_eigenvalue < -rounding):
+    min_eigenvalue, tolerance = np.linalg.eigvalsh(array)[0], 1e-12 * np.abs(array).max()
+    if not is_symmetric or (min_eigenvalue <= 0 if name == "R" else min_eigenvalue < -tolerance):
         reason = f"the eigenvalue {min_eigenvalue:.3g}" if is_symmetric else "a matrix that is not symmetric"
         kind = "definite" if name == "R" else "semidefinite"
         raise ConfigError(

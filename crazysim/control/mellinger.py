@@ -15,7 +15,7 @@ from crazysim.control.levels import Control
 from crazysim.control.power_distribution import (
     PowerDistributionParams,
     command_of_rotor_vel,
-    distribute,
+    distribute_power,
     pwm_of_thrust,
     rotor_vel_of_pwm,
 )
@@ -180,7 +180,7 @@ class Mellinger(Controller):
         memory = memory.replace(
             integral=jnp.where(is_off, 0.0, memory.integral), integral_m=jnp.where(is_off, 0.0, memory.integral_m)
         )
-        pwm = distribute(thrust, torque, params=p.motors, whole_numbers=self.whole_numbers)
+        pwm = distribute_power(thrust, torque, params=p.motors, whole_numbers=self.whole_numbers)
         return rotor_vel_of_pwm(pwm, params=p.motors), memory
 
     def take_over(

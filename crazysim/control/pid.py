@@ -24,7 +24,7 @@ from crazysim.control.pid_cascade import (
     wrap_degrees,
 )
 from crazysim.control.pid_loop import PIDLoopMemory, continue_integral, pid_step
-from crazysim.control.power_distribution import command_of_rotor_vel, distribute, pwm_of_thrust, rotor_vel_of_pwm
+from crazysim.control.power_distribution import command_of_rotor_vel, distribute_power, pwm_of_thrust, rotor_vel_of_pwm
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
@@ -81,7 +81,7 @@ class PID(Controller):
         thrust = memory.thrust if isinstance(command, Setpoint) else pwm_of_thrust(command[3:], params=params.motors)
         rpy_des, attitude, ang_vel_des = self._desired_rates(data, command, memory, params, rpy)
         torque, rate = desired_torque(ang_vel, ang_vel_des, memory.rate, self.freq, loop=params.rate)
-        pwm = distribute(thrust, torque, params=params.motors, whole_numbers=self.whole_numbers)
+        pwm = distribute_power(thrust, torque, params=params.motors, whole_numbers=self.whole_numbers)
         rotor_vel = rotor_vel_of_pwm(pwm, params=params.motors)
         new_memory = memory.replace(
             attitude=attitude, rate=rate, rpy_des=rpy_des, thrust=thrust, started=jnp.ones_like(memory.started)

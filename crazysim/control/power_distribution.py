@@ -56,7 +56,9 @@ def torque_allocation(airframe: Airframe) -> np.ndarray:
     return np.round(allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0], 12)
 
 
-def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams, whole_numbers: bool = False) -> Array:
+def distribute_power(
+    thrust: Array, torque: Array, *, params: PowerDistributionParams, whole_numbers: bool = False
+) -> Array:
     """Return the PWM of the motors for a thrust and a torque.
 
     Where a motor would exceed its maximum, all motors are lowered by the largest excess, which keeps the torque at the

@@ -89,8 +89,8 @@ def _solve_by_doubling(A: Array, G: Array, H: Array) -> Array:
         return (A @ WA, (G + G.T) / 2, (H + H.T) / 2), None
 
     (A, G, H), _ = jax.lax.scan(double_step, (A, G, H), length=N_DOUBLINGS)
-    converged = jnp.all(jnp.isfinite(H)) & (jnp.max(jnp.abs(A)) < 1e-3)
-    return jnp.where(converged, H, jnp.nan)
+    has_converged = jnp.all(jnp.isfinite(H)) & (jnp.max(jnp.abs(A)) < 1e-3)
+    return jnp.where(has_converged, H, jnp.nan)
 
 
 def solve_lyapunov(A: Array, Q: Array) -> Array:

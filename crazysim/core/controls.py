@@ -170,7 +170,7 @@ def check_same_controllers(controls: SimControls, reference: SimControls, name: 
     if [_layout(controller) for controller in records] != [_layout(controller) for controller in expected_records]:
         expected_text, actual_text = (", then ".join(map(_describe_controller, x)) for x in (expected_records, records))
         raise ConfigError(
-            f"expected_records data of controller {name!r} with {expected_text or 'no records'}, got "
+            f"expected data of controller {name!r} with {expected_text or 'no records'}, got "
             f"{actual_text or 'no records'}. Use data of this simulation, or of one with the same settings."
         )
 

@@ -67,7 +67,7 @@ def remove_fn(pipeline: Pipeline, name: str) -> None:
 
 
 class BuiltPipeline(Generic[F]):
-    """A pipeline, and the function that runs it, which is built_stages again after an edit."""
+    """A pipeline, and the function that runs it, which is built again after an edit."""
 
     def __init__(self, name: str, stages: Pipeline, build: Callable[[Pipeline], F]):
         """Build the function for the first time.

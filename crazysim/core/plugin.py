@@ -99,11 +99,11 @@ def parameter(
 
 
 def airframe_numbers(sim: Simulation, get_number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
-    """Return a get_number of the airframes for ``check_parameter``: one for all drones, or one for each.
+    """Return a number of the airframes for ``check_parameter``: one for all drones, or one for each.
 
     Args:
         sim: The simulation.
-        get_number: Function from an airframe to a get_number or array. (*core)
+        get_number: Function from an airframe to a number or array. (*core)
 
     Returns:
         (*core), or (n_worlds, n_drones, *core) where the drones have several airframes

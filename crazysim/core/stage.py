@@ -195,9 +195,9 @@ class Axes:
                 f"stage {name!r} changed the structure of SimData (a field became None, or a plugin came or went); "
                 f"make such changes before the step, with sim.data = sim.data.replace(...)"
             )
-        written = [i for i, (x, y) in enumerate(zip(before, new_leaves, strict=True)) if x is not y]
+        written_indices = [i for i, (x, y) in enumerate(zip(before, new_leaves, strict=True)) if x is not y]
         writable_scopes = self.writable_scopes(stage)
-        for i in written:
+        for i in written_indices:
             x, y = before[i], new_leaves[i]
             if jnp.shape(x) != jnp.shape(y) or jnp.result_type(x) != jnp.result_type(y):
                 raise ConfigError(
@@ -210,7 +210,7 @@ class Axes:
                     f"{self.scopes[i]}; it may write leaves of scope {' or '.join(writable_scopes)}. Give every "
                     f"{stage.scope} a leaf of its own first, or leave the stage undeclared."
                 )
-        return written
+        return written_indices
 
     def writable_scopes(self, stage: Stage) -> list[str] | None:
         """Return the scopes of the leaves that a stage may write; None if it may write all leaves."""
@@ -259,40 +259,40 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
         # Leaves of worlds, (n_worlds, 1, ...), lose their second axis.
         inputs = [x[:, 0] if scope == "world" else x for scope, x in zip(leaf_scopes, leaves, strict=True)]
         is_split = [n_batch_axes(scope) >= min_batch_axes for scope in leaf_scopes]
-        returned: dict[str, Any] = {}
+        result_structure: dict[str, Any] = {}
 
         def apply_to_world(values: list[Any]) -> list[Any]:
             result = fn(*treedef.unflatten(values))
-            paths, returned["treedef"] = jax.tree_util.tree_flatten_with_path(result)
-            returned["scopes"] = result_scopes = _leaf_scopes(result)
+            paths, result_structure["treedef"] = jax.tree_util.tree_flatten_with_path(result)
+            result_structure["scopes"] = result_scopes = _leaf_scopes(result)
             # Unchanged leaves are found by identity, since ``fn`` may return trees of another structure. Only shared
             # leaves can be the same array, and then it does not matter which of them is found.
             indices = {id(x): i for i, x in enumerate(values)}
-            unchanged = [indices.get(id(x)) for _, x in paths]
-            for k, i in enumerate(unchanged):
+            input_indices = [indices.get(id(x)) for _, x in paths]
+            for k, i in enumerate(input_indices):
                 if i is not None and not is_split[i] and n_batch_axes(result_scopes[k]) >= min_batch_axes:
-                    unchanged[k] = None  # a shared leaf, returned in a field that has a value for every world
+                    input_indices[k] = None  # a shared leaf, returned in a field that has a value for every world
                 elif i is not None and n_batch_axes(result_scopes[k]) < min_batch_axes:
                     result_scopes[k] = leaf_scopes[i]  # within one world, a leaf of a foreign record loses its scope
-            returned["unchanged"] = unchanged
-            for (path, _), scope, i in zip(paths, result_scopes, unchanged, strict=True):
+            result_structure["input_indices"] = input_indices
+            for (path, _), scope, i in zip(paths, result_scopes, input_indices, strict=True):
                 if n_batch_axes(scope) < min_batch_axes and i is None:
                     name = jax.tree_util.keystr(path).lstrip(".")
                     raise ConfigError(
                         f"{getattr(fn, '__name__', fn)!r} is written for one world and changes {name}, which all "
                         f"worlds share. Give every drone or world a leaf of its own first."
                     )
-            return [x for (_, x), i in zip(paths, unchanged, strict=True) if i is None]
+            return [x for (_, x), i in zip(paths, input_indices, strict=True) if i is None]
 
-        changed = iter(jax.vmap(apply_to_world, ([0 if split else None for split in is_split],))(inputs))
+        changed_leaves = iter(jax.vmap(apply_to_world, ([0 if split else None for split in is_split],))(inputs))
         outputs = []
-        for scope, i in zip(returned["scopes"], returned["unchanged"], strict=True):
+        for scope, i in zip(result_structure["scopes"], result_structure["input_indices"], strict=True):
             if i is not None and leaf_scopes[i] == scope:
                 outputs.append(leaves[i])
             else:
-                x = next(changed) if i is None else inputs[i]
+                x = next(changed_leaves) if i is None else inputs[i]
                 outputs.append(x[:, None] if scope == "world" else x)
-        return returned["treedef"].unflatten(outputs)
+        return result_structure["treedef"].unflatten(outputs)
 
     return apply_to_worlds
 

@@ -39,7 +39,7 @@ def build_step_pipeline(
     control: Control, dynamics: Dynamics, integrator: Integrator, controller: Controller | None
 ) -> Pipeline:
     """Return the stages of one physics step, in order; ``controller`` is None where commands need none."""
-    fitted_model = dynamics != Dynamics.first_principles
+    is_fitted = dynamics != Dynamics.first_principles
     stages: Pipeline = {}
     followers, last_level = controller_chain(controller, control)
     for level, follower in followers:
@@ -48,9 +48,9 @@ def build_step_pipeline(
         stages["commit_attitude"] = commit_attitude
     if last_level == Control.force_torque:
         stages["force_torque_controller"] = force_torque_controller
-    stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
+    stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if is_fitted else clip_rotor_vel_cmd
     deriv_fn: DerivFn = first_principles_derivative
-    if fitted_model:
+    if is_fitted:
         deriv_fn = fitted_derivative
     elif integrator.order == 1:
         deriv_fn = first_principles_euler_derivative
@@ -184,17 +184,17 @@ def nonfinite_worlds(data: SimData) -> Array:
     n_axes = max(core.steps.ndim - 1, 0)
     pairs = zip(jax.tree.leaves(scopes(records)), jax.tree.leaves(records), strict=True)
     leaves = [x for scope, x in pairs if has_members(scope)]
-    finite = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(n_axes, x.ndim))) for x in leaves])
-    return core.nonfinite | ~jnp.all(finite, axis=0).reshape(core.steps.shape) | (core.steps < 0)
+    is_finite = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(n_axes, x.ndim))) for x in leaves])
+    return core.nonfinite | ~jnp.all(is_finite, axis=0).reshape(core.steps.shape) | (core.steps < 0)
 
 
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:
     """Return the data with some worlds, or the whole simulation, reset to the default data.
 
-    With a mask, everything that belongs to the worlds of the mask is restored. What worlds share (parameters that are
-    not one per drone, plugins without declared axes) stays. Without a mask, shared data is restored too. Either way the
-    seed stays, a parameter that has become one per drone stays one per drone, with its default values, and plugins
-    that the default data lack stay as they are.
+    With a mask, everything that belongs to the worlds of the mask is restored. Data that all worlds share (parameters
+    that are not one per drone, plugins without declared axes) stays. Without a mask, shared data is restored too. In
+    both cases the seed stays, a parameter that has become one per drone stays one per drone, with its default values,
+    and plugins that the default data lack stay as they are.
 
     Args:
         data: The simulation.

@@ -46,7 +46,7 @@ class Airframe:
     """Name: the key ``name``, or else the file's stem; ``custom`` for a dict without one."""
     values: Mapping[str, NDArray[np.float64]]
     """All numbers by dotted path, such as ``rigid_body.mass``, as float64 arrays, without units and sources."""
-    not_inherited: str = ""
+    not_inherited_reason: str = ""
     """Reason why gains and fits of the base are missing, for messages; empty if all were inherited."""
 
     def table(self, path: str) -> Mapping[str, Any]:
@@ -94,7 +94,11 @@ class Airframe:
 
     def missing_reason(self, path: str) -> str:
         """Return the reason why a table or value of the base was not inherited, followed by a space; empty for none."""
-        return f"{self.not_inherited} " if self.not_inherited and path.partition(".")[0] in TUNED_TABLES else ""
+        return (
+            f"{self.not_inherited_reason} "
+            if self.not_inherited_reason and path.partition(".")[0] in TUNED_TABLES
+            else ""
+        )
 
     @functools.cached_property
     def tables(self) -> Mapping[str, Any]:

@@ -25,7 +25,7 @@ PITCH_RATIO = 0.5
 """Pitch over diameter of a propeller whose pitch is not given, 1."""
 OUTER_MASS_SHARE = 0.4
 """Fraction of the mass that is located at the rotors, 1; the built-in airframes have 0.31 to 0.52."""
-MERIT_DIAMETERS, MERITS = (0.127, 0.254), (0.44, 0.68)
+MERIT_DIAMETERS, FIGURES_OF_MERIT = (0.127, 0.254), (0.44, 0.68)
 """Diameters of propellers of 5 and 10 inches, m, and their figures of merit in hover, 1."""
 DRAG_RATE = 0.45
 """Linear drag over mass, 1/s; the built-in airframes that were identified from flights have 0.35 to 0.58."""
@@ -328,15 +328,15 @@ def _add_thrust(
     pitch_text = f"pitch {pitch_ratio:g} D" + (" assumed" if pitch is None else "")
     file.add("rotors", "thrust_curve", np.array([0, 0, k]), "N, N/rpm, N/rpm^2", source, ct=ct, pitch=pitch_text)
 
-    area, to_rad = np.pi * diameter**2 / 4, 2 * np.pi / 60
-    merit = float(np.interp(diameter, MERIT_DIAMETERS, MERITS))
-    torque, source = k**1.5 / np.sqrt(2 * AIR_DENSITY * area) / merit / to_rad, "torque_curve"
+    area, rpm_to_rad_s = np.pi * diameter**2 / 4, 2 * np.pi / 60
+    merit = float(np.interp(diameter, MERIT_DIAMETERS, FIGURES_OF_MERIT))
+    torque, source = k**1.5 / np.sqrt(2 * AIR_DENSITY * area) / merit / rpm_to_rad_s, "torque_curve"
     if "rpm" in rows and "torque" in rows:
         torque, error = _fit_quadratic(rows["rpm"], rows["torque"])
         file.describe("motor_torque", f"Least squares Q = k rpm^2 to the {table_name}, off by at most {error:.2g} N m")
         source = "motor_torque"
     elif "rpm" in rows and "power" in rows:
-        shaft_torque = MOTOR_EFFICIENCY * rows["power"] / (rows["rpm"] * to_rad)
+        shaft_torque = MOTOR_EFFICIENCY * rows["power"] / (rows["rpm"] * rpm_to_rad_s)
         torque, error = _fit_quadratic(rows["rpm"], shaft_torque)
         file.describe(
             "motor_power",

@@ -72,17 +72,19 @@ def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, 
         base: The base.
         changes: The airframe's own numbers, by dotted path.
     """
-    old = base.values
+    base_values = base.values
     changed_paths = [
-        path for path in BODY_KEYS if path in changes and not np.array_equal(changes[path], old.get(path, np.nan))
+        path
+        for path in BODY_KEYS
+        if path in changes and not np.array_equal(changes[path], base_values.get(path, np.nan))
     ]
     lost_tables = [table for table in TUNED_TABLES if table in base.tables]
     if not changed_paths or not lost_tables:
-        return dict(old), base.not_inherited
-    numbers = {path: x for path, x in old.items() if path.partition(".")[0] not in TUNED_TABLES}
+        return dict(base_values), base.not_inherited_reason
+    numbers = {path: x for path, x in base_values.items() if path.partition(".")[0] not in TUNED_TABLES}
     ratio = "controller.thrust2torque"
-    if ratio in old and not {"rotors.thrust_curve", "rotors.torque_curve"} & set(changes):
-        numbers[ratio] = old[ratio]  # it depends on the propellers only
+    if ratio in base_values and not {"rotors.thrust_curve", "rotors.torque_curve"} & set(changes):
+        numbers[ratio] = base_values[ratio]  # it depends on the propellers only
     names = _join_names(f"[{table}]" for table in lost_tables)
     reason = (
         f"Its base {base.name!r} has {names}, which fit another {_join_names(changed_paths)} and are not inherited."

@@ -26,6 +26,7 @@ from crazysim.rotation import along_z, matvec
 
 MIN_FITTED_COSINE = math.cos(math.radians(80))
 MIN_BLENDED_COSINE = math.cos(math.radians(88))
+"""Cosines of the pitch up to which the fit is used, and of the pitch at which its blend into the spring ends, 1."""
 MAX_FITTED_MAGNITUDE = 100.0
 """Body rate, rad/s, and commanded angles, rad, up to which the fit is used; the blend ends at twice as much.
 

@@ -52,7 +52,7 @@ def blade_coefficient(
 def thrust_in_flight(
     static_thrust: Array,
     ang_vel: Array,
-    axial: Array,
+    axial_vel: Array,
     in_plane_square: Array,
     blade: Array,
     radius: Array,
@@ -80,7 +80,7 @@ def thrust_in_flight(
     Args:
         static_thrust: Thrust T_0 at this speed in still air, N; below zero counts as zero. (...)
         ang_vel: Speed of the rotor, rad/s. (...)
-        axial: Velocity of the hub relative to the air along the thrust, m/s. (...)
+        axial_vel: Velocity of the hub relative to the air along the thrust, m/s. (...)
         in_plane_square: Square of the velocity of the hub relative to the air across the thrust, m^2/s^2. (...)
         blade: Coefficient b, N s^2/(m rad). (...)
         radius: Radius of the propeller, m. (...)
@@ -94,13 +94,13 @@ def thrust_in_flight(
     lift = (hover_thrust + loss * safe_sqrt(hover_thrust / disc)) * (1 + 1.5 * advance_squared)
 
     disc = disc * ceiling * ceiling
-    in_plane = in_plane_square + MIN_AIR_SPEED**2
-    linear = loss - disc * axial
-    inflow = (safe_sqrt(linear * linear + 4 * disc * lift) - linear) / (2 * disc)
+    squared_speed = in_plane_square + MIN_AIR_SPEED**2
+    linear_term = loss - disc * axial_vel
+    inflow = (safe_sqrt(linear_term * linear_term + 4 * disc * lift) - linear_term) / (2 * disc)
     for _ in range(N_ITERATIONS):
-        speed = jnp.sqrt(in_plane + inflow * inflow)
-        residual = disc * (inflow - axial) * speed + loss * inflow - lift
-        slope = disc * (speed + (inflow - axial) * inflow / speed) + loss
+        speed = jnp.sqrt(squared_speed + inflow * inflow)
+        residual = disc * (inflow - axial_vel) * speed + loss * inflow - lift
+        slope = disc * (speed + (inflow - axial_vel) * inflow / speed) + loss
         inflow = inflow - residual / slope
         inflow = jnp.where(inflow > 0, inflow, 0.0)
     return lift - loss * inflow

@@ -129,21 +129,21 @@ def start_guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
     def serve(handler: Any, *args: Any, process_request: Any = None, **options: Any) -> Any:
         nonlocal is_guarded
         if not handler.__module__.startswith("viser."):
-            return original(handler, *args, process_request=process_request, **options)
+            return original_serve(handler, *args, process_request=process_request, **options)
 
         def process_checked(connection: Any, request: Any) -> Any:
             refusal = access.answer(connection, request)
             return process_request(connection, request) if refusal is None else refusal
 
         is_guarded = True
-        return original(handler, *args, process_request=process_checked, **options)
+        return original_serve(handler, *args, process_request=process_checked, **options)
 
-    with _LOCK:
-        original, server_module.serve = server_module.serve, serve
+    with _SERVE_LOCK:
+        original_serve, server_module.serve = server_module.serve, serve
         try:
             server = viser.ViserServer(host=access.host, port=access.port, verbose=False, **settings)
         finally:
-            server_module.serve = original
+            server_module.serve = original_serve
     if not is_guarded:
         server.stop()
         raise RenderError(
@@ -152,4 +152,4 @@ def start_guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
     return server
 
 
-_LOCK = threading.Lock()
+_SERVE_LOCK = threading.Lock()

@@ -51,8 +51,10 @@ def render_worlds(
     if renderer not in RENDERERS:
         raise ConfigError(f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}")
     indices = world_indices(sim, worlds)
-    can_warp = camera != -1 and not len(sim.overlays) and sim.device.platform == "gpu" and batch_render.is_installed()
-    if renderer == "warp" or (renderer == "auto" and can_warp):
+    can_use_warp = (
+        camera != -1 and not len(sim.overlays) and sim.device.platform == "gpu" and batch_render.is_installed()
+    )
+    if renderer == "warp" or (renderer == "auto" and can_use_warp):
         return np.asarray(sim.scene.render_worlds(sim.data, indices, camera, width, height))
     total_height = positive_integer("height", height) * len(indices)
     column = View(indices.tolist(), width, total_height, camera, cam_config, columns=1, border=0)

@@ -71,7 +71,9 @@ class Film:
         """
         self.path, self.view = Path(path), View() if view is None else view
         check_writable(self.path, tuple(ENCODERS))
-        self._file = self.path.absolute()  # the working directory may change; ffmpeg would take -y.mp4 for an option
+        self._absolute_path = (
+            self.path.absolute()
+        )  # the working directory may change; ffmpeg would take -y.mp4 for an option
         for name, value in (("fps", fps), ("speed", speed)):
             if not np.isfinite(value) or value <= 0:
                 raise ConfigError(f"expected a positive {name}, got {value!r}")
@@ -172,9 +174,9 @@ class Film:
             ffmpeg.stdin.close()
         message = ffmpeg.stderr.read().decode(errors="replace").strip()
         ffmpeg.stderr.close()
-        unfinished = unfinished_path(self._file)
+        unfinished = unfinished_path(self._absolute_path)
         if ffmpeg.wait() == 0:
-            unfinished.replace(self._file)
+            unfinished.replace(self._absolute_path)
         else:
             unfinished.unlink(missing_ok=True)
             raise RenderError(
@@ -198,10 +200,14 @@ class Film:
             "-i",
             "-",
         ]
-        encoder = [*ENCODERS[self.path.suffix.lower()], "-g", f"{math.ceil(self.fps)}"]  # a key frame every second
-        output = str(unfinished_path(self._file))
-        file_format = ["-f", self.path.suffix[1:].lower()]
-        return [get_ffmpeg_exe(), "-loglevel", "error", *input_options, *encoder, *file_format, "-y", output]
+        encoder_options = [
+            *ENCODERS[self.path.suffix.lower()],
+            "-g",
+            f"{math.ceil(self.fps)}",
+        ]  # a key frame every second
+        output = str(unfinished_path(self._absolute_path))
+        format_options = ["-f", self.path.suffix[1:].lower()]
+        return [get_ffmpeg_exe(), "-loglevel", "error", *input_options, *encoder_options, *format_options, "-y", output]
 
     def __enter__(self) -> Film:
         return self

@@ -156,8 +156,8 @@ SAMPLE_FIELDS = ("time", "pos", "quat", "body_pos", "body_quat", "setpoint")
 
 def pack_scene(scene: dict[str, Any]) -> bytes:
     """Return the fields of a flight that do not change with time as a chunk of a journal."""
-    others = {name: x for name, x in scene.items() if name != "shapes"}
-    return pack_arrays(format=np.array(FORMAT), **others, **shape_arrays(scene["shapes"]))
+    constant_fields = {name: x for name, x in scene.items() if name != "shapes"}
+    return pack_arrays(format=np.array(FORMAT), **constant_fields, **shape_arrays(scene["shapes"]))
 
 
 def pack_sample(sample: dict[str, Any]) -> bytes:

@@ -47,9 +47,11 @@ class Journal(Closeable):
             ConfigError: If it exists and is not to be replaced, or cannot be created.
         """
         self.path = Path(path)
-        if_exists = os.O_TRUNC if replace else os.O_EXCL
+        existing_file_flag = os.O_TRUNC if replace else os.O_EXCL
         try:
-            self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | if_exists | getattr(os, "O_BINARY", 0), 0o644)
+            self._file = os.open(
+                self.path, os.O_WRONLY | os.O_CREAT | existing_file_flag | getattr(os, "O_BINARY", 0), 0o644
+            )
         except FileExistsError:
             raise ConfigError(f"expected a new file, got {str(path)!r}, which exists. Use another name.") from None
         except OSError as error:

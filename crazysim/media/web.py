@@ -149,10 +149,10 @@ def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -
         int(mocap): scene.add_frame(f"/bodies/{mocap}", show_axes=False)
         for mocap in (*flight.drone_ids, *flight.body_ids)
     }
-    by_color: dict[tuple[int, tuple], list[VisualGeom]] = defaultdict(list)
+    shapes_by_color: dict[tuple[int, tuple], list[VisualGeom]] = defaultdict(list)
     for shape in flight.shapes:
-        by_color[shape.mocap, tuple(np.round(shape.rgba, 3))].append(shape)
-    for i, ((mocap, rgba), shapes) in enumerate(by_color.items()):
+        shapes_by_color[shape.mocap, tuple(np.round(shape.rgba, 3))].append(shape)
+    for i, ((mocap, rgba), shapes) in enumerate(shapes_by_color.items()):
         parent = f"/bodies/{mocap}" if mocap in frames else "/scene"
         add_geoms(scene, f"{parent}/{i}", shapes, rgba)
 
@@ -165,12 +165,12 @@ def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -
             scene.add_line_segments(
                 f"/trails/{drone}", segments, rgb(colors[drone]), thickness=1.5, thickness_units="screen"
             )
-    balls = [
+    setpoint_balls = [
         scene.add_icosphere(f"/setpoints/{drone}", radius=0.02, color=rgb(colors[drone]))
         for drone in range(flight.setpoint.shape[2])
     ]
 
-    bulbs = [
+    light_balls = [
         scene.add_icosphere(f"/bodies/{mocap}/light", radius=LIGHT_RADIUS, color=rgb(color), opacity=0.8)
         for mocap, color in zip(flight.drone_ids, [] if lights is None else lights[0], strict=False)
     ]
@@ -181,7 +181,7 @@ def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -
     last_values: dict[Any, NDArray] = {}
     light_colors: dict[str, tuple[int, int, int]] = {}
 
-    def move(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
+    def move_handle(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
         pose = np.concatenate([pos, [] if quat is None else np.roll(quat, 1)])
         if not np.isfinite(pose).all() or np.array_equal(last_values.get(handle.name, np.inf), pose):
             return  # unchanged poses are not sent again, and non-finite poses are never sent
@@ -193,20 +193,20 @@ def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -
     for i, time in enumerate(times):
         if i:
             recording.insert_sleep(float(time - times[i - 1]))
-        now = flight.at(float(time))
+        flight_poses = flight.at(float(time))
         for ids, pos, quat in (
-            (flight.drone_ids, now["pos"][k], now["quat"][k]),
-            (flight.body_ids, now["body_pos"][k], now["body_quat"][k]),
+            (flight.drone_ids, flight_poses["pos"][k], flight_poses["quat"][k]),
+            (flight.body_ids, flight_poses["body_pos"][k], flight_poses["body_quat"][k]),
         ):
             for mocap, p, q in zip(ids, pos, quat, strict=True):
-                move(frames[int(mocap)], p, q)
-        for ball, p in zip(balls, now["setpoint"][k], strict=True):
-            move(ball, p)
+                move_handle(frames[int(mocap)], p, q)
+        for setpoint_ball, p in zip(setpoint_balls, flight_poses["setpoint"][k], strict=True):
+            move_handle(setpoint_ball, p)
         if lights is not None:
             colors = lights[min(int(np.searchsorted(flight.time, time)), len(lights) - 1)]
-            for bulb, color in zip(bulbs, colors, strict=True):
-                if (value := rgb(color)) != light_colors.get(bulb.name):
-                    light_colors[bulb.name] = bulb.color = value
+            for light_ball, color in zip(light_balls, colors, strict=True):
+                if (value := rgb(color)) != light_colors.get(light_ball.name):
+                    light_colors[light_ball.name] = light_ball.color = value
     return recording
 
 

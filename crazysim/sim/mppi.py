@@ -166,7 +166,7 @@ class MPPI:
         self._step = Step(pipeline, c.engine, c.device.platform, device=c.device)
         self._device = c.device
         self._memory = jax.device_put(self.init(sim.n_worlds, sim.n_drones), c.device)
-        self._jitted = jax.jit(self._plan)
+        self._compiled_plan = jax.jit(self._plan)
 
     def init(self, n_worlds: int, n_drones: int) -> MPPIMemory:
         """Return the memory before the first command: plans that hover."""
@@ -192,7 +192,7 @@ class MPPI:
         Returns:
             Command of the simulation's level. (n_worlds, n_drones, k)
         """
-        command, self._memory = self._jitted(self._memory, data, setpoint)
+        command, self._memory = self._compiled_plan(self._memory, data, setpoint)
         return command
 
     def plan(self, memory: MPPIMemory, data: SimData, setpoint: Setpoint) -> tuple[Array, MPPIMemory]:
@@ -207,7 +207,7 @@ class MPPI:
             Command of the simulation's level (n_worlds, n_drones, k); the memory.
         """
         arguments = (memory, data, setpoint)
-        return (self._plan if is_traced(arguments) else self._jitted)(*arguments)
+        return (self._plan if is_traced(arguments) else self._compiled_plan)(*arguments)
 
     def _plan(self, memory: MPPIMemory, data: SimData, setpoint: Setpoint) -> tuple[Array, MPPIMemory]:
         key, plan = jax.random.fold_in(self._key, memory.count), memory.plan
@@ -256,18 +256,18 @@ class MPPI:
             return self._repeat_for_samples(x) if n_batch_axes(scope) == 2 else default if scope != "shared" else x
 
         leaves = [
-            repeat_for_rollouts(*pair)
-            for pair in zip(
+            repeat_for_rollouts(*leaf_args)
+            for leaf_args in zip(
                 jax.tree.leaves(scopes(data)), jax.tree.leaves(template), jax.tree.leaves(data), strict=True
             )
         ]
-        initial_record = jax.tree.unflatten(jax.tree.structure(template), leaves)
-        core = initial_record.core.replace(
+        initial_data = jax.tree.unflatten(jax.tree.structure(template), leaves)
+        core = initial_data.core.replace(
             steps=jnp.zeros_like(template.core.steps),
             world_id=template.core.world_id,
             drone_mocap_ids=template.core.drone_mocap_ids,
         )
-        return initial_record.replace(core=core, plugins=initial_record.plugins | {RECORD_NAME: record})
+        return initial_data.replace(core=core, plugins=initial_data.plugins | {RECORD_NAME: record})
 
     def _starts_control_step(self, data: SimData) -> Array:
         return data.core.steps % self.substeps == 0
@@ -288,15 +288,15 @@ class MPPI:
     def _command_at(self, data: SimData, step: Array) -> Array:
         """Return the command of one drone's plan at a step. (k,)"""
         knots = data.plugins[RECORD_NAME].knots
-        knot = step.astype(knots.dtype) * ((self.knots - 1) / ((self.horizon - 1) * self.substeps))
-        index = jnp.clip(jnp.floor(knot).astype(jnp.int32), 0, self.knots - 2)
-        return knots[index] + (knot - index) * (knots[index + 1] - knots[index])
+        knot_position = step.astype(knots.dtype) * ((self.knots - 1) / ((self.horizon - 1) * self.substeps))
+        index = jnp.clip(jnp.floor(knot_position).astype(jnp.int32), 0, self.knots - 2)
+        return knots[index] + (knot_position - index) * (knots[index + 1] - knots[index])
 
     def _shift_plan(self, plan: Array) -> Array:
         """Return the plan shifted by one control step, with its last command repeated."""
-        knot = np.arange(self.knots) + (self.knots - 1) / (self.horizon - 1)
-        index = np.minimum(np.floor(knot).astype(int), self.knots - 2)
-        fraction = np.minimum(knot - index, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
+        knot_position = np.arange(self.knots) + (self.knots - 1) / (self.horizon - 1)
+        index = np.minimum(np.floor(knot_position).astype(int), self.knots - 2)
+        fraction = np.minimum(knot_position - index, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
         return plan[:, :, index] + fraction * (plan[:, :, index + 1] - plan[:, :, index])
 
 
@@ -307,16 +307,16 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     low = airframe.n_rotors * float(airframe.value("rotors.thrust_min", ()))
     high = airframe.n_rotors * float(airframe.value("rotors.thrust_max", ()))
     weight = -GRAVITY[2] * mass
-    thrust, thrust_deviation = (weight, low, high), 0.2 * (high - low)
+    thrust_deviation = 0.2 * (high - low)
     if level == Control.rotor_vel:
         min_rotor_vel, max_rotor_vel = rotor_vel_limits(sim.dynamics, airframe)
         hover = min_rotor_vel + (max_rotor_vel - min_rotor_vel) * np.sqrt(max(weight - low, 0.0) / (high - low))
         n = airframe.n_rotors
         rows = [[hover] * n, [min_rotor_vel] * n, [max_rotor_vel] * n, [0.05 * max_rotor_vel] * n]
     elif level == Control.force_torque:
-        arm = 0.5 * airframe.arm * (high - low)
-        torque = np.array([arm, arm, 0.1 * arm])
-        rows = [[thrust[0], 0, 0, 0], [low, *-torque], [high, *torque], [thrust_deviation, *(0.05 * torque)]]
+        max_torque = 0.5 * airframe.arm * (high - low)
+        torque = np.array([max_torque, max_torque, 0.1 * max_torque])
+        rows = [[weight, 0, 0, 0], [low, *-torque], [high, *torque], [thrust_deviation, *(0.05 * torque)]]
     else:
         limit, deviation = (
             ((0.7, 0.7, np.pi), (0.1, 0.1, 0.05)) if level == Control.attitude else ((8, 8, 3), (2, 2, 1))

@@ -176,8 +176,8 @@ class Sim:
         self._default_data = self._stepper.data
 
         stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
-        self._steps = BuiltPipeline("step_pipeline", stages, self._stepper.build)
-        self._resets = BuiltPipeline("reset_pipeline", {"reset": reset}, Reset)
+        self._built_step = BuiltPipeline("step_pipeline", stages, self._stepper.build)
+        self._built_reset = BuiltPipeline("reset_pipeline", {"reset": reset}, Reset)
         for plugin in first_plugins:
             self.add(plugin)
 
@@ -293,7 +293,7 @@ class Sim:
 
     @locked
     def build_data(self) -> SimData:
-        """Return new data at rest, as at construction, with a new record of every plugin; make it the simulation's."""
+        """Replace the data by data at rest, as at construction, with a new record of every plugin, and return it."""
         c, freqs = self.configuration, dict(self.configuration.control_freqs)
         data = SimData.create(
             c.n_worlds, c.n_drones, c.dynamics, c.control, c.airframes, c.freq, freqs, self._scene.drone_mocap_ids,
@@ -394,24 +394,24 @@ class Sim:
     @locked
     def attitude_control(self, controls: ArrayLike, check_finite: bool = False) -> None:
         """Stage roll, pitch, yaw, rad, and collective thrust, N. (n_worlds, n_drones, 4)"""
-        self._stage(Control.attitude, controls, check_finite)
+        self._stage_command(Control.attitude, controls, check_finite)
 
     @locked
     def body_rate_control(self, controls: ArrayLike, check_finite: bool = False) -> None:
         """Stage body rates, rad/s, and collective thrust, N. (n_worlds, n_drones, 4)"""
-        self._stage(Control.body_rate, controls, check_finite)
+        self._stage_command(Control.body_rate, controls, check_finite)
 
     @locked
     def force_torque_control(self, controls: ArrayLike, check_finite: bool = False) -> None:
         """Stage collective thrust, N, and body torque, N m. (n_worlds, n_drones, 4)"""
-        self._stage(Control.force_torque, controls, check_finite)
+        self._stage_command(Control.force_torque, controls, check_finite)
 
     @locked
     def rotor_vel_control(self, controls: ArrayLike, check_finite: bool = False) -> None:
         """Command rotor speeds, rpm. (n_worlds, n_drones, n_rotors)"""
-        self._stage(Control.rotor_vel, controls, check_finite)
+        self._stage_command(Control.rotor_vel, controls, check_finite)
 
-    def _stage(self, control: Control, command: ArrayLike, check_finite: bool) -> None:
+    def _stage_command(self, control: Control, command: ArrayLike, check_finite: bool) -> None:
         self._stepper.stage_command(F.check_command(self._stepper.data_or_shapes, control, command, check_finite))
 
     # Pipelines --------------------------------------------------------------------------------------------------------
@@ -419,43 +419,43 @@ class Sim:
     @property
     def step_pipeline(self) -> Pipeline:
         """Stages of a step by name, in their order. An edit takes effect at the next step, which compiles again."""
-        return self._steps.stages
+        return self._built_step.stages
 
     @step_pipeline.setter
     def step_pipeline(self, pipeline: Pipeline) -> None:
-        self._steps.stages = pipeline
+        self._built_step.stages = pipeline
 
     @property
     def reset_pipeline(self) -> Pipeline:
         """Functions of a reset by name, in order. An edit takes effect at the next reset, which compiles again."""
-        return self._resets.stages
+        return self._built_reset.stages
 
     @reset_pipeline.setter
     def reset_pipeline(self, pipeline: Pipeline) -> None:
-        self._resets.stages = pipeline
+        self._built_reset.stages = pipeline
 
     @property
     @locked
     def step_fn(self) -> Step:
         """The step of the pipeline as it is now, ``step(data, n_steps=1) -> data``, pure."""
         self.plugins.check()
-        return self._steps.fn()
+        return self._built_step.fn()
 
     @property
     @locked
     def reset_fn(self) -> Reset:
         """The reset of the pipeline as it is now, ``reset(data, default_data, mask=None) -> data``, pure."""
-        return self._resets.fn()
+        return self._built_reset.fn()
 
     @locked
     def build_step_fn(self) -> Step:
         """Return a new step of the pipeline as it is now, and use it; ``step(data, n_steps=1) -> data``, pure."""
-        return self._steps.build()
+        return self._built_step.build()
 
     @locked
     def build_reset_fn(self) -> Reset:
         """Return a new reset of the pipeline as it is now, and use it; ``reset(data, default_data, mask=None)``."""
-        return self._resets.build()
+        return self._built_reset.build()
 
     # Stepping ---------------------------------------------------------------------------------------------------------
 
@@ -469,7 +469,7 @@ class Sim:
         n_steps = positive_integer("n_steps", n_steps)
         self._adopt_scene()
         self.plugins.check()
-        self._steps.fn()
+        self._built_step.fn()
         self._stepper.advance(n_steps)
 
     @locked
@@ -511,7 +511,7 @@ class Sim:
     def explain(self, measure: bool = False) -> str:
         """Return in a few lines which engine runs the step, which stages it fuses, and why it does not fuse others.
 
-        A last line says how rays of all worlds were cast last, if any: for images or for many movable objects.
+        If rays were cast, for images or for many movable objects, a last line says how.
 
         Args:
             measure: True to measure the cost of stages that are not fused, which compiles a second step.
@@ -642,8 +642,8 @@ class Sim:
     def contact_report(self, objects: ObjectSelection = None, floor: bool = True, drones: bool = True) -> ContactReport:
         """Return the contacts and distances of every drone: to the floor, to objects, to other drones.
 
-        Computed by JAX from the poses in the data. Bodies that were attached to ``spec`` and are moved through
-        ``mjx_data`` are where ``mjx_data`` has them. Fields that were not requested are None and are not computed.
+        Computed by JAX from the poses in the data; the poses of bodies that were attached to ``spec`` and are moved
+        through ``mjx_data`` come from there. Fields that were not requested are None and are not computed.
 
         Args:
             objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.

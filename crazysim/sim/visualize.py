@@ -24,7 +24,7 @@ def draw_line(
         start_size: Width at the first point, pixels.
         end_size: Width at the last point, pixels.
     """
-    sim.overlays.line(_points(points), DEFAULT_COLOR if rgba is None else rgba, start_size, end_size)
+    sim.overlays.line(_check_points(points), DEFAULT_COLOR if rgba is None else rgba, start_size, end_size)
 
 
 def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size: float = 0.01) -> None:
@@ -36,7 +36,7 @@ def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size
         rgba: Colour, 0 to 1; None for red. (4,)
         size: Radius, m.
     """
-    sim.overlays.points(_points(points), DEFAULT_COLOR if rgba is None else rgba, size)
+    sim.overlays.points(_check_points(points), DEFAULT_COLOR if rgba is None else rgba, size)
 
 
 def draw_capsule(
@@ -135,7 +135,7 @@ def change_material(
         sim.mj_model.mat_emission[materials] = np.broadcast_to(np.asarray(emission, float), (len(ids),))
 
 
-def _points(points: ArrayLike) -> np.ndarray:
+def _check_points(points: ArrayLike) -> np.ndarray:
     array = np.atleast_2d(np.asarray(points, dtype=float))
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"expected points of shape (n, 3), got {array.shape}")

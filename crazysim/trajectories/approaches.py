@@ -62,10 +62,10 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
             part = slice(k, k + CELLS_PER_BATCH)
             i, j = first[pair[part]], second[pair[part]]
             motion_i, motion_j = (motion.motion_in_cells(drone, cell[part], dt, table) for drone in (i, j))
-            lower = _lower_bounds(
+            lower_bound = _lower_bounds(
                 pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, min_distance, best_time
             )
-            is_kept[part] = lower < min_distance[pair[part]] - tolerance
+            is_kept[part] = lower_bound < min_distance[pair[part]] - tolerance
         pair, cell = (
             np.repeat(pair[is_kept], N_SPLITS),
             (cell[is_kept][:, None] * N_SPLITS + np.arange(N_SPLITS)).ravel(),
@@ -82,14 +82,14 @@ class _Motion:
         self.pieces = pieces
         snap = pieces.derivative_coefficients(4)[:, :3]
         control_points = snap @ bernstein_matrix(snap.shape[-1] - 1).T  # a polynomial lies in their convex hull
-        self.snaps = np.cumsum(np.max(np.linalg.norm(control_points, axis=1), axis=-1))
-        jumps = np.zeros((4, len(pieces.drone)))
+        self.summed_snaps = np.cumsum(np.max(np.linalg.norm(control_points, axis=1), axis=-1))
+        summed_jumps = np.zeros((4, len(pieces.drone)))
         piece = np.flatnonzero(pieces.drone[1:] == pieces.drone[:-1])
         for order in range(4):
-            before = pieces.evaluate_pieces(piece, np.ones(len(piece)), order)
-            after = pieces.evaluate_pieces(piece + 1, np.zeros(len(piece)), order)
-            jumps[order, piece + 1] = np.linalg.norm((after - before)[:, :3], axis=-1)
-        self.jumps = np.cumsum(jumps, axis=1)
+            end_values = pieces.evaluate_pieces(piece, np.ones(len(piece)), order)
+            start_values = pieces.evaluate_pieces(piece + 1, np.zeros(len(piece)), order)
+            summed_jumps[order, piece + 1] = np.linalg.norm((start_values - end_values)[:, :3], axis=-1)
+        self.summed_jumps = np.cumsum(summed_jumps, axis=1)
 
     def table(self, n_cells: int, dt: float) -> tuple[Floats, ...]:
         """Return the motion of every drone in every cell. (n_drones, n_cells, ...)"""
@@ -107,10 +107,12 @@ class _Motion:
         drone, cell = np.broadcast_arrays(drone, cell)
         start, end = cell * dt, (cell + 1) * dt
         a, b = self.pieces.find_pieces(drone, start), self.pieces.find_pieces(drone, end)
-        jumps = self.jumps[:, b] - self.jumps[:, a]
-        snap = self.snaps[b] - np.where(a > 0, self.snaps[a - 1], 0.0)  # the sum over all pieces of the cell
-        acc_change = dt / 2 * (dt / 2 * snap + jumps[3]) + jumps[2]
-        bound = dt**2 / 8 * acc_change + dt / 4 * jumps[1] + jumps[0]
+        summed_jumps = self.summed_jumps[:, b] - self.summed_jumps[:, a]
+        snap = self.summed_snaps[b] - np.where(
+            a > 0, self.summed_snaps[a - 1], 0.0
+        )  # the sum over all pieces of the cell
+        acc_change = dt / 2 * (dt / 2 * snap + summed_jumps[3]) + summed_jumps[2]
+        bound = dt**2 / 8 * acc_change + dt / 4 * summed_jumps[1] + summed_jumps[0]
         times = ((start, 0), (end, 0), (start + dt / 2, 2), (start + dt / 2, 3))
         return *(self.pieces.evaluate(drone, t, order)[..., :3] for t, order in times), bound
 
@@ -132,15 +134,15 @@ def _lower_bounds(
     step = end - start
     square = _dot(step, step)
     u = np.clip(-_dot(start, step) / np.where(square > 0, square, 1.0), 0.0, 1.0)
-    to_chord = _norm(start + u[:, None] * step)
+    chord_distance = _norm(start + u[:, None] * step)
 
-    order = np.lexsort((to_chord, pair))  # the cell in which each pair comes closest is evaluated exactly
+    order = np.lexsort((chord_distance, pair))  # the cell in which each pair comes closest is evaluated exactly
     k = order[np.unique(pair[order], return_index=True)[1]]
     t = (cell[k] + u[k]) * dt
     distance = _norm((pieces.evaluate(drones[0][k], t) - pieces.evaluate(drones[1][k], t))[:, :3])
     is_closer = distance < upper_bound[pair[k]]
     upper_bound[pair[k[is_closer]]], best_time[pair[k[is_closer]]] = distance[is_closer], t[is_closer]
-    return to_chord - deviation
+    return chord_distance - deviation
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

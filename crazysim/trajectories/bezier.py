@@ -53,8 +53,8 @@ def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
     """
     n = coefficients.shape[1]
     new_degree = n - 1 if degree is None else degree
-    padded = np.pad(coefficients, ((0, 0), (0, new_degree + 1 - n)))
-    return bernstein_matrix(new_degree) @ padded.T
+    padded_coefficients = np.pad(coefficients, ((0, 0), (0, new_degree + 1 - n)))
+    return bernstein_matrix(new_degree) @ padded_coefficients.T
 
 
 def restrict_interval(coefficients: NDArray, start: float, end: float) -> NDArray:
@@ -84,5 +84,5 @@ def significant_degree(coefficients: NDArray, tolerance: float) -> int:
         tolerance: Largest sum of the omitted coefficients.
     """
     tail_sums = np.cumsum(np.abs(coefficients)[:, ::-1], axis=1)[:, ::-1].max(axis=0)
-    significant = np.flatnonzero(tail_sums[1:] > tolerance)
-    return int(significant[-1]) + 1 if len(significant) else 0
+    significant_orders = np.flatnonzero(tail_sums[1:] > tolerance)
+    return int(significant_orders[-1]) + 1 if len(significant_orders) else 0

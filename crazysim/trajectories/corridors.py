@@ -175,12 +175,12 @@ class _Program:
             for axis, factor in enumerate(self.factors)
         ]
         new_rows = np.concatenate(columns, axis=0).T
-        size = np.linalg.norm(new_rows, axis=-1)
-        if np.any((size < 1e-9) & (slack < 0)):
+        row_norms = np.linalg.norm(new_rows, axis=-1)
+        if np.any((row_norms < 1e-9) & (slack < 0)):
             raise _infeasible_error()
-        size = np.maximum(size, 1e-9)
-        self.rows = np.concatenate([self.rows, new_rows / size[:, None]])
-        self.slack = np.concatenate([self.slack, slack / size])
+        row_norms = np.maximum(row_norms, 1e-9)
+        self.rows = np.concatenate([self.rows, new_rows / row_norms[:, None]])
+        self.slack = np.concatenate([self.slack, slack / row_norms])
 
     def solve(self) -> Floats:
         """Return the derivatives of the nearest point in all half-spaces."""

@@ -195,11 +195,11 @@ def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repea
     knots = np.linspace(0.0, duration, n + 1)
     # Derivatives with respect to u = t / h, divided by k!: at the start they are the first four coefficients, at the
     # end they give four conditions for the others.
-    at_knots = np.stack([curve(knots, k) * h**k / math.factorial(k) for k in range(4)], axis=-1)
+    knot_coefficients = np.stack([curve(knots, k) * h**k / math.factorial(k) for k in range(4)], axis=-1)
     binomials = np.array([[math.comb(j, k) for j in range(8)] for k in range(4)], float)
-    end_residuals = at_knots[1:] - at_knots[:-1] @ binomials[:, :4].T
+    end_residuals = knot_coefficients[1:] - knot_coefficients[:-1] @ binomials[:, :4].T
     coefficients = np.concatenate(
-        [at_knots[:-1], np.linalg.solve(binomials[:, 4:], end_residuals[..., None])[..., 0]], axis=-1
+        [knot_coefficients[:-1], np.linalg.solve(binomials[:, 4:], end_residuals[..., None])[..., 0]], axis=-1
     )
     return Trajectory.of_pieces(np.full(n, h), coefficients / h ** np.arange(8), repeats)
 

@@ -14,7 +14,7 @@ from crazysim.drones import AirframeSource, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
 from crazysim.trajectories.approaches import Approach, closest_approaches
-from crazysim.trajectories.peaks import QUANTITIES, Peak, peaks
+from crazysim.trajectories.peaks import QUANTITIES, Peak, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.trajectory import Trajectory
 
@@ -195,18 +195,18 @@ def check(
         )
     if not 0 < tolerance < np.inf:
         raise ConfigError(f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3.")
-    allowed = (limits if airframe is None else limits.of_airframe(airframe)).as_dict()
-    extremes, closest = peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
+    limit_values = (limits if airframe is None else limits.of_airframe(airframe)).as_dict()
+    extremes, closest = find_peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
     violations = []
     for name, peak in extremes.items():
-        if name not in allowed:
+        if name not in limit_values:
             continue
-        limit, sign = allowed[name], QUANTITIES[name].sign
+        limit, sign = limit_values[name], QUANTITIES[name].sign
         for k in np.flatnonzero(sign * (peak.value - limit) > LIMIT_TOLERANCE * limit_size(name, limit)):
             violations.append(
                 Violation(name, (int(k),), float(peak.time[k]), float(peak.value[k]), limit, (labels[k],))
             )
-    separation = allowed.get("separation", 0.0)
+    separation = limit_values.get("separation", 0.0)
     for pair in closest:
         if pair.distance < separation * (1 - LIMIT_TOLERANCE):
             pair_names = tuple(labels[k] for k in pair.drones)

@@ -92,7 +92,7 @@ class Peak:
     """Time at which it is reached, s. (n_drones,)"""
 
 
-def peaks(table: PieceTable, names: Sequence[str]) -> dict[str, Peak]:
+def find_peaks(table: PieceTable, names: Sequence[str]) -> dict[str, Peak]:
     """Return the peaks of some quantities.
 
     Each piece is sampled at ``N_INTERVALS + 1`` times; every local maximum of the samples that lies at most
@@ -105,10 +105,10 @@ def peaks(table: PieceTable, names: Sequence[str]) -> dict[str, Peak]:
         table: Trajectories.
         names: Names of quantities, keys of ``QUANTITIES``.
     """
-    return {name: _peak(table, QUANTITIES[name]) for name in names}
+    return {name: _find_peak(table, QUANTITIES[name]) for name in names}
 
 
-def _peak(table: PieceTable, quantity: Quantity) -> Peak:
+def _find_peak(table: PieceTable, quantity: Quantity) -> Peak:
     u = np.linspace(0.0, 1.0, N_INTERVALS + 1)
     powers = u ** np.arange(table.coefficients.shape[-1])[:, None]
 
@@ -122,21 +122,23 @@ def _peak(table: PieceTable, quantity: Quantity) -> Peak:
     )
     high = np.maximum.reduceat(samples.max(axis=1), table.first_pieces)
     low = np.minimum.reduceat(samples.min(axis=1), table.first_pieces)
-    piece, sample = _candidates(samples, (high - REFINED_PART * (high - low))[table.drone])
+    piece, sample = _find_candidates(samples, (high - REFINED_PART * (high - low))[table.drone])
 
     def value(u: Floats) -> Floats:
         return quantity.sign * quantity.compute(*(table.evaluate_pieces(piece, u, k) for k in quantity.orders))
 
-    refined, best_u = _golden_sections(value, np.maximum(u[sample] - u[1], 0.0), np.minimum(u[sample] + u[1], 1.0))
-    is_better = refined > samples[piece, sample]
-    best, best_u = np.where(is_better, refined, samples[piece, sample]), np.where(is_better, best_u, u[sample])
+    refined_value, best_u = _golden_sections(
+        value, np.maximum(u[sample] - u[1], 0.0), np.minimum(u[sample] + u[1], 1.0)
+    )
+    is_better = refined_value > samples[piece, sample]
+    best, best_u = np.where(is_better, refined_value, samples[piece, sample]), np.where(is_better, best_u, u[sample])
     order = np.lexsort((-best, table.drone[piece]))
     first = order[np.searchsorted(table.drone[piece][order], np.arange(table.n_drones))]
     time = table.start[piece] + best_u * table.length[piece]
     return Peak(quantity.sign * best[first], time[first])
 
 
-def _candidates(samples: Floats, threshold: Floats) -> tuple[Ints, Ints]:
+def _find_candidates(samples: Floats, threshold: Floats) -> tuple[Ints, Ints]:
     """Return piece and sample of the local maxima of pieces above their thresholds; a plateau by its first sample."""
     padded_samples = np.pad(samples, ((0, 0), (1, 1)), constant_values=-np.inf)
     is_maximum = (samples > padded_samples[:, :-2]) & (samples >= padded_samples[:, 2:])

@@ -11,7 +11,7 @@ from crazysim.trajectories import interpolation
 from crazysim.trajectories.corridors import OutsideError
 from crazysim.trajectories.interpolation import Floats
 from crazysim.trajectories.limits import Limits, limit_size
-from crazysim.trajectories.peaks import QUANTITIES, peaks
+from crazysim.trajectories.peaks import QUANTITIES, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
 
 LIMIT_MARGIN = 1e-4
@@ -80,7 +80,7 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
     checked_limits = {name: limit for name, limit in limits.as_dict().items() if name in QUANTITIES}
     ends = np.cumsum(durations)
     table = PieceTable(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
-    extremes = peaks(table, tuple(checked_limits))
+    extremes = find_peaks(table, tuple(checked_limits))
     excesses = {
         name: QUANTITIES[name].sign * (extremes[name].value[0] - limit) for name, limit in checked_limits.items()
     }

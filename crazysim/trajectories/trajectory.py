@@ -128,11 +128,11 @@ class Trajectory(PyTree):
         """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
         end, repeats = _clipped_entry(ends, index, ends.shape[1] - 1), _clipped_entry(jnp.asarray(self.repeats), index)
-        local, is_active = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
-        piece = _find_piece(ends, index, local)
+        local_time, is_active = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
+        piece = _find_piece(ends, index, local_time)
         start = jnp.where(piece > 0, _clipped_entry(ends, index, piece - 1), 0.0)
         inverse = _inverse_length(jnp, _clipped_entry(ends, index, piece) - start)
-        u, piece_coefficients = (local - start) * inverse, _clipped_entry(coefficients, index, piece)
+        u, piece_coefficients = (local_time - start) * inverse, _clipped_entry(coefficients, index, piece)
         degrees = [self.degree] * 4 if degrees is None else degrees
         rows: dict[int, list[Array]] = {}
         for degree in sorted(set(degrees)):
@@ -140,7 +140,7 @@ class Trajectory(PyTree):
             derivatives = _polynomial_derivatives(piece_coefficients[np.array(axes), : degree + 1], u, N_DERIVATIVES)
             rows.update((axis, [x[k] for x in derivatives]) for k, axis in enumerate(axes))
         values = [jnp.stack([rows[axis][k] for axis in range(4)]) for k in range(N_DERIVATIVES + 1)]
-        return _build_setpoint(_per_second(values, jnp.where(is_active, inverse * rate, 0.0)))
+        return _build_setpoint(_scale_derivatives(values, jnp.where(is_active, inverse * rate, 0.0)))
 
     def derivatives(self, t: ArrayLike, order: int) -> list[Array]:
         """Return x, y, z, m, and yaw, rad, of one trajectory at one time, and their derivatives up to an order.
@@ -155,13 +155,13 @@ class Trajectory(PyTree):
         xp, n = _array_module(self), self.n_pieces
         starts = xp.concatenate([xp.zeros_like(self.ends[:1]), self.ends[:-1]])
         # A table with one row for each piece needs a single lookup. The parts of a row begin at multiples of four.
-        numbers = [starts, _inverse_length(xp, self.ends - starts), xp.zeros((2, n), self.ends.dtype)]
-        table = xp.concatenate([xp.vstack(numbers).T, self.coefficients.reshape(n, -1)], axis=1)
-        local, is_active = _local_time(jnp.asarray(t, self.ends.dtype), self.ends[-1], self.repeats)
-        piece = _find_piece(jnp.asarray(self.ends)[None], 0, local)
+        piece_columns = [starts, _inverse_length(xp, self.ends - starts), xp.zeros((2, n), self.ends.dtype)]
+        table = xp.concatenate([xp.vstack(piece_columns).T, self.coefficients.reshape(n, -1)], axis=1)
+        local_time, is_active = _local_time(jnp.asarray(t, self.ends.dtype), self.ends[-1], self.repeats)
+        piece = _find_piece(jnp.asarray(self.ends)[None], 0, local_time)
         row = jnp.asarray(table).at[piece].get(mode="promise_in_bounds")
-        derivatives = _polynomial_derivatives(row[4:].reshape(4, -1), (local - row[0]) * row[1], order)
-        return _per_second(derivatives, jnp.where(is_active, row[1], 0.0))
+        derivatives = _polynomial_derivatives(row[4:].reshape(4, -1), (local_time - row[0]) * row[1], order)
+        return _scale_derivatives(derivatives, jnp.where(is_active, row[1], 0.0))
 
     def degrees(self) -> tuple[int, ...]:
         """Return the largest degree with a nonzero coefficient of x, y, z and yaw, or -1 for none, on the host.
@@ -257,8 +257,10 @@ class Trajectory(PyTree):
             coefficients = unit_coefficients(np.stack([before, after]), lengths).astype(self.coefficients.dtype)
             ends = lengths.astype(self.ends.dtype)
             piece = Trajectory(ends, coefficients, np.bool_(False))  # type: ignore[arg-type]
-            shifted = other.coefficients + np.pad([[yaw_shift]], ((3, 0), (0, other.degree))).astype(coefficients.dtype)
-            return self.then(piece).then(other.replace(coefficients=shifted))
+            shifted_coefficients = other.coefficients + np.pad([[yaw_shift]], ((3, 0), (0, other.degree))).astype(
+                coefficients.dtype
+            )
+            return self.then(piece).then(other.replace(coefficients=shifted_coefficients))
         degree = max(self.degree, other.degree)
         first, second = self.padded(0, degree), other.padded(0, degree)
         xp = _array_module([first, second])
@@ -310,11 +312,11 @@ def _clipped_entry(x: Array, *index: Array | int) -> Array:
 
 def _local_time(t: Array, end: Array, repeats: Array) -> tuple[Array, Array]:
     """Return a time mapped into the duration of a trajectory, s, and True if the trajectory is active then. () each"""
-    local = jnp.where(t < 0, 0.0, t)
+    local_time = jnp.where(t < 0, 0.0, t)
     # Computed with floor, which is a vector instruction, since lax.rem calls a function for each number.
-    local = local - jnp.where(repeats, end * lax.floor(local / end), 0.0)
-    local = jnp.where(local > end, end, jnp.where(local < 0, 0.0, local))
-    return local, (t >= 0) & (repeats | (t <= end))
+    local_time = local_time - jnp.where(repeats, end * lax.floor(local_time / end), 0.0)
+    local_time = jnp.where(local_time > end, end, jnp.where(local_time < 0, 0.0, local_time))
+    return local_time, (t >= 0) & (repeats | (t <= end))
 
 
 def _inverse_length(xp: Any, length: Array) -> Array:
@@ -322,7 +324,7 @@ def _inverse_length(xp: Any, length: Array) -> Array:
     return 1 / xp.where(length > 0, length, xp.ones_like(length))
 
 
-def _per_second(derivatives: list[Array], rate: Array) -> list[Array]:
+def _scale_derivatives(derivatives: list[Array], rate: Array) -> list[Array]:
     """Convert derivatives with respect to the scaled time of a piece to derivatives with respect to time in seconds.
 
     Args:

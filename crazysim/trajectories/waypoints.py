@@ -148,8 +148,8 @@ def _plan_trajectory(
 ) -> Trajectory:
     nodes = _waypoint_nodes(waypoints, fixed_derivatives)
     n_pieces = len(nodes) - 1
-    angles = np.full((n_pieces + 1, YAW_ORDER, 1), np.nan)
-    angles[:, 0, 0], angles[[0, -1], 1:] = unwrap_yaw(yaw, n_pieces + 1), 0.0
+    yaw_nodes = np.full((n_pieces + 1, YAW_ORDER, 1), np.nan)
+    yaw_nodes[:, 0, 0], yaw_nodes[[0, -1], 1:] = unwrap_yaw(yaw, n_pieces + 1), 0.0
     radii, heights = _corridor_radii(corridors, n_pieces), _height_bounds(limits, nodes[:, 0, 2])
 
     def solve(lengths: Floats) -> Floats:
@@ -163,7 +163,7 @@ def _plan_trajectory(
                 f"waypoints, or fix the derivatives at the ends."
             ) from error
         paths = interpolation.unit_coefficients(filled_nodes, lengths)
-        yaw_paths = interpolation.unit_coefficients(interpolation.fill_derivatives(angles, lengths), lengths)
+        yaw_paths = interpolation.unit_coefficients(interpolation.fill_derivatives(yaw_nodes, lengths), lengths)
         return np.concatenate([paths, interpolation.pad_degree(yaw_paths, paths.shape[-1] - 1)], axis=1)
 
     if durations is not None:

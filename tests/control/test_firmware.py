@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from crazysim.control.mellinger import Mellinger, rotation_error
 from crazysim.control.pid import PID
-from crazysim.control.power_distribution import PowerDistributionParams, distribute, rotor_vel_of_pwm
+from crazysim.control.power_distribution import PowerDistributionParams, distribute_power, rotor_vel_of_pwm
 from crazysim.drones import load_airframe
 from crazysim.dynamics.rotor import quadratic_curve
 from crazysim.errors import ConfigError
 from crazysim.lab.validate import firmware_controllers as flown
 
-jitted = jax.jit(distribute, static_argnames="whole_numbers")
+jitted = jax.jit(distribute_power, static_argnames="whole_numbers")
 
 
 @pytest.mark.parametrize("name", flown.CASES)
@@ -40,7 +40,9 @@ def test_the_motors_are_those_of_the_firmware(name):
 @pytest.mark.usefixtures("x64")
 def test_whole_numbers_leave_the_gradient(motors):
     def total(torque, whole):
-        return distribute(jnp.array([30000.3]), torque, params=motors, whole_numbers=whole) @ jnp.array([1.0, 2, 3, 5])
+        return distribute_power(jnp.array([30000.3]), torque, params=motors, whole_numbers=whole) @ jnp.array(
+            [1.0, 2, 3, 5]
+        )
 
     torque = np.array([1001.7, -500.2, 300.9])
     smooth, whole = (jax.jit(jax.grad(total), static_argnums=1)(torque, flag) for flag in (False, True))

@@ -87,7 +87,7 @@ def arguments(module, function, model, rng, per_drone):
         ranges = {
             "static_thrust": (0, 0.2),
             "ang_vel": (0, 2500),
-            "axial": (-5, 5),
+            "axial_vel": (-5, 5),
             "in_plane_square": (0, 25),
             "blade": (1e-6, 1e-5),
             "radius": (0.02, 0.03),

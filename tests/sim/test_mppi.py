@@ -53,7 +53,7 @@ def test_it_hovers_from_a_bad_start(sim, mppi):
     found = errors(sim, mppi, lambda t: point(), 4.0)
     assert found[0].min() > 1.0
     assert found[-50:].max() < 0.3
-    assert mppi._jitted._cache_size() == 1
+    assert mppi._compiled_plan._cache_size() == 1
 
 
 def test_it_follows_a_figure_eight(sim, mppi):

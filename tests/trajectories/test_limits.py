@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from crazysim import ConfigError, load_airframe
 from crazysim.trajectories import Limits, Trajectory, check, circle, line, spline
-from crazysim.trajectories.peaks import QUANTITIES, peaks
+from crazysim.trajectories.peaks import QUANTITIES, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
 
 
@@ -30,7 +30,7 @@ def test_peaks_are_those_of_dense_samples(seed):
         for n in rng.integers(2, 7, 3)
     ]
     table = PieceTable.create(trajectories, rng.uniform(0, 2, 3))
-    found = peaks(table, [name for name in QUANTITIES if name != "body_rate"])
+    found = find_peaks(table, [name for name in QUANTITIES if name != "body_rate"])
     times = np.linspace(0, table.duration, 20_001)[:-1]
     for name, peak in found.items():
         quantity = QUANTITIES[name]
@@ -50,7 +50,7 @@ def test_body_rate_peaks_are_those_of_dense_samples():
     table = PieceTable.create(
         [spline(np.arange(5.0), 0.5 * rng.normal(size=(5, 3)), 7, rng.normal(size=5)) for _ in range(3)]
     )
-    peak = peaks(table, ["body_rate"])["body_rate"]
+    peak = find_peaks(table, ["body_rate"])["body_rate"]
     quantity, times = QUANTITIES["body_rate"], np.linspace(0, 4, 40_001)
     for k in range(3):
         at = [table.evaluate(np.full(len(times), k), times, order) for order in quantity.orders]

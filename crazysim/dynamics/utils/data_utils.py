@@ -80,15 +80,15 @@ def derivatives_svf(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
     def filter_signal(key: str, cutoff: str, zero_order_hold: bool = False) -> NDArray:
         return state_variable_filter(log[key].T, time, CUTOFFS[cutoff], 3, zero_order_hold=zero_order_hold)
 
-    def columns(x: NDArray, k: int) -> NDArray:
+    def derivative_columns(x: NDArray, k: int) -> NDArray:
         return x[:, k].T
 
     pos, rpy = filter_signal("pos", "translation"), filter_signal("rpy", "rotation")
-    log |= {f"SVF_{key}": columns(pos, k) for k, key in enumerate(("pos", "vel", "acc", "jerk"))}
-    log |= {f"SVF_{key}": columns(rpy, k) for k, key in enumerate(("rpy", "drpy", "ddrpy", "dddrpy"))}
+    log |= {f"SVF_{key}": derivative_columns(pos, k) for k, key in enumerate(("pos", "vel", "acc", "jerk"))}
+    log |= {f"SVF_{key}": derivative_columns(rpy, k) for k, key in enumerate(("rpy", "drpy", "ddrpy", "dddrpy"))}
     log["SVF_quat"] = np.asarray(rotation.from_rpy(jnp.asarray(log["SVF_rpy"])), np.float64)
     log["SVF_cmd_f"] = filter_signal("cmd_f", "translation", zero_order_hold=True)[0]
-    log["SVF_cmd_rpy"] = columns(filter_signal("cmd_rpy", "rotation", zero_order_hold=True), 0)
+    log["SVF_cmd_rpy"] = derivative_columns(filter_signal("cmd_rpy", "rotation", zero_order_hold=True), 0)
     return log
 
 
@@ -129,10 +129,10 @@ def state_variable_filter(
     a[order, order + 1] = 1.0
     step_matrix = expm(a)[:order]
 
-    def low_pass(u: NDArray, change: NDArray) -> NDArray:
+    def low_pass(u: NDArray, input_change: NDArray) -> NDArray:
         x = np.zeros((len(u), order))
         x[:, 0] = u[:, 0]
-        inputs = u[..., None] * step_matrix[:, order] + change[..., None] * step_matrix[:, order + 1]
+        inputs = u[..., None] * step_matrix[:, order] + input_change[..., None] * step_matrix[:, order + 1]
         states, transition = np.empty((*u.shape, order)), step_matrix[:, :order].T
         for k in range(u.shape[1]):
             states[:, k] = x

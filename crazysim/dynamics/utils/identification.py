@@ -60,7 +60,9 @@ def sys_id_translation(
     values, _ = fit_translation(dynamics, mass, [data], gravity)
     for name, log in (("data", data), ("validation", data_validation)):
         if log is not None:
-            terms, acc = _terms(Dynamics(dynamics), mass, log, values.get("thrust_dyn_coef", np.inf), gravity)
+            terms, acc = _acceleration_terms(
+                Dynamics(dynamics), mass, log, values.get("thrust_dyn_coef", np.inf), gravity
+            )
             coefs = [values[key] for key in ("cmd_f_coef", "drag_xy_coef", "drag_z_coef") if key in values]
             logger.info("%s, %s: RMSE of the acceleration %.4g m/s^2", dynamics, name, _rms(acc - terms @ coefs))
     return values
@@ -91,7 +93,7 @@ def sys_id_rotation(
     for name, log in (("data", data), ("validation", data_validation)):
         if log is not None:
             axis_errors = [
-                _rotation_error(np.array([x[k] for x in values.values()]), *_angles(log, [k])) for k in range(3)
+                _rotation_error(np.array([x[k] for x in values.values()]), *_angle_samples(log, [k])) for k in range(3)
             ]
             logger.info("rotation, %s: RMSE of roll, pitch, yaw %s rad", name, [f"{_rms(x):.4g}" for x in axis_errors])
     return values
@@ -112,7 +114,7 @@ def fit_translation(
     kind = Dynamics(dynamics)
 
     def solve_for_rate(rate: float) -> tuple[float, NDArray, NDArray, NDArray]:
-        parts = [_terms(kind, mass, log, rate, gravity) for log in logs]
+        parts = [_acceleration_terms(kind, mass, log, rate, gravity) for log in logs]
         terms, acc = (np.concatenate(x) for x in zip(*parts, strict=True))
         coefs = np.linalg.lstsq(terms.reshape(-1, terms.shape[-1]), acc.ravel(), rcond=None)[0]
         residuals = acc - terms @ coefs
@@ -135,7 +137,7 @@ def fit_translation(
         jacobian = np.insert(jacobian, 1, rate_slopes, axis=-1)
     if kind == Dynamics.so_rpy_rotor_drag:
         names, values = [*names, "drag_xy_coef", "drag_z_coef"], [*values, *coefs[1:]]
-    deviations = _deviations(jacobian, residuals, np.arange(len(residuals)) * len(logs) * 10 // len(residuals))
+    deviations = _standard_deviations(jacobian, residuals, np.arange(len(residuals)) * len(logs) * 10 // len(residuals))
     return dict(zip(names, map(float, values), strict=True)), dict(zip(names, map(float, deviations), strict=True))
 
 
@@ -145,7 +147,7 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
 
     groups = []
     for axes in ([0, 1], [2]):
-        data = [_angles(log, axes) for log in logs]
+        data = [_angle_samples(log, axes) for log in logs]
 
         def residuals(x: NDArray, data: list = data) -> NDArray:
             return np.concatenate([_rotation_error(x, *log) for log in data])
@@ -163,18 +165,20 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
         error = lambda x, residuals=residuals: residuals(x).ravel()  # noqa: E731
         jacobian: Any = lambda x, slopes=slopes: -slopes(x).reshape(-1, 3)  # noqa: E731
         x = least_squares(error, start, jacobian, method="lm").x
-        groups.append((x, _deviations(slopes(x), residuals(x), _blocks(logs))))
-    (tilt, tilt_spread), (yaw, yaw_spread) = groups
+        groups.append((x, _standard_deviations(slopes(x), residuals(x), _block_numbers(logs))))
+    (tilt_values, tilt_deviations), (yaw_values, yaw_deviations) = groups
     names = ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")
-    values = {name: np.array([tilt[k], tilt[k], yaw[k]]) for k, name in enumerate(names)}
-    deviations = {name: np.array([tilt_spread[k], tilt_spread[k], yaw_spread[k]]) for k, name in enumerate(names)}
+    values = {name: np.array([tilt_values[k], tilt_values[k], yaw_values[k]]) for k, name in enumerate(names)}
+    deviations = {
+        name: np.array([tilt_deviations[k], tilt_deviations[k], yaw_deviations[k]]) for k, name in enumerate(names)
+    }
     return values, deviations
 
 
-def _terms(
+def _acceleration_terms(
     kind: Dynamics, mass: float, log: Mapping[str, ArrayLike], rate: float, gravity: ArrayLike
 ) -> tuple[NDArray, NDArray]:
-    """Return the acceleration per coefficient, (n, 3, k), and the one by all forces but gravity, (n, 3), m/s^2."""
+    """Return the acceleration per coefficient, (n, 3, k), and the acceleration without gravity, (n, 3), m/s^2."""
     time, vel, acc, quat, cmd = (
         np.asarray(log[key], np.float64) for key in ("time", "SVF_vel", "SVF_acc", "SVF_quat", "SVF_cmd_f")
     )
@@ -210,7 +214,7 @@ def lag_signal(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
     return lagged
 
 
-def _angles(log: Mapping[str, ArrayLike], axes: Sequence[int]) -> tuple[float, Array, Array, Array]:
+def _angle_samples(log: Mapping[str, ArrayLike], axes: Sequence[int]) -> tuple[float, Array, Array, Array]:
     """Return sample time, commands, angles, (n, len(axes)), and the first angles and rates, (2, len(axes))."""
     time = np.asarray(log["time"], np.float64)
     cmd, rpy, rates = (jnp.asarray(log[key])[:, jnp.asarray(axes)] for key in ("SVF_cmd_rpy", "SVF_rpy", "SVF_drpy"))
@@ -250,13 +254,13 @@ def _rotation_error(x: NDArray, *log: Array | float) -> NDArray:
     return np.asarray(_residual(jnp.asarray(x), *log), np.float64)
 
 
-def _blocks(logs: Sequence[Mapping[str, ArrayLike]]) -> NDArray:
+def _block_numbers(logs: Sequence[Mapping[str, ArrayLike]]) -> NDArray:
     """Return the number of the block of each sample of all logs. (n,)"""
     parts = [1000 * k + np.asarray(log["time"], np.float64) // BLOCK_DURATION for k, log in enumerate(logs)]
     return np.concatenate(parts)
 
 
-def _deviations(jacobian: NDArray, residuals: NDArray, blocks: NDArray) -> NDArray:
+def _standard_deviations(jacobian: NDArray, residuals: NDArray, blocks: NDArray) -> NDArray:
     """Return standard deviations from the scatter between blocks of time. (k,)"""
     inverse = np.linalg.pinv(np.einsum("nri,nrj->ij", jacobian, jacobian), hermitian=True)
     scores = np.einsum("nri,nr->ni", jacobian, residuals)
