@@ -10,7 +10,7 @@ from crazysim.errors import ConfigError, EngineWarning, UnsupportedError, warn
 
 
 class LimitError(UnsupportedError):
-    """A documented limit: the stage runs unfused, without a warning."""
+    """A documented limit of the engine, for which a stage runs unfused without a warning."""
 
 
 class KernelError(UnsupportedError):
@@ -18,13 +18,13 @@ class KernelError(UnsupportedError):
 
 
 def report_unsupported(problems: Sequence[str], strict: bool, reported: set[str], remedy: str) -> None:
-    """Warn once that a slower path computes some operations, which the engine does not support, or raise it.
+    """Warn once about operations that the engine does not support, so that they run more slowly, or raise an error.
 
     Args:
-        problems: Unsupported operations, each with the reason; nothing happens if there are none.
-        strict: True to raise an error instead.
+        problems: Unsupported operations, each with the reason. Without any, there is no warning.
+        strict: True to raise an error instead of the warning.
         reported: Warnings that were given before; the new one is added.
-        remedy: Way out of the error, as the beginning of a sentence that ends with ``use strict=False``.
+        remedy: Remedy for the error: the beginning of a sentence that ends with ``or use strict=False``.
     """
     if not problems:
         return

@@ -1,7 +1,7 @@
 """Steps on the host without XLA: compiled kernels are called on the memory of arrays.
 
-A call of a compiled JAX function takes about 30 us, most of it for its operands and results. A loop that commands,
-steps and reads needs few of them as JAX arrays, so JAX arrays are made only when they are read.
+A call of a compiled JAX function takes about 30 us, mostly to convert its operands and results. A loop of commands,
+steps and reads uses few of them as JAX arrays, so a JAX array is made only when it is read.
 
 Memory that a kernel has read or written does not change afterwards. A kernel reads JAX arrays through NumPy views; as
 long as a view exists, JAX copies the buffer instead of reusing it for a donated array. It also reads commands, which
@@ -28,7 +28,7 @@ from crazysim.engine.backends.fused import Kernels
 ALIGNMENT_BYTES = 64
 """Alignment of memory that JAX takes over without a copy, bytes."""
 MAX_SHARED_BYTES = 1 << 16
-"""Bytes up to which all results of a call share one piece of memory."""
+"""Total size of the results of a call up to which they share one piece of memory, bytes."""
 
 
 class HostLeaves:
@@ -67,7 +67,7 @@ class HostLeaves:
         return x.array(i) if isinstance(x, CallResults) else np.asarray(x)
 
     def replace(self, indices: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
-        """Return the leaves with some replaced by arrays that are never written again."""
+        """Return the leaves with some replaced by arrays that must not change afterwards."""
         arrays = [np.ascontiguousarray(x) for x in arrays]
         return self.replace_items(indices, arrays, [_address(x) for x in arrays])
 
@@ -85,7 +85,7 @@ def _address(x: NDArray) -> int:
 
 
 class _Offset(NamedTuple):
-    """Offset of an array in the memory of a call."""
+    """Location of an array in the memory of a call: the index of a piece, and the offset in it in bytes."""
 
     piece: int
     offset: int
@@ -156,7 +156,7 @@ class HostCall:
         """Plan the memory and the calls of some kernels.
 
         Args:
-            kernels: Kernels of the programs, for which ``is_possible`` holds.
+            kernels: Kernels of the programs, for which ``is_host_call_possible`` holds.
             owned: For each program the leaves whose new values are taken from it; None for all.
             leaves: Leaves of the data, for their shapes and types.
             nonfinite: Index of the leaf with the flags of worlds, ``core.nonfinite``.
@@ -230,7 +230,7 @@ class HostCall:
         return leaves_after.replace([self._nonfinite], [flagged])
 
 
-def is_possible(kernels: Sequence[Kernels]) -> bool:
+def is_host_call_possible(kernels: Sequence[Kernels]) -> bool:
     """Return whether kernels can be called without XLA.
 
     Each must check its results and write them into new memory, not into rows in place. None may write random keys.

@@ -42,22 +42,22 @@ class MapKernels:
                 self._launches[platform] = native.HostLaunch(write_map(self._block, "host"))
         return self._launches[platform]
 
-    def results(self, n: int) -> list[jax.ShapeDtypeStruct]:
+    def result_shapes(self, n: int) -> list[jax.ShapeDtypeStruct]:
         """Return shapes and types of the results for ``n`` indices."""
         return [jax.ShapeDtypeStruct((n,), x.dtype) for x in self._block.outputs]
 
 
-def _results(*args: Any, kernels: MapKernels, n: int) -> list[jax.ShapeDtypeStruct]:
+def _result_shapes(*args: Any, kernels: MapKernels, n: int) -> list[jax.ShapeDtypeStruct]:
     del args
-    return kernels.results(n)
+    return kernels.result_shapes(n)
 
 
 def _launch(platform: str, *tables: Array, kernels: MapKernels, n: int) -> list[Array]:
-    return kernels.get_launch(platform)(n, jnp.zeros(1, np.int32), tables, kernels.results(n))
+    return kernels.get_launch(platform)(n, jnp.zeros(1, np.int32), tables, kernels.result_shapes(n))
 
 
 map_p = jaxcompat.primitive_by_platform(
-    "crazysim_map", _results, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
+    "crazysim_map", _result_shapes, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
 )
 """Call of a kernel: from its tables to its results for all indices."""
 
@@ -93,7 +93,7 @@ def map_indices(
         broadcast_tables = [
             x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(tables, *in_batched, strict=True)
         ]
-        return jax.lax.map(run, broadcast_tables), [True] * len(kernels.results(n))
+        return jax.lax.map(run, broadcast_tables), [True] * len(kernels.result_shapes(n))
 
     return jaxcompat.batched_rule(run, batching_rule)(list(tables))
 

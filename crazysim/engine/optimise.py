@@ -18,23 +18,25 @@ VERIFY_VARIABLE = "CRAZYSIM_VERIFY"
 """Environment variable; if it is 1, every program is verified after every pass."""
 
 
-def optimise(program: Program, rows: Callable[[list[int]], list[int]] | None = None, pack: bool = True) -> Program:
+def optimise(
+    program: Program, select_rows: Callable[[list[int]], list[int]] | None = None, pack: bool = True
+) -> Program:
     """Return a lowered program after all passes, ready for a backend.
 
     Args:
         program: The program, from ``lower_stages``.
-        rows: Function from the written leaves to the leaves to store as rows, each row with one number of all drones.
-            None for no rows.
+        select_rows: Function from the written leaves to the leaves to store as rows, each of one number of all drones.
+            None to store none as rows.
         pack: True to pack shared numbers in one leaf.
     """
     passes: list[Pass] = [fuse, join_ticks, hoist, *([pack_shared] if pack else [])]
-    if rows is not None:
-        stored = functools.partial(pack_rows, select=rows)
-        passes.append(functools.update_wrapper(stored, pack_rows))
-    return apply(program, passes)
+    if select_rows is not None:
+        pack_selected_rows = functools.partial(pack_rows, select=select_rows)
+        passes.append(functools.update_wrapper(pack_selected_rows, pack_rows))
+    return apply_passes(program, passes)
 
 
-def apply(program: Program, passes: Iterable[Pass]) -> Program:
+def apply_passes(program: Program, passes: Iterable[Pass]) -> Program:
     """Apply passes to a program, and verify and dump it after each pass if the environment variables are set."""
     _inspect(program, "lowered")
     for compiler_pass in passes:

@@ -1,4 +1,4 @@
-"""Plans: the choice of the engine that steps data of one structure, and the reason why no faster engine was chosen.
+"""Plans, which state the engine that steps data of one structure, and the reason why no faster engine was chosen.
 
 If an engine cannot run a step, this is found here, before the first step. There are three cases:
 
@@ -31,7 +31,7 @@ from crazysim.core.stage import Stage
 from crazysim.core.stages import watched_records
 from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
-from crazysim.engine.host_call import HostCall, is_possible
+from crazysim.engine.host_call import HostCall, is_host_call_possible
 from crazysim.engine.ir.program import Leaf, Program, Zeros
 from crazysim.engine.lowering.groups import Group, independent_groups
 from crazysim.engine.lowering.relative import adapt_to_data_leaves
@@ -72,7 +72,7 @@ class Plan:
     packed: tuple[int, ...]
     """Indices of the shared leaves that are passed as one concatenated leaf, the first after the leaves of the data."""
     rows: tuple[PackedRows, ...]
-    """Leaves whose rows are other leaves, after the packed leaf; empty if no leaf is stored as rows."""
+    """Leaves that hold other leaves as rows; they follow the packed leaf. Empty if no leaf is stored as rows."""
     written_leaves: tuple[int, ...]
     """Indices of the leaves that the compiled step returns."""
     leaf_indices: SimData
@@ -82,12 +82,12 @@ class Plan:
     static_count_step: Callable[..., Any]
     """Compiled step that takes the number of steps as a Python number, and can be differentiated in reverse mode."""
     numpy_step: Callable[..., Any] | None = None
-    """Step in NumPy for arguments that are not traced; None unless ``interpret`` runs all of it without a mesh."""
+    """Step in NumPy for arguments that are not traced; None unless ``interpret`` runs the whole step without a mesh."""
     host_call: HostCall | None = None
     """Step without XLA, for a simulation that holds its data between calls; None if it is not possible."""
 
     @property
-    def synced(self) -> int:
+    def synced_leaf(self) -> int:
         """Index of the leaf ``core.mjx_synced``, which is False after a step."""
         return int(self.leaf_indices.core.mjx_synced)
 
@@ -109,7 +109,7 @@ class Planner(NamedTuple):
     location: Location
     """Devices that hold the data."""
     reported: set[str]
-    """Warnings that have been given, for data of any structure; none is given twice."""
+    """Texts of the warnings so far, for data of any structure; no warning is repeated."""
 
     def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None], separate: SeparateLeaves = None) -> Plan:
         """Return the plan that steps data of one structure.
@@ -168,11 +168,11 @@ class Planner(NamedTuple):
             for g in groups
         ]
         one_kernel = self._has_kernels and [x.fused for x in lowered_programs] == [True]
-        select = None
+        select_rows = None
         if separate is not None and one_kernel:
             separate_leaves = {*separate, leaf_indices(data).core.mjx_synced}
-            select = lambda written: [i for i in written if i not in separate_leaves]  # noqa: E731
-        programs = tuple([optimise(program, select, pack=k == 0) for k, program in enumerate(lowered_programs)])
+            select_rows = lambda written: [i for i in written if i not in separate_leaves]  # noqa: E731
+        programs = tuple([optimise(program, select_rows, pack=k == 0) for k, program in enumerate(lowered_programs)])
         unfused = [stage for program in programs for stage in program.unfused_stages]
         problems = [f"stage {s.explanation}" for s in unfused if not isinstance(s.error, LimitError)]
         if self.location.is_distributed and unfused:
@@ -183,7 +183,7 @@ class Planner(NamedTuple):
             engine, reason = "lanes", fused.unavailable_reason(self.location.platform) or ""
             if not reason:
                 try:
-                    without_rows = None if select is None else optimise(lowered_programs[0])
+                    without_rows = None if select_rows is None else optimise(lowered_programs[0])
                     runs, engine = [fused.build(x, self.location, without_rows) for x in programs], "fused"
                 except UnsupportedError as error:
                     error = self._error_of_stage(error, data)
@@ -192,15 +192,15 @@ class Planner(NamedTuple):
             if reason and self.engine == "fused":
                 raise ConfigError(f"engine 'fused' cannot run this pipeline: {reason}. Use 'lanes' or 'auto'.")
         runs = runs or [BACKENDS[engine](program, self.location) for program in programs]
-        inputs = {i for program in programs for i in _inputs(program)}
+        inputs = {i for program in programs for i in _input_leaves(program)}
         run, written = _join_runs(groups, programs, runs)
         plan = self._make_plan(engine, reason, data, programs, inputs, written, run, len(programs[0].leaves))
         kernels = [run.kernels for run in runs if isinstance(run, fused.FusedRun) and run.kernels is not None]
         on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
-        if on_host and is_possible(kernels):
-            owned = [group.owned for group in groups]
-            call = HostCall(kernels, owned, jax.tree.leaves(data), int(plan.leaf_indices.core.nonfinite))
-            plan = dataclasses.replace(plan, host_call=call)
+        if on_host and is_host_call_possible(kernels):
+            owned = [group.owned_leaves for group in groups]
+            host_call = HostCall(kernels, owned, jax.tree.leaves(data), int(plan.leaf_indices.core.nonfinite))
+            plan = dataclasses.replace(plan, host_call=host_call)
         return plan, problems
 
     def _distribution_limit(self, data: SimData) -> str:
@@ -256,7 +256,7 @@ class Planner(NamedTuple):
         if programs and self.location.mesh is not None:
             advance = self._shard_over_mesh(advance, data, programs[0].leaves, inputs, written_leaves)
         plan = Plan(
-            engine, reason, programs, self.location, inputs, packed, rows, written_leaves, indices, *_jit_step(advance)
+            engine, reason, programs, self.location, inputs, packed, rows, written_leaves, indices, *_jit_steps(advance)
         )
         in_numpy = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
         return dataclasses.replace(plan, numpy_step=_put_results_on_device(advance)) if in_numpy else plan
@@ -324,7 +324,7 @@ class Planner(NamedTuple):
         return ""
 
 
-def _jit_step(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _jit_steps(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Return a step compiled for a number of steps that is an array, and for one that is a Python number."""
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
@@ -347,7 +347,7 @@ def _join_runs(
     runs = [adapt_to_data_leaves(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:
         return runs[0], tuple(programs[0].written_leaves)
-    owned = [group.owned for group in groups]
+    owned = [group.owned_leaves for group in groups]
     written = sorted({i for program in programs for i in program.written_leaves})
 
     def run_all(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
@@ -371,7 +371,7 @@ def _watched_leaves(data: SimData) -> list[Any]:
     return jax.tree.leaves(watched_records(data))
 
 
-def _inputs(program: Program) -> list[int]:
+def _input_leaves(program: Program) -> list[int]:
     """Return the indices of the leaves that must be passed to a program.
 
     These are the leaves that it reads, and a leaf of the drones, whose shape gives the number of worlds. If unfused

@@ -20,8 +20,8 @@ from crazysim.pytree import leaf_indices
 
 Policy = Callable[[Any, SimData], Any]
 """Function from parameters and data to a command for every drone, (n_worlds, n_drones, k)."""
-Keep = Callable[[SimData], Any]
-"""Function from data to the arrays to record: any tree of arrays."""
+RecordFunction = Callable[[SimData], Any]
+"""Function from data to any tree of arrays to record."""
 
 
 def get_states(data: SimData) -> Any:
@@ -36,7 +36,7 @@ def rollout(
     params: Any,
     n_control_steps: int,
     n_substeps: int,
-    keep: Keep = get_states,
+    keep: RecordFunction = get_states,
     every: int = 1,
     zeros: Zeros | None = None,
 ) -> tuple[SimData, Any]:
@@ -67,7 +67,7 @@ def rollout(
     zeros = step.zeros(data) if zeros is None else zeros
     staged = F.staged_leaves(leaf_indices(data))
     flat = step.flatten(data, zeros, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
-    carried = sorted({*flat.plan.written_leaves, flat.plan.synced, *staged})
+    carried = sorted({*flat.plan.written_leaves, flat.plan.synced_leaf, *staged})
 
     def control_step(carry: list[Any]) -> list[Any]:
         flat_before = flat.replace(carried, carry)
@@ -89,7 +89,7 @@ compiled_rollout = functools.partial(jax.jit, static_argnames=STATIC_ARGUMENTS)(
 """``rollout`` in one compiled call; only the carries of its loops reuse buffers."""
 
 
-def run(
+def run_rollout(
     step: Step,
     data: SimData,
     policy: Policy,

@@ -1,4 +1,4 @@
-"""The step of a simulation as a pure function: a pipeline, run by the chosen engine, or by the fastest."""
+"""The step of a simulation as a pure function, which runs a pipeline on the chosen or the fastest engine."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from crazysim.pytree import check_axes, lazy_record, replace_leaves
 
 
 class FlatData:
-    """``SimData`` as a list of arrays, with the plan that steps it. Successive steps need no record between them."""
+    """``SimData`` as a list of arrays, with the plan that steps it. Successive steps make no record in between."""
 
     __slots__ = ("_record", "leaves", "plan")
 
     def __init__(self, leaves: list[Any] | HostLeaves, plan: Plan):
-        """Store the leaves of the data, with None for a leaf in rows, followed by the leaves that passes add."""
+        """Store the leaves of the data, followed by the leaves that passes add. Leaves stored as rows are None."""
         self.leaves: Any = leaves
         self.plan = plan
         self._record: SimData | None = None
@@ -45,11 +45,11 @@ class FlatData:
         return data is self._record
 
     def data(self) -> SimData:
-        """Return the data as a record, which is made once. Its fields are computed when they are read."""
+        """Return the data as a record, always the same one. Its fields are computed when they are read."""
         record = self._record
         if record is None:
             # Without a reference to this object, so that no cycle keeps arrays in memory.
-            read_leaf = functools.partial(_leaf, self.leaves, self.plan)
+            read_leaf = functools.partial(_read_leaf, self.leaves, self.plan)
             record = self._record = lazy_record(self.plan.leaf_indices, read_leaf)
         return record
 
@@ -81,8 +81,8 @@ class FlatData:
         return [self.leaves[i] for i in self.plan.inputs]
 
 
-def _leaf(leaves: Any, plan: Plan, i: int) -> Any:
-    """Return one of the leaves of the data, from the rows if it is in rows."""
+def _read_leaf(leaves: Any, plan: Plan, i: int) -> Any:
+    """Return one of the leaves of the data, taken from the rows if it is stored as rows."""
     x = leaves[i]
     if x is not None or not plan.rows:
         return x
@@ -122,7 +122,7 @@ class Step:
             pipeline: The stages.
             engine: One of ``ENGINES``.
             platform: ``"cpu"`` or ``"gpu"``.
-            mesh: Devices that the worlds are spread over.
+            mesh: Devices that the worlds are distributed over; None without a mesh.
             device: Device that it runs on; None for any of the platform.
             strict: True to raise an error instead of an ``EngineWarning`` and the use of a slower engine.
 
@@ -140,8 +140,8 @@ class Step:
         self._plans: dict[Any, Plan] = {}
         self._reported: set[str] = set()
         self._called: set[tuple[int, int | None]] = set()
-        self._zeros = ZerosCache()
-        self._pack = PackCache()
+        self._zeros_cache = ZerosCache()
+        self._pack_cache = PackCache()
         self._home_sharding: Any = None
         self._last_false_flag: Any = None
 
@@ -164,9 +164,9 @@ class Step:
 
         Args:
             data: The simulation.
-            n_steps: Number of steps, an integer of at least 0, or an array of one. ()
-            zeros: Result of ``zeros`` for this data before it was traced. Under a trace the values of parameters are
-                unknown, and no terms are left out.
+            n_steps: Number of steps, at least 0: an integer, or an array of integer type. ()
+            zeros: Result of the method ``zeros`` for this data from before it was traced. Without it, the values of
+                parameters are unknown under a trace, and no terms are left out.
         """
         _check_steps(n_steps)
         leaves, treedef = jax.tree.flatten(data)
@@ -185,9 +185,9 @@ class Step:
         Args:
             data: The simulation.
             zeros: As in ``__call__``.
-            n_steps: A number of steps with the type that ``advance`` will get; None for an array.
-            separate: Leaves that remain separate arrays. The other leaves that a call writes are stored as rows, which
-                is faster in loops over calls. None for no rows.
+            n_steps: Any number of steps of the type that will be passed to ``advance``; None for an array.
+            separate: Leaves that remain separate arrays. The other leaves that a call writes are stored as rows of one
+                array, which makes loops over calls faster. None to store none as rows.
         """
         return self._flatten(data, *jax.tree.flatten(data), zeros, n_steps, separate)
 
@@ -209,22 +209,22 @@ class Step:
         step, inputs = plan.static_count_step if isinstance(n_steps, int) else plan.traced_count_step, flat.inputs()
         if plan.numpy_step is not None and not any(isinstance(x, jax.core.Tracer) for x in (*inputs, n_steps)):
             step = plan.numpy_step
-        program = id(plan), n_steps if isinstance(n_steps, int) else None
-        with keep_programs(enabled=program not in self._called):
+        call_key = id(plan), n_steps if isinstance(n_steps, int) else None
+        with keep_programs(enabled=call_key not in self._called):
             outputs = step(inputs, n_steps)
-        self._called.add(program)
+        self._called.add(call_key)
         leaves = replace_leaves(flat.leaves, plan.written_leaves, outputs)  # type: ignore[arg-type]  # a list, but for a host call
-        leaves[plan.synced] = self._false_flag(leaves[plan.synced])
+        leaves[plan.synced_leaf] = self._make_false_flag(leaves[plan.synced_leaf])
         return FlatData(leaves, plan)
 
     def advance_on_host(self, flat: FlatData, n_steps: int) -> FlatData:
-        """Return the data some steps later, without XLA; the plan must have a ``host_call``. Wait for the steps."""
+        """Return the data some steps later, computed without XLA; the plan must have a ``host_call``."""
         plan, leaves = flat.plan, flat.leaves
         host_call: Any = plan.host_call
         if not isinstance(leaves, HostLeaves):
-            leaves = host_call.make_host_leaves(leaves, leaves[plan.synced].sharding)
+            leaves = host_call.make_host_leaves(leaves, leaves[plan.synced_leaf].sharding)
         leaves_after = host_call(leaves, n_steps)
-        leaves_after.items[plan.synced] = self._false_flag(leaves_after.items[plan.synced])
+        leaves_after.items[plan.synced_leaf] = self._make_false_flag(leaves_after.items[plan.synced_leaf])
         return FlatData(leaves_after, plan)
 
     def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
@@ -234,7 +234,7 @@ class Step:
 
     def zeros(self, data: SimData) -> Zeros:
         """Return the elements of shared parameters that are zero, for ``__call__``."""
-        return self._zeros(data, *jax.tree.flatten(data))
+        return self._zeros_cache(data, *jax.tree.flatten(data))
 
     def lower(self, data: SimData, n_steps: int | Array = 1) -> Any:
         """Return the step lowered for this data, as ``jax.jit(...).lower`` does: to inspect, or to compile ahead."""
@@ -250,7 +250,7 @@ class Step:
 
     @property
     def engines(self) -> list[str]:
-        """Engines that have run it so far, each once."""
+        """Engines that have run it so far, sorted and without repetition."""
         return sorted({plan.engine for plan in self._plans.values()})
 
     def _cache_size(self) -> int:
@@ -262,13 +262,13 @@ class Step:
 
     def _all_leaves(self, plan: Plan, leaves: list[Any]) -> list[Any]:
         """Return the leaves of the data, followed by the leaves that the plan adds."""
-        packed = [self._pack([leaves[i] for i in plan.packed])] if plan.packed else []
+        packed = [self._pack_cache([leaves[i] for i in plan.packed])] if plan.packed else []
         rows = [rows.pack(view_leaves(rows.program.views, leaves)) for rows in plan.rows]
         in_rows = [i for rows in plan.rows for i in rows.members]
         return [*replace_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
 
-    def _false_flag(self, old_flag: Any) -> Any:
-        """Return a false flag on the devices of the previous flag; the last such flag is returned again if possible."""
+    def _make_false_flag(self, old_flag: Any) -> Any:
+        """Return a false flag on the devices of the previous flag; the flag from the last call if possible."""
         if old_flag is self._last_false_flag:
             return old_flag
         traced = isinstance(old_flag, jax.core.Tracer)
@@ -286,8 +286,8 @@ class Step:
         n_steps: int | Array | None = None,
         separate: SeparateLeaves = None,
     ) -> Plan:
-        zeros = self._zeros(data, leaves, treedef) if zeros is None else zeros
-        other_location = self._other_location(data.states.pos)
+        zeros = self._zeros_cache(data, leaves, treedef) if zeros is None else zeros
+        other_location = self._find_other_location(data.states.pos)
         key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, other_location, separate)
         plan = self._plans.get(key)
         if plan is None:
@@ -306,7 +306,7 @@ class Step:
             plan = self._plans[key] = planner.plan(data, zeros, trace, separate)
         return plan
 
-    def _other_location(self, x: Any) -> Location | None:
+    def _find_other_location(self, x: Any) -> Location | None:
         """Return the location of an array; None if it is unknown, or the one that the step was built for."""
         sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
         if sharding is None or sharding is self._home_sharding:

@@ -98,7 +98,7 @@ class Stepper:
         The flag is compared by identity with an array that is known to be false, so that it never waits for the device.
         """
         data = self._data
-        flag = data.leaves[data.plan.synced] if isinstance(data, FlatData) else self.data.core.mjx_synced
+        flag = data.leaves[data.plan.synced_leaf] if isinstance(data, FlatData) else self.data.core.mjx_synced
         return flag is not self._unsynced_flag
 
     def assign(self, data: SimData) -> None:
@@ -138,7 +138,7 @@ class Stepper:
                 flat_after = self.step.advance(flat, self._as_array(n_steps))
             else:
                 flat_after = self.step.advance_on_host(flat, n_steps)
-        self._data, self._unsynced_flag = flat_after, flat_after.leaves[flat.plan.synced]
+        self._data, self._unsynced_flag = flat_after, flat_after.leaves[flat.plan.synced_leaf]
 
     def count_steps(self, n_steps: int, times: int = 1) -> None:
         """Count steps that are about to be taken.

@@ -59,7 +59,7 @@ class Transition(PyTree):
         return self.state.final_obs
 
 
-Keep = Callable[[Transition], Any]
+RecordFunction = Callable[[Transition], Any]
 """``keep(transition)``: the part of a transition to store, any tree of arrays."""
 
 
@@ -69,7 +69,7 @@ def rollout(
     policy: Policy,
     key: Array,
     n_steps: int,
-    keep: Keep = lambda transition: (transition.reward, transition.done),
+    keep: RecordFunction = lambda transition: (transition.reward, transition.done),
     initial_memory: Any = (),
     memory: Any = None,
 ) -> tuple[EnvState, Any, Any]:
@@ -91,7 +91,7 @@ def rollout(
     n_steps = positive_integer("n_steps", n_steps)
     memory = initial_memory if memory is None else memory
     flat = env.flatten(state)
-    carried_indices = sorted({*flat.plan.written_leaves, flat.plan.synced})
+    carried_indices = sorted({*flat.plan.written_leaves, flat.plan.synced_leaf})
 
     def step(carry: tuple[list[Any], Any], key: Array) -> tuple[Any, Any]:
         flat_before, memory = flat.replace(carried_indices, carry[0]), carry[1]

@@ -170,7 +170,7 @@ def _step_expressions(program: Program, initial_value: Callable[[Slot], Any]) ->
         slots = (*segment.reads, *segment.hoisted_reads)
         numbers = {slot: written_values[slot] if slot in written_values else initial_value(slot) for slot in slots}
         try:
-            written_values |= symbolic.step(segment, numbers.__getitem__)
+            written_values |= symbolic.step_expressions(segment, numbers.__getitem__)
         except UnsupportedError as error:
             raise _export_error(error.stage, error.reason) from None
     return written_values

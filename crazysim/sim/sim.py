@@ -31,8 +31,7 @@ from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Reset, Step, Stepper, explain
-from crazysim.engine.rollout import Keep, Policy, get_states
-from crazysim.engine.rollout import run as run_rollout
+from crazysim.engine.rollout import Policy, RecordFunction, get_states, run_rollout
 from crazysim.plugins.plugin_registry import P, PluginRegistry
 from crazysim.pytree import device_array
 from crazysim.scene import mjx
@@ -479,7 +478,7 @@ class Sim:
         params: Any = None,
         n_control_steps: int = 1,
         *,
-        keep: Keep = get_states,
+        keep: RecordFunction = get_states,
         every: int = 1,
         progress: bool = False,
     ) -> Any:

@@ -78,7 +78,7 @@ def test_a_block_with_tangents_is_what_jax_makes_of_the_function(fn, x64):
     for some, way in (((0, 1), (dx, dy)), ((1,), (jnp.zeros(16), dy))):
         made = add_block_tangents(block, [block.inputs[k] for k in some])
         verify_block(made)
-        found = xla.run(made, [x, y, *(way[k] for k in some)], (16,))
+        found = xla.run_block(made, [x, y, *(way[k] for k in some)], (16,))
         for a, b in zip(found, jax.jvp(jax.vmap(fn), (x, y), way), strict=True):
             np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 
@@ -89,7 +89,7 @@ def test_a_transposed_block_is_what_jax_makes_of_the_function(name, x64):
     block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
     x, y, ct = np.random.default_rng(1).normal(size=(3, 16))
     _, pull = jax.vjp(jax.vmap(fn), jnp.asarray(x), jnp.asarray(y))
-    found = xla.run(transpose_block(block, block.inputs), [jnp.asarray(v) for v in (x, y, ct)], (16,))
+    found = xla.run_block(transpose_block(block, block.inputs), [jnp.asarray(v) for v in (x, y, ct)], (16,))
     for a, b in zip(found, pull(jnp.asarray(ct)), strict=True):
         np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 

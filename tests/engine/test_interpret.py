@@ -24,7 +24,7 @@ def test_lanes_leave_a_loop_one_by_one():
         return jax.lax.while_loop(lambda c: c[0] > 1, lambda c: (0.5 * c[0], c[1] + 1), (x, jnp.float32(0)))
 
     x = np.float32([0.5, 3.0, 40.0])
-    halved, n = interpret.run(lower_function(halve, ONE), [x], x.shape)
+    halved, n = interpret.run_block(lower_function(halve, ONE), [x], x.shape)
     np.testing.assert_array_equal(halved, [0.5, 0.75, 0.625])
     np.testing.assert_array_equal(n, [0, 2, 6])
 
@@ -32,7 +32,7 @@ def test_lanes_leave_a_loop_one_by_one():
 def test_an_observer_gets_every_operation_with_its_results():
     seen = []
     block = lower_function(lambda x: jnp.exp(x) + 1, ONE)
-    interpret.run(
+    interpret.run_block(
         block, [np.zeros(2, np.float32)], (2,), observe=lambda op, out: seen.append((op.name, float(out[0][0])))
     )
     assert seen == [("exp", 1.0), ("add", 2.0)]
@@ -54,8 +54,8 @@ def test_vmap_is_a_loop(step):
     program, leaves = step
     i = next(i for i, leaf in enumerate(program.leaves) if leaf.name == "states.vel")
     many = jnp.stack([leaves[i], leaves[i] + 1.0])
-    run = jax.jit(jax.vmap(lambda x: interpret.steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0]))
-    one = jax.jit(lambda x: interpret.steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0])(many[1])
+    run = jax.jit(jax.vmap(lambda x: interpret.run_steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0]))
+    one = jax.jit(lambda x: interpret.run_steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0])(many[1])
     for x, y in zip(run(many), one, strict=True):
         np.testing.assert_array_equal(x[1], y)
 
@@ -97,7 +97,7 @@ def _kernel(program, leaves, n_steps):
     return jax.jit(lambda leaves: fused.build(program, Location("cpu"))(leaves, n_steps))(leaves)
 
 
-@pytest.mark.parametrize("steps", [lanes.steps, interpret.steps, *([_kernel] if native.compiler() else [])])
+@pytest.mark.parametrize("steps", [lanes.run_steps, interpret.run_steps, *([_kernel] if native.compiler() else [])])
 def test_a_stage_may_write_random_keys(steps):
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     own = Own(jax.random.split(jax.random.key(5), (3, 2)), jnp.zeros((3, 2)))

@@ -340,7 +340,7 @@ slow += "constexpr long x = f();"
 flags = ["-fconstexpr-ops-limit=1000000000000", "-fconstexpr-loop-limit=2000000000"]
 quick = 'extern "C" __attribute__((visibility("default"))) int crazysim_call = 1;'
 source = quick if sys.argv[1] == "quick" else slow
-compile = lambda key: native._library([*native.compiler_command(), *flags], key, source)
+compile = lambda key: native._get_library([*native.compiler_command(), *flags], key, source)
 if sys.argv[1] == "threads":
     with native.compiling_threads(2) as pool:
         list(pool.map(compile, "abcd"))

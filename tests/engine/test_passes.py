@@ -14,7 +14,7 @@ from crazysim.engine.ir.blocks import Builder, Operation, Value
 from crazysim.engine.ir.program import Leaf, Program, Segment
 from crazysim.engine.ir.verify import VerificationError, verify
 from crazysim.engine.lowering.stages import lower_stages
-from crazysim.engine.optimise import apply
+from crazysim.engine.optimise import apply_passes
 from crazysim.engine.passes import schedule
 from crazysim.jaxcompat import is_key
 
@@ -37,12 +37,13 @@ def run(program, numbers, n_steps):
     numbers = dict(numbers)
     shape = (N_WORLDS,)
     hoisted = {
-        id(s): interpret.run(s.hoisted, [numbers[slot] for slot in s.hoisted_reads], shape) for s in program.segments
+        id(s): interpret.run_block(s.hoisted, [numbers[slot] for slot in s.hoisted_reads], shape)
+        for s in program.segments
     }
     for phase, times in (("before", 1), ("each", n_steps), ("after", 1)):
         for _ in range(times):
             for s in program.phase_segments(phase):
-                out = interpret.run(s.block, [*(numbers[slot] for slot in s.reads), *hoisted[id(s)]], shape)
+                out = interpret.run_block(s.block, [*(numbers[slot] for slot in s.reads), *hoisted[id(s)]], shape)
                 numbers.update(zip(s.writes, out, strict=True))
     return numbers
 
@@ -252,7 +253,7 @@ def test_verification_finds_phases_out_of_order():
 def test_every_pass_is_verified_if_that_is_asked_for(monkeypatch):
     monkeypatch.setenv("CRAZYSIM_VERIFY", "1")
     with pytest.raises(VerificationError):
-        apply(Program(LEAVES, 1, (WELL_FORMED,)), [lambda program: broken(writes=(Y, Z))])
+        apply_passes(Program(LEAVES, 1, (WELL_FORMED,)), [lambda program: broken(writes=(Y, Z))])
 
 
 # Stages to programs -------------------------------------------------------------------------------------------------

@@ -115,7 +115,7 @@ def test_a_bug_is_reported_where_auto_can_go_on(sim, monkeypatch):
 def test_a_bug_in_tracing_is_found_at_planning(sim, monkeypatch):
     """Tracing the program is part of planning, so that the first call finds nothing new."""
     monkeypatch.setattr(native, "compiler", lambda: None)
-    monkeypatch.setattr(lanes, "steps", broken)
+    monkeypatch.setattr(lanes, "run_steps", broken)
     with pytest.warns(EngineWarning, match="a slip"):
         assert Step(sim.step_pipeline).plan(sim.data).engine == "plain"
 

@@ -33,7 +33,7 @@ def test_a_case_gives_what_jax_gives(name):
     block = lower_function(function(name), drone_shapes(g))
     verify_block(block)
     assert block.outputs
-    found = interpret.run(block, lanes_of(g), (N_LANES,))
+    found = interpret.run_block(block, lanes_of(g), (N_LANES,))
     agree(np.stack(found, axis=-1), jax.jit(map_over_drones(name)).lower(g).compile()(g), name)
 
 
@@ -48,8 +48,10 @@ def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
     g = make_inputs()
     block = lower_function(all_of_them, drone_shapes(g))
     program, leaves = make_program(block, lanes_of(g), N_LANES)
-    expected = interpret.run(block, lanes_of(g), (N_LANES,))
-    run = build(program, Location("cpu")) if engine == "fused" else lambda x, n: interpret.lanes.steps(program, x, n)
+    expected = interpret.run_block(block, lanes_of(g), (N_LANES,))
+    run = (
+        build(program, Location("cpu")) if engine == "fused" else lambda x, n: interpret.lanes.run_steps(program, x, n)
+    )
     written, _ = jax.jit(lambda leaves: run(leaves, 1))(leaves)
     for x, y in zip(written, expected, strict=True):
         agree(np.asarray(x).reshape(-1), y, engine)
@@ -116,7 +118,7 @@ def test_a_parameter_that_a_version_of_jax_does_not_have_makes_a_primitive_unsup
 def test_constants_do_not_hide_what_is_not_finite(fn):
     """A product with zero is NaN where the other number is infinite, whatever is known when the program is made."""
     x = np.float32([np.nan, np.inf, -np.inf, 0.0, -2.5])
-    (found,) = interpret.run(lower_function(fn, jax.ShapeDtypeStruct((), np.float32)), [x], x.shape)
+    (found,) = interpret.run_block(lower_function(fn, jax.ShapeDtypeStruct((), np.float32)), [x], x.shape)
     np.testing.assert_array_equal(found, np.asarray(jax.jit(jax.vmap(fn))(x)))
 
 

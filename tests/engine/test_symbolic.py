@@ -36,7 +36,7 @@ def expressions(fn, *avals):
     block = lower_function(lambda *args: jnp.ravel(fn(*args)), *avals)
     symbolic.require_casadi(block)
     vectors = [casadi.SX.sym(f"x{k}", int(np.prod(x.shape))) for k, x in enumerate(jax.tree.leaves(avals))]
-    outputs = symbolic.run(block, [x[k] for x in vectors for k in range(x.numel())])
+    outputs = symbolic.run_block(block, [x[k] for x in vectors for k in range(x.numel())])
     return casadi.Function("case", vectors, [casadi.vertcat(*outputs)])
 
 

@@ -159,7 +159,7 @@ def test_a_lowered_stage_reads_what_it_reads_as_it_is_written(scope, chosen):
         verify(program)
         assert program.fused, program.unfused_stages[0].explanation
         leaves = jax.tree.leaves(data())
-        (out,), _ = interpret.steps(program, [*leaves, _packed(program, leaves)], 1)
+        (out,), _ = interpret.run_steps(program, [*leaves, _packed(program, leaves)], 1)
         np.testing.assert_array_equal(out, expected, err_msg=name)
 
 

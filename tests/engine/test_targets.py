@@ -92,7 +92,7 @@ def expected(everything):
     program, arrays = everything
     (segment,) = program.fused_segments
     inputs = [np.asarray(arrays[leaf])[:, 0] for leaf, _ in segment.reads]
-    return interpret.run(segment.block, inputs, (N_LANES,))
+    return interpret.run_block(segment.block, inputs, (N_LANES,))
 
 
 def check(found, expected, what):
@@ -117,7 +117,7 @@ def check(found, expected, what):
 
 def test_xla_computes_what_the_interpreter_does(everything, expected):
     program, arrays = everything
-    written, _ = jax.jit(lambda leaves: lanes.steps(program, leaves, 1))(arrays)
+    written, _ = jax.jit(lambda leaves: lanes.run_steps(program, leaves, 1))(arrays)
     check(written, expected, "lanes")
 
 
@@ -165,12 +165,12 @@ def test_casadi_computes_what_the_interpreter_does_or_refuses():
         low, high = DOMAIN.get(name, (-3, 3))
         rng = np.random.default_rng(0)
         symbols = [casadi.SX.sym(f"x{k}") for k in range(len(args))]
-        function = casadi.Function("f", symbols, symbolic.run(block, symbols))
+        function = casadi.Function("f", symbols, symbolic.run_block(block, symbols))
         for _ in range(5):
             values = [_number(rng, d, low, min(high, 50)) for d in dtypes]
             if name in ("rem", "div") and values[1] == 0:
                 continue
-            (wanted,) = interpret.run(block, values, ())
+            (wanted,) = interpret.run_block(block, values, ())
             found = float(function(*map(float, values)))
             np.testing.assert_allclose(found, float(wanted), rtol=1e-9, atol=1e-9, err_msg=name)
     assert {stage for _, stage in refused} == {"one"}

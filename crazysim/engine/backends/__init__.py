@@ -1,6 +1,6 @@
 """Backends: XLA on vectors (lanes), kernels in C++ and CUDA (fused), NumPy (interpret), batched XLA (plain).
 
-``lanes``, ``fused`` and ``interpret`` run programs, and each has a function ``build``, which is a ``Build``. ``plain``,
+``lanes``, ``fused`` and ``interpret`` run programs, and each has a function ``build`` of the type ``Build``. ``plain``,
 the reference, runs stages.
 """
 
@@ -15,10 +15,10 @@ from crazysim.core.sharding import Location
 from crazysim.engine.ir.program import Program
 
 Run = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
-"""Leaves of all worlds and a number of steps to the written leaves after them, and True for worlds that are flagged as
-not finite, (n_worlds, 1).
+"""Function that takes the leaves of all worlds and a number of steps. It returns the written leaves after these steps,
+and True for worlds that are flagged as not finite, (n_worlds, 1).
 
-A step count that is a Python number makes a loop that can be differentiated in reverse.
+If the number of steps is a Python number, the loop can be differentiated in reverse mode.
 """
 
 

@@ -37,10 +37,11 @@ PTX_TARGET = "__gpu$xla.gpu.ptx"
 
 NVRTC_OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false",
                  "--device-as-default-execution-space")  # fmt: skip
-"""Division and square root are accurate to 2 and 1 units in the last place, as in XLA; nothing else is approximated."""
+"""Options of NVRTC. Division is accurate to 2 units in the last place and the square root to 1, as in XLA; nothing else
+is approximated."""
 
 THREADS_TO_TRY = (512, 384)
-"""Threads on a multiprocessor to try, the larger number first: they leave 128 or 168 registers to each thread."""
+"""Numbers of threads on a multiprocessor to try, in this order; each thread gets 128 or 168 registers."""
 
 LARGE_KERNEL_THREADS = 256
 """Threads per block for kernels larger than the instruction cache, from ``RESIDENT_LANES`` lanes on. The threads of a
@@ -53,7 +54,7 @@ MAX_GRADIENT_MEMORY_BYTES = 2**30
 """Maximum memory for the states that the kernel of a gradient stores, bytes."""
 
 RESIDENT_LANES = 2**16
-"""Maximum number of lanes that run at once on a GPU with 132 multiprocessors; gradients get memory for as many."""
+"""Maximum number of lanes that run at once on a GPU with 132 multiprocessors; gradients get memory for this number."""
 
 DEFAULT_ARCHITECTURE = "compute_90"
 """Architecture to compile for on a machine without a GPU."""
@@ -95,7 +96,7 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
         block = {"block_x": kernel.threads, "block_y": 1, "block_z": 1}
         code = ptx(kernel, architecture(device))
         target = _launching_handler() if jaxcompat.FALLBACKS else PTX_TARGET
-        digest = {"digest": hashlib.sha256(code.encode()).hexdigest()} if jaxcompat.FALLBACKS else {}
+        digest_attribute = {"digest": hashlib.sha256(code.encode()).hexdigest()} if jaxcompat.FALLBACKS else {}
         run = jax.ffi.ffi_call(target, [*outputs, *memory], input_output_aliases=kernel.aliases())
         written = list(
             run(
@@ -106,7 +107,7 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
                 kernel_type="ptx",
                 kernel_data=code,
                 shared_mem_bytes=np.int32(0),
-                **digest,
+                **digest_attribute,
                 **{name: np.int32(size) for name, size in (grid | block).items()},
             )
         )
@@ -159,7 +160,7 @@ def architecture(device: jax.Device | None) -> str:
 
 @functools.cache
 def fit_registers(kernel: Kernel, device: jax.Device) -> Kernel:
-    """Return a kernel with as many blocks at once on a multiprocessor as possible with almost no spilled registers.
+    """Return a kernel for the largest number of blocks on a multiprocessor at which hardly any register is spilled.
 
     More blocks hide more latency, but leave fewer registers to each thread. Spilled variables soon cost more time.
     """

@@ -1,4 +1,4 @@
-"""Kernels of the derivatives of a program: tangents, computed with the steps, and cotangents, computed backward."""
+"""Kernels of the derivatives of a program: tangents in a forward pass with the steps, cotangents in a backward pass."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class DerivativeKernels:
         """
         self.program, self.location, self.run_on_lanes = program, location, run_on_lanes
         self.descriptions: dict[str, None] = {}
-        """Ways in which derivatives were computed so far, for ``explain``."""
+        """Descriptions of how derivatives were computed so far, for ``explain``, as keys in order."""
         self.floats = tuple(i for i in program.written_leaves if program.leaves[i].number_type.kind == "f")
         """Leaves that are written and have derivatives."""
         self._programs: dict[Any, Any] = {}
         self._launches: dict[Any, Launch | None] = {}
 
-    def is_own(self, leaf: int) -> bool:
-        """Return True for a leaf with numbers of its own for each drone or world."""
+    def has_world_axis(self, leaf: int) -> bool:
+        """Return True for a leaf of drones or worlds, whose first axis is the axis of worlds."""
         return self.program.leaves[leaf].scope in ("drone", "world")
 
     def tangent_kernel(self, perturbed: tuple[int, ...], platform: str) -> Callable[..., list[Array]] | None:
@@ -121,7 +121,7 @@ def _launch_tangents(
 
     def broadcast_tangent(i: int, x: Array) -> Array:
         """Return the tangent of a leaf, repeated for each world if all drones share the leaf."""
-        if kernels.is_own(i):
+        if kernels.has_world_axis(i):
             return x
         return jnp.broadcast_to(x[:, None, None], (n_batches, n_worlds // n_batches, 1, *x.shape[1:])).reshape(
             n_worlds, 1, *x.shape[1:]
@@ -161,6 +161,10 @@ def _launch_cotangents(
         """Return the cotangent of a leaf, summed over the drones that share it."""
         if program.leaves[i].scope == "world":
             return jnp.sum(x, axis=1)
-        return x if kernels.is_own(i) else jnp.sum(x.reshape(n_batches, n_worlds * n_drones // n_batches, -1), axis=1)
+        return (
+            x
+            if kernels.has_world_axis(i)
+            else jnp.sum(x.reshape(n_batches, n_worlds * n_drones // n_batches, -1), axis=1)
+        )
 
     return {i: sum_cotangent(i, x) for i, x in zip(cotangent_program.perturbed, lane_cotangents, strict=True)}

@@ -1,7 +1,7 @@
 """Derivatives of the steps of a kernel for JAX: primitives with rules for derivatives, transposes and vmap.
 
 One primitive computes the tangents after some steps, and is linear in the tangents before them. Its transpose is
-another primitive. JAX lowers each to a kernel of the platform, or to the program on lanes if there is no such kernel.
+another primitive. JAX lowers both to a kernel of the platform, or to the program on lanes if there is no such kernel.
 """
 
 from __future__ import annotations
@@ -45,11 +45,13 @@ def make_differentiable(run: CountedRun, run_on_lanes: Run, kernels: DerivativeK
             perturbed = [i for i, t in enumerate(leaf_tangents) if not jaxcompat.is_symbolic_zero(t)]
             if kernels is not None and isinstance(n_steps, int) and perturbed:
                 array_leaves = tuple([i for i, x in enumerate(values) if x is not None])
-                case = Case(kernels, n_steps, array_leaves, tuple(perturbed), len(values))
+                spec = DerivativeSpec(kernels, n_steps, array_leaves, tuple(perturbed), len(values))
                 operands = [values[i] for i in array_leaves]
-                *written, flagged = advance_p.bind(*operands, run=run, case=case)
-                in_tangents = [leaf_tangents[i] if kernels.is_own(i) else leaf_tangents[i][None] for i in perturbed]
-                out_tangents = tangent_p.bind(*operands, *in_tangents, case=case, n_nonlinear=len(operands))
+                *written, flagged = advance_p.bind(*operands, run=run, spec=spec)
+                in_tangents = [
+                    leaf_tangents[i] if kernels.has_world_axis(i) else leaf_tangents[i][None] for i in perturbed
+                ]
+                out_tangents = tangent_p.bind(*operands, *in_tangents, spec=spec, n_nonlinear=len(operands))
                 tangent_by_leaf = dict(zip(kernels.floats, out_tangents, strict=True))
                 written_leaves = kernels.program.written_leaves
                 written_tangents = [
@@ -78,8 +80,8 @@ def _float0_zeros(x: Any) -> np.ndarray:
     return np.zeros(x.shape, jax.dtypes.float0)
 
 
-class Case(NamedTuple):
-    """Derivative of a program: static parameters of the primitives.
+class DerivativeSpec(NamedTuple):
+    """Description of a derivative of a program, which the primitives take as a static parameter.
 
     The operands are the leaves in ``array_leaves``, then the tangents of ``perturbed``, or the cotangents of the floats
     that are written. Under ``vmap`` arrays of drones or worlds hold ``size`` batches of worlds, one after another;
@@ -107,14 +109,14 @@ class Case(NamedTuple):
         """Return the operands in which the derivative is linear."""
         return list(args[len(self.array_leaves) :])
 
-    def is_own(self, leaves: Sequence[int]) -> list[bool]:
-        """Return True for leaves with numbers of their own for each drone or world."""
-        return list(map(self.kernels.is_own, leaves))
+    def world_axis_flags(self, leaves: Sequence[int]) -> list[bool]:
+        """Return for each leaf whether it has a world axis, which leaves of drones and worlds have."""
+        return list(map(self.kernels.has_world_axis, leaves))
 
     def map_batches(self, fn: Callable[..., list[Array]], args: Sequence[Any], linear_leaves: Sequence[int],
                      result_leaves: Sequence[int]) -> list[Array]:  # fmt: skip
         """Apply a function of the leaves and linear operands of one batch to all batches, and return the results."""
-        leaves_batched, linear_batched = self.is_own(self.array_leaves), self.is_own(linear_leaves)
+        leaves_batched, linear_batched = self.world_axis_flags(self.array_leaves), self.world_axis_flags(linear_leaves)
 
         def split_batches(x: Any) -> Any:
             return x.reshape(self.n_batches, -1, *x.shape[1:])
@@ -127,102 +129,107 @@ class Case(NamedTuple):
                 x if o else x[0] for x, o in zip(self.linear_operands(args), linear_batched, strict=True)
             ]
             outs = run_batch(args, linear_operands)
-            return [x if o else x[None] for x, o in zip(outs, self.is_own(result_leaves), strict=True)]
+            return [x if o else x[None] for x, o in zip(outs, self.world_axis_flags(result_leaves), strict=True)]
         values = [split_batches(x) if o else x for x, o in zip(args, leaves_batched, strict=False)]
         linear_operands = [
             split_batches(x) if o else x for x, o in zip(self.linear_operands(args), linear_batched, strict=True)
         ]
         outs = jax.vmap(run_batch, ([0 if o else None for o in leaves_batched], 0))(values, linear_operands)
-        return [x.reshape(-1, *x.shape[2:]) if o else x for x, o in zip(outs, self.is_own(result_leaves), strict=True)]
+        return [
+            x.reshape(-1, *x.shape[2:]) if o else x
+            for x, o in zip(outs, self.world_axis_flags(result_leaves), strict=True)
+        ]
 
 
 # Tangents ----------------------------------------------------------------------------------------------------------
 
 
-def _tangent_shapes(*args: Any, case: Case, **params: Any) -> list[jax.ShapeDtypeStruct]:
+def _tangent_shapes(*args: Any, spec: DerivativeSpec, **params: Any) -> list[jax.ShapeDtypeStruct]:
     del params
-    program = case.kernels.program
-    n_worlds, _ = lanes.batch_counts(program, case.values(args))
-    return [lanes.leaf_shape(program, i, n_worlds) for i in case.kernels.floats]
+    program = spec.kernels.program
+    n_worlds, _ = lanes.batch_counts(program, spec.values(args))
+    return [lanes.leaf_shape(program, i, n_worlds) for i in spec.kernels.floats]
 
 
-def _tangents_on_lanes(*args: Any, case: Case, **params: Any) -> list[Array]:
+def _tangents_on_lanes(*args: Any, spec: DerivativeSpec, **params: Any) -> list[Array]:
     del params
 
     def tangents(values: list[Any], leaf_tangents: list[Any]) -> list[Array]:
-        fn = partial(_advance_floats, case, values)
-        return jax.jvp(fn, ([values[i] for i in case.perturbed],), (leaf_tangents,))[1]
+        fn = partial(_advance_floats, spec, values)
+        return jax.jvp(fn, ([values[i] for i in spec.perturbed],), (leaf_tangents,))[1]
 
-    return case.map_batches(tangents, args, case.perturbed, case.kernels.floats)
+    return spec.map_batches(tangents, args, spec.perturbed, spec.kernels.floats)
 
 
-def _tangents(platform: str, *args: Any, case: Case, **params: Any) -> list[Array]:
+def _tangents(platform: str, *args: Any, spec: DerivativeSpec, **params: Any) -> list[Array]:
     del params
-    kernel = case.kernels.tangent_kernel(case.perturbed, platform)
+    kernel = spec.kernels.tangent_kernel(spec.perturbed, platform)
     if kernel is None:
-        return _tangents_on_lanes(*args, case=case)
-    in_tangents = dict(zip(case.perturbed, case.linear_operands(args), strict=True))
-    return kernel(case.values(args), in_tangents, case.n_steps, case.n_batches, _tangent_shapes(*args, case=case))
+        return _tangents_on_lanes(*args, spec=spec)
+    in_tangents = dict(zip(spec.perturbed, spec.linear_operands(args), strict=True))
+    return kernel(spec.values(args), in_tangents, spec.n_steps, spec.n_batches, _tangent_shapes(*args, spec=spec))
 
 
 # Cotangents --------------------------------------------------------------------------------------------------------
 
 
-def _cotangent_shapes(*args: Any, case: Case) -> list[jax.ShapeDtypeStruct]:
-    leaves = [case.values(args)[i] for i in case.perturbed]
-    shapes = [x.shape if is_own else (case.n_batches, *x.shape)
-              for x, is_own in zip(leaves, case.is_own(case.perturbed), strict=True)]  # fmt: skip
+def _cotangent_shapes(*args: Any, spec: DerivativeSpec) -> list[jax.ShapeDtypeStruct]:
+    leaves = [spec.values(args)[i] for i in spec.perturbed]
+    shapes = [x.shape if has_world_axis else (spec.n_batches, *x.shape)
+              for x, has_world_axis in zip(leaves, spec.world_axis_flags(spec.perturbed), strict=True)]  # fmt: skip
     return [jax.ShapeDtypeStruct(shape, x.dtype) for shape, x in zip(shapes, leaves, strict=True)]
 
 
-def _cotangents_on_lanes(*args: Any, case: Case) -> list[Array]:
+def _cotangents_on_lanes(*args: Any, spec: DerivativeSpec) -> list[Array]:
     def cotangents(values: list[Any], seeds: list[Any]) -> list[Array]:
-        return jax.vjp(partial(_advance_floats, case, values), [values[i] for i in case.perturbed])[1](seeds)[0]
+        return jax.vjp(partial(_advance_floats, spec, values), [values[i] for i in spec.perturbed])[1](seeds)[0]
 
-    return case.map_batches(cotangents, args, case.kernels.floats, case.perturbed)
+    return spec.map_batches(cotangents, args, spec.kernels.floats, spec.perturbed)
 
 
-def _cotangents(platform: str, *args: Any, case: Case) -> list[Array]:
-    kernel = case.kernels.cotangent_kernel(case.perturbed, platform)
+def _cotangents(platform: str, *args: Any, spec: DerivativeSpec) -> list[Array]:
+    kernel = spec.kernels.cotangent_kernel(spec.perturbed, platform)
     if kernel is None:
-        return _cotangents_on_lanes(*args, case=case)
-    seeds = dict(zip(case.kernels.floats, case.linear_operands(args), strict=True))
-    cotangents = kernel(case.values(args), seeds, case.n_steps, case.n_batches)
+        return _cotangents_on_lanes(*args, spec=spec)
+    seeds = dict(zip(spec.kernels.floats, spec.linear_operands(args), strict=True))
+    cotangents = kernel(spec.values(args), seeds, spec.n_steps, spec.n_batches)
     return [cotangents[i].reshape(x.shape) if i in cotangents else jnp.zeros(x.shape, x.dtype)
-            for i, x in zip(case.perturbed, _cotangent_shapes(*args, case=case), strict=True)]  # fmt: skip
+            for i, x in zip(spec.perturbed, _cotangent_shapes(*args, spec=spec), strict=True)]  # fmt: skip
 
 
-def _transpose(operands: Sequence[Any], seeds: Sequence[Any], case: Case, **params: Any) -> list[Array]:
+def _transpose(operands: Sequence[Any], seeds: Sequence[Any], spec: DerivativeSpec, **params: Any) -> list[Array]:
     del params
-    kernels = case.kernels
+    kernels = spec.kernels
     if not kernels.program.fused:  # unfused stages may have effects, such as printing, which a primitive cannot have
-        kernels.cotangent_kernel(case.perturbed, kernels.location.platform)  # returns None, and records the reason
-        return _cotangents_on_lanes(*operands, *seeds, case=case)
-    return cotangent_p.bind(*operands, *seeds, case=case)
+        kernels.cotangent_kernel(spec.perturbed, kernels.location.platform)  # returns None, and records the reason
+        return _cotangents_on_lanes(*operands, *seeds, spec=spec)
+    return cotangent_p.bind(*operands, *seeds, spec=spec)
 
 
-def _advance_floats(case: Case, values: Sequence[Any], floats: Sequence[Any]) -> list[Array]:
-    kernels = case.kernels
-    written, _ = kernels.run_on_lanes(replace_leaves(values, case.perturbed, floats), case.n_steps)
+def _advance_floats(spec: DerivativeSpec, values: Sequence[Any], floats: Sequence[Any]) -> list[Array]:
+    kernels = spec.kernels
+    written, _ = kernels.run_on_lanes(replace_leaves(values, spec.perturbed, floats), spec.n_steps)
     return [x for i, x in zip(kernels.program.written_leaves, written, strict=True) if i in kernels.floats]
 
 
 def _batching_rule(
-    primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], case: Case, **params: Any
+    primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], spec: DerivativeSpec, **params: Any
 ) -> Any:
-    """Return the results of a primitive for ``n`` batches: one call for more worlds, if parameters do not differ."""
-    n_nonlinear = len(case.array_leaves)
-    is_own = [*case.is_own(case.array_leaves), *(True for _ in args[n_nonlinear:])]
-    if any(b and not o for b, o in zip(batched, is_own, strict=True)):  # parameters differ: one batch at a time
+    """Return the results of a primitive for ``n`` batches, by one call for more worlds if they share parameters."""
+    n_nonlinear = len(spec.array_leaves)
+    with_world_axis = [*spec.world_axis_flags(spec.array_leaves), *(True for _ in args[n_nonlinear:])]
+    if any(
+        b and not o for b, o in zip(batched, with_world_axis, strict=True)
+    ):  # parameters differ: one batch at a time
         broadcast_args = [x if b else jnp.broadcast_to(x, (n, *x.shape)) for x, b in zip(args, batched, strict=True)]
-        return jax.lax.map(lambda xs: list(primitive.bind(*xs, case=case, **params)), broadcast_args)
+        return jax.lax.map(lambda xs: list(primitive.bind(*xs, spec=spec, **params)), broadcast_args)
 
     def join_batches(x: Any, b: bool) -> Any:
         x = x if b else jnp.broadcast_to(x, (n, *x.shape))
         return x.reshape(-1, *x.shape[2:])
 
-    operands = [join_batches(x, b) if o else x for x, b, o in zip(args, batched, is_own, strict=True)]
-    outs = primitive.bind(*operands, case=case._replace(n_batches=n * case.n_batches), **params)
+    operands = [join_batches(x, b) if o else x for x, b, o in zip(args, batched, with_world_axis, strict=True)]
+    outs = primitive.bind(*operands, spec=spec._replace(n_batches=n * spec.n_batches), **params)
     return [x.reshape(n, -1, *x.shape[1:]) for x in outs]
 
 
@@ -249,25 +256,25 @@ tangent_p = jaxcompat.primitive_by_platform(
 # The steps in a derivative -----------------------------------------------------------------------------------------
 
 
-def _advance(*args: Any, run: CountedRun, case: Case) -> list[Any]:
-    written, flagged = run(case.values(args), jnp.asarray(case.n_steps, jnp.int32))
+def _advance(*args: Any, run: CountedRun, spec: DerivativeSpec) -> list[Any]:
+    written, flagged = run(spec.values(args), jnp.asarray(spec.n_steps, jnp.int32))
     return [*written, flagged]
 
 
-def _advance_on_lanes(*args: Any, run: CountedRun, case: Case) -> list[Any]:
+def _advance_on_lanes(*args: Any, run: CountedRun, spec: DerivativeSpec) -> list[Any]:
     del run
-    written, flagged = case.kernels.run_on_lanes(case.values(args), case.n_steps)
+    written, flagged = spec.kernels.run_on_lanes(spec.values(args), spec.n_steps)
     return [*written, flagged]
 
 
-def _shapes(*args: Any, **params: Any) -> list[Any]:
+def _advance_shapes(*args: Any, **params: Any) -> list[Any]:
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args]
     return jax.eval_shape(lambda *arrays: _advance(*arrays, **params), *avals)
 
 
 advance_p = jaxcompat.primitive_by_platform(
     "crazysim_advance",
-    _shapes,
+    _advance_shapes,
     {"": _advance},
     differentiable_fn=_advance_on_lanes,
     batching_rule=jaxcompat.make_vmap_rule(_advance),

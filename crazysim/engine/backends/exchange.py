@@ -52,7 +52,7 @@ class LineWriter(Protocol):
         ...
 
     def forget_intermediate_results(self) -> None:
-        """Do not reuse earlier intermediate results: their variables are not defined after this line."""
+        """Forget intermediate results, whose variables are not defined after the last line."""
         ...
 
 
@@ -73,11 +73,11 @@ class Exchange(Protocol):
         """
         ...
 
-    def define_variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+    def define_variable(self, writer: LineWriter, name: str, ctype: str, value: str, depth: int) -> str:
         """Define a number of a lane that changes, and return the expression for it."""
         ...
 
-    def define_constant(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+    def define_constant(self, writer: LineWriter, name: str, ctype: str, value: str, depth: int) -> str:
         """Define a number of a lane that does not change, and return the expression for it in all later code."""
         ...
 
@@ -100,11 +100,11 @@ class UnsplitLane(Exchange):
 
     depth = 0
 
-    def define_variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+    def define_variable(self, writer: LineWriter, name: str, ctype: str, value: str, depth: int) -> str:
         writer.write_line(f"auto {name} = {value};", depth)
         return name
 
-    def define_constant(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
+    def define_constant(self, writer: LineWriter, name: str, ctype: str, value: str, depth: int) -> str:
         writer.write_line(f"const auto {name} = {value};", depth)
         return name
 
@@ -120,9 +120,9 @@ class Registers(UnsplitLane):
 
     def publish(self, writer: LineWriter, values: PublishedNumbers, live: LiveValues, depth: int) -> list[ReadFunction]:
         names = []
-        for kind, value in values:
+        for ctype, value in values:
             names.append(writer.new_name())
-            writer.write_line(f"const auto {names[-1]} = {kind}_lanes({value});", depth)
+            writer.write_line(f"const auto {names[-1]} = {ctype}_lanes({value});", depth)
         return [lambda j, x=x: f"of_drone({x}, {j})" for x in names]
 
     @property
@@ -170,9 +170,8 @@ class SharedMemory(UnsplitLane):
 class HostMemory(Exchange):
     """Several vectors of the host for a world, which exchange numbers through memory.
 
-    Each part of a step is computed for all vectors before the next part begins.
-
-    Numbers that later parts use are kept in memory.
+    Each part of a step is computed for all vectors before the next part begins. Numbers that later parts use are stored
+    in memory.
     """
 
     depth = 1
@@ -182,23 +181,23 @@ class HostMemory(Exchange):
 
     def publish(self, writer: LineWriter, values: PublishedNumbers, live: LiveValues, depth: int) -> list[ReadFunction]:
         arrays = []
-        for kind, value in values:
+        for ctype, value in values:
             arrays.append(writer.new_name("g"))
-            self.define_constant(writer, arrays[-1], kind, value, depth)
-        for x, kind in live:
-            writer.names[x] = self.define_constant(writer, writer.new_name("m"), kind, writer.names[x], depth)
+            self.define_constant(writer, arrays[-1], ctype, value, depth)
+        for x, ctype in live:
+            writer.names[x] = self.define_constant(writer, writer.new_name("m"), ctype, writer.names[x], depth)
         self.close_loop(writer, depth - 1)
         self.open_loop(writer, depth - 1)
         writer.forget_intermediate_results()
         return [lambda j, x=x: f"of_place(w.{x}, {j})" for x in arrays]
 
-    def define_variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
-        self._fields.append(f"{kind}v {name}[VECTORS];")
-        writer.write_line(f"w.{name}[v] = {kind}_lanes({value});", depth)
+    def define_variable(self, writer: LineWriter, name: str, ctype: str, value: str, depth: int) -> str:
+        self._fields.append(f"{ctype}v {name}[VECTORS];")
+        writer.write_line(f"w.{name}[v] = {ctype}_lanes({value});", depth)
         return f"w.{name}[v]"
 
-    def define_constant(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
-        return self.define_variable(writer, name, kind, value, depth)
+    def define_constant(self, writer: LineWriter, name: str, ctype: str, value: str, depth: int) -> str:
+        return self.define_variable(writer, name, ctype, value, depth)
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
         writer.write_line("SWEEP {", depth)

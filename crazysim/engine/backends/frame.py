@@ -11,7 +11,7 @@ from crazysim.engine.backends.exchange import BLOCK_SIZE, lanes_of_block
 from crazysim.engine.ir.blocks import Block
 
 MIN_BLOCKS_PLACEHOLDER = "1 /* blocks at least */"
-"""Text in a kernel for a GPU that ``Kernel.with_blocks`` replaces by a number of blocks."""
+"""Text in a kernel for a GPU, in place of which ``Kernel.with_blocks`` writes a number of blocks."""
 
 BLOCK_THREADS_DEFINITION = "#define BLOCK_THREADS {}\n"
 """Text in a kernel for a GPU that ``Kernel.with_threads`` replaces."""
@@ -37,7 +37,7 @@ class Kernel:
     """Drones of a world that read each other's numbers."""
     state_bytes: int = 0
     """Memory in which a lane stores the state before a step, bytes; 0 for a kernel without backward pass. A kernel with
-    backward pass takes the number of steps of an interval after the number of all steps."""
+    backward pass takes two counts: the number of all steps, and the number of steps of an interval."""
 
     def aliases(self) -> dict[int, int]:
         """Return the index of the result that shares memory with an operand, by the operand's index.
@@ -78,7 +78,7 @@ def _preamble(target: str) -> str:
 
 
 def _epilogue(target: str) -> str:
-    """Return the code by which a target calls the kernel."""
+    """Return the code with which a target calls the kernel."""
     if target == "cuda":
         return ""
     return resources.files("crazysim.engine.backends").joinpath("targets", "host_call.h").read_text()
@@ -174,8 +174,8 @@ def _host_function(pointers: Sequence[str], shared: str, body: str, in_memory: b
     buffers = [f"in[{k}]" if k < n_in else f"out[{k - n_in}]" for k in range(len(pointers))]
     definitions = []
     for pointer, buffer in zip(pointers, buffers, strict=True):
-        kind, name = pointer.split("* __restrict__ ")
-        definitions.append(f"  {kind}* __restrict__ const {name} = ({kind}*){buffer};")
+        ctype, name = pointer.split("* __restrict__ ")
+        definitions.append(f"  {ctype}* __restrict__ const {name} = ({ctype}*){buffer};")
     pointer_definitions, memory, free_line = "\n".join(definitions), "", ""
     if stores_states:  # the number of steps, which XLA passes before the inputs, is followed by the interval
         memory = """

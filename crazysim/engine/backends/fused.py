@@ -1,4 +1,4 @@
-"""Fused: one kernel for all steps, in which a drone's numbers stay in registers.
+"""Backend with one kernel for all steps, in which the numbers of a drone stay in registers.
 
 A call of a kernel is a JAX primitive, which JAX lowers to the kernel of its platform.
 """
@@ -33,7 +33,7 @@ from crazysim.pytree import replace_leaves
 
 
 class Kernels:
-    """Kernels of one program: one for its planned platform, and one for each other platform that JAX compiles it for.
+    """Kernels of a program: for the platform that it is planned for, and for others that JAX compiles it for.
 
     The other kernels are compiled when they are first needed.
     """
@@ -64,7 +64,7 @@ class Kernels:
     def _compile(self, location: Location) -> Launch:
         return compile_kernel(kernel.write(self.program, TARGETS[location.platform]), location)
 
-    def results(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
+    def result_shapes(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
         """Return the shapes and types of the kernel's outputs: leaves, and flags of drones if there is a check."""
         flags = (
             [jax.ShapeDtypeStruct((n_worlds, self.program.n_drones), np.bool_)] if self.program.check_segment else []
@@ -72,18 +72,18 @@ class Kernels:
         return [*(lanes.leaf_shape(self.program, i, n_worlds) for i in self.outputs), *flags]
 
 
-def _results(*args: Any, kernels: Kernels, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
+def _result_shapes(*args: Any, kernels: Kernels, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
     del args
-    return kernels.results(n_worlds)
+    return kernels.result_shapes(n_worlds)
 
 
 def _launch(platform: str, count: Array, *inputs: Array, kernels: Kernels, n_worlds: int) -> list[Array]:
     launch = kernels.get_launch(platform)
-    return launch(n_worlds * kernels.program.n_drones, count, inputs, kernels.results(n_worlds))
+    return launch(n_worlds * kernels.program.n_drones, count, inputs, kernels.result_shapes(n_worlds))
 
 
 launch_p = jaxcompat.primitive_by_platform(
-    "crazysim_kernel", _results, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
+    "crazysim_kernel", _result_shapes, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
 )
 """Call of a kernel: from the number of steps and its inputs to its outputs."""
 
@@ -165,10 +165,14 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
 
     def batching_rule(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
         leaves_batched, count_batched = in_batched
-        is_own = [leaf.scope in ("drone", "world") for leaf in program.leaves]
+        with_world_axis = [leaf.scope in ("drone", "world") for leaf in program.leaves]
         out_batched = ([True] * len(program.written_leaves), True)
-        if count_batched or not program.fused or any(b and not o for b, o in zip(leaves_batched, is_own, strict=True)):
-            # Shared parameters that differ between batches: one batch after the other.
+        if (
+            count_batched
+            or not program.fused
+            or any(b and not o for b, o in zip(leaves_batched, with_world_axis, strict=True))
+        ):
+            # Shared parameters differ between the batches, so the kernel runs one batch after the other.
             broadcast_leaves = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
                     for x, b in zip(leaves, leaves_batched, strict=True)]  # fmt: skip
             counts = count if count_batched else jnp.broadcast_to(count, (size,))
@@ -186,7 +190,7 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
         rows = [i in program.rows for i in range(len(leaves))]
         merged = [
             join_batches(x, b, in_rows) if o and x is not None else x
-            for x, b, o, in_rows in zip(leaves, leaves_batched, is_own, rows, strict=True)
+            for x, b, o, in_rows in zip(leaves, leaves_batched, with_world_axis, rows, strict=True)
         ]
         written, flagged = run(merged, count)
         return (
@@ -239,7 +243,7 @@ def _run_parts(program: Program, location: Location) -> CountedRun:
 
     def run_phase(phase: Phase, leaves: list[Any], count: Array) -> list[Any]:
         for part, run in runs_by_phase[phase]:
-            results, _ = lanes.steps(part, leaves, 1) if run is None else run(leaves, count)
+            results, _ = lanes.run_steps(part, leaves, 1) if run is None else run(leaves, count)
             leaves = replace_leaves(leaves, part.written_leaves, results)
         return leaves
 
@@ -269,7 +273,7 @@ def _call_kernel(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[lis
     """Return the outputs of a kernel: leaves, and the worlds that are flagged."""
     program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, leaves)
-    inputs = [_key_numbers(leaves[i]) for i in kernels.inputs]
+    inputs = [_as_numbers(leaves[i]) for i in kernels.inputs]
     results = launch_p.bind(count.reshape(1), *inputs, kernels=kernels, n_worlds=n_worlds)
     written = [
         jax.random.wrap_key_data(x) if jaxcompat.is_key(program.leaves[i]) else x
@@ -280,6 +284,6 @@ def _call_kernel(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[lis
     return written, results[-1] if n_drones == 1 else jnp.any(results[-1], axis=1, keepdims=True)
 
 
-def _key_numbers(x: Any) -> Array:
-    """Return an array of numbers; random keys as their 32-bit integers."""
+def _as_numbers(x: Any) -> Array:
+    """Return an array unchanged, or an array of random keys as their 32-bit integers."""
     return jax.random.key_data(x) if jaxcompat.is_key(x) else x

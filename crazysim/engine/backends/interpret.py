@@ -1,4 +1,4 @@
-"""An interpreter: programs in NumPy, one operation after the other, with nothing compiled.
+"""An interpreter that runs programs in NumPy, one operation after the other, without compiling anything.
 
 It defines what the operations of ``ops.TABLE`` mean, and it is slow. Passes, rules and other engines are tested against
 it, and ``Sim(engine="interpret")`` steps with it.
@@ -38,7 +38,7 @@ FLUSH_BITS = 0x8040
 """Bits that flush subnormal results and operands to zero: Intel 64 manual, volume 1, section 10.2.3."""
 
 
-def run(
+def run_block(
     block: Block, inputs: Sequence[Any], shape: tuple[int, ...], observe: Observer | None = None
 ) -> list[np.ndarray]:
     """Return the outputs of a block.
@@ -47,7 +47,7 @@ def run(
         block: The block.
         inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
         shape: Shape of the lanes.
-        observe: Called with every operation and its results.
+        observe: Function that is called with every operation and its results; None for none.
 
     Returns:
         Its outputs, of the lanes' shape.
@@ -80,11 +80,11 @@ class _Call(NamedTuple):
     """Indices of the results."""
     dtype: np.dtype
     """Type of the first result."""
-    blocks: list[_Prepared]
+    blocks: list[_PreparedBlock]
     """Blocks that it runs."""
 
 
-class _Prepared(NamedTuple):
+class _PreparedBlock(NamedTuple):
     """A block whose values have indices in a list, with the function of each operation."""
 
     inputs: list[int]
@@ -102,7 +102,7 @@ class _Prepared(NamedTuple):
                 arrays of the lanes' shape, scalars or tables.
             inputs: Its inputs.
             shape: Shape of the lanes.
-            observe: Called with every operation and its results.
+            observe: Function that is called with every operation and its results; None for none.
         """
         for i, x in zip(self.inputs, inputs, strict=True):
             values[i] = x
@@ -122,11 +122,11 @@ class _Prepared(NamedTuple):
 _Run = Callable[[Sequence[Any]], list[Any]]
 """Function that runs a block: from its inputs to its outputs."""
 
-_PREPARED_BLOCKS: WeakKeyDictionary[Block, tuple[_Prepared, list[Any]]] = WeakKeyDictionary()
+_PREPARED_BLOCKS: WeakKeyDictionary[Block, tuple[_PreparedBlock, list[Any]]] = WeakKeyDictionary()
 """Prepared blocks of earlier runs. The list has the constants at their indices, and None for all other values."""
 
 
-def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _Prepared:
+def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _PreparedBlock:
     """Prepare a block, and add its values to ``indices`` and its constants to ``constants``."""
 
     def get_index(x: Any) -> int:
@@ -146,7 +146,7 @@ def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _Pr
         results = [get_index(x) for x in op.results]
         dtype = op.dtype if op.results else np.dtype(bool)
         calls.append(_Call(op, _numpy_function(op), args, results, dtype, blocks))
-    return _Prepared(inputs, calls, [get_index(x) for x in block.outputs])
+    return _PreparedBlock(inputs, calls, [get_index(x) for x in block.outputs])
 
 
 def _numpy_function(op: Operation) -> Callable[..., Any] | None:
@@ -221,7 +221,7 @@ def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], 
 
 
 THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
-"""Bits that a round rotates by: J. K. Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC 2011, table 2."""
+"""Bits of each rotation: J. K. Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC 2011, table 2."""
 
 
 def threefry2x32(k0: np.ndarray, k1: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -237,23 +237,23 @@ def threefry2x32(k0: np.ndarray, k1: np.ndarray, x0: np.ndarray, x1: np.ndarray)
     return x0, x1
 
 
-def call(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Array]:
-    """Run a block as ``run`` does, inside a function that JAX traces or compiles; it has no derivative."""
+def run_block_in_callback(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Array]:
+    """Run a block as ``run_block`` does, inside a function that JAX traces or compiles; it has no derivative."""
     results = [jax.ShapeDtypeStruct(shape, x.dtype) for x in block.outputs]
 
     def run_arrays(*inputs: Any) -> list[np.ndarray]:
-        return [np.array(x) for x in run(block, [np.asarray(x) for x in inputs], shape)]
+        return [np.array(x) for x in run_block(block, [np.asarray(x) for x in inputs], shape)]
 
     return list(jax.pure_callback(run_arrays, results, *inputs, vmap_method="sequential"))
 
 
 def build(program: Program, location: Location) -> Run:
     """Return the function that runs a program in NumPy."""
-    return functools.partial(steps, program, on_cpu=location.platform == "cpu")
+    return functools.partial(run_steps, program, on_cpu=location.platform == "cpu")
 
 
-def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: bool = True) -> tuple[list[Any], Any]:
-    """Run steps as ``lanes.steps`` does, but in NumPy: immediately, or in a callback if arguments are traced.
+def run_steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: bool = True) -> tuple[list[Any], Any]:
+    """Run steps as ``lanes.run_steps`` does, but in NumPy: immediately, or in a callback if arguments are traced.
 
     If the program has unfused stages, only its blocks are interpreted, and the rest runs in XLA.
 
@@ -264,7 +264,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
         on_cpu: True to treat subnormal numbers as zero, as XLA does on a CPU but not on a GPU.
     """
     if not program.fused:
-        return lanes.steps(program, leaves, n_steps, call)
+        return lanes.run_steps(program, leaves, n_steps, run_block_in_callback)
     n_worlds, _ = lanes.batch_counts(program, leaves)
     array_leaves = [i for i, x in enumerate(leaves) if x is not None]
     written = [lanes.leaf_shape(program, i, n_worlds) for i in program.written_leaves]
@@ -273,7 +273,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
     def run_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
         arrays = replace_leaves([None] * len(leaves), array_leaves, [np.asarray(x) for x in values])
         with flush_subnormals() if on_cpu else contextlib.nullcontext():
-            return _steps(program, arrays, int(n_steps))
+            return _run_steps(program, arrays, int(n_steps))
 
     values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in array_leaves]
     if any(isinstance(x, jax.core.Tracer) for x in (n_steps, *values)):
@@ -287,19 +287,19 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
     ], flags
 
 
-def _steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.ndarray], Any]:
-    values = lanes.LeafValues(program, leaves, run, np)
-    constants = lanes.prepare(program, values)
+def _run_steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.ndarray], Any]:
+    values = lanes.LeafValues(program, leaves, run_block, np)
+    constants = lanes.prepare_steps(program, values)
     for _ in range(n_steps):
-        lanes.run(program, values, "each", constants)
+        lanes.run_phase(program, values, "each", constants)
     flagged = lanes.nonfinite_worlds(program, values)
-    lanes.run(program, values, "after", {})
+    lanes.run_phase(program, values, "after", {})
     return [np.ascontiguousarray(values.array(i)) for i in program.written_leaves], flagged
 
 
 @contextlib.contextmanager
 def flush_subnormals() -> Iterator[None]:
-    """Treat subnormal numbers as zero in this thread; only on x86-64 Linux."""
+    """Treat subnormal numbers as zero in this thread inside a ``with`` block, on x86-64 Linux; elsewhere do nothing."""
     library = _c_library()
     if library is None:
         yield

@@ -35,22 +35,22 @@ def write(program: Program, target: str) -> Kernel:
     body.write_stores()
 
     inputs, outputs, rank = needed_leaves(program), tuple(program.written_leaves), program.ranks
-    pointers = [f"const {_type(program, i)}* __restrict__ p{rank[i]}" for i in inputs]
-    pointers += [f"{_type(program, i)}* __restrict__ q{rank[i]}" for i in outputs]
+    pointers = [f"const {_type_name(program, i)}* __restrict__ p{rank[i]}" for i in inputs]
+    pointers += [f"{_type_name(program, i)}* __restrict__ q{rank[i]}" for i in outputs]
     pointers += ["b1* __restrict__ flagged"] if program.check_segment is not None else []
     in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
-    return body.kernel(pointers, inputs, outputs, in_place, [s.block for s in body.step_segments])
+    return body.finish_kernel(pointers, inputs, outputs, in_place, [s.block for s in body.step_segments])
 
 
 class Body:
-    """The code of a kernel between its braces: loads and the stages before the steps, the loop, checks and stores."""
+    """The code of a kernel between its braces: loads, stages before the steps, the loop, checks and stores."""
 
     def __init__(self, program: Program, target: str):
         self.program, self.target = program, target
         self.exchange = make_exchange(target, program.group_size)
         self.writer = Writer(self.exchange)
         self.step_segments = [s for s in program.fused_segments if s.phase == "each"]
-        self.stored = _written_slots(program)
+        self.stored_slots = _written_slots(program)
         self._depth = 1 + self.exchange.depth
         self.names: dict[Slot, str] = {}
         """Expression of each number."""
@@ -59,14 +59,14 @@ class Body:
         self._n_shared = 0
 
     def write_loads(self, registers: int | None = None) -> list[list[str]]:
-        """Write loads and the stages before the steps; return the hoisted values of each segment of the loop.
+        """Write loads and the stages before the steps, and return the names of hoisted values by segment of the loop.
 
         Args:
-            registers: Registers of a lane. If the kernel uses more numbers, it reads the numbers that all lanes share
-                where they are used. None for no limit.
+            registers: Number of registers of a lane. If the kernel uses more numbers, it reads the numbers that all
+                lanes share at the place of their use. None for no limit.
         """
         program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
-        written, slots = self._slots()
+        written, slots = self._collect_slots()
         is_read_at_use = registers is not None and len(slots) > registers
         loaded, rank = _loaded_slots(program), program.ranks
         deferred = set() if exchange.depth else _deferred_slots(program)
@@ -75,30 +75,32 @@ class Body:
         for slot in shared:
             if slot[1] == TABLE_INDEX:
                 names[slot] = f"p{rank[slot[0]]}"
-            elif slot in self.stored or not (is_read_at_use or slot in deferred):
-                writer.write_line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
+            elif slot in self.stored_slots or not (is_read_at_use or slot in deferred):
+                writer.write_line(f"const auto {names[slot]} = {_load_expression(program, slot)};", 1)
             else:
-                names[slot] = f"SHARED(p{rank[slot[0]]}, {slot[1]})" if is_read_at_use else _load(program, slot)
+                names[slot] = (
+                    f"SHARED(p{rank[slot[0]]}, {slot[1]})" if is_read_at_use else _load_expression(program, slot)
+                )
         self._n_shared = len(writer.lines)
         exchange.open_loop(writer, 1)
         lane_slots = [slot for slot in slots if slot not in shared and (slot not in written or slot in loaded)]
         for i in dict.fromkeys(i for i, _ in lane_slots if i not in program.rows):
             size, drones = program.leaves[i].size, _n_sharing_lanes(program, i)
-            writer.write_line(rows_line(f"p{rank[i]}", _type(program, i), size, drones), self._depth)
+            writer.write_line(rows_line(f"p{rank[i]}", _type_name(program, i), size, drones), self._depth)
         for slot in slots:
-            kind, access = _type(program, slot[0]), _load(program, slot)
+            ctype, load = _type_name(program, slot[0]), _load_expression(program, slot)
             if slot in shared:
                 continue
             if slot in written:
-                initial = access if slot in loaded else f"{kind}(0)"
-                self.initial_values[slot] = f"{kind}_lanes({initial})"
+                initial = load if slot in loaded else f"{ctype}(0)"
+                self.initial_values[slot] = f"{ctype}_lanes({initial})"
                 names[slot] = exchange.define_variable(
-                    writer, names[slot], kind, self.initial_values[slot], self._depth
+                    writer, names[slot], ctype, self.initial_values[slot], self._depth
                 )
-            elif slot not in self.stored and slot in deferred:
-                names[slot] = access
+            elif slot not in self.stored_slots and slot in deferred:
+                names[slot] = load
             else:
-                names[slot] = exchange.define_constant(writer, names[slot], kind, access, self._depth)
+                names[slot] = exchange.define_constant(writer, names[slot], ctype, load, self._depth)
         self._write_phase("before")
         hoisted = [self._write_hoisted(segment) for segment in self.step_segments]
         exchange.close_loop(writer, 1)
@@ -122,16 +124,16 @@ class Body:
             write_results(writer, "flagged", "b1", 1, [flagged], self._depth)
         self._write_phase("after")
         for leaf in program.written_leaves:
-            kind, pointer = _type(program, leaf), f"q{program.ranks[leaf]}"
+            ctype, pointer = _type_name(program, leaf), f"q{program.ranks[leaf]}"
             values = [self.names[leaf, k] for k in range(program.leaves[leaf].size)]
             if leaf in program.rows:
                 for k, x in enumerate(values):
-                    writer.write_line(f"STORE_ROW({pointer}, {k}, {kind}_lanes({x}))", self._depth)
+                    writer.write_line(f"STORE_ROW({pointer}, {k}, {ctype}_lanes({x}))", self._depth)
             else:
-                write_results(writer, pointer, kind, _n_sharing_lanes(program, leaf), values, self._depth)
+                write_results(writer, pointer, ctype, _n_sharing_lanes(program, leaf), values, self._depth)
         self.exchange.close_loop(writer, 1)
 
-    def kernel(
+    def finish_kernel(
         self,
         pointers: Sequence[str],
         inputs: tuple[int, ...],
@@ -157,22 +159,22 @@ class Body:
             in_memory=self.exchange.depth > 0, n_stored=n_stored,
         )  # fmt: skip
 
-    def _slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
+    def _collect_slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
         """Return the numbers that the stages write, and all that the kernel uses."""
         program, segments = self.program, self.program.fused_segments
         written = dict.fromkeys(slot for s in segments for slot in program.drone_slots(s, s.writes))
         read = dict.fromkeys(slot for s in segments for slot in [*program.drone_slots(s, s.reads), *s.hoisted_reads])
         checked = program.check_segment.reads if program.check_segment else ()
-        return written, dict.fromkeys([*read, *written, *checked, *self.stored])
+        return written, dict.fromkeys([*read, *written, *checked, *self.stored_slots])
 
     def _write_hoisted(self, segment: Segment) -> list[str]:
         """Write the hoisted block of a segment, and return the names of the results."""
         writer, define_constant = self.writer, self.exchange.define_constant
         outs = writer.write_block(segment.hoisted, [self.names[slot] for slot in segment.hoisted_reads], self._depth)
-        kinds = [type_name(x.dtype) for x in segment.hoisted.outputs]
+        ctypes = [type_name(x.dtype) for x in segment.hoisted.outputs]
         return [
-            define_constant(writer, writer.new_name("h"), kind, x, self._depth)
-            for kind, x in zip(kinds, outs, strict=True)
+            define_constant(writer, writer.new_name("h"), ctype, x, self._depth)
+            for ctype, x in zip(ctypes, outs, strict=True)
         ]
 
     def _write_phase(self, phase: Phase) -> None:
@@ -233,10 +235,10 @@ def _loaded_slots(program: Program) -> set[Slot]:
 def write_segment(
     writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str], depth: int
 ) -> None:
-    """Write a segment, which assigns to the variables of the numbers it writes.
+    """Write a segment, which assigns to the variables of the numbers that it writes.
 
     Args:
-        writer: Takes the lines.
+        writer: Writer that the lines are added to.
         program: The program.
         segment: The segment.
         names: Expression of each number.
@@ -259,16 +261,16 @@ def write_segment(
     for (leaf, number), slot, new_name in zip(
         segment.writes, program.drone_slots(segment, segment.writes), new_names, strict=True
     ):
-        kind, name = _type(program, leaf), names[slot]
+        ctype, name = _type_name(program, leaf), names[slot]
         if segment.scope == "world" and program.leaves[leaf].scope == "drone":  # every lane computes all of them
             is_own_drone = f"eq_(own, i32({number // program.leaves[leaf].size}))"
-            writer.write_line(f"{name} = select_n_({is_own_drone}, {name}, {kind}_lanes({new_name}));", depth)
+            writer.write_line(f"{name} = select_n_({is_own_drone}, {name}, {ctype}_lanes({new_name}));", depth)
         else:
-            writer.write_line(f"{name} = {kind}_lanes({new_name});", depth)
+            writer.write_line(f"{name} = {ctype}_lanes({new_name});", depth)
 
 
 def _deferred_slots(program: Program) -> set[Slot]:
-    """Return the numbers that only stages below the step rate use, or only the check after the loop.
+    """Return the numbers that only stages slower than the step use, or only the check after the loop.
 
     Unless a stage writes them, they are loaded where they are used, and take no register in between.
     """
@@ -278,7 +280,7 @@ def _deferred_slots(program: Program) -> set[Slot]:
         block = segment.block
         used_at_each_step = {x for op in block.operations for x in op.args} | set(block.outputs)
         used_at_each_step = used_at_each_step.union(
-            *(x.uses() for op in block.operations if op.name == "over_others" for x in op.blocks)
+            *(x.used_values() for op in block.operations if op.name == "over_others" for x in op.blocks)
         )
         slots_of_each_step.update(segment.hoisted_reads)
         for x, slot in zip(block.inputs, program.drone_slots(segment, segment.reads), strict=False):
@@ -287,11 +289,11 @@ def _deferred_slots(program: Program) -> set[Slot]:
     return (slots_of_ticks ^ slots_of_check) - slots_of_each_step
 
 
-def _type(program: Program, leaf: int) -> str:
+def _type_name(program: Program, leaf: int) -> str:
     return type_name(program.leaves[leaf].number_type)
 
 
-def _load(program: Program, slot: Slot) -> str:
+def _load_expression(program: Program, slot: Slot) -> str:
     (leaf, k), rank = slot, program.ranks[slot[0]]
     if program.leaves[leaf].scope not in ("drone", "world"):
         return f"p{rank}[{k}]"
@@ -300,34 +302,34 @@ def _load(program: Program, slot: Slot) -> str:
     return f"LOAD({program.leaves[leaf].size}, {_n_sharing_lanes(program, leaf)}, p{rank}, {k})"
 
 
-def rows_line(pointer: str, kind: str, size: int, drones: int = 1) -> str:
+def rows_line(pointer: str, ctype: str, size: int, n_sharing: int = 1) -> str:
     """Return the line that finds the rows of an input, one for each lane; it comes before the loads.
 
     Args:
         pointer: The input.
-        kind: Type of its numbers.
+        ctype: Type of its numbers.
         size: Numbers of a row.
-        drones: Number of lanes that share a row.
+        n_sharing: Number of lanes that share a row.
     """
-    return f"ROWS({kind}, {size}, {drones}, {pointer})"
+    return f"ROWS({ctype}, {size}, {n_sharing}, {pointer})"
 
 
-def write_results(writer: Writer, pointer: str, kind: str, drones: int, values: Sequence[str], depth: int) -> None:
+def write_results(writer: Writer, pointer: str, ctype: str, n_sharing: int, values: Sequence[str], depth: int) -> None:
     """Write the stores of all numbers of an output.
 
     Args:
-        writer: Takes the lines.
+        writer: Writer that the lines are added to.
         pointer: The output.
-        kind: Type of its numbers.
-        drones: Number of lanes that share the same numbers.
+        ctype: Type of its numbers.
+        n_sharing: Number of lanes that share the same numbers.
         values: Expressions of the numbers of a lane.
         depth: Depth of the lines.
     """
     size = len(values)
-    writer.write_line(f"RESULT({kind}, {size}, {pointer})", depth)
+    writer.write_line(f"RESULT({ctype}, {size}, {pointer})", depth)
     for k, x in enumerate(values):
-        writer.write_line(f"STORE({size}, {drones}, {pointer}, {k}, {kind}_lanes({x}))", depth)
-    writer.write_line(f"PUT({size}, {drones}, {pointer})", depth)
+        writer.write_line(f"STORE({size}, {n_sharing}, {pointer}, {k}, {ctype}_lanes({x}))", depth)
+    writer.write_line(f"PUT({size}, {n_sharing}, {pointer})", depth)
 
 
 def _n_sharing_lanes(program: Program, leaf: int) -> int:

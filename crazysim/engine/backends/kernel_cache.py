@@ -1,4 +1,4 @@
-"""Files of compiled kernels, safe to share between the processes and machines of one user.
+"""Files of compiled kernels, which processes and machines of one user can safely share.
 
 The name of a file consists of its key, a hash of everything that the code depends on, and the hash of its contents. A
 truncated or damaged file does not match its name and is not used. Two processes may write the same kernel at the same
@@ -108,10 +108,10 @@ def process_name() -> str:
 def _machine() -> str:
     """Return a short name of this machine and its namespace of process IDs, such as a container."""
     try:
-        numbering = os.readlink("/proc/self/ns/pid")
+        pid_namespace = os.readlink("/proc/self/ns/pid")
     except OSError:
-        numbering = ""
-    return digest(platform.node(), numbering)[:8]
+        pid_namespace = ""
+    return digest(platform.node(), pid_namespace)[:8]
 
 
 def sweep(cache_folder: Path, pattern: str) -> None:

@@ -36,7 +36,7 @@ class LeafValues:
     A form that is missing is made from the other one when it is read, and removed when the other one is written.
     """
 
-    def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run, library: Any = jnp):
+    def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run_block, library: Any = jnp):
         """Store leaves as arrays.
 
         Args:
@@ -138,9 +138,9 @@ Constants = dict[int, Sequence[Any]]
 """Results of hoisted blocks, by the index of their segment among the segments of the phase ``each``."""
 
 
-def prepare(program: Program, values: LeafValues) -> Constants:
+def prepare_steps(program: Program, values: LeafValues) -> Constants:
     """Run the segments before the first step, then the hoisted blocks, and return the results of these blocks."""
-    run(program, values, "before", {})
+    run_phase(program, values, "before", {})
     return {
         k: values.execute(s.hoisted, [values.get(slot) for slot in s.hoisted_reads], values.shape)
         for k, s in enumerate(program.phase_segments("each"))
@@ -148,7 +148,7 @@ def prepare(program: Program, values: LeafValues) -> Constants:
     }
 
 
-def run(program: Program, values: LeafValues, phase: Phase, constants: Constants) -> None:
+def run_phase(program: Program, values: LeafValues, phase: Phase, constants: Constants) -> None:
     """Run the segments of a phase."""
     for k, segment in enumerate(program.phase_segments(phase)):
         if isinstance(segment, UnfusedStage):
@@ -204,11 +204,11 @@ def _run_unfused(stage: UnfusedStage, values: LeafValues) -> None:
 
 def build(program: Program, location: Location) -> Run:
     """Return the function that runs a program in XLA."""
-    return functools.partial(steps, add_barriers(program) if location.platform == "cpu" else program)
+    return functools.partial(run_steps, add_barriers(program) if location.platform == "cpu" else program)
 
 
-def steps(
-    program: Program, leaves: list[Any], n_steps: int | Array, execute: Execute = xla.run
+def run_steps(
+    program: Program, leaves: list[Any], n_steps: int | Array, execute: Execute = xla.run_block
 ) -> tuple[list[Any], Array]:
     """Return the written leaves after some steps, and True for worlds that are flagged as not finite. (n_worlds, 1)
 
@@ -221,7 +221,7 @@ def steps(
         execute: Function that runs blocks.
     """
     initial_values = LeafValues(program, leaves, execute)
-    constants = prepare(program, initial_values)
+    constants = prepare_steps(program, initial_values)
     segments = program.phase_segments("each")
     carried_leaves = sorted({i for s in segments if isinstance(s, UnfusedStage) for i in s.written_leaves})
     fused = [s for s in segments if isinstance(s, Segment)]
@@ -230,7 +230,7 @@ def steps(
 
     def advance(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
         values = unpack_carry(carry)
-        run(program, values, "each", constants)
+        run_phase(program, values, "each", constants)
         return [values.get(slot) for slot in carried_slots], [values.array(leaf) for leaf in carried_leaves]
 
     def unpack_carry(carry: tuple[list[Any], list[Any]]) -> LeafValues:
@@ -252,15 +252,15 @@ def steps(
         carry = jax.lax.fori_loop(0, n_steps, lambda _, c: advance(c), carry)
     final_values = unpack_carry(carry)
     flagged = nonfinite_worlds(program, final_values)
-    run(program, final_values, "after", {})
+    run_phase(program, final_values, "after", {})
     return [final_values.array(i) for i in program.written_leaves], flagged
 
 
 def repeat(iterate: Callable[[Any], Any], carry: Any, n: int) -> Any:
     """Return a carry after ``n`` iterations, computed so that its gradient needs little memory.
 
-    Only the carry before each iteration is stored. The backward pass recomputes the rest, which costs less than
-    fetching it from memory. From ``MIN_CHECKPOINTED_STEPS`` iterations on, only every k-th carry is stored, where k is
+    Only the carry before each iteration is stored. The backward pass recomputes all other values, which is faster than
+    reading them from memory. From ``MIN_CHECKPOINTED_STEPS`` iterations on, only every k-th carry is stored, where k is
     the square root of n. The memory of a gradient then grows with that root, at the price of one more forward pass.
     """
     iterate = jax.checkpoint(iterate, prevent_cse=False)  # within a scan it is not needed

@@ -35,8 +35,9 @@ from crazysim.startup import __version__
 
 COMPILER_FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math",
                   "-fwrapv", "-shared", "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
-"""Options of the compiler, before the options of the variable CXXFLAGS. Products and sums may be contracted; no option
-assumes that there is no NaN. Integers wrap, as in XLA; NVRTC has no such option, so sources add them as unsigned."""
+"""Options of the compiler; the options of the variable CXXFLAGS follow them. Products and sums may be contracted, and
+no option assumes that there is no NaN. Integers wrap around, as in XLA; NVRTC has no option for it, so sources add
+integers as unsigned ones."""
 
 ZIG_ARGUMENTS = ("cc", "-nostdlib", "-lc", "-lm", "-g0")
 """Arguments that make zig a compiler of kernels. As ``c++``, or without ``-nostdlib``, it would first compile libraries
@@ -56,7 +57,7 @@ Measured with g++ 12 on one core: 20,000 lines of matrix products take 5 s, of m
 SELECTING_LINE = re.compile(r"^.*\b(?:select_n_|max_|min_|clamp_|at_least|at_most)\(.*$", re.MULTILINE)
 """Lines of a kernel that select between numbers."""
 SELECTING_LINE_WEIGHT = 2.4
-"""Lines that a selecting line counts for: by the same measurements 10,000 lines of conditions take 5.9 s."""
+"""Weight of a selecting line, in lines: in the same measurements 10,000 lines of conditions take 5.9 s."""
 
 TEMPORARY_FOLDER_VARIABLES = ("TMPDIR", "ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
 """Variables that name the folder of a compiler's temporary files."""
@@ -181,7 +182,7 @@ def register_kernel(kernel: Kernel) -> str:
     key = kernel_cache.digest(*words, toolchain(tuple(words)), kernel.text)
     name = f"crazysim_advance_{key}"
     if name not in _LIBRARIES:
-        library = _library(words, key, kernel.text)
+        library = _get_library(words, key, kernel.text)
         with _LIBRARIES_LOCK:
             if name not in _LIBRARIES:
                 jaxcompat.register_target(name, library.crazysim_advance, "cpu")
@@ -209,7 +210,7 @@ def toolchain(words: tuple[str, ...]) -> str:
     return "\n".join([steps.stdout, steps.stderr, cpu_features(), libc, jaxcompat.versions(), __version__])
 
 
-def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
+def _get_library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
     """Return a kernel's library: from the cache, or compiled."""
     cache_folder = kernel_cache.folder()
     for path in kernel_cache.find(cache_folder, key):
@@ -312,7 +313,7 @@ _COMPILER_PIPES: set[IO[str]] = set()
 def _run_compiler(
     words: Sequence[str], work: Path, seconds: float, cwd: str | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run the compiler; it is killed with all its children when its time is over or this process ends.
+    """Run the compiler. It is killed with all its children when its time is up or this process ends.
 
     Args:
         words: Command of the compiler.

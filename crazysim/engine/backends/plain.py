@@ -1,4 +1,4 @@
-"""The reference: a pipeline as batched XLA, jitted and scanned."""
+"""The reference backend: a pipeline on all worlds at once in XLA, compiled and looped by JAX."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from crazysim.pytree import leaf_flags, replace_leaves
 def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
     """Return a function that runs the stages and the loop over steps on leaves, and the leaves that it writes.
 
-    The loop carries only the leaves that a stage of the steps writes. All others, mainly parameters, are constants.
+    The loop carries only the leaves that a stage of the phase ``each`` writes. All others, mainly parameters, are
+    constants.
 
     Args:
         stages: The stages.

@@ -1,4 +1,4 @@
-"""Reverse mode of many steps in one kernel: from cotangents of the leaves after the steps to cotangents before them.
+"""Reverse mode of many steps in one kernel, which turns cotangents after the steps into cotangents before them.
 
 The kernel recomputes the steps, stores the state before each step, and goes back from the last step to the first. If
 there are more steps than ``interval``, it first stores only the state before each interval, and recomputes the steps of
@@ -21,7 +21,7 @@ from crazysim.engine.backends.source import type_name
 from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Builder, Value, constant, inline
 from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
-from crazysim.engine.lowering.activity import changed_slots, remove_check
+from crazysim.engine.lowering.activity import changed_slots, prepare_derivative
 from crazysim.engine.lowering.transpose import transpose_block
 
 
@@ -42,11 +42,11 @@ class ReverseProgram:
     carry: tuple[Slot, ...]
     """State of the loop over the steps: numbers that a step uses and that steps change."""
     restored: frozenset[Slot]
-    """Members of ``carry`` that the backward pass through a step needs."""
+    """Slots of ``carry`` whose numbers the backward pass through a step needs."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Leaves with given cotangents: the floats that the program writes."""
+        """Leaves whose cotangents are inputs: the floats that the program writes."""
         return tuple(i for i in self.program.written_leaves if self.program.leaves[i].number_type.kind == "f")
 
     def slots(self) -> list[Slot]:
@@ -69,7 +69,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     Raises:
         UnsupportedError: If a part of it has no derivative in a kernel.
     """
-    program, perturbed = remove_check(program, perturbed)
+    program, perturbed = prepare_derivative(program, perturbed)
     n = len(program.leaves)
     cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number_type) for x in program.leaves]
     step_segments = [s for s in program.fused_segments if s.phase == "each"]
@@ -109,7 +109,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
 
 def _used_slots(program: Program, s: Segment) -> list[Slot]:
     """Return the slots of the inputs that a segment uses."""
-    used, slots = s.block.uses(), program.drone_slots(s, s.reads)
+    used, slots = s.block.used_values(), program.drone_slots(s, s.reads)
     return [slot for x, slot in zip(s.block.inputs, slots, strict=False) if x in used]
 
 
@@ -227,14 +227,14 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         raise LimitError(
             f"gradients of worlds of more than {MAX_DRONES_IN_VECTOR} drones that act on each other have no kernel"
         )
-    checked = dataclasses.replace(program, segments=(*program.segments, *reverse.backward_segments.values()))
-    kernel.require_source(checked)
+    program_to_check = dataclasses.replace(program, segments=(*program.segments, *reverse.backward_segments.values()))
+    kernel.require_source(program_to_check)
     body = Body(program, target)
     writer, rank = body.writer, program.ranks
     constants = body.write_loads()
     names = body.names
 
-    def kind(slot: Slot) -> str:
+    def slot_type(slot: Slot) -> str:
         if slot[0] >= 2 * n:
             s = [s for s in program.fused_segments if s.phase == "each"][slot[0] - 2 * n]
             return type_name(s.hoisted.outputs[slot[1]].dtype)
@@ -245,12 +245,12 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
             kernel.rows_line(f"s{rank[i]}", type_name(program.leaves[i].number_type), program.leaves[i].size), 1
         )
     for i, k in reverse.slots():
-        primal = i - n
-        name = f"g{i - 2 * n}_{k}" if i >= 2 * n else f"c{rank[primal]}_{k}"
-        seed = f"{kind((i, k))}(0)"
-        if i < 2 * n and primal in reverse.seeds:
-            seed = f"LOAD({program.leaves[primal].size}, 1, s{rank[primal]}, {k})"
-        writer.write_line(f"auto {name} = {kind((i, k))}_lanes({seed});", 1)
+        primal_leaf = i - n
+        name = f"g{i - 2 * n}_{k}" if i >= 2 * n else f"c{rank[primal_leaf]}_{k}"
+        seed = f"{slot_type((i, k))}(0)"
+        if i < 2 * n and primal_leaf in reverse.seeds:
+            seed = f"LOAD({program.leaves[primal_leaf].size}, 1, s{rank[primal_leaf]}, {k})"
+        writer.write_line(f"auto {name} = {slot_type((i, k))}_lanes({seed});", 1)
         names[i, k] = name
 
     carry = reverse.carry
@@ -317,7 +317,7 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         *(s.block for s in step_segments for _ in range(2)),
         *(reverse.backward_segments[s].block for s in step_segments),
     ]
-    return body.kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carry))
+    return body.finish_kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carry))
 
 
 def _write_backward(
@@ -344,8 +344,8 @@ def _write_backward(
         names_by_segment.append(dict(names))
         if s is not segments[-1]:
             for slot in dict.fromkeys(program.drone_slots(s, s.writes)):
-                name, kind = writer.new_name("a"), type_name(program.leaves[slot[0]].number_type)
-                writer.write_line(f"auto {name} = {kind}_lanes({names[slot]});", depth)
+                name, ctype = writer.new_name("a"), type_name(program.leaves[slot[0]].number_type)
+                writer.write_line(f"auto {name} = {ctype}_lanes({names[slot]});", depth)
                 names[slot] = name
             kernel.write_segment(writer, program, s, names, segment_constants, depth)
     for s, segment_constants, names_before in reversed(list(zip(segments, constants, names_by_segment, strict=True))):

@@ -43,7 +43,7 @@ INDENT = "  "
 """Indentation of one depth."""
 
 EntryGroup = tuple[Element, Element, int]
-"""Table, index, and number of a group of four neighbouring entries, which a target reads at once."""
+"""Group of four neighbouring entries that a target reads at once: the table, the index, and the number of the group."""
 
 
 class Writer(LineWriter):
@@ -80,16 +80,16 @@ class Writer(LineWriter):
     def write_block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
         """Write a block's operations, and return the names of its outputs."""
         self.names.update(zip(block.inputs, inputs, strict=True))
-        outer_names = dict(self.sin_cos_names), self.entry_groups  # variables of a block are not defined outside it
+        outer_state = dict(self.sin_cos_names), self.entry_groups  # variables of a block are not defined outside it
         self.entry_groups = dict.fromkeys(_entry_groups(block), "")
         for position, op in enumerate(block.operations):
             if op.name == "over_others":
                 self._over_others(op, depth, _live_values(block, position))
-                self.shared.clear()  # values that are kept for later code are kept for each lane
+                self.shared.clear()  # values for later code are stored for each lane
             else:
                 self._operation(op, depth)
                 self.shared.update(shared_results(op, self.shared))
-        self.sin_cos_names, self.entry_groups = outer_names
+        self.sin_cos_names, self.entry_groups = outer_state
         return [self.element(x) for x in block.outputs]
 
     def forget_intermediate_results(self) -> None:
@@ -164,8 +164,8 @@ class Writer(LineWriter):
         """Write sine and cosine together, as they share most of their work."""
         if x not in self.sin_cos_names:
             pair = self.sin_cos_names[x] = self.new_name()
-            kind = "auto" if isinstance(op.args[0], Value) else type_name(op.dtype)
-            self.write_line(f"{kind} {pair}_0 = {x}, {pair}_1 = {x};", depth)
+            ctype = "auto" if isinstance(op.args[0], Value) else type_name(op.dtype)
+            self.write_line(f"{ctype} {pair}_0 = {x}, {pair}_1 = {x};", depth)
             self.write_line(f"sin_cos({x}, {pair}_0, {pair}_1);", depth)
         self.names[op.results[0]] = f"{self.sin_cos_names[x]}_{0 if op.name == 'sin' else 1}"
 
@@ -232,7 +232,7 @@ class Writer(LineWriter):
         self.write_line("}", depth)
 
     def _shared_carry(self, op: Operation) -> list[bool]:
-        """Return which carried numbers of a loop are shared by all lanes, and mark them as such in its iterations."""
+        """Return for each number that a loop carries whether all lanes share it, and mark shared ones in its blocks."""
         shared = shared_carry(op, self.shared)
         for block in op.blocks:
             self.shared.update(x for x, is_shared_number in zip(block.inputs, shared, strict=True) if is_shared_number)
@@ -242,9 +242,9 @@ class Writer(LineWriter):
         """Write a variable with its initial number for each result of an operation that updates them."""
         name = self._name_results(op)
         for k, (x, value, is_shared_number) in enumerate(zip(op.results, initial, shared, strict=True)):
-            kind = type_name(x.dtype)
+            ctype = type_name(x.dtype)
             self.write_line(
-                f"{kind} {name}_{k} = {value};" if is_shared_number else f"auto {name}_{k} = {kind}_lanes({value});",
+                f"{ctype} {name}_{k} = {value};" if is_shared_number else f"auto {name}_{k} = {ctype}_lanes({value});",
                 depth,
             )
         return name
@@ -265,8 +265,8 @@ class Writer(LineWriter):
 def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:
     """Return the values of a block that are computed before an operation, and used in its blocks or after it."""
     earlier = [x for op in block.operations[:position] for x in op.results if not x.size]
-    used = dataclasses.replace(block, operations=block.operations[position + 1 :]).uses()
-    used = used.union(*(inner.uses() for inner in block.operations[position].blocks))
+    used = dataclasses.replace(block, operations=block.operations[position + 1 :]).used_values()
+    used = used.union(*(inner.used_values() for inner in block.operations[position].blocks))
     return [(x, type_name(x.dtype)) for x in earlier if x in used]
 
 
@@ -327,13 +327,13 @@ def _entry(x: np.generic) -> str:
 
 def literal(x: np.generic) -> str:
     """Return an expression that is exactly equal to a constant."""
-    kind = type_name(x.dtype)
-    if kind == "b1":
+    ctype = type_name(x.dtype)
+    if ctype == "b1":
         return "b1(1)" if bool(x) else "b1(0)"
-    if kind in ("f32", "f64"):
+    if ctype in ("f32", "f64"):
         if not np.isfinite(x):
-            return f"{kind}_nan()" if np.isnan(x) else f"{'-' if float(x) < 0 else ''}{kind}_infinity()"
-        return f"{kind}({float(x).hex()})"
-    if kind == "i32":
+            return f"{ctype}_nan()" if np.isnan(x) else f"{'-' if float(x) < 0 else ''}{ctype}_infinity()"
+        return f"{ctype}({float(x).hex()})"
+    if ctype == "i32":
         return f"i32({int(x)})" if int(x) != -(2**31) else "i32(-2147483647 - 1)"
     return f"u32({int(x)}u)"

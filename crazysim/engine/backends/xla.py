@@ -20,7 +20,7 @@ Env = dict[Value, Any]
 """Array of each value."""
 
 
-def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: Env | None = None) -> list[Any]:
+def run_block(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: Env | None = None) -> list[Any]:
     """Return the outputs of a block.
 
     Args:
@@ -53,7 +53,7 @@ def _last_uses(block: Block) -> dict[Value, int]:
     """Return the position of the last operation that uses each value; an output is used after the end."""
     last_uses: dict[Value, int] = {}
     for position, op in enumerate(block.operations):
-        used = {x for x in op.args if isinstance(x, Value)}.union(*(b.uses() for b in op.blocks))
+        used = {x for x in op.args if isinstance(x, Value)}.union(*(b.used_values() for b in op.blocks))
         last_uses.update(dict.fromkeys(used, position))
     last_uses.update((x, len(block.operations)) for x in block.outputs if isinstance(x, Value))
     return last_uses
@@ -89,7 +89,7 @@ def _loop(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> l
     carry = [_broadcast_to_lanes(x, shape) for x in args]
 
     def iterate(carry: list[Any], _: Any) -> tuple[list[Any], None]:
-        return [_broadcast_to_lanes(x, shape) for x in run(body, carry, shape, env)], None
+        return [_broadcast_to_lanes(x, shape) for x in run_block(body, carry, shape, env)], None
 
     return lax.scan(iterate, carry, length=op.param("length"))[0]
 
@@ -99,11 +99,11 @@ def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> 
     test, body = op.blocks
 
     def is_continuing(carry: list[Any]) -> Array:
-        return _broadcast_to_lanes(run(test, carry, shape, env)[0], shape)
+        return _broadcast_to_lanes(run_block(test, carry, shape, env)[0], shape)
 
     def iterate(carry: list[Any]) -> list[Any]:
         mask = is_continuing(carry)
-        new = run(body, carry, shape, env)
+        new = run_block(body, carry, shape, env)
         return [jnp.where(mask, _broadcast_to_lanes(x, shape), old) for x, old in zip(new, carry, strict=True)]
 
     return lax.while_loop(
@@ -117,7 +117,7 @@ def _when(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> l
     mask, old = args[0], [_broadcast_to_lanes(x, shape) for x in args[1:]]
 
     def run_body(mask: Array, old: list[Array]) -> list[Array]:
-        new = run(body, [], shape, env)
+        new = run_block(body, [], shape, env)
         return [jnp.where(mask, _broadcast_to_lanes(x, shape), o) for x, o in zip(new, old, strict=True)]
 
     return lax.cond(jnp.any(mask), run_body, lambda _, old: old, mask, old)
@@ -129,12 +129,12 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
 
     @jax.custom_jvp
     def call(*args: Any) -> list[Any]:
-        return run(body, args, shape, env)
+        return run_block(body, args, shape, env)
 
     @call.defjvp
     def _(primals: Any, tangents: Any) -> Any:
         outs = call(*primals)
-        out_tangents = run(derivative(), [*primals, *tangents], shape)
+        out_tangents = run_block(derivative(), [*primals, *tangents], shape)
         return outs, [_broadcast_to_lanes(t, np.shape(o)) for t, o in zip(out_tangents, outs, strict=True)]
 
     return call(*(jnp.asarray(x) for x in args))
@@ -148,7 +148,7 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
     """Combine the results of a block for each drone of the world."""
     (block,), n = op.blocks, op.param("n_members")
     n_worlds = shape[0] // n
-    used = [v for v in block.uses() if v in env]
+    used = [v for v in block.used_values() if v in env]
     lane_values = {v: env[v] for v in used if not v.size and np.ndim(env[v])}
     shared_values = {v: env[v] for v in used if v not in lane_values}
     rows = [jnp.reshape(x, (n_worlds, n)) if np.ndim(x) else x for x in args]
@@ -159,7 +159,7 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
         for j in range(n):
             other_numbers = [x[:, j : j + 1] if np.ndim(x) else x for x in rows]
             results_by_drone.append(
-                run(block, [*other_numbers, drone_number == j], (n_worlds, n), shared_values | own_values)
+                run_block(block, [*other_numbers, drone_number == j], (n_worlds, n), shared_values | own_values)
             )
         combining_functions = [COMBINING_FUNCTIONS[name] for name in op.param("reduce")]
         reduced = [functools.reduce(fn, [_broadcast_to_lanes(x, (n_worlds, n)) for x in results])
@@ -171,7 +171,7 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
     def reduce_for_drone(xs: tuple[Array, list[Array]]) -> list[Array]:
         i, column = xs
         own_values = dict(zip(lane_values, column, strict=True))
-        outs = run(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), shared_values | own_values)
+        outs = run_block(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), shared_values | own_values)
         return [
             REDUCING_FUNCTIONS[name](_broadcast_to_lanes(x, (n_worlds, n)), axis=1)
             for name, x in zip(op.param("reduce"), outs, strict=True)

@@ -96,18 +96,18 @@ class Block:
             for block in operation.blocks:
                 yield from block.blocks()
 
-    def uses(self) -> set[Value]:
+    def used_values(self) -> set[Value]:
         """Return the values that operations and outputs use, including inner blocks."""
         used = {x for x in self.outputs if isinstance(x, Value)}
         for operation in self.operations:
             used.update(x for x in operation.args if isinstance(x, Value))
             for block in operation.blocks:
-                used |= block.uses()
+                used |= block.used_values()
         return used
 
 
 class Builder:
-    """Builds a block, operation by operation."""
+    """Builder of a block, operation by operation."""
 
     def __init__(self, outer: Builder | None = None, stage: str = ""):
         """Create the builder of an empty block, inside another block if one is given.
@@ -148,12 +148,16 @@ class Builder:
     ) -> tuple[Value, ...]:
         """Return the results of an operation that may have several results, or runs blocks."""
         args, types = tuple(args), tuple(map(np.dtype, dtypes))
-        return self._new(name, args, types, params, blocks) if blocks else self._add(name, args, types, params)
+        return (
+            self._append_operation(name, args, types, params, blocks)
+            if blocks
+            else self._add(name, args, types, params)
+        )
 
     def barrier(self) -> None:
         """Add a barrier: values that are used after it should be computed once, before it."""
         if self.operations and self.operations[-1].name != "barrier":
-            self._new("barrier", (), (), (), ())
+            self._append_operation("barrier", (), (), (), ())
 
     def finish(self, outputs: Sequence[Element]) -> Block:
         """Return the block with these outputs."""
@@ -168,10 +172,12 @@ class Builder:
             if earlier_results is not None:
                 return earlier_results
             builder = builder.outer
-        results = self._results_by_key[key] = self._new(name, args, dtypes, params, ())
+        results = self._results_by_key[key] = self._append_operation(name, args, dtypes, params, ())
         return results
 
-    def _new(self, name: str, args: tuple, dtypes: tuple, params: tuple, blocks: tuple) -> tuple[Value, ...]:
+    def _append_operation(
+        self, name: str, args: tuple, dtypes: tuple, params: tuple, blocks: tuple
+    ) -> tuple[Value, ...]:
         if name not in ops.TABLE:
             raise KeyError(f"operation {name!r} is not in ops.TABLE")
         size = dict(params)["numbers"].array.size if name == "table" else 0
@@ -200,7 +206,7 @@ def prune(block: Block, keep_inputs: bool = True) -> Block:
     block = _prune(block, set())
     if keep_inputs:
         return block
-    used = block.uses()
+    used = block.used_values()
     return dataclasses.replace(block, inputs=tuple([x for x in block.inputs if x in used]))
 
 
@@ -233,7 +239,7 @@ def _drop_results(op: Operation, used_values: Collection[Value]) -> Operation:
 
 
 def substitute(block: Block, replacements: Mapping[Value, Element]) -> Block:
-    """Return a block in which operands and outputs are replaced; the operations that define the old ones stay."""
+    """Return a block in which operands and outputs are replaced; the operations that define the old values remain."""
 
     def map_element(x: Element) -> Element:
         return replacements.get(x, x) if isinstance(x, Value) else x

@@ -1,4 +1,4 @@
-"""NumPy forms of operations whose NumPy functions differ from XLA; the table of operations is in ``ops``.
+"""NumPy forms of operations for which NumPy has no function that agrees with XLA; ``ops`` has the table of operations.
 
 Operands are NumPy arrays or scalars.
 """
@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike
 
 
 def divide(a: Any, b: Any) -> Any:
-    """Divide; integers round towards zero, x / 0 has all bits set, and the smallest integer / -1 is itself."""
+    """Divide; integers round towards zero, x / 0 has all bits set, and the smallest integer / -1 is unchanged."""
     if a.dtype.kind == "f":
         return np.divide(a, b)
     if a.dtype.kind == "u":

@@ -22,7 +22,7 @@ from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import numpy_forms as forms
 
 DTYPES = frozenset(map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()))
-"""Types of numbers. Half precision is missing: where XLA fuses, it keeps more digits, so engines could not agree."""
+"""Types of numbers. Half precision is missing: in a fusion, XLA keeps more digits, so engines could not agree."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,8 @@ class OperationForm:
     name: str
     """Name in programs, and of JAX's primitive if there is one."""
     operands: str
-    """One letter for each operand: T for a type that all T share, b for bool, u for uint32, * for any type."""
+    """One letter for each operand: T for a type that all T share, b for bool, u for uint32, * for any type. ``...``
+    stands for any number of operands of any type."""
     results: str = "T"
     """One letter for each result, as for ``operands``."""
     kinds: str = "f"
@@ -59,13 +60,13 @@ class OperationForm:
         """Return True if the operation is defined for operands of these types."""
         if "..." in self.operands:
             return True
-        kinds = {x for x, letter in zip(dtypes, self.operands, strict=False) if letter == "T"}
-        rest = [(x, letter) for x, letter in zip(dtypes, self.operands, strict=False) if letter in "bu"]
+        shared_types = {x for x, letter in zip(dtypes, self.operands, strict=False) if letter == "T"}
+        fixed_types = [(x, letter) for x, letter in zip(dtypes, self.operands, strict=False) if letter in "bu"]
         return (
             len(dtypes) == len(self.operands)
-            and len(kinds) <= 1
-            and all(x.kind in self.kinds for x in kinds)
-            and all(x == {"b": np.dtype(bool), "u": np.dtype(np.uint32)}[letter] for x, letter in rest)
+            and len(shared_types) <= 1
+            and all(x.kind in self.kinds for x in shared_types)
+            and all(x == {"b": np.dtype(bool), "u": np.dtype(np.uint32)}[letter] for x, letter in fixed_types)
         )
 
 
@@ -74,7 +75,7 @@ EXPENSIVE_COST = 2
 
 
 def unsupported_error(name: str, dtypes: Sequence[np.dtype], result: Any = bool) -> UnsupportedError | None:
-    """Return the error of an operation that is not defined for operands and a result of these types, or None."""
+    """Return the error for an operation that is not defined for these types of operands and result, or None."""
     other = next((x.name for x in (*dtypes, np.dtype(result)) if x not in DTYPES), None)
     if other is not None:
         return UnsupportedError(f"numbers of type {other}")
@@ -237,7 +238,8 @@ the reading drone itself; ``reduce`` names the operation that combines each outp
 that the numbers that depend on it are recomputed; compilers on the host may still merge them.
 ``table(numbers=)`` is a table of constants. ``lookup(table, index, offset=, aligned=)`` is its entry at the sum of an
 int32 index (a multiple of four if ``aligned``) and a constant offset, which must be in bounds.
-``any_lane`` is true at least where its operand is; a target may return true in all lanes of a vector if any is true.
+``any_lane`` is true where its operand is true; a target may also return true in all lanes of a vector if it is true in
+any of them.
 
 Comparisons and changes of sign cost nothing: comparisons are counted with the selections that use them, and a change of
 sign is part of another operation. A function costs as much as a hardware approximation and a step that refines it, or
@@ -269,5 +271,5 @@ BOOLEAN_FORM: Mapping[str, tuple[str, int | None]] = {
     "max": ("or", None),
     "min": ("and", None),
 }
-"""Logical operations that replace comparisons, maxima and minima of bools, and the index of the operand to negate, or
-None."""
+"""Logical operation that replaces each comparison, maximum or minimum of bools, and the index of the operand that is
+negated first, or None."""

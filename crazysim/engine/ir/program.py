@@ -30,7 +30,7 @@ PACKED_LEAF_NAME = "packed"
 """Name of the leaf that holds the packed shared leaves."""
 
 Zeros = tuple[tuple[int, frozenset[int]], ...]
-"""Pairs of a leaf and the elements of it that are known to be zero."""
+"""Pairs of the index of a leaf and the indices of its elements that are known to be zero."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ class UnfusedStage:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """Names of the stages."""
+        """Name of the stage, in a tuple like the names of a segment."""
         return (self.name,)
 
     @property
@@ -150,7 +150,7 @@ class Program:
     check_segment: Segment | None = None
     """Segment that flags a drone whose watched numbers are not finite, after the last step."""
     scratch: frozenset[int] = frozenset()
-    """Leaves that only carry numbers from one stage to another; their values are not kept."""
+    """Leaves that only pass numbers from one stage to another; their values are lost after a call."""
     packed: tuple[int, ...] = ()
     """Shared leaves that are concatenated in one additional leaf."""
     population: str = "drone"
@@ -185,7 +185,7 @@ class Program:
 
     @functools.cached_property
     def ranks(self) -> dict[int, int]:
-        """Rank of each used leaf among the used leaves, for names in kernels, so that equal steps have equal source."""
+        """Rank of each used leaf among the used leaves. Kernels name leaves by it, so equal steps have equal source."""
         checked = [leaf for leaf, _ in self.check_segment.reads] if self.check_segment is not None else []
         used = {*checked, *(i for s in self.segments for i in (*s.read_leaves, *s.written_leaves))}
         return {leaf: n for n, leaf in enumerate(sorted(used))}
@@ -198,7 +198,7 @@ class Program:
 
     @functools.cached_property
     def rows(self) -> dict[int, int]:
-        """Leaves that are rows, and how many rows they have."""
+        """Number of rows of each leaf that holds other leaves as rows."""
         return {i: leaf.shape[0] for i, leaf in enumerate(self.leaves) if leaf.row_leaves}
 
     @functools.cached_property

@@ -1,4 +1,4 @@
-"""Activity analysis: the numbers that depend differentiably on some leaves, for derivatives in either direction."""
+"""Activity analysis: it finds the numbers that depend differentiably on some leaves, for both modes of derivatives."""
 
 from __future__ import annotations
 
@@ -15,8 +15,12 @@ from crazysim.engine.ir.blocks import Block, Value
 from crazysim.engine.ir.program import Program, Segment, Slot
 
 
-def remove_check(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
-    """Return a program without its check, and the perturbed leaves that are floats and that it uses."""
+def prepare_derivative(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
+    """Return a program without its check, and the perturbed leaves, without leaves that are unused or not floats.
+
+    Raises:
+        UnsupportedError: If it has no derivative in a kernel.
+    """
     if not program.fused:
         raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
     if program.rows:
@@ -55,10 +59,10 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
     for s in program.phase_segments("each"):
         constants[s] = tuple(active_outputs(s.hoisted, s.hoisted_reads))
     while True:  # numbers that depend on the leaves after one step may affect others in the next
-        before = len(changed)
+        n_changed_before = len(changed)
         for s in program.phase_segments("each"):
             propagate(s)
-        if len(changed) == before:
+        if len(changed) == n_changed_before:
             break
     for s in program.phase_segments("after"):
         propagate(s)
@@ -78,7 +82,7 @@ def _propagate(block: Block, active: set[Value]) -> None:
             (body,) = op.blocks
             active.update(x for x, arg in zip(body.inputs, op.args, strict=False) if arg in active)
         if op.name in ("loop", "while"):  # an active number of one iteration may affect all floats of the next
-            has_active = any(x in active for x in (*op.args, *op.blocks[-1].uses()))
+            has_active = any(x in active for x in (*op.args, *op.blocks[-1].used_values()))
             if has_active:
                 active.update(x for x in op.blocks[-1].inputs if x.dtype.kind == "f")
         if op.name == "custom_jvp":

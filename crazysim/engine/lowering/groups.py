@@ -19,19 +19,19 @@ class Group(NamedTuple):
     """Population whose members the engine computes in lanes. Members of other populations are unrolled."""
     stages: tuple[Stage, ...]
     """The stages, in order."""
-    owned: frozenset[int] | None
+    owned_leaves: frozenset[int] | None
     """Leaves whose new values are taken from this group; None for all."""
 
 
 class _Access(NamedTuple):
-    """Leaves that a stage reads and writes, and the populations that it is for."""
+    """Leaves that a stage reads and writes, and the populations that it acts on."""
 
     read_leaves: frozenset[int]
     written_leaves: frozenset[int]
     populations: frozenset[str]
 
     @property
-    def touched(self) -> frozenset[int]:
+    def used_leaves(self) -> frozenset[int]:
         """Leaves that it reads or writes."""
         return self.read_leaves | self.written_leaves
 
@@ -50,7 +50,7 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     axes, leaves = Axes(data), jax.tree.leaves(data)
     if all(scope == "drone" or not has_members(scope) for scope in axes.scopes):
         return [Group("drone", tuple(stages), None)]
-    accesses = [_access(tracer(stage, axes, leaves), stage, axes) for stage in stages]
+    accesses = [_find_access(tracer(stage, axes, leaves), stage, axes) for stage in stages]
     clocks = _find_clocks(accesses, axes)
     n_members = {scope: x.shape[1] for scope, x in zip(axes.scopes, leaves, strict=True) if has_members(scope)}
     components = _find_components([k for k in range(len(stages)) if k not in clocks], accesses)
@@ -72,18 +72,18 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     return groups
 
 
-def _access(traced: TracedStage, stage: Stage, axes: Axes) -> _Access:
+def _find_access(traced: TracedStage, stage: Stage, axes: Axes) -> _Access:
     populations = {axes.scopes[i] for i in traced.written_leaves if has_members(axes.scopes[i])}
     populations |= {stage.scope} if stage.scope in axes.scopes and has_members(stage.scope) else set()
     return _Access(frozenset(traced.input_leaves), frozenset(traced.written_leaves), frozenset(populations))
 
 
 def _find_clocks(accesses: Sequence[_Access], axes: Axes) -> set[int]:
-    """Return the stages that use no leaf of a population, and no leaf that a stage outside the returned set writes."""
-    clocks = {k for k, a in enumerate(accesses) if not any(has_members(axes.scopes[i]) for i in a.touched)}
+    """Return the stages that use neither a leaf of a population nor a leaf that a stage outside the set writes."""
+    clocks = {k for k, a in enumerate(accesses) if not any(has_members(axes.scopes[i]) for i in a.used_leaves)}
     while True:
         others = frozenset().union(*(a.written_leaves for k, a in enumerate(accesses) if k not in clocks))
-        depending = {k for k in clocks if accesses[k].touched & others}
+        depending = {k for k in clocks if accesses[k].used_leaves & others}
         if not depending:
             return clocks
         clocks -= depending
@@ -106,7 +106,7 @@ def _find_components(stages: Iterable[int], accesses: Sequence[_Access]) -> list
 def _are_dependent(a: _Access, b: _Access) -> bool:
     # A stage without a population counts as a stage of the drones.
     populations = (a.populations or {"drone"}) & (b.populations or {"drone"})
-    return bool(populations or a.written_leaves & b.touched or b.written_leaves & a.touched)
+    return bool(populations or a.written_leaves & b.used_leaves or b.written_leaves & a.used_leaves)
 
 
 def _add_clocks(stages: Collection[int], clocks: Collection[int], accesses: Sequence[_Access]) -> set[int]:

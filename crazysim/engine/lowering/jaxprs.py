@@ -6,8 +6,8 @@ primitives need no rule of their own:
 
 - element-wise: the same operation for every element;
 - movement: nothing is computed, so the primitive is run once on the indices of the elements;
-- reduction: unrolled;
-- structure: calls are inlined, branches become selections, loops stay loops.
+- reduction: the operations are unrolled;
+- structure: calls are inlined, branches become selections, and loops remain loops.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ Elements = np.ndarray
 """An array of elements, of type object. A random key is a pair of elements."""
 
 Rule = Callable[["Lowering", Any, list[Elements]], Sequence[Elements]]
+"""Function from the lowering, an equation and its operands to its results."""
 RULES: dict[str, Rule] = {}
+"""Rules by the name of the primitive."""
 
 MAX_UNROLL = 64
 """Longest scan with inputs or outputs per iteration, and largest range of a run-time index, that is unrolled."""
@@ -59,7 +61,7 @@ class TableEntry(NamedTuple):
 
 
 class Lowering:
-    """Lowers jaxprs into a block of scalar operations."""
+    """Lowering of jaxprs into a block of scalar operations."""
 
     def __init__(
         self, builder: Builder | None = None, entries: dict[Value, TableEntry] | None = None, n_members: int = 0

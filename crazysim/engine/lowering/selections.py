@@ -49,7 +49,10 @@ def _add_selection(
     dtypes, n_members = [op.results[k].dtype for k in indices], ("n_members", op.param("n_members"))
 
     def copy_body(n_extra: int) -> tuple[Builder, list[Value], list[Element]]:
-        """Return a copy of the body with further published integers, which follow the other inputs."""
+        """Return the builder of a copy of the body, its last inputs, and its candidates.
+
+        The copy has further inputs for published integers, before the input that marks the drone itself.
+        """
         inner = Builder(builder)
         new_inputs = [inner.input(x.dtype) for x in body.inputs[:-1]] + [inner.input("int32") for _ in range(n_extra)]
         is_self = inner.input(bool)

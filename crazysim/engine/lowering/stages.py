@@ -83,14 +83,14 @@ def lower_stages(
 
 
 def _move_before_steps(
-    segments: Sequence[Segment | UnfusedStage], stages: Sequence[Stage], clock: Any
+    segments: Sequence[Segment | UnfusedStage], stages: Sequence[Stage], step_count_leaf: Any
 ) -> list[Segment | UnfusedStage]:
     """Return the segments of a step. Leading segments that begin an episode run before the first step of a call.
 
-    An episode cannot begin during a call as long as at most one stage writes the ``clock``, the leaf of step counts.
+    An episode cannot begin during a call as long as at most one stage writes the leaf of step counts.
     Numbers that only the moved segments write are then constant during the steps, and can be hoisted.
     """
-    if sum(clock in s.written_leaves for s in segments) > 1:
+    if sum(step_count_leaf in s.written_leaves for s in segments) > 1:
         return list(segments)
     runs_first = [
         stage.when is is_first_step and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)

@@ -19,7 +19,7 @@ from crazysim.engine.ir import ops
 from crazysim.engine.ir.algebra import known_zero
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
 from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
-from crazysim.engine.lowering.activity import apply_operation, changed_slots, remove_check
+from crazysim.engine.lowering.activity import apply_operation, changed_slots, prepare_derivative
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.selections import add_selections
 from crazysim.pytree import replace_leaves
@@ -41,7 +41,7 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     Raises:
         UnsupportedError: If a part of it has no derivative in a kernel.
     """
-    program, perturbed = remove_check(program, perturbed)
+    program, perturbed = prepare_derivative(program, perturbed)
     n = len(program.leaves)
     changed, constants = changed_slots(program, perturbed)
     segments = [_add_segment_tangents(program, n, s, changed, constants.get(s, ())) for s in program.fused_segments]
@@ -191,12 +191,16 @@ def _when(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
     (block,) = op.blocks
     inner, inner_tangents = Builder(builder), dict(tangents)
     outputs = _add_with_tangents(inner, block, dict(values), inner_tangents)
-    after = [_tangent(x, inner_tangents) for x in block.outputs]
-    before = [_tangent(x, tangents) for x in old]
-    indices = [k for k, pair in enumerate(zip(before, after, strict=True)) if any(isinstance(x, Value) for x in pair)]
-    args = [_map_element(mask, values), *(_map_element(x, values) for x in old), *(before[k] for k in indices)]
-    inner_values = inner.finish([*outputs, *(after[k] for k in indices)])
-    results = builder.add_many("when", args, [x.dtype for x in args[1:]], op.params, (inner_values,))
+    new_tangents = [_tangent(x, inner_tangents) for x in block.outputs]
+    old_tangents = [_tangent(x, tangents) for x in old]
+    indices = [
+        k
+        for k, pair in enumerate(zip(old_tangents, new_tangents, strict=True))
+        if any(isinstance(x, Value) for x in pair)
+    ]
+    args = [_map_element(mask, values), *(_map_element(x, values) for x in old), *(old_tangents[k] for k in indices)]
+    new_block = inner.finish([*outputs, *(new_tangents[k] for k in indices)])
+    results = builder.add_many("when", args, [x.dtype for x in args[1:]], op.params, (new_block,))
     values.update(zip(op.results, results, strict=False))
     _record_tangents([op.results[k] for k in indices], results[len(old) :], tangents)
 
@@ -219,7 +223,7 @@ def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Value
 def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
     """Carry a tangent for each float: any float may depend on a perturbed number after further iterations."""
     *test, body = op.blocks
-    if not any(isinstance(x, Value) and x in tangents for x in (*op.args, *body.uses())):
+    if not any(isinstance(x, Value) and x in tangents for x in (*op.args, *body.used_values())):
         inline(builder, Block((), (op,), ()), values)
         return
     inner = Builder(builder)

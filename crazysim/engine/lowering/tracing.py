@@ -1,4 +1,4 @@
-"""Stages as jaxprs."""
+"""Tracing of stages to jaxprs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class TracedStage:
         self.fn = jaxcompat.select_inputs(fn, self.input_leaves)
         self.when = jaxcompat.select_inputs(when, self.input_leaves) if when is not None else None
         self.segments: dict[Any, Any] = {}
-        """Segments that it was lowered to, by everything else that lowering depends on."""
+        """Segments that it was lowered to; the key has everything else that lowering depends on."""
 
     def dump(self, name: str) -> None:
         """Write the jaxprs into the folder that ``CRAZYSIM_DUMP`` names, if it is set."""
@@ -57,7 +57,7 @@ class TracedStage:
 
 
 class Tracer:
-    """Cache of traced stages: each is traced once for leaves of the same shapes and types."""
+    """Cache of traced stages. A stage is traced once for leaves of the same shapes and types."""
 
     def __init__(self) -> None:
         self._traced: dict[Any, tuple[Stage, TracedStage]] = {}  # the stage keeps its functions, whose ids are keys
@@ -68,7 +68,7 @@ class Tracer:
         key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
         if key not in self._traced:
             if stage.trace_once:
-                traced = _trace_once(stage, axes, leaves, shapes)
+                traced = _get_shared_trace(stage, axes, leaves, shapes)
             else:
                 traced = TracedStage(stage, axes, leaves)
             traced.dump(stage.__name__)
@@ -82,7 +82,7 @@ MAX_TRACED_STAGES = 256
 """Maximum number of traced stages that are kept."""
 
 
-def _trace_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
+def _get_shared_trace(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
     """Return a traced stage with ``trace_once``, from the cache of this process if possible.
 
     The stage must not read ``n_worlds`` and ``n_drones``.

@@ -1,8 +1,8 @@
 """Reverse mode on blocks: from the cotangents of a block's outputs to the cotangents of its inputs.
 
-Operations have their JAX derivatives: the VJP of each operation is traced once for each combination of types, and
+The derivatives of operations come from JAX: the VJP of an operation is traced once for each combination of types, and
 lowered like any other function. The returned block first computes the whole block forward. The backward pass then goes
-through it part by part, and recomputes the results of each part that the derivatives need.
+through it part by part. For each part, it recomputes the results that the derivatives need.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.selections import add_selections
 from crazysim.pytree import replace_leaves
 
-MAX_UNROLLED = 4096
+MAX_UNROLLED_OPERATIONS = 4096
 """Maximum number of operations, over all iterations, of a loop that is unrolled for its derivative."""
 
 Cotangents = dict[Value, Element]
@@ -43,21 +43,21 @@ def transpose_block(block: Block, perturbed: Sequence[Value]) -> Block:
     indices = [block.inputs.index(x) for x in perturbed]
     block = _unroll_loops(add_selections(block))
     perturbed = [block.inputs[k] for k in indices]
-    on_path = active_values(block, perturbed)
+    active_set = active_values(block, perturbed)
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
-    parts = _parts(block)
+    parts = _split_into_parts(block)
     for part in parts:
         inline(builder, part, values)
     cotangents: Cotangents = {}
     for x in block.outputs:
         if x.dtype.kind == "f":
             ct = builder.input(x.dtype)
-            if isinstance(x, Value) and x in on_path:
+            if isinstance(x, Value) and x in active_set:
                 _accumulate(builder, cotangents, x, ct)
     for k, part in reversed(list(enumerate(parts))):
-        elements = values if k == len(parts) - 1 else _recompute(builder, part, k, values, on_path)
-        _add_cotangents(builder, part, elements, on_path, cotangents)
+        elements = values if k == len(parts) - 1 else _recompute(builder, part, k, values, active_set)
+        _add_cotangents(builder, part, elements, active_set, cotangents)
     return prune(builder.finish([cotangents.get(x, constant(0, x.dtype)) for x in perturbed]))
 
 
@@ -65,7 +65,7 @@ OPERATIONS_PER_PART = 60
 """Operations in a part of a block. Of 60, 100, 150, 250 and all, 60 and 100 left the most numbers in registers."""
 
 
-def _parts(block: Block) -> list[Block]:
+def _split_into_parts(block: Block) -> list[Block]:
     """Return the operations of a block in parts, one after the other."""
     operations = [op for op in block.operations if op.name != "barrier"]
     return [
@@ -75,7 +75,7 @@ def _parts(block: Block) -> list[Block]:
 
 
 def _recompute(
-    builder: Builder, part: Block, part_number: int, values: dict[Value, Element], on_path: set[Value]
+    builder: Builder, part: Block, part_number: int, values: dict[Value, Element], active_set: set[Value]
 ) -> dict[Value, Element]:
     """Recompute a part of a block from the values that it uses, and return the new elements by value.
 
@@ -83,8 +83,10 @@ def _recompute(
     other drones and loops are not recomputed.
     """
     operations = [op for op in part.operations if op.name not in ("over_others", "loop", "while")]
-    recomputed, used = {x for op in operations for x in op.results}, part.uses()
-    inputs = [x for x in values if x in used and x in on_path and x not in recomputed and isinstance(values[x], Value)]
+    recomputed, used = {x for op in operations for x in op.results}, part.used_values()
+    inputs = [
+        x for x in values if x in used and x in active_set and x not in recomputed and isinstance(values[x], Value)
+    ]
     copies = {x: builder.add("opaque_copy", (values[x],), x.dtype, (("part", part_number),)) for x in inputs}
     elements = values | copies
     inline(builder, Block((), tuple(operations)), elements)
@@ -92,7 +94,7 @@ def _recompute(
 
 
 def _add_cotangents(
-    builder: Builder, block: Block, values: dict[Value, Element], on_path: set[Value], cts: Cotangents
+    builder: Builder, block: Block, values: dict[Value, Element], active_set: set[Value], cts: Cotangents
 ) -> None:
     """Go through a block backwards, from the cotangents of its results to the cotangents of the values that it uses.
 
@@ -100,7 +102,7 @@ def _add_cotangents(
         builder: Builder that the operations are added to.
         block: The block.
         values: Elements of the builder that stand for its values.
-        on_path: Values whose cotangents are computed.
+        active_set: Values whose cotangents are computed.
         cts: Cotangents so far; changed in place.
     """
 
@@ -109,12 +111,12 @@ def _add_cotangents(
 
     for op in reversed(block.operations):
         result_cts = [cts.pop(x, None) for x in op.results]
-        if all(ct is None for ct in result_cts) or not any(x in on_path for x in op.results):
+        if all(ct is None for ct in result_cts) or not any(x in active_set for x in op.results):
             continue
         builder.stage = op.stage
         rule = STRUCTURED_RULES.get(op.name)
         if rule is not None:
-            rule(builder, op, values, on_path, result_cts, cts)
+            rule(builder, op, values, active_set, result_cts, cts)
             continue
         if ops.TABLE[op.name].structured:
             raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
@@ -123,7 +125,7 @@ def _add_cotangents(
         parts = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
         floats = [x for x in op.args if x.dtype.kind == "f"]
         for x, part in zip(floats, parts, strict=True):
-            if isinstance(x, Value) and x in on_path:
+            if isinstance(x, Value) and x in active_set:
                 _accumulate(builder, cts, x, part)
 
 
@@ -152,7 +154,7 @@ ResultCotangents = Sequence[Element | None]
 
 
 def _when(
-    builder: Builder, op: Operation, values: dict, on_path: set[Value], result_cts: ResultCotangents, cts: Cotangents
+    builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
     """Pass cotangents through the block where the mask is true, and to the old numbers elsewhere."""
     mask, *old = op.args
@@ -163,12 +165,12 @@ def _when(
     for x, before, ct in zip(block.outputs, old, result_cts, strict=True):
         if ct is None:
             continue
-        if isinstance(before, Value) and before in on_path:
-            rest = builder.add("select_n", (mask, ct, constant(0, ct.dtype)), ct.dtype)
-            _accumulate(builder, cts, before, rest)
-        if isinstance(x, Value) and x in on_path:
+        if isinstance(before, Value) and before in active_set:
+            masked_ct = builder.add("select_n", (mask, ct, constant(0, ct.dtype)), ct.dtype)
+            _accumulate(builder, cts, before, masked_ct)
+        if isinstance(x, Value) and x in active_set:
             _accumulate(inner, inner_cts, x, ct)
-    _add_cotangents(inner, block, inner_values, on_path, inner_cts)
+    _add_cotangents(inner, block, inner_values, active_set, inner_cts)
     before = [cts.get(x, constant(0, x.dtype)) for x in inner_cts]
     sums = [inner.add("add", (a, inner_cts[x]), x.dtype) for a, x in zip(before, inner_cts, strict=True)]
     if inner_cts:
@@ -177,7 +179,7 @@ def _when(
 
 
 def _custom_jvp(
-    builder: Builder, op: Operation, values: dict, on_path: set[Value], result_cts: ResultCotangents, cts: Cotangents
+    builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
     """Transpose the function's custom derivative."""
     derivative = _transpose_derivative(op.param("derivative")())
@@ -187,7 +189,7 @@ def _custom_jvp(
     operands = [*args, *(constant(0, x.dtype) for x in args), *seeds]
     parts = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
     for x, part in zip([x for x in op.args if x.dtype.kind == "f"], parts, strict=True):
-        if isinstance(x, Value) and x in on_path:
+        if isinstance(x, Value) and x in active_set:
             _accumulate(builder, cts, x, part)
 
 
@@ -198,17 +200,17 @@ def _transpose_derivative(derivative: Block) -> Block:
 
 
 def _over_others(
-    builder: Builder, op: Operation, values: dict, on_path: set[Value], result_cts: ResultCotangents, cts: Cotangents
+    builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
     """Add cotangents to the drone's own numbers that the block uses, and to its published numbers from all readers."""
-    used = [ct for ct in result_cts if ct is not None]
+    given_cts = [ct for ct in result_cts if ct is not None]
     names = [name for name, ct in zip(op.param("reduce"), result_cts, strict=True) if ct is not None]
     if any(name != "add" for name in names):  # see ``selections``
         raise UnsupportedError(f"{', '.join(names)} over other drones has no derivative in a kernel", op.name)
     (body,) = op.blocks
-    uses = body.uses()
+    used = body.used_values()
     # A list, so that the order is always the same.
-    captured = [x for x in values if x in uses and not x.size and isinstance(values[x], Value)]
+    captured = [x for x in values if x in used and not x.size and isinstance(values[x], Value)]
     published = [values.get(x, x) for x in op.args]
 
     def add_reverse_loop(
@@ -221,30 +223,30 @@ def _over_others(
         inner_values.update(zip((*inputs, body.inputs[-1]), new_inputs, strict=True))
         inline(inner, body, inner_values)
         for x, ct in zip(body.outputs, result_cts, strict=True):
-            if ct is not None and isinstance(x, Value) and x in on_path:
+            if ct is not None and isinstance(x, Value) and x in active_set:
                 _accumulate(inner, inner_cts, x, inner_values.get(ct, ct) if isinstance(ct, Value) else ct)
-        _add_cotangents(inner, body, inner_values, on_path, inner_cts)
+        _add_cotangents(inner, body, inner_values, active_set, inner_cts)
         perturbed = [x for x in perturbed if x in inner_cts]
         if not perturbed:
             return
         block = prune(inner.finish([inner_cts[x] for x in perturbed]))
-        read = block.uses()
-        pairs = [(y, s) for y, s in zip(new_inputs, shared, strict=False) if y in read]
+        used_inside = block.used_values()
+        pairs = [(y, s) for y, s in zip(new_inputs, shared, strict=False) if y in used_inside]
         block = Block((*(y for y, _ in pairs), new_inputs[-1]), block.operations, block.outputs)
         params = (("reduce", ("add",) * len(perturbed)), ("n_members", op.param("n_members")))
         sums = builder.add_many("over_others", [s for _, s in pairs], [x.dtype for x in perturbed], params, (block,))
         for x, part in zip(perturbed, sums, strict=True):
             target = dict(zip(body.inputs, op.args, strict=False)).get(x, x)
-            if isinstance(target, Value) and target in on_path:
+            if isinstance(target, Value) and target in active_set:
                 _accumulate(builder, cts, target, part)
 
     others = body.inputs[:-1]
-    add_reverse_loop(others, {}, [x for x in captured if x in on_path], published)
-    seeds = [ct for ct in used if isinstance(ct, Value)]
+    add_reverse_loop(others, {}, [x for x in captured if x in active_set], published)
+    seeds = [ct for ct in given_cts if isinstance(ct, Value)]
     add_reverse_loop(
         (*captured, *seeds),
         dict(zip(others, published, strict=True)),
-        [x for x in others if x in on_path],
+        [x for x in others if x in active_set],
         [*(values[x] for x in captured), *seeds],
     )
 
@@ -256,7 +258,7 @@ STRUCTURED_RULES: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "
 def _unroll_loops(block: Block) -> Block:
     """Return a block whose loops of fixed length are unrolled: the backward pass needs the carry of every iteration.
 
-    Loops that carry no float have no derivative, and stay.
+    Loops that carry no float have no derivative and are not unrolled.
     """
     if not any(_is_differentiable_loop(op) for inner in block.blocks() for op in inner.operations):
         return block
@@ -279,7 +281,7 @@ def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> lis
         if _is_differentiable_loop(op):
             (body,) = op.blocks
             length, carry = op.param("length"), [map_element(x) for x in op.args]
-            if length * sum(1 for _ in body.walk()) > MAX_UNROLLED:
+            if length * sum(1 for _ in body.walk()) > MAX_UNROLLED_OPERATIONS:
                 raise UnsupportedError(f"a loop of {length} iterations is too long to be reversed", op.name, op.stage)
             for _ in range(length):
                 inner_values = values | dict(zip(body.inputs, carry, strict=True))

@@ -16,7 +16,7 @@ from crazysim.jaxcompat import is_key
 def pack_shared(program: Program) -> Program:
     """Read the numbers that all drones share from one additional leaf, which concatenates the shared leaves.
 
-    The time of a call of a compiled step grows with the number of its arrays. Leaves that unfused stages read, and
+    A call of a compiled step takes longer the more arrays it has. Leaves that unfused stages read, and
     leaves that are read as tables, stay separate.
     """
     leaves = program.leaves
@@ -111,11 +111,11 @@ def packed_rows(program: Program) -> list[PackedRows]:
     return [PackedRows(program, i) for i, leaf in enumerate(program.leaves) if leaf.row_leaves]
 
 
-def _move_slots(program: Program, new_slot: Callable[[Slot], Slot]) -> Program:
-    """Return a program in which all slots are replaced."""
+def _move_slots(program: Program, move_slot: Callable[[Slot], Slot]) -> Program:
+    """Return a program in which ``move_slot`` replaces every slot."""
 
     def move_segment(s: Segment) -> Segment:
-        reads, writes, hoisted = ([new_slot(slot) for slot in x] for x in (s.reads, s.writes, s.hoisted_reads))
+        reads, writes, hoisted = ([move_slot(slot) for slot in x] for x in (s.reads, s.writes, s.hoisted_reads))
         return dataclasses.replace(s, reads=tuple(reads), writes=tuple(writes), hoisted_reads=tuple(hoisted))
 
     segments = tuple([move_segment(s) if isinstance(s, Segment) else s for s in program.segments])

@@ -62,7 +62,7 @@ def _join_segments(segments: list[Segment]) -> Segment:
 def join_ticks(program: Program) -> Program:
     """Join neighbouring stages that run at the same ticks.
 
-    A number that one stage writes and the next reads is then passed on without a selection between its old and its new
+    A number that one stage writes and the next reads is then passed on without selecting between its old and its new
     value, and a constant remains a constant.
     """
     segments = [
@@ -97,8 +97,8 @@ def _join_two_ticks(first: Operation, second: Operation) -> Operation:
 
 
 BARRIER_INTERVAL = 40
-"""Operations between two barriers of ``add_barriers``. Of 20, 30, 40, 60, 80 and 150, 20 to 40 gave the fastest
-gradients on two cores with jax 0.11.2; smaller numbers take longer to compile."""
+"""Operations between two barriers of ``add_barriers``. Of 20, 30, 40, 60, 80 and 150, the values from 20 to 40 gave the
+fastest gradients on two cores with JAX 0.11.2; smaller values take longer to compile."""
 
 
 def add_barriers(program: Program) -> Program:
@@ -154,7 +154,7 @@ def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
     step_block = Block(
         block.inputs, tuple([op for op in operations if hoistable.isdisjoint(op.results)]), block.outputs
     )
-    step_uses = step_block.uses()
+    step_uses = step_block.used_values()
     hoisted_values = [x for op in operations for x in op.results if x in hoistable and x in step_uses]
     if not hoisted_values:
         return segment

@@ -42,8 +42,8 @@ class Difference:
     engines: tuple[str, str]
     """Names of the engines."""
     operation: str = ""
-    """First operation of the stage whose result differs from the interpreter's; empty if there is none, or if neither
-    engine runs operations of a program."""
+    """First operation of the stage whose result differs from that of the interpreter; empty if there is none, or if
+    neither engine runs a program."""
 
     def __str__(self) -> str:
         (a, b), (x, y) = self.engines, self.values
@@ -61,7 +61,7 @@ def first_difference(
     """Return the first difference between two engines in one step, or None.
 
     Both engines run each stage on the data that the first engine computed so far, so a difference is due to that stage
-    alone. To find the operation, an engine that runs programs then runs the stage with every value as a result.
+    alone. To find the operation, an engine that runs programs then runs the stage again and returns every value.
 
     Args:
         pipeline: Stages of a step.
@@ -86,7 +86,7 @@ def first_difference(
 
 
 def _largest_difference(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | None:
-    """Return the index at which arrays differ most, or None if nowhere beyond the tolerance."""
+    """Return the index at which arrays differ most, or None if no difference exceeds the tolerance."""
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
         x, y = jax.random.key_data(x), jax.random.key_data(y)
     x, y = np.asarray(x), np.asarray(y)
@@ -106,14 +106,14 @@ def _largest_difference(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | N
 
 
 def _find_operation(stage: Any, name: str, data: Any, engines: Sequence[str], tolerance: float) -> str:
-    """Return the first operation of a stage whose result in an engine of programs differs from the interpreter's."""
+    """Return the first operation of a stage whose result is not that of the interpreter; empty if there is none."""
     program = fuse(lower_stages(as_stages({name: stage}), data))
-    builds: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "auto": fused.build}
+    builders: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "auto": fused.build}
     for engine in engines:
-        if engine in builds and program.fused and program.segments:
-            listed = first_operation(program, jax.tree.leaves(data), builds[engine], tolerance)
-            if listed is not None:
-                return f"{engine}: {listed}"
+        if engine in builders and program.fused and program.segments:
+            operation_text = first_operation(program, jax.tree.leaves(data), builders[engine], tolerance)
+            if operation_text is not None:
+                return f"{engine}: {operation_text}"
     return ""
 
 
@@ -123,7 +123,7 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
     Args:
         program: A program of one segment.
         leaves: Its leaves, for all worlds.
-        build: Function that builds the run of a program.
+        build: Function ``build`` of a backend.
         tolerance: As in ``first_difference``.
     """
     exposed_program, operations = expose_values(program)

@@ -17,6 +17,7 @@ from crazysim.engine.ir.blocks import Block, Element, Operation, Value
 from crazysim.engine.ir.program import Segment, Slot
 
 RANDOM_REASON = "it draws random numbers"
+"""Reason why a stage with random numbers has no expressions."""
 
 Expression = Any
 """A ``casadi.SX`` of one number."""
@@ -25,7 +26,7 @@ MAX_ITERATIONS = 256
 """Maximum number of iterations of a loop that is unrolled."""
 
 
-def step(segment: Segment, get_number: Callable[[Slot], Expression]) -> dict[Slot, Expression]:
+def step_expressions(segment: Segment, get_number: Callable[[Slot], Expression]) -> dict[Slot, Expression]:
     """Return the expressions that a step writes.
 
     Args:
@@ -37,8 +38,8 @@ def step(segment: Segment, get_number: Callable[[Slot], Expression]) -> dict[Slo
     """
     require_casadi(segment.hoisted)
     require_casadi(segment.block)
-    hoisted = run(segment.hoisted, [get_number(slot) for slot in segment.hoisted_reads])
-    outputs = run(segment.block, [*(get_number(slot) for slot in segment.reads), *hoisted])
+    hoisted = run_block(segment.hoisted, [get_number(slot) for slot in segment.hoisted_reads])
+    outputs = run_block(segment.block, [*(get_number(slot) for slot in segment.reads), *hoisted])
     return dict(zip(segment.writes, outputs, strict=True))
 
 
@@ -72,7 +73,7 @@ def _refusal(op: Operation) -> str | None:
     return None
 
 
-def run(block: Block, inputs: Sequence[Expression]) -> list[Expression]:
+def run_block(block: Block, inputs: Sequence[Expression]) -> list[Expression]:
     """Return the outputs of a block whose operations all have a form in CasADi."""
     return _Interpreter().run(block, inputs)
 

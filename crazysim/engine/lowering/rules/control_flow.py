@@ -1,4 +1,4 @@
-"""Lowering rules for calls (inlined), branches (all computed, one selected) and loops (kept as loops or unrolled)."""
+"""Rules for calls (inlined), branches (all computed, one selected) and loops (lowered to loops or unrolled)."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
     aval = eqn.invars[0].aval
     if not jax.numpy.issubdtype(aval.dtype, np.inexact) or all(map(is_constant, args[0].reshape(-1))):
         return args
-    called = jax.make_jaxpr(lambda x: x)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
-    return _lower_with_derivative(ctx, eqn, args, called)
+    called_jaxpr = jax.make_jaxpr(lambda x: x)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
+    return _lower_with_derivative(ctx, eqn, args, called_jaxpr)
 
 
 @rule("call_hi_primitive")
@@ -57,16 +57,18 @@ def _expand(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
     call, so it reads tables where the operands are tables.
     """
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-    called = jax.make_jaxpr(expand_primitive(eqn))(*avals)
+    called_jaxpr = jax.make_jaxpr(expand_primitive(eqn))(*avals)
     if not any(jax.numpy.issubdtype(v.aval.dtype, np.inexact) for v in eqn.outvars):
-        return ctx.lower(called, args)
-    return _lower_with_derivative(ctx, eqn, args, called)
+        return ctx.lower(called_jaxpr, args)
+    return _lower_with_derivative(ctx, eqn, args, called_jaxpr)
 
 
-def _lower_with_derivative(ctx: Lowering, eqn: JaxprEqn, args: list[Elements], called: ClosedJaxpr) -> list[Elements]:
+def _lower_with_derivative(
+    ctx: Lowering, eqn: JaxprEqn, args: list[Elements], called_jaxpr: ClosedJaxpr
+) -> list[Elements]:
     """Lower a call with a custom derivative. The derivative itself is lowered only when it is requested."""
     body = ctx.make_inner()
-    block = body.finish(body.lower(called, [_add_inputs(body, x) for x in args]))
+    block = body.finish(body.lower(called_jaxpr, [_add_inputs(body, x) for x in args]))
 
     @functools.cache
     def derivative() -> Block:

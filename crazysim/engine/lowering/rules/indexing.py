@@ -1,4 +1,4 @@
-"""Rules for indexing: a known index moves elements; a computed one looks up a table or selects among elements."""
+"""Rules for indexing: a known index moves elements, and a computed index looks up a table or selects an element."""
 
 from __future__ import annotations
 
@@ -255,10 +255,10 @@ def _combine(ctx: Lowering, eqn: JaxprEqn, old: Elements, new: Elements) -> Elem
     combination = eqn.params["update_jaxpr"]
     if combination is None:
         return new
-    called = ClosedJaxpr(combination, eqn.params["update_consts"])
+    called_jaxpr = ClosedJaxpr(combination, eqn.params["update_consts"])
     pairs = zip(old.reshape(-1), new.reshape(-1), strict=True)
     return as_elements(
-        [ctx.lower(called, [as_elements([a], ()), as_elements([b], ())])[0][()] for a, b in pairs], old.shape
+        [ctx.lower(called_jaxpr, [as_elements([a], ()), as_elements([b], ())])[0][()] for a, b in pairs], old.shape
     )
 
 

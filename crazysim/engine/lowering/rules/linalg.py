@@ -34,14 +34,16 @@ def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
         factor, fails = np.full((n, n), zero, object), constant(False, bool)
         for j in range(n):
             for i in range(j, n):
-                rest = a[i, j]
+                remainder = a[i, j]
                 for k in range(j):
-                    rest = ctx.scalar("sub", rest, ctx.scalar("mul", factor[i, k], factor[j, k]))
+                    remainder = ctx.scalar("sub", remainder, ctx.scalar("mul", factor[i, k], factor[j, k]))
                 factor[i, j] = (
-                    ctx.builder.add("sqrt", (rest,), dtype) if i == j else ctx.scalar("div", rest, factor[j, j])
+                    ctx.builder.add("sqrt", (remainder,), dtype)
+                    if i == j
+                    else ctx.scalar("div", remainder, factor[j, j])
                 )
                 if i == j:
-                    fails = ctx.scalar("or", fails, ctx.scalar("le", rest, zero, dtype=bool))
+                    fails = ctx.scalar("or", fails, ctx.scalar("le", remainder, zero, dtype=bool))
         for j, i in itertools.combinations_with_replacement(range(n), 2):
             factor[i, j] = ctx.scalar("select_n", fails, factor[i, j], constant(np.nan, dtype))
         out.append(factor)
@@ -68,10 +70,10 @@ def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool
     order = list(range(n)) if lower else list(range(n))[::-1]
     for column in range(b.shape[1]):
         for n_done, i in enumerate(order):
-            rest = b[i, column]
+            remainder = b[i, column]
             for k in order[:n_done]:
-                rest = ctx.scalar("sub", rest, ctx.scalar("mul", a[i, k], x[k, column]))
-            x[i, column] = rest if unit else ctx.scalar("div", rest, a[i, i])
+                remainder = ctx.scalar("sub", remainder, ctx.scalar("mul", a[i, k], x[k, column]))
+            x[i, column] = remainder if unit else ctx.scalar("div", remainder, a[i, i])
     return x
 
 

@@ -29,7 +29,7 @@ def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> l
     other_elements = [_replace_elements(x, others) for x in args[n_captured:]]
     results = inner.lower(eqn.params["jaxpr"], [*args[:n_captured], *other_elements, as_elements([is_self], ())])
     block = inner.finish(results)
-    used = block.uses()  # numbers that the block does not use are not published
+    used = block.used_values()  # numbers that the block does not use are not published
     pairs = [(x, y) for x, y in others.items() if y in used]
     block = dataclasses.replace(block, inputs=(*(y for _, y in pairs), is_self))
     types = [x.dtype for x in block.outputs]
