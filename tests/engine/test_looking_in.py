@@ -58,7 +58,7 @@ def test_a_program_is_listed_with_the_names_of_fields_and_stages(data):
 
 def test_a_packed_number_keeps_the_name_of_its_field(data):
     assert "= params.mass[0]\n" in listing.list_program(optimise(lower_stages([sway], data)))
-    rows = optimise(lower_stages([sway], data), rows=lambda written: written)
+    rows = optimise(lower_stages([sway], data), select_rows=lambda written: written)
     assert "states.force[0] = " in listing.list_program(rows)
 
 
