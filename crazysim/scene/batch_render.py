@@ -50,10 +50,11 @@ class BatchRenderer:
         camera_index = camera_id(model, camera)
         if camera_index < 0:
             raise ConfigError("expected a camera of the scene, got the free camera, which MuJoCo Warp cannot render")
-        import mujoco.mjx.third_party.mujoco_warp as mjw
         import warp as wp
 
-        wp.config.quiet = True
+        wp.config.log_level = wp.LOG_WARNING  # before MuJoCo Warp starts Warp
+        import mujoco.mjx.third_party.mujoco_warp as mjw
+
         self._wp, self._mjw, self._shape = wp, mjw, (n_worlds, height, width)
         self._device = f"cuda:{device.local_hardware_id}" if device.platform == "gpu" else "cpu"
         has_sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX in model.tex_type
