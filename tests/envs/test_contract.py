@@ -73,7 +73,7 @@ def test_goals_that_are_positions_can_be_set(env, start_state, name):
     state = env.set_goal(start_state, pos)
     np.testing.assert_array_equal(env.target(state), np.broadcast_to(pos[:, None], start_state.data.states.pos.shape))
     assert jax.tree.structure(state) == jax.tree.structure(start_state)
-    trees_equal(jax.jit(env.set_goal)(start_state, pos), state)
+    assert trees_equal(jax.jit(env.set_goal)(start_state, pos), state)
 
 
 class Flight(NamedTuple):

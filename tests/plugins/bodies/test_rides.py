@@ -19,8 +19,8 @@ def build(**kwargs):
     return sim, cars
 
 
-def deck(sim):
-    """Return the height of the upper side of the car's box, world frame, m."""
+def deck_of(sim):
+    """Return the height of the upper side of the car's box, world frame, and the box's position in the car, m."""
     body = next(b for b in sim.scene.collision_model.objects if b.name == "cars:0")
     geom = max(body.geoms, key=lambda g: g.pos[2] + g.shape.size[2])
     return geom.pos[2] + geom.shape.size[2] + float(np.asarray(sim.data.plugins["cars"].pos)[0, 0, 2]), geom.pos
@@ -29,13 +29,13 @@ def deck(sim):
 def test_a_drone_lands_on_a_moving_car_and_rides():
     # the body of a vehicle with two wheels is one box, half as wide as the vehicle
     sim, cars = build(vehicle={"base": "f1tenth_ros", "wheels": {"number": 2}, "shape": {"width": 0.4}})
-    height, at = deck(sim)
+    height, deck_pos = deck_of(sim)
     sim.add(ContactResponse(friction=0.9))
     sim.data = cars.with_command(sim.data, np.float32([[[0.8, 0.0]]]))
     sim.step(1000)
     car = cars.read(sim.data)
     np.testing.assert_allclose(np.asarray(car.vel)[0, 0, 0], 0.8, rtol=0.05)
-    start = np.asarray(car.pos)[0, 0] + np.array([at[0], at[1], 0.0])
+    start = np.asarray(car.pos)[0, 0] + np.array([deck_pos[0], deck_pos[1], 0.0])
     start[2] = height + 0.06
     sim.data = with_states(sim.data, pos=start, vel=[0.8, 0, 0], quat=[0, 0, 0, 1], ang_vel=0.0)
     sim.step(250)
@@ -43,10 +43,10 @@ def test_a_drone_lands_on_a_moving_car_and_rides():
     sim.data = cars.with_command(sim.data, np.float32([[[0.8, 0.15]]]))  # it turns
     sim.step(500)
     car, s = cars.read(sim.data), sim.data.states
-    at, pos, car_vel, vel = (np.asarray(x)[0, 0] for x in (car.pos, s.pos, car.vel, s.vel))
+    car_pos, pos, car_vel, vel = (np.asarray(x)[0, 0] for x in (car.pos, s.pos, car.vel, s.vel))
     assert abs(np.asarray(car.yaw)[0, 0, 0]) > 0.15
     assert pos[2] > height
-    np.testing.assert_allclose(np.linalg.norm((pos - at)[:2]), np.linalg.norm(gap[:2]), atol=0.005)
+    np.testing.assert_allclose(np.linalg.norm((pos - car_pos)[:2]), np.linalg.norm(gap[:2]), atol=0.005)
     np.testing.assert_allclose(vel[:2], car_vel[:2], atol=0.08)
 
 
@@ -62,14 +62,14 @@ def test_a_car_pushes_a_body():
 
 
 def test_the_deck_of_a_turning_car_moves_with_its_points():
-    """At every corner of the drone: v + w x r, of a car with 0.5 m/s and 2 rad/s."""
+    """It moves at v + w x r below each corner of the drone, for a car with 0.5 m/s and 2 rad/s."""
     sim, cars = build()
     car = cars.read(sim.data)
     sim.data = cars.write(sim.data, car.with_vel(np.float32([[[0.5, 0, 0]]]), np.float32([[[0, 0, 2.0]]])))
     sim.data = with_states(sim.data, pos=[0.1, 0.2, 0.3], quat=[0, 0, 0, 1])
     surfaces = [surface for surface in find_surfaces(sim, None) if surface.population == "cars"]
     box = np.asarray(sim.airframe.value("shape.collision_box"))
-    vel = jax.jit(vmap_worlds(vmap_drones(lambda one: contact_points(one, surfaces[:1], box).vel)))(sim.data)
+    vel = jax.jit(vmap_worlds(vmap_drones(lambda drone: contact_points(drone, surfaces[:1], box).vel)))(sim.data)
     corners = box[:3] + box[3:] * np.array(list(itertools.product((-1, 1), repeat=3)))
     lever = corners + [0.1, 0.2, 0.3] - np.asarray(car.pos)[0, 0]
     expected = np.array([0.5, 0, 0]) + np.cross([0, 0, 2.0], lever)

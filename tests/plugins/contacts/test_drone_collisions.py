@@ -17,17 +17,17 @@ def build(n_worlds=2, n_drones=2, engine="auto", **kwargs):
 
 
 @pytest.mark.parametrize("restitution", [0.0, 1.0])
-def test_a_central_impact_shares_momentum(restitution):
-    """Equal masses: (1 + e) / 2 of the speed goes over; the other world does not collide."""
+def test_a_central_impact_passes_momentum_on(restitution):
+    """With equal masses (1 + e) / 2 of the speed goes to the drone that is hit; the other world has no impact."""
     sim, _ = build(restitution=restitution)
     vel = np.zeros((2, 2, 3))
     vel[0, 0, 0], vel[1, 0, 0] = 2.0, -2.0
     sim.data = with_states(sim.data, vel=vel)
     sim.step(80)
-    found = np.asarray(sim.data.states.vel)[..., 0]
-    share = (1 + restitution) / 2
-    np.testing.assert_allclose(found[0], [2 * (1 - share), 2 * share], atol=0.02)
-    np.testing.assert_allclose(found[1], [-2.0, 0.0], atol=1e-6)
+    vel_x = np.asarray(sim.data.states.vel)[..., 0]
+    fraction = (1 + restitution) / 2
+    np.testing.assert_allclose(vel_x[0], [2 * (1 - fraction), 2 * fraction], atol=0.02)
+    np.testing.assert_allclose(vel_x[1], [-2.0, 0.0], atol=1e-6)
 
 
 def test_momentum_is_kept_in_an_oblique_impact_of_three():
@@ -37,13 +37,13 @@ def test_momentum_is_kept_in_an_oblique_impact_of_three():
     sim.step(100)
     after = np.asarray(sim.data.states.vel, np.float64)[0].sum(axis=0) + [0, 0, 3 * 9.81 * 0.2]
     np.testing.assert_allclose(after, before, atol=1e-4)
-    assert np.abs(np.asarray(sim.data.states.ang_vel)).max() > 0.1, "it turns them"
+    assert np.abs(np.asarray(sim.data.states.ang_vel)).max() > 0.1, "the impact turns them"
     pos = np.asarray(sim.data.states.pos)[0]
     assert np.all(np.diff(pos[:, 0]) > 0.05), "none has passed through another"
 
 
 def test_an_overlap_is_removed_without_a_velocity():
-    """Two drones that begin within each other part in tenths of a second and fall side by side then."""
+    """Two drones that overlap at the start separate within tenths of a second, and then fall at the same speed."""
     sim, _ = build(n_worlds=1)
     sim.data = with_states(sim.data, pos=np.array([[0, 0, 20.0], [0.0, 0, 20.01]]))
     sim.step(250)
@@ -55,9 +55,9 @@ def test_an_overlap_is_removed_without_a_velocity():
 
 @pytest.mark.parametrize("iterations", [10, 100])
 def test_law_08_impacts_of_any_attitude_add_no_energy(iterations, rng):
-    """Restitution 1 and friction, where drones that turn gained up to 38 % (two) and 81 % (three).
+    """Rotating drones with restitution 1 and friction.
 
-    Energies are those in the frame of the mean velocity, which gravity alone changes.
+    Energies are measured in the frame of the mean velocity, which only gravity changes.
     """
     n_worlds, n_drones = 64, 3
     sim, _ = build(n_worlds, n_drones, restitution=1.0, iterations=iterations)
@@ -77,12 +77,12 @@ def test_law_08_impacts_of_any_attitude_add_no_energy(iterations, rng):
         v = v - v.mean(axis=1, keepdims=True)
         return 0.5 * mass * (v**2).sum(axis=(1, 2)) + 0.5 * np.einsum("wni,ij,wnj->w", w, inertia, w)
 
-    found = [energy()]
+    energies = [energy()]
     for _ in range(20):
         sim.step(10)
-        found.append(energy())
-    changes = np.array(found) / found[0] - 1
-    assert changes.max() < 0.02, "what the integration of fast spins adds"
+        energies.append(energy())
+    changes = np.array(energies) / energies[0] - 1
+    assert changes.max() < 0.02, "the integration of fast spins adds this much"
     assert changes[-1].min() < -0.3, "they collide, with friction"
 
 

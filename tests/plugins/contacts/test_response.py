@@ -1,4 +1,4 @@
-"""Contact response: what rests, slides, bounces and lands, against closed forms and C MuJoCo."""
+"""Contact response: resting, sliding, bouncing and landing, against closed forms and C MuJoCo."""
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,8 @@ HALF = 0.02
 GRAVITY = 9.81
 
 
-def without_air(n_worlds=1, objects=(), engine="auto", integrator="euler", **settings):
-    """Return drones with motors off in a vacuum, which fall, slide and bounce as the closed forms have it."""
+def build(n_worlds=1, objects=(), engine="auto", integrator="euler", **settings):
+    """Return a simulation of drones in a vacuum with motors off, for which the closed forms hold."""
     sim = Sim(n_worlds=n_worlds, control="rotor_vel", engine=engine, integrator=integrator)
     for kind, options in objects:
         sim.scene.add(kind, **options)
@@ -27,26 +27,26 @@ def without_air(n_worlds=1, objects=(), engine="auto", integrator="euler", **set
     return sim
 
 
-def throw(sim, **states):
+def set_states(sim, **states):
     sim.data = sim.data.replace(states=sim.data.states.replace(**{k: np.float32(v) for k, v in states.items()}))
 
 
 def track(sim, n, every=1):
-    """Return states every few steps, with time in front."""
-    found = []
+    """Return pos, vel, quat and ang_vel once in ``every`` steps, with the time as their first axis."""
+    states = []
     for _ in range(n // every):
         sim.step(every)
         s = sim.data.states
-        found.append([np.asarray(x, np.float64) for x in (s.pos, s.vel, s.quat, s.ang_vel)])
-    return [np.stack(x) for x in zip(*found, strict=True)]
+        states.append([np.asarray(x, np.float64) for x in (s.pos, s.vel, s.quat, s.ang_vel)])
+    return [np.stack(x) for x in zip(*states, strict=True)]
 
 
 def test_a_drone_on_the_floor_rests():
     """It does not sink, slide, yaw or tip, at any heading, with motors off or idling."""
-    sim = without_air(4)
+    sim = build(4)
     yaw = np.array([0, 0.3, 1.0, 2.0])
     quat = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=-1)[:, None]
-    throw(sim, pos=np.tile([0.3, -0.2, HALF - 1e-4], (4, 1, 1)), quat=quat)
+    set_states(sim, pos=np.tile([0.3, -0.2, HALF - 1e-4], (4, 1, 1)), quat=quat)
     sim.rotor_vel_control(np.full((4, 1, 4), 0.5 * 15864.0) * np.array([0, 0, 1, 1])[:, None, None])
     sim.step(500)
     first = sim.data.states
@@ -58,10 +58,10 @@ def test_a_drone_on_the_floor_rests():
     np.testing.assert_allclose(np.asarray(last.pos)[..., :2], np.tile([0.3, -0.2], (4, 1, 1)), atol=1e-4)
 
 
-def test_it_takes_off():
+def test_a_drone_takes_off_once_its_thrust_exceeds_its_weight():
     sim = Sim(control="attitude")
     sim.add(ContactResponse())
-    throw(sim, pos=[[[0, 0, HALF]]])
+    set_states(sim, pos=[[[0, 0, HALF]]])
     sim.attitude_control(np.array([[[0, 0, 0, 0.3]]]))  # less than its weight of 0.426 N
     sim.step(500)
     assert float(sim.data.states.pos[0, 0, 2]) == pytest.approx(HALF, abs=1e-3)
@@ -70,11 +70,11 @@ def test_it_takes_off():
     assert float(sim.data.states.pos[0, 0, 2]) > 0.5
 
 
-def test_a_slide_ends_where_friction_has_taken_the_speed():
-    """Over v^2 / (2 mu g); with a step of 2 ms and the gentle push on the ground, within 3%."""
-    sim = without_air(2, friction=0.4)
+def test_friction_stops_a_slide():
+    """After v^2 / (2 mu g), within 3%, with steps of 2 ms and the slow separation of overlaps."""
+    sim = build(2, friction=0.4)
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.tile(np.float32([0, 0, HALF]), (2, 1, 1))))
-    throw(sim, vel=[[[1.0, 0, 0]], [[0, 2.0, 0]]])
+    set_states(sim, vel=[[[1.0, 0, 0]], [[0, 2.0, 0]]])
     sim.step(1500)
     pos = np.asarray(sim.data.states.pos)[:, 0]
     np.testing.assert_allclose([pos[0, 0], pos[1, 1]], [1 / (2 * 0.4 * GRAVITY), 4 / (2 * 0.4 * GRAVITY)], rtol=0.03)
@@ -82,39 +82,39 @@ def test_a_slide_ends_where_friction_has_taken_the_speed():
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 0.8])
-def test_it_bounces_to_the_square_of_the_restitution(restitution):
-    sim = without_air(restitution=restitution)
-    throw(sim, pos=[[[0, 0, 0.5 + HALF]]])
+def test_the_height_of_a_bounce_follows_from_the_restitution(restitution):
+    sim = build(restitution=restitution)
+    set_states(sim, pos=[[[0, 0, 0.5 + HALF]]])
     z = track(sim, 600)[0][:, 0, 0, 2] - HALF
     fell = int(np.argmax(z < 0.002))
     apex = z[fell + 20 :].max()
-    # Within a step's fall of 6 mm: the floor is felt at the end of the step in which it was passed.
+    # Within the 6 mm of the fall in one step: contact acts at the end of the step in which the drone reached the floor.
     assert apex == pytest.approx(restitution**2 * 0.5, rel=0.03, abs=0.007)
 
 
-def kinetic(data):
-    """Return the energy of motion of every drone, J."""
+def kinetic_energy(data):
+    """Return the kinetic energy of every drone, J."""
     mass, inertia = float(data.params.mass[0]), np.asarray(data.params.J, np.float64)
     vel, ang = (np.asarray(x, np.float64) for x in (data.states.vel, data.states.ang_vel))
     return 0.5 * mass * (vel**2).sum(-1) + 0.5 * np.einsum("...i,ij,...j", ang, inertia, ang)
 
 
 def test_a_contact_creates_no_energy(rng):
-    """Of drones that overlap floor, wall, pole or pad in any way, at any speed, with every restitution and friction.
+    """Drones overlap floor, wall, pole or pad in any way, at any speed, with every restitution and friction.
 
-    What is allowed is what parting an overlap at its fastest takes, a whole drone's motion at 0.25 m/s, and rounding.
+    They may gain rounding errors and the energy of a drone at 0.25 m/s, at which overlaps are separated at most.
     """
     n = 1000
     course = [("wall", {"pos": [0.6, 0, 0]}), ("pole", {"pos": [0, 0.5, 0]}), ("landing_pad", {"pos": [-0.6, 0, 0.2]})]
-    sim = without_air(n, course)
-    how = sim.data.plugins["contact_response"]
-    spread = np.linspace(0, 1, n, dtype=np.float32)[:, None, None]
+    sim = build(n, course)
+    response = sim.data.plugins["contact_response"]
+    values = np.linspace(0, 1, n, dtype=np.float32)[:, None, None]
     sim.data = sim.data.replace(
-        plugins={"contact_response": how.replace(restitution=spread, friction=2 * spread[::-1] ** 2)}
+        plugins={"contact_response": response.replace(restitution=values, friction=2 * values[::-1] ** 2)}
     )
     quat = rng.normal(size=(n, 1, 4))
     places = np.array([[0, 0, 0.03], [0.56, 0, 0.5], [0, 0.48, 0.5], [-0.6, 0, 0.22]])[rng.integers(0, 4, n)]
-    throw(
+    set_states(
         sim,
         pos=(places + rng.uniform(-0.04, 0.04, (n, 3)))[:, None],
         quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
@@ -122,7 +122,7 @@ def test_a_contact_creates_no_energy(rng):
         ang_vel=10 * rng.normal(size=(n, 1, 3)),
     )
     after = Step({"contact_response": sim.step_pipeline["contact_response"]}, "interpret")(sim.data, jnp.int32(1))
-    before, now = kinetic(sim.data)[:, 0], kinetic(after)[:, 0]
+    before, now = kinetic_energy(sim.data)[:, 0], kinetic_energy(after)[:, 0]
     touched = np.abs(np.asarray(after.plugins["contact_response"].impulse)).sum(axis=(1, 2)) > 0
     assert touched.sum() > n // 2
     assert (now < 0.9 * before).sum() > n // 20
@@ -131,19 +131,19 @@ def test_a_contact_creates_no_energy(rng):
 
 
 @pytest.fixture(scope="module")
-def between():
-    """Return 12 drones between a wall and a pole, by an integrator that keeps their energy."""
+def course_sim():
+    """Return a simulation of 12 drones between a wall and a pole, with an integrator that keeps their energy."""
     course = [("wall", {"pos": [1, 0, 0], "height": 6}), ("pole", {"pos": [-1, 0, 0], "height": 6.0})]
-    return without_air(12, course, integrator="rk4")
+    return build(12, course, integrator="rk4")
 
 
-def test_flights_with_bounces_lose_what_they_have(between, rng):
-    """Height and motion together, of tumbling drones."""
-    sim, n = between, 12
+def test_tumbling_drones_lose_energy_as_they_bounce(course_sim, rng):
+    """Potential and kinetic energy together."""
+    sim, n = course_sim, 12
     sim.reset()
     sim.replace(ContactResponse(restitution=0.6))
     quat = rng.normal(size=(n, 1, 4))
-    throw(
+    set_states(
         sim,
         pos=rng.uniform([-0.9, -0.3, 0.3], [0.9, 0.3, 1.0], (n, 1, 3)),
         quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
@@ -151,7 +151,7 @@ def test_flights_with_bounces_lose_what_they_have(between, rng):
     )
     mass, energy = float(sim.data.params.mass[0]), []
     for _ in range(200):
-        energy.append(kinetic(sim.data)[:, 0] + mass * GRAVITY * np.asarray(sim.data.states.pos)[:, 0, 2])
+        energy.append(kinetic_energy(sim.data)[:, 0] + mass * GRAVITY * np.asarray(sim.data.states.pos)[:, 0, 2])
         sim.step(5)
     energy = np.array(energy)
     gained = (energy[1:] - np.minimum.accumulate(energy, axis=0)[:-1]).max()
@@ -159,11 +159,11 @@ def test_flights_with_bounces_lose_what_they_have(between, rng):
     assert (energy[-1] < 0.7 * energy[0]).all()
 
 
-def test_it_bounces_off_a_wall_and_a_pole(between):
-    sim = between
+def test_drones_bounce_off_a_wall_and_a_pole(course_sim):
+    sim = course_sim
     sim.reset()
     sim.replace(ContactResponse(restitution=0.5, friction=0.0))
-    throw(sim, pos=[[[0.7, 0, 3]], [[-0.7, 0, 3]]] * 6, vel=[[[2, 0, 0]], [[-2, 0, 0]]] * 6)
+    set_states(sim, pos=[[[0.7, 0, 3]], [[-0.7, 0, 3]]] * 6, vel=[[[2, 0, 0]], [[-2, 0, 0]]] * 6)
     sim.step(200)
     vel = np.asarray(sim.data.states.vel)[:2, 0, 0]
     np.testing.assert_allclose(vel, [-1, 1], rtol=0.01)
@@ -172,7 +172,7 @@ def test_it_bounces_off_a_wall_and_a_pole(between):
     assert x[1] > -1 + 0.015 + 0.07
 
 
-def test_it_lands_on_a_moving_pad_and_rides_along():
+def test_a_drone_lands_on_a_moving_pad_and_rides_on_it():
     sim = Sim(control="rotor_vel")
     pad = sim.scene.add("landing_pad", pos=[0, 0, 0.5], radius=0.4)
     sim.add(ContactResponse(friction=0.8))
@@ -186,7 +186,7 @@ def test_it_lands_on_a_moving_pad_and_rides_along():
 
     sim.step_pipeline = {"drive": drive, **sim.step_pipeline}
     sim.build_step_fn()
-    throw(sim, pos=[[[0, 0, 0.6]]])
+    set_states(sim, pos=[[[0, 0, 0.6]]])
     sim.step(600)
     states = sim.data.states
     assert float(states.pos[0, 0, 2]) == pytest.approx(0.5 + HALF, abs=2e-3)
@@ -194,12 +194,12 @@ def test_it_lands_on_a_moving_pad_and_rides_along():
     assert "not fused" not in sim.explain()
 
 
-def test_drop_and_slide_are_those_of_c_mujoco():
-    """A tilted drop with a sideways throw, as MuJoCo has it with a hard floor, elliptic cones and fine steps."""
-    sim = without_air(restitution=0.0, friction=0.5)
+def test_drop_and_slide_as_in_mujoco():
+    """A tilted drone falls with a sideways velocity; MuJoCo has a hard floor, elliptic cones and small steps."""
+    sim = build(restitution=0.0, friction=0.5)
     angle = 0.3
     quat = np.array([np.sin(angle / 2), 0, 0, np.cos(angle / 2)])
-    throw(sim, pos=[[[0, 0, 0.2]]], quat=quat[None, None], vel=[[[0.8, 0, 0]]])
+    set_states(sim, pos=[[[0, 0, 0.2]]], quat=quat[None, None], vel=[[[0.8, 0, 0]]])
     sim.step(1000)
     inertia = np.diag(np.asarray(sim.data.params.J))
     model = mujoco.MjModel.from_xml_string(f"""
@@ -216,14 +216,14 @@ def test_drop_and_slide_are_those_of_c_mujoco():
         mujoco.mj_step(model, data)
     pos = np.asarray(sim.data.states.pos)[0, 0]
     assert pos[2] == pytest.approx(data.qpos[2], abs=1e-3)
-    # What a tilted impact does to the throw depends on which corner is first: the two agree to a tenth of the way.
+    # How the impact changes the sideways velocity depends on which corner touches first: the ways agree within 10 %.
     assert pos[0] == pytest.approx(data.qpos[0], rel=0.1)
     assert np.abs(sim.data.states.vel).max() < 1e-3
 
 
-def test_the_landing_place_has_a_gradient():
-    """Of where a thrown drone comes to rest, by the speed of the throw: more speed, further; against differences."""
-    sim = without_air(friction=0.5)
+def test_the_place_where_a_drone_stops_has_a_gradient():
+    """The derivative of that place by the speed of a throw equals the difference quotient."""
+    sim = build(friction=0.5)
     stages = as_stages(sim.step_pipeline)
     data = sim.data.replace(states=sim.data.states.replace(pos=jnp.array([[[0, 0, HALF + 0.01]]])))
 
@@ -236,23 +236,23 @@ def test_the_landing_place_has_a_gradient():
         thrown = data.replace(states=data.states.replace(vel=jnp.array([[[1.0, 0, 0]]]) * speed))
         return jax.lax.scan(step, thrown, length=150)[0].states.pos[0, 0, 0]
 
-    place = jax.jit(lambda speed: jax.jvp(end, (speed,), (1.0,)))
-    slope = place(1.0)[1]
-    difference = (place(1.05)[0] - place(0.95)[0]) / 0.1
+    end_and_slope = jax.jit(lambda speed: jax.jvp(end, (speed,), (1.0,)))
+    slope = end_and_slope(1.0)[1]
+    difference = (end_and_slope(1.05)[0] - end_and_slope(0.95)[0]) / 0.1
     assert np.isfinite(slope)
     assert float(slope) == pytest.approx(float(difference), rel=0.15)
 
 
 def test_the_impulse_is_reported():
-    sim = without_air(2)
-    throw(sim, pos=[[[0, 0, 0.1]], [[0.3, 0.05, 0.06]]], vel=[[[0.5, 0, 0]], [[0, 0, 0]]])
+    sim = build(2)
+    set_states(sim, pos=[[[0, 0, 0.1]], [[0.3, 0.05, 0.06]]], vel=[[[0.5, 0, 0]], [[0, 0, 0]]])
     sim.step(460)
     weight = float(sim.data.params.mass[0]) * GRAVITY
     impulse = np.asarray(sim.data.plugins["contact_response"].impulse)[0, 0]
     np.testing.assert_allclose(impulse * 500, [0, 0, weight], atol=0.02 * weight)
 
 
-def test_law_09_what_cannot_be_is_refused():
+def test_law_09_wrong_settings_are_errors():
     sim = Sim()
     for settings, words in (
         ({"friction": -1}, "expected friction of ContactResponse to be from 0 to 1000, got -1"),

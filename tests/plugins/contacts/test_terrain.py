@@ -24,7 +24,7 @@ def hills(n_rows=16, n_columns=21):
 
 
 def flat(height):
-    """Return heights of one number, of as many nodes as the hills, so that kernels are shared."""
+    """Return equal heights on as many nodes as the hills have, so that both use the same kernels."""
     return np.full_like(hills(), height)
 
 
@@ -35,8 +35,8 @@ def build(heights=None, n_worlds=2, n_drones=2, pos=(0.3, 0.2, 2.0), control="ro
     return sim, sim.add(Terrain(hills() if heights is None else heights, SIZE, **kwargs))
 
 
-def test_height_and_normal_are_those_of_mujocos_rays(rng):
-    """Rays straight down on the compiled scene meet the same surface, with the same normal."""
+def test_height_and_normal_are_those_of_mujoco(rng):
+    """Vertical rays of MuJoCo hit the surface at the same height; normals agree with differences of heights."""
     sim, plugin = build()
     model, data = sim.scene.mj_model, mujoco.MjData(sim.scene.mj_model)
     mujoco.mj_forward(model, data)
@@ -52,14 +52,14 @@ def test_height_and_normal_are_those_of_mujocos_rays(rng):
     for axis in np.eye(3)[:2]:
         ends = [plugin.read(sim.data).surface_at(np.float32(points + s * h * axis))[0] for s in (-1, 1)]
         slopes.append((np.asarray(ends[1]) - np.asarray(ends[0]))[:, 0] / (2 * h))
-    flat = np.stack([-slopes[0], -slopes[1], np.ones(200)], axis=-1)
-    flat /= np.linalg.norm(flat, axis=-1, keepdims=True)
-    off = np.abs(normal - flat).max(axis=-1)
-    assert np.quantile(off, 0.95) < 5e-3, "differences over an edge apart"
+    expected_normal = np.stack([-slopes[0], -slopes[1], np.ones(200)], axis=-1)
+    expected_normal /= np.linalg.norm(expected_normal, axis=-1, keepdims=True)
+    error = np.abs(normal - expected_normal).max(axis=-1)
+    assert np.quantile(error, 0.95) < 5e-3, "except for differences across an edge"
     np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1, rtol=1e-6)
 
 
-def test_around_it_is_the_floor_or_the_border_continued():
+def test_beyond_the_border_is_the_floor_or_the_height_of_the_border():
     sim, plugin = build()
     far = np.float32([[5.0, 0.0, 1.0], [0.0, -9.0, 1.0]])
     height, normal = ground_at(sim.data, far)
@@ -72,7 +72,7 @@ def test_around_it_is_the_floor_or_the_border_continued():
     np.testing.assert_array_equal(ground_height(Sim().data, far), 0)
 
 
-def test_drones_land_on_it_and_take_off():
+def test_drones_land_on_terrain_and_take_off():
     sim, plugin = build(control="attitude")
     sim.step(1000)
     ground = np.asarray(ground_height(sim.data, sim.data.states.pos))
@@ -103,7 +103,7 @@ def test_law_07_nothing_breaks_at_the_border_of_the_terrain():
 
 
 def test_a_drone_on_a_slope_rests_with_contact_response_where_friction_holds_it():
-    """A plane of slope 0.3 holds by friction of 0.6, and not by 0.1; the body turns to its normal."""
+    """On a slope of 0.3 it rests with a friction of 0.6, not with 0.05; it turns into the plane."""
     slope = 0.3 * np.linspace(0, 4, 21)[None].repeat(16, axis=0)
     for friction, holds in ((0.6, True), (0.05, False)):
         sim, _ = build(slope, n_worlds=1, n_drones=1, pos=(0.5, 0.2, 0.83))
@@ -124,7 +124,7 @@ def test_a_drone_on_a_slope_rests_with_contact_response_where_friction_holds_it(
             assert moved[0] < -0.05
 
 
-def test_loads_rest_on_it():
+def test_loads_rest_on_terrain():
     sim = Sim(control="rotor_vel")
     sim.data = with_states(sim.data, pos=[0.5, 0.0, 2.0])
     sim.add(Terrain(flat(0.4), SIZE))
@@ -134,7 +134,7 @@ def test_loads_rest_on_it():
     np.testing.assert_allclose(np.asarray(load.read(sim.data).pos)[0, 0, 2], 0.43, atol=1e-5)
     sim.data = with_states(sim.data, pos=[-0.5, 0.0, 2.0], vel=0.0)
     sim.add(ContactResponse())
-    remove_fn(sim.step_pipeline, "contact_response")  # that of the drones, which touch nothing here
+    remove_fn(sim.step_pipeline, "contact_response")  # of the drones, which touch nothing here
     sim.build_step_fn()
     sim.step(100)
     np.testing.assert_allclose(np.asarray(load.read(sim.data).pos)[0, 0, 2], 0.43, atol=1e-3)
@@ -151,18 +151,18 @@ def test_height_above_ground_counts_for_ground_effect_and_wind():
     plain = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
     plain.data = with_states(plain.data, pos=[0, 0, 0.05])
     vels = []
-    for one in (sim, plain):
-        one.data = with_states(one.data, rotor_vel=15000.0)
-        one.rotor_vel_control(np.full((2, 2, 4), 15000.0))
-        one.add(GroundEffect())
-        one.add(Wind((5.0, 0, 0), speed_20ft=5.0, roughness=0.01))
-        one.step(10)
-        vels.append(np.asarray(one.data.states.vel))
+    for s in (sim, plain):
+        s.data = with_states(s.data, rotor_vel=15000.0)
+        s.rotor_vel_control(np.full((2, 2, 4), 15000.0))
+        s.add(GroundEffect())
+        s.add(Wind((5.0, 0, 0), speed_20ft=5.0, roughness=0.01))
+        s.step(10)
+        vels.append(np.asarray(s.data.states.vel))
     np.testing.assert_allclose(vels[0], vels[1], rtol=1e-4, atol=1e-6)
     assert abs(vels[0][..., 0]).min() > 1e-3
 
 
-def test_range_finders_and_depth_measure_it():
+def test_range_finders_measure_terrain():
     sim, _ = build(n_drones=1)
     finder = sim.add(RangeFinder([(0, 0, -1.0)]))
     sim.step()
@@ -173,10 +173,10 @@ def test_range_finders_and_depth_measure_it():
 
 def test_large_tables_of_heights_are_read_outside_of_the_kernel_with_the_same_numbers(monkeypatch):
     ends = []
-    for largest in (10**6, 1):
-        monkeypatch.setattr(terrain_module, "MAX_FUSED_VALUES", largest)
+    for max_values in (10**6, 1):
+        monkeypatch.setattr(terrain_module, "MAX_FUSED_VALUES", max_values)
         sim, _ = build(n_worlds=3, pos=(0.3, 0.2, 0.62))
-        assert bool(sim.step_fn.plan(sim.data).program.unfused_stages) == (largest == 1)
+        assert bool(sim.step_fn.plan(sim.data).program.unfused_stages) == (max_values == 1)
         sim.data = with_states(sim.data, vel=[0.5, 0.2, -0.5])
         sim.step(60)
         ends.append(np.asarray(sim.data.states.pos))
@@ -194,14 +194,14 @@ def test_law_08_gradients_of_the_height_are_its_slopes(x64):
 
     for point in ([0.31, 0.17, 0.0], [-1.47, 1.2, 0.0]):
         p = np.array(point)
-        found = np.asarray(slope(p))
+        gradient = np.asarray(slope(p))
         central = [(surface_at(p + h * e)[0] - surface_at(p - h * e)[0])[0] / (2 * h) for e in np.eye(3)]
-        np.testing.assert_allclose(found, central, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(gradient, central, rtol=1e-6, atol=1e-8)
         normal = surface_at(p)[1]
-        np.testing.assert_allclose(found[:2], -normal[:2] / normal[2], rtol=1e-9)
+        np.testing.assert_allclose(gradient[:2], -normal[:2] / normal[2], rtol=1e-9)
 
 
-def test_images_lie_with_their_upper_edge_at_the_largest_y(tmp_path):
+def test_the_upper_edge_of_an_image_is_at_the_largest_y(tmp_path):
     pixels = np.zeros((3, 4), np.uint8)
     pixels[0, 3] = 200  # the upper right corner
     pixels[2, 0] = 100  # the lower left corner
@@ -232,7 +232,7 @@ def test_law_09_files_that_are_no_images_are_errors_before_memory_is_allocated(t
             Sim().add(Terrain(path, (4, 3, 2.0)))
 
 
-def test_other_heights_replace_it():
+def test_heights_can_be_replaced():
     sim, _plugin = build(flat(0.5))
     sim.step()
     sim.replace(Terrain(flat(0.7), SIZE))
@@ -264,7 +264,7 @@ def test_law_09_wrong_settings_leave_the_simulation_as_it_was(args, kwargs, mess
     assert "clip_floor_pos" in sim.step_pipeline
 
 
-def test_law_09_response_comes_after_the_terrain():
+def test_law_09_terrain_after_contact_response_is_an_error():
     sim = Sim()
     sim.add(ContactResponse())
     with pytest.raises(ConfigError, match="terrain before contact response"):

@@ -91,7 +91,7 @@ def test_it_is_fused_and_drawn():
     sim = Sim(2, 3, drone="bumblebee", control="rotor_vel", integrator="symplectic_euler", strict=True)
     load = sim.add(SharedLoad(mass=0.3))
     sim.step(5)
-    assert "unfused" not in sim.explain()
+    assert "splits the step" not in sim.explain()
     assert sim.contact_report().object_names == ("load:0",)
     sim.sync(1)
     body = sim.mj_model.body("load:0").mocapid.item()

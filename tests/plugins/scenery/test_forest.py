@@ -253,7 +253,7 @@ def test_a_task_places_a_forest_in_its_episodes():
         )
     assert 1 <= n_changes <= 3
     np.testing.assert_array_equal(record.difficulty, 0.75)
-    assert "unfused" not in env.explain()
+    assert "splits the step" not in env.explain()
 
 
 BAD = {
