@@ -1,4 +1,4 @@
-"""Battery: energy is booked, the voltage sags by hand-made numbers, and rotors slow down with it."""
+"""Battery: balance of energy, voltage under load calculated by hand, and rotors that slow down with it."""
 
 import functools
 
@@ -28,6 +28,7 @@ def record(sim):
 
 
 def ocv(charge):
+    """Return the open-circuit voltage of a cell, V."""
     return -1.031 * np.exp(-35 * charge) + 3.685 + 0.2156 * charge - 0.1178 * charge**2 + 0.3201 * charge**3
 
 
@@ -38,37 +39,37 @@ def rotor_power(rotor_vel):
 
 
 def test_voltage_and_current_under_load_by_hand():
-    """4 V, 0.5 ohm: 6 W at 3 V and 2 A. 8 W is the most there is, at half the voltage; 100 W get no more."""
-    one = lambda *x: [np.float32([v]) for v in x]  # noqa: E731
+    """At 4 V and 0.5 ohm, 6 W are 3 V and 2 A. The most is 8 W, at half the voltage; 100 W give the same."""
+    as_arrays = lambda *x: [np.float32([v]) for v in x]  # noqa: E731
     for power, expected in ((0, (4, 0)), (6, (3, 2)), (8, (2, 4)), (100, (2, 4))):
         np.testing.assert_allclose(
-            np.ravel(jax.jit(battery.voltage_under_load)(*one(power, 4.0, 0.5))), expected, rtol=1e-6
+            np.ravel(jax.jit(battery.voltage_under_load)(*as_arrays(power, 4.0, 0.5))), expected, rtol=1e-6
         )
     np.testing.assert_allclose(battery.open_circuit_voltage(np.ones(1, np.float32), 2), [2 * 4.1029], rtol=1e-6)
     np.testing.assert_allclose(battery.open_circuit_voltage(np.zeros(1, np.float32), 1), [2.654], rtol=1e-6)
 
 
-def test_energy_is_booked():
-    """What the cells gave, integral of V_0 I, is what the rotors took over their efficiency and what heated R."""
+def test_energy_is_balanced():
+    """The integral of V_0 I of the cells is the energy of the rotors over their efficiency plus the heat in R."""
     sim = build(efficiency=0.6, base_power=0.5, charge=[[1.0, 0.5], [0.2, 0.05]], n_cells=1)
     sim.rotor_vel_control(np.linspace(0.7, 1.1, 16).reshape(2, 2, 4) * hover_rotor_state(sim.data))
     start = np.asarray(record(sim).charge, np.float64)
-    given = taken = heat = charge = 0.0
+    supplied = consumed = heat = charge = 0.0
     for _ in range(250):
-        asked, before = rotor_power(sim.data.states.rotor_vel) / 0.6 + 0.5, np.asarray(record(sim).charge, np.float64)
+        power, before = rotor_power(sim.data.states.rotor_vel) / 0.6 + 0.5, np.asarray(record(sim).charge, np.float64)
         sim.step()
         v, i = (np.asarray(x, np.float64) for x in (record(sim).voltage, record(sim).current))
-        given, taken, heat = given + ocv(before) * i, taken + asked, heat + 0.1 * i**2
+        supplied, consumed, heat = supplied + ocv(before) * i, consumed + power, heat + 0.1 * i**2
         charge = charge + i / 500 / 3600
-        np.testing.assert_allclose(v * i, asked, rtol=1e-5)  # float32
+        np.testing.assert_allclose(v * i, power, rtol=1e-5)  # float32
         np.testing.assert_allclose(v, ocv(before) - 0.1 * i, rtol=1e-6)
-    np.testing.assert_allclose(given, taken + heat, rtol=1e-5)
-    # The charge, to what float32 can hold of it: one rounding of the last value, none of the 250 steps.
+    np.testing.assert_allclose(supplied, consumed + heat, rtol=1e-5)
+    # In float32 the charge is rounded once, at its last value, and not in each of the 250 steps.
     np.testing.assert_allclose(start - np.asarray(record(sim).charge, np.float64), charge / 0.25, atol=7e-8)
     assert np.min(charge / 0.25) > 1e-4
 
 
-def test_a_sagging_battery_slows_the_rotors_and_leaves_the_command():
+def test_a_low_voltage_slows_the_rotors_and_leaves_the_command():
     """The rotors settle at the airframe's largest speed times V / V_full, here V / 4 V."""
     sim = build(capacity=10.0, resistance=0.5, full_speed_voltage=4.0)
     top = np.float32(sim.data.params.rotor_vel_max[0])
@@ -84,28 +85,30 @@ def test_a_sagging_battery_slows_the_rotors_and_leaves_the_command():
 
 
 def test_without_compensation_all_speeds_follow_the_voltage():
-    """At a half and at a full charge, and of a fleet: the command times V over the voltage of the command."""
+    """Speeds are the commands times V over the voltage of the commands, at full and half charge."""
     sim = build(capacity=10.0, charge=[[1.0, 0.5], [0.2, 0.5]], command_voltage=[[3.7, 3.7], [3.7, 4.0]])
     sim.rotor_vel_control(np.full((2, 2, 4), 12000.0))
     sim.step(600)
-    v, at = np.asarray(record(sim).voltage), np.array([[3.7, 3.7], [3.7, 4.0]])[..., None]
+    v, command_voltage = np.asarray(record(sim).voltage), np.array([[3.7, 3.7], [3.7, 4.0]])[..., None]
     assert np.ptp(v) > 0.1
-    np.testing.assert_allclose(sim.data.states.rotor_vel, np.repeat(12000 * v / at, 4, -1), rtol=1e-4)  # discharges
+    np.testing.assert_allclose(
+        sim.data.states.rotor_vel, np.repeat(12000 * v / command_voltage, 4, -1), rtol=1e-4
+    )  # discharges
     with pytest.raises(ConfigError, match="command_voltage of Battery to be positive"):
         sim.replace(Battery(0.25, 0.1, command_voltage=0.0))
 
 
 @pytest.mark.parametrize("name, expected", [("cf21B_500", 3.1257), ("cf2x_T350", 2.8166), ("bumblebee", 2 * 3.7)])
 def test_full_speed_needs_the_voltage_of_the_airframe(name, expected):
-    """A Crazyflie's is that of the firmware's thrust curve; an airframe without a curve gets 3.7 V per cell."""
+    """For a Crazyflie it follows from the firmware's thrust curve; airframes without a curve get 3.7 V per cell."""
     sim = Sim(drone=name, control="rotor_vel")
     sim.add(Battery(capacity=0.25, resistance=0.1, n_cells=2 if name == "bumblebee" else 1))
     np.testing.assert_allclose(record(sim).full_speed_voltage, expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", sorted(set(supported_drones("first_principles")) - {"bumblebee_lab"}))
-def test_without_arguments_it_is_that_of_the_airframe(name):
-    """It is full, sags under load, and lasts some minutes of hover. No battery feeds bumblebee_lab."""
+def test_without_arguments_a_battery_is_that_of_the_airframe(name):
+    """It is full, its voltage falls under load, and it lasts minutes of hover. bumblebee_lab has none."""
     sim = Sim(drone=name, control="state", controller="auto")
     sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(sim.data))
     sim.add(Battery())
@@ -139,8 +142,7 @@ def test_law_09_an_airframe_without_a_battery_needs_arguments():
 
 
 def test_above_full_speed_voltage_nothing_is_limited():
-    strong, plain = build(resistance=1e-3, full_speed_voltage=3.0), build()
-    assert len(plain.step_pipeline) == len(strong.step_pipeline)
+    strong = build(resistance=1e-3, full_speed_voltage=3.0)
     plain = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
     plain.data = strong.data.replace(plugins={})
     for sim in (strong, plain):
@@ -165,7 +167,7 @@ def test_an_empty_battery_turns_no_rotor_and_a_reset_fills_it():
     assert np.all(charge[1] < 1)
 
 
-def test_law_07_gradients_are_finite_from_full_to_empty_and_at_the_most_power():
+def test_law_07_gradients_are_finite_at_any_charge_and_power():
     @jax.jit
     @functools.partial(jax.grad, argnums=(0, 1))
     def slopes(charge, power):
@@ -174,8 +176,8 @@ def test_law_07_gradients_are_finite_from_full_to_empty_and_at_the_most_power():
 
     for charge in (0.0, 0.1, 1.0):
         charge = np.float32([charge])
-        most = np.asarray(battery.open_circuit_voltage(charge, 1)) ** 2 / 2
-        for power in (0 * most, most, 10 * most):
+        max_power = np.asarray(battery.open_circuit_voltage(charge, 1)) ** 2 / 2
+        for power in (0 * max_power, max_power, 10 * max_power):
             assert np.isfinite(slopes(charge, power)).all()
 
 
@@ -187,6 +189,6 @@ def test_law_07_gradients_are_finite_from_full_to_empty_and_at_the_most_power():
     ({"n_cells": 0}, "n_cells"),
     ({"n_cells": 1.5}, "n_cells of Battery as a whole number"),
 ])  # fmt: skip
-def test_law_09_a_battery_that_cannot_be_is_told(kwargs, message):
+def test_law_09_wrong_settings_are_errors(kwargs, message):
     with pytest.raises(ConfigError, match=message):
         build(**kwargs)

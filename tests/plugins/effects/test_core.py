@@ -1,4 +1,4 @@
-"""What holds for every effect: off it is not there, on it keeps to the laws, and all of them go together."""
+"""Laws for all effects at once; an effect that is off adds nothing to the step."""
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +23,10 @@ from crazysim.plugins import effects
 from crazysim.pytree import scopes
 
 IDLE = {Battery: {"capacity": 1e6, "resistance": 1e-6}, Latency: {"delay": 0}, MotorFailure: {}, Wind: {}}
-"""Effects at settings at which they do nothing."""
+"""Effects with settings that have no effect."""
 
 
-def switch_on(sim, settings=EFFECTS):
+def add_effects(sim, settings=EFFECTS):
     for effect, kwargs in settings.items():
         n = sim.airframe.n_rotors
         if "fail_step" in kwargs:
@@ -35,36 +35,40 @@ def switch_on(sim, settings=EFFECTS):
 
 
 @pytest.fixture(scope="module")
-def every():
+def sim_with_effects():
+    """Return a simulation of hovering drones with all effects."""
     sim = hovering()
-    switch_on(sim)
+    add_effects(sim)
     return sim
 
 
 @pytest.fixture(autouse=True)
 def restore(request):
-    if "every" not in request.fixturenames:
+    """Restore the data of the shared simulation after each test."""
+    if "sim_with_effects" not in request.fixturenames:
         yield
         return
-    sim = request.getfixturevalue("every")
+    sim = request.getfixturevalue("sim_with_effects")
     data = sim.data
     yield
     sim.data = data
 
 
-def test_every_effect_is_here_and_sorted():
+def test_all_effects_are_tested_and_sorted():
     assert effects.__all__ == sorted(effects.__all__)
     kinds = [name for name in effects.__all__ if isinstance(getattr(effects, name), type)]
     plugins = [name for name in kinds if issubclass(getattr(effects, name), Plugin)]
     assert plugins == sorted(effect.__name__ for effect in EFFECTS)
 
 
-def test_off_nothing_is_there_and_without_strength_nothing_changes():
-    """At settings that do nothing a flight is the plain one, but for the rounding of what is fused differently."""
+def test_effects_without_strength_change_nothing():
+    """The flight is that without effects, except for rounding, as the step is fused differently."""
     plain, idle = hovering(engine="interpret"), hovering(engine="interpret")
     stages = list(plain.step_pipeline)
-    switch_on(idle, IDLE)
-    assert set(idle.step_pipeline) - set(stages) == {"battery", "latency"}, "nothing runs that has nothing to do"
+    add_effects(idle, IDLE)
+    assert set(idle.step_pipeline) - set(stages) == {"battery", "latency"}, (
+        "stages that have nothing to do are left out"
+    )
     assert [s for s in idle.step_pipeline if s in stages] == stages
     assert not plain.data.plugins
     for sim in (plain, idle):
@@ -81,7 +85,7 @@ def signature(tree):
 
 
 @pytest.mark.long("traces all effects for four sizes")
-def test_law_02_shapes_and_types_stay_for_any_number_of_worlds_drones_and_rotors():
+def test_law_02_a_step_keeps_shapes_and_types_for_any_number_of_worlds_drones_and_rotors():
     tables = dict(load_airframe("cf21B_500").tables)
     angle = np.arange(6) * np.pi / 3
     rotors = {
@@ -93,7 +97,7 @@ def test_law_02_shapes_and_types_stay_for_any_number_of_worlds_drones_and_rotors
         control = ("attitude", "rotor_vel")[i % 2]
         drone = ("cf21B_500", hexacopter)[i // 2 % 2]
         sim = Sim(n_worlds, n_drones, drone=drone, control=control, engine="lanes")
-        switch_on(sim)
+        add_effects(sim)
         after = jax.eval_shape(lambda d, sim=sim: sim.step_fn(d, 1), sim.data)
         assert signature(after) == signature(sim.data)
         for scope, x in zip(*map(jax.tree.leaves, (scopes(sim.data.plugins), sim.data.plugins)), strict=True):
@@ -103,7 +107,7 @@ def test_law_02_shapes_and_types_stay_for_any_number_of_worlds_drones_and_rotors
 
 def test_float64_stays_float64(x64):
     sim = Sim(2, 2, engine="lanes")  # random numbers in float64 come from integers of 64 bits, which kernels lack
-    switch_on(sim)
+    add_effects(sim)
     assert all(x.dtype != jnp.float32 for x in jax.tree.leaves(sim.data.plugins))
     after = jax.eval_shape(lambda d: sim.step_fn(d, 1), sim.data)
     assert signature(after) == signature(sim.data)
@@ -116,17 +120,17 @@ STAGES = (
 
 
 @pytest.fixture(scope="module")
-def flown(every):
-    """Data in flight, with everything at work."""
-    before = every.data
-    every.attitude_control(repeat_command(before, hover_command(before) + [0.1, -0.2, 0.0, 0.1]))
-    every.step(20)
-    data, every.data = on_host(every.data), before
+def flight_data(sim_with_effects):
+    """Return data in flight, in which all effects act."""
+    before = sim_with_effects.data
+    sim_with_effects.attitude_control(repeat_command(before, hover_command(before) + [0.1, -0.2, 0.0, 0.1]))
+    sim_with_effects.step(20)
+    data, sim_with_effects.data = on_host(sim_with_effects.data), before
     return data
 
 
 def on_host(tree):
-    """Return a tree with its numbers in NumPy's arrays, whose parts are taken without compiling anything."""
+    """Return a tree of NumPy arrays, whose parts are taken without compiling anything; random keys stay."""
     return jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else np.asarray(x), tree)
 
 
@@ -136,11 +140,11 @@ def at_world(scope, x, world):
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_law_01_what_a_stage_does_to_all_it_does_to_one(every, flown, name):
-    """A stage on the data of one drone, or one world, gives what it gives on all data at that place."""
-    stage = every.step_pipeline[name]
-    all_at_once, of_one = on_host(jax.jit(stage)(flown)), jax.jit(stage.apply_unbatched)
-    blown = jax.jit(vmap_drones(stage.apply_unbatched))
+def test_law_01_a_stage_computes_the_same_for_one_and_for_all(sim_with_effects, flight_data, name):
+    """On the data of one drone or world a stage gives what it gives on all data at that index."""
+    stage = sim_with_effects.step_pipeline[name]
+    all_at_once, apply_to_one = on_host(jax.jit(stage)(flight_data)), jax.jit(stage.apply_unbatched)
+    apply_to_world = jax.jit(vmap_drones(stage.apply_unbatched))
     for index in [(0, 0), (1, 1), (2, 0)]:
 
         def at(scope, x, index=index):
@@ -148,27 +152,27 @@ def test_law_01_what_a_stage_does_to_all_it_does_to_one(every, flown, name):
                 return x[index[0], 0]
             return x[index if stage.scope == "drone" else index[0]] if scope == "drone" else x
 
-        expected = jax.tree.map(at, scopes(flown), all_at_once)
+        expected = jax.tree.map(at, scopes(flight_data), all_at_once)
         if name == "downwash":  # a drone alone has no others
-            world = jax.tree.map(lambda scope, x, w=index[0]: at_world(scope, x, w), scopes(flown), flown)
-            one = jax.tree.map(lambda x, k=index[1]: x[k], on_host(blown(world)))
+            world = jax.tree.map(lambda scope, x, w=index[0]: at_world(scope, x, w), scopes(flight_data), flight_data)
+            found = jax.tree.map(lambda x, k=index[1]: x[k], on_host(apply_to_world(world)))
         else:
-            one = of_one(jax.tree.map(at, scopes(flown), flown))
-        for x, y in zip(*map(jax.tree.leaves, (expected, one)), strict=True):
+            found = apply_to_one(jax.tree.map(at, scopes(flight_data), flight_data))
+        for x, y in zip(*map(jax.tree.leaves, (expected, found)), strict=True):
             if jnp.issubdtype(y.dtype, jnp.floating):
                 # float32: one drone's arithmetic is fused in another way
                 np.testing.assert_allclose(y, x, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_stages_are_straight_line(every, flown, name):
-    """Nothing of a stage loops or branches, or engines could not turn it into scalar code."""
-    jaxpr = str(jax.make_jaxpr(every.step_pipeline[name])(flown))
+def test_stages_neither_loop_nor_branch(sim_with_effects, flight_data, name):
+    """Otherwise engines could not turn them into scalar code."""
+    jaxpr = str(jax.make_jaxpr(sim_with_effects.step_pipeline[name])(flight_data))
     for word in ("while[", "scan[", "cond[", "sort[", "dot_general["):
         assert word not in jaxpr, word
 
 
-def test_docstrings_give_the_shapes(every):
+def test_docstrings_of_records_give_the_shapes(sim_with_effects):
     sizes = {
         "n_worlds": 3,
         "n_drones": 2,
@@ -180,22 +184,22 @@ def test_docstrings_give_the_shapes(every):
         "n_z": 2,
         "n_hidden": 2,
     }
-    for record in every.data.plugins.values():
+    for record in sim_with_effects.data.plugins.values():
         assert n_documented(record, **sizes) == len(jax.tree.leaves(record))
 
 
-def test_every_effect_is_fused(every):
-    program = every.step_fn.plan(every.data).program
+def test_every_effect_is_fused(sim_with_effects):
+    program = sim_with_effects.step_fn.plan(sim_with_effects.data).program
     assert program.unfused_stages == ()
     fused = {name for s in program.fused_segments for name in s.stages}
     assert {*STAGES} <= fused
-    own = set(every.step_pipeline) - set(hovering(engine="interpret").step_pipeline)
+    own = set(sim_with_effects.step_pipeline) - set(hovering(engine="interpret").step_pipeline)
     assert own == {*STAGES} - {"integration"}, "an effect's stages are listed in STAGES"
     assert [(s.scope, s.phase) for s in program.fused_segments] == [("drone", "before"), ("drone", "each")]
 
 
-def test_law_06_one_trace_whatever_is_reset_and_changed(every):
-    sim = every
+def test_law_06_resets_and_commands_cause_no_other_trace(sim_with_effects):
+    sim = sim_with_effects
     for i in range(4):
         sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
         sim.step(i + 1)
@@ -205,8 +209,8 @@ def test_law_06_one_trace_whatever_is_reset_and_changed(every):
     assert sim.step_fn._cache_size() == 1
 
 
-def test_the_users_wrench_parameters_and_commands_stay(every):
-    sim = every
+def test_force_parameters_and_commands_of_the_user_stay(sim_with_effects):
+    sim = sim_with_effects
     sim.data = with_states(sim.data, force=[0.01, 0.02, 0.03], torque=[1e-5, 0, 0])
     sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     before = sim.data
@@ -219,30 +223,30 @@ def test_the_users_wrench_parameters_and_commands_stay(every):
         assert not trees_equal(before.plugins[record], after.plugins[record]), record
 
 
-def test_a_reset_brings_every_record_back_in_its_worlds_alone(every):
-    sim = every
+def test_a_reset_restores_the_records_of_its_worlds_only(sim_with_effects):
+    sim = sim_with_effects
     sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     sim.step(40)
-    flown, mask = sim.data.plugins, np.array([False, True, True])
+    before_reset, mask = sim.data.plugins, np.array([False, True, True])
     sim.reset(mask)
     drawn, default = sim.data.plugins, dict(sim.default_data.plugins)
     for name, fields in (("randomize", ("factors", "thrust_factors", "air_vel")), ("wind_field", ("shift",))):
         found = {field: getattr(drawn[name], field) for field in fields}
-        changed = np.asarray(found[fields[0]]) != np.asarray(getattr(flown[name], fields[0]))
+        changed = np.asarray(found[fields[0]]) != np.asarray(getattr(before_reset[name], fields[0]))
         np.testing.assert_array_equal(
             changed[..., 0], np.broadcast_to(mask[:, None], (3, 2)), f"{name}: drawn at resets"
         )
         default[name] = default[name].replace(**found)
-    pairs = zip(*map(jax.tree.leaves, (scopes(flown), flown, sim.data.plugins, default)), strict=True)
+    pairs = zip(*map(jax.tree.leaves, (scopes(before_reset), before_reset, sim.data.plugins, default)), strict=True)
     for scope, before, after, default in pairs:
         if scope == "drone":
             np.testing.assert_array_equal(np.asarray(after)[mask], np.asarray(default)[mask])
             np.testing.assert_array_equal(np.asarray(after)[~mask], np.asarray(before)[~mask])
 
 
-def test_law_07_values_and_gradients_are_finite(every):
-    """On the floor, coincident, upside down, nose up, at rest, with saturated commands, through a rotor's failure."""
-    sim = every
+def test_law_07_values_and_gradients_are_finite(sim_with_effects):
+    """Drones on the floor, at one place, upside down, nose up and at rest, with saturated commands and a failure."""
+    sim = sim_with_effects
     half = np.sqrt(0.5)
     quat = np.array([[[0, 0, 0, 1], [0, 0, 0, 1]], [[1, 0, 0, 0], [0, half, 0, half]], [[0, 0, 0, 1], [0, 0, 0, 1]]])
     pos = np.array([[[0, 0, 0], [0, 0, -0.001]], [[0, 0, 1], [0, 0, 2]], [[0, 0, 3], [0, 0, 3]]])
@@ -269,7 +273,7 @@ def test_law_07_values_and_gradients_are_finite(every):
 
 
 def test_law_08_an_integrator_keeps_its_order_in_wind(x64):
-    """RK4 feels the wind at every substep: a force held over the step would leave order 1."""
+    """RK4 evaluates the wind at every substep; with a force that is constant over a step its order would be 1."""
     ends = []
     for freq in (20, 40, 320):
         sim = Sim(control="rotor_vel", integrator="rk4", freq=freq, engine="interpret")
@@ -294,12 +298,12 @@ def test_law_09_effects_need_the_built_in_integration():
 
 
 def test_default_data_get_the_record_and_nothing_else():
-    """An effect that is added in flight does not make the present state the one that resets return to."""
+    """An effect that is added in flight does not change the states that resets return to."""
     sim = hovering()
     sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     sim.step(3)
     default = sim.default_data
-    switch_on(sim)
+    add_effects(sim)
     assert trees_equal(sim.default_data.replace(plugins={}), default)
     assert (
         set(sim.default_data.plugins)

@@ -1,4 +1,4 @@
-"""Ground effect: against Cheeseman and Bennett where theirs holds, and bounded where it does not."""
+"""Ground effect: that of Cheeseman and Bennett where their formula holds, and bounded elsewhere."""
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ def gain(height, upright=1.0):
     return np.asarray(thrust_gain(*[np.float32([x]) for x in (height, upright, R)]), np.float64)[0]
 
 
-def test_the_gain_is_that_of_cheeseman_and_bennett_a_radius_up_and_more():
+def test_the_gain_is_that_of_cheeseman_and_bennett_from_one_radius_on():
     for z in (1.0, 1.5, 2.0, 4.0):
         theirs = 1 / (1 - (1 / (4 * z)) ** 2)
         assert theirs - 0.0145 < gain(z * R) <= theirs
@@ -36,7 +36,7 @@ def test_the_gain_is_bounded_on_the_floor_below_it_and_upside_down():
 
 
 def test_a_drone_that_hovers_near_the_floor_is_lifted_and_levelled():
-    """One step at hover speed: v = g dt (gain - 1); tilted, the lower rotors push more and turn it back."""
+    """One step at hover speed: v = g dt (gain - 1); the lower rotors of a tilted drone push more and turn it back."""
     sim = Sim(n_worlds=3, control="rotor_vel")
     pos, quat = np.zeros((3, 1, 3)), np.zeros((3, 1, 4))
     pos[:, 0, 2] = 5.0, R, 0.05
@@ -49,8 +49,8 @@ def test_a_drone_that_hovers_near_the_floor_is_lifted_and_levelled():
     v, w = np.asarray(sim.data.states.vel)[:, 0, 2], np.asarray(sim.data.states.ang_vel)[:, 0]
     np.testing.assert_allclose(v[:2], [0, 0.002 * 9.81 * (1 / 0.95 - 1)], rtol=1e-4, atol=1e-6)  # float32 hover
     y = 0.035355 * np.array([-1, -1, 1, 1])
-    each = [gain(0.05 + np.sin(0.2) * a, np.cos(0.2)) for a in y]
-    torque = np.sum(y * np.array(each)) * 0.0434 * 9.81 / 4
+    gains = [gain(0.05 + np.sin(0.2) * a, np.cos(0.2)) for a in y]
+    torque = np.sum(y * np.array(gains)) * 0.0434 * 9.81 / 4
     assert torque < -1e-5
     np.testing.assert_allclose(w[2, 0], 0.002 * torque / 25e-6, rtol=1e-4)
     np.testing.assert_allclose(w[:2], 0.0, atol=1e-6)
@@ -63,7 +63,7 @@ def test_law_07_gradients_are_finite_on_the_floor():
         assert np.isfinite(slope(np.float32([z, 1.0, R]))).all()
 
 
-def test_law_09_what_has_no_rotors_or_no_radius_is_told():
+def test_law_09_models_without_rotors_and_wrong_radii_are_errors():
     with pytest.raises(ConfigError, match="first_principles"):
         Sim(dynamics="so_rpy").add(GroundEffect())
     with pytest.raises(ConfigError, match="propeller_radius of GroundEffect to be positive, got -1"):

@@ -1,4 +1,4 @@
-"""Latency: a command arrives exactly so many steps later, in every command level; nothing of the user's is touched."""
+"""Latency: a command arrives exactly after its delay, at every command level; the data of the user stay."""
 
 import jax
 import numpy as np
@@ -12,12 +12,12 @@ STEPS = 24
 
 
 def command_of(sim, step):
-    """Return the command sent before a step: hover, and a little more of everything the later it is."""
+    """Return the command sent before a step: hover, plus an offset that grows with the step."""
     return repeat_command(sim.data, hover_command(sim.data) + (1 + step) * 1e-4)
 
 
 def fly(sim, n_steps=STEPS):
-    """Send another command before every step, and return the tracks. (n_steps, n_worlds, n_drones, 13 + n_rotors)"""
+    """Send another command before every step, and return the states. (n_steps, n_worlds, n_drones, 13 + n_rotors)"""
     track = []
     for step in range(n_steps):
         getattr(sim, f"{sim.control.value}_control")(command_of(sim, step))
@@ -37,11 +37,11 @@ def build(control, dynamics="first_principles", engine="auto"):
 @pytest.mark.parametrize(
     "control, dynamics", [(c, "first_principles") for c in LEVELS] + [("attitude", "so_rpy"), ("state", FITTED[-1])]
 )
-def test_a_command_arrives_exactly_so_many_steps_later(control, dynamics):
-    """Late by k steps a drone flies as one to which the first k commands were never sent, but the initial one."""
+def test_a_command_arrives_exactly_after_its_delay(control, dynamics):
+    """With a delay of k steps a drone flies as if the initial command had been sent k times before the others."""
     sim = build(control, dynamics, engine="interpret")
     initial = initial_command(sim)
-    prompt = {}
+    undelayed = {}
     for k in np.unique(DELAY):
         sim.data = sim.default_data
         track = []
@@ -51,15 +51,15 @@ def test_a_command_arrives_exactly_so_many_steps_later(control, dynamics):
             sim.step()
             s = sim.data.states
             track.append(np.concatenate([s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel], axis=-1))
-        prompt[k] = np.stack(track)
+        undelayed[k] = np.stack(track)
     sim.data = sim.default_data
     sim.add(Latency(DELAY))
-    late = fly(sim)
+    delayed = fly(sim)
     for (world, drone), k in np.ndenumerate(DELAY):
         # Two programs of the same arithmetic: float32, relative to rotor speeds of 15,000 rpm and angles near zero.
-        np.testing.assert_allclose(late[:, world, drone], prompt[k][:, world, drone], rtol=2e-6, atol=2e-6)
-        others = [j for j in prompt if j != k]
-        assert all(np.abs(prompt[j] - prompt[k])[-1, world, drone].max() > 1e-5 for j in others)
+        np.testing.assert_allclose(delayed[:, world, drone], undelayed[k][:, world, drone], rtol=2e-6, atol=2e-6)
+        others = [j for j in undelayed if j != k]
+        assert all(np.abs(undelayed[j] - undelayed[k])[-1, world, drone].max() > 1e-5 for j in others)
     sent = sim.data.controls.rotor_vel if control == "rotor_vel" else getattr(sim.data.controls, control).staged_cmd
     np.testing.assert_array_equal(sent, command_of(sim, STEPS - 1).astype(np.float32))
 
@@ -73,15 +73,16 @@ def initial_command(sim):
 
 
 @pytest.fixture(scope="module")
-def late():
+def delayed_sim():
+    """Return a simulation whose commands arrive three steps late."""
     sim = build("attitude")
     sim.add(Latency(3, max_delay=5))
     return sim
 
 
-def test_a_command_that_is_sent_once_stays(late):
-    """The queue is fed with what was sent, not with what came out of it."""
-    sim, before = late, late.data
+def test_a_command_that_is_sent_once_stays(delayed_sim):
+    """The queue is filled with the command that was sent, not with the one that arrived."""
+    sim, before = delayed_sim, delayed_sim.data
     sim.attitude_control(command_of(sim, 5))
     in_force = []
     for _ in range(9):
@@ -93,8 +94,8 @@ def test_a_command_that_is_sent_once_stays(late):
         np.testing.assert_array_equal(command, command_of(sim, 5)[0, 0].astype(np.float32))
 
 
-def test_a_reset_empties_the_queues_of_its_worlds_alone(late):
-    sim, before = late, late.data
+def test_a_reset_empties_the_queues_of_its_worlds_only(delayed_sim):
+    sim, before = delayed_sim, delayed_sim.data
     fly(sim, 8)
     flown = jax.device_get(sim.data.plugins["latency"])
     sim.reset(np.array([True, False, False]))
@@ -106,8 +107,8 @@ def test_a_reset_empties_the_queues_of_its_worlds_alone(late):
         assert np.any(getattr(flown, name)[0] != getattr(after, name)[0])
 
 
-def test_the_delay_may_change_in_flight_without_another_trace(late):
-    sim, before = late, late.data
+def test_the_delay_may_change_in_flight_without_another_trace(delayed_sim):
+    sim, before = delayed_sim, delayed_sim.data
     record = before.plugins["latency"]
     sim.attitude_control(command_of(sim, 0))
     sim.step()
@@ -125,7 +126,7 @@ def test_the_delay_may_change_in_flight_without_another_trace(late):
 
 @pytest.mark.parametrize("first", ["latency", "motors"])
 def test_a_late_rotor_command_does_not_turn_a_failed_rotor(first):
-    """Whatever was added first: commands are late before they are lost."""
+    """In any order of adding, a command is delayed before the failure acts on it."""
     sim = build("rotor_vel")
     for name in (first, *{"latency", "motors"} - {first}):
         sim.add(Latency(1) if name == "latency" else MotorFailure(effectiveness=[0.0, 1, 1, 1]))
@@ -133,7 +134,9 @@ def test_a_late_rotor_command_does_not_turn_a_failed_rotor(first):
         sim.rotor_vel_control(command_of(sim, step))
         sim.step()
     speed = np.asarray(sim.data.states.rotor_vel)[0, 0]
-    assert speed[1:].min() - speed[0] > 1000  # rpm; coasting costs 1,500 in these 10 ms, 300 before the command comes
+    assert (
+        speed[1:].min() - speed[0] > 1000
+    )  # rpm; a failed rotor loses 1,500 in these 10 ms, the others 300 before the command arrives
 
 
 @pytest.mark.parametrize("kwargs, message", [
@@ -148,7 +151,7 @@ def test_a_late_rotor_command_does_not_turn_a_failed_rotor(first):
     ({"delay": [1, 2]}, r"delay as whole.*got shape \(2,\)"),
     ({"delay": 1, "max_delay": 2.5}, "max_delay of Latency as a whole number, got 2.5"),
 ])  # fmt: skip
-def test_law_09_a_delay_that_cannot_be_is_told(kwargs, message):
+def test_law_09_wrong_delays_are_errors(kwargs, message):
     sim = Sim(n_worlds=3, n_drones=3)
     with pytest.raises(ConfigError, match=message):
         sim.add(Latency(**kwargs))

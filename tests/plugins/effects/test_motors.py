@@ -36,7 +36,7 @@ def weak():
 
 
 def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak):
-    """One step from hover: v = g dt (mean effectiveness - 1), and J w' = the torque of what is left."""
+    """One step from hover: v = g dt (mean effectiveness - 1), and J w' = the torque that remains."""
     sim, before = weak, weak.data
     sim.step()
     after, sim.data = sim.data, before
@@ -57,14 +57,14 @@ def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak):
     assert np.array_equal(p.rpm2thrust, after.params.rpm2thrust)
 
 
-def test_a_drone_without_rotors_falls_like_a_stone(weak):
+def test_a_drone_without_rotors_falls(weak):
     """It falls as explicit Euler with linear drag computes, however fast its rotors still turn; commands do not
     change."""
     sim, before = weak, weak.data
     sim.step(100)
     states, controls, sim.data = *jax.device_get((sim.data.states, sim.data.controls)), before
-    keep = 1 - 0.02477138502714662 / 0.0434 * DT
-    fall = -9.81 * DT * (1 - keep**100) / (1 - keep)
+    decay = 1 - 0.02477138502714662 / 0.0434 * DT
+    fall = -9.81 * DT * (1 - decay**100) / (1 - decay)
     np.testing.assert_allclose(states.vel[0, 0, 2], fall, rtol=1e-5)  # float32 over 100 steps
     first = np.asarray(before.states.rotor_vel)[0, 0]
     assert states.rotor_vel[0, 0].max() < 0.2 * first.min(), "failed rotors run down"
@@ -72,7 +72,7 @@ def test_a_drone_without_rotors_falls_like_a_stone(weak):
     np.testing.assert_allclose(states.vel[2], 0.0, atol=1e-4)  # at full strength it hovers, in float32
 
 
-def test_rotors_fail_in_their_step_and_come_back_with_a_reset():
+def test_rotors_fail_in_their_step_until_a_reset():
     fail_step = np.full((3, 2, 4), -1)
     fail_step[0, 0, 1], fail_step[1, 1] = 4, [7, -1, 0, 9]
     sim = build(fail_step=fail_step)
@@ -84,8 +84,8 @@ def test_rotors_fail_in_their_step_and_come_back_with_a_reset():
     assert effectiveness(sim)[0, 0, 1] == 0
 
 
-def test_rotors_fail_by_chance_at_their_rate():
-    """After t a fraction exp(-rate t) still works; nothing that failed comes back."""
+def test_rotors_fail_at_random_at_their_rate():
+    """After t a fraction exp(-rate t) still works; failed rotors stay failed."""
     n = 2048
     sim = build(n_worlds=n, n_drones=1, rate=[0.0, 5.0, 20.0, 5.0])
     sim.step(20)
@@ -101,7 +101,7 @@ def test_rotors_fail_by_chance_at_their_rate():
     assert abs(pairs.mean() - np.exp(-1.0)) < 4 * np.sqrt(0.25 / n), "rotors fail independently"
 
 
-def test_rotors_fail_when_told(weak):
+def test_fail_stops_the_rotors_of_its_mask(weak):
     before = weak.data
     mask = np.zeros((3, 2, 4), bool)
     mask[2, 1, 3] = True

@@ -1,4 +1,4 @@
-"""Randomisation: what is drawn, that it acts as parameters do, and that it follows the laws of random numbers."""
+"""Randomisation: distributions, equality with changed parameters, and the laws of random numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -22,17 +22,17 @@ def build(n_worlds=3, n_drones=2, engine="interpret", **settings):
 
 
 @pytest.fixture(scope="module")
-def many():
-    """A thousand worlds after one step."""
+def thousand_worlds():
+    """Return a simulation of a thousand worlds after one step, and its plugin."""
     sim, plugin = build(1000, 1, **RANGES)
     sim.rotor_vel_control(sim.data.states.rotor_vel)
     sim.step()
     return sim, plugin
 
 
-def test_numbers_are_uniform_in_their_ranges_and_independent(many):
-    """Mean and deviation of 1000 uniform numbers: four standard errors."""
-    sim, plugin = many
+def test_factors_are_uniform_in_their_ranges_and_independent(thousand_worlds):
+    """Means and deviations of 1000 uniform numbers agree to four standard errors."""
+    sim, plugin = thousand_worlds
     record = plugin.read(sim.data)
     names = ("mass", "inertia", "torque", "lag", "drag")
     columns = [np.asarray(record.factors)[:, 0, k] for k in range(5)]
@@ -52,9 +52,9 @@ def test_numbers_are_uniform_in_their_ranges_and_independent(many):
     np.testing.assert_array_equal(record.air_vel[..., 2], 0.0)
 
 
-def test_factors_act_as_the_parameters_themselves(many):
-    """One step of each drone against one of a simulation whose parameters are set to what was drawn, with the wind."""
-    sim, plugin = many
+def test_factors_act_as_changed_parameters(thousand_worlds):
+    """Drones fly as in a simulation whose parameters and wind are set to what was drawn."""
+    sim, plugin = thousand_worlds
     record = jax.tree.map(np.asarray, plugin.read(sim.data))
     other = Sim(1000, control="rotor_vel", engine="interpret")
     p, f = other.data.params, record.factors[..., None]
@@ -72,11 +72,11 @@ def test_factors_act_as_the_parameters_themselves(many):
     )
     other.add(Wind(record.air_vel))
     command = 1.05 * np.asarray(other.data.states.rotor_vel)
-    again, same = build(1000, 1, **RANGES)
-    for one in (other, again):
-        one.rotor_vel_control(command)
-        one.step(20)
-    np.testing.assert_array_equal(same.read(again.data).factors, record.factors)
+    again, plugin_again = build(1000, 1, **RANGES)
+    for s in (other, again):
+        s.rotor_vel_control(command)
+        s.step(20)
+    np.testing.assert_array_equal(plugin_again.read(again.data).factors, record.factors)
     for name in ("pos", "vel", "ang_vel", "rotor_vel"):
         # float32 over 20 steps
         found, expected = (np.asarray(getattr(x.data.states, name)) for x in (again, other))
@@ -101,7 +101,7 @@ def test_law_10_numbers_depend_on_the_episode_and_not_on_other_worlds():
     assert np.all(after[1] != found[1][1])
 
 
-def test_batteries_and_delays_of_their_plugins_are_drawn():
+def test_charges_of_batteries_and_delays_are_drawn():
     sim, _ = build(50, 2, charge=(0.2, 0.6), delay=(1, 4))
     battery = sim.add(Battery())
     latency = sim.add(Latency(delay=np.zeros((50, 2), int), max_delay=4))
@@ -113,7 +113,7 @@ def test_batteries_and_delays_of_their_plugins_are_drawn():
     np.testing.assert_array_equal(latency.read(sim.data).delay, delay)
 
 
-def test_presets_fly_and_take_changes():
+def test_presets_fly_and_accept_changes():
     for preset in (Randomize.crazyflie, Randomize.generic):
         assert preset(drag=None, mass=(1.0, 1.1)).drag is None
         sim = Sim(50, control="state", rng_key=1)
@@ -130,7 +130,7 @@ def test_presets_fly_and_take_changes():
     assert Randomize.crazyflie(mass=(1.0, 1.1)).mass == (1.0, 1.1)
 
 
-def test_a_task_flies_other_drones_in_every_episode():
+def test_a_task_draws_new_drones_in_every_episode():
     env = AutoReset(make("hover", 4, randomize="crazyflie", seconds=0.1))
     assert "splits the step" not in env.explain(), "draws at resets are fused too"
     assert "randomize_begin" not in [s.__name__ for s in env.step_fn.stages], "and nothing is drawn again in a step"
@@ -168,10 +168,10 @@ def test_law_09_wrong_ranges_and_missing_plugins_are_errors():
 
 
 def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
-    """What is drawn is fixed in a call then; a stage that begins episodes in the middle of one keeps its meaning."""
+    """Factors are constant in a call, except if a stage begins an episode within it."""
 
     @stage("world")
-    def again(data):
+    def restart_episode(data):
         steps = data.core.steps
         return data.replace(
             core=data.core.replace(steps=jnp.where(steps == 2, 0, steps), episode=data.core.episode + 1)
@@ -180,13 +180,13 @@ def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
     def flown(*stages):
         sim = Sim(n_worlds=2, control="rotor_vel", engine="interpret")
         sim.add(Randomize.crazyflie())
-        for one in stages:
-            append_fn(sim.step_pipeline, one)
+        for fn in stages:
+            append_fn(sim.step_pipeline, fn)
         sim.build_step_fn()
         sim.step(5)
         return sim
 
-    drawn, reset = flown(), flown(again)
+    drawn, reset = flown(), flown(restart_episode)
     phases = [[s.phase for s in sim.step_fn.plan(sim.data).program.fused_segments] for sim in (drawn, reset)]
     assert phases[0] == ["before", "each"]
     assert "before" not in phases[1]
@@ -199,7 +199,7 @@ def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
     ({"drag": (0.5, 1.5)}, "Use sim.add.RotorAerodynamics"),
 ])  # fmt: skip
 def test_law_09_ranges_that_would_do_nothing_are_errors(setting, remedy):
-    """Those of a preset do nothing; the same range given by hand is an error, before the first step."""
+    """In a preset such ranges are ignored; the same range as an argument is an error, before the first step."""
     sim = Sim(drone="bumblebee", control="rotor_vel", engine="interpret")
     sim.add(Randomize.generic())
     sim.step()
@@ -225,8 +225,8 @@ def test_delays_are_drawn_in_any_order_of_adding(latency_first):
     assert set(np.unique(sim.data.plugins["latency"].delay)) == {0, 1, 2, 3}
 
 
-def test_what_is_drawn_is_there_at_the_reset():
-    """Observations after a reset are those of the episode, in its worlds alone; law 10: in any number of worlds."""
+def test_factors_are_drawn_at_the_reset():
+    """Observations after a reset are those of the new episode, in its worlds only, in any number of worlds."""
     seen = []
     for n_worlds in (2, 3):
         sim, plugin = build(n_worlds, charge=(0.2, 0.6), **RANGES)
@@ -252,7 +252,7 @@ def test_what_is_drawn_is_there_at_the_reset():
 
 
 def test_a_factor_of_the_drag_acts_on_rotor_aerodynamics():
-    """A factor of two is that of twice the coefficient of rotor drag, whose moment tips the drone back."""
+    """A factor of two acts as twice the coefficient of rotor drag, whose moment tips the drone back."""
     found = []
     for factor, drag in ((2.0, 1e-6), (1.0, 2e-6)):
         sim, _ = build(1, 1, drag=(factor, factor))

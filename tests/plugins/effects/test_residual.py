@@ -16,8 +16,8 @@ def drone(**residual):
     return {"base": "cf21B_500", "residual": {key: x.tolist() for key, x in residual.items()}}
 
 
-def moving(sim):
-    """Give a simulation states in flight."""
+def set_flight_states(sim):
+    """Return the simulation with random states in flight."""
     rng, s = np.random.default_rng(0), sim.data.states
     quat = rng.normal(size=s.quat.shape)
     sim.data = sim.data.replace(
@@ -32,17 +32,17 @@ def moving(sim):
     return sim
 
 
-def test_wrench_is_that_of_the_coefficients():
-    """Velocities after one Euler step, against the same step without the residual plus the wrench by hand."""
-    plain = moving(Sim(3, 2, drone="cf21B_500", control="rotor_vel", integrator="euler"))
-    sim = moving(
+def test_the_wrench_is_that_of_the_coefficients():
+    """Compare velocities after an Euler step with those without the residual, plus the wrench by hand."""
+    plain = set_flight_states(Sim(3, 2, drone="cf21B_500", control="rotor_vel", integrator="euler"))
+    sim = set_flight_states(
         Sim(3, 2, drone=drone(linear=LINEAR, hidden=HIDDEN, output=OUTPUT), control="rotor_vel", integrator="euler")
     )
     sim.add(Residual())
     s, p = sim.data.states, sim.data.params
-    for each in (plain, sim):
-        each.rotor_vel_control(np.asarray(s.rotor_vel))
-        each.step()
+    for flown in (plain, sim):
+        flown.rotor_vel_control(np.asarray(s.rotor_vel))
+        flown.step()
     x, y, z, w = np.moveaxis(np.asarray(s.quat, np.float64), -1, 0)
     rot = np.stack(
         [
@@ -60,10 +60,10 @@ def test_wrench_is_that_of_the_coefficients():
     mixing, mass, arm = np.asarray(p.mixing_matrix, np.float64), float(p.mass[0]), float(p.L[0])
     load = mass * 9.81
     torque = np.concatenate([thrust @ mixing[:2].T / load, drag @ mixing[2:].T / (load * arm)], -1)
-    one = np.ones((3, 2, 1))
+    constant = np.ones((3, 2, 1))
     inputs = np.concatenate(
         [
-            one,
+            constant,
             vel,
             vel * np.linalg.norm(vel, axis=-1, keepdims=True),
             np.asarray(s.ang_vel),
@@ -81,23 +81,23 @@ def test_wrench_is_that_of_the_coefficients():
     np.testing.assert_allclose(ang_acc, wrench[..., 3:] / np.diag(np.asarray(p.J)), rtol=2e-3, atol=2e-3)
 
 
-def test_airframe_without_residual_is_refused():
+def test_an_airframe_without_a_residual_is_an_error():
     with pytest.raises(ConfigError, match=r"table \[residual\].*Use 'crazysim identify LOG.*cf21B_500_idsia"):
         Sim(drone="cf21B_500").add(Residual())
 
 
-def test_residuals_of_different_size_are_refused():
+def test_residuals_of_different_sizes_are_errors():
     with pytest.raises(ConfigError, match="number of hidden units"):
         Sim(1, 2, drone=[drone(linear=LINEAR), drone(linear=LINEAR, hidden=HIDDEN, output=OUTPUT)]).add(Residual())
 
 
-def test_base_of_another_body_passes_no_residual_on():
+def test_an_airframe_with_another_body_does_not_inherit_the_residual():
     heavier = {"base": drone(linear=LINEAR), "rigid_body": {"mass": 0.05}}
     with pytest.raises(ConfigError, match="not inherited"):
         Sim(drone=heavier, control="rotor_vel").add(Residual())
 
 
-def test_network_without_its_other_half_is_refused():
+def test_hidden_without_output_is_an_error():
     with pytest.raises(ConfigError, match="hidden and output together"):
         Sim(control="rotor_vel").add(Residual(linear=LINEAR, hidden=HIDDEN))
 
@@ -111,7 +111,7 @@ def test_aero_identified_adds_the_residual_of_the_airframe():
         Sim(aero=True)
 
 
-def test_coefficients_that_were_fitted_beside_rotor_aerodynamics_go_with_it():
+def test_only_coefficients_that_were_fitted_with_rotor_aerodynamics_are_combined_with_it():
     sim = Sim(drone=drone(linear=LINEAR), control="rotor_vel")
     sim.add(RotorAerodynamics())
     sim.add(Residual(linear=LINEAR))

@@ -1,4 +1,4 @@
-"""Rotors in moving air: against roots of the theories' equations, hand calculation, and recorded RotorPy wrenches."""
+"""Rotors in moving air: against roots of the equations, values by hand, and recorded wrenches of RotorPy."""
 
 import functools
 
@@ -27,13 +27,13 @@ def hover(n_worlds=1, drone="cf21B_500", **settings):
 
 
 def wrench(sim, plugin, **states):
-    """Return force, N, and torque, N m, that the plugin adds in each world, world frame. (n_worlds, 3) each"""
+    """Return force, N, and torque, N m, that the plugin adds to each drone, world frame. (n_worlds, 3) each"""
     return wrench_of(stage("drone")(plugin.influence)(with_states(sim.data, **states)).states)
 
 
-def wrench_of(found):
-    """Return the external force and torque of states. (n_worlds, 3) each"""
-    return np.asarray(found.force, float)[:, 0], np.asarray(found.torque, float)[:, 0]
+def wrench_of(states):
+    """Return the external force and torque in states. (n_worlds, 3) each"""
+    return np.asarray(states.force, float)[:, 0], np.asarray(states.torque, float)[:, 0]
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_the_thrust_solves_blade_element_and_momentum_theory(axial, across, fact
     np.testing.assert_allclose(thrust(static, speed, axial, across, b, factor), expected[same_sign][0], rtol=1e-5)
 
 
-def test_the_thrust_worked_out_by_hand():
+def test_the_thrust_by_hand():
     """b omega = 2 d y / (y - d), d = 6.193e-3, y = 0.10644 / 4.276 = 0.02489 N s/m: 0.01649 N s/m."""
     b = blade()
     np.testing.assert_allclose(b * HOVER, 0.01649, rtol=1e-3)
@@ -114,7 +114,7 @@ def test_a_ceiling_gives_thrust_by_mass_momentum_and_energy():
 
 
 def test_near_hover_the_rotors_give_the_linear_drag_of_the_airframe(quad):
-    """What is added vanishes in hover, and is of second order for small velocities in the body's axes."""
+    """The added wrench is zero in hover, and of second order for small velocities along the body's axes."""
     sim, plugin = quad
     force, torque = wrench(sim, plugin)
     np.testing.assert_allclose(force, 0.0, atol=1e-6)
@@ -128,7 +128,7 @@ def test_near_hover_the_rotors_give_the_linear_drag_of_the_airframe(quad):
 
 
 def test_rotor_drag_grows_with_the_speed_of_the_rotors(quad):
-    """At twice the hover speed the drag is twice the airframe's: D v more than what the dynamics have."""
+    """At twice the hover speed the drag is twice the airframe's: D v is added to that of the dynamics."""
     sim, plugin = quad
     faster = 2 * hover_rotor_state(sim.data)
     force, _ = wrench(sim, plugin, vel=[0.5, 0, 0], rotor_vel=faster)
@@ -160,7 +160,7 @@ def crazyflie_20():
     return sim, sim.add(plugin)
 
 
-def test_the_wrench_is_that_of_rotorpy_where_both_are_linear(crazyflie_20):
+def test_the_wrench_is_that_of_rotorpy_where_both_models_are_linear(crazyflie_20):
     """``Multirotor(crazyflie_params).compute_body_wrench`` of RotorPy 3.0.0, aero=True less aero=False, k_flap = 2e-8.
 
     Rotors at 1788.55 rad/s, for the velocities, body rates and factors of the rotor speeds below. RotorPy's moment of
@@ -190,8 +190,8 @@ def test_the_wrench_is_that_of_rotorpy_where_both_are_linear(crazyflie_20):
     assert np.abs(flapping[1:, :2] / torque[1:, :2]).max() > 0.1
 
 
-def test_wind_counts_as_velocity_of_the_drone(quad):
-    """A drone at rest in a wind has the forces of one that flies against it: both the drag and the change of thrust."""
+def test_wind_acts_as_the_opposite_velocity_of_the_drone(quad):
+    """In wind, a drone at rest has the drag and the change of thrust of one that flies with the opposite velocity."""
     air = np.array([3.0, -1.0, 0.5])
     calm, plugin = quad
     windy, in_wind = hover()
@@ -254,7 +254,7 @@ def test_law_08_gradients_equal_central_differences(x64):
         assert abs(gradient[name]) > 1e-6, name
 
 
-def test_law_09_what_is_missing_or_impossible_is_an_error():
+def test_law_09_wrong_settings_and_models_are_errors():
     with pytest.raises(ConfigError, match="first_principles"):
         Sim(dynamics="so_rpy").add(RotorAerodynamics())
     with pytest.raises(ConfigError, match=r"has no linear drag.*inflow=.*RotorPy"):
@@ -269,8 +269,8 @@ def test_law_09_what_is_missing_or_impossible_is_an_error():
         Sim().add(RotorAerodynamics(inflow=0.0, ceiling=2.0))
 
 
-def test_each_term_can_be_alone_and_a_ceiling_lies_above_the_drone():
-    """At 2 m/s: the drag of the airframe alone, the thrust alone, neither; above a ceiling as without one."""
+def test_terms_can_be_left_out_and_a_ceiling_below_the_drone_has_no_effect():
+    """At 2 m/s: drag alone, thrust alone, neither, and a ceiling below and above the drone."""
     vel = [2.0, 0, 0]
     for settings, drag, lift in (
         ({"inflow": 0.0}, 2 * DRAG_XY, 0.0),

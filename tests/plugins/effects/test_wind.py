@@ -1,4 +1,4 @@
-"""Wind: drag relative to the air, worked out by hand; gusts against the formulas of Dryden over many worlds."""
+"""Wind: drag relative to the air, by hand; gusts in many worlds against the formulas of Dryden."""
 
 import jax
 import jax.numpy as jnp
@@ -23,13 +23,13 @@ def build(velocity=(0.0, 0.0, 0.0), n_worlds=2, n_drones=2, **kwargs):
 
 @pytest.fixture(scope="module")
 def steady():
-    """Each of four drones in a wind of its own, 3 m/s along x, y, z and calm; nose up, so that body z lies along x."""
+    """Return four drones in winds of 3 m/s along x, y and z, and in calm air; nose up, so that body z lies along x."""
     sim = build(np.array([[[3, 0, 0], [0, 3, 0]], [[0, 0, 3], [0, 0, 0.0]]]))
     sim.data = with_states(sim.data, quat=[0, HALF, 0, HALF])
     return sim
 
 
-def test_a_steady_wind_pushes_by_the_drag_worked_out_by_hand(steady):
+def test_a_steady_wind_pushes_with_the_drag_by_hand(steady):
     """At rest with still rotors: v = dt (-R D R^T w / m + g), D = -(21.64, 21.64, 24.77) mN s/m, m = 43.4 g."""
     sim = steady
     sim.data = with_states(sim.data, vel=0.0)
@@ -43,7 +43,7 @@ def test_a_steady_wind_pushes_by_the_drag_worked_out_by_hand(steady):
     sim.data = before
 
 
-def test_a_drone_that_drifts_with_the_wind_feels_none(steady):
+def test_a_drone_that_drifts_with_the_wind_has_no_drag(steady):
     sim, before = steady, steady.data
     sim.data = with_states(sim.data, vel=np.asarray(sim.data.plugins["wind"].velocity))
     sim.step()
@@ -52,7 +52,7 @@ def test_a_drone_that_drifts_with_the_wind_feels_none(steady):
     sim.data = before
 
 
-def test_the_users_force_stays_and_adds_up(steady):
+def test_the_force_of_the_user_stays_and_is_added(steady):
     sim, before = steady, steady.data
     force = np.float32([0.1, -0.2, 0.3])
     vel = []
@@ -72,7 +72,7 @@ WIND = np.array([12.0, 16.0, 0.0])
 
 @pytest.fixture(scope="module")
 def samples():
-    """Gusts in wind axes at steps 1 + LAGS of many worlds, 30 m above ground in 20 m/s, at 20 steps a second."""
+    """Return gusts in wind axes at steps 1 + LAGS of many worlds, 30 m above ground in 20 m/s, at 20 steps/s."""
     sim = Sim(n_worlds=N, control="rotor_vel", freq=20)
     sim.data = with_states(sim.data, pos=[0, 0, 30.48])
     sim.add(Wind(WIND, 10.0))
@@ -99,7 +99,7 @@ def test_gusts_have_the_variance_of_the_specification_from_the_first_step_on(sam
     np.testing.assert_allclose(correlation, np.eye(3), atol=4 / np.sqrt(N))
 
 
-def test_gusts_are_correlated_in_time_as_dryden_has_it(samples):
+def test_gusts_have_the_correlation_in_time_of_dryden(samples):
     """R_u = exp(-x), R_v = R_w = exp(-x) (1 - x / 2) with x = V t / L: the transforms of the two spectra."""
     airspeed = np.sqrt(20.0**2 + 1)
     length = np.array([30.48 / 0.2593**1.2, 30.48 / 0.2593**1.2, 30.48])
@@ -109,11 +109,11 @@ def test_gusts_are_correlated_in_time_as_dryden_has_it(samples):
         found = np.mean(samples[0] * samples[i], axis=0) / np.mean(samples[0] ** 2, axis=0)
         # four standard errors of a correlation of N pairs; the trapezoidal rule's step of 0.033 adds less than 3e-4
         np.testing.assert_allclose(found, expected, atol=4 / np.sqrt(N))
-    assert np.exp(-x[2]) - expected[2] > 3 * 4 / np.sqrt(N), "a first-order filter would not pass"
+    assert np.exp(-x[2]) - expected[2] > 3 * 4 / np.sqrt(N), "a filter of first order would fail"
 
 
 def test_uneven_steps_keep_the_variance(rng):
-    """P = F P F^T + Q for every loss: the covariance ((1, 1/2), (1/2, 1/2)) is kept exactly, not on average."""
+    """P = F P F^T + Q for every loss: the covariance ((1, 1/2), (1/2, 1/2)) stays exactly the same."""
     with jax.enable_x64(True):
 
         @jax.jit
@@ -129,7 +129,7 @@ def test_uneven_steps_keep_the_variance(rng):
             np.testing.assert_allclose(F[:, :2] @ P @ F[:, :2].T + np.outer(F[:, 2], F[:, 2]), P, atol=1e-15)
 
 
-def test_law_10_gusts_do_not_depend_on_how_many_worlds_there_are():
+def test_law_10_gusts_do_not_depend_on_the_number_of_worlds():
     gusts = []
     for n_worlds in (2, 3):
         sim = build((1.0, 0, 0), n_worlds=n_worlds, speed_20ft=8.0)
@@ -154,7 +154,7 @@ def test_law_10_gusts_do_not_depend_on_how_many_worlds_there_are():
     ("first_principles", "cf21B_500", np.zeros((2, 1, 2)), "expected velocity"),
     ("first_principles", "cf21B_500", (np.nan, 0, 0), "finite"),
 ])  # fmt: skip
-def test_law_09_wind_that_cannot_be_is_told(dynamics, drone, velocity, message):
+def test_law_09_wrong_winds_are_errors(dynamics, drone, velocity, message):
     sim = Sim(n_worlds=2, dynamics=dynamics, drone=drone, control="attitude")
     stages = dict(sim.step_pipeline)
     with pytest.raises(ConfigError, match=message):
@@ -177,16 +177,16 @@ def test_profiles_by_hand():
         assert np.isfinite(jax.jit(slope)(np.float32([-1.0, 0.0, 0.01, 0.05, 1.0]))).all()
 
 
-@pytest.mark.parametrize("profile, share", [({"roughness": 0.05}, np.log(2 / 0.05) / np.log(6.096 / 0.05)),
+@pytest.mark.parametrize("profile, factor", [({"roughness": 0.05}, np.log(2 / 0.05) / np.log(6.096 / 0.05)),
                                             ({"exponent": 0.3}, (2 / 6.096) ** 0.3)])  # fmt: skip
-def test_the_mean_grows_with_height(profile, share):
+def test_the_mean_wind_grows_with_height(profile, factor):
     sim = build((6.0, 0, 0), **profile)
     sim.data = with_states(sim.data, pos=[0, 0, 2.0])
     sim.step()
-    expected = build((6.0 * share, 0, 0))
+    expected = build((6.0 * factor, 0, 0))
     expected.step()
     np.testing.assert_allclose(sim.data.states.vel, expected.data.states.vel, rtol=1e-5)
-    assert share < 0.8
+    assert factor < 0.8
 
 
 @pytest.mark.parametrize("profile, message", [

@@ -23,8 +23,8 @@ def build(field=SHEAR, n_worlds=2, n_drones=2, engine="interpret", **kwargs):
     return sim
 
 
-def test_the_field_pushes_as_a_steady_wind_of_the_same_velocity():
-    """Half way up the shear the air moves with (2, 0, 1) m/s."""
+def test_a_field_pushes_as_a_steady_wind_of_the_same_velocity():
+    """In the middle of the shear the air moves with (2, 0, 1) m/s."""
     field, steady = build(), Sim(n_worlds=2, n_drones=2, control="rotor_vel", engine="interpret")
     steady.data = with_states(steady.data, pos=[0, 0, 2.0])
     steady.add(Wind((2.0, 0.0, 1.0)))
@@ -42,7 +42,7 @@ def test_offset_scale_and_outside():
     np.testing.assert_allclose(sim.data.plugins["wind_field"].air_vel, expected, rtol=1e-6)
 
 
-def test_law_10_displacements_are_of_world_and_episode():
+def test_law_10_displacements_depend_on_world_and_episode():
     shifts = []
     for n_worlds in (2, 4):
         sim = build(n_worlds=n_worlds, spread=(1.0, 2.0, 0.0))
@@ -61,20 +61,20 @@ def test_law_10_displacements_are_of_world_and_episode():
     assert not np.isclose(again[0], found[0]).all(axis=-1).any()
 
 
-def test_a_displacement_comes_and_goes_with_its_setting():
+def test_displacements_follow_the_setting_spread():
     sim = build()
     for spread in ((1.0, 2.0, 0.0), None):
         before = [*sim.step_pipeline]
         sim.replace(WindField(SHEAR, spread=spread))
-        has = spread is not None
-        assert ("wind_field" in sim.reset_pipeline) == ("wind_field_begin" in sim.step_pipeline) == has
-        assert len(sim.step_pipeline) == len(before) + (1 if has else -1)
+        has_shift = spread is not None
+        assert ("wind_field" in sim.reset_pipeline) == ("wind_field_begin" in sim.step_pipeline) == has_shift
+        assert len(sim.step_pipeline) == len(before) + (1 if has_shift else -1)
         sim.reset()
-        assert (sim.data.plugins["wind_field"].shift is not None) == has
-        assert not has or np.ptp(np.asarray(sim.data.plugins["wind_field"].shift)[:, 0, 0]) > 0
+        assert (sim.data.plugins["wind_field"].shift is not None) == has_shift
+        assert not has_shift or np.ptp(np.asarray(sim.data.plugins["wind_field"].shift)[:, 0, 0]) > 0
 
 
-def test_the_air_at_loads_counts_for_loads():
+def test_loads_feel_the_air_at_their_own_positions():
     """A load 1.6 m below drones at 3 m is at 1.4 m, in (0.8, 0, 0.4) m/s, and drones in (4, 0, 2)."""
     sim = build()
     sim.data = with_states(sim.data, pos=[0, 0, 3.0])
@@ -90,13 +90,13 @@ def test_the_air_at_loads_counts_for_loads():
     np.testing.assert_allclose(push[..., 0], 0.8 * 0.05 / 500 / (0.01 + 0.05 / 500), rtol=0.02)  # the cable's pull too
     sim.remove("wind_field")
     sim.step()
-    assert np.abs(np.asarray(load.read(sim.data).vel)[..., 0]).max() < push[..., 0].max(), "no wind remains"
+    assert np.abs(np.asarray(load.read(sim.data).vel)[..., 0]).max() < push[..., 0].max(), "there is no wind any more"
 
 
 def test_a_large_table_is_read_outside_of_the_kernel_with_the_same_numbers(monkeypatch, rng):
     grid, ends = Grid(rng.normal(size=(6, 5, 4, 3)), (-1, -1, 0), 1.0), []
-    for largest, unfused in ((10**6, []), (1, ["wind_field"])):
-        monkeypatch.setattr(wind_field, "MAX_FUSED_VALUES", largest)
+    for max_values, unfused in ((10**6, []), (1, ["wind_field"])):
+        monkeypatch.setattr(wind_field, "MAX_FUSED_VALUES", max_values)
         sim = build(grid, n_worlds=3, engine="auto", spread=(0.5, 0.5, 0.5))
         assert [stage.name for stage in sim.step_fn.plan(sim.data).program.unfused_stages] == unfused
         sim.step(20)
