@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 class Radio(Closeable):
-    """``Link`` to a real Crazyflie, which must stand on the ground when it is created.
+    """``Link`` to a real Crazyflie, which must stand on the ground when the link is created.
 
     | Level | Packet of cflib | |
     | --- | --- | --- |

@@ -197,15 +197,15 @@ class CrazyflieServer:
         self._call_all(lambda cf: cf.emergency())
 
     def takeoff(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
-        """Make all rise to a height, m, within a time, s."""
+        """Make all drones rise to a height, m, within a time, s."""
         self._call_all(lambda cf: cf.takeoff(targetHeight, duration, groupMask))
 
     def land(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
-        """Make all descend to a height, m, within a time, s, and stop their motors."""
+        """Make all drones descend to a height, m, within a time, s, and stop their motors."""
         self._call_all(lambda cf: cf.land(targetHeight, duration, groupMask))
 
     def goTo(self, goal: ArrayLike, yaw: float, duration: float, groupMask: int = 0) -> None:
-        """Move all by an offset, m, and turn them by an angle, rad, within a time, s."""
+        """Move all drones by an offset, m, and turn them by an angle, rad, within a time, s."""
         self._call_all(lambda cf: cf.goTo(goal, yaw, duration, True, groupMask))
 
     def startTrajectory(
@@ -220,15 +220,15 @@ class CrazyflieServer:
         self._call_all(lambda cf: cf.startTrajectory(trajectoryId, timescale, reverse, relative, groupMask))
 
     def arm(self, arm: bool = True) -> None:
-        """Arm or disarm all."""
+        """Arm or disarm all drones."""
         self._call_all(lambda cf: cf.arm(arm))
 
     def setParam(self, name: str, value: float) -> None:
-        """Set a parameter of all."""
+        """Set a parameter of all drones."""
         self._call_all(lambda cf: cf.setParam(name, value))
 
     def cmdFullState(self, pos: ArrayLike, vel: ArrayLike, acc: ArrayLike, yaw: float, omega: ArrayLike) -> None:
-        """Stream one state to all."""
+        """Stream the same state to all drones."""
         self._call_all(lambda cf: cf.cmdFullState(pos, vel, acc, yaw, omega))
 
     def _call_all(self, function: Callable[[Crazyflie], object]) -> None:

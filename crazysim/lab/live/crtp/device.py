@@ -142,18 +142,18 @@ class CrtpDevice:
                     continue
                 block.next_time = max(block.next_time + block.period, now)
                 stamp = struct.pack("<I", round(now * 1000) & 0xFFFFFF)[:3]
-                values = b"".join(self._pack_value(k, layout, state) for k, layout in block.variables)
+                values = b"".join(self._pack_value(k, struct_format, state) for k, struct_format in block.variables)
                 packets.append(bytes([LOGGING << 4 | 0x0C | 2, block_id]) + stamp + values)
         return packets
 
-    def _pack_value(self, k: int, layout: str, state: object) -> bytes:
+    def _pack_value(self, k: int, struct_format: str, state: object) -> bytes:
         name = self.log.variables[k].name
         try:
             value = float(self.readings[name][1](state, self.commander))  # type: ignore[arg-type]
         except Exception as error:  # raised by a reading that a user has added
             self.swarm.reports.add("refused", self.name, self.swarm.time, f"log variable {name} failed: {error}")
             value = math.nan
-        return pack_number(layout, value)
+        return pack_number(struct_format, value)
 
     def _report(self, text: str) -> None:
         """Report a refused command, also on the drone's console."""
@@ -207,14 +207,14 @@ class CrtpDevice:
         if thrust == 0:
             self.commander.stop()
         elif any(self.param_values[f"flightmode.stabMode{axis}"] == 0 for axis in ("Roll", "Pitch")):
-            self.commander.command(Control.body_rate, [*_radians(roll, -pitch, -yaw), self._thrust_force(thrust)])
+            self.commander.command(Control.body_rate, [*_radians(roll, -pitch, -yaw), self._collective_thrust(thrust)])
         elif self.param_values["flightmode.stabModeYaw"]:
-            self.commander.command(Control.attitude, [*_radians(roll, -pitch, yaw), self._thrust_force(thrust)])
+            self.commander.command(Control.attitude, [*_radians(roll, -pitch, yaw), self._collective_thrust(thrust)])
         else:
-            self.commander.attitude(*_radians(roll, -pitch, -yaw), self._thrust_force(thrust))
+            self.commander.attitude(*_radians(roll, -pitch, -yaw), self._collective_thrust(thrust))
         return []
 
-    def _thrust_force(self, thrust: int) -> float:
+    def _collective_thrust(self, thrust: int) -> float:
         """Return the collective thrust, N, of a 16-bit value; full scale is all rotors at their largest thrust."""
         airframe = self.swarm.sim.airframes[self.drone]
         return thrust / 65535 * airframe.n_rotors * float(np.max(airframe.value("rotors.thrust_max")))
@@ -226,9 +226,9 @@ class CrtpDevice:
             roll, pitch, yaw_rate, thrust, rates = struct.unpack("<fffHB", data[1:])
             angles = _radians(roll, -pitch, yaw_rate)
             if rates:
-                self.commander.command(Control.body_rate, [*angles, self._thrust_force(thrust)])
+                self.commander.command(Control.body_rate, [*angles, self._collective_thrust(thrust)])
             else:
-                self.commander.attitude(*angles, self._thrust_force(thrust))
+                self.commander.attitude(*angles, self._collective_thrust(thrust))
         elif channel == 0:
             handle_generic(self.commander, data)
         return []
@@ -286,7 +286,7 @@ class CrtpDevice:
             return errno.EEXIST
         if command == 7 and block_id not in self.blocks:
             return errno.ENOENT
-        formats = {number: layout for number, layout in LOG_TYPES.values()}
+        formats = {number: struct_format for number, struct_format in LOG_TYPES.values()}
         new_variables = []
         for kind, k in struct.iter_unpack("<BH", data):
             if k >= len(self.log.variables) or kind & 15 not in formats:
@@ -294,7 +294,7 @@ class CrtpDevice:
             new_variables.append((k, formats[kind & 15]))
         block = self.blocks.get(block_id, LogBlock([]))
         variables = block.variables + new_variables
-        if sum(struct.calcsize(layout) for _, layout in variables) > MAX_LOG_BYTES:
+        if sum(struct.calcsize(struct_format) for _, struct_format in variables) > MAX_LOG_BYTES:
             return errno.E2BIG
         n_others = sum(len(other.variables) for i, other in self.blocks.items() if i != block_id)
         if len(self.blocks | {block_id: block}) > MAX_LOG_BLOCKS or n_others + len(variables) > MAX_LOG_VARIABLES:
@@ -311,11 +311,11 @@ class CrtpDevice:
         (k,) = struct.unpack("<H", data[:2])
         if k >= len(self.params.variables):
             return [(PARAM, channel, data[:2] + bytes([errno.ENOENT]))]
-        name, layout = self.params.variables[k].name, self.params.format(k)
+        name, struct_format = self.params.variables[k].name, self.params.format(k)
         if channel == 1:
-            return [(PARAM, 1, data[:2] + b"\0" + pack_number(layout, self.param_values[name]))]
-        self._set_parameter(name, struct.unpack(layout, data[2:])[0])
-        return [(PARAM, 2, data[:2] + pack_number(layout, self.param_values[name]))]
+            return [(PARAM, 1, data[:2] + b"\0" + pack_number(struct_format, self.param_values[name]))]
+        self._set_parameter(name, struct.unpack(struct_format, data[2:])[0])
+        return [(PARAM, 2, data[:2] + pack_number(struct_format, self.param_values[name]))]
 
     def _handle_param_misc(self, data: bytes) -> list[Packet]:
         command = data[0]
@@ -323,7 +323,7 @@ class CrtpDevice:
             group, name, payload = data[1:].split(b"\0", 2)
             full_name = f"{group.decode()}.{name.decode()}"
             code = errno.ENOENT
-            formats = {number: layout for number, layout in PARAM_TYPES.values()}
+            formats = {number: struct_format for number, struct_format in PARAM_TYPES.values()}
             if full_name in self.param_values and payload[0] in formats:
                 self._set_parameter(full_name, struct.unpack(formats[payload[0]], payload[1:])[0])
                 code = 0
@@ -355,8 +355,8 @@ class CrtpDevice:
         length = content[0] if channel == 1 else len(content)
         is_valid = address + length <= len(memory) and length <= 24
         if channel == 1:
-            contents = bytes(memory[address : address + length]) if is_valid else b""
-            return [(MEM, 1, data[:5] + bytes([0 if is_valid else errno.EIO]) + contents)]
+            answer = bytes(memory[address : address + length]) if is_valid else b""
+            return [(MEM, 1, data[:5] + bytes([0 if is_valid else errno.EIO]) + answer)]
         if channel != 2:
             return []
         if not isinstance(memory, bytearray):

@@ -30,11 +30,11 @@ def handle_generic(commander: Commander, data: bytes) -> None:
     if kind == 0:
         commander.stop()
     elif kind in (1, 8):
-        x, y, z, rate = struct.unpack("<ffff", content)
-        commander.velocity([x, y, z], math.radians(-rate if kind == 1 else rate))
+        x, y, z, yaw_rate = struct.unpack("<ffff", content)
+        commander.velocity([x, y, z], math.radians(-yaw_rate if kind == 1 else yaw_rate))
     elif kind in (5, 10):
-        x, y, rate, height = struct.unpack("<ffff", content)
-        commander.hover(x, y, math.radians(-rate if kind == 5 else rate), height)
+        x, y, yaw_rate, height = struct.unpack("<ffff", content)
+        commander.hover(x, y, math.radians(-yaw_rate if kind == 5 else yaw_rate), height)
     elif kind == 6:
         *numbers, packed, wx, wy, wz = struct.unpack("<9hI3h", content)
         pos, vel, acc = np.reshape(numbers, (3, 3)) / 1000
@@ -75,8 +75,10 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
             raise ConfigError(
                 f"expected a trajectory in memory of type 0 or 1, got location {location}, type {encoding}"
             )
-        path = _bezier_trajectory(memory, offset) if encoding else _polynomial_trajectory(memory, offset, n_pieces)
-        commander.upload(trajectory_id, path, compressed=bool(encoding))
+        trajectory = (
+            _bezier_trajectory(memory, offset) if encoding else _polynomial_trajectory(memory, offset, n_pieces)
+        )
+        commander.upload(trajectory_id, trajectory, compressed=bool(encoding))
         return
     if not commander.in_group(content[0]):
         return
@@ -105,13 +107,13 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
         raise ConfigError(f"expected a high-level command of type 0 to 8, 12 or 13, got {kind}")
 
 
-def _polynomial_trajectory(memory: bytes, offset: int, n: int) -> HostTrajectory:
+def _polynomial_trajectory(memory: bytes, offset: int, n_pieces: int) -> HostTrajectory:
     """Return the trajectory of polynomials in memory."""
-    if not n or offset + PIECE_SIZE * n > len(memory):
-        raise ConfigError(f"expected 1 or more pieces within {len(memory)} bytes, got {n} from {offset} on")
+    if not n_pieces or offset + PIECE_SIZE * n_pieces > len(memory):
+        raise ConfigError(f"expected 1 or more pieces within {len(memory)} bytes, got {n_pieces} from {offset} on")
     with np.errstate(invalid="ignore"):  # NaN is refused below
-        numbers = np.frombuffer(memory, "<f4", 33 * n, offset).astype(float).reshape(n, 33)
-    durations, c = numbers[:, 32], numbers[:, :32].reshape(n, 4, 8)
+        numbers = np.frombuffer(memory, "<f4", 33 * n_pieces, offset).astype(float).reshape(n_pieces, 33)
+    durations, c = numbers[:, 32], numbers[:, :32].reshape(n_pieces, 4, 8)
     _require_durations(durations)
     with np.errstate(over="ignore", invalid="ignore"):
         return _create_trajectory(durations, c * durations[:, None, None] ** np.arange(8))
@@ -126,18 +128,18 @@ def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
     units = np.array([0.001, 0.001, 0.001, math.radians(0.1)])
     durations, pieces = [], []
     try:
-        last_point, position = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
-        while (header := struct.unpack_from("<BH", memory, position))[1] > 0:
+        last_point, address = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
+        while (header := struct.unpack_from("<BH", memory, address))[1] > 0:
             coordinate_types, duration_ms = header
-            position += 3
+            address += 3
             rows = []
             for axis in range(4):
                 n_points = N_CONTROL_POINTS[coordinate_types >> (2 * axis) & 3]
                 points = [
                     last_point[axis],
-                    *np.array(struct.unpack_from(f"<{n_points}h", memory, position)) * units[axis],
+                    *np.array(struct.unpack_from(f"<{n_points}h", memory, address)) * units[axis],
                 ]
-                position += 2 * n_points
+                address += 2 * n_points
                 c = power_coefficients(np.array(points)[:, None])[0]
                 rows.append(np.pad(c, (0, 8 - len(c))))
                 last_point[axis] = points[-1]

@@ -28,7 +28,7 @@ PARAM_TYPES = {
 READ_ONLY_BIT = 0x40
 """Bit of the type of a parameter that cannot be written."""
 OUT_OF_RANGE_DISTANCE = 32767
-"""Reading if no object is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
+"""Distance that is reported if no object is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
 RANGE_VARIABLES = {"down": "zrange"}
 """Names of log variables in the group ``range`` that differ from the name of their direction."""
 
@@ -79,28 +79,28 @@ def pack_number(struct_format: str, value: float) -> bytes:
         largest = 3.4e38 if struct_format == "<f" else 65504.0
         return struct.pack(struct_format, value if math.isnan(value) else min(max(value, -largest), largest))
     bits = 8 * struct.calcsize(struct_format)
-    signed = struct_format[1].islower()
-    low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+    is_signed = struct_format[1].islower()
+    low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if is_signed else (0, 2**bits - 1)
     return struct.pack(struct_format, min(max(round(value) if math.isfinite(value) else 0, low), high))
 
 
 def _component_variables(group: str, names: str, field: str, scale: float = 1.0) -> dict[str, tuple[str, Reading]]:
     """Return log variables of the components of a field of the state."""
 
-    def reading(k: int) -> Reading:
+    def component_reading(k: int) -> Reading:
         return lambda state, _c: scale * float(getattr(state, field)[k])
 
-    return {f"{group}.{name}": ("float", reading(k)) for k, name in enumerate(names.split())}
+    return {f"{group}.{name}": ("float", component_reading(k)) for k, name in enumerate(names.split())}
 
 
 def _angle_variables(group: str) -> dict[str, tuple[str, Reading]]:
     """Return log variables of roll, pitch and yaw in degrees; the firmware's pitch has the opposite sign."""
     index_and_sign = {"roll": (0, 1), "pitch": (1, -1), "yaw": (2, 1)}
 
-    def reading(k: int, sign: int) -> Reading:
+    def angle_reading(k: int, sign: int) -> Reading:
         return lambda state, _c: sign * math.degrees(float(state.rpy[k]))
 
-    return {f"{group}.{name}": ("float", reading(*pair)) for name, pair in index_and_sign.items()}
+    return {f"{group}.{name}": ("float", angle_reading(*pair)) for name, pair in index_and_sign.items()}
 
 
 def _acceleration_reading(k: int) -> Reading:

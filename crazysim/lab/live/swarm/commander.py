@@ -39,7 +39,7 @@ N_TRAJECTORIES = 256
 
 
 class Commander:
-    """Setpoints of one drone from commands; all times are simulated, s."""
+    """Setpoints of one drone, calculated from commands; all times are simulated, s."""
 
     def __init__(self, control: Control = Control.state, report: Callable[[str], None] | None = None):
         """Create the commander of a drone on the floor with motors off.
@@ -128,7 +128,7 @@ class Commander:
         Args:
             trajectory_id: ID of the trajectory.
             trajectory: Trajectory.
-            compressed: True for one that the firmware stores compressed, which it can neither stretch nor reverse.
+            compressed: True if the firmware stores it compressed; it can then be neither stretched nor reversed.
         """
         if not 0 <= trajectory_id < N_TRAJECTORIES:
             raise ConfigError(
@@ -280,13 +280,8 @@ class Commander:
             elif age > STABILIZE_TIMEOUT and self._stream[0] != "stay":
                 self._stream = ("stay", np.append(pos, yaw))
         plan = self._plan
-        if (
-            self._stream is None
-            and plan is not None
-            and plan.is_landing
-            and plan.finished(now)
-            and self._has_landed(plan)
-        ):
+        is_landing_over = plan is not None and plan.is_landing and plan.finished(now) and self._has_landed(plan)
+        if self._stream is None and is_landing_over:
             self.stop()
         if not self.motors_on:
             return None
@@ -294,9 +289,8 @@ class Commander:
             return self._streamed_command(dt)
         if plan is None or not plan.finished(now) or plan.is_landing:
             return _state_command(*self.goal())
-        if (
-            self._cached_hover is None or self._cached_hover[0] is not plan
-        ):  # evaluated only once while the drone hovers
+        # The command is calculated only once while the drone hovers.
+        if self._cached_hover is None or self._cached_hover[0] is not plan:
             self._cached_hover = plan, _state_command(plan.evaluate(now)[0], np.zeros(4), np.zeros(4))
         return self._cached_hover[1]
 
@@ -306,6 +300,7 @@ class Commander:
         return is_standing or self.pos[2] <= plan.evaluate(self.now)[0, 2] + LANDED_HEIGHT
 
     def _streamed_command(self, dt: float) -> NDArray:
+        """Return the command of the streamed setpoint; velocities and yaw rates are integrated over a time, s."""
         kind, x = self._stream  # type: ignore[misc]
         if self.control != Control.state:
             return self._streamed_attitude(kind, x, dt)
@@ -334,6 +329,7 @@ class Commander:
         return x
 
     def _stream_setpoint(self, kind: str, values: NDArray) -> None:
+        """Make a streamed setpoint the active one, and discard the plan of high-level commands."""
         if self._stream is None:
             self._last_goal = self.goal()
             self._reference = self._last_goal[0].copy()
@@ -342,12 +338,12 @@ class Commander:
 
     def _move_vertically(self, height: float, duration: float, yaw: float | None, is_landing: bool) -> None:
         (height,) = _check_numbers("height", [height], 1)
-        start_pos = self._motion_start("land" if is_landing else "take_off")[0]
-        goal = start_pos.copy()
+        start_point = self._motion_start("land" if is_landing else "take_off")[0]
+        goal = start_point.copy()
         goal[2] = height
         if yaw is not None:
-            goal[3] = nearest_yaw(start_pos[3], _check_numbers("yaw", [yaw], 1)[0])
-        start = np.array([start_pos, np.zeros(4), np.zeros(4)])
+            goal[3] = nearest_yaw(start_point[3], _check_numbers("yaw", [yaw], 1)[0])
+        start = np.array([start_point, np.zeros(4), np.zeros(4)])
         self._plan = PlannedMotion(plan_move(start, goal, _check_duration(duration)), self.now, is_landing=is_landing)
 
     def _drone_motion(self) -> NDArray:

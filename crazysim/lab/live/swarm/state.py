@@ -34,7 +34,7 @@ class DroneState(NamedTuple):
 
 
 class EstimateFrame(NamedTuple):
-    """Frame of a drone's estimate, turned about the vertical and shifted against the world.
+    """Frame of a drone's estimate: the world's frame, turned about the vertical and shifted.
 
     Without absolute positioning, as with a Flow deck, the estimate starts at an initial pose (``kalmanCoreInit`` in
     kalman_core.c of crazyflie-firmware) and adds the motion since then. Commands are in the frame of the estimate.
@@ -58,14 +58,14 @@ class EstimateFrame(NamedTuple):
         return EstimateFrame(yaw_offset, pose[:3] - rotate(from_yaw(yaw_offset), pos))
 
     def state_to_estimate(self, state: DroneState) -> DroneState:
-        """Return the state of a drone in this frame."""
+        """Return a drone's state in this frame, from its state in the world's frame."""
         quat = from_yaw(self.yaw_offset)
         return state._replace(
             pos=rotate(quat, state.pos) + self.origin, quat=multiply(quat, state.quat), vel=rotate(quat, state.vel)
         )
 
     def motion_to_estimate(self, pos: NDArray, vel: NDArray, yaw: float) -> tuple[NDArray, NDArray, float]:
-        """Return position, m, velocity, m/s, and yaw, rad, in this frame."""
+        """Return position, m, velocity, m/s, and yaw, rad, in this frame, from values in the world's frame."""
         quat = from_yaw(self.yaw_offset)
         return rotate(quat, pos) + self.origin, rotate(quat, vel), yaw + self.yaw_offset
 

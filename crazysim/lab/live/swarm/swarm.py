@@ -41,10 +41,10 @@ class Swarm(Closeable):
         swarm.advance(3.0)
 
     States are estimates of the filter of ``Sim(estimator=...)`` and its ``IMU``; without a filter they are the true
-    states.
-    Commands may come from any thread; hold ``lock`` while another thread advances. The simulation advances by
-    ``advance``, by ``start`` in real time, by a loop that calls the swarm, such as ``Live.add(swarm)``, or by a loop
-    that ``advance`` runs, after ``run_in(live)``.
+    states. Commands may come from any thread; hold ``lock`` while another thread advances.
+
+    The simulation advances in one of four ways: by calls of ``advance``; in real time, after ``start``; in a loop that
+    calls the swarm, after ``Live.add(swarm)``; or in a live loop that ``advance`` runs, after ``run_in(live)``.
     """
 
     reports: Reports
