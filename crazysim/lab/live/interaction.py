@@ -122,7 +122,7 @@ class Interaction:
 
     @property
     def followed(self) -> tuple[int, str, int] | None:
-        """World, kind and index of the body that viewers mark and follow: the selected drone, unless ``follow`` chose another."""
+        """World, kind and index of the body that viewers follow: the selected drone, or the choice of ``follow``."""
         if self._followed_body is not None or self.selected is None:
             return self._followed_body
         return self.selected[0], DRONE, self.selected[1]
