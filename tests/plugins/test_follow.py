@@ -1,4 +1,4 @@
-"""Following trajectories in the step: setpoints at ticks, starts, rates, uploads, resets, pictures."""
+"""Following trajectories in the step: setpoints at ticks, starts, rates, uploads, resets, overlays."""
 
 import dataclasses
 
@@ -27,8 +27,8 @@ def build(n_worlds=N_WORLDS, n_drones=N_DRONES, **settings):
 
 
 @pytest.fixture(scope="module")
-def flown():
-    """Return a simulation after 0.3 s, with its setpoint of each step."""
+def flight():
+    """Return a simulation after 0.3 s, its plugin, and the setpoint of each step."""
     sim = build()
     plugin = sim.add(Follow([EIGHT, UP], start=START, rate=RATE))
     commands = []
@@ -39,16 +39,16 @@ def flown():
 
 
 def expected(world, drone, t):
-    """The setpoint of a drone at a time of its world, from the trajectory alone."""
+    """Return the setpoint of a drone at a time of its world, from the trajectory alone."""
     rate = RATE[world, drone]
     s = jax.tree.map(np.asarray, evaluate([EIGHT, UP][drone], (t - START[world, drone]) * rate))
     scaled = {"vel": 1, "acc": 2, "jerk": 3, "snap": 4, "yaw_rate": 1, "yaw_acc": 2}
     return s.replace(**{name: rate**k * getattr(s, name) for name, k in scaled.items()})
 
 
-def test_setpoints_are_those_of_the_trajectory_at_each_tick(flown):
-    """The state controller fires every fifth step of 2 ms; in between the setpoint stays."""
-    sim, _, commands = flown
+def test_setpoints_are_those_of_the_trajectory_at_each_tick(flight):
+    """The state controller runs in every fifth step of 2 ms; in between the setpoint stays."""
+    sim, _, commands = flight
     assert sim.data.core.freq == 5 * sim.data.controls.state.freq
     for step in (0, 4, 5, 7, 12, 149):
         t = step // 5 * 5 / sim.data.core.freq
@@ -59,8 +59,8 @@ def test_setpoints_are_those_of_the_trajectory_at_each_tick(flown):
                 )
 
 
-def test_a_drone_waits_for_its_start_and_stays_at_the_end(flown):
-    _, _, commands = flown
+def test_a_drone_waits_for_its_start_and_stays_at_the_end(flight):
+    _, _, commands = flight
     np.testing.assert_array_equal(commands[:, 2, 0, 3:9], np.zeros((150, 6)))
     np.testing.assert_allclose(commands[:, 2, 0, :3], np.broadcast_to([0, 0, 1], (150, 3)), atol=1e-6)
     sim = build()
@@ -79,8 +79,8 @@ def test_one_start_per_drone_spaces_them_along_a_curve():
     sim.step(1)
     for drone, t in enumerate((3.0, 0.0)):
         s = evaluate(EIGHT, t)
-        at = np.asarray(sim.data.controls.state.staged_cmd)[:, drone]
-        np.testing.assert_allclose(at[:, :3], np.tile(s.pos, (N_WORLDS, 1)), atol=1e-5)
+        setpoint = np.asarray(sim.data.controls.state.staged_cmd)[:, drone]
+        np.testing.assert_allclose(setpoint[:, :3], np.tile(s.pos, (N_WORLDS, 1)), atol=1e-5)
     follow.assign(sim, start=-start)
     np.testing.assert_array_equal(
         np.asarray(follow.read(sim.data).start)[..., 0], np.tile(-start, (N_WORLDS, 1)).astype(np.float32)
@@ -89,7 +89,7 @@ def test_one_start_per_drone_spaces_them_along_a_curve():
         follow.assign(sim, start=np.zeros(N_WORLDS))
 
 
-def test_drones_follow(flown):
+def test_drones_follow_a_helix():
     sim = build(n_worlds=1, n_drones=1)
     sim.add(Follow(helix(0.3, 0.2, 2, period=3.0, height=1.0)))
     sim.step(1500)
@@ -104,43 +104,43 @@ def test_uploads_are_flown_and_nothing_is_compiled_again():
     sim = build()
     plugin = sim.add(Follow([EIGHT, UP], n_slots=4, max_pieces=20))
     sim.step(5)
-    plan, size = sim.step_fn.plan(sim.data), _compiled(sim)
+    plan, size = sim.step_fn.plan(sim.data), _n_compiled(sim)
     other = line([0.2, 0, 1], [0.2, 2, 1.5], duration=3.0).then(hover([0.2, 2, 1.5]))
     for slot in (1, 2, 3):
         plugin.upload(sim, slot, other)
         plugin.assign(sim, index=np.array([[0, slot]] * N_WORLDS))
         sim.step(5)
     assert sim.step_fn.plan(sim.data) is plan
-    assert _compiled(sim) == size
+    assert _n_compiled(sim) == size
     s = evaluate(other, 15 / 500)
     cmd, eight = np.asarray(sim.data.controls.state.cmd), jax.tree.map(np.asarray, evaluate(EIGHT, 15 / 500))
     np.testing.assert_allclose(cmd[:, 1, :3], np.tile(s.pos, (3, 1)), atol=1e-6)
     np.testing.assert_allclose(cmd[:, 0], np.tile(eight.command(), (3, 1)), rtol=1e-5, atol=2e-5)
 
 
-def test_coefficients_that_are_zero_in_all_trajectories_are_not_read():
+def test_coefficients_that_are_zero_in_all_trajectories_are_not_looked_up():
     level = Trajectory(EIGHT.ends, EIGHT.coefficients * (np.arange(4) < 2)[:, None] * np.ones(8), EIGHT.repeats)
     lookups = {}
-    for name, one, settings in (("level", level, {}), ("room", level, {"n_slots": 1}), ("turned", UP, {})):
+    for name, trajectory, settings in (("level", level, {}), ("slots", level, {"n_slots": 1}), ("turned", UP, {})):
         sim = build(engine="interpret")
-        plugin = sim.add(Follow(one, **settings))
-        lookups[name] = _lookups(sim)
+        plugin = sim.add(Follow(trajectory, **settings))
+        lookups[name] = _n_lookups(sim)
         sim.step(20)
-        expected = jax.tree.map(np.asarray, evaluate(one, 15 / 500)).command()
+        expected = jax.tree.map(np.asarray, evaluate(trajectory, 15 / 500)).command()
         np.testing.assert_allclose(np.asarray(sim.data.controls.state.cmd)[0, 0], expected, rtol=1e-5, atol=2e-5)
         if name == "level":
             assert plugin.read(sim.data).degrees == (7, 7, -1, -1)
             with pytest.raises(ConfigError, match="degrees of x, y, z and yaw"):
                 plugin.upload(sim, 0, hover([0, 0, 1]))
-    assert lookups["level"] <= lookups["room"] - 16
+    assert lookups["level"] <= lookups["slots"] - 16
 
 
-def _lookups(sim):
+def _n_lookups(sim):
     blocks = [s.block for s in sim.step_fn.plan(sim.data).program.segments]
     return sum(op.name == "lookup" for block in blocks for op in block.walk())
 
 
-def _compiled(sim):
+def _n_compiled(sim):
     return sim.step_fn.plan(sim.data).traced_count_step._cache_size()
 
 
@@ -162,7 +162,7 @@ def test_resets_restore_slots_starts_and_indices():
         np.testing.assert_array_equal(a, b)
 
 
-def test_drones_are_given_other_starts_and_rates():
+def test_starts_and_rates_can_be_changed():
     sim = build()
     plugin = sim.add(Follow([EIGHT, UP], start=START))
     plugin.assign(sim, start=2.0, rate=RATE)
@@ -203,8 +203,8 @@ def test_trajectories_have_gradients_through_the_step():
     assert slope > 1e-3
 
 
-def test_the_path_ahead_and_the_setpoints_are_drawn(flown):
-    sim, _, _ = flown
+def test_the_path_ahead_and_the_setpoints_are_drawn(flight):
+    sim, _, _ = flight
     overlays = sim.scene.renderer.overlays
     overlays.clear()
     sim.plugins.draw(0)
@@ -225,12 +225,12 @@ def test_the_path_ahead_and_the_setpoints_are_drawn(flown):
         ({"max_pieces": 3}, "max_pieces"),
     ],
 )
-def test_wrong_settings_are_refused(settings, message):
+def test_wrong_settings_are_errors(settings, message):
     with pytest.raises(ConfigError, match=message):
         build().add(Follow([EIGHT, UP], **settings))
 
 
-def test_what_cannot_follow_is_refused():
+def test_wrong_levels_trajectories_and_uploads_are_errors():
     with pytest.raises(ConfigError, match="control='state'"):
         Sim(control="attitude").add(Follow(EIGHT))
     with pytest.raises(ConfigError, match="one or more"):

@@ -16,18 +16,18 @@ ERRORS = Triad(noise=1e-3, bias=0.01, scale=0.01, misalignment=0.02, instability
 STEPS = 10
 """Steps of 2 ms: two predictions of each filter, and a measurement of each sensor."""
 SMALL, DIFFERENCE = 1e-9, 1e-5
-"""Slope below which nothing is compared, and step of the differences relative to the directions."""
+"""Slope below which nothing is compared, and step of the differences as a multiple of the directions."""
 
 
 def filters():
-    """Return a filter that flies two drones, and one that watches, with their sensors."""
+    """Return a filter that controls the drones, another one that only estimates, and their sensors."""
     imu, tracked = IMU(ERRORS, ERRORS), MotionCapture(1e-3, 1e-2, delay=0.004)
     aids = [OpticalFlow(0.1), TimeOfFlight(resolution=None), UWB(ANCHORS[:2], 0.1, tdoa=True)]
     return [imu, tracked, *aids, Kalman([imu, tracked]), ESKF([imu, *aids], control=False)]
 
 
 def everything():
-    """Return effects, all sensors, and filters on all that they can use."""
+    """Return effects, all sensors, and filters that use all sensors that they support."""
     imu, tracked = IMU(ERRORS, ERRORS, (0.01, 0.0, 0.0), imbalance=1e-8), MotionCapture(1e-3, 1e-2, delay=0.004)
     aids = [
         OpticalFlow(0.1),
@@ -49,8 +49,8 @@ def is_float(x):
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
-def pushed(stage):
-    """Return a function from data, and the slopes of its real numbers, to those after a stage."""
+def push_forward(stage):
+    """Return a function from the data and the slopes of its floats to both after a stage."""
 
     def run(data, slopes):
         leaves, tree = jax.tree.flatten(data)
@@ -63,7 +63,7 @@ def pushed(stage):
         _, slopes, after = jax.jvp(real, ([x for x in leaves if is_float(x)],), (slopes,), has_aux=True)
         return tree.unflatten(after), slopes
 
-    # Nothing is optimised: to compile takes longer than to run.
+    # Without optimisation: compiling takes longer than running.
     return jax.jit(run, compiler_options={"xla_backend_optimization_level": 0})
 
 
@@ -73,10 +73,10 @@ SLOW = pytest.mark.slow("compiles the derivative of every plugin; the filters al
 @pytest.mark.long("compiles the derivative of each stage, in float64")
 @pytest.mark.parametrize("plugins", [filters, pytest.param(everything, marks=SLOW)])
 def test_law_08_slopes_are_central_differences(plugins, x64):
-    """Of every real number of the data, by the states at the start, with the stages as they are written.
+    """Derivatives of every float of the data by the states at the start, with the stages as they are written.
 
-    Each stage is compiled alone, forwards; a gradient is its transpose. Differences are off by their step squared, and
-    by rounding of the largest numbers: of pressures of 1e5 Pa, and of a battery's charge that hardly changes.
+    Each stage is compiled alone, in forward mode; a gradient is its transpose. Differences have errors of their step
+    squared, and of the rounding of large numbers, such as a pressure of 1e5 Pa or a charge that hardly changes.
     """
     sim = Sim(n_drones=2, control="state", engine="plain")
     for plugin in plugins():
@@ -93,25 +93,25 @@ def test_law_08_slopes_are_central_differences(plugins, x64):
     rng = np.random.default_rng(1)
     sizes = {name: 100.0 if name == "rotor_vel" else 0.1 for name in start}
     directions = {name: jnp.asarray(sizes[name] * rng.normal(size=x.shape)) for name, x in start.items()}
-    stages = [pushed(stage) for stage in as_stages(sim.step_pipeline)]
+    stages = [push_forward(stage) for stage in as_stages(sim.step_pipeline)]
 
-    def begin(x):
+    def start_data(x):
         quat = x["quat"] / jnp.linalg.norm(x["quat"], axis=-1, keepdims=True)
         return sim.data.replace(states=sim.data.states.replace(**x | {"quat": quat}))
 
-    def flown(x):
-        """Return the real numbers of the data after some steps, by their names, and their slopes."""
-        data = begin(x)
+    def fly(x):
+        """Return the floats of the data after some steps, by name, and their slopes."""
+        data = start_data(x)
         _, slopes = jax.jvp(
-            lambda x: [leaf for leaf in jax.tree.leaves(begin(x)) if is_float(leaf)], (x,), (directions,)
+            lambda x: [leaf for leaf in jax.tree.leaves(start_data(x)) if is_float(leaf)], (x,), (directions,)
         )
         for _ in range(STEPS):
             for stage in stages:
                 data, slopes = stage(data, slopes)
         return {jax.tree_util.keystr(k): x for k, x in jax.tree.leaves_with_path(data) if is_float(x)}, slopes
 
-    values, slopes = flown(start)
-    ends = [flown({k: x + h * directions[k] for k, x in start.items()})[0] for h in (DIFFERENCE, -DIFFERENCE)]
+    values, slopes = fly(start)
+    ends = [fly({k: x + h * directions[k] for k, x in start.items()})[0] for h in (DIFFERENCE, -DIFFERENCE)]
     compared = set()
     for (name, value), slope in zip(values.items(), slopes, strict=True):
         difference = np.asarray(ends[0][name] - ends[1][name]) / (2 * DIFFERENCE)
@@ -120,6 +120,6 @@ def test_law_08_slopes_are_central_differences(plugins, x64):
         if size > SMALL:
             assert np.abs(slope - difference).max() < 1e-6 * size + rounding, name
             compared.add(name)
-    own = {name for name, plugin in sim.plugins.items() if hasattr(plugin, "channels")} | {"kalman", "eskf"}
-    assert own <= {name.split("'")[1] for name in compared if name.startswith(".plugins")}
+    sensor_names = {name for name, plugin in sim.plugins.items() if hasattr(plugin, "channels")} | {"kalman", "eskf"}
+    assert sensor_names <= {name.split("'")[1] for name in compared if name.startswith(".plugins")}
     assert {".states.pos", ".states.rotor_vel", ".plugins['eskf'].estimate.gyro_bias"} <= compared

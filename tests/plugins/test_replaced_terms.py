@@ -1,4 +1,4 @@
-"""Terms of the model that plugins replace: two that replace the same one are refused."""
+"""Terms of the model that plugins replace: two plugins that replace the same term are an error."""
 
 import dataclasses
 
@@ -37,7 +37,7 @@ def sim():
     ],
     ids=lambda plugin: plugin.name,
 )
-def test_law_09_two_plugins_that_replace_the_same_term_are_refused_by_name(sim, first, second):
+def test_law_09_two_plugins_that_replace_the_same_term_are_an_error_with_both_names(sim, first, second):
     second = dataclasses.replace(second, name="second")
     sim.add(first)
     kinds = type(first).__name__, type(second).__name__
@@ -51,7 +51,7 @@ def test_law_09_two_plugins_that_replace_the_same_term_are_refused_by_name(sim, 
     sim.remove(second)
 
 
-def test_plugins_that_add_up_stay_together(sim):
+def test_plugins_that_replace_no_term_can_be_added_twice(sim):
     for name in ("first", "second"):
         sim.add(Wind((1.0, 0.0, 0.0), name=name))
         sim.add(Kalman(SENSORS, control=False, name=f"{name}_filter"))

@@ -1,4 +1,4 @@
-"""Consistency of filters: errors of estimates, and whether they are distributed as a filter expects."""
+"""Consistency of filters: errors of estimates, and a check of their distribution."""
 
 import math
 
@@ -9,7 +9,7 @@ from crazysim import rotation
 
 
 def errors(sim, name):
-    """Return the errors of position, velocity and attitude of a filter, body frame for the last two. (n_worlds, 9)"""
+    """Return the errors of position, world frame, velocity and attitude, body frame, of a filter. (n_worlds, 9)"""
     e, s = sim.data.plugins[name].estimate, sim.data.states
     vel = rotation.rotate_inverse(s.quat, s.vel) - e.vel
     turn = 2 * rotation.multiply(rotation.conjugate(e.quat), s.quat)
@@ -20,10 +20,11 @@ def errors(sim, name):
 def assert_chi_squared(values, k):
     """Check that values have the mean of a chi-square distribution with k degrees of freedom.
 
-    The mean of n has the standard deviation sqrt(2 k / n); beyond 3.3 of them it is once in a thousand seeds.
+    The mean of n values has the standard deviation sqrt(2 k / n); it is off by 3.3 of them for one seed in a thousand.
     """
     assert abs(np.mean(values) - k) < 3.3 * math.sqrt(2 * k / len(values))
 
 
-def normalised(error, cov):
+def normalised_square(error, cov):
+    """Return squared errors, (n, k), normalised by covariances, (n, k, k). (n,)"""
     return np.einsum("wi,wij,wj->w", error, np.linalg.inv(cov), error)

@@ -4,7 +4,7 @@
 
 Needs gcc and a checkout of bitcraze/crazyflie-firmware; recorded at commit 2a18fc29 on 2026-11-24. The fast inverse
 square root of sensfusion6.c, which is off by up to 0.2%, is replaced by an exact one. Attitudes are updated every 4 ms,
-heights every 10 ms; rows are those of every 20 ms.
+heights every 10 ms; outputs are recorded every 20 ms.
 """
 
 import ctypes
@@ -26,12 +26,12 @@ uint32_t xTaskGetTickCount(void) { return now; }
 static state_t state;
 static baro_t baro;
 static tofMeasurement_t tof = {.timestamp = -1000000};
-void turn(float *g, float *a) {
+void update_attitude(float *g, float *a) {
   sensfusion6UpdateQ(g[0], g[1], g[2], a[0], a[1], a[2], 0.004f);
   positionUpdateVelocity(sensfusion6GetAccZWithoutGravity(a[0], a[1], a[2]), 0.004f);
 }
-void rise(float asl, float distance, uint32_t taken, uint32_t tick) {
-  now = tick; baro.asl = asl; tof.distance = distance; tof.timestamp = taken;
+void update_height(float asl, float distance, uint32_t measured_at, uint32_t tick) {
+  now = tick; baro.asl = asl; tof.distance = distance; tof.timestamp = measured_at;
   positionEstimate(&state, &baro, &tof, 0.01f, 0);
 }
 void get(float *out) {
@@ -56,15 +56,15 @@ FOLDERS = (
 ).split()
 
 
-def compiled(firmware: Path) -> ctypes.CDLL:
+def compile_filter(firmware: Path) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory() as folder:
         for name, text in HEADERS.items():
             Path(folder, name).write_text(text)
         fusion = (firmware / "src/modules/src/sensfusion6.c").read_text()
         root = "\nfloat invSqrt(float x) { return 1 / sqrtf(x); }"
-        exact = re.sub(r"\nfloat invSqrt\(float x\)\n\{.*?\n\}", root, fusion, flags=re.DOTALL)
-        assert exact != fusion
-        Path(folder, "fusion.c").write_text(exact)
+        exact_fusion = re.sub(r"\nfloat invSqrt\(float x\)\n\{.*?\n\}", root, fusion, flags=re.DOTALL)
+        assert exact_fusion != fusion
+        Path(folder, "fusion.c").write_text(exact_fusion)
         Path(folder, "driver.c").write_text(DRIVER)
         sources = [f"{folder}/driver.c", f"{folder}/fusion.c"]
         sources += [
@@ -77,14 +77,15 @@ def compiled(firmware: Path) -> ctypes.CDLL:
         return ctypes.CDLL(f"{folder}/filter.so")
 
 
-def v(x):
+def float_array(x):
+    """Return numbers as an array of C."""
     return (ctypes.c_float * len(x))(*[float(a) for a in x])
 
 
 def run(lib, uses_ground: bool, ticks=2000):
     """Return inputs of each millisecond (gyro, degrees/s, accel, g, height, distance, age, ms) and outputs."""
     rng, inputs, outputs = np.random.default_rng(7), [], []
-    phase, taken = rng.normal(size=3), -1000
+    phase, measured_at = rng.normal(size=3), -1000
     for k in range(ticks):
         t = k / 1000
         gyro = 30 * np.sin(2 * np.pi * t * np.array([0.7, 1.1, 0.4]) + phase)
@@ -92,15 +93,15 @@ def run(lib, uses_ground: bool, ticks=2000):
         height = 1.0 + 0.3 * np.sin(t) + 0.05 * rng.normal()
         distance = 1.1 + 0.3 * np.sin(t) + 0.01 * rng.normal()
         if uses_ground and k >= 500 and k % 25 == 0 and not 1000 < k < 1300:
-            taken = k
-        row = np.float32([*gyro, *accel, height, distance, k - taken])
+            measured_at = k
+        row = np.float32([*gyro, *accel, height, distance, k - measured_at])
         if k % 4 == 0:
-            lib.turn(v(row[:3]), v(row[3:6]))
+            lib.update_attitude(float_array(row[:3]), float_array(row[3:6]))
         if k % 10 == 0:
-            lib.rise(ctypes.c_float(row[6]), ctypes.c_float(row[7]), taken & 0xFFFFFFFF, k)
+            lib.update_height(ctypes.c_float(row[6]), ctypes.c_float(row[7]), measured_at & 0xFFFFFFFF, k)
         inputs.append(row)
         if k % 20 == 19:
-            out = v([0] * 6)
+            out = float_array([0] * 6)
             lib.get(out)
             outputs.append(np.float32(out[:]))
     return np.stack(inputs), np.stack(outputs)
@@ -109,5 +110,5 @@ def run(lib, uses_ground: bool, ticks=2000):
 if __name__ == "__main__":
     recorded = {}
     for name, uses_ground in (("pressure", False), ("ground", True)):
-        recorded[f"{name}/inputs"], recorded[f"{name}/outputs"] = run(compiled(Path(sys.argv[1])), uses_ground)
+        recorded[f"{name}/inputs"], recorded[f"{name}/outputs"] = run(compile_filter(Path(sys.argv[1])), uses_ground)
     np.savez_compressed(Path(__file__).parent / "firmware_complementary.npz", **recorded)

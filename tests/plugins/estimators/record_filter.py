@@ -4,8 +4,8 @@
 
 Needs gcc and a checkout of bitcraze/crazyflie-firmware; recorded at commit 2a18fc29 on 2026-11-25. The functions of
 CMSIS that the filter calls are replaced by plain C. Flights last 4 s, with up to 5.4 m/s and tilts up to 62 degrees.
-Loops last 1 ms; every 100th is kept: position, velocity in the body frame, attitude error, attitude wxyz, and the upper
-triangle of the covariance.
+Loops last 1 ms; every 100th is recorded: position, velocity in the body frame, attitude error, attitude wxyz, and the
+upper triangle of the covariance.
 """
 
 import ctypes
@@ -33,7 +33,7 @@ HEADERS = {
 }
 
 
-def compiled(firmware: Path) -> ctypes.CDLL:
+def compile_filter(firmware: Path) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory() as folder:
         for name, text in HEADERS.items():
             Path(folder, name).write_text(text.read_text() if isinstance(text, Path) else text)
@@ -46,11 +46,12 @@ def compiled(firmware: Path) -> ctypes.CDLL:
         return ctypes.CDLL(str(library))
 
 
-f = ctypes.c_float
+c_float = ctypes.c_float
 
 
-def v(x):
-    return (f * len(x))(*[float(a) for a in x])
+def float_array(x):
+    """Return numbers as an array of C."""
+    return (c_float * len(x))(*[float(a) for a in x])
 
 
 LOOPS, SAMPLE_PERIOD, GRAVITY = 4000, 100, 9.81
@@ -61,14 +62,14 @@ STATIONS = np.float32([[-3.5, -3.0, 2.4], [3.5, 3.0, 2.4]])
 DIODE = np.float32([0.015, 0.0075, 0.0])
 
 
-def facing(place):
+def station_attitude(pos):
     """Return the attitude of a station that looks at the middle of the flight, station to world. (3, 3)"""
-    x = np.array([0, 0, 1.2]) - place
+    x = np.array([0, 0, 1.2]) - pos
     y = np.cross([0, 0, 1], x)
     return np.float32(np.stack([a / np.linalg.norm(a) for a in (x, y, np.cross(x, y))], axis=-1))
 
 
-FRAMES = np.stack([facing(place) for place in STATIONS])
+FRAMES = np.stack([station_attitude(pos) for pos in STATIONS])
 
 
 def flight():
@@ -100,76 +101,84 @@ def quaternion(rot):
     return np.array([*(np.array(v) / (4 * w)), w])
 
 
-def inertial(flown, flies, rng):
-    """Return accelerations and angular velocities of each loop, used in every tenth, zero in the others. (n, 6)"""
+def inertial_measurements(flight_states, is_flying, rng):
+    """Return accelerations and angular velocities in every tenth loop, and zeros in the others. (n, 6)"""
     rows = np.zeros((LOOPS + 1, 6), np.float32)
     for k in range(10, LOOPS + 1, 10):
-        accel, rate = flown[4][k - 10 : k].mean(0), flown[3][k - 10 : k].mean(0)
-        if not flies:
+        accel, rate = flight_states[4][k - 10 : k].mean(0), flight_states[3][k - 10 : k].mean(0)
+        if not is_flying:
             accel, rate = np.array([0.3, -0.2, GRAVITY]), 0.8 * np.sin(k / 1000 * np.array([4.4, 6.9, 2.5]))
         rows[k] = *(accel + 0.3 * rng.normal(size=3)), *(rate + 0.02 * rng.normal(size=3))
     return rows
 
 
-def run(lib, kind, flown, sums):
+def run(lib, kind, flight_states, inertial):
     """Return the measurements of each loop, and the outputs."""
     rng = np.random.default_rng(7)
     inputs, out = [], []
-    lib.k_init(*[f(x) for x in (0.05, -0.05, 1.25, 0.0)])
+    lib.k_init(*[c_float(x) for x in (0.05, -0.05, 1.25, 0.0)])
     for k in range(1, LOOPS + 1):
-        pos, vel, rot, rate, _ = (x[k] for x in flown)
-        accel, gyro = sums[k, :3], sums[k, 3:]
+        pos, vel, rot, rate, _ = (x[k] for x in flight_states)
+        accel, gyro = inertial[k, :3], inertial[k, 3:]
         if k % 10 == 0:
-            lib.k_predict(v(accel), v(gyro), k, int(kind != "ground"))
+            lib.k_predict(float_array(accel), float_array(gyro), k, int(kind != "ground"))
         lib.k_noise(k)
         m = np.zeros(9, np.float32)
         if (kind in ("position", "ground") and k % 10 == 5) or (kind == "sweep" and k == 2):
             m[:3] = (0 if kind == "ground" else pos) + 0.05 * rng.normal(size=3)
-            lib.k_position(v(m[:3]), f(0.01))
+            lib.k_position(float_array(m[:3]), c_float(0.01))
         if kind == "pose" and k % 10 == 0:
             q = quaternion(rot) + 0.01 * rng.normal(size=4)
             m[:3] = pos + 0.02 * rng.normal(size=3)
             m[3:7] = q / np.linalg.norm(q)
-            lib.k_pose(v(m[:3]), v(m[3:7]), f(0.01), f(0.05))
+            lib.k_pose(float_array(m[:3]), float_array(m[3:7]), c_float(0.01), c_float(0.05))
         if kind in ("flow", "range") and k % 10 == 0:
             moved = (rot.T @ vel)[:2] * rot[2, 2] / pos[2] + [-rate[1], rate[0]]
             m[:2] = 10 * (0.01 * PIXELS * moved + 0.2 * rng.normal(size=2))
-            degrees = v(np.degrees(gyro.astype(np.float64)))
-            lib.k_flow(f(m[0]), f(m[1]), f(2.0), f(2.0), f(0.01), degrees)
+            degrees = float_array(np.degrees(gyro.astype(np.float64)))
+            lib.k_flow(c_float(m[0]), c_float(m[1]), c_float(2.0), c_float(2.0), c_float(0.01), degrees)
         if kind == "range" and k % 25 == 10:
             tilt = max(np.arccos(rot[2, 2]) - np.radians(7.5), 0)
             m[2] = pos[2] / np.cos(tilt) + 0.02 * rng.normal()
-            lib.k_tof(f(m[2]), f(0.02))
+            lib.k_tof(c_float(m[2]), c_float(0.02))
         a = k // 5 % 4
         b = (a + 1) % 4
         if kind == "distance" and k % 5 == 0:
             m[0] = np.linalg.norm(pos - ANCHORS[a]) + 0.1 * rng.normal()
-            lib.k_distance(f(m[0]), v(ANCHORS[a]), f(0.25))
+            lib.k_distance(c_float(m[0]), float_array(ANCHORS[a]), c_float(0.25))
         if kind == "difference" and k % 5 == 0:
             m[0] = np.linalg.norm(pos - ANCHORS[b]) - np.linalg.norm(pos - ANCHORS[a]) + 0.1 * rng.normal()
-            lib.k_tdoa(f(m[0]), v(ANCHORS[a]), v(ANCHORS[b]), f(0.15), k)
+            lib.k_tdoa(c_float(m[0]), float_array(ANCHORS[a]), float_array(ANCHORS[b]), c_float(0.15), k)
         if kind == "sweep" and k % 4 == 0:
             tilt, station = math.pi / 6 * (-1) ** (k // 4), k // 8 % 2
             d = FRAMES[station].T @ (pos + rot @ DIODE - STATIONS[station])
             m[0] = math.atan2(d[1], d[0]) + math.asin(d[2] * math.tan(tilt) / math.hypot(*d[:2]))
             m[0] += 0.002 * rng.normal()
-            frame = v(FRAMES[station].ravel())
-            lib.k_sweep(f(m[0]), f(tilt), v(DIODE), v(STATIONS[station]), frame, f(0.001), k)
+            frame = float_array(FRAMES[station].ravel())
+            lib.k_sweep(
+                c_float(m[0]),
+                c_float(tilt),
+                float_array(DIODE),
+                float_array(STATIONS[station]),
+                frame,
+                c_float(0.001),
+                k,
+            )
         lib.k_finalize()
         inputs.append(m)
         if k % SAMPLE_PERIOD == 0:
-            S, q, P = v([0] * 9), v([0] * 4), v([0] * 81)
+            S, q, P = float_array([0] * 9), float_array([0] * 4), float_array([0] * 81)
             lib.k_get(S, q, P)
             out.append(np.concatenate([S[:], q[:], np.float32(P[:]).reshape(9, 9)[np.triu_indices(9)]]))
     return np.stack(inputs), np.float32(out)
 
 
 if __name__ == "__main__":
-    library, flown = compiled(Path(sys.argv[1])), flight()
+    library, flight_states = compile_filter(Path(sys.argv[1])), flight()
     recorded = {"sweep/places": STATIONS, "sweep/frames": FRAMES}
-    for name, flies in (("air", True), ("ground", False)):
-        recorded[f"inertial/{name}"] = inertial(flown, flies, np.random.default_rng(5))
+    for name, is_flying in (("air", True), ("ground", False)):
+        recorded[f"inertial/{name}"] = inertial_measurements(flight_states, is_flying, np.random.default_rng(5))
     for kind in ("position", "pose", "flow", "range", "distance", "difference", "sweep", "ground"):
-        sums = recorded["inertial/ground" if kind == "ground" else "inertial/air"]
-        recorded[f"{kind}/inputs"], recorded[f"{kind}/outputs"] = run(library, kind, flown, sums)
+        inertial = recorded["inertial/ground" if kind == "ground" else "inertial/air"]
+        recorded[f"{kind}/inputs"], recorded[f"{kind}/outputs"] = run(library, kind, flight_states, inertial)
     np.savez_compressed(FOLDER / "firmware_filter.npz", **recorded)

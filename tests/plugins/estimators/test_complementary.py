@@ -15,16 +15,16 @@ from crazysim.plugins.sensors import IMU
 
 @pytest.mark.parametrize("kind", ["pressure", "ground"])
 def test_the_filter_is_that_of_the_compiled_firmware(kind):
-    """In 2 s of 1 ms: but for rounding of float32, in 500 updates of numbers around one."""
+    """In 2 s of 1 ms, except for rounding in float32, in 500 updates of numbers around one."""
     found, recorded = firmware_filters.complementary_states(kind)
-    assert np.ptp(recorded[:, [0, 1, 2, 4, 5]], axis=0).min() > 0.05, "nothing moved: the run shows nothing"
+    assert np.ptp(recorded[:, [0, 1, 2, 4, 5]], axis=0).min() > 0.05, "nothing moved in the recording"
     np.testing.assert_allclose(found[:, :4], recorded[:, :4], rtol=0, atol=5e-6)
     np.testing.assert_allclose(found[:, 4], recorded[:, 4], rtol=0, atol=5e-6)
     np.testing.assert_allclose(found[:, 5], recorded[:, 5], rtol=0, atol=5e-4)  # differences over 10 ms
 
 
-def flying(estimator, n_worlds=4, engine="auto", seconds=2.0):
-    """Return a simulation of drones at 1 m that fly a tilt back and forth on the estimate."""
+def fly(estimator, n_worlds=4, engine="auto", seconds=2.0):
+    """Return a simulation after drones at 1 m have tilted back and forth, controlled by the estimate."""
     sim = Sim(n_worlds, control="attitude", rng_key=4, engine=engine, estimator=estimator)
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0)))
@@ -36,26 +36,26 @@ def flying(estimator, n_worlds=4, engine="auto", seconds=2.0):
 
 
 @pytest.fixture(scope="module")
-def flown():
-    """Return a simulation that has flown on the filter of the name, with the Crazyflie's sensors."""
-    return flying("complementary")
+def flown_sim():
+    """Return a simulation that has flown with the filter given by its name, with the Crazyflie's sensors."""
+    return fly("complementary")
 
 
-def test_drones_fly_on_the_estimate(flown):
+def test_drones_fly_on_the_estimate(flown_sim):
     """Attitudes agree within some degrees (the accelerometer shows thrust, not gravity), heights within centimetres."""
-    record, s = flown.data.plugins["complementary"], flown.data.states
+    record, s = flown_sim.data.plugins["complementary"], flown_sim.data.states
     down, true = (np.asarray(rotation.matrix(q))[..., 2, :] for q in (record.quat, s.quat))
     tilt = np.degrees(np.arccos(np.clip(np.sum(down * true, axis=-1), -1, 1)))
     assert 1e-3 < tilt.max() < 5
     assert np.abs(np.asarray(record.height - s.pos[..., 2:])).max() < 0.1
     assert np.abs(np.asarray(s.quat)[..., 3]).min() > 0.9
-    measured = flown.plugins.observations(flown.data)
+    measured = flown_sim.plugins.observations(flown_sim.data)
     np.testing.assert_array_equal(measured["complementary.pos"][..., :2], 0.0)
-    assert list(flown.plugins) == ["imu", "barometer", "complementary"]
+    assert list(flown_sim.plugins) == ["imu", "barometer", "complementary"]
 
 
 def test_gradients_of_the_estimate_are_central_differences(x64):
-    """With respect to rates and forces; the dead band and the fresh measurement are kinks that stay away."""
+    """With respect to rates and forces, away from the kinks at the dead band and at fresh measurements."""
     quat = jnp.array([0.1, -0.2, 0.05, 0.97])
     quat = quat / jnp.linalg.norm(quat)
 
@@ -69,7 +69,7 @@ def test_gradients_of_the_estimate_are_central_differences(x64):
     np.testing.assert_allclose(jax.grad(loss)(x), slope, rtol=1e-6, atol=1e-9)
 
 
-def test_what_it_cannot_do_is_refused():
+def test_levels_and_sensors_that_it_does_not_support_are_errors():
     with pytest.raises(ConfigError, match="estimates no position"):
         Sim(control="state", estimator="complementary")
     with pytest.raises(ConfigError, match="a TimeOfFlight or one of each"):

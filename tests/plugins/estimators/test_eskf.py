@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from consistency import assert_chi_squared, errors, normalised
+from consistency import assert_chi_squared, errors, normalised_square
 
 from crazysim import ConfigError, Sim, rotation
 from crazysim.plugins.estimators import ESKF, error_state, updates
@@ -28,8 +28,8 @@ ACCEL = Triad(noise=2e-3, bias_spread=0.2, random_walk=1e-3)
 POS, ANGLE = 0.01, 0.02
 
 
-def moved(estimate, error):
-    """Return an estimate with errors, (15,), added: its true state."""
+def add_error(estimate, error):
+    """Return the true state of an estimate with these errors, (15,)."""
     turn = jnp.concatenate([0.5 * error[6:9], jnp.ones(1)])
     return estimate.replace(
         pos=estimate.pos + error[:3],
@@ -40,7 +40,7 @@ def moved(estimate, error):
     )
 
 
-def difference(true, estimate):
+def error_of(true, estimate):
     """Return the errors of an estimate, (15,)."""
     turn = 2 * rotation.multiply(rotation.conjugate(estimate.quat), true.quat)[:3]
     biases = true.accel_bias - estimate.accel_bias, true.gyro_bias - estimate.gyro_bias
@@ -51,8 +51,8 @@ def difference(true, estimate):
 def estimate(x64):
     """Return an estimate in motion, with a full covariance."""
     quat = jnp.array([0.3, -0.2, 0.4, 0.8])
-    pos, vel, small = jnp.array([0.3, -0.2, 1.0]), jnp.array([2.0, -1.0, 0.5]), jnp.array([0.1, -0.2, 0.3])
-    found = error_state.initial_estimate(pos, vel, quat / jnp.sqrt(quat @ quat), [1.0] * 15, small, 0.1 * small)
+    pos, vel, bias = jnp.array([0.3, -0.2, 1.0]), jnp.array([2.0, -1.0, 0.5]), jnp.array([0.1, -0.2, 0.3])
+    found = error_state.initial_estimate(pos, vel, quat / jnp.sqrt(quat @ quat), [1.0] * 15, bias, 0.1 * bias)
     root = np.random.default_rng(1).normal(size=(15, 15))
     return found.replace(cov=jnp.asarray(0.01 * root @ root.T)[np.triu_indices(15)])
 
@@ -66,11 +66,11 @@ def test_the_covariance_moves_with_the_derivatives_of_the_step(estimate):
         return error_state.predict_biased(at, accel, gyro, dt, gravity, *noise)
 
     after = jax.jit(step)(estimate)
-    f = jax.jit(jax.jacfwd(lambda error: difference(step(moved(estimate, error)), after)))(jnp.zeros(15))
+    f = jax.jit(jax.jacfwd(lambda error: error_of(step(add_error(estimate, error)), after)))(jnp.zeros(15))
     g = f[:, 9:] * (np.arange(15) < 9)[:, None]  # noise acts as a bias of one interval, and leaves the biases
     expected = f @ error_state.covariance(estimate.cov) @ f.T + g @ jnp.diag(jnp.concatenate(noise)) @ g.T
     np.testing.assert_allclose(error_state.covariance(after.cov), expected, rtol=0, atol=5e-6)
-    assert (g @ g.T)[3:9, 3:9].max() * 40 > 1e-4, "the noise shows nothing"
+    assert (g @ g.T)[3:9, 3:9].max() * 40 > 1e-4, "the noise would be too small to matter"
 
 
 KNOWN, SCALE, GYRO_NOW = jnp.array([0.6, 0.0, -0.8]), 0.49, jnp.array([0.3, -0.2, 0.1])
@@ -114,17 +114,17 @@ def test_updates_move_by_the_derivatives_of_the_measurement(estimate, kind):
     std = jnp.array([0.1, 0.2, 0.3]) if kind in ("vel", "direction") else 0.1
     variance = jnp.diag(jnp.full(len(error), std**2)) + (std**2 if kind == "differences" else 0.0)
     after = jax.jit(lambda z: UPDATES[kind](estimate, z, rot, std))(prediction + error)
-    h = jax.jit(jax.jacfwd(lambda e: MEASURED[kind](moved(estimate, e), rot)))(jnp.zeros(15))
+    h = jax.jit(jax.jacfwd(lambda e: MEASURED[kind](add_error(estimate, e), rot)))(jnp.zeros(15))
     p = error_state.covariance(estimate.cov)
     gain = p @ h.T @ jnp.linalg.inv(h @ p @ h.T + variance)
-    found = difference(error_state.finalize(after, min_angle=0.0), estimate)
+    found = error_of(error_state.finalize(after, min_angle=0.0), estimate)
     # rounding of float64 and the 1e-6 that the firmware adds to norms
     np.testing.assert_allclose(found, gain @ error, rtol=0, atol=1e-11)
     np.testing.assert_allclose(error_state.covariance(after.cov), p - gain @ h @ p, rtol=1e-6, atol=1e-8)
 
 
-def test_a_move_back_undoes_a_move(estimate):
-    """With which late measurements are used where they were taken."""
+def test_propagation_back_in_time_undoes_propagation(estimate):
+    """The filter moves its state back in time to use late measurements."""
     inputs = jnp.array([0.5, 1.0, 9.0]), jnp.array([3.0, -2.0, 1.0])
     gravity = jnp.array([0, 0, -9.81])
     there = error_state.propagate(estimate, *inputs, 0.2, gravity)
@@ -135,9 +135,9 @@ def test_a_move_back_undoes_a_move(estimate):
 
 
 def test_a_path_carries_covariance_and_state(estimate):
-    """``F P F'`` with F by automatic differentiation, and there and back; a turn by 0.27 rad in 0.2 s.
+    """``F P F'`` with F by automatic differentiation, along a path and back; a turn by 0.27 rad in 0.2 s.
 
-    Derivatives with respect to the biases are those of a force that does not turn.
+    Derivatives with respect to the biases assume a force that does not rotate.
     """
     gravity, path = jnp.array([0, 0, -9.81]), InertialPath.from_row(jnp.asarray(EMPTY_PATH_ROW, float), jnp.zeros(()))
     for k in range(20):
@@ -147,10 +147,10 @@ def test_a_path_carries_covariance_and_state(estimate):
         return propagate_along(at, path.without_biases(at), gravity)
 
     there = jax.jit(carry)(estimate)
-    f = jax.jit(jax.jacfwd(lambda error: difference(carry(moved(estimate, error)), there)))(jnp.zeros(15))
+    f = jax.jit(jax.jacfwd(lambda error: error_of(carry(add_error(estimate, error)), there)))(jnp.zeros(15))
     p = error_state.covariance(estimate.cov)
     np.testing.assert_allclose(error_state.covariance(there.cov), f @ p @ f.T, rtol=0, atol=2e-3 * float(p.max()))
-    assert np.abs(f @ p @ f.T - p).max() > 0.1 * float(p.max()), "the path shows nothing"
+    assert np.abs(f @ p @ f.T - p).max() > 0.1 * float(p.max()), "the path would be too short to matter"
 
     back = jax.jit(propagate_along)(there, path.without_biases(there).reverse(), gravity)
     assert np.abs(there.pos - estimate.pos).max() > 0.1
@@ -158,8 +158,8 @@ def test_a_path_carries_covariance_and_state(estimate):
         np.testing.assert_allclose(getattr(back, name), getattr(estimate, name), rtol=0, atol=atol, err_msg=name)
 
 
-def flown(n_worlds, aids, steps, engine="auto"):
-    """Return a simulation that has flown moves of 1 m, exact in time, on the estimate."""
+def fly(n_worlds, aids, steps, engine="auto"):
+    """Return a simulation after a flight in steps of 1 m, controlled by the estimate, integrated by Runge-Kutta."""
     imu = IMU(gyro=GYRO, accel=ACCEL)
     sim = Sim(n_worlds, control="state", integrator="rk4", rng_key=2, engine=engine, estimator=ESKF([imu, *aids]))
     for k in range(steps // 500):
@@ -171,7 +171,7 @@ def flown(n_worlds, aids, steps, engine="auto"):
 
 @pytest.fixture(scope="module")
 def indoors():
-    return flown(128, [MotionCapture(noise=POS, angle_noise=ANGLE), GPS(noise=POS, vel_noise=0.02, delay=0.2)], 2000)
+    return fly(128, [MotionCapture(noise=POS, angle_noise=ANGLE), GPS(noise=POS, vel_noise=0.02, delay=0.2)], 2000)
 
 
 def all_errors(sim, name="eskf"):
@@ -184,20 +184,20 @@ def all_errors(sim, name="eskf"):
 
 def test_the_covariance_is_that_of_the_errors(indoors):
     """NEES: 15 states, one degree of freedom each."""
-    assert_chi_squared(normalised(*all_errors(indoors)), 15)
+    assert_chi_squared(normalised_square(*all_errors(indoors)), 15)
     assert not np.asarray(indoors.data.plugins["eskf"].failures).any()
 
 
-def test_biases_are_found(indoors):
+def test_biases_are_estimated(indoors):
     """After 4 s with 1 cm and 0.02 rad of noise the errors are a fraction of the spread of the biases."""
     error, _ = all_errors(indoors)
     rms = np.sqrt(np.mean(error**2, axis=0))
     assert rms[9:12].max() < 0.1 * 0.2
     assert rms[12:].max() < 0.1 * 0.0175
     measured = indoors.plugins.observations(indoors.data)["eskf.ang_vel"]
-    wrong = np.asarray(measured - indoors.data.states.ang_vel)
-    white = 2.4e-4 * np.sqrt(250)  # of one sample at 500 Hz
-    assert np.sqrt(np.mean(wrong**2)) < 1.1 * white
+    rate_error = np.asarray(measured - indoors.data.states.ang_vel)
+    white_noise = 2.4e-4 * np.sqrt(250)  # of one sample at 500 Hz
+    assert np.sqrt(np.mean(rate_error**2)) < 1.1 * white_noise
 
 
 def test_innovations_are_as_the_filter_expects(indoors):
@@ -210,18 +210,18 @@ def test_innovations_are_as_the_filter_expects(indoors):
     error = np.concatenate([pose[:, :3] - estimate.pos[:, 0], 2 * turn[:, :3] / turn[:, 3:]], axis=-1)
     rows = [*error_state.POS, *error_state.ATT]
     cov = np.asarray(error_state.covariance(estimate.cov))[:, 0][:, rows][..., rows]
-    assert_chi_squared(normalised(error, cov + np.diag([POS**2] * 3 + [ANGLE**2] * 3)), 6)
+    assert_chi_squared(normalised_square(error, cov + np.diag([POS**2] * 3 + [ANGLE**2] * 3)), 6)
 
 
 DEVIATIONS = (*[0.1] * 6, *[0.02] * 3, *[0.03] * 3, *[0.002] * 3)
-"""Standard deviations at the start of the flights below. Products of errors count nothing: the biases are what a
-calibration leaves."""
+"""Standard deviations at the start of the flights below. Biases are as small as after a calibration; products of errors
+are negligible."""
 FLOW = [OpticalFlow(noise=0.2), TimeOfFlight(noise=0.005, resolution=None)]
 STATIONS = [[-2, -2, 2.5], [2, 2, 2.5]], [[0, 0.5, 0.8], [0, 0.5, -2.4]]
 
 
-def watched(filters):
-    """Return a simulation of 128 drones that move by 0.4 m, with filters, by their names, that began with errors."""
+def fly_with_filters(filters):
+    """Return a simulation of 128 drones that move by 0.4 m, with filters, by name, that start with errors."""
     sim, imu = Sim(128, control="state", integrator="rk4", rng_key=2), IMU(
         gyro=Triad(noise=2.4e-4, bias_spread=DEVIATIONS[-1], random_walk=1e-5),
         accel=Triad(noise=2e-3, bias_spread=DEVIATIONS[9], random_walk=1e-4),
@@ -238,43 +238,45 @@ def watched(filters):
         s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, zero, jnp.tile(cov, (128, 1, 1)), zero, zero
     )
     error = jnp.asarray(np.random.default_rng(3).normal(0.0, DEVIATIONS, (128, 1, 15)), zero.dtype).at[..., 9:].set(0)
-    begun = jax.jit(jax.vmap(jax.vmap(moved)))(true, error)
+    start_estimate = jax.jit(jax.vmap(jax.vmap(add_error)))(true, error)
     for name in filters:
         record = sim.data.plugins[name]
-        sim.data = sim.data.replace(plugins=sim.data.plugins | {name: record.replace(estimate=begun)})
+        sim.data = sim.data.replace(plugins=sim.data.plugins | {name: record.replace(estimate=start_estimate)})
     sim.step(1999)
     return sim
 
 
-def test_flow_range_and_differences_are_used_as_they_err():
-    """NEES of the states, and NIS of the next differences and ranges, which have errors in common and a tilted ray."""
-    sim = watched({"eskf": [*FLOW, UWB(ANCHORS, noise=0.1, tdoa=True)]})
+def test_flow_range_and_differences_are_used_with_their_errors():
+    """NEES of the states, and NIS of the next differences, with correlated errors, and ranges along a tilted ray."""
+    sim = fly_with_filters({"eskf": [*FLOW, UWB(ANCHORS, noise=0.1, tdoa=True)]})
     error, cov = all_errors(sim)
-    assert_chi_squared(normalised(error, cov), 15)
+    assert_chi_squared(normalised_square(error, cov), 15)
     assert not np.asarray(sim.data.plugins["eskf"].failures).any()
 
     record, steps = sim.data.plugins["eskf"], sim.data.core.steps[0, 0]
     data = ESKF(()).write(
         sim.data, record.replace(used_steps=jnp.full_like(record.used_steps, steps))
-    )  # nothing is new
+    )  # no measurement is new
     plugins = sim.step_fn(data, jnp.int32(1)).plugins
     values = jnp.concatenate([plugins[name].samples.value[:, 0] for name in ("uwb", "time_of_flight")], axis=-1)
 
-    def predicted(at):
+    def predict(at):
         return jnp.concatenate([MEASURED["differences"](at, None), MEASURED["ray"](at, None)])
 
     at = jax.tree.map(lambda x: x[:, 0], plugins["eskf"].estimate)
-    h = jax.jit(jax.vmap(lambda at: jax.jacfwd(lambda e: predicted(moved(at, e)))(jnp.zeros(15))))(at)
+    h = jax.jit(jax.vmap(lambda at: jax.jacfwd(lambda e: predict(add_error(at, e)))(jnp.zeros(15))))(at)
     noise = np.zeros((4, 4))
     noise[:3, :3] = 0.1**2 * (np.eye(3) + 1)
-    noise[3, 3] = (0.005 + 0.0025 * (1 + np.exp(2.92 * (1 - 2.5)))) ** 2 + 0.001**2  # at 1 m, and the least
-    innovation = np.asarray(values - jax.vmap(predicted)(at), np.float64)
+    noise[3, 3] = (
+        0.005 + 0.0025 * (1 + np.exp(2.92 * (1 - 2.5)))
+    ) ** 2 + 0.001**2  # at 1 m, plus the smallest deviation
+    innovation = np.asarray(values - jax.vmap(predict)(at), np.float64)
     h, cov = np.asarray(h, np.float64), np.asarray(error_state.covariance(at.cov), np.float64)
-    assert_chi_squared(normalised(innovation, h @ cov @ h.transpose(0, 2, 1) + noise), 4)
+    assert_chi_squared(normalised_square(innovation, h @ cov @ h.transpose(0, 2, 1) + noise), 4)
 
 
 @pytest.mark.slow("four filters of 128 drones for 4 s; the test above flies three of the aids together")
-def test_every_kind_of_aid_is_used_as_it_errs():
+def test_every_kind_of_aid_is_used_with_its_errors():
     """NEES of filters on one kind of sensor."""
     filters = {
         "flow": FLOW,
@@ -282,24 +284,24 @@ def test_every_kind_of_aid_is_used_as_it_errs():
         "tdoa": [UWB(ANCHORS, noise=0.1, tdoa=True, name="differences")],
         "sweeps": [Lighthouse(*STATIONS, noise=2e-3, delay=0.01)],
     }
-    sim = watched(filters)
+    sim = fly_with_filters(filters)
     for name in filters:
-        assert_chi_squared(normalised(*all_errors(sim, name)), 15)
+        assert_chi_squared(normalised_square(*all_errors(sim, name)), 15)
 
 
 @pytest.mark.slow("128 drones for 8 s; the tests above fly other aids through the same filter")
 def test_satellites_barometer_and_magnetometer_are_enough():
-    """NEES after 8 s: 15; the heading is known by the field alone, whose noise is 0.08 rad in a sample."""
+    """NEES after 8 s; the heading follows from the magnetic field alone, whose noise is 0.08 rad in a sample."""
     field = Magnetometer((2e-5, 0.0, -4.5e-5), Triad(noise=5e-7))
-    sim = flown(128, [GPS(noise=0.3, vel_noise=0.05), Barometer(noise=3.0), field], 4000)
+    sim = fly(128, [GPS(noise=0.3, vel_noise=0.05), Barometer(noise=3.0), field], 4000)
     error, cov = all_errors(sim)
-    assert_chi_squared(normalised(error, cov), 15)
+    assert_chi_squared(normalised_square(error, cov), 15)
     assert np.sqrt(np.mean(error[:, :3] ** 2)) < 0.08, "m: a quarter of the noise of one position"
     assert np.sqrt(np.mean(error[:, 12:] ** 2)) < 0.1 * 0.0175
 
 
-def test_an_impossible_estimate_begins_anew(indoors):
-    """World 1 is moved out of bounds, then world 0 is too fast."""
+def test_an_impossible_estimate_is_reset(indoors):
+    """In world 1 the position is out of bounds, then in world 0 the velocity."""
 
     def after_a_step(data, **changes):
         record = data.plugins["eskf"]
@@ -314,7 +316,7 @@ def test_an_impossible_estimate_begins_anew(indoors):
     assert np.asarray(data.plugins["eskf"].failures)[:3, 0, 0].tolist() == [1, 1, 0]
 
 
-def test_one_argument_adds_it_and_wrong_sensors_are_refused():
+def test_one_argument_adds_the_filter_and_wrong_sensors_are_errors():
     assert list(Sim(estimator="eskf").plugins) == ["imu", "motion_capture", "eskf"]
     with pytest.raises(ConfigError, match="got RotorSpeeds"):
         Sim(estimator=ESKF([IMU(), RotorSpeeds()]))

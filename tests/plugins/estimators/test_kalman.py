@@ -1,10 +1,10 @@
-"""The Kalman filter: that of the compiled firmware, the distribution of its errors, and flight on it."""
+"""The Kalman filter: agreement with the compiled firmware, the distribution of its errors, and flights."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from consistency import assert_chi_squared, errors, normalised
+from consistency import assert_chi_squared, errors, normalised_square
 
 from crazysim import ConfigError, Plugin, Sim, rotation
 from crazysim.core.random import drone_key
@@ -18,7 +18,7 @@ ANCHORS = [[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]]
 
 @pytest.mark.parametrize("kind", firmware_filters.MEASUREMENT_KINDS)
 def test_the_filter_is_that_of_the_compiled_firmware(kind):
-    """In fast flights of 4 s: but for rounding of float32 that 4,000 loops of 1 ms add up."""
+    """In fast flights of 4 s, except for the rounding in float32 of 4,000 loops of 1 ms."""
     found, recorded = firmware_filters.kalman_states(kind)
     assert np.ptp(recorded[:, :3], axis=0).max() > (0.01 if kind == "ground" else 1.0), "nothing moved"
     np.testing.assert_allclose(found[:, :9], recorded[:, :9], rtol=0, atol=2e-4)
@@ -27,7 +27,7 @@ def test_the_filter_is_that_of_the_compiled_firmware(kind):
 
 
 def test_flow_is_two_updates_from_one_prediction(x64):
-    """In closed form: both derivatives and both innovations are of the estimate before; the second gain is not."""
+    """In closed form: both derivatives and innovations are those of the estimate before, but not the second gain."""
     rng = np.random.default_rng(1)
     root = 0.3 * rng.normal(size=(9, 9))
     level, vel = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([3.0, -2.0, 0.5])
@@ -50,7 +50,7 @@ def test_flow_is_two_updates_from_one_prediction(x64):
 
 
 def build(*aids, n_worlds=8, imu=None, engine="auto", **settings):
-    """Return a simulation at 1 m that flies on the estimate of the given sensors."""
+    """Return a simulation at 1 m that is controlled by the estimate from these sensors."""
     sim = Sim(n_worlds=n_worlds, control="state", rng_key=2, engine=engine)
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos.at[..., 2].set(1.0)))
     sensors = [sim.add(sensor) for sensor in (imu or IMU.bmi088(), *aids)]
@@ -72,13 +72,14 @@ class Gusts(Plugin):
 
 
 ACCEL, GYRO, POS, QUAT = 0.5, 0.1, 0.01, 4.5e-3
-"""Standard deviations that the filter assumes: accelerations along x and y, and rates, of 1 ms, and measurements."""
+"""Standard deviations that the filter assumes: of accelerations along x and y and of rates in 1 ms, and of measured
+positions and attitudes."""
 
 
 @pytest.fixture(scope="module")
-def captured():
-    """Return 256 worlds after 2 s in which accelerations and sensors err exactly as the filter assumes."""
-    density = (2 * 0.001) ** 0.5  # of noise that has the deviation 1 at 1000 Hz
+def flown_sim():
+    """Return 256 worlds after 2 s in which accelerations and sensors have the errors that the filter assumes."""
+    density = (2 * 0.001) ** 0.5  # of noise with the standard deviation 1 at 1000 Hz
     imu = IMU(gyro=Triad(noise=GYRO * density), accel=Triad(noise=np.array([ACCEL, ACCEL, 1.0]) * density))
     sim = build(MotionCapture(noise=POS, angle_noise=QUAT), n_worlds=256, imu=imu)
     sim.add(Gusts())
@@ -86,34 +87,34 @@ def captured():
     return sim
 
 
-def test_drones_hover_on_the_estimate(captured):
-    """The setpoint is held to some standard deviations of the estimate, here some 3 mm, in gusts that move drones."""
-    pos = np.asarray(captured.data.states.pos)
+def test_drones_hover_on_the_estimate(flown_sim):
+    """In gusts they hold the setpoint to some standard deviations of the estimate, which is about 3 mm."""
+    pos = np.asarray(flown_sim.data.states.pos)
     assert np.abs(pos - [0, 0, 1]).max() < 0.1
-    assert not captured.data.plugins["kalman"].failures.any()
+    assert not flown_sim.data.plugins["kalman"].failures.any()
 
 
-def test_the_covariance_is_that_of_the_errors(captured):
+def test_the_covariance_is_that_of_the_errors(flown_sim):
     """NEES: squared errors normalised by the covariance are chi-square distributed, one degree for each state."""
-    cov = np.asarray(error_state.covariance(captured.data.plugins["kalman"].estimate.cov))[:, 0]
-    assert_chi_squared(normalised(errors(captured, "kalman"), cov), 9)
+    cov = np.asarray(error_state.covariance(flown_sim.data.plugins["kalman"].estimate.cov))[:, 0]
+    assert_chi_squared(normalised_square(errors(flown_sim, "kalman"), cov), 9)
 
 
-def test_innovations_are_as_the_filter_expects(captured):
+def test_innovations_are_as_the_filter_expects(flown_sim):
     """NIS: measurements minus predictions, normalised by ``H P H' + R``, of a pose that the filter does not use yet."""
-    record, step = captured.data.plugins["kalman"], captured.data.core.steps[0, 0]
-    data = Kalman(()).write(captured.data, record.replace(used_steps=jnp.full_like(record.used_steps, step)))
-    data = captured.step_fn(data, jnp.int32(1))
+    record, step = flown_sim.data.plugins["kalman"], flown_sim.data.core.steps[0, 0]
+    data = Kalman(()).write(flown_sim.data, record.replace(used_steps=jnp.full_like(record.used_steps, step)))
+    data = flown_sim.step_fn(data, jnp.int32(1))
     estimate, (pose,) = data.plugins["kalman"].estimate, (data.plugins["motion_capture"].samples.value[:, 0],)
     turn = rotation.multiply(rotation.conjugate(estimate.quat[:, 0]), pose[:, 3:7])
     error = np.concatenate([pose[:, :3] - estimate.pos[:, 0], 2 * turn[:, :3] / turn[:, 3:]], axis=-1)
     rows = [*error_state.POS, *error_state.ATT]
     cov = np.asarray(error_state.covariance(estimate.cov))[:, 0][:, rows][..., rows]
-    assert_chi_squared(normalised(error, cov + np.diag([POS**2] * 3 + [QUAT**2] * 3)), 6)
+    assert_chi_squared(normalised_square(error, cov + np.diag([POS**2] * 3 + [QUAT**2] * 3)), 6)
 
 
-def test_controllers_see_the_estimate():
-    """An estimate that is 0.3 m off, with no sensor to tell, moves the drone the other way."""
+def test_controllers_use_the_estimate():
+    """Without a sensor of the position, an estimate that is 0.3 m off moves the drone the other way."""
     for control, low, high in ((True, -0.3, -0.05), (False, -0.01, 0.01)):
         sim = build(imu=IMU(), control=control)
         sim.step(1)
@@ -127,7 +128,7 @@ def test_controllers_see_the_estimate():
         assert x.max() < high
 
 
-def test_an_impossible_estimate_begins_anew():
+def test_an_impossible_estimate_is_reset():
     sim = build(imu=IMU())
     sim.step(1)
     record = sim.data.plugins["kalman"]
@@ -142,8 +143,8 @@ def test_an_impossible_estimate_begins_anew():
 
 @pytest.mark.parametrize("drone", ["cf2x_L250", "bumblebee"])
 def test_all_axes_of_the_accelerometer_serve_any_airframe(drone):
-    """In a steady push of a tenth of the weight, which the firmware's filter takes for a drift, as it expects none."""
-    wrong = []
+    """Under a constant force of a tenth of the weight, which the firmware's filter does not model."""
+    vel_errors = []
     for all_axes in (False, True):
         estimator = Kalman([IMU(), MotionCapture()], all_axes=all_axes, control=False)
         sim = Sim(drone=drone, control="state", controller="auto", estimator=estimator)
@@ -152,12 +153,12 @@ def test_all_axes_of_the_accelerometer_serve_any_airframe(drone):
         sim.data = sim.data.replace(states=states.replace(pos=pos, force=force))
         sim.state_control(pos=(0.0, 0.0, 1.0))
         sim.step(2500)
-        wrong.append(np.abs(errors(sim, "kalman")[0, 3]))
-    assert wrong[0] > 0.02
-    assert wrong[1] < 0.1 * wrong[0]
+        vel_errors.append(np.abs(errors(sim, "kalman")[0, 3]))
+    assert vel_errors[0] > 0.02
+    assert vel_errors[1] < 0.1 * vel_errors[0]
 
 
-def test_removal_gives_the_controllers_back():
+def test_removal_restores_the_controllers():
     sim = build(imu=IMU())
     names = [stage for stage in sim.step_pipeline if not stage.startswith("kalman")]
     sim.remove("kalman")
@@ -180,12 +181,12 @@ def test_one_argument_adds_filter_and_sensors():
     assert list(sims[0].plugins) == ["imu", "motion_capture", "kalman"]
     np.testing.assert_array_equal(one, other)
     assert np.abs(one - [0.2, 0.0, 0.5]).max() < 0.05
-    assert np.ptp(one, axis=0).max() > 1e-5, "both worlds fly alike: nothing is estimated"
+    assert np.ptp(one, axis=0).max() > 1e-5, "estimates differ between worlds"
 
 
 @pytest.mark.parametrize("controller", ["pid", "crazyflow"])
 def test_every_kind_of_controller_flies_on_the_estimate(controller):
-    """With sensors of its own: the estimate is held, which is where motion capture takes the drone for."""
+    """Motion capture is off by 0.1 m: the controller holds the estimate, not the true position."""
     estimator = Kalman([IMU(), MotionCapture(pos=(0.1, 0.0, 0.0))])
     sim = Sim(drone="cf2x_L250", control="state", controller=controller, estimator=estimator)
     sim.state_control(pos=(0.0, 0.0, 0.5))
@@ -226,7 +227,7 @@ def test_wrong_sensors_are_refused():
 
 
 def test_a_task_observes_the_estimate():
-    """An estimate that is moved, with no sensor to tell, moves the observed position, and not the reward."""
+    """Without a sensor of the position, an estimate that is moved moves the observed position, and not the reward."""
     imu = IMU()
     env = make("hover", n_worlds=4, sensors=[imu, Kalman([imu])], engine="interpret")
     state = jax.jit(env.reset)(jax.random.key(0))

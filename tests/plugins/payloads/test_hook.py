@@ -1,4 +1,4 @@
-"""The hook: picking up with the impulse, letting go, and a hinge that turns the drone."""
+"""The hook: the impulse of picking up, release, and a hinge that turns the drone."""
 
 import jax
 import numpy as np
@@ -13,7 +13,7 @@ MASS, LOAD, HOOK = 0.605, 0.2, 0.0203
 SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "strict": True}
 
 
-def hooked(height=5.0, integrator="euler", **settings):
+def build(height=5.0, integrator="euler", **settings):
     sim = Sim(**SETTINGS, integrator=integrator)
     sim.data = with_states(sim.data, pos=np.array([0.0, 0.0, height]))
     return sim, sim.add(Hook.bumblebee(**{"in_scene": False} | settings))
@@ -22,7 +22,7 @@ def hooked(height=5.0, integrator="euler", **settings):
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_picking_up_keeps_momentum(integrator, x64):
     """Without a mass at the hook, P = (q.u - q.v) / (1/m + 1/m_L), and q' = (I - q q^T) (u - v) / L."""
-    sim, hook = hooked(integrator=integrator, hook_mass=0.0, damping=0.0, load_at=(0.0, 0.0, 4.59))
+    sim, hook = build(integrator=integrator, hook_mass=0.0, damping=0.0, load_at=(0.0, 0.0, 4.59))
     sim.data = with_states(hook.command(sim.data, True), vel=np.array([0.1, 0.0, 0.0]))
     record = hook.read(sim.data)
     u = np.array([0.2, 0.1, -0.2])
@@ -32,21 +32,21 @@ def test_picking_up_keeps_momentum(integrator, x64):
     )
     after = jax.jit(hook.pick_up_and_release)(sim.data.replace(states=states, plugins={"load": record}))
     after = jax.tree.map(np.asarray, (after.states, after.plugins["load"]))
-    (states, got), v, q = after, np.array([0.1, 0, 0]), np.array([0, 0, -1.0])
-    assert got.attached
+    (states, load), v, q = after, np.array([0.1, 0, 0]), np.array([0, 0, -1.0])
+    assert load.attached
     impulse = (q @ u - q @ v) / (1 / MASS + 1 / LOAD)
     np.testing.assert_allclose(states.vel, v + impulse * q / MASS, atol=1e-12)
-    swing = (got.vel - states.vel) / 0.4
+    swing = (load.vel - states.vel) / 0.4
     np.testing.assert_allclose(swing, (u - v - q * (q @ (u - v))) / 0.4, atol=1e-9)
-    np.testing.assert_allclose(MASS * states.vel + LOAD * got.vel, MASS * v + LOAD * u, atol=1e-12)
+    np.testing.assert_allclose(MASS * states.vel + LOAD * load.vel, MASS * v + LOAD * u, atol=1e-12)
 
 
-def test_conditions_of_picking_up_and_letting_go():
-    """Only with the command, near and slow; a load that is let go falls freely, and the drone is rid of it."""
-    sim, hook = hooked(load_at=(0.0, 0.0, 4.58))
+def test_conditions_of_picking_up_and_release():
+    """A hook takes a load only with the command, near it and at a low speed; a released load falls freely."""
+    sim, hook = build(load_at=(0.0, 0.0, 4.58))
     start, record = sim.data, hook.read(sim.data)
     pos = np.asarray(record.pos)
-    for drop, vel, grip, holds in (
+    for drop, vel, grip, is_attached in (
         (0.08, 0, True, False),
         (0, 0.8, True, False),
         (0, 0.2, False, False),
@@ -55,7 +55,7 @@ def test_conditions_of_picking_up_and_letting_go():
         near = record.replace(pos=broadcast_like(pos - [0, 0, drop], pos), vel=broadcast_like([vel, 0, 0], pos))
         sim.data = hook.command(hook.write(start, near), grip)
         sim.step()
-        assert np.asarray(hook.read(sim.data).attached)[0, 0] == holds, (drop, vel, grip)
+        assert np.asarray(hook.read(sim.data).attached)[0, 0] == is_attached, (drop, vel, grip)
     sim.step(50)
     sim.data = hook.command(sim.data, False)
     before = np.asarray(hook.read(sim.data).vel)
@@ -70,7 +70,7 @@ def test_conditions_of_picking_up_and_letting_go():
 def test_a_hinge_keeps_the_rod_in_its_plane_and_turns_the_drone(integrator, x64):
     ends = {}
     for dof in (1, 2):
-        sim, hook = hooked(500.0, dof=dof, damping=0.0, integrator=integrator)
+        sim, hook = build(500.0, dof=dof, damping=0.0, integrator=integrator)
         record = hook.read(sim.data)
         push = broadcast_like([0.5, 0.4, 0.0], record.vel)
         sim.data = hook.write(sim.data, record.replace(vel=push, tip_vel=push))
@@ -85,7 +85,7 @@ def test_a_hinge_keeps_the_rod_in_its_plane_and_turns_the_drone(integrator, x64)
 
 
 def test_law_09_commands_that_are_neither_true_nor_false_are_errors():
-    sim, hook = hooked()
+    sim, hook = build()
     shape = hook.read(sim.data).grip.shape
     for grip in ("open", np.nan, 2, 1, None, np.ones((7, *shape), bool), np.ones((shape[0], shape[1] + 1), bool)):
         with pytest.raises(ConfigError, match="expected grip as True or False, or a bool for each drone"):
@@ -102,11 +102,11 @@ def test_wrong_settings_are_errors():
         ({"mass": -1}, "mass"),
     ):
         with pytest.raises(ConfigError, match=message):
-            hooked(**settings)
+            build(**settings)
 
 
-def test_a_load_on_the_floor_waits(x64):
-    sim, hook = hooked(2.0, load_at=(1.0, 0.5, 0.0))
+def test_a_load_on_the_floor_stays_at_rest(x64):
+    sim, hook = build(2.0, load_at=(1.0, 0.5, 0.0))
     sim.step(50)
     record = hook.read(sim.data)
     np.testing.assert_allclose(np.asarray(record.pos)[0, 0], [1.0, 0.5, 0.04 + 0.1275])
@@ -116,8 +116,8 @@ def test_a_load_on_the_floor_waits(x64):
 
 @pytest.mark.parametrize("size", [(0.14, 0.14, 0.08), 0.05])
 def test_hook_and_load_are_drawn_where_they_meet(size):
-    """The wires of the load end in its ring, and the bend of the hook is there while it carries."""
-    sim, _ = hooked(2.0, in_scene=True, size=size)
+    """The wires of the load end in its ring, which is at the bend of the hook that carries it."""
+    sim, _ = build(2.0, in_scene=True, size=size)
     sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), 0)
     model, data = sim.mj_model, sim.mj_data
 

@@ -14,7 +14,8 @@ MASS, INERTIA = 0.605, (1.5e-3, 1.45e-3, 2.66e-3)
 START = np.array([0.3, -0.2, 2.0])
 
 
-def model(dof, attach, damping):
+def create_model(dof, attach, damping):
+    """Return MuJoCo's model of the drone with its rod."""
     joints = ['<joint name="pitch" type="hinge" axis="0 1 0"/>', '<joint name="roll" type="hinge" axis="1 0 0"/>'][:dof]
     joints = "".join(joints).replace("type", f'damping="{damping}" type')
     return mujoco.MjModel.from_xml_string(f"""
@@ -27,7 +28,7 @@ def model(dof, attach, damping):
     </body></body></worldbody></mujoco>""")
 
 
-def constant(pos, vel, quat, ang_vel):
+def constant_thrust(pos, vel, quat, ang_vel):
     """Return a thrust along the body's z axis that carries drone, hook and load, and no torque. (2, 3)"""
     return np.array([[0, 0, (MASS + LOAD + HOOK) * 9.81], [0, 0, 0]])
 
@@ -36,39 +37,39 @@ def feedback(pos, vel, quat, ang_vel):
     """Return thrust and body torque that hold position and attitude. (2, 3)"""
     x, y, z, w = quat
     up = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    wanted = (MASS + LOAD + HOOK) * np.array([0, 0, 9.81]) - 4 * (pos - START) - 2.5 * vel
-    tilt = np.cross(up, wanted / np.linalg.norm(wanted))
+    force = (MASS + LOAD + HOOK) * np.array([0, 0, 9.81]) - 4 * (pos - START) - 2.5 * vel
+    tilt = np.cross(up, force / np.linalg.norm(force))
     rot = np.zeros(9)
     mujoco.mju_quat2Mat(rot, np.array([w, x, y, z]))
-    return np.array([[0, 0, wanted @ up], 1.2 * rot.reshape(3, 3).T @ tilt - 0.15 * ang_vel])
+    return np.array([[0, 0, force @ up], 1.2 * rot.reshape(3, 3).T @ tilt - 0.15 * ang_vel])
 
 
-def of_mujoco(dof, attach, damping, angles, ang_vel, law):
-    """Return positions of drone and tip after every tenth step, m. (n, 2, 3)"""
-    m = model(dof, attach, damping)
+def simulate_in_mujoco(dof, attach, damping, angles, ang_vel, law):
+    """Return positions of drone and tip after every tenth step, m, (n, 2, 3), and the start of the tip."""
+    m = create_model(dof, attach, damping)
     d = mujoco.MjData(m)
     d.qpos[:3], d.qpos[7 : 7 + dof], d.qvel[3:6] = START, angles[:dof], ang_vel
     mujoco.mj_forward(m, d)
     tip_vel = np.zeros(6)
     mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_SITE, 0, tip_vel, 0)
-    start, found = (d.site_xpos[0].copy(), tip_vel[3:].copy()), []
+    start, positions = (d.site_xpos[0].copy(), tip_vel[3:].copy()), []
     for k in range(FREQ * SECONDS):
         forces = law(d.qpos[:3], d.qvel[:3], np.roll(d.qpos[3:7], -1), d.qvel[3:6])
         d.xfrc_applied[1] = np.ravel(forces @ d.xmat[1].reshape(3, 3).T)
         mujoco.mj_step(m, d)
         if k % 10 == 9:
             mujoco.mj_kinematics(m, d)
-            found.append([d.qpos[:3].copy(), d.site_xpos[0].copy()])
-    return np.array(found), start
+            positions.append([d.qpos[:3].copy(), d.site_xpos[0].copy()])
+    return np.array(positions), start
 
 
-def of_crazysim(dof, cases, starts):
-    """Return positions of drone and tip after every tenth step, m, of cases that fly in worlds of their own.
+def simulate_in_crazysim(dof, cases, starts):
+    """Return positions of drone and tip after every tenth step, m, with each case in its own world.
 
     Args:
         dof: Degrees of freedom of the joint.
         cases: Entries of ``CASES``.
-        starts: Position and velocity of the tip of each.
+        starts: Position and velocity of the tip of each case.
     """
     n, laws = len(cases), [case[-1] for case in cases]
     attach, damping, ang_vel = (np.array([case[k] for case in cases])[:, None] for k in (1, 2, 4))
@@ -80,7 +81,7 @@ def of_crazysim(dof, cases, starts):
     pos, vel = (np.array([start[k] for start in starts])[:, None] for k in (0, 1))
     tip = {"tip_pos": pos, "tip_vel": vel, "pos": pos, "vel": vel}
     sim.data = hook.write(sim.data, record.replace(**{k: broadcast_like(v, record.pos) for k, v in tip.items()}))
-    found, rot = [], np.zeros(9)
+    positions, rot = [], np.zeros(9)
     for k in range(FREQ * SECONDS):
         s = sim.data.states
         pos, vel, quat, w = (np.asarray(x)[:, 0] for x in (s.pos, s.vel, s.quat, s.ang_vel))
@@ -92,41 +93,45 @@ def of_crazysim(dof, cases, starts):
         sim.step()
         if k % 10 == 9:
             tip_pos = np.asarray(hook.read(sim.data).tip_pos)[:, 0]
-            found.append(np.stack([np.asarray(sim.data.states.pos)[:, 0], tip_pos], axis=1))
-    return np.stack(found, axis=1)
+            positions.append(np.stack([np.asarray(sim.data.states.pos)[:, 0], tip_pos], axis=1))
+    return np.stack(positions, axis=1)
 
 
 CASES = {
     # degrees of freedom, joint, damping, initial angles, initial body rates, forces
-    "swing": (2, (0, 0, 0), 0.0, (0.6, 0.3), (0, 0, 0), constant),
+    "swing": (2, (0, 0, 0), 0.0, (0.6, 0.3), (0, 0, 0), constant_thrust),
     "swing, hinge": (1, (0, 0, 0), 0.001, (0.8, 0.0), (0.3, 0, 0.5), feedback),
     "hover": (2, (0.01, 0, -0.02), 0.001, (0.3, 0.2), (0, 0, 0.5), feedback),
     "hover, hinge": (1, (0.01, 0, -0.02), 0.001, (0.3, 0.0), (0, 0, 0.5), feedback),
 }
-WITHIN = {"swing": 1e-5, "swing, hinge": 1e-4, "hover": 3e-5, "hover, hinge": 1e-5}
-"""Largest distance of drone or tip in MuJoCo, m. In ``hover`` MuJoCo damps two hinge angles in turn, crazysim the
-angular velocity of the rod, which differ in the second order of the angle."""
+TOLERANCES = {"swing": 1e-5, "swing, hinge": 1e-4, "hover": 3e-5, "hover, hinge": 1e-5}
+"""Largest distance of drone or tip between both simulators, m. In ``hover`` MuJoCo damps the rates of two hinges and
+crazysim the angular velocity of the rod, which differ in the second order of the angle."""
 
 
 @pytest.fixture(scope="module")
-def flown():
+def flights():
     """Return positions by MuJoCo and by crazysim, by case."""
-    found = {}
+    flights = {}
     with jax.enable_x64(True):
         for dof in (1, 2):
             cases = {name: case for name, case in CASES.items() if case[0] == dof}
-            wants, starts = zip(*(of_mujoco(*case) for case in cases.values()), strict=True)
-            found |= dict(
-                zip(cases, zip(wants, of_crazysim(dof, list(cases.values()), starts), strict=True), strict=True)
+            expected, starts = zip(*(simulate_in_mujoco(*case) for case in cases.values()), strict=True)
+            flights |= dict(
+                zip(
+                    cases,
+                    zip(expected, simulate_in_crazysim(dof, list(cases.values()), starts), strict=True),
+                    strict=True,
+                )
             )
-    return found
+    return flights
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_five_seconds_as_in_mujoco(case, flown):
-    want, got = flown[case]
-    error = np.linalg.norm(got - want, axis=-1).max(axis=0)
-    swings = np.ptp(want[:, 1] - want[:, 0], axis=0).max()
-    print(f"{case}: drone {error[0]:.1e} m, tip {error[1]:.1e} m; the tip swings over {swings:.2f} m")
-    assert swings > 0.15
-    assert error.max() < WITHIN[case]
+def test_five_seconds_as_in_mujoco(case, flights):
+    expected, found = flights[case]
+    error = np.linalg.norm(found - expected, axis=-1).max(axis=0)
+    swing_width = np.ptp(expected[:, 1] - expected[:, 0], axis=0).max()
+    print(f"{case}: drone {error[0]:.1e} m, tip {error[1]:.1e} m; the tip swings over {swing_width:.2f} m")
+    assert swing_width > 0.15
+    assert error.max() < TOLERANCES[case]

@@ -18,8 +18,8 @@ DEPTH = 0.5
 
 
 @pytest.mark.parametrize("shape, area", [(Shape("box", (0.1, 0.05, 0.02)), 0.064), (Shape("sphere", (0.1,)), 0.12566)])
-def test_panels_close_a_surface(shape, area):
-    """The areas add up, area times normal adds up to nothing, and position times normal to three volumes."""
+def test_panels_form_a_closed_surface(shape, area):
+    """Sums over panels: of areas, of area times normal, which is zero, and of position times normal, three volumes."""
     panels = shape_panels(shape, 0.03)
     assert panels.pos.shape == panels.normal.shape
     assert len(panels.area) == len(panels.pos) >= 24
@@ -31,7 +31,7 @@ def test_panels_close_a_surface(shape, area):
 
 
 def build(n_worlds=2, n_drones=1, rotor_vel=1000.0, engine="interpret", **kwargs):
-    """Return bumblebees whose rotors turn with 1000 rad/s, with a box 0.5 m below each."""
+    """Return a simulation of bumblebees with rotors at 1000 rad/s and a box 0.5 m below each, and the jet."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, drone="bumblebee", control="rotor_vel", engine=engine)
     grid = np.arange(n_worlds * n_drones * 3).reshape(n_worlds, n_drones, 3) * [1.0, 0.5, 0.0] + [0, 0, 2.0]
     sim.data = with_states(sim.data, pos=grid, rotor_vel=rotor_vel * RPM)
@@ -41,20 +41,20 @@ def build(n_worlds=2, n_drones=1, rotor_vel=1000.0, engine="interpret", **kwargs
     return sim, sim.add(RotorJet(**kwargs))
 
 
-def jet_of(sim):
+def jet_record(sim):
     """Return the record of the jet after its stage alone."""
     return jax.jit(sim.step_pipeline["rotor_jet"])(sim.data).plugins["rotor_jet"]
 
 
 def pressure_table(low=40.0, high=160.0):
-    """Return pressures that fall linearly from the drone down, zero 1 m below, at two speeds."""
+    """Return pressures that decrease linearly downwards to zero 1 m below the drone, at two speeds."""
     z = np.linspace(-1.0, 0.0, 11)
     shape = np.broadcast_to(1 + z, (5, 5, 11))
     return JetTable([500.0, 1500.0], np.stack([low * shape, high * shape]), None, (-0.2, -0.2, -1.0), 0.1)
 
 
-def test_a_pressure_that_grows_upwards_pushes_down_by_its_gradient_times_the_volume():
-    """-P A n over a closed surface is -grad P V: 100 Pa/m half way between the speeds, over 0.8 l."""
+def test_a_pressure_that_increases_upwards_pushes_down_by_its_gradient_times_the_volume():
+    """-P A n over a closed surface is -grad P V: 100 Pa/m between both speeds, for 0.8 l."""
     sim, plugin = build(table=pressure_table())
     sim.step()
     np.testing.assert_allclose(
@@ -67,15 +67,15 @@ def test_tables_are_linear_in_the_speed_and_fall_to_zero_below_the_smallest():
     sim.data = with_states(sim.data, rotor_vel=np.array([250.0, 500.0, 1000.0, 2000.0])[:, None, None] * RPM)
     expected = -np.array([20.0, 40.0, 100.0, 160.0]) * 0.2 * 0.1 * 0.04
     # float32: a sum of cancelling terms
-    np.testing.assert_allclose(np.asarray(jet_of(sim).force)[:, 0, 2], expected, rtol=2e-3)
+    np.testing.assert_allclose(np.asarray(jet_record(sim).force)[:, 0, 2], expected, rtol=2e-3)
 
 
-def test_a_velocity_gives_its_momentum_to_the_upper_side():
-    """Air of (1, 0, -5) m/s: rho v (v.(-n)) A on the upper side and on the side that faces it, none in the lee."""
+def test_moving_air_passes_its_momentum_to_the_sides_that_face_it():
+    """Air of (1, 0, -5) m/s: rho v (v.(-n)) A on the upper side and on the windward side, none in the lee."""
     velocity = np.broadcast_to([1.0, 0.0, -5.0], (1, 5, 5, 11, 3))
     table = JetTable([1000.0], None, velocity, (-0.2, -0.2, -1.0), 0.1)
     sim, _plugin = build(table=table, air_density=1.2)
-    force = jax.tree.map(np.asarray, jet_of(sim))
+    force = jax.tree.map(np.asarray, jet_record(sim))
     expected = 1.2 * np.array([1.0, 0, -5.0]) * (5.0 * 0.2 * 0.1 + 1.0 * 0.1 * 0.04)
     np.testing.assert_allclose(force.force[1, 0], expected, rtol=1e-5, atol=1e-7)
     # the force of the side acts at (-0.1, 0, 0), that of the top at (0, 0, 0.02)
@@ -87,18 +87,18 @@ def test_a_velocity_gives_its_momentum_to_the_upper_side():
 def test_outside_the_box_of_the_table_there_is_no_jet():
     table = pressure_table()._replace(origin=(-0.2, -0.2, -0.4))  # from -0.4 to 0.6 m: the load hangs below
     sim, _plugin = build(table=table)
-    assert not np.asarray(jet_of(sim).force).any()
+    assert not np.asarray(jet_record(sim).force).any()
 
 
 def test_the_analytic_jet_is_that_of_downwash():
     """One panel for the whole top: rho u^2 A at its centre, DEPTH - 0.02 below the drone, in the middle of the jet."""
     sim, _plugin = build(panel=1.0)
-    force = np.asarray(jet_of(sim).force)
+    force = np.asarray(jet_record(sim).force)
     radius = float(sim.airframe.value("shape.propeller_radius", ()))
     thrust = 4 * 9.3945e-7 * 1000**2  # N, of the lab's coefficient
-    below, one = np.array([[0.0, 0.0, -(DEPTH - 0.02)]]), np.ones((1, 1))
+    below, ones = np.array([[0.0, 0.0, -(DEPTH - 0.02)]]), np.ones((1, 1))
     speed = jax.jit(hover_jet_speed)(
-        below, np.array([[0, 0, 1.0]]), thrust * one, np.sqrt(8) * radius * one, 1.225 * one
+        below, np.array([[0, 0, 1.0]]), thrust * ones, np.sqrt(8) * radius * ones, 1.225 * ones
     )
     speed = np.asarray(speed)[0, 0]
     assert 3 < speed < 30
@@ -109,12 +109,12 @@ def test_finer_panels_converge():
     forces = []
     for panel in (0.1, 0.02, 0.01):
         sim, _ = build(panel=panel)
-        forces.append(np.asarray(jet_of(sim).force)[0, 0, 2])
+        forces.append(np.asarray(jet_record(sim).force)[0, 0, 2])
     assert abs(forces[1] - forces[2]) < 0.02 * abs(forces[2]) < abs(forces[0]) / 10
 
 
 def test_the_force_moves_the_load():
-    """A free load under a jet falls faster by F dt / m; the record holds the force that the step used."""
+    """A released load under a jet falls faster by F dt / m; the record holds the force of that step."""
     sim, plugin = build(table=pressure_table(400.0, 400.0))
     load = sim.plugins["load"]
     sim.data = load.release(sim.data)
@@ -135,26 +135,26 @@ def test_the_force_moves_the_load():
 
 
 def test_jets_of_all_drones():
-    """A drone above another's load: the load gets both jets, its own drone's load none of the lower one's."""
+    """A drone flies above another: the load of the lower drone gets both jets, that of the upper one only its own."""
     sim, _plugin = build(n_drones=2, n_worlds=1, all_drones=True)
     sim.data = with_states(sim.data, pos=np.array([[[0, 0, 2.0], [0.0, 0, 3.0]]]))
     load = sim.plugins["load"]
     sim.data = load.hang(sim.data)
-    both = np.asarray(jet_of(sim).force)[0, :, 2]
+    force_of_all = np.asarray(jet_record(sim).force)[0, :, 2]
     own, _ = build(n_drones=2, n_worlds=1)
     own.data = with_states(own.data, pos=np.array([[[0, 0, 2.0], [0.0, 0, 3.0]]]))
     own.data = own.plugins["load"].hang(own.data)
-    alone = np.asarray(jet_of(own).force)[0, :, 2]
-    assert both[0] < 1.1 * alone[0] < 0
-    np.testing.assert_allclose(both[1], alone[1], rtol=1e-5)
+    force_of_own = np.asarray(jet_record(own).force)[0, :, 2]
+    assert force_of_all[0] < 1.1 * force_of_own[0] < 0
+    np.testing.assert_allclose(force_of_all[1], force_of_own[1], rtol=1e-5)
 
 
 def test_a_large_table_is_read_outside_of_the_kernel_with_the_same_numbers(monkeypatch):
     ends = []
-    for largest in (10**6, 1):
-        monkeypatch.setattr(rotor_jet, "MAX_FUSED_VALUES", largest)
+    for max_values in (10**6, 1):
+        monkeypatch.setattr(rotor_jet, "MAX_FUSED_VALUES", max_values)
         sim, _ = build(table=pressure_table(), n_drones=2, engine="auto")
-        assert bool(sim.step_fn.plan(sim.data).program.unfused_stages) == (largest == 1)
+        assert bool(sim.step_fn.plan(sim.data).program.unfused_stages) == (max_values == 1)
         sim.step(20)
         ends.append(sim.data.plugins["load"].vel)
     np.testing.assert_allclose(*ends, rtol=1e-4, atol=1e-5)
@@ -185,7 +185,7 @@ def write_tables(folder, speeds, rows):
 
 
 def test_files_of_the_lab_are_read_in_their_order(tmp_path, rng):
-    """A cube of 3^3 voxels, z fastest; the box is centred below the drone: from -n/200 m, and -n/100 m in z."""
+    """A cube of 3^3 voxels, z is the fastest index; the box is below the drone: from -n/200 m, in z from -n/100 m."""
     tables = rng.uniform(0, 100, size=(2, 27))
     write_tables(tmp_path, (500, 1500), tables)
     table = load_jet_table(tmp_path)
@@ -259,7 +259,7 @@ def test_law_09_wrong_settings():
         fitted.add(RotorJet())
 
 
-def test_removing_the_load_leaves_a_jet_on_nothing():
+def test_a_jet_without_its_load_has_no_force():
     sim, plugin = build()
     sim.step()
     assert np.asarray(plugin.read(sim.data).force).any()

@@ -11,21 +11,21 @@ SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "st
 CORNERS = np.array([[0.3, 0.3, 5.0], [-0.3, 0.3, 5.0], [-0.3, -0.3, 5.0], [0.3, -0.3, 5.0]])
 
 
-def carrying(n_drones, integrator, engine="fused", **settings):
+def build(n_drones, integrator, engine="fused", **settings):
     sim = Sim(1, n_drones, **SETTINGS | {"engine": engine}, integrator=integrator)
     sim.data = with_states(sim.data, pos=CORNERS[:n_drones])
     return sim, sim.add(SharedLoad(**{"in_scene": False, "mass": 0.3} | settings))
 
 
-def test_below_one_drone_it_is_the_slung_load(x64):
+def test_a_shared_load_of_one_drone_is_a_slung_load(x64):
     ends = []
     for kind in (SharedLoad, SlungLoad):
         sim = Sim(**SETTINGS, integrator="rk4")
         sim.data = with_states(sim.data, pos=CORNERS[:1])
         load = sim.add(kind(mass=0.2, length=0.4, cable=False, attach=(0.02, 0.01, -0.03), in_scene=False))
         record = load.read(sim.data)
-        at = broadcast_like(np.asarray(sim.data.states.pos) + [0.02, 0.01, -0.43], record.pos)
-        sim.data = load.write(sim.data, record.replace(pos=at, vel=broadcast_like([0.5, 0.2, 0.0], record.vel)))
+        start = broadcast_like(np.asarray(sim.data.states.pos) + [0.02, 0.01, -0.43], record.pos)
+        sim.data = load.write(sim.data, record.replace(pos=start, vel=broadcast_like([0.5, 0.2, 0.0], record.vel)))
         sim.step(200)
         ends.append(np.concatenate([np.ravel(load.read(sim.data).pos), np.ravel(sim.data.states.ang_vel)]))
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)  # SOFT is a millionth of the tension
@@ -34,13 +34,13 @@ def test_below_one_drone_it_is_the_slung_load(x64):
 @pytest.mark.parametrize("cable", [False, True])
 @pytest.mark.parametrize("integrator", ["symplectic_euler", "rk4"])
 def test_four_drones_share_the_weight_and_keep_momentum(integrator, cable, x64):
-    sim, load = carrying(4, integrator, cable=cable)
+    sim, load = build(4, integrator, cable=cable)
     mass = float(sim.data.params.mass[0])
-    share = mass + 0.3 / 4
+    carried_mass = mass + 0.3 / 4
     drop = np.sqrt(1 - 0.18)
     pull = 0.3 / 4 * 9.81 * 0.3 / drop  # horizontal pull on each, towards the middle
     outward = np.sign(CORNERS[:, :2]) * pull
-    force = np.concatenate([outward, np.full((4, 1), share * 9.81)], axis=-1)
+    force = np.concatenate([outward, np.full((4, 1), carried_mass * 9.81)], axis=-1)
     sim.data = with_states(sim.data, force=force)
     sim.step(250)
     np.testing.assert_allclose(np.asarray(sim.data.states.pos)[0], CORNERS, atol=1e-4)
@@ -55,9 +55,9 @@ def test_four_drones_share_the_weight_and_keep_momentum(integrator, cable, x64):
     np.testing.assert_allclose(momentum() - before, [0, 0, -9.81 * 0.2 * (4 * mass + 0.3)], atol=1e-10)
 
 
-def test_cables_go_slack_and_drones_let_go(x64):
-    """Two drones hold the load; a third, which comes nearer, pulls nothing, and one that lets go neither."""
-    sim, load = carrying(3, "symplectic_euler", "interpret")
+def test_slack_and_released_cables_do_not_pull(x64):
+    """The first drone has released the load, and the third is so near that its cable is slack."""
+    sim, load = build(3, "symplectic_euler", "interpret")
     lower = np.array(CORNERS[:3])
     lower[2] = [0.0, 0.0, 4.5]
     sim.data = load.release(with_states(sim.data, pos=lower), [[True, False, False]])
@@ -69,8 +69,8 @@ def test_cables_go_slack_and_drones_let_go(x64):
 
 
 def test_where_gravity_differs_the_load_falls_with_the_mean(x64):
-    """Whatever the order of the drones."""
-    sim, load = carrying(2, "symplectic_euler", "interpret")
+    """The mean of the gravity of its drones."""
+    sim, load = build(2, "symplectic_euler", "interpret")
     gravity = np.zeros((1, 2, 3))
     gravity[0, :, 2] = [-8.0, -10.0]
     sim.data = with_params(sim.data, gravity_vec=gravity)
@@ -82,12 +82,12 @@ def test_where_gravity_differs_the_load_falls_with_the_mean(x64):
     )
 
 
-def test_explicit_euler_is_refused():
+def test_explicit_euler_is_an_error():
     with pytest.raises(ConfigError, match="symplectic_euler"):
-        carrying(2, "euler")
+        build(2, "euler")
 
 
-def test_it_is_fused_and_drawn():
+def test_a_shared_load_is_fused_and_drawn():
     sim = Sim(2, 3, drone="bumblebee", control="rotor_vel", integrator="symplectic_euler", strict=True)
     load = sim.add(SharedLoad(mass=0.3))
     sim.step(5)

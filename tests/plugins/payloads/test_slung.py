@@ -1,4 +1,4 @@
-"""Loads on rods and cables: invariants, impacts, the bare drone in the limit, and the laws.
+"""Loads on rods and cables: invariants, impacts, the limit of no mass, and the laws.
 
 Flights use the fused engine, whose programs compile in a quarter of the time.
 """
@@ -18,7 +18,7 @@ MASS, LOAD = 0.605, 0.2
 OFFSET = (0.02, 0.01, -0.03)
 
 
-def flying(n_worlds=1, n_drones=1, height=500.0, **kwargs):
+def build(n_worlds=1, n_drones=1, height=500.0, **kwargs):
     options = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "strict": True} | kwargs
     sim = Sim(n_worlds, n_drones, **options)
     sim.data = with_states(sim.data, pos=np.asarray(sim.data.states.pos) + [0, 0, height])
@@ -40,7 +40,7 @@ def momentum(load, data):
     return MASS * v + LOAD * u, orbit + spin
 
 
-def inner_energy(load, data):
+def relative_energy(load, data):
     """Return the kinetic energy of drone and load relative to their centre of mass, J. (n_worlds,)"""
     s, r = data.states, load.read(data)
     v, u, w = (np.asarray(a)[:, 0] for a in (s.vel, r.vel, s.ang_vel))
@@ -50,16 +50,16 @@ def inner_energy(load, data):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_law_08_momentum_and_energy_of_drone_and_load_are_kept(integrator, x64):
-    """In free fall the tension is the only force between them: for 10 s at 500 Hz, centred and with an offset."""
-    sim, attach = flying(2, integrator=integrator), np.array([(0, 0, 0), OFFSET])
+    """In free fall the tension is the only force: 10 s at 500 Hz, attached at the centre of mass and off it."""
+    sim, attach = build(2, integrator=integrator), np.array([(0, 0, 0), OFFSET])
     load = sim.add(SlungLoad(mass=LOAD, attach=attach[:, None], in_scene=False))
     sim.data = with_load(load, sim.data, vel=(1.0, 0.5, 0.0))
-    (p0, l0), e0 = momentum(load, sim.data), inner_energy(load, sim.data)
+    (p0, l0), e0 = momentum(load, sim.data), relative_energy(load, sim.data)
     n = 5000
     sim.step(n)
     p, spin = momentum(load, sim.data)
     np.testing.assert_allclose(p, p0 + [0, 0, -9.81 * n / 500 * (MASS + LOAD)], atol=1e-11)
-    assert np.abs(inner_energy(load, sim.data) / e0 - 1).max() < 2e-3
+    assert np.abs(relative_energy(load, sim.data) / e0 - 1).max() < 2e-3
     assert (np.linalg.norm(spin - l0, axis=-1) < 1e-2 * np.linalg.norm(l0, axis=-1)).all()
     pos, quat, at = (np.asarray(x)[:, 0] for x in (sim.data.states.pos, sim.data.states.quat, load.read(sim.data).pos))
     length = np.linalg.norm(at - pos - Rotation.from_quat(quat).apply(attach), axis=-1)
@@ -69,8 +69,8 @@ def test_law_08_momentum_and_energy_of_drone_and_load_are_kept(integrator, x64):
 @pytest.mark.parametrize("cable", [False, True])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
-    """A pendulum below a body of 1e9 kg that hovers: 60 s at 500 Hz in float32, at amplitudes up to 2.5 rad."""
-    sim = flying(8, integrator=integrator, height=2.0)
+    """A pendulum below a hovering body of 1e9 kg: 60 s at 500 Hz in float32, with amplitudes up to 2.5 rad."""
+    sim = build(8, integrator=integrator, height=2.0)
     sim.data = with_params(sim.data, mass=np.full(1, 1e9, np.float32))
     sim.data = with_states(sim.data, force=np.array([0, 0, 9.81e9]))
     load = sim.add(SlungLoad(mass=LOAD, cable=cable, in_scene=False))
@@ -83,23 +83,23 @@ def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
         at, vel, pos, drone_vel = (np.asarray(x)[:, 0] for x in (r.pos, r.vel, s.pos, s.vel))
         return 9.81 * (at - pos)[:, 2] + np.sum((vel - drone_vel) ** 2, axis=-1) / 2
 
-    start, seen = energy(), []
+    start, energies = energy(), []
     for _ in range(60):
         sim.step(497)
-        seen.append(energy())
+        energies.append(energy())
     span = 2 * 9.81 * 0.4
     # Semi-implicit schemes oscillate within a band of dt, which does not widen.
-    assert (np.array(seen) - start).max() < 0.01 * span
-    assert (np.array(seen)[-20:].max(0) - np.array(seen)[:20].max(0)).max() < 0.002 * span
+    assert (np.array(energies) - start).max() < 0.01 * span
+    assert (np.array(energies)[-20:].max(0) - np.array(energies)[:20].max(0)).max() < 0.002 * span
     if not cable:
-        assert np.abs(np.array(seen) - start).max() < 0.01 * span
+        assert np.abs(np.array(energies) - start).max() < 0.01 * span
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_without_mass_the_drone_flies_as_without_load(integrator):
     flights = []
     for mass in (None, 0.0):
-        sim = flying(integrator=integrator, height=5.0)
+        sim = build(integrator=integrator, height=5.0)
         if mass is not None:
             load = sim.add(SlungLoad(mass=mass, attach=OFFSET, damping=0.001, drag=0.1, in_scene=False))
         sim.rotor_vel_control(np.array([[[12000.0, 12100, 12050, 11990]]]))
@@ -112,8 +112,8 @@ def test_without_mass_the_drone_flies_as_without_load(integrator):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_cable_that_becomes_taut(integrator, x64):
-    """The impulse of two masses along the line, with and without a bounce: speeds as worked out by hand."""
-    sim, restitution = flying(2, integrator=integrator, engine="interpret"), np.array([0.0, 0.6])
+    """The impulse of two masses along the line, with and without a bounce: speeds by hand."""
+    sim, restitution = build(2, integrator=integrator, engine="interpret"), np.array([0.0, 0.6])
     load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=restitution[:, None], in_scene=False))
     start = np.asarray(sim.data.states.pos)
     sim.data = with_load(load, sim.data, pos=start + [0, 0, -0.35], vel=(0.0, 0.0, -1.0))
@@ -130,7 +130,7 @@ def test_a_cable_that_becomes_taut(integrator, x64):
 
 def test_impulse_by_hand():
     """P = q.(u - v) / (1/m + 1/m_L), which changes v by P q / m and u by -P q / m_L."""
-    sim = flying()
+    sim = build()
     s = jax.tree.map(lambda x: np.asarray(x)[0, 0], sim.data.states)
     s = s.replace(vel=np.float32([0.1, 0.2, 0.3]))
     q, p = np.array([0.6, 0.0, -0.8]), sim.data.params
@@ -149,14 +149,14 @@ def test_impulse_by_hand():
 
 
 def test_order_of_convergence(x64):
-    """Runge-Kutta keeps order four with a load, Euler's scheme order one; both tend to the same flight.
+    """With a load Runge-Kutta has order four and Euler's scheme order one; both converge to the same flight.
 
-    The load has drag, and its joint damping and a place far off the centre: each of them made Runge-Kutta's order 1 to
-    3 when it was implicit in time or corrected lengths by a share per step.
+    The load has drag, and its joint damping and a position far from the centre of mass. Each of them reduces the order
+    of Runge-Kutta to 1 to 3 if it is implicit in time, or if lengths are corrected by a fraction per step.
     """
 
     def end(integrator, freq):
-        sim = flying(integrator=integrator, freq=freq)
+        sim = build(integrator=integrator, freq=freq)
         far = (0.05, 0.03, -0.1)
         load = sim.add(SlungLoad(mass=LOAD, attach=far, drag=0.05, damping=0.001, in_scene=False))
         sim.data = with_states(sim.data, ang_vel=np.array([0.5, -1.0, 2.0]), vel=np.array([0.3, 0, 0]))
@@ -174,8 +174,8 @@ def test_order_of_convergence(x64):
 
 @pytest.mark.parametrize("cable", [False, True])
 def test_law_08_gradients_are_central_differences(cable, x64):
-    """Those of a rod in forward mode, those of a cable in reverse mode."""
-    sim = flying(height=2.0, engine="plain")
+    """In forward mode for a rod, in reverse mode for a cable."""
+    sim = build(height=2.0, engine="plain")
     load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, damping=0.001, cable=cable, in_scene=False))
     sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
     step, data = by_stages(sim) if cable else sim.build_step_fn(), sim.data  # each compiles sooner in its mode
@@ -199,9 +199,9 @@ def test_law_08_gradients_are_central_differences(cable, x64):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_law_07_no_nan(integrator):
-    """Upside down with the load above, on the floor, load in the attachment, at the fastest spin, for 10 s."""
+    """For 10 s: upside down with the load above, a load at its attachment, fast rotation, on the floor."""
     for cable in (False, True):
-        sim = flying(5, integrator=integrator, height=0.5, engine="auto")
+        sim = build(5, integrator=integrator, height=0.5, engine="auto")
         load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, cable=cable, damping=0.001, drag=0.05, in_scene=False))
         quat = np.tile([0, 0, 0, 1.0], (5, 1, 1))
         quat[0], ang_vel, pos = [1, 0, 0, 0], np.zeros((5, 1, 3)), np.array(load.read(sim.data).pos)
@@ -220,8 +220,8 @@ def test_law_07_no_nan(integrator):
 
 
 def test_law_07_no_nan_in_gradients():
-    """Of two steps, by all states: with the load in the attachment, on the floor."""
-    sim = flying(2, height=0.0, engine="plain")
+    """Gradients of two steps by all states, on the floor with the load at its attachment."""
+    sim = build(2, height=0.0, engine="plain")
     load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=0.3, in_scene=False))
     data = with_load(load, sim.data, pos=np.asarray(sim.data.states.pos))
 
@@ -232,7 +232,7 @@ def test_law_07_no_nan_in_gradients():
 
     @jax.jit
     def gradient_and_next(data):
-        """Return gradients of the sum of what moves after a step, and the data then."""
+        """Return gradients of the sum of all states after a step, and the data after it."""
 
         def total(data):
             after = advanced(data)
@@ -247,16 +247,16 @@ def test_law_07_no_nan_in_gradients():
             assert x.dtype == jax.dtypes.float0 or np.isfinite(x).all()
 
 
-def test_law_01_worlds_fly_as_alone():
-    """With loads of their own masses."""
+def test_law_01_a_world_flies_as_it_does_alone():
+    """Loads have different masses."""
     masses = np.array([[0.0, 0.1], [0.2, 0.3]])
-    sim = flying(2, 2, height=2.0)
+    sim = build(2, 2, height=2.0)
     load = sim.add(SlungLoad(mass=masses, attach=OFFSET, cable=True, in_scene=False))
     sim.data = load.release(sim.data, np.array([[False, False], [False, True]]))
     sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
     sim.step(50)
     heights = np.asarray(load.read(sim.data).pos)[..., 2]
-    alone = flying(1, 1, height=2.0)
+    alone = build(1, 1, height=2.0)
     load = alone.add(SlungLoad(mass=0.2, attach=OFFSET, cable=True, in_scene=False))
     alone.rotor_vel_control(np.full((1, 1, 4), 13000.0))
     alone.step(50)
@@ -265,8 +265,8 @@ def test_law_01_worlds_fly_as_alone():
     np.testing.assert_allclose(heights[1, 1], 2 - 0.03 - 0.4 - 9.81 * 0.1**2 / 2, atol=3e-3)  # cut loose
 
 
-def test_rest_on_the_floor_and_release(x64):
-    sim = flying(height=1.0)
+def test_a_released_load_comes_to_rest_on_the_floor(x64):
+    sim = build(height=1.0)
     load = sim.add(SlungLoad(mass=LOAD, cable=True, size=(0.1, 0.1, 0.06), in_scene=False))
     sim.data = with_load(load, load.release(sim.data), vel=(0.5, 0.0, 0.0))
     sim.step(500)
@@ -277,7 +277,7 @@ def test_rest_on_the_floor_and_release(x64):
 
 
 def test_direction_and_its_rate(x64):
-    sim = flying()
+    sim = build()
     load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, in_scene=False))
     sim.data = with_states(sim.data, ang_vel=np.array([1.0, 2.0, 3.0]))
     sim.data = with_load(load, sim.data, vel=(0.3, 0.2, 0.1))
@@ -288,7 +288,7 @@ def test_direction_and_its_rate(x64):
 
 
 def test_wind_and_downwash_push_the_load():
-    sim = flying(drone="cf21B_500", height=2.0)
+    sim = build(drone="cf21B_500", height=2.0)
     load = sim.add(SlungLoad(mass=0.01, drag=0.01, in_scene=False))
     sim.add(Downwash())
     sim.add(Wind(velocity=(1.0, 0.0, 0.0)))
@@ -301,7 +301,7 @@ def test_wind_and_downwash_push_the_load():
 
 
 def test_loads_are_objects_of_the_scene():
-    sim = flying(2, 2, height=1.0, engine="interpret")
+    sim = build(2, 2, height=1.0, engine="interpret")
     load = sim.add(SlungLoad(mass=0.05, cable=True, size=0.05))
     pos = np.asarray(load.read(sim.data).pos).copy()
     pos[1, 0] = np.asarray(sim.data.states.pos)[1, 1]  # into the other drone
@@ -321,7 +321,7 @@ def test_loads_are_objects_of_the_scene():
 
 
 def test_law_09_wrong_settings_are_errors():
-    sim = flying()
+    sim = build()
     for settings, message in (
         ({"mass": -1.0}, "mass"), ({"mass": 0.1, "length": 0.0}, "length"), ({"mass": 0.1, "size": (1, 2)}, "size"),
         ({"mass": 0.1, "cable": True, "restitution": 2.0}, "restitution"), ({"mass": [1.0, 2.0]}, "mass"),
@@ -333,8 +333,8 @@ def test_law_09_wrong_settings_are_errors():
         sim.add(SlungLoad(mass=0.1, name="second", in_scene=False))
 
 
-def test_other_numbers_compile_nothing():
-    sim = flying(engine="interpret")
+def test_other_values_compile_nothing():
+    sim = build(engine="interpret")
     load = sim.add(SlungLoad(mass=0.1, in_scene=False))
     sim.step()
     before = sim.step_fn
@@ -343,16 +343,16 @@ def test_other_numbers_compile_nothing():
     assert float(load.read(sim.data).mass[0]) == pytest.approx(0.3)
 
 
-def test_zeros_of_an_attachment_are_left_out_of_the_step_until_they_change():
-    sim = flying()
+def test_zeros_of_an_attachment_cost_no_operations_until_they_change():
+    sim = build()
     load = SlungLoad(mass=LOAD, attach=(0.0, 0.0, -0.03), in_scene=False)
     sim.add(load)
 
     def n_operations():
         return sum(s.n_operations for s in sim.step_fn.plan(sim.data).program.fused_segments)
 
-    few, other = n_operations(), with_load(load, sim.data, attach=(0.0, 0.0, -0.02))
-    sim.data = other
-    assert n_operations() == few
+    n_with_zeros = n_operations()
+    sim.data = with_load(load, sim.data, attach=(0.0, 0.0, -0.02))
+    assert n_operations() == n_with_zeros
     sim.data = with_load(load, sim.data, attach=OFFSET)
-    assert n_operations() > few + 40
+    assert n_operations() > n_with_zeros + 40

@@ -1,4 +1,4 @@
-"""Forests: other layouts in every world and episode, distances, free paths, difficulty, tasks, and wrong input."""
+"""Forests: layouts of worlds and episodes, distances, free paths, difficulty, tasks, and wrong input."""
 
 from dataclasses import dataclass
 
@@ -27,19 +27,19 @@ def build(n_worlds=3, n_drones=2, **settings):
 
 
 @pytest.fixture(scope="module")
-def half():
-    """A forest of which half the trees stand."""
+def half_forest():
+    """Return a simulation with a forest of which half the trees stand, and its plugin."""
     return build(difficulty=0.5)
 
 
-def places(sim, forest):
-    """Return position and radius of the trees that stand, of each world."""
+def standing_trees(sim, forest):
+    """Return positions and radii of the trees that stand, for each world."""
     pos = np.asarray(forest.poses(sim.data)[0])
     radii = np.concatenate([np.full(len(m.pos), m.options["radius"]) for m in forest.models()])
     return [(p[p[:, 2] == 0], radii[p[:, 2] == 0]) for p in pos]
 
 
-def test_trees_stand_in_their_cells_at_the_density_that_is_asked_for():
+def test_trees_stand_in_their_cells_at_the_requested_density():
     sim, forest = build(n_worlds=200, free=np.zeros((0, 3)))
     assert (forest.cell, forest.n_cells) == (4.0, (5, 4))
     radii = np.concatenate([np.full(len(m.pos), m.options["radius"]) for m in forest.models()])
@@ -59,15 +59,15 @@ def test_trees_stand_in_their_cells_at_the_density_that_is_asked_for():
     assert abs(np.corrcoef(scaled[:, 0, 0], scaled[:, 1, 0])[0, 1]) < 0.25
 
 
-def test_law_10_a_layout_is_of_world_and_episode():
-    (sim, forest), (more, forest_of_more) = build(), build(n_worlds=5)
-    first, all_worlds = (np.asarray(f.poses(s.data)[0]) for s, f in ((sim, forest), (more, forest_of_more)))
+def test_law_10_a_layout_depends_on_world_and_episode():
+    (sim, forest), (larger_sim, larger_forest) = build(), build(n_worlds=5)
+    first, all_worlds = (np.asarray(f.poses(s.data)[0]) for s, f in ((sim, forest), (larger_sim, larger_forest)))
     np.testing.assert_array_equal(first, all_worlds[:3])
     assert len(np.unique(all_worlds[:, 0, 0])) == 5
-    more.step(3)
-    np.testing.assert_array_equal(forest_of_more.poses(more.data)[0], all_worlds)
-    more.reset(np.array([True, False, False, False, False]))
-    after = np.asarray(forest_of_more.poses(more.data)[0])
+    larger_sim.step(3)
+    np.testing.assert_array_equal(larger_forest.poses(larger_sim.data)[0], all_worlds)
+    larger_sim.reset(np.array([True, False, False, False, False]))
+    after = np.asarray(larger_forest.poses(larger_sim.data)[0])
     np.testing.assert_array_equal(after[1:], all_worlds[1:])
     assert not np.any(after[0, :, 0] == all_worlds[0, :, 0])
 
@@ -79,28 +79,28 @@ def test_worlds_that_were_not_reset_draw_in_their_first_step():
     assert len(np.unique(forest.read(sim.data).words[..., 0])) == 3
 
 
-def test_clearance_is_the_distance_of_the_contact_report(half):
-    sim, forest = half
+def test_clearance_is_the_distance_of_the_contact_report(half_forest):
+    sim, forest = half_forest
     contacts = jax.jit(sim.scene.contact_fn(floor=False, drones=False))
     ball = sim.scene.collision_model.drones[0].geoms[0]
     rng = np.random.default_rng(0)
     clearance = jax.jit(forest.clearance)
-    of_drones = jax.jit(vmap_worlds(vmap_drones(lambda d: forest.clearance(d, d.states.pos))))
+    clearance_of_drones = jax.jit(vmap_worlds(vmap_drones(lambda d: forest.clearance(d, d.states.pos))))
     found, expected = [], []
     for _ in range(200):
         data = with_states(sim.data, pos=rng.uniform([-10, -13, -1], [18, 9, 7], (3, 2, 3)))
         found.append(clearance(data, data.states.pos + np.float32(ball.pos)))
         expected.append(contacts(data).object_distance.min(axis=-1) + ball.shape.size[0])
-    np.testing.assert_array_equal(clearance(data, data.states.pos), of_drones(data))
+    np.testing.assert_array_equal(clearance(data, data.states.pos), clearance_of_drones(data))
     found, expected = np.array(found), np.array(expected)
     assert found.min() < 0
     assert np.mean(found < 4) > 0.5
     np.testing.assert_allclose(found, np.minimum(expected, 4.0), atol=2e-6)
 
 
-def test_clearance_points_away_from_the_nearest_tree(half):
-    sim, forest = half
-    trees, radii = places(sim, forest)[1]
+def test_clearance_points_away_from_the_nearest_tree(half_forest):
+    sim, forest = half_forest
+    trees, radii = standing_trees(sim, forest)[1]
     point = trees[0] + [radii[0] + 0.2, 0, 1.0]
     value, slope = jax.value_and_grad(lambda pos: forest.clearance(sim.data, pos)[1, 0])(
         jnp.broadcast_to(jnp.float32(point), (3, 2, 3))
@@ -123,39 +123,39 @@ def test_a_path_leads_through_each_of_1000_forests():
     in_layer = np.zeros((3, 3, 3))
     in_layer[1] = ndimage.generate_binary_structure(2, 1)
     area = np.asarray(ndimage.label(gap >= 0.2, in_layer)[0])
-    joined = [np.intersect1d(a[0][a[0] > 0], a[-1][a[-1] > 0]).size for a in area]
-    assert min(joined) > 0
-    assert np.mean(np.all(gap >= 0.2, axis=1).any(axis=1)) < 0.8  # which is not always straight
+    n_paths = [np.intersect1d(a[0][a[0] > 0], a[-1][a[-1] > 0]).size for a in area]
+    assert min(n_paths) > 0
+    assert np.mean(np.all(gap >= 0.2, axis=1).any(axis=1)) < 0.8  # paths are not always straight
 
 
-def test_difficulty_is_the_share_of_trees_that_stand():
+def test_difficulty_is_the_fraction_of_trees_that_stand():
     sim, forest = build(n_worlds=300, difficulty=(0.2, 0.6), free=np.zeros((0, 3)))
     difficulty = np.asarray(forest.read(sim.data).difficulty)[:, 0]
     assert difficulty.min() < 0.22
     assert difficulty.max() > 0.58
-    share = np.mean(np.asarray(forest.poses(sim.data)[0])[..., 2] == 0, axis=1)
-    np.testing.assert_allclose(np.mean(share), 0.4, atol=0.03)
-    assert np.corrcoef(share, difficulty)[0, 1] > 0.6
-    begin = sim.step_pipeline["forest_begin"]
+    fraction = np.mean(np.asarray(forest.poses(sim.data)[0])[..., 2] == 0, axis=1)
+    np.testing.assert_allclose(np.mean(fraction), 0.4, atol=0.03)
+    assert np.corrcoef(fraction, difficulty)[0, 1] > 0.6
+    stage_before = sim.step_pipeline["forest_begin"]
     sim.replace(Forest(**SMALL | {"difficulty": 0.0, "free": np.zeros((0, 3))}))
-    assert sim.step_pipeline["forest_begin"] is begin  # no stage was built
+    assert sim.step_pipeline["forest_begin"] is stage_before  # no stage was built
     sim.reset()
-    assert not any(len(trees) for trees, _ in places(sim, forest))
+    assert not any(len(trees) for trees, _ in standing_trees(sim, forest))
     assert np.all(np.asarray(forest.clearance(sim.data, sim.data.states.pos)) == forest.cell)
 
 
-def test_discs_stay_free(half):
-    sim, forest = half
-    for trees, radii in places(sim, forest):
+def test_free_discs_have_no_trees(half_forest):
+    sim, forest = half_forest
+    for trees, radii in standing_trees(sim, forest):
         assert np.all(np.linalg.norm(trees[:, :2] - [4, -2], axis=1) > 2 + radii)
-    everywhere, _ = build(n_worlds=50, free=np.zeros((0, 3)), difficulty=1.0)
-    all_trees = np.concatenate([t for t, _ in places(everywhere, everywhere.plugins["forest"])])
+    sim_without_discs, _ = build(n_worlds=50, free=np.zeros((0, 3)), difficulty=1.0)
+    all_trees = np.concatenate([t for t, _ in standing_trees(sim_without_discs, sim_without_discs.plugins["forest"])])
     assert np.any(np.linalg.norm(all_trees[:, :2] - [4, -2], axis=1) < 2)
 
 
-def test_rays_meet_the_trees_of_each_world(half):
-    """Each world has an image of its own, as C MuJoCo's rays see it; hidden trees are in no image."""
-    sim, _ = half
+def test_rays_meet_the_trees_of_each_world(half_forest):
+    """Each world has its own image, with the distances of C MuJoCo's rays; hidden trees are in no image."""
+    sim, _ = half_forest
     sim.data = with_states(sim.data, pos=[[4, -2, 1.5], [4, -2, 50]], quat=[0, 0, 0, 1])
     hits = jax.jit(sim.scene.depth_fn("fpv_cam:0", 64, 4, drones=False, along="ray"))(sim.data)
     distance, eye = (
@@ -186,19 +186,19 @@ class Gap(PyTree):
 
 
 @pytest.mark.parametrize("engine", ["fused", "interpret"])
-def test_a_stage_of_one_drone_reads_the_clearance(engine):
+def test_a_stage_of_one_drone_can_compute_the_clearance(engine):
     sim = Sim(3, 2, control="rotor_vel", rng_key=5, engine=engine)
     forest = sim.add(Forest(**SMALL))
     sim.reset()
     sim.data = with_states(sim.data, pos=np.random.default_rng(2).uniform([-4, -8, 1], [12, 4, 3], (3, 2, 3)))
 
     @stage("drone")
-    def look(data):
+    def measure_gap(data):
         return data.replace(
             plugins=data.plugins | {"gap": data.plugins["gap"].replace(value=forest.clearance(data, data.states.pos))}
         )
 
-    sim.add(FunctionPlugin("gap", Gap(jnp.zeros((3, 2))), [StagePlacement(look, before="increment_steps")]))
+    sim.add(FunctionPlugin("gap", Gap(jnp.zeros((3, 2))), [StagePlacement(measure_gap, before="increment_steps")]))
     expected = np.asarray(forest.clearance(sim.data, sim.data.states.pos))
     sim.step()
     assert engine in sim.explain()
@@ -208,7 +208,7 @@ def test_a_stage_of_one_drone_reads_the_clearance(engine):
 
 @dataclass(frozen=True, kw_only=True)
 class Wander(Task):
-    """Stay away from trees that are placed where an episode starts."""
+    """Stay away from trees, which are drawn at the start of an episode."""
 
     name = "wander"
     forest = Forest(size=(40.0, 40.0))
@@ -256,7 +256,7 @@ def test_a_task_places_a_forest_in_its_episodes():
     assert "splits the step" not in env.explain()
 
 
-BAD = {
+WRONG_SETTINGS = {
     "radii": ({"radii": (0.3, 0.1)}, "expected the smallest before the largest size of .forest., got"),
     "dense": ({"density": 4.0}, "Use a lower density, or a smaller gap"),
     "many": ({"size": (1000.0, 1000.0)}, "expected at most 10000 obstacles in Forest, got 62500"),
@@ -266,14 +266,14 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("what", BAD)
-def test_law_09_wrong_settings_are_errors(what):
-    settings, message = BAD[what]
+@pytest.mark.parametrize("case", WRONG_SETTINGS)
+def test_law_09_wrong_settings_are_errors(case):
+    settings, message = WRONG_SETTINGS[case]
     with pytest.raises(ConfigError, match=message):
         Sim().add(Forest(**settings))
 
 
-def test_the_trees_of_a_scene_stay(half):
-    sim, _ = half
+def test_a_forest_with_other_trees_needs_another_name(half_forest):
+    sim, _ = half_forest
     with pytest.raises(ConfigError, match="use another name="):
         sim.replace(Forest(**SMALL | {"radii": (0.2, 0.4)}))

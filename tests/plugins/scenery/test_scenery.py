@@ -25,8 +25,8 @@ def build(plugin, n_worlds=3, n_drones=2):
     return sim
 
 
-def after(sim, seconds):
-    """Return the data some time after the reset."""
+def data_at(sim, seconds):
+    """Return the data with its clock at a time after the reset."""
     core = sim.data.core
     return sim.data.replace(core=core.replace(steps=core.steps + round(seconds * sim.freq)))
 
@@ -37,10 +37,10 @@ def test_clearance_is_the_distance_of_the_contact_report(name):
     sim = build(plugin)
     ball = sim.scene.collision_model.drones[0].geoms[0]
     contacts, clearance = jax.jit(sim.scene.contact_fn(floor=False, drones=False)), jax.jit(plugin.clearance)
-    rng, data, found, expected = np.random.default_rng(0), after(sim, 7.3), [], []
-    place = plugin.poses(data)[0]
+    rng, data, found, expected = np.random.default_rng(0), data_at(sim, 7.3), [], []
+    pos = plugin.poses(data)[0]
     for _ in range(100):
-        near = np.asarray(place)[:, rng.integers(place.shape[1], size=2)] * [1, 1, 0] + [0, 0, 1.5]
+        near = np.asarray(pos)[:, rng.integers(pos.shape[1], size=2)] * [1, 1, 0] + [0, 0, 1.5]
         data = with_states(data, pos=near + rng.normal(0, 0.7, (3, 2, 3)))
         found.append(clearance(data, data.states.pos + np.float32(ball.pos)))
         expected.append(contacts(data).object_distance.min(axis=-1) + ball.shape.size[0])
@@ -50,14 +50,14 @@ def test_clearance_is_the_distance_of_the_contact_report(name):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_law_10_a_layout_is_of_world_and_episode(name):
+def test_law_10_a_layout_depends_on_world_and_episode(name):
     plugin = KINDS[name]
-    sim, more = build(plugin), build(plugin, 4, 1)
-    first, all_worlds = (np.concatenate(plugin.poses(s.data), axis=-1) for s in (sim, more))
+    sim, larger_sim = build(plugin), build(plugin, 4, 1)
+    first, all_worlds = (np.concatenate(plugin.poses(s.data), axis=-1) for s in (sim, larger_sim))
     np.testing.assert_array_equal(first, all_worlds[:3])
     assert len({x.tobytes() for x in all_worlds}) == 4
-    more.reset(np.array([False, True, False, False]))
-    changed = np.any(np.concatenate(plugin.poses(more.data), axis=-1) != all_worlds, axis=(1, 2))
+    larger_sim.reset(np.array([False, True, False, False]))
+    changed = np.any(np.concatenate(plugin.poses(larger_sim.data), axis=-1) != all_worlds, axis=(1, 2))
     np.testing.assert_array_equal(changed, [False, True, False, False])
 
 
@@ -68,16 +68,16 @@ def test_moving_obstacles_stay_in_their_regions_below_their_speed(plugin):
     sim = build(plugin, 4)
     times = np.arange(0.0, 8.0, 0.02)
     poses = jax.jit(plugin.poses)
-    path = np.array([poses(after(sim, t))[0] for t in times])
+    path = np.array([poses(data_at(sim, t))[0] for t in times])
     vel = np.diff(path, axis=0) / 0.02
     assert np.abs(vel).max() <= 1.5 + 1e-3
     assert np.quantile(np.abs(vel[..., 0]), 0.9) > 1.2
     middle = np.concatenate([model.pos for model in plugin.models()])
-    way = np.abs(path - middle)[..., 0] if not isinstance(plugin, Clutter) else None
-    if way is not None:
+    if not isinstance(plugin, Clutter):  # whose regions depend on the layout
+        shift = np.abs(path - middle)[..., 0]
         reach = plugin.offset[0] if isinstance(plugin, Gates) else (plugin.cell - plugin.gap) / 2
-        assert way.max() <= reach + 1e-5
-        assert way.max() > 0.8 * reach
+        assert shift.max() <= reach + 1e-5
+        assert shift.max() > 0.8 * reach
     sim.step(50)
     np.testing.assert_allclose(plugin.poses(sim.data)[0], path[5], atol=1e-5)  # 0.1 s
 
@@ -94,7 +94,7 @@ def test_boxes_and_balls_keep_their_distance():
     assert gap[:, ~np.eye(24, dtype=bool)].min() >= 0.3 - 1e-5
 
 
-def test_difficulty_moves_gates_out_of_their_line():
+def test_difficulty_moves_gates_off_their_line():
     easy, hard = (Gates(difficulty=x) for x in (0.0, 1.0))
     pos, quat = (np.asarray(x) for x in easy.poses(build(easy).data))
     np.testing.assert_allclose(pos, np.broadcast_to([[3 + 4 * k, 0, 1.5] for k in range(6)], (3, 6, 3)), atol=1e-6)
@@ -118,11 +118,11 @@ def test_a_path_leads_from_each_room_to_all_others():
     assert middles.min() > 0
     np.testing.assert_array_equal(middles, middles[:, :1].repeat(6, axis=1))
     np.testing.assert_allclose(np.mean(gap < 0.05), np.mean(gap[0] < 0.05), rtol=0.02)
-    door_at = [np.argmax(gap[k, 20, :20] > 0.4) for k in range(100)]
-    assert len(set(door_at)) > 2
+    doors = [np.argmax(gap[k, 20, :20] > 0.4) for k in range(100)]
+    assert len(set(doors)) > 2
 
 
-BAD = {
+WRONG_SETTINGS = {
     "widths": (lambda: Pillars(widths=(0.8, 0.3)), "expected the smallest before the largest size of 'pillars'"),
     "pillars": (lambda: Pillars(density=2.0), "Use a lower density, or a smaller gap"),
     "sizes": (lambda: Clutter(sizes=(0.5, 0.2)), "expected sizes as smallest and largest"),
@@ -133,8 +133,8 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("what", BAD)
-def test_law_09_wrong_settings_are_errors(what):
-    make, message = BAD[what]
+@pytest.mark.parametrize("case", WRONG_SETTINGS)
+def test_law_09_wrong_settings_are_errors(case):
+    make, message = WRONG_SETTINGS[case]
     with pytest.raises(ConfigError, match=message):
         make()

@@ -11,8 +11,8 @@ from crazysim import Camera, ConfigError, Sim, rotation
 SIZE = {"width": 9, "height": 6}
 
 
-def placed(sim, pos, quat=(0.0, 0, 0, 1)):
-    """Put drones at positions, with attitudes."""
+def place_drones(sim, pos, quat=(0.0, 0, 0, 1)):
+    """Move drones to positions, with attitudes."""
     states = sim.data.states
     pos, quat = (
         jnp.broadcast_to(jnp.asarray(x, jnp.float32), (*states.pos.shape[:2], len(x[0]) if np.ndim(x) > 1 else len(x)))
@@ -23,42 +23,42 @@ def placed(sim, pos, quat=(0.0, 0, 0, 1)):
 
 @pytest.fixture(scope="module")
 def flight():
-    """Return a simulation with a slow, late and tilted camera of all outputs, and what it should see in each step."""
+    """Return a simulation, its slow, late and tilted camera with all outputs, and images and records of each step."""
     sim = Sim(2, 2, control="attitude", freq=200)
     sim.scene.add("wall", pos=[3, 0, 0], length=20, height=20, mocap=False)
     outputs = ("depth", "distance", "normal", "segmentation")
-    late = sim.add(
+    camera = sim.add(
         Camera(**SIZE, fovy=60.0, rpy=(0.1, 0.4, -0.2), outputs=outputs, freq=50, latency=0.03, drones=False)
     )
     sim.scene.add("sphere", pos=[1.4, 0.1, 0.9], radius=0.3, mocap=False)
-    placed(sim, [[0.0, 0, 1], [0.5, -0.4, 1.2]])
-    take, seen, records = jax.jit(late.image_fn(sim)), [], []
+    place_drones(sim, [[0.0, 0, 1], [0.5, -0.4, 1.2]])
+    take_image, images, records = jax.jit(camera.image_fn(sim)), [], []
     for _ in range(15):
         sim.step()
-        seen.append(jax.device_get(take(sim.data)))
-        records.append((jax.device_get(late.read(sim.data)), np.asarray(late.age(sim.data))))
-    return sim, late, seen, records
+        images.append(jax.device_get(take_image(sim.data)))
+        records.append((jax.device_get(camera.read(sim.data)), np.asarray(camera.age(sim.data))))
+    return sim, camera, images, records
 
 
 def test_images_are_taken_at_a_rate_and_delivered_late(flight):
     """50 images/s in 200 steps/s, 6 steps late: images of steps 0, 4, 8; the first one is delivered at once."""
-    _, _, seen, records = flight
+    _, _, images, records = flight
     for step, (record, age) in enumerate(records):
-        shown = max((step - 6) // 4 * 4, 0)
-        assert (record.taken_step == shown).all()
-        np.testing.assert_allclose(age, (step - shown) / 200, rtol=1e-6)
+        taken_step = max((step - 6) // 4 * 4, 0)
+        assert (record.taken_step == taken_step).all()
+        np.testing.assert_allclose(age, (step - taken_step) / 200, rtol=1e-6)
         for name, image in record.images.items():
-            np.testing.assert_allclose(image, seen[shown][name], rtol=1e-5, atol=1e-6, err_msg=f"{name} {step}")
-    assert np.ptp([x["depth"] for x in seen], axis=0).max() > 1e-4
+            np.testing.assert_allclose(image, images[taken_step][name], rtol=1e-5, atol=1e-6, err_msg=f"{name} {step}")
+    assert np.ptp([x["depth"] for x in images], axis=0).max() > 1e-4
 
 
 def test_outputs_are_those_of_c_mujoco_in_the_frame_of_the_camera(flight):
-    sim, camera, seen, _ = flight
-    images, names = seen[-1], camera.segment_names(sim)
+    sim, camera, images_of_steps, _ = flight
+    images, names = images_of_steps[-1], camera.segment_names(sim)
     assert names == ("floor", "wall:0", "sphere:0")
     sim.scene.sync_one(sim.data, 1)
     mount = np.asarray(rotation.matrix(rotation.from_rpy(jnp.array([0.1, 0.4, -0.2]))))
-    group, geom, met = np.array([1, 1, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32), set()
+    group, geom, names_hit = np.array([1, 1, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32), set()
     for drone in range(2):
         body = np.asarray(rotation.matrix(sim.data.states.quat[1, drone]))
         eye = np.asarray(sim.data.states.pos[1, drone]) + body @ sim.airframe.value("shape.fpv_camera")
@@ -71,20 +71,20 @@ def test_outputs_are_those_of_c_mujoco_in_the_frame_of_the_camera(flight):
             assert images["distance"][1, drone, row, column] == pytest.approx(min(far, 10.0), rel=1e-5)
             assert images["depth"][1, drone, row, column] == pytest.approx(min(far * ray[0], 10.0), rel=1e-5)
             root = sim.mj_model.body(sim.mj_model.body_rootid[sim.mj_model.geom_bodyid[geom[0]]]).name
-            met.add(name := "nothing" if far == np.inf else root if root != "world" else "floor")
+            names_hit.add(name := "nothing" if far == np.inf else root if root != "world" else "floor")
             index = images["segmentation"][1, drone, row, column]
             assert (names[index] if index >= 0 else "nothing") == name
             np.testing.assert_allclose(images["normal"][1, drone, row, column], (body @ mount).T @ normal, atol=1e-4)
-    assert met >= {"floor", "wall:0", "sphere:0"}
+    assert names_hit >= {"floor", "wall:0", "sphere:0"}
     # A pixel on the left of the image is on the left of the camera, a pixel in the upper row above it.
     assert camera.rays[0, 0, 1] > 0 > camera.rays[0, -1, 1]
     assert camera.rays[0, 0, 2] > 0 > camera.rays[-1, 0, 2]
     assert np.degrees(2 * np.arctan2(camera.rays[0, 4, 2] * 6 / 5, camera.rays[0, 4, 0])) == pytest.approx(60)
 
 
-def test_law_09_wrong_cameras_are_refused():
+def test_law_09_wrong_cameras_are_errors():
     sim = Sim(n_worlds=2, control="attitude")
-    for act, words in (
+    for call, words in (
         (lambda: Camera(0, 4), "expected width of Camera to be finite and at least 1"),
         (lambda: Camera(4, 4.5), "height of Camera"),
         (lambda: Camera(fovy=180.0), "fovy of Camera"),
@@ -99,6 +99,6 @@ def test_law_09_wrong_cameras_are_refused():
         (lambda: Camera().read(sim.data), "expected data with a record of plugin 'camera', got records of none"),
     ):
         with pytest.raises(ConfigError) as error:
-            act()
+            call()
         assert words in str(error.value), error.value
     assert not sim.plugins

@@ -40,10 +40,10 @@ def test_stereo_noise_grows_with_the_square_of_the_distance(wall):
     assert np.all(np.abs(errors.mean(axis=(1, 2))) < 4 * expected / np.sqrt(n))
     np.testing.assert_allclose(images["distance"] * camera.rays[..., 0], images["depth"], rtol=1e-5)
     standard = errors / expected[:, None, None]
-    assert len(np.unique(standard.round(5))) > 0.95 * standard.size, "worlds and pixels have numbers of their own"
+    assert len(np.unique(standard.round(5))) > 0.95 * standard.size, "worlds and pixels have different random numbers"
 
 
-def test_depth_has_steps_and_a_smallest_value(wall):
+def test_depth_has_a_resolution_and_a_smallest_value(wall):
     _, _, (_, images, _) = wall
     depth = images["depth"][:, 0]
     assert (depth[0] == 0).all()
@@ -52,7 +52,7 @@ def test_depth_has_steps_and_a_smallest_value(wall):
 
 
 def test_pixels_behind_an_edge_are_holes_where_the_second_imager_does_not_see_them():
-    """A near strip before a far wall hides f b (1 / near - 1 / far) pixels on its left, and none on its right."""
+    """A near strip in front of a far wall hides f b (1 / near - 1 / far) pixels on its left, and none on its right."""
     noise = StereoNoise(baseline=0.1, disparity_noise=0.0, resolution=0.0, min_depth=0.0)
     depth = np.full((2, 60), 5.0, np.float32)
     depth[:, 30:40] = 1.0
@@ -65,7 +65,7 @@ def test_pixels_behind_an_edge_are_holes_where_the_second_imager_does_not_see_th
     assert (np.asarray(StereoNoise(has_holes=False).apply(jnp.asarray(depth), 100.0, jax.random.key(0))) > 0).all()
 
 
-def test_noise_of_a_lidar_and_its_lost_returns(wall):
+def test_a_lidar_has_noise_and_lost_returns(wall):
     _, (*_, lidar), (*_, images) = wall
     distance, true = images["distance"][:, 0], np.arange(1.0, 7.0)[:, None, None] / lidar.rays[..., 0]
     lost = distance == 9.0
@@ -75,17 +75,19 @@ def test_noise_of_a_lidar_and_its_lost_returns(wall):
     assert standard.std() == pytest.approx(1.0, rel=4 / np.sqrt(2 * standard.size))
 
 
-def test_numbers_of_a_world_do_not_depend_on_the_others_and_change_with_the_step(wall):
+def test_noise_of_a_world_does_not_depend_on_other_worlds_and_changes_with_the_step(wall):
     sim, (camera, *_), (images, *_) = wall
     steps = sim.data.core.steps + 1
-    take = jax.jit(camera.image_fn(sim))
-    later = take(sim.data.replace(core=sim.data.core.replace(steps=steps)))
+    take_image = jax.jit(camera.image_fn(sim))
+    later = take_image(sim.data.replace(core=sim.data.core.replace(steps=steps)))
     assert np.mean(later["depth"] == images["depth"]) < 0.01
-    few = Sim(2, control="attitude", rng_key=2)
-    few.scene.add("wall", pos=[6.055, 0, -20], length=80, height=80, mocap=False)
+    smaller_sim = Sim(2, control="attitude", rng_key=2)
+    smaller_sim.scene.add("wall", pos=[6.055, 0, -20], length=80, height=80, mocap=False)
     pos = sim.data.states.pos[:2]
-    few.data = few.data.replace(states=few.data.states.replace(pos=pos))
-    np.testing.assert_allclose(jax.jit(camera.image_fn(few))(few.data)["depth"], images["depth"][:2], rtol=1e-6)
+    smaller_sim.data = smaller_sim.data.replace(states=smaller_sim.data.states.replace(pos=pos))
+    np.testing.assert_allclose(
+        jax.jit(camera.image_fn(smaller_sim))(smaller_sim.data)["depth"], images["depth"][:2], rtol=1e-6
+    )
 
 
 def test_a_lens_has_the_pixels_of_the_formula_of_opencv():
@@ -121,14 +123,14 @@ def test_patterns_of_lidars_are_those_of_their_data_sheets():
 
 
 def test_gradients_pass_through_noise_and_lens(wall):
-    """The slope of the mean distance to the wall, by position, equals that of central differences."""
+    """The slope of the mean distance to the wall by the position equals central differences."""
     sim, _, _ = wall
     camera = Camera(4, 3, fovy=20.0, noise=StereoNoise(), distortion=Distortion(k1=-0.1))
-    take = camera.image_fn(sim)
+    take_image = camera.image_fn(sim)
 
     def mean_depth(x):
         states = sim.data.states.replace(pos=sim.data.states.pos + jnp.array([1.0, 0, 0]) * x)
-        return jnp.mean(take(sim.data.replace(states=states))["depth"])
+        return jnp.mean(take_image(sim.data.replace(states=states))["depth"])
 
     slope = jax.jit(jax.value_and_grad(mean_depth))
     ends = [float(slope(h)[0]) for h in (0.05, -0.05)]
@@ -149,7 +151,7 @@ def test_engines_agree_on_the_images_of_a_step():
     assert np.mean(found[0]["depth"] == found[1]["depth"]) > 0.9
 
 
-def test_a_camera_sees_nothing_in_an_empty_scene_and_the_inner_side_of_what_it_is_in(tmp_path):
+def test_a_camera_sees_nothing_in_an_empty_scene_and_the_inside_of_a_geom_around_it(tmp_path):
     path = tmp_path / "empty.xml"
     path.write_text("<mujoco><worldbody/></mujoco>")
     sim = Sim(xml_path=path, control="attitude")
@@ -170,8 +172,8 @@ def test_a_camera_sees_nothing_in_an_empty_scene_and_the_inner_side_of_what_it_i
     assert far == pytest.approx(1.0, rel=1e-5)
 
 
-def test_law_09_wrong_errors_and_patterns_are_refused():
-    for act, words in (
+def test_law_09_wrong_noise_lenses_and_patterns_are_errors():
+    for call, words in (
         (lambda: Camera(noise=0.1), "expected noise of Camera as StereoNoise"),
         (lambda: StereoNoise(baseline=0.0), "baseline of StereoNoise"),
         (lambda: StereoNoise(disparity_noise=np.nan), "disparity_noise of StereoNoise"),
@@ -184,5 +186,5 @@ def test_law_09_wrong_errors_and_patterns_are_refused():
         (lambda: Sim().add(Lidar(np.zeros(10**5), np.zeros(10**6))), "got 1 of 1000000 x 100000 pixels, which need"),
     ):
         with pytest.raises(ConfigError) as error:
-            act()
+            call()
         assert words in str(error.value), error.value

@@ -25,7 +25,7 @@ def read(sim, name="accel"):
     return np.asarray(sim.plugins.observations(sim.data)[f"imu.{name}"])
 
 
-def test_specific_force_is_the_second_derivative_of_the_place(x64):
+def test_specific_force_is_the_second_derivative_of_the_position(x64):
     """Against differentiation of p(t) = c(t) + R(t) r, for a turn with an angular acceleration about a fixed axis."""
     axis, r, g = jnp.array([0.6, 0.0, 0.8]), jnp.array([0.02, -0.05, 0.03]), jnp.array([0.0, 0.0, -9.81])
 
@@ -33,26 +33,26 @@ def test_specific_force_is_the_second_derivative_of_the_place(x64):
         angle = 0.3 + 2.0 * t + 1.5 * t**2
         return jnp.concatenate([jnp.sin(angle / 2) * axis, jnp.cos(angle / 2)[None]])
 
-    def place(t, r):
+    def position(t, r):
         centre = jnp.array([1.0, 2.0, -0.5]) * t**2 + jnp.array([0.0, 0.3, 0.0]) * t**3
         return centre + rotation.rotate(quat(t), r)
 
     t = jnp.asarray(0.7)
 
     @jax.jit
-    def both(t):
-        acc = jax.jacfwd(jax.jacfwd(place))
+    def expected_and_found(t):
+        acc = jax.jacfwd(jax.jacfwd(position))
         expected = rotation.rotate_inverse(quat(t), acc(t, r) - g)
         ang_vel, ang_acc = (2.0 + 3.0 * t) * axis, 3.0 * axis
         return expected, specific_force(quat(t), acc(t, 0 * r), ang_vel, ang_acc, g, r)
 
-    expected, found = both(t)
+    expected, found = expected_and_found(t)
     np.testing.assert_allclose(found, expected, atol=1e-12)
     assert np.linalg.norm(found - specific_force(quat(t), jnp.zeros(3), 0 * r, 0 * r, g, r)) > 1
 
 
-def test_hover_fall_and_rest():
-    """9.81 m/s^2 upwards where something carries the drone, floor or rotors; nothing in a fall, but for the drag."""
+def test_accelerations_in_hover_in_a_fall_and_at_rest():
+    """9.81 m/s^2 upwards where the floor or the rotors carry the drone; zero in a fall, except for the drag."""
     sim, _ = build(IMU(), 3)
     pos = np.array([10.0, 10.0, -0.001])[:, None, None] * [0, 0, 1]
     speed = hover_rotor_state(sim.data) * np.array([1.0, 0.0, 0.0])[:, None, None]
@@ -64,8 +64,8 @@ def test_hover_fall_and_rest():
 
 
 def test_lever_arm_and_mounting_by_hand():
-    """Free fall at 10 rad/s about z: the place 2 cm ahead accelerates inwards by 2 m/s^2. The sensor is turned by 90
-    degrees about z, so that the body's x axis is its -y axis."""
+    """In a fall at 10 rad/s about z a point 2 cm ahead accelerates inwards by 2 m/s^2. The sensor is turned by 90
+    degrees about z: the body's x axis is its -y axis."""
     sim, imu = build(IMU(pos=(0.02, 0, 0), rpy=(0, 0, np.pi / 2)))
     sim.data = with_states(sim.data, ang_vel=[0, 0, 10.0])
     sim.step()
@@ -73,12 +73,12 @@ def test_lever_arm_and_mounting_by_hand():
     sim.data = with_states(sim.data, ang_vel=[3.0, 0, 10.0])
     sim.step()
     np.testing.assert_allclose(read(sim, "gyro")[0, 0], [0, -3, 10], atol=0.1)  # a turning body's axes
-    body = imu.measured_states(one(sim))["ang_vel"]
+    body = imu.measured_states(data_of_drone(sim))["ang_vel"]
     np.testing.assert_allclose(body, sim.data.states.ang_vel[0, 0], atol=1e-5)
 
 
-def one(sim):
-    """Return the data of the only drone, as methods of plugins get them."""
+def data_of_drone(sim):
+    """Return the data of the only drone, as methods of plugins get it."""
     from crazysim.core.stage import Axes
     from crazysim.pytree import n_batch_axes
 
@@ -103,7 +103,7 @@ def test_errors_by_hand():
     np.testing.assert_allclose(read(sim, "gyro")[0, 0], [0.5, -1, 1], atol=5e-2)  # a turning body's axes
 
 
-def test_the_low_pass_answers_a_step_as_one_of_first_order():
+def test_the_low_pass_has_the_step_response_of_first_order():
     sim, _ = build(IMU(gyro=Triad(bandwidth=20.0)))
     sim.step()
     sim.data = with_states(sim.data, ang_vel=[0, 0, 1.0])
@@ -116,7 +116,7 @@ def test_the_low_pass_answers_a_step_as_one_of_first_order():
     np.testing.assert_allclose(found, expected, rtol=1e-3)  # drag of one step
 
 
-def test_each_episode_draws_a_sensor_of_its_own():
+def test_each_episode_draws_new_errors():
     spread = Triad(bias=0.2, bias_spread=0.1, scale_spread=0.03, misalignment_spread=0.02)
     sim, imu = build(IMU(gyro=spread), 1000, 2)
     sim.step(2)
@@ -135,7 +135,7 @@ def test_each_episode_draws_a_sensor_of_its_own():
 
 
 def test_an_unbalanced_rotor_shakes_at_its_own_frequency():
-    """One rotor at 16000 rpm: m e w^2 / m in the plane of the rotors, and J^-1 (r x m e w) about the vertical axis."""
+    """One rotor at 16000 rpm with an imbalance b: b w^2 / m in the plane of the rotors, and J^-1 (r x b w) about z."""
     imbalance, speed = 1e-8, 16000.0
     sim, imu = build(IMU(imbalance=[imbalance, 0, 0, 0]), freq=5000)
     speeds = np.full((1, 1, 4), speed)
@@ -163,18 +163,21 @@ def test_an_unbalanced_rotor_shakes_at_its_own_frequency():
 
 
 N, FREQ = 20_000, 100
-NOISE, WALK, INSTABILITY, TIME = 0.02, 0.01, 0.05, 0.5
+NOISE, RANDOM_WALK, INSTABILITY, CORRELATION_TIME = 0.02, 0.01, 0.05, 0.5
 
 
 @pytest.fixture(scope="module")
-def rest():
-    """Gyroscope and accelerometer at rest for 200 s: white noise in a third of the drones, a random walk of the bias in
-    another, a wandering bias in the last. (3 kinds, n_channels, N)"""
+def measurements_at_rest():
+    """Return measurements of gyroscope and accelerometer at rest for 200 s, with white noise in a third of the drones,
+    a random walk of the bias in another, and a Gauss-Markov bias in the last. (3 kinds, n_channels, N)"""
     n = 12
     kind = np.repeat(np.eye(3)[:, :, None, None], n, axis=2)  # of each error: (3 kinds, n, 1)
     noise, walk, wander = (np.broadcast_to(k.reshape(3 * n, 1, 1), (3 * n, 1, 3)) for k in kind)
     errors = Triad(
-        noise=NOISE * noise, random_walk=WALK * walk, instability=INSTABILITY * wander, correlation_time=TIME
+        noise=NOISE * noise,
+        random_walk=RANDOM_WALK * walk,
+        instability=INSTABILITY * wander,
+        correlation_time=CORRELATION_TIME,
     )
     sim = Sim(3 * n, control="rotor_vel", freq=FREQ, engine="plain", rng_key=5)
     sim.data = with_states(sim.data, pos=[0, 0, -0.001])
@@ -199,27 +202,27 @@ def expected_deviation(kind, t):
     if kind == 0:
         return NOISE / np.sqrt(2 * t)
     if kind == 1:  # sampled: 1/3 + 1/(6 m^2) in place of 1/3
-        return WALK * np.sqrt(t * (1 / 3 + 1 / (6 * (t * FREQ) ** 2)))
-    x = TIME / t
+        return RANDOM_WALK * np.sqrt(t * (1 / 3 + 1 / (6 * (t * FREQ) ** 2)))
+    x = CORRELATION_TIME / t
     return INSTABILITY * np.sqrt(2 * x * (1 - x / 2 * (3 - 4 * np.exp(-1 / x) + np.exp(-2 / x))))
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2])
-def test_the_allan_deviation_is_that_of_the_parameters(rest, kind):
+def test_the_allan_deviation_is_that_of_the_parameters(measurements_at_rest, kind):
     times = np.array([0.01, 0.1, 0.5, 0.95, 2.0, 10.0])[1 if kind == 2 else 0 :]
-    variance = [np.square(allantools.oadev(x, FREQ, "freq", times)[1]) for x in rest[kind]]
+    variance = [np.square(allantools.oadev(x, FREQ, "freq", times)[1]) for x in measurements_at_rest[kind]]
     found = np.sqrt(np.mean(variance, axis=0))
     # Each channel has about N / (FREQ t) independent differences: four standard errors of a mean square, halved by the
     # root. Ten samples of the process in 0.1 s differ from their integral by less than 1 %.
     tolerance = 4 * 0.5 * np.sqrt(2 / (len(variance) * N / (FREQ * times)) * 1.5) + 0.01
     assert np.all(np.abs(found / expected_deviation(kind, times) - 1) < tolerance)
     assert tolerance.max() < 0.2
-    if kind == 2:  # the largest deviation of a wandering bias, as the docstring of Triad has it
+    if kind == 2:  # the largest deviation of a Gauss-Markov bias, as the docstring of Triad says
         np.testing.assert_allclose(found[2], 0.618 * INSTABILITY, rtol=tolerance[2])
 
 
 def test_presets_have_the_numbers_of_their_data_sheets():
-    """Their densities agree with their root mean squares: 0.1 degrees/s behind 47 Hz for the BMI088, and so on."""
+    """Their densities agree with their root mean squares, such as 0.1 degrees/s within 47 Hz for the BMI088."""
     assert abs(IMU.bmi088().gyro.noise * np.sqrt(47) / DEGREE - 0.1) < 0.005
     assert abs(IMU.mpu9250().gyro.noise * np.sqrt(92) / DEGREE - 0.1) < 0.005
     assert abs(IMU.mpu6050().gyro.noise * np.sqrt(100) / DEGREE - 0.05) < 0.005

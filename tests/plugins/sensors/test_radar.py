@@ -13,12 +13,12 @@ LOBES = [(10.0, 1.3, 1.0, 0.0), (6.0, 2.5, 0.6, 0.3), (8.0, 0.0, 1.0, 0.0), (8.0
 
 @pytest.mark.parametrize("lobe", LOBES)
 def test_the_outline_is_where_the_margin_changes_sign(lobe, x64):
-    """The parametric curve of the drawing bounds the closed form of the test."""
+    """The parametric curve that is drawn is the boundary of the region of detection."""
     size, tilt = lobe[0] / 2, lobe[3]
     outline = lobe_curves(*lobe)[0]
     middle = np.array([size * np.cos(tilt), 0.0, size * np.sin(tilt)])  # on the axis of the lobe
-    for share, inside in ((0.98, True), (1.02, False)):
-        points = (middle + share * (outline - middle))[2:-2]
+    for scale, inside in ((0.98, True), (1.02, False)):
+        points = (middle + scale * (outline - middle))[2:-2]
         np.testing.assert_array_equal(np.asarray(lobe_margin(points, *lobe)) > 0, inside)
     np.testing.assert_allclose(lobe_margin(outline[2:-2], *lobe), 0, atol=1e-6 * size)
 
@@ -35,9 +35,9 @@ def test_the_lobe_by_hand_and_its_symmetry(rng):
 def test_law_07_margin_and_gradient_are_finite_everywhere():
     points = np.float32([[0, 0, 0], [10, 0, 0], [0, 0, 3.0], [1e6, 0, 1e6], [1e-9, 0, 0], [5, 0, 0]])
     margin = jax.value_and_grad(lambda p, e: lobe_margin(p, 10.0, e, 1.0, 0.2))
-    each = jax.jit(jax.vmap(margin, in_axes=(0, None)))
+    margins = jax.jit(jax.vmap(margin, in_axes=(0, None)))
     for e in (0.0, 1.3):
-        value, slope = each(points, e)
+        value, slope = margins(points, e)
         assert np.isfinite(value).all()
         assert np.isfinite(slope).all()
 
@@ -63,12 +63,12 @@ def test_the_lobe_is_drawn_in_red_where_it_detects():
     sim = Sim(n_worlds=2, control="rotor_vel")
     sim.data = with_states(sim.data, pos=np.array([[[5, 0, 4.0]], [[50, 0, 4.0]]]))
     radar = sim.add(Radar((0, 0, 4.0), visible=True))
-    for world, red in ((0, True), (1, False)):
+    for world, is_red in ((0, True), (1, False)):
         overlays = sim.scene.renderer.overlays
         radar.draw(sim, world)
         assert len(overlays) > 500
         color = overlays._geoms[0][4]
-        assert (color[0] > color[2]) == red
+        assert (color[0] > color[2]) == is_red
         overlays.clear()
     sim.add(Radar((0, 0, 4.0)), name="hidden").draw(sim, 0)
     assert len(sim.scene.renderer.overlays) == 0

@@ -1,4 +1,4 @@
-"""Every sensor: fused with the physics, measuring something, reproducible, and differentiable."""
+"""Every sensor: fused with the physics, with changing measurements, reproducible, and differentiable."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from crazysim.plugins import sensors
 from crazysim.plugins.sensors import IMU
 
 
-def test_every_sensor_is_here():
+def test_all_sensors_are_tested():
     names = set(sensors.__all__) - {
         "Camera",
         "Distortion",
@@ -30,7 +30,7 @@ def test_every_sensor_is_here():
     assert all(sensor().name == name for name, sensor in SENSORS.items())
 
 
-def flying(n_worlds, names, **settings):
+def build(n_worlds, names, **settings):
     """Return a simulation of drones that fly and turn, with sensors."""
     sim = Sim(n_worlds, 2, control="rotor_vel", rng_key=9, **settings)
     speed = hover_rotor_state(sim.data) * np.array([1.02, 1.0, 0.99, 1.0])
@@ -52,8 +52,8 @@ def measurements(sim, data):
 
 @pytest.fixture(scope="module")
 def sim():
-    """Return a flight with every sensor."""
-    return flying(3, SENSORS)
+    """Return a simulation with every sensor."""
+    return build(3, SENSORS)
 
 
 def test_every_sensor_is_fused(sim):
@@ -72,21 +72,21 @@ def test_every_sensor_measures_something(sim):
 
 
 def test_law_10_measurements_do_not_depend_on_other_worlds(sim):
-    alone = flying(2, SENSORS)
-    many, few = (measurements(s, s.step_fn(s.data, jnp.int32(9))) for s in (sim, alone))
-    for name, x in few.items():
-        np.testing.assert_array_equal(x, many[name][:2], err_msg=name)
+    smaller_sim = build(2, SENSORS)
+    all_worlds, two_worlds = (measurements(s, s.step_fn(s.data, jnp.int32(9))) for s in (sim, smaller_sim))
+    for name, x in two_worlds.items():
+        np.testing.assert_array_equal(x, all_worlds[name][:2], err_msg=name)
 
 
 @pytest.mark.long("compiles the derivatives of all sensors in float64")
 def test_law_08_gradients_are_central_differences(x64):
-    """Of all parts of each measurement, by position, velocity, attitude, rates and rotor speeds of the start."""
-    sim = flying(1, SENSORS)
+    """Derivatives of each measurement by position, velocity, attitude, rates and rotor speeds at the start."""
+    sim = build(1, SENSORS)
     step, names = by_stages(sim), ("pos", "vel", "quat", "ang_vel", "rotor_vel")
     start = {k: jnp.asarray(getattr(sim.data.states, k)) for k in names}
-    measuring = [sim.plugins[name] for name in SENSORS]
+    all_sensors = [sim.plugins[name] for name in SENSORS]
     rng = np.random.default_rng(1)
-    weights = [jnp.asarray(rng.normal(size=(1, 2, sum(sensor.channels.values())))) for sensor in measuring]
+    weights = [jnp.asarray(rng.normal(size=(1, 2, sum(sensor.channels.values())))) for sensor in all_sensors]
     rng = np.random.default_rng(2)
     directions = {k: jnp.asarray(rng.normal(size=x.shape)) * (100.0 if k == "rotor_vel" else 0.1)
                   for k, x in start.items()}  # fmt: skip
@@ -95,7 +95,7 @@ def test_law_08_gradients_are_central_differences(x64):
         """Return a weighted sum of the measurements of each sensor, and the largest of them. (n_sensors,)"""
         quat = x["quat"] / jnp.linalg.norm(x["quat"], axis=-1, keepdims=True)
         end = step(sim.data.replace(states=sim.data.states.replace(**(x | {"quat": quat}))), 8)
-        values = [sensor.read(end).samples.value for sensor in measuring]
+        values = [sensor.read(end).samples.value for sensor in all_sensors]
         sums = jnp.stack([jnp.sum(w * value) for w, value in zip(weights, values, strict=True)])
         return sums, jnp.stack([jnp.abs(value).max() for value in values])
 
@@ -103,7 +103,7 @@ def test_law_08_gradients_are_central_differences(x64):
     def derivatives(x):
         """Return the sums, their slopes along the directions by forward and by reverse derivatives, and the sizes."""
         sums, linear, sizes = jax.linearize(measure, x, has_aux=True)
-        transposed = jax.vmap(lambda row: jax.linear_transpose(linear, x)(row)[0])(jnp.eye(len(measuring)))
+        transposed = jax.vmap(lambda row: jax.linear_transpose(linear, x)(row)[0])(jnp.eye(len(all_sensors)))
         along = sum(jnp.sum(transposed[k] * directions[k], axis=range(1, 4)) for k in names)
         return sums, linear(directions), along, sizes
 
@@ -117,17 +117,17 @@ def test_law_08_gradients_are_central_differences(x64):
         np.testing.assert_allclose([slope, back], difference, rtol=1e-5, err_msg=name)  # h^2 of the difference
 
 
-def test_gradients_pass_what_rounds(x64):
-    """A measurement is rounded; its gradient is that of what was rounded, and finite."""
-    sim = flying(1, [])
-    rough = [sim.add(make()) for make in (IMU.bmi088, lambda: sensors.RotorSpeeds.telemetry(6))]
+def test_gradients_pass_through_rounding(x64):
+    """The gradient of a rounded measurement is that before rounding, and finite."""
+    sim = build(1, [])
+    rounding_sensors = [sim.add(make()) for make in (IMU.bmi088, lambda: sensors.RotorSpeeds.telemetry(6))]
     step = by_stages(sim)
 
     @jax.jit
     @jax.jacrev
     def gradients(rotor_vel):
         end = step(sim.data.replace(states=sim.data.states.replace(rotor_vel=rotor_vel)), 3)
-        return jnp.stack([jnp.sum(jnp.square(sensor.read(end).samples.value)) for sensor in rough])
+        return jnp.stack([jnp.sum(jnp.square(sensor.read(end).samples.value)) for sensor in rounding_sensors])
 
     found = np.asarray(gradients(jnp.asarray(sim.data.states.rotor_vel)))
     assert np.isfinite(found).all()

@@ -27,8 +27,8 @@ def read(sim, name):
     return np.asarray(sim.plugins.observations(sim.data)[name], np.float64)
 
 
-def errors(n):
-    """Return the tolerance of a standard deviation from n numbers: four of its standard errors."""
+def std_tolerance(n):
+    """Return the relative tolerance of a standard deviation of n numbers: four of its standard errors."""
     return 4 / np.sqrt(2 * n)
 
 
@@ -38,19 +38,19 @@ def test_motion_capture_has_its_noise_and_offsets():
     sim = build(plugin, n_worlds=N, quat=quat, vel=[1.0, 0, 0])
     sim.step()
     s = sim.data.states
-    at = np.asarray(s.pos)[:, 0] + [0.0, 0.1, 0.0]
+    tracked_pos = np.asarray(s.pos)[:, 0] + [0.0, 0.1, 0.0]
     pos, attitude = read(sim, "motion_capture.pos")[:, 0], read(sim, "motion_capture.quat")[:, 0]
-    np.testing.assert_allclose((pos - at).std(axis=0), 2e-3, rtol=errors(N))
-    np.testing.assert_allclose((pos - at).mean(axis=0), 0, atol=4 * 2e-3 / np.sqrt(N))
+    np.testing.assert_allclose((pos - tracked_pos).std(axis=0), 2e-3, rtol=std_tolerance(N))
+    np.testing.assert_allclose((pos - tracked_pos).mean(axis=0), 0, atol=4 * 2e-3 / np.sqrt(N))
     np.testing.assert_allclose(np.linalg.norm(attitude, axis=-1), 1, atol=1e-6)
     true = jax.jit(lambda q: rotation.multiply(q, rotation.from_rpy(np.float32([0, 0, 0.2]))))(s.quat[:, 0])
     turn = 2 * np.asarray(jax.jit(lambda a, b: rotation.multiply(rotation.conjugate(a), b))(true, attitude))[:, :3]
-    np.testing.assert_allclose(turn.std(axis=0), 0.01, rtol=errors(N))
+    np.testing.assert_allclose(turn.std(axis=0), 0.01, rtol=std_tolerance(N))
 
 
 def test_motion_capture_differentiates_positions():
-    """A constant velocity is met at once. The low-pass leaves 2 a^2 / (2 - a) of the variance of the positions over the
-    interval squared, where differences of white noise in the position have 2."""
+    """A constant velocity is measured at once. The low-pass leaves 2 a^2 / (2 - a) of the variance of the positions
+    over the interval squared; without it differences of white noise have 2."""
     sim = build(sensors.MotionCapture(), vel=[3.0, 0, 0])
     sim.step(21)
     vel = read(sim, "motion_capture.vel")[0, 0]
@@ -59,7 +59,7 @@ def test_motion_capture_differentiates_positions():
     sim.step(101)
     noise = read(sim, "motion_capture.vel")[:, 0, 1:2].std()
     a = 1 - np.exp(-2 * np.pi * 10 / 100)
-    np.testing.assert_allclose(noise, 1e-3 * 100 * np.sqrt(2 * a**2 / (2 - a)), rtol=errors(N))
+    np.testing.assert_allclose(noise, 1e-3 * 100 * np.sqrt(2 * a**2 / (2 - a)), rtol=std_tolerance(N))
 
 
 def test_optical_flow_by_hand():
@@ -80,7 +80,7 @@ def test_optical_flow_by_hand():
     sim = build(sensors.OpticalFlow(0.3, resolution=0.1), n_worlds=N)
     sim.step()
     found = read(sim, "optical_flow.flow")
-    np.testing.assert_allclose(found.std(), np.sqrt(0.3**2 + 0.1**2 / 12), rtol=errors(2 * N))
+    np.testing.assert_allclose(found.std(), np.sqrt(0.3**2 + 0.1**2 / 12), rtol=std_tolerance(2 * N))
     np.testing.assert_allclose(found / 0.1, np.round(found / 0.1), atol=1e-4)
 
 
@@ -122,7 +122,7 @@ def test_time_of_flight_by_hand():
         sim = build(sensors.TimeOfFlight(0.01, resolution=None), n_worlds=N, pos=[0, 0, height])
         sim.step()
         distance = read(sim, "time_of_flight.distance")
-        np.testing.assert_allclose(distance.std(), deviation, rtol=errors(N) + 0.01)
+        np.testing.assert_allclose(distance.std(), deviation, rtol=std_tolerance(N) + 0.01)
         np.testing.assert_allclose(distance.mean(), height, atol=4 * deviation / np.sqrt(N) + 1e-3)
 
 
@@ -139,10 +139,10 @@ def test_barometer_has_its_errors():
     sim = build(plugin, n_worlds=N, pos=[0, 0, 10.0])
     sim.step()
     pressure, height = read(sim, "barometer.pressure"), read(sim, "barometer.height")
-    np.testing.assert_allclose(pressure.std(), 2.0, rtol=errors(N))
+    np.testing.assert_allclose(pressure.std(), 2.0, rtol=std_tolerance(N))
     np.testing.assert_allclose(pressure.mean(), pressure_at(410.0), atol=4 * 2.0 / np.sqrt(N) + 0.02)
     slope = 96500 * 9.80665 * 0.0289644 / 8.31432 / (288.15 - 2.665)  # p g M / (R T) at 410 m, Pa/m
-    np.testing.assert_allclose((height - 10).std(), 2.0 / slope, rtol=errors(N) + 0.01)
+    np.testing.assert_allclose((height - 10).std(), 2.0 / slope, rtol=std_tolerance(N) + 0.01)
 
     drifting = sensors.Barometer(drift=5.0, drift_time=0.1, offset_spread=20.0, freq=100)
     sim = build(drifting, n_worlds=N)
@@ -150,8 +150,10 @@ def test_barometer_has_its_errors():
     for n_steps in (1, 50):
         sim.step(n_steps)
         found.append(read(sim, "barometer.pressure")[:, 0, 0])
-    np.testing.assert_allclose(found[0].std(), np.hypot(5, 20), rtol=errors(N))
-    np.testing.assert_allclose((found[1] - found[0]).std(), 5 * np.sqrt(2 - 2 * np.exp(-1)), rtol=errors(N) + 0.01)
+    np.testing.assert_allclose(found[0].std(), np.hypot(5, 20), rtol=std_tolerance(N))
+    np.testing.assert_allclose(
+        (found[1] - found[0]).std(), 5 * np.sqrt(2 - 2 * np.exp(-1)), rtol=std_tolerance(N) + 0.01
+    )
 
 
 def test_magnetometer_by_hand():
@@ -173,7 +175,7 @@ def test_telemetry_and_battery():
     assert np.abs(speeds - np.asarray(sim.data.states.rotor_vel)).max() <= 100 / 12 + 1e-2
     voltage = read(sim, "battery_voltage.voltage")
     np.testing.assert_allclose(voltage.mean(), sim.data.plugins["battery"].voltage[0, 0, 0], atol=4 * 0.02 / np.sqrt(N))
-    np.testing.assert_allclose(voltage.std(), np.sqrt(0.02**2 + 0.01**2 / 12), rtol=errors(N))
+    np.testing.assert_allclose(voltage.std(), np.sqrt(0.02**2 + 0.01**2 / 12), rtol=std_tolerance(N))
 
 
 def test_multi_ranger_measures_what_the_range_finder_does():
@@ -182,10 +184,10 @@ def test_multi_ranger_measures_what_the_range_finder_does():
     distance = read(sim, "multi_ranger.distance")[:, 0]
     np.testing.assert_array_equal(distance[:, :5], 2.0)
     np.testing.assert_allclose(distance[:, 5].mean(), 1.0, atol=4 * 0.05 / np.sqrt(N) + 1e-3)
-    np.testing.assert_allclose(distance[:, 5].std(), 0.05, rtol=errors(N))
+    np.testing.assert_allclose(distance[:, 5].std(), 0.05, rtol=std_tolerance(N))
 
 
-def test_ranges_by_hand_and_their_detours():
+def test_ranges_and_their_detours_by_hand():
     anchors = [(3.0, 0, 1.0), (0, 4.0, 1.0), (0, 0, 6.0)]
     sim = build(
         sensors.UWB(anchors, bias=0.1, freq=None), sensors.UWB(anchors, bias=0.1, tdoa=True, freq=None, name="t")
@@ -195,8 +197,8 @@ def test_ranges_by_hand_and_their_detours():
     np.testing.assert_allclose(read(sim, "t.difference")[0, 0], [1, 2], atol=1e-4)
     sim = build(sensors.UWB(anchors, 0.05), sensors.UWB(anchors, 0.05, tdoa=True, name="t"), n_worlds=N)
     sim.step()
-    np.testing.assert_allclose(read(sim, "uwb.distance")[:, 0].std(axis=0), 0.05, rtol=errors(N))
-    np.testing.assert_allclose(read(sim, "t.difference")[:, 0].std(axis=0), 0.05 * np.sqrt(2), rtol=errors(N))
+    np.testing.assert_allclose(read(sim, "uwb.distance")[:, 0].std(axis=0), 0.05, rtol=std_tolerance(N))
+    np.testing.assert_allclose(read(sim, "t.difference")[:, 0].std(axis=0), 0.05 * np.sqrt(2), rtol=std_tolerance(N))
     sim = build(sensors.UWB(anchors, outliers=0.2, detour=0.5), n_worlds=N)
     sim.step()
     excess = (read(sim, "uwb.distance")[:, 0] - [3, 4, 5]).ravel()
@@ -206,7 +208,7 @@ def test_ranges_by_hand_and_their_detours():
 
 
 def test_sweep_angles_by_hand(x64):
-    """The plane of tilt t through the station, turned by the angle, contains the place."""
+    """The plane of tilt t through the station, turned by the angle, contains the point."""
     rng = np.random.default_rng(3)
     for pos in rng.normal(size=(20, 3)) + [4, 0, 0]:
         for tilt in SWEEP_TILTS:
@@ -226,7 +228,7 @@ def test_a_lighthouse_has_its_view_and_noise():
     lift = np.arcsin(0.5 * np.tan(np.pi / 6) / np.hypot(3, 0.3))
     expected = np.arctan2(0.3, 3.0) + lift * np.array([1, -1])
     np.testing.assert_allclose(angle[:, :2].mean(axis=0), expected, atol=4e-3 / np.sqrt(N) + 1e-4)
-    np.testing.assert_allclose(angle[:, :2].std(axis=0), 1e-3, rtol=errors(N))
+    np.testing.assert_allclose(angle[:, :2].std(axis=0), 1e-3, rtol=std_tolerance(N))
     np.testing.assert_array_equal(angle[:, 2:], 0)
 
 
@@ -236,11 +238,11 @@ def test_satellite_navigation_wanders():
     for n_steps in (1, 100):
         sim.step(n_steps)
         found.append(read(sim, "gps.pos")[:, 0] - np.asarray(sim.data.states.pos)[:, 0])
-    np.testing.assert_allclose(found[0].std(axis=0), np.hypot([1, 1, 2], 3), rtol=errors(N))
+    np.testing.assert_allclose(found[0].std(axis=0), np.hypot([1, 1, 2], 3), rtol=std_tolerance(N))
     change = np.sqrt(2 * np.array([1, 1, 4]) + 9 * (2 - 2 * np.exp(-1)))
-    np.testing.assert_allclose((found[1] - found[0]).std(axis=0), change, rtol=errors(N))
+    np.testing.assert_allclose((found[1] - found[0]).std(axis=0), change, rtol=std_tolerance(N))
     vel = read(sim, "gps.vel")[:, 0] - np.asarray(sim.data.states.vel)[:, 0]
-    np.testing.assert_allclose(vel.std(axis=0), 0.1, rtol=errors(N))
+    np.testing.assert_allclose(vel.std(axis=0), 0.1, rtol=std_tolerance(N))
 
 
 @pytest.mark.parametrize("plugin, message", [
@@ -293,9 +295,9 @@ class Relative(Plugin):
 
 
 def test_a_task_observes_measurements_by_one_argument():
-    """Positions are off by the tracked body's offset, rates by the bias of the gyroscope; the reward is not."""
-    on = [sensors.MotionCapture(pos=(0, 0, 0.3)), sensors.IMU(gyro=sensors.Triad(bias=0.2))]
-    envs = [make("hover", n_worlds=3, sensors=s, engine="interpret") for s in ((), on)]
+    """Observed positions have the offset of the tracked point, rates the gyroscope's bias; rewards do not change."""
+    biased_sensors = [sensors.MotionCapture(pos=(0, 0, 0.3)), sensors.IMU(gyro=sensors.Triad(bias=0.2))]
+    envs = [make("hover", n_worlds=3, sensors=s, engine="interpret") for s in ((), biased_sensors)]
     states = [env.reset(jax.random.key(1)) for env in envs]
     action = np.zeros(envs[0].sim.data.states.pos.shape[:2] + (4,), np.float32)
     for _ in range(2):

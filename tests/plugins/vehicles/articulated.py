@@ -1,4 +1,4 @@
-"""A car with four wheels, steering hinges and contacts in C MuJoCo, of the numbers of a vehicle model."""
+"""A car with four wheels, steering hinges and contacts in C MuJoCo, with the parameters of a vehicle model."""
 
 import mujoco
 import numpy as np
@@ -19,7 +19,7 @@ def articulated_car(vehicle: VehicleModel, trailer: bool = False) -> str:
     for name, (ahead, left) in WHEELS.items():
         x = number("axles.front") if ahead > 0 else -number("axles.rear")
         y = left * number("axles.track") / 2
-        # The kingpins are in the wheels: beside them, the inertia of the motors would turn the car as it steers.
+        # The kingpins are in the middle of the wheels; elsewhere the inertia of the motors would turn a steering car.
         hinge = f'<joint name="steer_{name}" axis="0 0 1" damping="4" armature="0.001"/>'
         wheels += f"""<body pos="{x} {y} 0">{hinge if ahead > 0 else ""}
             <joint name="{name}" axis="0 1 0" {spin}/>
@@ -38,7 +38,7 @@ def articulated_car(vehicle: VehicleModel, trailer: bool = False) -> str:
 
 
 def _trailer(vehicle: VehicleModel) -> str:
-    """Return MJCF of a trailer of a light mass: its kinematics alone are compared."""
+    """Return MJCF of a light trailer: only its kinematics are compared."""
     number = vehicle.number
     radius, track = number("trailer.wheel_radius"), number("trailer.track")
     drop = number("wheels.radius") - radius
@@ -61,7 +61,7 @@ def _trailer(vehicle: VehicleModel) -> str:
 
 
 class Articulated:
-    """The car in motion, driven by the lab's torque law or by given torques."""
+    """The simulated car, driven by the lab's torque law or by torques."""
 
     def __init__(self, vehicle: VehicleModel, trailer: bool = False):
         self.vehicle = vehicle
@@ -83,7 +83,7 @@ class Articulated:
             self.data.actuator(name).ctrl[0] = torque
 
     def steer(self, angle: float) -> None:
-        """Set the steering angle of a wheel in the middle, rad."""
+        """Set the steering angles for that of a wheel in the middle of the front axle, rad."""
         number = self.vehicle.number
         left, right = np.asarray(ackermann(np.array([angle]), self.vehicle.wheelbase, number("axles.track")))
         self.data.actuator("steer_fl").ctrl[0] = left

@@ -1,8 +1,8 @@
 """Vehicles against an articulated car in C MuJoCo: circles, a step of the steering, braking, and a trailer.
 
 MuJoCo's wheels have Coulomb friction, regularised by its solver: they hardly slip below the limit. The models differ
-there, so that yaw rates, radii, distances and angles of joints are compared, and not states over time: the kinematic
-model, and the single-track model with tyres so stiff that they do not slip either.
+in slip, so the tests compare yaw rates, radii, distances and angles of joints, and not states over time. They use the
+kinematic model, and the single-track model with tyres so stiff that they hardly slip, too.
 """
 
 import functools
@@ -23,8 +23,8 @@ def vehicle(friction=2.5, armature=0.05):
     return load_vehicle({"base": "aiml_head", "tyres": {"friction": friction}, "wheels": {"armature": armature}})
 
 
-def ours(model, command, duration, speed=0.0, trailer=False, **changes):
-    """Return the states of our vehicle at 1000 Hz, by Euler's method."""
+def simulate(model, command, duration, speed=0.0, trailer=False, **changes):
+    """Return the states of crazysim's vehicle at 1000 Hz, by Euler's method."""
     car = CarParams.create(vehicle(), 1000, trailer)
     car = car.replace(stiffness=np.full(2, STIFF), slip_speed=np.full(1, 0.2)).replace(**changes)
     zero, joints = np.zeros(1, np.float32), np.zeros(2, np.float32) if trailer else None
@@ -50,11 +50,11 @@ def test_circles(reference, steer):
         car.drive(reference)
         car.step()
     for model in (kinematic, single_track):
-        end = ours(model, [reference, steer], 4.0)
-        speed, turn = float(end.body_vel[-1, 0]), float(end.yaw_rate[-1, 0])
+        end = simulate(model, [reference, steer], 4.0)
+        speed, yaw_rate = float(end.body_vel[-1, 0]), float(end.yaw_rate[-1, 0])
         assert speed == pytest.approx(car.body_vel[0], rel=0.01)
-        assert turn == pytest.approx(car.yaw_rate, rel=0.012)
-        assert speed / turn == pytest.approx(car.body_vel[0] / car.yaw_rate, rel=0.012)
+        assert yaw_rate == pytest.approx(car.yaw_rate, rel=0.012)
+        assert speed / yaw_rate == pytest.approx(car.body_vel[0] / car.yaw_rate, rel=0.012)
 
 
 def test_step_steer():
@@ -66,35 +66,35 @@ def test_step_steer():
     while car.time < 3:
         car.drive(0.15)
         car.step()
-    speed, begin, turns = car.body_vel[0], car.time, []
-    while car.time < begin + 1.0:
+    speed, start_time, yaw_rates = car.body_vel[0], car.time, []
+    while car.time < start_time + 1.0:
         car.drive(0.15)
         car.steer(0.2)
         car.step()
-        turns.append(car.yaw_rate)
-    path = ours(single_track, [0.15, 0.2], 1.0, speed)
-    turns, found = np.array(turns), np.asarray(path.yaw_rate)[:, 0]
-    assert found[-1] == pytest.approx(turns[-1], rel=0.01)
-    rise, expected = (np.argmax(x > 0.9 * x[-1]) / 1000 for x in (found, turns))
-    assert rise == pytest.approx(expected, abs=0.03)
+        yaw_rates.append(car.yaw_rate)
+    path = simulate(single_track, [0.15, 0.2], 1.0, speed)
+    expected, found = np.array(yaw_rates), np.asarray(path.yaw_rate)[:, 0]
+    assert found[-1] == pytest.approx(expected[-1], rel=0.01)
+    rise_time, expected_time = (np.argmax(x > 0.9 * x[-1]) / 1000 for x in (found, expected))
+    assert rise_time == pytest.approx(expected_time, abs=0.03)
 
 
 @pytest.mark.parametrize("torque", [-0.5, -1.0, -2.0])
 def test_braking_with_the_motors(torque):
-    """Distance and time agree within 0.5%: wheels roll, and what counts is the inertia of wheels and motors."""
+    """Distance and time agree within 0.5%: wheels roll, with the inertia of wheels and motors."""
     car = Articulated(vehicle())
     while car.body_vel[0] < 1.5:
         car.torque(2.0)
         car.step()
-    speed, begin, start = car.body_vel[0], car.time, car.pos[0]
+    speed, start_time, start = car.body_vel[0], car.time, car.pos[0]
     while car.body_vel[0] > 0.3:
         car.torque(torque)
         car.step()
-    # Our drive without damping and friction of its own: its force is the torque.
-    path = ours(single_track, [4 * torque / 0.052388, 0.0], 3.5, speed, drive=np.array([1.0, 0.0, 0.0]))
+    # The drive has neither damping nor friction: its force follows from the torque alone.
+    path = simulate(single_track, [4 * torque / 0.052388, 0.0], 3.5, speed, drive=np.array([1.0, 0.0, 0.0]))
     stop = int(np.argmax(np.asarray(path.body_vel)[:, 0] < 0.3))
     assert float(path.pos[stop, 0]) == pytest.approx(car.pos[0] - start, rel=5e-3)
-    assert stop / 1000 == pytest.approx(car.time - begin, rel=5e-3)
+    assert stop / 1000 == pytest.approx(car.time - start_time, rel=5e-3)
 
 
 def test_braking_with_locked_wheels():
@@ -111,7 +111,7 @@ def test_braking_with_locked_wheels():
     while car.body_vel[0] > 0.3:
         car.step()
     params = CarParams.create(slippery, 1000)
-    path = ours(single_track, [-1e4, 0.0], 1.0, speed, grip=params.grip, towed_mass=params.towed_mass,
+    path = simulate(single_track, [-1e4, 0.0], 1.0, speed, grip=params.grip, towed_mass=params.towed_mass,
                 drive=np.array([1.0, 0.0, 0.0]), drive_max=np.full(1, np.inf))  # fmt: skip
     stop = int(np.argmax(np.asarray(path.body_vel)[:, 0] < 0.3))
     assert float(path.pos[stop, 0]) == pytest.approx(car.pos[0] - start, rel=0.02)
@@ -132,10 +132,10 @@ def test_trailer():
         angles.append((car.yaw, car.yaw_of("bar"), car.yaw_of("deck")))
     yaw, bar, deck = np.unwrap(np.array(angles), axis=0).T
     light = CarParams.create(vehicle(), 1000).towed_mass + 0.05 + 0.3 + 4 * (0.1 + 5e-5 / 0.0315**2)
-    path = ours(kinematic, [0.1, 0.2], 6.0, trailer=True, towed_mass=light)
+    path = simulate(kinematic, [0.1, 0.2], 6.0, trailer=True, towed_mass=light)
     hitch, joint = path.yaw[:, 0] - path.joints[:, 0], path.joints[:, 0] - path.joints[:, 1]
     n = min(len(yaw), len(path.yaw))
-    for at in (1500, 3000, n - 1):
-        assert float(hitch[at]) == pytest.approx(yaw[at] - bar[at], abs=0.004)
-        assert float(joint[at]) == pytest.approx(bar[at] - deck[at], abs=0.004)
+    for k in (1500, 3000, n - 1):
+        assert float(hitch[k]) == pytest.approx(yaw[k] - bar[k], abs=0.004)
+        assert float(joint[k]) == pytest.approx(bar[k] - deck[k], abs=0.004)
     assert float(path.yaw_rate[n - 1, 0]) == pytest.approx(car.yaw_rate, rel=0.01)

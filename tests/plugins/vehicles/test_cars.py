@@ -20,17 +20,18 @@ EIGHT = figure_eight(5, 1.5, period=14.0, height=0.0)
 CONTROLLERS = {"pursuit": PurePursuit(), "stanley": Stanley(), "lpv": LPV(), "lqr": PathLQR()}
 
 
-def build(n_worlds=2, n_drones=1, engine="interpret", alone=True, **settings):
-    """Return a simulation with cars, whose drones stand still if cars move alone."""
+def build(n_worlds=2, n_drones=1, engine="interpret", cars_only=True, **settings):
+    """Return a simulation with cars, and its plugin; with ``cars_only`` the drones stand still."""
     sim = Sim(n_worlds, n_drones, control="rotor_vel", engine=engine)
     cars = sim.add(Cars(**settings))
-    if alone:
+    if cars_only:
         stages = sim.step_pipeline.items()
         sim.step_pipeline = {name: fn for name, fn in stages if name.startswith("cars") or name == "increment_steps"}
     return sim, cars
 
 
-def states_of(sim):
+def car_states(sim):
+    """Return the states of the cars by name."""
     record = sim.data.plugins["cars"]
     return {name: np.asarray(getattr(record, name)) for name in ("pos", "yaw", "body_vel", "yaw_rate", "steer")}
 
@@ -41,7 +42,7 @@ def test_cars_follow_their_commands_for_any_counts(n_worlds, n_drones, n_cars):
     command = np.random.default_rng(0).uniform([0.5, -0.3], [1.5, 0.3], (n_worlds, n_cars, 2))
     sim.data = cars.with_command(sim.data, command)
     sim.step(300)
-    np.testing.assert_allclose(states_of(sim)["body_vel"][..., 0], command[..., 0], atol=0.1)
+    np.testing.assert_allclose(car_states(sim)["body_vel"][..., 0], command[..., 0], atol=0.1)
 
 
 @jax.jit
@@ -58,7 +59,7 @@ def deviations(record, time):
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_cars_follow_a_path(name):
-    """Three cars on a figure eight at up to 1.5 m/s, in their places on it, that start beside it and turned."""
+    """Three cars on a figure eight at up to 1.5 m/s, which start beside it and with other headings."""
     sim, _ = build(1, engine="fused", members=3, path=EIGHT, controller=CONTROLLERS[name], in_scene=False)
     record = sim.data.plugins["cars"]
     pos, yaw = np.asarray(record.pos) + np.float32([0.0, 0.1, 0.0]), np.asarray(record.yaw) + np.float32(0.3)
@@ -77,17 +78,17 @@ def test_cars_follow_a_path(name):
 
 @pytest.mark.parametrize("kind", [PurePursuit, Stanley, PathLQR])
 def test_gains_of_the_speed_are_settings_of_controllers(kind):
-    """A car at 1 m/s that has to drive 1.5 m/s and is 0.2 m behind."""
+    """A car at 1 m/s whose reference has 1.5 m/s and is 0.2 m ahead."""
     car = CarParams.create(load_vehicle("f1tenth_ros"), 500)
     zero, speed = jnp.zeros(1), jnp.float32([1.5])
     state = CarState(jnp.zeros(3), zero, jnp.float32([1.0, 0.0]), zero, zero, zero)
-    at = PathState(None, None, zero, zero, zero, zero, speed, jnp.float32([0.2]))
+    path_state = PathState(None, None, zero, zero, zero, zero, speed, jnp.float32([0.2]))
     controller = kind(position_gain=3.0, speed_gain=2.0, reference_max=0.05)
-    driven = controller.driving(state, at, None, car)
+    driven = controller.driving(state, path_state, None, car)
     np.testing.assert_allclose(driven, motor_reference(speed, 3.0 * 0.2 + 2.0 * 0.5, car), rtol=1e-6)
     if kind is Stanley:
         assert driven > 0.05
-        assert controller.update(state, at, None, None, car)[0][0] == np.float32(0.05)
+        assert controller.update(state, path_state, None, None, car)[0][0] == np.float32(0.05)
         assert LPV(reference_max=0.05).reference_max == 0.05
         with pytest.raises(ConfigError, match=r"expected no speed_gain of LPV, got 2\.0\. Use longitudinal="):
             LPV(speed_gain=2.0)
@@ -117,8 +118,8 @@ def test_a_car_drives_as_it_does_alone():
     sim.step(60)
     alone, _ = build(1, 1, path=circle(2.0, speed=1.0), in_scene=False)
     alone.step(60)
-    for name, value in states_of(alone).items():
-        np.testing.assert_allclose(states_of(sim)[name][1, 1], value[0, 0], rtol=1e-5, atol=1e-5)
+    for name, value in car_states(alone).items():
+        np.testing.assert_allclose(car_states(sim)[name][1, 1], value[0, 0], rtol=1e-5, atol=1e-5)
 
 
 def test_gradients_reach_commands_and_parameters():
@@ -132,17 +133,18 @@ def test_gradients_reach_commands_and_parameters():
         return jnp.sum(cars.read(step(data, 100)).pos[..., :2])
 
     command, mass = np.float32([[[0.2, 0.1]]]), cars.read(sim.data).params.mass
-    both = jax.jit(jax.value_and_grad(end, argnums=(0, 1)))
-    by_command, by_mass = (np.asarray(x) for x in both(command, mass)[1])
+    end_and_gradient = jax.jit(jax.value_and_grad(end, argnums=(0, 1)))
+    by_command, by_mass = (np.asarray(x) for x in end_and_gradient(command, mass)[1])
     assert np.all(by_command > 0)
     assert by_mass[0] < 0
-    step = np.float32([[[0.02, 0.0]]])
-    central = float(both(command + step, mass)[0] - both(command - step, mass)[0]) / 0.04
+    change = np.float32([[[0.02, 0.0]]])
+    ends = [end_and_gradient(command + sign * change, mass)[0] for sign in (1, -1)]
+    central = float(ends[0] - ends[1]) / 0.04
     assert by_command[0, 0, 0] == pytest.approx(central, rel=0.02)
 
 
-def test_rest_has_finite_gradients():
-    """Of a step at rest, and of one after the car has driven off, by all that moves."""
+def test_gradients_are_finite_at_rest():
+    """Gradients by all states, of a step at rest and of one after the car has driven off."""
     sim, cars = build(1, path=EIGHT, controller=PathLQR(), in_scene=False)
     stages = list(sim.step_pipeline.values())
 
@@ -154,19 +156,20 @@ def test_rest_has_finite_gradients():
 
     slopes = jax.jit(jax.grad(end, allow_int=True))
     for n_steps in (0, 60):
-        sim.step(n_steps) if n_steps else None
+        if n_steps:
+            sim.step(n_steps)
         found = jax.tree.leaves(slopes(cars.read(sim.data), sim.data))
         assert all(x.dtype == jax.dtypes.float0 or np.all(np.isfinite(x)) for x in found)
 
 
 def test_resets_restore_the_start():
     sim, _ = build(3, members=2, path=EIGHT, in_scene=False)
-    start = states_of(sim)
+    start = car_states(sim)
     sim.step(50)
     sim.reset(np.array([True, False, True]))
-    for name, value in states_of(sim).items():
+    for name, value in car_states(sim).items():
         np.testing.assert_array_equal(value[[0, 2]], start[name][[0, 2]])
-    assert np.ptp(states_of(sim)["pos"][1] - start["pos"][1]) > 0
+    assert np.ptp(car_states(sim)["pos"][1] - start["pos"][1]) > 0
 
 
 def test_external_forces_move_a_car():
@@ -189,7 +192,7 @@ def test_bicycles_are_driven_by_a_torque():
     record = bikes.read(sim.data)
     inertia = 1 + 2 * 0.1507964 + 2 * (0.01 / 0.04**2 + 0.1507964 / 2)
     speed = np.asarray(record.body_vel)[0, 0, 0]
-    # The friction of both wheels is 0.001 N m / 0.04 m, of which a part acts below the slip speed.
+    # Each wheel has a friction of 0.001 N m / 0.04 m, which is smaller below the slip speed.
     assert (0.01 / 0.04 - 2 * 0.001 / 0.04) / inertia < speed < 0.01 / 0.04 / inertia
     np.testing.assert_array_equal(record.steer, 0.0)
 
@@ -228,7 +231,7 @@ def test_contacts_of_drones_name_the_car():
 
 
 def test_cars_roll_down_a_slope():
-    """Without drive a car on a plane of 0.1 rad accelerates by g sin(a) and loses what its damping takes."""
+    """Without drive a car on a plane of 0.1 rad accelerates by g sin(a), less its damping."""
     x = np.linspace(-20, 20, 41)
     heights = np.tile(5 - np.tan(0.1) * x, (41, 1))
     sim = Sim(control="rotor_vel", engine="fused")
@@ -246,7 +249,7 @@ def test_cars_roll_down_a_slope():
     assert record.body_vel[0, 0, 0] == pytest.approx(speed, rel=0.01)
 
 
-def test_a_negative_weight_is_an_error():
+def test_a_weight_of_zero_is_an_error():
     with pytest.raises(ConfigError, match=r"expected R of PathLQR to be positive, got 0\.0"):
         PathLQR(R=0.0)
 

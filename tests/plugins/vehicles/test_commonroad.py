@@ -70,12 +70,12 @@ def test_derivatives_are_those_of_the_gym():
         np.testing.assert_allclose(np.concatenate(rate, axis=-1), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_batch_equals_one():
+def test_a_batch_has_the_derivatives_of_single_states():
     x, u, _ = (np.array(column, float) for column in zip(*GYM, strict=True))
     params = CommonRoadParams.create()
-    many = [np.asarray(a) for a in gym_rates(state_of(x), np.float32(u), params)]
+    batch = [np.asarray(a) for a in gym_rates(state_of(x), np.float32(u), params)]
     for i in range(len(x)):
-        for a, b in zip(many, gym_rates(state_of(x[i]), np.float32(u[i]), params), strict=True):
+        for a, b in zip(batch, gym_rates(state_of(x[i]), np.float32(u[i]), params), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-6)  # XLA rounds a batch in another order
 
 

@@ -21,23 +21,23 @@ def params(name="f1tenth_ros", trailer=False):
     return CarParams.create(load_vehicle(name), 500, trailer)
 
 
-def state(speed=0.0, side=0.0, yaw_rate=0.0, steer=0.0, yaw=0.0, joints=None) -> CarState:
+def create_state(speed=0.0, side=0.0, yaw_rate=0.0, steer=0.0, yaw=0.0, joints=None) -> CarState:
     vel = np.array([speed, side], float)
-    one = [np.array([x], float) for x in (yaw, yaw_rate, steer, 0.0)]
-    return CarState(np.zeros(3), one[0], vel, one[1], one[2], one[3], joints)
+    yaw, yaw_rate, steer, zero = (np.array([x], float) for x in (yaw, yaw_rate, steer, 0.0))
+    return CarState(np.zeros(3), yaw, vel, yaw_rate, steer, zero, joints)
 
 
 def after_step(name, car, s, command, freq):
     """Return the state of a vehicle one step later, by the classical Runge-Kutta method."""
 
-    def at(rate, dt):
+    def advance(rate, dt):
         return jax.tree.map(lambda a, b: a + dt * b, s, rate)
 
     model = MODELS[name]
     k1 = model(s, command, car)
-    k2 = model(at(k1, 0.5 / freq), command, car)
-    k3 = model(at(k2, 0.5 / freq), command, car)
-    k4 = model(at(k3, 1 / freq), command, car)
+    k2 = model(advance(k1, 0.5 / freq), command, car)
+    k3 = model(advance(k2, 0.5 / freq), command, car)
+    k4 = model(advance(k3, 1 / freq), command, car)
     return jax.tree.map(lambda a, b, c, d, e: a + (b + 2 * c + 2 * d + e) / (6 * freq), s, k1, k2, k3, k4)
 
 
@@ -64,8 +64,8 @@ def end_of(name, car, start, command, duration):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_small_slip_is_the_published_model(seed):
-    """The equations of the lab's simulator, whose slip angles are small: the difference is of order three."""
+def test_for_small_slip_the_model_is_the_published_one(seed):
+    """The equations of the lab's simulator assume small slip angles: the difference is of order three."""
     with jax.enable_x64(True):
         car = jax.tree.map(lambda x: np.asarray(x, np.float64), CarParams.create(load_vehicle("f1tenth_ros"), 500))
         car = car.replace(grip=np.full(2, np.inf), slip_speed=np.full(1, 1e-9))
@@ -81,7 +81,7 @@ def test_small_slip_is_the_published_model(seed):
                 (r_y + force * np.sin(steer) + f_y * np.cos(steer)) / m - vx * w,
                 (f_y * lf * np.cos(steer) + force * lf * np.sin(steer) - r_y * lr) / inertia,
             ]
-            rate = RATES["single_track"](state(vx, vy, w, steer), np.array([d, steer]), car)
+            rate = RATES["single_track"](create_state(vx, vy, w, steer), np.array([d, steer]), car)
             errors.append(np.concatenate([rate.body_vel, rate.yaw_rate]) - theirs)
         slopes = np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
         assert np.all(slopes > 2.7), (slopes, errors)
@@ -92,9 +92,9 @@ def test_slow_vehicles_roll_on_the_circle_of_their_wheels(model):
     """At 0.2 m/s tyres hardly slip: the yaw rate is v tan(d) / L."""
     car = params()
     reference = (4.0304 * 0.2 + 0.8656 * 0.2 / np.hypot(0.2, 0.1)) / 83.592
-    end = end_of(model, car, state(), [reference, 0.3], 8.0)
+    end = end_of(model, car, create_state(), [reference, 0.3], 8.0)
     expected = float(end.body_vel[0]) * np.tan(0.3) / 0.331
-    # Slip angles m v^2 / (R C) of 0.001 rad, and the force of the drive, of which a share acts across: 2%.
+    # 2 % for slip angles m v^2 / (R C) of 0.001 rad, and for the lateral part of the force of the drive.
     assert float(end.yaw_rate[0]) == pytest.approx(expected, rel=0.02)
 
 
@@ -103,18 +103,20 @@ def test_steady_cornering_has_the_understeer_gradient():
     car = params().replace(front_share=np.zeros(1, np.float32), slip_speed=np.full(1, 1e-3, np.float32))
     speed, steer = 2.0, 0.01
     reference = (4.0304 * speed + 0.8656) / 83.592
-    end = end_of("single_track", car, state(speed), [reference, steer], 6.0)
+    end = end_of("single_track", car, create_state(speed), [reference, steer], 6.0)
     gradient = 2.923 / 0.331 * (0.168 / 41.7372 - 0.163 / 29.4662)
     v = float(end.body_vel[0])
     assert float(end.yaw_rate[0]) == pytest.approx(steer * v / (0.331 + gradient * v**2), rel=5e-3)
 
 
 def test_wheels_lock_at_the_friction_coefficient():
-    """With all the brake there is, the deceleration is the friction coefficient times g."""
+    """At full brake the deceleration is the friction coefficient times g."""
     car = params()
-    slip, roll = (np.asarray(RATES[name](state(5.0), np.array([-100.0, 0.0]), car).body_vel)[0] for name in MODELS)
-    assert slip == pytest.approx(-1.0489 * 9.81, rel=1e-3)
-    assert abs(roll + 1.0489 * 9.81) < 0.02
+    single_track_acc, kinematic_acc = (
+        np.asarray(RATES[name](create_state(5.0), np.array([-100.0, 0.0]), car).body_vel)[0] for name in MODELS
+    )
+    assert single_track_acc == pytest.approx(-1.0489 * 9.81, rel=1e-3)
+    assert abs(kinematic_acc + 1.0489 * 9.81) < 0.02
 
 
 force_of = jax.jit(tyre_force)
@@ -130,12 +132,12 @@ def test_forces_stay_in_the_friction_circle_and_oppose_slip(drive, along, across
 
 @pytest.mark.parametrize("name", ["f1tenth_ros", "aiml_head"])
 def test_a_sliding_vehicle_loses_energy(name):
-    """Tyres and losses only take energy from a vehicle without drive, forwards, backwards and sideways."""
+    """Tyres and losses take energy from a vehicle without drive, forwards, backwards and sideways."""
     car = params(name)
     rng = np.random.default_rng(0)
     for _ in range(20):
         speed, side, turn, steer = rng.uniform(-1, 1, 4) * [8, 8, 20, 0.5]
-        s = state(speed, side, turn, steer)
+        s = create_state(speed, side, turn, steer)
         rate = jax.tree.map(np.asarray, RATES["single_track"](s, np.array([0.0, steer]), car))
         mass, inertia = np.asarray(car.mass)[0], np.asarray(car.yaw_inertia)[0]
         power = mass * np.sum(s.body_vel * rate.body_vel) + inertia * turn * rate.yaw_rate[0]
@@ -143,13 +145,13 @@ def test_a_sliding_vehicle_loses_energy(name):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_mirrored_motion(model):
-    """Left and right are alike."""
+def test_a_mirrored_state_has_mirrored_rates(model):
+    """Left and right are equivalent."""
     rng = np.random.default_rng(1)
     speed, side, turn, steer, d = rng.uniform(-1, 1, 5) * [5, 2, 5, 0.4, 0.3]
     car = params()
-    left = RATES[model](state(speed, side, turn, steer), np.array([d, steer / 2]), car)
-    right = RATES[model](state(speed, -side, -turn, -steer), np.array([d, -steer / 2]), car)
+    left = RATES[model](create_state(speed, side, turn, steer), np.array([d, steer / 2]), car)
+    right = RATES[model](create_state(speed, -side, -turn, -steer), np.array([d, -steer / 2]), car)
     left, right = jax.tree.map(np.asarray, (left, right))
     np.testing.assert_allclose(left.body_vel * [1, -1], right.body_vel, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(left.yaw_rate, -right.yaw_rate, rtol=1e-5, atol=1e-5)
@@ -158,10 +160,10 @@ def test_mirrored_motion(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_reversing_retraces_the_circle(model):
-    """Backwards a slow vehicle rolls along the same circle."""
+    """A slow vehicle rolls backwards along the same circle."""
     car, radius = params(), 0.331 / np.tan(0.3)
     for d in (0.02, -0.02):
-        path = jax.tree.map(np.asarray, path_of(model, car, state(steer=0.3), np.array([d, 0.3]), 3000))
+        path = jax.tree.map(np.asarray, path_of(model, car, create_state(steer=0.3), np.array([d, 0.3]), 3000))
         assert path.body_vel[-1, 0] * d > 0
         # The middle of the rear axle, around the point beside it.
         axle = path.pos[:, :2] - 0.168 * np.concatenate([np.cos(path.yaw), np.sin(path.yaw)], axis=-1)
@@ -185,11 +187,11 @@ def test_rest_stays_at_rest_with_finite_gradients(model, name):
     if model == "single_track" and name == "bicycle":
         model = "kinematic"
     car = params(name, trailer=name == "aiml_head")
-    rest = state(0, 0, joints=np.zeros(2) if name == "aiml_head" else None)
+    rest = create_state(0, 0, joints=np.zeros(2) if name == "aiml_head" else None)
     rate = RATES[model](rest, np.zeros(2), car)
     assert all(np.all(np.asarray(x) == 0) for x in jax.tree.leaves(rate))
     for speed, side, turn, steer, d in ((0, 0, 0, 0, 0), (-3, 2, 1, 0.4, 0.3), (9, -9, 30, -0.5, -1), (0, 5, 0, 0, 0)):
-        s = state(speed, side, turn, steer, joints=rest.joints)
+        s = create_state(speed, side, turn, steer, joints=rest.joints)
         slopes = slopes_of(model, s, np.array([d, 0.1]), car)
         assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(slopes))
 
@@ -197,16 +199,16 @@ def test_rest_stays_at_rest_with_finite_gradients(model, name):
 @given(*[st.floats(-30, 30)] * 3, st.floats(-0.6, 0.6), st.floats(-5, 5), st.floats(-2, 2))
 @settings(deadline=None, max_examples=40)
 def test_values_and_gradients_are_finite(speed, side, turn, steer, d, command):
-    s, car = state(speed, side, turn, steer), params()
+    s, car = create_state(speed, side, turn, steer), params()
     rate = RATES["single_track"](s, np.array([d, command]), car)
     slope = slopes_of("single_track", s, np.array([d, command]), car)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((rate, slope)))
 
 
 def test_long_slides_stay_finite():
-    """Spun and thrown, a vehicle at the lowest rate comes to rest and stays finite."""
+    """With a fast spin and slide, a vehicle at 50 Hz comes to rest and stays finite."""
     car = CarParams.create(load_vehicle("f1tenth_ros"), 50)
-    path = path_of("single_track", car, state(10.0, -8.0, 40.0, 0.5), np.array([0.0, 0.5]), 3000, 50.0)
+    path = path_of("single_track", car, create_state(10.0, -8.0, 40.0, 0.5), np.array([0.0, 0.5]), 3000, 50.0)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(path))
     assert np.linalg.norm(np.asarray(path.body_vel)[1500]) < 0.02
 
@@ -222,7 +224,7 @@ def test_gradients_equal_central_differences(model):
             def step(s, _):
                 return after_step(model, car, s, command, 500.0), None
 
-            last, _ = jax.lax.scan(step, state(1.0), None, length=200)
+            last, _ = jax.lax.scan(step, create_state(1.0), None, length=200)
             return last.pos @ np.array([1.0, 2.0, 0.0]) + last.yaw[0]
 
         slope = np.asarray(jax.jit(jax.grad(end))(command))
@@ -230,9 +232,9 @@ def test_gradients_equal_central_differences(model):
             assert slope[k] == pytest.approx(float(end(command + step) - end(command - step)) / (2 * h), rel=1e-6)
 
 
-def test_drive_holds_the_speed_of_its_balance():
+def test_the_drive_holds_the_speed_at_which_its_forces_are_balanced():
     """``gain d = damping v + friction`` at constant speed."""
-    end = end_of("single_track", params(), state(1.0), [0.1, 0.0], 12.0)
+    end = end_of("single_track", params(), create_state(1.0), [0.1, 0.0], 12.0)
     assert float(end.body_vel[0]) == pytest.approx((8.3592 - 0.8656) / 4.0304, rel=2e-3)
     # At full reference the lab's motors give their largest torque, most of which accelerates their own rotors.
     one = np.ones(1, np.float32)
@@ -242,15 +244,15 @@ def test_drive_holds_the_speed_of_its_balance():
 
 
 def test_external_forces_push_a_vehicle():
-    rate = RATES["single_track"](state(), np.zeros(2), params(), np.array([2.923, 5.846, 0.0796]))
+    rate = RATES["single_track"](create_state(), np.zeros(2), params(), np.array([2.923, 5.846, 0.0796]))
     np.testing.assert_allclose(rate.body_vel, [1.0, 2.0], rtol=1e-6)
     np.testing.assert_allclose(rate.yaw_rate, [1.0], rtol=1e-6)
 
 
 def test_steering_keeps_its_limits():
-    rate = RATES["single_track"](state(), np.array([0.0, 9.0]), params()).steer
+    rate = RATES["single_track"](create_state(), np.array([0.0, 9.0]), params()).steer
     np.testing.assert_allclose(rate, [3.2], rtol=1e-6)
-    end = end_of("single_track", params(), state(), [0.0, 9.0], 1.0)
+    end = end_of("single_track", params(), create_state(), [0.0, 9.0], 1.0)
     np.testing.assert_allclose(end.steer, [0.5], rtol=1e-5)
 
 
@@ -260,7 +262,7 @@ wheels_of = jax.jit(ackermann)
 @given(st.floats(-0.6, 0.6, allow_subnormal=False))
 @settings(deadline=None, max_examples=30)
 def test_ackermann_axes_meet_on_the_rear_axle(steer):
-    """Each front wheel stands across the line to the one centre of turning."""
+    """Each front wheel is perpendicular to the line to the centre of the turn."""
     left, right = np.asarray(wheels_of(np.array([steer]), 0.331, 0.24))
     centre = 0.331 / np.tan(steer) if steer else np.inf
     np.testing.assert_allclose(np.tan(left), 0.331 / (centre - 0.12), rtol=1e-4, atol=1e-6)
@@ -275,7 +277,7 @@ def test_ackermann_of_the_fact_sheet():
 def test_a_trailer_follows_on_its_own_circle():
     """In steady cornering hitch, front and rear axle are on circles: each radius and its rod make a right angle."""
     car, steer = params("aiml_head", True), 0.2
-    end = end_of("kinematic", car, state(joints=np.zeros(2)), [0.05, steer], 30.0)
+    end = end_of("kinematic", car, create_state(joints=np.zeros(2)), [0.05, steer], 30.0)
     hitch, drawbar, axles = np.asarray(car.trailer)
     radius = 0.32226 / np.tan(steer)  # of the middle of the rear axle
     at_hitch = np.hypot(radius, hitch - 0.16113)

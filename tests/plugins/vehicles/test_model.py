@@ -25,7 +25,7 @@ def test_every_number_has_a_unit_and_a_source(name):
     assert {entry["source"] for entry in entries.values()} <= set(tables["sources"])
 
 
-def test_published_sets():
+def test_published_vehicles_have_their_parameters():
     assert {"aiml_apr24", "aiml_head", "f1tenth_ros", "bicycle"} <= set(vehicle_names())
     ros, head, apr = (load_vehicle(name) for name in ("f1tenth_ros", "aiml_head", "aiml_apr24"))
     assert [ros.number(f"rigid_body.{k}") for k in ("mass", "yaw_inertia")] == [2.923, 0.0796]

@@ -15,7 +15,8 @@ STRAIGHT = spline([0, 1], [(0, 0, 0), (1, 0, 0)])
 SQUARE = [(0, 0), (2, 0), (2, 2), (0, 2)]
 
 
-def along(path, n=200, index=0):
+def sample(path, n=200, index=0):
+    """Return arc lengths and the points of a path there."""
     s = np.linspace(0.0, np.asarray(path.length)[index], n).astype(np.float32)
     return s, jax.tree.map(np.asarray, points_at(path, index, s))
 
@@ -25,9 +26,9 @@ def points_at(path, index, s):
     return jax.vmap(lambda x: path.point_at(index, x))(s)
 
 
-def test_a_circle_is_a_circle():
+def test_a_path_of_a_circle_is_a_circle():
     path = Path.of_trajectory(circle(2.0, speed=1.5, height=0.7))
-    s, points = along(path)
+    s, points = sample(path)
     angle = s / 2
     np.testing.assert_allclose(path.length, 4 * np.pi, rtol=1e-6)
     np.testing.assert_allclose(points.pos, 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=2e-5)
@@ -38,16 +39,16 @@ def test_a_circle_is_a_circle():
 def test_curvature_has_a_sign():
     """A figure eight turns both ways; the total change of heading of a circle is one revolution."""
     eight = Path.of_trajectory(figure_eight(4, 1.5, period=8.0))
-    curvature = np.asarray(along(eight)[1].curvature)
+    curvature = np.asarray(sample(eight)[1].curvature)
     assert curvature.min() < -1 and curvature.max() > 1  # noqa: PT018
     clockwise = Path.of_points([(0, 2), (2, 2), (2, 0), (0, 0)], closed=True)
-    s, points = along(clockwise, 2000)
+    s, points = sample(clockwise, 2000)
     assert float(np.trapezoid(points.curvature[:, 0], s)) == pytest.approx(-2 * np.pi, rel=1e-3)
 
 
 @pytest.mark.parametrize("path", [Path.of_points(SQUARE, closed=True), Path.of_points(SQUARE)], ids=["closed", "open"])
 def test_arc_length_is_that_of_the_curve(path):
-    s, points = along(path, 4000)
+    s, points = sample(path, 4000)
     chords = np.linalg.norm(np.diff(np.asarray(points.pos, float), axis=0), axis=1)
     np.testing.assert_allclose(np.cumsum(chords), s[1:], rtol=2e-3, atol=1e-4)
     tangent = np.diff(np.asarray(points.pos, float), axis=0) / chords[:, None]
@@ -58,8 +59,8 @@ def test_closed_paths_continue_and_open_ones_end():
     closed, open_ = Path.of_points(SQUARE, closed=True), Path.of_points(SQUARE)
     length = closed.length[0]
     for s in (-0.3, 0.0, 1.7):
-        there, again = closed.point_at(0, jnp.float32(s)), closed.point_at(0, jnp.float32(s + 2 * length))
-        np.testing.assert_allclose(there.pos, again.pos, atol=1e-4)
+        point, later = closed.point_at(0, jnp.float32(s)), closed.point_at(0, jnp.float32(s + 2 * length))
+        np.testing.assert_allclose(point.pos, later.pos, atol=1e-4)
     np.testing.assert_allclose(
         closed.point_at(0, jnp.float32(0)).curvature, closed.point_at(0, length - 1e-4).curvature, atol=0.01
     )
