@@ -1,4 +1,4 @@
-"""What an action means: an affine map with units, whose zero makes every airframe hover."""
+"""Actions as an affine map to commands, whose zero makes every airframe hover."""
 
 import jax
 import jax.numpy as jnp
@@ -70,23 +70,23 @@ def test_the_map_is_affine_and_ends_at_one(control):
     np.testing.assert_allclose(command_at(-1.0), 2 * command_at(0.0) - command_at(1.0), rtol=1e-6, atol=1e-4)
     np.testing.assert_array_equal(command_at(1.7), command_at(1.0))
     np.testing.assert_array_equal(command_at(-9.0), command_at(-1.0))
-    most = 4 * airframe.value("rotors.thrust_max", ())
+    max_thrust = 4 * airframe.value("rotors.thrust_max", ())
     ends = {
         "state": np.array([0, 0, 1]) + MAX_OFFSET,
-        "attitude": [MAX_TILT, MAX_TILT, MAX_YAW, most],
-        "body_rate": [*MAX_BODY_RATES, most],
-        "force_torque": [most, *command_at(1.0)[1:]],
+        "attitude": [MAX_TILT, MAX_TILT, MAX_YAW, max_thrust],
+        "body_rate": [*MAX_BODY_RATES, max_thrust],
+        "force_torque": [max_thrust, *command_at(1.0)[1:]],
         "rotor_vel": np.broadcast_to(first_principles.Params.create(airframe).rotor_vel_max, 4),
     }[control]
     np.testing.assert_allclose(command_at(1.0), ends, rtol=1e-6)
 
 
-def test_torques_at_one_are_a_quarter_of_what_the_rotors_can_do():
+def test_torques_at_one_are_a_quarter_of_the_largest_ones():
     """Roll: two rotors at full thrust on an arm of 3.5 cm, two off."""
     airframe = load_airframe("cf21B_500")
     actions = actions_of(airframe, first_principles.Params.create(airframe), Control.force_torque)
-    each = airframe.value("rotors.thrust_max", ())
-    np.testing.assert_allclose(actions.scale[1:3], 2 * each * airframe.arm / 4, rtol=1e-6)
+    rotor_thrust = airframe.value("rotors.thrust_max", ())
+    np.testing.assert_allclose(actions.scale[1:3], 2 * rotor_thrust * airframe.arm / 4, rtol=1e-6)
     assert 0 < actions.scale[3] < actions.scale[1]
 
 
@@ -97,14 +97,14 @@ def test_any_leading_axes_and_gradients_everywhere():
     commands = actions.command(jax.device_put(action))
     assert (commands.shape, commands.dtype) == ((3, 2, 4), jnp.float32)
     np.testing.assert_array_equal(np.asarray(commands)[1, 1], actions.command(action[1, 1]))
-    command_at = np.float32([-2, -1, 0, 1, 2])
-    slopes = np.asarray(jax.jit(jax.vmap(jax.jacobian(actions.command)))(np.tile(command_at[:, None], 4)))
+    values = np.float32([-2, -1, 0, 1, 2])
+    slopes = np.asarray(jax.jit(jax.vmap(jax.jacobian(actions.command)))(np.tile(values[:, None], 4)))
     assert np.isfinite(slopes).all()
     assert not slopes[:, ~np.eye(4, dtype=bool)].any()
     np.testing.assert_allclose(np.diag(slopes[2]), actions.scale, rtol=1e-6)
 
 
-def test_an_action_says_what_it_is():
+def test_the_text_of_actions_has_their_level_and_limits():
     airframe = load_airframe("cf21B_500")
     actions = actions_of(airframe, first_principles.Params.create(airframe), Control.attitude, tilt=0.1)
     assert "attitude" in str(actions)
@@ -131,5 +131,5 @@ def test_drones_of_several_airframes_have_actions_of_their_own(control):
     for k, airframe in enumerate(fleet):
         own = actions_of(airframe, create_params(Dynamics.first_principles, airframe), Control(control))
         np.testing.assert_allclose(commands[k], own.command(jnp.full(own.size, 0.3)), rtol=1e-6)
-    alike = actions_of([fleet[0]] * 2, create_params(Dynamics.first_principles, fleet[0]), Control(control))
-    assert alike.centre.ndim == 1
+    equal_actions = actions_of([fleet[0]] * 2, create_params(Dynamics.first_principles, fleet[0]), Control(control))
+    assert equal_actions.centre.ndim == 1

@@ -1,4 +1,4 @@
-"""The contract of Brax's environments: fields, shapes, types, jit, scan, and what its training wrappers would add."""
+"""The interface of Brax's environments: fields, shapes, types, jit, scan, and entries of its training wrappers."""
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +15,13 @@ N_WORLDS, N_STEPS = 3, 5
 
 
 @pytest.fixture(scope="module")
-def functional():
+def drone_env():
     return make("hover", N_WORLDS, n_drones=2, seconds=N_STEPS / 50)
 
 
 @pytest.fixture(scope="module")
-def env(functional):
-    return BraxEnv(functional)
+def env(drone_env):
+    return BraxEnv(drone_env)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def reset(env):
 
 @pytest.fixture(scope="module")
 def recorded_flight(env, reset):
-    """A scan over more than two episodes: the states from the first one on."""
+    """Return the states of a scan over more than two episodes."""
 
     @jax.jit
     def fly(state):
@@ -44,7 +44,7 @@ def recorded_flight(env, reset):
     return fly(reset(jax.random.key(0)))
 
 
-def test_what_an_environment_says_of_itself(env):
+def test_attributes_of_an_environment(env):
     assert (env.observation_size, env.action_size) == (2 * 21, 2 * 4)
     assert env.backend == "crazysim"
     assert env.unwrapped is env
@@ -83,7 +83,7 @@ def test_steps_return_the_same_kind_of_state(env, reset, recorded_flight):
     assert array_types(first) == array_types(state)
 
 
-def test_episodes_end_and_begin_as_brax_wraps_them(recorded_flight):
+def test_episodes_end_and_begin_as_with_the_wrappers_of_brax(recorded_flight):
     ends = np.zeros((2 * N_STEPS + 1, N_WORLDS))
     ends[[N_STEPS - 1, 2 * N_STEPS - 1]] = 1
     np.testing.assert_array_equal(recorded_flight.done, ends)
@@ -101,7 +101,7 @@ def test_episodes_end_and_begin_as_brax_wraps_them(recorded_flight):
     assert set(np.argsort(jumps)[-2:]) == {N_STEPS - 2, 2 * N_STEPS - 2}, "new episodes begin in the step that ends one"
 
 
-def test_the_step_is_that_of_the_environment(functional, env, reset, recorded_flight):
+def test_the_step_is_that_of_the_environment(env, reset, recorded_flight):
     state = reset(jax.random.key(0)).pipeline_state
     state = jax.jit(env.env.step)(state, np.full(state.action.shape, 0.1, np.float32))
     np.testing.assert_allclose(recorded_flight.obs[0], flatten(state.obs).reshape(N_WORLDS, -1), rtol=1e-5, atol=1e-6)
@@ -109,8 +109,8 @@ def test_the_step_is_that_of_the_environment(functional, env, reset, recorded_fl
     np.testing.assert_allclose(recorded_flight.metrics["error"][0], state.info["error"].mean(axis=1), rtol=1e-5)
 
 
-def test_what_wrappers_add_is_kept(env, reset):
-    """Brax's evaluation writes into ``metrics`` and ``info`` of a state, and expects to find it in the next."""
+def test_entries_of_wrappers_are_kept(env, reset):
+    """Brax's evaluation adds entries to ``metrics`` and ``info`` of a state and reads them from the next state."""
     state = reset(jax.random.key(0))
     state.metrics["reward"] = state.reward
     state.info["eval_metrics"] = {"mine": jnp.ones(N_WORLDS)}
@@ -119,9 +119,9 @@ def test_what_wrappers_add_is_kept(env, reset):
     np.testing.assert_array_equal(after.info["eval_metrics"]["mine"], np.ones(N_WORLDS))
 
 
-def test_wrong_input_is_told(functional, env, reset):
+def test_wrong_input_is_an_error(drone_env, env, reset):
     with pytest.raises(ConfigError, match="without AutoReset"):
-        BraxEnv(AutoReset(functional))
+        BraxEnv(AutoReset(drone_env))
     state = reset(jax.random.key(0))
     with pytest.raises(
         ValueError, match=r"expected an action of shape \(3, 8\) = \(n_worlds, action_size\), got \(8,\)"

@@ -1,4 +1,4 @@
-"""What every task promises, by the name it is registered under: a new one is tested as soon as it is there."""
+"""The interface of tasks, tested for all registered ones: a new task is tested as soon as it is registered."""
 
 import functools
 import os
@@ -56,12 +56,12 @@ def env(name):
 
 @pytest.fixture(scope="module")
 def start_state(env):
-    """All worlds at the beginning of an episode."""
+    """Return the state with all worlds at the beginning of an episode."""
     return env.reset(jax.random.key(0))
 
 
 def test_goals_that_are_positions_can_be_set(env, start_state, name):
-    """One for each world; the others are an error that says what to do."""
+    """One goal for each world; other tasks raise an error that says what to do."""
     pos = jnp.asarray(np.linspace([0.0, 0.5, 1.0], [0.3, -0.5, 1.5], N_WORLDS), jnp.float32)
     if type(env.task).set_goal is Task.set_goal:
         assert name not in ("hover", "recover", "swarm", "avoid", "transport", "deliver")
@@ -93,7 +93,7 @@ class Flight(NamedTuple):
 
 @functools.cache
 def vector(name):
-    """Return what Gymnasium makes of a task."""
+    """Return Gymnasium's vector environment of a task."""
     return gymnasium.make_vec(TASKS[name].id, num_envs=N_FLYING)
 
 
@@ -155,12 +155,12 @@ def test_an_episode_begins_with_nothing_done(env, start_state):
     assert not start_state.data.core.steps.any()
     assert np.isfinite(start_state.info["error"]).all()
     next_state = env.step(start_state, jnp.zeros_like(start_state.action))
-    assert not next_state.done.any(), "no episode may end before a policy could do anything about it"
+    assert not next_state.done.any(), "no episode may end before a policy has acted"
     assert int(next_state.data.core.steps[0, 0]) == env.n_substeps
 
 
 def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(name, start_state):
-    """Whichever device the environment was made for: JAX runs what is compiled where its arguments are."""
+    """For any device of the environment: JAX runs a compiled function where its arguments are."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     step = jax.jit(make(name, N_WORLDS).step).trace(start_state, start_state.action)
@@ -189,7 +189,7 @@ for name in sys.argv[1:]:
 
 
 WITH_INDICES = ("race", "avoid", "chase", "deliver")
-"""Tasks that count and choose."""
+"""Tasks with counts and indices."""
 
 
 @pytest.mark.long("plans steps in a process of its own")
@@ -221,7 +221,7 @@ def test_repeated_steps_are_traced_once(env, start_state):
 
 
 def test_the_same_seed_gives_the_same_numbers(env, start_state):
-    """Law 10, for worlds at their beginning and for those that begin anew beside others."""
+    """Law 10, for resets of all worlds and of some."""
     assert trees_equal(env.reset(jax.random.key(0)), start_state)
     other = env.reset(jax.random.key(5))
     assert not trees_equal(other.obs, start_state.obs)
@@ -258,7 +258,7 @@ def test_the_number_of_worlds_changes_nothing(env, start_state, random_flight):
         assert (reward.shape, reward.dtype) == ((N_FLYING,), np.float32)
         assert terminated.dtype == truncated.dtype == bool
         state = env.step(state, random_flight.actions[step][:N_WORLDS].reshape(state.action.shape))
-        if state.done.any():  # there the two part: the vector environment begins a new episode
+        if state.done.any():  # the vector environment begins a new episode here
             break
         np.testing.assert_allclose(reward[:N_WORLDS], np.asarray(state.reward).mean(axis=1), rtol=1e-3, atol=1e-4)
 
@@ -281,7 +281,7 @@ def test_random_steps_are_finite_and_within_the_spaces(random_flight):
 
 @pytest.mark.parametrize("name", FLIGHT_TASKS, indirect=True)
 def test_episodes_end_in_time_and_are_counted(env, random_flight):
-    """Law 4: the time is over after ``max_steps`` steps, and never else."""
+    """Law 4: episodes are truncated after ``max_steps`` steps, and at no other step."""
     _, reward, terminated, truncated, info = random_flight.results
     done = terminated | truncated
     assert done.any(axis=0).all(), "1,250 random steps end an episode in every world"
@@ -307,7 +307,7 @@ BY_STAGES = pytest.mark.slow("other tasks have all operations, and tests/gpu com
     indirect=True,
 )
 def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, random_flight):
-    """Actions, physics, task and new episodes as one kernel equal the reference, where random flight leads."""
+    """Actions, physics, task and new episodes in one kernel equal the reference, at states of the random flight."""
     vector_env, plain = (
         random_flight.env,
         AutoReset(EpisodeStatistics(make(name, N_WORLDS, engine="plain")), "SameStep"),
@@ -337,20 +337,22 @@ def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, random_fligh
 
 
 @pytest.fixture(scope="module", params=["hover", "swarm"])
-def two(request):
-    """Name of a task, of which one has several drones: the modes of automatic resets do not depend on the task."""
+def task_name(request):
+    """Return the name of one of two tasks, one with several drones: the reset modes do not depend on the task."""
     return request.param
 
 
-def test_next_step_begins_with_the_step_after_the_last(two):
-    env, auto = make_compiled_env(two, N_WORLDS), make_compiled_env(two, N_WORLDS, "NextStep")
+def test_next_step_begins_episodes_in_the_step_after_the_last(task_name):
+    env, auto = make_compiled_env(task_name, N_WORLDS), make_compiled_env(task_name, N_WORLDS, "NextStep")
     start_state = env.reset(jax.random.key(0))
     last = auto.step(set_last_step(env, start_state, IS_ENDING), random_action(start_state))
     np.testing.assert_array_equal(last.done, IS_ENDING)
     assert trees_equal(last, env.step(set_last_step(env, start_state, IS_ENDING), random_action(start_state)))
     ignored, other = random_action(start_state, 1), random_action(start_state, 2)
     after, again = auto.step(last, ignored), auto.step(last, np.where(IS_ENDING[:, None, None], other, ignored))
-    assert trees_equal(select_state(after, IS_ENDING), select_state(again, IS_ENDING)), "the action is heeded"
+    assert trees_equal(select_state(after, IS_ENDING), select_state(again, IS_ENDING)), (
+        "the action of this step has no effect"
+    )
     assert not after.done[IS_ENDING].any()
     assert not after.reward[IS_ENDING].any()
     assert not after.data.core.steps[IS_ENDING].any()
@@ -359,12 +361,14 @@ def test_next_step_begins_with_the_step_after_the_last(two):
     assert trees_equal(select_state(after, ~IS_ENDING), select_state(env.step(last, ignored), ~IS_ENDING))
 
 
-def test_same_step_begins_within_the_last_step(two):
-    env, auto = make_compiled_env(two, N_WORLDS), make_compiled_env(two, N_WORLDS, "SameStep")
-    start_state, also = env.reset(jax.random.key(0)), auto.reset(jax.random.key(0))
-    assert trees_equal(also.final_obs, start_state.obs)
+def test_same_step_begins_episodes_within_the_last_step(task_name):
+    env, auto = make_compiled_env(task_name, N_WORLDS), make_compiled_env(task_name, N_WORLDS, "SameStep")
+    start_state, auto_start = env.reset(jax.random.key(0)), auto.reset(jax.random.key(0))
+    assert trees_equal(auto_start.final_obs, start_state.obs)
     action = random_action(start_state)
-    ended, state = (x.step(set_last_step(env, y, IS_ENDING), action) for x, y in ((env, start_state), (auto, also)))
+    ended, state = (
+        x.step(set_last_step(env, y, IS_ENDING), action) for x, y in ((env, start_state), (auto, auto_start))
+    )
     np.testing.assert_array_equal(ended.done, IS_ENDING)
     for field in ("reward", "terminated", "truncated"):
         assert trees_equal(getattr(state, field), getattr(ended, field)), field
@@ -381,39 +385,39 @@ def test_same_step_begins_within_the_last_step(two):
     assert not auto.step(state, action).done[IS_ENDING].any()
 
 
-def test_disabled_begins_where_and_when_it_is_said(two):
-    env = auto = make_compiled_env(two, N_WORLDS, "Disabled")
+def test_disabled_begins_episodes_only_in_restarts(task_name):
+    env = auto = make_compiled_env(task_name, N_WORLDS, "Disabled")
     start_state = env.reset(jax.random.key(0))
     action = random_action(start_state)
     ended = auto.step(set_last_step(env, start_state, IS_ENDING), action)
     np.testing.assert_array_equal(ended.done, IS_ENDING)
-    on = auto.step(ended, action)
-    assert on.truncated[IS_ENDING].all(), "nothing begins by itself"
-    assert trees_equal(on.data.core.episode, start_state.data.core.episode)
-    some = np.array([True, True, False, False])
-    state = auto.restart(on, jnp.asarray(some))
-    np.testing.assert_array_equal(state.data.core.episode[:, 0] - start_state.data.core.episode[:, 0], some)
-    assert not state.done[some].any()
-    assert not state.reward[some].any()
-    assert trees_equal(select_state(state, ~some), select_state(on, ~some))
+    later = auto.step(ended, action)
+    assert later.truncated[IS_ENDING].all(), "no episode begins by itself"
+    assert trees_equal(later.data.core.episode, start_state.data.core.episode)
+    mask = np.array([True, True, False, False])
+    state = auto.restart(later, jnp.asarray(mask))
+    np.testing.assert_array_equal(state.data.core.episode[:, 0] - start_state.data.core.episode[:, 0], mask)
+    assert not state.done[mask].any()
+    assert not state.reward[mask].any()
+    assert trees_equal(select_state(state, ~mask), select_state(later, ~mask))
 
 
-def test_a_world_that_is_lost_ends_alone(env, start_state):
-    """Law 7: it says so, is observed as zeros, and is whole again in its next episode."""
+def test_a_nonfinite_world_ends_alone(env, start_state):
+    """Law 7: it is terminated and reported, and other worlds do not change."""
     action = random_action(start_state)
     bad = np.array(action)
     bad[1] = np.nan
-    lost, fine = env.step(start_state, bad), env.step(start_state, action)
-    is_lost = np.arange(N_WORLDS) == 1
-    np.testing.assert_array_equal(lost.info["nonfinite"], is_lost)
-    assert lost.terminated[1]
-    assert trees_equal(select_state(lost, ~is_lost), select_state(fine, ~is_lost))
+    nonfinite, finite = env.step(start_state, bad), env.step(start_state, action)
+    is_nonfinite = np.arange(N_WORLDS) == 1
+    np.testing.assert_array_equal(nonfinite.info["nonfinite"], is_nonfinite)
+    assert nonfinite.terminated[1]
+    assert trees_equal(select_state(nonfinite, ~is_nonfinite), select_state(finite, ~is_nonfinite))
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_a_world_that_is_lost_is_whole_again_in_its_next_episode(two, mode):
-    """Law 7, within the step."""
-    auto = make_compiled_env(two, N_WORLDS, mode)
+def test_a_nonfinite_world_is_observed_as_zeros_and_finite_in_its_next_episode(task_name, mode):
+    """Law 7, with automatic resets."""
+    auto = make_compiled_env(task_name, N_WORLDS, mode)
     start_state = auto.reset(jax.random.key(0))
     action = random_action(start_state)
     bad = np.array(action)
@@ -430,9 +434,9 @@ def test_a_world_that_is_lost_is_whole_again_in_its_next_episode(two, mode):
 @pytest.mark.long("compiles the gradient of each task")
 @pytest.mark.parametrize("name", task_names(classes_once=True), indirect=True)
 def test_the_gradient_of_the_reward_is_finite(env, start_state, random_flight):
-    """Law 7, for actions and states, at the beginning of an episode and where random flight leads.
+    """Law 7, by actions and states, at the beginning of an episode and at states of the random flight.
 
-    One physics step, stage by stage: what is differentiated here is the task; the engine has tests of its own.
+    One physics step, stage by stage, since the derivatives of the task are tested here; the engine has its own tests.
     """
 
     @jax.jit
@@ -484,7 +488,7 @@ def test_a_zero_action_hovers(control):
 
     pos = fly(jax.random.key(0))
     assert pos.shape == (50, 1, 1, 3)
-    # The state controller asks for 1.45 times the weight at rest, as the firmware's does: it settles 9 cm too high, and
+    # The state controller commands 1.45 times the weight at rest, as the firmware does: it settles 9 cm too high, and
     # its integral takes a minute to bring it down.
     atol = 0.12 if control == "state" else 0.001
     np.testing.assert_allclose(pos, np.broadcast_to([0.0, 0.0, 1.0], pos.shape), atol=atol)

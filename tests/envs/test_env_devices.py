@@ -1,4 +1,4 @@
-"""Environments with their worlds on four devices: results of one device, bit for bit."""
+"""Environments with their worlds on four devices have the results of one device, bit for bit."""
 
 import gymnasium
 import jax
@@ -20,7 +20,7 @@ def mesh():
 
 
 def sequence(n, shape):
-    """Yield resets with a seed, resets of some worlds, and steps with random actions, of a random sequence."""
+    """Yield a random sequence of resets with a seed, restarts of some worlds, and steps with random actions."""
     rng = np.random.default_rng(3)
     yield "reset", 7
     for kind in ["restart", *rng.choice(["step", "restart"], n, p=[0.8, 0.2]), "step"]:
@@ -36,7 +36,7 @@ def assert_equal(one, several, n_devices=4):
         np.testing.assert_array_equal(x, y, err_msg=name)
 
 
-def wrapped(env):
+def add_wrappers(env):
     return EpisodeStatistics(ActionDelay(ObservationNoise(env, {"pos": 0.01}), 1))
 
 
@@ -44,7 +44,7 @@ def wrapped(env):
 @pytest.mark.parametrize(
     ("task", "wrap", "options"),
     [
-        ("hover", wrapped, {"randomize": "crazyflie"}),
+        ("hover", add_wrappers, {"randomize": "crazyflie"}),
         pytest.param(
             "swarm", lambda env: env, {}, marks=pytest.mark.slow("hover has wrappers too, race is flown below")
         ),
@@ -66,13 +66,13 @@ def test_law_10_worlds_on_four_devices_are_those_of_one(task, wrap, options, mes
             yield state
         assert jax.eval_shape(env.flatten, state).plan.rows  # a rollout updates them in place
 
-    n_over = 0
+    n_ended = 0
     for one, several in zip(fly_on_mesh(None), fly_on_mesh(mesh), strict=True):
         assert_equal(one, several)
         assert several.obs["vel"].sharding.is_equivalent_to(several.reward.sharding, several.reward.ndim)
         assert several.reward.addressable_shards[0].data.shape[0] == N_WORLDS // 4
-        n_over += int(one.done.sum())
-    assert n_over >= N_WORLDS
+        n_ended += int(one.done.sum())
+    assert n_ended >= N_WORLDS
 
 
 @pytest.mark.long("compiles an environment for one device and for four")
@@ -86,8 +86,8 @@ def test_gymnasium_worlds_on_four_devices_are_those_of_one(mesh):
             action = jax.device_put(argument, jax.devices()[0]) if i % 2 else argument
             results = [env.step(action) for env in envs]
         else:
-            given = {"seed": argument} if kind == "reset" else {"options": {"reset_mask": argument}}
-            results = [env.reset(**given) for env in envs]
+            settings = {"seed": argument} if kind == "reset" else {"options": {"reset_mask": argument}}
+            results = [env.reset(**settings) for env in envs]
         assert_equal(*results)
     assert_equal(*(env.unwrapped.state for env in envs))
     assert envs[1].unwrapped.explain().startswith("engine: fused")
@@ -96,7 +96,7 @@ def test_gymnasium_worlds_on_four_devices_are_those_of_one(mesh):
 
 @pytest.mark.long("compiles images for one device and for four")
 def test_depth_images_on_four_devices_are_those_of_one(mesh):
-    """Also of more rays than fit at a time; no device needs the worlds of another, and each has the kernel."""
+    """No device needs the worlds of another, and each runs the kernel."""
 
     def images(mesh):
         sim = Sim(N_WORLDS, control="attitude", mesh=mesh)
@@ -104,13 +104,13 @@ def test_depth_images_on_four_devices_are_those_of_one(mesh):
         sim.data = sim.data.replace(
             states=sim.data.states.replace(pos=np.float32(np.random.default_rng(0).uniform(0, 1, (N_WORLDS, 1, 3))))
         )
-        look = jax.jit(sim.scene.depth_fn("fpv_cam", 12, 8))
-        program = look.lower(sim.data).compile()
+        measure_depth = jax.jit(sim.scene.depth_fn("fpv_cam", 12, 8))
+        program = measure_depth.lower(sim.data).compile()
         return program(sim.data), exchanged_bytes(program.as_text()), sim
 
-    one, exchanged, _ = images(None)
-    several, between, sim = images(mesh)
-    assert (exchanged, between) == ({}, {})
+    one, exchanged_of_one, _ = images(None)
+    several, exchanged_of_four, sim = images(mesh)
+    assert (exchanged_of_one, exchanged_of_four) == ({}, {})
     assert_equal(one, several)
     assert several.distance.addressable_shards[0].data.shape == (2, 1, 8, 12)
     assert "one kernel with a lane for each ray" in sim.explain()

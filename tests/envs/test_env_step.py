@@ -24,7 +24,7 @@ N = 6
 
 
 def assert_close(actual, expected, tolerance=2e-5):
-    """Compare two trees: engines may contract a product and a sum, and each step multiplies what that does."""
+    """Compare two trees: engines may contract a product and a sum, and the difference grows from step to step."""
     assert jax.tree.structure(actual) == jax.tree.structure(expected)
     for (path, x), y in zip(jax.tree_util.tree_flatten_with_path(actual)[0], jax.tree.leaves(expected), strict=True):
         name = jax.tree_util.keystr(path)
@@ -33,16 +33,16 @@ def assert_close(actual, expected, tolerance=2e-5):
             np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance, err_msg=name)
 
 
-def lopsided(data, key):
+def draw_products_of_inertia(data, key):
     """Draw products of inertia, which are zero where all drones share them."""
     x = jax.random.uniform(key, (1, 1, 1), minval=2e-6, maxval=4e-6)
-    off = jnp.array([[0.0, 1, 1], [1, 0, 1], [1, 1, 0]])
-    inertia = data.params.J + x * off
+    is_off_diagonal = jnp.array([[0.0, 1, 1], [1, 0, 1], [1, 1, 0]])
+    inertia = data.params.J + x * is_off_diagonal
     return data.replace(params=data.params.replace(J=inertia, J_inv=jnp.linalg.inv(inertia)))
 
 
-class Bound(Wrapper):
-    """Halves rewards by a method that it holds as an attribute."""
+class HalfRewards(Wrapper):
+    """Halves rewards by a bound method that is an attribute."""
 
     def __init__(self, env):
         super().__init__(env)
@@ -57,11 +57,13 @@ class Bound(Wrapper):
 
 def noisy_hover(engine):
     env = envs.make("hover", N, seconds=0.3, engine=engine)
-    return AutoReset(Bound(envs.EpisodeStatistics(envs.ObservationNoise(env, {"pos": 0.1}))), "SameStep")
+    return AutoReset(HalfRewards(envs.EpisodeStatistics(envs.ObservationNoise(env, {"pos": 0.1}))), "SameStep")
 
 
 def lopsided_hover(engine):
-    env = envs.RandomizeWith(envs.make("hover", N, seconds=0.3, engine=engine), lopsided, ("J", "J_inv"))
+    env = envs.RandomizeWith(
+        envs.make("hover", N, seconds=0.3, engine=engine), draw_products_of_inertia, ("J", "J_inv")
+    )
     return AutoReset(envs.FrameStack(envs.ActionDelay(env, 1), 2), "NextStep")
 
 
@@ -70,7 +72,7 @@ def swarm(engine):
 
 
 def normalised_hover(engine):
-    """Return an environment with a wrapper of all worlds, at which the step is split."""
+    """Return an environment whose step is split by a wrapper of all worlds."""
     return AutoReset(envs.Normalize(envs.make("hover", N, seconds=0.3, engine=engine)), "SameStep")
 
 
@@ -81,18 +83,18 @@ def normalised_hover(engine):
      (noisy_hover, "lanes"), (normalised_hover, "lanes"), (swarm, "interpret")],
 )  # fmt: skip
 def test_an_engine_steps_an_environment_as_the_reference_does(make, engine):
-    one, written = make(engine), make("plain")
-    state = jax.jit(written.reset)(jax.random.key(0))
-    assert one.explain().startswith(f"engine: {engine}")
-    assert ("splits the step" in one.explain()) == (make is normalised_hover)
-    step, expected = jax.jit(one.step), jax.jit(written.step)
-    ended = 0
+    env, reference = make(engine), make("plain")
+    state = jax.jit(reference.reset)(jax.random.key(0))
+    assert env.explain().startswith(f"engine: {engine}")
+    assert ("splits the step" in env.explain()) == (make is normalised_hover)
+    step, reference_step = jax.jit(env.step), jax.jit(reference.step)
+    n_ended = 0
     for k in range(40):
         action = jax.random.uniform(jax.random.key(k), state.action.shape, minval=-1, maxval=1)
         after = step(state, action)
-        assert_close(after, expected(state, action))
-        state, ended = after, ended + int(after.done.sum())
-    assert ended or make is swarm, "no episode has ended"
+        assert_close(after, reference_step(state, action))
+        state, n_ended = after, n_ended + int(after.done.sum())
+    assert n_ended or make is swarm, "no episode has ended"
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +104,7 @@ def hover():
 
 @pytest.mark.long("compiles a rollout and a loop, and derivatives of both")
 def test_a_rollout_is_a_loop_of_steps(hover):
-    """What a policy sees, what is kept and what remains; and derivatives and vmap of it."""
+    """Observations of the policy, recorded values and the last state are equal, and so are derivatives and ``vmap``."""
     env = AutoReset(envs.make("hover", N, seconds=0.3, control="rotor_vel"))
     start = jax.jit(env.reset)(jax.random.key(0))
     key = jax.random.key(1)
@@ -138,7 +140,7 @@ def test_a_rollout_is_a_loop_of_steps(hover):
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
-def test_a_policys_memory_begins_anew_with_an_episode(mode):
+def test_the_memory_of_a_policy_is_reset_with_an_episode(mode):
     env = AutoReset(envs.make("hover", 3, seconds=0.06, engine="interpret"), mode)  # three steps
     start = env.reset(jax.random.key(0))
     policy = lambda obs, memory, key: (jnp.zeros((3, 1, 4)), memory + 1, memory)  # noqa: E731
@@ -157,27 +159,29 @@ def test_a_policys_memory_begins_anew_with_an_episode(mode):
     assert last.shape == (3,)
 
 
-class Remembered(PyTree):
+class DeclaredMemory(PyTree):
     """Memory whose leaves declare their axes."""
 
     of_drones: jax.Array = leaf("drone")
     of_world: jax.Array = leaf("world", 1)
 
 
-class Remembers(Wrapper):
+class WithMemory(Wrapper):
     """Remembers as many numbers of the world as there are drones, and one for each drone."""
 
     def after_reset(self, state):
-        return self.remember(state, (jnp.zeros(2), Remembered(jnp.zeros(2), jnp.zeros(2))))
+        return self.remember(state, (jnp.zeros(2), DeclaredMemory(jnp.zeros(2), jnp.zeros(2))))
 
     def after_step(self, state):
         plain, record = self.recall(state)
         height = state.data.states.pos[:, 2]
-        return self.remember(state, (plain + height, Remembered(record.of_drones + height, record.of_world - height)))
+        return self.remember(
+            state, (plain + height, DeclaredMemory(record.of_drones + height, record.of_world - height))
+        )
 
 
-class Confused(Wrapper):
-    """Returns observations of the world."""
+class WorldObservations(Wrapper):
+    """Returns observations without the axis of drones."""
 
     def after_reset(self, state):
         return state.replace(obs={"pos": state.data.states.pos[0]})
@@ -185,33 +189,36 @@ class Confused(Wrapper):
     after_step = after_reset
 
 
-class Counting(Wrapper):
-    """Adds entries of ``info``: one of the world, one of drones, and one that is neither."""
+class WithInfo(Wrapper):
+    """Adds entries of ``info``: one of the world, one of drones, and with ``has_wrong_entry`` one that is neither."""
 
-    def __init__(self, env, wrong=False):
+    def __init__(self, env, has_wrong_entry=False):
         super().__init__(env)
-        self.wrong = wrong
+        self.has_wrong_entry = has_wrong_entry
 
     def after_step(self, state):
         own = {"n": jnp.float32(2), "each": state.data.states.pos}
-        return state.replace(info=state.info | own | ({"three": jnp.zeros(3)} if self.wrong else {}))
+        return state.replace(info=state.info | own | ({"three": jnp.zeros(3)} if self.has_wrong_entry else {}))
 
 
 def test_law_02_entries_of_a_state_are_of_worlds_or_drones_as_declared():
-    """An axis that is as long as there are drones is not theirs."""
+    """An axis whose length is the number of drones is not an axis of drones, unless it is declared."""
     env = envs.make("hover", N, n_drones=2, control="rotor_vel", engine="interpret")
-    one = AutoReset(Counting(Remembers(env)), "Disabled")
-    state = one.reset(jax.random.key(0))
-    after = one.step(state, state.action)
+    auto = AutoReset(WithInfo(WithMemory(env)), "Disabled")
+    state = auto.reset(jax.random.key(0))
+    after = auto.step(state, state.action)
     assert jax.tree.structure(state) == jax.tree.structure(after)
-    scopes = {x.name: x.scope for x in one.step_fn.plan(state.full_data, ()).program.leaves if ".memory" in x.name}
+    scopes = {x.name: x.scope for x in auto.step_fn.plan(state.full_data, ()).program.leaves if ".memory" in x.name}
     assert sorted(scopes.values()) == ["drone", "world", "world"]
-    plain, record = after.memory["Remembers"]
+    plain, record = after.memory["WithMemory"]
     assert (plain.shape, record.of_drones.shape, record.of_world.shape) == ((N, 2), (N, 2), (N, 1, 2))
     assert (after.info["n"].shape, after.info["each"].shape) == ((N,), (N, 2, 3))
     for wrong, message in (
-        (Confused(env), r"expected obs\['pos'\] of shape \(n_drones, ...\).* 2 drones, got \(3,\)"),
-        (Counting(env, wrong=True), r"expected info\['three'\] as one number of a world, .* 2 drones in front"),
+        (WorldObservations(env), r"expected obs\['pos'\] of shape \(n_drones, ...\).* 2 drones, got \(3,\)"),
+        (
+            WithInfo(env, has_wrong_entry=True),
+            r"expected info\['three'\] as one number of a world, .* 2 drones in front",
+        ),
     ):
         with pytest.raises(ConfigError, match=message):
             wrong.reset(jax.random.key(0))
@@ -254,16 +261,16 @@ def with_other_defaults(env):
     return AutoReset(envs.DroneEnv(sim, env.task))
 
 
-class Numbers(PyTree):
-    """Numbers of worlds."""
+class WorldNumbers(PyTree):
+    """Numbers of the worlds."""
 
     number: jax.Array = leaf("world")
 
 
-def with_the_numbers_of_worlds(env):
+def with_world_numbers(env):
     """Return an environment with a record that holds the array of ``core.world_id``."""
     sim = envs.make("hover", N).sim
-    sim.data = sim.data.replace(plugins=sim.data.plugins | {"numbers": Numbers(sim.data.core.world_id)})
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {"numbers": WorldNumbers(sim.data.core.world_id)})
     sim.build_default_data()
     return AutoReset(envs.DroneEnv(sim, env.task))
 
@@ -283,20 +290,20 @@ def with_foreign_record(env):
     return AutoReset(envs.DroneEnv(sim, env.task))
 
 
-REFUSED = {
+SPLIT_STEPS = {
     "a record in data.plugins is of another library": with_foreign_record,
     "task 'hover' is declared to need all worlds at once": lambda env: AutoReset(envs.DroneEnv(env.sim, Ranked())),
     "wrapper 'Normalize' is declared to need all worlds at once": lambda env: AutoReset(envs.Normalize(env)),
     "a stage of one world is unrolled for at most 8 drones": lambda _: AutoReset(envs.make("swarm", 2, n_drones=9)),
     "'own' of the reset pipeline takes all worlds at once": with_reset_stage,
     "episodes begin from different data in different worlds": with_other_defaults,
-    "different data in different worlds": with_the_numbers_of_worlds,
+    "different data in different worlds": with_world_numbers,
 }
 
 
-@pytest.mark.parametrize("why", REFUSED)
+@pytest.mark.parametrize("why", SPLIT_STEPS)
 def test_a_step_that_is_split_says_where_and_why(hover, why):
-    env = REFUSED[why](hover)
+    env = SPLIT_STEPS[why](hover)
     text = env.explain()
     assert text.startswith("engine: fused\n")
     assert why in next(line for line in text.split("\n") if line.startswith("splits the step: "))
@@ -316,7 +323,7 @@ def test_a_step_that_the_engine_cannot_lower_warns_once_or_raises(hover):
 @pytest.mark.long("plans the steps of six environments")
 def test_every_environment_explains_its_step(hover):
     """With automatic resets and without, and those of other libraries."""
-    for adapted in (
+    for env in (
         hover,
         AutoReset(hover),
         envs.DroneVectorEnv(hover),
@@ -324,14 +331,14 @@ def test_every_environment_explains_its_step(hover):
         envs.DroneSingleEnv(envs.make("hover")),
         envs.make_parallel("swarm", n_drones=2),
     ):
-        text = adapted.explain()
+        text = env.explain()
         assert text.startswith("engine: fused\n")
         assert "observe" in text
         assert "splits" not in text
 
 
 def test_a_task_of_all_worlds_is_rewarded_across_them(hover):
-    env = REFUSED["task 'hover' is declared to need all worlds at once"](hover)
+    env = SPLIT_STEPS["task 'hover' is declared to need all worlds at once"](hover)
     state = jax.jit(env.reset)(jax.random.key(0))
     after = jax.jit(env.step)(state, state.action)
     height = after.data.states.pos[..., 2]
@@ -341,7 +348,7 @@ def test_a_task_of_all_worlds_is_rewarded_across_them(hover):
 
 @pytest.mark.parametrize("make", [with_reset_stage, with_other_defaults])
 def test_episodes_begin_as_the_simulation_resets(hover, make):
-    """What takes all worlds at once still takes part in every reset."""
+    """Reset stages and default data of all worlds are used in every reset."""
     env = make(hover)
     if make is with_reset_stage:
         lift = lambda data, default, mask: data.replace(  # noqa: E731
@@ -367,7 +374,7 @@ def test_records_of_other_libraries_are_reset_with_their_world(hover):
 
 
 class Buggy(Hover):
-    """Adds what cannot be added, in a method that is not traced when the environment is made."""
+    """Adds None to an array, in a method that is not traced when the environment is made."""
 
     def before_step(self, data):
         return data.replace(states=data.states.pos[..., 2] + None)
@@ -379,8 +386,8 @@ def test_a_bug_in_a_task_is_raised_as_it_is(hover):
         jax.eval_shape(env.reset, jax.random.key(0))
 
 
-class Begun(Wrapper):
-    """Sets an entry of ``info`` at the start of an episode alone."""
+class StartInfo(Wrapper):
+    """Sets an entry of ``info`` only at the start of an episode."""
 
     def after_reset(self, state):
         return state.replace(info=state.info | {"start": state.data.states.pos})
@@ -388,7 +395,7 @@ class Begun(Wrapper):
 
 @pytest.mark.parametrize("mode", ["Disabled", "SameStep"])
 def test_info_that_only_a_reset_sets_stays(mode):
-    vec = envs.DroneVectorEnv(Begun(envs.make("hover", 2, engine="interpret")), mode)
+    vec = envs.DroneVectorEnv(StartInfo(envs.make("hover", 2, engine="interpret")), mode)
     _, start_state = vec.reset(seed=0)
     _, _, _, _, info = vec.step(np.zeros((2, 4), np.float32))
     np.testing.assert_array_equal(info["start"], start_state["start"])
@@ -402,12 +409,14 @@ def test_a_restart_observes_the_episodes_that_it_begins():
         np.testing.assert_array_equal(after.final_obs[name][0], x[0])
 
 
-def test_two_wrappers_of_one_class_remember_apart():
+def test_two_wrappers_of_one_class_have_separate_memories():
     env = envs.make("hover", 1, engine="interpret")
-    twice, once = (AutoReset(x) for x in (envs.ActionDelay(envs.ActionDelay(env, 1), 1), envs.ActionDelay(env, 2)))
-    assert [wrapper.name for wrapper in twice.wrappers][:2] == ["ActionDelay", "ActionDelay 2"]
+    two_wrappers, one_wrapper = (
+        AutoReset(x) for x in (envs.ActionDelay(envs.ActionDelay(env, 1), 1), envs.ActionDelay(env, 2))
+    )
+    assert [wrapper.name for wrapper in two_wrappers.wrappers][:2] == ["ActionDelay", "ActionDelay 2"]
     action, sent = np.full((1, 1, 4), 0.5, np.float32), []
-    for delayed in (twice, once):
+    for delayed in (two_wrappers, one_wrapper):
         state = delayed.reset(jax.random.key(0))
         for _ in range(3):
             state = delayed.step(state, action)
@@ -424,13 +433,13 @@ def test_law_09_stages_have_names_of_their_own():
 
 
 def test_a_rollout_in_rows_takes_commands_of_every_level():
-    """As on GPUs; what the policy commands may also be written by the step, as limits of rotor speeds are."""
+    """As on GPUs, also if the step writes the commands of the policy, such as limited rotor speeds."""
     for control in ("rotor_vel", "state"):
         sim = Sim(2, control=control)
         command = jnp.zeros((2, 1, 4)) + 15e3 if control == "rotor_vel" else jnp.zeros((2, 1, 16)).at[..., 2].set(1.0)
         step, ends = sim.step_fn, []
         for platform in ("cpu", "gpu"):
-            step.platform = platform  # which decides on rows alone
+            step.platform = platform  # which only decides whether rows are used
             fly = lambda data: rollout(step, data, lambda params, data: command, None, 4, 5)[0].states  # noqa: B023, E731
             ends.append(jax.jit(fly)(sim.data))
         assert_close(*ends)

@@ -1,4 +1,4 @@
-"""Images among the observations: of the state after the step, of new episodes, at a rate, late, and in Gymnasium."""
+"""Images among the observations: after a step, in new episodes, with a rate and a latency, and in Gymnasium."""
 
 import jax
 import jax.numpy as jnp
@@ -24,28 +24,30 @@ DEPTH = {"depth": "depth"}
 
 
 @pytest.fixture(scope="module")
-def pair():
-    """Return environments with and without images whose episodes end after two steps, automatic resets around them."""
+def envs_with_and_without_images():
+    """Return environments with automatic resets, with and without images, whose episodes end after two steps."""
     base = make("avoid", 3, seconds=0.04, n_boxes=1, n_poles=3)
     return AutoReset(CameraImages(base, Camera(**SIZE, max_depth=5.0), DEPTH)), AutoReset(base)
 
 
 @pytest.fixture(scope="module")
-def recorded_flight(pair):
-    """Return the states of both environments after a reset and three random steps; the second one ends the episodes."""
-    states = [[jax.jit(env.reset)(jax.random.key(3))] for env in pair]
-    for env, reached in zip(pair, states, strict=True):
+def recorded_flight(envs_with_and_without_images):
+    """Return the states of both environments after a reset and three random steps; the second one ends episodes."""
+    states = [[jax.jit(env.reset)(jax.random.key(3))] for env in envs_with_and_without_images]
+    for env, visited in zip(envs_with_and_without_images, states, strict=True):
         step = jax.jit(env.step)
         for seed in range(3):
-            reached.append(step(reached[-1], random_action(reached[-1], seed)))
+            visited.append(step(visited[-1], random_action(visited[-1], seed)))
     return states
 
 
-def test_images_are_those_of_the_state_after_the_step_and_after_new_episodes(pair, recorded_flight):
-    look = jax.jit(pair[0].sim.scene.depth_fn("fpv_cam", 8, 6))
+def test_images_are_those_of_the_state_after_the_step_and_after_new_episodes(
+    envs_with_and_without_images, recorded_flight
+):
+    measure_depth = jax.jit(envs_with_and_without_images[0].sim.scene.depth_fn("fpv_cam", 8, 6))
     for state in recorded_flight[0]:
-        seen = np.minimum(look(state.data).distance, 5.0).reshape(3, 1, -1)
-        np.testing.assert_allclose(state.obs["depth"], seen, rtol=1e-6)
+        expected = np.minimum(measure_depth(state.data).distance, 5.0).reshape(3, 1, -1)
+        np.testing.assert_allclose(state.obs["depth"], expected, rtol=1e-6)
     assert recorded_flight[0][2].done.all()
     assert np.asarray(recorded_flight[0][2].obs["depth"]).std() > 0.1, "nothing is in view"
 
@@ -57,8 +59,8 @@ def test_final_observations_of_episodes_have_the_images_of_the_step_before(recor
         assert after.final_obs.keys() == after.obs.keys()
 
 
-def test_restarted_worlds_have_images_of_their_new_episodes(pair, recorded_flight):
-    restarted = pair[0].restart(recorded_flight[0][1], np.array([True, False, False]))
+def test_restarted_worlds_have_images_of_their_new_episodes(envs_with_and_without_images, recorded_flight):
+    restarted = envs_with_and_without_images[0].restart(recorded_flight[0][1], np.array([True, False, False]))
     assert jax.tree.structure(restarted) == jax.tree.structure(recorded_flight[0][1])
     for obs in (restarted.obs, restarted.final_obs):
         np.testing.assert_array_equal(obs["depth"][1:], recorded_flight[0][1].obs["depth"][1:])
@@ -95,9 +97,9 @@ def test_adapters_have_the_images_in_their_spaces():
 
 def test_wrappers_around_images_leave_them_as_they_are():
     env = CameraImages(make("hover", 2, engine="interpret"), Camera(**SIZE), DEPTH)
-    for around in (lambda env: FrameStack(env, 2), Normalize, lambda env: ObservationNoise(env, {"pos": 0.1})):
-        state = around(env).reset(jax.random.key(0))
-        state = around(env).step(state, jnp.zeros((2, 1, 4)))
+    for wrap in (lambda env: FrameStack(env, 2), Normalize, lambda env: ObservationNoise(env, {"pos": 0.1})):
+        state = wrap(env).reset(jax.random.key(0))
+        state = wrap(env).step(state, jnp.zeros((2, 1, 4)))
         assert state.obs["depth"].shape == (2, 1, 48)
 
 
@@ -105,35 +107,35 @@ def test_a_slow_and_late_camera_shows_old_images_and_a_new_one_in_a_new_episode(
     """25 images/s in an environment of 50 steps/s, delivered 30 ms later, between two of its steps."""
     base = make("avoid", 3, seconds=0.2, n_boxes=1, n_poles=3)
     env = AutoReset(CameraImages(base, Camera(**SIZE, freq=25, latency=0.03, outputs=("depth", "normal"))))
-    look = jax.jit(env.sim.scene.depth_fn("fpv_cam", **SIZE))
+    measure_depth = jax.jit(env.sim.scene.depth_fn("fpv_cam", **SIZE))
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(3))
     assert {name: x.shape for name, x in state.obs.items() if "camera" in name} == {
         "camera.depth": (3, 1, 48),
         "camera.normal": (3, 1, 144),
     }
-    taken = []
+    images = []
     for k in range(13):
         if k:
             state = step(state, random_action(state, k))
         if k == 5:  # one world begins an episode on its own
             state = env.restart(state, np.array([True, False, False]))
-        taken.append(np.minimum(look(state.data).distance, 10.0).reshape(3, 1, -1))
+        images.append(np.minimum(measure_depth(state.data).distance, 10.0).reshape(3, 1, -1))
         steps = np.asarray(state.full_data.core.steps)[:, 0] // env.n_substeps
         # The images of steps 0, 2, 4 ... of an episode arrive 1.5 steps later, the first one at once.
-        shown = np.maximum((2 * steps - 3) // 4 * 2, 0)
+        taken_steps = np.maximum((2 * steps - 3) // 4 * 2, 0)
         expected = np.stack(
-            [taken[k - now + then][world] for world, (now, then) in enumerate(zip(steps, shown, strict=True))]
+            [images[k - now + then][world] for world, (now, then) in enumerate(zip(steps, taken_steps, strict=True))]
         )
         np.testing.assert_allclose(state.obs["camera.depth"], expected, rtol=1e-6)
     assert steps.tolist() != [12] * 3
-    assert np.ptp(taken, axis=0).max() > 1e-3
+    assert np.ptp(images, axis=0).max() > 1e-3
 
 
 def test_law_09_wrong_images_are_refused():
     base = make("hover", 2, engine="interpret")
     with pytest.raises(ConfigError, match=r"expected depth_image as width and height in pixels, got '16x12'"):
         make("hover", 2, depth_image="16x12")
-    for refused, message in [
+    for call, message in [
         (
             lambda: make("hover", 2, depth_image=(0, 12), engine="interpret"),
             "expected width of Camera to be finite and at least 1",
@@ -145,13 +147,13 @@ def test_law_09_wrong_images_are_refused():
         (lambda: CameraImages(base, Camera(200_000, 200_000)), "got 2 of 200000 x 200000 pixels, which need"),
     ]:
         with pytest.raises(ConfigError, match=message):
-            refused()
-    for around, message in [
+            call()
+    for wrap, message in [
         (lambda env: CameraImages(env, Camera(), {"depth": "pos"}),
          "expected other names of images than those of obs.*, got 'pos'"),
         (lambda env: Observe(CameraImages(env, Camera(), DEPTH), lambda obs, _: {k: 2 * x for k, x in obs.items()}),
          "expected images unchanged in functions of one world, got a new 'depth'"),
     ]:  # fmt: skip
-        env = around(base)
+        env = wrap(base)
         with pytest.raises(ConfigError, match=message):
             env.step(env.reset(jax.random.key(0)), jnp.zeros((2, 1, 4)))

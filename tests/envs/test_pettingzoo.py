@@ -1,4 +1,4 @@
-"""PettingZoo's own tests of a parallel environment, and what they do not ask."""
+"""PettingZoo's own tests of a parallel environment, and further ones."""
 
 import importlib
 import sys
@@ -17,13 +17,13 @@ from crazysim.envs.pettingzoo import DroneParallelEnv, make_parallel
 
 
 @pytest.fixture(scope="module")
-def functional():
+def drone_env():
     return make("hover", 1, n_drones=2, seconds=0.3)
 
 
 @pytest.fixture(scope="module")
-def env(functional):
-    return DroneParallelEnv(functional)
+def env(drone_env):
+    return DroneParallelEnv(drone_env)
 
 
 def zeros(env):
@@ -35,8 +35,8 @@ def test_pettingzoos_own_test(env, capsys):
     assert "Passed" in capsys.readouterr().out
 
 
-def test_pettingzoos_own_test_of_seeds(functional):
-    parallel_seed_test(lambda: DroneParallelEnv(functional), num_cycles=10)
+def test_pettingzoos_own_test_of_seeds(drone_env):
+    parallel_seed_test(lambda: DroneParallelEnv(drone_env), num_cycles=10)
 
 
 def test_seeds_lead_to_the_same_episodes(env):
@@ -51,7 +51,7 @@ def test_seeds_lead_to_the_same_episodes(env):
     assert not trees_equal(env.reset(seed=6)[0], first)
 
 
-def test_every_drone_has_its_own(env):
+def test_every_drone_has_its_own_observations_and_reward(env):
     obs, info = env.reset(seed=0)
     assert env.agents == env.possible_agents == ["drone_0", "drone_1"]
     assert all(obs[agent] in env.observation_space(agent) for agent in env.agents)
@@ -72,7 +72,7 @@ def test_every_drone_has_its_own(env):
     assert terminated == truncated == {"drone_0": False, "drone_1": False}
 
 
-def test_the_state_is_what_all_observe(env):
+def test_the_state_is_the_observations_of_all_drones(env):
     obs, _ = env.reset(seed=0)
     expected = [obs[agent][name] for agent in env.agents for name in sorted(obs[agent])]
     np.testing.assert_array_equal(env.state(), np.concatenate(expected))
@@ -113,13 +113,13 @@ def test_wrong_actions_are_refused(env):
             env.step(actions)
 
 
-def test_wrong_settings_are_refused(functional):
+def test_wrong_settings_are_refused(drone_env):
     with pytest.raises(ConfigError, match=r"got 2 worlds\. Make it with n_worlds=1"):
         DroneParallelEnv(make("hover", 2))
     with pytest.raises(ConfigError, match="without AutoReset"):
-        DroneParallelEnv(AutoReset(functional))
+        DroneParallelEnv(AutoReset(drone_env))
     with pytest.raises(ConfigError, match="got 'ascii'"):
-        DroneParallelEnv(functional, "ascii")
+        DroneParallelEnv(drone_env, "ascii")
     fresh = make_parallel("hover", n_drones=2)
     for ask in (fresh.state, fresh.render, lambda: fresh.step({})):
         with pytest.raises(ConfigError, match="reset"):
@@ -127,8 +127,8 @@ def test_wrong_settings_are_refused(functional):
 
 
 @pytest.mark.usefixtures("opengl")
-def test_pictures(functional):
-    env = DroneParallelEnv(functional, "rgb_array", (64, 48))
+def test_pictures(drone_env):
+    env = DroneParallelEnv(drone_env, "rgb_array", (64, 48))
     env.reset(seed=0)
     picture = env.render()
     assert (picture.shape, picture.dtype) == ((48, 64, 3), np.uint8)
@@ -137,7 +137,7 @@ def test_pictures(functional):
 
 
 @pytest.mark.parametrize(
-    ("module", "package", "way"),
+    ("module", "package", "message"),
     [
         (
             "crazysim.envs.pettingzoo",
@@ -147,8 +147,8 @@ def test_pictures(functional):
         ("crazysim.envs.sb3", "stable_baselines3", "needs stable-baselines3, which is not installed"),
     ],
 )
-def test_without_a_package_the_way_to_it_is_told(monkeypatch, module, package, way):
+def test_without_a_package_the_error_says_how_to_install_it(monkeypatch, module, package, message):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, module, raising=False)
-    with pytest.raises(ImportError, match=way):
+    with pytest.raises(ImportError, match=message):
         importlib.import_module(module)

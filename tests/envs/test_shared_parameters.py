@@ -1,4 +1,4 @@
-"""Parameters that all drones share, changed after an environment was made: every path computes with their values."""
+"""Shared parameters that change after an environment was made: every path computes with the new values."""
 
 import functools
 
@@ -20,32 +20,32 @@ TILTED = np.array([3.0, 0.0, -9.81], np.float32)
 
 
 @functools.cache
-def hovering(control):
-    """Return an environment; with rotor commands each drone carries a load, whose attachment has zeros too."""
+def make_env(control):
+    """Return an environment; with rotor commands each drone carries a load, whose attachment has zeros, too."""
     effects = [SlungLoad(mass=0.003, length=0.3, attach=(0.0, 0.0, -0.01))] if control == "rotor_vel" else []
     return envs.make("hover", N_WORLDS, control=control, effects=effects)
 
 
 CONSTANTS = {"rpm2thrust": 2e-3, "rpm2torque": 1e-5}
-"""Sizes of the constant terms of polynomials in the rotor speed, N and N m: no share of the largest coefficient."""
+"""Sizes of the constant terms of polynomials in the rotor speed, N and N m."""
 
 
-def drawn(data, rng):
-    """Return the data with every element of every shared number changed, and none of them zero."""
+def with_random_parameters(data, rng):
+    """Return the data with every element of all shared parameters changed, and none of them zero."""
 
     def change(path, scope, x):
         if scope != "shared" or not jnp.issubdtype(x.dtype, jnp.floating):
             return x
         x = np.asarray(x)
         zero = CONSTANTS.get(path[-1].name, 0.03 * np.abs(x).max() or 1e-3)
-        by = rng.uniform(0.3, 1.0, x.shape) * rng.choice([-1, 1], x.shape)
-        return jnp.asarray(np.where(x == 0, zero * by, x * (1 + 0.03 * by)), x.dtype)
+        factor = rng.uniform(0.3, 1.0, x.shape) * rng.choice([-1, 1], x.shape)
+        return jnp.asarray(np.where(x == 0, zero * factor, x * (1 + 0.03 * factor)), x.dtype)
 
     return jax.tree_util.tree_map_with_path(change, scopes(data), data)
 
 
-def numbers(data):
-    """Return the states of drones and plugins."""
+def drone_states(data):
+    """Return the states of the drones by name."""
     states = data.states
     return {"pos": states.pos, "vel": states.vel, "quat": states.quat, "ang_vel": states.ang_vel}
 
@@ -59,8 +59,8 @@ def relative_difference(actual, expected):
 @pytest.mark.long("compiles every path of two environments")
 @pytest.mark.parametrize("control", ["state", "rotor_vel"])
 def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_values(control):
-    """Environments with automatic resets and without, their rollouts, steps of simulations, traced and not."""
-    env = hovering(control)
+    """Paths: environments with and without automatic resets, rollouts, and steps of simulations, traced and not."""
+    env = make_env(control)
     auto, sim, n = envs.AutoReset(env), env.sim, env.n_substeps
     key = jax.random.key(0)
     start, start_state, before = env.reset(key), auto.reset(key), sim.data
@@ -74,11 +74,13 @@ def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_val
     rng = np.random.default_rng(0)
     for _ in range(N_DRAWS):
         action = jnp.asarray(rng.uniform(-0.5, 0.5, start.action.shape), start.action.dtype)
-        data = drawn(start.data, rng)
+        data = with_random_parameters(start.data, rng)
         sent = stage_command(data, env.actions.command(action))
-        expected = numbers(plain(sent, n))
+        expected = drone_states(plain(sent, n))
         assert (
-            relative_difference(numbers(plain(stage_command(start.data, env.actions.command(action)), n)), expected)
+            relative_difference(
+                drone_states(plain(stage_command(start.data, env.actions.command(action)), n)), expected
+            )
             > 1e-3
         )
         starts = {name: start if name == "env.step" else start_state for name in paths}
@@ -87,18 +89,18 @@ def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_val
         sim.data = sent
         sim.step(n)
         actual["sim.step"], sim.data = sim.data, before
-        differences = {name: relative_difference(numbers(x), expected) for name, x in actual.items()}
+        differences = {name: relative_difference(drone_states(x), expected) for name, x in actual.items()}
         assert max(differences.values()) < 2e-5, differences
 
 
-def tilted(data):
+def with_tilted_gravity(data):
     return with_params(data, gravity_vec=TILTED)
 
 
-def test_gravity_that_is_tilted_pulls_the_drones_of_an_environment(hover_of_tilted):
-    """In ``sim.default_data`` alone before it is made, which episodes begin from; then in the data of a state."""
-    upright = hover_of_tilted.sim.data.params
-    for env in (hover_of_tilted, envs.AutoReset(hover_of_tilted)):
+def test_gravity_that_is_tilted_pulls_the_drones_of_an_environment(tilted_hover):
+    """Gravity is tilted in ``sim.default_data``, from which episodes begin, and made vertical in the data of a state."""
+    upright = tilted_hover.sim.data.params
+    for env in (tilted_hover, envs.AutoReset(tilted_hover)):
         start_state = jax.jit(env.reset)(jax.random.key(0))
         np.testing.assert_array_equal(start_state.data.params.gravity_vec, TILTED)
         step, speeds = jax.jit(env.step), []
@@ -111,44 +113,44 @@ def test_gravity_that_is_tilted_pulls_the_drones_of_an_environment(hover_of_tilt
 
 
 @pytest.fixture(scope="module")
-def hover_of_tilted():
+def tilted_hover():
     sim, task = envs.make("hover", N_WORLDS, control="rotor_vel").sim, Hover()
-    sim.default_data = tilted(sim.default_data)
+    sim.default_data = with_tilted_gravity(sim.default_data)
     return envs.DroneEnv(sim, task)
 
 
-def test_an_environment_refuses_to_begin_episodes_after_its_default_data_was_replaced(hover_of_tilted):
-    sim = hover_of_tilted.sim
+def test_an_environment_refuses_to_begin_episodes_after_its_default_data_was_replaced(tilted_hover):
+    sim = tilted_hover.sim
     before = sim.default_data
     sim.default_data = with_params(before, mass=2 * before.params.mass)
     with pytest.raises(ConfigError, match="expected the default data with which the environment was made, got others"):
-        hover_of_tilted.reset(jax.random.key(0))
+        tilted_hover.reset(jax.random.key(0))
     sim.default_data = before
-    hover_of_tilted.reset(jax.random.key(0))
+    tilted_hover.reset(jax.random.key(0))
 
 
 @pytest.mark.long("compiles gradients of the stages and of environment steps")
 def test_gradients_of_an_environment_step_by_parameters_that_are_zero():
-    """Speeds by every component of gravity, rates by every element of the inverse inertia: those of the stages."""
-    env = hovering("rotor_vel")
+    """Derivatives of velocities by gravity, and of rates by the inverse inertia, are those of the stages."""
+    env = make_env("rotor_vel")
     auto, stages = envs.AutoReset(env), by_stages(env.sim)
     start = env.reset(jax.random.key(0))
     action = 0.3 * jnp.ones_like(start.action).at[..., 0].set(0.2)
-    of = {name: getattr(start.data.params, name) for name in ("gravity_vec", "J_inv")}
+    parameters = {name: getattr(start.data.params, name) for name in ("gravity_vec", "J_inv")}
 
     def slopes(step, start=start):
         def total(values):
             states = step(start.replace(data=with_params(start.data, **values))).data.states
             return jnp.sum(states.vel) + jnp.sum(states.ang_vel)
 
-        return jax.jit(jax.grad(total))(of)
+        return jax.jit(jax.grad(total))(parameters)
 
-    def as_written(state):
+    def step_by_stages(state):
         return state.replace(data=stages(stage_command(state.data, env.actions.command(action)), env.n_substeps))
 
-    expected = slopes(as_written)
+    expected = slopes(step_by_stages)
     assert all(np.all(x != 0) for x in expected.values())
-    for one in (env, auto):
-        actual = slopes(lambda state, one=one: one.step(state, action), one.reset(jax.random.key(0)))
+    for stepped in (env, auto):
+        actual = slopes(lambda state, env=stepped: env.step(state, action), stepped.reset(jax.random.key(0)))
         for name, x in expected.items():
             np.testing.assert_allclose(actual[name], x, rtol=2e-4, atol=1e-6 * np.abs(x).max(), err_msg=name)

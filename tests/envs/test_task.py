@@ -46,7 +46,7 @@ def test_names_are_no_tasks():
 
 
 def test_goals_are_set_for_all_for_each_world_and_for_each_drone():
-    """They are observed from the next step on, which is the one program; another shape is an error."""
+    """Goals are observed from the next step on, without another compilation; wrong shapes are errors."""
     env = AutoReset(make("hover", 3, n_drones=2, engine="interpret"))
     state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
     full = np.arange(18, dtype=np.float32).reshape(3, 2, 3)
@@ -109,15 +109,15 @@ def test_keys_depend_on_seed_world_episode_and_name_only():
     four, two = (Sim(n_worlds=n, rng_key=7).data for n in (4, 2))
 
     def words(data, name="spawn"):
-        return np.asarray(jax.random.key_data(vmap_worlds(lambda one: episode_key(one, name))(data)))
+        return np.asarray(jax.random.key_data(vmap_worlds(lambda data: episode_key(data, name))(data)))
 
     first = words(four)
     np.testing.assert_array_equal(words(two), first[:2])
     others = [words(four, "another"), words(Sim(n_worlds=4, rng_key=8).data)]
     later = four.replace(core=four.core.replace(episode=four.core.episode + 1))
     assert len(np.unique(np.concatenate([first, words(later), *others]), axis=0)) == 16
-    ticked = four.replace(core=four.core.replace(steps=four.core.steps + 5))
-    np.testing.assert_array_equal(words(ticked), first)
+    later_step = four.replace(core=four.core.replace(steps=four.core.steps + 5))
+    np.testing.assert_array_equal(words(later_step), first)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -147,7 +147,7 @@ def two_drones():
     return Sim(n_worlds=3, n_drones=2, control="attitude")
 
 
-WRONG = {
+WRONG_METHODS = {
     "flat": ("observe", lambda s, d: {"height": d.states.pos[:, 2]},
              r"observation 'height' of shape \(n_drones, k\) = \(2, k\), got shape \(2,\) .*x\[:, None\]"),
     "of the world": ("observe", lambda s, d: {"ok": d.states.pos, "all": d.states.pos.ravel()},
@@ -171,30 +171,30 @@ WRONG = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", WRONG)
+@pytest.mark.parametrize("case", WRONG_METHODS)
 def test_law_09_wrong_shapes_of_a_task_are_refused_at_making(two_drones, case):
-    method, fn, words = WRONG[case]
+    method, fn, words = WRONG_METHODS[case]
     wrong = type("Wrong", (Still,), {method: fn})()
     DroneEnv(two_drones, Still())
     with pytest.raises(ConfigError, match=f"task 'still': expected {words}"):
         DroneEnv(two_drones, wrong)
 
 
-def lost(sim, state="pos"):
-    """Return an environment in whose second world a state begins as NaN."""
+def make_nonfinite_env(sim, state="pos"):
+    """Return an environment whose second world starts with NaN in a state."""
 
-    class Lost(Still):
+    class NonfiniteStart(Still):
         def spawn(self, data, key):
             value = getattr(data.states, state)
             wrong = jnp.where(data.core.world_id == 1, jnp.nan, value)
             return data.replace(states=data.states.replace(**{state: wrong}))
 
-    return DroneEnv(sim, Lost())
+    return DroneEnv(sim, NonfiniteStart())
 
 
 @pytest.mark.parametrize("state", ["pos", "quat", "ang_vel"])
 def test_law_09_a_start_that_is_not_finite_is_refused(two_drones, state):
-    env = lost(two_drones, state)
+    env = make_nonfinite_env(two_drones, state)
     words = f"task 'still': expected spawn to return finite states, got {state} with NaN or infinity in world 1"
     with pytest.raises(ConfigError, match=words):
         env.reset(jax.random.key(0))
@@ -204,7 +204,7 @@ def test_law_09_a_start_that_is_not_finite_is_refused(two_drones, state):
 
 def test_a_start_that_is_not_finite_ends_at_the_first_step_of_compiled_code(two_drones):
     """Compiled code cannot raise; see ``Env.reset``."""
-    env = lost(two_drones)
+    env = make_nonfinite_env(two_drones)
     state = jax.jit(lambda key: env.step(start := env.reset(key), jnp.zeros_like(start.action)))(jax.random.key(0))
     np.testing.assert_array_equal(state.terminated, np.arange(two_drones.n_worlds) == 1)
     np.testing.assert_array_equal(state.info["nonfinite"], state.terminated)
@@ -258,18 +258,20 @@ def test_law_09_shapes_of_a_batched_task_have_worlds_in_front(two_drones):
 
 def test_law_09_missing_methods_are_named(two_drones):
     @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Half(Task):
+    class Incomplete(Task):
         """A task without observations and an error."""
 
-        name = "half"
+        name = "incomplete"
         spawn, rewards, terminated = Still.spawn, Still.rewards, Still.terminated
 
-    with pytest.raises(ConfigError, match=r"task 'half': expected class Half to define .*, got no observe, error\. "):
-        DroneEnv(two_drones, Half())
     with pytest.raises(
-        NotImplementedError, match=r"task 'half': expected class Half to define observe\(data\); see docs"
+        ConfigError, match=r"task 'incomplete': expected class Incomplete to define .*, got no observe, error\. "
     ):
-        Half().observe(two_drones.data)
+        DroneEnv(two_drones, Incomplete())
+    with pytest.raises(
+        NotImplementedError, match=r"task 'incomplete': expected class Incomplete to define observe\(data\); see docs"
+    ):
+        Incomplete().observe(two_drones.data)
 
 
 def test_plugins_that_are_added_to_the_simulation_of_an_environment_are_refused():
