@@ -98,7 +98,7 @@ def with_tilted_gravity(data):
 
 
 def test_gravity_that_is_tilted_pulls_the_drones_of_an_environment(tilted_hover):
-    """Gravity is tilted in ``sim.default_data``, from which episodes begin, and made vertical in the data of a state."""
+    """Gravity is tilted in ``sim.default_data``, with which episodes begin, and vertical in the data of a state."""
     upright = tilted_hover.sim.data.params
     for env in (tilted_hover, envs.AutoReset(tilted_hover)):
         start_state = jax.jit(env.reset)(jax.random.key(0))

@@ -1,4 +1,4 @@
-"""Flying through a field: what stands where, what is seen of it, hits and arrivals."""
+"""Avoid: positions of obstacles, observations of them, hits and arrivals."""
 
 import jax
 import numpy as np
@@ -14,7 +14,7 @@ N_WORLDS = 2048
 
 @pytest.fixture(scope="module")
 def start_state():
-    """Return the environment, two drones in every world, the state where episodes begin, and the step."""
+    """Return an environment of two drones in every world, its state at the start of episodes, and its step."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=2, control="attitude")
     task = Avoid()
     task.install(sim)
@@ -22,8 +22,8 @@ def start_state():
     return env, jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
 
 
-def put(state, pos, **changes):
-    """Return the state with drones elsewhere, at rest and level."""
+def place_drones(state, pos, **changes):
+    """Return the state with drones at other positions, at rest and level."""
     data, s = state.data, state.data.states
     pos = np.broadcast_to(np.asarray(pos, np.float32), s.pos.shape)
     level = np.broadcast_to(np.float32([0, 0, 0, 1]), s.quat.shape)
@@ -40,17 +40,17 @@ def test_starts_and_goals_are_clear_of_contact(start_state):
     assert not np.any(report.any)
     assert report.object_distance.min() > 0.2
     assert report.drone_distance.min() > 0.05
-    env.sim.data = put(state, data.plugins["task"].goal).data
+    env.sim.data = place_drones(state, data.plugins["task"].goal).data
     report = env.sim.contact_report()
     assert not np.any(report.any)
     assert report.object_distance.min() > 0.2
 
 
-def test_obstacles_stand_elsewhere_in_every_world_and_leave_room(start_state):
+def test_obstacles_have_other_positions_in_every_world_and_leave_gaps(start_state):
     _, state, _ = start_state
     pos = np.asarray(state.data.objects.pos)[:, 0]
-    apart = np.linalg.norm(pos[:, :, None, :2] - pos[:, None, :, :2], axis=-1) + 9 * np.eye(12)
-    assert apart.min() >= CELL - 2 * CELL_JITTER - 1e-5
+    distances = np.linalg.norm(pos[:, :, None, :2] - pos[:, None, :, :2], axis=-1) + 9 * np.eye(12)
+    assert distances.min() >= CELL - 2 * CELL_JITTER - 1e-5
     assert np.all(np.ptp(pos[..., :2], axis=0) > 2.5)
     quat = np.asarray(state.data.objects.quat)
     np.testing.assert_allclose(1 - 2 * np.sum(quat[..., :2] ** 2, axis=-1), 1, atol=1e-5)  # upright
@@ -61,15 +61,15 @@ def test_obstacles_stand_elsewhere_in_every_world_and_leave_room(start_state):
     assert np.ptp(boxes) > 1
 
 
-def test_what_is_seen_are_the_nearest_points_of_the_nearest_obstacles(start_state):
+def test_observations_are_the_nearest_points_of_the_nearest_obstacles(start_state):
     env, state, _ = start_state
     rng = np.random.default_rng(0)
-    inside = put(state, rng.uniform([-1.6, -2, 0.2], [1.6, 2, 1.8], (N_WORLDS, 2, 3))).data
+    inside = place_drones(state, rng.uniform([-1.6, -2, 0.2], [1.6, 2, 1.8], (N_WORLDS, 2, 3))).data
     env.sim.data = inside
     gaps = np.sort(np.asarray(env.sim.contact_report().object_distance), axis=-1)[..., :4]
     obs = jax.jit(vmap_worlds(env.task.observe))(inside)
     ways, to_middle = (np.asarray(obs[f"obstacles_{x}"]).reshape(N_WORLDS, 2, 4, 3) for x in ("near", "middle"))
-    # A report measures from the ball around the drone, 2 cm above its centre, which the ways begin at.
+    # A report measures from the ball around the drone, whose middle is 2 cm above the start of the vectors.
     far = np.linalg.norm(ways, axis=-1) - 0.086
     outside = gaps > 0.05
     assert outside.mean() > 0.5
@@ -80,7 +80,7 @@ def test_what_is_seen_are_the_nearest_points_of_the_nearest_obstacles(start_stat
     boxes = np.asarray(inside.objects.pos)[:, 0, None, None, 8:] - middle[..., None, :]
     outside_box = is_box & (np.linalg.norm(ways, axis=-1) > 0.01)
     np.testing.assert_allclose(np.linalg.norm(boxes, axis=-1).min(axis=-1)[outside_box], 0, atol=1e-5)
-    # A short step along a way leads there: nearer by as much.
+    # A short step along such a vector reduces the distance by its length.
     length = np.maximum(np.linalg.norm(ways[:, :, 0], axis=-1, keepdims=True), 0.01)
     ahead = inside.states.pos + 0.1 * ways[:, :, 0] / length
     env.sim.data = inside.replace(states=inside.states.replace(pos=ahead))
@@ -101,10 +101,10 @@ def test_hits_disable_and_arriving_is_a_success(start_state):
     pos[5, 0, 2] = 2.01
     pos[6, 0, 0] = -3.0
     pos[7, 0] = pos[7, 1] + [0.1, 0, 0]  # another drone
-    pos[8, 0] = pos[8, 1] + [0.1, 0, 0]  # one that is out
+    pos[8, 0] = pos[8, 1] + [0.1, 0, 0]  # a drone that is disabled
     disabled = np.zeros((N_WORLDS, 2), bool)
     disabled[8, 0] = True
-    after = step(put(state, pos, disabled=disabled), state.action)
+    after = step(place_drones(state, pos, disabled=disabled), state.action)
     expected = np.zeros((N_WORLDS, 2), bool)
     expected[2:9, 0] = True
     expected[7, 1] = True
@@ -121,7 +121,7 @@ def test_hits_disable_and_arriving_is_a_success(start_state):
     assert np.linalg.norm(near[9, 1]) > 0.7
 
 
-def test_time_ends_an_episode(start_state):
+def test_an_episode_is_truncated_when_its_time_is_over(start_state):
     env, state, step = start_state
     core = state.data.core
     late = core.replace(steps=np.full_like(core.steps, (env.max_steps - 1) * env.n_substeps))
@@ -131,6 +131,6 @@ def test_time_ends_an_episode(start_state):
 
 
 @pytest.mark.parametrize("options", [{"n_poles": -1}, {"n_poles": 0, "n_boxes": 0}, {"n_seen": 0}, {"n_boxes": 1.5}])
-def test_what_cannot_be_a_field_is_refused(options):
+def test_wrong_numbers_of_obstacles_are_errors(options):
     with pytest.raises(ConfigError, match=r"n_poles|n_seen of Avoid|n_boxes of Avoid as a whole number"):
         make("avoid", 1, **options)

@@ -1,4 +1,4 @@
-"""Chase: a roof that drives, what counts as landed on it, and what as crashed."""
+"""Chase: the motion of the roof, and conditions of landing and crashing."""
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from crazysim.envs import make
 CONTACT = 0.066
 """Height of the centre of mass over a level roof that the drone touches, m: radius 0.086 less 0.02."""
 CASES = {
-    # Place over the roof's middle, m, and velocity relative to it, m/s.
+    # Position relative to the roof's middle, m, and velocity relative to it, m/s.
     "soft": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.3)),
     "to the side": ((0.0, 0.07, CONTACT + 0.003), (0, 0, -0.3)),
     "fast": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.7)),
@@ -22,7 +22,7 @@ CASES = {
     "high": ((0.0, 0.0, 2.45), (0, 0, 0)),
     "hover": ((0.0, 0.0, 0.3), (0, 0, 0)),
 }
-"""One world each, over cars that drive ahead."""
+"""Cases, each in its own world, over cars that drive ahead."""
 LANDED, IN_FLIGHT = {"soft", "to the side"}, {"hover"}
 
 
@@ -43,13 +43,13 @@ def step(env):
 
 
 @pytest.fixture(scope="module")
-def place(env):
-    """Return the function from data to place and velocity of the roof."""
+def roof_motion(env):
+    """Return the function from data to position and velocity of the roof."""
     return jax.jit(vmap_worlds(env.task.target_motion))
 
 
 @pytest.fixture(scope="module")
-def recorded_flight(start_state, step, place):
+def recorded_flight(start_state, step, roof_motion):
     """Return the state after a step from all cases, over cars at their full speed."""
     data = start_state.data
     car = data.plugins["cars"]
@@ -59,7 +59,7 @@ def recorded_flight(start_state, step, place):
     car = car.replace(**ahead)
     data = data.replace(plugins=data.plugins | {"cars": car})
     offset, vel = (np.array(x, np.float32)[:, None] for x in zip(*CASES.values(), strict=True))
-    roof, along = map(np.asarray, place(data))
+    roof, along = map(np.asarray, roof_motion(data))
     np.testing.assert_allclose(along, np.broadcast_to([0.8, 0, 0], along.shape), atol=1e-6)
     level = np.broadcast_to(np.float32([0, 0, 0, 1]), data.states.quat.shape)
     states = data.states.replace(pos=roof + offset, vel=along + vel, quat=level, ang_vel=np.zeros_like(roof))
@@ -71,42 +71,42 @@ def names(mask):
     return {name for name, x in zip(CASES, np.asarray(mask)[:, 0], strict=True) if x}
 
 
-def test_landed_is_who_touches_the_roof_softly_from_above(recorded_flight):
+def test_a_soft_touch_of_the_roof_from_above_is_a_landing(recorded_flight):
     assert names(recorded_flight.info["landed"]) == LANDED
 
 
-def test_everything_else_that_touches_or_gets_away_crashes(recorded_flight):
+def test_every_other_touch_and_flying_away_is_a_crash(recorded_flight):
     assert names(recorded_flight.info["crashed"]) == set(CASES) - LANDED - IN_FLIGHT
     np.testing.assert_array_equal(recorded_flight.terminated, [name not in IN_FLIGHT for name in CASES])
 
 
 def test_the_reward_is_for_landing(recorded_flight):
-    paid = dict(zip(CASES, np.asarray(recorded_flight.reward)[:, 0], strict=True))
-    assert min(paid[name] for name in LANDED) > 9 > 0 > -3 > max(paid[name] for name in ("fast", "hood", "far"))
+    rewards = dict(zip(CASES, np.asarray(recorded_flight.reward)[:, 0], strict=True))
+    assert min(rewards[name] for name in LANDED) > 9 > 0 > -3 > max(rewards[name] for name in ("fast", "hood", "far"))
 
 
-def test_the_roof_moves_with_the_car(env, start_state, step, place):
-    """Its velocity is that of its place, also in a turn, and the drone observes both."""
+def test_the_roof_moves_with_the_car(env, start_state, step, roof_motion):
+    """Its velocity is the derivative of its position, also in a turn, and the drone observes both."""
     before, after = start_state.data, step(start_state, start_state.action).data
-    (pos, vel), (later, _) = (jax.device_get(place(data)) for data in (before, after))
+    (pos, vel), (later, _) = (jax.device_get(roof_motion(data)) for data in (before, after))
     dt = env.n_substeps / env.sim.freq
     np.testing.assert_allclose((later - pos) / dt, vel, atol=0.05)
     np.testing.assert_allclose(start_state.obs["difference_to_roof"] + np.asarray(before.states.pos), pos, atol=1e-5)
     np.testing.assert_allclose(
         start_state.obs["difference_to_roof_vel"] + np.asarray(before.states.vel), vel, atol=1e-5
     )
-    assert np.ptp(np.linalg.norm(vel, axis=-1)) > 0.2, "each car has a speed of its own"
+    assert np.ptp(np.linalg.norm(vel, axis=-1)) > 0.2, "the speeds of the cars differ"
 
 
-def test_the_roof_is_the_top_of_the_car(env, start_state, place):
+def test_the_roof_is_the_top_of_the_car(env, start_state, roof_motion):
     body = next(b for b in env.sim.scene.collision_model.objects if b.name == "cars:0")
     top = max(body.geoms, key=lambda geom: geom.pos[2] + geom.shape.size[2])
     data = start_state.data
-    height = (np.asarray(place(data)[0]) - data.plugins["cars"].pos)[..., 2]
+    height = (np.asarray(roof_motion(data)[0]) - data.plugins["cars"].pos)[..., 2]
     np.testing.assert_allclose(height, top.pos[2] + top.shape.size[2], atol=1e-6)
 
 
 @pytest.mark.parametrize("speed", [-1, 4.0, "x"])
-def test_a_speed_out_of_range_is_refused(speed):
+def test_a_speed_out_of_range_is_an_error(speed):
     with pytest.raises(ConfigError, match=r"expected speed of Chase (to be from 0 to 3|as a number), got"):
         make("chase", 1, speed=speed)

@@ -1,4 +1,4 @@
-"""Deliver: a load that rides on a trailer until the hook takes it, and when it is delivered."""
+"""Deliver: a load on a trailer, and conditions of taking and delivering it."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ def start_state(env):
 
 
 def move_drone(state, pos, vel, load=None):
-    """Return a state with drones and hooks elsewhere, level, and other fields of the loads."""
+    """Return a state with drones and hooks at other positions, level, and with other fields of the loads."""
     data = state.data
     s = data.states
     level = jnp.broadcast_to(jnp.array([0.0, 0, 0, 1]), s.quat.shape)
@@ -55,13 +55,13 @@ def test_a_load_rides_on_its_trailer(start_state, step):
     np.testing.assert_allclose(load.vel, exact, atol=2e-6)
 
 
-def test_a_hook_takes_it_only_if_it_is_near_and_as_fast(start_state, step):
-    """Above the ring with the trailer's velocity, at rest, 10 cm away, 5 cm away, and too fast upwards."""
+def test_a_hook_takes_a_load_only_near_its_ring_and_at_its_velocity(start_state, step):
+    """At the ring with the trailer's velocity, at rest, 10 cm away, 5 cm away, and with a large upward velocity."""
     load = start_state.data.plugins["load"]
-    aside = np.array([0.0, 0.0, 0.10, 0.05, 0.0], np.float32)[:, None, None] * np.array([0, 0, 1], np.float32)
+    offset = np.array([0.0, 0.0, 0.10, 0.05, 0.0], np.float32)[:, None, None] * np.array([0, 0, 1], np.float32)
     faster = np.array([0.0, 0.0, 0.0, 0.0, 0.7], np.float32)[:, None, None] * np.array([0, 0, 1], np.float32)
     vel = load.vel.at[1].multiply(0.0)
-    state = move_drone(start_state, load.pos + aside + np.array([0, 0, 0.3], np.float32), vel + faster)
+    state = move_drone(start_state, load.pos + offset + np.array([0, 0, 0.3], np.float32), vel + faster)
     after = step(state, state.action)
     assert float(jnp.linalg.norm(load.vel[1])) < 0.6
     np.testing.assert_array_equal(after.info["taken"][:, 0], [True, True, False, True, False])
@@ -71,10 +71,10 @@ def test_a_hook_takes_it_only_if_it_is_near_and_as_fast(start_state, step):
 def test_a_load_is_delivered_after_half_a_second_at_its_goal(env, start_state, step):
     goal = start_state.data.plugins["task"].goal
     pos = goal + jnp.array([0.0, 0, 0.3])
-    held = jnp.ones_like(start_state.data.plugins["load"].attached)
-    state, at = start_state, {"pos": goal, "vel": jnp.zeros_like(pos), "attached": held}
-    for k in range(26):  # put back before every step: at zero action a drone sinks with its load
-        state = step(move_drone(state, pos, jnp.zeros_like(pos), at), state.action)
+    attached = jnp.ones_like(start_state.data.plugins["load"].attached)
+    state, load = start_state, {"pos": goal, "vel": jnp.zeros_like(pos), "attached": attached}
+    for k in range(26):  # moved back before every step, as with zero action a drone sinks with its load
+        state = step(move_drone(state, pos, jnp.zeros_like(pos), load), state.action)
         assert np.asarray(env.succeeded(state)).all() == (k >= 24), "half a second is 25 steps"
     assert state.info["taken"].all()
     assert float(state.info["error"].max()) < env.task.tolerance

@@ -20,7 +20,7 @@ def env():
 
 
 @pytest.fixture(scope="module")
-def begun(env):
+def start_state(env):
     return jax.jit(env.reset)(jax.random.key(0))
 
 
@@ -35,15 +35,15 @@ def step(env):
 
 
 def with_drones(state, **states):
-    """Return the state with drones elsewhere."""
+    """Return the state with other states of the drones."""
     return state.replace(data=state.data.replace(states=state.data.states.replace(**states)))
 
 
-def test_every_car_drives_in_its_own_way(env, begun):
-    """Drones that fall are no matter here, so that the cars are stepped without episodes."""
-    state, speeds, yaws = begun, [], []
+def test_every_car_drives_in_its_own_way(env, start_state):
+    """Cars are stepped without episodes, since the falling drones do not matter here."""
+    speeds, yaws = [], []
     simulate = jax.jit(lambda data: env.sim.step_fn(vmap_worlds(env.task.before_step)(data), env.n_substeps))
-    data = state.data
+    data = start_state.data
     for _ in range(N_STEPS):
         data = simulate(data)
         car = data.plugins["cars"]
@@ -56,12 +56,12 @@ def test_every_car_drives_in_its_own_way(env, begun):
     assert speeds.max() < 1.25
     assert np.ptp(speeds, axis=0).mean() > 0.2, "it speeds up and slows down"
     assert np.ptp(yaws, axis=0).mean() > 0.2, "it turns"
-    assert np.abs(yaws).mean() < 0.5, "on the whole it drives along the x axis"
+    assert np.abs(yaws).mean() < 0.5, "on average it drives along the x axis"
     assert np.std(yaws[-1]) > 0.1
 
 
-def test_the_point_is_behind_and_above_the_car(begun, step, target_motion):
-    before, after = begun.data, step(begun, begun.action).data
+def test_the_point_is_behind_and_above_the_car(start_state, step, target_motion):
+    before, after = start_state.data, step(start_state, start_state.action).data
     (pos, vel), (later, _) = (jax.device_get(target_motion(data)) for data in (before, after))
     car = before.plugins["cars"]
     heading = np.concatenate([np.cos(car.yaw), np.sin(car.yaw), 0 * car.yaw], axis=-1)
@@ -72,26 +72,28 @@ def test_the_point_is_behind_and_above_the_car(begun, step, target_motion):
     np.testing.assert_allclose((later - pos) * 50, vel, atol=0.05)
 
 
-def test_images_show_the_car(env, begun):
-    """Almost every episode begins with the car in view; what is shown as car is as far away as the car."""
+def test_images_show_the_car(env, start_state):
+    """Almost every episode begins with the car in view; pixels of the car have its distance."""
     format = env.image_formats()["segmentation"]
     shape = (N_WORLDS, format["height"], format["width"])
-    mask, depth = (np.asarray(begun.obs[name]).reshape(shape) for name in ("segmentation", "depth"))
+    mask, depth = (np.asarray(start_state.obs[name]).reshape(shape) for name in ("segmentation", "depth"))
     assert set(np.unique(mask)) == {0, 1}
     assert mask.any(axis=(1, 2)).mean() > 0.95
-    distance = np.linalg.norm(np.asarray(begun.data.plugins["cars"].pos - begun.data.states.pos)[:, 0], axis=-1)
+    distance = np.linalg.norm(
+        np.asarray(start_state.data.plugins["cars"].pos - start_state.data.states.pos)[:, 0], axis=-1
+    )
     for image, depths, far in zip(mask, depth, distance, strict=True):
         assert not image.any() or depths[image > 0].min() < far + 0.3
         assert not image.any() or depths[image > 0].max() < far + 0.3
 
 
-def test_a_drone_is_lost_where_it_is_too_low_or_too_far_away(env, begun, step, target_motion):
-    pos, vel = (np.array(x) for x in target_motion(begun.data))
+def test_an_episode_ends_where_the_drone_is_too_low_or_too_far_away(env, start_state, step, target_motion):
+    pos, vel = (np.array(x) for x in target_motion(start_state.data))
     pos[0, 0, 1] += MAX_DISTANCE + 0.05
     pos[1, 0, 2] = MIN_HEIGHT - 0.05
     pos[2, 0, 0] += MAX_DISTANCE - 0.1
-    level = jnp.broadcast_to(jnp.asarray([0, 0, 0, 1.0]), begun.data.states.quat.shape)
-    state = with_drones(begun, pos=jnp.asarray(pos), vel=jnp.asarray(vel), quat=level)
+    level = jnp.broadcast_to(jnp.asarray([0, 0, 0, 1.0]), start_state.data.states.quat.shape)
+    state = with_drones(start_state, pos=jnp.asarray(pos), vel=jnp.asarray(vel), quat=level)
     after = step(state, state.action)
     np.testing.assert_array_equal(np.flatnonzero(after.terminated), [0, 1])
     reward = np.asarray(after.reward)[:, 0]
@@ -101,9 +103,9 @@ def test_a_drone_is_lost_where_it_is_too_low_or_too_far_away(env, begun, step, t
 
 
 @pytest.mark.long("flies whole episodes, step by step")
-def test_a_drone_that_knows_the_car_can_follow_it():
+def test_a_controller_with_privileged_observations_follows_the_car():
     class Informed(FollowCar):
-        """Observe what only the critic may see."""
+        """Observe the privileged observations, too."""
 
         def observe(self, data):
             return super().observe(data) | self.privileged(data)
@@ -120,14 +122,14 @@ def test_a_drone_that_knows_the_car_can_follow_it():
     assert outcome["crashed"] == 0
 
 
-def test_only_the_critic_knows_where_the_car_is(env, begun):
-    assert set(begun.obs) == {"ang_vel", "depth", "heading", "heading_vel", "height", "segmentation", "up"}
+def test_only_the_critic_observes_the_position_of_the_car(env, start_state):
+    assert set(start_state.obs) == {"ang_vel", "depth", "heading", "heading_vel", "height", "segmentation", "up"}
     privileged = jax.eval_shape(PrivilegedObservation(env).reset, jax.random.key(0)).obs["privileged"]
     hover = jax.eval_shape(PrivilegedObservation(make("hover", 2)).reset, jax.random.key(0)).obs["privileged"]
     assert privileged.shape[-1] - hover.shape[-1] == 12
 
 
-def test_each_drone_has_a_car_of_its_own():
+def test_each_drone_has_its_own_car():
     env = make("follow_car", 2, n_drones=2, engine="interpret")
     state = jax.jit(env.reset)(jax.random.key(0))
     assert np.asarray(state.obs["segmentation"]).any(axis=-1).all()

@@ -1,4 +1,4 @@
-"""Flying through a forest: what stands where, what is seen of it, what ends a flight, and what pays."""
+"""Forest: positions of trees, observations, ends of flights, and rewards."""
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +15,13 @@ N_WORLDS, SEEN = 64, 6
 
 @pytest.fixture(scope="module")
 def start_state():
-    """Return the environment without images, the state where episodes begin, and the step."""
+    """Return an environment without images, its state at the start of episodes, and its step."""
     env = make("forest", N_WORLDS, camera=(), trees_seen=SEEN, engine="interpret")
     return env, jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
 
 
-def put(state, pos, vel=0.0, yaw=0.0, **changes):
-    """Return the state with drones elsewhere, level."""
+def place_drones(state, pos, vel=0.0, yaw=0.0, **changes):
+    """Return the state with drones at other positions, level."""
     data, s = state.data, state.data.states
     pos = jnp.broadcast_to(jnp.asarray(pos, jnp.float32), s.pos.shape)
     quat = jnp.broadcast_to(rotation.from_rpy(jnp.asarray([0.0, 0.0, yaw], jnp.float32)), s.quat.shape)
@@ -42,7 +42,7 @@ def standing_trees(env, data):
     return np.stack([trees.x, trees.y], axis=-1), radius, np.asarray(trees.is_standing)
 
 
-def test_every_world_has_a_forest_of_its_own_with_clear_starts(start_state):
+def test_every_world_has_its_own_forest_with_clear_starts(start_state):
     env, state, _ = start_state
     xy, radius, stands = standing_trees(env, state.data)
     assert stands.mean() > 0.98
@@ -67,7 +67,7 @@ def test_every_world_has_a_forest_of_its_own_with_clear_starts(start_state):
 def test_nearest_trees_are_those_of_the_forest(start_state):
     env, state, _ = start_state
     rng = np.random.default_rng(0)
-    data = put(state, rng.uniform([0, -6, 0.5], [28, 6, 3], (N_WORLDS, 1, 3)), yaw=0.7).data
+    data = place_drones(state, rng.uniform([0, -6, 0.5], [28, 6, 3], (N_WORLDS, 1, 3)), yaw=0.7).data
     xy, radius, _ = standing_trees(env, data)
     offset = xy - np.asarray(data.states.pos)[..., :2]
     gap = np.linalg.norm(offset, axis=-1) - radius
@@ -79,10 +79,10 @@ def test_nearest_trees_are_those_of_the_forest(start_state):
     worlds = np.arange(N_WORLDS)
     np.testing.assert_allclose(near[:, 0, 2], radius[worlds, nearest], atol=1e-6)
     ahead, left = np.array([np.cos(0.7), np.sin(0.7)]), np.array([-np.sin(0.7), np.cos(0.7)])
-    way = offset[worlds, nearest] / np.linalg.norm(offset[worlds, nearest], axis=-1, keepdims=True)
-    way = way * gap[worlds, nearest][:, None]
+    to_tree = offset[worlds, nearest] / np.linalg.norm(offset[worlds, nearest], axis=-1, keepdims=True)
+    to_tree = to_tree * gap[worlds, nearest][:, None]
     np.testing.assert_allclose(
-        near[:, 0, :2][outside], np.stack([way @ ahead, way @ left], axis=-1)[outside], atol=1e-4
+        near[:, 0, :2][outside], np.stack([to_tree @ ahead, to_tree @ left], axis=-1)[outside], atol=1e-4
     )
     lengths = np.linalg.norm(near[outside][..., :2], axis=-1)
     assert (np.diff(lengths, axis=-1) > -1e-5).all(), "nearest first"
@@ -91,12 +91,15 @@ def test_nearest_trees_are_those_of_the_forest(start_state):
     np.testing.assert_allclose(lengths[:, 0], np.minimum(clearance[:, 0], VIEW_RANGE)[outside], atol=1e-4)
 
 
-def test_vectors_turn_with_the_heading_and_the_critic_sees_trees(start_state):
+def test_observed_vectors_turn_with_the_heading_and_the_critic_observes_trees(start_state):
     env, state, _ = start_state
     observe = jax.jit(vmap_worlds(env.task.observe))
     pos, goal = np.array([5.0, 1.0, 1.5]), np.array([32.0, 1.0, 1.5], np.float32)
     goals = jnp.broadcast_to(goal, state.data.states.pos.shape)
-    seen = {k: np.asarray(x)[0, 0] for k, x in observe(put(state, pos, (0, 2, 1), np.pi / 2, goal=goals).data).items()}
+    seen = {
+        k: np.asarray(x)[0, 0]
+        for k, x in observe(place_drones(state, pos, (0, 2, 1), np.pi / 2, goal=goals).data).items()
+    }
     np.testing.assert_allclose(seen["heading_vel"], [2, 0, 1], atol=1e-5)
     np.testing.assert_allclose(seen["goal_direction"], [0, -1, 0], atol=1e-5)
     np.testing.assert_allclose(seen["heading"], [0, 1], atol=1e-5)
@@ -121,9 +124,9 @@ def test_hits_disable_and_crossing_the_line_is_a_success(start_state):
     pos[6] = [env.task.length + 0.01, 0, HEIGHT]
     pos[7, 0] = -EDGE - 0.01
     clear = np.asarray(vmap_worlds(lambda data: env.task.trees(1).clearance(data, data.states.pos))(
-        put(state, pos[:, None]).data))[:, 0]  # fmt: skip
+        place_drones(state, pos[:, None]).data))[:, 0]  # fmt: skip
     pos[6, 1] += 1.0 if clear[6] < 0.2 else 0.0
-    after = step(put(state, pos[:, None]), state.action)
+    after = step(place_drones(state, pos[:, None]), state.action)
     expected = np.zeros(N_WORLDS, bool)
     expected[[0, 1, 3, 4, 5, 7]] = True
     np.testing.assert_array_equal(after.info["disabled"][:, 0], expected)
@@ -132,16 +135,16 @@ def test_hits_disable_and_crossing_the_line_is_a_success(start_state):
     reward = np.asarray(after.reward)[:, 0]
     assert reward[6] > 9
     assert (reward[expected] < -9).all()
-    assert env.task.error(put(state, [4.0, 0, 1]).data).max() == env.task.length - 4
+    assert env.task.error(place_drones(state, [4.0, 0, 1]).data).max() == env.task.length - 4
 
 
-def test_speed_pays_up_to_the_set_one_and_trees_nearby_cost(start_state):
+def test_speed_is_rewarded_up_to_its_setting_and_trees_nearby_cost(start_state):
     env, state, _ = start_state
     goals = jnp.broadcast_to(jnp.asarray([32.0, 0.0, HEIGHT]), state.data.states.pos.shape)
     action = state.action
 
     def rewards(pos, vel):
-        data = put(state, pos, vel, goal=goals).data
+        data = place_drones(state, pos, vel, goal=goals).data
         terms = vmap_worlds(env.task.rewards)(data, action, action)
         return {name: float(x[0, 0]) for name, x in terms.items()}
 
@@ -153,7 +156,7 @@ def test_speed_pays_up_to_the_set_one_and_trees_nearby_cost(start_state):
     (x, y), radius = (values[0, 12] for values in standing_trees(env, state.data)[:2])
     near, far = (rewards([x - radius - gap, y, HEIGHT], (2, 0, 0))["closeness"] for gap in (0.2, 0.6))
     np.testing.assert_allclose([near, far], [-0.3 * np.exp(-1), -0.3 * np.exp(-3)], rtol=1e-3)
-    over = put(state, start, flight_over_before=jnp.ones((N_WORLDS, 1), bool)).data
+    over = place_drones(state, start, flight_over_before=jnp.ones((N_WORLDS, 1), bool)).data
     assert not any(np.any(x) for x in vmap_worlds(env.task.rewards)(over, action, action).values())
 
 

@@ -1,4 +1,4 @@
-"""Landing: pads that move, what counts as landed, and what as crashed."""
+"""Land: the motion of pads, and conditions of landing and crashing."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ N_SPAWNS, SPEED = 2048, 0.5
 CONTACT = 0.066
 """Height of the centre of mass over a level pad that the drone touches, m: radius 0.086 less 0.02."""
 CASES = {
-    # Place over the pad's middle, m, velocity relative to the pad, m/s, tilt, rad.
+    # Position relative to the pad's middle, m, velocity relative to the pad, m/s, tilt, rad.
     "soft": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
     "edge": ((0.24, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
     "fast": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.7), 0.0),
@@ -42,7 +42,7 @@ def environment(n_worlds, n_drones=1, **options):
 
 @pytest.fixture(scope="module")
 def touch_downs():
-    """Return the environment of all cases, their names to worlds, the state before, after a step, and the step."""
+    """Return an environment of all cases, the world of each case, the states before and after a step, and the step."""
     env, step = environment(len(CASES)), None
     state = jax.jit(env.reset)(jax.random.key(0))
     offset, vel, tilt = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
@@ -54,7 +54,7 @@ def touch_downs():
     return env, {name: k for k, name in enumerate(CASES)}, before, step(before, before.action), step
 
 
-def test_landed_is_who_touches_the_pad_softly_upright_and_within_it(touch_downs):
+def test_a_soft_upright_touch_within_the_pad_is_a_landing(touch_downs):
     env, world, _, after, _ = touch_downs
     landed = np.asarray(env.succeeded(after))[:, 0]
     assert {name for name, k in world.items() if landed[k]} == {"soft", "edge"}
@@ -67,25 +67,25 @@ def test_every_other_touch_and_flying_away_is_a_crash(touch_downs):
     np.testing.assert_array_equal(after.terminated, [name != "hover" for name in CASES])
 
 
-def test_landing_pays_and_crashing_costs_once(touch_downs):
+def test_landing_is_rewarded_and_crashing_costs_once(touch_downs):
     _, world, _, after, step = touch_downs
     reward = np.asarray(after.reward)[:, 0]
     assert reward[world["soft"]] > 9
-    assert -3 < reward[world["fast"]] < -1, "less than a landing pays, or none is tried"
+    assert -3 < reward[world["fast"]] < -1, "less than the reward of a landing, or policies would not try to land"
     assert abs(reward[world["hover"]]) < 0.1
     again = step(after, after.action)
     np.testing.assert_array_equal(np.asarray(again.reward)[:, 0] == 0, [name != "hover" for name in CASES])
 
 
 @pytest.fixture(scope="module")
-def moving():
-    """Return the environment of pads that move, two drones a world, and a beginning."""
+def moving_pads():
+    """Return an environment with moving pads and two drones in each world, and data at the start of episodes."""
     env = environment(N_SPAWNS, 2, speed=SPEED)
     return env, jax.jit(env.reset)(jax.random.key(5)).data
 
 
-def test_starts_are_clear_of_contact_and_pads_on_their_circles(moving):
-    env, data = moving
+def test_starts_are_clear_of_contact_and_pads_on_their_circles(moving_pads):
+    env, data = moving_pads
     env.sim.data = data
     report = env.sim.contact_report()
     assert not np.any(report.any)
@@ -96,8 +96,8 @@ def test_starts_are_clear_of_contact_and_pads_on_their_circles(moving):
     assert np.all(np.asarray(data.plugins["task"].ang_vel)[..., 0].min(axis=0) < 0)
 
 
-def test_a_moving_pad_moves_in_the_data_at_its_speed(moving):
-    env, data = moving
+def test_a_moving_pad_moves_in_the_data_at_its_speed(moving_pads):
+    env, data = moving_pads
     env.sim.data = data
     steps = 5
     env.sim.step(steps)
@@ -145,6 +145,6 @@ def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes
         ({"speed": "x"}, "got 'x'"),
     ],
 )
-def test_what_cannot_be_landed_on_is_refused(options, message):
+def test_wrong_pads_are_errors(options, message):
     with pytest.raises(ConfigError, match=message):
         make("land", 1, **options)

@@ -1,4 +1,4 @@
-"""Landing on a marker: what the camera shows of it, what policies do not observe, and what counts as landed."""
+"""Land on marker: images of the marker, observations, and conditions of landing and crashing."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def env():
 
 
 @pytest.fixture(scope="module")
-def placed(env):
+def state_before(env):
     """Return the state of all cases before a step."""
     state = jax.jit(env.reset)(jax.random.key(0))
     offset, vel, yaw = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
@@ -46,22 +46,22 @@ def placed(env):
 
 
 @pytest.fixture(scope="module")
-def flown(env, placed):
-    """Return the state after a step from all cases."""
-    return jax.jit(env.step)(placed, placed.action)
+def state_after(env, state_before):
+    """Return the state of all cases after a step."""
+    return jax.jit(env.step)(state_before, state_before.action)
 
 
 def names(mask):
     return {name for name, x in zip(CASES, np.asarray(mask)[:, 0], strict=True) if x}
 
 
-def test_rules_are_those_of_land(env, flown):
-    assert names(flown.info["landed"]) == LANDED == names(env.succeeded(flown))
-    assert names(flown.info["crashed"]) == CRASHED
+def test_rules_are_those_of_land(env, state_after):
+    assert names(state_after.info["landed"]) == LANDED == names(env.succeeded(state_after))
+    assert names(state_after.info["crashed"]) == CRASHED
 
 
-def test_images_show_the_marker_where_it_is(flown):
-    images = np.asarray(flown.obs["segmentation"]).reshape(len(CASES), SIDE, SIDE)
+def test_images_show_the_marker_where_it_is(state_after):
+    images = np.asarray(state_after.obs["segmentation"]).reshape(len(CASES), SIDE, SIDE)
     assert set(np.unique(images)) == {0, 1}
     middle = (SIDE - 1) / 2
     shift = FOCAL * 0.8
@@ -80,7 +80,7 @@ def test_images_show_the_marker_where_it_is(flown):
     assert images[list(CASES).index("soft")].all(), "the marker fills the image at touch-down"
 
 
-def test_each_drone_sees_its_own_marker_alone():
+def test_each_drone_sees_only_its_own_marker():
     env = make("land_on_marker", 1, n_drones=2)
     state = jax.eval_shape(env.reset, jax.random.key(0))
     assert state.obs["segmentation"].shape == (1, 2, SIDE**2)
@@ -93,8 +93,8 @@ def test_each_drone_sees_its_own_marker_alone():
     assert np.asarray(seen).any(axis=(2, 3)).tolist() == [[True, False]]
 
 
-def test_only_the_critic_knows_where_the_marker_is(env, placed):
-    assert set(placed.obs) == {"ang_vel", "heading", "heading_vel", "height", "segmentation", "up"}
+def test_only_the_critic_observes_the_position_of_the_marker(env, state_before):
+    assert set(state_before.obs) == {"ang_vel", "heading", "heading_vel", "height", "segmentation", "up"}
     privileged = jax.eval_shape(PrivilegedObservation(env).reset, jax.random.key(0)).obs["privileged"]
     hover = jax.eval_shape(PrivilegedObservation(make("hover", 2)).reset, jax.random.key(0)).obs["privileged"]
     assert privileged.shape[-1] - hover.shape[-1] == 6

@@ -1,4 +1,4 @@
-"""The race: its rules, its levels, what is seen of the course, and its courses."""
+"""The race: its rules, its levels, observations of the course, and its courses."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from crazysim.train.evaluation import evaluate
 
 TRACK = Track()
 CASES = {
-    # Gate, place in its frame, m, forwards or backwards, gates passed before.
+    # Gate, position in its frame, m, speed along its axis, m/s, and gates passed before.
     "forwards": (0, (-0.01, 0.1, -0.1), 2.0, 0),
     "backwards": (0, (0.01, 0.0, 0.0), -2.0, 0),
     "beside": (0, (-0.01, 0.45, 0.0), 2.0, 0),
@@ -36,15 +36,15 @@ CASES = {
 
 
 def environment(n_worlds, n_drones=1, engine="interpret", **options):
-    """Return an environment; a few steps are interpreted, as compiling them would take longer."""
+    """Return an environment, interpreted by default, as compiling would take longer than a few steps."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude", engine=engine)
     race = task.Race(**options)
     race.install(sim)
     return DroneEnv(sim, race)
 
 
-def put(state, pos, vel=0.0, **changes):
-    """Return the state with drones elsewhere, and other numbers in the race's record."""
+def place_drones(state, pos, vel=0.0, **changes):
+    """Return the state with drones at other positions, and other fields of the race's record."""
     data = state.data
     pos, vel, quat = (jnp.asarray(np.broadcast_to(np.float32(x), (*data.states.pos.shape[:2], n)))
                       for x, n in ((pos, 3), (vel, 3), ([0, 0, 0, 1], 4)))  # fmt: skip
@@ -54,8 +54,8 @@ def put(state, pos, vel=0.0, **changes):
 
 
 @pytest.fixture(scope="module")
-def raced():
-    """Return the environment of all cases, their names to worlds, the state before, and that one step later."""
+def cases():
+    """Return an environment of all cases, the world of each case, the states before and after a step, and the step."""
     env = environment(len(CASES))
     pos, vel = np.zeros((len(CASES), 1, 3)), np.zeros((len(CASES), 1, 3))
     passed = np.zeros((len(CASES), 1), np.int32)
@@ -66,13 +66,13 @@ def raced():
         if gate is not None:
             pos[world] = np.asarray(TRACK.gates_pos[gate]) + turns[gate].apply(at)
             vel[world] = speed * turns[gate].apply([1.0, 0.0, 0.0])
-    before = put(jax.jit(env.reset)(jax.random.key(0)), pos, vel, passed=jnp.asarray(passed))
+    before = place_drones(jax.jit(env.reset)(jax.random.key(0)), pos, vel, passed=jnp.asarray(passed))
     step = jax.jit(env.step)
     return env, {name: k for k, name in enumerate(CASES)}, before, step(before, before.action), step
 
 
-def test_only_crossing_the_next_gate_forwards_within_its_opening_passes_it(raced):
-    _, world, before, after, _ = raced
+def test_only_crossing_the_next_gate_forwards_within_its_opening_passes_it(cases):
+    _, world, before, after, _ = cases
     new = np.asarray(after.data.plugins["task"].passed) - before.data.plugins["task"].passed
     assert {name for name, k in world.items() if new[k, 0]} == {"forwards", "last"}
     target = np.asarray(after.obs["target_gate"])[:, 0, 0]
@@ -80,8 +80,8 @@ def test_only_crossing_the_next_gate_forwards_within_its_opening_passes_it(raced
     assert target[world["last"]] == -1
 
 
-def test_contacts_and_the_edge_of_the_arena_disable_and_end(raced):
-    _, world, _, after, _ = raced
+def test_contacts_and_the_edge_of_the_arena_disable_and_end(cases):
+    _, world, _, after, _ = cases
     disabled = np.asarray(after.info["disabled"])[:, 0]
     hit = {"frame", "post", "obstacle", "floor", "outside", "over the top"}
     assert {name for name, k in world.items() if disabled[k]} == hit
@@ -90,16 +90,16 @@ def test_contacts_and_the_edge_of_the_arena_disable_and_end(raced):
     assert not np.any(after.truncated)
 
 
-def test_the_last_gate_ends_the_race_as_a_success(raced):
-    env, world, _, after, _ = raced
+def test_the_last_gate_ends_the_race_as_a_success(cases):
+    env, world, _, after, _ = cases
     succeeded, info = np.asarray(env.succeeded(after)), jax.tree.map(np.asarray, after.info)
     assert {name for name, k in world.items() if succeeded[k, 0]} == {"last"}
     assert info["error"][world["last"], 0] == 0
     assert info["gates_passed"][world["last"], 0] == 4
 
 
-def test_rewards_count_way_gates_and_crashes_once(raced):
-    _, world, _, after, step = raced
+def test_rewards_contain_progress_and_each_gate_and_crash_once(cases):
+    _, world, _, after, step = cases
     reward = np.asarray(after.reward)[:, 0]
     moved = 2.0 * 0.02  # m in one step, to the gate at twice a metre
     np.testing.assert_allclose(reward[world["not there yet"]], 2 * moved, atol=0.01)
@@ -117,8 +117,8 @@ def test_rewards_count_way_gates_and_crashes_once(raced):
     assert np.asarray(again.terminated)[world["obstacle"]]
 
 
-def test_an_episode_is_truncated_when_its_time_is_over(raced):
-    env, world, before, _, step = raced
+def test_an_episode_is_truncated_when_its_time_is_over(cases):
+    env, world, before, _, step = cases
     core = before.data.core
     late = core.replace(steps=jnp.full_like(core.steps, (env.max_steps - 1) * env.n_substeps))
     after = step(before.replace(data=before.data.replace(core=late)), before.action)
@@ -126,12 +126,12 @@ def test_an_episode_is_truncated_when_its_time_is_over(raced):
     assert not np.asarray(after.terminated)[world["not there yet"]]
 
 
-def test_observations_in_the_drones_frame_are_those_of_the_course(raced):
-    _, world, before, after, _ = raced
+def test_observations_in_the_drones_frame_are_those_of_the_course(cases):
+    _, world, before, after, _ = cases
     k = world["forwards"]
     pos, quat = np.asarray(after.data.states.pos)[k, 0], np.asarray(after.data.states.quat)[k, 0]
     corners = np.asarray(after.obs["gate_corners"])[k, 0].reshape(2, 4, 3)
-    # The forwards one is on its way to gate 1 now, after which comes gate 2.
+    # The next gates of this drone are gates 1 and 2.
     for corner, gate in zip(corners, (1, 2), strict=True):
         middle = pos + Rotation.from_quat(quat).apply(corner.mean(axis=0))
         np.testing.assert_allclose(middle, TRACK.gates_pos[gate], atol=1e-5)
@@ -149,7 +149,7 @@ def test_drones_out_of_the_race_do_not_matter_to_others():
     passed = jnp.array([[0, 0], [0, 0], [4, 0], [4, 0]])
     disabled = jnp.array([[False, False], [True, False], [False, False], [False, True]])
     step = jax.jit(env.step)
-    state = put(jax.jit(env.reset)(jax.random.key(0)), at, passed=passed, disabled=disabled)
+    state = place_drones(jax.jit(env.reset)(jax.random.key(0)), at, passed=passed, disabled=disabled)
     after = step(state, state.action)
     #           both collide     one is out already      one has finished      one finished, one out
     expected = [[True, True], [True, False], [False, False], [False, True]]
@@ -157,23 +157,23 @@ def test_drones_out_of_the_race_do_not_matter_to_others():
     np.testing.assert_array_equal(after.terminated, [True, False, False, True])
     assert np.all(np.asarray(after.reward)[1:, 0] == 0)
     observed_drones = np.asarray(after.obs["drones_near"])[2]
-    assert np.linalg.norm(observed_drones[0]) > 0.04  # the one that flies on is seen by the other
-    np.testing.assert_array_equal(observed_drones[1], 0)  # and does not see the one that has finished
+    assert np.linalg.norm(observed_drones[0]) > 0.04  # the drone that has finished observes the other one
+    np.testing.assert_array_equal(observed_drones[1], 0)  # which does not observe it
 
 
 @pytest.fixture(scope="module")
-def drawn():
-    """Return for each level the environment and what it draws for many worlds."""
-    out = {}
+def data_of_levels():
+    """Return an environment of each level, and data at the start of episodes in many worlds."""
+    data_of_levels = {}
     for level, n_worlds, n_drones in ((0, 64, 1), (1, 64, 2), (2, 2048, 1), (3, 2048, 2)):
         env = environment(n_worlds, n_drones, level=level)
-        out[level] = env, jax.jit(lambda key, env=env: env.reset(key).data)(jax.random.key(5))
-    return out
+        data_of_levels[level] = env, jax.jit(lambda key, env=env: env.reset(key).data)(jax.random.key(5))
+    return data_of_levels
 
 
-def test_levels_draw_what_they_say(drawn):
+def test_levels_draw_starts_parameters_poses_and_courses(data_of_levels):
     varies = {}
-    for level, (_, data) in drawn.items():
+    for level, (_, data) in data_of_levels.items():
         shared = data.params.mass.ndim == 1
         pos, objects, nominal = data.states.pos, data.objects.pos, data.plugins["task"].nominal_pos
         varies[level] = (
@@ -190,8 +190,8 @@ def test_levels_draw_what_they_say(drawn):
     }
 
 
-def test_drawn_inertias_have_their_inverses_and_masses_their_range(drawn):
-    env, data = drawn[1]
+def test_drawn_inertias_have_their_inverses_and_masses_their_range(data_of_levels):
+    env, data = data_of_levels[1]
     product = np.einsum("...ij,...jk->...ik", data.params.J, data.params.J_inv)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-5)
     mass = np.asarray(data.params.mass) / 0.0434
@@ -201,8 +201,8 @@ def test_drawn_inertias_have_their_inverses_and_masses_their_range(drawn):
     np.testing.assert_allclose(env.actions.centre[3], 0.0434 * 9.81, rtol=1e-3)  # hover is the nominal drone's
 
 
-def test_level_two_moves_gates_as_far_as_it_says(drawn):
-    _, data = drawn[2]
+def test_level_two_moves_gates_by_up_to_the_jitter(data_of_levels):
+    _, data = data_of_levels[2]
     moved = np.asarray(data.objects.pos)[:, 0, :4] - np.asarray(TRACK.gates_pos)
     assert np.all(np.abs(moved) <= np.array(task.GATE_JITTER[:3]) + 1e-6)
     assert np.all(np.abs(moved).max(axis=(0, 1)) > 0.9 * np.array(task.GATE_JITTER[:3]))
@@ -210,8 +210,8 @@ def test_level_two_moves_gates_as_far_as_it_says(drawn):
 
 
 @pytest.mark.parametrize("level", [2, 3])
-def test_starts_are_clear_of_contact(drawn, level):
-    env, data = drawn[level]
+def test_starts_are_clear_of_contact(data_of_levels, level):
+    env, data = data_of_levels[level]
     env.sim.data = data
     report = env.sim.contact_report()
     assert not np.any(report.any)
@@ -219,48 +219,48 @@ def test_starts_are_clear_of_contact(drawn, level):
     assert level != 3 or report.drone_distance.min() > 0.01
 
 
-def test_random_courses_leave_room_between_gates_and_poles(drawn):
-    _, data = drawn[3]
+def test_random_courses_have_gaps_between_gates_and_poles(data_of_levels):
+    _, data = data_of_levels[3]
     pos = np.asarray(data.objects.pos)[:, 0, :, :2]
     gates, poles = pos[:, :4], pos[:, 4:]
-    apart = np.linalg.norm(gates[:, :, None] - gates[:, None], axis=-1) + 9 * np.eye(4)
-    assert apart.min() > 0.55
+    distances = np.linalg.norm(gates[:, :, None] - gates[:, None], axis=-1) + 9 * np.eye(4)
+    assert distances.min() > 0.55
     assert np.linalg.norm(gates[:, :, None] - poles[:, None], axis=-1).min() > 0.3
     assert np.all(np.abs(pos) < np.array(TRACK.high[:2]) - 0.05)
     used = np.unique(np.round(np.asarray(data.plugins["task"].nominal_pos)[:, 0, :4, 0] / 1.0 - 0.5), axis=0)
     assert len(used) > 100
 
 
-def test_poses_are_nominal_until_the_drone_was_near(drawn):
-    env, data = drawn[2]
+def test_poses_are_nominal_until_the_drone_was_near(data_of_levels):
+    env, data = data_of_levels[2]
     gate = np.asarray(data.objects.pos)[:, :, 0]
     observe = jax.jit(vmap_worlds(env.task.observe))
-    said, far = np.asarray(TRACK.gates_pos[0]), np.array([-2.0, 1.0, 1.0])
+    nominal, far = np.asarray(TRACK.gates_pos[0]), np.array([-2.0, 1.0, 1.0])
 
-    def at(data, pos):
+    def move_drones(data, pos):
         return data.replace(states=data.states.replace(pos=jnp.asarray(np.broadcast_to(np.float32(pos), gate.shape))))
 
-    def observed_drones(data):
+    def observe_gate(data):
         obs = observe(data)
         return np.asarray(obs["gates_pos"])[..., :3], np.asarray(obs["gates_visited"])[..., 0]
 
-    observed, visited = observed_drones(at(data, far))
-    np.testing.assert_allclose(observed, np.broadcast_to(said, observed.shape), atol=1e-6)
+    observed, visited = observe_gate(move_drones(data, far))
+    np.testing.assert_allclose(observed, np.broadcast_to(nominal, observed.shape), atol=1e-6)
     assert not visited.any()
-    # High over the gate is near too: distances are in the plane.
-    near = at(data, gate + [0.6, 0.3, 0.5])
-    observed, visited = observed_drones(near)
+    # A drone high above a gate is near it, too: distances are horizontal.
+    near = move_drones(data, gate + [0.6, 0.3, 0.5])
+    observed, visited = observe_gate(near)
     np.testing.assert_allclose(observed, gate, atol=1e-6)
     assert visited.all()
-    observed, _ = observed_drones(at(data, gate + [0.6, 0.4, 0.0]))
-    np.testing.assert_allclose(observed, np.broadcast_to(said, observed.shape), atol=1e-6)
-    observed, visited = observed_drones(at(jax.jit(vmap_worlds(env.task.before_step))(near), far))
+    observed, _ = observe_gate(move_drones(data, gate + [0.6, 0.4, 0.0]))
+    np.testing.assert_allclose(observed, np.broadcast_to(nominal, observed.shape), atol=1e-6)
+    observed, visited = observe_gate(move_drones(jax.jit(vmap_worlds(env.task.before_step))(near), far))
     np.testing.assert_allclose(observed, gate, atol=1e-6)
     assert visited.all()
 
 
-def test_the_same_key_gives_the_same_course_in_any_world(drawn):
-    env, _ = drawn[1]
+def test_the_same_key_gives_the_same_course_in_any_world(data_of_levels):
+    env, _ = data_of_levels[1]
     spawn = jax.jit(vmap_worlds(env.task.spawn))
     default, keys = env.episode_reset.make_default(env.sim.default_data), world_keys(env.sim.default_data, "spawn")
     data, again, other = spawn(default, keys), spawn(default, keys), spawn(default, jnp.roll(keys, 1))
@@ -272,7 +272,7 @@ def test_the_same_key_gives_the_same_course_in_any_world(drawn):
     assert not np.allclose(other.params.mass, data.params.mass)
 
 
-def test_way_leads_around_a_gate_from_behind_and_back_from_beside_it():
+def test_the_way_leads_around_a_gate_from_behind_and_back_from_beside_it():
     beside = np.array([[1e-7, 0.45, 0.0], [-1e-7, 0.45, 0.0]])
     places = [[-1.0, 0.0, 0.0], [-4.0, 3.0, 0.0], [-3.0, 4.0, 0.0], [0.5, 0.0, 0.0], [0.3, 0.9, 0.0], *beside]
     before_the_frame = np.array([-0.01, 0.38, 0.1])
@@ -281,10 +281,10 @@ def test_way_leads_around_a_gate_from_behind_and_back_from_beside_it():
     around = 2 * 0.45 - 0.15  # from beside the frame, where both ways are the same
     expected = [1.0, 5.0, 5.0 + 0.85, np.hypot(0.5, 0.45) + around, np.hypot(0.3, 0.45) + around]
     np.testing.assert_allclose(ahead, [*expected, around, around], rtol=1e-6)
-    assert slope[0] > 0.9, "beside the frame the way is shorter farther back"
+    assert slope[0] > 0.9, "beside the frame the way is shorter further back"
 
 
-def test_practice_begins_behind_gates():
+def test_practice_begins_episodes_behind_gates():
     env = make("race", 400, practice=True)
     data = jax.jit(lambda key: env.reset(key).data)(jax.random.key(0))
     passed = np.asarray(rules.race_of(data).passed)[:, 0]
@@ -300,14 +300,14 @@ def test_practice_begins_behind_gates():
     assert not np.any(env.sim.contact_report().any)
 
 
-def test_drones_that_practice_together_begin_behind_different_gates():
+def test_practice_places_drones_of_a_world_behind_different_gates():
     env = make("multi_race", 200, practice=True, n_drones=3)
     data = jax.jit(lambda key: env.reset(key).data)(jax.random.key(0))
     passed = np.asarray(rules.race_of(data).passed)
     assert np.bincount(passed[:, 0], minlength=4).min() > 30, "each gate as often as the others"
     assert np.all((passed == 0).all(axis=1) | (np.sort(passed, axis=1) == [1, 2, 3]).all(axis=1))
-    apart = np.asarray(data.states.pos)[:, :, None] - np.asarray(data.states.pos)[:, None]
-    assert np.linalg.norm(apart + np.eye(3)[..., None], axis=-1).min() > 0.2
+    offsets = np.asarray(data.states.pos)[:, :, None] - np.asarray(data.states.pos)[:, None]
+    assert np.linalg.norm(offsets + np.eye(3)[..., None], axis=-1).min() > 0.2
     env.sim.data = data
     assert not np.any(env.sim.contact_report().any)
     with pytest.raises(ConfigError, match="expected fewer drones than gates for practice, got 4 drones and 4 gates"):
@@ -320,8 +320,8 @@ def test_ranks_are_a_draw_without_replacement():
     np.testing.assert_array_equal(ranks(x, 2), [[1, 2], [4, 3]])
 
 
-def test_a_given_track_is_flown_and_judged():
-    """Two gates in a row, and a drone that is thrown through both."""
+def test_a_track_of_the_user_can_be_raced():
+    """Two gates in a row, and drones that start with a velocity through both, or away from them."""
     track = Track(
         gates_pos=[(-1, 0, 1), (0.0, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, obstacles_pos=[(1, 1, 1.5)], start=(-2, 0, 1)
     )
@@ -358,6 +358,6 @@ def test_a_given_track_is_flown_and_judged():
         ({"n_drones": 9, "level": 3}, "expected at most 8 drones"),
     ],
 )
-def test_what_cannot_be_raced_is_refused(options, message):
+def test_wrong_levels_and_tracks_are_errors(options, message):
     with pytest.raises(ConfigError, match=message):
         make("race", 1, **options)

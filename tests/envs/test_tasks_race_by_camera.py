@@ -1,4 +1,4 @@
-"""The race by camera: what is observed, which way drones face at the start, and the cost of looking away."""
+"""The race by camera: observations, headings at the start, and the cost of looking away."""
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,8 @@ SIZES = {"ang_vel": 3, "height": 1, "next_gate": 4, "rot": 9, "vel_body": 3}
 
 
 @pytest.fixture(scope="module")
-def begun():
-    """Return the environment in practice, and the state where episodes begin."""
+def start_state():
+    """Return an environment with practice, and its state at the start of episodes."""
     env = make("race_by_camera", N_WORLDS, camera=(), practice=True, engine="interpret")
     return env, jax.jit(env.reset)(jax.random.key(0))
 
@@ -34,9 +34,9 @@ def test_policies_observe_an_image_and_no_positions_but_the_height():
     assert seen["privileged"].shape[-1] - hover["privileged"].shape[-1] >= 24 + 6
 
 
-def test_observations_do_not_change_where_the_course_and_the_drone_move_alike(begun):
-    """Neither the place of a gate nor that of the drone over ground is observed."""
-    env, state = begun
+def test_observations_do_not_change_where_the_course_and_the_drone_move_alike(start_state):
+    """Neither the positions of gates nor the horizontal position of the drone are observed."""
+    env, state = start_state
     observe = jax.jit(vmap_worlds(env.task.observe))
     data, shift = state.data, jnp.asarray([0.3, -0.2, 0.0], jnp.float32)
     seen, s = observe(data), data.states
@@ -47,8 +47,8 @@ def test_observations_do_not_change_where_the_course_and_the_drone_move_alike(be
         np.testing.assert_array_equal(x, moved_gates[name], err_msg=name)
 
 
-def test_the_critic_gets_the_true_corners_of_the_next_gates(begun):
-    env, state = begun
+def test_the_critic_gets_the_true_corners_of_the_next_gates(start_state):
+    env, state = start_state
     corners = np.asarray(jax.jit(vmap_worlds(env.task.privileged))(state.data)["gate_corners"]).reshape(-1, 2, 4, 3)
     passed, s = np.asarray(state.data.plugins["task"].passed)[:, 0], state.data.states
     quat = jnp.broadcast_to(s.quat, (N_WORLDS, 1, 4))
@@ -58,8 +58,8 @@ def test_the_critic_gets_the_true_corners_of_the_next_gates(begun):
     np.testing.assert_array_equal(next_gate, np.eye(4)[passed])
 
 
-def test_drones_face_the_first_gate_or_along_the_gate_that_they_passed(begun):
-    _, state = begun
+def test_drones_face_the_first_gate_or_along_the_gate_that_they_passed(start_state):
+    _, state = start_state
     passed, s = np.asarray(state.data.plugins["task"].passed)[:, 0], state.data.states
     assert set(passed) == {0, 1, 2, 3}
     yaw = np.asarray(rotation.to_rpy(s.quat))[:, 0, 2]
@@ -69,8 +69,8 @@ def test_drones_face_the_first_gate_or_along_the_gate_that_they_passed(begun):
     assert np.abs((yaw - expected + np.pi) % (2 * np.pi) - np.pi).max() < 0.1 + 1e-5
 
 
-def test_looking_away_from_the_next_gate_costs(begun):
-    env, state = begun
+def test_looking_away_from_the_next_gate_costs(start_state):
+    env, state = start_state
     data, s = state.data, state.data.states
     record = data.plugins["task"].replace(passed=jnp.zeros((N_WORLDS, 1), jnp.int32))
     pos = jnp.broadcast_to(jnp.asarray(TRACK.gates_pos[0], jnp.float32) - jnp.asarray([1.0, 0, 0]), s.pos.shape)

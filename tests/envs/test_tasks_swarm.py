@@ -15,7 +15,7 @@ N_WORLDS, N_DRONES = 2048, 4
 
 @pytest.fixture(scope="module")
 def start_state():
-    """Return the environment, the state where episodes begin, and the step."""
+    """Return an environment, its state at the start of episodes, and its step."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
     task = Swarm()
     task.install(sim)
@@ -23,8 +23,8 @@ def start_state():
     return env, jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
 
 
-def put(state, pos):
-    """Return the state with drones elsewhere, at rest and level."""
+def place_drones(state, pos):
+    """Return the state with drones at other positions, at rest and level."""
     data, s = state.data, state.data.states
     level = np.broadcast_to(np.float32([0, 0, 0, 1]), s.quat.shape)
     still = np.zeros_like(s.vel)
@@ -43,7 +43,7 @@ def test_separation_is_that_of_an_ellipsoid_longer_in_z():
     assert np.all(np.isfinite(at_one_point))
 
 
-def test_starts_are_clear_and_places_are_exchanged(start_state):
+def test_starts_are_clear_and_drones_exchange_their_positions(start_state):
     env, state, _ = start_state
     data = state.data
     env.sim.data = data
@@ -51,13 +51,15 @@ def test_starts_are_clear_and_places_are_exchanged(start_state):
     assert not np.any(report.any)
     assert np.asarray(separations(data.states.pos)).min() > 1.5
     goal = np.asarray(data.plugins["task"].goal)
-    # A goal is the place of another drone, and everyone has one of its own.
-    far = np.linalg.norm(goal[:, :, None] - np.asarray(data.states.pos)[:, None], axis=-1)
-    whose = far.argmin(axis=-1)
-    assert far.min(axis=-1).max() < 0.1 * np.sqrt(3) + 1e-5
-    assert not np.any(whose == np.arange(N_DRONES))
-    np.testing.assert_array_equal(np.sort(whose, axis=-1), np.broadcast_to(np.arange(N_DRONES), whose.shape))
-    assert set((whose[:, 0]).tolist()) == {1, 2, 3}
+    # A goal is the position of another drone, and no two drones have the same goal.
+    distance = np.linalg.norm(goal[:, :, None] - np.asarray(data.states.pos)[:, None], axis=-1)
+    target_drone = distance.argmin(axis=-1)
+    assert distance.min(axis=-1).max() < 0.1 * np.sqrt(3) + 1e-5
+    assert not np.any(target_drone == np.arange(N_DRONES))
+    np.testing.assert_array_equal(
+        np.sort(target_drone, axis=-1), np.broadcast_to(np.arange(N_DRONES), target_drone.shape)
+    )
+    assert set((target_drone[:, 0]).tolist()) == {1, 2, 3}
     np.testing.assert_allclose(state.info["error"], np.linalg.norm(goal - data.states.pos, axis=-1), rtol=1e-5)
 
 
@@ -71,26 +73,26 @@ def test_coming_too_near_ends_and_costs(start_state):
     pos[4, 2, 2] = 0.01
     pos[5, 3, 0] = 2.5
     pos[6, 0] = pos[6, 1] + [0.2, 0, 0]
-    after = step(put(state, pos), state.action)
+    after = step(place_drones(state, pos), state.action)
     np.testing.assert_array_equal(np.flatnonzero(after.terminated), [1, 2, 4, 5, 6])
     assert np.all(np.asarray(after.info["separation"])[1:3, :2] < 1)
     reward = np.asarray(after.reward)
     assert np.all(reward[0] > 1.3)
     assert np.all(reward[1:3, :2] < -9)
-    assert reward[1, 2] > 1  # whom the two did not come near is not to blame
+    assert reward[1, 2] > 1  # a drone that no other one comes near is not punished
     assert np.all(np.asarray(after.info["error"])[0] < 0.03)
-    ways = np.asarray(after.obs["drones_near"]).reshape(N_WORLDS, N_DRONES, 3, 3)
-    np.testing.assert_allclose(ways[1, 0, 0], [0.2, 0, 0], atol=0.01)
-    assert np.all(np.diff(np.linalg.norm(ways, axis=-1), axis=-1) > -1e-6)
+    offsets = np.asarray(after.obs["drones_near"]).reshape(N_WORLDS, N_DRONES, 3, 3)
+    np.testing.assert_allclose(offsets[1, 0, 0], [0.2, 0, 0], atol=0.01)
+    assert np.all(np.diff(np.linalg.norm(offsets, axis=-1), axis=-1) > -1e-6)
 
 
 def test_separation_is_kept_at_every_physics_step(start_state):
     _, state, step = start_state
-    # One flies past another at 40 m/s within one environment step: too near only in between.
+    # One drone flies past another at 40 m/s within one environment step, so both are near only between steps.
     pos = np.asarray(state.data.plugins["task"].goal).copy()
     pos[0, 0], pos[0, 1] = [-0.4, 0, 1.2], [0.0, 0.05, 1.2]
     pos[0, 2:] = [[0, 1.5, 1.2], [0, -1.5, 1.2]]
-    fast = put(state, pos)
+    fast = place_drones(state, pos)
     vel = fast.data.states.vel.copy()
     vel[0, 0, 0] = 40.0
     after = step(fast.replace(data=fast.data.replace(states=fast.data.states.replace(vel=vel))), state.action)
@@ -98,7 +100,7 @@ def test_separation_is_kept_at_every_physics_step(start_state):
     assert after.terminated[0]
 
 
-def test_a_formation_is_what_drones_are_sent_to():
+def test_goals_can_be_a_formation():
     formation = [(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (0, 0, 2)]
     sim = Sim(n_worlds=64, n_drones=N_DRONES, control="attitude")
     task = Swarm(formation=formation, strict=False)
@@ -111,8 +113,8 @@ def test_a_formation_is_what_drones_are_sent_to():
     near = near.replace(plugins={"task": near.plugins["task"].replace(closest=np.zeros((64, 4), np.float32))})
     assert not np.any(jax.jit(vmap_worlds(task.terminated))(near))
     zeros, rewards = np.zeros((64, 4, 4), np.float32), jax.jit(vmap_worlds(task.rewards))
-    calm, crowded = rewards(data, zeros, zeros), rewards(near, zeros, zeros)
-    assert np.all((np.asarray(crowded["crowding"]) - calm["crowding"])[:, 0] < -2)
+    rewards_apart, rewards_near = rewards(data, zeros, zeros), rewards(near, zeros, zeros)
+    assert np.all((np.asarray(rewards_near["crowding"]) - rewards_apart["crowding"])[:, 0] < -2)
 
 
 @pytest.mark.parametrize(
@@ -126,6 +128,6 @@ def test_a_formation_is_what_drones_are_sent_to():
         ({"n_seen": 0}, "n_seen of Swarm to be finite and at least 1, got 0"),
     ],
 )
-def test_what_cannot_be_a_swarm_is_refused(options, message):
+def test_wrong_numbers_and_formations_are_errors(options, message):
     with pytest.raises(ConfigError, match=message):
         make("swarm", 1, **options)

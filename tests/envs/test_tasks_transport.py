@@ -1,4 +1,4 @@
-"""Transport: what passes the gate and what misses it, when a load is delivered, and how progress is rewarded."""
+"""Transport: conditions of passing and missing the gate, of delivery, and rewards of progress."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ N_SPAWNS, LENGTH = 512, 0.3
 GATE, GOAL = np.array([0.0, 0.0, 1.3], np.float32), np.array([1.4, 0.0, 1.2], np.float32)
 DOWN = (0.0, 0.0, -LENGTH)
 CASES = {
-    # Place of the drone from the middle of the gate, m, load from the drone, m, velocity of both, m/s.
+    # Position of the drone relative to the gate, m, of the load relative to the drone, m, and velocity of both, m/s.
     "through": ((-0.005, 0.0, 0.15), DOWN, (1.0, 0.0, 0.0)),
     "backwards": ((0.005, 0.0, 0.15), DOWN, (-1.0, 0.0, 0.0)),
     "before": ((-0.5, 0.0, 0.15), DOWN, (0.0, 0.0, 0.0)),
@@ -36,7 +36,7 @@ CASES = {
 """One world each, with an unturned gate."""
 SAFE = {"through", "backwards", "before", "behind", "load just inside"}
 AT_GOAL = {
-    # Place of the load from its goal, m, velocity, m/s, and x of the goal, m.
+    # Position of the load relative to its goal, m, velocity, m/s, and x of the goal, m.
     "there": ((0.0, 0.05, 0.0), (0.0, 0.0, 0.0), 1.4),
     "off": ((0.0, 0.12, 0.0), (0.0, 0.0, 0.0), 1.4),
     "fast": ((0.0, 0.0, 0.0), (0.0, 0.25, 0.0), 1.4),
@@ -53,25 +53,25 @@ def environment(n_worlds, n_drones=1, **options):
     return DroneEnv(sim, task)
 
 
-def placed(state, drone, load, vel, goal=GOAL):
-    """Return a state of single drones with level drones and loads in other places, and an unturned gate."""
+def place_drones(state, drone, load, vel, goal=GOAL):
+    """Return the state with level drones and loads at other positions, and an unturned gate."""
     data = state.data
-    s, own, hanging = data.states, data.plugins["task"], data.plugins["load"]
+    s, task, load_record = data.states, data.plugins["task"], data.plugins["load"]
     drone, load, vel, goal = (jnp.asarray(np.broadcast_to(np.float32(x), (len(s.pos), 3))[:, None])
                               for x in (drone, load, vel, goal))  # fmt: skip
     level = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
     still = jnp.zeros(vel.shape)
     data = data.replace(states=s.replace(pos=drone, vel=vel, quat=jnp.full(s.quat.shape, level), ang_vel=still))
-    plugins = data.plugins | {"task": own.replace(goal=goal), "load": hanging.replace(pos=load, vel=vel)}
-    return state.replace(data=own.gates.set_pose(data.replace(plugins=plugins), GATE, level))
+    plugins = data.plugins | {"task": task.replace(goal=goal), "load": load_record.replace(pos=load, vel=vel)}
+    return state.replace(data=task.gates.set_pose(data.replace(plugins=plugins), GATE, level))
 
 
 @pytest.fixture(scope="module")
 def recorded_flight():
-    """Return names of all cases to worlds, and the state after a step."""
+    """Return the world of each case, and the state after a step."""
     env = environment(len(CASES))
     place, hang, vel = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
-    before = placed(jax.jit(env.reset)(jax.random.key(0)), GATE + place, GATE + place + hang, vel)
+    before = place_drones(jax.jit(env.reset)(jax.random.key(0)), GATE + place, GATE + place + hang, vel)
     return {name: k for k, name in enumerate(CASES)}, jax.jit(env.step)(before, before.action)
 
 
@@ -93,7 +93,7 @@ def test_a_load_is_delivered_after_it_has_stayed_at_its_goal_slowly_and_behind_t
     env = environment(len(AT_GOAL))
     offset, vel, x = (np.array(v, np.float32) for v in zip(*AT_GOAL.values(), strict=True))
     goal = np.broadcast_to(GOAL, offset.shape) * [0, 1, 1] + x[:, None] * [1, 0, 0]
-    state = placed(jax.jit(env.reset)(jax.random.key(0)), goal + offset - DOWN, goal + offset, vel, goal)
+    state = place_drones(jax.jit(env.reset)(jax.random.key(0)), goal + offset - DOWN, goal + offset, vel, goal)
     step, hold = jax.jit(env.step), round(env.task.hold * env.sim.freq)
     waiting = np.array([[hold - 15]] * len(AT_GOAL), np.int32)
     own = state.data.plugins["task"].replace(steps_there=jnp.asarray(waiting))
@@ -103,12 +103,12 @@ def test_a_load_is_delivered_after_it_has_stayed_at_its_goal_slowly_and_behind_t
     np.testing.assert_array_equal(first.data.plugins["task"].steps_there[:, 0], [hold - 5, 0, 0, 0])
     second = step(first, state.action)
     np.testing.assert_array_equal(np.asarray(env.succeeded(second))[:, 0], [True, False, False, False])
-    away = placed(second, GOAL + np.array([0.0, 0.5, LENGTH]), GOAL + np.array([0.0, 0.5, 0.0]), 0.0)
+    away = place_drones(second, GOAL + np.array([0.0, 0.5, LENGTH]), GOAL + np.array([0.0, 0.5, 0.0]), 0.0)
     assert step(away, state.action).info["delivered"][0, 0], "it stays delivered"
 
 
-def test_progress_pays_for_the_way_only_and_passing_the_gate_never_costs(rng):
-    """The sum over a way there and back is zero, and the way jumps down or not at all where the gate is passed."""
+def test_progress_is_rewarded_by_its_length_and_passing_the_gate_never_costs(rng):
+    """The remaining way decreases, or does not change, where the gate is passed."""
     env = environment(64)
     state = jax.jit(env.reset)(jax.random.key(0))
     corner = np.array([0.0, 0.35, 0.35])
@@ -118,13 +118,13 @@ def test_progress_pays_for_the_way_only_and_passing_the_gate_never_costs(rng):
     ways, to_go = [], jax.jit(vmap_worlds(env.task.remaining_way))
     for x in (-1.0, -1e-3, 1e-3, 1.0):
         load = (at + np.array([x, 0.0, 0.0])).astype(np.float32)
-        ways.append(np.asarray(to_go(placed(state, load - DOWN, load, 0.0).data))[:, 0])
+        ways.append(np.asarray(to_go(place_drones(state, load - DOWN, load, 0.0).data))[:, 0])
         around = np.linalg.norm(load - aim, axis=-1) + np.linalg.norm(GOAL - aim)
         expected = around if x < 0 else np.linalg.norm(load - GOAL, axis=-1)
         np.testing.assert_allclose(ways[-1], expected, atol=1e-5)
     assert np.all(ways[1] - ways[2] > -1e-3)
     np.testing.assert_allclose(ways[1][0], ways[2][0], atol=3e-3)
-    data = placed(state, GOAL - DOWN, GOAL, 0.0).data
+    data = place_drones(state, GOAL - DOWN, GOAL, 0.0).data
     own = data.plugins["task"].replace(remaining_way_before=jnp.asarray(ways[0])[:, None])
     data = data.replace(plugins=data.plugins | {"task": own})
     paid = jax.jit(vmap_worlds(env.task.rewards))(data, state.action, state.action)
@@ -171,9 +171,9 @@ class Pilot(PyTree):
         aside = gate - ahead * axis
         pace = jnp.clip(1 - 4 * jnp.linalg.norm(aside, axis=-1, keepdims=True), 0.0, 1.0)
         to_goal = obs["difference_to_goal"] + load + jnp.array([0.0, 0.0, LENGTH])
-        wanted = jnp.where(ahead > -0.2, 0.8 * pace * axis + 1.5 * aside, jnp.clip(1.2 * to_goal, -0.8, 0.8))
+        vel = jnp.where(ahead > -0.2, 0.8 * pace * axis + 1.5 * aside, jnp.clip(1.2 * to_goal, -0.8, 0.8))
         level = jnp.array([1.0, 1.0, 0.0])
-        acc = 3 * (wanted - obs["vel"]) + 2 * level * obs["load_vel"]
+        acc = 3 * (vel - obs["vel"]) + 2 * level * obs["load_vel"]
         roll, pitch = -acc[..., 1:2] / 9.81, acc[..., :1] / 9.81
         actions = [roll / (jnp.pi / 4), pitch / (jnp.pi / 4), 0 * roll, 0.26 + 0.14 * acc[..., 2:]]
         return self.gain * jnp.clip(jnp.concatenate(actions, axis=-1), -1, 1)
@@ -197,6 +197,6 @@ def test_a_pilot_that_aims_at_the_opening_and_damps_the_swing_delivers_and_one_t
         ({"mass": -1.0}, "mass"),
     ],
 )
-def test_what_cannot_be_carried_is_refused(options, message):
+def test_wrong_openings_lengths_and_masses_are_errors(options, message):
     with pytest.raises(ConfigError, match=message):
         make("transport", 1, **options)

@@ -25,7 +25,7 @@ ID = "crazysim/Hover-v0"
 
 @pytest.fixture(scope="module")
 def envs():
-    """Three worlds with short episodes, in every mode, over one functional environment."""
+    """Return vector environments of all modes, with three worlds and short episodes, over one environment."""
     short = make("hover", 3, seconds=N_STEPS / 50)
     return {mode: DroneVectorEnv(short, mode) for mode in MODES}
 
@@ -62,7 +62,7 @@ def test_an_episode_takes_its_time_in_every_mode(env):
 
 @pytest.mark.long("compiles an environment for two devices")
 def test_episodes_stay_on_the_device_that_was_asked_for():
-    """Compiled or not, where the key and the actions are on JAX's default device; a moved state stays there."""
+    """Compiled or not, with keys and actions on JAX's default device; the steps of a moved state stay on its device."""
     default, device = jax.devices()[:2]
     env = make("hover", 3, device="cpu:1")
     state = jax.jit(env.reset)(jax.random.key(0))
@@ -81,7 +81,7 @@ def test_episodes_stay_on_the_device_that_was_asked_for():
         assert trees_equal(jax.jit(env.reset)(jax.random.key(0)), state)
 
 
-def test_next_step_gives_no_reward_for_the_step_that_begins(next_step):
+def test_next_step_gives_no_reward_in_the_step_that_begins_an_episode(next_step):
     results = run(next_step, N_STEPS + 2)
     rewards = np.stack([reward for _, reward, _, _, _ in results])
     np.testing.assert_array_equal(rewards[N_STEPS], np.zeros(3))
@@ -92,7 +92,7 @@ def test_next_step_gives_no_reward_for_the_step_that_begins(next_step):
     assert "final_obs" not in results[-1][4]
 
 
-def test_same_step_tells_the_last_observation(envs):
+def test_same_step_returns_the_last_observation_of_an_episode(envs):
     env = envs["SameStep"]
     results = run(env, N_STEPS + 1)
     disabled = run(envs["Disabled"], N_STEPS)
@@ -110,7 +110,7 @@ def test_same_step_tells_the_last_observation(envs):
     assert "final_info" not in disabled[-1][4]
 
 
-def test_disabled_resets_those_of_a_mask(envs):
+def test_disabled_resets_the_worlds_of_a_mask(envs):
     env, mask = envs["Disabled"], np.array([True, False, True])
     last = run(env, N_STEPS + 1)[-1][0]
     obs, _ = env.reset(options={"reset_mask": mask})
@@ -120,19 +120,19 @@ def test_disabled_resets_those_of_a_mask(envs):
     np.testing.assert_array_equal(truncated, ~mask)
 
 
-def test_seeds(next_step):
+def test_seeds_determine_all_episodes(next_step):
     first, _ = next_step.reset(seed=3)
     again, _ = next_step.reset(seed=3)
-    on, _ = next_step.reset()
+    second, _ = next_step.reset()
     assert trees_equal(first, again)
-    assert not np.allclose(on["pos"], first["pos"])
+    assert not np.allclose(second["pos"], first["pos"])
     next_step.reset(seed=3)
-    assert trees_equal(next_step.reset()[0], on), "what comes after a seed follows from it"
+    assert trees_equal(next_step.reset()[0], second), "the episodes after a seed follow from it"
     assert len(np.unique(first["pos"][:, 0])) == 3, "worlds differ"
     assert trees_equal(next_step.reset(seed=np.int64(3))[0], first)
 
 
-def test_one_dispatch_a_step_and_arrays_stay_where_they_are(next_step):
+def test_a_step_transfers_no_arrays_and_is_traced_once(next_step):
     next_step.reset(seed=0)
     action = jnp.zeros(next_step.action_space.shape)
     next_step.step(action)
@@ -142,7 +142,7 @@ def test_one_dispatch_a_step_and_arrays_stay_where_they_are(next_step):
     traces = next_step._stepper.compiled._cache_size()
     for actions in (zeros(next_step), zeros(next_step).astype(np.float64), zeros(next_step).tolist()):
         next_step.step(actions)
-    # NumPy comes in by another door than JAX, and is traced once
+    # NumPy arrays are converted in another way than JAX arrays, and traced once
     assert next_step._stepper.compiled._cache_size() <= traces + 1
 
 
@@ -159,14 +159,14 @@ def test_one_dispatch_a_step_and_arrays_stay_where_they_are(next_step):
         ),
     ],
 )
-def test_wrong_actions(next_step, action, error, message):
+def test_wrong_actions_are_errors(next_step, action, error, message):
     next_step.reset(seed=0)
     with pytest.raises(error, match=message):
         next_step.step(action)
 
 
 def test_an_action_of_the_device_that_is_not_finite_ends_its_world(next_step):
-    """Looking at it would stall the device; the world says so itself."""
+    """A check on the host would stall the device; the world is terminated and reported instead."""
     next_step.reset(seed=0)
     obs, reward, terminated, _, info = next_step.step(jnp.zeros((3, 4)).at[1].set(jnp.nan))
     np.testing.assert_array_equal(terminated, [False, True, False])
@@ -194,7 +194,7 @@ def test_an_action_of_the_device_that_is_not_finite_ends_its_world(next_step):
         ),
     ],
 )
-def test_wrong_resets(next_step, kwargs, error, message):
+def test_wrong_resets_are_errors(next_step, kwargs, error, message):
     next_step.reset(seed=0)
     with pytest.raises(error, match=message):
         next_step.reset(**kwargs)
@@ -214,17 +214,17 @@ def test_wrong_resets(next_step, kwargs, error, message):
         ({"freq": 300}, "expected an environment freq that divides the simulation's 500 Hz, got 300 Hz"),
     ],
 )
-def test_wrong_settings(kwargs, message):
+def test_wrong_settings_are_errors(kwargs, message):
     with pytest.raises(ConfigError, match=message):
         gymnasium.make_vec(ID, num_envs=2, **kwargs)
 
 
-def test_a_task_that_does_not_exist():
+def test_an_unknown_task_is_an_error():
     with pytest.raises(ConfigError, match="task 'hoover' does not exist; there are hover"):
         make("hoover")
 
 
-def test_what_comes_before_a_reset_is_refused():
+def test_a_step_before_the_first_reset_is_an_error():
     env = make_vector("hover", 1)
     with pytest.raises(ConfigError, match=r"expected a reset of all worlds before the first reset_mask, got none"):
         env.reset(options={"reset_mask": [False]})
@@ -260,8 +260,8 @@ def test_pictures_show_the_drone_as_it_is():
 
 
 @pytest.mark.usefixtures("opengl")
-def test_gymnasiums_recorder_films_every_world_or_the_env_renders_a_chosen_one(tmp_path, monkeypatch):
-    """It writes films with MoviePy, in whose place the test takes the frames."""
+def test_gymnasiums_recorder_films_all_worlds_and_render_worlds_chooses_some(tmp_path, monkeypatch):
+    """The recorder writes films with MoviePy, which the test replaces to get the frames."""
     films = []
 
     class Clip:
@@ -293,7 +293,7 @@ def test_gymnasiums_recorder_films_every_world_or_the_env_renders_a_chosen_one(t
     env.close()
 
 
-def test_numpy_users_go_through_gymnasiums_wrappers(envs):
+def test_gymnasiums_wrappers_return_numpy_arrays(envs):
     pytest.importorskip("array_api_compat")
     wrappers = gymnasium.wrappers.vector
     env = wrappers.RecordEpisodeStatistics(wrappers.JaxToNumpy(envs["NextStep"]))

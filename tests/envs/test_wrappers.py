@@ -1,4 +1,4 @@
-"""What every wrapper does, in numbers, and what wrappers may not be put around."""
+"""Every wrapper, by numbers, and environments that wrappers refuse."""
 
 import jax
 import jax.numpy as jnp
@@ -31,41 +31,41 @@ FIRST = np.array([True, False, False, False])
 
 @pytest.fixture(scope="module")
 def env():
-    return make("hover", 4, engine="interpret")  # compiles nothing
+    return make("hover", 4, engine="interpret")  # without compilation
 
 
 def assert_same_world(a, b):
-    """Compare states of one world by two programs, a wrapper's and the environment's, up to rounding of a few steps."""
+    """Compare states of a world by two programs, with and without a wrapper, up to the rounding of a few steps."""
     assert jax.tree.structure(a) == jax.tree.structure(b)
     for x, y in zip(*(jax.tree.leaves(jax.tree.map(as_numbers, tree)) for tree in (a, b)), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)
 
 
-def steps(env, state, n, seed=0):
-    """Return the states of n random steps."""
-    out = []
+def random_steps(env, state, n, seed=0):
+    """Return the states after each of n random steps."""
+    states = []
     for i in range(n):
         state = env.step(state, random_action(state, seed + i))
-        out.append(state)
-    return out
+        states.append(state)
+    return states
 
 
-def test_nothing_goes_around_automatic_resets(env):
+def test_wrappers_around_automatic_resets_are_errors(env):
     auto = AutoReset(env)
-    same = lambda e: RandomizeWith(e, lambda d, k: d)  # noqa: E731
-    for around in (EpisodeStatistics, AutoReset, lambda e: FrameStack(e, 2), same):
+    randomize = lambda e: RandomizeWith(e, lambda d, k: d)  # noqa: E731
+    for wrap in (EpisodeStatistics, AutoReset, lambda e: FrameStack(e, 2), randomize):
         with pytest.raises(ConfigError, match="without AutoReset, got one with it"):
-            around(auto)
+            wrap(auto)
 
 
-def test_a_wrapper_passes_on_what_it_is_about(env):
+def test_a_wrapper_has_the_attributes_of_its_environment(env):
     wrapped = FrameStack(EpisodeStatistics(env), 2)
     for name in ("sim", "task", "actions", "n_substeps", "max_steps"):
         assert getattr(wrapped, name) is getattr(env, name)
 
 
 class Recorder(Wrapper):
-    """Notes calls of its hooks, and the shapes that they receive."""
+    """Records calls of its hooks, and the shapes of their arguments."""
 
     def __init__(self, env, name, calls):
         super().__init__(env)
@@ -90,18 +90,18 @@ class Recorder(Wrapper):
 
 def test_shared_parameters_stay_when_episodes_begin(env):
     state = env.reset(jax.random.key(0))
-    heavier_all = state.data.params.replace(mass=state.data.params.mass * 2)
-    after = env.restart(state.replace(data=state.data.replace(params=heavier_all)), jnp.asarray(FIRST))
-    assert trees_equal(after.data.params, heavier_all)
+    heavier_params = state.data.params.replace(mass=state.data.params.mass * 2)
+    after = env.restart(state.replace(data=state.data.replace(params=heavier_params)), jnp.asarray(FIRST))
+    assert trees_equal(after.data.params, heavier_params)
 
 
-def test_hooks_are_called_in_their_order_with_one_world():
+def test_hooks_are_called_in_order_with_data_of_one_world():
     calls = []
     env = Recorder(Recorder(make("hover", 3, n_drones=2), "inner", calls), "outer", calls)
     state = jax.eval_shape(env.reset, jax.random.key(0))
     at_start = [("after_spawn", (2, 3)), ("after_reset", (2, 3))]
     assert calls[:4] == [(name, *call) for call in at_start for name in ("inner", "outer")]
-    calls.clear()  # the first reset also looks at what a step adds
+    calls.clear()  # the first reset also traces a step
     jax.eval_shape(env.step, state, state.action)
     assert calls == [
         ("outer", "before_step", (2, 4)),
@@ -123,7 +123,7 @@ def test_hooks_change_actions_and_remember(env):
 
 
 def test_wrappers_that_step_the_environment_themselves_are_refused():
-    """Gymnasium's are written so."""
+    """As wrappers of Gymnasium do."""
     with pytest.raises(ConfigError, match=r"expected hooks for one world, got Counting\.step\. Override before_step"):
 
         class Counting(Wrapper):
@@ -131,15 +131,15 @@ def test_wrappers_that_step_the_environment_themselves_are_refused():
                 return self.env.step(state, action)
 
 
-class Restless(Hover):
-    """Becomes non-finite, and pays for it."""
+class OneMoreTerm(Hover):
+    """Hover with one more reward."""
 
     def rewards(self, data, action, last_action):
         return super().rewards(data, action, last_action) | {"first": jnp.full(1, 3.0)}
 
 
 def test_the_terms_of_a_reward_add_up_to_it(env):
-    wrapped = RewardTerms(DroneEnv(env.sim, Restless()))
+    wrapped = RewardTerms(DroneEnv(env.sim, OneMoreTerm()))
     state = jax.jit(wrapped.reset)(jax.random.key(0))
     names = {"reward proximity", "reward spin", "reward action_rate", "reward crash", "reward first"}
     assert names <= set(state.info)
@@ -155,7 +155,7 @@ def test_the_terms_of_a_reward_add_up_to_it(env):
 
 
 def test_randomised_episodes_are_observed_through_other_wrappers(env):
-    """RandomizeWith may stand anywhere: episodes are randomised before they are observed."""
+    """RandomizeWith may be inside or outside: episodes are randomised before they are observed."""
 
     def lifted(data, key):
         return data.replace(states=data.states.replace(pos=data.states.pos + jnp.array([0.0, 0.0, 0.5])))
@@ -176,7 +176,7 @@ def test_lengths_are_positive_whole_numbers(env, n):
             wrapper(env, n)
 
 
-def test_an_unknown_mode_names_those_there_are(env):
+def test_an_unknown_mode_is_an_error_that_names_all(env):
     with pytest.raises(ConfigError, match="'NextStep', 'SameStep', 'Disabled'"):
         AutoReset(env, "sometimes")
 
@@ -186,14 +186,14 @@ def test_episode_statistics(env, mode):
     auto = AutoReset(EpisodeStatistics(env), mode)
     start_state = auto.reset(jax.random.key(0))
     assert not start_state.info["episode_length"].any()
-    one, two = steps(auto, start_state, 2)
+    one, two = random_steps(auto, start_state, 2)
     last = auto.step(set_last_step(env, two, FIRST), random_action(start_state, 7))
     np.testing.assert_array_equal(last.done, FIRST)
     np.testing.assert_array_equal(last.info["episode_length"], [3, 0, 0, 0])
     total = one.reward + two.reward + last.reward
     np.testing.assert_allclose(last.info["episode_return"], total * FIRST[:, None], rtol=1e-5)
     after = auto.step(last, random_action(start_state, 8))
-    if mode == "Disabled":  # the episode goes on and ends again
+    if mode == "Disabled":  # the episode continues and ends again
         np.testing.assert_array_equal(after.info["episode_length"], [1, 0, 0, 0])
         again = auto.restart(after, jnp.asarray(FIRST))
         assert not again.info["episode_length"].any()
@@ -205,7 +205,7 @@ def test_episode_statistics(env, mode):
         np.testing.assert_array_equal(after.memory["EpisodeStatistics"].length[:, 0], [begins, 4, 4, 4])
 
 
-def test_observe_changes_what_is_seen_at_all_times(env):
+def test_observe_changes_observations_of_resets_steps_and_restarts(env):
     wrapped = Observe(env, lambda obs, data: {"all": flatten(obs), "clock": jnp.full((1, 1), data.core.steps)})
     state = wrapped.reset(jax.random.key(0))
     plain = env.reset(jax.random.key(0))
@@ -219,12 +219,12 @@ def test_observe_changes_what_is_seen_at_all_times(env):
     assert_same_world(state.obs["all"], flatten(plain.obs))
 
 
-def test_normalised_over_all_that_was_seen(env):
+def test_observations_are_normalised_by_all_observations_so_far(env):
     wrapped = AutoReset(Normalize(env), "NextStep")
     start_state = wrapped.reset(jax.random.key(0))
-    states = [start_state, *steps(wrapped, start_state, 9)]
+    states = [start_state, *random_steps(wrapped, start_state, 9)]
     plain = env.reset(jax.random.key(0))
-    seen = [s.obs["pos"] for s in (plain, *steps(env, plain, 9))]
+    seen = [s.obs["pos"] for s in (plain, *random_steps(env, plain, 9))]
     stats = states[-1].memory["Normalize"]["pos"]
     flat = np.concatenate([np.asarray(x, float).reshape(-1, 3) for x in seen])
     # float32, and the weight of 1e-4 that the prior has among 40: relative to a variance of one
@@ -232,30 +232,30 @@ def test_normalised_over_all_that_was_seen(env):
     np.testing.assert_allclose(stats.var, flat.var(axis=0), atol=1e-4)
     expected = (seen[-1] - flat.mean(axis=0)) / np.sqrt(flat.var(axis=0) + 1e-6)
     np.testing.assert_allclose(states[-1].obs["pos"], expected, rtol=1e-3, atol=1e-3)
-    # a new episode is normalised with what is known, and its beginning is not counted twice
+    # a new episode is normalised by the same statistics, and its first observation is not counted twice
     again = wrapped.restart(states[-1], jnp.asarray(FIRST))
     assert trees_equal(again.memory, states[-1].memory)
     np.testing.assert_array_equal(again.obs["pos"][1:], states[-1].obs["pos"][1:])
 
 
-def test_given_statistics_stay(env):
-    known = Normalize(env).reset(jax.random.key(0)).memory["Normalize"]
-    frozen = Normalize(env, known)
+def test_statistics_that_are_passed_are_not_updated(env):
+    statistics = Normalize(env).reset(jax.random.key(0)).memory["Normalize"]
+    frozen = Normalize(env, statistics)
     state = frozen.step(frozen.reset(jax.random.key(3)), jnp.zeros((4, 1, 4)))
-    assert trees_equal(state.memory["Normalize"], known)
+    assert trees_equal(state.memory["Normalize"], statistics)
     plain = env.step(env.reset(jax.random.key(3)), jnp.zeros((4, 1, 4)))
-    np.testing.assert_allclose(state.obs["vel"], known["vel"].normalize(plain.obs["vel"]), rtol=1e-6)
-    del known["vel"]
+    np.testing.assert_allclose(state.obs["vel"], statistics["vel"].normalize(plain.obs["vel"]), rtol=1e-6)
+    del statistics["vel"]
     with pytest.raises(ConfigError, match="vel is in one of them only"):
         frozen.reset(jax.random.key(0))
 
 
-def test_noise_is_as_large_as_said_and_reproducible(env):
+def test_noise_has_its_standard_deviation_and_is_reproducible(env):
     std = {"pos": 0.1, "vel": 0.01}
     wrapped = ObservationNoise(env, std)
     noisy, plain = jax.jit(vmap_worlds(wrapped._add_noise)), env.reset(jax.random.key(0))
     seen = {name: [] for name in plain.obs}
-    for state in (plain, *steps(env, plain, 60)):
+    for state in (plain, *random_steps(env, plain, 60)):
         obs = noisy(state.obs, state.data)
         for name, values in seen.items():
             values.append(np.asarray(obs[name] - state.obs[name]))
@@ -267,16 +267,16 @@ def test_noise_is_as_large_as_said_and_reproducible(env):
         np.testing.assert_allclose(noise.std(), std[name], rtol=0.1)
         np.testing.assert_allclose(noise.mean(), 0.0, atol=0.15 * std[name])
         flat = noise.reshape(len(noise), -1)
-        apart = np.abs(np.corrcoef(flat, rowvar=False) - np.eye(flat.shape[1]))
-        assert apart.max() < 0.6, "worlds and axes have noise of their own"
+        correlation = np.abs(np.corrcoef(flat, rowvar=False) - np.eye(flat.shape[1]))
+        assert correlation.max() < 0.6, "the noise of worlds and axes is independent"
     ratio = np.stack(seen["pos"]) / np.stack(seen["vel"])
-    assert ratio.std() > 1, "every observation has noise of its own"
+    assert ratio.std() > 1, "the noise of observations is independent"
     again = wrapped.reset(jax.random.key(0))
     assert trees_equal(again.obs, wrapped.reset(jax.random.key(0)).obs)
     assert not trees_equal(again.obs["pos"], wrapped.reset(jax.random.key(1)).obs["pos"])
-    assert_same_world(again.data, plain.data)  # the world knows nothing of it
-    one = wrapped.restart(again, jnp.asarray(FIRST))
-    assert trees_equal(one.obs["pos"][1:], again.obs["pos"][1:]), "nobody else is seen anew"
+    assert_same_world(again.data, plain.data)  # the states have no noise
+    restarted = wrapped.restart(again, jnp.asarray(FIRST))
+    assert trees_equal(restarted.obs["pos"][1:], again.obs["pos"][1:]), "observations of other worlds stay"
 
 
 def test_noise_of_two_wrappers_is_independent(env):
@@ -306,7 +306,7 @@ def test_frames_are_stacked_oldest_first(env):
     assert trees_equal(select_state(anew, ~FIRST), select_state(state, ~FIRST))
 
 
-def test_actions_arrive_late(env):
+def test_delayed_actions_arrive_after_their_steps(env):
     delayed = ActionDelay(env, 2)
     state, plain = delayed.reset(jax.random.key(0)), env.reset(jax.random.key(0))
     sent = [np.zeros_like(plain.action)] * 2
@@ -319,7 +319,7 @@ def test_actions_arrive_late(env):
     sent.append(random_action(plain, 9))
     for i in (4, 5):
         action = np.array(sent[i])
-        action[0] = 0  # what the old episode had sent is forgotten
+        action[0] = 0  # actions of the last episode are discarded
         state, plain = delayed.step(state, sent[6]), env.step(plain, action)
         np.testing.assert_array_equal(state.action, action)
         assert_same_world(state.data, plain.data)
@@ -332,45 +332,45 @@ def test_a_wrong_action_is_refused_around_every_wrapper(env):
             wrapped.step(state, jnp.zeros((4, 4)))
 
 
-def heavier(data, key):
-    """Draw masses between 1 and 2 times the usual, one for every drone of a world."""
+def draw_masses(data, key):
+    """Draw masses between 1 and 2 times the nominal one, for every drone of a world."""
     factor = jax.random.uniform(key, (data.core.n_drones, 1), minval=1.0, maxval=2.0)
     return data.replace(params=data.params.replace(mass=0.0434 * factor))
 
 
 @pytest.fixture(scope="module")
 def randomized(env):
-    return RandomizeWith(env, heavier, params=("mass",))
+    return RandomizeWith(env, draw_masses, params=("mass",))
 
 
 @pytest.fixture(scope="module")
-def heavy(randomized):
+def randomized_state(randomized):
     return jax.jit(randomized.reset)(jax.random.key(0))
 
 
-def test_randomised_parameters_are_one_per_drone(env, heavy):
-    mass = np.asarray(heavy.data.params.mass)
+def test_every_drone_has_its_own_randomised_parameters(env, randomized_state):
+    mass = np.asarray(randomized_state.data.params.mass)
     assert mass.shape == (4, 1, 1)
     assert ((mass >= 0.0434) & (mass <= 0.0868)).all()
     assert len(np.unique(mass)) == 4
-    assert heavy.data.params.J.shape == (3, 3), "what is not named stays shared"
-    assert trees_equal(heavy.data.states, jax.jit(env.reset)(jax.random.key(0)).data.states)
+    assert randomized_state.data.params.J.shape == (3, 3), "parameters that are not named stay shared"
+    assert trees_equal(randomized_state.data.states, jax.jit(env.reset)(jax.random.key(0)).data.states)
 
 
-def test_only_worlds_that_begin_anew_are_randomised_anew(randomized, heavy):
-    new = jax.jit(randomized.restart)(heavy, jnp.asarray(FIRST))
-    assert new.data.params.mass[0] != heavy.data.params.mass[0]
-    assert trees_equal(select_state(new, ~FIRST), select_state(heavy, ~FIRST))
+def test_only_restarted_worlds_are_randomised_again(randomized, randomized_state):
+    new = jax.jit(randomized.restart)(randomized_state, jnp.asarray(FIRST))
+    assert new.data.params.mass[0] != randomized_state.data.params.mass[0]
+    assert trees_equal(select_state(new, ~FIRST), select_state(randomized_state, ~FIRST))
 
 
-def test_randomisation_does_not_depend_on_the_number_of_worlds(heavy):
+def test_randomisation_does_not_depend_on_the_number_of_worlds(randomized_state):
     """Law 10."""
-    two = jax.jit(RandomizeWith(make("hover", 2), heavier, params=("mass",)).reset)(jax.random.key(0))
-    np.testing.assert_allclose(two.data.params.mass, heavy.data.params.mass[:2], rtol=1e-6)
+    two = jax.jit(RandomizeWith(make("hover", 2), draw_masses, params=("mass",)).reset)(jax.random.key(0))
+    np.testing.assert_allclose(two.data.params.mass, randomized_state.data.params.mass[:2], rtol=1e-6)
 
 
-def test_what_cannot_be_randomised_is_refused(env):
+def test_parameters_that_cannot_be_randomised_are_errors(env):
     with pytest.raises(ConfigError, match=r"expected parameters of first_principles, mass.* got colour"):
-        RandomizeWith(env, heavier, params=("mass", "colour"))
+        RandomizeWith(env, draw_masses, params=("mass", "colour"))
     with pytest.raises(ConfigError, match=r"params.mass cannot be randomised: all worlds share it.*params="):
-        jax.eval_shape(RandomizeWith(env, heavier).reset, jax.random.key(0))
+        jax.eval_shape(RandomizeWith(env, draw_masses).reset, jax.random.key(0))
