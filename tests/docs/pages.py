@@ -1,4 +1,4 @@
-"""The pages, and how tests run them."""
+"""The pages, and a function that runs their blocks."""
 
 import importlib.util
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 FIRST_PAGES = [ROOT / "README.md", ROOT / "docs" / "quick_start.md"]
-"""What a newcomer reads first."""
+"""Pages for newcomers."""
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 spec = importlib.util.spec_from_file_location("outputs", ROOT / "docs" / "outputs.py")
@@ -16,15 +16,17 @@ spec.loader.exec_module(outputs)
 
 
 def run(page):
-    """Run the blocks of a page, in its order and in one namespace, and compare what they print with what it shows."""
+    """Run the blocks of a page in order and in one namespace, and compare their outputs with those of the page."""
     text = page.read_text()
-    for package, sign in (("casadi", "import casadi"), ("viser", "from crazysim.media import web")):
-        if sign in text:
+    for package, line in (("casadi", "import casadi"), ("viser", "from crazysim.media import web")):
+        if line in text:
             pytest.importorskip(package)
     namespace = {"__name__": "page"}
     for block in outputs.blocks(text):
         printed = outputs.run_block(block, page, namespace)
-        line = text[: block.end].count("\n")
+        line_number = text[: block.end].count("\n")
         if block.output is not None and not outputs.is_same_output(block.output, printed, block.example):
             name = page.relative_to(ROOT)
-            pytest.fail(f"the block that ends at line {line} prints\n{printed}; run `python docs/outputs.py {name}`")
+            pytest.fail(
+                f"the block that ends at line {line_number} prints\n{printed}; run `python docs/outputs.py {name}`"
+            )

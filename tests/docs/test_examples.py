@@ -5,12 +5,14 @@ from pathlib import Path
 
 import pytest
 
-ELSEWHERE = {"sac"}
+NEEDS_TORCH = {"sac"}
 """Examples that need Torch, which ``.ci/sb3`` runs."""
-EXAMPLES = sorted(x for x in (Path(__file__).parents[2] / "docs" / "examples").glob("*.py") if x.stem not in ELSEWHERE)
+EXAMPLES = sorted(
+    x for x in (Path(__file__).parents[2] / "docs" / "examples").glob("*.py") if x.stem not in NEEDS_TORCH
+)
 
 
-def fits(result):
+def check_fit(result):
     """Check that a fit, started 4 % off or more, finds every number to 0.2 % with a matching standard deviation."""
     assert len(result) == 7
     for name, (found, true, sigma) in result.items():
@@ -18,44 +20,44 @@ def fits(result):
         assert sigma < 1e-3 * true, name
 
 
-def races(result):
+def check_race(result):
     """Check that three laps were flown in every world, and nothing was hit."""
-    passed, hit = result
-    assert passed.shape == hit.shape == (16,)
-    assert passed.min() >= 12
-    assert not hit.any()
+    n_passed, has_hit = result
+    assert n_passed.shape == has_hit.shape == (16,)
+    assert n_passed.min() >= 12
+    assert not has_hit.any()
 
 
-def repeats(result):
+def check_replay(result):
     """Check that the twin was never touched, and that its replay gave the same flight."""
-    closest, same = result
-    assert closest > 0.05
-    assert same
+    distance, is_same = result
+    assert distance > 0.05
+    assert is_same
 
 
-def lands(result):
+def check_landing(result):
     """Check that the drones followed their circle, and stand on the floor."""
     error, heights = result
     assert error < 0.25
     assert max(heights) < 0.01
 
 
-def mixes(result):
+def check_mixed_reality(result):
     """Check that the drones carry their load, the cars drive, and the real drone was passed at a distance."""
-    heights, hanging, speeds, closest = result
+    heights, load_height, speeds, distance = result
     assert heights.min() > 1.8
-    assert 0.9 < hanging < 1.3
+    assert 0.9 < load_height < 1.3
     assert speeds.min() > 0.5
-    assert 0.3 < closest < 2.0
+    assert 0.3 < distance < 2.0
 
 
-def calms(errors):
+def check_damping(errors):
     """Check that the pushes moved the loads, and that the loads came back to their goals."""
     assert errors[0] > 0.02
     assert errors[-1] < 0.02
 
 
-def places(result):
+def check_placement(result):
     """Check that every load was carried along its path, and set down within millimetres."""
     placed, distance, rms = result
     assert placed.all()
@@ -63,24 +65,24 @@ def places(result):
     assert rms < 0.03
 
 
-def keeps_apart(result):
+def check_separation(result):
     """Check that a drone escorted a car, and that nothing touched or left its path."""
-    closest, touches, rms = result
-    assert closest[0] > 0.2
-    assert 0.2 < closest[1] < 0.8
+    distances, touches, rms = result
+    assert distances[0] > 0.2
+    assert 0.2 < distances[1] < 0.8
     assert not touches.any()
     assert rms.shape == (5,)
     assert rms.max() < 0.15
 
 
-def visits(result):
+def check_waypoints(result):
     """Check that every world passed all points, and hovers at the last one."""
     passed, distance = result
     assert passed.tolist() == [5] * 8
     assert distance.max() < 0.05
 
 
-def learns(result):
+def check_student(result):
     """Check that the student hovers nearly as often as its teacher."""
     teacher, student = result
     assert teacher > 0.98
@@ -88,26 +90,29 @@ def learns(result):
 
 
 CHECKS = {
-    "crazyswarm2": lands,
-    "fit_flight": fits,
-    "hooked_load": calms,
-    "mixed_fleet": keeps_apart,
-    "mixed_reality": mixes,
-    "pick_and_place": places,
-    "race": races,
-    "replayed_twin": repeats,
-    "student": learns,
-    "waypoints": visits,
+    "crazyswarm2": check_landing,
+    "fit_flight": check_fit,
+    "hooked_load": check_damping,
+    "mixed_fleet": check_separation,
+    "mixed_reality": check_mixed_reality,
+    "pick_and_place": check_placement,
+    "race": check_race,
+    "replayed_twin": check_replay,
+    "student": check_student,
+    "waypoints": check_waypoints,
 }
 """Further checks of the values that ``main`` of an example returns."""
 
 
-LONG = {"student": "trains two policies", "waypoints": "trains a policy"}
+LONG_REASONS = {"student": "trains two policies", "waypoints": "trains a policy"}
 
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(x, marks=[pytest.mark.long(LONG[x.stem])] if x.stem in LONG else []) for x in EXAMPLES],
+    [
+        pytest.param(x, marks=[pytest.mark.long(LONG_REASONS[x.stem])] if x.stem in LONG_REASONS else [])
+        for x in EXAMPLES
+    ],
     ids=lambda path: path.stem,
 )
 def test_example_runs(path, capsys):

@@ -1,4 +1,4 @@
-"""README and quick start: every Python block runs, in the order of the page, and prints what is shown."""
+"""README and quick start: every Python block runs, in the order of the page, and prints its output."""
 
 import pytest
 from pages import FIRST_PAGES, run

@@ -1,4 +1,4 @@
-"""What pages and examples import: public names, from a few modules."""
+"""Pages and examples import public names only, from a few modules."""
 
 import ast
 import importlib.util
@@ -30,7 +30,7 @@ SOURCES = [page for page in PAGES if page not in EXEMPT] + sorted((ROOT / "docs"
 
 
 def imports(source: Path):
-    """Return (module, names) of every import of the project in a page or an example."""
+    """Yield (module, names) of every import of the project in a page or an example."""
     text = source.read_text()
     blocks = [block.code for block in outputs.blocks(text)] if source.suffix == ".md" else [text]
     for block in blocks:

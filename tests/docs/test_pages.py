@@ -1,4 +1,4 @@
-"""Every Python block of every page runs as a reader would run it, and prints what is shown."""
+"""Every Python block of every page runs, in the order of the page, and prints its output."""
 
 import sys
 
@@ -40,7 +40,7 @@ PEER_CODE = (
 """Scene code written for Crazyflow; each line is in an executed block of a page."""
 
 
-def test_the_peers_way_with_the_scene_is_on_the_pages():
+def test_scene_code_of_crazyflow_is_on_the_pages():
     code = "".join(block.code for page in SCENE_PAGES for block in outputs.blocks((ROOT / page).read_text()))
     for line in PEER_CODE:
         assert line in code, line

@@ -1,4 +1,4 @@
-"""A film is read back, and looked at frame by frame."""
+"""Films: their frames are read back and compared with the flight."""
 
 import builtins
 import re
@@ -18,14 +18,14 @@ WIDTH, HEIGHT = 96, 64
 
 @pytest.fixture(scope="module")
 def sim(opengl, plain_scene):
-    """Two worlds whose drones go east by 1 m/s, 0.2 m and 0.5 m ahead, under a camera that looks down."""
+    """Return a simulation of two worlds with a camera that looks down."""
     sim = Sim(n_worlds=2, xml_path=plain_scene)
     yield sim
     sim.close()
 
 
-def fly(sim, steps):
-    """Put the drones where they are after so many steps."""
+def move_to_step(sim, steps):
+    """Set the drones to their positions after some steps at 1 m/s to the east, and the clock."""
     pos = jnp.zeros((2, 1, 3)).at[..., 0].set(-0.5 + steps / sim.freq).at[1, :, 1].set(0.3).at[..., 2].set(1.0)
     core = sim.data.core.replace(steps=jnp.full_like(sim.data.core.steps, steps))
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos), core=core)
@@ -36,17 +36,17 @@ def view(**options):
 
 
 def column(frame):
-    """Return the mean column of what is darker than the floor."""
+    """Return the mean column of the pixels that are darker than the floor."""
     return np.nonzero(frame.astype(int).max(-1) < 130)[1].mean()
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
-def test_a_film_shows_the_drone_go_from_left_to_right(sim, tmp_path, suffix):
-    """One second at 1 m/s: 11 frames at 10 Hz, each with the drone further right by as much as it flew."""
+def test_a_film_shows_the_drone_fly_from_left_to_right(sim, tmp_path, suffix):
+    """One second at 1 m/s has 11 frames at 10 Hz; from frame to frame the drone moves right by 0.1 m."""
     path = tmp_path / f"flight{suffix}"
     with Film(path, view(), fps=10) as film:
         for k in range(11):
-            fly(sim, 50 * k)
+            move_to_step(sim, 50 * k)
             assert film.add(sim) == 1
     frames = read_frames(path, HEIGHT, WIDTH)
     assert len(frames) == film.n_frames == 11
@@ -66,21 +66,23 @@ def test_a_film_stays_in_its_folder_when_the_working_directory_changes(tmp_path,
 
 
 @pytest.mark.parametrize(("fps", "speed", "n_frames"), [(10, 1.0, 11), (25, 1.0, 26), (10, 0.25, 41), (10, 5.0, 3)])
-def test_frames_go_with_simulated_time(sim, tmp_path, fps, speed, n_frames):
-    """Whatever the rate of calls, a second makes fps / speed frames and the first; too few calls repeat an image."""
-    drawn = []
+def test_the_number_of_frames_follows_from_simulated_time(sim, tmp_path, fps, speed, n_frames):
+    """At any rate of calls, a second has fps / speed frames and the first one; with few calls images are repeated."""
+    n_frames_of_calls = []
     with Film(tmp_path / "flight.mp4", view(), fps=fps, speed=speed) as film:
         for k in range(21):
-            fly(sim, 25 * k)
-            drawn.append(film.add(sim))
-    assert sum(drawn) == film.n_frames == len(read_frames(tmp_path / "flight.mp4", HEIGHT, WIDTH)) == n_frames
-    assert max(drawn) - min(drawn[1:]) <= 1
+            move_to_step(sim, 25 * k)
+            n_frames_of_calls.append(film.add(sim))
+    assert (
+        sum(n_frames_of_calls) == film.n_frames == len(read_frames(tmp_path / "flight.mp4", HEIGHT, WIDTH)) == n_frames
+    )
+    assert max(n_frames_of_calls) - min(n_frames_of_calls[1:]) <= 1
 
 
 def test_a_reset_does_not_turn_the_film_back(sim, tmp_path):
     with Film(tmp_path / "flight.mp4", view(), fps=10) as film:
         for steps in (0, 50, 100, 0, 50, 100):
-            fly(sim, steps)
+            move_to_step(sim, steps)
             film.add(sim)
     assert film.n_frames == 5  # 0.2 s before the reset, 0.2 s after it
 
@@ -89,24 +91,24 @@ def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path, capfd):
     """Recorded at 10 Hz and played at 20 Hz: drones are interpolated, and the simulation stays as it is."""
     recorder = Recorder(sim)
     for k in range(6):
-        fly(sim, 50 * k)
+        move_to_step(sim, 50 * k)
         recorder.add()
-    fly(sim, 5000)
-    shown = view(worlds=[0, 1], columns=1, border=0)
-    with Film(tmp_path / "flight.mp4", shown, fps=20, progress=True) as film:
+    move_to_step(sim, 5000)
+    two_worlds = view(worlds=[0, 1], columns=1, border=0)
+    with Film(tmp_path / "flight.mp4", two_worlds, fps=20, progress=True) as film:
         assert film.play(sim, recorder.flight()) == 11
     assert not capfd.readouterr().err  # no bar without a terminal
     np.testing.assert_allclose(sim.data.states.pos[:, 0, 0], 9.5)
     np.testing.assert_array_equal(sim.data.core.steps, 5000)
     frames = read_frames(tmp_path / "flight.mp4", HEIGHT, WIDTH)
     for k in range(2):
-        columns = [column(frame[shown.tile(k)]) for frame in frames]
+        columns = [column(frame[two_worlds.tile(k)]) for frame in frames]
         focal = 0.25 * HEIGHT / np.tan(np.deg2rad(45 / 2))
         np.testing.assert_allclose(np.diff(columns), 0.05 * focal, atol=1.0)
         np.testing.assert_allclose(columns[10] - columns[0], 0.5 * focal, atol=1.5)
 
 
-def test_given_images_are_frames(sim, tmp_path):
+def test_images_can_be_written_as_frames(sim, tmp_path):
     with Film(tmp_path / "flight.mp4", view(), fps=10) as film:
         film.write(np.full((HEIGHT, WIDTH, 3), 200, np.uint8), 3)
     frames = read_frames(tmp_path / "flight.mp4", HEIGHT, WIDTH)
@@ -167,7 +169,7 @@ def test_an_unwritable_file_is_refused(sim, tmp_path):
         Film(tmp_path / "flight.mp4", view())
 
 
-def test_a_film_takes_the_place_of_another_one_when_it_is_whole(sim, tmp_path):
+def test_a_film_replaces_an_older_one_only_when_it_is_complete(sim, tmp_path):
     path = tmp_path / "flight.mp4"
     path.write_bytes(b"before")
 
@@ -188,13 +190,13 @@ def test_a_film_takes_the_place_of_another_one_when_it_is_whole(sim, tmp_path):
 
 @pytest.mark.parametrize(("missing", "word"), [("imageio_ffmpeg", "imageio-ffmpeg"), ("tqdm", "tqdm")])
 def test_a_missing_package_is_named(tmp_path, monkeypatch, missing, word):
-    found = builtins.__import__
+    original_import = builtins.__import__
 
-    def without(name, *args, **kwargs):
+    def import_without_package(name, *args, **kwargs):
         if name == missing:
             raise ImportError(name)
-        return found(name, *args, **kwargs)
+        return original_import(name, *args, **kwargs)
 
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setattr(builtins, "__import__", import_without_package)
     with pytest.raises(ImportError, match=rf"need {word}, which is not installed\. Run pip install 'crazysim\[demo\]'"):
         Film(tmp_path / "flight.mp4", progress=True)

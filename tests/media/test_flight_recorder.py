@@ -1,4 +1,4 @@
-"""What is recorded is what was flown, survives a file, and puts a simulation back where it was."""
+"""Recorded flights: their contents, files, and simulations that show them."""
 
 from contextlib import closing
 
@@ -20,7 +20,7 @@ ROLL = np.array([[0, 0, 0, 1.0], [0.6, 0, 0, 0.8]])
 
 
 def build(n_worlds=3, **options):
-    """Return worlds of two drones with a red ball that is somewhere else in each."""
+    """Return a simulation of two drones and a movable red ball."""
     sim = Sim(n_worlds=n_worlds, n_drones=2, control="state", **options)
     ball = sim.spec.worldbody.add_body(name="ball", pos=[0, 0, 0.3], mocap=True)
     ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0], rgba=[1, 0, 0, 1])
@@ -30,7 +30,7 @@ def build(n_worlds=3, **options):
 
 @pytest.fixture(scope="module")
 def sim():
-    """Its balls are 0, 1 and 2 m east, and rolled."""
+    """Return a simulation whose balls are 0, 1 and 2 m to the east, and rolled."""
     sim = build()
     k = sim.mj_model.body("ball").mocapid.item()
     sim.mjx_data = sim.mjx_data.replace(
@@ -42,7 +42,7 @@ def sim():
 
 @pytest.fixture(scope="module")
 def flight(sim):
-    """Worlds 2 and 0, at 0 and 0.5 s: drone 1 of world 2 goes 1 m up and rolls, the others stand."""
+    """Return a flight of worlds 2 and 0, at 0 and 0.5 s: drone 1 of world 2 rises by 1 m and rolls."""
     recorder = Recorder(sim, worlds=[2, 0])
     data = sim.data
     for k in range(2):
@@ -59,7 +59,7 @@ def flight(sim):
     return recorder.flight()
 
 
-def test_it_has_what_was_flown(flight):
+def test_a_flight_has_the_recorded_poses_and_setpoints(flight):
     np.testing.assert_allclose(flight.time, [0, 0.5])
     np.testing.assert_array_equal(flight.worlds, [2, 0])
     np.testing.assert_allclose(flight.pos[:, 0, 1], [[0.5, 0, 1], [0.5, 0, 2]])
@@ -84,7 +84,7 @@ def test_shapes_are_those_of_the_scene(flight, sim):
     for drone in flight.drone_ids:
         kinds = [shape.kind for shape in flight.shapes if shape.mocap == drone]
         assert kinds.count("cylinder") == 8, "four motors and four propellers"
-        assert kinds.count("sphere") == 0, "the sphere that touches is not seen"
+        assert kinds.count("sphere") == 0, "the collision sphere is left out"
 
 
 def test_meshes_and_children_of_moving_bodies_are_shapes():
@@ -105,12 +105,12 @@ def test_meshes_and_children_of_moving_bodies_are_shapes():
     spin = np.zeros(9)
     mujoco.mju_quat2Mat(spin, np.roll(mesh.quat, 1))
     corners = mesh.vertices @ spin.reshape(3, 3).T + mesh.pos
-    wanted = [[0, 0, 1], [0, 0.3, 1], [-0.3, 0, 1], [0, 0, 1.3]]  # turned by 90 degrees about z
-    for corner in wanted:
+    expected = [[0, 0, 1], [0, 0.3, 1], [-0.3, 0, 1], [0, 0, 1.3]]  # turned by 90 degrees about z
+    for corner in expected:
         assert np.linalg.norm(corners - corner, axis=1).min() < 1e-6
 
 
-def test_between_two_moments_it_is_interpolated(flight):
+def test_poses_between_two_samples_are_interpolated(flight):
     """At half the time it is at half the height and half the turn; times beyond the ends are clipped."""
     half = flight.at(0.25)
     np.testing.assert_allclose(half["pos"][0, 1], [0.5, 0, 1.5])
@@ -120,19 +120,19 @@ def test_between_two_moments_it_is_interpolated(flight):
     np.testing.assert_allclose(flight.at(9.0)["pos"], flight.pos[1])
 
 
-def test_a_file_gives_back_all_of_it(flight, tmp_path):
+def test_a_file_keeps_the_whole_flight(flight, tmp_path):
     flight.save(tmp_path / "flight.npz")
     again = Flight.load(tmp_path / "flight.npz")
     for name in ("time", "pos", "quat", "body_pos", "body_quat", "setpoint", "worlds", "drone_ids", "body_ids"):
         np.testing.assert_array_equal(getattr(again, name), getattr(flight, name))
     assert len(again.shapes) == len(flight.shapes)
-    for one, other in zip(again.shapes, flight.shapes, strict=True):
-        assert (one.kind, one.mocap) == (other.kind, other.mocap)
+    for found, expected in zip(again.shapes, flight.shapes, strict=True):
+        assert (found.kind, found.mocap) == (expected.kind, expected.mocap)
         for name in ("size", "rgba", "pos", "quat", "vertices", "faces"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
-def test_another_simulation_is_put_where_the_flight_was(flight, opengl):
+def test_another_simulation_shows_the_flight(flight, opengl):
     """A new simulation shows drones and ball of world 2 where they were, also where its own ball was elsewhere."""
     other = build()
     show_flight_at(other, flight, 0.25)
@@ -143,15 +143,15 @@ def test_another_simulation_is_put_where_the_flight_was(flight, opengl):
     np.testing.assert_allclose(other.mjx_data.mocap_pos[2, k], [2, 0, 0.3], atol=1e-6)
     np.testing.assert_allclose(other.mjx_data.mocap_quat[2, k], np.roll(ROLL[1], 1), atol=1e-6)
     above = {"lookat": [2, 0, 0.3], "distance": 2.0, "azimuth": 90, "elevation": -89}
-    for world, seen in ((2, True), (0, False)):
+    for world, is_visible in ((2, True), (0, False)):
         picture = View(worlds=world, width=64, height=48, cam_config=above).render(other).astype(int)
         red = has_colour(picture, [1, 0, 0])
-        assert red[23:25, 31:33].all() == red.any() == seen
+        assert red[23:25, 31:33].all() == red.any() == is_visible
     other.close()
 
 
-def test_setpoints_are_put_without_the_feedforward_of_earlier_ones(flight):
-    """That of the worlds that the flight has not stays."""
+def test_setpoints_replace_the_feedforward_of_earlier_ones(flight):
+    """Worlds that are not in the flight keep theirs."""
     other = build()
     other.state_control(pos=[0.0, 0.0, 1.0], feedforward=np.ones((3, 2, 8)))
     show_flight_at(other, flight, 0.25)
@@ -159,7 +159,7 @@ def test_setpoints_are_put_without_the_feedforward_of_earlier_ones(flight):
     np.testing.assert_array_equal(found, np.broadcast_to(np.array([0.0, 1.0, 0.0])[:, None, None], (3, 2, 8)))
 
 
-def test_objects_with_handles_are_recorded_and_put_back():
+def test_objects_with_handles_are_recorded_and_shown():
     """A box that is moved through its handle is where it was in each world, in a new simulation too."""
 
     def build():
@@ -177,17 +177,17 @@ def test_objects_with_handles_are_recorded_and_put_back():
     flight = recorder.flight()
     np.testing.assert_allclose(flight.body_pos[1], [[[1, 0, 0.5], [2, 1, 1]], [[1, 1, 0.5], [2, 1, 1]]], atol=1e-6)
     np.testing.assert_allclose(flight.body_quat[1], np.broadcast_to(ROLL[1], (2, 2, 4)), atol=1e-6)
-    other, its_boxes = build()
+    other, other_boxes = build()
     show_flight_at(other, flight, 0.5)
-    pos, quat = its_boxes.pose(other.data)
+    pos, quat = other_boxes.pose(other.data)
     np.testing.assert_allclose(pos, flight.at(0.5)["body_pos"], atol=1e-6)
     np.testing.assert_allclose(quat, flight.at(0.5)["body_quat"], atol=1e-6)
     np.testing.assert_allclose(pos[:, 0, 0], 0.5, atol=1e-6)
 
 
 @pytest.mark.parametrize("cable", [True, False], ids=["cable", "rod"])
-def test_loads_are_put_back_where_they_were(cable):
-    """Also after the load was dropped, from which its pose in the recording does not follow."""
+def test_loads_are_shown_at_their_recorded_poses(cable):
+    """Also if the load of the simulation has been released since."""
     sim = Sim(n_worlds=2, control="rotor_vel")
     load = sim.add(SlungLoad(mass=0.1, length=0.5, cable=cable))
     recorder = Recorder(sim)
@@ -202,15 +202,15 @@ def test_loads_are_put_back_where_they_were(cable):
     flight = recorder.flight()
     sim.data = load.release(sim.data)
     sim.step(100)
-    now = sim.data
+    data = sim.data
     show_flight_at(sim, flight, 1.0)
     sim.sync(1)
     np.testing.assert_allclose(sim.mj_data.body("load:0").xpos, [0.3, 0, 1.5], atol=1e-5)
     ids = flight.body_ids
     np.testing.assert_allclose(sim.mj_data.mocap_pos[ids], flight.body_pos[1, 1], atol=1e-6)
-    sim.data = now
+    sim.data = data
     sim.sync(1)
-    np.testing.assert_allclose(sim.mj_data.body("load:0").xpos, load.read(now).pos[1, 0], atol=1e-6)
+    np.testing.assert_allclose(sim.mj_data.body("load:0").xpos, load.read(data).pos[1, 0], atol=1e-6)
 
 
 def test_a_reset_does_not_turn_the_recording_back(sim):
@@ -223,7 +223,7 @@ def test_a_reset_does_not_turn_the_recording_back(sim):
     np.testing.assert_allclose(recorder.flight().time, [0, 0.1, 0.2, 0.3], atol=1e-6)
 
 
-def test_what_a_rollout_kept_is_a_flight(flight):
+def test_states_of_a_rollout_can_become_a_flight():
     """States of a rollout become a flight of the requested worlds."""
     sim = Sim(n_worlds=2, control="attitude")
     thrust = 1.2 * sim.data.params.mass.ravel()[0] * 9.81
@@ -301,8 +301,8 @@ def test_a_damaged_flight_is_refused_or_read_up_to_the_damage(flight, sim, tmp_p
         Flight.load(damaged)
 
 
-def test_a_recording_does_without_mjx(monkeypatch):
-    """Importing and compiling it takes seconds."""
+def test_a_recording_does_not_use_mjx(monkeypatch):
+    """Importing and compiling MJX would take seconds."""
     monkeypatch.setattr(MjxScene, "sync", None)
     recorder = Recorder(Sim())
     recorder.add()

@@ -1,4 +1,4 @@
-"""What was appended is read back, whatever happens to the process, and a broken end loses only itself."""
+"""Journals: appended chunks are read back, also after the process was killed, and damage loses only what follows."""
 
 import signal
 import subprocess
@@ -20,7 +20,7 @@ CHUNKS = [(b"AAAA", b"first"), (b"BBBB", b""), (b"CCCC", bytes(range(256)))]
 
 
 @pytest.fixture
-def written(tmp_path):
+def journal_path(tmp_path):
     path = tmp_path / "x.journal"
     with Journal(path) as journal:
         for chunk in CHUNKS:
@@ -30,30 +30,30 @@ def written(tmp_path):
     return path
 
 
-def test_cut_anywhere_it_has_the_chunks_before(written, caplog):
-    content = written.read_bytes()
+def test_a_journal_that_is_cut_off_keeps_the_chunks_before(journal_path, caplog):
+    content = journal_path.read_bytes()
     last = len(content) - CHUNK_HEADER.size - len(CHUNKS[-1][1])
     for length in (last, last + 1, last + CHUNK_HEADER.size, len(content) - 1):
-        written.write_bytes(content[:length])
+        journal_path.write_bytes(content[:length])
         caplog.clear()
-        assert list(read_journal(written)) == CHUNKS[:2]
+        assert list(read_journal(journal_path)) == CHUNKS[:2]
         assert ("cut off or damaged at byte" in caplog.text) == (length > last)
 
 
-def test_a_damaged_chunk_ends_the_file(written):
-    content = bytearray(written.read_bytes())
+def test_a_damaged_chunk_ends_the_file(journal_path):
+    content = bytearray(journal_path.read_bytes())
     content[content.index(b"first")] ^= 1
-    written.write_bytes(content)
-    assert list(read_journal(written)) == []
-    content[-300:] = b"\xff" * 300  # a head of nonsense that promises exabytes
-    written.write_bytes(content)
-    assert list(read_journal(written)) == []
+    journal_path.write_bytes(content)
+    assert list(read_journal(journal_path)) == []
+    content[-300:] = b"\xff" * 300  # a header of nonsense with a length of exabytes
+    journal_path.write_bytes(content)
+    assert list(read_journal(journal_path)) == []
 
 
-def test_wrong_files(written, tmp_path):
+def test_wrong_files_are_errors(journal_path, tmp_path):
     with pytest.raises(ConfigError, match="expected a new file"):
-        Journal(written)
-    assert list(read_journal(written)) == CHUNKS, "what was there stays"
+        Journal(journal_path)
+    assert list(read_journal(journal_path)) == CHUNKS, "the old journal stays"
     with pytest.raises(ConfigError, match="expected a file that can be created"):
         Journal(tmp_path / "nowhere" / "x")
     other = tmp_path / "other"
@@ -61,8 +61,8 @@ def test_wrong_files(written, tmp_path):
     assert not is_journal(other)
     with pytest.raises(ValueError, match="the first line is not 'crazysim journal 1'"):
         list(read_journal(other))
-    Journal(written, replace=True).close()
-    assert list(read_journal(written)) == []
+    Journal(journal_path, replace=True).close()
+    assert list(read_journal(journal_path)) == []
     with Journal(tmp_path / "y") as journal, pytest.raises(ConfigError, match="kind of 4 bytes"):
         journal.append(b"TOOLONG", b"")
 
@@ -81,14 +81,14 @@ def test_a_recorder_with_a_path_writes_the_same_flight(tmp_path):
         sim.step(10)
     assert len(memory) == len(file) == 4
     file.close()
-    kept, read = memory.flight(), Flight.load(tmp_path / "f.journal")
+    in_memory, read = memory.flight(), Flight.load(tmp_path / "f.journal")
     assert read.pos.shape == (4, 2, 2, 3)
     assert read.body_pos.shape == (4, 2, 1, 3)
     for name in ("time", "pos", "quat", "body_pos", "body_quat", "setpoint", "worlds", "drone_ids", "body_ids"):
-        np.testing.assert_array_equal(getattr(read, name), getattr(kept, name), err_msg=name)
-    assert [shape.kind for shape in read.shapes] == [shape.kind for shape in kept.shapes]
+        np.testing.assert_array_equal(getattr(read, name), getattr(in_memory, name), err_msg=name)
+    assert [shape.kind for shape in read.shapes] == [shape.kind for shape in in_memory.shapes]
     read.save(tmp_path / "f.npz")
-    np.testing.assert_array_equal(Flight.load(tmp_path / "f.npz").pos, kept.pos)
+    np.testing.assert_array_equal(Flight.load(tmp_path / "f.npz").pos, in_memory.pos)
 
 
 def test_a_recording_without_samples_is_refused(tmp_path):
@@ -111,7 +111,7 @@ KILLED = textwrap.dedent("""
 
 
 def test_a_film_survives_the_end_of_its_process(tmp_path):
-    """A killed simulation loses no frame; a killed encoder what it had not yet encoded, some seconds."""
+    """A killed simulation loses no frame; a killed encoder loses the last seconds, which it had not encoded yet."""
     film = path = tmp_path / "film.mp4"
     ended = subprocess.run([sys.executable, "-c", KILLED, path, "200", "python"], check=False)
     assert ended.returncode == -signal.SIGKILL

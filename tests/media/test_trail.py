@@ -1,4 +1,4 @@
-"""Trails keep their duration, and begin again when a world is reset."""
+"""Trails keep positions for their duration, and start again when a world is reset."""
 
 import numpy as np
 import pytest
@@ -8,23 +8,23 @@ from crazysim.media import Trail
 from crazysim.scene.overlays import Overlays
 
 
-def moments(trail, times, n_worlds=2, n_drones=1):
+def add_positions(trail, times, n_worlds=2, n_drones=1):
     for time in times:
         pos = np.zeros((n_worlds, n_drones, 3))
         pos[:, :, 0] = time
         trail.add(np.full(n_worlds, time), pos)
 
 
-def test_it_keeps_its_time_and_no_more():
+def test_a_trail_keeps_positions_for_its_duration():
     trail = Trail(1.0)
-    moments(trail, 0.25 * np.arange(9))
+    add_positions(trail, 0.25 * np.arange(9))
     np.testing.assert_allclose(trail.path(0)[:, 0, 0], [1.0, 1.25, 1.5, 1.75, 2.0])
     assert len(trail) == 5
 
 
-def test_a_reset_world_leaves_its_way_behind_and_others_keep_theirs():
+def test_a_reset_clears_the_trail_of_its_world_only():
     trail = Trail(5.0)
-    moments(trail, [0.0, 1.0, 2.0])
+    add_positions(trail, [0.0, 1.0, 2.0])
     trail.add([0.0, 3.0], [[[7, 0, 0]], [[3, 0, 0]]])
     trail.add([1.0, 4.0], [[[8, 0, 0]], [[4, 0, 0]]])
     np.testing.assert_allclose(trail.path(0)[:, 0, 0], [7, 8])
@@ -33,14 +33,14 @@ def test_a_reset_world_leaves_its_way_behind_and_others_keep_theirs():
 
 def test_a_second_call_at_one_time_replaces_the_first():
     trail = Trail(5.0)
-    moments(trail, [0.0, 1.0])
+    add_positions(trail, [0.0, 1.0])
     trail.add([1.0, 1.0], np.full((2, 1, 3), 9.0))
     np.testing.assert_allclose(trail.path(1)[:, 0, 0], [0, 9])
 
 
 def test_lines_fade_towards_their_beginning():
     trail, overlays = Trail(5.0), Overlays()
-    moments(trail, np.arange(5.0), n_drones=2)
+    add_positions(trail, np.arange(5.0), n_drones=2)
     trail.draw(overlays, 1, rgba=[[1, 0, 0, 1], [0, 0, 1, 0.5]])
     assert len(overlays) == 8
     alphas = np.array([rgba[3] for *_, rgba, _ in overlays._geoms]).reshape(2, 4)
@@ -64,6 +64,6 @@ def test_a_duration_that_is_not_positive_is_refused(seconds):
 )
 def test_positions_of_another_shape_are_refused(time, pos, message):
     trail = Trail(1.0)
-    moments(trail, [0.0])
+    add_positions(trail, [0.0])
     with pytest.raises(ConfigError, match=message):
         trail.add(time, pos)

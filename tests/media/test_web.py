@@ -1,4 +1,4 @@
-"""A recorded flight is opened in a real browser, scrubbed with its mouse, and looked at."""
+"""Recorded flights in a real browser, which is controlled by mouse events."""
 
 import os
 import signal
@@ -23,15 +23,15 @@ from crazysim.media.web import FOV, initial_camera_pose, page
 from crazysim.sim import Sim
 
 START, END = np.array([-0.5, 0.0, 0.8]), np.array([0.5, 0.0, 1.2])
-"""Where the drone of world 1 begins and ends, m."""
+"""Positions of the drone of world 1 at the start and at the end, m."""
 BOX = np.array([0.25, 0.0, 0.05])
-"""Where the obstacle of world 0 is, m; it stands upright in the model, and lies along x in that world."""
+"""Position of the obstacle of world 0, m; it is upright in the model, and lies along x in that world."""
 MAGENTA, GREEN = (1, 0, 1), (0, 1, 0)
 
 
 @pytest.fixture(scope="module")
 def flight(plain_scene):
-    """A second in two worlds: a magenta drone flies from left to right in world 1, and stands by a box in world 0."""
+    """Return a flight of 1 s: a magenta drone flies from left to right in world 1, and stands by a box in world 0."""
     sim = Sim(n_worlds=2, xml_path=plain_scene)
     box = sim.spec.worldbody.add_body(name="box", pos=[0, 0, -5], mocap=True)
     box.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02, 0.02, 0.1], rgba=[0, 1, 0, 1])
@@ -56,7 +56,7 @@ def open_flight(browser, url):
     """Open a page with a flight, and wait until its bar and its image are there."""
     browser.open(url, 640, 340)
     wait_for(lambda: browser.box(".mantine-Slider-track") and browser.box("canvas"))
-    scrub(browser, 0.5)  # from here on it stands still
+    scrub(browser, 0.5)  # which stops the playback
 
 
 def scrub(browser, fraction):
@@ -65,19 +65,19 @@ def scrub(browser, fraction):
     The first click may only stop the playback, one frame late; then another one is needed.
     """
     left, top, width, height = browser.box(".mantine-Slider-track")
-    where = {"x": left + fraction * width, "y": top + height / 2, "button": "left", "clickCount": 1}
+    position = {"x": left + fraction * width, "y": top + height / 2, "button": "left", "clickCount": 1}
 
-    def shown():
+    def is_shown():
         return abs(float(browser.value("document.querySelector('input').value")) - fraction) < 0.06
 
     def click_and_check():
         for event in ("mousePressed", "mouseReleased"):
-            browser.call("Input.dispatchMouseEvent", type=event, **where)
+            browser.call("Input.dispatchMouseEvent", type=event, **position)
         deadline = time.monotonic() + 0.5
-        while not shown() and time.monotonic() < deadline:
+        while not is_shown() and time.monotonic() < deadline:
             time.sleep(0.05)
         time.sleep(0.1)
-        return shown()
+        return is_shown()
 
     wait_for(click_and_check)
 
@@ -94,7 +94,7 @@ def pixel(browser, flight, point, world):
 
 
 def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
-    """Wherever the bar is clicked, forwards and backwards, the drone is shown where it was at that time."""
+    """After a click on the bar, forwards or backwards, the drone is shown at its position of that time."""
     flight.save(tmp_path / "flight.npz")
     # Programs that a shell started in the background ignore SIGINT, and so would this one.
     start = "import browsing, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
@@ -109,8 +109,8 @@ def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
         open_flight(chromium, url)
         for fraction in (0.1, 0.9, 0.3):
             scrub(chromium, fraction)
-            wanted = pixel(chromium, flight, START + fraction * (END - START), 1)
-            np.testing.assert_allclose(chromium.find(MAGENTA, wanted), wanted, atol=MAX_PIXEL_DISTANCE)
+            expected = pixel(chromium, flight, START + fraction * (END - START), 1)
+            np.testing.assert_allclose(chromium.find(MAGENTA, expected), expected, atol=MAX_PIXEL_DISTANCE)
     finally:
         program.send_signal(signal.SIGINT)
         assert program.wait(30) == 0
@@ -118,7 +118,7 @@ def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
 
 
 def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, capsys):
-    """One file, no server: it has what was recorded of the requested world, here a drone and a box at rest."""
+    """The file needs no server and has the requested world, here with a drone and a box at rest."""
     flight.save(tmp_path / "flight.npz")
     out = tmp_path / "flight.html"
     assert main(["replay", str(tmp_path / "flight.npz"), "--export", str(out)]) == 0
@@ -127,8 +127,8 @@ def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, caps
     for fraction in (0.2, 0.8):
         scrub(chromium, fraction)
         for color, place in ((MAGENTA, np.zeros(3)), (GREEN, BOX)):
-            wanted = pixel(chromium, flight, place, 0)
-            np.testing.assert_allclose(chromium.find(color, wanted), wanted, atol=MAX_PIXEL_DISTANCE)
+            expected = pixel(chromium, flight, place, 0)
+            np.testing.assert_allclose(chromium.find(color, expected), expected, atol=MAX_PIXEL_DISTANCE)
     rows, columns = chromium.mask(GREEN)
     assert np.ptp(columns) > 2 * np.ptp(rows), "the box lies"
 
@@ -158,8 +158,8 @@ def test_without_viser_the_extra_is_named(flight, monkeypatch):
         page(flight)
 
 
-class Served:
-    """A stand-in for a server of pages that ends at once."""
+class StubServer:
+    """A server of pages that ends at once."""
 
     server_port = 8123
 
@@ -174,7 +174,7 @@ class Served:
 
 
 def test_a_served_page_says_who_can_watch(monkeypatch, capsys):
-    monkeypatch.setattr(web, "create_server", lambda html, port, host: Served())
+    monkeypatch.setattr(web, "create_server", lambda html, port, host: StubServer())
     web.serve_page("", 0)
     assert capsys.readouterr().out == "serving the flight at http://127.0.0.1:8123; stop with Ctrl-C\n"
     web.serve_page("", 0, "0.0.0.0")
