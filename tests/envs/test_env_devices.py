@@ -86,8 +86,8 @@ def test_gymnasium_worlds_on_four_devices_are_those_of_one(mesh):
             action = jax.device_put(argument, jax.devices()[0]) if i % 2 else argument
             results = [env.step(action) for env in envs]
         else:
-            settings = {"seed": argument} if kind == "reset" else {"options": {"reset_mask": argument}}
-            results = [env.reset(**settings) for env in envs]
+            reset_options = {"seed": argument} if kind == "reset" else {"options": {"reset_mask": argument}}
+            results = [env.reset(**reset_options) for env in envs]
         assert_equal(*results)
     assert_equal(*(env.unwrapped.state for env in envs))
     assert envs[1].unwrapped.explain().startswith("engine: fused")
