@@ -1,4 +1,4 @@
-"""Depth in the manner of Crazyflow, against geometry worked out by hand."""
+"""Depth images with Crazyflow's functions, against geometry by hand."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ from crazysim.sim.sensors.depth import render_depth
 
 @pytest.fixture(scope="module")
 def sim():
-    """Two worlds in which two level drones hover at different heights, far from each other."""
+    """Return two worlds with two level drones each, far from each other, at other heights in each world."""
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     pos = jnp.array([[[0, 0, 1.0], [0, -9, 1]], [[0, 0, 2.0], [0, -9, 1]]])
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
@@ -33,16 +33,18 @@ def test_camera_0_follows_the_first_drone_and_sees_45_degrees(sim):
     camera = sim.mj_model.camera(0)
     assert camera.name == "track_cam:0"
     assert camera.fovy == 45
-    alone, all_seen = (np.asarray(render_depth(sim, resolution=(64, 64), include_drone=x)) for x in (False, True))
-    drone = all_seen != alone
-    np.testing.assert_array_equal(np.asarray(render_depth(sim, 0, (64, 64))), alone)
+    without_drones, with_drones = (
+        np.asarray(render_depth(sim, resolution=(64, 64), include_drone=x)) for x in (False, True)
+    )
+    drone = with_drones != without_drones
+    np.testing.assert_array_equal(np.asarray(render_depth(sim, 0, (64, 64))), without_drones)
     assert 10 < drone[0].sum() < 1000
-    away = np.linalg.norm(np.asarray(camera.pos))  # how far the camera stands from the drone
-    np.testing.assert_allclose(all_seen[drone], away, atol=0.1)
+    distance = np.linalg.norm(np.asarray(camera.pos))  # of the camera from the drone
+    np.testing.assert_allclose(with_drones[drone], distance, atol=0.1)
 
 
 def test_law_09_wrong_cameras_and_resolutions_are_refused(sim):
-    for act, words in (
+    for call, words in (
         (lambda: render_depth(sim, "nose"), "got 'nose'"),
         (lambda: render_depth(sim, 4), "got 4"),
         (lambda: render_depth(sim, "fpv_cam"), "got 2 for 'fpv_cam'. Use one such as 'fpv_cam:0'"),
@@ -51,5 +53,5 @@ def test_law_09_wrong_cameras_and_resolutions_are_refused(sim):
         (lambda: render_depth(sim, resolution=(0, 4)), "got 0 x 4 pixels"),
     ):
         with pytest.raises(ConfigError) as error:
-            act()
+            call()
         assert words in str(error.value)

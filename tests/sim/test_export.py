@@ -1,4 +1,4 @@
-"""A step as CasADi has it is the step: at random states of every dynamics and command level, and its Jacobian."""
+"""The step exported to CasADi equals the step and its Jacobian, at random states of all dynamics and command levels."""
 
 import jax
 import jax.numpy as jnp
@@ -34,8 +34,8 @@ def with_fields(data, changes):
     return treedef.unflatten([changes.get(name, x) for name, x in zip(Axes(data).names, leaves, strict=True)])
 
 
-def anywhere(sim, step):
-    """Return the simulation's data with every number of every drone's x and u drawn at random.
+def with_random_states(sim, step):
+    """Return the simulation's data with random values of x and u for every drone.
 
     Some drones are on or under the floor, some rotors off, some commands beyond what the motors can give.
     """
@@ -61,7 +61,7 @@ def anywhere(sim, step):
 
 
 def on_host(data):
-    """Return the data with NumPy's arrays, besides random keys."""
+    """Return the data with NumPy arrays; random keys stay."""
     return jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else np.asarray(x), data)
 
 
@@ -71,15 +71,15 @@ def compare(sim, step, data):
     after = on_host(jax.jit(by_stages(sim), static_argnums=1)(data, 1))
     for world in range(sim.n_worlds):
         for drone in range(sim.n_drones):
-            place = world, drone
-            parts = [part.of(data, *place) for part in (step.x, step.u, step.p) if len(part)]
+            index = world, drone
+            parts = [part.of(data, *index) for part in (step.x, step.u, step.p) if len(part)]
             found = np.asarray(step(*parts)).ravel()
-            expected = step.x.of(after, *place)
+            expected = step.x.of(after, *index)
             assert len(found) == len(step.x)
             for name in step.x.sizes:
                 a, b = found[step.x[name]], expected[step.x[name]]
                 scale = max(1.0, np.abs(b).max())
-                np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * scale, err_msg=f"{name} of {place}")
+                np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * scale, err_msg=f"{name} of {index}")
 
 
 @pytest.mark.parametrize(("dynamics", "control", "integrator"), [(*pair, "euler") for pair in PAIRS] + RK4)
@@ -89,7 +89,7 @@ def test_the_exported_step_is_the_step(dynamics, control, integrator):
     assert step.function.name_in() == ["x", "u"]
     assert list(step.x.sizes)[: len(STATES)] == list(STATES)
     assert step.dt == 1 / sim.freq
-    compare(sim, step, anywhere(sim, step))
+    compare(sim, step, with_random_states(sim, step))
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_the_exported_step_is_the_step(dynamics, control, integrator):
     ],
 )
 def test_the_jacobian_is_that_of_jax(dynamics, control, integrator):
-    """At a state away from switches, in x and u."""
+    """By x and u, at a state where nothing switches."""
     sim = Sim(dynamics=dynamics, control=control, integrator=integrator)
     exported, step = to_casadi(sim), by_stages(sim)
     rng = np.random.default_rng(1)
@@ -148,7 +148,7 @@ def test_parameters_are_an_input():
     assert step.function.name_in() == ["x", "u", "p"]
     assert step.p.sizes == {"states.force": 3, "params.mass": 1, "params.rpm2thrust": 3}
     rng = np.random.default_rng(2)
-    data = anywhere(sim, step)
+    data = with_random_states(sim, step)
     changes = {
         "states.force": rng.normal(size=(N_WORLDS, N_DRONES, 3)),
         "params.mass": rng.uniform(0.02, 0.06, (N_WORLDS, N_DRONES, 1)),
@@ -158,13 +158,13 @@ def test_parameters_are_an_input():
 
 
 @pytest.mark.long("exports a step twice, and compiles its stages")
-def test_the_feedforward_of_a_setpoint_is_that_of_its_setter_or_a_parameter():
-    """A feedforward that was staged before is no constant of the step: the one of the command replaces it."""
+def test_the_feedforward_follows_from_the_setpoint_or_is_a_parameter():
+    """A feedforward that was staged before is no constant of the step: that of the command replaces it."""
     sim, name = Sim(N_WORLDS, N_DRONES, control="state"), "controls.state.staged_feedforward"
     feedforward = np.random.default_rng(3).normal(size=(N_WORLDS, N_DRONES, 8))
     sim.state_control(pos=(0, 0, 1), feedforward=feedforward)
     step = to_casadi(sim)
-    compare(sim, step, anywhere(sim, step))
+    compare(sim, step, with_random_states(sim, step))
     assert to_casadi(sim, [name]).p.sizes == {name: 8}
 
 
@@ -192,31 +192,35 @@ def test_stages_of_the_user_are_exported_with_their_memory():
     append_fn(sim.step_pipeline, brake)
     step = to_casadi(sim)
     assert set(step.x.sizes) > set(STATES), "a battery remembers its charge"
-    data = anywhere(sim, step)
+    data = with_random_states(sim, step)
     charge = {name: x for name, x in zip(Axes(data).names, jax.tree.leaves(sim.data), strict=True) if "plugins" in name}
     compare(sim, step, with_fields(data, charge))
 
 
-def undeclared(data):
+def undeclared_stage(data):
     return data.replace(states=data.states.replace(vel=0.99 * data.states.vel))
 
 
 @stage("drone")
-def gust(data):
+def random_gust(data):
     return data.replace(states=data.states.replace(force=jax.random.normal(data.core.rng_key, (3,))))
 
 
 @stage("drone")
-def until(data):
+def slow_down(data):
     vel = jax.lax.while_loop(lambda v: jnp.sum(v * v) > 1.0, lambda v: 0.9 * v, data.states.vel)
     return data.replace(states=data.states.replace(vel=vel))
 
 
 @pytest.mark.parametrize(
     ("fn", "words"),
-    [(undeclared, "not declared for one drone"), (gust, "random numbers"), (until, "until a condition fails")],
+    [
+        (undeclared_stage, "not declared for one drone"),
+        (random_gust, "random numbers"),
+        (slow_down, "until a condition fails"),
+    ],
 )
-def test_a_stage_that_stands_in_the_way_is_named(fn, words):
+def test_a_stage_that_cannot_be_exported_is_named(fn, words):
     sim = Sim(control="rotor_vel")
     insert_fn_before(sim.step_pipeline, "integration", fn)
     with pytest.raises(ValueError, match=f"(?s)'{fn.__name__}'.*{words}"):

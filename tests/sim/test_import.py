@@ -1,4 +1,4 @@
-"""What importing the package and flying import besides JAX and MuJoCo: nothing, until it is used."""
+"""Importing the package and flying import nothing besides JAX and MuJoCo."""
 
 import json
 import os
@@ -33,7 +33,8 @@ assert not {"warp", "trimesh"} & sys.modules.keys()
 
 
 @pytest.fixture(scope="module")
-def imported():
+def printed_lines():
+    """Return the lines that the program prints."""
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", LIST], capture_output=True, text=True, env=os.environ, check=False
     )
@@ -41,16 +42,16 @@ def imported():
     return done.stdout.splitlines()
 
 
-def test_flying_imports_neither_mjx_nor_anything_else(imported):
-    """Contacts import MJX."""
-    assert json.loads(imported[0]) == ["crazysim"]
+def test_flying_imports_neither_mjx_nor_anything_else(printed_lines):
+    """MJX is imported for contacts only."""
+    assert json.loads(printed_lines[0]) == ["crazysim"]
 
 
-def test_importing_mjx_prints_nothing_and_leaves_warp_alone(imported):
-    assert len(imported) == 1
+def test_importing_mjx_prints_nothing_and_does_not_import_warp(printed_lines):
+    assert len(printed_lines) == 1
 
 
-def test_a_name_that_mjx_lends_not_is_no_attribute():
+def test_an_unknown_name_of_mjx_is_an_attribute_error():
     from crazysim.scene import mjx
 
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):

@@ -27,26 +27,27 @@ VEHICLES = [
 CAR = ("Fleet1Tenth_5", "2 3 0.05", "0 0 0 1")
 
 
-def fleet(**settings):
+def build_fleet(**settings):
     sim = Sim(2, drone=["cf21B_500", "bumblebee", "cf2x_L250"], **settings)
     sim.add(Springs(2))
     return sim
 
 
-def file_with(folder, vehicles=VEHICLES):
+def write_fleet(folder, vehicles=VEHICLES):
+    """Return the path of an MJCF file with vehicles."""
     path = folder / "fleet.xml"
     path.write_text(MJCF.format(bodies="\n".join(BODY.format(*v) for v in vehicles)))
     return path
 
 
 def test_names_are_prefixes_with_numbers():
-    assert fleet().names == ("Crazyflie_0", "Bumblebee_0", "Crazyflie_1", "Mass_0", "Mass_1")
+    assert build_fleet().names == ("Crazyflie_0", "Bumblebee_0", "Crazyflie_1", "Mass_0", "Mass_1")
     own = {"base": "cf21B_500", "name": "my hexa-rotor"}
     assert Sim(drone=[own, "crazyflie"]).names == ("MyHexaRotor_0", "Crazyflie_0")
 
 
-def test_a_view_reads_what_the_data_has():
-    sim = fleet()
+def test_a_view_reads_the_data():
+    sim = build_fleet()
     np.testing.assert_array_equal(sim["Bumblebee_0"].pos, sim.data.states.pos[:, 1])
     np.testing.assert_array_equal(sim["Mass_1"].pos, sim.data.plugins["springs"].pos[:, 1])
     view = sim["Mass_1"]
@@ -56,8 +57,8 @@ def test_a_view_reads_what_the_data_has():
     assert np.all(view.vel != 0)
 
 
-def test_a_view_writes_one_alone():
-    sim = fleet()
+def test_a_view_writes_the_states_of_its_vehicle_only():
+    sim = build_fleet()
     before, masses = sim.data.states.pos, sim.data.plugins["springs"].pos
     sim["Crazyflie_1"].set(pos=[0.0, 0, 2], vel=[[1.0, 0, 0], [2.0, 0, 0]])
     sim["Mass_0"].set(pos=[7.0, 8, 9])
@@ -69,11 +70,11 @@ def test_a_view_writes_one_alone():
 
 
 @pytest.mark.parametrize("control", ["attitude", "state"])
-def test_a_command_is_of_one_alone(control):
-    sim = fleet(control=control, controller="crazyflow" if control == "attitude" else "geometric")
+def test_a_view_commands_its_vehicle_only(control):
+    sim = build_fleet(control=control, controller="crazyflow" if control == "attitude" else "geometric")
     size = 4 if control == "attitude" else 16
-    everyone = np.tile(np.arange(1.0, size + 1), (2, 3, 1))
-    getattr(sim, f"{control}_control")(everyone)
+    commands = np.tile(np.arange(1.0, size + 1), (2, 3, 1))
+    getattr(sim, f"{control}_control")(commands)
     before = getattr(sim.data.controls, control)
     sim["Bumblebee_0"].command(np.full(size, 0.5))
     after = getattr(sim.data.controls, control)
@@ -84,8 +85,8 @@ def test_a_command_is_of_one_alone(control):
         assert not np.array_equal(after.staged_feedforward[:, 1], before.staged_feedforward[:, 1])
 
 
-def test_a_member_takes_the_command_of_its_population():
-    sim = fleet()
+def test_a_member_accepts_commands_of_its_population():
+    sim = build_fleet()
     sim["Mass_1"].command([[1.0, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(sim.data.plugins["springs"].cmd, [[[0, 0, 0], [1, 2, 3]], [[0, 0, 0], [4, 5, 6]]])
 
@@ -101,7 +102,7 @@ def test_rotors_of_other_drones_need_no_command():
 
 def test_wrong_names_and_shapes_are_refused():
     """Law 9."""
-    sim = fleet()
+    sim = build_fleet()
     with pytest.raises(
         UnknownNameError, match=r"got 'Crazyfly_0'. There are Crazyflie_0, Bumblebee_0, Crazyflie_1, Mas"
     ):
@@ -130,7 +131,7 @@ def test_wrong_names_and_shapes_are_refused():
 
 def test_the_vehicles_of_a_file_are_adopted(tmp_path):
     load = SlungLoad(0.01, 0.5, in_scene=False)
-    sim = Sim.from_mjcf(file_with(tmp_path), 2, kinds={"Mass": Springs}, control="state", plugins=[load])
+    sim = Sim.from_mjcf(write_fleet(tmp_path), 2, kinds={"Mass": Springs}, control="state", plugins=[load])
     assert sim.names == ("Bumblebee_3", "Crazyflie_0", "Crazyflie_2", "Mass_4")
     assert [airframe.name for airframe in sim.airframes] == ["bumblebee", "crazyflie", "crazyflie"]
     np.testing.assert_allclose(sim["Bumblebee_3"].pos, [[1, 2, 3]] * 2)
@@ -145,7 +146,7 @@ def test_the_vehicles_of_a_file_are_adopted(tmp_path):
 
 
 def test_cars_of_a_file_are_adopted(tmp_path):
-    sim = Sim.from_mjcf(file_with(tmp_path, [CAR, *VEHICLES[:2]]), 2)
+    sim = Sim.from_mjcf(write_fleet(tmp_path, [CAR, *VEHICLES[:2]]), 2)
     assert sim.names == ("Bumblebee_3", "Crazyflie_0", "Fleet1Tenth_5")
     car = sim["Fleet1Tenth_5"]
     np.testing.assert_allclose(car.pos[:, :2], [[2, 3]] * 2)
@@ -166,10 +167,10 @@ def test_cars_of_a_file_are_adopted(tmp_path):
 )
 def test_files_with_other_names_are_refused(tmp_path, vehicles, error, message):
     with pytest.raises(error, match=message):
-        Sim.from_mjcf(file_with(tmp_path, vehicles))
+        Sim.from_mjcf(write_fleet(tmp_path, vehicles))
 
 
 def test_a_name_twice_in_a_file_is_refused(tmp_path):
     twice = [("Crazyflie_0", "0 0 1", "1 0 0 0")] * 2
     with pytest.raises(ConfigError, match="Crazyflie_0"):
-        Sim.from_mjcf(file_with(tmp_path, twice))
+        Sim.from_mjcf(write_fleet(tmp_path, twice))

@@ -17,7 +17,7 @@ N_CALLS = 200
 
 
 def run_together(*calls, n_calls=N_CALLS):
-    """Run functions in threads of their own, which begin at once, with the numbers of their calls."""
+    """Call each function repeatedly, with the number of the call, in its own thread; threads start together."""
     start, errors = threading.Barrier(len(calls)), []
 
     def run(call):
@@ -45,7 +45,7 @@ def sim():
     return sim
 
 
-def test_steps_of_two_threads_are_all_taken(sim):
+def test_steps_of_two_threads_are_all_counted(sim):
     sim.reset()
     run_together(lambda _: sim.step(), lambda _: sim.step())
     assert np.all(sim.data.core.steps == 2 * N_CALLS)
@@ -76,44 +76,49 @@ def test_steps_are_taken_while_others_command_read_and_sync(sim):
     assert np.all(np.isfinite(sim.mj_data.mocap_pos))
 
 
-def taking_turns(frame, event, arg):
-    """Let other threads run between any two lines of the engine: a trace function of threads."""
+def switch_threads(frame, event, arg):
+    """Let other threads run between any two lines of the engine; a trace function of threads."""
     if os.path.join("crazysim", "engine") not in frame.f_code.co_filename:
         return None
     time.sleep(1e-6)
-    return taking_turns
+    return switch_threads
 
 
 @pytest.fixture
-def turns():
-    threading.settrace(taking_turns)
+def frequent_switches():
+    """Switch threads between any two lines of the engine."""
+    threading.settrace(switch_threads)
     yield
     threading.settrace(None)
 
 
 @pytest.mark.long("compiles two kernels, and switches threads at every line of the engine")
-def test_a_pure_step_computes_with_the_parameters_of_its_own_thread(sim, turns):
-    """Packed numbers and zeros of parameters are kept from call to call, and each thread has its own."""
+def test_a_pure_step_computes_with_the_parameters_of_its_own_thread(sim, frequent_switches):
+    """The engine caches packed parameters and their zeros between calls, separately for each thread."""
     flying = with_states(sim.data, pos=[0.0, 0.0, 5.0], rotor_vel=15e3, ang_vel=[1.0, 2.0, 3.0])
-    lopsided = np.array(flying.params.J_inv)
-    lopsided[0, 1] = lopsided[1, 0] = 1e4
-    each = [flying, with_params(flying, mass=2 * flying.params.mass), with_params(flying, J_inv=lopsided)]
+    inverse_inertia = np.array(flying.params.J_inv)
+    inverse_inertia[0, 1] = inverse_inertia[1, 0] = 1e4
+    data_of_threads = [
+        flying,
+        with_params(flying, mass=2 * flying.params.mass),
+        with_params(flying, J_inv=inverse_inertia),
+    ]
     step, n_steps = Step(sim.step_pipeline), jnp.int32(1)
 
     def speeds(data):
         states = step(data, n_steps).states
         return np.concatenate([states.vel, states.ang_vel])
 
-    expected = [speeds(data) for data in each]
+    expected = [speeds(data) for data in data_of_threads]
 
-    def fly(which):
-        return lambda _: np.testing.assert_array_equal(speeds(each[which]), expected[which])
+    def compare_speeds(k):
+        return lambda _: np.testing.assert_array_equal(speeds(data_of_threads[k]), expected[k])
 
-    run_together(fly(0), fly(1), fly(2), n_calls=40)
+    run_together(compare_speeds(0), compare_speeds(1), compare_speeds(2), n_calls=40)
 
 
 def test_a_pipeline_that_is_edited_while_it_is_built_is_built_again():
-    """The function of the stages before, which another thread was building, does not take the place of theirs."""
+    """A function of older stages, which another thread is still building, does not replace that of the new stages."""
     building, edited = threading.Event(), threading.Event()
 
     def build(stages):

@@ -12,8 +12,8 @@ from crazysim.trajectories.piece_table import PieceTable
 TOLERANCE = 1e-3
 
 
-def straight(begin, end, duration):
-    """Return a flight at constant speed that begins and ends with a jump of the velocity."""
+def fly_straight(begin, end, duration):
+    """Return a flight at constant speed, whose velocity jumps at both ends."""
     begin, end = np.asarray(begin, float), np.asarray(end, float)
     return Trajectory.of_pieces([duration], np.stack([begin, (end - begin) / duration], axis=-1)[None])
 
@@ -43,18 +43,18 @@ def test_distances_are_those_of_dense_samples(seed, n_drones):
 
 def test_crossing_flights_by_hand():
     """They pass the crossing half a second apart, at 1 m/s and at right angles: sqrt(2) / 4 m."""
-    one = straight([-5, 0, 1], [5, 0, 1], 10.0)
-    other = straight([0, -5.5, 1], [0, 4.5, 1], 10.0)
+    one = fly_straight([-5, 0, 1], [5, 0, 1], 10.0)
+    other = fly_straight([0, -5.5, 1], [0, 4.5, 1], 10.0)
     (approach,) = closest_approaches(PieceTable.create([one, other]))
     np.testing.assert_allclose(approach.distance, 0.5 / np.sqrt(2), atol=1e-3)
     np.testing.assert_allclose(approach.time, 5.25, atol=0.01)
 
 
-def test_a_short_meeting_at_high_speed_is_found():
+def test_a_short_approach_at_high_speed_is_found():
     """Two drones pass each other head on at 40 m/s, 1 cm apart for a millisecond, in an hour of hovering."""
-    wait, rush = straight([0, 0, 1], [0, 0, 1], 1800.123), straight([0, 0, 1], [20, 0, 1], 1.0)
-    one = wait.then(rush).then(straight([20, 0, 1], [20, 0, 1], 1800.0))
-    other = straight([20, 0.01, 1], [20, 0.01, 1], 1800.123).then(straight([20, 0.01, 1], [0, 0.01, 1], 1.0))
+    wait, rush = fly_straight([0, 0, 1], [0, 0, 1], 1800.123), fly_straight([0, 0, 1], [20, 0, 1], 1.0)
+    one = wait.then(rush).then(fly_straight([20, 0, 1], [20, 0, 1], 1800.0))
+    other = fly_straight([20, 0.01, 1], [20, 0.01, 1], 1800.123).then(fly_straight([20, 0.01, 1], [0, 0.01, 1], 1.0))
     (approach,) = closest_approaches(PieceTable.create([one, other]))
     np.testing.assert_allclose(approach.distance, 0.01, atol=1e-3)
     np.testing.assert_allclose(approach.time, 1800.623, atol=1e-3)
@@ -65,34 +65,39 @@ def test_a_dash_within_a_cell_is_found(smooth):
     """A drone at rest dashes to another and back in 0.16 s, between the ends of a cell and off its middle."""
 
     def dash(begin, end):
-        return spline([0.0, 0.08], [begin, end], 7) if smooth else straight(begin, end, 0.08)
+        return spline([0.0, 0.08], [begin, end], 7) if smooth else fly_straight(begin, end, 0.08)
 
     home, away = np.array([0, 0, 1.0]), np.array([1, 0, 1.0])
-    one = straight(home, home, 0.82).then(dash(home, away)).then(dash(away, home)).then(straight(home, home, 3.02))
-    other = straight(away + [0.02, 0, 0], away + [0.02, 0, 0], 4.0)
+    one = (
+        fly_straight(home, home, 0.82)
+        .then(dash(home, away))
+        .then(dash(away, home))
+        .then(fly_straight(home, home, 3.02))
+    )
+    other = fly_straight(away + [0.02, 0, 0], away + [0.02, 0, 0], 4.0)
     (approach,) = closest_approaches(PieceTable.create([one, other]))
     np.testing.assert_allclose(approach.distance, 0.02, atol=1e-3)
     np.testing.assert_allclose(approach.time, 0.9, atol=0.01)
 
 
-def test_starts_shift_the_meeting():
-    flights = [straight([-5, 0, 1], [5, 0, 1], 10.0), straight([5, 0, 1], [-5, 0, 1], 10.0)]
+def test_starts_shift_the_approach():
+    flights = [fly_straight([-5, 0, 1], [5, 0, 1], 10.0), fly_straight([5, 0, 1], [-5, 0, 1], 10.0)]
     (together,) = closest_approaches(PieceTable.create(flights))
     (shifted,) = closest_approaches(PieceTable.create(flights, [0.0, 2.0]))
     np.testing.assert_allclose([together.distance, shifted.distance], 0.0, atol=1e-3)
     np.testing.assert_allclose([together.time, shifted.time], [5.0, 6.0], atol=1e-2)
 
 
-def test_a_jump_of_the_position_is_a_flight_through_nothing():
-    """A drone that jumps past another never is between: the distances before and after it count."""
-    jumps = straight([-2, 0, 0], [-2, 0, 0], 1.05).then(straight([1, 0, 0], [1, 0, 0], 1.0))
-    stays = straight([0, 0, 0], [0, 0, 0], 2.05)
+def test_a_jump_of_the_position_has_no_points_in_between():
+    """Only the distances before and after the jump count."""
+    jumps = fly_straight([-2, 0, 0], [-2, 0, 0], 1.05).then(fly_straight([1, 0, 0], [1, 0, 0], 1.0))
+    stays = fly_straight([0, 0, 0], [0, 0, 0], 2.05)
     (approach,) = closest_approaches(PieceTable.create([jumps, stays]))
     np.testing.assert_allclose(approach.distance, 1.0, atol=1e-6)
 
 
 def test_one_drone_has_no_pairs():
-    assert closest_approaches(PieceTable.create([straight([0, 0, 0], [1, 0, 0], 1.0)])) == []
+    assert closest_approaches(PieceTable.create([fly_straight([0, 0, 0], [1, 0, 0], 1.0)])) == []
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -11,23 +11,23 @@ from crazysim.trajectories import formation
 SHAPES = {"line": formation.line, "grid": formation.grid, "circle": formation.circle}
 
 
-def distances(places):
-    return np.linalg.norm(places[:, None] - places, axis=-1)[np.triu_indices(len(places), 1)]
+def distances(positions):
+    return np.linalg.norm(positions[:, None] - positions, axis=-1)[np.triu_indices(len(positions), 1)]
 
 
 @pytest.mark.parametrize("name", SHAPES)
 @given(n=st.integers(1, 30), spacing=st.floats(0.1, 10.0), yaw=st.floats(-4, 4))
 def test_neighbours_are_one_spacing_from_each_other(name, n, spacing, yaw):
-    places = SHAPES[name](n, spacing, center=(1.0, -2.0, 0.5), yaw=yaw)
-    assert places.shape == (n, 3)
-    np.testing.assert_array_equal(places[:, 2], 0.5)
+    positions = SHAPES[name](n, spacing, center=(1.0, -2.0, 0.5), yaw=yaw)
+    assert positions.shape == (n, 3)
+    np.testing.assert_array_equal(positions[:, 2], 0.5)
     if n > 1:
-        np.testing.assert_allclose(distances(places).min(), spacing, rtol=1e-9)
+        np.testing.assert_allclose(distances(positions).min(), spacing, rtol=1e-9)
     if name != "grid" or round(n**0.5) ** 2 == n:  # a grid that is not full leaves out its last corners
-        np.testing.assert_allclose(places.mean(axis=0), [1.0, -2.0, 0.5], atol=1e-9)
+        np.testing.assert_allclose(positions.mean(axis=0), [1.0, -2.0, 0.5], atol=1e-9)
     level = SHAPES[name](n, spacing, center=(0.0, 0.0, 0.0))
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    np.testing.assert_allclose(places[:, :2] - [1.0, -2.0], level[:, :2] @ turn.T, atol=1e-9)
+    np.testing.assert_allclose(positions[:, :2] - [1.0, -2.0], level[:, :2] @ turn.T, atol=1e-9)
 
 
 def test_by_hand():

@@ -89,7 +89,7 @@ def test_units_of_time_do_not_matter():
     )
 
 
-def test_too_little_that_is_fixed_is_an_error():
+def test_too_few_fixed_derivatives_are_an_error():
     nodes, durations = problem(4, 1, 6)
     nodes[:, 1:] = np.nan
     with pytest.raises(np.linalg.LinAlgError):

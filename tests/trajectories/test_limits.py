@@ -11,12 +11,13 @@ from crazysim.trajectories.peaks import QUANTITIES, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
 
 
-def straight(begin, end, duration):
+def fly_straight(begin, end, duration):
+    """Return a flight at constant speed."""
     begin, end = np.asarray(begin, float), np.asarray(end, float)
     return Trajectory.of_pieces([duration], np.stack([begin, (end - begin) / duration], axis=-1)[None])
 
 
-def taylor(*derivatives):
+def fly_from_derivatives(*derivatives):
     """Return a flight of 1 s with these derivatives of position and yaw at its start, the zeroth first."""
     factorials = np.cumprod([1, *range(1, len(derivatives))])
     return Trajectory.of_pieces([1.0], (np.array(derivatives, float).T / factorials)[None])
@@ -35,14 +36,14 @@ def test_peaks_are_those_of_dense_samples(seed):
     for name, peak in found.items():
         quantity = QUANTITIES[name]
         for k in range(3):
-            at = [table.evaluate(np.full(len(times), k), times, order) for order in quantity.orders]
-            dense = np.max(quantity.sign * quantity.compute(*at))
-            here = quantity.sign * peak.value[k]
-            assert dense - 1e-7 * abs(dense) - 1e-12 <= here <= dense * (1 + 0.01 * np.sign(dense)) + 1e-6, name
+            derivatives = [table.evaluate(np.full(len(times), k), times, order) for order in quantity.orders]
+            dense = np.max(quantity.sign * quantity.compute(*derivatives))
+            found_peak = quantity.sign * peak.value[k]
+            assert dense - 1e-7 * abs(dense) - 1e-12 <= found_peak <= dense * (1 + 0.01 * np.sign(dense)) + 1e-6, name
             # Where pieces meet, the record has the derivatives of either side.
             near = peak.time[k] + np.array([-1e-6, 0.0, 1e-6])
-            at = [table.evaluate(np.full(3, k), near, order) for order in quantity.orders]
-            assert np.min(np.abs(quantity.compute(*at) - peak.value[k])) < 1e-3 * (1 + abs(here)), name
+            derivatives = [table.evaluate(np.full(3, k), near, order) for order in quantity.orders]
+            assert np.min(np.abs(quantity.compute(*derivatives) - peak.value[k])) < 1e-3 * (1 + abs(found_peak)), name
 
 
 def test_body_rate_peaks_are_those_of_dense_samples():
@@ -53,29 +54,29 @@ def test_body_rate_peaks_are_those_of_dense_samples():
     peak = find_peaks(table, ["body_rate"])["body_rate"]
     quantity, times = QUANTITIES["body_rate"], np.linspace(0, 4, 40_001)
     for k in range(3):
-        at = [table.evaluate(np.full(len(times), k), times, order) for order in quantity.orders]
-        np.testing.assert_allclose(peak.value[k], np.max(quantity.compute(*at)), rtol=1e-6)
+        derivatives = [table.evaluate(np.full(len(times), k), times, order) for order in quantity.orders]
+        np.testing.assert_allclose(peak.value[k], np.max(quantity.compute(*derivatives)), rtol=1e-6)
 
 
 def test_values_by_hand():
     """Derivatives at the start, largest there or constant: 3-4-5 triangles, and g along with 0.5 g upwards."""
     g = 9.81
-    moving = taylor([0, 0, 1, 0], [3, 0, -4, -0.5])
+    moving = fly_from_derivatives([0, 0, 1, 0], [3, 0, -4, -0.5])
     found = check(moving, Limits()).peaks
     for name, value in (("speed", 5), ("horizontal_speed", 3), ("vertical_speed", 4), ("yaw_rate", 0.5), ("height", 1)):
         np.testing.assert_allclose(found[name].value, [value], rtol=1e-6)
     np.testing.assert_allclose(found["body_rate"].value, [0.5], rtol=1e-6)  # hover that turns
-    pushed = check(taylor([0] * 4, [0] * 4, [3 * g / 4, 0, 0, 0]), Limits()).peaks
+    pushed = check(fly_from_derivatives([0] * 4, [0] * 4, [3 * g / 4, 0, 0, 0]), Limits()).peaks
     np.testing.assert_allclose(pushed["acceleration"].value, [0.75 * g], rtol=1e-6)
     np.testing.assert_allclose([pushed["thrust"].value[0], pushed["min_thrust"].value[0]], 1.25, rtol=1e-6)
-    # Thrust along z that leans at jerk / g.
-    leaning = check(taylor([0] * 4, [0] * 4, [0] * 4, [2.0, 0, 0, 0]), Limits()).peaks
+    # The thrust tilts at the rate jerk / g.
+    leaning = check(fly_from_derivatives([0] * 4, [0] * 4, [0] * 4, [2.0, 0, 0, 0]), Limits()).peaks
     np.testing.assert_allclose(leaning["jerk"].value, [2.0], rtol=1e-5)
     np.testing.assert_allclose(leaning["body_rate"].value, [2.0 / g], rtol=1e-5)
 
 
 def test_violations_name_limit_drone_time_and_value():
-    slow, fast = straight([0, 0, 1], [1, 0, 1], 2.0), straight([0, 3, 1], [0, 1, 1], 1.0)
+    slow, fast = fly_straight([0, 0, 1], [1, 0, 1], 2.0), fly_straight([0, 3, 1], [0, 1, 1], 1.0)
     report = check([slow, fast], Limits(speed=1.0, separation=1.5), starts=[0.0, 1.0], names=["ada", "bob"])
     speed, separation = report.violations
     assert not report.ok
@@ -100,14 +101,17 @@ def test_several_starts_of_one_trajectory_are_as_many_drones():
 
 
 def test_a_trajectory_at_its_limit_is_fine_and_one_above_is_not():
-    flight = straight([0, 0, 1], [2, 0, 1], 1.0)
+    flight = fly_straight([0, 0, 1], [2, 0, 1], 1.0)
     assert check(flight, Limits(speed=2.0)).ok
     assert not check(flight, Limits(speed=1.999)).ok
     assert "no violations" in str(check(flight, Limits(speed=2.0)))
 
 
 def test_every_limit_can_be_exceeded():
-    wild = [taylor([0, 0, 1, 0], [2, 2, 2, 2], [5, 5, -8, 1], [9, 9, 9, 1]), straight([0, 0, 1], [1, 0, 1], 1.0)]
+    wild = [
+        fly_from_derivatives([0, 0, 1, 0], [2, 2, 2, 2], [5, 5, -8, 1], [9, 9, 9, 1]),
+        fly_straight([0, 0, 1], [1, 0, 1], 1.0),
+    ]
     tight = Limits(0.1, 0.1, 0.1, 0.1, 0.1, 1.01, 0.99, 0.1, 0.1, 0.7, 0.5, floor=0.6)
     found = {violation.limit for violation in check(wild, tight).violations}
     assert found == set(tight.as_dict())
@@ -121,15 +125,15 @@ def test_an_airframe_limits_the_thrust():
     np.testing.assert_allclose(limits.thrust, 4 * 0.2 / (0.0434 * 9.81))
     assert limits.speed == 3.0
     assert Limits(thrust=1.1).of_airframe(airframe).thrust == 1.1
-    climb = taylor([0] * 4, [0] * 4, [0, 0, 10.0, 0])
+    climb = fly_from_derivatives([0] * 4, [0] * 4, [0, 0, 10.0, 0])
     assert check(climb, Limits()).ok
     (violation,) = check(climb, Limits(), airframe).violations
     assert violation.limit == "thrust"
     np.testing.assert_allclose(violation.value, 1 + 10 / 9.81, rtol=1e-6)
 
 
-def test_a_stack_is_a_fleet():
-    flights = [straight([0, k, 1], [1, k, 1], 1.0) for k in range(3)]
+def test_a_stack_is_checked_as_a_list():
+    flights = [fly_straight([0, k, 1], [1, k, 1], 1.0) for k in range(3)]
     stacked, listed = check(Trajectory.stack(flights), Limits()), check(flights, Limits())
     assert str(stacked) == str(listed)
     assert len(stacked.closest) == 3
@@ -157,11 +161,11 @@ def test_the_floor_is_at_zero_unless_it_is_set():
         (lambda: Limits(floor=np.nan), "expected floor of Limits to be finite"),
         (lambda: Limits(floor=1.0, height=1.0), "a floor below the height of 1.0 m"),
         (lambda: check([], Limits()), "at least one"),
-        (lambda: check(straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), names=["a", "b"]), "1 names"),
-        (lambda: check(straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), tolerance=0.0), "tolerance"),
-        (lambda: check(straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), tolerance=np.nan), "tolerance"),
+        (lambda: check(fly_straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), names=["a", "b"]), "1 names"),
+        (lambda: check(fly_straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), tolerance=0.0), "tolerance"),
+        (lambda: check(fly_straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), tolerance=np.nan), "tolerance"),
     ],
 )
-def test_law_09_bad_limits_are_errors(make, message):
+def test_law_09_wrong_limits_are_errors(make, message):
     with pytest.raises(ConfigError, match=message):
         make()

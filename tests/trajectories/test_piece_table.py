@@ -1,4 +1,4 @@
-"""The host's view of several trajectories, against the record evaluated one by one."""
+"""The table of the pieces of several trajectories on the host, against the trajectories one by one."""
 
 import jax
 import numpy as np
@@ -23,7 +23,7 @@ evaluate = jax.jit(lambda k, t: STACK.evaluate_one(k, t))
 
 
 @given(drone=st.integers(0, 2), t=st.floats(0.01, 11.99))
-def test_it_evaluates_as_the_record_does(drone, t):
+def test_the_table_evaluates_as_the_trajectories(drone, t):
     setpoint = evaluate(drone, t - STARTS[drone])
     np.testing.assert_allclose(TABLE.evaluate(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
     end = STARTS[drone] + float(TRAJECTORIES[drone].duration)
@@ -32,20 +32,20 @@ def test_it_evaluates_as_the_record_does(drone, t):
             np.testing.assert_allclose(TABLE.evaluate(drone, t, order)[:3], expected, atol=5e-3, rtol=1e-3)
 
 
-EARLY = np.array([-1.3, -7.7, -60.0])
-BEGUN = PieceTable.create(TRAJECTORIES, EARLY, duration=12.0)
+EARLY_STARTS = np.array([-1.3, -7.7, -60.0])
+EARLY_TABLE = PieceTable.create(TRAJECTORIES, EARLY_STARTS, duration=12.0)
 
 
 @given(drone=st.integers(0, 2), t=st.floats(0.0, 12.0))
 def test_drones_that_started_before_zero_are_in_the_middle(drone, t):
     """One that repeats is in one of its rounds, and one whose end is over rests there."""
-    setpoint = evaluate(drone, t - EARLY[drone])
-    np.testing.assert_allclose(BEGUN.evaluate(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
-    assert BEGUN.start[BEGUN.first_pieces].tolist() == [0.0, 0.0, 0.0]
-    assert np.all(np.diff(BEGUN._keys) > 0)
+    setpoint = evaluate(drone, t - EARLY_STARTS[drone])
+    np.testing.assert_allclose(EARLY_TABLE.evaluate(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
+    assert EARLY_TABLE.start[EARLY_TABLE.first_pieces].tolist() == [0.0, 0.0, 0.0]
+    assert np.all(np.diff(EARLY_TABLE._keys) > 0)
 
 
-def test_many_at_once_are_those_one_by_one():
+def test_a_batch_is_evaluated_as_one_by_one():
     drones, times = np.repeat([0, 1, 2], 7), np.tile(np.linspace(0, 12, 7), 3)
     together = TABLE.evaluate(drones, times, 1)
     alone = [TABLE.evaluate(int(d), float(t), 1) for d, t in zip(drones, times, strict=True)]
@@ -72,6 +72,6 @@ def test_the_default_duration_ends_with_the_last_drone():
         ((TRAJECTORIES, 0.0, np.nan), "positive, finite duration"),
     ],
 )
-def test_law_09_bad_fleets_are_errors(arguments, message):
+def test_law_09_wrong_fleets_are_errors(arguments, message):
     with pytest.raises(ConfigError, match=message):
         PieceTable.create(*arguments)

@@ -1,4 +1,4 @@
-"""The differentiable form, against that in float64 on the host and against differences."""
+"""The differentiable function ``smoothest``, against planning in float64 on the host and against differences."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ METHODS = {4: minimum_snap, 3: minimum_jerk}
 
 
 @pytest.mark.parametrize("order", METHODS)
-def test_it_is_that_of_the_host(order, x64):
+def test_trajectory_and_cost_are_those_of_the_host(order, x64):
     trajectory, cost = jax.jit(smoothest, static_argnums=2)(WAYPOINTS, DURATIONS, order)
     expected = METHODS[order](WAYPOINTS, DURATIONS)
     nodes = np.full((6, order, 3), np.nan)
@@ -46,7 +46,9 @@ def test_gradients_are_those_of_differences(x64):
     check_grads(jax.jit(objective), (jnp.array(WAYPOINTS), jnp.array(DURATIONS)), 1, modes=["rev"], eps=1e-6)
 
 
-def test_it_can_be_mapped():
-    many = jax.jit(jax.vmap(smoothest))(np.stack([WAYPOINTS, 2 * WAYPOINTS]), np.stack([DURATIONS, DURATIONS]))
-    np.testing.assert_allclose(many[1][1], 4 * np.asarray(many[1][0]), rtol=1e-4)
-    assert many[0].coefficients.shape == (2, 5, 4, 8)
+def test_smoothest_can_be_mapped():
+    trajectories, costs = jax.jit(jax.vmap(smoothest))(
+        np.stack([WAYPOINTS, 2 * WAYPOINTS]), np.stack([DURATIONS, DURATIONS])
+    )
+    np.testing.assert_allclose(costs[1], 4 * np.asarray(costs[0]), rtol=1e-4)
+    assert trajectories.coefficients.shape == (2, 5, 4, 8)

@@ -1,3 +1,5 @@
+"""Splines through points and Bezier curves, against SciPy."""
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,6 +110,6 @@ def test_bezier_repeats_on_request():
         (lambda: of_bezier([1.0], [np.full((4, 3), np.nan)]), "finite control points"),
     ],
 )
-def test_law_09_bad_splines_are_errors(make, message):
+def test_law_09_wrong_splines_are_errors(make, message):
     with pytest.raises(ConfigError, match=message):
         make()

@@ -25,7 +25,7 @@ def evaluate(trajectory, t):
     return jax.tree.map(np.asarray, on_device(trajectory, t))
 
 
-at = jax.jit(Trajectory.evaluate)
+setpoint_at = jax.jit(Trajectory.evaluate)
 slopes_at = jax.jit(jax.jacfwd(Trajectory.evaluate, argnums=1))
 
 
@@ -34,17 +34,21 @@ def random_pieces(n_pieces=5, degree=7, seed=0):
     return rng.uniform(0.2, 2.0, n_pieces), rng.normal(size=(n_pieces, 4, degree + 1))
 
 
-def oracle(durations, c, t, order):
-    """The derivative of all axes at times inside. (n, 4)"""
+def derivatives_by_scipy(durations, c, t, order):
+    """Return the derivative of all axes at times within the trajectory. (n, 4)"""
     curves = PPoly(np.moveaxis(c[..., ::-1], -1, 0), np.concatenate([[0], np.cumsum(durations)]))
     return curves.derivative(order)(t) if order else curves(t)
 
 
 def check_same(setpoint, durations, c, t, rtol=1e-10):
     for order, name in enumerate(DERIVATIVES):
-        np.testing.assert_allclose(getattr(setpoint, name), oracle(durations, c, t, order)[:, :3], rtol, 1e-9, name)
+        np.testing.assert_allclose(
+            getattr(setpoint, name), derivatives_by_scipy(durations, c, t, order)[:, :3], rtol, 1e-9, name
+        )
     for order, name in enumerate(YAW):
-        np.testing.assert_allclose(getattr(setpoint, name), oracle(durations, c, t, order)[:, 3:], rtol, 1e-9, name)
+        np.testing.assert_allclose(
+            getattr(setpoint, name), derivatives_by_scipy(durations, c, t, order)[:, 3:], rtol, 1e-9, name
+        )
 
 
 @pytest.mark.parametrize("n_pieces", [1, 2, 3, 5, 8, 13])
@@ -65,13 +69,13 @@ def test_before_the_start_and_after_the_end_it_is_at_rest():
     durations, c = random_pieces()
     trajectory, end = Trajectory.of_pieces(durations, c), durations.sum()
     s = evaluate(trajectory, np.array([-1e9, -1e-9, end + 1e-9, 1e9]))
-    first, last = (oracle(durations, c, np.array([t]), 0)[0] for t in (0, end))
+    first, last = (derivatives_by_scipy(durations, c, np.array([t]), 0)[0] for t in (0, end))
     np.testing.assert_allclose(np.concatenate([s.pos, s.yaw], 1), [first, first, last, last], rtol=1e-9)
     for name in ("vel", "acc", "jerk", "snap", "yaw_rate", "yaw_acc"):
         np.testing.assert_array_equal(getattr(s, name), np.zeros_like(getattr(s, name)))
 
 
-def test_one_that_repeats_starts_again():
+def test_a_trajectory_that_repeats_starts_again():
     durations, c = random_pieces()
     trajectory, end = Trajectory.of_pieces(durations, c, repeats=True), durations.sum()
     t = np.linspace(0.001, 0.999, 17) * end
@@ -81,7 +85,7 @@ def test_one_that_repeats_starts_again():
     np.testing.assert_array_equal(before.vel, np.zeros((1, 3)))
 
 
-def test_stacked_ones_are_the_same_as_alone_within_and_beyond_their_ends():
+def test_stacked_trajectories_are_the_same_as_alone_within_and_beyond_their_ends():
     pieces = [random_pieces(1, 7, 1), random_pieces(4, 3, 2), random_pieces(6, 5, 3)]
     alone = [Trajectory.of_pieces(*p, repeats=k == 1) for k, p in enumerate(pieces)]
     stacked = Trajectory.stack(alone)
@@ -91,14 +95,14 @@ def test_stacked_ones_are_the_same_as_alone_within_and_beyond_their_ends():
         end = durations.sum()
         t = np.concatenate([np.linspace(-1, end + 2, 50), [end, np.nextafter(end, 0), np.nextafter(end, 9e9)]])
         of_stacked = jax.tree.map(lambda x, k=k: np.asarray(x)[k], stacked)
-        one, many = (evaluate(x, t) for x in (trajectory, of_stacked))
+        expected, found = (evaluate(x, t) for x in (trajectory, of_stacked))
         inside = (t < end - 1e-9) | (t > end + 1e-9) | (k == 1)  # at the end itself padding is already at rest
-        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
+        for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
             np.testing.assert_allclose(x[inside], y[inside], atol=1e-9)
-        np.testing.assert_allclose(one.pos, many.pos, atol=1e-9)
+        np.testing.assert_allclose(expected.pos, found.pos, atol=1e-9)
 
 
-def test_one_after_the_other():
+def test_then_appends_a_trajectory():
     (d1, c1), (d2, c2) = random_pieces(2, 3, 1), random_pieces(3, 7, 2)
     both = Trajectory.of_pieces(d1, c1).then(Trajectory.of_pieces(d2, c2))
     t = np.linspace(0, d1.sum() + d2.sum() - 1e-9, 60)
@@ -111,7 +115,7 @@ def test_one_after_the_other():
         endless.then(both)
 
 
-def test_rounds_are_those_of_one_that_repeats_and_then_end():
+def test_repeat_gives_rounds_that_end():
     durations, c = random_pieces(3, 5)
     endless, end = Trajectory.of_pieces(durations, c, repeats=True), durations.sum()
     three = endless.repeat(3)
@@ -131,16 +135,16 @@ def test_a_transition_connects_two_smoothly_and_turns_the_shorter_way(turns):
     c2[:, 3, 0] += 2 * np.pi * turns
     first, second = Trajectory.of_pieces(d1, c1).padded(4, 3), Trajectory.of_pieces(d2, c2)
     both = first.then(second, transition=1.5)
-    meet = [d1.sum(), d1.sum() + 1.5]
+    ends = [d1.sum(), d1.sum() + 1.5]
     assert float(both.duration) == pytest.approx(d1.sum() + 1.5 + d2.sum())
-    for t in meet:
+    for t in ends:
         setpoints = evaluate(both, np.array([t - 1e-8, t + 1e-8]))
         for name in ("pos", "vel", "acc", "jerk", "yaw", "yaw_rate", "yaw_acc"):
             before, after = getattr(setpoints, name)
             np.testing.assert_allclose(before, after, atol=2e-4, err_msg=name)  # 2e-8 s of derivatives up to 1e4
-    at_start = evaluate(both, np.array([meet[1]]))
+    at_start = evaluate(both, np.array([ends[1]]))
     np.testing.assert_allclose(at_start.pos[0], c2[0, :3, 0], atol=1e-9)
-    turned = evaluate(both, np.array(meet)).yaw[:, 0]
+    turned = evaluate(both, np.array(ends)).yaw[:, 0]
     assert abs(turned[1] - turned[0]) <= np.pi + 1e-9
     np.testing.assert_allclose(np.exp(1j * turned[1]), np.exp(1j * c2[0, 3, 0]), atol=1e-9)
     for wrong in (-1.0, np.inf, "long"):
@@ -166,7 +170,7 @@ def test_moving_turns_and_shifts_positions_and_turns_derivatives(traced):
 @given(t=st.floats(-5, 20), repeats=st.booleans())
 def test_each_derivative_is_the_gradient_of_the_one_before(t, repeats):
     trajectory = Trajectory.of_pieces(*random_pieces(), repeats=repeats)
-    s, slopes = at(trajectory, t), slopes_at(trajectory, t)
+    s, slopes = setpoint_at(trajectory, t), slopes_at(trajectory, t)
     for low, high in [*pairwise(DERIVATIVES), *pairwise(YAW)]:
         np.testing.assert_allclose(getattr(slopes, low), getattr(s, high), rtol=1e-9, atol=1e-9)
 
@@ -188,7 +192,7 @@ def test_float32_keeps_a_minute_of_long_pieces_to_a_hundredth_of_a_millimetre():
     c = np.zeros((1, 4, n))
     c[0, :3, :4] = np.array([0, 0, 3 / t_end**2, -2 / t_end**3]) * np.array([[5.0], [-4.0], [2.0]])
     t = np.linspace(0, t_end, 500)
-    exact = oracle([t_end], c, t, 0)[:, :3]
+    exact = derivatives_by_scipy([t_end], c, t, 0)[:, :3]
     with jax.enable_x64(False):
         trajectory = Trajectory.of_pieces([t_end], c)
         assert trajectory.coefficients.dtype == np.float32

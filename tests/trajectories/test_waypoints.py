@@ -77,7 +77,7 @@ def snap_by_lagrange(waypoints, durations, order, velocity):
 
 @pytest.mark.parametrize("velocity", [[np.nan] * 3, [1.0, np.nan, -0.5]])
 @pytest.mark.parametrize("method", METHODS)
-def test_it_is_the_solution_of_the_kkt_system(method, velocity, x64):
+def test_the_plan_is_the_solution_of_the_kkt_system(method, velocity, x64):
     velocities = np.full_like(WAYPOINTS, np.nan)
     velocities[[0, -1]], velocities[1] = 0.0, velocity
     trajectory = method(WAYPOINTS, DURATIONS, velocities=velocities)
@@ -116,8 +116,8 @@ def test_planned_flights_pass_the_waypoints_at_rest_within_tight_limits(method, 
     trajectory = method(waypoints, limits=limits, yaw=rng.uniform(-3, 3, n))
     report = check(trajectory, limits)
     assert report.ok, str(report)
-    use = [report.peaks[name].value[0] / limit for name, limit in limits.as_dict().items()]
-    assert max(use) > 0.999
+    usage = [report.peaks[name].value[0] / limit for name, limit in limits.as_dict().items()]
+    assert max(usage) > 0.999
     ends = np.concatenate([[0.0], trajectory.ends])
     table = PieceTable.create([trajectory])
     np.testing.assert_allclose(table.evaluate(np.zeros(n, int), ends)[:, :3], waypoints, atol=1e-4)
@@ -142,7 +142,7 @@ def test_a_smallest_thrust_bounds_how_fast_a_climb_ends():
     np.testing.assert_allclose(report.peaks["thrust"].value, 1.5, rtol=1e-3)  # the climb is symmetric
 
 
-def test_ratios_of_the_durations_are_those_of_least_snap():
+def test_ratios_of_the_durations_minimise_snap():
     trajectory = minimum_snap(WAYPOINTS, limits=LIMITS)
     durations = np.diff(np.asarray(trajectory.ends, float), prepend=0)
 
@@ -208,12 +208,12 @@ def test_a_wide_corridor_changes_nothing_and_one_may_be_bounded_alone():
     free = minimum_snap(WAYPOINTS, DURATIONS)
     wide = minimum_snap(WAYPOINTS, DURATIONS, corridors=10.0)
     np.testing.assert_array_equal(wide.coefficients, free.coefficients)
-    one = deviations(minimum_snap(WAYPOINTS, DURATIONS, corridors=[np.inf, 0.1, np.inf, np.inf]), WAYPOINTS)
-    assert one[1] <= 0.1 < 0.3 < deviations(free, WAYPOINTS)[1]
-    assert one[[0, 2, 3]].max() > 0.1
+    bounded = deviations(minimum_snap(WAYPOINTS, DURATIONS, corridors=[np.inf, 0.1, np.inf, np.inf]), WAYPOINTS)
+    assert bounded[1] <= 0.1 < 0.3 < deviations(free, WAYPOINTS)[1]
+    assert bounded[[0, 2, 3]].max() > 0.1
 
 
-def test_the_corridor_costs_no_more_than_the_optimum_of_scipy(x64):
+def test_the_cost_in_a_corridor_is_the_optimum_of_scipy(x64):
     """Two pieces in a plane; SciPy minimises the same cost under the same bound at 60 times of each piece."""
     waypoints, durations, radius = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1.0]]), np.array([1.0, 1.0]), 0.05
     found = pieces(minimum_snap(waypoints, durations, corridors=radius))
@@ -236,21 +236,21 @@ def test_the_corridor_costs_no_more_than_the_optimum_of_scipy(x64):
     base = coefficients(np.zeros(6))
     parts = np.array([coefficients(e) - base for e in np.eye(6)])
 
-    def room(x):
+    def clearance(x):
         """Return the squared radius, of which 0.5% to 1% is kept free, less the squared distance to the segments."""
         pos = np.einsum("uk,pak->pua", powers, base + np.tensordot(x, parts, 1))
         begin, along = waypoints[:2, None, :2], np.diff(waypoints, axis=0)[:, None, :2]
         nearest = begin + np.clip(np.sum((pos - begin) * along, axis=-1), 0, 1)[..., None] * along
         return ((0.9925 * radius) ** 2 - np.sum((pos - nearest) ** 2, axis=-1)).ravel()
 
-    bound = {"type": "ineq", "fun": room}
+    bound = {"type": "ineq", "fun": clearance}
     least = 1e4 * minimize(lambda x: cost(coefficients(x)) / 1e4, np.zeros(6), constraints=bound, method="SLSQP").fun
     free = cost(pieces(minimum_snap(waypoints, durations))[:, :2])
     assert free < 0.7 * least  # the corridor matters
     np.testing.assert_allclose(cost(found[:, :2]), least, rtol=3e-3)
 
 
-def test_coincident_waypoints_are_fine_with_durations():
+def test_coincident_waypoints_are_allowed_with_durations():
     trajectory = minimum_snap([[0, 0, 1], [0, 0, 1], [1, 0, 1]], [1.0, 2.0], corridors=0.1, yaw=[0, 1, 1])
     assert deviations(trajectory, np.array([[0, 0, 1], [0, 0, 1], [1, 0, 1.0]]))[0] <= 0.1
 

@@ -1,4 +1,4 @@
-"""The Crazyflie's trajectory memory and CSV: against bytes and rows made by hand, and back."""
+"""The Crazyflie's trajectory memory and CSV, against bytes and rows by hand, written and read back."""
 
 import struct
 
@@ -59,7 +59,7 @@ def test_poly4d_is_33_floats_with_the_duration_last():
     check_same(unpack_poly4d(content), Trajectory.of_pieces([2.0], axes[None]), 1e-3)
 
 
-def test_poly4d_and_csv_and_back(tmp_path):
+def test_poly4d_and_csv_are_read_back(tmp_path):
     t = trajectory()
     check_same(unpack_poly4d(pack_poly4d(t)), t, 1e-5)
     save_memory(t, tmp_path / "a.bin")
@@ -87,7 +87,7 @@ def test_compressed_bytes_by_hand():
     check_same(unpack_compressed(content), t, 1e-6)
 
 
-def test_compressed_and_back(tmp_path):
+def test_compressed_trajectories_are_read_back(tmp_path):
     t = trajectory(seed=1)
     check_same(unpack_compressed(pack_compressed(t)), t, 2e-3)
     save_memory(t, tmp_path / "a.bin", compressed=True)
@@ -141,7 +141,7 @@ def test_samples(tmp_path):
     assert not load_csv(tmp_path / "a.csv").coefficients[:, 3].any()
 
 
-WRONG = {
+WRONG_CSV = {
     "empty": ("", "at least one row"),
     "header alone": (POLYNOMIAL_HEADER, "at least one row"),
     "words": ("0,0,0,0\n1,2,x,4", "line 2"),
@@ -158,14 +158,14 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize(("content", "message"), WRONG.values(), ids=WRONG)
-def test_wrong_csv(content, message, tmp_path):
+@pytest.mark.parametrize(("content", "message"), WRONG_CSV.values(), ids=WRONG_CSV)
+def test_wrong_csv_files_are_errors(content, message, tmp_path):
     (tmp_path / "a.csv").write_text(content)
     with pytest.raises(ConfigError, match=message):
         load_csv(tmp_path / "a.csv")
 
 
-def test_wrong_memory(tmp_path):
+def test_wrong_memories_and_trajectories_are_errors(tmp_path):
     for content in (b"", bytes(100), bytes(132)):
         with pytest.raises(ConfigError):
             unpack_poly4d(content)
