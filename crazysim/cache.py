@@ -98,9 +98,9 @@ def folder() -> Path | None:
 
     A default folder that cannot be used is reported on stderr, once; the process then keeps no programs.
     """
-    configured = jaxcompat.cache_folder()
-    if configured is not None:
-        return Path(configured)
+    configured_folder = jaxcompat.cache_folder()
+    if configured_folder is not None:
+        return Path(configured_folder)
     return _usable_default_folder()
 
 

@@ -135,7 +135,7 @@ def select_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
 def _trace_function(fn: Callable[..., Any], variables: Sequence[Any]) -> ClosedJaxpr:
     """Return the jaxpr of a function of some variables of another jaxpr."""
     avals = [(v.aval, getattr(v.aval, "weak_type", False)) for v in variables]
-    return jax.make_jaxpr(fn)(*(jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=weak) for x, weak in avals))
+    return jax.make_jaxpr(fn)(*(jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=is_weak) for x, is_weak in avals))
 
 
 def _zeros(aval: Any) -> Any:
@@ -281,15 +281,17 @@ def primitive_by_platform(
 
 
 def _apply_derivative(fn: Callable[..., Any], primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> Any:
-    perturbed = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
+    perturbed_indices = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
 
     def apply(*values: Any) -> Any:
         args = list(primals)
-        for i, x in zip(perturbed, values, strict=True):
+        for i, x in zip(perturbed_indices, values, strict=True):
             args[i] = x
         return list(fn(*args, **params))
 
-    return jax.jvp(apply, tuple([primals[i] for i in perturbed]), tuple([tangents[i] for i in perturbed]))
+    return jax.jvp(
+        apply, tuple([primals[i] for i in perturbed_indices]), tuple([tangents[i] for i in perturbed_indices])
+    )
 
 
 def _apply_transpose(

@@ -235,7 +235,7 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
             ending = "" if core is None else f" and end with {core}"
             n_axes = len(batch) + (core_ndim or 0)
             raise ConfigError(
-                f"{name} has shape {shape}; needed are {n_axes} dimensions that begin with {batch}{ending}, for "
+                f"{name} has shape {shape}; expected {n_axes} dimensions that begin with {batch}{ending}, for "
                 f"{n_worlds} worlds of {n} {kinds}{shared_text}. For one value per world, repeat it for every {kind} "
                 f"with jnp.broadcast_to."
             )

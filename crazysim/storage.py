@@ -148,13 +148,13 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         raise ConfigError(
             f"expected a file that can be written, got the {kind} {str(path)!r}. Give the name of a file."
         )
-    unfinished = unfinished_path(path)
+    temporary_path = unfinished_path(path)
     try:
-        with unfinished.open("wb") as file:
+        with temporary_path.open("wb") as file:
             yield file
-        os.replace(unfinished, path)
+        os.replace(temporary_path, path)
     except BaseException as error:
-        unfinished.unlink(missing_ok=True)
+        temporary_path.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise ConfigError(
                 f"expected a file that can be written, got {str(path)!r}: {error}. Use another folder, or make room."

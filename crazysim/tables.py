@@ -96,8 +96,8 @@ def read_numbers(
     if shapes is not None and not any(_is_allowed_shape(array.shape, shape) for shape in shapes):
         raise ConfigError(f"{owner}expected {name} of shape {' or '.join(map(str, shapes))}, got {array.shape}{remedy}")
     # Compare a float32 in float32: a bound such as pi / 2, rounded to float32, may exceed the bound itself.
-    compared = np.asarray(value) if getattr(value, "dtype", None) == np.float32 else array
-    if not np.all((compared >= allowed.low) & (compared <= allowed.high)):
+    compared_values = np.asarray(value) if getattr(value, "dtype", None) == np.float32 else array
+    if not np.all((compared_values >= allowed.low) & (compared_values <= allowed.high)):
         raise ConfigError(f"{owner}expected {name} to be {allowed.text}, got {short_repr(array.tolist())}{remedy}")
     return array
 
@@ -219,8 +219,8 @@ class Layout:
 
     def _did_you_mean(self, candidates: Iterable[str]) -> str:
         nearest = list(candidates)[:3]
-        meant = f"Did you mean {' or '.join(nearest)}? " if nearest else ""
-        return f"{meant}{self.guide} lists all keys."
+        hint = f"Did you mean {' or '.join(nearest)}? " if nearest else ""
+        return f"{hint}{self.guide} lists all keys."
 
 
 def read_source(

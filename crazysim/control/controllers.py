@@ -45,8 +45,8 @@ def find_controller(controller: Any, switch: Any = None) -> Controller:
         )
     if controller not in CONTROLLERS:
         names = ", ".join(repr(name) for name in sorted(CONTROLLERS))
-        library = controller.endswith((".so", ".dylib"))
-        remedy = f" Use CFirmware({controller!r}) for a compiled controller." if library else ""
+        is_library = controller.endswith((".so", ".dylib"))
+        remedy = f" Use CFirmware({controller!r}) for a compiled controller." if is_library else ""
         raise UnknownNameError(f"expected controller as one of {names}, got {controller!r}.{remedy}")
     module, _, name = CONTROLLERS[controller].partition(":")
     return getattr(importlib.import_module(module), name)()

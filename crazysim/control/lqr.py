@@ -197,9 +197,16 @@ def state_error(
             (..., 1)
     """
     matrix = rotation.matrix(quat)
-    relative = [[dot(reference.matrix[..., i], matrix[..., j])[..., 0] for j in range(3)] for i in range(3)]  # R_d^T R
+    relative_matrix = [
+        [dot(reference.matrix[..., i], matrix[..., j])[..., 0] for j in range(3)] for i in range(3)
+    ]  # R_d^T R
     rotation_error = 0.5 * jnp.stack(
-        [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]], axis=-1
+        [
+            relative_matrix[2][1] - relative_matrix[1][2],
+            relative_matrix[0][2] - relative_matrix[2][0],
+            relative_matrix[1][0] - relative_matrix[0][1],
+        ],
+        axis=-1,
     )
     to_body = jnp.swapaxes(matrix, -1, -2)
     rate_error = ang_vel - matvec(to_body, matvec(reference.matrix, reference.ang_vel))

@@ -75,8 +75,8 @@ class Population(Plugin):
                 f"or {kind}(['{self.prefix}_0'])."
             )
         if len(set(names)) < len(names):
-            repeated = next(name for name in names if names.count(name) > 1)
-            raise ConfigError(f"expected distinct names of members, got {repeated!r} twice. Rename one.")
+            repeated_name = next(name for name in names if names.count(name) > 1)
+            raise ConfigError(f"expected distinct names of members, got {repeated_name!r} twice. Rename one.")
         return names
 
     @property
@@ -185,8 +185,8 @@ class Population(Plugin):
         def rates(record: Members) -> dict[str, Array]:
             return plugin_rates(self, self.write(data, record))
 
-        advanced = scheme(self.read(data), rates, 1 / data.core.freq)
-        return self.write(data, self.finish(advanced))
+        advanced_record = scheme(self.read(data), rates, 1 / data.core.freq)
+        return self.write(data, self.finish(advanced_record))
 
 
 Rates = Callable[[R], dict[str, Array]]
@@ -200,8 +200,10 @@ def euler(record: R, rates: Rates, dt: float) -> R:
 
 def symplectic_euler(record: R, rates: Rates, dt: float, positions: Sequence[str]) -> R:
     """Return a record one semi-implicit Euler step later: positions move with the new values of the other states."""
-    advanced = advance_record(record, {k: rate for k, rate in rates(record).items() if k not in positions}, dt)
-    return advance_record(advanced, {k: rate for k, rate in rates(advanced).items() if k in positions}, dt)
+    advanced_record = advance_record(record, {k: rate for k, rate in rates(record).items() if k not in positions}, dt)
+    return advance_record(
+        advanced_record, {k: rate for k, rate in rates(advanced_record).items() if k in positions}, dt
+    )
 
 
 def rk4(record: R, rates: Rates, dt: float) -> R:

@@ -160,7 +160,7 @@ def _distribute_over_hosts(x: Any, sharding: Sharding) -> jax.Array:
     return jax.make_array_from_callback(value.shape, sharding, lambda part: value[part])
 
 
-def fetch(tree: T) -> T:
+def fetch_arrays(tree: T) -> T:
     """Return arrays as host arrays, random keys as their data.
 
     Arrays that are distributed over several hosts are sent to all of them, which must all call this.

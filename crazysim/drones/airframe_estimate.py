@@ -214,10 +214,10 @@ class _AirframeFile:
 
 
 def _toml_string(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    if not escaped.isprintable():
+    escaped_text = text.replace("\\", "\\\\").replace('"', '\\"')
+    if not escaped_text.isprintable():
         raise ConfigError(f"expected a name of printable characters, got {short_repr(text)}")
-    return f'"{escaped}"'
+    return f'"{escaped_text}"'
 
 
 def _toml_value(value: Any) -> str:

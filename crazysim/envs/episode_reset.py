@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.population import populations
-from crazysim.core.sharding import fetch
+from crazysim.core.sharding import fetch_arrays
 from crazysim.core.stage import Axes, Stage, world_function
 from crazysim.core.stages import reset
 from crazysim.pytree import has_members, leaf_indices, map_batched, n_batch_axes, n_world_axes, scopes
@@ -104,7 +104,7 @@ def deduplicate(data: SimData) -> SimData:
     def deduplicate_leaf(scope: str, x: Array) -> Array | np.ndarray:
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
             return x
-        host = fetch(x)
+        host = fetch_arrays(x)
         for axis in _BATCH_AXES.get(scope, (0,) if has_members(scope) else ()):
             first_entry = host.take([0], axis)
             if np.array_equal(host, np.broadcast_to(first_entry, host.shape), equal_nan=host.dtype.kind == "f"):

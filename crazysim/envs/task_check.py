@@ -13,7 +13,7 @@ from jax.tree_util import keystr, tree_leaves_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.settings import check_settings
-from crazysim.core.sharding import fetch
+from crazysim.core.sharding import fetch_arrays
 from crazysim.envs.state import EnvState
 from crazysim.envs.task import NAME, Task
 from crazysim.errors import ConfigError
@@ -41,7 +41,7 @@ def require_finite_start(task: Task, state: EnvState) -> None:
     """Check that episodes begin in finite states."""
     states = state.data.states
     for field in dataclasses.fields(states):  # type: ignore[arg-type]
-        value = fetch(getattr(states, field.name))
+        value = fetch_arrays(getattr(states, field.name))
         if not np.all(np.isfinite(value)):
             world = int(np.argwhere(~np.isfinite(value))[0, 0])
             raise ConfigError(

@@ -121,8 +121,8 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     # Coplanar triangles share a plane through the outermost vertex, so that all vertices are inside.
     planes = _unique_normals(normals)
     offsets = np.max(v @ planes.T, axis=0)
-    used, indices = np.unique(triangles, return_inverse=True)
-    return Shape("mesh", (), *map(_read_only_copy, (v[used], indices.reshape(-1, 3), planes, offsets)))
+    used_vertices, indices = np.unique(triangles, return_inverse=True)
+    return Shape("mesh", (), *map(_read_only_copy, (v[used_vertices], indices.reshape(-1, 3), planes, offsets)))
 
 
 def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:

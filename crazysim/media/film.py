@@ -174,11 +174,11 @@ class Film:
             ffmpeg.stdin.close()
         message = ffmpeg.stderr.read().decode(errors="replace").strip()
         ffmpeg.stderr.close()
-        unfinished = unfinished_path(self._absolute_path)
+        temporary_path = unfinished_path(self._absolute_path)
         if ffmpeg.wait() == 0:
-            unfinished.replace(self._absolute_path)
+            temporary_path.replace(self._absolute_path)
         else:
-            unfinished.unlink(missing_ok=True)
+            temporary_path.unlink(missing_ok=True)
             raise RenderError(
                 f"expected a file that can be written, got {str(self.path)!r}: {message or 'ffmpeg failed'}"
             )

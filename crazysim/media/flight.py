@@ -73,8 +73,8 @@ class Flight:
         def interpolate_attitude(quat: NDArray) -> NDArray:
             # q and -q are the same attitude: interpolate along the shorter arc.
             sign = np.where((quat[before] * quat[after]).sum(-1, keepdims=True) < 0, -1, 1)
-            blended = (1 - weight) * quat[before] + weight * sign * quat[after]
-            return blended / np.linalg.norm(blended, axis=-1, keepdims=True)
+            blended_quat = (1 - weight) * quat[before] + weight * sign * quat[after]
+            return blended_quat / np.linalg.norm(blended_quat, axis=-1, keepdims=True)
 
         return {
             "pos": interpolate(self.pos),

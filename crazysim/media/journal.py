@@ -83,9 +83,9 @@ class Journal(Closeable):
             self._file = -1
 
     def _write(self, content: bytes) -> None:
-        unwritten = memoryview(content)
-        while unwritten:
-            unwritten = unwritten[os.write(self._file, unwritten) :]
+        remaining_bytes = memoryview(content)
+        while remaining_bytes:
+            remaining_bytes = remaining_bytes[os.write(self._file, remaining_bytes) :]
 
 
 def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:

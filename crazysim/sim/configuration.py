@@ -86,11 +86,11 @@ class Configuration:
                 f"expected the data of a simulation, got {type(data).__name__}. Use sim.data = sim.data.replace(...)."
             ) from None
         is_fitted = self.dynamics != Dynamics.first_principles
-        expected = self.n_worlds, self.n_drones, self.freq, self.control, is_fitted
-        if settings != expected:
+        expected_settings = self.n_worlds, self.n_drones, self.freq, self.control, is_fitted
+        if settings != expected_settings:
             raise ConfigError(
-                f"expected data of {_describe_settings(*expected)}, got data of {_describe_settings(*settings)}. Use "
-                f"data of this simulation, or of one with the same settings."
+                f"expected data of {_describe_settings(*expected_settings)}, got data of "
+                f"{_describe_settings(*settings)}. Use data of this simulation, or of one with the same settings."
             )
         check_same_controllers(controls, reference.controls, getattr(self.controller, "name", None))
 

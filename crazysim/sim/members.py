@@ -65,14 +65,14 @@ class Member:
     @locked
     def set(self, **values: ArrayLike) -> None:
         """Write fields of the record, such as ``pos``, in all worlds: (...), or (n_worlds, ...) for each."""
-        record, new = self._record(), {}
+        record, new_values = self._record(), {}
         for field, value in values.items():
             if field not in self._fields():
                 raise UnknownNameError(
                     f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}."
                 )
-            new[field] = self._replace_checked_row(f"{field} of {self.name}", getattr(record, field), value)
-        data, record = self._sim.data, record.replace(**new)
+            new_values[field] = self._replace_checked_row(f"{field} of {self.name}", getattr(record, field), value)
+        data, record = self._sim.data, record.replace(**new_values)
         plugin = self._plugin
         self._sim.data = data.replace(states=record) if plugin is None else plugin.write(data, record)
 

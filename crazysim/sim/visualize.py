@@ -57,10 +57,10 @@ def draw_capsule(
         rgba: Colour, 0 to 1; None for red. (4,)
         cylinder: True for flat ends.
     """
-    first, last = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
-    if first.shape != (3,) or last.shape != (3,):
-        raise ValueError(f"expected ends of shape (3,), got {first.shape} and {last.shape}")
-    sim.overlays.capsule(first, last, radius, DEFAULT_COLOR if rgba is None else rgba, check_flag("cylinder", cylinder))
+    start, end = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
+    if start.shape != (3,) or end.shape != (3,):
+        raise ValueError(f"expected ends of shape (3,), got {start.shape} and {end.shape}")
+    sim.overlays.capsule(start, end, radius, DEFAULT_COLOR if rgba is None else rgba, check_flag("cylinder", cylinder))
 
 
 def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:

@@ -24,7 +24,7 @@ from jax import Array
 import crazysim
 from crazysim.cache import announce_if_slow, keep_programs
 from crazysim.core.settings import positive_integer
-from crazysim.core.sharding import distribute, fetch
+from crazysim.core.sharding import distribute, fetch_arrays
 from crazysim.engine.backends.native import compiling_threads
 from crazysim.envs.env import Env
 from crazysim.envs.references import code_digest, is_reference, split_reference
@@ -194,7 +194,7 @@ def train_many(
             return distribute(files["learner"], shardings), jax.device_put(files["kept"], eval_env.sim.device)
         learner = init(env, hyperparameters, distribute(keys, replicated))
         require_finite_start(base_env.task, learner.env)
-        policies = fetch(learner.as_policy())
+        policies = fetch_arrays(learner.as_policy())
         return learner, [take_seed(policies, i) for i in range(n_trainings)]
 
     def evaluate_policies(policies: Policy, key: Array | None) -> list[dict[str, float]]:
@@ -245,14 +245,14 @@ def train_many(
         nonlocal saved_iteration, save_time
         runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.divergence_iteration} for x in trainings}
         meta = {"crazysim": crazysim.__version__, "code": code, "runs": runs, "seconds": seconds()}
-        files = fetch({"learner": learner, "kept": [training.kept_policy for training in trainings]})
+        files = fetch_arrays({"learner": learner, "kept": [training.kept_policy for training in trainings]})
         if is_first_host():
             checkpoint.save(path, files, meta)
         saved_iteration, save_time = int(learner.iteration), time.perf_counter()
 
     def evaluate_and_save(learner: Learner, metrics: dict[str, Array]) -> list[dict[str, Any]]:
         """Evaluate the policies, keep those that no earlier one clearly beats, write all files, and return points."""
-        iteration, policies = int(learner.iteration), fetch(learner.as_policy())
+        iteration, policies = int(learner.iteration), fetch_arrays(learner.as_policy())
         mark_diverged(metrics, iteration)
         is_planned = iteration % evaluation_period == 0 or iteration == n_iterations
         results, checks = evaluate_policies(policies, None), evaluate_policies(policies, check_key)

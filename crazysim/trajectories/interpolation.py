@@ -49,11 +49,11 @@ def _exact_basis(order: int) -> list[list[Fraction]]:
                 coefficients[j + i + m] += Fraction(sign_and_size, math.factorial(j))
         columns.append(coefficients)
     for j in range(k):  # p(1 - u), with the sign that keeps the derivative
-        mirrored = [Fraction(0)] * (2 * k)
+        mirrored_coefficients = [Fraction(0)] * (2 * k)
         for power, value in enumerate(columns[j]):
             for m in range(power + 1):
-                mirrored[m] += (-1) ** (m + j) * math.comb(power, m) * value
-        columns.append(mirrored)
+                mirrored_coefficients[m] += (-1) ** (m + j) * math.comb(power, m) * value
+        columns.append(mirrored_coefficients)
     return [list(row) for row in zip(*columns, strict=True)]
 
 

@@ -56,8 +56,10 @@ class PieceTable:
         ends = [start + float(t.ends[-1]) for start, t in zip(starts, host_trajectories, strict=True)]
         end = max(ends) if duration is None else float(duration)
         if not 0 < end < np.inf:
-            actual = f"{duration!r}" if duration is not None else f"trajectories that end at {end:g} s"
-            raise ConfigError(f"expected a positive, finite duration, s, got {actual}. Use for example duration=10.0.")
+            actual_text = f"{duration!r}" if duration is not None else f"trajectories that end at {end:g} s"
+            raise ConfigError(
+                f"expected a positive, finite duration, s, got {actual_text}. Use for example duration=10.0."
+            )
         size = max(t.coefficients.shape[-1] for t in host_trajectories)
         parts = [_collect_pieces(t, start, end, size) for t, start in zip(host_trajectories, starts, strict=True)]
         drone = np.repeat(np.arange(n_drones), [len(part[0]) for part in parts])

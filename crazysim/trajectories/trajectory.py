@@ -184,9 +184,9 @@ class Trajectory(PyTree):
         if not trajectories:
             raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
         n_pieces, degree = max(t.n_pieces for t in trajectories), max(t.degree for t in trajectories)
-        padded = [t.padded(n_pieces, degree) for t in trajectories]
-        xp = _array_module(padded)
-        return jax.tree.map(lambda *leaves: xp.stack(leaves), *padded)
+        padded_trajectories = [t.padded(n_pieces, degree) for t in trajectories]
+        xp = _array_module(padded_trajectories)
+        return jax.tree.map(lambda *leaves: xp.stack(leaves), *padded_trajectories)
 
     def unstacked(self) -> list[Trajectory]:
         """Return the trajectories of all vehicles, one by one."""
@@ -272,8 +272,8 @@ class Trajectory(PyTree):
     def _end_derivatives(self, at_end: bool) -> np.ndarray:
         """Return x, y, z and yaw at the start or the end, with derivatives up to jerk, on the host. (4, 4)"""
         lengths = np.diff(np.asarray(self.ends, float), prepend=0.0)
-        nonempty = np.flatnonzero(lengths > 0)
-        k, u = (nonempty[-1], 1.0) if at_end else (nonempty[0], 0.0)
+        nonempty_pieces = np.flatnonzero(lengths > 0)
+        k, u = (nonempty_pieces[-1], 1.0) if at_end else (nonempty_pieces[0], 0.0)
         Polynomial = np.polynomial.polynomial.Polynomial
         polynomials = [Polynomial(x) for x in np.asarray(self.coefficients[k], float)]
         return np.array([[p.deriv(m)(u) / lengths[k] ** m for p in polynomials] for m in range(4)])
@@ -295,9 +295,9 @@ class Trajectory(PyTree):
         c, offset = self.coefficients, xp.asarray(offset, self.coefficients.dtype)
         cos, sin = xp.cos(yaw).astype(c.dtype), xp.sin(yaw).astype(c.dtype)
         x, y = cos * c[..., 0, :] - sin * c[..., 1, :], sin * c[..., 0, :] + cos * c[..., 1, :]
-        rotated = xp.stack([x, y, c[..., 2, :], c[..., 3, :]], axis=-2)
-        constant = rotated[..., :1] + xp.append(offset, xp.asarray(yaw, c.dtype))[:, None]
-        return self.replace(coefficients=xp.concatenate([constant, rotated[..., 1:]], axis=-1))
+        rotated_coefficients = xp.stack([x, y, c[..., 2, :], c[..., 3, :]], axis=-2)
+        constant = rotated_coefficients[..., :1] + xp.append(offset, xp.asarray(yaw, c.dtype))[:, None]
+        return self.replace(coefficients=xp.concatenate([constant, rotated_coefficients[..., 1:]], axis=-1))
 
 
 def _array_module(tree: object) -> Any:

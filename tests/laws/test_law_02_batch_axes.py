@@ -130,7 +130,7 @@ def test_a_mass_of_a_world_alone_is_refused(square, shape):
     wrong = with_params(square.data, mass=np.full(shape, 0.03, np.float32))
     with pytest.raises(ConfigError) as error:
         square.step_fn(wrong, jnp.int32(1))
-    assert f"data.params.mass has shape {shape}; needed are 3 dimensions that begin with (3, 3)" in str(error.value)
+    assert f"data.params.mass has shape {shape}; expected 3 dimensions that begin with (3, 3)" in str(error.value)
     assert "or 1 if all drones share it" in str(error.value)
 
 

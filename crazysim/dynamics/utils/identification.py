@@ -207,11 +207,11 @@ def lag_signal(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
     decay = np.exp(-rate * dt)
     later_weight = 1 - (1 - decay) / (rate * dt)  # weight of the later sample
     inputs = (1 - decay - later_weight) * x[:-1] + later_weight * x[1:]
-    lagged = np.empty((len(x), *inputs.shape[1:]))
-    lagged[0] = x[0]
+    lagged_signal = np.empty((len(x), *inputs.shape[1:]))
+    lagged_signal[0] = x[0]
     for k, u in enumerate(inputs):
-        lagged[k + 1] = decay * lagged[k] + u
-    return lagged
+        lagged_signal[k + 1] = decay * lagged_signal[k] + u
+    return lagged_signal
 
 
 def _angle_samples(log: Mapping[str, ArrayLike], axes: Sequence[int]) -> tuple[float, Array, Array, Array]:
