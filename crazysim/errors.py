@@ -16,13 +16,17 @@ SKIPPED_PACKAGES = ("crazysim", "jax", "contextlib", "functools", "importlib")
 def short_repr(value: object) -> str:
     """Return a value for a message, at most ``MAX_REPR_LENGTH`` characters of it."""
     try:
-        text = repr(value) if not isinstance(value, (list, dict)) or len(value) < MAX_REPR_LENGTH else _kind(value)
+        text = (
+            repr(value)
+            if not isinstance(value, (list, dict)) or len(value) < MAX_REPR_LENGTH
+            else _describe_type(value)
+        )
     except RecursionError:
-        text = _kind(value)
+        text = _describe_type(value)
     return text if len(text) <= MAX_REPR_LENGTH else f"{text[: MAX_REPR_LENGTH - 3]}..."
 
 
-def _kind(value: object) -> str:
+def _describe_type(value: object) -> str:
     return f"a {type(value).__name__}"
 
 
@@ -89,7 +93,7 @@ class UnsupportedError(Exception):
     """
 
     def __init__(self, cause: str, primitive: str = "", stage: str = ""):
-        """Keep the reason and its place.
+        """Create the error.
 
         Args:
             cause: The reason, as a sentence without a full stop.
@@ -111,8 +115,8 @@ class UnsupportedError(Exception):
     @property
     def reason(self) -> str:
         """Reason, with the primitive."""
-        has_name = not self.primitive or f"'{self.primitive}'" in self.cause
-        return self.cause if has_name else f"primitive {self.primitive!r}: {self.cause}"
+        is_complete = not self.primitive or f"'{self.primitive}'" in self.cause
+        return self.cause if is_complete else f"primitive {self.primitive!r}: {self.cause}"
 
     def __str__(self) -> str:
         """Return the reason, with the stage and the version of JAX where the stage is known."""

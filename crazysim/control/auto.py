@@ -219,12 +219,12 @@ class Auto(Controller):
     yaw_rate: bool = False
     """True if the third entry of an attitude command is a yaw rate, rad/s, instead of a yaw."""
 
-    def adapt(self, control: Control, fitted: str | None) -> Controller | None:
-        if fitted is None and control in self.levels:
+    def adapt(self, control: Control, fitted_model: str | None) -> Controller | None:
+        if fitted_model is None and control in self.levels:
             return self if control == Control.state else dataclasses.replace(self, outer_freq=None)
-        if fitted is None:
+        if fitted_model is None:
             return None
-        return FittedAuto(Dynamics(fitted), cast(int, self.outer_freq)) if control == Control.state else None
+        return FittedAuto(Dynamics(fitted_model), cast(int, self.outer_freq)) if control == Control.state else None
 
     def outer(self, data: DroneData, command: Setpoint, memory: AutoMemory, params: AutoParams) -> AutoMemory:
         # The z axis of the body is to point along the specific force, its x axis closest to the heading, and their

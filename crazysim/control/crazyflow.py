@@ -80,10 +80,10 @@ class Crazyflow(Controller):
     freq: int = 500
     """Rate, Hz."""
 
-    def adapt(self, control: Control, fitted: str | None) -> Controller | None:
+    def adapt(self, control: Control, fitted_model: str | None) -> Controller | None:
         if control == Control.state:
-            return CrazyflowState(inner=None if fitted else self)
-        return self if fitted is None and control in self.levels else None
+            return CrazyflowState(inner=None if fitted_model else self)
+        return self if fitted_model is None and control in self.levels else None
 
     def params(self, airframe: Airframe) -> AttitudeParams:
         return AttitudeParams.create(airframe)

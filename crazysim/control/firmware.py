@@ -160,14 +160,14 @@ def copy_library(library: str | Path) -> str:
         content = read_bytes(path, MAX_LIBRARY_BYTES)
     except ConfigError as error:
         raise ConfigError(f"expected a shared library at {path}: {error}. {remedy}") from error
-    copy = Path(_copies_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
-    if not copy.exists():  # a library that is loaded must not be overwritten
-        with replacing(copy) as file:
+    copy_path = Path(_copies_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
+    if not copy_path.exists():  # a library that is loaded must not be overwritten
+        with replacing(copy_path) as file:
             file.write(content)
-        if reason := _loading_error(copy):
-            copy.unlink()
+        if reason := _loading_error(copy_path):
+            copy_path.unlink()
             raise ConfigError(f"expected a shared library at {path}, got one that cannot be loaded: {reason}. {remedy}")
-    library_copy = _open_library(str(copy))
+    library_copy = _open_library(str(copy_path))
     missing = [name for name in LIBRARY_FUNCTIONS if not hasattr(library_copy, name)]
     if missing:
         required_names, missing_names = ", ".join(LIBRARY_FUNCTIONS), ", ".join(missing)
@@ -184,7 +184,7 @@ def copy_library(library: str | Path) -> str:
     library_copy.crazysim_init.restype = None
     library_copy.crazysim_update_all.argtypes = [integer, integer, size, pointer, integer, pointer, pointer]
     library_copy.crazysim_update_all.restype = None
-    return str(copy)
+    return str(copy_path)
 
 
 def _loading_error(library: Path) -> str:

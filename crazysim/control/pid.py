@@ -143,7 +143,7 @@ class PID(Controller):
 
 
 def _reset_at_zero_thrust(memory: PIDMemory, rpy: Array, pos: Array) -> PIDMemory:
-    """Return the memory with all loops reset, where the thrust is zero or less, as ``controllerPidReinitialize``."""
+    """Return the memory, reset where the thrust is zero or less, as by ``controllerPidReinitialize``."""
     m, is_off = memory, memory.thrust <= 0
     return m.replace(
         position=m.position.reset_where(is_off, pos),

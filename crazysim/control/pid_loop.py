@@ -160,9 +160,9 @@ def continue_integral(memory: PIDLoopMemory, output: Array, desired: Array, *, l
 def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array, Array]:
     """Return the output of the low-pass filter, and its delays after a tick (``lpf2pApply``)."""
     b0, a1, a2 = coefficients[..., 0:1], coefficients[..., 1:2], coefficients[..., 2:3]
-    first, second = delays[..., 0, :], delays[..., 1, :]
-    latest = sample - first * a1 - second * a2
-    return b0 * (latest + 2 * first + second), jnp.stack([latest, first], axis=-2)
+    last_delay, previous_delay = delays[..., 0, :], delays[..., 1, :]
+    new_delay = sample - last_delay * a1 - previous_delay * a2
+    return b0 * (new_delay + 2 * last_delay + previous_delay), jnp.stack([new_delay, last_delay], axis=-2)
 
 
 def _wrap_angle(angle: Array, is_angle: Sequence[bool]) -> Array:

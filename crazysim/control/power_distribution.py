@@ -84,8 +84,8 @@ def distribute_power(
     else:
         pwm = thrust + matvec(p.torque_allocation, torque)
     # The gradient of jnp.max divides by the number of equal elements, which is zero if XLA rounds a copy differently.
-    highest = functools.reduce(jnp.maximum, [pwm[..., i : i + 1] for i in range(pwm.shape[-1])])
-    excess = highest - p.pwm_max
+    max_pwm = functools.reduce(jnp.maximum, [pwm[..., i : i + 1] for i in range(pwm.shape[-1])])
+    excess = max_pwm - p.pwm_max
     pwm = pwm - jnp.where(excess > 0, excess, 0.0)
     return jnp.where(thrust <= 0, 0.0, jnp.where(pwm < 0, 0.0, pwm))
 

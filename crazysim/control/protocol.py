@@ -164,12 +164,12 @@ class Controller:
         """
         return memory
 
-    def adapt(self, control: Control, fitted: str | None) -> Controller | None:
+    def adapt(self, control: Control, fitted_model: str | None) -> Controller | None:
         """Return the controller to use for a command level and dynamics; None if commands need none.
 
         Args:
             control: Command level.
-            fitted: Name of the fitted model; None for dynamics with rotors.
+            fitted_model: Name of the fitted model; None for dynamics with rotors.
         """
         return self
 

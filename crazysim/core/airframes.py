@@ -43,8 +43,8 @@ def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: i
             f"one airframe for all."
         )
     keys = [str(source) if isinstance(source, (str, Path)) else id(source) for source in drone]
-    loaded = {key: load_airframe(source) for key, source in dict(zip(keys, drone, strict=True)).items()}
-    return tuple([loaded[key] for key in keys])
+    airframe_by_key = {key: load_airframe(source) for key, source in dict(zip(keys, drone, strict=True)).items()}
+    return tuple([airframe_by_key[key] for key in keys])
 
 
 def is_airframe_list(drone: object) -> TypeGuard[Sequence[AirframeSource]]:
@@ -68,8 +68,10 @@ def find_common_airframe(airframes: Airframes) -> Airframe:
 
 def max_n_rotors(airframes: Airframes) -> int:
     """Return the largest number of rotors of any of the airframes."""
-    kinds = {id(airframe): airframe for airframe in as_airframes(airframes)}  # thousands of drones share a few
-    return max(airframe.n_rotors for airframe in kinds.values())
+    distinct_airframes = {
+        id(airframe): airframe for airframe in as_airframes(airframes)
+    }  # thousands of drones share a few
+    return max(airframe.n_rotors for airframe in distinct_airframes.values())
 
 
 def name_prefix(airframe: Airframe) -> str:
@@ -104,21 +106,22 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
         n_worlds: Number of worlds.
     """
     airframes = as_airframes(airframes)
-    kinds = list({id(airframe): airframe for airframe in airframes}.values())
-    records = [create(kind) for kind in kinds]
-    if len(kinds) == 1:
+    distinct_airframes = list({id(airframe): airframe for airframe in airframes}.values())
+    records = [create(kind) for kind in distinct_airframes]
+    if len(distinct_airframes) == 1:
         return records[0]
-    counts = [kind.n_rotors for kind in kinds]
+    counts = [kind.n_rotors for kind in distinct_airframes]
     if len(set(counts)) > 1:
         records = [_add_rotor_masks(record, n) for record, n in zip(records, counts, strict=True)]
     structures = [jax.tree.structure(record) for record in records]
-    for kind, structure in zip(kinds, structures, strict=True):
+    for kind, structure in zip(distinct_airframes, structures, strict=True):
         if structure != structures[0]:
             raise ConfigError(
-                f"expected airframes with the same numbers for {type(records[0]).__name__}, got {kinds[0].name!r} and "
-                f"{kind.name!r}, of which one lacks some. Add them, with the key 'base', or use another controller."
+                f"expected airframes with the same numbers for {type(records[0]).__name__}, got "
+                f"{distinct_airframes[0].name!r} and {kind.name!r}, of which one lacks some. Add "
+                f"them, with the key 'base', or use another controller."
             )
-    kind_indices = [kinds.index(airframe) for airframe in airframes]
+    kind_indices = [distinct_airframes.index(airframe) for airframe in airframes]
 
     def stack_leaf(path: tuple[object, ...], *values: ArrayLike) -> np.ndarray:
         name = jax.tree_util.keystr(path[-1:]).strip("[].'\"")

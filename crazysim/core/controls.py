@@ -251,7 +251,7 @@ class SimControls(PyTree):
         check_controller(dynamics, control, controller)
         followers, last_level = controller_chain(controller, control)
         controller_by_level = dict(followers)
-        data = {level: ControllerData.create(*shape, x, airframes) for level, x in followers}
+        controller_data = {level: ControllerData.create(*shape, x, airframes) for level, x in followers}
 
         def zeros(n: int) -> Any:
             return host_array(0.0, *shape, n)
@@ -264,7 +264,7 @@ class SimControls(PyTree):
             )
             # A copy, because two leaves that share a buffer cannot both be donated.
             state = StateControlData(
-                data[control],
+                controller_data[control],
                 cmd,
                 cmd.copy(),
                 freqs[Control.state],
@@ -274,14 +274,14 @@ class SimControls(PyTree):
         if Control.attitude in (*controller_by_level, last_level):
             follower = controller_by_level.get(Control.attitude)
             attitude = AttitudeControlData(
-                data.get(Control.attitude),
+                controller_data.get(Control.attitude),
                 zeros(4),
                 zeros(4),
                 freqs[Control.attitude],
                 staged_ang_vel_des=zeros(3) if follower is not None and follower.follows_rates else None,
             )
         if control == Control.body_rate:
-            body_rate = BodyRateControlData(data[control], zeros(4), zeros(4), freqs[control])
+            body_rate = BodyRateControlData(controller_data[control], zeros(4), zeros(4), freqs[control])
         if dynamics == Dynamics.first_principles:
             rotor_vel = zeros(max_n_rotors(airframes))
         if last_level == Control.force_torque:

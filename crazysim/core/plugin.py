@@ -108,10 +108,10 @@ def airframe_numbers(sim: Simulation, get_number: Callable[[Airframe], ArrayLike
     Returns:
         (*core), or (n_worlds, n_drones, *core) where the drones have several airframes
     """
-    kinds = {id(airframe): airframe for airframe in sim.airframes}
-    values = {key: np.asarray(get_number(airframe)) for key, airframe in kinds.items()}
+    distinct_airframes = {id(airframe): airframe for airframe in sim.airframes}
+    values = {key: np.asarray(get_number(airframe)) for key, airframe in distinct_airframes.items()}
     first_value = next(iter(values.values()))
-    if len(kinds) == 1:
+    if len(distinct_airframes) == 1:
         return first_value
     per_drone = np.stack([values[id(airframe)] for airframe in sim.airframes])
     return np.broadcast_to(per_drone, (sim.n_worlds, *per_drone.shape))

@@ -150,10 +150,10 @@ def estimate_airframe(
         if value is not None:
             read_number(key, value, POSITIVE)
     file = _AirframeFile(name)
-    rotor_pos, signs = _rotors(file, arm, n_rotors, layout, positions, spins, propeller)
+    rotor_pos, signs = _rotor_layout(file, arm, n_rotors, layout, positions, spins, propeller)
     file.add("rigid_body", "mass", mass, "kg", "given")
     if inertia is None:
-        file.add("rigid_body", "inertia", _inertia(mass, rotor_pos), "kg m^2", "inertia")
+        file.add("rigid_body", "inertia", _estimate_inertia(mass, rotor_pos), "kg m^2", "inertia")
     else:
         file.add("rigid_body", "inertia", np.asarray(inertia, float), "kg m^2", "given")
     file.add(
@@ -227,7 +227,7 @@ def _toml_value(value: Any) -> str:
     return f"{float(value):.6g}" if isinstance(value, (float, np.floating)) else str(int(value))
 
 
-def _rotors(
+def _rotor_layout(
     file: _AirframeFile,
     arm: Any,
     n_rotors: int,
@@ -285,7 +285,7 @@ def _rotors(
     return rotor_pos, -spin_signs
 
 
-def _inertia(mass: float, rotor_pos: NDArray) -> NDArray:
+def _estimate_inertia(mass: float, rotor_pos: NDArray) -> NDArray:
     """Return the inertia of points at the rotors: moments, or a matrix if its principal axes are not the body's."""
     squares = np.einsum("ni,nj->ij", rotor_pos, rotor_pos) / len(rotor_pos)
     matrix = OUTER_MASS_SHARE * mass * (np.trace(squares) * np.eye(3) - squares)
@@ -308,19 +308,19 @@ def _add_thrust(
             "expected either thrust_to_weight or motor_table. Use thrust_to_weight=2 for a drone that carries things, "
             "4 for an agile one."
         )
-    rows = {} if table is None else _motor_table(table)
+    motor_data = {} if table is None else _parse_motor_table(table)
     table_name = f"motor table {Path(table).name}" if isinstance(table, (str, Path)) else "motor table that was given"
     if table is None:
         thrust = ratio * mass * GRAVITY_MAGNITUDE / n
         file.add("rotors", "thrust_max", thrust, "N", "thrust_to_weight", ratio=ratio)
     else:
-        thrust = float(np.max(rows["thrust"]))
+        thrust = float(np.max(motor_data["thrust"]))
         file.describe("motor_thrust", f"Largest thrust of the {table_name}")
         file.add("rotors", "thrust_max", thrust, "N", "motor_thrust")
     pitch_ratio = PITCH_RATIO if pitch is None else pitch / diameter
     ct = 0.0427 + 0.144 * pitch_ratio
-    if "rpm" in rows:
-        k, error = _fit_quadratic(rows["rpm"], rows["thrust"])
+    if "rpm" in motor_data:
+        k, error = _fit_quadratic(motor_data["rpm"], motor_data["thrust"])
         file.describe("motor_curve", f"Least squares T = k rpm^2 to the {table_name}, off by at most {error:.2g} N")
         source = "motor_curve"
     else:
@@ -331,13 +331,13 @@ def _add_thrust(
     area, rpm_to_rad_s = np.pi * diameter**2 / 4, 2 * np.pi / 60
     merit = float(np.interp(diameter, MERIT_DIAMETERS, FIGURES_OF_MERIT))
     torque, source = k**1.5 / np.sqrt(2 * AIR_DENSITY * area) / merit / rpm_to_rad_s, "torque_curve"
-    if "rpm" in rows and "torque" in rows:
-        torque, error = _fit_quadratic(rows["rpm"], rows["torque"])
+    if "rpm" in motor_data and "torque" in motor_data:
+        torque, error = _fit_quadratic(motor_data["rpm"], motor_data["torque"])
         file.describe("motor_torque", f"Least squares Q = k rpm^2 to the {table_name}, off by at most {error:.2g} N m")
         source = "motor_torque"
-    elif "rpm" in rows and "power" in rows:
-        shaft_torque = MOTOR_EFFICIENCY * rows["power"] / (rows["rpm"] * rpm_to_rad_s)
-        torque, error = _fit_quadratic(rows["rpm"], shaft_torque)
+    elif "rpm" in motor_data and "power" in motor_data:
+        shaft_torque = MOTOR_EFFICIENCY * motor_data["power"] / (motor_data["rpm"] * rpm_to_rad_s)
+        torque, error = _fit_quadratic(motor_data["rpm"], shaft_torque)
         file.describe(
             "motor_power",
             f"estimate: least squares Q = k rpm^2 to the {table_name}, with {MOTOR_EFFICIENCY:g} of the electric power "
@@ -366,7 +366,7 @@ def _fit_quadratic(rpm: NDArray, values: NDArray) -> tuple[float, float]:
     return k, float(np.max(np.abs(values - k * squares)))
 
 
-def _motor_table(table: MotorTable) -> dict[str, NDArray]:
+def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
     """Return the columns of a motor table by quantity, in SI units and rpm."""
     columns = table if isinstance(table, Mapping) else _read_columns(Path(table))
     column_names = ", ".join(COLUMNS)
@@ -426,10 +426,12 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
 def _add_battery(
     file: _AirframeFile, mass: float, cells: int | None, capacity: float | None, resistance: float | None
 ) -> None:
-    n = cells or next(n for n, limit in ((1, 0.1), (3, 0.5), (4, 3.0), (6, np.inf)) if mass < limit)
-    charge = capacity or BATTERY_SHARE * mass * BATTERY_ENERGY / (n * CELL_VOLTAGE)
-    file.add("battery", "cells", n, "1, in series", "given" if cells else "cells")
+    n_cells = cells or next(n_cells for n_cells, limit in ((1, 0.1), (3, 0.5), (4, 3.0), (6, np.inf)) if mass < limit)
+    charge = capacity or BATTERY_SHARE * mass * BATTERY_ENERGY / (n_cells * CELL_VOLTAGE)
+    file.add("battery", "cells", n_cells, "1, in series", "given" if cells else "cells")
     file.add("battery", "capacity", charge, "A h", "given" if capacity else "capacity")
-    ohms = resistance or n * CELL_RESISTANCE / charge
-    file.add("battery", "resistance", ohms, "ohm, of all cells", "given" if resistance else "resistance")
-    file.add("battery", "mass", n * charge * CELL_VOLTAGE / BATTERY_ENERGY, "kg, part of the drone's", "battery_mass")
+    total_resistance = resistance or n_cells * CELL_RESISTANCE / charge
+    file.add("battery", "resistance", total_resistance, "ohm, of all cells", "given" if resistance else "resistance")
+    file.add(
+        "battery", "mass", n_cells * charge * CELL_VOLTAGE / BATTERY_ENERGY, "kg, part of the drone's", "battery_mass"
+    )

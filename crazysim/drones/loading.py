@@ -82,9 +82,9 @@ def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, 
     if not changed_paths or not lost_tables:
         return dict(base_values), base.not_inherited_reason
     numbers = {path: x for path, x in base_values.items() if path.partition(".")[0] not in TUNED_TABLES}
-    ratio = "controller.thrust2torque"
-    if ratio in base_values and not {"rotors.thrust_curve", "rotors.torque_curve"} & set(changes):
-        numbers[ratio] = base_values[ratio]  # it depends on the propellers only
+    ratio_path = "controller.thrust2torque"
+    if ratio_path in base_values and not {"rotors.thrust_curve", "rotors.torque_curve"} & set(changes):
+        numbers[ratio_path] = base_values[ratio_path]  # it depends on the propellers only
     names = _join_names(f"[{table}]" for table in lost_tables)
     reason = (
         f"Its base {base.name!r} has {names}, which fit another {_join_names(changed_paths)} and are not inherited."

@@ -65,20 +65,24 @@ def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
     numbers, mass = airframe.values, airframe.value("rigid_body.mass")
     rates_by_path: dict[str, np.ndarray] = {}
     if dynamics == Dynamics.first_principles:
-        drag = "drag.coefficients"
+        drag_path = "drag.coefficients"
         if "rotors.lag" in numbers:
-            lag, fastest = np.atleast_2d(numbers["rotors.lag"]), airframe.rotor_vel_limits[1]
-            rates_by_path["rotors.lag"] = lag[:, 0::2] + 2 * lag[:, 1::2] * fastest[:, None]
+            lag, max_rotor_vel = np.atleast_2d(numbers["rotors.lag"]), airframe.rotor_vel_limits[1]
+            rates_by_path["rotors.lag"] = lag[:, 0::2] + 2 * lag[:, 1::2] * max_rotor_vel[:, None]
     else:
-        fit = f"fitted.{dynamics.value}."
-        drag = f"{fit}drag_coefficients"
+        fit_prefix = f"fitted.{dynamics.value}."
+        drag_path = f"{fit_prefix}drag_coefficients"
         rates_by_path = {
-            path: numbers[path] for path in (f"{fit}rpy_rates_coef", f"{fit}thrust_dyn_coef") if path in numbers
+            path: numbers[path]
+            for path in (f"{fit_prefix}rpy_rates_coef", f"{fit_prefix}thrust_dyn_coef")
+            if path in numbers
         }
-        if f"{fit}rpy_coef" in numbers and f"{fit}rpy_rates_coef" in numbers:
-            rates_by_path[f"{fit}rpy_coef"] = numbers[f"{fit}rpy_coef"] / numbers[f"{fit}rpy_rates_coef"]
-    if drag in numbers:
-        rates_by_path[drag] = numbers[drag] / mass
+        if f"{fit_prefix}rpy_coef" in numbers and f"{fit_prefix}rpy_rates_coef" in numbers:
+            rates_by_path[f"{fit_prefix}rpy_coef"] = (
+                numbers[f"{fit_prefix}rpy_coef"] / numbers[f"{fit_prefix}rpy_rates_coef"]
+            )
+    if drag_path in numbers:
+        rates_by_path[drag_path] = numbers[drag_path] / mass
     for path, rates in rates_by_path.items():
         max_rate = float(np.max(np.abs(rates)))
         if max_rate > MAX_LAG_RATE * freq:

@@ -17,16 +17,16 @@ def solve_symmetric(matrix: Array, b: Array) -> Array:
     scale = [jax.lax.rsqrt(matrix[..., k, k]) for k in range(n)]
     a = [[matrix[..., i, j] * scale[i] * scale[j] for j in range(i + 1)] for i in range(n)]
     y = [b[..., k] * scale[k] for k in range(n)]
-    low: list[list[Array]] = []
+    lower: list[list[Array]] = []
     for i in range(n):
-        low.append([])
+        lower.append([])
         for j in range(i):
-            low[i].append((a[i][j] - sum(low[i][k] * low[j][k] for k in range(j))) / low[j][j])
-        low[i].append(jnp.sqrt(a[i][i] - sum(low[i][k] ** 2 for k in range(i))))
+            lower[i].append((a[i][j] - sum(lower[i][k] * lower[j][k] for k in range(j))) / lower[j][j])
+        lower[i].append(jnp.sqrt(a[i][i] - sum(lower[i][k] ** 2 for k in range(i))))
     for i in range(n):
-        y[i] = (y[i] - sum(low[i][k] * y[k] for k in range(i))) / low[i][i]
+        y[i] = (y[i] - sum(lower[i][k] * y[k] for k in range(i))) / lower[i][i]
     for i in reversed(range(n)):
-        y[i] = (y[i] - sum(low[k][i] * y[k] for k in range(i + 1, n))) / low[i][i]
+        y[i] = (y[i] - sum(lower[k][i] * y[k] for k in range(i + 1, n))) / lower[i][i]
     return jnp.stack([y[k] * scale[k] for k in range(n)], axis=-1)
 
 

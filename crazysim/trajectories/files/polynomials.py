@@ -129,8 +129,8 @@ def pack_compressed(trajectory: Trajectory) -> bytes:
     require_no_jumps(ends, c)
     ends, c = split_pieces(ends, c, np.arange(MAX_PIECE_DURATION, ends[-1], MAX_PIECE_DURATION))
     c = c / AXIS_UNITS[:, None]
-    stamps = np.round(ends / DURATION_UNIT).astype(int)
-    durations = np.diff(stamps, prepend=0)
+    end_ticks = np.round(ends / DURATION_UNIT).astype(int)
+    durations = np.diff(end_ticks, prepend=0)
     if not np.all(durations > 0):
         raise ConfigError(f"expected pieces of at least 1 ms, got {int(durations.min())} ms. Merge shorter pieces.")
     content = bytearray(_pack_shorts(c[0, :, 0]))
