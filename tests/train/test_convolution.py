@@ -82,7 +82,7 @@ def test_a_convolution_is_that_of_xla(rng, shape):
     assert features.shape == (np.prod(list(Image(0, *shape).shapes((3, 2)))[-1]),)
 
 
-def test_pixels_are_inverse_distances_and_not_normalised(rng):
+def test_pixels_are_scaled_distances_and_not_normalised(rng):
     images = find_images({"z": 2, "depth": 6, "a": 3}, {"depth": {"height": 2, "width": 3, "unit": "m"}})
     assert images == (Image(3, 2, 3),)
     x = jnp.asarray(rng.normal(5, 3, size=(50, 11)), jnp.float32)
@@ -161,7 +161,7 @@ def test_c_gives_the_actions_of_jax(tmp_path, meta, episode):
 
 @pytest.mark.long("renders a film")
 def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
-    """Each pixel of the depth image is a block of the film, near ones brighter."""
+    """Each pixel of the depth image is a block of pixels of the film; near ones are brighter."""
     options = OPTIONS | {"seconds": 0.04, "engine": "interpret"}
     short = make("hover", 1, **options)
     film(short, make_policy(meta, memory=0, channels=(2,)), tmp_path / "film.gif", worlds=1)
@@ -207,17 +207,17 @@ def test_a_run_with_a_convolution_resumes_bit_for_bit_and_its_policy_comes_back(
 
 
 def test_policies_of_several_seeds_have_convolutions_of_their_own(rng, meta):
-    each = [make_policy(meta, memory=0, channels=(2,), seed=seed) for seed in (0, 1)]
-    policies = Policies(jax.tree.map(lambda *x: jnp.stack(x), *each))
+    policies_of_seeds = [make_policy(meta, memory=0, channels=(2,), seed=seed) for seed in (0, 1)]
+    policies = Policies(jax.tree.map(lambda *x: jnp.stack(x), *policies_of_seeds))
     obs = {name: jnp.asarray(rng.uniform(size=(4, 1, n)), jnp.float32) for name, n in meta["observations"].items()}
     actions = policies(obs)
-    for policy, worlds in zip(each, (slice(2), slice(2, 4)), strict=True):
+    for policy, worlds in zip(policies_of_seeds, (slice(2), slice(2, 4)), strict=True):
         np.testing.assert_allclose(actions[worlds], policy({k: x[worlds] for k, x in obs.items()}), atol=1e-6)
-    assert np.abs(actions[:2] - each[1]({k: x[:2] for k, x in obs.items()})).max() > 0.01
+    assert np.abs(actions[:2] - policies_of_seeds[1]({k: x[:2] for k, x in obs.items()})).max() > 0.01
 
 
 def test_a_student_learns_from_images(env, rng):
-    """Its labels are a pixel: observations without images have no part in them."""
+    """Its labels follow from a pixel alone, not from other observations."""
     config = dagger.Config(iterations=30, minibatches=1, epochs=4, hidden=(8,), convolution=(4,), learning_rate=0.01)
     seen = AutoReset(dagger.TeacherObservation(env, lambda data: {"pos": data.states.pos}))
     init = jax.jit(functools.partial(dagger.init, seen, (config,), teacher=lambda obs: obs["pos"]))

@@ -14,7 +14,7 @@ from crazysim.train import dagger, imitate
 from crazysim.train.config import TrainConfig
 from crazysim.train.training import load_policy, train
 
-SEEN = ("rot", "difference_to_goal", "vel")
+STUDENT_OBSERVATIONS = ("rot", "difference_to_goal", "vel")
 SMALL = {"n_steps": 4, "minibatches": 2, "epochs": 1, "hidden": (8,)}
 
 
@@ -26,7 +26,7 @@ def teacher(tmp_path_factory):
 @pytest.mark.long("trains a student")
 def test_a_student_learns_the_actions_from_its_own_observations():
     """The rollouts begin with the teacher's flight, and the student's actions become those of the teacher."""
-    env = Observe(make("hover", 64), lambda obs, _: {name: obs[name] for name in SEEN})
+    env = Observe(make("hover", 64), lambda obs, _: {name: obs[name] for name in STUDENT_OBSERVATIONS})
     rows = []
     config = {"iterations": 60, "hidden": (16,), "n_steps": 8}
     student = imitate(env, steer, config, on_iteration=lambda i, metrics: rows.append((i, metrics)))
@@ -38,29 +38,29 @@ def test_a_student_learns_the_actions_from_its_own_observations():
     assert student(obs).shape == (64, 1, 4)
 
 
-def test_the_teacher_acts_first_and_less_and_less():
-    """With a student of zero actions, the share of the teacher's actions is the decay to the power of the iteration."""
+def test_the_fraction_of_the_teachers_actions_decays():
+    """The fraction is the decay to the power of the iteration, as a student with zero actions shows."""
     env = dagger.AutoReset(dagger.TeacherObservation(make("hover", 64), lambda data: {"x": data.states.pos}))
     config = dagger.Config(teacher_decay=0.5, n_steps=4)
     init = jax.jit(lambda key: dagger.init(env, (config,), key[None], lambda obs: jnp.ones((64, 1, 4))))
     learner = init(jax.random.key(0))
-    for iteration, share in ((0, 1.0), (1, 0.5), (30, 0.0)):
+    for iteration, fraction in ((0, 1.0), (1, 0.5), (30, 0.0)):
         learner = learner.replace(iteration=jnp.int32(iteration))
         after, _ = dagger.iterate(learner, env, (config,))
-        flown = (np.asarray(after.env.action) == 1.0).mean()
-        assert abs(flown - share) < 0.2
+        found = (np.asarray(after.env.action) == 1.0).mean()
+        assert abs(found - fraction) < 0.2
 
 
-def test_the_teacher_observes_the_truth_and_the_student_what_is_measured():
+def test_the_teacher_observes_true_states_and_the_student_measurements():
     env = make("hover", 2, sensors=[MotionCapture(noise=0.1)])
     guided = dagger.TeacherObservation(env, env.task.observe)
     state = jax.jit(guided.step)(jax.jit(guided.reset)(jax.random.key(0)), jnp.zeros((2, 1, 4)))
-    student, shown = dagger.split_obs(state.obs)
-    np.testing.assert_array_equal(shown["pos"], state.data.states.pos)
-    assert student.keys() == shown.keys()
-    difference = np.abs(student["pos"] - shown["pos"]).max(axis=-1)
+    student, teacher = dagger.split_obs(state.obs)
+    np.testing.assert_array_equal(teacher["pos"], state.data.states.pos)
+    assert student.keys() == teacher.keys()
+    difference = np.abs(student["pos"] - teacher["pos"]).max(axis=-1)
     assert (difference > 0.001).all()
-    assert flatten(shown).shape == (2, 1, 21)
+    assert flatten(teacher).shape == (2, 1, 21)
 
 
 @pytest.mark.long("trains and resumes by the command")
@@ -77,7 +77,7 @@ def test_the_command_trains_a_student_and_resumes(teacher, tmp_path, capsys):
     assert policy(jax.jit(config.make_env(2).reset)(jax.random.key(0)).obs).shape == (2, 1, 4)
 
 
-def test_teachers_that_do_not_fit_are_refused(teacher, tmp_path):
+def test_teachers_that_do_not_fit_are_errors(teacher, tmp_path):
     def run(task, teacher, **options):
         config = TrainConfig.create(
             task, "dagger", n_worlds=4, options=options, config=SMALL | {"iterations": 2, "teacher": teacher}

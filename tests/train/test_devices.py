@@ -1,4 +1,4 @@
-"""Trainings on several devices: the policies of one device, one checkpoint, and no exchange but sums."""
+"""Trainings on several devices: the policies of one device, one checkpoint, and exchange of sums only."""
 
 import dataclasses
 import functools
@@ -48,7 +48,7 @@ class Training:
         self.shardings = learner_shardings(shapes, env.sim, n_seeds)
         init = jax.jit(init, static_argnums=(0, 1), out_shardings=self.shardings)
         iterate = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(self.shardings, everywhere))
-        learner = self.begun = init(env, configs, keys)
+        learner = self.initial_learner = init(env, configs, keys)
         self.program = iterate.lower(learner, env, configs).compile()
         for _ in range(3):
             learner, self.metrics = self.program(learner)
@@ -78,7 +78,7 @@ def test_four_devices_train_the_policy_of_one(algorithm, config):
     """The first episodes are equal bit for bit, weights and statistics after three iterations to rounding. Devices only
     exchange sums."""
     one, four = (Training(algorithm, config, 1, 16, n) for n in (1, 4))
-    assert_same(four.begun.env, one.begun.env, atol=0)
+    assert_same(four.initial_learner.env, one.initial_learner.env, atol=0)
     assert_same(four.learner, one.learner, atol=1e-5)
     assert_same(four.metrics, one.metrics, atol=1e-5)
     assert four.learner.env.obs["pos"].addressable_shards[0].data.shape[0] == 4
@@ -96,8 +96,11 @@ def test_four_devices_train_the_policy_of_one(algorithm, config):
 def test_two_devices_train_the_student_of_one():
     """DAgger: the same first episodes, and the same student within a hundredth of what its 24 updates change."""
     one, two = (Training(dagger, DAGGER, 1, 16, n) for n in (1, 2))
-    assert_same(two.begun.env, one.begun.env, atol=0)
-    moved = [x - y for x, y in zip(*(jax.tree.leaves(x.agents.student) for x in (one.learner, one.begun)), strict=True)]
+    assert_same(two.initial_learner.env, one.initial_learner.env, atol=0)
+    moved = [
+        x - y
+        for x, y in zip(*(jax.tree.leaves(x.agents.student) for x in (one.learner, one.initial_learner)), strict=True)
+    ]
     assert max(np.abs(x).max() for x in moved) > 1e-2
     assert_same(two.learner, one.learner, atol=1e-4)
     assert_same(two.metrics, one.metrics, atol=1e-5)
@@ -105,8 +108,8 @@ def test_two_devices_train_the_student_of_one():
 
 
 @pytest.mark.long("compiles a training of two seeds and of three for two devices")
-def test_seeds_are_spread_over_devices_and_those_that_do_not_divide_are_on_each():
-    """A device trains its own seeds, without samples or gradients of others. Each seed is trained as it is alone."""
+def test_seeds_are_divided_among_devices_or_trained_on_all():
+    """If devices divide the seeds, each trains its own seeds, without exchange. Seeds are trained as they are alone."""
     alone = Training(ppo, PPO, 1, 16, 1)
     two, three = (Training(ppo, PPO, n, 16, 2) for n in (2, 3))
     for training in (two, three):
@@ -147,7 +150,7 @@ def test_a_run_continues_on_another_number_of_devices(tmp_path, monkeypatch):
     assert not {"devices", "mesh"} & {*meta["runs"][""]["settings"], *load_policy(tmp_path)[1].options}
 
 
-WRONG = {
+WRONG_OPTIONS = {
     ("--set", "mesh=2"): "expected no option 'mesh' of a training, got 2. Use --devices all, or devices='all'",
     ("--devices", "5"): "expected devices among the 4 of 'cpu', got cpu:4. Use --devices all.*device_count=N",
     ("--devices", "0,7", "--device", "cpu"): "got cpu:7",
@@ -164,16 +167,16 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("texts", WRONG, ids=" ".join)
-def test_devices_that_cannot_be_used_are_refused(texts, tmp_path, capsys):
+@pytest.mark.parametrize("texts", WRONG_OPTIONS, ids=" ".join)
+def test_devices_that_cannot_be_used_are_errors(texts, tmp_path, capsys):
     assert main(["train", "hover", "--out", str(tmp_path / "out"), *texts]) == 2
     error = " ".join(capsys.readouterr().err.split())
-    assert re.search(WRONG[texts], error), error
+    assert re.search(WRONG_OPTIONS[texts], error), error
     assert not (tmp_path / "out").exists()
 
 
 def test_the_mesh_of_a_training_is_an_option_of_neither_task_nor_simulation():
-    """What ``make`` and ``Sim`` accept is refused with the option that serves, and the other way around."""
+    """Each is an error that names the other option."""
     with pytest.raises(ConfigError, match=r"expected no option 'mesh' of a training, got .*devices='all' in Python"):
         TrainConfig.create("hover", options={"mesh": world_mesh(jax.devices())})
     with pytest.raises(
@@ -183,12 +186,12 @@ def test_the_mesh_of_a_training_is_an_option_of_neither_task_nor_simulation():
 
 
 def test_a_training_on_several_devices_is_evaluated_on_the_first_of_them():
-    def where(**settings):
+    def device_option(**settings):
         return TrainConfig.create("hover", **settings).options.get("device")
 
-    assert [where(), where(devices="all"), where(devices=2)] == [None, "cpu", "cpu"]
-    assert [where(devices="2,3"), where(devices=[3])] == ["cpu:2", "cpu:3"]
-    assert where(devices="2,3", options={"device": "cpu:1"}) == "cpu:1"
+    assert [device_option(), device_option(devices="all"), device_option(devices=2)] == [None, "cpu", "cpu"]
+    assert [device_option(devices="2,3"), device_option(devices=[3])] == ["cpu:2", "cpu:3"]
+    assert device_option(devices="2,3", options={"device": "cpu:1"}) == "cpu:1"
     env = TrainConfig.create("hover", devices=[3], n_worlds=2).make_training_env()
     assert (env.sim.device, env.sim.mesh) == (jax.devices()[3], None)
     assert find_devices("cpu", "2,0") == [jax.devices()[2], jax.devices()[0]]

@@ -1,4 +1,4 @@
-"""Every built-in task is learned: after seconds of training with its recipe, its reward is higher than without."""
+"""Every built-in task is learned: seconds of training with its recipe increase the reward."""
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ N_WORLDS, ITERATIONS = {"ppo": 256, "apg": 64}, {"ppo": 30, "apg": 15}
 @pytest.mark.slow("trains every task; the tests of both algorithms on one task are quicker")
 @pytest.mark.parametrize("task", [task for task in TASKS if task in BUILT_IN_TASKS])
 def test_the_reward_rises(task):
-    """In the last ten iterations it is higher than that of a policy that is not trained, by over two standard errors.
+    """In the last ten iterations it exceeds that of an untrained policy by more than two standard errors.
 
     All episodes begin together, so rewards of different iterations are of different times of an episode.
     """
@@ -26,11 +26,11 @@ def test_the_reward_rises(task):
     env = PrivilegedObservation(env) if config.config.get("critic") == "privileged" else env
     env = env if algorithm is apg else AutoReset(env)
     first = jax.jit(algorithm.init, static_argnums=(0, 1))(env, (hyperparameters,), jax.random.key(0)[None])
-    kept = {x: getattr(first.agents, x) for x in ("policy", "log_std") if hasattr(first.agents, x)}
+    initial_weights = {x: getattr(first.agents, x) for x in ("policy", "log_std") if hasattr(first.agents, x)}
     learner, untrained, gains = first, first, []
     for _ in range(hyperparameters.iterations):
         learner, metrics = algorithm.iterate(learner, env, (hyperparameters,))
-        untrained = untrained.replace(agents=untrained.agents.replace(**kept))
-        untrained, others = algorithm.iterate(untrained, env, (hyperparameters,))
-        gains.append(float(metrics["reward"][0] - others["reward"][0]))
+        untrained = untrained.replace(agents=untrained.agents.replace(**initial_weights))
+        untrained, untrained_metrics = algorithm.iterate(untrained, env, (hyperparameters,))
+        gains.append(float(metrics["reward"][0] - untrained_metrics["reward"][0]))
     assert np.mean(gains[-10:]) > 2 * np.std(gains[-10:], ddof=1) / np.sqrt(10)

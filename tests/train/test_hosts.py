@@ -1,4 +1,4 @@
-"""Trainings of two processes with two devices each, which act as two hosts: one policy, and one end."""
+"""Trainings of two processes with two devices each, which act as two hosts."""
 
 import argparse
 import json
@@ -58,7 +58,7 @@ class Process:
 
 
 def start(folder, arguments, others=((), ())):
-    """Return the processes of two hosts that run a command, each with other arguments besides."""
+    """Return the processes of two hosts that run a command, with further arguments of each host."""
     address = free_address()
     common = f"--coordinator {address} --hosts 2 --heartbeat-timeout {HEARTBEAT}".split()
     return [
@@ -87,7 +87,7 @@ def assert_same_files(actual_folder, others):
 
 
 @pytest.mark.long("six processes import JAX, and compile or load a training")
-def test_two_hosts_train_as_one_stop_together_and_survive_the_loss_of_one(tmp_path):
+def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_path):
     """One training: complete; continued, and interrupted by Ctrl-C on one host; continued, until a host is killed;
     continued by one process with all devices."""
     out, alone = tmp_path / "two", tmp_path / "one"
@@ -107,7 +107,7 @@ def test_two_hosts_train_as_one_stop_together_and_survive_the_loss_of_one(tmp_pa
     (status, text), (other_status, _) = first.end(), second.end()
     assert (status, other_status) == (128 + signal.SIGTERM, 128 + signal.SIGINT), text
     assert f"interrupted after iteration {iteration(out)}" in text
-    assert "start all hosts again" not in text, "nothing was lost"
+    assert "start all hosts again" not in text, "no host was lost"
 
     stopped = iteration(out)
     first, second = start(tmp_path, endless)

@@ -1,4 +1,4 @@
-"""Policies with memory, networks of one's own, and critics with more inputs than the policy."""
+"""Policies with memory, custom networks, and critics with more inputs than the policy."""
 
 import dataclasses
 import functools
@@ -51,17 +51,17 @@ def train_quietly(folder, config, network=None, iterations=2, **options):
     return train(config, folder, evaluation_worlds=8, log=lambda line: None, progress=False, **options)
 
 
-def started(env, **config):
+def init_learner(env, **config):
     """Return an untrained learner of one seed, and its configuration."""
     config = ppo.Config(**SHORT | config)
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     return learner, config
 
 
-def test_an_update_computes_what_the_rollout_did(rng):
+def test_an_update_computes_the_outputs_of_the_rollout(rng):
     """Unrolled over a rollout in which episodes end, the networks give the same actions and values, to rounding."""
     env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))  # three steps an episode
-    learner, config = started(env, memory=5)
+    learner, config = init_learner(env, memory=5)
     memory = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), learner.memory)
     collect = jax.jit(ppo._collect_samples, static_argnums=(2, 3))
     key, rates = jax.random.key(1)[None], stack_rates((config,))
@@ -78,7 +78,7 @@ def test_an_update_computes_what_the_rollout_did(rng):
     np.testing.assert_allclose(log_prob, samples.log_prob, atol=1e-4)
     scaled = value * ppo._return_std(agent.returns) + agent.returns.mean
     np.testing.assert_allclose(scaled, samples.value, atol=1e-5)
-    assert np.abs(outputs(jnp.zeros_like(samples.done))[1] - value)[3:].max() > 1e-3, "memories begin anew"
+    assert np.abs(outputs(jnp.zeros_like(samples.done))[1] - value)[3:].max() > 1e-3, "memories are reset"
     assert np.abs(after[0]).max() > 0
     assert after[0].shape == (4, 1, 5)
 
@@ -91,17 +91,17 @@ def test_gradients_flow_back_in_time_to_the_start_of_an_episode(rng):
     obs = jnp.asarray(rng.normal(size=(6, 2, 3)), jnp.float32)
     done = jnp.zeros((6, 2), bool).at[2, 1].set(True)
 
-    def last(obs):
+    def last_output(obs):
         return unroll(network, weights, obs, network.make_memory(2), done)[-1].sum()
 
-    grads = np.abs(jax.grad(last)(obs)).max(axis=-1)
+    grads = np.abs(jax.grad(last_output)(obs)).max(axis=-1)
     assert (grads[:, 0] > 0).all()
     np.testing.assert_array_equal(grads[:, 1] > 0, [False, False, False, True, True, True])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Recall(Hover):
-    """A cue is shown in the first step of an episode alone, and pays in all of them."""
+    """A cue is observed only in the first step of an episode, and determines the reward of all steps."""
 
     def _cue(self, data):
         return jnp.where(data.plugins["task"].pos[..., :1] > data.states.pos[..., :1], 1.0, -1.0)
@@ -116,13 +116,13 @@ class Recall(Hover):
 
 
 @pytest.mark.long("trains two policies")
-def test_a_memory_learns_what_a_policy_without_cannot():
+def test_a_policy_with_memory_learns_a_task_that_needs_it():
     """Without memory the best action in four steps of five is 0, which costs 0.25 each: 0.2 on average."""
     base = make("hover", 128, freq=500, seconds=0.01)
     env = AutoReset(DroneEnv(base.sim, Recall(seconds=0.01), freq=500))
     rewards = {}
     for memory in (0, 8):
-        learner, config = started(
+        learner, config = init_learner(
             env, memory=memory, iterations=40, n_steps=20, epochs=4, init_std=0.2, discount=0.5, learning_rate=5e-3
         )
         for _ in range(config.iterations):
@@ -182,7 +182,7 @@ def test_a_run_with_memory_resumes_is_evaluated_filmed_and_exported(tmp_path):
     assert not np.any(link._memory)
 
 
-def test_policies_of_several_seeds_keep_memories_of_their_own(rng):
+def test_policies_of_several_seeds_have_separate_memories(rng):
     env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))
     config = ppo.Config(**SHORT | {"minibatches": 1, "memory": 3})
     keys = jax.random.split(jax.random.key(0), 2)
@@ -218,7 +218,7 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
         state = env.step(state, jnp.zeros((3, 1, 4)))
     assert np.abs(state.obs["pos"] - state.data.states.pos).max() > 0.01
     assert len(np.unique(seen[..., -5:])) > 10
-    learner, _ = started(env, minibatches=1, critic="privileged")
+    learner, _ = init_learner(env, minibatches=1, critic="privileged")
     other = state.obs | {"privileged": 1 + state.obs["privileged"]}
     config = ppo.Config(critic="privileged")
     agent = take_seed(learner.agents, 0)
@@ -229,7 +229,7 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
     assert np.abs(values[0] - values[1]).min() > 1e-4
     assert agent.n_obs == flatten(base.reset(jax.random.key(0)).obs).shape[-1] == agent.as_policy().stats.mean.shape[0]
     with pytest.raises(ConfigError, match=r"expected the observation 'privileged' .*AutoReset\(PrivilegedObservation"):
-        started(AutoReset(base), minibatches=1, critic="privileged")
+        init_learner(AutoReset(base), minibatches=1, critic="privileged")
     with pytest.raises(ConfigError, match="expected observations without 'privileged', got "):
         PrivilegedObservation(PrivilegedObservation(base)).reset(jax.random.key(0))
 
@@ -240,13 +240,13 @@ def test_an_observation_of_the_task_may_be_named_privileged(rng):
     base = make("hover", 2, seconds=0.06, engine="interpret")
     add = lambda obs, data: obs | {"privileged": data.states.rotor_vel, "zeros": 0 * obs["pos"]}  # noqa: E731
     env = AutoReset(Observe(base, add))
-    learner, _ = started(env, minibatches=1)
+    learner, _ = init_learner(env, minibatches=1)
     n_obs = flatten(learner.env.obs).shape[-1]
     assert learner.agents.n_obs == n_obs == take_seed(learner.as_policy(), 0).stats.mean.shape[0]
     assert learner.agents.policy.layers[0][0].shape[1] == n_obs
 
 
-def test_a_critic_of_all_drones_gets_the_observations_of_each_its_own_first():
+def test_a_critic_of_all_drones_gets_all_observations_with_those_of_its_drone_first():
     obs = jnp.arange(2 * 3 * 2).reshape(2, 3, 2)
     seen = np.asarray(ppo._critic_input(obs, ppo.Config(critic="all_drones")))
     np.testing.assert_array_equal(seen[0], [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5, 0, 1], [4, 5, 0, 1, 2, 3]])
@@ -257,7 +257,7 @@ def test_a_critic_may_see_all_drones_and_their_true_states():
     """Its inputs are the observations and privileged observations of each drone; the policy has its own alone."""
     base = make("swarm", 2, seconds=0.1, engine="interpret")
     env = AutoReset(PrivilegedObservation(base))
-    learner, _ = started(env, minibatches=1, critic="all_drones_privileged")
+    learner, _ = init_learner(env, minibatches=1, critic="all_drones_privileged")
     sizes = {name: x.shape[-1] for name, x in learner.env.obs.items()}
     n_obs = sum(sizes.values()) - sizes["privileged"]
     agent = take_seed(learner.agents, 0)
@@ -271,7 +271,7 @@ def test_a_critic_may_see_all_drones_and_their_true_states():
 )
 def test_tasks_of_several_drones_train_with_a_critic_of_all(task):
     env = AutoReset(make(task, 4, seconds=0.1))
-    learner, config = started(env, critic="all_drones")
+    learner, config = init_learner(env, critic="all_drones")
     value = take_seed(learner.agents, 0).value
     n_obs = learner.agents.n_obs
     assert value.layers[0][0].shape[0] == env.sim.n_drones * n_obs
@@ -319,7 +319,7 @@ def equinox_network():
         equinox_network,
     ],
 )
-def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_network):
+def test_a_custom_network_is_trained_saved_and_loaded(tmp_path, make_network):
     network = make_network()
     result = train_quietly(tmp_path, {}, network)
     policy, config, meta = load_policy(tmp_path, network=network)
@@ -342,7 +342,7 @@ def test_a_network_of_ones_own_is_trained_saved_and_loaded(tmp_path, make_networ
         to_c(policy, tmp_path / "policy.h", meta)
 
 
-def test_wrong_networks_are_refused():
+def test_wrong_networks_are_errors():
     network = plain_network()
     settings = {"task": "hover", **SIZES}
     with pytest.raises(ConfigError, match="expected memory=0 with a custom network, got 8"):

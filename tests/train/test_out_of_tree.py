@@ -102,19 +102,19 @@ FULL = 4 * float(AIRFRAME.value("rotors.thrust_max"))
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     """Return a policy for hover of each level, the description of its actions, and the folder of its controller."""
-    made = {}
+    exports = {}
 
-    def of(level):
-        if level not in made:
+    def export(level):
+        if level not in exports:
             meta = describe(make("hover", 1, control=level))
             n = sum(meta["observations"].values())
             stats = RunningStats(jnp.zeros(n), jnp.ones(n), jnp.asarray(1e4))
             policy, folder = Policy(stats, init_mlp(jax.random.key(0), (n, 16, 4), 0.3)), tmp_path_factory.mktemp(level)
             to_out_of_tree(policy, folder, meta, AIRFRAME, 50)
-            made[level] = policy, meta["actions"], folder
-        return made[level]
+            exports[level] = policy, meta["actions"], folder
+        return exports[level]
 
-    return of
+    return export
 
 
 def command_of(policy, actions, x):
@@ -199,7 +199,7 @@ def test_the_example_compiles_against_the_headers(tmp_path):
     subprocess.run([shutil.which("cc") or "gcc", *FLAGS, *folders, "-fsyntax-only", EXAMPLE], check=True)
 
 
-def test_policies_that_the_firmware_cannot_fly_are_refused(exported, tmp_path):
+def test_policies_that_the_firmware_cannot_fly_are_errors(exported, tmp_path):
     policy, *_ = exported("attitude")
     meta = describe(make("hover", 1))
     with pytest.raises(ConfigError, match="expected a rate that divides the firmware's 1000 Hz, got 60 Hz"):

@@ -1,4 +1,4 @@
-"""Tasks of users: from a file to a trained policy, by place, by name and as objects; the package stays as it is."""
+"""Tasks of users: from a file to a trained policy, by their file, by name and as objects."""
 
 import importlib.metadata
 import os
@@ -43,7 +43,7 @@ QUIET = {"evaluation_worlds": 8, "progress": False, "film": False, "n_worlds": 4
 
 @pytest.fixture(autouse=True)
 def own_list(tmp_path_factory, monkeypatch):
-    """Give each test a list of named tasks of its own, and take away what it registers."""
+    """Give each test its own list of named tasks, and remove the tasks that it registers."""
     path = tmp_path_factory.mktemp("user") / "crazysim" / "tasks"
     monkeypatch.setattr(references, "_list_path", lambda: path)
     monkeypatch.setattr(references, "_CLASSES", {})
@@ -63,14 +63,14 @@ def file(tmp_path):
     return tmp_path / "my_tasks.py"
 
 
-def another_process(monkeypatch):
-    """Forget what this process has named, as another one would."""
+def forget_tasks(monkeypatch):
+    """Forget the tasks that this process has named, as in another process."""
     monkeypatch.setattr(references, "_CLASSES", {})
     monkeypatch.setattr(references, "_NAMED", set())
 
 
 def test_a_file_is_trained_evaluated_resumed_and_exported(file, tmp_path, monkeypatch, capsys):
-    """By the commands alone, from the folder of the run."""
+    """By commands only, from the folder of the run."""
     monkeypatch.chdir(tmp_path)
     small_options = [f"{k}={list(v) if isinstance(v, tuple) else v}" for k, v in SMALL.items()]
     assert (
@@ -90,7 +90,7 @@ def test_a_file_is_trained_evaluated_resumed_and_exported(file, tmp_path, monkey
         == 0
     )
     assert "high by ppo, seed 0: 2 iterations" in capsys.readouterr().out
-    another_process(monkeypatch)
+    forget_tasks(monkeypatch)
     folder = str(tmp_path / "out" / "high")
     assert main(["evaluate", folder, "--worlds", "4"]) == 0
     assert "high, 4 starts: success" in capsys.readouterr().out
@@ -104,11 +104,11 @@ def test_a_file_is_trained_evaluated_resumed_and_exported(file, tmp_path, monkey
     assert "expected extra = 'its default' as in" in capsys.readouterr().err
 
 
-def test_code_named_by_a_run_alone_is_not_executed(file, tmp_path, monkeypatch, own_list):
-    """A run of somebody else may name any file; naming it oneself is what executes it, and its network needs none."""
+def test_code_that_only_a_run_names_is_not_executed(file, tmp_path, monkeypatch, own_list):
+    """A run of somebody else may name any file, which is executed only if the user names it."""
     train.run(f"{file}:High", tmp_path / "run", log=list, options={"seconds": 0.4}, **QUIET)
     own_list.unlink()
-    another_process(monkeypatch)
+    forget_tasks(monkeypatch)
     (tmp_path / "my_tasks.py").write_text("raise SystemExit('executed')")
     policy, config, _ = load_policy(tmp_path / "run")
     assert policy({"x": np.zeros(policy.stats.mean.shape)}).shape == (4,)
@@ -121,10 +121,10 @@ def test_code_named_by_a_run_alone_is_not_executed(file, tmp_path, monkeypatch, 
     moved = load_policy(tmp_path / "run", task=f"{tmp_path / 'moved.py'}:High")[1]
     assert moved.make_env(1).task.extra == 0.5
     assert f"{tmp_path / 'moved.py'}:High" in own_list.read_text()
-    another_process(monkeypatch)
+    forget_tasks(monkeypatch)
     assert moved.make_env(1).task.extra == 0.5  # named before
     (tmp_path / "moved.py").chmod(0o666)
-    another_process(monkeypatch)
+    forget_tasks(monkeypatch)
     with pytest.raises(ConfigError, match=r"only you can write.*other users can write to it"):
         moved.make_env(1)
 
@@ -132,7 +132,7 @@ def test_code_named_by_a_run_alone_is_not_executed(file, tmp_path, monkeypatch, 
 def test_a_list_that_others_can_write_is_not_used(file, own_list, monkeypatch):
     envs.make(f"{file}:High")
     assert own_list.stat().st_mode & 0o077 == 0
-    another_process(monkeypatch)
+    forget_tasks(monkeypatch)
     own_list.chmod(0o666)
     with pytest.raises(ConfigError, match="expected a task that you have named"):
         TrainConfig(f"{file}:High", "ppo", 0, 4, {}, {}).make_env(1)
@@ -153,7 +153,7 @@ def test_an_object_is_trained_with_its_settings(tmp_path, monkeypatch):
     config = load_policy(tmp_path / "run")[1]
     assert config.options == {"depth": 0.3, "seconds": 0.4}
     assert config.title == "low"
-    another_process(monkeypatch)
+    forget_tasks(monkeypatch)
     assert config.make_env(2).task.depth == 0.3  # from this file, which another process finds by its path
     with pytest.raises(ConfigError, match=r"expected depth = 0\.3 as in .*, got 0\.1"):
         train.run(Low(seconds=0.4), tmp_path / "run", resume=True)
@@ -165,7 +165,7 @@ def test_an_object_is_trained_with_its_settings(tmp_path, monkeypatch):
         """Low, in a function."""
 
     train.run(Local(seconds=0.4), tmp_path / "local", log=list, **QUIET)
-    another_process(monkeypatch)
+    forget_tasks(monkeypatch)
     with pytest.raises(ConfigError, match="expected a task that you have named"):
         load_policy(tmp_path / "local")[1].make_env(1)
 

@@ -33,13 +33,13 @@ APG = [apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=rate) for 
 
 
 def block_observations(state, i):
-    """Observations of a block of four worlds."""
+    """Return the observations of a block of four worlds."""
     return {name: np.asarray(x[4 * i : 4 * i + 4]) for name, x in state.obs.items()}
 
 
 @pytest.mark.long("compiles a training of one seed, and of two")
 @pytest.mark.parametrize(("algorithm", "hyperparameters"), [(ppo, PPO), (apg, APG)], ids=["ppo", "apg"])
-def test_a_seed_trains_beside_others_as_it_does_alone(algorithm, hyperparameters):
+def test_a_seed_trains_with_others_as_it_does_alone(algorithm, hyperparameters):
     """Initial states are equal; agents, metrics and worlds agree to rounding after three iterations, with episodes that
     end in between. Hyperparameters of the seeds differ."""
     wrap = AutoReset if algorithm is ppo else lambda env: env
@@ -100,8 +100,8 @@ SMALL = {"n_steps": 4, "minibatches": 1, "epochs": 1, "hidden": (8,), "iteration
 
 def train_quietly(folder, log=lambda line: None, **settings):
     """Train in 4 worlds for each seed."""
-    given = {"n_worlds": 4, "options": {"seconds": 0.2}, "config": SMALL} | settings
-    return run_many("hover", folder, evaluation_worlds=8, log=log, progress=False, **given)
+    options = {"n_worlds": 4, "options": {"seconds": 0.2}, "config": SMALL} | settings
+    return run_many("hover", folder, evaluation_worlds=8, log=log, progress=False, **options)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -114,15 +114,15 @@ def shared_environments():
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory):
+def sweep_run(tmp_path_factory):
     """Return a run of two seeds with two learning rates, one of which is too large, and its lines."""
     folder, lines = tmp_path_factory.mktemp("run") / "swept", []
     return train_quietly(folder, lines.append, seeds=(3, 5), sweep={"learning_rate": [1e-3, 1e38]}), folder, lines
 
 
 @pytest.mark.long("compiles a training of four seeds")
-def test_each_training_has_a_policy_and_a_row_and_one_that_diverges_ends_alone(swept):
-    results, folder, lines = swept
+def test_each_training_has_a_policy_and_a_row_and_one_that_diverges_ends_alone(sweep_run):
+    results, folder, lines = sweep_run
     names = [f"learning_rate-{rate}-seed-{seed}" for rate in (0.001, 1e38) for seed in (3, 5)]
     assert list(results) == names
     table = json.loads((folder / "seeds.json").read_text())

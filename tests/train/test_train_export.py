@@ -52,8 +52,8 @@ def flights(meta, policy):
     return x, actions
 
 
-def remembering(policy, size):
-    """Return a policy with memory, and the statistics of another one."""
+def with_memory(policy, size):
+    """Return a policy with memory and the statistics of another policy."""
     network = gru_network(size)
     weights = init_weights(network, jax.random.key(2), len(policy.stats.mean), (16, 4), 1.0)
     body = weights.body.replace(bias=jax.random.normal(jax.random.key(3), weights.body.bias.shape))
@@ -63,7 +63,7 @@ def remembering(policy, size):
 @pytest.fixture(scope="module")
 def episodes(policy, flights):
     """Return a policy with memory, observations of 25 steps of 20 drones, where memories begin anew, and actions."""
-    policy, obs = remembering(policy, 9), flights[0].reshape(25, 20, -1)
+    policy, obs = with_memory(policy, 9), flights[0].reshape(25, 20, -1)
     reset = np.random.default_rng(4).uniform(size=(25, 20)) < 0.1
     seen, memory, actions = jnp.asarray(obs), policy.initial_memory(20), []
     act = jax.jit(policy.act)
@@ -76,7 +76,7 @@ def episodes(policy, flights):
     return policy, obs, reset, np.stack(actions), np.asarray(memory)
 
 
-def compiled(path, folder, name="policy"):
+def compile_header(path, folder, name="policy"):
     """Return the function of a header, compiled by the C compiler."""
     source, library = folder / "use.c", folder / "use.so"
     source.write_text(
@@ -100,7 +100,7 @@ def compiled(path, folder, name="policy"):
 def test_c_gives_the_actions_of_jax(tmp_path, policy, meta, flights):
     obs, actions = flights
     path = to_c(policy, tmp_path / "policy.h", meta)
-    np.testing.assert_allclose(compiled(path, tmp_path)(obs), actions, atol=5e-6)
+    np.testing.assert_allclose(compile_header(path, tmp_path)(obs), actions, atol=5e-6)
 
 
 def test_c_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta, episodes):
@@ -154,7 +154,7 @@ def test_onnx_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta,
 def test_the_function_may_have_another_name_and_the_header_compiles_as_cpp(tmp_path, policy, meta, flights):
     obs, actions = flights
     path = to_c(policy, str(tmp_path / "hover.h"), meta, name="hover_v2")
-    np.testing.assert_allclose(compiled(path, tmp_path, "hover_v2")(obs[:9]), actions[:9], atol=5e-6)
+    np.testing.assert_allclose(compile_header(path, tmp_path, "hover_v2")(obs[:9]), actions[:9], atol=5e-6)
     both = tmp_path / "both.cpp"
     both.write_text(f'#include "{to_c(policy, tmp_path / "policy.h", meta)}"\n#include "{path}"\n#include "{path}"\n'
                     "void fly(const float *x, float *a) { policy(x, a); hover_v2(x, a); }\n")  # fmt: skip
@@ -212,12 +212,12 @@ def test_a_policy_of_other_sizes_or_with_nan_is_refused(tmp_path, policy, meta, 
     assert not path.exists()
 
 
-def test_a_network_of_your_own_with_the_weights_of_a_gru_is_refused(tmp_path, policy, meta):
+def test_a_custom_network_with_the_weights_of_a_gru_is_an_error(tmp_path, policy, meta):
     """Before, only the type of the weights was checked, and the file computed another function."""
-    remembers = remembering(policy, 3)
-    network = Network(remembers.network.init, lambda gru, obs, memory: (obs, -gru(obs, memory)), np.zeros(3))
+    policy_with_memory = with_memory(policy, 3)
+    network = Network(policy_with_memory.network.init, lambda gru, obs, memory: (obs, -gru(obs, memory)), np.zeros(3))
     with pytest.raises(ConfigError, match="expected a policy with the built-in network, got one with a custom"):
-        to_c(remembers.replace(network=network), tmp_path / "policy.h", meta)
+        to_c(policy_with_memory.replace(network=network), tmp_path / "policy.h", meta)
     assert not list(tmp_path.iterdir())
 
 
