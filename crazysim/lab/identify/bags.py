@@ -66,7 +66,7 @@ def is_bag(path: Path) -> bool:
     return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
-def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> dict[str, NDArray]:
+def read_bag(path: Path, repairs: list[str], requested_columns: Columns | None = None) -> dict[str, NDArray]:
     """Return the columns of a bag of ROS 1 or 2, interpolated at the times of the fastest topic.
 
     A name such as ``/drone/odom/pose/pose/position/x`` or ``/motors/data[0]`` is a topic and a field of its messages.
@@ -84,7 +84,7 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
     Args:
         path: File ``.bag``, ``.mcap`` or ``.db3``, or folder with ``metadata.yaml``.
         repairs: List that descriptions of repairs are appended to.
-        wanted: Names of the columns; None for the default ones.
+        requested_columns: Names of the columns; None for the default ones.
 
     Raises:
         ConfigError: If a topic or a field is missing, or topics are ambiguous.
@@ -95,7 +95,7 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ImportError(not_installed("ROS bags need", "rosbags", "logs")) from error
-    names = [] if wanted is None else [x for x in wanted.names if "/" in x]
+    names = [] if requested_columns is None else [x for x in requested_columns.names if "/" in x]
     folder = path.parent if path.suffix in (".mcap", ".db3") and (path.parent / "metadata.yaml").is_file() else path
     with AnyReader([_BagPath(folder)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
         topics = {c.topic: c.msgtype for c in bag.connections}
@@ -109,7 +109,7 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
             streams[topic] = _read_stream(path.name, bag, topic, topics[topic], fields)
     if not names:
         streams = {topic: _with_world_velocity(stream) for topic, stream in streams.items()}
-    return resample(path.name, streams, repairs, wanted if names else None)
+    return resample(path.name, streams, repairs, requested_columns if names else None)
 
 
 def _split_column(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:

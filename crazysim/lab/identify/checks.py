@@ -52,7 +52,8 @@ class Pair(NamedTuple):
     def sizes(self) -> NDArray:
         """Return the medians of measured and expected changes on each axis, zero for axes that do not move. (3, 2)
 
-        They are over the quarter of the windows with the largest expected changes, with signs that make these positive.
+        Only the quarter of the windows with the largest expected changes counts. Both changes of a window are
+        multiplied by the sign of the expected one.
         """
         sizes = np.zeros((3, 2))
         for k, (x, y) in enumerate(zip(self.measured.T, self.expected.T, strict=True)):

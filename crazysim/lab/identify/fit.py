@@ -81,9 +81,9 @@ class Identification:
     """Identified parameters by name, see ``FACTOR_NAMES``, ``FORCE_TERMS`` and ``TORQUE_TERMS``, and ``motor lag``,
     1/s, for logs with commands and measured speeds."""
     deviations: dict[str, float]
-    """Standard deviations of the parameters, from the scatter between blocks of 10 s, enlarged if there are few blocks
-    so that three of them are as likely to contain the truth as with many; NaN for fewer than three blocks. In simulated
-    flights three contain the truth for at least 99% of the parameters."""
+    """Standard deviations of the parameters, from the scatter between blocks of 10 s; NaN for fewer than three blocks.
+    They are larger if there are few blocks, so that an interval of three deviations contains the truth as often as with
+    many blocks. In simulated flights it does for at least 99% of the parameters."""
     delays: dict[str, float]
     """Delay of the state behind the rotor speeds in each log, by its name, s."""
     changes: dict[str, NDArray]
@@ -144,9 +144,10 @@ class Identification:
 def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: float | None = None) -> Identification:
     """Fit the parameters of an airframe to logs with rotor speeds, measured or from ``with_speeds``.
 
-    Three linear regressions: of the changes of velocity over 0.5 s on thrust and drag, turned by the measured attitude;
-    of fast rotation on the torques of the rotors (``fast_rotation``); and of the changes of angular velocity over
-    0.5 s on the other torques. The mass is not observable from the motion, so it is not fitted.
+    The fit consists of three linear regressions. The first explains changes of the velocity over 0.5 s by thrust and
+    drag, rotated by the measured attitude. The second explains fast rotation by the torques of the rotors
+    (``fast_rotation``). The third explains changes of the angular velocity over 0.5 s by the other torques. The mass is
+    not observable from the motion, so it is not fitted.
 
     Args:
         logs: Logs of the same sample time.

@@ -20,7 +20,7 @@ from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
 VOLTAGE_WINDOW = 1.0
 """Width of the Hann window over the voltage, s: telemetry is slow and coarse."""
 GROUND_MARGIN = 1.0
-"""Duration that is left out after the rotors first carry the drone, and before they last do, s."""
+"""Duration that is left out after take-off and before landing, s."""
 MIN_RATE, MAX_RATE = 2.0, 200.0
 """Rates between which the lag of motors is sought, 1/s."""
 MAX_DELAY = 0.04
@@ -38,7 +38,7 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
 
     Args:
         log: Log, whose commands are shares of the battery's voltage, 0 to 1, if it has no speeds.
-        airframe: Airframe; without ``battery.thrust_over_voltage`` the log comes back unchanged.
+        airframe: Airframe; without ``battery.thrust_over_voltage`` the log is returned unchanged.
     """
     command, voltage = log.command, log.voltage
     if log.rotor_vel.shape[1] or command is None or voltage is None or command.shape[1] != airframe.n_rotors:

@@ -22,7 +22,8 @@ WINDOW_DURATION = 0.5
 WINDOW_STRIDE = 0.05
 """Time between the starts of training windows, s."""
 FORCE_SCALE, TORQUE_SCALE = 0.1, 0.03
-"""Scales of force and torque, which make the weights of order one: shares of the weight, and of weight times arm."""
+"""Scales of force and torque, as fractions of the drone's weight and of its weight times its arm. With them the trained
+weights are of order one."""
 
 
 def fit_residual(

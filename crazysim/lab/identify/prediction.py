@@ -97,7 +97,7 @@ class Model(PyTree):
         return Model(params=params, residual=residual)
 
     def prepare_log(self, log: Log) -> Log:
-        """Return the log."""
+        """Return the log unchanged."""
         return log
 
     def start(self, window: Windows) -> Array:

@@ -19,7 +19,7 @@ MAX_INTERPOLATION = 0.03
 PERIOD_RANGE = (1e-4, 0.2)
 """Intervals between samples that a log of a flight can have, s: gyroscopes give up to 8 kHz; at less than 5 Hz nothing
 is left of the rotation."""
-UNITS_OF_TIME = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TIME_UNITS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 MIN_SAMPLES = 20
 """Least number of samples of a log."""
 GROUND_DURATION = 1.0
@@ -46,7 +46,7 @@ def check_period(name: str, t: NDArray) -> None:
     period, (low, high) = float(np.median(steps)) if len(steps) else 0.0, PERIOD_RANGE
     if not len(steps) or low <= period <= high:
         return
-    units = [(unit, x) for unit, x in UNITS_OF_TIME.items() if low <= period * x <= high]
+    units = [(unit, x) for unit, x in TIME_UNITS.items() if low <= period * x <= high]
     hint = f"The times seem to be in {units[0][0]}: give seconds_per_unit={units[0][1]:g}" if units else (
         "Give seconds_per_unit, the factor from the logged times to s"
     )  # fmt: skip

@@ -36,8 +36,8 @@ MIN_BLOCKS = 3
 MAX_DELAY = 0.04
 """Largest delay, s."""
 SAMPLING_ERROR = 5e-4
-"""Relative error of integrals between samples, which is the same in all blocks: of moments of inertia it was 0.04 to
-0.12% in simulated flights without noise, at 100 and 500 Hz."""
+"""Relative error of integrals between samples, which is the same in all blocks. In simulated flights without noise, at
+100 and 500 Hz, it changed moments of inertia by 0.04 to 0.12%."""
 DELAY_DEVIATION = 0.02
 """Standard deviation of delays, samples. A first-order motor whose command changes at a sample has a corner there,
 which quadrature turns into a delay of dt^2 / (12 time constant): 0.04 samples for 0.01 s and a constant of 0.02 s."""

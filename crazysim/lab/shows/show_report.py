@@ -105,6 +105,7 @@ def report(flight: ShowFlight) -> dict[str, Any]:
 
 
 def _closest_pairs(flight: ShowFlight, pos: NDArray) -> list[dict[str, Any]]:
+    """Return an entry of ``closest`` for every pair of drones, sorted by distance; see ``report``."""
     distance, closest_times = sampled_approaches(flight.times, pos)
     first, second = np.triu_indices(len(distance), 1)
     names = flight.show.names

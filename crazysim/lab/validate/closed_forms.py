@@ -143,7 +143,7 @@ def terminal_velocity() -> Iterable[Row]:
         sim.step(20_000)
         speed = -read_state(sim)["vel"][2]
     rate = GRAVITY_MAGNITUDE / terminal_speed
-    # bound: what remains of the transient after 40 s, twice to allow for rounding
+    # bound: twice the remainder of the transient after 40 s, to allow for rounding
     bound = (0, 2 * math.exp(-40 * rate))
     reference = f"m g / D = {terminal_speed:.3f} m/s"
     yield Row("terminal velocity, 40 s", reference, abs(speed / terminal_speed - 1), "", bound)

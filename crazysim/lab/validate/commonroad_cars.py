@@ -77,7 +77,7 @@ def lane_change(t: float, rate: float) -> list[float]:
     return [next(r for start, r in reversed(steps) if t >= start), 1.0 if t < 4 else -1.0]
 
 
-def drive(rates: Callable[[NDArray, list[float]], ArrayLike], initial_state: NDArray, rate: float) -> NDArray:
+def simulate_drive(rates: Callable[[NDArray, list[float]], ArrayLike], initial_state: NDArray, rate: float) -> NDArray:
     """Return the state after a lane change, by Runge-Kutta of order 4.
 
     Args:
@@ -114,8 +114,8 @@ def compare_with_commonroad() -> Iterable[Row]:
         rate_laws = [jax.jit(lambda x, u, law=law: law(x, u, params)) for law in (commonroad_rates, crazysim_rates)]
         initial_state = np.array([0.0, 0, 0, INITIAL_SPEED, 0, 0, 0])
         for rate in (0.03, 0.12):
-            reference = drive(lambda x, u: model(list(x), list(u), car), initial_state, rate)
-            ported_state, shipped_state = (drive(law, initial_state, rate) for law in rate_laws)
+            reference = simulate_drive(lambda x, u: model(list(x), list(u), car), initial_state, rate)
+            ported_state, shipped_state = (simulate_drive(law, initial_state, rate) for law in rate_laws)
             manoeuvre = f"lane change, steering at {rate:g} rad/s, {DURATION:g} s"
             difference = float(np.linalg.norm((ported_state - reference)[:2]))
             yield Row(f"{manoeuvre}: `commonroad_single_track`, position", REFERENCE, difference, "m", (0, 1e-9))

@@ -25,6 +25,7 @@ from crazysim.dynamics.rotor import quadratic_curve
 from crazysim.lab.validate.rows import Row
 
 FREQ, POSITION_PERIOD = 500, 5
+"""Rate of the ticks, Hz, and number of ticks between two updates of the position controller."""
 RECORDINGS = Path(crazysim.__file__).parents[1] / "tests"
 """Folder with the recorded outputs; it exists in a checkout of the sources only."""
 FILTERED_AIRFRAME = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
@@ -86,33 +87,39 @@ def sample_flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray,
     rng = np.random.default_rng(seed)
     amplitude = np.geomspace(0.02, 1.0, n)[:, None]  # the last flights turn upside down
 
-    def smooth(k: int, scale: Any, period: float) -> NDArray:
-        phase, slow = rng.uniform(0, 2 * np.pi, (3, n, k)), rng.uniform(0.3, 1.7, (3, n, k))
+    def smooth_signal(k: int, scale: Any, period: float) -> NDArray:
+        phase, frequency_factor = rng.uniform(0, 2 * np.pi, (3, n, k)), rng.uniform(0.3, 1.7, (3, n, k))
         t = np.arange(n_ticks)[:, None, None, None] / FREQ
-        return scale * np.sum(np.sin(2 * np.pi * t * slow / period + phase), axis=1) / 1.7
+        return scale * np.sum(np.sin(2 * np.pi * t * frequency_factor / period + phase), axis=1) / 1.7
 
-    pos, vel = smooth(3, 2 * amplitude, 1.0), smooth(3, 3 * amplitude, 0.7)
+    pos, vel = smooth_signal(3, 2 * amplitude, 1.0), smooth_signal(3, 3 * amplitude, 0.7)
     # Rolls go upside down; pitch keeps away from 90 degrees, where rounding of the Euler angles is amplified.
-    tilt, yaw = smooth(2, 1.2 * amplitude, 0.5) * [1.0, 0.5], 3.0 + smooth(1, 2.0, 0.9)
+    tilt, yaw = smooth_signal(2, 1.2 * amplitude, 0.5) * [1.0, 0.5], 3.0 + smooth_signal(1, 2.0, 0.9)
     quat = np.array(
         [[quat_of_rpy(tilt[i, j, 0], tilt[i, j, 1], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)]
     )
-    ang_vel = smooth(3, 10 * amplitude, 0.3)
+    ang_vel = smooth_signal(3, 10 * amplitude, 0.3)
     states = np.concatenate([pos, vel, quat, ang_vel], axis=-1)
     if mode == "state":
         tick_of_command = POSITION_PERIOD * (np.arange(n_ticks) // POSITION_PERIOD)
-        desired_yaw = (yaw + smooth(1, amplitude, 0.4))[tick_of_command, :, 0]
+        desired_yaw = (yaw + smooth_signal(1, amplitude, 0.4))[tick_of_command, :, 0]
         quat_des = np.stack([0 * desired_yaw, 0 * desired_yaw, np.sin(desired_yaw / 2), np.cos(desired_yaw / 2)], -1)
-        parts = [pos + smooth(3, 1.5 * amplitude, 0.6), vel + smooth(3, amplitude, 0.4), smooth(3, 4 * amplitude, 0.5)]
-        rates = smooth(3, 3 * amplitude, 0.3)
+        parts = [
+            pos + smooth_signal(3, 1.5 * amplitude, 0.6),
+            vel + smooth_signal(3, amplitude, 0.4),
+            smooth_signal(3, 4 * amplitude, 0.5),
+        ]
+        rates = smooth_signal(3, 3 * amplitude, 0.3)
         commands = np.concatenate(
             [*(part[tick_of_command] for part in parts), quat_des, rates[tick_of_command]], axis=-1
         )
     else:
-        thrust = np.clip(38000 + 40000 * amplitude * smooth(1, 1.0, 0.5), 1000, 65535)
+        thrust = np.clip(38000 + 40000 * amplitude * smooth_signal(1, 1.0, 0.5), 1000, 65535)
         thrust[n_ticks // 3 : n_ticks // 3 + 20, ::3] = 0
-        angles = np.concatenate([tilt, yaw], axis=-1) + smooth(3, amplitude, 0.4)
-        commands = np.concatenate([angles if mode == "attitude" else smooth(3, 8 * amplitude, 0.3), thrust], axis=-1)
+        angles = np.concatenate([tilt, yaw], axis=-1) + smooth_signal(3, amplitude, 0.4)
+        commands = np.concatenate(
+            [angles if mode == "attitude" else smooth_signal(3, 8 * amplitude, 0.3), thrust], axis=-1
+        )
     return states, commands
 
 

@@ -124,10 +124,10 @@ def compare_filter(folder: Path) -> Iterable[Row]:
             continue
         size = len(log["pos"])  # all logs are padded to one length, so that the filter compiles once
         padded_columns = (log[k][np.minimum(np.arange(n), size - 1)] for k in ("accel", "gyro", "pos", "quat"))
-        ours = estimate_errors(log, *(np.asarray(x)[:size] for x in replay_filter(*padded_columns)))
-        board = estimate_errors(log, log["est_pos"], log["est_quat"])
+        our_errors = estimate_errors(log, *(np.asarray(x)[:size] for x in replay_filter(*padded_columns)))
+        board_errors = estimate_errors(log, log["est_pos"], log["est_quat"])
         for quantity, unit, our_error, board_error in zip(
-            ("position", "attitude"), ("m", "degrees"), ours, board, strict=True
+            ("position", "attitude"), ("m", "degrees"), our_errors, board_errors, strict=True
         ):
             yield Row(f"{name}: {quantity}", "filter on board", our_error / board_error, "", (0, 1.1),
                       f"on board {board_error:.3g} {unit}, here {our_error:.3g} {unit}", series=quantity,

@@ -92,7 +92,7 @@ def hold_goal(
         if time >= 1000 * (FLIGHT_SECONDS - 1):
             max_distance = np.maximum(max_distance, np.linalg.norm(state[:, :3], axis=-1))
         apply_action(policy.action(state))
-    return max_distance < 0.3  # a NaN is not held
+    return max_distance < 0.3  # false for NaN
 
 
 def hold_in_simulation(

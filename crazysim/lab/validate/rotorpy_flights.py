@@ -40,7 +40,7 @@ def hover_speed(params: dict[str, Any]) -> float:
     return math.sqrt(params["mass"] * GRAVITY_MAGNITUDE / (params["num_rotors"] * params["k_eta"]))
 
 
-def simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = True) -> Sim:
+def create_simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = True) -> Sim:
     """Return a simulation of an airframe with RotorPy's parameters.
 
     Args:
@@ -82,9 +82,9 @@ def crazysim_flight(
         params: Parameters.
         commands: Speeds of the rotors, rad/s. (n, 4)
         effects: Effects of the air.
-        drag: See ``simulation``.
+        drag: See ``create_simulation``.
     """
-    sim = simulation(params, drag=drag)
+    sim = create_simulation(params, drag=drag)
     for effect in effects:
         sim.add(effect)
     sim.data = with_states(sim.data, **INITIAL_STATES, rotor_vel=np.full(4, hover_speed(params) / RPM_TO_RAD_S))
@@ -97,7 +97,13 @@ def crazysim_flight(
 
 
 def rotorpy_flight(params: dict[str, Any], commands: NDArray, aero: bool = False) -> States:
-    """Return RotorPy's states after each command, in our names and units; with ``aero`` in ``WIND``."""
+    """Return RotorPy's states after each command, in our names and units.
+
+    Args:
+        params: Parameters.
+        commands: Speeds of the rotors, rad/s. (n, 4)
+        aero: True to fly in ``WIND`` with RotorPy's aerodynamic forces, False for neither.
+    """
     multirotor = importlib.import_module("rotorpy.vehicles.multirotor").Multirotor
     drone = multirotor(params, aero=aero, integrator_kwargs={"rtol": 1e-10, "atol": 1e-12})
     state = {
@@ -122,7 +128,7 @@ def state_differences(a: dict[str, NDArray], b: dict[str, NDArray]) -> dict[str,
     return differences | {"quat": math.degrees(angle_between(a["quat"], b["quat"]))}
 
 
-def wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArray, NDArray]:
+def air_wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArray, NDArray]:
     """Return the additional forces and torques of the air in ``n`` states, ours and RotorPy's.
 
     Args:
@@ -136,7 +142,7 @@ def wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArra
     rng = np.random.default_rng(1)
     vel, rate = rng.uniform(-speed, speed, (n, 3)), rng.uniform(-3, 3, (n, 3))
     speeds = hover_speed(params) * rng.uniform(0.9, 1.1, (n, 4))
-    sim = simulation(params, n)
+    sim = create_simulation(params, n)
     plugin = sim.add(rotor_aerodynamics(params))
     moving_data = with_states(
         sim.data, vel=vel[:, None], ang_vel=rate[:, None], rotor_vel=speeds[:, None] / RPM_TO_RAD_S
@@ -163,7 +169,7 @@ def compare_with_rotorpy() -> Iterable[Row]:
         drag_only = crazysim_flight(params, commands, [Wind(WIND)], drag=True)
         ours = crazysim_flight(params, commands, [Wind(WIND), rotor_aerodynamics(params)], drag=True)
         theirs = rotorpy_flight(params, commands, aero=True)
-        slow, fast = (wrenches(params, speed) for speed in (0.1, 3.0))
+        slow, fast = (air_wrenches(params, speed) for speed in (0.1, 3.0))
     # RotorPy's integrator has a relative tolerance of 1e-10 in each of about 100 steps
     for name, quantity, unit, bound in (("pos", "position", "m", 1e-8), ("quat", "attitude", "degrees", 1e-6),
                                     ("ang_vel", "angular velocity", "rad/s", 1e-8),

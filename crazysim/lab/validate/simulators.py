@@ -65,7 +65,7 @@ class Crazysim(Simulator):
     def fly_period(self, commands: NDArray) -> States:
         self._sim.attitude_control(commands[:, None])
         self._sim.step(round(COMMAND_PERIOD * self._sim.freq))
-        return _states(self._sim.data)
+        return _read_states(self._sim.data)
 
 
 class Crazyflow(Simulator):
@@ -82,7 +82,7 @@ class Crazyflow(Simulator):
     def fly_period(self, commands: NDArray) -> States:
         self._sim.attitude_control(np.asarray(commands[:, None], np.float32))
         self._sim.step(round(COMMAND_PERIOD * self._sim.freq))
-        return _states(self._sim.data)
+        return _read_states(self._sim.data)
 
 
 class AttitudeController:
@@ -113,7 +113,7 @@ class AttitudeController:
 
         self._control = control
 
-    def command(self, commands: NDArray) -> None:
+    def stage_command(self, commands: NDArray) -> None:
         """Stage attitude commands. (n, 4)"""
         self._data = attitude_control(self._data, commands[:, None])
 
@@ -143,7 +143,7 @@ class Mujoco(Simulator):
             body.act[:] = self._controller.hover
 
     def fly_period(self, commands: NDArray) -> States:
-        self._controller.command(commands)
+        self._controller.stage_command(commands)
         for _ in range(round(COMMAND_PERIOD / self._controller.dt)):
             thrusts = self._controller.thrusts(self._states(), np.stack([body.act for body in self._bodies]))
             for body, thrust in zip(self._bodies, thrusts, strict=True):
@@ -204,7 +204,7 @@ class RotorPyRotors(RotorPy):
         self._controller = AttitudeController(len(start["pos"]))
 
     def fly_period(self, commands: NDArray) -> States:
-        self._controller.command(commands)
+        self._controller.stage_command(commands)
         for _ in range(round(COMMAND_PERIOD / self._controller.dt)):
             current_thrust = self._k_eta * self._state["rotor_speeds"].numpy() ** 2
             control = {"cmd_motor_thrusts": self._tensor(self._controller.thrusts(self._states(), current_thrust))}
@@ -338,7 +338,7 @@ def _world_rows(states: States) -> States:
     return {name: x[:, None] for name, x in states.items()}
 
 
-def _states(data: Any) -> States:
+def _read_states(data: Any) -> States:
     return {
         name: np.asarray(getattr(data.states, name), np.float64)[:, 0] for name in ("pos", "quat", "vel", "ang_vel")
     }

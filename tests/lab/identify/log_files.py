@@ -12,11 +12,11 @@ T = 5.0 + 0.01 * np.arange(N)
 ANGLE = 0.3 * np.sin(T)
 """Roll, rad."""
 RATE = 0.3 * np.cos(T)
-SIDE = 9.81 * ANGLE
+LATERAL_POS = 9.81 * ANGLE
 """Position along y, m: roll accelerates a drone by ``-g roll``, which this is twice the integral of."""
 
 
-def crazyflie(path, version=2, pause=(), damaged=False):
+def write_crazyflie(path, version=2, pause=(), damaged=False):
     """Write a log of a micro-SD card: body rates in degrees/s at 100 Hz, all others at 50 Hz, and two rare events."""
     kinds = {
         1: ("start", ["x", "y"]),
@@ -48,7 +48,7 @@ def crazyflie(path, version=2, pause=(), damaged=False):
             body.append(
                 struct.pack("<H", 7)
                 + time
-                + struct.pack("<14f", T[k], SIDE[k], 3, 1, 9.81 * RATE[k], 0, *quat, 1e4, 1e4, 1e4, 1e4)
+                + struct.pack("<14f", T[k], LATERAL_POS[k], 3, 1, 9.81 * RATE[k], 0, *quat, 1e4, 1e4, 1e4, 1e4)
             )
     data = head + b"".join(body)
     path.write_bytes((data + struct.pack("<I", crc32(data)))[: -7 if damaged else None])
@@ -65,7 +65,7 @@ COLUMNS = Columns(
 )
 
 
-def ulog(path, leave_out=(), slow=(), old=False):
+def write_ulog(path, leave_out=(), slow=(), old=False):
     """Write a ULog (https://docs.px4.io/main/en/dev_log/ulog_file_format.html); slow messages come every 0.25 s.
 
     Old ones have the body rates in the message of the attitude.
@@ -96,7 +96,7 @@ def ulog(path, leave_out=(), slow=(), old=False):
         content = {
             "esc_status": stamp + b"".join(stamp + struct.pack("<i", 1000 * (i + 1)) for i in range(4)) + b"\x04",
             "vehicle_local_position": stamp
-            + struct.pack("<6f", 1 + 0.1 * t, -SIDE[k], -3 - 0.3 * t, 0.1, -9.81 * RATE[k], -0.3),
+            + struct.pack("<6f", 1 + 0.1 * t, -LATERAL_POS[k], -3 - 0.3 * t, 0.1, -9.81 * RATE[k], -0.3),
             "vehicle_attitude": stamp + (rates if old else b"") + struct.pack("<4f", *quat),
             "vehicle_attitude_setpoint": stamp + struct.pack("<7f", *quat, 0, 0, -0.5),
             "actuator_motors": stamp + struct.pack("<12f", 0.4, 0.5, 0.6, 0.7, *[np.nan] * 8),
@@ -111,7 +111,7 @@ def ulog(path, leave_out=(), slow=(), old=False):
     return path
 
 
-FAST = np.arange(5.0, 5.0 + 0.01 * N, 0.001)
+BLACKBOX_TIMES = np.arange(5.0, 5.0 + 0.01 * N, 0.001)
 """Times of the blackbox, s."""
 
 
@@ -128,15 +128,23 @@ def drift(t):
     )
 
 
-def blackbox(path, explorer=False, damaged=0, leave_out=()):
+def write_blackbox(path, explorer=False, damaged=0, leave_out=()):
     """Write a log at 1 kHz as blackbox_decode or the Blackbox Explorer (12 poles, high resolution) does."""
     names = ["loopIteration", "time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(4))]
     names += [*(f"eRPM[{k}]" for k in range(4)), "vbatLatest", "flightModeFlags"]
-    _, rate = swing(FAST)
+    _, rate = swing(BLACKBOX_TIMES)
     scale = 10 if explorer else 1
-    cells = [np.arange(len(FAST)), np.round(1e6 * FAST), np.degrees(rate) * scale, 0 * FAST, 0 * FAST]
-    cells += [np.full(len(FAST), 1000.0 + k) for k in range(4)] + [np.full(len(FAST), 60.0 + k) for k in range(4)]
-    cells += [np.full(len(FAST), 1610.0 if explorer else 16.1)]
+    cells = [
+        np.arange(len(BLACKBOX_TIMES)),
+        np.round(1e6 * BLACKBOX_TIMES),
+        np.degrees(rate) * scale,
+        0 * BLACKBOX_TIMES,
+        0 * BLACKBOX_TIMES,
+    ]
+    cells += [np.full(len(BLACKBOX_TIMES), 1000.0 + k) for k in range(4)] + [
+        np.full(len(BLACKBOX_TIMES), 60.0 + k) for k in range(4)
+    ]
+    cells += [np.full(len(BLACKBOX_TIMES), 1610.0 if explorer else 16.1)]
     keep = [k for k, name in enumerate(names) if name not in leave_out]
     unit = {} if explorer else {"time": " (us)", "vbatLatest": " (V)", "flightModeFlags": " (flags)"}
     header = [names[k] + unit.get(names[k], "") for k in keep]
@@ -151,7 +159,7 @@ def blackbox(path, explorer=False, damaged=0, leave_out=()):
     return path
 
 
-def mocap(offset=0.0, reverse=False):
+def create_mocap(offset=0.0, reverse=False):
     """Return motion capture of the same swing at 100 Hz, on a clock that is behind by an offset, s."""
     angle, _ = swing(T)
     if reverse:
@@ -168,7 +176,7 @@ def mocap(offset=0.0, reverse=False):
     return columns | {"t": T - offset}
 
 
-def bag(path, leave_out=(), odometry=True, storage="sqlite3", seconds=4.0):
+def write_bag(path, leave_out=(), odometry=True, storage="sqlite3", seconds=4.0):
     """Write a bag: pose or odometry and rotor speeds at 100 Hz, gyroscope at 200 Hz, all with headers.
 
     The storage is that of ROS 2, ``"sqlite3"`` or ``"mcap"``, or ``"bag"``, the file of ROS 1.

@@ -12,17 +12,17 @@ from zlib import crc32
 
 import numpy as np
 import pytest
-from log_files import COLUMNS, N, T, bag, blackbox, crazyflie, drift, mocap, swing, ulog
+from log_files import COLUMNS, N, T, create_mocap, drift, swing, write_bag, write_blackbox, write_crazyflie, write_ulog
 
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Columns, read_log
 from crazysim.lab.identify.columns import without_huge_numbers
 
-MUTATIONS = 10 if os.environ.get("CRAZYSIM_HYPOTHESIS") != "explore" else 500
+N_MUTATIONS = 10 if os.environ.get("CRAZYSIM_HYPOTHESIS") != "explore" else 500
 """Mutated files of each kind."""
-MEMORY = 64 * 2**20
+MAX_MEMORY = 64 * 2**20
 """Most memory that reading a file of some 200 kB takes, bytes."""
-HANG = 60
+HANG_TIMEOUT = 60
 """Processor time after which a reader counts as hanging, s: a valid file takes a tenth of a second."""
 INTEGERS = [0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1]
 CELLS = ["", "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-1", "x", '"', "1" * 400, "\x00", "1,2", "é"]
@@ -32,25 +32,32 @@ class HangError(BaseException):
     """Raised by the alarm; no ``Exception``, which readers turn into errors of their own."""
 
 
-def table():
+def create_table():
     """Return the columns of a flight by name."""
-    columns = mocap() | {"vx": np.ones(N), "vy": drift(T)[1], "vz": T, "wx": swing(T)[1], "wy": 0 * T, "wz": 0 * T}
+    columns = create_mocap() | {
+        "vx": np.ones(N),
+        "vy": drift(T)[1],
+        "vz": T,
+        "wx": swing(T)[1],
+        "wy": 0 * T,
+        "wz": 0 * T,
+    }
     return columns | {f"rpm{k}": 1000.0 + 10 * np.sin(7 * T + k) for k in range(1, 5)}
 
 
-def csv(path):
-    columns = table()
+def write_csv(path):
+    columns = create_table()
     rows = [",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True)]
     path.write_text("\n".join([",".join(columns), *rows]) + "\n")
 
 
-def packed_bag(storage):
+def bag_writer(storage):
     """Return the function that writes a bag of one file."""
 
     def write(path):
         if storage == "bag":
-            return bag(path, storage=storage, seconds=1.0)
-        folder = bag(path.parent / f"{path.name}-folder", storage=storage, seconds=1.0)
+            return write_bag(path, storage=storage, seconds=1.0)
+        folder = write_bag(path.parent / f"{path.name}-folder", storage=storage, seconds=1.0)
         (made,) = folder.glob(f"*{path.suffix}")
         path.write_bytes(made.read_bytes())
         return path
@@ -59,29 +66,29 @@ def packed_bag(storage):
 
 
 READERS = {
-    "sd": ("log00", crazyflie, COLUMNS, None),
-    "ulog": ("a.ulg", ulog, None, None),
-    "csv": ("a.csv", csv, None, None),
-    "angles": ("b.csv", csv, Columns(rpy=("qx", "qy", "qz")), None),
-    "npz": ("a.npz", lambda path: np.savez(path, **table()), None, None),
-    "deflated": ("b.npz", lambda path: np.savez_compressed(path, **table()), None, None),
-    "blackbox": ("c.csv", blackbox, None, mocap(offset=1234.56)),
-    "ros1": ("a.bag", packed_bag("bag"), None, None),
-    "mcap": ("a.mcap", packed_bag("mcap"), None, None),
-    "db3": ("a.db3", packed_bag("sqlite3"), None, None),
+    "sd": ("log00", write_crazyflie, COLUMNS, None),
+    "ulog": ("a.ulg", write_ulog, None, None),
+    "csv": ("a.csv", write_csv, None, None),
+    "angles": ("b.csv", write_csv, Columns(rpy=("qx", "qy", "qz")), None),
+    "npz": ("a.npz", lambda path: np.savez(path, **create_table()), None, None),
+    "deflated": ("b.npz", lambda path: np.savez_compressed(path, **create_table()), None, None),
+    "blackbox": ("c.csv", write_blackbox, None, create_mocap(offset=1234.56)),
+    "ros1": ("a.bag", bag_writer("bag"), None, None),
+    "mcap": ("a.mcap", bag_writer("mcap"), None, None),
+    "db3": ("a.db3", bag_writer("sqlite3"), None, None),
 }
 """Name of the file, its writer, its columns and its motion capture by kind."""
 
 
-def place(rng, n):
+def draw_offset(rng, n):
     """Return an offset, half of the time near one of the ends, where most formats have their structure."""
     near = min(n, 1500)
     return rng.choice([rng.randrange(n), rng.randrange(n), rng.randrange(near), n - 1 - rng.randrange(near)])
 
 
-def damaged(rng, data):
+def damage_bytes(rng, data):
     """Return the bytes with one damage."""
-    at, length = place(rng, len(data)), rng.choice([1, 2, 4, 8, 100, 3000])
+    at, length = draw_offset(rng, len(data)), rng.choice([1, 2, 4, 8, 100, 3000])
     how = rng.randrange(8)
     if how == 0:
         return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
@@ -98,11 +105,11 @@ def damaged(rng, data):
         return data[:at] + data[at + length :]
     if how == 6:
         return data[:at] + data[at : at + length] + data[at:]
-    other = place(rng, len(data))
+    other = draw_offset(rng, len(data))
     return data[:at] + data[other : other + length] + data[at + length :]
 
 
-def miswritten(rng, text):
+def damage_table(rng, text):
     """Return a table with one cell, row or column that is wrong."""
     lines = text.splitlines()
     k = rng.choice([0, rng.randrange(len(lines))])
@@ -130,9 +137,9 @@ def miswritten(rng, text):
     return "\n".join(lines)
 
 
-def repacked(rng):
+def damage_archive(rng):
     """Return the archive of a table with one array that is wrong."""
-    columns, file = table(), io.BytesIO()
+    columns, file = create_table(), io.BytesIO()
     key = rng.choice(list(columns))
     x = columns[key]
     columns[key] = rng.choice([
@@ -143,28 +150,28 @@ def repacked(rng):
     return file.getvalue()
 
 
-def mutated(rng, kind, k, data):
+def mutate_file(rng, kind, k, data):
     """Return the file of a kind after one to three mutations; the number says which kind of them."""
     if kind == "npz" and k % 2:
-        return repacked(rng)
+        return damage_archive(rng)
     for _ in range(rng.randint(1, 3)):
         if READERS[kind][0].endswith(".csv") and k % 4:
-            data = miswritten(rng, data.decode()).encode()
+            data = damage_table(rng, data.decode()).encode()
         else:
-            data = damaged(rng, data) or b"\0"
+            data = damage_bytes(rng, data) or b"\0"
     return data
 
 
 @pytest.fixture(scope="module")
-def seeds(tmp_path_factory):
+def valid_files(tmp_path_factory):
     """Return a valid file of each kind, which is read."""
     pytest.importorskip("rosbags")
-    folder, seeds = tmp_path_factory.mktemp("seeds"), {}
+    folder, valid_files = tmp_path_factory.mktemp("seeds"), {}
     for kind, (name, write, columns, motion) in READERS.items():
         write(folder / name)
         read_log(folder / name, columns if kind != "angles" else None, motion)
-        seeds[kind] = (folder / name).read_bytes()
-    return seeds
+        valid_files[kind] = (folder / name).read_bytes()
+    return valid_files
 
 
 def refusal(path, columns, motion):
@@ -174,7 +181,7 @@ def refusal(path, columns, motion):
         raise HangError
 
     before = signal.signal(signal.SIGVTALRM, hang)
-    signal.setitimer(signal.ITIMER_VIRTUAL, HANG)
+    signal.setitimer(signal.ITIMER_VIRTUAL, HANG_TIMEOUT)
     tracemalloc.reset_peak()
     start, _ = tracemalloc.get_traced_memory()
     message = None
@@ -190,7 +197,7 @@ def refusal(path, columns, motion):
         signal.setitimer(signal.ITIMER_VIRTUAL, 0)
         signal.signal(signal.SIGVTALRM, before)
     assert not warned, str(warned[0])
-    assert tracemalloc.get_traced_memory()[1] - start < MEMORY
+    assert tracemalloc.get_traced_memory()[1] - start < MAX_MEMORY
     return message
 
 
@@ -204,14 +211,14 @@ def traced():
 
 @pytest.mark.long("reads mutated files with their allocations traced")
 @pytest.mark.parametrize("kind", READERS)
-def test_a_mutated_log_is_read_or_refused(kind, seeds, tmp_path, capfd, traced):
+def test_a_mutated_log_is_read_or_refused(kind, valid_files, tmp_path, capfd, traced):
     name, _, columns, motion = READERS[kind]
     seed = int(os.environ.get("CRAZYSIM_FUZZ_SEED", "0"))
     outcomes = {True: 0, False: 0}
-    for k in range(MUTATIONS):
+    for k in range(N_MUTATIONS):
         rng = random.Random(f"{kind} {seed} {k}")
         path = tmp_path / f"{k}-{name}"
-        path.write_bytes(mutated(rng, kind, k, seeds[kind]))
+        path.write_bytes(mutate_file(rng, kind, k, valid_files[kind]))
         try:
             outcomes[refusal(path, columns, motion) is None] += 1
         except BaseException as error:
@@ -224,9 +231,9 @@ def test_a_mutated_log_is_read_or_refused(kind, seeds, tmp_path, capfd, traced):
 
 def test_bytes_that_are_signalling_nans_are_missing_numbers(tmp_path):
     """NumPy warns where it converts one."""
-    damaged = np.frombuffer(np.array([0x7FA00000, 0x3F800000], np.uint32).tobytes(), np.float32)
-    np.testing.assert_array_equal(without_huge_numbers(damaged), [np.nan, 1.0])
-    path, columns = tmp_path / "a.npz", table()
+    signalling = np.frombuffer(np.array([0x7FA00000, 0x3F800000], np.uint32).tobytes(), np.float32)
+    np.testing.assert_array_equal(without_huge_numbers(signalling), [np.nan, 1.0])
+    path, columns = tmp_path / "a.npz", create_table()
     columns["x"] = columns["x"].astype(np.float32)
     columns["x"].view(np.uint32)[10] = 0x7FA00000
     np.savez(path, **columns)
@@ -301,25 +308,25 @@ def test_a_log_without_an_end_is_refused_before_it_is_read(name, tmp_path, trace
     assert "expected a log of at most 2147483648 bytes, got 1099511627776" in refusal(tmp_path / name, None, None)
 
 
-def test_a_blackbox_log_without_a_motor_or_with_a_strange_setting_is_refused_or_read(seeds, tmp_path):
-    text, path = seeds["blackbox"].decode(), tmp_path / "a.csv"
+def test_a_blackbox_log_without_a_motor_or_with_a_strange_setting_is_refused_or_read(valid_files, tmp_path):
+    text, path = valid_files["blackbox"].decode(), tmp_path / "a.csv"
     path.write_text(text.replace("motor[2]", "other", 1))
     with pytest.raises(ConfigError, match=r"expected columns motor\[2\], got"):
-        read_log(path, motion=mocap())
+        read_log(path, motion=create_mocap())
     path.write_text('"blackbox_high_resolution",inf\n' + text)
-    assert read_log(path, motion=mocap()).ang_vel.shape[1] == 3
+    assert read_log(path, motion=create_mocap()).ang_vel.shape[1] == 3
 
 
 def test_a_bag_whose_description_is_not_text_is_refused(tmp_path):
     pytest.importorskip("rosbags")
-    folder = bag(tmp_path / "flight", seconds=0.1)
+    folder = write_bag(tmp_path / "flight", seconds=0.1)
     (folder / "metadata.yaml").write_bytes(b"rosbag2_bagfile_information: \xff\xfe")
     with pytest.raises(ConfigError, match=r"expected text in .*metadata\.yaml, got bytes that are not UTF-8"):
         read_log(folder)
 
 
-def test_a_ulog_that_counts_more_motors_than_it_has_is_refused(seeds, tmp_path):
-    data = seeds["ulog"]
+def test_a_ulog_that_counts_more_motors_than_it_has_is_refused(valid_files, tmp_path):
+    data = valid_files["ulog"]
     path = tmp_path / "a.ulg"
     path.write_bytes(data.replace(b"\xa0\x0f\0\0\4", b"\xa0\x0f\0\0\5"))  # the speed of the last motor, and the count
     with pytest.raises(ConfigError, match=r"a\.ulg: esc_status: expected a field esc\[4\]\.esc_rpm, got timestamp,"):

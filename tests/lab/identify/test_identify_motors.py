@@ -14,7 +14,7 @@ DT, N = 0.01, 1500
 AIRFRAME = "cf2x_L250"
 
 
-def log(command, voltage=None, rotor_vel=None):
+def create_log(command, voltage=None, rotor_vel=None):
     t, zeros = DT * np.arange(N), np.zeros((N, 3))
     rotor_vel = np.zeros((N, 0)) if rotor_vel is None else rotor_vel
     return Log("flight", t, zeros, np.tile([0.0, 0, 0, 1], (N, 1)), zeros, zeros, rotor_vel, command, voltage=voltage)
@@ -24,7 +24,7 @@ def test_voltage_and_lag_give_the_speeds():
     """A step of the commands in the middle, at 3.8 V, against a fine integration of the airframe's equation."""
     airframe = load_airframe(AIRFRAME)
     share = np.where(np.arange(N) < N // 2, 0.6, 0.7)
-    found = with_speeds(log(np.tile(share[:, None], 4), np.full(N, 3.8)), airframe)
+    found = with_speeds(create_log(np.tile(share[:, None], 4), np.full(N, 3.8)), airframe)
     low, high = (airframe.rotor_vel(np.polyval(airframe.value("battery.thrust_over_voltage")[::-1], 3.8 * x))
                  for x in (0.6, 0.7))  # fmt: skip
     a, b, _, _ = airframe.value("rotors.lag")
@@ -42,7 +42,7 @@ def test_voltage_and_lag_give_the_speeds():
 def test_rotors_that_need_more_command_pull_the_same():
     command = np.tile([0.6, 0.63, 0.6, 0.66], (N, 1))
     command[50, 2] = -9.9
-    found = with_speeds(log(command, np.full(N, 3.8)), load_airframe(AIRFRAME))
+    found = with_speeds(create_log(command, np.full(N, 3.8)), load_airframe(AIRFRAME))
     np.testing.assert_allclose(found.rotor_vel, found.rotor_vel[:, :1] * np.ones(4), rtol=1e-5)
     assert "interpolated 1 commands" in found.repairs[1]
 
@@ -50,7 +50,9 @@ def test_rotors_that_need_more_command_pull_the_same():
 def test_samples_on_the_ground_are_left_out():
     command = np.full((N, 4), 0.6)
     command[:200] = command[-100:] = 0.1
-    found = with_speeds(replace(log(command, np.full(N, 3.8)), gaps=np.array([50, 400])), load_airframe(AIRFRAME))
+    found = with_speeds(
+        replace(create_log(command, np.full(N, 3.8)), gaps=np.array([50, 400])), load_airframe(AIRFRAME)
+    )
     assert (found.t[0], found.t[-1]) == pytest.approx((200 * DT + 1, (N - 102) * DT - 1))
     assert found.gaps.tolist() == [100]
     assert len(found.pos) == len(found.rotor_vel) == len(found.t)
@@ -58,11 +60,11 @@ def test_samples_on_the_ground_are_left_out():
 
 def test_measured_speeds_stay_and_commands_in_other_units_are_refused():
     airframe, command = load_airframe(AIRFRAME), np.full((N, 4), 40000.0)
-    measured = log(command, np.full(N, 3.8), command)
+    measured = create_log(command, np.full(N, 3.8), command)
     assert with_speeds(measured, airframe) is measured
-    assert with_speeds(log(command), airframe).rotor_vel.shape == (N, 0)
+    assert with_speeds(create_log(command), airframe).rotor_vel.shape == (N, 0)
     with pytest.raises(ConfigError, match="share_per_command"):
-        with_speeds(log(command, np.full(N, 3.8)), airframe)
+        with_speeds(create_log(command, np.full(N, 3.8)), airframe)
 
 
 @pytest.mark.parametrize("rate", [10.0, 40.0])
@@ -73,7 +75,7 @@ def test_lag_is_found_behind_noise_and_delay(rate):
     t, response = DT * np.arange(N), lag_signal(command, DT, rate)
     speeds = np.stack([np.interp(t - 0.012, t, x) for x in (8000 + 9000 * response + 6000 * response**2).T], axis=-1)
     speeds += rng.normal(scale=0.1 * speeds.std(), size=speeds.shape)
-    found = motor_lag([log(command, rotor_vel=speeds), log(command)])
+    found = motor_lag([create_log(command, rotor_vel=speeds), create_log(command)])
     assert found.shape == (1, 4)
     np.testing.assert_allclose(np.median(found), rate, rtol=0.04)
-    assert np.all(np.isnan(motor_lag([replace(log(command, rotor_vel=1e4 * command))])))
+    assert np.all(np.isnan(motor_lag([replace(create_log(command, rotor_vel=1e4 * command))])))

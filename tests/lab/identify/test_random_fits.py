@@ -10,12 +10,12 @@ from crazysim.drones import estimate_airframe, load_airframe
 from crazysim.lab.identify import identify, read_log
 from crazysim.sim import Sim
 
-NAMES = "x y z qx qy qz qw vx vy vz wx wy wz rpm1 rpm2 rpm3 rpm4".split()
-NOISE = np.repeat([1e-3, 1e-3, 1e-2, 1e-2], [3, 4, 3, 3])
+COLUMN_NAMES = "x y z qx qy qz qw vx vy vz wx wy wz rpm1 rpm2 rpm3 rpm4".split()
+NOISE_STD = np.repeat([1e-3, 1e-3, 1e-2, 1e-2], [3, 4, 3, 3])
 """Deviations of a log: position, m, quaternion, velocity, m/s, angular velocity, rad/s."""
 
 
-def draw(rng, folder, k):
+def draw_airframe(rng, folder, k):
     """Return a file of what is known of an airframe, the airframe, and its factors and numbers."""
     mass = float(np.exp(rng.uniform(np.log(0.03), np.log(5))))
     propeller = 0.127 * (mass / 0.6) ** (1 / 3) * rng.uniform(0.85, 1.2)
@@ -44,7 +44,7 @@ def draw(rng, folder, k):
     return path, true | {"drag": {"coefficients": drag}}, truth
 
 
-def flown(airframes, seconds, rng, *, at_samples):
+def fly_airframes(airframes, seconds, rng, *, at_samples):
     """Return flights of drones that tilt, turn and climb at random, as columns at 100 Hz.
 
     Commands come at samples of the log, or at any time between them, as of a program that does not wait for it.
@@ -78,17 +78,19 @@ def flown(airframes, seconds, rng, *, at_samples):
     return np.stack(rows[50:], axis=1).astype(np.float64)
 
 
-def missed(folder, n, seconds, seed, *, at_samples):
+def find_missed_parameters(folder, n, seconds, seed, *, at_samples):
     """Return numbers further than three deviations from the truth, of fits with and without noise, and how many are."""
     rng = np.random.default_rng(seed)
-    paths, airframes, truths = zip(*(draw(rng, folder, k) for k in range(n)), strict=True)
+    paths, airframes, truths = zip(*(draw_airframe(rng, folder, k) for k in range(n)), strict=True)
     wrong, total = [], 0
-    for path, flight, truth in zip(paths, flown(airframes, seconds, rng, at_samples=at_samples), truths, strict=True):
+    for path, flight, truth in zip(
+        paths, fly_airframes(airframes, seconds, rng, at_samples=at_samples), truths, strict=True
+    ):
         for noise in (0, 1):
             x = flight + 0
-            x[:, :13] += noise * NOISE * rng.normal(size=(len(x), 13))
+            x[:, :13] += noise * NOISE_STD * rng.normal(size=(len(x), 13))
             x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=-1, keepdims=True)
-            log = read_log({"t": 0.01 * np.arange(len(x)), **dict(zip(NAMES, x.T, strict=True))})
+            log = read_log({"t": 0.01 * np.arange(len(x)), **dict(zip(COLUMN_NAMES, x.T, strict=True))})
             result = identify([log], path)
             for name, value in result.values.items():
                 error, total = value - truth.get(name, 0.0), total + 1
@@ -105,12 +107,12 @@ def missed(folder, n, seconds, seed, *, at_samples):
     "at_samples", [False, pytest.param(True, marks=pytest.mark.slow("commands between samples are harder to fit"))]
 )
 def test_three_deviations_contain_the_truth(tmp_path, at_samples):
-    wrong, total = missed(tmp_path, 4, 40.0, 0, at_samples=at_samples)
+    wrong, total = find_missed_parameters(tmp_path, 4, 40.0, 0, at_samples=at_samples)
     assert len(wrong) <= 0.02 * total, wrong
 
 
 @pytest.mark.slow("50 airframes; four do the same")
 @pytest.mark.parametrize("at_samples", [False, True])
 def test_three_deviations_contain_the_truth_in_99_percent(tmp_path, at_samples):
-    wrong, total = missed(tmp_path, 50, 60.0, 1, at_samples=at_samples)
+    wrong, total = find_missed_parameters(tmp_path, 50, 60.0, 1, at_samples=at_samples)
     assert len(wrong) <= 0.01 * total, wrong

@@ -2,7 +2,21 @@
 
 import numpy as np
 import pytest
-from log_files import ANGLE, COLUMNS, RATE, SIDE, N, T, bag, blackbox, crazyflie, drift, mocap, swing, ulog
+from log_files import (
+    ANGLE,
+    COLUMNS,
+    LATERAL_POS,
+    RATE,
+    N,
+    T,
+    create_mocap,
+    drift,
+    swing,
+    write_bag,
+    write_blackbox,
+    write_crazyflie,
+    write_ulog,
+)
 
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Columns, read_log
@@ -11,7 +25,7 @@ from crazysim.lab.identify.readers import Stream, decompress_quat, resample
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_micro_sd_logs_are_read_at_the_rate_of_the_fastest(tmp_path, version):
-    log = read_log(crazyflie(tmp_path / "log00", version), COLUMNS)
+    log = read_log(write_crazyflie(tmp_path / "log00", version), COLUMNS)
     assert log.dt == pytest.approx(0.01)
     np.testing.assert_allclose(log.pos[:, 0], T[: len(log.t)], atol=2e-3)  # interpolated, from milliseconds
     np.testing.assert_allclose(log.ang_vel[:, 0], RATE[: len(log.t)], atol=1e-3)
@@ -19,14 +33,14 @@ def test_micro_sd_logs_are_read_at_the_rate_of_the_fastest(tmp_path, version):
 
 
 def test_damaged_micro_sd_logs_are_read_up_to_the_last_record(tmp_path):
-    log = read_log(crazyflie(tmp_path / "log00", damaged=True), COLUMNS)
+    log = read_log(write_crazyflie(tmp_path / "log00", damaged=True), COLUMNS)
     assert "checksum" in log.repairs[0]
     np.testing.assert_allclose(log.pos[:, 0], T[: len(log.t)], atol=1e-5)
     assert len(log.t) > N - 10
 
 
 def test_pauses_of_a_stream_are_gaps(tmp_path):
-    log = read_log(crazyflie(tmp_path / "log00", pause=range(150, 220)), COLUMNS)
+    log = read_log(write_crazyflie(tmp_path / "log00", pause=range(150, 220)), COLUMNS)
     assert len(log.gaps) == 1
     assert np.diff(log.t)[log.gaps[0] - 1] == pytest.approx(0.72, abs=0.02)
     assert "1 gap," in log.repairs[0]
@@ -63,15 +77,15 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="begins with 0xBC"):
         read_log(tmp_path / "log")
     with pytest.raises(ConfigError, match="version 1 or 2"):
-        read_log(crazyflie(tmp_path / "log03", version=3))
+        read_log(write_crazyflie(tmp_path / "log03", version=3))
     with pytest.raises(ConfigError, match="stateEstimate"):
-        read_log(crazyflie(tmp_path / "log04"))
+        read_log(write_crazyflie(tmp_path / "log04"))
 
 
 @pytest.mark.parametrize("old", [False, True])
 def test_ulogs_are_read_with_axes_up_and_left(tmp_path, old):
-    log = read_log(ulog(tmp_path / "flight.ulg", ["vehicle_angular_velocity"] if old else (), old=old))
-    np.testing.assert_allclose(log.pos[5], [1 + 0.1 * T[5], SIDE[5], 3 + 0.3 * T[5]], rtol=1e-6)
+    log = read_log(write_ulog(tmp_path / "flight.ulg", ["vehicle_angular_velocity"] if old else (), old=old))
+    np.testing.assert_allclose(log.pos[5], [1 + 0.1 * T[5], LATERAL_POS[5], 3 + 0.3 * T[5]], rtol=1e-6)
     np.testing.assert_allclose(log.vel[5], [0.1, 9.81 * RATE[5], 0.3], rtol=1e-6)
     np.testing.assert_allclose(log.ang_vel[:, 1:], [[-0.05, -0.025]] * len(log.t), rtol=1e-6)
     np.testing.assert_allclose(log.quat[:, 0], np.sin(ANGLE / 2)[: len(log.t)], atol=1e-6)
@@ -81,16 +95,16 @@ def test_ulogs_are_read_with_axes_up_and_left(tmp_path, old):
 
 
 def test_ulogs_lack_what_is_not_logged_or_slow(tmp_path):
-    log = read_log(ulog(tmp_path / "a.ulg", ["vehicle_angular_velocity"], slow=["esc_status"]))
+    log = read_log(write_ulog(tmp_path / "a.ulg", ["vehicle_angular_velocity"], slow=["esc_status"]))
     assert log.rotor_vel.shape[1] == 0
     assert "esc_status every 0.2 s or more often, got every 0.25 s" in log.repairs[0]
     assert any("differentiated the attitude" in x for x in log.repairs)
     with pytest.raises(ConfigError, match=r"columns rpm2, rpm1, .* a slow stream: expected esc_status"):
         read_log(tmp_path / "a.ulg", Columns(rotor_vel=("rpm2", "rpm1", "rpm3", "rpm4")))
     with pytest.raises(ConfigError, match=r"vehicle_attitude every 0\.2 s"):
-        read_log(ulog(tmp_path / "b.ulg", slow=["vehicle_attitude"]))
+        read_log(write_ulog(tmp_path / "b.ulg", slow=["vehicle_attitude"]))
     with pytest.raises(ConfigError, match="expected messages vehicle_attitude, got esc_status"):
-        read_log(ulog(tmp_path / "c.ulg", ["vehicle_attitude"]))
+        read_log(write_ulog(tmp_path / "c.ulg", ["vehicle_attitude"]))
     (tmp_path / "d.ulg").write_bytes(b"no ULog")
     with pytest.raises(ConfigError, match="expected a ULog"):
         read_log(tmp_path / "d.ulg")
@@ -98,7 +112,7 @@ def test_ulogs_lack_what_is_not_logged_or_slow(tmp_path):
 
 @pytest.mark.parametrize("explorer", [False, True])
 def test_blackbox_logs_are_joined_with_motion_capture(tmp_path, explorer):
-    log = read_log(blackbox(tmp_path / "LOG00001.csv", explorer), motion=mocap(offset=1234.56))
+    log = read_log(write_blackbox(tmp_path / "LOG00001.csv", explorer), motion=create_mocap(offset=1234.56))
     assert log.dt == pytest.approx(0.004)
     angle, rate = swing(log.t - log.t[0] + 5.0015)  # times are means of four samples
     np.testing.assert_allclose(log.ang_vel[:, 0], rate, atol=2e-3)
@@ -116,23 +130,23 @@ def test_blackbox_logs_are_joined_with_motion_capture(tmp_path, explorer):
 
 def test_bad_blackbox_logs_are_repaired_or_refused(tmp_path):
     path = tmp_path / "LOG00001.csv"
-    assert "dropped 50 rows" in read_log(blackbox(path, damaged=50), motion=mocap()).repairs[0]
+    assert "dropped 50 rows" in read_log(write_blackbox(path, damaged=50), motion=create_mocap()).repairs[0]
     with pytest.raises(ConfigError, match="Decode the log again"):
-        read_log(blackbox(path, damaged=2000), motion=mocap())
+        read_log(write_blackbox(path, damaged=2000), motion=create_mocap())
     with pytest.raises(ConfigError, match="--motion"):
-        read_log(blackbox(path))
+        read_log(write_blackbox(path))
     with pytest.raises(ConfigError, match="one flight"):
-        read_log(blackbox(path), motion=mocap(reverse=True))
+        read_log(write_blackbox(path), motion=create_mocap(reverse=True))
     with pytest.raises(ConfigError, match=r"gyroADC\[1\]"):
-        read_log(blackbox(path, leave_out=["gyroADC[1]"]), motion=mocap())
+        read_log(write_blackbox(path, leave_out=["gyroADC[1]"]), motion=create_mocap())
     with pytest.raises(ConfigError, match="degrees per second"):
-        read_log(blackbox(path, explorer=True), Columns(rad_per_unit=60.0), motion=mocap())
+        read_log(write_blackbox(path, explorer=True), Columns(rad_per_unit=60.0), motion=create_mocap())
 
 
 @pytest.mark.parametrize("odometry", [True, False])
 def test_ros_bags_are_read_by_the_types_of_their_topics(tmp_path, odometry):
     pytest.importorskip("rosbags")
-    log = read_log(bag(tmp_path / "flight", odometry=odometry))
+    log = read_log(write_bag(tmp_path / "flight", odometry=odometry))
     assert log.dt == pytest.approx(0.005)
     angle, rate = swing(log.t + 5.0)
     np.testing.assert_allclose(2 * np.arcsin(log.quat[:, 0]) * np.sign(log.quat[0, 3]), angle, atol=1e-3)
@@ -152,7 +166,7 @@ def test_ros_bags_are_read_by_a_map_of_topics(tmp_path):
         rotor_vel=("/motors/velocity[0]", "-/motors/velocity[1]", "/motors/velocity[2]", "-/motors/velocity[3]"),
         rpm_per_unit=60 / (2 * np.pi),
     )
-    path = bag(tmp_path / "flight", odometry=False)
+    path = write_bag(tmp_path / "flight", odometry=False)
     log, same = read_log(path, columns), read_log(path)
     for key in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
         np.testing.assert_allclose(getattr(log, key), getattr(same, key), err_msg=key)
@@ -161,9 +175,9 @@ def test_ros_bags_are_read_by_a_map_of_topics(tmp_path):
 def test_ros_bags_without_a_topic_or_a_field_are_refused(tmp_path):
     pytest.importorskip("rosbags")
     with pytest.raises(ConfigError, match=r"expected a topic of nav_msgs.*/motors"):
-        read_log(bag(tmp_path / "a", leave_out=["/drone/pose"]))
+        read_log(write_bag(tmp_path / "a", leave_out=["/drone/pose"]))
     with pytest.raises(ConfigError, match=r"expected a topic and a field.*/drone/pose \(nav_msgs"):
-        read_log(bag(tmp_path / "b"), Columns(voltage=("/battery/voltage",)))
+        read_log(write_bag(tmp_path / "b"), Columns(voltage=("/battery/voltage",)))
     with pytest.raises(ConfigError, match="ros2 interface show"):
         read_log(tmp_path / "b", Columns(voltage=("/drone/imu/voltage",)))
     (tmp_path / "c.bag").write_bytes(b"no bag")

@@ -23,11 +23,11 @@ TO_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Axes east, north, up to north, east, down, and back."""
 TO_FRD = np.diag([1.0, -1, -1])
 """Axes forward, left, up to forward, right, down, and back."""
-HOVER = 0.733
+HOVER_COMMAND = 0.733
 """Part of the largest rotor speed at which a cf21B_500 hovers (15,864 of 21,661 rpm)."""
 
 
-def matrix(quat):
+def rotation_matrix(quat):
     """Return the rotation matrix of a quaternion, xyzw."""
     x, y, z, w = quat
     return np.array([
@@ -37,14 +37,14 @@ def matrix(quat):
     ])  # fmt: skip
 
 
-def flown(link, pos, vel, rotation, gyro):
+def autopilot_commands(link, pos, vel, rotation, gyro):
     """Return the motor commands of a simple autopilot that holds 1 m above the origin and heads east.
 
     All in the axes east, north, up and forward, left, up; motors by the position and the torque that the firmware gives
     each of its numbers.
     """
     wanted = -1.0 * pos - 1.0 * vel
-    thrust = HOVER + 0.15 * (wanted[2] + 1.0)
+    thrust = HOVER_COMMAND + 0.15 * (wanted[2] + 1.0)
     tilt = np.cross([0, 0, 1.0], rotation[2])  # from the body's z to the world's z, in the body
     lean = rotation.T @ np.array([-wanted[1], wanted[0], 0.0]) * 0.1
     heading = np.arctan2(rotation[1, 0], rotation[0, 0])
@@ -54,7 +54,7 @@ def flown(link, pos, vel, rotation, gyro):
     return np.clip(thrust + y * roll - x * pitch + np.array(link.yaw_torque_signs) * yaw, 0, 1)
 
 
-class Thread(threading.Thread):
+class StandInThread(threading.Thread):
     """Thread of a stand-in, which ends when its socket is closed or silent; an error is raised by ``end``."""
 
     def __init__(self, serve):
@@ -82,7 +82,7 @@ def free_port(kind):
         return s.getsockname()[1]
 
 
-def disturbed(**settings):
+def create_disturbed_sim(**settings):
     """Return a simulation whose drone hangs in the air, turned and beside its goal."""
     sim = Sim(control="rotor_vel", **settings)
     states = sim.data.states
@@ -94,14 +94,14 @@ def disturbed(**settings):
     return sim
 
 
-def require_home(sim):
+def assert_at_goal(sim):
     """Check that the drone is at its goal, level, and heads east."""
     states = sim.data.states
     np.testing.assert_allclose(states.pos[0, 0], [0, 0, 1.0], atol=0.1)  # the autopilot has no integral
-    np.testing.assert_allclose(matrix(states.quat[0, 0]), np.eye(3), atol=0.05)
+    np.testing.assert_allclose(rotation_matrix(states.quat[0, 0]), np.eye(3), atol=0.05)
 
 
-class Waiting(Betaflight):
+class LockstepBetaflight(Betaflight):
     """Waits for each answer, so that the flight does not depend on how fast the machine is."""
 
     lockstep = True
@@ -125,20 +125,20 @@ def test_betaflight_receives_the_state_and_flies():
             degrees = 2 * received[0][14:16] - place[:2]  # the bridge mirrors places at the first one
             east, north = (degrees - [20.0, 10.0]) * 111194.93 * np.array([np.cos(np.radians(10.0)), 1])
             pos = np.array([east, north, place[2] - 100.0])
-            motors = flown(Betaflight, pos, vel, matrix([x, y, z, w]), TO_FRD @ gyro)
+            motors = autopilot_commands(Betaflight, pos, vel, rotation_matrix([x, y, z, w]), TO_FRD @ gyro)
             state.sendto(np.asarray(motors, "<f4").tobytes(), ("127.0.0.1", ports[0]))
 
-    sim = disturbed(freq=250)
+    sim = create_disturbed_sim(freq=250)
     data = sim.data
     sim.step()  # compiles before the stand-in waits
     sim.data = data
-    with state, rc, SoftwareInTheLoop(sim, Waiting(ports=ports, origin=origin, rc_freq=5.0)) as loop:
-        thread = Thread(serve)
+    with state, rc, SoftwareInTheLoop(sim, LockstepBetaflight(ports=ports, origin=origin, rc_freq=5.0)) as loop:
+        thread = StandInThread(serve)
         loop.links[0].channels[:] = np.arange(1000, 1016)
         loop.run(12.0)
         controls = [rc.recv(100) for _ in range(12 * 5)]
     thread.end()
-    require_home(sim)
+    assert_at_goal(sim)
     times = np.array([packet[0] for packet in received])
     np.testing.assert_allclose(times, np.arange(len(times)) / 250, atol=1e-9)
     # Hovering: the specific force points up, which is minus 9.81 in the axes forward, right, down.
@@ -164,17 +164,17 @@ def test_ardupilot_steps_with_the_simulation_and_flies():
             line = json.loads(peer.recv(2000))
             lines.append(line)
             w, x, y, z = line["quaternion"]
-            rotation = TO_NED @ matrix([x, y, z, w]) @ TO_FRD
+            rotation = TO_NED @ rotation_matrix([x, y, z, w]) @ TO_FRD
             pos, vel, gyro = TO_NED @ line["position"], TO_NED @ line["velocity"], TO_FRD @ line["imu"]["gyro"]
-            motors = flown(ArduPilot, pos, vel, rotation, gyro)
+            motors = autopilot_commands(ArduPilot, pos, vel, rotation, gyro)
         peer.close()
 
-    sim = disturbed()
+    sim = create_disturbed_sim()
     with SoftwareInTheLoop(sim, ArduPilot(port=port), freq=250) as loop:
-        thread = Thread(serve)
+        thread = StandInThread(serve)
         loop.run(n_steps / 250)
     thread.end()
-    require_home(sim)
+    assert_at_goal(sim)
     assert len(lines) == n_steps - 1
     np.testing.assert_allclose([line["timestamp"] for line in lines], np.arange(1, n_steps) / 250, atol=1e-9)
 
@@ -197,23 +197,23 @@ def test_px4_starts_slowly_and_flies_on_mounted_sensors_with_rates_of_their_own(
                 # A real one estimates its state; the stand-in takes the simulation's.
                 m = loop.measure()[0]
                 gyro = np.array([message.xgyro, -message.ygyro, -message.zgyro])
-                motors = flown(Px4, m.pos, m.vel, matrix(m.quat), gyro)
+                motors = autopilot_commands(Px4, m.pos, m.vel, rotation_matrix(m.quat), gyro)
                 mode = common.MAV_MODE_FLAG_SAFETY_ARMED
                 answer = common.MAVLink_hil_actuator_controls_message(message.time_usec, [*motors, *[0] * 12], mode, 1)
                 client.sendall(answer.pack(mav))
         client.close()
 
-    sim = disturbed(freq=250)
+    sim = create_disturbed_sim(freq=250)
     sim.add(IMU(gyro=Triad(bias=[0.03, 0.0, 0.03]), rpy=(np.pi, 0.0, 0.3), freq=125))
     sim.add(Barometer(altitude=100.0, freq=50))
     sim.add(Magnetometer(MAGNETIC_FIELD, rpy=(0.0, 0.0, np.pi / 2), freq=25))
     sim.add(GPS(freq=10))
     loop = SoftwareInTheLoop(sim, link)
     with loop:
-        thread = Thread(serve)
+        thread = StandInThread(serve)
         loop.run(n_steps / 250)
     thread.end()
-    require_home(sim)
+    assert_at_goal(sim)
     assert link.armed
     assert [message.time_usec for message in sensors[:3]] == [0, 4000, 8000]
     last, truth = sensors[-1], truths[-1]
@@ -255,7 +255,7 @@ def test_px4_turns_no_motor_while_it_is_disarmed_and_is_given_time_to_start():
 
 def test_betaflight_in_real_time_and_one_that_does_not_answer():
     ports = tuple(free_port(socket.SOCK_DGRAM) for _ in range(3))
-    sent, sim = [], disturbed(freq=250)
+    sent, sim = [], create_disturbed_sim(freq=250)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer, Betaflight(ports=ports) as link:
         loop = SoftwareInTheLoop(sim, link)
         with pytest.raises(ConfigError, match=r"expected motor commands of Betaflight within 1\.\d* s, got none"):
@@ -269,7 +269,7 @@ def test_betaflight_in_real_time_and_one_that_does_not_answer():
                 sent.append(np.float32([0.5, 0.6, 0.7, 0.8]) + np.float32(1e-4) * len(sent))
                 peer.sendto(sent[-1].astype("<f4").tobytes(), ("127.0.0.1", ports[0]))
 
-        thread, began = Thread(serve), time.monotonic()
+        thread, began = StandInThread(serve), time.monotonic()
         loop.run(0.5)
         assert time.monotonic() - began > 0.49  # the last step begins 4 ms before the end
     thread.end()
@@ -283,7 +283,7 @@ def test_attitudes_in_the_axes_of_aviation():
     for quat in rng.normal(size=(20, 4)):
         quat /= np.linalg.norm(quat)
         w, x, y, z = to_ned_quat(quat)
-        np.testing.assert_allclose(matrix([x, y, z, w]), TO_NED @ matrix(quat) @ TO_FRD, atol=1e-12)
+        np.testing.assert_allclose(rotation_matrix([x, y, z, w]), TO_NED @ rotation_matrix(quat) @ TO_FRD, atol=1e-12)
 
 
 @pytest.mark.parametrize("link", [Betaflight, ArduPilot, Px4])
@@ -369,7 +369,7 @@ def test_law_09_channels_times_and_links_are_checked():
                 loop.run(seconds)
 
 
-GARBAGE = [b"", b"\x01", b"\xff" * 15, b"\x00" * 17, np.float32([np.nan, 0, 0, 0]).tobytes(), bytes(range(200))]
+INVALID_PACKETS = [b"", b"\x01", b"\xff" * 15, b"\x00" * 17, np.float32([np.nan, 0, 0, 0]).tobytes(), bytes(range(200))]
 """Packets that no firmware sends."""
 
 
@@ -383,12 +383,12 @@ def test_packets_of_another_format_are_skipped_and_extend_no_deadline(kind):
 
         def serve():
             for k in range(6000):
-                peer.sendto(GARBAGE[k % len(GARBAGE)], address)
+                peer.sendto(INVALID_PACKETS[k % len(INVALID_PACKETS)], address)
                 if wait.wait(0.005):
                     return
             raise AssertionError("receive did not return while garbage arrived")
 
-        thread = Thread(serve)
+        thread = StandInThread(serve)
         assert link.receive(0.1) is None
         wait.set()
         thread.end()
@@ -397,7 +397,7 @@ def test_packets_of_another_format_are_skipped_and_extend_no_deadline(kind):
             if kind is ArduPilot
             else struct.pack("<4f", *[0.25] * 4)
         )
-        for packet in [good, *GARBAGE]:
+        for packet in [good, *INVALID_PACKETS]:
             peer.sendto(packet, address)
         np.testing.assert_allclose(link.receive(2.0), 0.25)
 
@@ -408,7 +408,8 @@ def test_px4_skips_bytes_that_are_no_message():
         controls = [0.5, 0.25, np.nan, 1.0, *[0.0] * 12]
         message = common.MAVLink_hil_actuator_controls_message(0, controls, mode, 1).pack(mav)
         damaged = message[:20] + bytes([message[20] ^ 0xFF]) + message[21:]
-        client.sendall(b"".join(GARBAGE) + damaged + b"\xfd\xfe" + 20 * message)  # a false start takes some with it
+        # the false start of a message takes some of the messages with it
+        client.sendall(b"".join(INVALID_PACKETS) + damaged + b"\xfd\xfe" + 20 * message)
         wait_for(lambda: np.array_equal(link.receive(0.1), [0.5, 0.25, 0.0, 1.0]))
 
 
@@ -429,7 +430,7 @@ def test_measurements_are_those_of_the_plugins_in_the_axes_of_the_body():
             states = sim.data.states
             for k, measured in enumerate(loop.measure()):
                 assert isinstance(measured, Measurements)
-                pos, rotation = np.asarray(states.pos[k, 0]), matrix(states.quat[k, 0])
+                pos, rotation = np.asarray(states.pos[k, 0]), rotation_matrix(states.quat[k, 0])
                 assert measured.height == pytest.approx(pos[2])
                 # In float32, with positions of 50 m.
                 np.testing.assert_allclose(measured.gps_pos, pos + rotation @ [0.1, 0, -0.2], atol=1e-5)

@@ -14,7 +14,7 @@ from crazysim.lab.validate.closed_loop import (
 
 
 @pytest.fixture(scope="module")
-def circling():
+def circling_flight():
     """Return a setpoint that rises to 1 m and circles, and the flight of a simulated drone that follows it."""
     t = np.arange(0, 9, 0.01)
     angle = np.clip(t - 3, 0, None)
@@ -23,24 +23,26 @@ def circling():
     return setpoint, simulate_flights([still])[:, 0]
 
 
-def log(path, setpoint, pos, rest=0.06, before=100):
+def write_log(path, setpoint, pos, rest=0.06, before=100):
     """Write a log with a second before the first setpoint, in which the tracked body rests on the floor."""
     n = len(pos) + before
     t = 1.7e9 + 0.01 * np.arange(n)
-    given = np.zeros((n, 4))
-    given[before:] = setpoint * [1, 1, 1, 180 / np.pi] + [0, 0, rest, 0]
+    setpoints = np.zeros((n, 4))
+    setpoints[before:] = setpoint * [1, 1, 1, 180 / np.pi] + [0, 0, rest, 0]
     pos = np.concatenate([np.tile(pos[:1], (before, 1)), pos]) + [0, 0, rest]
     columns = {f"p{k}": pos[:, i] for i, k in enumerate("xyz")}
-    columns |= {f"sp_ctrltarget_{k}": given[:, i] for i, k in enumerate(("x", "y", "z", "yaw"))}
+    columns |= {f"sp_ctrltarget_{k}": setpoints[:, i] for i, k in enumerate(("x", "y", "z", "yaw"))}
     np.savez(path, t=t, **columns)
     return path
 
 
-def test_a_flight_of_the_simulation_is_matched(circling, tmp_path):
+def test_a_flight_of_the_simulation_is_matched(circling_flight, tmp_path):
     """The same flight again: position within interpolation, error and lag alike; the filter adds little of either."""
-    path = log(tmp_path / "own.npz", *circling)
+    path = write_log(tmp_path / "own.npz", *circling_flight)
     flight = read_flight(path)
-    np.testing.assert_allclose(flight.pos, circling[1][: len(flight.pos)], rtol=0, atol=2e-3)  # 1.7e9 s has 0.2 us
+    np.testing.assert_allclose(
+        flight.pos, circling_flight[1][: len(flight.pos)], rtol=0, atol=2e-3
+    )  # 1.7e9 s has 0.2 us
     (row,) = compare_tracking([flight])
     assert row.logged_error > 0.1
     assert abs(row.ratio - 1) < 0.01
@@ -50,16 +52,18 @@ def test_a_flight_of_the_simulation_is_matched(circling, tmp_path):
     assert 1.0 < row.ratio < 1.3
 
 
-def test_a_flight_that_fails_is_marked(circling, tmp_path):
-    setpoint, pos = circling
+def test_a_flight_that_fails_is_marked(circling_flight, tmp_path):
+    setpoint, pos = circling_flight
     away = pos + np.where(np.arange(len(pos)) > 700, 3.0, 0.0)[:, None]
-    rows = compare_tracking([read_flight(log(tmp_path / f"{k}.npz", setpoint, p)) for k, p in enumerate((pos, away))])
+    rows = compare_tracking(
+        [read_flight(write_log(tmp_path / f"{k}.npz", setpoint, p)) for k, p in enumerate((pos, away))]
+    )
     assert [row.failed for row in rows] == [False, True]
     assert rows[1].ratio < 0.5
 
 
-def test_a_table_of_text_is_the_same_flight(circling, tmp_path):
-    path = log(tmp_path / "own.npz", *circling)
+def test_a_table_of_text_is_the_same_flight(circling_flight, tmp_path):
+    path = write_log(tmp_path / "own.npz", *circling_flight)
     with np.load(path) as file:
         columns = dict(file)
     text = np.stack([*columns.values()], axis=-1)
@@ -74,4 +78,4 @@ def test_other_logs_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="got no px"):
         read_flight(tmp_path / "other.npz")
     with pytest.raises(ConfigError, match="setpoint above the floor"):
-        read_flight(log(tmp_path / "still.npz", np.full((50, 4), -1.0), np.zeros((50, 3))))
+        read_flight(write_log(tmp_path / "still.npz", np.full((50, 4), -1.0), np.zeros((50, 3))))

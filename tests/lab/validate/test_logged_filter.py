@@ -9,18 +9,18 @@ from crazysim.lab.validate.logged_filter import compare_filter, estimate_errors,
 RNG = np.random.default_rng(0)
 
 
-TILT = np.array([0.02, -0.03, 0.0, 0.9993])
+TILT_QUAT = np.array([0.02, -0.03, 0.0, 0.9993])
 """Attitude of the tracked body of a level drone, xyzw: 4.1 degrees off."""
 
 
-def write(path, away=0.0, n=600):
+def write_log(path, away=0.0, n=600):
     """Write a log of a hover whose filter on board is 3 cm and 10 degrees off; motion capture scatters by 1 mm.
 
     The tracked body is tilted against the drone.
     """
     still = {k: np.zeros(n) for k in ("sp_ctrltarget_x", "sp_ctrltarget_y", "imu_acc_x", "imu_acc_y")}
     still |= {f"imu_gyro_{k}": np.zeros(n) for k in "xyz"} | {
-        f"q{k}": np.full(n, v) for k, v in zip("xyzw", TILT, strict=True)
+        f"q{k}": np.full(n, v) for k, v in zip("xyzw", TILT_QUAT, strict=True)
     }
     still |= {
         f"att_stateEstimate_q{k}": np.full(n, v)
@@ -33,8 +33,8 @@ def write(path, away=0.0, n=600):
 
 
 def test_a_hover_is_estimated_better_than_by_a_filter_that_is_off(tmp_path):
-    write(tmp_path / "hover.npz")
-    write(tmp_path / "crashed.npz", away=3.0)
+    write_log(tmp_path / "hover.npz")
+    write_log(tmp_path / "crashed.npz", away=3.0)
     log = read_filter_log(tmp_path / "hover.npz")
     # The scatter moves the mean thrust by 1 mm / (2 * 0.01 s) / 4 s, 0.1 degrees.
     np.testing.assert_allclose(estimate_errors(log, log["est_pos"], log["est_quat"]), [0.03, 10.0], rtol=1e-3)
@@ -46,8 +46,8 @@ def test_a_hover_is_estimated_better_than_by_a_filter_that_is_off(tmp_path):
 
 
 def test_a_log_without_a_flight_is_a_row(tmp_path):
-    write(tmp_path / "hover.npz")
-    write(tmp_path / "rest.npz", away=-1.0)
+    write_log(tmp_path / "hover.npz")
+    write_log(tmp_path / "rest.npz", away=-1.0)
     *flown, failed = sorted(compare_filter(tmp_path), key=lambda row: row.failed)
     assert "expected a setpoint above the floor" in failed.problem
     assert len(flown) == 2

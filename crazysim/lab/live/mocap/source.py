@@ -196,8 +196,8 @@ class RealTimeSource(ThreadSource):
         """Send the frames of a function of time.
 
         Args:
-            source: Source, whose time is 0 when the thread starts.
-            speed: Speed of the source's time relative to real time, 1.
+            source: Source of the frames; its time is 0 when the thread starts.
+            speed: Seconds of the source's time per second of real time.
         """
         super().__init__(f"real-time {source.name}")
         self._source, self._speed = source, speed

@@ -16,14 +16,14 @@ from crazysim.lab.live.mocap.source_events import Reports
 N_INTERVALS = 32
 """Number of intervals between frames whose median is the period of the source."""
 MAX_COORDINATE = 1e6
-"""Magnitude from which a coordinate is invalid, m."""
-CLOCK_AGE = 10.0
-"""Age after which the smallest delay is replaced, since clocks drift, s."""
+"""Magnitude at which a coordinate becomes invalid, m."""
+MAX_DELAY_AGE = 10.0
+"""Age after which the smallest delay is replaced by the present one, s, because clocks drift."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """Limits beyond which frames or bodies are reported or refused."""
+    """Limits beyond which frames and poses are reported or refused."""
 
     max_speed: float = setting(default=10.0, low=0.0)
     """Largest speed of a body, m/s; a faster motion counts as a jump."""
@@ -179,7 +179,7 @@ class Tracker:
 
     def _watch_delay(self, now: float, delay: float) -> None:
         """Report frames that took much longer than the quickest one; the clocks may differ by any constant."""
-        if delay < self._least_delay or now - self._least_delay_time > CLOCK_AGE:
+        if delay < self._least_delay or now - self._least_delay_time > MAX_DELAY_AGE:
             self._least_delay, self._least_delay_time = delay, now
         elif delay - self._least_delay > self.rules.late:
             self._report("late", self.source, now, f"{delay - self._least_delay:.3f} s after the quickest frame")
@@ -205,6 +205,7 @@ class Tracker:
         return entries, rows
 
     def _update_bodies(self, frame: Frame, now: float) -> None:
+        """Store the valid poses of a frame, and the velocity of each body since its last pose."""
         entries, rows = self._find_rows(frame.names, now)
         pos, quat = frame.pos[entries], frame.quat[entries]
         norm = np.sqrt((quat * quat).sum(-1))

@@ -262,11 +262,11 @@ class Twins(Closeable):
 
 def discover(source: MocapSource, twins: Mapping[str, Twin], seconds: float = 1.0) -> tuple[str, ...]:
     """Return the names of a running source's bodies that have a twin, after polling it for a time, s."""
-    wait, names = threading.Event(), dict[str, None]()
+    pause, names = threading.Event(), dict[str, None]()
     for k in range(max(round(seconds / 0.05), 1)):
         for frame in source.poll(k, 20).frames:
             names.update(dict.fromkeys(frame.names))
-        wait.wait(0.05)
+        pause.wait(0.05)
     return tuple(name for name in names if twin_of(name, twins) is not None)
 
 

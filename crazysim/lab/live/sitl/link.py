@@ -25,7 +25,7 @@ MAX_PORT = 65535
 MAX_DRAIN_TIME = 0.1
 """Longest time for reading the waiting packets after the timeout, s, even if more keep arriving."""
 TIMEOUT_RANGE = range_between(high=1e6, positive=True)
-"""Range of a time to wait, s."""
+"""Allowed range of a timeout, s."""
 
 
 class FirmwareLink(Closeable):
@@ -51,7 +51,7 @@ class FirmwareLink(Closeable):
         """Return the newest motor commands from 0 to 1, or None if none arrived in time. (4,)
 
         Args:
-            timeout: Time to wait for one, s; 0 to read only what has arrived.
+            timeout: Time to wait for commands, s; 0 to read only what has arrived.
         """
 
 
@@ -122,7 +122,7 @@ class Datagrams(Closeable):
         """Return the contents of the newest valid packet, or None if none arrived in time.
 
         Args:
-            timeout: Time to wait for one, s; 0 to read only what has arrived.
+            timeout: Time to wait for a packet, s; 0 to read only what has arrived.
             parse: Function that returns the contents of a packet, or None for another format, which is skipped.
         """
         newest_contents, now = None, time.monotonic()

@@ -233,7 +233,7 @@ def _check_links(links: object) -> tuple[FirmwareLink, ...]:
         )
     if len(set(map(id, sequence))) < len(sequence):
         raise ConfigError(
-            f"expected one link for each of {len(sequence)} drones, got one twice. Make a link of other ports for each."
+            f"expected one link for each of {len(sequence)} drones, got one twice. Create each with its own ports."
         )
     return tuple(sequence)
 

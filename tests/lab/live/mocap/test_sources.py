@@ -27,11 +27,11 @@ from crazysim.lab.live.mocap import source as source_module
 from crazysim.media.journal import Journal
 from crazysim.trajectories import Trajectory, circle, line
 
-LEVEL = (0.0, 0.0, 0.0, 1.0)
+LEVEL_QUAT = (0.0, 0.0, 0.0, 1.0)
 
 
-def moving(t):
-    return {"a": ((t, 0.0, 1.0), LEVEL)}
+def poses_at(t):
+    return {"a": ((t, 0.0, 1.0), LEVEL_QUAT)}
 
 
 def stamps(poll):
@@ -39,20 +39,20 @@ def stamps(poll):
 
 
 def test_a_function_is_sampled_in_simulated_time():
-    source = FunctionSource(moving, freq=120.0)
+    source = FunctionSource(poses_at, freq=120.0)
     assert stamps(source.poll(0, 500)) == [0.0]
     assert stamps(source.poll(4, 500)) == []
     np.testing.assert_allclose(stamps(source.poll(13, 500)), np.arange(1, 4) / 120)
     assert stamps(source.poll(0, 500)) == [0.0]  # after a reset
     with pytest.raises(ConfigError, match="frames per second"):
-        FunctionSource(moving, freq=0)
+        FunctionSource(poses_at, freq=0)
 
 
 def test_a_function_has_a_convention():
     source = FunctionSource(lambda t: {"a": ((0, 1000, 0), (1, 0, 0, 0))}, convention=Convention("y", "wxyz", 0.001))
     frame = source.poll(0, 500).frames[0]
     np.testing.assert_allclose(frame.pos, [[0, 0, 1]])
-    np.testing.assert_allclose(frame.quat, [LEVEL])
+    np.testing.assert_allclose(frame.quat, [LEVEL_QUAT])
 
 
 def test_a_show_is_a_source():
@@ -68,38 +68,38 @@ def test_a_show_is_a_source():
 
 
 def test_a_thread_sends_in_real_time():
-    with RealTimeSource(FunctionSource(moving, freq=200.0)).start() as source:
+    with RealTimeSource(FunctionSource(poses_at, freq=200.0)).start() as source:
         found = []
         wait_for(lambda: found.extend(source.poll(0, 500).frames) or len(found) >= 20)
     np.testing.assert_allclose(np.diff([f.stamp for f in found]), 1 / 200)
     assert found[19].received - found[0].received > 0.05
 
 
-class Broken(ThreadSource):
+class FailingSource(ThreadSource):
     """A source that sends one frame and fails."""
 
     def stream(self, stop_event):
-        yield Frame.of(0.0, moving(0.0))
+        yield Frame.of(0.0, poses_at(0.0))
         raise OSError("unplugged")
 
 
-class Quick(ThreadSource):
+class OverflowingSource(ThreadSource):
     """A source that sends more frames than are kept."""
 
     def stream(self, stop_event):
         for k in range(source_module.MAX_QUEUED_FRAMES + 100):
-            yield Frame.of(k, moving(0.0))
+            yield Frame.of(k, poses_at(0.0))
 
 
 def test_a_failing_source_says_why():
-    with Broken("vicon").start() as source:
+    with FailingSource("vicon").start() as source:
         wait_for(lambda: source.ended)
         assert source.ended == "OSError: unplugged"
         assert len(source.poll(0, 500).frames) == 1
 
 
 def test_lost_frames_are_counted():
-    with Quick("quick").start() as source:
+    with OverflowingSource("quick").start() as source:
         wait_for(lambda: source.ended)
         poll = source.poll(0, 500)
     assert (len(poll.frames), poll.lost) == (source_module.MAX_QUEUED_FRAMES, 100)
@@ -146,13 +146,13 @@ def test_a_silent_process_is_ended(tmp_path):
 def worker(tmp_path):
     """A function that starts the program of a laboratory with another module ``motioncapture``."""
 
-    def started(motioncapture):
+    def start_worker(motioncapture):
         (tmp_path / "motioncapture.py").write_text(motioncapture)
         path = source_module.__file__.replace("source.py", "worker.py")
         run = f"import sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); runpy.run_path({path!r}, run_name='__main__')"
         return MotionCaptureSource("optitrack", "10.0.0.1", command=[sys.executable, "-c", run])
 
-    return started
+    return start_worker
 
 
 def test_the_program_says_that_the_package_is_missing(worker):
@@ -189,12 +189,12 @@ def test_unknown_systems():
 # Recordings ---------------------------------------------------------------------------------------------------------
 
 
-def polls():
-    frame = [Frame.of(k / 3, {f"cf{i}": ((k, i, 0.1), LEVEL) for i in range(k)}, 7 + k / 3) for k in range(5)]
+def create_polls():
+    frame = [Frame.of(k / 3, {f"cf{i}": ((k, i, 0.1), LEVEL_QUAT) for i in range(k)}, 7 + k / 3) for k in range(5)]
     return [Poll(7.0, frame[:2]), Poll(7.1, [], 4), Poll(7.2, frame[2:])]
 
 
-def assert_same(found, expected):
+def assert_polls_equal(found, expected):
     assert [(p.now, p.lost, len(p.frames)) for p in found] == [(p.now, p.lost, len(p.frames)) for p in expected]
     for a, b in zip([f for p in found for f in p.frames], [f for p in expected for f in p.frames], strict=True):
         assert (a.stamp, a.received, a.names) == (b.stamp, b.received, b.names)
@@ -202,41 +202,41 @@ def assert_same(found, expected):
         np.testing.assert_array_equal(a.quat, b.quat)
 
 
-def recorded(path):
+def write_recording(path):
     with MocapRecorder(path) as recorder:
-        for poll in polls():
+        for poll in create_polls():
             recorder.write(poll)
     return path
 
 
 def test_a_recording_holds_every_bit(tmp_path):
-    assert_same(list(read_polls(recorded(tmp_path / "a.mocap"))), polls())
+    assert_polls_equal(list(read_polls(write_recording(tmp_path / "a.mocap"))), create_polls())
 
 
 def test_an_unfinished_recording_is_readable(tmp_path):
     recorder = MocapRecorder(tmp_path / "a.mocap")  # never closed, as after a crash
-    recorder.write(polls()[0])
-    assert_same(list(read_polls(tmp_path / "a.mocap")), polls()[:1])
+    recorder.write(create_polls()[0])
+    assert_polls_equal(list(read_polls(tmp_path / "a.mocap")), create_polls()[:1])
     recorder.close()
 
 
 def test_what_is_before_a_damage_is_read(tmp_path, caplog):
-    path = recorded(tmp_path / "a.mocap")
+    path = write_recording(tmp_path / "a.mocap")
     content = path.read_bytes()
     for k in range(len(content) - 1, len(content) - 60, -7):
         path.write_bytes(content[:k])
-        assert_same(list(read_polls(path)), polls()[:2])
+        assert_polls_equal(list(read_polls(path)), create_polls()[:2])
         assert "cut off or damaged" in caplog.text
     path.write_bytes(content[:-9] + b"x" + content[-8:])
-    assert_same(list(read_polls(path)), polls()[:2])
+    assert_polls_equal(list(read_polls(path)), create_polls()[:2])
 
 
 @settings(max_examples=100, deadline=None)
 @given(tail=st.binary(max_size=200))
 def test_any_tail_is_refused_or_ignored(tail, tmp_path_factory):
-    path = recorded(tmp_path_factory.mktemp("m") / "a.mocap")
+    path = write_recording(tmp_path_factory.mktemp("m") / "a.mocap")
     path.write_bytes(path.read_bytes() + tail)
-    assert_same(list(read_polls(path)), polls())
+    assert_polls_equal(list(read_polls(path)), create_polls())
 
 
 def test_wrong_files(tmp_path):
@@ -253,14 +253,14 @@ def test_wrong_files(tmp_path):
     with pytest.raises(ConfigError, match="can be created"):
         MocapRecorder(tmp_path / "no" / "folder")
     with pytest.raises(ConfigError, match="'poll' or 'time'"):
-        ReplaySource(recorded(tmp_path / "a.mocap"), by="day")
+        ReplaySource(write_recording(tmp_path / "a.mocap"), by="day")
 
 
 def test_replay_by_poll_and_by_time(tmp_path):
-    path = recorded(tmp_path / "a.mocap")
+    path = write_recording(tmp_path / "a.mocap")
     source = ReplaySource(path)
     assert source.names == ("cf0", "cf1", "cf2", "cf3")
-    assert_same([source.poll(0, 500) for _ in range(3)], polls())
+    assert_polls_equal([source.poll(0, 500) for _ in range(3)], create_polls())
     assert source.ended
     assert source.poll(0, 500).frames == []
     source = ReplaySource(path, by="time")

@@ -10,135 +10,137 @@ from hypothesis import strategies as st
 from crazysim.errors import ConfigError
 from crazysim.lab.live.mocap import Frame, Rules, Tracker
 
-LEVEL = (0.0, 0.0, 0.0, 1.0)
+LEVEL_QUAT = (0.0, 0.0, 0.0, 1.0)
 
 
-def frame(t, received=None, quat=LEVEL, **places):
+def create_frame(t, received=None, quat=LEVEL_QUAT, **places):
     return Frame.of(t, {name: (pos, quat) for name, pos in places.items()}, received)
 
 
-def tracked(n=40, freq=100.0):
+def create_tracker(n=40, freq=100.0):
     """Return a tracker that has followed a body at 1 m/s and a resting one."""
     tracker = Tracker(["a", "b"])
     for k in range(n):
-        assert tracker.accept(frame(k / freq, a=(k / freq, 0, 1), b=(0, 5, 0)))
+        assert tracker.accept(create_frame(k / freq, a=(k / freq, 0, 1), b=(0, 5, 0)))
         tracker.advance(k / freq)
     assert not tracker.reports.latest
     return tracker, n / freq
 
 
-def kinds(tracker):
+def report_kinds(tracker):
     return [(report.kind, report.name) for report in tracker.reports.latest]
 
 
 def test_poses_and_velocities():
-    tracker, t = tracked()
+    tracker, t = create_tracker()
     np.testing.assert_allclose(tracker.pos, [[t - 0.01, 0, 1], [0, 5, 0]])
     np.testing.assert_allclose(tracker.vel, [[1, 0, 0], [0, 0, 0]], atol=1e-9)
     assert tracker.n_frames == 40
 
 
 def test_repeated_and_old_frames_are_refused():
-    tracker, t = tracked()
-    assert not tracker.accept(frame(t - 0.01, a=(9, 0, 1)))
-    assert not tracker.accept(frame(t - 0.05, a=(9, 0, 1)))
-    assert kinds(tracker) == [("repeated", "mocap"), ("backwards", "mocap")]
+    tracker, t = create_tracker()
+    assert not tracker.accept(create_frame(t - 0.01, a=(9, 0, 1)))
+    assert not tracker.accept(create_frame(t - 0.05, a=(9, 0, 1)))
+    assert report_kinds(tracker) == [("repeated", "mocap"), ("backwards", "mocap")]
     assert tracker.reports.latest[1].time == t - 0.05
     np.testing.assert_allclose(tracker.pos[0], [t - 0.01, 0, 1])
 
 
 def test_restarted_clock_is_accepted():
-    tracker, _ = tracked(150)
-    assert tracker.accept(frame(0.0, a=(3, 0, 1), b=(0, 5, 0)))
-    assert kinds(tracker) == [("restarted", "mocap")]
+    tracker, _ = create_tracker(150)
+    assert tracker.accept(create_frame(0.0, a=(3, 0, 1), b=(0, 5, 0)))
+    assert report_kinds(tracker) == [("restarted", "mocap")]
     np.testing.assert_array_equal(tracker.pos[0], [3, 0, 1])
     np.testing.assert_array_equal(tracker.vel, 0)
-    assert tracker.accept(frame(0.01, a=(3.02, 0, 1)))
+    assert tracker.accept(create_frame(0.01, a=(3.02, 0, 1)))
     np.testing.assert_allclose(tracker.vel[0], [2, 0, 0])
 
 
 def test_dropped_frames_are_counted():
-    tracker, t = tracked()
-    tracker.accept(frame(t + 0.03, a=(t + 0.03, 0, 1)))
+    tracker, t = create_tracker()
+    tracker.accept(create_frame(t + 0.03, a=(t + 0.03, 0, 1)))
     (report,) = tracker.reports.latest
     assert (report.kind, report.text) == ("dropped", "3 frames missing in 0.0400 s")
     np.testing.assert_allclose(tracker.vel[0], [1, 0, 0])
 
 
 def test_late_frames_are_used():
-    tracker, t = tracked()
-    tracker.accept(frame(t, received=t + 0.1, a=(t, 0, 1)))
-    assert kinds(tracker) == [("late", "mocap")]
+    tracker, t = create_tracker()
+    tracker.accept(create_frame(t, received=t + 0.1, a=(t, 0, 1)))
+    assert report_kinds(tracker) == [("late", "mocap")]
     np.testing.assert_allclose(tracker.pos[0], [t, 0, 1])
 
 
 def test_clocks_may_differ():
     tracker = Tracker(["a"])
     for k in range(100):
-        tracker.accept(frame(1e6 + k / 100, received=k / 100, a=(0, 0, 0)))
+        tracker.accept(create_frame(1e6 + k / 100, received=k / 100, a=(0, 0, 0)))
     assert not tracker.reports.latest
 
 
 def test_invalid_bodies_keep_their_pose_and_others_do_not():
-    tracker, t = tracked()
-    tracker.accept(frame(t, a=(math.nan, 0, 1), b=(0, 5, 0.02)))
-    assert kinds(tracker) == [("invalid", "a")]
+    tracker, t = create_tracker()
+    tracker.accept(create_frame(t, a=(math.nan, 0, 1), b=(0, 5, 0.02)))
+    assert report_kinds(tracker) == [("invalid", "a")]
     np.testing.assert_allclose(tracker.pos, [[t - 0.01, 0, 1], [0, 5, 0.02]])
-    tracker.accept(frame(t + 0.01, quat=(0, 0, 0, 0), a=(t, 0, 1)))
-    assert not tracker.accept(frame(math.inf, a=(0, 0, 0)))
-    assert kinds(tracker)[1:] == [("invalid", "a"), ("invalid", "mocap")]
+    tracker.accept(create_frame(t + 0.01, quat=(0, 0, 0, 0), a=(t, 0, 1)))
+    assert not tracker.accept(create_frame(math.inf, a=(0, 0, 0)))
+    assert report_kinds(tracker)[1:] == [("invalid", "a"), ("invalid", "mocap")]
 
 
 def test_a_jump_is_refused_once_and_accepted_when_it_stays():
-    tracker, t = tracked()
-    tracker.accept(frame(t, a=(7, 0, 1)))
-    tracker.accept(frame(t + 0.01, a=(t + 0.01, 0, 1)))
-    assert kinds(tracker) == [("jumped", "a")]
+    tracker, t = create_tracker()
+    tracker.accept(create_frame(t, a=(7, 0, 1)))
+    tracker.accept(create_frame(t + 0.01, a=(t + 0.01, 0, 1)))
+    assert report_kinds(tracker) == [("jumped", "a")]
     np.testing.assert_allclose(tracker.pos[0], [t + 0.01, 0, 1])
     for k in range(2, 5):
-        tracker.accept(frame(t + k / 100, a=(7, 0, 1)))
-    assert kinds(tracker)[1:] == [("jumped", "a")] * 2 + [("relocated", "a")]
+        tracker.accept(create_frame(t + k / 100, a=(7, 0, 1)))
+    assert report_kinds(tracker)[1:] == [("jumped", "a")] * 2 + [("relocated", "a")]
     np.testing.assert_array_equal(tracker.pos[0], [7, 0, 1])
     np.testing.assert_array_equal(tracker.vel[0], 0)
 
 
 def test_frames_in_a_burst_do_not_make_a_body_fast():
-    tracker, t = tracked()
-    tracker.accept(frame(t, a=(t, 0, 1)))
-    tracker.accept(frame(t + 1e-6, a=(t + 0.03, 0, 1)))
+    tracker, t = create_tracker()
+    tracker.accept(create_frame(t, a=(t, 0, 1)))
+    tracker.accept(create_frame(t + 1e-6, a=(t + 0.03, 0, 1)))
     np.testing.assert_allclose(tracker.vel[0], [10, 0, 0], rtol=1e-6)
     np.testing.assert_allclose(tracker.pos[0], [t + 0.03, 0, 1])
 
 
 def test_unknown_and_duplicate_names():
-    tracker, t = tracked()
-    twice = Frame(t, ("a", "ghost", "a", "b"), np.array([[9, 9, 9.0]] * 3 + [[0, 5, 0.01]]), np.tile(LEVEL, (4, 1)), t)
+    tracker, t = create_tracker()
+    twice = Frame(
+        t, ("a", "ghost", "a", "b"), np.array([[9, 9, 9.0]] * 3 + [[0, 5, 0.01]]), np.tile(LEVEL_QUAT, (4, 1)), t
+    )
     tracker.accept(twice)
-    tracker.accept(frame(t + 0.01, ghost=(1, 1, 1), a=(t + 0.01, 0, 1)))
-    assert kinds(tracker) == [("unknown", "ghost"), ("duplicate", "a")]
+    tracker.accept(create_frame(t + 0.01, ghost=(1, 1, 1), a=(t + 0.01, 0, 1)))
+    assert report_kinds(tracker) == [("unknown", "ghost"), ("duplicate", "a")]
     np.testing.assert_allclose(tracker.pos, [[t + 0.01, 0, 1], [0, 5, 0.01]])
 
 
 def test_lost_bodies_rest_until_they_are_found():
-    tracker, t = tracked()
+    tracker, t = create_tracker()
     for k in range(40):
-        tracker.accept(frame(t + k / 100, b=(0, 5, 0)))
-    assert kinds(tracker) == [("lost", "a")]
+        tracker.accept(create_frame(t + k / 100, b=(0, 5, 0)))
+    assert report_kinds(tracker) == [("lost", "a")]
     np.testing.assert_array_equal(tracker.vel[0], 0)
-    tracker.accept(frame(t + 0.4, a=(t + 0.4, 0, 1), b=(0, 5, 0)))
-    assert kinds(tracker) == [("lost", "a"), ("found", "a")]
+    tracker.accept(create_frame(t + 0.4, a=(t + 0.4, 0, 1), b=(0, 5, 0)))
+    assert report_kinds(tracker) == [("lost", "a"), ("found", "a")]
     np.testing.assert_allclose(tracker.pos[0], [t + 0.4, 0, 1])
 
 
 def test_a_stalled_source():
-    tracker, t = tracked()
+    tracker, t = create_tracker()
     tracker.advance(t + 0.5)
     tracker.advance(t + 0.6, ended="unplugged")
     tracker.advance(t + 0.7, lost=3, ended="unplugged")
-    assert [k for k, _ in kinds(tracker)] == ["stalled", "ended", "overrun"]
+    assert [k for k, _ in report_kinds(tracker)] == ["stalled", "ended", "overrun"]
     assert tracker.stalled
     np.testing.assert_array_equal(tracker.vel, 0)
-    tracker.accept(frame(t + 0.8, a=(t, 0, 1)))
+    tracker.accept(create_frame(t + 0.8, a=(t, 0, 1)))
     assert not tracker.stalled
 
 

@@ -22,12 +22,12 @@ from crazysim.lab.live.mocap import (
     twin_of,
 )
 
-LEVEL = (0.0, 0.0, 0.0, 1.0)
+LEVEL_QUAT = (0.0, 0.0, 0.0, 1.0)
 BOX = Twin("box", {"size": (0.2, 0.2, 0.2)})
 BALL = Twin("sphere", {"radius": 0.1})
 
 
-class Given(MocapSource):
+class ManualSource(MocapSource):
     """A source of frames that a test gives."""
 
     def __init__(self):
@@ -35,7 +35,7 @@ class Given(MocapSource):
 
     def send(self, **bodies):
         self.t += 0.01
-        self.waiting.append(Frame.of(self.t, {n: b if len(b) == 2 else (b, LEVEL) for n, b in bodies.items()}))
+        self.waiting.append(Frame.of(self.t, {n: b if len(b) == 2 else (b, LEVEL_QUAT) for n, b in bodies.items()}))
 
     def poll(self, step, freq):
         frames, self.waiting = self.waiting, []
@@ -47,7 +47,7 @@ def sim():
     return Sim(n_worlds=2, n_drones=1, control="state")
 
 
-def meeting(source, *settings):
+def create_meeting(source, *settings):
     """Return drones that measure and hit balls which the poses of a source move, and the plugins that do so."""
     sim = Sim(n_worlds=2, n_drones=1, control="state")
     states = sim.data.states
@@ -60,7 +60,7 @@ def meeting(source, *settings):
 @pytest.fixture(scope="module")
 def step():
     """Return the step of every such simulation, which is compiled once."""
-    return meeting(Given())[0].build_step_fn()
+    return create_meeting(ManualSource())[0].build_step_fn()
 
 
 def test_names_take_the_longest_prefix():
@@ -72,7 +72,7 @@ def test_names_take_the_longest_prefix():
 
 
 def test_poses_reach_every_world_in_one_write(sim):
-    source = Given()
+    source = ManualSource()
     twins = Twins(sim, source, {"cf": BOX}, ["cf1", "cf2"])
     turned = from_rpy([0.1, 0.2, 0.3])
     source.send(cf1=((1, 2, 3), 5 * turned), cf2=(0, 0, 1))
@@ -93,14 +93,14 @@ def test_wrong_fixed_angles_are_errors(fixed):
 
 
 def test_offset_turn_and_fixed_angles(sim):
-    source = Given()
+    source = ManualSource()
     kinds = {
         "a": Twin("box", offset=(0.1, 0, 0), turn=(0, 0, np.pi / 2)),
         "b": Twin("box", offset=(0.1, 0, 0), fixed=(0.0, 0.0, None)),
     }
     twins = Twins(sim, source, kinds, ["a", "b"])
     tilted = from_rpy([0.3, -0.2, np.pi / 2])
-    source.send(a=((1, 0, 1), LEVEL), b=((2, 0, 1), tilted))
+    source.send(a=((1, 0, 1), LEVEL_QUAT), b=((2, 0, 1), tilted))
     twins.update(sim)
     np.testing.assert_allclose(twins.pose("a")[0], [1, 0.1, 1], atol=1e-12)
     np.testing.assert_allclose(twins.pose("a")[1], from_rpy([0, 0, np.pi / 2]), atol=1e-12)
@@ -110,7 +110,7 @@ def test_offset_turn_and_fixed_angles(sim):
 
 def test_skeletons(sim):
     """A hook hangs at its joint below a drone; a trailer stays at the length of its drawbar."""
-    source = Given()
+    source = ManualSource()
     kinds = {
         "bb": Twin.drone("bumblebee"),
         "hook": Twin("pole", {"height": 0.4}, parent="bb1", at=(0.03, 0, -0.03)),
@@ -128,18 +128,18 @@ def test_skeletons(sim):
 
 def test_wrong_skeletons_and_names(sim):
     with pytest.raises(ConfigError, match="without a circle"):
-        Twins(sim, Given(), {"a": Twin(parent="b"), "b": Twin(parent="a")}, ["a", "b"])
+        Twins(sim, ManualSource(), {"a": Twin(parent="b"), "b": Twin(parent="a")}, ["a", "b"])
     with pytest.raises(ConfigError, match="expected parents among"):
-        Twins(sim, Given(), {"a": Twin(parent="b")}, ["a"])
+        Twins(sim, ManualSource(), {"a": Twin(parent="b")}, ["a"])
     with pytest.raises(UnknownNameError, match="names that begin with"):
-        Twins(sim, Given(), {"a": Twin()}, ["x"])
-    twins = Twins(sim, Given(), {"a": Twin()}, ["a"])
+        Twins(sim, ManualSource(), {"a": Twin()}, ["x"])
+    twins = Twins(sim, ManualSource(), {"a": Twin()}, ["a"])
     with pytest.raises(UnknownNameError, match="one of the bodies"):
         twins.freeze("b")
 
 
 def test_freezing(sim):
-    source = Given()
+    source = ManualSource()
     twins = Twins(sim, source, {"": BOX}, ["a", "b"])
     source.send(a=(1, 0, 1), b=(2, 0, 1))
     twins.update(sim)
@@ -154,7 +154,7 @@ def test_freezing(sim):
 
 
 def test_the_rest_continues_when_one_body_fails(sim):
-    source = Given()
+    source = ManualSource()
     twins = Twins(sim, source, {"": BOX}, ["a", "b"])
     source.send(a=(1, 0, 1), b=(2, 0, 1))
     source.send(a=(np.nan, 0, 1), b=(2.01, 0, 1), stranger=(0, 0, 0))
@@ -164,14 +164,14 @@ def test_the_rest_continues_when_one_body_fails(sim):
 
 
 def test_objects_before_their_first_pose_are_out_of_the_way(sim):
-    twins = Twins(sim, Given(), {"": BOX}, ["a"])
+    twins = Twins(sim, ManualSource(), {"": BOX}, ["a"])
     twins.update(sim)
     report = sim.contact_report(twins.handles["a"], floor=False, drones=False)
     assert report.object_distance.min() > 90
 
 
 def test_a_reset_keeps_the_measured_pose(sim):
-    source = Given()
+    source = ManualSource()
     twins = Twins(sim, source, {"": BOX}, ["a"])
     source.send(a=(1, 0, 1))
     twins.update(sim)
@@ -182,7 +182,7 @@ def test_a_reset_keeps_the_measured_pose(sim):
 
 
 def test_a_source_in_simulated_time_begins_again_after_a_reset(sim):
-    twins = Twins(sim, FunctionSource(lambda t: {"a": ((1 + t, 0, 1), LEVEL)}, 100.0), {"": BOX}, ["a"])
+    twins = Twins(sim, FunctionSource(lambda t: {"a": ((1 + t, 0, 1), LEVEL_QUAT)}, 100.0), {"": BOX}, ["a"])
     for _ in range(2):
         for _ in range(5):
             twins.update(sim)
@@ -195,8 +195,8 @@ def test_a_source_in_simulated_time_begins_again_after_a_reset(sim):
 
 
 def test_simulated_drones_measure_report_and_hit_a_real_one(step):
-    source = Given()
-    sim, twins, rays, response = meeting(source)
+    source = ManualSource()
+    sim, twins, rays, response = create_meeting(source)
     command = np.zeros((2, 1, 16))
     command[..., 2] = 1.0
     sim.state_control(command)
@@ -222,7 +222,7 @@ def test_simulated_drones_avoid_a_real_one(sim):
     """A drone that keeps 0.5 m from the twin's pose in the data never touches it."""
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0)))
-    source = Given()
+    source = ManualSource()
     twins = Twins(sim, source, {"cf": BOX}, ["cf1"])
     closest = np.inf
     for k in range(150):
@@ -241,7 +241,7 @@ def test_simulated_drones_avoid_a_real_one(sim):
 
 
 def test_discovery_lists_names_that_have_a_twin():
-    poses = {"cf1": ((0, 0, 1), LEVEL), "wand": ((0, 0, 1), LEVEL)}
+    poses = {"cf1": ((0, 0, 1), LEVEL_QUAT), "wand": ((0, 0, 1), LEVEL_QUAT)}
     with RealTimeSource(FunctionSource(lambda t: poses, 100.0)).start() as source:
         assert discover(source, {"cf": BOX}, 0.3) == ("cf1",)
 
@@ -251,10 +251,10 @@ def test_a_recorded_stream_gives_the_same_run_bit_for_bit(tmp_path, step):
 
     def bodies(t):
         near = 0.25 * np.cos(3 * t)
-        return {"cf1": ((near, 0, 1.0), from_rpy([0, 0, t])), "cf2": ((0, near, 1.2), LEVEL)}
+        return {"cf1": ((near, 0, 1.0), from_rpy([0, 0, t])), "cf2": ((0, near, 1.2), LEVEL_QUAT)}
 
     def run(source, record=None):
-        sim, twins, *_ = meeting(source, Rules(stalled=0.01), record)
+        sim, twins, *_ = create_meeting(source, Rules(stalled=0.01), record)
         command = np.zeros((2, 1, 16))
         command[..., 2] = 1.0
         found = []
@@ -286,7 +286,7 @@ def test_playback_moves_objects_in_the_compiled_step():
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0)))
 
     def bodies(t):
-        return {"cf1": ((1.0 + t, 0, 1), from_rpy([0, 0, 3 * t])), "cf2": ((0, 2, 1), LEVEL)}
+        return {"cf1": ((1.0 + t, 0, 1), from_rpy([0, 0, 3 * t])), "cf2": ((0, 2, 1), LEVEL_QUAT)}
 
     source = FunctionSource(bodies, 50.0)
     twins = Twins(sim, source, {"cf": BOX}, ["cf1", "cf2"])
@@ -309,7 +309,7 @@ def test_playback_moves_objects_in_the_compiled_step():
 
 
 def test_wrong_playbacks(sim):
-    source = FunctionSource(lambda t: {"a": ((t, 0, 1), LEVEL)}, 50.0)
+    source = FunctionSource(lambda t: {"a": ((t, 0, 1), LEVEL_QUAT)}, 50.0)
     twins = Twins(sim, source, {"a": BOX}, ["a"])
     with pytest.raises(ConfigError, match="at least two samples"):
         twins.playback(source, 0.0)
