@@ -245,7 +245,7 @@ def test_the_example_hands_the_firmware_what_it_expects(tmp_path):
     memory = np.asarray(controller.memory(None).words)
     x = np.arange(1.0, 40.0, dtype=np.float32) / 8  # time, dt, pos, quat, vel, ang_vel, command
     pos, quat, vel, gyro, command = x[2:5], x[5:9], x[9:12], x[12:15], x[15:31]
-    words, motors = firmware._call_library(controller._copy, 0, 4, memory[None], x[None])
+    words, motors = firmware._call_library(controller._copy_path, 0, 4, memory[None], x[None])
     degrees = np.rad2deg(1.0)
     sums = [
         command[0] + 2 * command[4] + 4 * command[8] + 8 * command[12],
