@@ -1,14 +1,14 @@
-"""Differential fuzzer of the engines: random programs must give on every engine what they give on ``plain``.
+"""Differential fuzzer: random programs must give the same results on every engine as on ``plain``.
 
     python tests/engine/fuzz.py --programs 20000 --seed 1
     python tests/engine/fuzz.py --programs 5000 --seed 1 --device gpu
 
-Programs (``programs``) are drawn at random, each becomes a stage of one drone or of one world, and many stages make a
+Programs (``programs``) are drawn at random. Each becomes a stage of one drone or of one world, and many stages make a
 step, so that compilers are called once for all of them. Every value of every program is written to a record and
-compared, on inputs that hold zeros of both signs, ties, huge and tiny numbers, infinities and NaN.
+compared. The inputs contain zeros of both signs, ties, huge and tiny numbers, infinities and NaN.
 
-Integers, bools and moved numbers must be equal; what rounding explains is in ``rounding``. As a difference grows in
-the lines that follow, a value is compared with what JAX makes of the operands that the engine itself found.
+Integers, bools and moved numbers must be equal; ``rounding`` defines which differences rounding explains. As a
+difference grows in later lines, a value is compared with the result of JAX for the operands that the engine computed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if __name__ == "__main__":  # the environment must be set before JAX is imported
     import compiling
 
     os.environ.update(compiling.environment(os.environ))
-    os.environ["XLA_FLAGS"] += " --xla_disable_hlo_passes=algsimp"  # it takes NaN times False for zero
+    os.environ["XLA_FLAGS"] += " --xla_disable_hlo_passes=algsimp"  # it replaces NaN times False by zero
     os.environ["CXXFLAGS"] = f"{os.environ.get('CXXFLAGS', '')} -O0"
 
 import jax
@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from programs import Program, draw, evaluate, prune_program
-from rounding import allow_gpu, are_explained, is_close, keeps_sign_of_zero
+from rounding import allow_gpu_results, are_within_rounding, is_close, keeps_sign_of_zero
 
 from crazysim import Sim
 from crazysim.core.stage import Stage, as_stages, stage
@@ -50,7 +50,7 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.pytree import PyTree, leaf
 
 N_WORLDS, N_DRONES = 36, 2
-COMPARED = ("lanes", "interpret", "fused")
+COMPARED_ENGINES = ("lanes", "interpret", "fused")
 
 
 class Inputs(PyTree):
@@ -68,14 +68,14 @@ class Results(PyTree):
     """Values of the programs: floating point, and other types."""
 
     drone: dict = leaf("drone", 1)
-    """Of stages of one drone. (n,)"""
+    """Values from stages of one drone. (n,)"""
     world: dict = leaf("world", 1)
-    """Of stages of one world. (n,)"""
+    """Values from stages of one world. (n,)"""
 
 
 SHAPES = {"f": [(), (3,), (4,), (2, 3), (3, 3)], "i": [(), (3,), (2, 3)], "u": [(), (3,)], "b": [(), (3,)]}
 DTYPES = {"f": np.float32, "i": np.int32, "u": np.uint32, "b": np.bool_}
-SPECIAL = np.float32(
+SPECIAL_NUMBERS = np.float32(
     [0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 2.0, np.nan, np.inf, -np.inf, 1e-3, 1e30, -1e30, 1e-30, 8e37, 89.0, -104.0,
      8388609.0, -2147483648.0, 4294967296.0, 1.5, -2.5, 1.1754944e-38, 1e5, 0.99999994]
 )  # fmt: skip
@@ -88,7 +88,7 @@ def draw_inputs(rng: np.random.Generator) -> Inputs:
         for shape in shapes:
             size = (N_WORLDS, N_DRONES, *shape)
             if letter == "f":
-                options = [rng.uniform(-3, 3, size), rng.integers(-4, 5, size) / 2, rng.choice(SPECIAL, size)]
+                options = [rng.uniform(-3, 3, size), rng.integers(-4, 5, size) / 2, rng.choice(SPECIAL_NUMBERS, size)]
             elif letter == "b":
                 options = [rng.integers(0, 2, size)] * 3
             else:
@@ -102,16 +102,16 @@ def draw_inputs(rng: np.random.Generator) -> Inputs:
     return Inputs(*fields)
 
 
-def flat(g: Inputs) -> dict:
+def inputs_by_name(g: Inputs) -> dict:
     """Return inputs by name."""
     return {**g.numbers, **g.vectors, **g.matrices}
 
 
 def input_shapes(scope: str) -> dict[str, jax.ShapeDtypeStruct]:
-    """Return shapes and types that a program sees, of one drone or of one world."""
-    lead = () if scope == "drone" else (N_DRONES,)
+    """Return the shapes and types of the inputs of a program, for one drone or one world."""
+    batch_shape = () if scope == "drone" else (N_DRONES,)
     return {
-        letter + "".join(map(str, s)): jax.ShapeDtypeStruct((*lead, *s), DTYPES[letter])
+        letter + "".join(map(str, s)): jax.ShapeDtypeStruct((*batch_shape, *s), DTYPES[letter])
         for letter, shapes in SHAPES.items()
         for s in shapes
     }
@@ -134,14 +134,16 @@ class Case:
 
         def write(data):
             results = data.plugins["results"]
-            floats, others = packed(self.program.values(flat(data.plugins["given"])), len(self.program.inputs))
+            floats, others = pack_values(
+                self.program.values(inputs_by_name(data.plugins["inputs"])), len(self.program.inputs)
+            )
             new = getattr(results, self.scope) | {f"{name}f": floats, f"{name}o": others}
             return data.replace(plugins=data.plugins | {"results": results.replace(**{self.scope: new})})
 
         return Stage(write, self.scope, name=name)
 
-    def blank(self, name: str) -> dict:
-        """Return the slots that the stage writes to, of all worlds."""
+    def empty_slots(self, name: str) -> dict:
+        """Return arrays for the values that the stage writes, for all worlds."""
         results = self.avals[len(self.program.inputs) :]
         n_floats = sum(aval.size for aval in results if jnp.issubdtype(aval.dtype, jnp.floating))
         n_others = sum(aval.size for aval in results) - n_floats
@@ -153,25 +155,25 @@ class Case:
 
     @functools.cached_property
     def signed(self) -> list[bool]:
-        """Whether each line keeps the sign of zero."""
+        """True for each line that preserves the sign of zero."""
         n = len(self.program.inputs)
         lines = enumerate(self.program.lines)
         return [keeps_sign_of_zero(functools.partial(_apply_to_values, line), self.avals[: n + j]) for j, line in lines]
 
-    def unpacked(self, floats: np.ndarray, others: np.ndarray) -> list[np.ndarray]:
-        """Return the values of the lines from slots, of all worlds."""
-        values, at = [], [0, 0]
+    def unpack_values(self, floats: np.ndarray, others: np.ndarray) -> list[np.ndarray]:
+        """Return the values of the lines, for all worlds, from arrays that the stage has written."""
+        values, offsets = [], [0, 0]
         for aval in self.avals[len(self.program.inputs) :]:
             k = 0 if jnp.issubdtype(aval.dtype, jnp.floating) else 1
-            part = (floats, others)[k][..., at[k] : at[k] + aval.size]
-            at[k] += aval.size
+            part = (floats, others)[k][..., offsets[k] : offsets[k] + aval.size]
+            offsets[k] += aval.size
             part = part.view(np.uint32) if aval.dtype == np.uint32 else part
             values.append(part.reshape(-1, *aval.shape).astype(aval.dtype))
         return values
 
 
-def packed(values: Sequence, n_inputs: int) -> tuple:
-    """Return the values behind the inputs as one vector of floats and one of integers."""
+def pack_values(values: Sequence, n_inputs: int) -> tuple:
+    """Return the values after the inputs as one vector of floats and one of integers."""
     floats, others = [jnp.zeros(0, np.float32)], [jnp.zeros(0, np.int32)]
     for x in values[n_inputs:]:
         x = jnp.ravel(x)
@@ -183,30 +185,30 @@ def packed(values: Sequence, n_inputs: int) -> tuple:
 
 
 @stage("drone")
-def turned(data):
-    """Turn the vectors round, so that they are not the same at every step; engines hoist what is."""
-    inputs = data.plugins["given"]
+def reverse_vectors(data):
+    """Reverse the vectors, so that they change at every step, and engines do not hoist results."""
+    inputs = data.plugins["inputs"]
     vectors = {name: x[::-1] for name, x in inputs.vectors.items()}
-    return data.replace(plugins=data.plugins | {"given": inputs.replace(vectors=vectors)})
+    return data.replace(plugins=data.plugins | {"inputs": inputs.replace(vectors=vectors)})
 
 
 @dataclasses.dataclass
 class Finding:
-    """A program that an engine gets wrong."""
+    """A program for which an engine returns a wrong result."""
 
     case: Case
     engine: str
     description: str
 
     def __str__(self) -> str:
-        """Return the program and what is wrong with it."""
+        """Return the program and the description of the difference."""
         return f"--- {self.engine}, one {self.case.scope}: {self.description}\n{self.case.program}"
 
 
 class Fuzzer:
-    """Runs programs on all engines and counts."""
+    """Runner of programs on all engines, which counts the outcomes."""
 
-    def __init__(self, seed: int, engines: Sequence[str] = COMPARED, device: str = "cpu"):
+    def __init__(self, seed: int, engines: Sequence[str] = COMPARED_ENGINES, device: str = "cpu"):
         """Draw the inputs of all programs.
 
         Args:
@@ -219,7 +221,7 @@ class Fuzzer:
         self.rng = np.random.default_rng(seed)
         sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel", device=device)
         self.device, self.data = sim.device, sim.data
-        self.given = jax.device_put(draw_inputs(self.rng), sim.device)
+        self.inputs = jax.device_put(draw_inputs(self.rng), sim.device)
         self.counts: collections.Counter[str] = collections.Counter()
         self.refused: collections.Counter[str] = collections.Counter()
 
@@ -232,7 +234,7 @@ class Fuzzer:
         return cases
 
     def check(self, cases: Sequence[Case]) -> Iterator[Finding]:
-        """Run programs on all engines, and yield what is wrong."""
+        """Run programs on all engines, and yield the findings."""
         self.counts["programs"] += len(cases)
         yield from self._check(list(cases))
 
@@ -262,20 +264,20 @@ class Fuzzer:
                 for segment in program.fused_segments:
                     require_block_source(segment.block)
             except UnsupportedError as error:
-                (no_source,) = [case for k, case in enumerate(cases) if f"p{k}" == error.stage]
+                (case_without_source,) = [case for k, case in enumerate(cases) if f"p{k}" == error.stage]
                 self.counts["without source"] += 1
                 self.refused[error.reason] += 1
-                yield from self._check([case for case in cases if case is not no_source])
-                yield from self._compare([no_source], tuple(e for e in self.engines if e != "fused"))
+                yield from self._check([case for case in cases if case is not case_without_source])
+                yield from self._compare([case_without_source], tuple(e for e in self.engines if e != "fused"))
                 return
         yield from self._compare(cases, self.engines)
 
     def _build_stages(self, cases: Sequence[Case]) -> tuple[Any, dict[str, Stage]]:
-        stages = {f"p{k}": case.stage(f"p{k}") for k, case in enumerate(cases)} | {"turned": turned}
+        stages = {f"p{k}": case.stage(f"p{k}") for k, case in enumerate(cases)} | {"reverse_vectors": reverse_vectors}
         slots: dict[str, dict] = {"drone": {}, "world": {}}
         for k, case in enumerate(cases):
-            slots[case.scope] |= case.blank(f"p{k}")
-        plugins = {"given": self.given, "results": Results(**slots)}
+            slots[case.scope] |= case.empty_slots(f"p{k}")
+        plugins = {"inputs": self.inputs, "results": Results(**slots)}
         return self.data.replace(plugins=plugins), stages
 
     def run(self, cases: Sequence[Case], engine: str) -> list[list[np.ndarray]]:
@@ -283,10 +285,10 @@ class Fuzzer:
         data, stages = self._build_stages(cases)
         results = Step(stages, engine, self.platform, device=self.device)(data).plugins["results"]
         slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
-        return [case.unpacked(slots[f"p{k}f"], slots[f"p{k}o"]) for k, case in enumerate(cases)]
+        return [case.unpack_values(slots[f"p{k}f"], slots[f"p{k}o"]) for k, case in enumerate(cases)]
 
     def _refused_by_jax(self, cases: Sequence[Case]) -> bool:
-        """Return True where ``plain`` fails too, so that there is nothing to compare with."""
+        """Return True if ``plain`` fails too, so that there is nothing to compare with."""
         try:
             self.run(cases, "plain")
         except Exception:
@@ -320,7 +322,7 @@ class Fuzzer:
                 break
 
     def _first_difference(self, case: Case, engine: str, plain: list, other_results: list) -> Finding | None:
-        """Return the first value that differs for no good reason."""
+        """Return the first difference that rounding does not explain, or None."""
         n = len(case.program.inputs)
         inputs = [self._lanes(case.scope, name) for name in case.program.inputs]
         for j, (a, b) in enumerate(zip(plain, other_results, strict=True)):
@@ -333,7 +335,7 @@ class Fuzzer:
             for fn, operands in ((line, [*inputs, *other_results[:j]]), (value_fn, inputs)):
                 if len(lanes):
                     self.counts["examined for rounding"] += 1
-                    lanes = lanes[~are_explained(fn, [x[lanes] for x in operands], b[lanes], signed)]
+                    lanes = lanes[~are_within_rounding(fn, [x[lanes] for x in operands], b[lanes], signed)]
             if len(lanes):
                 values = {f"v{k}": x[lanes[0]] for k, x in enumerate([*inputs, *other_results[:j]])}
                 text = case.program.lines[j]
@@ -347,7 +349,7 @@ class Fuzzer:
         return None
 
     def _lanes(self, scope: str, name: str) -> np.ndarray:
-        x = np.asarray(flat(self.given)[name])
+        x = np.asarray(inputs_by_name(self.inputs)[name])
         return x.reshape(-1, *x.shape[2:]) if scope == "drone" else x
 
 
@@ -380,9 +382,9 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu", help="platform that runs the programs")
     args = parser.parse_args()
     fuzzer, start_time, n_finds = Fuzzer(args.seed, device=args.device), time.perf_counter(), 0
-    jax.config.update("jax_default_device", fuzzer.device)  # for what is computed to explain a difference
+    jax.config.update("jax_default_device", fuzzer.device)  # for the computations that explain a difference
     if args.device == "gpu":
-        allow_gpu()
+        allow_gpu_results()
     print(f"# {', '.join(fuzzer.engines)} against plain on {fuzzer.device.device_kind}", flush=True)
     for n_done in range(0, args.programs, args.batch):
         for finding in fuzzer.check(fuzzer.draw(min(args.batch, args.programs - n_done))):

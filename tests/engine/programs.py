@@ -1,8 +1,8 @@
 """Random programs from the public surface of ``jax.numpy`` and ``jax.lax``, as lines of Python.
 
-A program is a list of expressions, each of which may use the values before it: ``v0``, ``v1``, ... Kept as text, a
-program that fails can be printed, shortened and copied into a test. A line is drawn from a template and kept if JAX
-accepts it, so a template need not describe which shapes and types fit together.
+A program is a list of expressions, each of which may use the values before it: ``v0``, ``v1``, ... Programs are text,
+so a program that fails can be printed, shortened and copied into a test. A line is drawn from a template, and used if
+JAX accepts it, so templates need not state which shapes and types fit together.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ import numpy as np
 from jax import lax
 
 MAX_ELEMENTS = 24
-"""Most elements of a value; larger ones only make programs slow."""
+"""Maximum number of elements of a value; larger values only make programs slow."""
 
 NAMES: dict = {"jax": jax, "jnp": jnp, "lax": lax, "np": np}
 
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """Lines of Python, and the shapes and types of the values before them."""
+    """Lines of Python, and the names of the inputs before them."""
 
     inputs: tuple[str, ...]
-    """Names of the leaves that ``v0``, ``v1``, ... begin with."""
+    """Names of the inputs, which are ``v0``, ``v1``, ..."""
     lines: tuple[str, ...]
-    """Expressions, each of which is the next value."""
+    """Expressions; the values of the lines follow the inputs."""
 
-    def values(self, given: dict) -> list:
+    def values(self, inputs_by_name: dict) -> list:
         """Return all values: the inputs, and the results of the lines."""
-        values = [given[name] for name in self.inputs]
+        values = [inputs_by_name[name] for name in self.inputs]
         for line in self.lines:
             values.append(evaluate(line, values))
         return values
 
     def __str__(self) -> str:
         """Return the program as Python."""
-        first = [f"v{k} = {name}" for k, name in enumerate(self.inputs)]
-        return "\n".join(first + [f"v{k} = {line}" for k, line in enumerate(self.lines, len(self.inputs))])
+        input_lines = [f"v{k} = {name}" for k, name in enumerate(self.inputs)]
+        return "\n".join(input_lines + [f"v{k} = {line}" for k, line in enumerate(self.lines, len(self.inputs))])
 
 
 @functools.cache
@@ -61,7 +61,7 @@ class Draw:
     """Random choices for the templates of one line."""
 
     def __init__(self, rng: np.random.Generator, avals: Sequence[jax.ShapeDtypeStruct]):
-        """Choose among values of these shapes and types."""
+        """Create the choices for values of these shapes and types."""
         self.rng, self.avals = rng, avals
         self.shape: tuple[int, ...] = ()
         """Shape of the value that was chosen last."""
@@ -75,7 +75,7 @@ class Draw:
         return int(self.rng.integers(low, high + 1))
 
     def value(self, kinds: str = "biuf", min_ndim: int = 0, max_ndim: int = 9) -> str:
-        """Return the name of a value of one of some kinds; late ones are likelier."""
+        """Return the name of a value of one of some kinds, more often of the last such value."""
         fits = [k for k, a in enumerate(self.avals)
                 if _kind(a.dtype) in kinds and min_ndim <= len(a.shape) <= max_ndim]  # fmt: skip
         if not fits:
@@ -84,8 +84,8 @@ class Draw:
         self.shape = tuple(self.avals[k].shape)
         return f"v{k}"
 
-    def like(self, kinds: str = "biuf") -> str:
-        """Return the name of a value of the shape chosen last, or of one that is likely to broadcast."""
+    def match(self, kinds: str = "biuf") -> str:
+        """Return the name of a value that has the shape of the last chosen value or is a scalar, if there is one."""
         fits = [k for k, a in enumerate(self.avals) if _kind(a.dtype) in kinds and a.shape in (self.shape, ())]
         return f"v{self.choice(fits)}" if fits else self.value(kinds)
 
@@ -148,7 +148,7 @@ BINARY_INT = (
 ).split()
 
 
-def _names(text: Sequence[str] | str) -> list[str]:
+def _split_names(text: Sequence[str] | str) -> list[str]:
     names = text.split() if isinstance(text, str) else text
     return [name for name in names if not name.endswith("_")]
 
@@ -156,44 +156,44 @@ def _names(text: Sequence[str] | str) -> list[str]:
 # Element-wise
 @template("elementwise", 8)
 def unary(d: Draw) -> str:
-    """One operand of floating point."""
-    return f"{d.choice(_names(UNARY_FLOAT))}({d.value('f')})"
+    """Functions of one floating-point operand."""
+    return f"{d.choice(_split_names(UNARY_FLOAT))}({d.value('f')})"
 
 
 @template("elementwise", 2)
 def unary_int(d: Draw) -> str:
-    """One integer operand."""
-    return f"{d.choice(_names(UNARY_INT))}({d.value('iu')})"
+    """Functions of one integer operand."""
+    return f"{d.choice(_split_names(UNARY_INT))}({d.value('iu')})"
 
 
 @template("elementwise", 2)
 def unary_any(d: Draw) -> str:
-    """One operand of any type."""
-    return f"{d.choice(_names(UNARY_ANY))}({d.value()})"
+    """Functions of one operand of any type."""
+    return f"{d.choice(_split_names(UNARY_ANY))}({d.value()})"
 
 
 @template("elementwise", 8)
 def binary_float(d: Draw) -> str:
-    """Two operands of floating point."""
-    name = d.choice(_names(BINARY_FLOAT))
+    """Functions of two floating-point operands."""
+    name = d.choice(_split_names(BINARY_FLOAT))
     first = d.value("f")
-    second = d.like("f") if d.rng.random() < 0.7 else d.real()
+    second = d.match("f") if d.rng.random() < 0.7 else d.real()
     return f"{name}({first}, {second})" if d.rng.random() < 0.8 else f"{name}({second}, {first})"
 
 
 @template("elementwise", 5)
 def binary_any(d: Draw) -> str:
-    """Two operands of any types, which JAX promotes."""
-    return f"{d.choice(BINARY_ANY)}({d.value()}, {d.like()})"
+    """Functions of two operands of any types, which JAX promotes."""
+    return f"{d.choice(BINARY_ANY)}({d.value()}, {d.match()})"
 
 
 @template("elementwise", 6)
 def binary_int(d: Draw) -> str:
-    """Two integer operands."""
+    """Functions of two integer operands."""
     kind = d.choice("iu")
     first = d.value(kind)
-    second = d.like(kind) if d.rng.random() < 0.7 else str(d.int(0 if kind == "u" else -3, 40))
-    return f"{d.choice(_names(BINARY_INT))}({first}, {second})"
+    second = d.match(kind) if d.rng.random() < 0.7 else str(d.int(0 if kind == "u" else -3, 40))
+    return f"{d.choice(_split_names(BINARY_INT))}({first}, {second})"
 
 
 @template("elementwise", 3)
@@ -201,11 +201,11 @@ def selections(d: Draw) -> str:
     """Selections and limits."""
     x = d.value()
     return d.choice([
-        f"jnp.where({d.like('b')}, {x}, {d.like()})", f"jnp.clip({x}, {d.like()}, {d.like()})",
-        f"lax.select({d.like('b')}, {x}, {x})", f"lax.clamp({d.like()}, {x}, {d.like()})",
-        f"lax.select_n({d.like('bi')}, {x}, {d.like()})", f"jnp.where({x} > 0, {x}, 0)",
-        f"lax.select_n(jnp.clip(lax.convert_element_type({d.like('i')}, np.int32), 0, 2), {x}, -{x}, {x} * 2)",
-        f"jnp.select([{d.like('b')}, {d.like('b')}], [{x}, {d.like()}], {d.int(-1, 2)})",
+        f"jnp.where({d.match('b')}, {x}, {d.match()})", f"jnp.clip({x}, {d.match()}, {d.match()})",
+        f"lax.select({d.match('b')}, {x}, {x})", f"lax.clamp({d.match()}, {x}, {d.match()})",
+        f"lax.select_n({d.match('bi')}, {x}, {d.match()})", f"jnp.where({x} > 0, {x}, 0)",
+        f"lax.select_n(jnp.clip(lax.convert_element_type({d.match('i')}, np.int32), 0, 2), {x}, -{x}, {x} * 2)",
+        f"jnp.select([{d.match('b')}, {d.match('b')}], [{x}, {d.match()}], {d.int(-1, 2)})",
         f"jnp.piecewise({x}, [{x} < 0, {x} >= 1], [-1, lambda t: t * 2, 3])",
     ])  # fmt: skip
 
@@ -217,10 +217,10 @@ def powers(d: Draw) -> str:
     return d.choice([
         f"lax.integer_pow({x}, {d.int(-4, 7)})", f"{x} ** {d.int(-3, 5)}", f"{x} ** {d.real()}",
         f"lax.round({x}, lax.RoundingMethod({d.int(0, 1)}))", f"jnp.round({x}, {d.int(-1, 2)})",
-        f"lax.reduce_precision({x}, {d.int(3, 8)}, {d.int(2, 23)})", f"lax.pow({x}, {d.like('i')})",
+        f"lax.reduce_precision({x}, {d.int(3, 8)}, {d.int(2, 23)})", f"lax.pow({x}, {d.match('i')})",
         f"lax.integer_pow({d.value('iu')}, {d.int(0, 5)})", f"jnp.power({d.value('iu')}, {d.int(0, 5)})",
-        f"lax.nextafter({x}, {d.like('f')})", f"jnp.frexp({x})[{d.int(0, 1)}]", f"jnp.modf({x})[{d.int(0, 1)}]",
-        f"jnp.ldexp({x}, {d.like('i')})", f"jnp.divmod({x}, {d.like('f')})[{d.int(0, 1)}]",
+        f"lax.nextafter({x}, {d.match('f')})", f"jnp.frexp({x})[{d.int(0, 1)}]", f"jnp.modf({x})[{d.int(0, 1)}]",
+        f"jnp.ldexp({x}, {d.match('i')})", f"jnp.divmod({x}, {d.match('f')})[{d.int(0, 1)}]",
     ])  # fmt: skip
 
 
@@ -239,7 +239,7 @@ def conversions(d: Draw) -> str:
 # Movement
 @template("movement", 8)
 def movement(d: Draw) -> str:
-    """What only moves elements."""
+    """Functions that only move elements."""
     x = d.value(min_ndim=1)
     axis, n, length = d.axis(), len(d.shape), d.shape[d.axis()]
     low, high = d.int(-2, 2), d.int(-1, 2)
@@ -248,7 +248,7 @@ def movement(d: Draw) -> str:
         f"jnp.pad({x}, {d.int(0, 2)}, mode={d.choice(['constant', 'edge', 'reflect', 'wrap', 'symmetric'])!r})",
         f"lax.pad({x}, {x}.dtype.type(1), {[(d.int(-1, 2), d.int(-1, 2), d.int(0, 2)) for _ in range(n)]})",
         f"lax.pad({x}, {d.value(max_ndim=0)}, {[(low, high, d.int(0, 1))] * n})",
-        f"jnp.concatenate([{x}, {d.like()}], {axis})", f"jnp.stack([{x}, {d.like()}], {axis})",
+        f"jnp.concatenate([{x}, {d.match()}], {axis})", f"jnp.stack([{x}, {d.match()}], {axis})",
         f"jnp.repeat({x}, {d.int(0, 2)}, {axis})", f"jnp.tile({x}, {d.int(1, 2)})", f"lax.rev({x}, [{n - 1}])",
         f"jnp.expand_dims({x}, {axis})", f"jnp.squeeze({x})", f"jnp.reshape({x}, -1)", f"{x}.T",
         f"jnp.moveaxis({x}, 0, -1)", f"lax.slice_in_dim({x}, 0, {length}, {d.int(1, 2)}, {axis})",
@@ -265,7 +265,7 @@ def movement(d: Draw) -> str:
 
 
 @template("movement", 1)
-def made_of_nothing(d: Draw) -> str:
+def constants(d: Draw) -> str:
     """Constants."""
     x = d.value(max_ndim=1)
     return d.choice([
@@ -278,8 +278,8 @@ def made_of_nothing(d: Draw) -> str:
 
 
 @template("movement", 3)
-def numbers_that_are_known(d: Draw) -> str:
-    """Constants that the engines fold: what follows is likely to be computed before the program runs."""
+def foldable_constants(d: Draw) -> str:
+    """Constants that the engines fold; later lines are then often computed before the program runs."""
     floats = "0.0 -0.0 1.0 -1.0 0.5 2.5 -3.5 np.nan np.inf -np.inf 1e30 3e9 -3e9 255.5 1e-30 100000.0".split()
     integers = "0 1 -1 3 -7 127 128 255 256 2147483647 -2147483648 65536".split()
     return d.choice([
@@ -304,8 +304,9 @@ def reductions(d: Draw) -> str:
     axis, n = d.axis(), len(d.shape)
     back = d.choice(["True", "False"])
     return d.choice([
-        f"jnp.{d.choice(_names(REDUCTIONS))}({x}, axis={axis})", f"jnp.{d.choice(_names(REDUCTIONS))}({x}, {axis})",
-        f"jnp.{d.choice(_names(REDUCTIONS))}({x})",
+        f"jnp.{d.choice(_split_names(REDUCTIONS))}({x}, axis={axis})",
+        f"jnp.{d.choice(_split_names(REDUCTIONS))}({x}, {axis})",
+        f"jnp.{d.choice(_split_names(REDUCTIONS))}({x})",
         f"lax.{d.choice(['cumsum', 'cumprod', 'cummax', 'cummin', 'cumlogsumexp'])}({x}, {axis % n}, reverse={back})",
         f"lax.reduce_{d.choice(['max', 'min', 'sum', 'prod', 'and', 'or', 'xor'])}({x}, ({axis % n},))",
         f"lax.{d.choice(['argmax', 'argmin'])}({x}, {axis % n}, {d.choice(['np.int32', 'np.uint32', 'np.int8'])})",
@@ -317,7 +318,7 @@ def reductions(d: Draw) -> str:
         f"jax.nn.standardize({x}, {axis})", f"jnp.ptp({x}, {axis})", f"jnp.average({x}, {axis})",
         f"jnp.unwrap({x}, axis={axis})", f"jnp.gradient({x}, axis={axis})", f"jnp.trapezoid({x}, axis={axis})",
         f"lax.reduce_window({x}, {x}.dtype.type(0), lax.add, {(2,) * n}, {(1,) * n}, 'SAME')",
-        f"jnp.lexsort(({x}, {d.like()}))", f"lax.top_k({x}, 2)[{d.int(0, 1)}]", f"jnp.unique({x}, size=3)",
+        f"jnp.lexsort(({x}, {d.match()}))", f"lax.top_k({x}, 2)[{d.int(0, 1)}]", f"jnp.unique({x}, size=3)",
         f"lax.associative_scan(jnp.{d.choice(['add', 'multiply', 'maximum'])}, {x}, axis={axis}, reverse={back})",
     ])  # fmt: skip
 
@@ -327,7 +328,7 @@ def sorts(d: Draw) -> str:
     """Sorts of several operands."""
     x = d.value(min_ndim=1)
     axis = d.axis() % max(len(d.shape), 1)
-    y, z = d.like(), d.like()
+    y, z = d.match(), d.match()
     stable = d.choice(["True", "False"])
     return d.choice([
         f"lax.sort(({x}, {y}), {axis}, {stable}, num_keys={d.int(1, 2)})[1]",
@@ -345,7 +346,7 @@ def products(d: Draw) -> str:
     """Products of arrays."""
     kind = d.choice(["f", "f", "iu", "biuf"])
     x = d.value(kind, 1)
-    y = d.like(kind)
+    y = d.match(kind)
     z = d.value(kind, 1)
     return d.choice([
         f"{x} @ {z}", f"{x} @ {y}.T", f"jnp.outer({x}, {z})", f"jnp.dot({x}, {y})", f"jnp.vdot({x}, {y})",
@@ -360,10 +361,10 @@ def products(d: Draw) -> str:
 
 @template("linear algebra", 2)
 def systems(d: Draw) -> str:
-    """Small systems, of matrices that are far from singular where their elements are moderate."""
+    """Small linear systems; their matrices are far from singular if their elements are moderate."""
     x = d.value("f", 2, 3)
     n = d.shape[-1]
-    x = f"jnp.clip(jnp.nan_to_num({x}), -4, 4)"  # what LAPACK makes of NaN depends on the order of its operations
+    x = f"jnp.clip(jnp.nan_to_num({x}), -4, 4)"  # results of LAPACK for NaN depend on the order of its operations
     spd = f"({x} @ jnp.swapaxes({x}, -1, -2) + 4 * jnp.eye({x}.shape[-2]))"
     b = d.choice([f"jnp.ones({x}.shape[-2])", f"{spd}[..., 0]"])
     lower = d.choice(["True", "False"])
@@ -382,7 +383,7 @@ def systems(d: Draw) -> str:
 # Indexing
 @template("indexing", 8)
 def gathers(d: Draw) -> str:
-    """Reads at places that are known, or computed."""
+    """Reads at known and computed indices."""
     x = d.value(min_ndim=1)
     axis, length = d.axis(), max(d.shape[0], 1)
     i, j = d.value("iu", 0, 1), d.value("iu", 0, 1)
@@ -411,7 +412,7 @@ def gathers(d: Draw) -> str:
 
 @template("indexing", 4)
 def tables(d: Draw) -> str:
-    """Reads of constants at places that are computed, of more places than are selected from."""
+    """Reads of constants at computed indices, from tables that are too long for selections."""
     i, j = d.value("iu", 0, 1), d.value("iu", 0, 0)
     kind = d.choice(["np.float32", "np.int32", "np.uint32", "np.bool_"])
     x = f"jnp.asarray(({kind})(np.arange({3 * d.int(9, 80)}) * {d.int(1, 7)} % 11).reshape(-1, 3))"
@@ -425,7 +426,7 @@ def tables(d: Draw) -> str:
 
 @template("indexing", 10)
 def scatters(d: Draw) -> str:
-    """Writes at places that are known, or computed."""
+    """Writes at known and computed indices."""
     x = d.value(min_ndim=1)
     length, n = max(d.shape[0], 1), len(d.shape)
     i, j = d.value("iu", 0, 1), d.value("iu", 0, 1)
@@ -455,7 +456,7 @@ def scatters(d: Draw) -> str:
             f"jax.vmap(lambda r, k: r.at[k].add(1))({x}, jnp.clip({x}.astype(int), -1, 3))",
             f"jnp.put_along_axis({x}, jnp.argmax({x}, 0, keepdims=True), 2, 0, inplace=False)",
             f"jax.ops.segment_sum({x}, jnp.clip({x}.astype(int), -1, 2), 3)",
-            f"jax.ops.segment_max({x}, {d.like('i')}, 3)", f"jnp.bincount(jnp.clip({i}, 0, 3), length=3)",
+            f"jax.ops.segment_max({x}, {d.match('i')}, 3)", f"jnp.bincount(jnp.clip({i}, 0, 3), length=3)",
             f"jnp.histogram({x}, bins=3, range=(-2.0, 2.0))[0]", f"jnp.fill_diagonal({x}, 3, inplace=False)",
             _windowed_scatter(d, x),
         ]
@@ -463,7 +464,7 @@ def scatters(d: Draw) -> str:
 
 
 def _windowed_scatter(d: Draw, x: str) -> str:
-    """Return a scatter of windows with dimension numbers that are written out."""
+    """Return a scatter of windows with explicit dimension numbers."""
     rows = d.value("i", 1, 1)
     mode = d.choice(["clip", "fill", "promise_in_bounds"])
     kind = d.choice(["", "_add", "_mul", "_min", "_max", "_sub"])
@@ -508,7 +509,7 @@ def control_flow(d: Draw) -> str:
         f"jax.value_and_grad(lambda t: jnp.sum(jnp.sin(t)))({x})[1]",
         f"jax.lax.platform_dependent({x}, cpu=jnp.sin, default=jnp.cos)",
         f"jax.hessian(lambda t: jnp.sum(t ** 3))({x})", f"jax.device_put({x})", f"lax.optimization_barrier({x})",
-        f"jnp.vectorize(lambda a, b: a * b + 1)({x}, {d.like()})", f"jnp.apply_along_axis(jnp.sum, 0, {x})",
+        f"jnp.vectorize(lambda a, b: a * b + 1)({x}, {d.match()})", f"jnp.apply_along_axis(jnp.sum, 0, {x})",
         f"lax.fori_loop(0, {length}, lambda k, c: c.at[k].set(c[k] * 2 + k), {x})",
         f"lax.scan(lambda k, y: (jax.random.fold_in(k, 1), y * 2), jax.random.key(3), {x})[1]",
     ])  # fmt: skip
@@ -517,7 +518,7 @@ def control_flow(d: Draw) -> str:
 # Random numbers
 @template("random", 2)
 def random_numbers(d: Draw) -> str:
-    """Random numbers from a key of the drone's own."""
+    """Random numbers from a key of each drone."""
     key = f"jax.random.fold_in(jax.random.key({d.choice(['3', d.value('iu', 0, 0)])}), {d.value('iu', 0, 0)})"
     return d.choice([
         f"jax.random.bits({key}, (3,))", f"jax.random.uniform({key}, (3,))", f"jax.random.key_data({key})",
@@ -533,16 +534,16 @@ def random_numbers(d: Draw) -> str:
     ])  # fmt: skip
 
 
-def draw(rng: np.random.Generator, given: dict[str, jax.ShapeDtypeStruct], n_lines: int) -> Program:
+def draw(rng: np.random.Generator, input_shapes: dict[str, jax.ShapeDtypeStruct], n_lines: int) -> Program:
     """Return a random program.
 
     Args:
         rng: Source of random choices.
-        given: Shapes and types of the leaves that it may read.
+        input_shapes: Shapes and types of the leaves that it may read.
         n_lines: Number of lines.
     """
-    inputs = tuple(given)
-    avals = list(given.values())
+    inputs = tuple(input_shapes)
+    avals = list(input_shapes.values())
     lines: list[str] = []
     while len(lines) < n_lines:
         _, fn = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
@@ -550,17 +551,17 @@ def draw(rng: np.random.Generator, given: dict[str, jax.ShapeDtypeStruct], n_lin
         if aval is not None:
             lines.append(line)
             avals.append(aval)
-    return shortened(Program(inputs, tuple(lines)))
+    return remove_unused_lines(Program(inputs, tuple(lines)))
 
 
 def _draw_line(rng: np.random.Generator, fn: Template, avals: Sequence) -> tuple[str, Any]:
-    """Return a line and its shape and type; None instead of those if JAX refuses it or it is too large."""
+    """Return a line, and its shape and type, or None if JAX refuses the line or its value is too large."""
     try:
         line = fn(Draw(rng, avals))
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # an unsafe conversion, or something deprecated
             aval = jax.eval_shape(lambda *values: evaluate(line, values), *avals)
-    except Exception:  # of any kind: what JAX refuses is no program
+    except Exception:  # any error: JAX refuses the line
         return "", None
     if not isinstance(aval, jax.ShapeDtypeStruct) or aval.size > MAX_ELEMENTS or aval.dtype.kind == "c":
         return "", None
@@ -569,13 +570,13 @@ def _draw_line(rng: np.random.Generator, fn: Template, avals: Sequence) -> tuple
     return line, aval
 
 
-def shortened(program: Program) -> Program:
+def remove_unused_lines(program: Program) -> Program:
     """Return a program without the inputs and lines that its last line does not need."""
     return prune_program(program, len(program.inputs) + len(program.lines) - 1)
 
 
 def prune_program(program: Program, last: int) -> Program:
-    """Return the program of one value, and of what it needs."""
+    """Return a program without the lines and inputs that the value with index ``last`` does not need."""
     import re
 
     n = len(program.inputs)

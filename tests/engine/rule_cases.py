@@ -38,7 +38,7 @@ def case(fn):
     return fn
 
 
-def spd(m):
+def make_positive_definite(m):
     return m @ m.T + 2.0 * jnp.eye(len(m))
 
 
@@ -60,7 +60,7 @@ def functions(g):
 
 
 @case
-def far_angles(g):
+def large_angles(g):
     return jnp.stack([jnp.sin(1e3 * g.x), jnp.cos(1e3 * g.x), jnp.sin(1e5 * g.x), jnp.cos(1e5 * g.x)])
 
 
@@ -91,7 +91,7 @@ def integers(g):
 
 
 @case
-def words(g):
+def unsigned_integers(g):
     u, n = g.u, jnp.uint32([0, 5, 31])
     out = jnp.stack([u << n, u >> n, u + u[::-1], u * jnp.uint32(2654435761), ~u, u ^ n])
     return jax.lax.bitcast_convert_type(out, jnp.int32)
@@ -173,21 +173,23 @@ def loops(g):
 
 
 @case
-def walk_together(g):
-    """A walk over pairs of a table that all lanes of a vector take together; what it skips adds nothing."""
+def uniform_loop(g):
+    """Loop over pairs of a table, in the same iterations in all lanes; skipped pairs would add nothing."""
 
-    def turn(carry):
+    def iterate(carry):
         k, total = carry
         pair = [g.table[k], g.table[k + 1]]
-        meets = (pair[0] < g.x[0]) | (pair[1] < g.x[0])
-        total = compute_where(any_lane(meets), lambda x: x + sum(jnp.where(t < g.x[0], t, 0.0) for t in pair), total)
+        is_needed = (pair[0] < g.x[0]) | (pair[1] < g.x[0])
+        total = compute_where(
+            any_lane(is_needed), lambda x: x + sum(jnp.where(t < g.x[0], t, 0.0) for t in pair), total
+        )
         return k + 2, total
 
-    return jax.lax.while_loop(lambda carry: carry[0] < 8, turn, (0, 0 * g.x[0]))[1]
+    return jax.lax.while_loop(lambda carry: carry[0] < 8, iterate, (0, 0 * g.x[0]))[1]
 
 
 @case
-def loop_until(g):
+def while_loops(g):
     x, n = jax.lax.while_loop(
         lambda c: (jnp.abs(c[0]) > 0.1) & (c[1] < 40), lambda c: (0.7 * c[0], c[1] + 1), (g.x[0], 0)
     )
@@ -196,7 +198,7 @@ def loop_until(g):
 
 
 @case
-def index_by_a_number(g):
+def computed_indices(g):
     k = g.i[0]
     clipped = jnp.clip(k, 0, 5)
     return jnp.concatenate([
@@ -216,7 +218,7 @@ def interpolation(g):
 
 @case
 def small_systems(g):
-    a, b = spd(g.m), spd(g.big)
+    a, b = make_positive_definite(g.m), make_positive_definite(g.big)
     low = jnp.linalg.cholesky(a)
     return jnp.concatenate([
         low.ravel(), jax.scipy.linalg.cho_solve((low, True), g.x[:3]), jnp.linalg.solve(a, g.m[0]),
@@ -234,7 +236,7 @@ def nested_calls(g):
 
 
 @case
-def own_gradient(g):
+def gradient(g):
     return jax.grad(lambda x: jnp.sum(jnp.tanh(g.big @ x) * g.x))(g.x)
 
 
@@ -274,13 +276,13 @@ def make_inputs():
 
 
 def drone_shapes(g):
-    """Return the shapes and types of what one drone is given."""
-    kinds = Inputs("d", "d", "d", "d", "d", "shared", "d")
-    strip = {"d": 2, "shared": 0}
-    return jax.tree.map(lambda s, x: jax.ShapeDtypeStruct(x.shape[strip[s] :], x.dtype), kinds, g)
+    """Return the shapes and types of the inputs of one drone."""
+    scope_letters = Inputs("d", "d", "d", "d", "d", "shared", "d")
+    n_batch_axes = {"d": 2, "shared": 0}
+    return jax.tree.map(lambda s, x: jax.ShapeDtypeStruct(x.shape[n_batch_axes[s] :], x.dtype), scope_letters, g)
 
 
-def function(name):
+def case_function(name):
     """Return a case as a function of one drone's arrays, to a flat array."""
     fn = (lambda g: RANDOM[name](jax.random.key(3), g)) if name in RANDOM else CASES[name]
     return lambda g: jnp.ravel(fn(g))
@@ -289,18 +291,18 @@ def function(name):
 def map_over_drones(name):
     """Return a case as a function of the arrays of all drones, to rows. (n_lanes, k)"""
     axes = Inputs(0, 0, 0, 0, 0, None, 0)
-    return lambda g: jax.vmap(jax.vmap(function(name), (axes,)), (axes,))(g).reshape(N_LANES, -1)
+    return lambda g: jax.vmap(jax.vmap(case_function(name), (axes,)), (axes,))(g).reshape(N_LANES, -1)
 
 
-# What rounds: library functions of XLA and NumPy differ by a few units in the last place, and a solve multiplies that
-# by the condition of the system, here below 1e2. All else is the same arithmetic.
+# Library functions of XLA and NumPy differ by a few units in the last place, and a solve multiplies this by the
+# condition number of the system, here below 1e2. Everything else is the same arithmetic.
 ULP = 2.0**-23
-TOLERANCE = {"functions": 16 * ULP, "small_systems": 1e3 * ULP, "far_angles": 8 * ULP, "interpolation": 1e2 * ULP}
+TOLERANCE = {"functions": 16 * ULP, "small_systems": 1e3 * ULP, "large_angles": 8 * ULP, "interpolation": 1e2 * ULP}
 TOLERANCE |= dict.fromkeys(["lanes", "fused"], 32 * ULP)  # sums of products that cancel, contracted or not
 
 
-def agree(actual, expected, name):
-    """Check that what rounds differs by what rounding explains, and the rest not at all."""
+def assert_agree(actual, expected, name):
+    """Assert that floats differ by no more than rounding, and other numbers not at all."""
     actual, expected = np.asarray(actual), np.asarray(expected)
     assert actual.dtype == expected.dtype
     if expected.dtype.kind != "f":

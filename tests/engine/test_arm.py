@@ -13,10 +13,10 @@ from crazysim.engine import Step
 from crazysim.engine.backends import kernel, native
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
-NEEDED = {program: shutil.which(program) for program in (COMPILER, EMULATOR)}
+PROGRAM_PATHS = {program: shutil.which(program) for program in (COMPILER, EMULATOR)}
 
-# Reads the numbers of lanes, steps, inputs and outputs and the bytes of each array, then the inputs; calls the kernel,
-# and writes the outputs.
+# Reads the numbers of lanes, steps, inputs and outputs, the size of each array in bytes, and the inputs. Calls the
+# kernel, and writes the outputs.
 DRIVER = """
 #include <stdio.h>
 #include <stdlib.h>
@@ -47,16 +47,16 @@ def run_on_arm(folder, source, n_lanes, n_steps, inputs, outputs):
         cwd=folder, check=True,
     )  # fmt: skip
     head = np.array([n_lanes, n_steps, len(inputs), len(outputs), *[x.nbytes for x in (*inputs, *outputs)]], np.int32)
-    sent = head.tobytes() + b"".join(x.tobytes() for x in inputs)
-    got = subprocess.run([EMULATOR, "run"], cwd=folder, input=sent, capture_output=True, check=True).stdout
+    request = head.tobytes() + b"".join(x.tobytes() for x in inputs)
+    received = subprocess.run([EMULATOR, "run"], cwd=folder, input=request, capture_output=True, check=True).stdout
     ends = np.cumsum([x.nbytes for x in outputs])
-    assert len(got) == ends[-1]
-    parts = np.split(np.frombuffer(got, np.uint8), ends[:-1])
+    assert len(received) == ends[-1]
+    parts = np.split(np.frombuffer(received, np.uint8), ends[:-1])
     return [part.view(x.dtype).reshape(x.shape) for part, x in zip(parts, outputs, strict=True)]
 
 
 @needs_compiler
-@pytest.mark.skipif(None in NEEDED.values(), reason=f"needs {' and '.join(NEEDED)}")
+@pytest.mark.skipif(None in PROGRAM_PATHS.values(), reason=f"needs {' and '.join(PROGRAM_PATHS)}")
 def test_a_kernel_for_arm_computes_the_numbers_of_this_machine(tmp_path):
     """Compilers contract products and sums differently, so numbers differ by rounding; 37 lanes fill no vector."""
     sim, scales = Sim(n_worlds=37), np.linspace(0.5, 1, 37, dtype=np.float32)

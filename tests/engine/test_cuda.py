@@ -1,4 +1,4 @@
-"""Kernels for GPUs, as far as they can be made without one: architectures, and the choice between several."""
+"""Kernels for GPUs, as far as they can be tested without a GPU: architectures, and the choice between several."""
 
 import dataclasses
 import re
@@ -20,7 +20,7 @@ from crazysim.engine.ir.program import Leaf, Program, Segment
 
 @dataclasses.dataclass(frozen=True)
 class Gpu:
-    """A GPU that says what it can do."""
+    """A fake GPU with a compute capability."""
 
     compute_capability: str
     local_hardware_id: int = 0
@@ -53,7 +53,7 @@ def test_kernels_for_several_gpus_run_on_the_oldest():
 
 
 def test_each_architecture_has_its_own_code(source):
-    """The key of what is kept holds the architecture."""
+    """The key of a stored kernel includes the architecture."""
     texts = [
         cuda.ptx(source, cuda.architecture(cuda.weakest_device(gpus))) for gpus in ([NEW], [OLD], [NEW, OLD], [NEW])
     ]
@@ -81,11 +81,11 @@ def test_worlds_whose_drones_act_on_each_other_fill_warps_or_blocks(n_drones, th
     """A warp reads registers; a block reads records in its memory, four numbers at a time, between two barriers."""
     sim = Sim(n_worlds=2, n_drones=n_drones, control="attitude", engine="lanes")
     sim.add(Downwash())
-    made = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
-    assert (made.threads, made.lanes) == (threads, lanes)
+    gpu_kernel = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
+    assert (gpu_kernel.threads, gpu_kernel.lanes) == (threads, lanes)
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
-    code = cuda.ptx(made, cuda.DEFAULT_ARCHITECTURE)
+    code = cuda.ptx(gpu_kernel, cuda.DEFAULT_ARCHITECTURE)
     in_block = n_drones > 32
     assert ("ld.shared.v4.f32" in code, "shfl.sync" in code) == (in_block, not in_block)
     assert code.count("bar.sync") == (2 if in_block else 0)
@@ -95,19 +95,19 @@ def test_a_wider_block_has_more_whole_worlds():
     """Worlds of three drones: 20 of them in 64 threads, 80 in 256."""
     sim = Sim(n_worlds=2, n_drones=3, control="attitude", engine="lanes")
     sim.add(Downwash())
-    made = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
-    wide = made.with_threads(256)
-    assert (wide.threads, wide.lanes) == (256, 240)
-    assert ".maxntid 256" in cuda.ptx(wide, cuda.DEFAULT_ARCHITECTURE)
+    gpu_kernel = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
+    wide_kernel = gpu_kernel.with_threads(256)
+    assert (wide_kernel.threads, wide_kernel.lanes) == (256, 240)
+    assert ".maxntid 256" in cuda.ptx(wide_kernel, cuda.DEFAULT_ARCHITECTURE)
 
 
 def test_a_gpu_reads_what_drones_share_where_it_is_used_if_registers_are_too_few(source):
-    """So with an estimator; in a short kernel each such read would cost more than a register."""
+    """A kernel with an estimator needs it; in a short kernel each such read would cost more than a register."""
     sim = Sim(2, 1, control="state", estimator=Kalman.default(), engine="lanes")
-    long = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
-    texts = [k.text[k.text.index(" advance(") :] for k in (long, source)]
+    long_kernel = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
+    texts = [k.text[k.text.index(" advance(") :] for k in (long_kernel, source)]
     assert ["SHARED(p" in text for text in texts] == [True, False]
-    assert cuda.ptx(long, cuda.DEFAULT_ARCHITECTURE).count("ld.global.nc.f32 %f") > 100
+    assert cuda.ptx(long_kernel, cuda.DEFAULT_ARCHITECTURE).count("ld.global.nc.f32 %f") > 100
 
 
 def test_a_world_that_does_not_fit_into_a_block_runs_on_lanes():
@@ -124,7 +124,7 @@ def test_records_that_do_not_fit_into_a_block_are_refused():
         exchange.publish(Writer(exchange), [("f32", "0")] * 13, [], 1)
 
 
-def lowered(sim, planned_for, platform):
+def lowered_text(sim, planned_for, platform):
     """Return the text of a step that is planned for one platform and compiled for another."""
     step = Step(sim.step_pipeline, "fused", planned_for)
     return jax.jit(lambda data: step(data, 3)).trace(sim.data).lower(lowering_platforms=(platform,)).as_text()
@@ -140,11 +140,11 @@ def test_integers_wrap(name, remains):
     test = builder.add("lt", (result, a), bool) if name == "sub" else builder.add("rem", (result, a), np.int32)
     leaves = (Leaf("a", "drone", (2, 1), np.dtype(np.int32)), Leaf("b", "drone", (2, 1), test.dtype))
     segment = Segment("drone", ("one",), "each", builder.finish([test]), ((0, 0),), ((1, 0),))
-    made = kernel.write(Program(leaves, 1, (segment,)), "cuda")
-    assert f"{name}_(" in made.text.split("n_steps;")[-1]
+    gpu_kernel = kernel.write(Program(leaves, 1, (segment,)), "cuda")
+    assert f"{name}_(" in gpu_kernel.text.split("n_steps;")[-1]
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
-    assert remains in cuda.ptx(made, cuda.DEFAULT_ARCHITECTURE)
+    assert remains in cuda.ptx(gpu_kernel, cuda.DEFAULT_ARCHITECTURE)
 
 
 def test_a_step_has_a_kernel_on_platforms_that_it_was_not_planned_for():
@@ -153,7 +153,7 @@ def test_a_step_has_a_kernel_on_platforms_that_it_was_not_planned_for():
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
     for planned_for in ("cpu", "gpu"):
         for platform, target in (("cpu", "crazysim_advance"), ("cuda", cuda.PTX_TARGET)):
-            text = lowered(sim, planned_for, platform)
+            text = lowered_text(sim, planned_for, platform)
             assert [text.count(name) for name in ("crazysim_advance", cuda.PTX_TARGET)] == [
                 int(name == target) for name in ("crazysim_advance", cuda.PTX_TARGET)
             ]
@@ -163,18 +163,18 @@ def test_compiling_for_one_platform_needs_no_compiler_of_another(monkeypatch):
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
     with monkeypatch.context() as patch:
         patch.setattr(cuda, "nvrtc", lambda: None)
-        assert "crazysim_advance" in lowered(sim, "cpu", "cpu")
+        assert "crazysim_advance" in lowered_text(sim, "cpu", "cpu")
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     monkeypatch.setattr(native, "compiler", lambda: None)
-    assert cuda.PTX_TARGET in lowered(sim, "gpu", "cuda")
+    assert cuda.PTX_TARGET in lowered_text(sim, "gpu", "cuda")
 
 
 def test_a_step_without_a_kernel_where_jax_compiles_it_is_an_error():
     sim = Sim(n_worlds=1, n_drones=1025, control="rotor_vel")
     sim.add(Downwash())
     with pytest.raises(ConfigError, match=r"expected a kernel for the GPU, .*up to 1024 .*\. Use engine='lanes'"):
-        lowered(sim, "cpu", "cuda")
+        lowered_text(sim, "cpu", "cuda")
 
 
 def test_a_step_that_splits_is_described():

@@ -1,4 +1,4 @@
-"""The fuzzer, and the programs that it found engines to be wrong on."""
+"""The fuzzer, and programs for which it found wrong results of an engine."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from programs import Program
 
 from crazysim.engine.lowering.jaxprs import RULES, constants
 
-FOUND = {
+PROGRAMS_ONCE_WRONG = {
     # A reduction to an array without elements has no size to be inferred.
     "reduction to nothing": (("b3",), "jnp.unique(v0[:1], size=3)"),
     # Both rows of an exchange in a sort were views of one array: medians of matrices were wrong.
@@ -55,15 +55,15 @@ FOUND = {
         "jax.sharding.reshard(v0, jax.sharding.NamedSharding(jax.make_mesh((1,), ('i',)), jax.P())) + 1",
     ),
 }  # fmt: skip
-"""Inputs and a line, by what was wrong."""
+"""Inputs and a line, by the former defect."""
 
-REFUSED = {
+REFUSED_PROGRAMS = {
     "platform_index": (("f3",), "lax.platform_dependent(v0, cpu=jnp.sin, default=jnp.cos)"),
     "dot_general": (("f33",), "lax.dot(v0, v0, preferred_element_type=np.int32)"),
     "svd": (("f33",), "jnp.linalg.svd(jnp.nan_to_num(v0))[1]"),
     "float16": (("f3",), "v0.astype(np.float16)"),
 }
-"""Inputs and a line, by what the reason names."""
+"""Inputs and a line, by a word of the reason for which they are refused."""
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,11 @@ def cases(programs, scope="drone"):
 @pytest.mark.parametrize("scope", ["drone", "world"])
 def test_programs_that_were_wrong_give_what_they_give_plain(scope):
     fuzzer = Fuzzer(1)
-    chosen = FOUND if scope == "drone" else {name: FOUND[name] for name in ("sort by bools", "top_k of equals")}
+    chosen = (
+        PROGRAMS_ONCE_WRONG
+        if scope == "drone"
+        else {name: PROGRAMS_ONCE_WRONG[name] for name in ("sort by bools", "top_k of equals")}
+    )
     finds = list(fuzzer.check(cases(chosen, scope)))
     assert not finds, "\n".join(map(str, finds))
     assert not fuzzer.counts["refused"], fuzzer.refused
@@ -86,15 +90,15 @@ def test_programs_that_were_wrong_give_what_they_give_plain(scope):
 
 
 def test_refused_programs_are_refused_when_the_step_is_planned(fuzzer):
-    for name, program in REFUSED.items():
+    for name, program in REFUSED_PROGRAMS.items():
         fuzzer.refused.clear()
         assert not list(fuzzer.check(cases({name: program})))
-        (why,) = fuzzer.refused
-        assert name in why
+        (reason,) = fuzzer.refused
+        assert name in reason
 
 
 def test_random_programs_give_what_they_give_plain(fuzzer):
-    """A small run; ``python tests/engine/fuzz.py --programs 20000`` is a large one."""
+    """This is a small run; ``python tests/engine/fuzz.py --programs 20000`` is a large one."""
     finds = list(fuzzer.check(fuzzer.draw(16)))
     assert not finds, "\n".join(map(str, finds))
     assert fuzzer.counts["compared on lanes"] > 8
@@ -104,7 +108,7 @@ def minimum(ctx, eqn, args):
     return [ctx.elementwise("min", args, args[0].reshape(-1)[0].dtype)]
 
 
-def zero_less(ctx, eqn, args):
+def subtract_from_zero(ctx, eqn, args):
     """Return 0 - x, which has another sign where x is zero."""
     return [ctx.elementwise("sub", [constants(0, np.float32), args[0]], np.float32)]
 
@@ -114,7 +118,7 @@ def zero_less(ctx, eqn, args):
     [
         ("rev", lambda ctx, eqn, args: args, "jnp.flip(v0)"),
         ("max", minimum, "jnp.maximum(v0, 1.0)"),
-        ("neg", zero_less, "-v0"),
+        ("neg", subtract_from_zero, "-v0"),
         ("cumprod", lambda ctx, eqn, args: args, "lax.cumprod(v0, 1)"),
         ("lgamma", lambda ctx, eqn, args: [ctx.elementwise("digamma", args, np.float32)], "lax.lgamma(v0)"),
         ("rem", lambda ctx, eqn, args: [ctx.elementwise("div", args, np.float32)], "lax.rem(v0, v0 + 1)"),

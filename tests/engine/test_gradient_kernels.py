@@ -1,4 +1,4 @@
-"""Gradients of steps in a kernel: equal to gradients of the unfused stages, in whatever way they are used."""
+"""Gradients of steps in a kernel equal gradients of the unfused stages, also in vmap and in higher derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,16 @@ from crazysim.errors import EngineWarning
 COMMAND = np.array([0.05, -0.08, 0.1, 1.02 * 0.0434 * 9.81])
 
 
-def functions(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
-    """Return losses of each world's commands and speeds, with kernels and as the stages are written, and both steps."""
+def make_losses(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
+    """Return (losses, step, data) for kernels and for the plain stages, and the point to evaluate the losses at.
+
+    The losses are a function of commands and velocities, (n_worlds,).
+    """
     found = []
     for engine in ("fused", "plain"):
         sim = Sim(n_worlds, n_drones, engine=engine, **options)
-        for one in stages:
-            insert_fn_before(sim.step_pipeline, "integration", one)
+        for stage_fn in stages:
+            insert_fn_before(sim.step_pipeline, "integration", stage_fn)
         apart = jnp.arange(n_worlds * n_drones * 3.0).reshape(n_worlds, n_drones, 3)
         start = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + jnp.sin(apart)))
         step = Step(sim.step_pipeline, engine)
@@ -45,12 +48,12 @@ def functions(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
     return found, jax.tree.map(jnp.asarray, at)
 
 
-def assert_same(found, expected):
+def assert_close(found, expected):
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * max(np.max(np.abs(b)), 1e-3))
 
 
-def gradient(losses):
+def jit_gradient(losses):
     return jax.jit(jax.grad(lambda x: jnp.sum(losses(x))))
 
 
@@ -65,21 +68,21 @@ OPERATIONS = {
 
 
 def branching(x, y):
-    """Only what forward mode takes: a number of turns that depends on the numbers, and a loop that changes nothing."""
+    """Use what only forward mode supports: a loop with a computed number of iterations, and a loop over an integer."""
     z = jax.lax.while_loop(lambda c: c[0] < 3.0, lambda c: (c[0] + 1.0 + y * y, jnp.sin(c[1]) * y), (jnp.abs(x), x))[1]
     return z + jax.lax.fori_loop(0, 5, lambda i, n: n + i, jnp.int32(0)) * x
 
 
 @pytest.mark.parametrize("fn", [*OPERATIONS.values(), branching], ids=[*OPERATIONS, "branching"])
 def test_a_block_with_tangents_is_what_jax_makes_of_the_function(fn, x64):
-    """With respect to both operands, and to the second alone."""
+    """The tangents are with respect to both operands, and to the second alone."""
     block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
     x, y, dx, dy = map(jnp.asarray, np.random.default_rng(1).normal(size=(4, 16)))
-    for some, way in (((0, 1), (dx, dy)), ((1,), (jnp.zeros(16), dy))):
-        made = add_block_tangents(block, [block.inputs[k] for k in some])
-        verify_block(made)
-        found = xla.run_block(made, [x, y, *(way[k] for k in some)], (16,))
-        for a, b in zip(found, jax.jvp(jax.vmap(fn), (x, y), way), strict=True):
+    for indices, direction in (((0, 1), (dx, dy)), ((1,), (jnp.zeros(16), dy))):
+        extended_block = add_block_tangents(block, [block.inputs[k] for k in indices])
+        verify_block(extended_block)
+        found = xla.run_block(extended_block, [x, y, *(direction[k] for k in indices)], (16,))
+        for a, b in zip(found, jax.jvp(jax.vmap(fn), (x, y), direction), strict=True):
             np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 
 
@@ -88,76 +91,76 @@ def test_a_transposed_block_is_what_jax_makes_of_the_function(name, x64):
     fn = OPERATIONS[name]
     block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
     x, y, ct = np.random.default_rng(1).normal(size=(3, 16))
-    _, pull = jax.vjp(jax.vmap(fn), jnp.asarray(x), jnp.asarray(y))
+    _, vjp_fn = jax.vjp(jax.vmap(fn), jnp.asarray(x), jnp.asarray(y))
     found = xla.run_block(transpose_block(block, block.inputs), [jnp.asarray(v) for v in (x, y, ct)], (16,))
-    for a, b in zip(found, pull(jnp.asarray(ct)), strict=True):
+    for a, b in zip(found, vjp_fn(jnp.asarray(ct)), strict=True):
         np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 
 
 @pytest.mark.long("compiles four gradients as kernels, and by XLA to compare")
 @needs_compiler
 def test_a_kernel_goes_back(x64, monkeypatch):
-    """Twice with the same bits; in intervals too; for many batches of worlds; and it is differentiable once more."""
-    ((fast, step, data), (plain, *_)), at = functions(n_steps=3, n_drones=2)
-    of_kernel = gradient(fast)
-    found = of_kernel(at)
+    """Gradients are repeatable to the bit, also in intervals, and for batches of worlds."""
+    ((fast, step, data), (plain, *_)), at = make_losses(n_steps=3, n_drones=2)
+    kernel_gradient = jit_gradient(fast)
+    found = kernel_gradient(at)
     assert "gradient: one kernel" in explain(step, data)
-    assert_same(found, gradient(plain)(at))
-    for a, b in zip(found, of_kernel(at), strict=True):
+    assert_close(found, jit_gradient(plain)(at))
+    for a, b in zip(found, kernel_gradient(at), strict=True):
         np.testing.assert_array_equal(a, b)
 
     monkeypatch.setattr(native, "GRADIENT_MEMORY_BYTES", 0)
-    ((in_intervals, step, data), (plain, *_)), at = functions(n_steps=10)
-    assert_same(gradient(in_intervals)(at), gradient(plain)(at))
+    ((in_intervals, step, data), (plain, *_)), at = make_losses(n_steps=10)
+    assert_close(jit_gradient(in_intervals)(at), jit_gradient(plain)(at))
     assert "gradient: one kernel" in explain(step, data)
 
     many = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), at)
-    expected = jax.vmap(gradient(plain))(many)
-    assert_same(jax.vmap(gradient(in_intervals))(many), expected)
-    assert_same(gradient(jax.vmap(in_intervals))(many), expected)
+    expected = jax.vmap(jit_gradient(plain))(many)
+    assert_close(jax.vmap(jit_gradient(in_intervals))(many), expected)
+    assert_close(jit_gradient(jax.vmap(in_intervals))(many), expected)
     assert "lanes" not in explain(step, data)
 
 
 @pytest.mark.long("compiles kernels with many tangents")
 @needs_compiler
 def test_a_kernel_takes_tangents_along(x64):
-    """Of one direction and of many, with respect to what drones have and to what they share; twice as well."""
-    ((fast, step, data), (plain, *_)), at = functions(n_steps=3, n_drones=2)
+    """Tangents in one direction and in many, with respect to numbers of drones and to shared numbers."""
+    ((fast, step, data), (plain, *_)), at = make_losses(n_steps=3, n_drones=2)
     of = lambda losses: jax.jit(jax.jacfwd(lambda x, mass: losses(x, mass=mass), (0, 1)))  # noqa: E731
     mass = data.params.mass
     expected = of(plain)(at, mass)
-    assert_same(of(fast)(at, mass), expected)
+    assert_close(of(fast)(at, mass), expected)
     slope = jax.jit(lambda mass, way: jax.jvp(lambda mass: fast(at, mass=mass), (mass,), (way,))[1])
-    assert_same(slope(mass, 3.0 * mass), 3.0 * expected[1] @ mass)
-    ran = [line for line in explain(step, data).splitlines() if "jvp" in line]
-    assert ran
-    assert all(line.startswith("jvp: one kernel") for line in ran)
+    assert_close(slope(mass, 3.0 * mass), 3.0 * expected[1] @ mass)
+    descriptions = [line for line in explain(step, data).splitlines() if "jvp" in line]
+    assert descriptions
+    assert all(line.startswith("jvp: one kernel") for line in descriptions)
     _, tangent = jax.linearize(lambda vel: fast((at[0], vel)), at[1])
-    assert_same(jax.jit(tangent)(at[1]), jnp.einsum("wvdi,vdi->w", expected[0][1], at[1]))
+    assert_close(jax.jit(tangent)(at[1]), jnp.einsum("wvdi,vdi->w", expected[0][1], at[1]))
 
 
 @pytest.mark.long("compiles second derivatives")
 @needs_compiler
 def test_second_derivatives_are_those_of_lanes(x64):
     """Forward over forward, and forward over reverse."""
-    pairs, (cmd, vel) = functions(n_worlds=1, n_steps=1, dynamics="so_rpy")
+    pairs, (cmd, vel) = make_losses(n_worlds=1, n_steps=1, dynamics="so_rpy")
 
     def twice(losses):
         loss = lambda x: jnp.sum(losses((cmd, x)))  # noqa: E731
         forward = lambda x: jax.jvp(loss, (x,), (vel,))[1]  # noqa: E731
         return jax.jit(lambda x: [jax.jvp(fn, (x,), (vel,))[1] for fn in (forward, jax.grad(loss))])(vel)
 
-    assert_same(*(twice(losses) for losses, *_ in pairs))
+    assert_close(*(twice(losses) for losses, *_ in pairs))
 
 
 @needs_compiler
 @pytest.mark.long("compiles derivatives in both directions, as a kernel and by XLA")
 def test_drones_that_act_on_each_other_are_differentiated_in_the_kernel(x64):
-    ((fast, step, data), (plain, *_)), at = functions(n_drones=3, stages=[repulsion, centre, gap], n_steps=4)
-    assert_same(gradient(fast)(at), gradient(plain)(at))
-    along = jax.tree.map(jnp.sin, at)
-    slope = [jax.jit(lambda x, losses=losses: jax.jvp(losses, (x,), (along,)))(at) for losses in (fast, plain)]
-    assert_same(*slope)
+    ((fast, step, data), (plain, *_)), at = make_losses(n_drones=3, stages=[repulsion, centre, gap], n_steps=4)
+    assert_close(jit_gradient(fast)(at), jit_gradient(plain)(at))
+    direction = jax.tree.map(jnp.sin, at)
+    slope = [jax.jit(lambda x, losses=losses: jax.jvp(losses, (x,), (direction,)))(at) for losses in (fast, plain)]
+    assert_close(*slope)
     assert [line.split(",")[0] for line in explain(step, data).splitlines()[-2:]] == [
         "gradient: one kernel",
         "jvp: one kernel",
@@ -165,7 +168,7 @@ def test_drones_that_act_on_each_other_are_differentiated_in_the_kernel(x64):
 
 
 @stage("drone")
-def long(data):
+def long_loop(data):
     """Push a drone by the result of a loop that is too long to be unrolled."""
     x, _ = jax.lax.scan(lambda x, _: (jnp.sin(x) + 1e-3 * x, None), data.states.pos[0], length=3000)
     return data.replace(states=data.states.replace(force=jnp.zeros(3).at[1].set(1e-2 * x)))
@@ -174,10 +177,10 @@ def long(data):
 @pytest.mark.long("compiles a gradient in two engines")
 @needs_compiler
 def test_what_has_no_kernel_is_differentiated_on_lanes(x64):
-    ((fast, step, data), (plain, *_)), at = functions(stages=[long], n_steps=1, dynamics="so_rpy")
+    ((fast, step, data), (plain, *_)), at = make_losses(stages=[long_loop], n_steps=1, dynamics="so_rpy")
     with pytest.warns(EngineWarning, match="the gradient of the step runs on 'lanes'"):
-        found = gradient(fast)(at)
-    assert_same(found, gradient(plain)(at))
+        found = jit_gradient(fast)(at)
+    assert_close(found, jit_gradient(plain)(at))
     assert "a loop of 3000 iterations is too long to be reversed" in explain(step, data)
 
 
@@ -189,30 +192,32 @@ def undeclared(data):
 @pytest.mark.long("compiles a gradient in two engines")
 @needs_compiler
 def test_a_step_that_splits_is_differentiated_on_lanes(x64):
-    ((fast, step, data), (plain, *_)), at = functions(stages=[undeclared], n_steps=1, dynamics="so_rpy")
-    assert_same(gradient(fast)(at), gradient(plain)(at))
+    ((fast, step, data), (plain, *_)), at = make_losses(stages=[undeclared], n_steps=1, dynamics="so_rpy")
+    assert_close(jit_gradient(fast)(at), jit_gradient(plain)(at))
     assert "gradient: on lanes ('undeclared' is not fused)" in explain(step, data)
 
 
 @pytest.mark.parametrize(("dynamics", "control"), PAIRS)
 def test_the_derivatives_of_every_pipeline_compile_for_a_gpu(dynamics, control):
-    """With respect to all that a drone has of its own."""
+    """The derivatives are with respect to all leaves of drones."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     sim = shared_sim(n_worlds=2, n_drones=3, dynamics=dynamics, control=control)
     program = Step(sim.step_pipeline, "fused", "gpu").plan(sim.data).program
-    back = reverse.reverse_program(program, [i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone"])
-    text = cuda.ptx(reverse.write(back, "cuda"), cuda.DEFAULT_ARCHITECTURE)
-    stored = sum(program.leaves[i].size for i in back.perturbed) + len(back.carry)
+    reverse_program = reverse.reverse_program(
+        program, [i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone"]
+    )
+    text = cuda.ptx(reverse.write(reverse_program, "cuda"), cuda.DEFAULT_ARCHITECTURE)
+    stored = sum(program.leaves[i].size for i in reverse_program.perturbed) + len(reverse_program.carry)
     assert text.count("st.global") >= stored
-    ahead = add_tangents(program, back.perturbed)
-    verify(ahead)
-    assert all(ahead.leaves[i].name.startswith("tangent of ") for i in ahead.written_leaves)
-    assert "st.global" in cuda.ptx(kernel.write(ahead, "cuda"), cuda.DEFAULT_ARCHITECTURE)
+    tangent_program = add_tangents(program, reverse_program.perturbed)
+    verify(tangent_program)
+    assert all(tangent_program.leaves[i].name.startswith("tangent of ") for i in tangent_program.written_leaves)
+    assert "st.global" in cuda.ptx(kernel.write(tangent_program, "cuda"), cuda.DEFAULT_ARCHITECTURE)
 
 
 def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():
-    """A kernel there, or lanes; a kernel of the CPU has up to 8 drones that act on each other."""
+    """It is a kernel or runs on lanes; a kernel of the CPU supports up to 8 drones that act on each other."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     for n_drones, planned_for in ((1, "cpu"), (1, "gpu"), (9, "gpu")):
@@ -230,9 +235,11 @@ def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():
             ways.append([text.count(name) for name in (cuda.PTX_TARGET, "crazysim_advance")])
         forward_and_back, kernels_of_cpu = 2, 2 if n_drones == 1 else 1
         assert ways == [[forward_and_back, 0], [0, kernels_of_cpu]]
-        ran = [line for line in explain(step, sim.data).splitlines() if line.startswith("gradient: ")]
-        assert ran[0].startswith("gradient: one kernel, compiled for compute_90")
-        assert ran[1].startswith("gradient: one kernel, compiled by" if n_drones == 1 else "gradient: on lanes (")
+        descriptions = [line for line in explain(step, sim.data).splitlines() if line.startswith("gradient: ")]
+        assert descriptions[0].startswith("gradient: one kernel, compiled for compute_90")
+        assert descriptions[1].startswith(
+            "gradient: one kernel, compiled by" if n_drones == 1 else "gradient: on lanes ("
+        )
 
 
 @pytest.mark.parametrize(
@@ -253,6 +260,6 @@ def test_a_gradient_on_a_gpu_has_limited_memory(n_lanes, n_steps, n_blocks, inte
 @pytest.mark.long("compiles tangents in two engines")
 @needs_compiler
 def test_forward_mode_takes_a_number_of_steps_that_is_an_array(x64):
-    ((fast, *_), (plain, *_)), at = functions(n_steps=jnp.int32(3))
-    for along in (at, jax.tree.map(jnp.ones_like, at)):
-        assert_same(jax.jvp(fast, (at,), (along,)), jax.jvp(plain, (at,), (along,)))
+    ((fast, *_), (plain, *_)), at = make_losses(n_steps=jnp.int32(3))
+    for direction in (at, jax.tree.map(jnp.ones_like, at)):
+        assert_close(jax.jvp(fast, (at,), (direction,)), jax.jvp(plain, (at,), (direction,)))

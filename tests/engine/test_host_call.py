@@ -1,4 +1,4 @@
-"""Steps on the host without XLA: the numbers of the compiled step, from memory that nothing writes into again."""
+"""Steps on the host without XLA: same numbers as the compiled step, in memory that is never written again."""
 
 import copy
 import pickle
@@ -27,7 +27,7 @@ def sim():
     return sim
 
 
-def on_xla(sim, n):
+def step_on_xla(sim, n):
     """Return the data some steps later, by the compiled function."""
     return sim.step_fn(sim.data, jnp.int32(n))
 
@@ -37,14 +37,14 @@ def on_xla(sim, n):
 def test_it_gives_the_numbers_of_the_compiled_step(n_worlds, n_drones):
     sim = Sim(n_worlds, n_drones, control="state")
     for _ in range(3):
-        expected = on_xla(sim, 7)
+        expected = step_on_xla(sim, 7)
         sim.step(7)
         assert trees_equal(sim.data, expected)
 
 
 @pytest.mark.parametrize(("n_drones", "control"), [(1, "state"), (3, "attitude"), (9, "rotor_vel")])
 def test_numbers_depend_neither_on_blocks_nor_on_threads(n_drones, control):
-    """Thirteen worlds end within a block of lanes; 1,400 are shared between the cores, of which there may be one."""
+    """13 worlds end within a block of lanes; 1,400 worlds are distributed over the cores."""
     n_worlds, after = 1400, []
     rng = np.random.default_rng(n_drones)
     shapes = {"pos": 3, "vel": 3, "ang_vel": 3, "rotor_vel": 4}
@@ -63,11 +63,11 @@ def test_numbers_depend_neither_on_blocks_nor_on_threads(n_drones, control):
 
 
 def test_two_threads_of_python_may_step_at_once():
-    """One of them takes the threads of the kernel, the other does without."""
+    """One of them uses the threads of the kernel, the other runs without them."""
     sims = [Sim(4000, control="attitude") for _ in range(2)]
     for sim in sims:
         sim.step()
-    expected = on_xla(sims[0], 60)
+    expected = step_on_xla(sims[0], 60)
     threads = [threading.Thread(target=sim.step, args=(60,)) for sim in sims]
     for thread in threads:
         thread.start()
@@ -83,7 +83,7 @@ def test_a_kernel_without_memory_is_an_error(monkeypatch):
     with pytest.raises(MemoryError, match="no memory"):
         sim.step()
     with pytest.raises(jax.errors.JaxRuntimeError, match="no memory"):
-        jax.block_until_ready(on_xla(sim, 1))
+        jax.block_until_ready(step_on_xla(sim, 1))
 
 
 def test_populations_that_do_not_depend_on_each_other_are_stepped_alike():
@@ -93,7 +93,7 @@ def test_populations_that_do_not_depend_on_each_other_are_stepped_alike():
     plan = sim.step_fn.plan(sim.data)
     assert len(plan.programs) == 2
     assert plan.host_call.was_called
-    expected = on_xla(sim, 5)
+    expected = step_on_xla(sim, 5)
     sim.step(5)
     assert trees_equal(sim.data, expected)
 
@@ -101,7 +101,7 @@ def test_populations_that_do_not_depend_on_each_other_are_stepped_alike():
 def test_subnormal_numbers_are_zero_as_in_the_compiled_step(sim):
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(ang_vel=jnp.full_like(states.ang_vel, 1e-40)))
-    expected = on_xla(sim, 1)
+    expected = step_on_xla(sim, 1)
     sim.step()
     assert trees_equal(sim.data, expected)
     assert np.float32(1e-38) / np.float32(100) > 0  # and the caller's arithmetic is as it was
@@ -116,8 +116,8 @@ def test_a_non_finite_drone_flags_its_world_alone(sim):
 
 
 def test_what_is_read_late_is_what_it_was(sim):
-    """A record makes its fields when they are read; steps and commands since do not show in it."""
-    expected = [np.array(as_numbers(x)) for x in jax.tree.leaves(on_xla(sim, 3))]
+    """A record makes its fields when they are read; later steps and commands do not change them."""
+    expected = [np.array(as_numbers(x)) for x in jax.tree.leaves(step_on_xla(sim, 3))]
     sim.step(3)
     unread, half = sim.data, sim.data.states
     pos = half.pos
@@ -163,14 +163,14 @@ def test_a_command_of_the_device_may_be_donated_later(sim):
     command = jax.device_put(COMMAND.astype(np.float32), sim.device)
     sim.attitude_control(command)
     jax.jit(lambda x: x * 0 + 7, donate_argnums=0)(command)
-    expected = on_xla(sim, 3)
+    expected = step_on_xla(sim, 3)
     sim.step(3)
     assert trees_equal(sim.data, expected)
     np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, COMMAND.astype(np.float32))
 
 
 def test_threads_read_whole_moments_while_another_steps(sim):
-    """Drones that climb alike have positions and step counts of one moment in every record."""
+    """Height and step count in every record belong to the same moment."""
     seen, done = [], threading.Event()
 
     def read():

@@ -9,7 +9,7 @@ from crazysim.core.branches import any_lane, compute_where, table_row, table_row
 from crazysim.engine.index_map import lower_map, map_indices
 from crazysim.errors import UnsupportedError
 
-N = 1003  # a part of a vector is left over
+N = 1003  # not a multiple of a vector's length
 PLATFORMS = [None, "cpu"]
 
 
@@ -21,17 +21,17 @@ def tables():
 
 
 def longest_run(index, numbers, places):
-    """Sum what is positive, from a place of the table on, as many rows as the index says; lanes stop at their own."""
+    """Sum rows whose first number is positive; the number of rows depends on the index, and differs between lanes."""
     (place,) = table_rows(places, jax.lax.rem(index, jnp.int32(50)))
     own = table_row(numbers, place)
 
-    def turn(carry):
+    def iterate(carry):
         k, total, _ = carry
         row = table_rows(numbers, k)
         return k + 1, compute_where(row[0] > 0, lambda x: x + row[1] * own[2], total), row[3]
 
     start = jnp.int32(0), jnp.float32(0), jnp.float32(0)
-    k, total, last = jax.lax.while_loop(lambda carry: carry[0] < jax.lax.rem(index, jnp.int32(10)), turn, start)
+    k, total, last = jax.lax.while_loop(lambda carry: carry[0] < jax.lax.rem(index, jnp.int32(10)), iterate, start)
     return [total, k, last, jax.lax.div(index, jnp.int32(7))]
 
 
@@ -62,20 +62,20 @@ def test_a_batch_of_tables_is_a_batch_of_calls(tables, platform):
 
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_lanes_that_walk_together_find_what_each_finds(tables, platform):
-    """A row is skipped where no lane needs it, and a number with which all lanes begin becomes one for each lane."""
+    """A row is skipped if no lane needs it, and an initial number that all lanes share differs between lanes later."""
 
     def fn(index, numbers):
         limit = index.astype(np.float32) / N - 0.5
 
-        def turn(carry):
+        def iterate(carry):
             k, count, own = carry
             row = table_rows(numbers, k)
-            meets = row[0] < limit
-            count = compute_where(any_lane(meets), lambda n: n + jnp.where(meets, 1, 0), count)
+            is_needed = row[0] < limit
+            count = compute_where(any_lane(is_needed), lambda n: n + jnp.where(is_needed, 1, 0), count)
             return k + 1, count, own + jax.lax.rem(index, jnp.int32(3))
 
         start = jnp.int32(0), jnp.int32(0), jnp.int32(0)
-        return jax.lax.while_loop(lambda carry: carry[0] < 9, turn, start)[1:]
+        return jax.lax.while_loop(lambda carry: carry[0] < 9, iterate, start)[1:]
 
     count, own = jax.jit(lambda x: map_indices(fn, N, [x], platform))(tables[0])
     index = np.arange(N)

@@ -1,4 +1,4 @@
-"""Reads and writes at known and computed places give on every engine what they give on ``plain``, or are refused."""
+"""Reads and writes at known and computed indices have the same results on every engine as on ``plain``."""
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +48,7 @@ WRITES = [
 
 
 def test_writes_at_places(sim):
-    """All functions are lines of one stage of a drone."""
+    """One stage of a drone computes all functions."""
 
     @stage("drone")
     def write(data):
@@ -68,13 +68,13 @@ BATCHED = "lax.ScatterDimensionNumbers((), (1,), (1,), (0,), (0,))"
 PICK = "lax.GatherDimensionNumbers((), (1,), (1,), (0,), (0,))"
 SLICES = "lax.GatherDimensionNumbers((1,), (), (0,))"
 MODES = ("clip", "fill", "promise_in_bounds")
-INSIDE = {"clip": "v1", "fill": "v1", "promise_in_bounds": "jnp.clip(v1, 0, 1)"}
+INDICES = {"clip": "v1", "fill": "v1", "promise_in_bounds": "jnp.clip(v1, 0, 1)"}
 
 PROGRAMS = {
     **{
         f"windows in mode {mode}, {kind}": (
             ("f4", "i3"),
-            f"lax.scatter{kind}(v0, {INSIDE[mode]}[:, None], v0[:3, None] * jnp.ones(2), {WINDOW}, mode={mode!r})",
+            f"lax.scatter{kind}(v0, {INDICES[mode]}[:, None], v0[:3, None] * jnp.ones(2), {WINDOW}, mode={mode!r})",
         )
         for mode in MODES
         for kind in ("", "_add", "_sub", "_mul", "_min", "_max")
@@ -82,21 +82,21 @@ PROGRAMS = {
     **{
         f"batched writes in mode {mode}": (
             ("f23", "i3"),
-            f"lax.scatter_add(v0, {INSIDE[mode]}[:2, None], v0[:, 1], {BATCHED}, mode={mode!r})",
+            f"lax.scatter_add(v0, {INDICES[mode]}[:2, None], v0[:, 1], {BATCHED}, mode={mode!r})",
         )
         for mode in MODES
     },
     **{
         f"batched reads in mode {mode}": (
             ("f23", "i3"),
-            f"lax.gather(v0, {INSIDE[mode]}[:2, None], {PICK}, (1, 1), mode={mode!r})",
+            f"lax.gather(v0, {INDICES[mode]}[:2, None], {PICK}, (1, 1), mode={mode!r})",
         )
         for mode in MODES
     },
     **{
         f"read windows in mode {mode}": (
             ("f4", "i3"),
-            f"lax.gather(v0, {INSIDE[mode]}[:, None], {SLICES}, (2,), mode={mode!r}, fill_value=7.0)",
+            f"lax.gather(v0, {INDICES[mode]}[:, None], {SLICES}, (2,), mode={mode!r}, fill_value=7.0)",
         )
         for mode in MODES
     },
@@ -119,18 +119,18 @@ PROGRAMS = {
     "along an axis": (("f33",), "jnp.take_along_axis(v0, jnp.argsort(v0, 0), 0)"),
     "keys": (("i3", "i"), "jax.random.key_data(jax.random.split(jax.random.key(v0[0]), 3)[v1])"),
 }
-"""Inputs and a line, by what is tested."""
+"""Inputs and a line, by the tested case."""
 
 
 def test_windows_batches_and_modes(fuzzer):
-    cases = [Case(Program(*_in_order(inputs, line)), "drone") for inputs, line in PROGRAMS.values()]
+    cases = [Case(Program(*_program_parts(inputs, line)), "drone") for inputs, line in PROGRAMS.values()]
     finds = list(fuzzer.check(cases))
     assert not finds, "\n".join(map(str, finds))
     assert not fuzzer.counts["refused"]
     assert fuzzer.counts["compared on lanes"] == len(cases)
 
 
-def _in_order(inputs, line):
+def _program_parts(inputs, line):
     return inputs, (line,)
 
 

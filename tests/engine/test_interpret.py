@@ -16,7 +16,7 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
 from crazysim.pytree import PyTree, leaf
 
-ONE = jax.ShapeDtypeStruct((), np.float32)
+SCALAR = jax.ShapeDtypeStruct((), np.float32)
 
 
 def test_lanes_leave_a_loop_one_by_one():
@@ -24,14 +24,14 @@ def test_lanes_leave_a_loop_one_by_one():
         return jax.lax.while_loop(lambda c: c[0] > 1, lambda c: (0.5 * c[0], c[1] + 1), (x, jnp.float32(0)))
 
     x = np.float32([0.5, 3.0, 40.0])
-    halved, n = interpret.run_block(lower_function(halve, ONE), [x], x.shape)
+    halved, n = interpret.run_block(lower_function(halve, SCALAR), [x], x.shape)
     np.testing.assert_array_equal(halved, [0.5, 0.75, 0.625])
     np.testing.assert_array_equal(n, [0, 2, 6])
 
 
 def test_an_observer_gets_every_operation_with_its_results():
     seen = []
-    block = lower_function(lambda x: jnp.exp(x) + 1, ONE)
+    block = lower_function(lambda x: jnp.exp(x) + 1, SCALAR)
     interpret.run_block(
         block, [np.zeros(2, np.float32)], (2,), observe=lambda op, out: seen.append((op.name, float(out[0][0])))
     )
@@ -40,7 +40,7 @@ def test_an_observer_gets_every_operation_with_its_results():
 
 @pytest.fixture(scope="module")
 def step():
-    """Return the program of a built-in step, and leaves with what it reads as one array behind them."""
+    """Return the program of a built-in step, and its leaves, followed by the packed leaf."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
     program = optimise(
         lower_stages(as_stages(sim.step_pipeline), sim.data, watched=lambda data: jax.tree.leaves(data.states))
@@ -61,7 +61,7 @@ def test_vmap_is_a_loop(step):
 
 
 def test_outside_of_a_trace_nothing_is_compiled():
-    """Results equal the callback of a trace, and are on the device of the data."""
+    """Results equal those of a traced call, and are on the device of the data."""
     sim = Sim(n_worlds=2, control="rotor_vel", engine="interpret", device="cpu:1")
     sim.rotor_vel_control(np.full((2, 1, 4), 1.7e4))
     found = sim.step_fn(sim.data, jnp.int32(3))
@@ -76,8 +76,8 @@ def test_outside_of_a_trace_nothing_is_compiled():
 # Leaves --------------------------------------------------------------------------------------------------------------
 
 
-class Own(PyTree):
-    """A random key of each drone's own."""
+class Draws(PyTree):
+    """A random key of each drone, and the last number drawn."""
 
     key: jax.Array = leaf("drone", 0)
     """Key of the next draw. ()"""
@@ -87,24 +87,26 @@ class Own(PyTree):
 
 @stage("drone")
 def draw(data):
-    mine = data.plugins["own"]
-    key, use = jax.random.split(mine.key)
-    new = mine.replace(key=key, drawn=jax.random.uniform(use))
+    record = data.plugins["own"]
+    key, use = jax.random.split(record.key)
+    new = record.replace(key=key, drawn=jax.random.uniform(use))
     return data.replace(plugins=data.plugins | {"own": new})
 
 
-def _kernel(program, leaves, n_steps):
+def run_kernel(program, leaves, n_steps):
     return jax.jit(lambda leaves: fused.build(program, Location("cpu"))(leaves, n_steps))(leaves)
 
 
-@pytest.mark.parametrize("steps", [lanes.run_steps, interpret.run_steps, *([_kernel] if native.compiler() else [])])
-def test_a_stage_may_write_random_keys(steps):
+@pytest.mark.parametrize(
+    "run_steps", [lanes.run_steps, interpret.run_steps, *([run_kernel] if native.compiler() else [])]
+)
+def test_a_stage_may_write_random_keys(run_steps):
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
-    own = Own(jax.random.split(jax.random.key(5), (3, 2)), jnp.zeros((3, 2)))
+    own = Draws(jax.random.split(jax.random.key(5), (3, 2)), jnp.zeros((3, 2)))
     data = sim.data.replace(plugins={"own": own})
     program = optimise(lower_stages([draw], data))
     assert isinstance(program.segments[0], Segment)
-    written, _ = steps(program, jax.tree.leaves(data), 2)
+    written, _ = run_steps(program, jax.tree.leaves(data), 2)
     expected = draw(draw(data)).plugins["own"]
     found = dict(zip((program.leaves[i].name.split(".")[-1] for i in program.written_leaves), written, strict=True))
     assert found["key"].dtype == expected.key.dtype

@@ -1,4 +1,4 @@
-"""Blocks: built once, never changed."""
+"""Blocks and their builder."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Folders of kernels: of this user alone, and without what processes that were killed have left."""
+"""Folders of kernels belong to this user alone, and remains of killed processes are removed from them."""
 
 import os
 import stat
@@ -14,9 +14,9 @@ from crazysim.errors import ConfigError
 from crazysim.storage import untrusted_reason
 from crazysim.utils import enable_cache
 
-OTHERS = 12345
+OTHER_USER = 12345
 """User that the tests do not run as."""
-as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
 
 
 @pytest.fixture
@@ -72,32 +72,32 @@ def test_a_folder_that_others_can_replace_is_refused(cache):
     assert not untrusted_reason(shared)
 
 
-@as_root
+@needs_root
 def test_a_folder_of_another_user_is_refused(cache):
     shared = cache / "crazysim"
     shared.mkdir(mode=0o700)
-    os.chown(shared, OTHERS, OTHERS)
-    with pytest.warns(UserWarning, match=f"belongs to the user {OTHERS}"):
+    os.chown(shared, OTHER_USER, OTHER_USER)
+    with pytest.warns(UserWarning, match=f"belongs to the user {OTHER_USER}"):
         assert kernel_cache.folder() == kernel_cache.temporary_folder()
 
 
-@as_root
+@needs_root
 def test_a_folder_in_one_of_another_user_is_refused(cache):
-    """Who owns a folder can put another one in the place of what is in it."""
+    """The owner of a folder can replace everything in it."""
     shared = kernel_cache.folder()
-    os.chown(cache, OTHERS, OTHERS)
-    assert untrusted_reason(shared) == f"the user {OTHERS} can replace it, who owns {cache}"
+    os.chown(cache, OTHER_USER, OTHER_USER)
+    assert untrusted_reason(shared) == f"the user {OTHER_USER} can replace it, who owns {cache}"
     os.chown(cache, 65534, 65534)  # root, as containers and network file systems show it
     assert not untrusted_reason(shared)
 
 
-@as_root
+@needs_root
 def test_a_file_of_another_user_is_not_loaded(cache):
-    """It may have been put there before the folder was closed."""
+    """It may have been written before the folder became private."""
     folder = kernel_cache.folder()
     library = kernel_cache.store(folder, "key", b"library", ".so")
     assert list(kernel_cache.find(folder, "key")) == [library]
-    os.chown(library, OTHERS, OTHERS)
+    os.chown(library, OTHER_USER, OTHER_USER)
     assert not list(kernel_cache.find(folder, "key"))
     assert library.exists()
 
@@ -118,8 +118,8 @@ def test_a_folder_that_is_asked_for_is_checked_at_once(tmp_path):
 
 
 @pytest.fixture
-def kept(tmp_path):
-    """Function that makes a file or folder of a process, and returns its path."""
+def make_remains(tmp_path):
+    """Return a function that makes a file or folder of a process, and returns its path."""
 
     def make(name, age=0.0):
         path = tmp_path / name
@@ -134,22 +134,22 @@ def kept(tmp_path):
     return make
 
 
-def test_remains_of_killed_processes_are_removed(tmp_path, kept):
+def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
     here, other, gone = kernel_cache.process_name(), "0" * 8, finished_process()
     machine = here.split("-")[0]
     day = 1.01 * kernel_cache.ABANDONMENT_AGE
     remains = [
-        kept(f"key.{machine}-{gone}-140.tmp"),
-        kept(f"crazysim-{machine}-{gone}-abc"),
-        kept(f"key.{other}-{os.getpid()}-1.tmp", day),
-        kept("key.4711.140.tmp", day),  # as 0.1 named them
+        make_remains(f"key.{machine}-{gone}-140.tmp"),
+        make_remains(f"crazysim-{machine}-{gone}-abc"),
+        make_remains(f"key.{other}-{os.getpid()}-1.tmp", day),
+        make_remains("key.4711.140.tmp", day),  # as 0.1 named them
     ]
     needed = [
-        kept(f"key.{here}-140.tmp", day),
-        kept(f"crazysim-{here}-abc", day),
-        kept(f"key.{other}-{gone}-1.tmp"),  # of another machine, which may still need it
-        kept("key.4711.140.tmp2.tmp"),
-        kept("crazysim-mine", day),
+        make_remains(f"key.{here}-140.tmp", day),
+        make_remains(f"crazysim-{here}-abc", day),
+        make_remains(f"key.{other}-{gone}-1.tmp"),  # of another machine, which may still need it
+        make_remains("key.4711.140.tmp2.tmp"),
+        make_remains("crazysim-mine", day),
     ]
     for pattern in ("*.tmp", "crazysim-*"):
         kernel_cache.sweep(tmp_path, pattern)
@@ -158,7 +158,7 @@ def test_remains_of_killed_processes_are_removed(tmp_path, kept):
 
 
 def test_no_process_is_asked_for_on_windows(monkeypatch):
-    """There the call that asks on POSIX systems sends Ctrl+C."""
+    """On Windows, the call that tests for a process on POSIX systems would send Ctrl+C."""
     name = f"key.{kernel_cache.process_name()}-140.tmp"
     with monkeypatch.context() as faked:
         faked.setattr(kernel_cache.os, "kill", None)
@@ -167,10 +167,10 @@ def test_no_process_is_asked_for_on_windows(monkeypatch):
     assert found == [False, True]
 
 
-def test_the_folders_are_swept_at_the_next_start(cache, kept):
+def test_the_folders_are_swept_at_the_next_start(cache, make_remains):
     (cache / "crazysim").mkdir(mode=0o700)
     machine = kernel_cache.process_name().split("-")[0]
-    remains = kept(f"crazysim/key.{machine}-{finished_process()}-1.tmp")
+    remains = make_remains(f"crazysim/key.{machine}-{finished_process()}-1.tmp")
     assert kernel_cache.folder() == cache / "crazysim"
     assert not remains.exists()
 

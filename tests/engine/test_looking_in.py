@@ -1,4 +1,4 @@
-"""Looking into the engine: listings, dumps, source, and the first place at which two engines differ."""
+"""Tools to inspect the engine: listings, dumps, source, and the first difference between two engines."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Compiled host kernels: found again where they fit, and only there."""
+"""Compiled host kernels are reused on machines that they fit, and only there."""
 
 import ctypes
 import errno
@@ -28,15 +28,15 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
 
 @pytest.fixture(scope="module")
 def source():
-    """The source of a kernel that compiles fast: the clock alone."""
+    """Return the source of a kernel that compiles fast: only the count of steps."""
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
     clock = {"increment_steps": sim.step_pipeline["increment_steps"]}
     return kernel.write(Step(clock, "lanes").plan(sim.data).program, "host")
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch):
-    """An empty cache folder, and nothing loaded from an earlier one."""
+def cache_folder(tmp_path, monkeypatch):
+    """Return an empty folder of kernels, with no kernel loaded."""
     monkeypatch.setattr(kernel_cache, "folder", lambda: tmp_path)
     monkeypatch.setattr(native, "_LIBRARIES", {})
     monkeypatch.setattr("crazysim.jaxcompat.register_target", lambda name, function, platform: None)
@@ -47,21 +47,21 @@ def place(tmp_path, monkeypatch):
 
 @pytest.fixture
 def compilations(tmp_path_factory, monkeypatch):
-    """A function that returns the number of kernels that were compiled, by a compiler that notes each."""
+    """Return a function that returns the number of compiled kernels, which a fake compiler counts."""
     folder = tmp_path_factory.mktemp("bin")
-    fake_compiler(folder, monkeypatch)
+    install_fake_compiler(folder, monkeypatch)
     return lambda: len((folder / "compiled").read_text()) if (folder / "compiled").exists() else 0
 
 
-def again(source):
-    """Return the kernel's name in a process that has loaded nothing yet."""
+def register_anew(source):
+    """Return the name of a kernel, registered as in a new process that has loaded no kernel."""
     native._LIBRARIES.clear()
     native.toolchain.cache_clear()
     return native.register_kernel(source)
 
 
-def fake_compiler(folder, monkeypatch, version="1.0", march="znver3"):
-    """Put a script in place of the compiler that says which machine it compiles for, and notes each kernel."""
+def install_fake_compiler(folder, monkeypatch, version="1.0", march="znver3"):
+    """Replace the compiler by a script that prints a version and a machine, and counts the kernels it compiles."""
     script = folder / "c++"
     script.write_text(
         f'#!/bin/sh\ncase "$*" in *"-###"*) echo "gcc version {version} -march={march}" >&2; exit 0;;\n'
@@ -71,57 +71,57 @@ def fake_compiler(folder, monkeypatch, version="1.0", march="znver3"):
     monkeypatch.setattr(native, "compiler", lambda: str(script))
 
 
-def test_a_kernel_is_compiled_once_for_all_processes(source, place, compilations):
+def test_a_kernel_is_compiled_once_for_all_processes(source, cache_folder, compilations):
     name = native.register_kernel(source)
-    assert again(source) == name
+    assert register_anew(source) == name
     assert compilations() == 1
-    (library,) = place.iterdir()
+    (library,) = cache_folder.iterdir()
     assert library.name.startswith(name.removeprefix("crazysim_advance_"))
 
 
-def test_the_key_holds_machine_compiler_and_versions(source, place, compilations, monkeypatch):
-    """What ``-march=native`` stands for, the CPU's features, version and options of the compiler, JAX, this package."""
+def test_the_key_holds_machine_compiler_and_versions(source, cache_folder, compilations, monkeypatch):
+    """It changes with the instruction set, features of the CPU, compiler and its options, JAX, and this package."""
     folder = Path(native.compiler()).parent
-    names = [again(source)]
+    names = [register_anew(source)]
 
-    def changed(why):
-        names.append(again(source))
-        assert len(set(names)) == len(names), why
-        assert compilations() == len(names), why
+    def assert_new_name(reason):
+        names.append(register_anew(source))
+        assert len(set(names)) == len(names), reason
+        assert compilations() == len(names), reason
 
-    fake_compiler(folder, monkeypatch, march="skylake")
-    changed("another instruction set")
-    fake_compiler(folder, monkeypatch, version="2.0")
-    changed("another version of the compiler")
-    fake_compiler(folder, monkeypatch)
+    install_fake_compiler(folder, monkeypatch, march="skylake")
+    assert_new_name("another instruction set")
+    install_fake_compiler(folder, monkeypatch, version="2.0")
+    assert_new_name("another version of the compiler")
+    install_fake_compiler(folder, monkeypatch)
     info = folder / "cpuinfo"
     info.write_text("processor\t: 0\nflags\t\t: fpu sse2 avx512f\n")
     monkeypatch.setattr("crazysim.cache.CPU_INFO", info)
-    changed("another CPU")
+    assert_new_name("another CPU")
     info.write_text("processor\t: 0\nflags\t\t: fpu sse2\n")
-    changed("a CPU with fewer features")
+    assert_new_name("a CPU with fewer features")
     info.write_text("processor\t: 0\nFeatures\t: fp asimd\n")
-    changed("an ARM CPU")
+    assert_new_name("an ARM CPU")
     monkeypatch.setenv("CXXFLAGS", "-O1 -DOTHER")
-    changed("other options")
+    assert_new_name("other options")
     monkeypatch.setattr(native, "__version__", "99.0")
-    changed("another version of this package")
+    assert_new_name("another version of this package")
     monkeypatch.setattr("crazysim.jaxcompat.versions", lambda: "99.0")
-    changed("another JAX")
+    assert_new_name("another JAX")
     monkeypatch.setattr(native.platform, "libc_ver", lambda: ("glibc", "9.9"))
-    changed("another C library")
+    assert_new_name("another C library")
 
 
 def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
-    source, place, monkeypatch, tmp_path_factory
+    source, cache_folder, monkeypatch, tmp_path_factory
 ):
-    """The image has a kernel of each machine; the other machine's may have instructions that this CPU lacks."""
+    """A kernel of the other machine may have instructions that this CPU lacks."""
     folder = tmp_path_factory.mktemp("elsewhere")
     (folder / "cpuinfo").write_text("flags : fpu sse2 avx2 avx512f amx_tile\n")
     with monkeypatch.context() as elsewhere:
         elsewhere.setattr("crazysim.cache.CPU_INFO", folder / "cpuinfo")
-        key = again(source).removeprefix("crazysim_advance_")
-    (library,) = place.iterdir()
+        key = register_anew(source).removeprefix("crazysim_advance_")
+    (library,) = cache_folder.iterdir()
     library.unlink()
     (folder / "other.c").write_text("void crazysim_advance() { __builtin_trap(); } int crazysim_call() { return -1; }")
     other = [
@@ -135,10 +135,10 @@ def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
         str(folder / "other.so"),
     ]
     subprocess.run(other, check=True)
-    kernel_cache.store(place, key, (folder / "other.so").read_bytes(), ".so")
+    kernel_cache.store(cache_folder, key, (folder / "other.so").read_bytes(), ".so")
 
-    assert again(source) != f"crazysim_advance_{key}"
-    assert len(list(place.iterdir())) == 2
+    assert register_anew(source) != f"crazysim_advance_{key}"
+    assert len(list(cache_folder.iterdir())) == 2
     zeros, steps, flags = np.zeros(64), np.zeros(2, np.int32), np.zeros(2, bool)
     inputs = [zeros.ctypes.data] * len(source.inputs)
     addresses = (ctypes.c_void_p * (len(inputs) + 2))(*inputs, steps.ctypes.data, flags.ctypes.data)
@@ -147,49 +147,49 @@ def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
 
 
 @pytest.mark.parametrize("damage", [lambda raw: raw[: len(raw) // 2], lambda raw: b"", lambda raw: raw[:-8] + b"x" * 8])
-def test_a_damaged_file_is_compiled_again(source, place, compilations, damage):
-    """Loading half of a library can end the process, so it is found out before."""
+def test_a_damaged_file_is_compiled_again(source, cache_folder, compilations, damage):
+    """Loading half of a library could end the process, so files are checked first."""
     native.register_kernel(source)
-    (library,) = place.iterdir()
+    (library,) = cache_folder.iterdir()
     raw = library.read_bytes()
     library.unlink()  # it is loaded: its memory must stay as it is
     library.write_bytes(damage(raw))
-    again(source)
+    register_anew(source)
     assert compilations() == 2
-    assert [native._load_library(path) is not None for path in place.iterdir()] == [True]
+    assert [native._load_library(path) is not None for path in cache_folder.iterdir()] == [True]
 
 
-def test_a_library_that_does_not_load_here_is_compiled_again(source, place, compilations):
-    """Such as one that another machine wrote, which stays for it."""
+def test_a_library_that_does_not_load_here_is_compiled_again(source, cache_folder, compilations):
+    """The file may belong to another machine, so it is not removed."""
     key = native.register_kernel(source).removeprefix("crazysim_advance_")
-    (library,) = place.iterdir()
+    (library,) = cache_folder.iterdir()
     library.unlink()
-    foreign = kernel_cache.store(place, key, b"\x7fELF of another machine", ".so")
-    again(source)
+    foreign = kernel_cache.store(cache_folder, key, b"\x7fELF of another machine", ".so")
+    register_anew(source)
     assert compilations() == 2
     assert foreign.exists()
-    again(source)
+    register_anew(source)
     assert compilations() == 2
 
 
-def test_a_folder_that_forbids_execution_does_no_harm(source, place, compilations, monkeypatch):
+def test_a_folder_that_forbids_execution_does_no_harm(source, cache_folder, compilations, monkeypatch):
     real = native._load_library
-    monkeypatch.setattr(native, "_load_library", lambda path: None if path.is_relative_to(place) else real(path))
+    monkeypatch.setattr(native, "_load_library", lambda path: None if path.is_relative_to(cache_folder) else real(path))
     native.register_kernel(source)
     assert compilations() == 1
 
 
-def test_a_kernel_that_cannot_be_written_says_so(source, place, compilations, monkeypatch):
-    def full(*args):
+def test_a_kernel_that_cannot_be_written_says_so(source, cache_folder, compilations, monkeypatch):
+    def raise_no_space(*args):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(kernel_cache, "store", full)
+    monkeypatch.setattr(kernel_cache, "store", raise_no_space)
     with pytest.raises(KernelError, match=r"cannot be written: .*No space left on device; make room, or set TMPDIR"):
         native.register_kernel(source)
 
 
-def test_a_file_of_the_key_without_a_kernel_is_not_used(place, monkeypatch):
-    path = place / "empty.so"
+def test_a_file_of_the_key_without_a_kernel_is_not_used(cache_folder, monkeypatch):
+    path = cache_folder / "empty.so"
     done = subprocess.run(
         [native.compiler(), "-shared", "-x", "c++", "-", "-o", str(path)], input="int x;", text=True, check=False
     )
@@ -198,23 +198,23 @@ def test_a_file_of_the_key_without_a_kernel_is_not_used(place, monkeypatch):
     assert native._load_library(path) is None
 
 
-def test_nothing_partial_is_ever_seen(source, place, monkeypatch, tmp_path_factory):
+def test_nothing_partial_is_ever_seen(source, cache_folder, monkeypatch, tmp_path_factory):
     """The name of a library appears when it is complete, and a compiler that fails leaves nothing behind."""
     listed = []
 
     def replace(self, target, real=Path.replace):
-        listed.append([p.suffix for p in place.iterdir()])
+        listed.append([p.suffix for p in cache_folder.iterdir()])
         return real(self, target)
 
     monkeypatch.setattr(Path, "replace", replace)
     native.register_kernel(source)
     assert listed == [[".tmp"]]
-    assert [p.suffix for p in place.iterdir()] == [".so"]
+    assert [p.suffix for p in cache_folder.iterdir()] == [".so"]
 
     monkeypatch.setenv("CXXFLAGS", "-std=c++98")
     with pytest.raises(KernelError, match="refused the kernel"):
-        again(source)
-    assert [p.suffix for p in place.iterdir()] == [".so"]
+        register_anew(source)
+    assert [p.suffix for p in cache_folder.iterdir()] == [".so"]
     assert not any(p.is_dir() for p in kernel_cache.temporary_folder().iterdir())
 
 
@@ -253,8 +253,8 @@ def test_boundaries_between_the_parts_of_a_key_count():
         ("CRAZYSIM_COMPILE_TIMEOUT", "inf", "CRAZYSIM_COMPILE_TIMEOUT, got 'inf'"),
     ],
 )
-def test_wrong_settings_of_the_compiler_are_errors_that_name_them(place, monkeypatch, variable, value, message):
-    """With the default engine, which otherwise takes a slower one where the fastest is missing."""
+def test_wrong_settings_of_the_compiler_are_errors_that_name_them(cache_folder, monkeypatch, variable, value, message):
+    """They are errors even with the default engine, which otherwise falls back to a slower one."""
     native.compiler.cache_clear()
     monkeypatch.setenv(variable, value)
     try:
@@ -265,24 +265,24 @@ def test_wrong_settings_of_the_compiler_are_errors_that_name_them(place, monkeyp
 
 
 def test_a_kernel_that_would_take_longer_than_the_limit_is_refused_by_its_size(
-    source, place, compilations, monkeypatch
+    source, cache_folder, compilations, monkeypatch
 ):
     native.toolchain(tuple(native.compiler_command()))
     monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "0.001")
     with pytest.raises(KernelError, match=r"a kernel of [\d,]+ lines takes .* longer than 0.001 s; use loops"):
         native.register_kernel(source)
-    assert not list(place.iterdir())
+    assert not list(cache_folder.iterdir())
     assert compilations() == 0
 
 
-def test_lines_that_select_count_for_more(place, monkeypatch):
-    """They take the compiler longer, so fewer of them are refused before it is begun."""
+def test_lines_that_select_count_for_more(cache_folder, monkeypatch):
+    """They take longer to compile, so a kernel with fewer of them is already refused."""
 
-    def begin(*args):
+    def start_compiler(*args):
         raise LookupError
 
     monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "1")
-    monkeypatch.setattr(native, "_run_compiler", begin)
+    monkeypatch.setattr(native, "_run_compiler", start_compiler)
     for line, n_lines, error in (
         ("x = mul_(a, b);", 9_999, LookupError),
         ("x = max_(a, b);", 4_000, LookupError),
@@ -293,7 +293,7 @@ def test_lines_that_select_count_for_more(place, monkeypatch):
             native._compile(["g++"], f"{line}\n" * n_lines)
 
 
-def test_a_compiler_is_a_command_with_options(source, place, monkeypatch):
+def test_a_compiler_is_a_command_with_options(source, cache_folder, monkeypatch):
     native.compiler.cache_clear()
     monkeypatch.setenv("CXX", "g++ -DOTHER")
     try:
@@ -303,8 +303,8 @@ def test_a_compiler_is_a_command_with_options(source, place, monkeypatch):
         native.compiler.cache_clear()
 
 
-def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, place, monkeypatch, tmp_path_factory):
-    """Without its libraries, in one second rather than twenty; the key does not hold the working directory."""
+def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, cache_folder, monkeypatch, tmp_path_factory):
+    """It compiles without its libraries, in one second instead of 20. The key ignores the working directory."""
     pytest.importorskip("ziglang")
     monkeypatch.setenv("CXXFLAGS", "")  # the tests have options of g++
     which = shutil.which
@@ -315,8 +315,8 @@ def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, place
         assert Path(native.compiler_command()[0]).name.startswith("zig")
         name = native.register_kernel(source)
         monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
-        assert again(source) == name
-        assert len(list(place.iterdir())) == 1
+        assert register_anew(source) == name
+        assert len(list(cache_folder.iterdir())) == 1
         assert not any(p.is_dir() for p in kernel_cache.temporary_folder().iterdir()), "zig keeps nothing"
     finally:
         native.compiler.cache_clear()
@@ -326,9 +326,9 @@ def test_without_any_compiler_one_line_names_the_remedy(monkeypatch, capsys):
     monkeypatch.setattr(native, "compiler", lambda: None)
     fused._announce_missing_compiler.cache_clear()
     assert fused.unavailable_reason("cpu") == fused.unavailable_reason("cpu") == native.MISSING_COMPILER
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert "pip install 'crazysim[compiler]'" in told
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "pip install 'crazysim[compiler]'" in message
 
 
 COMPILE = """
@@ -351,9 +351,13 @@ else:
 
 def compile_in_another_process(folder, speed):
     """Start a process that compiles a kernel into a folder."""
-    place = folder / "cache"
-    environment = os.environ | {"JAX_PLATFORMS": "cpu", "TMPDIR": str(folder), "JAX_COMPILATION_CACHE_DIR": str(place)}
-    place.mkdir(exist_ok=True)
+    cache_folder = folder / "cache"
+    environment = os.environ | {
+        "JAX_PLATFORMS": "cpu",
+        "TMPDIR": str(folder),
+        "JAX_COMPILATION_CACHE_DIR": str(cache_folder),
+    }
+    cache_folder.mkdir(exist_ok=True)
     return subprocess.Popen([sys.executable, "-c", COMPILE, speed], env=environment, stderr=subprocess.DEVNULL)
 
 
@@ -397,9 +401,9 @@ print(repr(float(sim.data.states.rotor_vel[0, 0, 2])))
 
 
 def test_two_machines_share_a_home(tmp_path):
-    """JAX's own cache keeps programs that call kernels by name: one of another machine is never called.
+    """JAX's own cache has programs that call kernels by name; a kernel of another machine must never be called.
 
-    The second process finds another CPU (its key differs) in the same folder, the third one the first's again.
+    The second process runs on another CPU, so its key differs; the third uses the kernel of the first again.
     """
     other = tmp_path / "cpuinfo"
     other.write_text("flags : none of the first machine's\n")
@@ -421,7 +425,7 @@ def test_two_machines_share_a_home(tmp_path):
 
 
 def test_a_kernel_takes_any_number_of_lanes(source):
-    """The call itself: one launch for each number, one library."""
+    """One library serves all numbers of lanes."""
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
     step = Step(sim.step_pipeline, "fused")
     for n_worlds in (1, 5):

@@ -1,4 +1,4 @@
-"""Passes: what a program computes stays, what it takes becomes less. Programs are well formed after each."""
+"""Passes: programs compute the same numbers with less work, and are well formed after each pass."""
 
 import dataclasses
 
@@ -22,8 +22,8 @@ N_WORLDS = 5
 F32 = np.float32
 
 
-def flat(program, leaves):
-    """Return the numbers of one-drone worlds by place. (N_WORLDS,) or ()"""
+def numbers_by_slot(program, leaves):
+    """Return the numbers of worlds with one drone, by slot. (N_WORLDS,) or ()"""
     numbers = {}
     for i, x in enumerate(leaves):
         leaf, x = program.leaves[i], np.asarray(jax.random.key_data(x) if is_key(x) else x)
@@ -32,7 +32,7 @@ def flat(program, leaves):
     return numbers
 
 
-def run(program, numbers, n_steps):
+def run_program(program, numbers, n_steps):
     """Return all numbers after some steps, by the interpreter alone."""
     numbers = dict(numbers)
     shape = (N_WORLDS,)
@@ -50,12 +50,12 @@ def run(program, numbers, n_steps):
 
 @pytest.fixture(scope="module", params=["attitude", "state"])
 def pipeline(request):
-    """Return the program of a built-in pipeline before any pass, and numbers to begin with."""
+    """Return the program of a built-in pipeline before any pass, and initial numbers."""
     settings = {"state_freq": 100} if request.param == "state" else {}
     sim = shared_sim(n_worlds=N_WORLDS, n_drones=1, control=request.param, **settings)
     program = lower_stages(as_stages(sim.step_pipeline), sim.data)
     rng = np.random.default_rng(0)
-    numbers = flat(program, jax.tree.leaves(sim.data))
+    numbers = numbers_by_slot(program, jax.tree.leaves(sim.data))
     for slot, x in numbers.items():
         if program.leaves[slot[0]].scope == "drone" and x.dtype == np.float32:
             numbers[slot] = (x + 0.3 * rng.normal(size=x.shape)).astype(np.float32)
@@ -63,20 +63,20 @@ def pipeline(request):
 
 
 def test_fusing_changes_no_number(pipeline):
-    """Bit by bit: the same operations in the same order."""
+    """Results are equal to the bit, from the same operations in the same order."""
     program, numbers = pipeline
     fused = verify(schedule.fuse(program))
     assert len(fused.segments) == 1 < len(program.segments)
     assert fused.segments[0].stages == tuple(s.stages[0] for s in program.segments)
     assert fused.segments[0].n_operations <= sum(s.n_operations for s in program.segments)
     assert {op.stage for op in fused.segments[0].block.walk()} <= {*fused.segments[0].stages}
-    expected, found = run(program, numbers, 3), run(fused, numbers, 3)
+    expected, found = run_program(program, numbers, 3), run_program(fused, numbers, 3)
     for slot, x in expected.items():
         np.testing.assert_array_equal(found[slot], x, err_msg=str(slot))
 
 
 def test_hoisting_takes_work_out_of_the_loop(pipeline):
-    """Equal to the rounding of a product with an inverse instead of a division."""
+    """Results are equal up to the rounding of a product with an inverse instead of a division."""
     program, numbers = pipeline
     fused = schedule.fuse(program)
     hoisted = verify(schedule.hoist(fused))
@@ -85,7 +85,7 @@ def test_hoisting_takes_work_out_of_the_loop(pipeline):
     assert after.n_operations < before.n_operations
     assert {"cos", "sin", "div"} & {op.name for op in after.hoisted.operations}
     assert hoisted.changing_slots().isdisjoint(after.hoisted_reads)
-    expected, found = run(fused, numbers, 3), run(hoisted, numbers, 3)
+    expected, found = run_program(fused, numbers, 3), run_program(hoisted, numbers, 3)
     for slot, x in expected.items():
         np.testing.assert_allclose(found[slot], x, rtol=2e-4, atol=2e-5, err_msg=str(slot))
 
@@ -101,7 +101,7 @@ def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
     assert [name for name in names if name != "barrier"] == [
         op.name for op in before.block.operations if op.name != "barrier"
     ]
-    expected, found = run(fused, numbers, 3), run(separated, numbers, 3)
+    expected, found = run_program(fused, numbers, 3), run_program(separated, numbers, 3)
     for slot, x in expected.items():
         np.testing.assert_array_equal(found[slot], x, err_msg=str(slot))
 
@@ -115,17 +115,17 @@ LEAVES = tuple(Leaf(name, "drone", (N_WORLDS, 1), np.dtype(np.float32)) for name
 
 
 def segment(name, reads, writes, fn, scope="drone", phase="each"):
-    """Return a segment of a function of a builder and values."""
+    """Return a segment that computes a function of a builder and values."""
     b = Builder(stage=name)
     inputs = [b.input(LEAVES[leaf].dtype) for leaf, _ in reads]
     return Segment(scope, (name,), phase, b.finish(fn(b, *inputs)), tuple(reads), tuple(writes))
 
 
-def op(name):
+def apply_fn(name):
     return lambda b, *args: [b.add(name, args, np.float32)]
 
 
-def guarded(name, reads, write, fn):
+def guarded_segment(name, reads, write, fn):
     """Return a segment that writes a number where x is positive."""
     b = Builder(stage=name)
     x, old, *rest = [b.input(np.float32) for _ in [X, write, *reads]]
@@ -138,36 +138,40 @@ def guarded(name, reads, write, fn):
 
 @pytest.mark.parametrize("last", [Y, Z])
 def test_stages_of_the_same_ticks_are_joined(last):
-    """The second reads what the first wrote, and may write it again; the numbers where nothing ticks stay."""
-    half = guarded("half", [SHARED], Y, lambda b, x: b.add("mul", (x, np.float32(0.5)), np.float32))
-    sine = guarded("sine", [Y, SHARED], last, lambda b, y, x: b.add("add", (b.add("sin", (y,), F32), x), F32))
+    """The second stage reads a number that the first writes, and may write it too. Other worlds do not change."""
+    half = guarded_segment("half", [SHARED], Y, lambda b, x: b.add("mul", (x, np.float32(0.5)), np.float32))
+    sine = guarded_segment("sine", [Y, SHARED], last, lambda b, y, x: b.add("add", (b.add("sin", (y,), F32), x), F32))
     fused = schedule.fuse(Program(LEAVES, 1, (half, sine)))
     joined = verify(schedule.join_ticks(fused))
     assert [op.name for op in fused.segments[0].block.operations].count("when") == 2
     assert [op.name for op in joined.segments[0].block.operations].count("when") == 1
     x = np.array([-1, 1, 0, 2, -3], np.float32)
     numbers = {X: x, Y: x + 10, Z: x + 20, SHARED: np.float32(3)}
-    expected, found = run(fused, numbers, 2), run(joined, numbers, 2)
+    expected, found = run_program(fused, numbers, 2), run_program(joined, numbers, 2)
     assert all((found[slot] == expected[slot]).all() for slot in (X, Y, Z))
     assert (found[last] == np.where(x > 0, np.sin(np.float32(1.5)) + np.float32(3), numbers[last])).all()
 
 
 def test_stages_of_other_ticks_are_not_joined():
-    first = guarded("first", [], Y, lambda b: np.float32(1))
-    between = segment("between", [Y], [X], op("neg"))
-    second = guarded("second", [Y], Z, lambda b, y: b.add("sin", (y,), F32))
+    first = guarded_segment("first", [], Y, lambda b: np.float32(1))
+    between = segment("between", [Y], [X], apply_fn("neg"))
+    second = guarded_segment("second", [Y], Z, lambda b, y: b.add("sin", (y,), F32))
     joined = schedule.join_ticks(schedule.fuse(Program(LEAVES, 1, (first, between, second))))
     assert [op.name for op in joined.segments[0].block.operations].count("when") == 2
 
 
 def test_phases_and_scopes_are_not_joined():
-    stages = [segment("a", [X], [Y], op("exp"), phase="before"), segment("b", [Y], [Z], op("neg")),
-              segment("c", [Z], [X], op("exp"), scope="world"), segment("d", [X], [Y], op("exp"))]  # fmt: skip
+    stages = [
+        segment("a", [X], [Y], apply_fn("exp"), phase="before"),
+        segment("b", [Y], [Z], apply_fn("neg")),
+        segment("c", [Z], [X], apply_fn("exp"), scope="world"),
+        segment("d", [X], [Y], apply_fn("exp")),
+    ]
     assert len(schedule.fuse(Program(LEAVES, 1, tuple(stages))).segments) == 4
 
 
 def test_the_inverse_of_a_number_is_computed_once():
-    """Of zeros there are two, with inverses of their own."""
+    """Zeros of different sign have different inverses."""
 
     def body(b, x, shared):
         quotients = [b.add("div", (x, y), np.float32) for y in (shared, np.float32(0.0), np.float32(-0.0))]
@@ -179,59 +183,65 @@ def test_the_inverse_of_a_number_is_computed_once():
     assert [x.name for x in after.hoisted.operations] == ["div"]
     assert [x.name for x in after.block.operations] == ["mul"] * 4
     numbers = {X: np.full(N_WORLDS, 3.0, np.float32), SHARED: np.float32(2.0)}
-    found = run(schedule.hoist(program), numbers, 1)
+    found = run_program(schedule.hoist(program), numbers, 1)
     assert [found[slot][0] for slot in (X, Y, Z)] == [0.75, np.inf, -np.inf]
 
 
 # Verification -------------------------------------------------------------------------------------------------------
 
 
-def broken(**changes):
-    good = segment("a", [X], [Y], op("exp"))
+def broken_program(**changes):
+    good = segment("a", [X], [Y], apply_fn("exp"))
     return Program(LEAVES, 1, (dataclasses.replace(good, **changes),))
 
 
-def with_block(fn):
+def program_with_operations(fn):
     b = Builder(stage="a")
     x = b.input(np.float32)
-    return broken(block=dataclasses.replace(b.finish([x]), operations=tuple(fn(x)), outputs=(x,)))
+    return broken_program(block=dataclasses.replace(b.finish([x]), operations=tuple(fn(x)), outputs=(x,)))
 
 
-def value(dtype=np.float32):
+def new_value(dtype=np.float32):
     return Value(np.dtype(dtype))
 
 
-WELL_FORMED = segment("a", [X], [Y], op("exp"))
+WELL_FORMED = segment("a", [X], [Y], apply_fn("exp"))
 BROKEN = {
     "used before it is defined": (
-        broken(block=dataclasses.replace(WELL_FORMED.block, outputs=(value(),))),
+        broken_program(block=dataclasses.replace(WELL_FORMED.block, outputs=(new_value(),))),
         "before it is defined",
     ),
     "operand of another block": (
-        with_block(lambda x: [Operation("exp", (value(),), (value(),))]),
+        program_with_operations(lambda x: [Operation("exp", (new_value(),), (new_value(),))]),
         "'exp' uses a value",
     ),
     "defined twice": (
-        with_block(lambda x: [Operation("exp", (x,), (y := value(),)), Operation("neg", (x,), (y,))]),
+        program_with_operations(lambda x: [Operation("exp", (x,), (y := new_value(),)), Operation("neg", (x,), (y,))]),
         "defined twice",
     ),
     "mixed operands": (
-        with_block(lambda x: [Operation("add", (x, np.int32(1)), (value(),))]),
+        program_with_operations(lambda x: [Operation("add", (x, np.int32(1)), (new_value(),))]),
         "'add' of float32, int32",
     ),
-    "result type": (with_block(lambda x: [Operation("lt", (x, x), (value(),))]), "'lt' of float32, float32 to float32"),
-    "float logic": (with_block(lambda x: [Operation("not", (x,), (value(),))]), "'not' of float32"),
-    "unknown operation": (with_block(lambda x: [Operation("fft", (x,), (value(),))]), "'fft' is not in the table"),
+    "result type": (
+        program_with_operations(lambda x: [Operation("lt", (x, x), (new_value(),))]),
+        "'lt' of float32, float32 to float32",
+    ),
+    "float logic": (program_with_operations(lambda x: [Operation("not", (x,), (new_value(),))]), "'not' of float32"),
+    "unknown operation": (
+        program_with_operations(lambda x: [Operation("fft", (x,), (new_value(),))]),
+        "'fft' is not in the table",
+    ),
     "half precision": (
-        with_block(lambda x: [Operation("neg", (np.float16(1),), (value(np.float16),))]),
+        program_with_operations(lambda x: [Operation("neg", (np.float16(1),), (new_value(np.float16),))]),
         "type that the engine",
     ),
-    "too few inputs": (broken(reads=()), "1 further inputs for 0 hoisted"),
-    "too many outputs": (broken(writes=(Y, Z)), "1 outputs for 2 slots"),
-    "slot read twice": (broken(reads=(X, X)), "1 inputs for 2 slots"),
-    "slot out of range": (broken(writes=((1, 1),)), "output 1 of y, which has 1 numbers"),
+    "too few inputs": (broken_program(reads=()), "1 further inputs for 0 hoisted"),
+    "too many outputs": (broken_program(writes=(Y, Z)), "1 outputs for 2 slots"),
+    "slot read twice": (broken_program(reads=(X, X)), "1 inputs for 2 slots"),
+    "slot out of range": (broken_program(writes=((1, 1),)), "output 1 of y, which has 1 numbers"),
     "hoisted number changes": (
-        broken(writes=(X,), hoisted_reads=(X,), hoisted=WELL_FORMED.block),
+        broken_program(writes=(X,), hoisted_reads=(X,), hoisted=WELL_FORMED.block),
         "further inputs for 1 hoisted",
     ),
 }
@@ -245,7 +255,10 @@ def test_verification_finds(what):
 
 
 def test_verification_finds_phases_out_of_order():
-    late, early = segment("a", [X], [Y], op("exp"), phase="after"), segment("b", [X], [Y], op("exp"))
+    late, early = (
+        segment("a", [X], [Y], apply_fn("exp"), phase="after"),
+        segment("b", [X], [Y], apply_fn("exp")),
+    )
     with pytest.raises(VerificationError, match="order of their phases"):
         verify(Program(LEAVES, 1, (late, early)))
 
@@ -253,7 +266,7 @@ def test_verification_finds_phases_out_of_order():
 def test_every_pass_is_verified_if_that_is_asked_for(monkeypatch):
     monkeypatch.setenv("CRAZYSIM_VERIFY", "1")
     with pytest.raises(VerificationError):
-        apply_passes(Program(LEAVES, 1, (WELL_FORMED,)), [lambda program: broken(writes=(Y, Z))])
+        apply_passes(Program(LEAVES, 1, (WELL_FORMED,)), [lambda program: broken_program(writes=(Y, Z))])
 
 
 # Stages to programs -------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The plain engine: loops over the pipeline, carries what is written, refuses what a step cannot keep."""
+"""The plain engine loops over the pipeline, carries written leaves, and refuses stages that change the structure."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def step(sim):
 
 
 def test_steps_at_once_are_steps_one_by_one(data, step):
-    """Bit by bit: the loop runs the same program, however often it is entered."""
+    """Results are equal to the bit, since the loop runs the same program."""
     one_by_one = data
     for _ in range(7):
         one_by_one = step(one_by_one, jnp.int32(1))
@@ -34,7 +34,7 @@ def test_steps_at_once_are_steps_one_by_one(data, step):
 
 
 def test_a_static_number_of_steps_gives_what_a_dynamic_one_gives(data, step):
-    """Two programs of the same arithmetic: float32 rounding of what a scan and a loop fuse differently."""
+    """The results differ by float32 rounding, since XLA fuses a scan and a loop differently."""
     static, dynamic = step(data, 7), step(data, jnp.int32(7))
     for name in ("pos", "quat", "vel", "ang_vel"):
         np.testing.assert_allclose(getattr(static.states, name), getattr(dynamic.states, name), rtol=1e-5, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Planning a step: everything an engine can refuse is refused there, said once, and never hides a bug."""
+"""Planning a step: everything that an engine does not support is reported then, once, and bugs are not hidden."""
 
 import dataclasses
 import re
@@ -24,7 +24,7 @@ from crazysim.pytree import PyTree, leaf
 
 @stage("drone")
 def sway(data):
-    """Push with the sine of the position: the one use of ``sin`` in a pipeline under rotor commands."""
+    """Push with the sine of the position; no other stage of a pipeline for rotor commands uses ``sin``."""
     return data.replace(states=data.states.replace(force=1e-3 * jnp.sin(data.states.pos)))
 
 
@@ -39,14 +39,14 @@ def sim():
     return shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
 
 
-def pipeline(sim, *stages):
+def make_pipeline(sim, *stages):
     return {s.__name__: s for s in stages} | dict(sim.step_pipeline)
 
 
 def assert_steps_like_plain(sim, step, stages):
-    """Assert that a step that fell back computes what ``plain`` does."""
+    """Assert that a step that fell back to a slower engine computes the same as ``plain``."""
     data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + 1.0))
-    found, expected = step(data, jnp.int32(3)), Step(pipeline(sim, *stages), "plain")(data, jnp.int32(3))
+    found, expected = step(data, jnp.int32(3)), Step(make_pipeline(sim, *stages), "plain")(data, jnp.int32(3))
     for name in ("pos", "vel", "force", "torque"):
         np.testing.assert_allclose(getattr(found.states, name), getattr(expected.states, name), rtol=1e-5, atol=1e-7)
     assert float(jnp.abs(found.states.force).max()) > 1e-4
@@ -54,7 +54,7 @@ def assert_steps_like_plain(sim, step, stages):
 
 def test_a_stage_without_a_rule_is_named_in_one_warning(sim, monkeypatch):
     monkeypatch.delitem(RULES, "sin")
-    step = Step(pipeline(sim, sway, roll))
+    step = Step(make_pipeline(sim, sway, roll))
     with pytest.warns(EngineWarning) as caught:
         plan = step.plan(sim.data)
     assert len(caught) == 1
@@ -72,7 +72,7 @@ def test_a_stage_without_a_rule_is_named_in_one_warning(sim, monkeypatch):
 ])  # fmt: skip
 def test_a_parameter_that_jax_renamed_is_unsupported_and_a_wrong_rule_is_a_bug(sim, monkeypatch, rule, words):
     monkeypatch.setitem(RULES, "sin", rule)
-    step = Step(pipeline(sim, sway))
+    step = Step(make_pipeline(sim, sway))
     with pytest.warns(EngineWarning, match=words or "This is a bug of crazysim") as caught:
         plan = step.plan(sim.data)
     assert "stage 'sway'" in str(caught[0].message)
@@ -83,7 +83,7 @@ def test_a_parameter_that_jax_renamed_is_unsupported_and_a_wrong_rule_is_a_bug(s
 def test_strict_raises_what_is_not_supported(sim, monkeypatch):
     monkeypatch.delitem(RULES, "sin")
     with pytest.raises(ConfigError, match=r"stage 'sway' is not fused: .*'sin'"):
-        Step(pipeline(sim, sway), strict=True).plan(sim.data)
+        Step(make_pipeline(sim, sway), strict=True).plan(sim.data)
     strict = Sim(control="rotor_vel", strict=True)
     insert_fn_before(strict.step_pipeline, "integration", sway)
     strict.build_step_fn()
@@ -91,20 +91,20 @@ def test_strict_raises_what_is_not_supported(sim, monkeypatch):
         strict.step()
 
 
-def broken(*args):
+def raise_error(*args):
     raise ZeroDivisionError("a slip")
 
 
 @pytest.mark.parametrize("settings", [{"strict": True}, {"engine": "lanes"}])
 def test_a_bug_is_raised_where_it_is_asked_for(sim, monkeypatch, settings):
-    monkeypatch.setitem(RULES, "sin", broken)
+    monkeypatch.setitem(RULES, "sin", raise_error)
     with pytest.raises(ZeroDivisionError, match="a slip"):
-        Step(pipeline(sim, sway), **settings).plan(sim.data)
+        Step(make_pipeline(sim, sway), **settings).plan(sim.data)
 
 
 def test_a_bug_is_reported_where_auto_can_go_on(sim, monkeypatch):
-    monkeypatch.setitem(RULES, "sin", broken)
-    step = Step(pipeline(sim, sway))
+    monkeypatch.setitem(RULES, "sin", raise_error)
+    step = Step(make_pipeline(sim, sway))
     with pytest.warns(EngineWarning, match="ZeroDivisionError: a slip in stage 'sway'") as caught:
         assert step.plan(sim.data).engine == "plain"
     assert "CRAZYSIM_DUMP" in str(caught[0].message)
@@ -113,9 +113,9 @@ def test_a_bug_is_reported_where_auto_can_go_on(sim, monkeypatch):
 
 
 def test_a_bug_in_tracing_is_found_at_planning(sim, monkeypatch):
-    """Tracing the program is part of planning, so that the first call finds nothing new."""
+    """Planning traces the program, so no error first shows in the first call."""
     monkeypatch.setattr(native, "compiler", lambda: None)
-    monkeypatch.setattr(lanes, "run_steps", broken)
+    monkeypatch.setattr(lanes, "run_steps", raise_error)
     with pytest.warns(EngineWarning, match="a slip"):
         assert Step(sim.step_pipeline).plan(sim.data).engine == "plain"
 
@@ -129,18 +129,18 @@ def test_planning_traces_what_the_first_call_runs(sim):
 
 
 def test_an_error_of_the_stage_is_its_own(sim):
-    """No engine could run it: it is raised as it is, without a warning."""
+    """No engine could run the stage, so its error is raised unchanged, without a warning."""
 
     @stage("drone")
     def mine(data):
         raise KeyError("of the user")
 
     with pytest.raises(KeyError, match="of the user"):
-        Step(pipeline(sim, mine)).plan(sim.data)
+        Step(make_pipeline(sim, mine)).plan(sim.data)
 
 
 def test_documented_limits_are_explained_and_warn_of_nothing(sim, monkeypatch):
-    """An undeclared stage, a large swarm, a machine without a compiler."""
+    """They are an undeclared stage, a large swarm, and a machine without a compiler."""
 
     def everything(data):
         return data.replace(states=data.states.replace(force=0 * data.states.force))
@@ -150,8 +150,8 @@ def test_documented_limits_are_explained_and_warn_of_nothing(sim, monkeypatch):
         return data.replace(states=data.states.replace(force=0 * data.states.pos))
 
     swarm = Sim(n_drones=9, control="rotor_vel")
-    assert "it is not declared" in explain(Step(pipeline(sim, everything)), sim.data)
-    assert "drones" in explain(Step(pipeline(swarm, crowd)), swarm.data)
+    assert "it is not declared" in explain(Step(make_pipeline(sim, everything)), sim.data)
+    assert "drones" in explain(Step(make_pipeline(swarm, crowd)), swarm.data)
     monkeypatch.setattr(native, "compiler", lambda: None)
     for strict in (False, True):
         assert "no C++ compiler" in explain(Step(sim.step_pipeline, strict=strict), sim.data)
@@ -175,7 +175,7 @@ def use_compiler(monkeypatch, folder, script):
 def test_a_compiler_that_fails_costs_speed_and_says_so(sim, monkeypatch, tmp_path, script, words):
     monkeypatch.delenv("CXX", raising=False)  # a compiler that is named must accept its options
     use_compiler(monkeypatch, tmp_path, f'case "$*" in *fsyntax-only*) exit 0;; esac; {script}')
-    step = Step(pipeline(sim, sway))
+    step = Step(make_pipeline(sim, sway))
     with pytest.warns(EngineWarning, match=re.escape(words)) as caught:
         plan = step.plan(sim.data)
     assert plan.engine == "lanes"
@@ -183,13 +183,13 @@ def test_a_compiler_that_fails_costs_speed_and_says_so(sim, monkeypatch, tmp_pat
     assert "sway, " in str(caught[0].message)
     assert_steps_like_plain(sim, step, (sway,))
     with pytest.raises(ConfigError, match=re.escape(words)):
-        Step(pipeline(sim, sway), strict=True).plan(sim.data)
+        Step(make_pipeline(sim, sway), strict=True).plan(sim.data)
     with pytest.raises(ConfigError, match=r"engine 'fused' cannot run this pipeline.*Use 'lanes' or 'auto'"):
-        Step(pipeline(sim, sway), "fused").plan(sim.data)
+        Step(make_pipeline(sim, sway), "fused").plan(sim.data)
 
 
 def test_a_compiler_that_hangs_is_ended(sim, monkeypatch, tmp_path):
-    """Its children too: a compiler is a driver that runs others."""
+    """Its child processes end too, since a compiler runs other programs."""
     child = tmp_path / "pid"
     use_compiler(
         monkeypatch, tmp_path, f'case "$*" in *fsyntax-only*) exit 0;; esac; sleep 1000 & echo $! > {child}; wait'
@@ -197,10 +197,10 @@ def test_a_compiler_that_hangs_is_ended(sim, monkeypatch, tmp_path):
     monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "0.5")
     with pytest.warns(EngineWarning, match="took longer than 0.5 s; set CRAZYSIM_COMPILE_TIMEOUT"):
         assert Step(sim.step_pipeline).plan(sim.data).engine == "lanes"
-    wait_for(lambda: not runs(int(child.read_text())))
+    wait_for(lambda: not is_running(int(child.read_text())))
 
 
-def runs(pid):
+def is_running(pid):
     """Return whether a process runs; one that has ended may still be listed."""
     status = Path(f"/proc/{pid}/stat")
     try:
@@ -257,7 +257,7 @@ def test_small_integers_run_on_lanes_and_kernels_refuse_them_by_the_stage(sim, d
 def test_the_kernel_is_compiled_when_the_step_is_planned(sim, monkeypatch):
     seen = []
     monkeypatch.setattr(native, "register_kernel", lambda k, real=native.register_kernel: seen.append(k) or real(k))
-    step = Step(pipeline(sim, sway))
+    step = Step(make_pipeline(sim, sway))
     plan = step.plan(sim.data)
     assert (plan.engine, len(seen)) == ("fused", 1)
     step(sim.data, jnp.int32(1))
@@ -269,7 +269,7 @@ def test_the_kernel_is_compiled_when_the_step_is_planned(sim, monkeypatch):
 
 
 def undeclared(data):
-    """Look at all drones of all worlds."""
+    """Set a torque that depends on all drones of all worlds."""
     return data.replace(states=data.states.replace(torque=1e-6 * jnp.mean(data.states.pos) + 0 * data.states.torque))
 
 
@@ -287,7 +287,7 @@ def test_explaining_runs_nothing_unless_asked_to_measure():
 
 @dataclasses.dataclass
 class Push:
-    """A stage's function with settings, which are compared by value, so that it has no hash."""
+    """A stage function with settings. It is compared by value, so it has no hash."""
 
     force: float
 
@@ -296,7 +296,7 @@ class Push:
 
 
 def test_callable_objects_without_a_hash_are_planned(sim):
-    plan = Step(pipeline(sim, Stage(Push(0.01), "drone", name="push")), "lanes", strict=True).plan(sim.data)
+    plan = Step(make_pipeline(sim, Stage(Push(0.01), "drone", name="push")), "lanes", strict=True).plan(sim.data)
     assert "push" in {name for segment in plan.program.segments for name in segment.stages}
 
 
@@ -310,7 +310,7 @@ drop = Stage(lambda data: data.replace(states=data.states.replace(force=0 * data
 
 
 def test_stages_of_the_package_are_traced_once_in_a_process(sim, monkeypatch, tmp_path):
-    """Whatever the number of worlds; a user's stage is traced for every simulation, since it may have changed."""
+    """This holds for any number of worlds. Stages of users are traced for every simulation, since they may change."""
     traced = []
 
     class Counted(tracing.TracedStage):
@@ -323,7 +323,7 @@ def test_stages_of_the_package_are_traced_once_in_a_process(sim, monkeypatch, tm
     for n_worlds in (3, 4):
         monkeypatch.setenv("CRAZYSIM_DUMP", str(tmp_path / str(n_worlds)))
         data = shared_sim(n_worlds=n_worlds, n_drones=2, control="rotor_vel").data
-        plans.append(Step(pipeline(sim, lift) | {"drop": drop}, "lanes").plan(data))
+        plans.append(Step(make_pipeline(sim, lift) | {"drop": drop}, "lanes").plan(data))
     stages = {name for segment in plans[1].program.segments for name in segment.stages}
     assert {"lift", "drop", "integration", "clip_floor_pos"} <= stages
     assert traced.count("lift") == traced.count("drop") == 2

@@ -1,20 +1,20 @@
-"""The fuzzer's comparison: what rounding explains, and that it explains nothing else."""
+"""The fuzzer's comparison explains differences by rounding, and no other differences."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from rounding import TINY, are_explained
+from rounding import TINY, are_within_rounding
 
 NAN = np.nan
 DENORMAL = 2.0**-130
 
 
-def is_explained(fn, values, found, dtype=np.float32):
-    """Return whether a result for one lane is explained."""
+def is_within_rounding(fn, values, found, dtype=np.float32):
+    """Return whether a result for one lane is within rounding."""
     arrays = [np.asarray([x], None if isinstance(x, int) else np.float32) for x in values]
     arrays = [x.astype(np.int32) if x.dtype.kind == "i" else x for x in arrays]
-    return bool(are_explained(fn, arrays, np.asarray([found], dtype), signed=False)[0])
+    return bool(are_within_rounding(fn, arrays, np.asarray([found], dtype), signed=False)[0])
 
 
 @pytest.mark.parametrize(
@@ -39,18 +39,18 @@ def is_explained(fn, values, found, dtype=np.float32):
 )
 def test_what_rounding_explains(fn, values, found, wrong):
     """``wrong`` is what it must not explain; None where any number can come out."""
-    assert is_explained(fn, values, found)
-    assert wrong is None or not is_explained(fn, values, wrong)
+    assert is_within_rounding(fn, values, found)
+    assert wrong is None or not is_within_rounding(fn, values, wrong)
 
 
 def test_the_sign_of_zero_is_kept_where_it_is_defined():
     values, found = [np.float32([-0.0])], np.float32([0.0])
-    assert are_explained(jnp.rint, values, -found, signed=True)[0]
-    assert not are_explained(jnp.rint, values, found, signed=True)[0]
+    assert are_within_rounding(jnp.rint, values, -found, signed=True)[0]
+    assert not are_within_rounding(jnp.rint, values, found, signed=True)[0]
 
 
 def test_zero_by_zero_is_any_integer_that_compilers_make_of_it():
     for found in (-1, 1):
-        assert is_explained(lax.div, [0, 0], found, np.int32)
-    assert not is_explained(lax.div, [0, 0], 7, np.int32)
-    assert not is_explained(lax.div, [5, 0], 1, np.int32)
+        assert is_within_rounding(lax.div, [0, 0], found, np.int32)
+    assert not is_within_rounding(lax.div, [0, 0], 7, np.int32)
+    assert not is_within_rounding(lax.div, [5, 0], 1, np.int32)

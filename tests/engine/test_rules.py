@@ -1,4 +1,4 @@
-"""Every rule of lowering: what a function of one drone gives in the interpreter is what JAX gives."""
+"""Every rule of lowering: a function of one drone has the same results in the interpreter as in JAX."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from blocks import make_program
 from cases import COMPILED_ENGINES
-from rule_cases import CASES, N_LANES, RANDOM, ULP, agree, drone_shapes, function, make_inputs, map_over_drones
+from rule_cases import (
+    CASES,
+    N_LANES,
+    RANDOM,
+    ULP,
+    assert_agree,
+    case_function,
+    drone_shapes,
+    make_inputs,
+    map_over_drones,
+)
 
 from crazysim import Sim
 from crazysim.core.sharding import Location
@@ -20,59 +30,71 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.errors import EngineWarning
 
 
-def lanes_of(g):
-    """Return the numbers of all drones: of what they share one, of the rest one for each lane."""
+def lane_numbers(g):
+    """Return the numbers of all drones: scalars for shared numbers, and vectors with one lane per drone."""
     return [x for name, array in vars(g).items()
             for x in (np.asarray(array) if name == "table" else np.asarray(array).reshape(N_LANES, -1).T)]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [*CASES, *RANDOM])
 def test_a_case_gives_what_jax_gives(name):
-    """Integers, bools and random bits exactly; numbers to rounding."""
+    """Integers, bools and random bits are equal, floats equal up to rounding."""
     g = make_inputs()
-    block = lower_function(function(name), drone_shapes(g))
+    block = lower_function(case_function(name), drone_shapes(g))
     verify_block(block)
     assert block.outputs
-    found = interpret.run_block(block, lanes_of(g), (N_LANES,))
-    agree(np.stack(found, axis=-1), jax.jit(map_over_drones(name)).lower(g).compile()(g), name)
+    found = interpret.run_block(block, lane_numbers(g), (N_LANES,))
+    assert_agree(np.stack(found, axis=-1), jax.jit(map_over_drones(name)).lower(g).compile()(g), name)
 
 
 @pytest.mark.parametrize("engine", COMPILED_ENGINES)
 def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
-    """One program of the cases whose operations run blocks or have several results: the rest is in test_targets."""
-    names = ["cond", "loops", "loop_until", "walk_together", "nested_calls", "own_gradient", *RANDOM]
+    """Run the cases whose operations run blocks or have several results; test_targets has all other operations."""
+    names = ["cond", "loops", "while_loops", "uniform_loop", "nested_calls", "gradient", *RANDOM]
 
-    def all_of_them(g):
-        return [function(name)(g) for name in names]
+    def run_all(g):
+        return [case_function(name)(g) for name in names]
 
     g = make_inputs()
-    block = lower_function(all_of_them, drone_shapes(g))
-    program, leaves = make_program(block, lanes_of(g), N_LANES)
-    expected = interpret.run_block(block, lanes_of(g), (N_LANES,))
+    block = lower_function(run_all, drone_shapes(g))
+    program, leaves = make_program(block, lane_numbers(g), N_LANES)
+    expected = interpret.run_block(block, lane_numbers(g), (N_LANES,))
     run = (
         build(program, Location("cpu")) if engine == "fused" else lambda x, n: interpret.lanes.run_steps(program, x, n)
     )
     written, _ = jax.jit(lambda leaves: run(leaves, 1))(leaves)
     for x, y in zip(written, expected, strict=True):
-        agree(np.asarray(x).reshape(-1), y, engine)
+        assert_agree(np.asarray(x).reshape(-1), y, engine)
 
 
 # Refusals ------------------------------------------------------------------------------------------------------------
 
 
-def wrote(data, x):
+def write_first_number(data, x):
     return data.replace(states=data.states.replace(pos=jnp.zeros(3).at[0].set(jnp.ravel(x)[0])))
 
 
 REFUSED = {
-    "eigh": (lambda d: wrote(d, jnp.linalg.eigh(d.states.pos * jnp.eye(3))[0]), "primitive 'eigh' has no rule"),
-    "complex": (lambda d: wrote(d, jnp.fft.fft(d.states.pos).real), "numbers of type complex64"),
-    "half": (lambda d: wrote(d, d.states.pos.astype(jnp.bfloat16).astype(jnp.float32)), "numbers of type bfloat16"),
-    "index": (lambda d: wrote(d, (jnp.arange(100.0) + d.states.pos[0])[d.core.steps % 100]), "100"),
-    "cholesky": (lambda d: wrote(d, jnp.linalg.cholesky(jnp.eye(7) + d.states.pos[0])), "size 7"),
-    "sort": (lambda d: wrote(d, jnp.sort(jnp.zeros(65) + d.states.pos[0])), "65 elements"),
-    "generator": (lambda d: wrote(d, jax.random.uniform(jax.random.key(0, impl="rbg")) + d.states.pos), "random"),
-    "scan": (lambda d: wrote(d, jax.lax.scan(lambda c, y: (c + y, y), d.states.pos[0], jnp.ones(65))[0]), "65"),
+    "eigh": (
+        lambda d: write_first_number(d, jnp.linalg.eigh(d.states.pos * jnp.eye(3))[0]),
+        "primitive 'eigh' has no rule",
+    ),
+    "complex": (lambda d: write_first_number(d, jnp.fft.fft(d.states.pos).real), "numbers of type complex64"),
+    "half": (
+        lambda d: write_first_number(d, d.states.pos.astype(jnp.bfloat16).astype(jnp.float32)),
+        "numbers of type bfloat16",
+    ),
+    "index": (lambda d: write_first_number(d, (jnp.arange(100.0) + d.states.pos[0])[d.core.steps % 100]), "100"),
+    "cholesky": (lambda d: write_first_number(d, jnp.linalg.cholesky(jnp.eye(7) + d.states.pos[0])), "size 7"),
+    "sort": (lambda d: write_first_number(d, jnp.sort(jnp.zeros(65) + d.states.pos[0])), "65 elements"),
+    "generator": (
+        lambda d: write_first_number(d, jax.random.uniform(jax.random.key(0, impl="rbg")) + d.states.pos),
+        "random",
+    ),
+    "scan": (
+        lambda d: write_first_number(d, jax.lax.scan(lambda c, y: (c + y, y), d.states.pos[0], jnp.ones(65))[0]),
+        "65",
+    ),
 }
 
 
@@ -116,14 +138,14 @@ def test_a_parameter_that_a_version_of_jax_does_not_have_makes_a_primitive_unsup
     lambda x: jnp.dot(jnp.zeros(2), jnp.stack([x, x])), lambda x: jnp.maximum(x, 0.0), lambda x: jnp.clip(x, -1, 1),
 ])  # fmt: skip
 def test_constants_do_not_hide_what_is_not_finite(fn):
-    """A product with zero is NaN where the other number is infinite, whatever is known when the program is made."""
+    """A product with zero is NaN where the other number is infinite, even if the zero is a constant."""
     x = np.float32([np.nan, np.inf, -np.inf, 0.0, -2.5])
     (found,) = interpret.run_block(lower_function(fn, jax.ShapeDtypeStruct((), np.float32)), [x], x.shape)
     np.testing.assert_array_equal(found, np.asarray(jax.jit(jax.vmap(fn))(x)))
 
 
 def test_powers_and_angles_of_special_numbers():
-    """What kernels of the host compute with vectors of their own: signs of zero, infinities, over- and underflow."""
+    """Host kernels compute these functions themselves: test signs of zero, infinities, over- and underflow."""
     if native.compiler() is None:
         pytest.skip("no C++ compiler here")
     sides = np.float32([0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -2.0, 1e-30, 1e30])
@@ -139,7 +161,7 @@ def test_powers_and_angles_of_special_numbers():
                                                    np.arctan2(np.float64(z), 2.0))]  # fmt: skip
     for name, a, b in zip(("arctan2", "exp", "arctan2 of one"), found, expected, strict=True):
         a = np.asarray(a)[:, 0]
-        # XLA has its threads take what is below the least normal number for zero.
+        # XLA flushes subnormal numbers to zero.
         np.testing.assert_allclose(a, b, rtol=4 * ULP, atol=np.finfo(np.float32).tiny, err_msg=name)
         known = ~np.isnan(b)
         np.testing.assert_array_equal(np.signbit(a[known]), np.signbit(b[known]), err_msg=name)

@@ -1,4 +1,4 @@
-"""What is known when a program is made: only what no number contradicts."""
+"""Simplification when a program is made uses only identities that hold for every number."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def test_a_zero_of_a_shared_parameter_takes_its_term_with_it(dtype):
     assert build("add", product, ..., dtype=dtype)[2] == 0
     assert build("div", product, ..., dtype=dtype)[2] == 0
     assert build("mul", build("neg", product, dtype=dtype)[0], ..., dtype=dtype)[2] == 0
-    assert build("sub", zero, ..., dtype=dtype)[2] == 1  # of what is left the sign changes
+    assert build("sub", zero, ..., dtype=dtype)[2] == 1  # the sign of the other operand changes
     assert build("div", ..., zero, dtype=dtype)[2] == 1
 
 
@@ -62,8 +62,8 @@ def test_only_floats_have_known_zeros():
 
 
 def test_angles_of_zero_are_exact():
-    wanted = {"sin": 0.0, "cos": 1.0}
-    assert {name: simplify(name, (F(0),), np.dtype(F), ()) for name in wanted} == wanted
+    expected = {"sin": 0.0, "cos": 1.0}
+    assert {name: simplify(name, (F(0),), np.dtype(F), ()) for name in expected} == expected
     assert simplify("atan2", (F(0), F(2)), np.dtype(F), ()) == 0
     assert simplify("atan2", (F(0), F(-2)), np.dtype(F), ()) is None
     assert simplify("sin", (F(1),), np.dtype(F), ()) is None
@@ -90,7 +90,7 @@ def test_a_selection_between_equals_is_one_of_them():
 
 
 @pytest.mark.parametrize(
-    "name, args, wanted",
+    "name, args, expected",
     [
         ("div", (7, -2), -3),
         ("div", (-7, 2), -3),
@@ -104,13 +104,13 @@ def test_a_selection_between_equals_is_one_of_them():
         ("abs", (-(2**31),), -(2**31)),
     ],
 )
-def test_integers_fold_as_xla_computes_them(name, args, wanted):
+def test_integers_fold_as_xla_computes_them(name, args, expected):
     args = tuple(np.int32(x) for x in args)
-    assert simplify(name, args, np.dtype(np.int32), ()) == wanted
+    assert simplify(name, args, np.dtype(np.int32), ()) == expected
 
 
 @pytest.mark.parametrize(
-    "x, dtype, wanted",
+    "x, dtype, expected",
     [
         (np.nan, np.int32, 0),
         (np.inf, np.int32, 2**31 - 1),
@@ -124,8 +124,8 @@ def test_integers_fold_as_xla_computes_them(name, args, wanted):
         (np.nan, bool, True),
     ],
 )
-def test_conversions_fold_as_xla_computes_them(x, dtype, wanted):
-    assert simplify("convert_element_type", (F(x),), np.dtype(dtype), ()) == wanted
+def test_conversions_fold_as_xla_computes_them(x, dtype, expected):
+    assert simplify("convert_element_type", (F(x),), np.dtype(dtype), ()) == expected
 
 
 def test_what_numpy_rounds_otherwise_is_not_folded():

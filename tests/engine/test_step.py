@@ -21,14 +21,14 @@ from crazysim.engine.backends import cuda, kernel, lanes, native
 from crazysim.engine.lowering.stages import MAX_UNROLLED_DRONES
 from crazysim.pytree import PyTree, leaf
 
-SLOW = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}
-PAIRS = [("first_principles", c.value) for c in Control] + [
+SLOW_CONTROL_SETTINGS = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}
+DYNAMICS_AND_CONTROL = [("first_principles", c.value) for c in Control] + [
     (d.value, c) for d in Dynamics if d != Dynamics.first_principles for c in ("attitude", "state")
 ]
 
 
-def scattered(sim, extreme=False, dtype=np.float32):
-    """Return the data with every drone in a state and under a command of its own, worlds out of phase."""
+def scatter_drones(sim, extreme=False, dtype=np.float32):
+    """Return the data with a different state and command for each drone, and different step counts of worlds."""
     rng = np.random.default_rng(1)
     shape = (sim.n_worlds, sim.n_drones)
     far = 20.0 if extreme else 1.0
@@ -66,11 +66,11 @@ def scattered(sim, extreme=False, dtype=np.float32):
     ("first_principles", "rotor_vel", "rk4"),
 ])  # fmt: skip
 def test_long_runs_agree_in_float64(x64, dynamics, control, integrator):
-    """200 steps: what rounding differs in, 2e-16 a step, grows by the closed loop's gains to no more than 1e-9."""
+    """In 200 steps, rounding of 2e-16 a step grows to at most 1e-9 through the gains of the closed loop."""
     sim = Sim(n_worlds=3, n_drones=2, dynamics=dynamics, control=control, integrator=integrator)
-    data = scattered(sim, dtype=np.float64)
+    data = scatter_drones(sim, dtype=np.float64)
     expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(200))
-    # ``lanes`` runs every integrator once; of the two pipelines with rk4, XLA takes long for that with a controller.
+    # ``lanes`` runs every integrator once; XLA takes long to compile the pipeline that has rk4 and a controller.
     for engine in COMPILED_ENGINES[-1:] if (integrator, control) == ("rk4", "attitude") else COMPILED_ENGINES:
         found = Step(sim.step_pipeline, engine)(data, jnp.int32(200))
         for name in ("pos", "quat", "vel"):
@@ -91,7 +91,7 @@ def test_a_parameter_of_each_drone_is_its_own():
 
 
 def test_zeros_of_parameters_are_seen_anew_when_a_parameter_changes():
-    """A diagonal inertia is computed with as one only as long as it is one."""
+    """Terms of a diagonal inertia are left out only as long as the inertia is diagonal."""
     sim = shared_sim(n_worlds=1, n_drones=1, control="rotor_vel")
     step = Step(sim.step_pipeline)
     data = with_states(sim.data, pos=[0.0, 0.0, 1.0], torque=[1e-5, 0.0, 0.0])
@@ -105,7 +105,7 @@ def test_zeros_of_parameters_are_seen_anew_when_a_parameter_changes():
 
 
 def test_a_parameter_that_a_stage_writes_is_not_taken_for_zero():
-    """Gravity that turns in every step: its component along x is zero only where a call begins."""
+    """Gravity turns in every step, so its component along x is zero only at the beginning of a call."""
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
 
     def turn(data):
@@ -118,7 +118,7 @@ def test_a_parameter_that_a_stage_writes_is_not_taken_for_zero():
 
 
 def test_arrays_of_numpy_are_read_again_in_every_call():
-    """Law 11: whoever holds them may write into them."""
+    """Law 11: the owner of an array may write into it between calls."""
     sim = shared_sim(n_worlds=1, n_drones=1, control="rotor_vel")
     gravity = np.zeros(3, np.float32)
     data = with_states(sim.data, pos=[0.0, 0.0, 9.0])
@@ -135,7 +135,7 @@ def pitch_rate(data):
 
 def test_a_nan_in_one_drone_stays_in_that_drone():
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
-    data = scattered(sim)
+    data = scatter_drones(sim)
     bad = data.replace(states=data.states.replace(vel=data.states.vel.at[1, 0].set(jnp.nan)))
     step = Step(sim.step_pipeline)
     good, after = step(data, jnp.int32(5)), step(bad, jnp.int32(5))
@@ -151,43 +151,43 @@ def test_a_nan_in_one_drone_stays_in_that_drone():
 
 
 class Gust(PyTree):
-    """A force that wanders."""
+    """A random force that changes slowly."""
 
     force: jax.Array = leaf("drone", 1)
     """Force, world frame, N. (3,)"""
     strength: jax.Array = leaf("world", 0)
-    """Size of its steps, N. ()"""
-    on: jax.Array = leaf("world", 0)
-    """Whether it blows. ()"""
-    met: jax.Array = leaf("drone", 0)
-    """Whether it has been strong. ()"""
+    """Standard deviation of its change per step, N. ()"""
+    is_on: jax.Array = leaf("world", 0)
+    """True where the force acts. ()"""
+    was_strong: jax.Array = leaf("drone", 0)
+    """True where it was strong at any step. ()"""
     count: jax.Array = leaf("drone", 0)
-    """How often it was. ()"""
+    """Number of steps at which it was strong. ()"""
 
 
 @stage("drone")
 def gust(data):
-    """Let the force wander, with numbers of the drone's own."""
-    mine = data.plugins["gust"]
+    """Change the force at random, differently for each drone."""
+    record = data.plugins["gust"]
     noise = jax.random.normal(drone_key(data, "gust"), (3,))
-    force = jnp.where(mine.on, 0.9 * mine.force + mine.strength * noise, 0.0)
+    force = jnp.where(record.is_on, 0.9 * record.force + record.strength * noise, 0.0)
     strong = force[0] > 0.001
-    mine = mine.replace(force=force, met=mine.met | strong, count=mine.count + strong)
-    states = data.states.replace(force=mine.force)
-    return data.replace(plugins=data.plugins | {"gust": mine}, states=states)
+    record = record.replace(force=force, was_strong=record.was_strong | strong, count=record.count + strong)
+    states = data.states.replace(force=record.force)
+    return data.replace(plugins=data.plugins | {"gust": record}, states=states)
 
 
 @stage("world")
 def separation(data):
     """Push drones of a world apart."""
-    apart = data.states.pos[:, None] - data.states.pos[None, :]
-    squared = jnp.sum(apart**2, axis=-1, keepdims=True) + 0.1
-    force = 1e-3 * jnp.sum(apart / squared, axis=1)
+    offsets = data.states.pos[:, None] - data.states.pos[None, :]
+    squared = jnp.sum(offsets**2, axis=-1, keepdims=True) + 0.1
+    force = 1e-3 * jnp.sum(offsets / squared, axis=1)
     return data.replace(states=data.states.replace(force=force))
 
 
 def undeclared(data):
-    """Look at all drones of all worlds."""
+    """Set a torque that depends on all drones of all worlds."""
     mean = jnp.mean(data.states.pos, axis=(0, 1))
     return data.replace(states=data.states.replace(torque=0 * data.states.torque + 1e-6 * mean))
 
@@ -205,7 +205,7 @@ def with_stages(n_drones, *stages):
     sim.data = sim.data.replace(plugins={"gust": record})
     for fn in stages:
         insert_fn_before(sim.step_pipeline, "integration", fn)
-    return sim, scattered(sim)
+    return sim, scatter_drones(sim)
 
 
 @pytest.mark.parametrize("stages, n_segments", [
@@ -223,7 +223,7 @@ def test_a_stage_of_one_drone_or_one_world_fuses_and_an_undeclared_one_splits_th
 
 @pytest.mark.parametrize("n_drones", [1, 3, MAX_UNROLLED_DRONES])
 def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
-    """Worlds that fill a vector, and worlds that do not: its force equals the force of the stage as it is written."""
+    """The force equals that of the unfused stage, in worlds that fill a vector and in worlds that do not."""
     _, data = with_stages(n_drones, separation)
     step = Step({"separation": separation})
     assert step.plan(data).program.fused
@@ -251,7 +251,7 @@ def test_law_09_a_stage_writes_within_its_scope(fn, words):
 
 
 def test_law_06_a_stage_is_traced_once(x64):
-    """Law 6: whatever is called afterwards."""
+    """Law 6: calls with other numbers of steps do not trace it again."""
     del x64
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     traces = []
@@ -284,9 +284,9 @@ def assert_gradients_equal(found, expected):
 
 @pytest.mark.long("compiles gradients of every engine, in float64")
 def test_gradients_equal_those_of_the_stages_in_float64(x64):
-    """Reverse mode through 40 steps of the attitude controller; without an engine forwards, which compiles sooner."""
+    """Reverse mode through 40 steps of the attitude controller equals forward mode of the stages without an engine."""
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
-    data = scattered(sim, dtype=np.float64)
+    data = scatter_drones(sim, dtype=np.float64)
     command = data.controls.attitude.staged_cmd
     found, expected = (
         jax.jit(derivative(functools.partial(loss, step, data=data, n=40)))(command)
@@ -300,10 +300,10 @@ def test_gradients_equal_those_of_the_stages_in_float64(x64):
 
 @pytest.mark.long("compiles gradients in both directions")
 def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
-    """From ``MIN_CHECKPOINTED_STEPS`` on few carries are kept; a zero of an inertia has a derivative all the same."""
+    """From ``MIN_CHECKPOINTED_STEPS`` on, few carries are stored; a zero of an inertia still has a derivative."""
     monkeypatch.setattr(lanes, "MIN_CHECKPOINTED_STEPS", 16)
     sim = Sim(n_worlds=2, n_drones=1, control="rotor_vel")
-    data = scattered(sim, dtype=np.float64)
+    data = scatter_drones(sim, dtype=np.float64)
     data = data.replace(states=data.states.replace(pos=data.states.pos + 5.0))  # off the floor
     at = (data.controls.rotor_vel, data.params.J)
 
@@ -312,10 +312,10 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
         return jnp.sum(step(ready, 36).states.ang_vel ** 2)
 
     at = 1e-4 * at[0], at[1]
-    alone, fast = (
+    unfused, fast = (
         functools.partial(energy, step) for step in (by_stages(sim), Step(sim.step_pipeline, COMPILED_ENGINES[-1]))
     )
-    expected = jax.jit(jax.jacfwd(alone, (0, 1)))(*at)
+    expected = jax.jit(jax.jacfwd(unfused, (0, 1)))(*at)
     assert abs(float(expected[1][0, 1])) > 0
     assert_gradients_equal(jax.jit(jax.grad(fast, (0, 1)))(*at), expected)
     slope = jax.jit(lambda *x: jax.jvp(fast, x, x)[1])(*at)
@@ -324,7 +324,7 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
 
 @pytest.mark.parametrize("n", [1, 15, 16, 18, 25])
 def test_a_loop_has_the_derivative_of_its_steps(monkeypatch, n):
-    """For fewer steps than ``MIN_CHECKPOINTED_STEPS`` and for more, square numbers and others."""
+    """Numbers of steps below and above ``MIN_CHECKPOINTED_STEPS``, square numbers and others."""
     monkeypatch.setattr(lanes, "MIN_CHECKPOINTED_STEPS", 16)
 
     def power(x, y):
@@ -337,7 +337,7 @@ def test_a_loop_has_the_derivative_of_its_steps(monkeypatch, n):
 
 def test_vmap_over_commands_and_parameters_is_a_loop():
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
-    data, step = scattered(sim), Step(sim.step_pipeline)
+    data, step = scatter_drones(sim), Step(sim.step_pipeline)
     commands = (
         np.asarray(data.controls.attitude.staged_cmd) * np.linspace(0.5, 1.5, 4, dtype=np.float32)[:, None, None, None]
     )
@@ -361,7 +361,7 @@ def test_vmap_over_commands_and_parameters_is_a_loop():
 
 
 class Twins(PyTree):
-    """Leaves that hold arrays of other leaves."""
+    """A record whose leaves share arrays with other leaves."""
 
     flags: jax.Array = leaf("world")
     speeds: jax.Array = leaf("drone", 1)
@@ -370,13 +370,13 @@ class Twins(PyTree):
 
 @stage("drone")
 def speed_up(data):
-    """Make the speeds of a plugin infinite, which are no state."""
+    """Make the speeds of a plugin infinite; they are not part of the state."""
     twins = data.plugins["twins"]
     return data.replace(plugins={"twins": twins.replace(speeds=twins.speeds + jnp.inf)})
 
 
 def test_leaves_that_share_an_array_are_not_confused():
-    """The flags of worlds and of the scene are found by their paths, and so are states, whose NaN flag a world."""
+    """Flags of worlds and of the scene, and the states that are checked for NaN, are identified by their paths."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     data = with_states(sim.data, pos=np.array([0.0, np.nan, 0.0])[:, None, None])
     data = data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True)))
@@ -393,27 +393,27 @@ def test_leaves_that_share_an_array_are_not_confused():
 # Rollouts ------------------------------------------------------------------------------------------------------------
 
 
-def hold(gain, data):
+def climb_policy(gain, data):
     """Climb to one metre."""
     thrust = 0.4258 + gain * (1.0 - data.states.pos[..., 2:]) - 0.2 * data.states.vel[..., 2:]
     return jnp.concatenate([jnp.zeros_like(data.states.pos), thrust], axis=-1)
 
 
 def test_a_rollout_is_the_loop_it_stands_for(capfd):
-    """The same numbers, kept at the rate asked for, and the simulation goes on from the end."""
+    """Its records equal those of a loop, at the requested rate, and the simulation continues from its end."""
     sim = Sim(n_worlds=3, n_drones=2, control="attitude", attitude_freq=100)
     start, gain = sim.data, jnp.float32(0.3)
-    kept = sim.rollout(hold, gain, 40, keep=lambda d: {"z": d.states.pos[..., 2]}, every=10)
-    assert kept["z"].shape == (4, 3, 2)
+    records = sim.rollout(climb_policy, gain, 40, keep=lambda d: {"z": d.states.pos[..., 2]}, every=10)
+    assert records["z"].shape == (4, 3, 2)
     step, data = sim.build_step_fn(), start
     for k in range(1, 41):
-        data = step(F.attitude_control(data, hold(gain, data)), jnp.int32(5))
+        data = step(F.attitude_control(data, climb_policy(gain, data)), jnp.int32(5))
         if k % 10 == 0:
-            np.testing.assert_allclose(kept["z"][k // 10 - 1], data.states.pos[..., 2], rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(records["z"][k // 10 - 1], data.states.pos[..., 2], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(sim.data.states.pos, data.states.pos, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(sim.data.core.steps, np.full((3, 1), 200))
     assert not start.states.pos.is_deleted()  # law 11
-    again = sim.rollout(hold, gain, 40, keep=lambda d: d.states.pos, every=20, progress=True)
+    again = sim.rollout(climb_policy, gain, 40, keep=lambda d: d.states.pos, every=20, progress=True)
     assert again.shape == (2, 3, 2, 3)
     assert "control steps" not in capfd.readouterr().err  # no bar without a terminal
 
@@ -422,13 +422,13 @@ def test_a_rollout_returns_its_last_command_where_leaves_share_an_array():
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
     attitude = sim.data.controls.attitude.replace(cmd=sim.data.controls.attitude.staged_cmd)
     data = sim.data.replace(controls=sim.data.controls.replace(attitude=attitude))
-    after, _ = rollout(sim.step_fn, data, hold, jnp.float32(0.3), 1, 5)
-    np.testing.assert_array_equal(after.controls.attitude.staged_cmd, hold(jnp.float32(0.3), data))
+    after, _ = rollout(sim.step_fn, data, climb_policy, jnp.float32(0.3), 1, 5)
+    np.testing.assert_array_equal(after.controls.attitude.staged_cmd, climb_policy(jnp.float32(0.3), data))
 
 
 @pytest.mark.parametrize("control", ["state", "rotor_vel"])
 def test_a_rollout_stages_what_the_setter_stages(control):
-    """Above all no jerk, snap and yaw rate of a command before."""
+    """In particular, no jerk, snap and yaw rate of an earlier command remains."""
     sim = shared_sim(n_worlds=2, n_drones=1, control=control)
     before = send(sim.data, repeat_command(sim.data, hover_command(sim.data)))
     if control == "state":
@@ -454,7 +454,7 @@ def test_a_rollout_has_a_gradient():
     step = sim.build_step_fn()
 
     def height(gain):
-        return rollout(step, data, hold, gain, 20, 5)[0].states.pos[0, 0, 2]
+        return rollout(step, data, climb_policy, gain, 20, 5)[0].states.pos[0, 0, 2]
 
     both = jax.jit(jax.value_and_grad(height))
     (low, _), (_, slope), (high, _) = (both(jnp.float32(gain)) for gain in (0.29, 0.3, 0.31))
@@ -471,7 +471,7 @@ def test_a_rollout_has_a_gradient():
 def test_law_09_rollouts_refuse_what_cannot_be(settings, words):
     sim = shared_sim(n_worlds=1, n_drones=1, control="attitude")
     with pytest.raises(ConfigError, match=words):
-        sim.rollout(hold, jnp.float32(0.3), **settings)
+        sim.rollout(climb_policy, jnp.float32(0.3), **settings)
 
 
 def test_law_09_a_policy_of_another_shape_is_told():
@@ -509,24 +509,28 @@ def test_law_09_an_engine_that_does_not_exist_is_refused():
         Sim(engine="warp")
 
 
-def turns(state, setpoint, time):
-    """Return the number of the controller that flies: PID for a second, then Mellinger."""
+def select_controller(state, setpoint, time):
+    """Return the index of the active controller: PID for one second, then Mellinger."""
     return jnp.where(time < 1.0, 0, 1)
 
 
 CONTROLLERS = [{"control": control, "controller": "pid"} for control in ("state", "attitude", "body_rate")] + [
     {"control": "state", "controller": "mellinger"},
-    {"control": "state", "controller": ("pid", "mellinger"), "switch": turns},
+    {"control": "state", "controller": ("pid", "mellinger"), "switch": select_controller},
 ]
 
 
 @pytest.mark.parametrize(
     "settings",
-    [{"dynamics": dynamics, "control": control} | SLOW.get(control, {}) for dynamics, control in PAIRS] + CONTROLLERS,
+    [
+        {"dynamics": dynamics, "control": control} | SLOW_CONTROL_SETTINGS.get(control, {})
+        for dynamics, control in DYNAMICS_AND_CONTROL
+    ]
+    + CONTROLLERS,
     ids=lambda settings: "-".join(str(s) for s in settings.values() if isinstance(s, (str, tuple))),
 )
 def test_every_pipeline_compiles_for_a_gpu(settings):
-    """NVRTC needs no GPU to compile for one."""
+    """NVRTC compiles without a GPU."""
     sim = shared_sim(n_worlds=2, n_drones=3, **settings)
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")

@@ -1,4 +1,4 @@
-"""Data between calls of the compiled step: flattened while it advances, a record when it is read."""
+"""Data between calls of the compiled step is flattened while it advances, and a record when it is read."""
 
 import contextlib
 
@@ -39,7 +39,7 @@ def test_a_record_is_put_together_once_when_it_is_read(stepper):
 
 
 def test_a_step_that_compiles_for_long_is_announced_once(sim, stepper, monkeypatch):
-    """The first step of a pipeline compiles: with a filter of many states for most of a minute."""
+    """The first step of a pipeline compiles, which takes most of a minute with a filter of many states."""
     announced = []
 
     def announce(work, *_):
@@ -55,7 +55,7 @@ def test_a_step_that_compiles_for_long_is_announced_once(sim, stepper, monkeypat
     assert len(announced) == 2
 
 
-LEVELS = [
+COMMAND_LEVELS = [
     {"control": "rotor_vel"},
     {"control": "force_torque"},
     {"control": "attitude"},
@@ -64,9 +64,9 @@ LEVELS = [
 ]
 
 
-@pytest.mark.parametrize("settings", LEVELS, ids=lambda s: "-".join(s.values()))
+@pytest.mark.parametrize("settings", COMMAND_LEVELS, ids=lambda s: "-".join(s.values()))
 def test_a_command_is_staged_in_flattened_data(settings):
-    """It is what the pure function stages, and what was read stays as it was."""
+    """The data equals that of the pure function, and records that were read before do not change."""
     sim = Sim(3, 2, **settings)
     shape = F.command_shape(sim.data, sim.control)
     command = np.random.default_rng(0).uniform(0.1, 0.4, shape).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Every rule of lowering once more, in CasADi: what JAX gives in float64 is what the expressions give."""
+"""Every rule of lowering in CasADi: expressions have the same values as JAX in float64."""
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +12,13 @@ from crazysim.engine.tools import symbolic
 
 pytestmark = pytest.mark.usefixtures("casadi", "x64")
 
-REFUSED = {
+REFUSED_CASES = {
     "integers": "'and' on int32",
-    "words": "'shift_left' on uint32",
-    "loop_until": "until a condition fails",
-    "walk_together": "until a condition fails",
+    "unsigned_integers": "'shift_left' on uint32",
+    "while_loops": "until a condition fails",
+    "uniform_loop": "until a condition fails",
 }
-UNCOMPARABLE = {"not_finite", "sort_not_finite", "argmin_and_sort", "conversions"}
+UNCOMPARED_CASES = {"not_finite", "sort_not_finite", "argmin_and_sort", "conversions"}
 """Cases with NaN or infinity, which CasADi's simplifications do not keep, and cases that need float32."""
 
 
@@ -29,7 +29,7 @@ def g():
         return jax.tree.map(lambda x: x.astype(float) if x.dtype == np.float32 else x, make_inputs())
 
 
-def expressions(fn, *avals):
+def casadi_function(fn, *avals):
     """Return a CasADi function from the arguments, one vector each, to the results as one vector."""
     import casadi
 
@@ -44,26 +44,26 @@ def call(function, *args):
     return np.asarray(function(*(np.asarray(x, float).ravel() for x in args))).ravel()
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if name not in {*REFUSED, *UNCOMPARABLE}])
+@pytest.mark.parametrize("name", [name for name in CASES if name not in {*REFUSED_CASES, *UNCOMPARED_CASES}])
 def test_a_case_gives_what_jax_gives(g, name):
-    function, compiled = expressions(CASES[name], drone_shapes(g)), jax.jit(CASES[name])
+    function, compiled = casadi_function(CASES[name], drone_shapes(g)), jax.jit(CASES[name])
     for world, drone in ((0, 0), (3, 1), (6, 2)):
         one = jax.tree.map(lambda x, w=world, d=drone: x[w, d], g.replace(table=np.tile(g.table, (7, 3, 1))))
         expected = np.asarray(compiled(one), float).ravel()
         assert expected.size
-        # Solves multiply the rounding by the condition of the system, below 1e3; what else there is, is rounding.
+        # Solves multiply rounding by the condition number of the system, which is below 1e3.
         np.testing.assert_allclose(call(function, *jax.tree.leaves(one)), expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", REFUSED_CASES)
 def test_unsupported_operations_are_named(g, name):
-    with pytest.raises(UnsupportedError, match=REFUSED[name]):
-        expressions(CASES[name], drone_shapes(g))
+    with pytest.raises(UnsupportedError, match=REFUSED_CASES[name]):
+        casadi_function(CASES[name], drone_shapes(g))
 
 
 def test_random_numbers_are_refused(g):
     with pytest.raises(UnsupportedError, match="random numbers"):
-        expressions(lambda g: random_numbers(jax.random.key(0), g), drone_shapes(g))
+        casadi_function(lambda g: random_numbers(jax.random.key(0), g), drone_shapes(g))
 
 
 def vector(n, dtype=float):
@@ -72,7 +72,7 @@ def vector(n, dtype=float):
 
 def test_whole_numbers_divide_as_in_jax():
     three = np.int32(3)
-    function = expressions(
+    function = casadi_function(
         lambda i: jnp.stack([jax.lax.div(i, 0 * i + 3), i // three, i % three, -i]), vector(4, np.int32)
     )
     i = np.array([-7, -3, 0, 8])
@@ -85,13 +85,13 @@ def test_conversions_cut_saturate_and_wrap_as_in_jax():
         return jnp.concatenate([(1e3 * x).astype(jnp.int32), i.astype(bool), words, (1e10 * x).astype(jnp.uint32)])
 
     x, i = np.array([-2.5, -0.0017, 0.0, 0.0017, 1.0, 3.1]), np.array([5, -1, 0, 7])
-    found = call(expressions(convert, vector(6), vector(4, np.int32)), x, i)
+    found = call(casadi_function(convert, vector(6), vector(4, np.int32)), x, i)
     np.testing.assert_array_equal(found, np.asarray(jax.jit(convert)(x, np.int32(i)), float))
 
 
 def test_a_long_loop_is_refused():
     with pytest.raises(UnsupportedError, match="257 iterations is too long; at most 256"):
-        expressions(lambda x: jax.lax.fori_loop(0, 257, lambda k, x: 0.99 * x, x), vector(2))
+        casadi_function(lambda x: jax.lax.fori_loop(0, 257, lambda k, x: 0.99 * x, x), vector(2))
 
 
 def test_a_norm_has_slope_zero_at_zero():
@@ -99,7 +99,7 @@ def test_a_norm_has_slope_zero_at_zero():
 
     from crazysim import rotation
 
-    function = expressions(rotation.safe_norm, vector(6))
+    function = casadi_function(rotation.safe_norm, vector(6))
     slope = casadi.Function("slope", [x := casadi.SX.sym("x", 6)], [casadi.jacobian(function(x), x)])
     np.testing.assert_array_equal(np.asarray(slope(np.zeros(6))), np.zeros((1, 6)))
     np.testing.assert_allclose(np.asarray(slope([3, 0, 4, 0, 0, 0])), [[0.6, 0, 0.8, 0, 0, 0]], rtol=1e-15)

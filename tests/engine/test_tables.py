@@ -1,4 +1,4 @@
-"""Tables: shared arrays and constants that stages read at computed places, from memory, in every engine."""
+"""Tables: shared arrays and constants that stages read from memory at computed indices, in every engine."""
 
 import functools
 
@@ -23,12 +23,12 @@ ENGINES = ("interpret", *COMPILED_ENGINES)
 RNG = np.random.default_rng(0)
 CONSTANTS = RNG.normal(size=(11, 2, 3)).astype(np.float32)
 CONSTANTS[:, 1, 2] = 0.25
-FAR = np.arange(70, dtype=np.int32)[::-1].copy()
+DESCENDING_NUMBERS = np.arange(70, dtype=np.int32)[::-1].copy()
 N_WORLDS, N_DRONES = 13, 2
 
 
 class Tables(PyTree):
-    """Shared arrays, and places of every drone, some of which do not exist."""
+    """Shared arrays, and indices of every drone, some of which are out of range."""
 
     numbers: jax.Array = leaf("shared", 3)
     """(9, 5, 4)"""
@@ -45,15 +45,15 @@ class Tables(PyTree):
 
 
 def bisection(x, value):
-    """Return the last place at which an ascending array is below a value, found in a loop."""
+    """Return the last index at which an ascending array is below a value, by bisection in a loop."""
 
-    def halved(_, bounds):
+    def halve(_, bounds):
         low, high = bounds
         middle = (low + high) // 2
         is_below = x[middle] < value
         return jnp.where(is_below, middle, low), jnp.where(is_below, high, middle)
 
-    low, _ = jax.lax.fori_loop(0, 7, halved, (jnp.int32(0), jnp.int32(len(x))))
+    low, _ = jax.lax.fori_loop(0, 7, halve, (jnp.int32(0), jnp.int32(len(x))))
     return low.astype(jnp.float32)
 
 
@@ -81,21 +81,21 @@ CASES = {
     "unsigned places": lambda t, i, j, k: t.ends[i.astype(jnp.uint32)],
     "small places": lambda t, i, j, k: t.ends[i.astype(jnp.int8)],
     "constants": lambda t, i, j, k: jnp.asarray(CONSTANTS)[i, :, 1:].ravel(),
-    "more constants than can be selected": lambda t, i, j, k: jnp.asarray(FAR)[i].astype(jnp.float32),
+    "more constants than can be selected": lambda t, i, j, k: jnp.asarray(DESCENDING_NUMBERS)[i].astype(jnp.float32),
     "in a branch": lambda t, i, j, k: jax.lax.cond(i > 2, lambda: t.ends[i], lambda: t.ends[j]),
     "in a loop": lambda t, i, j, k: jax.lax.fori_loop(0, 7, lambda n, x: x + t.ends[n + i], 0.0),
-    "a bisection": lambda t, i, j, k: bisection(jnp.asarray(FAR)[::-1] * 0.5, i * 0.3),
-    "a search in constants": lambda t, i, j, k: jnp.searchsorted(jnp.asarray(FAR)[::-1] * 0.5, i * 0.3),
+    "a bisection": lambda t, i, j, k: bisection(jnp.asarray(DESCENDING_NUMBERS)[::-1] * 0.5, i * 0.3),
+    "a search in constants": lambda t, i, j, k: jnp.searchsorted(jnp.asarray(DESCENDING_NUMBERS)[::-1] * 0.5, i * 0.3),
     "a search in a table": lambda t, i, j, k: t.ends[jnp.searchsorted(t.ends[::-1], i * 0.3, side="right")],
 }
 
 
-IN_KERNELS = [name for name in CASES if name != "small places"]
+KERNEL_CASES = [name for name in CASES if name != "small places"]
 """Cases that kernels, which have no integers of 8 bits, can run."""
 
 
 @functools.cache
-def data():
+def make_data():
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel")
     places = RNG.integers(-3, 12, (N_WORLDS, N_DRONES, 3))
     places[0] = [[2**31 - 1, -(2**31), 100], [99, -100, 5]]
@@ -110,65 +110,65 @@ def data():
     return sim.data.replace(plugins={"tables": tables})
 
 
-def of_case(name, scope="drone"):
-    def of_one(tables, places):
+def case_stage(name, scope="drone"):
+    def read_case(tables, places):
         found = jnp.ravel(CASES[name](tables, *places))[:8]
         return jnp.pad(found.astype(jnp.float32), (0, 8 - len(found)))
 
     @stage(scope, when=lambda data: data.core.steps % 2 == 0)
     def read(data):
         tables = data.plugins["tables"]
-        one = functools.partial(of_one, tables)
+        one = functools.partial(read_case, tables)
         out = one(tables.places) if scope == "drone" else jnp.stack([one(p) for p in tables.places])
         return data.replace(plugins={"tables": tables.replace(out=out)})
 
     return read
 
 
-def sum_of(names, scope="drone"):
-    """Return a stage that needs the results of all cases."""
+def sum_stage(names, scope="drone"):
+    """Return a stage that writes a weighted sum of the results of all cases."""
 
     @stage(scope)
     def total(data):
         tables = data.plugins["tables"]
         summed = 0.0
         for n, name in enumerate(names):
-            summed = summed + of_case(name, scope).fn(data).plugins["tables"].out * 0.9**n
+            summed = summed + case_stage(name, scope).fn(data).plugins["tables"].out * 0.9**n
         return data.replace(plugins={"tables": tables.replace(out=summed)})
 
     return total
 
 
-def pipeline(names, scope="drone"):
-    return {name: of_case(name, scope) for name in names}
+def make_pipeline(names, scope="drone"):
+    return {name: case_stage(name, scope) for name in names}
 
 
-OF_WORLDS = ["a matrix, then a row of it", "constants", "places from a table"]
-"""Cases that are read by a stage of one world, too."""
+WORLD_CASES = ["a matrix, then a row of it", "constants", "places from a table"]
+"""Cases that are also tested in a stage of one world."""
 
 
-@pytest.mark.parametrize(("scope", "chosen"), [("drone", list(CASES)), ("world", OF_WORLDS)])
-def test_a_lowered_stage_reads_what_it_reads_as_it_is_written(scope, chosen):
-    """Each case by itself, in the interpreter."""
+@pytest.mark.parametrize(("scope", "names"), [("drone", list(CASES)), ("world", WORLD_CASES)])
+def test_a_lowered_stage_reads_what_it_reads_as_it_is_written(scope, names):
+    """Each case runs by itself, in the interpreter."""
 
     def each(data):
-        return {name: read(data).plugins["tables"].out for name, read in pipeline(chosen, scope).items()}
+        return {name: read(data).plugins["tables"].out for name, read in make_pipeline(names, scope).items()}
 
-    for name, expected in jax.jit(each)(data()).items():
-        program = optimise(lower_stages(as_stages(pipeline([name], scope)), data()))
+    for name, expected in jax.jit(each)(make_data()).items():
+        program = optimise(lower_stages(as_stages(make_pipeline([name], scope)), make_data()))
         verify(program)
         assert program.fused, program.unfused_stages[0].explanation
-        leaves = jax.tree.leaves(data())
+        leaves = jax.tree.leaves(make_data())
         (out,), _ = interpret.run_steps(program, [*leaves, _packed(program, leaves)], 1)
         np.testing.assert_array_equal(out, expected, err_msg=name)
 
 
-@pytest.mark.parametrize(("scope", "chosen"), [("drone", IN_KERNELS), ("world", OF_WORLDS)])
-def test_a_kernel_reads_what_a_stage_reads_as_it_is_written(scope, chosen):
-    """All cases in one stage, summed up."""
-    total = sum_of(chosen, scope)
-    found = Step({"total": total})(data(), jnp.int32(1)).plugins["tables"].out
-    np.testing.assert_allclose(found, jax.jit(total)(data()).plugins["tables"].out, rtol=1e-5, atol=1e-3)
+@pytest.mark.parametrize(("scope", "names"), [("drone", KERNEL_CASES), ("world", WORLD_CASES)])
+def test_a_kernel_reads_what_a_stage_reads_as_it_is_written(scope, names):
+    """One stage sums up all cases."""
+    total = sum_stage(names, scope)
+    found = Step({"total": total})(make_data(), jnp.int32(1)).plugins["tables"].out
+    np.testing.assert_allclose(found, jax.jit(total)(make_data()).plugins["tables"].out, rtol=1e-5, atol=1e-3)
 
 
 def _packed(program, leaves):
@@ -176,7 +176,7 @@ def _packed(program, leaves):
 
 
 def test_a_table_is_read_where_it_is_and_never_selected_from():
-    program = optimise(lower_stages(as_stages(pipeline(["a matrix, then a row of it"])), data()))
+    program = optimise(lower_stages(as_stages(make_pipeline(["a matrix, then a row of it"])), make_data()))
     (segment,) = program.fused_segments
     names = [op.name for op in segment.block.walk()]
     assert names.count("lookup") == 4
@@ -187,8 +187,8 @@ def test_a_table_is_read_where_it_is_and_never_selected_from():
 
 
 def test_the_source_for_gpus_is_well_formed():
-    """All cases in one kernel, compiled by NVRTC where there is one."""
-    program = optimise(lower_stages(as_stages({"total": sum_of(IN_KERNELS)}), data()))
+    """One kernel has all cases; NVRTC compiles it if it is installed."""
+    program = optimise(lower_stages(as_stages({"total": sum_stage(KERNEL_CASES)}), make_data()))
     text = kernel.write(program, "cuda").text
     assert "TABLE f32 t" in text
     assert text.count("lookup(p") > 20
@@ -206,11 +206,11 @@ def test_gradients_by_states_and_entries_are_those_of_the_stage():
         return data.replace(states=data.states.replace(vel=vel * row[:3] + row[3]))
 
     def loss(step, numbers, vel):
-        tables = data().plugins["tables"].replace(numbers=numbers)
-        start = data().replace(plugins={"tables": tables}, states=data().states.replace(vel=vel))
+        tables = make_data().plugins["tables"].replace(numbers=numbers)
+        start = make_data().replace(plugins={"tables": tables}, states=make_data().states.replace(vel=vel))
         return jnp.sum(step(start, 2).states.vel ** 2)
 
-    numbers, vel = data().plugins["tables"].numbers, data().states.vel + jnp.asarray([1.0, 2.0, 3.0])
+    numbers, vel = make_data().plugins["tables"].numbers, make_data().states.vel + jnp.asarray([1.0, 2.0, 3.0])
     with pytest.warns(EngineWarning, match="read as a table"):
         found = jax.grad(functools.partial(loss, Step({"read": read})), argnums=(0, 1))(numbers, vel)
     expected = jax.grad(functools.partial(loss, lambda data, _: read(read(data))), argnums=(0, 1))(numbers, vel)
@@ -220,12 +220,12 @@ def test_gradients_by_states_and_entries_are_those_of_the_stage():
 
 
 def test_another_table_of_the_same_shape_is_not_compiled_again():
-    step = Step(pipeline(["a row"]), "auto")
-    before = step(data(), jnp.int32(1)).plugins["tables"].out
-    tables = data().plugins["tables"]
-    other = data().replace(plugins={"tables": tables.replace(numbers=2 * tables.numbers)})
+    step = Step(make_pipeline(["a row"]), "auto")
+    before = step(make_data(), jnp.int32(1)).plugins["tables"].out
+    tables = make_data().plugins["tables"]
+    other = make_data().replace(plugins={"tables": tables.replace(numbers=2 * tables.numbers)})
     np.testing.assert_array_equal(step(other, jnp.int32(1)).plugins["tables"].out, 2 * before)
-    assert step.plan(other) is step.plan(data())
+    assert step.plan(other) is step.plan(make_data())
 
 
 def test_verify_finds_wrong_tables():

@@ -1,4 +1,4 @@
-"""Every operation of the table in every target: what XLA and kernels compute is what the interpreter computes."""
+"""Every operation of the table in every target: XLA and kernels compute the same as the interpreter."""
 
 import jax
 import jax.numpy as jnp
@@ -29,19 +29,19 @@ TOLERANCE = dict.fromkeys(
     "cbrt rsqrt exp2 logistic pow tan asin acos atan atan2 sinh cosh asinh acosh atanh erf erfc".split(), 16
 )
 TOLERANCE |= {"erf_inv": 64}
-# XLA's are exact to that near their zeros.
-ABSOLUTE = dict.fromkeys(["lgamma", "digamma"], 3e-6)
-DOMAIN = {"acos": (-1, 1), "asin": (-1, 1), "atanh": (-0.99, 0.99), "erf_inv": (-0.99, 0.99), "acosh": (1, 1e4),
+# Absolute errors of XLA's functions near their zeros.
+ABSOLUTE_TOLERANCE = dict.fromkeys(["lgamma", "digamma"], 3e-6)
+DOMAINS = {"acos": (-1, 1), "asin": (-1, 1), "atanh": (-0.99, 0.99), "erf_inv": (-0.99, 0.99), "acosh": (1, 1e4),
           "lgamma": (0.1, 50), "digamma": (0.1, 50), "pow": (0.1, 9), "sin": (-1e4, 1e4), "cos": (-1e4, 1e4),
           "tan": (-1.4, 1.4), "sinh": (-50, 50), "cosh": (-50, 50), "erfc": (-5, 5)}  # fmt: skip
-"""Where functions are compared; elsewhere libraries differ, or have nothing to tell."""
+"""Ranges in which functions are compared; elsewhere libraries differ or overflow."""
 
 
 def numbers(dtype, name, seed):
     """Return special numbers first, then random ones. (N_LANES,)"""
     rng = np.random.default_rng(seed)
-    if name in DOMAIN:
-        return rng.uniform(*DOMAIN[name], N_LANES).astype(dtype)
+    if name in DOMAINS:
+        return rng.uniform(*DOMAINS[name], N_LANES).astype(dtype)
     special = np.array(VALUES[dtype], dtype)
     return rng.choice(special, N_LANES) if dtype != "float32" else np.where(
         rng.random(N_LANES) < 0.5, rng.choice(special, N_LANES), rng.normal(0, 3, N_LANES).astype(dtype)
@@ -68,7 +68,7 @@ def cases():
 
 
 @pytest.fixture(scope="module")
-def everything():
+def all_operations():
     """Return a program with every operation on every type, its leaves, and the cases in order of its outputs."""
     builder, leaves, arrays, reads, outputs = Builder(stage="all"), [], [], [], []
     for k, (name, operands, result) in enumerate(cases()):
@@ -88,14 +88,14 @@ def everything():
 
 
 @pytest.fixture(scope="module")
-def expected(everything):
-    program, arrays = everything
+def expected(all_operations):
+    program, arrays = all_operations
     (segment,) = program.fused_segments
     inputs = [np.asarray(arrays[leaf])[:, 0] for leaf, _ in segment.reads]
     return interpret.run_block(segment.block, inputs, (N_LANES,))
 
 
-def check(found, expected, what):
+def assert_agree(found, expected, engine):
     wrong = []
     for case, x, y in zip(cases(), found, expected, strict=True):
         name, x, y = case[0], np.asarray(x).reshape(-1), np.asarray(y)
@@ -104,7 +104,7 @@ def check(found, expected, what):
             same = x == y
         else:
             with np.errstate(all="ignore"):
-                least = max(ABSOLUTE.get(name, 0), 1.2e-38)  # XLA takes what is below the least normal number for zero
+                least = max(ABSOLUTE_TOLERANCE.get(name, 0), 1.2e-38)  # XLA flushes subnormal numbers to zero
                 close = np.abs(x.astype(np.float64) - y) <= TOLERANCE.get(name, 4) * 2.0**-23 * np.abs(y) + least
             # The sign of a zero that max and min return is not defined.
             zeros = np.signbit(x) == np.signbit(y) if name not in ("max", "min", "clamp") else np.ones_like(x, bool)
@@ -112,25 +112,25 @@ def check(found, expected, what):
         if not same.all():
             k = int(np.argmin(same))
             wrong.append((*case, k, x[k], y[k]))
-    assert not wrong, f"{what}: " + "; ".join(map(str, wrong))
+    assert not wrong, f"{engine}: " + "; ".join(map(str, wrong))
 
 
-def test_xla_computes_what_the_interpreter_does(everything, expected):
-    program, arrays = everything
+def test_xla_computes_what_the_interpreter_does(all_operations, expected):
+    program, arrays = all_operations
     written, _ = jax.jit(lambda leaves: lanes.run_steps(program, leaves, 1))(arrays)
-    check(written, expected, "lanes")
+    assert_agree(written, expected, "lanes")
 
 
-def test_a_kernel_computes_what_the_interpreter_does(everything, expected):
+def test_a_kernel_computes_what_the_interpreter_does(all_operations, expected):
     if native.compiler() is None:
         pytest.skip("no C++ compiler here")
-    program, arrays = everything
+    program, arrays = all_operations
     written, _ = jax.jit(lambda leaves: fused.build(program, Location("cpu"))(leaves, 1))(arrays)
-    check(written, expected, "fused")
+    assert_agree(written, expected, "fused")
 
 
-def test_nvidia_compiles_every_operation(everything):
-    program, _ = everything
+def test_nvidia_compiles_every_operation(all_operations):
+    program, _ = all_operations
     text = kernel.write(program, "cuda")
     if cuda.nvrtc() is None:
         pytest.skip("NVRTC is not here")
@@ -147,7 +147,7 @@ def _number(rng, dtype, low, high):
 
 @pytest.mark.usefixtures("casadi")
 def test_casadi_computes_what_the_interpreter_does_or_refuses():
-    """In float64, where it has numbers: CasADi has neither NaN nor infinity."""
+    """They are compared in float64, on finite numbers, since CasADi has neither NaN nor infinity."""
     import casadi
 
     refused = set()
@@ -162,7 +162,7 @@ def test_casadi_computes_what_the_interpreter_does_or_refuses():
         except UnsupportedError as error:
             refused.add((name, error.stage))
             continue
-        low, high = DOMAIN.get(name, (-3, 3))
+        low, high = DOMAINS.get(name, (-3, 3))
         rng = np.random.default_rng(0)
         symbols = [casadi.SX.sym(f"x{k}") for k in range(len(args))]
         function = casadi.Function("f", symbols, symbolic.run_block(block, symbols))
@@ -170,9 +170,9 @@ def test_casadi_computes_what_the_interpreter_does_or_refuses():
             values = [_number(rng, d, low, min(high, 50)) for d in dtypes]
             if name in ("rem", "div") and values[1] == 0:
                 continue
-            (wanted,) = interpret.run_block(block, values, ())
+            (expected_number,) = interpret.run_block(block, values, ())
             found = float(function(*map(float, values)))
-            np.testing.assert_allclose(found, float(wanted), rtol=1e-9, atol=1e-9, err_msg=name)
+            np.testing.assert_allclose(found, float(expected_number), rtol=1e-9, atol=1e-9, err_msg=name)
     assert {stage for _, stage in refused} == {"one"}
     assert {name for name, _ in refused} >= {"shift_left", "nextafter", "lgamma", "digamma", "bitcast_convert_type"}
 
