@@ -1,4 +1,4 @@
-"""Faults of Crazyflow that crazysim does not have, each with its number in the list of faults not to inherit."""
+"""Faults of Crazyflow that crazysim does not have, numbered as in the list of faults not to inherit."""
 
 import functools
 
@@ -29,20 +29,20 @@ from crazysim.pytree import n_batch_axes, scopes
 
 
 @functools.cache
-def program(dynamics="first_principles", control="attitude", **settings):
+def build_program(dynamics="first_principles", control="attitude", **settings):
     """Return the data at rest, the step and the reset of three worlds of two drones."""
     sim = shared_sim(n_worlds=3, n_drones=2, dynamics=dynamics, control=control, **settings)
     return sim.default_data, sim.build_step_fn(), sim.build_reset_fn()
 
 
-def run(step, data, n_steps):
+def run_steps(step, data, n_steps):
     # Committed to one device, whatever an edit was committed to, or the step would be compiled again.
     return step(jax.device_put(data, jax.devices()[0]), jnp.int32(n_steps))
 
 
 @pytest.mark.parametrize("dynamics", FITTED)
 def test_fault_01_attitude_freq_holds_for_fitted_dynamics(dynamics):
-    """At 50 Hz in 500 a command is taken over every tenth step; the peer took it at once."""
+    """At 50 Hz of 500 Hz, a command takes effect at every tenth step; in Crazyflow it does so at once."""
     sim = Sim(dynamics=dynamics, attitude_freq=50, engine="interpret")
     hover = hover_thrust(sim.data)
     first, second = np.array([[[0.1, 0, 0, hover]]]), np.array([[[-0.2, 0, 0.3, hover]]])
@@ -51,11 +51,11 @@ def test_fault_01_attitude_freq_holds_for_fitted_dynamics(dynamics):
     sim.step()
     np.testing.assert_allclose(sim.data.controls.attitude.cmd, first, rtol=1e-6)  # float32 of a float64 command
     assert not sim.controllable.any()
-    held = sim.data
+    data_before = sim.data
     sim.attitude_control(second)
     sim.step(9)
     np.testing.assert_allclose(sim.data.controls.attitude.cmd, first, rtol=1e-6)
-    commanded, sim.data = sim.data, held
+    commanded, sim.data = sim.data, data_before
     sim.step(9)
     assert trees_equal(commanded.states, sim.data.states), "the held command moved the drone before its tick"
     sim.data = commanded
@@ -66,31 +66,31 @@ def test_fault_01_attitude_freq_holds_for_fitted_dynamics(dynamics):
 
 @pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy"])
 def test_fault_02_a_zero_quaternion_means_yaw_zero(dynamics):
-    """An all-zero setpoint is what ``np.zeros`` gives: fly to the origin, nose along x."""
-    data, step, _ = program(dynamics, "state")
+    """A setpoint of zeros, as from ``np.zeros``, means: fly to the origin with yaw zero."""
+    data, step, _ = build_program(dynamics, "state")
     half = 0.4
-    up = hover_rotor_state(data)
-    data = with_states(data, pos=[0, 0, 0.2], quat=[0, 0, np.sin(half), np.cos(half)], rotor_vel=up)
+    hover_speeds = hover_rotor_state(data)
+    data = with_states(data, pos=[0, 0, 0.2], quat=[0, 0, np.sin(half), np.cos(half)], rotor_vel=hover_speeds)
     zeros = np.zeros((3, 2, 16))
     level = zeros.copy()
     level[..., 12] = 1.0
-    from_zeros, from_level = (run(step, send(data, cmd), 250) for cmd in (zeros, level))
+    from_zeros, from_level = (run_steps(step, send(data, cmd), 250) for cmd in (zeros, level))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(from_zeros.states))
     assert not from_zeros.core.nonfinite.any()
     assert trees_equal(from_zeros.states, from_level.states)
     if dynamics in FITTED:
         attitude = from_zeros.controls.attitude.cmd
-        np.testing.assert_allclose(attitude[..., 2], 0.0, atol=1e-4)  # float32, and what little it drifts
+        np.testing.assert_allclose(attitude[..., 2], 0.0, atol=1e-4)  # float32, and a small drift
     yaw = 2 * np.arctan2(from_zeros.states.quat[..., 2], from_zeros.states.quat[..., 3])
     assert np.all(np.abs(yaw) < 0.5), "after half a second at 0.8 rad it must be on its way to zero"
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_fault_03_nan_commands_are_refused_flagged_and_healed(dynamics, control):
-    data, step, reset = program(dynamics, control)
+    data, step, reset = build_program(dynamics, control)
     data = with_states(data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(data))
     good = repeat_command(data, hover_command(data)).astype(np.float32)
-    # Fitted dynamics contain the attitude controller and have no place for wanted body rates: the last three numbers.
+    # Fitted dynamics contain the attitude controller and ignore the last three numbers, the desired body rates.
     used = 13 if dynamics in FITTED and control == "state" else good.shape[-1]
     for component in range(used):
         bad = good.copy()
@@ -98,34 +98,35 @@ def test_fault_03_nan_commands_are_refused_flagged_and_healed(dynamics, control)
         if component == 0:
             with pytest.raises(ValueError, match=r"NaN or infinite.* in world\(s\) \[1\]"):
                 send(data, bad)
-        clean, poisoned = (run(step, send(data, jnp.asarray(cmd)), 20) for cmd in (good, bad))
+        clean, poisoned = (run_steps(step, send(data, jnp.asarray(cmd)), 20) for cmd in (good, bad))
         assert not clean.core.nonfinite.any()
         np.testing.assert_array_equal(poisoned.core.nonfinite[:, 0], [False, True, False], err_msg=f"{component}")
         for x, y in zip(jax.tree.leaves(poisoned.states), jax.tree.leaves(clean.states), strict=True):
             np.testing.assert_array_equal(x[::2], y[::2])  # the other worlds are not affected
-    still = run(step, send(poisoned, good), 1)
+    still = run_steps(step, send(poisoned, good), 1)
     assert still.core.nonfinite[1, 0], "only a reset clears the flag"
     healed = reset(still, data, jnp.asarray([False, True, False]))
     assert not healed.core.nonfinite.any()
-    healed = run(step, send(healed, good), 20)
+    healed = run_steps(step, send(healed, good), 20)
     assert not healed.core.nonfinite.any()
     for x, y in zip(jax.tree.leaves(healed.states), jax.tree.leaves(clean.states), strict=True):
         np.testing.assert_array_equal(x[1], y[1])
 
 
 @pytest.mark.parametrize(
-    "level, freq, given", [("state", 500, 300), ("attitude", 500, 333), ("attitude", 400, 500), ("body_rate", 100, 40)]
+    "level, freq, level_freq",
+    [("state", 500, 300), ("attitude", 500, 333), ("attitude", 400, 500), ("body_rate", 100, 40)],
 )
-def test_fault_05_rates_that_do_not_divide_are_refused(level, freq, given):
+def test_fault_05_rates_that_do_not_divide_are_refused(level, freq, level_freq):
     """Crazyflow runs such a controller at another rate than the one its integrals and derivatives use."""
-    with pytest.raises(ConfigError, match=f"{level}_freq is {given} Hz, which does not divide freq = {freq} Hz"):
-        Sim(control=level, freq=freq, **{f"{level}_freq": given})
+    with pytest.raises(ConfigError, match=f"{level}_freq is {level_freq} Hz, which does not divide freq = {freq} Hz"):
+        Sim(control=level, freq=freq, **{f"{level}_freq": level_freq})
 
 
-def fall(data, n_steps, commanded=lambda r: 0.0):
-    """Return height, speed and rotor state of a falling level drone, by explicit Euler in float64.
+def simulate_fall(data, n_steps, command_rotors=lambda r: 0.0):
+    """Return height, vertical velocity and rotor state of a level drone that falls, by explicit Euler in float64.
 
-    ``commanded(r)`` is the command to the rotors, rpm, or of fitted dynamics the thrust, N; 0 for motors that are off.
+    ``command_rotors(r)`` returns rotor speeds, rpm, or for fitted dynamics the thrust, N. 0 stops the motors.
     """
     dt, z, v = 1 / data.core.freq, 100.0, 0.0
     p = jax.tree.map(lambda x: np.asarray(x, np.float64), data.params)
@@ -133,24 +134,24 @@ def fall(data, n_steps, commanded=lambda r: 0.0):
     for _ in range(n_steps):
         if hasattr(p, "rpm2thrust"):
             (k0, k1, k2), (_, _, a, b) = p.rpm2thrust[0], p.rotor_dyn_coef[0]
-            cmd = commanded(r)
+            cmd = command_rotors(r)
             thrust, r_dot = np.sum(k0 + k1 * r + k2 * r**2), a * (cmd - r) + b * (cmd**2 - r**2)
         elif p.thrust_dyn_coef is None:
-            thrust, r_dot = p.acc_coef[0] + p.cmd_f_coef[0] * commanded(r), 0 * r
+            thrust, r_dot = p.acc_coef[0] + p.cmd_f_coef[0] * command_rotors(r), 0 * r
         else:
-            thrust, r_dot = p.acc_coef[0] + p.cmd_f_coef[0] * r[0], p.thrust_dyn_coef[0] * (commanded(r) - r)
+            thrust, r_dot = p.acc_coef[0] + p.cmd_f_coef[0] * r[0], p.thrust_dyn_coef[0] * (command_rotors(r) - r)
         drag = 0.0 if p.drag_matrix is None else p.drag_matrix[2, 2]
         acc = (thrust + drag * v) / p.mass[0] - 9.81
         z, v, r = z + dt * v, v + dt * acc, r + dt * r_dot
     return z, v, r
 
 
-def without_force(step, data):
-    """Return the data after 250 steps with setpoints at the present position and velocity that need no force."""
+def fly_without_force(step, data):
+    """Return the data after 250 steps with setpoints at the current position and velocity, which need no force."""
     for _ in range(50):
         cmd = np.broadcast_to(zero_thrust_command(data), (3, 2, 16)).copy()
         cmd[..., 0:3], cmd[..., 3:6] = data.states.pos, data.states.vel
-        data = run(step, send(data, cmd), 5)
+        data = run_steps(step, send(data, cmd), 5)
     return data
 
 
@@ -164,49 +165,49 @@ def assert_falls(states, z, v, r):
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_fault_06_zero_thrust_stops_the_motors_at_every_level(dynamics, control):
-    """The peer keeps the rotors at their least speed, a fifth of the weight: 3.6 m/s after half a second, not 4.3.
+    """Crazyflow keeps the rotors at their minimum speed, with a fifth of the weight: 3.6 m/s after 0.5 s, not 4.3.
 
-    From hover the rotors run down as their lag has it, and the drone falls in its drag alone. At the level state this
-    is Crazyflow's cascade, which has no command for motors that are on but give no thrust.
+    From hover the rotors slow down with their lag, and the drone falls with drag only. At the level ``state`` the test
+    uses Crazyflow's cascade, which has no command for motors that are on but give no thrust.
     """
-    data, step, _ = program(dynamics, control, **({"controller": "crazyflow"} if control == "state" else {}))
+    data, step, _ = build_program(dynamics, control, **({"controller": "crazyflow"} if control == "state" else {}))
     data = with_states(data, pos=[0, 0, 100.0], rotor_vel=hover_rotor_state(data))
     if control == "state":
-        data = without_force(step, data)
+        data = fly_without_force(step, data)
     else:
-        data = run(step, send(data, repeat_command(data, zero_thrust_command(data))), 250)
+        data = run_steps(step, send(data, repeat_command(data, zero_thrust_command(data))), 250)
     commanded = data.controls.attitude.cmd[..., 3] if dynamics in FITTED else data.controls.rotor_vel
     np.testing.assert_array_equal(commanded, 0.0)
-    z, v, r = fall(data, 250)
+    z, v, r = simulate_fall(data, 250)
     assert_falls(data.states, z, v, r)
-    assert v < -3.5, "gravity alone gives 4.905 m/s; the rotors' last turns and drag take some"
+    assert v < -3.5, "gravity alone gives 4.905 m/s; thrust of the slowing rotors and drag reduce it"
 
 
 @pytest.mark.parametrize("dynamics", ["first_principles", *FITTED])
 def test_fault_06_the_default_controller_keeps_the_rotors_at_their_least_speed(dynamics):
-    """Rotors that stand still cannot turn a drone, and start late; and what drag asks for does not tilt it."""
-    data, step, _ = program(dynamics, "state")
+    """Rotors that stand still cannot turn a drone, and start late. Compensation of drag does not tilt it."""
+    data, step, _ = build_program(dynamics, "state")
     data = with_states(data, pos=[0, 0, 100.0], rotor_vel=hover_rotor_state(data))
-    fell = without_force(step, data)
+    after_fall = fly_without_force(step, data)
     if dynamics in FITTED:
         least = float(data.params.thrust_min[0])
-        commanded, z_v_r = fell.controls.attitude.cmd[..., 3], fall(data, 250, lambda r: least)
+        commanded, z_v_r = after_fall.controls.attitude.cmd[..., 3], simulate_fall(data, 250, lambda r: least)
     else:
         p = jax.tree.map(lambda x: np.asarray(x, np.float64), data.controls.controller.params)
         (k0, k1, k2), lead = p.allocation.rpm2thrust[0], p.lead[0]
         idle = (np.sqrt(k1**2 - 4 * k2 * (k0 - p.allocation.thrust_min[0])) - k1) / (2 * k2)
-        least, commanded = idle, fell.controls.rotor_vel
+        least, commanded = idle, after_fall.controls.rotor_vel
         lowest = float(np.min(data.params.rotor_vel_min))  # of the dynamics, for rotors that are on
-        z_v_r = fall(data, 250, lambda r: np.maximum(r + lead * (idle - r), lowest))
+        z_v_r = simulate_fall(data, 250, lambda r: np.maximum(r + lead * (idle - r), lowest))
     np.testing.assert_allclose(commanded, least, rtol=1e-3)  # the last per mille of the lag
-    assert_falls(fell.states, *z_v_r)
-    assert z_v_r[1] < -2.5, "four fifths of gravity give 3.9 m/s; the rotors' last turns and drag take some"
+    assert_falls(after_fall.states, *z_v_r)
+    assert z_v_r[1] < -2.5, "four fifths of gravity give 3.9 m/s; thrust of the slowing rotors and drag reduce it"
 
 
 def test_fault_06_a_drone_dropped_with_its_motors_off_falls_freely():
-    """From rest with the rotors still, the exact solution in linear drag: v = -g tau (1 - exp(-t / tau))."""
-    data, step, _ = program("first_principles", "attitude")
-    data = run(step, send(with_states(data, pos=[0, 0, 100.0]), np.zeros((3, 2, 4))), 250)
+    """It falls from rest as the exact solution with linear drag: v = -g tau (1 - exp(-t / tau))."""
+    data, step, _ = build_program("first_principles", "attitude")
+    data = run_steps(step, send(with_states(data, pos=[0, 0, 100.0]), np.zeros((3, 2, 4))), 250)
     tau = float(data.params.mass[0]) / -float(data.params.drag_matrix[2, 2])
     expected = -9.81 * tau * (1 - np.exp(-0.5 / tau))
     assert -4.3 < expected < -4.2
@@ -216,29 +217,29 @@ def test_fault_06_a_drone_dropped_with_its_motors_off_falls_freely():
 
 
 def test_fault_09_a_parameter_is_shared_or_per_drone_never_guessed():
-    """With as many worlds as drones the peer takes one mass per world for one per drone."""
+    """If there are as many worlds as drones, Crazyflow takes one mass per world for one mass per drone."""
     sim = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
     data, step = with_states(sim.data, pos=[0, 0, 10.0]), sim.build_step_fn()
-    up, m = hover_rotor_state(data), float(data.params.mass[0])
-    data = send(with_states(data, rotor_vel=up), repeat_command(data, up))
+    hover_speeds, m = hover_rotor_state(data), float(data.params.mass[0])
+    data = send(with_states(data, rotor_vel=hover_speeds), repeat_command(data, hover_speeds))
     with pytest.raises(ConfigError, match=r"data.params.mass has shape \(2, 1\).*jnp.broadcast_to"):
-        run(step, with_params(data, mass=np.full((2, 1), m, np.float32)), 1)
+        run_steps(step, with_params(data, mass=np.full((2, 1), m, np.float32)), 1)
 
     heavy_world = np.broadcast_to(np.float32([m, 2 * m])[:, None, None], (2, 2, 1))
-    vel = np.asarray(run(step, with_params(data, mass=heavy_world), 50).states.vel[..., 2])
+    vel = np.asarray(run_steps(step, with_params(data, mass=heavy_world), 50).states.vel[..., 2])
     np.testing.assert_allclose(vel[0], 0.0, atol=1e-4)  # float32: hover to 1e-5 of the weight
-    # Twice the mass at the thrust of one: half of gravity is left. Drag takes 2 %.
+    # With twice the mass and the same thrust, half of gravity is left; drag reduces it by 2%.
     np.testing.assert_allclose(vel[1], -0.5 * 9.81 * 0.1, rtol=0.03)
 
     heavy_drone = np.swapaxes(heavy_world, 0, 1)
-    swapped = np.asarray(run(step, with_params(data, mass=heavy_drone), 50).states.vel[..., 2])
+    swapped = np.asarray(run_steps(step, with_params(data, mass=heavy_drone), 50).states.vel[..., 2])
     np.testing.assert_allclose(swapped, vel.T, atol=1e-6)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_fault_13_a_drone_on_the_floor_neither_slides_nor_turns_and_takes_off(integrator):
-    """A side force of half the weight and a yaw torque push it; its rotors carry half its weight."""
-    data, step, _ = program("first_principles", "rotor_vel", integrator=integrator)
+    """A side force of half its weight and a yaw torque act on it, and its rotors carry half its weight."""
+    data, step, _ = build_program("first_principles", "rotor_vel", integrator=integrator)
     hover, m = hover_rotor_state(data), float(data.params.mass[0])
     half = 0.3
     tilt = [0.1, -0.05, np.sin(half), 0.0]
@@ -251,14 +252,14 @@ def test_fault_13_a_drone_on_the_floor_neither_slides_nor_turns_and_takes_off(in
         force=[0.5 * m * 9.81, 0.1 * m * 9.81, 0],
         torque=[1e-5, 2e-5, 1e-4],
     )
-    landed = run(step, send(data, repeat_command(data, 0.7 * hover)), 500)
+    landed = run_steps(step, send(data, repeat_command(data, 0.7 * hover)), 500)
     for name in ("pos", "quat", "vel", "ang_vel"):
         before, after = getattr(data.states, name), getattr(landed.states, name)
         # at most the rounding of a quaternion that is normalised 500 times
         np.testing.assert_allclose(after, before, atol=1e-5 if name == "quat" else 0, rtol=0, err_msg=name)
 
     level = with_states(landed, quat=[0, 0, 0, 1], force=0.0, torque=0.0)
-    flying = run(step, send(level, repeat_command(level, 1.2 * hover)), 500)
+    flying = run_steps(step, send(level, repeat_command(level, 1.2 * hover)), 500)
     assert np.all(flying.states.pos[..., 2] > 0.5)
     np.testing.assert_allclose(flying.states.pos[..., :2], data.states.pos[..., :2], atol=0.02)
     assert not flying.core.nonfinite.any()
@@ -266,10 +267,10 @@ def test_fault_13_a_drone_on_the_floor_neither_slides_nor_turns_and_takes_off(in
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_fault_13_a_drone_that_has_fallen_stays_where_it_came_down(integrator):
-    data, step, _ = program("first_principles", "rotor_vel", integrator=integrator)
+    data, step, _ = build_program("first_principles", "rotor_vel", integrator=integrator)
     thrown = with_states(data, pos=[0, 0, 0.2], vel=[1.0, 0, -1.0], ang_vel=[0.5, 0.2, 3.0], torque=[0, 0, 1e-4])
-    down = run(step, send(thrown, np.zeros((3, 2, 4))), 250)
-    later = run(step, down, 250)
+    down = run_steps(step, send(thrown, np.zeros((3, 2, 4))), 250)
+    later = run_steps(step, down, 250)
     assert np.all(down.states.pos[..., 2] == np.float32(FLOOR_HEIGHT))
     assert np.all(down.states.pos[..., 0] > 0.05), "it has flown"
     np.testing.assert_array_equal(later.states.pos, down.states.pos)
@@ -278,7 +279,7 @@ def test_fault_13_a_drone_that_has_fallen_stays_where_it_came_down(integrator):
 
 
 class Queue(PyTree):
-    """A record as a user writes one: with a leaf per drone, one per world and one that all share."""
+    """A record of a user, with a leaf per drone, a leaf per world, and a shared leaf."""
 
     waiting: jax.Array = leaf("drone", 2)
     seen: jax.Array = leaf("world")
@@ -286,25 +287,25 @@ class Queue(PyTree):
 
 
 @pytest.fixture(scope="module")
-def dirty():
-    """Return default data with plugins and drawn masses, data far from it, and the reset."""
-    data, step, reset = program("first_principles", "state")
+def used_data():
+    """Return default data with plugins, data after a flight with other parameters, and the reset."""
+    data, step, reset = build_program("first_principles", "state")
     queue = Queue(jnp.zeros((3, 2, 4, 16)), jnp.zeros((3, 1)), jnp.arange(5.0))
-    default = data.replace(plugins={"queue": queue, "bare": jnp.zeros((3, 2))})
+    default = data.replace(plugins={"queue": queue, "undeclared": jnp.zeros((3, 2))})
     drawn = np.random.default_rng(3).uniform(0.03, 0.05, (3, 2, 1)).astype(np.float32)
     used = with_params(default, mass=drawn, gravity_vec=np.float32([0, 0, -1.62]))
     command = np.tile(np.float32([1, 1, 1, *np.zeros(9), 1, 0, 0, 0]), (3, 2, 1))
-    used = run(step, send(used, command), 30)
-    dirty_queue = Queue(jnp.ones((3, 2, 4, 16)), jnp.full((3, 1), 9.0), 2 * jnp.arange(5.0))
-    return default, used.replace(plugins={"queue": dirty_queue, "bare": jnp.ones((3, 2))}), reset
+    used = run_steps(step, send(used, command), 30)
+    used_queue = Queue(jnp.ones((3, 2, 4, 16)), jnp.full((3, 1), 9.0), 2 * jnp.arange(5.0))
+    return default, used.replace(plugins={"queue": used_queue, "undeclared": jnp.ones((3, 2))}), reset
 
 
 def named_leaves(data):
     return {jax.tree_util.keystr(k): as_numbers(v) for k, v in jax.tree_util.tree_leaves_with_path(data)}
 
 
-def test_fault_16_a_full_reset_is_that_of_all_worlds_and_of_what_they_share(dirty):
-    default, used, reset = dirty
+def test_fault_16_a_full_reset_is_that_of_all_worlds_and_of_what_they_share(used_data):
+    default, used, reset = used_data
     full, masked = reset(used, default), reset(used, default, jnp.ones(3, bool))
     assert jax.tree.structure(full) == jax.tree.structure(masked)
     per_world = dict(zip(named_leaves(full), (n_batch_axes(s) > 0 for s in jax.tree.leaves(scopes(full))), strict=True))
@@ -327,29 +328,36 @@ def test_fault_16_a_full_reset_is_that_of_all_worlds_and_of_what_they_share(dirt
             np.testing.assert_array_equal(full[name], value, err_msg=name)
 
 
-def test_fault_16_a_reset_touches_its_worlds_and_what_belongs_to_them_only(dirty):
-    default, used, reset = dirty
+def test_fault_16_a_reset_touches_its_worlds_and_what_belongs_to_them_only(used_data):
+    default, used, reset = used_data
     mask = np.array([True, False, True])
-    before, after, wanted = (
+    before, after, default_leaves = (
         named_leaves(used),
         named_leaves(reset(used, default, jnp.asarray(mask))),
         named_leaves(default),
     )
     batched = [
-        name for name, x in before.items() if x.shape[:2] in ((3, 2), (3, 1)) and name not in (".plugins['bare']",)
+        name
+        for name, x in before.items()
+        if x.shape[:2] in ((3, 2), (3, 1)) and name not in (".plugins['undeclared']",)
     ]
     assert {".params.mass", ".plugins['queue'].waiting", ".plugins['queue'].seen", ".states.pos"} <= set(batched)
     assert len(batched) > 20
     for name in batched:
         np.testing.assert_array_equal(after[name][~mask], before[name][~mask], err_msg=name)
         if name != ".core.episode":
-            default_value = np.broadcast_to(wanted[name], before[name].shape)
+            default_value = np.broadcast_to(default_leaves[name], before[name].shape)
             np.testing.assert_array_equal(after[name][mask], default_value[mask], err_msg=name)
     np.testing.assert_array_equal(after[".core.episode"][:, 0], mask)
     for name in set(before) - set(batched) - {".core.mjx_synced"}:
         np.testing.assert_array_equal(
-            after[name], before[name], err_msg=f"{name} is shared or opaque: no reset takes it"
+            after[name], before[name], err_msg=f"{name} is shared or opaque: no masked reset changes it"
         )
-    # This is about leaves that had moved away from their default, or it would hold of anything.
-    for name in (".params.gravity_vec", ".plugins['bare']", ".plugins['queue'].table", ".plugins['queue'].waiting"):
-        assert not np.array_equal(before[name], wanted[name]), name
+    # These leaves must differ from their defaults, or the test would prove nothing.
+    for name in (
+        ".params.gravity_vec",
+        ".plugins['undeclared']",
+        ".plugins['queue'].table",
+        ".plugins['queue'].waiting",
+    ):
+        assert not np.array_equal(before[name], default_leaves[name]), name

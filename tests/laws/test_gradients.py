@@ -1,4 +1,4 @@
-"""Gradients through every command level: equal to central differences, and finite where a switch lies."""
+"""Gradients through every command level equal central differences, and are finite at switches."""
 
 import functools
 
@@ -20,19 +20,19 @@ COMMANDS = {
     "force_torque": [1.02 * WEIGHT, 1e-5, -2e-5, 1e-6],
     "rotor_vel": [16_000.0, 16_010.0, 16_020.0, 16_005.0],
 }
-SETTER = {c: getattr(F, f"{c}_control") for c in COMMANDS}
+SETTERS = {c: getattr(F, f"{c}_control") for c in COMMANDS}
 
 
 N_INPUTS = 6
 """Number of inputs of a flight: five states and the command."""
-DIFFERENCE = 1e-6
+RELATIVE_STEP = 1e-6
 """Relative step of the central differences."""
 
 
-def flight(dynamics, control, engine, n_worlds, n_steps=100):
-    """Return a function from (pos, quat direction, vel, ang_vel, rotor_vel, command) of each world to a number of each.
+def make_losses(dynamics, control, engine, n_worlds, n_steps=100):
+    """Return a loss as a function of a dict of inputs, each (n_worlds, k), and the inputs of one world to start from.
 
-    A start for one world comes with it.
+    The loss has one number per world, (n_worlds,). The quaternion is normalised first.
     """
     sim = Sim(n_worlds, dynamics=dynamics, control=control, engine="plain" if engine == "stages" else engine)
     step = by_stages(sim) if engine == "stages" else sim.build_step_fn()
@@ -51,40 +51,40 @@ def flight(dynamics, control, engine, n_worlds, n_steps=100):
         x = {name: value[:, None] for name, value in x.items()}
         quat = x["quat"] / jnp.linalg.norm(x["quat"], axis=-1, keepdims=True)
         states = sim.data.states.replace(quat=quat, **{k: x[k] for k in ("pos", "vel", "ang_vel", "rotor_vel")})
-        data = SETTER[control](sim.data.replace(states=states), x["command"])
+        data = SETTERS[control](sim.data.replace(states=states), x["command"])
         s = step(data, n_steps).states
-        each = s.pos * jnp.array([1.0, -2.0, 3.0]) + 0.5 * s.vel**2 + s.quat[..., :3]
-        return jnp.sum(each, axis=(1, 2))
+        terms = s.pos * jnp.array([1.0, -2.0, 3.0]) + 0.5 * s.vel**2 + s.quat[..., :3]
+        return jnp.sum(terms, axis=(1, 2))
 
     return losses, {name: np.asarray(value, float) for name, value in start.items()}
 
 
-def forward(losses, x, directions):
-    """Return the losses, and their slopes along the directions, by forward mode."""
+def forward_mode(losses, x, directions):
+    """Return the losses, and their derivatives along the directions, by forward mode."""
     return jax.jvp(losses, (x,), (directions,))
 
 
-def reverse(losses, x, directions):
-    """Return the same by reverse mode."""
+def reverse_mode(losses, x, directions):
+    """Return the losses, and their derivatives along the directions, by reverse mode."""
     values, pullback = jax.vjp(losses, x)
     (gradient,) = pullback(jnp.ones_like(values))
     return values, sum(jnp.sum(gradient[name] * directions[name], axis=-1) for name in x)
 
 
 CASES = [
-    ("first_principles", "state", "plain", reverse),
-    ("first_principles", "attitude", "plain", forward),
-    ("first_principles", "body_rate", "stages", forward),
-    ("first_principles", "force_torque", "stages", forward),
-    ("first_principles", "rotor_vel", "stages", forward),
-    ("so_rpy", "state", "stages", forward),
-    ("so_rpy", "attitude", "stages", forward),
-    ("so_rpy_rotor_drag", "state", "stages", forward),
-    ("so_rpy_rotor_drag", "attitude", "stages", forward),
-    ("first_principles", "attitude", "auto", reverse),
+    ("first_principles", "state", "plain", reverse_mode),
+    ("first_principles", "attitude", "plain", forward_mode),
+    ("first_principles", "body_rate", "stages", forward_mode),
+    ("first_principles", "force_torque", "stages", forward_mode),
+    ("first_principles", "rotor_vel", "stages", forward_mode),
+    ("so_rpy", "state", "stages", forward_mode),
+    ("so_rpy", "attitude", "stages", forward_mode),
+    ("so_rpy_rotor_drag", "state", "stages", forward_mode),
+    ("so_rpy_rotor_drag", "attitude", "stages", forward_mode),
+    ("first_principles", "attitude", "auto", reverse_mode),
 ]
-"""Both modes for a long pipeline and for engines; otherwise the stages as they are written, forwards, which compiles
-sooner: the slopes of physics and controllers are defined forwards alone, and JAX transposes them."""
+"""Dynamics, command level, engine and mode. Most cases run the stages without an engine in forward mode, which compiles
+fastest: derivatives of physics and controllers are defined in forward mode only, and JAX transposes them."""
 
 
 @pytest.mark.long("compiles gradients of every dynamics and engine")
@@ -92,43 +92,43 @@ sooner: the slopes of physics and controllers are defined forwards alone, and JA
 def test_gradient_equals_central_differences(dynamics, control, engine, mode, x64):
     """100 steps in float64, along a random direction in each input on its own, away from switches.
 
-    A central difference with a relative step of 1e-6 is off by about 1e-12 of curvature and 1e-10 of rounding,
-    over a gradient of order one: 1e-6 leaves room for both.
+    A central difference with a relative step of 1e-6 has errors of about 1e-12 from curvature and 1e-10 from rounding,
+    and the gradient is of order one, so a tolerance of 1e-6 suffices.
 
-    Each input has three worlds: at the start, ahead of it and behind it. One program computes all.
+    Each input has three worlds: at the start, one step ahead of it and one step behind it.
     """
-    losses, start = flight(dynamics, control, engine, n_worlds=3 * N_INPUTS)
+    losses, start = make_losses(dynamics, control, engine, n_worlds=3 * N_INPUTS)
     rng = np.random.default_rng(0)
     x, directions = {}, {}
     for k, (name, value) in enumerate(start.items()):
         direction = rng.normal(size=value.shape) * np.maximum(np.abs(value), 0.1)
         directions[name] = np.zeros((3 * len(start), len(value)))
         directions[name][3 * k : 3 * k + 3] = direction
-        x[name] = value + DIFFERENCE * np.tile([0.0, 1.0, -1.0], len(start))[:, None] * directions[name]
+        x[name] = value + RELATIVE_STEP * np.tile([0.0, 1.0, -1.0], len(start))[:, None] * directions[name]
     values, slopes = (np.asarray(found) for found in jax.jit(functools.partial(mode, losses))(x, directions))
     compared = 0
     for k, name in enumerate(start):
         _, ahead, behind = values[3 * k : 3 * k + 3]
-        numeric, analytic = (ahead - behind) / (2 * DIFFERENCE), slopes[3 * k]
+        numeric, analytic = (ahead - behind) / (2 * RELATIVE_STEP), slopes[3 * k]
         assert np.isfinite(analytic), name
         np.testing.assert_allclose(analytic, numeric, rtol=1e-5, atol=1e-6, err_msg=name)
         compared += abs(numeric) > 1e-6
     assert compared >= 5, "the loss hardly depends on its inputs: nothing was compared"
 
 
-def one_sided(fn, x, h):
+def one_sided_quotients(fn, x, h):
     """Return the forward and the backward difference quotient."""
     return (fn(x + h) - fn(x)) / h, (fn(x) - fn(x - h)) / h
 
 
-def nearest_side(gradient, sides):
-    """Return by how much a gradient misses the nearer of two one-sided quotients, relative to their size."""
+def side_error(gradient, sides):
+    """Return the difference of a gradient from the nearer of two one-sided quotients, relative to their size."""
     scale = max(1e-9, *(abs(float(side)) for side in sides))
     return min(abs(float(gradient) - float(side)) for side in sides) / scale
 
 
 def test_at_the_rotor_switch_the_gradient_is_one_side(x64):
-    """A command equal to the speed is the kink between spinning up and down."""
+    """The response has a kink where the command equals the speed, between spinning up and down."""
     params = first_principles.Params.create(load_airframe("cf21B_500"))
 
     @jax.jit
@@ -137,14 +137,14 @@ def test_at_the_rotor_switch_the_gradient_is_one_side(x64):
         return first_principles.dynamics(*states, jnp.full(4, cmd), np.full(4, 15_000.0), params=params)[3][0]
 
     gradient = jax.jit(jax.grad(response))(15_000.0)
-    assert nearest_side(gradient, one_sided(response, 15_000.0, 1e-3)) < 1e-5
+    assert side_error(gradient, one_sided_quotients(response, 15_000.0, 1e-3)) < 1e-5
 
 
-@pytest.mark.parametrize("at", ["rotor_vel_min", "rotor_vel_max"])
-def test_at_saturation_the_gradient_is_one_side(at, x64):
-    """At a limit the command either counts in full or not at all."""
+@pytest.mark.parametrize("limit_name", ["rotor_vel_min", "rotor_vel_max"])
+def test_at_saturation_the_gradient_is_one_side(limit_name, x64):
+    """At a limit the derivative with respect to the command is 1, beyond it 0."""
     params = first_principles.Params.create(load_airframe("cf21B_500"))
-    limit = float(getattr(params, at)[0])
+    limit = float(getattr(params, limit_name)[0])
 
     @jax.jit
     def saturated(cmd):
@@ -152,14 +152,14 @@ def test_at_saturation_the_gradient_is_one_side(at, x64):
 
     gradient = jax.jit(jax.grad(saturated))
     assert float(gradient(limit)) == 1.0
-    assert nearest_side(1.0, one_sided(saturated, limit, 1e-3)) < 1e-6
-    outside = limit * (1 + 1e-9 * (1 if at == "rotor_vel_max" else -1))
+    assert side_error(1.0, one_sided_quotients(saturated, limit, 1e-3)) < 1e-6
+    outside = limit * (1 + 1e-9 * (1 if limit_name == "rotor_vel_max" else -1))
     assert float(gradient(outside)) == 0.0
 
 
 @pytest.mark.long("compiles the gradient of all stages")
 def test_on_the_floor_and_at_rest_gradients_are_finite():
-    """A drone that rests, one that hits the floor, one that hovers, one with its motors off."""
+    """The drones rest, hit the floor, hover, and fall with their motors off."""
     sim = Sim(n_worlds=4, control="attitude")
     step = by_stages(sim)
 

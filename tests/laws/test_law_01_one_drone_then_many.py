@@ -30,7 +30,7 @@ AIRFRAME = load_airframe("cf21B_500")
 MODULES = (rigid_body, rotor, inflow, drag, first_principles, fitted, allocation, attitude_controller, state_controller)
 
 
-def functions_of(module):
+def public_functions(module):
     """Return the public functions of a module that return arrays."""
     own = [f for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__]
     return [f for f in own if "Array" in f.__annotations__["return"] and not f.__name__.startswith("_")]
@@ -41,12 +41,12 @@ CASES = [
         module, function, model, id="-".join(filter(None, [function.__module__[9:], function.__name__, model]))
     )
     for module in MODULES
-    for function in functions_of(module)
+    for function in public_functions(module)
     for model in (FITTED if module is fitted else (None,))
 ]
 
 
-def parameters(module, model):
+def make_parameters(module, model):
     """Return the shared parameters that the functions of a module take."""
     if module is fitted:
         return fitted.Params.create(AIRFRAME, Dynamics(model))
@@ -54,8 +54,8 @@ def parameters(module, model):
     return records.get(module, first_principles.Params).create(AIRFRAME)
 
 
-def command(module, function, rng):
-    """Return commands that reach limits and switches too, some of them without thrust."""
+def draw_command(module, function, rng):
+    """Return random commands, some of them beyond limits or without thrust."""
     if module in (rotor, first_principles):
         return rng.uniform(-2e3, 3e4, (*BATCH, 4))
     if module is state_controller:
@@ -66,15 +66,15 @@ def command(module, function, rng):
     return np.concatenate([others, thrust], -1)
 
 
-def arguments(module, function, model, rng, per_drone):
-    """Return random arguments by name, each with the batch axes, and those that every drone shares."""
-    shared = parameters(module, model)
+def draw_arguments(module, function, model, rng, per_drone):
+    """Return random arguments by name: arguments with batch axes, and arguments that all drones share."""
+    shared = make_parameters(module, model)
     if per_drone:
         shared = jax.tree.map(lambda x: x * rng.uniform(0.9, 1.1, (*BATCH, *x.shape)), shared)
-    drawn = {
+    draw_functions = {
         "quat": lambda: (q := rng.normal(size=(*BATCH, 4))) / np.linalg.norm(q, axis=-1, keepdims=True),
-        "cmd": lambda: command(module, function, rng),
-        "prev_cmd": lambda: command(module, function, rng),
+        "cmd": lambda: draw_command(module, function, rng),
+        "prev_cmd": lambda: draw_command(module, function, rng),
         "rotor_vel": lambda: (
             rng.uniform(0, 2.5e4, (*BATCH, 4)) if module is not fitted else rng.uniform(0, 1, (*BATCH, 4))
         ),
@@ -95,33 +95,35 @@ def arguments(module, function, model, rng, per_drone):
             "ceiling": (1.0, 1.5),
             "gap": (0, 0.2),
         }
-        drawn = {name: functools.partial(rng.uniform, *ends, (*BATCH, 4)) for name, ends in ranges.items()}
-    batched, common = {}, {}
+        draw_functions = {name: functools.partial(rng.uniform, *ends, (*BATCH, 4)) for name, ends in ranges.items()}
+    batched, shared_arguments = {}, {}
     for name in inspect.signature(function).parameters:
         if name == "ctrl_freq":
-            common[name] = 100.0
+            shared_arguments[name] = 100.0
         elif name == "dt":
-            common[name] = 0.002
+            shared_arguments[name] = 0.002
         elif name == "params":
-            (batched if per_drone else common)[name] = shared
+            (batched if per_drone else shared_arguments)[name] = shared
         elif name in ("coefficients", "yaw_torque_sign") or hasattr(shared, name):
             value = {"coefficients": "rpm2thrust", "yaw_torque_sign": "mixing_matrix"}.get(name, name)
             value = getattr(shared, value)
-            (batched if per_drone else common)[name] = value[..., 2, :] if name == "yaw_torque_sign" else value
+            (batched if per_drone else shared_arguments)[name] = (
+                value[..., 2, :] if name == "yaw_torque_sign" else value
+            )
         else:
-            batched[name] = drawn.get(name, lambda: rng.normal(size=(*BATCH, 3)))()
-    return jax.tree.map(np.asarray, batched), common
+            batched[name] = draw_functions.get(name, lambda: rng.normal(size=(*BATCH, 3)))()
+    return jax.tree.map(np.asarray, batched), shared_arguments
 
 
 @pytest.mark.parametrize("per_drone", [False, True], ids=["shared", "per_drone"])
 @pytest.mark.parametrize("module, function, model", CASES)
 def test_a_batch_is_its_drones(module, function, model, per_drone, x64, rng):
-    """Law 1 for every function of dynamics and control, with parameters shared and one per drone."""
-    batched, common = arguments(module, function, model, rng, per_drone)
+    """Law 1 for every function of dynamics and control, with shared parameters and parameters per drone."""
+    batched, shared_arguments = draw_arguments(module, function, model, rng, per_drone)
     if not batched:  # a function of parameters alone: without batch axes there is nothing to compare
         assert not per_drone
-        batched, common = arguments(module, function, model, rng, per_drone=True)
-    compiled = jax.jit(lambda batched: function(**batched, **common))
+        batched, shared_arguments = draw_arguments(module, function, model, rng, per_drone=True)
+    compiled = jax.jit(lambda batched: function(**batched, **shared_arguments))
     whole = jax.tree.leaves(jax.device_get(compiled(batched)))
     assert whole
     for i in np.ndindex(BATCH):
@@ -136,7 +138,7 @@ def test_a_batch_is_its_drones(module, function, model, per_drone, x64, rng):
 
 @pytest.mark.parametrize("name", [name for name in CONTROLLERS if name not in ("load_lqr", "tracking_lqr")])
 def test_drones_of_a_controller_fly_as_each_does_alone(name, rng):
-    """Law 1: worlds of drones with random states and setpoints, and each drone by itself.
+    """Law 1: drones with random states and setpoints fly in a batch as each drone flies alone.
 
     Controllers that need a load or a trajectory of their own are compared in tests/control.
     """
@@ -171,10 +173,8 @@ def test_drones_of_a_controller_fly_as_each_does_alone(name, rng):
 def test_the_cases_cover_dynamics_and_control():
     """No module of physics or control that computes arrays is missing.
 
-    ``parameters`` and ``parameter_tables`` only load them, and in ``firmware`` a library computes, which
-    ``test_c_firmware`` compares.
-
-    Laws of controllers are covered by the controllers that use them.
+    ``parameters`` and ``parameter_tables`` only load arrays. In ``firmware`` a library computes, which
+    ``test_c_firmware`` compares. Modules that controllers import count as covered by them.
     """
     covered = {m.__name__ for m in MODULES}
     for place in CONTROLLERS.values():
@@ -182,13 +182,13 @@ def test_the_cases_cover_dynamics_and_control():
         covered |= {module.__name__} | {getattr(x, "__module__", "") for x in vars(module).values()}
     names = ("__init__", "levels", "models", "parameters", "parameter_tables")
     names += ("protocol", "controllers", "setpoint", "switch", "firmware")
-    for path in sources():
+    for path in source_files():
         name = "crazysim." + ".".join(path.relative_to(Path(crazysim.__file__).parent).with_suffix("").parts)
         assert name in covered or path.stem in names, name
     assert len(CASES) >= 17
 
 
-def sources():
+def source_files():
     """Return the source files of physics and control."""
     root = Path(crazysim.__file__).parent
     paths = [p for package in ("dynamics", "control") for p in sorted((root / package).glob("*.py"))]
@@ -202,7 +202,7 @@ def test_physics_and_control_contain_no_batching():
     Riccati equations have loops over doublings, and gains along a trajectory over its setpoints.
     """
     batching = {"vmap", "pmap", "shard_map", "scan", "fori_loop", "while_loop", "n_worlds", "n_drones"}
-    for path in sources():
+    for path in source_files():
         forbidden = batching - {"scan", "vmap"} if path.stem in ("riccati", "tracking_lqr") else batching
         for node in ast.walk(ast.parse(path.read_text())):
             names = {getattr(node, key, None) for key in ("id", "attr", "arg", "name")}

@@ -14,39 +14,39 @@ from crazysim.engine import Step
 from crazysim.pytree import scopes
 
 SIZES = [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4)]
-EQUAL, UNEQUAL = ([size for size in SIZES if (size[0] == size[1]) == same] for same in (True, False))
+EQUAL_SIZES, UNEQUAL_SIZES = ([size for size in SIZES if (size[0] == size[1]) == same] for same in (True, False))
 
 
-def resized(sim, n_worlds, n_drones):
-    """Return the data that ``Sim`` would build for so many worlds and drones, without another scene."""
+def make_data(sim, n_worlds, n_drones):
+    """Return the data that ``Sim`` would build for these numbers of worlds and drones, without building a scene."""
     freqs, ids = dict.fromkeys(Control, 100), np.arange(n_drones)
     settings = sim.dynamics, sim.control, sim.airframe, sim.freq, freqs, ids, 0, sim.configuration.controller
     return SimData.create(n_worlds, n_drones, *settings)
 
 
-def per_drone(data):
-    """Return the data with every parameter that all drones shared given to each drone."""
+def with_drone_parameters(data):
+    """Return the data with all shared parameters broadcast to one per drone."""
     shape = data.states.pos.shape[:2]
 
-    def spread(record):
+    def broadcast(record):
         return jax.tree.map(lambda x: np.broadcast_to(x, (*shape, *x.shape)), record)
 
     controls = data.controls
     changes = {
-        level: record.replace(params=spread(record.params))
+        level: record.replace(params=broadcast(record.params))
         for level in LEVELS[:4]
         if (record := getattr(controls, level)) is not None and record.params is not None
     }
-    return data.replace(params=spread(data.params), controls=controls.replace(**changes))
+    return data.replace(params=broadcast(data.params), controls=controls.replace(**changes))
 
 
-def signature(tree):
+def array_types(tree):
     """Return structure, shapes and types of a tree."""
     return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]
 
 
-def after_all_stages(sim, data):
-    """Return the data after every stage, one after the other, each batched as it is without an engine."""
+def run_all_stages(sim, data):
+    """Return the data after all stages, run one after the other without an engine."""
     for stage in Step(sim.step_pipeline, "plain").stages:
         data = stage(data)
     return data
@@ -55,11 +55,11 @@ def after_all_stages(sim, data):
 @pytest.mark.long("traces the step for every number of worlds and drones")
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_a_step_keeps_every_shape_and_type(dynamics, control):
-    """Law 2: whatever the numbers of worlds and drones, equal ones included, parameters shared or one per drone."""
+    """Law 2, for equal and unequal numbers of worlds and drones, with shared parameters and one per drone."""
     sim = shared_sim(dynamics=dynamics, control=control)
-    # Every size for one pair; the others, whose stages are batched alike, share them out, equal numbers included.
+    # One pair is tested with all sizes. The other pairs, whose stages are batched alike, are tested with a few each.
     k = PAIRS.index((dynamics, control))
-    equal, unequal = EQUAL[(k + 1) % 4], UNEQUAL[k % 12]
+    equal, unequal = EQUAL_SIZES[(k + 1) % 4], UNEQUAL_SIZES[k % 12]
     cases = [
         ("step", *equal),
         ("step", *unequal),
@@ -67,31 +67,31 @@ def test_a_step_keeps_every_shape_and_type(dynamics, control):
     ]
     steps = {
         "step": functools.partial(Step(sim.step_pipeline, "interpret"), n_steps=1),
-        "stages": functools.partial(after_all_stages, sim),
+        "stages": functools.partial(run_all_stages, sim),
     }
     for name, n_worlds, n_drones in cases:
-        data = resized(sim, n_worlds, n_drones)
+        data = make_data(sim, n_worlds, n_drones)
         if (n_worlds + n_drones) % 2 == 0:
-            data = per_drone(data)
+            data = with_drone_parameters(data)
         after = jax.eval_shape(steps[name], data)
-        assert signature(after) == signature(data), (name, n_worlds, n_drones)
+        assert array_types(after) == array_types(data), (name, n_worlds, n_drones)
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_scopes_determine_the_axes(dynamics, control):
     """Law 2: drone leaves are (n_worlds, n_drones, *core), world leaves (n_worlds, 1, *core), shared ones core."""
     sim = shared_sim(dynamics=dynamics, control=control)
-    one = resized(sim, 1, 1)
+    one = make_data(sim, 1, 1)
     counts = dict.fromkeys(("drone", "world", "shared"), 0)
     for n_worlds, n_drones in SIZES:
-        data = resized(sim, n_worlds, n_drones)
+        data = make_data(sim, n_worlds, n_drones)
         for scope, x, single in zip(*map(jax.tree.leaves, (scopes(data), data, one)), strict=True):
             batch = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1), "shared": ()}[scope]
             core = single.shape[len(batch) :]
-            is_ids = x is data.core.drone_mocap_ids  # shared, and as long as there are drones
+            is_ids = x is data.core.drone_mocap_ids  # shared, with one number per drone
             assert x.shape == (*batch, *((n_drones,) if is_ids else core))
             counts[scope] += 1
-        spread = scopes(per_drone(data))
+        spread = scopes(with_drone_parameters(data))
         assert set(jax.tree.leaves((spread.params, spread.controls))) == {"drone"}
     assert all(counts.values())
 
@@ -100,12 +100,12 @@ def test_the_resized_data_are_what_sim_builds():
     """The shapes above are those of a real simulation, with as many worlds as drones and with more drones."""
     for n_worlds, n_drones in ((3, 3), (2, 4)):
         sim = Sim(n_worlds, n_drones, control="state", attitude_freq=100, force_torque_freq=100)
-        assert signature(sim.data) == signature(resized(sim, n_worlds, n_drones))
+        assert array_types(sim.data) == array_types(make_data(sim, n_worlds, n_drones))
 
 
 @pytest.fixture(scope="module")
-def square():
-    """Three worlds of three drones without weight or thrust, high up."""
+def three_by_three():
+    """Return a simulation of three worlds of three drones, high up, without weight or thrust."""
     sim = Sim(3, 3, control="rotor_vel")
     p = sim.data.params
     curve = np.array(p.rpm2thrust)
@@ -115,21 +115,21 @@ def square():
     return sim
 
 
-def test_a_mass_belongs_to_its_world_and_drone(square):
-    """Law 2, where lengths could deceive: three worlds, three drones, three axes, and nine masses."""
+def test_a_mass_belongs_to_its_world_and_drone(three_by_three):
+    """Law 2, with equal lengths of different axes: three worlds, three drones, three components, nine masses."""
     mass = 0.01 * np.arange(1, 10).reshape(3, 3, 1)
-    data = square.step_fn(with_params(square.data, mass=np.asarray(mass, np.float32)), jnp.int32(1))
-    expected = np.array([0.03, -0.02, 0.01]) / mass / square.freq
+    data = three_by_three.step_fn(with_params(three_by_three.data, mass=np.asarray(mass, np.float32)), jnp.int32(1))
+    expected = np.array([0.03, -0.02, 0.01]) / mass / three_by_three.freq
     # float32: force, mass, quotient, product and sum each round to 6e-8
     np.testing.assert_allclose(data.states.vel, expected, rtol=5e-7)
 
 
 @pytest.mark.parametrize("shape", [(3,), (3, 1), (3, 1, 1), (1, 3, 1), (3, 3), (3, 3, 3), (3, 3, 1, 1), (2, 3, 1), ()])
-def test_a_mass_of_a_world_alone_is_refused(square, shape):
-    """Law 2: a parameter is shared or per drone; one per world must be spread over its drones by hand."""
-    wrong = with_params(square.data, mass=np.full(shape, 0.03, np.float32))
+def test_a_mass_of_a_world_alone_is_refused(three_by_three, shape):
+    """Law 2: a parameter is shared or per drone; the user must broadcast a parameter of a world to its drones."""
+    wrong = with_params(three_by_three.data, mass=np.full(shape, 0.03, np.float32))
     with pytest.raises(ConfigError) as error:
-        square.step_fn(wrong, jnp.int32(1))
+        three_by_three.step_fn(wrong, jnp.int32(1))
     assert f"data.params.mass has shape {shape}; expected 3 dimensions that begin with (3, 3)" in str(error.value)
     assert "or 1 if all drones share it" in str(error.value)
 
@@ -137,13 +137,13 @@ def test_a_mass_of_a_world_alone_is_refused(square, shape):
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_docstrings_give_the_shapes(dynamics, control):
     """Law 2: every array field of every record documents its shape correctly."""
-    data = resized(shared_sim(dynamics=dynamics, control=control), 2, 3)
+    data = make_data(shared_sim(dynamics=dynamics, control=control), 2, 3)
     assert n_documented(data, n_worlds=2, n_drones=3, n_rotors=4) == len(jax.tree.leaves(data))
 
 
 @pytest.mark.parametrize("controller", ["pid", "mellinger", "crazyflow", ("pid", "mellinger")], ids=str)
 def test_docstrings_of_controllers_give_the_shapes(controller):
-    """Law 2, for those that are not the default, and for several of which each drone has one."""
+    """Law 2, for controllers other than the default, and for a choice of controllers per drone."""
     switch = {} if isinstance(controller, str) else {"switch": 0}
     sim = Sim(2, 3, control="state", controller=controller if isinstance(controller, str) else [*controller], **switch)
     record = sim.data.controls

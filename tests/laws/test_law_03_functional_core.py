@@ -1,4 +1,4 @@
-"""Law 3: what ``Sim`` does, the functional API does inside jit, scan, vmap and grad."""
+"""Law 3: the functional API does the same as ``Sim``, inside jit, scan, vmap and grad."""
 
 import ast
 import importlib
@@ -19,7 +19,7 @@ ROUNDING = {"rtol": 2e-6, "atol": 2e-6}  # float32: another program around the s
 
 @pytest.fixture(scope="module")
 def start():
-    """Three worlds of two drones in flight, their step and reset, and commands that turn them."""
+    """Return a simulation of three worlds of two flying drones, its data, step and reset, and random commands."""
     sim = Sim(3, 2, attitude_freq=250)
     sim.data = with_states(
         sim.data, pos=[0.1, 0.2, 2.0], vel=[0.5, -0.3, 0.1], rotor_vel=[12000.0, 13000, 12500, 12000]
@@ -31,7 +31,7 @@ def start():
 
 
 def assert_close(a, b):
-    """Check two data for equality, states to rounding and whole numbers to the bit."""
+    """Assert that two data are equal: states up to rounding, integers and flags exactly."""
     assert jax.tree.structure(a) == jax.tree.structure(b)
     for name in ("steps", "episode", "nonfinite"):
         np.testing.assert_array_equal(getattr(a.core, name), getattr(b.core, name))
@@ -42,7 +42,7 @@ def assert_close(a, b):
 
 @pytest.fixture(scope="module")
 def shell_rollout(start):
-    """What the object does: command, steps, masked reset, command, steps."""
+    """Return the data after commands, steps and a masked reset of ``Sim``."""
     sim, data, _, _, commands = start
     sim.data = data
     sim.attitude_control(commands[0])
@@ -55,8 +55,8 @@ def shell_rollout(start):
     return sim.data
 
 
-def rollout(start, step):
-    """Return the same as a pure function of the data and the commands."""
+def make_rollout(start, step):
+    """Return the same sequence as a pure function of the data and the commands."""
     _, default, _, reset, _ = start
 
     def function(data, commands):
@@ -69,10 +69,10 @@ def rollout(start, step):
 
 
 def test_the_shell_only_calls_the_core(start, shell_rollout):
-    """Law 3: the same calls on the pure functions give the same bits, and the data that went in are unchanged."""
+    """Law 3: pure functions return the same bits, and do not change their arguments."""
     _, data, step, _, commands = start
     before = jax.tree.map(jnp.copy, data)
-    run = rollout(start, lambda d, n: step(d, jnp.int32(n)))  # as Sim.step calls it: any number, one compilation
+    run = make_rollout(start, lambda d, n: step(d, jnp.int32(n)))  # as Sim.step calls it: any number, one compilation
     assert trees_equal(run(data, commands), shell_rollout)
     assert trees_equal(data, before)
     assert shell_rollout.core.steps[:, 0].tolist() == [10, 3, 10]
@@ -82,7 +82,7 @@ def test_the_shell_only_calls_the_core(start, shell_rollout):
 def test_jit_does_what_the_shell_does(start, shell_rollout):
     """Law 3: commands, steps and a masked reset as one compiled function."""
     _, data, step, _, commands = start
-    assert_close(jax.jit(rollout(start, step))(data, jnp.asarray(commands)), shell_rollout)
+    assert_close(jax.jit(make_rollout(start, step))(data, jnp.asarray(commands)), shell_rollout)
 
 
 def test_scan_does_what_the_shell_does(start):
@@ -120,7 +120,7 @@ def test_vmap_over_commands_is_a_loop(start):
 
 @pytest.mark.long("compiles the gradient of all stages")
 def test_grad_is_finite_and_points_up(start):
-    """Law 3: the thrust command of a drone lifts that drone and no other, here in stages without an engine."""
+    """Law 3: the thrust command of a drone lifts only that drone; the stages run without an engine."""
     sim, data, _, _, commands = start
     step = by_stages(sim)
 
@@ -135,14 +135,14 @@ def test_grad_is_finite_and_points_up(start):
     assert not others.any()
 
 
-SHELL = ("sim", "configuration")
+SHELL_MODULES = ("sim", "configuration")
 ARRAY_MODULES = {"jnp", "np", "numpy", "jax", "lax", "rotation", "math"}
 ALLOWED_CALLS = {"jnp.asarray", "jax.ensure_compile_time_eval"}
-"""Making an array of what is known on the host, also inside a trace; everything else belongs into a pure function."""
+"""Calls that make arrays of host values, also inside a trace; everything else belongs into a pure function."""
 
 
-def arithmetic(source):
-    """Return where a module computes: operators on anything but whole numbers of its own, and calls on arrays."""
+def find_arithmetic(source):
+    """Return the arithmetic of a module: operators outside ``HOST_ARITHMETIC``, and calls of array functions."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, (ast.BinOp, ast.AugAssign, ast.UnaryOp)):
@@ -161,14 +161,14 @@ def arithmetic(source):
 
 
 HOST_ARITHMETIC = {"self.freq // self.control_freq"}
-"""Whole numbers of the settings: steps of a control step."""
+"""Integer arithmetic on settings that is allowed: the steps of a control step."""
 
 
-@pytest.mark.parametrize("module", SHELL)
+@pytest.mark.parametrize("module", SHELL_MODULES)
 def test_the_shell_computes_nothing(module):
-    """Law 3: no operator, no function of arrays: ``Sim`` calls pure functions in order."""
+    """Law 3: ``Sim`` only calls pure functions, and uses no operators and no array functions."""
     source = inspect.getsource(importlib.import_module(f"crazysim.sim.{module}"))
-    assert arithmetic(source) == []
+    assert find_arithmetic(source) == []
     for physics in (dynamics.first_principles, dynamics.fitted):
         assert physics not in vars(importlib.import_module(f"crazysim.sim.{module}")).values()
 
@@ -189,6 +189,6 @@ def test_the_shell_computes_nothing(module):
     ],
 )
 def test_arithmetic_is_recognised(line):
-    """The test above can fail: each of these is physics that somebody might write into ``Sim``."""
-    assert len(arithmetic(line)) > 0
-    assert arithmetic("def f(x: int | None = -1):\n    return not x") == []
+    """The test above can fail: each line is physics that somebody might write into ``Sim``."""
+    assert len(find_arithmetic(line)) > 0
+    assert find_arithmetic("def f(x: int | None = -1):\n    return not x") == []

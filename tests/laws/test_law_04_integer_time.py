@@ -10,18 +10,18 @@ from crazysim import Cars, ConfigError, Sim
 from crazysim.trajectories import circle
 
 PERIOD = 5
-COMPILED = (("first_principles", "state"), ("so_rpy_rotor_drag", "state"))
-"""Pairs with the controllers of all others: they run on the engine that users get, the others with nothing compiled."""
+COMPILED_PAIRS = (("first_principles", "state"), ("so_rpy_rotor_drag", "state"))
+"""Pairs that contain the controllers of all others. They run on the default engine, the others on the interpreter."""
 RATES = {f"{level}_freq": 100 for level in ("state", "attitude", "body_rate", "force_torque")}
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_a_command_is_taken_over_at_its_tick(dynamics, control):
-    """Law 4: every step brings another command; in force is the last one that met a tick of its own world.
+    """Law 4: every step gets another command; the last command at a tick of a world is in force there.
 
     A masked reset after seven steps puts the second world out of phase.
     """
-    engine = "auto" if (dynamics, control) in COMPILED else "interpret"
+    engine = "auto" if (dynamics, control) in COMPILED_PAIRS else "interpret"
     sim = Sim(2, dynamics=dynamics, control=control, freq=500, engine=engine, **RATES)
     sim.data = with_states(sim.data, pos=[0.0, 0.0, 5.0])
     period = 1 if control == "rotor_vel" else PERIOD

@@ -1,7 +1,7 @@
 """Law 5: the scene is synced when, and only when, something has changed since the last sync.
 
-One world more than asked is never computed, one question more than needed is never answered from the past. Fault 7 of
-the peer, contacts that stay as they were after a teleport or a rebuild, is tested here.
+No sync is computed without need, and no question is answered from an old scene. Fault 7 of Crazyflow, contacts that do
+not change after a teleport or a rebuild, is tested here.
 """
 
 import jax
@@ -13,18 +13,18 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-import crazysim.scene.mjx_scene as place
 from crazysim.core import functional as F
+from crazysim.scene import mjx_scene
 from crazysim.sim import Sim
 from crazysim.sim.sim import sync_sim2mjx, use_box_collision
 
-UP = 1.0
+FREE_HEIGHT = 1.0
 """Height, m, at which a drone touches nothing."""
-SMALL = {"mode": "rgb_array", "width": 32, "height": 24}
+SMALL_IMAGE = {"mode": "rgb_array", "width": 32, "height": 24}
 
 
 class Unreadable:
-    """A flag that nobody may look at."""
+    """A flag that must not be read."""
 
     def __bool__(self):
         raise AssertionError("the device's flag was read")
@@ -34,13 +34,13 @@ class Unreadable:
 
 @pytest.fixture(scope="module")
 def one():
-    """One world of one drone."""
+    """Return a simulation of one world with one drone."""
     return Sim()
 
 
 @pytest.fixture(scope="module")
 def two():
-    """Two worlds of one drone, and a ball that a user moves."""
+    """Return a simulation of two worlds with one drone, and a ball that the tests move."""
     sim = Sim(n_worlds=2)
     add_ball(sim)
     return sim
@@ -55,7 +55,7 @@ def syncs(monkeypatch):
         done.append(1)
         return sync_sim2mjx(*args)
 
-    monkeypatch.setattr(place, "sync_sim2mjx", counted)
+    monkeypatch.setattr(mjx_scene, "sync_sim2mjx", counted)
     return done
 
 
@@ -69,14 +69,14 @@ def add_ball(sim):
     sim.build_mjx()
 
 
-def at_height(data, *heights):
-    """Return the data with every world's drones at a height of its own."""
+def with_heights(data, *heights):
+    """Return the data with the drones of each world at a given height."""
     pos = np.array(data.states.pos)
     pos[..., 2] = np.reshape(heights, (-1, 1))
     return data.replace(states=data.states.replace(pos=pos))
 
 
-def ball_at(sim, *heights):
+def scene_with_ball(sim, *heights):
     """Return the scene with the ball at another height in every world."""
     ids = sim.mj_model.body("ball").mocapid.item()
     mocap_pos = np.array(sim.mjx_data.mocap_pos)
@@ -89,12 +89,12 @@ def drone_touches(sim):
     return np.asarray(sim.contacts("drone:0")).any(-1).tolist()
 
 
-def fresh(sim, *heights):
-    """Put the drones of all worlds somewhere, the ball away, and have the scene synced."""
+def sync_scene(sim, *heights):
+    """Reset, set the heights of drones, move the ball away, and sync the scene."""
     sim.reset()
-    sim.data = at_height(sim.data, *heights)
+    sim.data = with_heights(sim.data, *heights)
     if sim.n_worlds == 2:
-        sim.mjx_data = ball_at(sim, 5, 5)
+        sim.mjx_data = scene_with_ball(sim, 5, 5)
     sim.contacts()
 
 
@@ -103,31 +103,31 @@ def fresh(sim, *heights):
 
 def test_contacts_after_a_teleport_are_those_of_the_new_place(two, syncs):
     """Fault 7: assigning sim.data makes the scene stale, whatever flag the assigned data carries."""
-    fresh(two, 0.0, UP)
+    sync_scene(two, 0.0, FREE_HEIGHT)
     assert drone_touches(two) == [True, False]
     assert bool(two.data.core.mjx_synced), "the data that is assigned next claims to be synced"
-    two.data = at_height(two.data, UP, 0.0)
+    two.data = with_heights(two.data, FREE_HEIGHT, 0.0)
     assert drone_touches(two) == [False, True]
 
 
 def test_contacts_after_a_rebuild_are_those_of_the_new_scene(syncs):
-    """Fault 7: floor contact stays floor contact through build_mjx, and what was added touches at once."""
+    """Fault 7: contact with the floor remains after build_mjx, and an added body has contacts at once."""
     sim = Sim(n_worlds=2)
-    sim.data = at_height(sim.data, 0.0, UP)
+    sim.data = with_heights(sim.data, 0.0, FREE_HEIGHT)
     assert drone_touches(sim) == [True, False]
     sim.build_mjx()
     assert not bool(sim.data.core.mjx_synced)
     assert drone_touches(sim) == [True, False]
     add_ball(sim)
     assert drone_touches(sim) == [True, False]
-    sim.mjx_data = ball_at(sim, 5, UP)
+    sim.mjx_data = scene_with_ball(sim, 5, FREE_HEIGHT)
     assert drone_touches(sim) == [True, True]
     assert len(syncs) == 4
 
 
 def test_contacts_after_box_collision_are_those_of_boxes(one):
-    """The sphere of 8.6 cm reaches the floor from 5 cm up, the box of 2 cm half height does not."""
-    fresh(one, 0.05)
+    """At a height of 5 cm, the sphere of 8.6 cm touches the floor, and the box of 2 cm half height does not."""
+    sync_scene(one, 0.05)
     assert drone_touches(one) == [True]
     slots = one.contacts().shape
     use_box_collision(one)
@@ -141,10 +141,10 @@ def test_contacts_after_box_collision_are_those_of_boxes(one):
 
 def test_contacts_after_a_body_was_moved_are_those_of_its_new_place(two, syncs):
     """Assigning sim.mjx_data makes the scene stale: a ball put on the drone of world 1 touches it."""
-    fresh(two, UP, UP)
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     assert drone_touches(two) == [False, False]
     syncs.clear()
-    two.mjx_data = ball_at(two, 5, UP)
+    two.mjx_data = scene_with_ball(two, 5, FREE_HEIGHT)
     assert drone_touches(two) == [False, True]
     assert drone_touches(two) == [False, True]
     assert len(syncs) == 1
@@ -168,7 +168,7 @@ def test_contacts_after_a_body_was_moved_are_those_of_its_new_place(two, syncs):
     ],
 )
 def test_a_change_has_the_next_question_sync_once(two, syncs, change):
-    fresh(two, UP, UP)
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
     change(two)
     assert not syncs, "a change alone syncs nothing"
@@ -180,7 +180,7 @@ def test_a_change_has_the_next_question_sync_once(two, syncs, change):
 
 def test_the_flag_of_the_data_follows(two):
     """``data.core.mjx_synced`` is set by a question, and cleared by whatever makes the scene stale."""
-    fresh(two, UP, UP)
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     synced = two.data
     changes = {
         "step": two.step,
@@ -222,8 +222,8 @@ def test_an_edit_of_the_scene_has_the_next_question_sync_once(syncs):
 
 
 def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two):
-    """Whatever the flag is, it is exchanged; one that is known to be clear stays, so that edits cost no transfer."""
-    fresh(two, UP, UP)
+    """Any flag is replaced by a cleared one; a flag that is known to be clear stays, so edits need no transfer."""
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     two.step()
     compiled = two.step_fn._cache_size()
     for flag in (Unreadable(), False, True, jnp.asarray(True), np.asarray(True)):
@@ -231,13 +231,13 @@ def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two):
         two.step()
     assert two.step_fn._cache_size() == compiled
     clear = two.data.core.mjx_synced
-    two.data = at_height(two.data, UP, UP)
+    two.data = with_heights(two.data, FREE_HEIGHT, FREE_HEIGHT)
     assert two.data.core.mjx_synced is clear
 
 
 def test_a_cleared_flag_is_an_array_of_its_own(two):
-    """Who donates what was read from ``sim.data`` takes no array from data that is kept, such as the default."""
-    fresh(two, UP, UP)
+    """A user who donates data read from ``sim.data`` must not invalidate other data, such as the default data."""
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     flags = [two.default_data.core.mjx_synced]
     for _ in range(3):
         two.contacts()
@@ -247,10 +247,10 @@ def test_a_cleared_flag_is_an_array_of_its_own(two):
 
 
 def test_what_sync_returns_may_be_assigned(two, syncs):
-    """After the pair of sync_sim2mjx is assigned one sync too many is allowed, a stale answer never."""
-    fresh(two, UP, UP)
+    """After the results of sync_sim2mjx are assigned, one redundant sync is allowed, but no stale answer."""
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
-    two.data, two.mjx_data = sync_sim2mjx(at_height(two.data, 0.0, UP), two.mjx_data, two.mjx_model)
+    two.data, two.mjx_data = sync_sim2mjx(with_heights(two.data, 0.0, FREE_HEIGHT), two.mjx_data, two.mjx_model)
     assert drone_touches(two) == [True, False]
     assert len(syncs) <= 1
 
@@ -259,7 +259,7 @@ def test_what_sync_returns_may_be_assigned(two, syncs):
 
 
 def test_questions_share_one_sync_and_a_step_between_forces_two(one, syncs):
-    """Grouped after a step, all contacts and those of a body need one sync; with a step between them, two."""
+    """Two questions after a step need one sync, and two syncs if there is a step between them."""
     one.step(5)
     syncs.clear()
     one.contacts()
@@ -281,8 +281,8 @@ def test_pictures_show_the_world_as_it_is_and_leave_mjx_alone(one, syncs, opengl
     syncs.clear()
     before = one.mjx_data
     for height in (0.5, 1.0):
-        one.data = at_height(one.data, height)
-        one.render(**SMALL)
+        one.data = with_heights(one.data, height)
+        one.render(**SMALL_IMAGE)
         np.testing.assert_allclose(one.mj_data.body("drone:0").xpos[2], height, atol=1e-6)
         assert not one.data.core.mjx_synced
     assert one.mjx_data is before
@@ -290,8 +290,8 @@ def test_pictures_show_the_world_as_it_is_and_leave_mjx_alone(one, syncs, opengl
 
 
 def test_commands_leave_the_scene_fresh(two, syncs):
-    """A command moves nothing: neither flag is cleared."""
-    fresh(two, UP, UP)
+    """A command moves nothing, so no flag is cleared."""
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
     two.attitude_control(np.zeros((2, 1, 4)))
     assert bool(two.data.core.mjx_synced)
@@ -300,7 +300,7 @@ def test_commands_leave_the_scene_fresh(two, syncs):
 
 
 def test_wrong_questions_change_nothing(two, syncs):
-    fresh(two, UP, UP)
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     data, mjx_data = two.data, two.mjx_data
     for wrong in (lambda: two.contacts("gate"), lambda: two.render("film"), lambda: two.render("rgb_array", world=2)):
         with pytest.raises(ValueError):
@@ -310,9 +310,9 @@ def test_wrong_questions_change_nothing(two, syncs):
 
 
 def test_asking_reads_no_device(two, syncs):
-    """Whether a sync is due is known on the host: a flag that cannot be read does no harm."""
+    """The host knows whether a sync is due, so the flag on the device is never read."""
 
-    fresh(two, UP, UP)
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     fine = two._stepper.data
     try:
         two._stepper.data = fine.replace(core=fine.core.replace(mjx_synced=Unreadable()))
@@ -328,23 +328,23 @@ def test_asking_reads_no_device(two, syncs):
 
 
 def test_nothing_of_the_scene_is_held_per_world_before_it_is_asked_for():
-    """Flying, resetting and rebuilding hold no MuJoCo state of any world; contacts do."""
-    n_worlds = 977  # as no other test has, so that an array of so many rows is this simulation's
+    """Steps, resets and rebuilds allocate no MuJoCo state of any world; contacts do."""
+    n_worlds = 977  # a number that no other test uses, so arrays with this number of rows belong to this simulation
     sim = Sim(n_worlds=n_worlds)
 
-    def foreign_bytes():
+    def scene_bytes():
         own = {id(x) for x in jax.tree.leaves((sim.data, sim.default_data))}
         return sum(x.nbytes for x in jax.live_arrays() if x.ndim and x.shape[0] == n_worlds and id(x) not in own)
 
     assert not sim.scene.is_allocated
-    assert foreign_bytes() == 0
+    assert scene_bytes() == 0
     sim.step(2)
     sim.reset()
     sim.build_mjx()
     assert not sim.scene.is_allocated
-    assert foreign_bytes() == 0
+    assert scene_bytes() == 0
     assert sim.mjx_data.mocap_pos.shape == (n_worlds, 1, 3)
-    assert foreign_bytes() > 1000 * n_worlds
+    assert scene_bytes() > 1000 * n_worlds
 
 
 def test_data_has_what_was_added_before_the_scene_is_compiled(monkeypatch, syncs):
@@ -355,26 +355,26 @@ def test_data_has_what_was_added_before_the_scene_is_compiled(monkeypatch, syncs
     compiled = []
     sim = Sim(n_worlds=2, n_drones=2)
 
-    def count(spec, real=place.build.compile_spec):
+    def count(spec, real=mjx_scene.build.compile_spec):
         compiled.append(1)
         return real(spec)
 
-    monkeypatch.setattr(place.build, "compile_spec", count)
+    monkeypatch.setattr(mjx_scene.build, "compile_spec", count)
     assert sim.data.objects is None
     first = sim.scene.add("gate", count=2, pos=(0, 3, 1))
     sim.spec.worldbody.add_body(name="by_hand", mocap=True, pos=[0, 0, 9]).add_geom(size=[0.1, 0, 0])
     sim.step()
-    second = sim.scene.add("box", pos=(0.0, 0.0, UP), size=(4.0, 4.0, 0.2))
+    second = sim.scene.add("box", pos=(0.0, 0.0, FREE_HEIGHT), size=(4.0, 4.0, 0.2))
     objects, default = sim.data.objects, sim.default_data.objects
     assert objects.names == default.names == ("gate:0", "gate:1", "box:0")
-    sim.data = second.set_pose(sim.data, pos=(0.0, 0.0, 2 * UP))
+    sim.data = second.set_pose(sim.data, pos=(0.0, 0.0, 2 * FREE_HEIGHT))
     sim.attitude_control(np.zeros((2, 2, 4)))
     sim.step(2)
     sim.seed(1)
-    moved = at_height(sim.data, UP, 2 * UP)
+    moved = with_heights(sim.data, FREE_HEIGHT, 2 * FREE_HEIGHT)
     sim.reset(np.array([True, False]))
     assert sim.data.objects.pos.shape == (2, 1, 3, 3)
-    np.testing.assert_allclose(second.pose(sim.data)[0][:, 0, 2], [UP, 2 * UP])
+    np.testing.assert_allclose(second.pose(sim.data)[0][:, 0, 2], [FREE_HEIGHT, 2 * FREE_HEIGHT])
     sim.data = moved
     assert not compiled
     touching = drone_touches(sim)
@@ -401,20 +401,20 @@ def test_drawing_one_world_of_several_holds_none_of_the_others(opengl, syncs):
     """A picture needs one world's poses: no MJX, no scene state, no sync of all worlds."""
     sim = Sim(n_worlds=2)
     sim.step()
-    assert sim.render(**SMALL, world=1).shape == (24, 32, 3)
+    assert sim.render(**SMALL_IMAGE, world=1).shape == (24, 32, 3)
     assert not sim.scene.is_allocated
     assert sim.scene._mjx._model is None
     assert not syncs
 
 
 def test_the_scene_is_returned_as_it_is(two, syncs):
-    """Reading sim.mjx_data syncs nothing: it is as the last question left it, and the same object every time."""
-    fresh(two, UP, UP)
+    """Reading sim.mjx_data syncs nothing: it returns the same object, as of the last sync."""
+    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
     before = two.mjx_data
-    two.data = at_height(two.data, 0.25, 0.5)
+    two.data = with_heights(two.data, 0.25, 0.5)
     assert two.mjx_data is before
-    np.testing.assert_allclose(two.mjx_data.mocap_pos[:, two.data.core.drone_mocap_ids[0], 2], UP)
+    np.testing.assert_allclose(two.mjx_data.mocap_pos[:, two.data.core.drone_mocap_ids[0], 2], FREE_HEIGHT)
     assert not syncs
     two.contacts()
     np.testing.assert_allclose(two.mjx_data.mocap_pos[:, two.data.core.drone_mocap_ids[0], 2], [0.25, 0.5])
@@ -422,32 +422,32 @@ def test_the_scene_is_returned_as_it_is(two, syncs):
 
 # Any order ------------------------------------------------------------------------------------------------------
 
-heights = st.tuples(st.sampled_from([0.0, 0.5, UP]), st.sampled_from([0.0, 0.5, UP]))
+heights = st.tuples(st.sampled_from([0.0, 0.5, FREE_HEIGHT]), st.sampled_from([0.0, 0.5, FREE_HEIGHT]))
 
 
-class AnyOrder(RuleBasedStateMachine):
-    """Whatever is done in whatever order, contacts are those of the poses as they are, with no sync too many."""
+class SceneMachine(RuleBasedStateMachine):
+    """Contacts always belong to the current poses, after any sequence of changes, without a redundant sync."""
 
     sim = None
-    """Built once: a simulation of two worlds with a ball."""
+    """Simulation of two worlds with a ball, which is built once."""
 
     @initialize()
-    def begin(self):
-        if AnyOrder.sim is None:
-            AnyOrder.sim = Sim(n_worlds=2)
-            add_ball(AnyOrder.sim)
+    def set_up_scene(self):
+        if SceneMachine.sim is None:
+            SceneMachine.sim = Sim(n_worlds=2)
+            add_ball(SceneMachine.sim)
         self.ball = (5.0, 5.0)
-        fresh(self.sim, UP, UP)
+        sync_scene(self.sim, FREE_HEIGHT, FREE_HEIGHT)
         self.changed = False
 
     @rule(heights=heights)
     def teleport(self, heights):
-        self.sim.data = at_height(self.sim.data, *heights)
+        self.sim.data = with_heights(self.sim.data, *heights)
         self.changed = True
 
     @rule(heights=heights)
     def move_ball(self, heights):
-        self.sim.mjx_data = ball_at(self.sim, *heights)
+        self.sim.mjx_data = scene_with_ball(self.sim, *heights)
         self.ball, self.changed = heights, True
 
     @rule(n=st.integers(1, 3))
@@ -476,11 +476,11 @@ class AnyOrder(RuleBasedStateMachine):
         expected = (z < 0.086) | (np.abs(z - self.ball) < 0.186)
         done = []
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(place, "sync_sim2mjx", lambda *args: done.append(1) or sync_sim2mjx(*args))
+            patch.setattr(mjx_scene, "sync_sim2mjx", lambda *args: done.append(1) or sync_sim2mjx(*args))
             assert drone_touches(self.sim) == expected.tolist()
         assert len(done) == self.changed
         self.changed = False
 
 
-TestAnyOrder = AnyOrder.TestCase
+TestAnyOrder = SceneMachine.TestCase
 TestAnyOrder.settings = settings(max_examples=15, stateful_step_count=15, deadline=None)

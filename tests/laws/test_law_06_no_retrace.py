@@ -1,4 +1,4 @@
-"""Law 6: ten calls, one trace, whatever the input comes as."""
+"""Law 6: ten calls, one trace, for any kind of input array."""
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +10,8 @@ from crazysim.sim import pipeline
 
 
 @pytest.fixture(scope="module")
-def counted():
-    """A simulation whose last stage counts how often Python runs it."""
+def traced_sim():
+    """Return a simulation, and a list that grows when its last stage is traced."""
     sim, traces = Sim(2, 2), []
 
     def count(data):
@@ -23,8 +23,8 @@ def counted():
     return sim, traces
 
 
-def compilations(fn):
-    """Return how many programs a jitted function holds."""
+def n_programs(fn):
+    """Return the number of compiled programs of a jitted function."""
     return fn._cache_size()
 
 
@@ -43,9 +43,9 @@ INPUTS = {
 }
 
 
-def test_ten_commands_one_trace(counted):
-    """Law 6: NumPy, JAX, int, float64 or list input alike, and all mean the same command."""
-    sim, traces = counted
+def test_ten_commands_one_trace(traced_sim):
+    """Law 6: NumPy, JAX, int, float64 and list inputs give the same command."""
+    sim, traces = traced_sim
     sim.reset()
     for name, command in INPUTS.items():
         sim.attitude_control(command)
@@ -53,13 +53,13 @@ def test_ten_commands_one_trace(counted):
         np.testing.assert_array_equal(staged, np.asarray(COMMAND, np.float32), err_msg=name)
         assert staged.dtype == sim.data.states.pos.dtype
         sim.step()
-        assert (len(traces), compilations(sim.step_fn)) == (1, 1), name
+        assert (len(traces), n_programs(sim.step_fn)) == (1, 1), name
     assert int(sim.data.core.steps[0, 0]) == 10
 
 
-def test_commands_resets_and_edits_between_steps_one_trace(counted):
-    """Law 6: where nothing is read between, commands go into flattened data; after a reset into a record."""
-    sim, traces = counted
+def test_commands_resets_and_edits_between_steps_one_trace(traced_sim):
+    """Law 6: between steps commands are written to flattened data, and after a reset to a record."""
+    sim, traces = traced_sim
     sim.reset()
     for i, (name, command) in enumerate(INPUTS.items()):
         sim.step(2)
@@ -70,21 +70,21 @@ def test_commands_resets_and_edits_between_steps_one_trace(counted):
             sim.data = sim.data.replace(states=sim.data.states.replace(vel=np.zeros((2, 2, 3))))
             sim.attitude_control(command)
         sim.step()
-        assert (len(traces), compilations(sim.step_fn)) == (1, 1), name
+        assert (len(traces), n_programs(sim.step_fn)) == (1, 1), name
 
 
-def test_any_number_of_steps_any_edit_any_reset_one_program(counted):
+def test_any_number_of_steps_any_edit_any_reset_one_program(traced_sim):
     """Law 6: the number of steps is no constant of the program, and edits and resets bring no new kind of array."""
-    sim, traces = counted
+    sim, traces = traced_sim
     program, n_steps = sim.step_fn, 0
     sim.reset()
 
-    def check(n, why):
+    def check(n, change):
         nonlocal n_steps
         sim.step(n)
         n_steps += int(n)
-        assert (len(traces), compilations(program)) == (1, 1), why
-        assert int(sim.data.core.steps[0, 0]) == n_steps, why
+        assert (len(traces), n_programs(program)) == (1, 1), change
+        assert int(sim.data.core.steps[0, 0]) == n_steps, change
 
     for n in (1, 5, 7, np.int64(3)):
         check(n, f"step({n!r})")
@@ -96,9 +96,9 @@ def test_any_number_of_steps_any_edit_any_reset_one_program(counted):
         "a result of jit": {"force": jax.jit(lambda x: x + 0.0)(jnp.zeros(states.force.shape))},
         "another device": {"torque": jax.device_put(np.zeros(states.torque.shape, np.float32), jax.devices()[1])},
     }
-    for why, changes in edits.items():
+    for change, changes in edits.items():
         sim.data = sim.data.replace(states=sim.data.states.replace(**changes))
-        check(2, why)
+        check(2, change)
     sim.data = sim.data.replace(core=sim.data.core.replace(steps=sim.data.core.steps + jnp.int32(0)))
     check(1, "another step count")
     sim.seed(7)
@@ -113,9 +113,9 @@ def test_any_number_of_steps_any_edit_any_reset_one_program(counted):
     check(1, "a reset")
 
 
-def test_resets_have_one_program_each_way(counted):
-    """Law 6: all worlds, or those of a mask in whatever form."""
-    sim, _ = counted
+def test_resets_have_one_program_each_way(traced_sim):
+    """Law 6: a reset of all worlds and a masked reset have one program each, for any form of mask."""
+    sim, _ = traced_sim
     sim.build_reset_fn()
     for mask in ([True, False], [False, False], [True, True]):
         sim.reset(np.array(mask))
@@ -124,16 +124,16 @@ def test_resets_have_one_program_each_way(counted):
         sim.reset(mask)
         sim.reset()
     jitted = sim.reset_fn
-    assert compilations(jitted) == 2  # one with a mask, one without
+    assert n_programs(jitted) == 2  # one with a mask, one without
 
 
-def test_a_rollout_in_jit_traces_once(counted):
+def test_a_rollout_in_jit_traces_once(traced_sim):
     """Law 6 for the functional API: ten calls of a jitted rollout run the stages in Python once."""
-    sim, traces = counted
+    sim, traces = traced_sim
     step = sim.build_step_fn()
     rollout = jax.jit(lambda data: step(data, 4))
     data, before = sim.data, len(traces)
     for _ in range(10):
         data = rollout(data)
     assert len(traces) - before == 1
-    assert compilations(rollout) == 1
+    assert n_programs(rollout) == 1

@@ -1,4 +1,4 @@
-"""Law 7: no NaN from valid input, in values or gradients, and one bad world never touches another."""
+"""Law 7: no NaN from valid input, in values or gradients, and one bad world never affects another."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ from crazysim import Drone, Sim, load_airframe
 from crazysim.core.stages import FLOOR_HEIGHT
 from crazysim.dynamics import supported_dynamics
 
-HALF = np.sqrt(0.5)
+SQRT_HALF = np.sqrt(0.5)
 SITUATIONS = (
     "hover",
     "rest at zero",
@@ -43,8 +43,8 @@ SITUATIONS = (
 N_STEPS = 50
 
 
-def tilted(data):
-    """Return a command without thrust that asks for a tilt, or the wrench or rotor speeds nearest to that."""
+def tilt_command(data):
+    """Return a command without thrust for a tilted drone, or a similar wrench or rotor speeds."""
     command = np.array(zero_thrust_command(data))
     mode = data.controls.mode.value
     if mode == "attitude":
@@ -54,57 +54,57 @@ def tilted(data):
     return command
 
 
-FITTED = ("so_rpy_rotor_drag", "attitude", "auto")
-AS_ATTITUDES = pytest.mark.slow("the state controller commands attitudes, which the fits follow in other cases")
+FITTED_CASE = ("so_rpy_rotor_drag", "attitude", "auto")
+SLOW_PAIR = pytest.mark.slow("the state controller commands attitudes, which the fits follow in other cases")
 ENGINES = [
     *((*pair, "stages") for pair in PAIRS[1:5]),
     *(
         pytest.param(
-            *pair, "stages", marks=[AS_ATTITUDES] if pair in (("so_rpy", "state"), ("so_rpy_rotor", "state")) else []
+            *pair, "stages", marks=[SLOW_PAIR] if pair in (("so_rpy", "state"), ("so_rpy_rotor", "state")) else []
         )
         for pair in PAIRS[5:]
-        if pair != FITTED[:2]
+        if pair != FITTED_CASE[:2]
     ),
     (*PAIRS[0], "auto"),
-    FITTED,
+    FITTED_CASE,
 ]
-"""Every pair, most as their stages are written, without an engine; the longest pipeline and one of fitted dynamics on
-the engine that users get."""
+"""Every pair of dynamics and level. Most run without an engine; the longest pipeline and one of fitted dynamics run on
+the default engine."""
 
 
 @functools.cache
-def situations(dynamics, control, engine="auto"):
-    """Return a simulation with one situation a world, its data, and the commands."""
+def make_situations(dynamics, control, engine="auto"):
+    """Return a simulation with one situation per world, its data, and the commands."""
     engine = "plain" if engine == "stages" else engine
     sim = shared_sim(n_worlds=len(SITUATIONS), dynamics=dynamics, control=control, engine=engine)
     n = len(SITUATIONS)
     pos, quat, rotor_vel = np.zeros((n, 1, 3)), np.zeros((n, 1, 4)), np.zeros((n, 1, 4))
     pos[..., 2], quat[..., 3] = 1.0, 1.0
     commands = np.broadcast_to(hover_command(sim.data), (n, 1, len(hover_command(sim.data)))).copy()
-    at = {name: i for i, name in enumerate(SITUATIONS)}
-    rotor_vel[at["hover"]] = hover_rotor_state(sim.data)
+    world_of = {name: i for i, name in enumerate(SITUATIONS)}
+    rotor_vel[world_of["hover"]] = hover_rotor_state(sim.data)
     for name, height in (("rest at zero", 0.0), ("rest on floor", FLOOR_HEIGHT), ("below floor", -1.0)):
-        pos[at[name], 0, 2] = height
-        commands[at[name]] = 0.0
-    quat[at["pitch +90"]] = 0, HALF, 0, HALF
-    quat[at["pitch -90"]] = 0, -HALF, 0, HALF
-    quat[at["upside down"]] = 1, 0, 0, 0
-    quat[at["zero thrust, tilted"]] = np.sin(0.4), 0, 0, np.cos(0.4)
-    commands[at["zero command"]] = 0.0
+        pos[world_of[name], 0, 2] = height
+        commands[world_of[name]] = 0.0
+    quat[world_of["pitch +90"]] = 0, SQRT_HALF, 0, SQRT_HALF
+    quat[world_of["pitch -90"]] = 0, -SQRT_HALF, 0, SQRT_HALF
+    quat[world_of["upside down"]] = 1, 0, 0, 0
+    quat[world_of["zero thrust, tilted"]] = np.sin(0.4), 0, 0, np.cos(0.4)
+    commands[world_of["zero command"]] = 0.0
     for name, sign in (("saturated", 1), ("saturated below", -1)):
-        commands[at[name]] = sign * (1e6 if control == "rotor_vel" else 100.0)
+        commands[world_of[name]] = sign * (1e6 if control == "rotor_vel" else 100.0)
         if control == "attitude":  # angles do not saturate; these are the largest there are
-            commands[at[name], 0, :3] = sign * np.pi * np.array([1.0, 0.5, -1.0])
-    commands[at["zero thrust, tilted"]] = tilted(sim.data)
+            commands[world_of[name], 0, :3] = sign * np.pi * np.array([1.0, 0.5, -1.0])
+    commands[world_of["zero thrust, tilted"]] = tilt_command(sim.data)
     arrays = {"pos": pos, "quat": quat, "rotor_vel": rotor_vel}
     states = sim.data.states.replace(**{k: np.float32(v) for k, v in arrays.items()})
     return sim, *jax.device_put((sim.data.replace(states=states), np.float32(commands)), sim.device)
 
 
 @functools.cache
-def flight(dynamics, control, engine):
+def make_flight(dynamics, control, engine):
     """Return a compiled flight: gradients of positions and velocities at its end, and the data there."""
-    sim = situations(dynamics, control, engine)[0]
+    sim = make_situations(dynamics, control, engine)[0]
     step = by_stages(sim) if engine == "stages" else sim.build_step_fn()
 
     @jax.jit
@@ -118,8 +118,8 @@ def flight(dynamics, control, engine):
     return fly
 
 
-def start_of(data, commands):
-    """Return what the gradients are taken with respect to."""
+def differentiated_inputs(data, commands):
+    """Return the inputs with respect to which gradients are computed."""
     names = ("pos", "quat", "vel", "ang_vel", "rotor_vel")
     return {"command": commands} | {name: getattr(data.states, name) for name in names}
 
@@ -128,30 +128,30 @@ def start_of(data, commands):
 @pytest.mark.parametrize("dynamics, control, engine", ENGINES)
 def test_values_and_gradients_are_finite(dynamics, control, engine):
     """Law 7: every situation, every kind of dynamics and command, after 50 steps."""
-    _, data, commands = situations(dynamics, control, engine)
-    gradients, end = jax.device_get(flight(dynamics, control, engine)(start_of(data, commands), data))
+    _, data, commands = make_situations(dynamics, control, engine)
+    gradients, end = jax.device_get(make_flight(dynamics, control, engine)(differentiated_inputs(data, commands), data))
     for world, name in enumerate(SITUATIONS):
         for leaf, x in {**vars(end.states), **{f"gradient of {k}": v for k, v in gradients.items()}}.items():
             assert np.all(np.isfinite(x[world])), f"{leaf} in {name!r}"
     assert not end.core.nonfinite.any()
     assert np.all(end.states.pos[..., 2] >= np.float32(FLOOR_HEIGHT))
-    # The drones did fly: the place of each counts fully in where it ends, but on the floor.
+    # Drones that fly have a gradient with respect to their initial position; drones on the floor have none.
     assert np.all(gradients["pos"][SITUATIONS.index("upside down"), 0, :2] != 0)
     # float32 rounding of 50 renormalisations
     np.testing.assert_allclose(np.linalg.norm(end.states.quat, axis=-1), 1.0, atol=1e-6)
 
 
-ABSURD = (20.0, 50.0, 90.0, 99.0, 150.0, 1e3, 1e6, 1e30, 3e38)
-ALONG = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (-1, 1, -1), (0, -1, 0), (0.3, 1, -0.5))
+HUGE_ANGLES = (20.0, 50.0, 90.0, 99.0, 150.0, 1e3, 1e6, 1e30, 3e38)
+DIRECTIONS = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (-1, 1, -1), (0, -1, 0), (0.3, 1, -0.5))
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_attitudes_that_no_drone_can_take_keep_a_fitted_model_bounded(integrator):
-    """Law 7: angles have no limit to saturate at. Two seconds of any number that float32 has, each axis and all.
+    """Law 7: angles do not saturate. Fly two seconds with angles up to the limit of float32, about several axes.
 
-    The fit alone would have 50 rad of pitch pull a drone through the vertical time and again, faster each time.
+    Without a limit, the fit would turn a drone through the vertical again and again at 50 rad of pitch, ever faster.
     """
-    angles = (np.array(ABSURD)[:, None, None] * np.array(ALONG)).reshape(-1, 1, 3)
+    angles = (np.array(HUGE_ANGLES)[:, None, None] * np.array(DIRECTIONS)).reshape(-1, 1, 3)
     airframes = [load_airframe(name) for name in ("cf21B_500", "cf2x_L250") for _ in angles]
     sim = Sim(len(airframes), dynamics="so_rpy_rotor", control="attitude", integrator=integrator)
     sim.data = with_states(with_airframes(sim, airframes), pos=[0.0, 0.0, 100.0])
@@ -162,16 +162,16 @@ def test_attitudes_that_no_drone_can_take_keep_a_fitted_model_bounded(integrator
         fastest = np.maximum(fastest, np.abs(sim.data.states.ang_vel).reshape(2, -1).max(axis=-1))
         assert np.all(np.isfinite(fastest))
     assert not np.any(sim.data.core.nonfinite)
-    # rad/s for each airframe; handed over from 100 to 200, and a step of 2 ms may overshoot
+    # rad/s for each airframe; the model limits it between 100 and 200, and a step of 2 ms may overshoot
     assert np.all((fastest > 50) & (fastest < 500))
 
 
 EXTREMES = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))
-"""Least, zero and largest of three numbers, all combinations. (27, 3)"""
+"""All combinations of minimum, zero and maximum of three numbers. (27, 3)"""
 
 
 def extreme_commands(airframe, control):
-    """Return constant legal commands of a level for one airframe, up to what its rotors can give and beyond. (n, k)"""
+    """Return constant valid commands of a level for one airframe, up to the limits of its rotors and beyond. (n, k)"""
     n_rotors, most = airframe.n_rotors, float(airframe.value("rotors.thrust_max"))
     hover = float(airframe.value("rigid_body.mass")) * 9.81
     if control == "rotor_vel":
@@ -187,7 +187,7 @@ def extreme_commands(airframe, control):
     return np.array([[*(largest * t), force] for force in (hover, n_rotors * most) for t in EXTREMES])
 
 
-CONSTANT = [*PAIRS[:5], ("so_rpy", "attitude"), ("so_rpy_rotor_drag", "attitude")]
+CONSTANT_COMMAND_PAIRS = [*PAIRS[:5], ("so_rpy", "attitude"), ("so_rpy_rotor_drag", "attitude")]
 OTHER_INTEGRATOR = pytest.mark.slow("every level flies with one integrator, and torques with all of them")
 
 
@@ -197,7 +197,7 @@ OTHER_INTEGRATOR = pytest.mark.slow("every level flies with one integrator, and 
         pytest.param(
             *pair, integrator, marks=[] if pair[1] == "force_torque" or (i + k) % 3 == 0 else [OTHER_INTEGRATOR]
         )
-        for i, pair in enumerate(CONSTANT)
+        for i, pair in enumerate(CONSTANT_COMMAND_PAIRS)
         for k, integrator in enumerate(INTEGRATORS)
     ],
 )
@@ -208,9 +208,9 @@ def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integr
     """
     airframes = [load_airframe(name) for name in Drone if dynamics in supported_dynamics(name)]
     commands = [extreme_commands(airframe, control) for airframe in airframes]
-    of_world = [airframe for airframe, mine in zip(airframes, commands, strict=True) for _ in mine]
-    sim = Sim(len(of_world), dynamics=dynamics, control=control, integrator=integrator)
-    sim.data = with_states(with_airframes(sim, of_world), pos=[0.0, 0.0, 100.0])
+    airframe_by_world = [airframe for airframe, mine in zip(airframes, commands, strict=True) for _ in mine]
+    sim = Sim(len(airframe_by_world), dynamics=dynamics, control=control, integrator=integrator)
+    sim.data = with_states(with_airframes(sim, airframe_by_world), pos=[0.0, 0.0, 100.0])
     getattr(sim, f"{control}_control")(np.concatenate(commands)[:, None])
     fastest = np.zeros(sim.n_worlds)
     for _ in range(60):
@@ -220,7 +220,7 @@ def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integr
         name, x = field.name, getattr(sim.data.states, field.name)
         assert np.all(np.isfinite(x)), (
             name,
-            {a.name for a, ok in zip(of_world, np.isfinite(x), strict=True) if not ok.all()},
+            {a.name for a, ok in zip(airframe_by_world, np.isfinite(x), strict=True) if not ok.all()},
         )
     assert not sim.data.core.nonfinite.any()
     assert fastest.max() <= sim.freq
@@ -229,38 +229,40 @@ def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integr
 
 @pytest.mark.parametrize("dynamics, control, engine", ENGINES)
 def test_a_bad_world_touches_no_other(dynamics, control, engine):
-    """Law 7: with NaN in world 1 every other world ends bit-equal, its gradients too, and only world 1 is flagged."""
-    _, data, commands = situations(dynamics, control, engine)
-    fly = flight(dynamics, control, engine)
-    good_gradients, good = fly(start_of(data, commands), data)
+    """Law 7: NaN in world 1 changes no bit of other worlds and of their gradients, and only world 1 is flagged."""
+    _, data, commands = make_situations(dynamics, control, engine)
+    fly = make_flight(dynamics, control, engine)
+    good_gradients, good = fly(differentiated_inputs(data, commands), data)
     states = data.states
-    for spoiled in (
+    for bad_numbers in (
         {"pos": (slice(None), np.nan), "quat": ((0, 2), np.nan)},
         {"vel": (slice(None), np.inf), "ang_vel": ((0, 0), -np.inf)},
     ):
-        changes = {name: np.array(getattr(states, name)) for name in spoiled}
-        for name, (place, value) in spoiled.items():
+        changes = {name: np.array(getattr(states, name)) for name in bad_numbers}
+        for name, (place, value) in bad_numbers.items():
             changes[name][1][place] = value
-        changes = jax.device_put(changes, jax.devices()[0])  # as all of the data, or the flight would compile again
-        bad_gradients, bad = fly(start_of(data.replace(states=states.replace(**changes)), commands), data)
+        changes = jax.device_put(
+            changes, jax.devices()[0]
+        )  # on the device of the data, or the flight would be compiled again
+        bad_gradients, bad = fly(differentiated_inputs(data.replace(states=states.replace(**changes)), commands), data)
         others = np.arange(len(SITUATIONS)) != 1
         for a, b in ((good, bad), (good_gradients, bad_gradients)):
             a, b = ((x.states, x.controls) if x in (good, bad) else x for x in (a, b))
-            assert trees_equal(*(only_drones(tree, others) for tree in (a, b)))
+            assert trees_equal(*(drone_leaves(tree, others) for tree in (a, b)))
         assert np.asarray(bad.core.nonfinite)[:, 0].tolist() == (~others).tolist()
 
 
-def only_drones(tree, worlds):
-    """Return the leaves of these worlds."""
+def drone_leaves(tree, worlds):
+    """Return the leaves of drones, for some worlds."""
     return [np.asarray(x)[worlds] for x in jax.tree.leaves(tree) if x.ndim == 3 and x.shape[0] == len(worlds)]
 
 
 @pytest.mark.parametrize("control", ["state", "attitude", "body_rate"])
 def test_a_reset_heals_the_bad_world_alone(control):
-    """Law 7: whatever a NaN got into, integrals included, a reset of that world clears; no other world is reset."""
-    sim, data, commands = situations("first_principles", control, "interpret")
+    """Law 7: a reset of the world removes NaN everywhere, also from integrals, and resets no other world."""
+    sim, data, commands = make_situations("first_principles", control, "interpret")
     mask = np.arange(len(SITUATIONS)) == 1
-    kept = sim.data
+    data_before = sim.data
     quat = np.array(data.states.quat)
     quat[1] = np.nan
     sim.data = send(data.replace(states=data.states.replace(quat=quat)), commands)
@@ -270,8 +272,8 @@ def test_a_reset_heals_the_bad_world_alone(control):
     sim.reset(mask)
     assert not sim.data.core.nonfinite.any()
     after = (sim.data.states, sim.data.controls)
-    assert trees_equal(only_drones(after, mask), only_drones((kept.states, kept.controls), mask))
-    assert trees_equal(only_drones(after, ~mask), only_drones((before.states, before.controls), ~mask))
+    assert trees_equal(drone_leaves(after, mask), drone_leaves((data_before.states, data_before.controls), mask))
+    assert trees_equal(drone_leaves(after, ~mask), drone_leaves((before.states, before.controls), ~mask))
     sim.step(10)
     assert not sim.data.core.nonfinite.any()
-    sim.data = kept
+    sim.data = data_before

@@ -19,8 +19,8 @@ def test_free_fall_equals_the_integrators_closed_form(integrator, x64):
     assert free_fall_error(integrator) < 500 * 1.5e-14
 
 
-def precession(integrator, freq):
-    """Return drift of angular momentum (world) and energy of a torque-free tumble over 0.5 s, relative."""
+def precession_errors(integrator, freq):
+    """Return relative errors of angular momentum (world frame) and energy after 0.5 s of torque-free tumbling."""
     ang_vel = np.array([4.0, 1.0, 7.0])
     inertia = np.diag([2e-5, 3e-5, 5e-5])
     sim = free_body(integrator, freq, ang_vel, inertia)
@@ -36,7 +36,7 @@ def precession(integrator, freq):
 def test_torque_free_precession_keeps_momentum_and_energy_to_order(integrator, x64):
     """The drift is the integration error, which shrinks by 2^order when the step is halved."""
     order = {"euler": 1, "rk4": 4}[integrator]
-    coarse, fine = precession(integrator, 250), precession(integrator, 500)
+    coarse, fine = precession_errors(integrator, 250), precession_errors(integrator, 500)
     for drift_coarse, drift_fine in zip(coarse, fine, strict=True):
         assert drift_fine < 1e-1
         assert np.log2(drift_coarse / drift_fine) > order - 0.4
@@ -49,9 +49,10 @@ SPINS = (  # free rotations at 60 rad/s: about each axis with a wobble of 0.5 ra
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_torque_free_spins_gain_no_energy(integrator):
-    """Ten seconds at 60 rad/s: energy rises by less than 1% at no time, and a wobble about z or x does not grow.
+    """In ten seconds at 60 rad/s, energy never rises by 1%, and a wobble about z or x does not grow.
 
-    Explicit Euler alone multiplies the wobble about z by 175 in two seconds. Half of the worlds have a full inertia.
+    Plain explicit Euler would multiply the wobble about z by 175 in two seconds. Half of the worlds have a full inertia
+    matrix.
     """
     axes = np.array(Rotation.from_rotvec([0.4, -0.7, 0.5]).as_matrix())
     inertias = [np.diag([25e-6, 28e-6, 49e-6]), axes @ np.diag([25e-6, 28e-6, 49e-6]) @ axes.T]
@@ -61,12 +62,12 @@ def test_torque_free_spins_gain_no_energy(integrator):
     params = sim.data.params.replace(J=np.float32(J[:, None]), J_inv=np.float32(np.linalg.inv(J)[:, None]))
     start = np.array([body[1] for body in bodies])
     sim.data = with_states(sim.data.replace(params=params), ang_vel=start[:, None])
-    before, most = np.einsum("ni,nij,nj->n", start, J, start), 0.0
+    before, max_energy_ratio = np.einsum("ni,nij,nj->n", start, J, start), 0.0
     for _ in range(20):
         sim.step(sim.freq // 2)
         ang_vel = np.asarray(sim.data.states.ang_vel, np.float64)[:, 0]
-        most = np.maximum(most, np.einsum("ni,nij,nj->n", ang_vel, J, ang_vel) / before)
-    assert np.all(most < 1.01), most
+        max_energy_ratio = np.maximum(max_energy_ratio, np.einsum("ni,nij,nj->n", ang_vel, J, ang_vel) / before)
+    assert np.all(max_energy_ratio < 1.01), max_energy_ratio
     in_axes = np.concatenate([ang_vel[: len(SPINS)], ang_vel[len(SPINS) :] @ axes])
     for world, spin_axis in ((0, 0), (2, 2), (3, 2), (6, 0), (8, 2), (9, 2)):
         assert np.linalg.norm(np.delete(in_axes[world], spin_axis)) < 0.55, world
@@ -74,10 +75,10 @@ def test_torque_free_spins_gain_no_energy(integrator):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_convergence_order_of_position_and_attitude(integrator, x64):
-    """Against a reference with steps eight times finer than the finest: slope of error over step, log-log.
+    """The order is the slope of log error over log step; the reference has steps at max_energy_ratio a quarter as long.
 
-    The body tumbles about an axis that turns, in a drag that depends on attitude, so that rotations which do not
-    commute, and the coupling of attitude to velocity, both count.
+    The body tumbles about an axis that turns, with drag that depends on attitude. So the test covers rotations that do
+    not commute, and the coupling of attitude to velocity.
     """
     order = {"euler": 1, "symplectic_euler": 1, "rk4": 4}[integrator]
     freqs = (100, 200, 400) if order == 4 else (400, 800, 1600)
@@ -98,9 +99,9 @@ def test_convergence_order_of_position_and_attitude(integrator, x64):
 
 
 def test_a_free_body_under_a_wrench_agrees_with_mujoco():
-    """C MuJoCo with its own Runge-Kutta and ours fly the same free joint under one wrench in the world frame.
+    """MuJoCo and crazysim, both with Runge-Kutta of order 4, move a free body under a wrench in the world frame.
 
-    Both are of order 4 with steps of 1 ms: they agree to 1e-8 in position and attitude after 0.5 s.
+    With steps of 1 ms, position and attitude agree to 1e-8 after 0.5 s.
     """
     difference = mujoco_differences()
     assert max(difference["pos"], difference["vel"], difference["quat"]) < 1e-8

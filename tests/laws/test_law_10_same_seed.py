@@ -20,7 +20,7 @@ def randomise_mass(data, default_data, mask=None):
     return data.replace(params=data.params.replace(mass=mass))
 
 
-def randomised(n_worlds, seed=7, mesh=None):
+def make_sim(n_worlds, seed=7, mesh=None):
     sim = Sim(n_worlds=n_worlds, n_drones=3, rng_key=seed, mesh=mesh)
     sim.data = sim.data.replace(params=sim.data.params.replace(mass=jnp.full((n_worlds, 3, 1), 0.0434)))
     sim.build_default_data()
@@ -31,11 +31,11 @@ def randomised(n_worlds, seed=7, mesh=None):
 
 @pytest.fixture(scope="module")
 def four():
-    return randomised(4)
+    return make_sim(4)
 
 
-def after_resets(sim, *masks, seed=7):
-    """Return the masses, and the episodes, after the start and these resets. (n_worlds, n_drones)"""
+def masses_after_resets(sim, *masks, seed=7):
+    """Return the masses after a seed and resets with some masks. (n_worlds, n_drones)"""
     sim.data = sim.default_data
     sim.seed(seed)
     for mask in masks:
@@ -44,49 +44,49 @@ def after_resets(sim, *masks, seed=7):
 
 
 def test_a_world_draws_the_same_with_other_numbers_of_worlds(four):
-    two = randomised(2)
+    two = make_sim(2)
     for n_resets in (1, 2, 3):
         masks = [None] * n_resets
-        np.testing.assert_array_equal(after_resets(two, *masks), after_resets(four, *masks)[:2])
+        np.testing.assert_array_equal(masses_after_resets(two, *masks), masses_after_resets(four, *masks)[:2])
 
 
 def test_a_world_draws_the_same_whichever_worlds_are_reset_along(four):
-    alone = after_resets(four, [False, False, True, False])
-    along = after_resets(four, [True, False, True, True])
-    everyone = after_resets(four, None)
+    alone = masses_after_resets(four, [False, False, True, False])
+    together = masses_after_resets(four, [True, False, True, True])
+    everyone = masses_after_resets(four, None)
     np.testing.assert_array_equal(alone[2], everyone[2])
-    np.testing.assert_array_equal(along[[0, 2, 3]], everyone[[0, 2, 3]])
-    # What the mask leaves out keeps what it had.
+    np.testing.assert_array_equal(together[[0, 2, 3]], everyone[[0, 2, 3]])
+    # Worlds that the mask leaves out keep their masses.
     np.testing.assert_array_equal(alone[[0, 1, 3]], np.float32(0.0434))
     # World 2 in its second episode draws as it does when all worlds are in theirs.
-    twice = after_resets(four, [False, False, True, False], [False, True, True, False])
-    np.testing.assert_array_equal(twice[2], after_resets(four, None, None)[2])
+    twice = masses_after_resets(four, [False, False, True, False], [False, True, True, False])
+    np.testing.assert_array_equal(twice[2], masses_after_resets(four, None, None)[2])
     np.testing.assert_array_equal(twice[1], everyone[1])
 
 
 def test_worlds_drones_and_episodes_draw_different_numbers(four):
-    """36 draws of 24 bits: that two are alike by chance has a probability of 4e-5, and the seed is fixed."""
-    draws = np.stack([after_resets(four, *[None] * n) for n in (1, 2, 3)])
+    """Two of 36 draws of 24 bits are equal by chance with a probability of 4e-5, and the seed is fixed."""
+    draws = np.stack([masses_after_resets(four, *[None] * n) for n in (1, 2, 3)])
     assert draws.shape == (3, 4, 3)
     assert len(np.unique(draws)) == draws.size
     assert 0.03 <= draws.min() < draws.max() <= 0.06
 
 
 def test_seeds_give_their_numbers_again_and_differ_from_each_other(four):
-    first, other, again = (after_resets(four, None, seed=seed) for seed in (7, 8, 7))
+    first, other, again = (masses_after_resets(four, None, seed=seed) for seed in (7, 8, 7))
     np.testing.assert_array_equal(first, again)
     assert not np.any(first == other)
 
 
 def test_the_seed_of_construction_and_of_seed_are_one(four):
-    sim = randomised(4, seed=7)
+    sim = make_sim(4, seed=7)
     sim.reset()
-    np.testing.assert_array_equal(sim.data.params.mass[..., 0], after_resets(four, None, seed=7))
+    np.testing.assert_array_equal(sim.data.params.mass[..., 0], masses_after_resets(four, None, seed=7))
 
 
 def test_resets_and_steps_leave_the_seeds_key(four):
-    """Batch stages may split it themselves; a reset that moved it would tie worlds to each other."""
-    after_resets(four, None, [True, False, False, True])
+    """Stages of the batch may split the key. A reset that changed it would make worlds depend on each other."""
+    masses_after_resets(four, None, [True, False, False, True])
     np.testing.assert_array_equal(as_numbers(four.data.core.rng_key), as_numbers(jax.random.key(7)))
     four.step(2)
     np.testing.assert_array_equal(as_numbers(four.data.core.rng_key), as_numbers(jax.random.key(7)))
@@ -129,7 +129,7 @@ def test_keys_do_not_depend_on_where_another_world_is_in_its_time(four):
 
 def test_two_devices_give_the_same_numbers_as_one(four):
     assert len(jax.devices()) >= 2, "conftest forces four host devices"
-    split = randomised(4, mesh=world_mesh(jax.devices()[:2]))
+    split = make_sim(4, mesh=world_mesh(jax.devices()[:2]))
     for masks in ([None], [None, [True, False, True, False]]):
-        np.testing.assert_array_equal(after_resets(split, *masks), after_resets(four, *masks))
+        np.testing.assert_array_equal(masses_after_resets(split, *masks), masses_after_resets(four, *masks))
     assert len(split.data.params.mass.sharding.device_set) == 2

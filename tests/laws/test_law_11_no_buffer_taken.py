@@ -43,21 +43,21 @@ def assert_unchanged(tree, before):
     ],
     ids=["step", "steps", "reset", "masked-reset", "pure-steps", "pure-step", "pure-reset", "command", "contacts"],
 )
-def test_held_data_stays_readable_and_unchanged(sim, use):
+def test_held_data_stays_readable_and_unchanged(sim, operation):
     sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     sim.step(5)
     held, default = sim.data, sim.default_data
     kept, kept_default = snapshot(held), snapshot(default)
-    use(sim)
+    operation(sim)
     assert_unchanged(held, kept)
     assert_unchanged(default, kept_default)
     assert sim.default_data is default
 
 
 def test_a_command_array_stays_its_callers(sim):
-    """Neither does the simulation keep a view of host memory: what is written into it later does not count."""
+    """The simulation keeps no view of host memory, so later changes of the array have no effect."""
     memory = np.zeros(128, np.uint8)
-    start = -memory.ctypes.data % 64  # JAX takes over memory that is aligned so
+    start = -memory.ctypes.data % 64  # JAX takes over memory with this alignment
     command = memory[start : start + 64].view(np.float32).reshape(2, 2, 4)
     on_device = jnp.full((2, 2, 4), 0.25)
     sim.attitude_control(on_device)

@@ -10,7 +10,7 @@ from crazysim.core.stages import reset
 from crazysim.utils import leaf_replace, pytree_replace, world_mask
 
 N_WORLDS = 3
-SOME = [True, False, True]
+MASK = [True, False, True]
 
 sim = Sim(N_WORLDS, n_drones=2)
 gates = sim.scene.add("gate", pos=[0, 0, 1])
@@ -20,7 +20,7 @@ hooked = Sim(N_WORLDS)
 hook = hooked.add(Hook(0.01))
 
 
-OF_WORLDS = {
+WORLD_MASK_FUNCTIONS = {
     "Sim.reset": lambda mask: sim.reset(mask),
     "reset_fn": lambda mask: sim.reset_fn(sim.data, sim.default_data, mask),
     "reset_fn.plain": lambda mask: sim.reset_fn.plain(sim.data, sim.default_data, mask),
@@ -32,7 +32,7 @@ OF_WORLDS = {
     "leaf_replace": lambda mask: leaf_replace(sim.data.states, mask, pos=np.ones((N_WORLDS, 2, 3), np.float32)),
     "pytree_replace": lambda mask: pytree_replace(sim.data, sim.default_data, world_mask(sim.data), mask),
 }
-WRONG = {
+WRONG_MASKS = {
     "ints": np.array([1, 0, 1]),
     "list of ints": [1, 0, 1],
     "one int": [1],
@@ -46,33 +46,33 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("wrong", WRONG)
-@pytest.mark.parametrize("name", OF_WORLDS)
+@pytest.mark.parametrize("wrong", WRONG_MASKS)
+@pytest.mark.parametrize("name", WORLD_MASK_FUNCTIONS)
 def test_a_mask_over_worlds_is_bool_and_one_per_world(name, wrong):
     before = sim.data
     with pytest.raises(ConfigError, match=r"expected a mask of .*got"):
-        OF_WORLDS[name](WRONG[wrong])
+        WORLD_MASK_FUNCTIONS[name](WRONG_MASKS[wrong])
     assert sim.data is before
 
 
 @pytest.mark.parametrize("wrong", ["ints", "floats", "a column", "of another number of worlds"])
 def test_traced_masks_are_checked_by_shape_and_type(wrong):
-    for name, fn in OF_WORLDS.items():
+    for name, fn in WORLD_MASK_FUNCTIONS.items():
         if name != "Sim.reset":
             with pytest.raises(ConfigError, match=r"expected a mask of .*got"):
-                jax.eval_shape(fn, WRONG[wrong])
+                jax.eval_shape(fn, WRONG_MASKS[wrong])
 
 
 def test_masks_of_host_and_device_do_what_they_say():
-    x = np.asarray(gates.set_pose(sim.data, [1, 0, 1], mask=SOME).objects.pos)[:, 0, 0, 0]
+    x = np.asarray(gates.set_pose(sim.data, [1, 0, 1], mask=MASK).objects.pos)[:, 0, 0, 0]
     np.testing.assert_array_equal(x, [1, 0, 1])
-    for mask in (SOME, np.array(SOME), jnp.array(SOME)):
-        np.testing.assert_array_equal(load.release(sim.data, mask).plugins["load"].attached[:, 0], ~np.array(SOME))
-    of_drones = np.array([[True, False], [False, False], [False, True]])
-    np.testing.assert_array_equal(load.release(sim.data, of_drones).plugins["load"].attached, ~of_drones)
+    for mask in (MASK, np.array(MASK), jnp.array(MASK)):
+        np.testing.assert_array_equal(load.release(sim.data, mask).plugins["load"].attached[:, 0], ~np.array(MASK))
+    drone_mask = np.array([[True, False], [False, False], [False, True]])
+    np.testing.assert_array_equal(load.release(sim.data, drone_mask).plugins["load"].attached, ~drone_mask)
     assert not np.any(load.release(sim.data).plugins["load"].attached)
-    of_traced = jax.jit(lambda mask: load.release(sim.data, mask).plugins["load"].attached)
-    np.testing.assert_array_equal(of_traced(of_drones), ~of_drones)
+    release_traced = jax.jit(lambda mask: load.release(sim.data, mask).plugins["load"].attached)
+    np.testing.assert_array_equal(release_traced(drone_mask), ~drone_mask)
 
 
 @pytest.mark.parametrize("mask", [np.ones((N_WORLDS, 2, 4)), np.ones((N_WORLDS, 1, 4), bool), [[1]], "all"])

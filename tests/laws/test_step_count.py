@@ -1,4 +1,4 @@
-"""Law 4 for long flights: the number of steps never wraps without a word."""
+"""Law 4 for long flights: the number of steps never wraps silently."""
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,8 @@ from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.vector import make_vector
 
 
-def counted(data, steps):
-    """Return data after numbers of steps. (n_worlds,)"""
+def with_step_counts(data, steps):
+    """Return the data with other step counts. (n_worlds,)"""
     return data.replace(core=data.core.replace(steps=np.array(steps, np.int32)[:, None]))
 
 
@@ -23,7 +23,7 @@ def sim():
 
 
 def test_a_simulation_refuses_the_step_that_would_pass_the_largest_count(sim):
-    sim.data = counted(sim.data, [0, MAX_STEPS - 3])
+    sim.data = with_step_counts(sim.data, [0, MAX_STEPS - 3])
     sim.step(2)
     sim.step()
     before = sim.data
@@ -38,7 +38,7 @@ def test_a_simulation_refuses_the_step_that_would_pass_the_largest_count(sim):
     sim.reset([False, True])
     sim.step(5)
     assert sim.data.core.steps.tolist() == [[8], [5]]
-    sim.data = counted(sim.data, [MAX_STEPS, 0])
+    sim.data = with_step_counts(sim.data, [MAX_STEPS, 0])
     with pytest.raises(ConfigError, match="at most 2147483647 steps"):
         sim.step()
     sim.reset()
@@ -47,7 +47,7 @@ def test_a_simulation_refuses_the_step_that_would_pass_the_largest_count(sim):
 
 def test_the_functional_api_flags_worlds_whose_count_has_wrapped():
     sim = Sim(3, control="rotor_vel")
-    data = counted(sim.data, [MAX_STEPS - 2, MAX_STEPS - 1, 0])
+    data = with_step_counts(sim.data, [MAX_STEPS - 2, MAX_STEPS - 1, 0])
     after = sim.step_fn(sim.step_fn(data, jnp.int32(2)), jnp.int32(1))
     np.testing.assert_array_equal(after.core.nonfinite[:, 0], [True, True, False])
     assert not np.any(sim.step_fn(data, jnp.int32(1)).core.nonfinite)
@@ -58,7 +58,7 @@ def test_an_environment_that_never_resets_ends_where_its_count_wraps():
     task.install(sim)
     env = AutoReset(DroneEnv(sim, task), "Disabled")
     state = env.reset(jax.random.key(0))
-    state = state.replace(data=counted(state.data, [MAX_STEPS - 5, MAX_STEPS - 10, 0]))
+    state = state.replace(data=with_step_counts(state.data, [MAX_STEPS - 5, MAX_STEPS - 10, 0]))
     after = jax.jit(env.step)(state, jnp.zeros_like(state.action))
     np.testing.assert_array_equal(after.info["nonfinite"], [True, False, False])
     np.testing.assert_array_equal(after.terminated, [True, False, False])
@@ -70,12 +70,12 @@ def test_a_call_of_more_steps_than_can_be_counted_is_refused(sim):
             sim.step_fn(sim.data, n_steps)
 
 
-NO_COUNTS = (2.5, 2.0, True, np.bool_(True), np.float32(2), jnp.float32(2), "2", None, [2], np.array([2]))
+WRONG_COUNTS = (2.5, 2.0, True, np.bool_(True), np.float32(2), jnp.float32(2), "2", None, [2], np.array([2]))
 
 
 def test_law_09_a_number_of_steps_is_one_integer_of_at_least_zero(sim):
     for call in (sim.step_fn, sim.step_fn.lower):
-        for n_steps in NO_COUNTS:
+        for n_steps in WRONG_COUNTS:
             with pytest.raises(ConfigError, match="expected a number of steps as one integer, got"):
                 call(sim.data, n_steps)
         for n_steps in (-5, np.int64(-5), jnp.int32(-5)):
@@ -84,7 +84,7 @@ def test_law_09_a_number_of_steps_is_one_integer_of_at_least_zero(sim):
 
 
 def test_any_integer_counts_steps_and_a_traced_one_is_checked_for_its_type(sim):
-    data = counted(sim.data, [0, 0])
+    data = with_step_counts(sim.data, [0, 0])
     for n_steps in (0, 3, np.int64(3), np.array(3), jnp.int32(3)):
         assert sim.step_fn(data, n_steps).core.steps[0, 0] == int(n_steps)
     traced = jax.jit(sim.step_fn)
