@@ -68,18 +68,18 @@ Two engines of the CPU differ by 8e-5 with cables. Kernels of GPUs divide to 2 u
 division a hook agrees to 1e-4. The task ``deliver`` needs no more than other tasks: after 20 steps two engines of the
 CPU differ by 2e-6, and each from float64 by 4e-6.
 """
-NOISE = {
+COMMAND_NOISE = {
     "state": [0.2, 0.2, 0.2, *[0.0] * 13],
     "attitude": [0.2, 0.2, 0.2, 0.0],
     "body_rate": [0.5, 0.5, 0.5, 0.0],
     "force_torque": [0.0, 1e-6, 1e-6, 1e-6],
     "rotor_vel": [0.0] * 4,
 }
-"""Largest differences of commands from those in hover, besides 2% of each number."""
+"""Largest differences of commands from hover commands, in addition to 2% of each number."""
 
 
-def flying(device="cpu", n_worlds=8, n_drones=2, plugins=(), prepare=None, height=1.5, **settings):
-    """Return a simulation whose drones differ in states and commands; those of world k are always the same."""
+def make_flying_sim(device="cpu", n_worlds=8, n_drones=2, plugins=(), prepare=None, height=1.5, **settings):
+    """Return a simulation whose drones differ in states and commands. World k does not depend on ``n_worlds``."""
     sim = Sim(n_worlds, n_drones, device=device, rng_key=4, **settings)
     rng = np.random.default_rng(3)
 
@@ -99,16 +99,16 @@ def flying(device="cpu", n_worlds=8, n_drones=2, plugins=(), prepare=None, heigh
     for plugin in plugins:
         sim.add(plugin)
     hover = hover_command(sim.data, (0, 0, height))
-    command = hover * (1 + draw(0.02, len(hover))) + draw(1.0, len(hover)) * NOISE[sim.control.value]
+    command = hover * (1 + draw(0.02, len(hover))) + draw(1.0, len(hover)) * COMMAND_NOISE[sim.control.value]
     sim.data = send(sim.data, command)
     return sim
 
 
-def agree(actual, expected, tolerance, label=""):
-    """Check that flags and integers are equal, and other numbers but for rounding.
+def assert_agree(actual, expected, tolerance, label=""):
+    """Assert that flags and integers are equal, and floats equal up to rounding.
 
-    Differences of large numbers carry their errors, so the tolerance is relative to the largest number of an array, or
-    to 1.
+    Differences of large numbers have the errors of these numbers, so the tolerance is relative to the largest number of
+    an array, or to 1.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(actual)
     assert structure == jax.tree.structure(expected)
@@ -163,7 +163,7 @@ EFFECTS = {
     Wind: {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7, "roughness": 0.05},
     WindField: {"field": FIELD, "spread": (0.5, 0.5, 0.0)},
 }
-"""Every effect, with settings that do something."""
+"""Every effect, with settings for which it has an effect."""
 RANGES = {
     "mass": (0.9, 1.2),
     "inertia": (0.8, 1.1),
@@ -177,8 +177,8 @@ RANGES = {
 """Every factor that ``Randomize`` draws by itself."""
 
 
-def errors(size):
-    """Return errors of three axes, of the size of what they measure."""
+def triad_errors(size):
+    """Return errors of three axes in proportion to the size of the measured quantity."""
     return Triad(noise=1e-3 * size, bias=0.1 * size, bias_spread=0.1 * size, random_walk=0.01 * size,
                  instability=0.1 * size, scale=0.1, scale_spread=0.03, misalignment=0.02, misalignment_spread=0.02,
                  bandwidth=80.0)  # fmt: skip
@@ -189,12 +189,12 @@ ANCHORS = [(2.0, 2.0, 2.0), (-2.0, -2.0, 2.5)]
 STATIONS = [(0, 0, -2.4), (0, 0.6, 0.8)]
 DELAY_SETTINGS = {"delay": 0.004, "jitter": 0.004, "dropout": 0.1}
 SENSORS = {
-    "imu": lambda: IMU(errors(1.0), errors(1.0), OFFSET, TURN, 1e-8, **DELAY_SETTINGS),
+    "imu": lambda: IMU(triad_errors(1.0), triad_errors(1.0), OFFSET, TURN, 1e-8, **DELAY_SETTINGS),
     "motion_capture": lambda: MotionCapture(1e-3, 1e-2, 50.0, OFFSET, TURN, freq=250, **DELAY_SETTINGS),
     "optical_flow": lambda: OpticalFlow(0.1, pos=OFFSET),
     "time_of_flight": lambda: TimeOfFlight(0.01, pos=OFFSET, resolution=None, freq=100, delay=0.01),
     "barometer": lambda: Barometer(1.0, 2.0, 10.0, 30.0, 200.0),
-    "magnetometer": lambda: sensors.Magnetometer((1e-5, 2e-5, -4.5e-5), errors(1e-4), TURN, freq=100),
+    "magnetometer": lambda: sensors.Magnetometer((1e-5, 2e-5, -4.5e-5), triad_errors(1e-4), TURN, freq=100),
     "rotor_speeds": lambda: sensors.RotorSpeeds(5.0, freq=250, delay=0.002),
     "battery_voltage": lambda: sensors.BatteryVoltage(0.01),
     "multi_ranger": lambda: sensors.MultiRanger(0.01, freq=100),
@@ -220,7 +220,7 @@ def biased_imu():
 
 
 def kalman():
-    """Return a filter with every kind of sensor that it uses."""
+    """Return every kind of sensor that the filter uses, and the filter."""
     measured_by = [
         biased_imu(),
         MotionCapture(noise=0.01, freq=100),
@@ -234,7 +234,7 @@ def kalman():
 
 
 def eskf():
-    """Return a filter with sensors of one number each, as each number is an update of 15 states to compile."""
+    """Return a filter and sensors of one number each, since each number adds an update of 15 states to compile."""
     measured_by = [biased_imu(), UWB(ANCHORS[:1], noise=0.1), TimeOfFlight(noise=0.01)]
     return [*measured_by, ESKF(measured_by)]
 
@@ -244,7 +244,7 @@ def complementary():
     return [*measured_by, Complementary(measured_by)]
 
 
-def drifting_pad(sim):
+def add_drifting_pad(sim):
     """Add an object that a stage of the user moves."""
     pad = sim.scene.add("landing_pad", pos=[0, 0, 0.5])
 
@@ -256,11 +256,11 @@ def drifting_pad(sim):
     sim.step_pipeline["drift"] = drift
 
 
-def ball(sim):
+def add_ball(sim):
     sim.scene.add("sphere", pos=[0.1, 0, 1.1], radius=0.1, mocap=False)
 
 
-def approach(sim):
+def let_drones_meet(sim):
     """Let the two drones of each world meet."""
     pos, vel = [[0, 0, 1.0], [0.12, 0.02, 1.01]], [[0.5, 0, -0.3], [-0.5, 0, -0.3]]
     shape = sim.data.states.pos.shape
@@ -269,7 +269,7 @@ def approach(sim):
 
 @stage("drone")
 def distances(data):
-    """Write distances of a sphere to every kind of shape, and the slope of one, where wrenches are."""
+    """Write distances of a sphere to every kind of shape, and the gradient of one, to the wrenches of the states."""
     s = data.states
     rot = rotation.matrix(s.quat)
     values = jnp.stack([distance(SPHERE, shape, s.pos, rot) for shape in SHAPES])
@@ -303,39 +303,39 @@ def undeclared(data):
 
 
 NAMED_CONTROLLERS = [name for name in CONTROLLERS if name not in ("auto", "crazyflow", "load_lqr", "tracking_lqr")]
-"""Controllers of states that need no more than their names; ``"auto"`` is the default."""
+"""Controllers of states that need no settings, except the default ``"auto"``."""
 
 
-def turns(state, setpoint, time):
-    """Return the number of the controller that flies: each for six steps."""
+def select_controller(state, setpoint, time):
+    """Return the index of the active controller; each is active for six steps."""
     return jnp.int32(time * 500 / 6) % len(NAMED_CONTROLLERS)
 
 
-def case(plugins=list, **settings):
-    """Return a function of further settings that returns a simulation."""
+def make_builder(plugins=list, **settings):
+    """Return a function that builds a simulation from these and further settings."""
 
     def build(**more):
-        return flying(plugins=plugins(), **settings | more)
+        return make_flying_sim(plugins=plugins(), **settings | more)
 
     build.plugins = plugins
     return build
 
 
-def along_a_figure_eight(**more):
+def build_tracking_sim(**more):
     t = np.linspace(0, 1, 11)
     controller = TrackingLQR(setpoints=jax.vmap(EIGHT.evaluate)(t), dt=0.1)
-    return flying(plugins=follow(), control="state", controller=controller, **more)
+    return make_flying_sim(plugins=follow(), control="state", controller=controller, **more)
 
 
 def follow():
     return [Follow([EIGHT])]
 
 
-along_a_figure_eight.plugins = follow
+build_tracking_sim.plugins = follow
 
 
-def fleet(**more):
-    """Return drones of several airframes, of which one has six rotors."""
+def build_fleet(**more):
+    """Return a simulation of drones of several airframes, one of which has six rotors."""
     sim = Sim(3, drone=FLEET, control="attitude", integrator="rk4", **more)
     rng = np.random.default_rng(0)
     sim.data = with_states(sim.data, pos=rng.uniform(0.9, 1.1, (3, 4, 3)), vel=[0.1, 0.1, 0.1])
@@ -349,60 +349,60 @@ STEPS = {
     } for i, (dynamics, control) in enumerate(PAIRS)
 }  # fmt: skip
 """Every kind of dynamics and command level, and every integrator."""
-CASES = {name: case(**settings) for name, settings in STEPS.items()}
+CASES = {name: make_builder(**settings) for name, settings in STEPS.items()}
 CASES |= {
-    "crazyflow": case(control="state", controller="crazyflow"),
-    "controllers": case(control="state", controller=NAMED_CONTROLLERS, switch=turns),
-    "load_lqr": case(
+    "crazyflow": make_builder(control="state", controller="crazyflow"),
+    "controllers": make_builder(control="state", controller=NAMED_CONTROLLERS, switch=select_controller),
+    "load_lqr": make_builder(
         lambda: [SlungLoad(0.05, 0.4)], drone="bumblebee", control="state", controller=LoadLQR()
     ),
-    "tracking_lqr": along_a_figure_eight,
-    "effects": case(effects, control="attitude"),
-    "randomize": case(
+    "tracking_lqr": build_tracking_sim,
+    "effects": make_builder(effects, control="attitude"),
+    "randomize": make_builder(
         lambda: [Randomize(**RANGES, charge=(0.2, 0.6), delay=(1, 4)), Battery(),
                  Latency(delay=np.zeros((8, 2), int), max_delay=4)],
         control="rotor_vel",
     ),
-    "sensors": case(all_sensors, control="rotor_vel"),
-    "kalman": case(kalman, n_drones=1, control="state"),
-    "eskf": case(eskf, n_drones=1, control="state"),
-    "complementary": case(complementary, control="attitude"),
-    "load": case(
+    "sensors": make_builder(all_sensors, control="rotor_vel"),
+    "kalman": make_builder(kalman, n_drones=1, control="state"),
+    "eskf": make_builder(eskf, n_drones=1, control="state"),
+    "complementary": make_builder(complementary, control="attitude"),
+    "load": make_builder(
         lambda: [SlungLoad(0.005, 0.3, cable=True, drag=0.01), RotorJet(), ContactResponse()],
-        control="attitude", prepare=ball,
+        control="attitude", prepare=add_ball,
     ),
-    "shared": case(lambda: [SharedLoad(0.005)], control="attitude", integrator="symplectic_euler"),
-    "hook": case(lambda: [Hook.bumblebee(0.2), ContactLog()], control="state", drone="bumblebee"),
-    "vehicles": case(
+    "shared": make_builder(lambda: [SharedLoad(0.005)], control="attitude", integrator="symplectic_euler"),
+    "hook": make_builder(lambda: [Hook.bumblebee(0.2), ContactLog()], control="state", drone="bumblebee"),
+    "vehicles": make_builder(
         lambda: [Cars(2, path=figure_eight(6.0, 2.0, period=12.0), controller=vehicles.PathLQR(), trailer=True),
                  Bicycles(pos=(0.0, 3.0)), Radar((0.0, 0.0, 0.5))],
         control="rotor_vel",
     ),
-    "terrain": case(
+    "terrain": make_builder(
         lambda: [Terrain(HILLS, (8.0, 8.0)), RangeFinder(drones=True), ContactLog()], control="attitude",
     ),
-    "bodies": case(
+    "bodies": make_builder(
         lambda: [FreeBodies(3, size=(0.2, 0.2, 0.2), mass=0.2, pos=[(0, 0, 0.11), (0.02, 0, 0.35), (1, 0, 2.0)])],
         control="state",
     ),
-    "scenery": case(
+    "scenery": make_builder(
         lambda: [Forest(size=(8.0, 8.0)), Pillars(size=(8.0, 8.0), speed=1.0), Clutter(size=(4.0, 4.0, 2.0)), Gates(),
                  Rooms()],
         control="rotor_vel",
     ),
-    "collisions": case(lambda: [DroneCollisions()], control="attitude", prepare=approach),
-    "impact": case(lambda: [ContactResponse()], control="attitude", height=0.03),
-    "objects": case(control="attitude", prepare=drifting_pad),
-    "distances": case(height=0.0, control="rotor_vel", prepare=replace_stages(distances=distances)),
-    "fleet": fleet,
+    "collisions": make_builder(lambda: [DroneCollisions()], control="attitude", prepare=let_drones_meet),
+    "impact": make_builder(lambda: [ContactResponse()], control="attitude", height=0.03),
+    "objects": make_builder(control="attitude", prepare=add_drifting_pad),
+    "distances": make_builder(height=0.0, control="rotor_vel", prepare=replace_stages(distances=distances)),
+    "fleet": build_fleet,
     "populations": lambda **more: build(KINDS, 3, 2, 4, **more),
     "populations of equal sizes": lambda **more: build(KINDS, 2, 2, 2, **more),
     "many members": lambda **more: build(Tied, 2, 2, 9, **more),
-    "stages of all scopes": case(
+    "stages of all scopes": make_builder(
         n_drones=4, control="attitude", prepare=before_integration(repulsion, centre, undeclared)
     ),
-    "pairs of 17": case(n_worlds=3, n_drones=17, control="rotor_vel", prepare=before_integration(gap)),
-    "downwash of 9": case(lambda: [Downwash()], n_worlds=4, n_drones=9, control="attitude"),
+    "pairs of 17": make_builder(n_worlds=3, n_drones=17, control="rotor_vel", prepare=before_integration(gap)),
+    "downwash of 9": make_builder(lambda: [Downwash()], n_worlds=4, n_drones=9, control="attitude"),
 }  # fmt: skip
 """Functions that return the simulations, by name."""
 PLUGINS = {name: build.plugins for name, build in CASES.items() if hasattr(build, "plugins")}

@@ -18,56 +18,56 @@ from crazysim.pytree import PyTree, as_parameter, leaf, replace_leaves
 WORLDS, DRONES = 3, 2
 
 
-class TowardsMemory(PyTree):
+class SpringMemory(PyTree):
     n_ticks: jax.Array = leaf("drone", 1)
     feedforward: jax.Array = leaf("drone", 1)
 
 
-class TowardsParams(PyTree):
+class SpringParams(PyTree):
     mass: jax.Array = leaf("parameter", 1, (1,))
 
 
-class Towards(Controller):
+class Spring(Controller):
     """Weight and a spring along z, with a counter of its ticks."""
 
-    name = "towards"
+    name = "spring"
     levels = (Control.state,)
     output = Control.force_torque
     freq: int = 100
 
     def params(self, airframe):
-        return TowardsParams(as_parameter(airframe.value("rigid_body.mass")))
+        return SpringParams(as_parameter(airframe.value("rigid_body.mass")))
 
     def memory(self, airframe):
-        return TowardsMemory(np.zeros(1), np.zeros(8))
+        return SpringMemory(np.zeros(1), np.zeros(8))
 
     def update(self, data, command, memory, params):
         s = data.states
         force = params.mass * (9.81 + 4 * (command.pos - s.pos) - 4 * s.vel)[2:]
-        memory = TowardsMemory(memory.n_ticks + 1, command.feedforward())
+        memory = SpringMemory(memory.n_ticks + 1, command.feedforward())
         return jnp.concatenate([force, -1e-3 * s.ang_vel]), memory
 
 
-def setpoint_of(sim, offset=(0.0, 0.0, 1.0), yaw=0.0):
+def make_setpoint(sim, offset=(0.0, 0.0, 1.0), yaw=0.0):
     cmd = np.zeros((sim.n_worlds, sim.n_drones, 16), np.float32)
     cmd[..., :3] = np.asarray(sim.default_data.states.pos) + offset
     cmd[..., 9:13] = [0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]
     return cmd
 
 
-def flown(controller, n_steps, engine="auto", offset=(0.0, 0.0, 1.0), n_worlds=WORLDS, **settings):
-    """Return a simulation that has taken off; like the real one, PID takes off straight up only."""
+def take_off(controller, n_steps, engine="auto", offset=(0.0, 0.0, 1.0), n_worlds=WORLDS, **settings):
+    """Return a simulation after takeoff; as on real drones, PID can only take off straight up."""
     sim = Sim(n_worlds, DRONES, drone="cf2x_L250", control="state", controller=controller, engine=engine, **settings)
-    sim.state_control(setpoint_of(sim, offset))
+    sim.state_control(make_setpoint(sim, offset))
     sim.step(n_steps)
     return sim
 
 
-def memory_of(sim):
+def controller_memory(sim):
     return sim.data.controls.controller.memory
 
 
-CRAZYFLOW = {
+CRAZYFLOW_MEMORY = {
     "state": {"state": ("pos_err_i",), "attitude": ("ang_vel_des", "r_int_error", "prev_ang_vel")},
     "attitude": {"attitude": ("ang_vel_des", "r_int_error", "prev_ang_vel")},
     "body_rate": {"body_rate": ("r_int_error", "prev_ang_vel")},
@@ -75,16 +75,16 @@ CRAZYFLOW = {
 """Names of the controllers' memory in Crazyflow, by command level and record."""
 
 
-@pytest.mark.parametrize("control", CRAZYFLOW)
+@pytest.mark.parametrize("control", CRAZYFLOW_MEMORY)
 def test_the_cascade_of_crazyflow_keeps_its_memory_where_all_do_and_is_read_under_crazyflows_names(control):
     sim = Sim(control=control, controller="crazyflow", engine="interpret")
-    stages = [f"{level}_controller" for level in (*CRAZYFLOW[control], "force_torque")]
+    stages = [f"{level}_controller" for level in (*CRAZYFLOW_MEMORY[control], "force_torque")]
     assert list(sim.step_pipeline)[: len(stages)] == stages
     sim.data = with_states(sim.data, pos=[0, 0, 1.0], ang_vel=[0.1, 0.2, 0.3])
     command = np.full((1, 1, 16 if control == "state" else 4), 0.125)
     getattr(sim, f"{control}_control")(command)
     sim.step(10)
-    controls, names = sim.data.controls, CRAZYFLOW[control]
+    controls, names = sim.data.controls, CRAZYFLOW_MEMORY[control]
     assert controls.controller is getattr(controls, control).controller
     for level, memory in names.items():
         record = getattr(controls, level)
@@ -156,12 +156,12 @@ def test_a_controller_of_attitudes_is_followed_by_its_inner_one():
     assert abs(sim.data.states.ang_vel[0, 0, 0]) < 0.2
     with pytest.raises(ConfigError, match=r"a controller that commands rotors .* got 'height' with output 'attitude'"):
         Sim(control="state", controller=Height(inner=None))
-    with pytest.raises(ConfigError, match="controller 'towards' follows, state, got control='attitude'"):
-        Sim(control="state", controller=Height(inner=Towards()))
+    with pytest.raises(ConfigError, match="controller 'spring' follows, state, got control='attitude'"):
+        Sim(control="state", controller=Height(inner=Spring()))
 
 
 def test_the_cascade_of_crazyflow_takes_turns_with_another_controller():
-    """At the levels that it follows by itself; it flies as it does alone."""
+    """At the levels that the cascade follows, it flies in a switch as it does alone."""
     command = np.array([[[0.1, -0.1, 0.3, 0.33]]])
 
     def fly(**settings):
@@ -188,7 +188,7 @@ def test_the_cascade_of_crazyflow_takes_turns_with_another_controller():
 def test_the_firmware_reaches_a_setpoint(controller, error, drone):
     """Mellinger's nominal mass leaves an offset in height; PID has an integral large enough."""
     sim = Sim(drone=drone, control="state", controller=controller)
-    cmd = setpoint_of(sim)
+    cmd = make_setpoint(sim)
     sim.state_control(cmd)
     sim.step(1000)
     sim.state_control(cmd + np.eye(16, dtype=np.float32)[0])
@@ -197,7 +197,7 @@ def test_the_firmware_reaches_a_setpoint(controller, error, drone):
 
 
 def test_body_rates_are_followed_and_nothing_levels():
-    """The field's CTBR: a roll rate turns the drone over, where Crazyflow's cascade levels it."""
+    """A commanded roll rate turns the drone over, whereas Crazyflow's cascade levels it."""
     for controller in (PID(hold_yaw=False), PID(hold_yaw=True), "crazyflow"):
         sim = Sim(drone="cf2x_L250", control="body_rate", controller=controller)
         sim.data = with_states(sim.data, pos=[0, 0, 20.0])
@@ -224,25 +224,27 @@ def test_rates_through_a_flip():
 
 
 def test_a_controller_fires_at_its_rate_and_resets_per_world():
-    sim = flown(Towards(), 101)
-    np.testing.assert_array_equal(np.asarray(memory_of(sim).n_ticks)[..., 0], 21.0)
+    sim = take_off(Spring(), 101)
+    np.testing.assert_array_equal(np.asarray(controller_memory(sim).n_ticks)[..., 0], 21.0)
     sim.reset(np.array([True, False, True]))
-    np.testing.assert_array_equal(np.asarray(memory_of(sim).n_ticks)[:, 0, 0], [0, 21, 0])
+    np.testing.assert_array_equal(np.asarray(controller_memory(sim).n_ticks)[:, 0, 0], [0, 21, 0])
     assert sim.control_freq == 100
 
 
 def test_feedforward_reaches_the_controller():
-    sim = Sim(WORLDS, DRONES, control="state", controller=Towards(), engine="interpret")
-    cmd = setpoint_of(sim)
+    sim = Sim(WORLDS, DRONES, control="state", controller=Spring(), engine="interpret")
+    cmd = make_setpoint(sim)
     cmd[..., 15] = 0.7
     sim.state_control(cmd)
     sim.step()
-    np.testing.assert_allclose(np.asarray(memory_of(sim).feedforward)[0, 0], [0, 0, 0, 0, 0, 0, 0.7, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(controller_memory(sim).feedforward)[0, 0], [0, 0, 0, 0, 0, 0, 0.7, 0], atol=1e-6
+    )
     forward = np.arange(8 * WORLDS * DRONES).reshape(WORLDS, DRONES, 8)
     sim.state_control(cmd, feedforward=forward)
     np.testing.assert_array_equal(sim.data.controls.state.staged_feedforward, forward)
     sim.step(5)
-    np.testing.assert_allclose(memory_of(sim).feedforward, forward)
+    np.testing.assert_allclose(controller_memory(sim).feedforward, forward)
     with pytest.raises(ValueError, match=r"feedforward command has shape.*jerk"):
         sim.state_control(cmd, feedforward=forward[0])
     with pytest.raises(ConfigError, match=r"no feedforward, which .* does not follow, got one. Use controller='auto'"):
@@ -250,16 +252,16 @@ def test_feedforward_reaches_the_controller():
 
 
 def test_latency_delays_setpoint_and_feedforward():
-    sim = Sim(control="state", controller=Towards(freq=500), engine="interpret")
+    sim = Sim(control="state", controller=Spring(freq=500), engine="interpret")
     sim.add(Latency(10))
-    cmd = setpoint_of(sim)
+    cmd = make_setpoint(sim)
     cmd[..., 15] = 0.5
     sim.state_control(cmd)
     sim.step(10)
-    assert np.asarray(memory_of(sim).feedforward)[0, 0, 6] == 0
+    assert np.asarray(controller_memory(sim).feedforward)[0, 0, 6] == 0
     assert np.asarray(sim.data.controls.state.cmd)[0, 0, 2] == 0
     sim.step()
-    assert np.asarray(memory_of(sim).feedforward)[0, 0, 6] == 0.5
+    assert np.asarray(controller_memory(sim).feedforward)[0, 0, 6] == 0.5
     np.testing.assert_array_equal(sim.data.controls.state.cmd, cmd)
 
 
@@ -306,11 +308,11 @@ def test_wrong_settings_are_refused(settings, message):
 
 
 def test_records_declare_their_scopes():
-    class Bare(Towards):
+    class Bare(Spring):
         def memory(self, airframe):
             return {"count": np.zeros(1)}
 
-    with pytest.raises(ConfigError, match=r"expected leaves of scope drone in dict of controller 'towards'.*opaque"):
+    with pytest.raises(ConfigError, match=r"expected leaves of scope drone in dict of controller 'spring'.*opaque"):
         Sim(control="state", controller=Bare())
 
 
@@ -328,7 +330,7 @@ def test_incomplete_controllers_are_refused():
 
 
 def test_it_shards():
-    one, two = (flown("pid", 50, mesh=mesh, n_worlds=4) for mesh in (None, world_mesh(jax.devices()[:2])))
+    one, two = (take_off("pid", 50, mesh=mesh, n_worlds=4) for mesh in (None, world_mesh(jax.devices()[:2])))
     np.testing.assert_allclose(one.data.states.rotor_vel, two.data.states.rotor_vel, rtol=1e-5)
 
 
@@ -342,46 +344,46 @@ def test_an_environment_uses_it():
 # Several controllers --------------------------------------------------------------------------------------------
 
 
-def at_one_second(state, setpoint, time):
+def switch_at_one_second(state, setpoint, time):
     return jnp.where(time < 1.0, 0, 1)
 
 
 def test_a_switch_function_exchanges_controllers_in_flight():
-    sim = flown(["pid", Towards()], 800, switch=at_one_second, strict=True)
-    np.testing.assert_array_equal(memory_of(sim).active, 1)
-    np.testing.assert_array_equal(memory_of(sim).controllers[1].n_ticks, 60.0)
+    sim = take_off(["pid", Spring()], 800, switch=switch_at_one_second, strict=True)
+    np.testing.assert_array_equal(controller_memory(sim).active, 1)
+    np.testing.assert_array_equal(controller_memory(sim).controllers[1].n_ticks, 60.0)
     assert "not fused" not in sim.explain()
 
 
 def test_each_drone_has_its_own():
     index = np.array([[0, 1], [1, 0], [0, 0]])
-    both = flown(["pid", "mellinger"], 300, switch=index)
-    apart = [flown(name, 300) for name in ("pid", "mellinger")]
+    both = take_off(["pid", "mellinger"], 300, switch=index)
+    apart = [take_off(name, 300) for name in ("pid", "mellinger")]
     expected = np.where(index[..., None] == 0, *(np.asarray(sim.data.states.pos) for sim in apart))
     np.testing.assert_allclose(both.data.states.pos, expected, atol=1e-5)
-    np.testing.assert_array_equal(np.asarray(memory_of(both).active)[..., 0], index)
-    # The memory of an inactive controller stands still.
-    assert not np.any(np.asarray(memory_of(both).controllers[1].ang_vel)[index == 0])
+    np.testing.assert_array_equal(np.asarray(controller_memory(both).active)[..., 0], index)
+    # The memory of an inactive controller does not change.
+    assert not np.any(np.asarray(controller_memory(both).controllers[1].ang_vel)[index == 0])
 
 
 def test_the_choice_sees_state_and_setpoint():
-    def high(state, setpoint, time):
+    def switch_when_high(state, setpoint, time):
         assert isinstance(setpoint, Setpoint)
         return (state.pos[2] > 0.5 * setpoint.pos[2]).astype(int)
 
-    sim = flown(["pid", "mellinger"], 10, switch=high)
-    np.testing.assert_array_equal(memory_of(sim).active, 0)
+    sim = take_off(["pid", "mellinger"], 10, switch=switch_when_high)
+    np.testing.assert_array_equal(controller_memory(sim).active, 0)
     sim.step(1000)
-    np.testing.assert_array_equal(memory_of(sim).active, 1)
+    np.testing.assert_array_equal(controller_memory(sim).active, 1)
 
 
 @pytest.mark.parametrize("names, bump", [(["mellinger", "pid"], 200.0), (["pid", "mellinger"], 1500.0)])
 def test_a_switch_in_hover_is_bumpless(names, bump):
     """PID continues thrust and torque; Mellinger's integral is limited to 0.02 N about its nominal mass."""
-    sim = flown(names, 6000, switch=lambda state, setpoint, time: jnp.where(time < 12.0, 0, 1))
+    sim = take_off(names, 6000, switch=lambda state, setpoint, time: jnp.where(time < 12.0, 0, 1))
     before = np.asarray(sim.data.controls.rotor_vel)
     sim.step()
-    np.testing.assert_array_equal(memory_of(sim).active, 1)
+    np.testing.assert_array_equal(controller_memory(sim).active, 1)
     assert np.max(np.abs(np.asarray(sim.data.controls.rotor_vel) - before)) < bump
     sim.step(1000)
     assert np.max(np.abs(np.asarray(sim.data.states.vel))) < 0.1
@@ -481,7 +483,7 @@ def test_gradients_flow_through_the_step():
     """A higher setpoint makes every controller climb faster."""
     sim, slope = every_controller("state")
     sim.reset()
-    command = jnp.asarray(setpoint_of(sim))
+    command = jnp.asarray(make_setpoint(sim))
     sim.state_control(command)
     sim.step(1500)
     gradient = slope(command, sim.data)
@@ -501,7 +503,7 @@ def test_ten_steps_and_commands_trace_once():
 
     sim.step_pipeline["counted"] = counted
     sim.build_step_fn()
-    cmd = setpoint_of(sim)
+    cmd = make_setpoint(sim)
     for each in (cmd, jnp.asarray(cmd), cmd.tolist(), cmd.astype(np.float64)):
         sim.state_control(each)
         sim.step(5)

@@ -87,7 +87,7 @@ def test_everything_is_float64_under_x64(x64):
 
 
 def test_no_two_leaves_share_a_buffer_that_a_rollout_may_give_away():
-    """A leaf that a user donates (``donate_argnums``) must not take another one along: commands start apart."""
+    """Donating a leaf (``donate_argnums``) must not invalidate another leaf."""
     data = shared_sim(n_worlds=2, n_drones=2, dynamics="first_principles", control="state").data
     pointers = {}
     for path, x in jax.tree_util.tree_leaves_with_path(data):

@@ -46,15 +46,15 @@ PARTS = [
 @pytest.mark.parametrize("on_device", [False, True])
 @pytest.mark.parametrize("parts", PARTS, ids=lambda parts: "-".join(parts))
 def test_a_setpoint_in_parts_is_the_vector_of_these_parts(parts, on_device):
-    """NumPy broadcasts, on the host and on the device alike; other parts and the body rates are zero."""
+    """Parts are broadcast, on the host and on the device; missing parts and the body rates are zero."""
     data = get_sim("first_principles", "state").data
     expected = np.zeros((2, 2, 16))
     for name, where in (("pos", slice(0, 3)), ("vel", slice(3, 6)), ("acc", slice(6, 9))):
         expected[..., where] = parts.get(name, 0.0)
     yaw = np.broadcast_to(parts.get("yaw", 0.0), (2, 2))
     expected[..., 11], expected[..., 12] = np.sin(yaw / 2), np.cos(yaw / 2)
-    given = {name: jnp.asarray(x) for name, x in parts.items()} if on_device else parts
-    staged = F.state_control(data, **given).controls.state.staged_cmd
+    setpoint_parts = {name: jnp.asarray(x) for name, x in parts.items()} if on_device else parts
+    staged = F.state_control(data, **setpoint_parts).controls.state.staged_cmd
     np.testing.assert_allclose(staged, expected, atol=2e-7)  # rounding of float32
     sim = get_sim("first_principles", "state")
     sim.state_control(**parts)
@@ -125,14 +125,14 @@ def test_controllable_is_per_world(dynamics, control):
     freq = 500 if control == "rotor_vel" else getattr(data.controls, control).freq
     period = 500 // freq
     for steps in ([0, 1], [period, period + 1], [7 * period, 7 * period - 1]):
-        at = data.replace(core=data.core.replace(steps=jnp.asarray(steps, jnp.int32)[:, None]))
+        later_data = data.replace(core=data.core.replace(steps=jnp.asarray(steps, jnp.int32)[:, None]))
         expected = [[step % period == 0] for step in steps]
-        np.testing.assert_array_equal(F.controllable(at), expected)
-        assert F.controllable(at).dtype == bool
+        np.testing.assert_array_equal(F.controllable(later_data), expected)
+        assert F.controllable(later_data).dtype == bool
 
 
 def test_commands_are_staged_in_one_function():
-    """Fields of staged commands are written by ``stage_command``, where they are made, and by loops for inner ones."""
+    """Only ``stage_command``, the creation of records, and controllers with inner loops write staged commands."""
     sources = (Path(crazysim.__file__).parent).rglob("*.py")
     writes = re.compile(r"staged_(cmd|feedforward)\"?(=|: )(?!Array)")
     written = {".".join(source.parts[-2:]) for source in sources if writes.search(source.read_text())}

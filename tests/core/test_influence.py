@@ -1,4 +1,4 @@
-"""Plugins within the integration: what they may write, and errors that name plugin, method and field."""
+"""Plugins within the integration: fields that they may write, and errors that name plugin, method and field."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +22,7 @@ class TiltData(PyTree):
 
 
 class Tilt(Plugin):
-    """A plugin whose methods are given by a test."""
+    """A plugin whose methods call functions of a test."""
 
     act: object = None
     rates: object = None
@@ -104,7 +104,7 @@ def test_law_09_an_influence_writes_what_the_dynamics_use_alone(case):
 
 
 def test_an_influence_may_write_forces_commands_and_parameters():
-    """Twice the mass and a force of its weight: the drone hovers with half of it pulled away."""
+    """The drone hovers without thrust, at a mass of 2 N weight that a force of 2 N carries."""
     half = with_fields(
         states={"force": lambda x: x + jnp.array([0, 0, 2.0]), "torque": lambda x: x * 1.0},
         params={"mass": lambda x: 2.0 / 9.81 * jnp.ones_like(x), "rpm2thrust": lambda x: jnp.zeros((4, 3))},

@@ -1,4 +1,4 @@
-"""Integrators: their order of convergence, against motions in closed form, in float64."""
+"""Order of convergence of the integrators, compared with motions in closed form, in float64."""
 
 from functools import partial
 
@@ -26,9 +26,9 @@ def data():
 
 @partial(jax.jit, static_argnames=("integrator", "deriv_fn"))
 def fly(data, freq, n_steps, integrator, deriv_fn):
-    """Return the states after as many steps as each drone takes, each with a step of its own length.
+    """Return the states after a different number of steps of a different length for each drone.
 
-    Rates are static in the record; here they are an array, so that one compilation serves all of them.
+    Rates are static in the record. Here they are an array, so that one compilation serves all of them.
     """
 
     def step(k, states):
@@ -44,8 +44,8 @@ def fly_all(data, integrator, deriv_fn=first_principles_derivative):
     return jax.device_get(fly(data, n_steps / DURATION, n_steps, Integrator(integrator), deriv_fn))
 
 
-def slope(errors):
-    """Return the order: the slope of the error over the length of a step, both as logarithms."""
+def convergence_order(errors):
+    """Return the order of convergence: the slope of log error over log step length."""
     errors = np.asarray(errors)
     assert np.all(errors > 1e-14), f"rounding hides the order: {errors}"
     return np.polyfit(np.log(1 / STEPS), np.log(errors), 1)[0]
@@ -55,8 +55,8 @@ def prepare_data(data, params=None, **states):
     new = {k: np.broadcast_to(np.asarray(v, float), getattr(data.states, k).shape) for k, v in states.items()}
     p = data.params
     params = {k: np.asarray(v, float) for k, v in (params or {}).items()}
-    nothing = {k: np.zeros_like(getattr(p, k)) for k in ("drag_matrix", "rpm2thrust", "rpm2torque")}
-    return data.replace(states=data.states.replace(**new), params=p.replace(**(nothing | params)))
+    zero_params = {k: np.zeros_like(getattr(p, k)) for k in ("drag_matrix", "rpm2thrust", "rpm2torque")}
+    return data.replace(states=data.states.replace(**new), params=p.replace(**(zero_params | params)))
 
 
 def rotation_error(quat, exact):
@@ -74,8 +74,8 @@ def test_law_08_order_of_position_and_velocity_under_drag(integrator, data, x64)
     decay = np.exp(-k * DURATION)
     vel = g / k + (v0 - g / k) * decay
     pos = np.array([0, 0, 10]) + g / k * DURATION + (v0 - g / k) * (1 - decay) / k
-    assert abs(slope(np.linalg.norm(states.vel[0] - vel, axis=-1)) - integrator.order) < 0.2
-    assert abs(slope(np.linalg.norm(states.pos[0] - pos, axis=-1)) - integrator.order) < 0.2
+    assert abs(convergence_order(np.linalg.norm(states.vel[0] - vel, axis=-1)) - integrator.order) < 0.2
+    assert abs(convergence_order(np.linalg.norm(states.pos[0] - pos, axis=-1)) - integrator.order) < 0.2
 
 
 @pytest.mark.parametrize("integrator", list(Integrator))
@@ -83,7 +83,7 @@ def test_law_08_order_of_attitude_with_an_axis_that_turns(integrator, data, x64)
     """A free body with J = diag(A, A, C): its attitude is the product of two turns at constant rates.
 
     exp(t L / A) q0 exp(t wz (1 - C/A) ez), L being the angular momentum in the world frame. Averaging body rates as
-    if rotations commuted is of order 2 only, and a commutator of the wrong sign too.
+    if rotations commuted has only order 2, and so has a commutator of the wrong sign.
     """
     A, C, ang_vel = 2e-5, 5e-5, np.array([4.0, 3.0, 8.0])
     q0 = Rotation.from_euler("ZYX", [0.5, -0.4, 0.3])
@@ -93,10 +93,12 @@ def test_law_08_order_of_attitude_with_an_axis_that_turns(integrator, data, x64)
     momentum = q0.apply(inertia @ ang_vel)
     body = Rotation.from_rotvec([0, 0, ang_vel[2] * (1 - C / A) * DURATION])
     exact = Rotation.from_rotvec(momentum / A * DURATION) * q0 * body
-    assert abs(slope(rotation_error(states.quat, exact)) - integrator.order) < 0.3
+    assert abs(convergence_order(rotation_error(states.quat, exact)) - integrator.order) < 0.3
     transverse = body.inv().apply([4.0, 3.0, 0.0])
-    wanted = np.array([transverse[0], transverse[1], 8.0])
-    assert abs(slope(np.linalg.norm(states.ang_vel[0] - wanted, axis=-1)) - integrator.order) < 0.3
+    expected_ang_vel = np.array([transverse[0], transverse[1], 8.0])
+    assert (
+        abs(convergence_order(np.linalg.norm(states.ang_vel[0] - expected_ang_vel, axis=-1)) - integrator.order) < 0.3
+    )
 
 
 def swaying_derivative(data):
@@ -108,7 +110,7 @@ def swaying_derivative(data):
 
 
 def test_law_08_rk4_has_order_4_where_rates_depend_on_the_attitude(data, x64):
-    """Against quaternion kinematics q' = q w / 2, solved by scipy to 1e-13: the middle stages count here."""
+    """The reference is q' = q w / 2, solved by SciPy to 1e-13; the result depends on the middle stages."""
     from scipy.integrate import solve_ivp
 
     def rate(_, q):
@@ -121,7 +123,7 @@ def test_law_08_rk4_has_order_4_where_rates_depend_on_the_attitude(data, x64):
     q0 = Rotation.from_euler("ZYX", [0.5, -0.4, 0.3]).as_quat()
     exact = solve_ivp(rate, (0, DURATION), q0, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
     states = fly_all(prepare_data(data, quat=q0), "rk4", swaying_derivative)
-    assert abs(slope(rotation_error(states.quat, Rotation.from_quat(exact))) - 4) < 0.3
+    assert abs(convergence_order(rotation_error(states.quat, Rotation.from_quat(exact))) - 4) < 0.3
 
 
 @pytest.mark.parametrize("integrator", list(Integrator))
@@ -131,15 +133,17 @@ def test_law_08_order_of_rotor_speed(integrator, data, x64):
     start = prepare_data(data, lag, pos=[0, 0, 10])
     start = start.replace(controls=start.controls.replace(rotor_vel=np.full((1, 3, 4), 1000.0)))
     errors = fly_all(start, integrator).rotor_vel[0, :, 0] - 1000 * (1 - np.exp(-8 * DURATION))
-    assert abs(slope(np.abs(errors)) - integrator.order) < 0.3
+    assert abs(convergence_order(np.abs(errors)) - integrator.order) < 0.3
 
 
 def test_symplectic_euler_moves_with_the_new_velocities_and_euler_with_the_old(data, x64):
     start = prepare_data(data, pos=[0, 0, 10], vel=[1, 0, 0], ang_vel=[0, 0, 1])
     start = start.replace(states=start.states.replace(force=np.full((1, 3, 3), 0.0434)))
     dt, deriv_fn = 1 / 500, first_principles_derivative
-    both = jax.jit(lambda data: [INTEGRATORS[name](data, deriv_fn).states for name in ("euler", "symplectic_euler")])
-    old, new = jax.device_get(both(start))
+    integrate_both = jax.jit(
+        lambda data: [INTEGRATORS[name](data, deriv_fn).states for name in ("euler", "symplectic_euler")]
+    )
+    old, new = jax.device_get(integrate_both(start))
     acc = np.array([1.0, 1.0, 1.0 - 9.81])
     np.testing.assert_allclose(old.pos[0, 0], [dt, 0, 10], rtol=1e-14)
     np.testing.assert_allclose(new.pos[0, 0], np.array([dt, 0, 10]) + dt * dt * acc, rtol=1e-14)

@@ -7,12 +7,12 @@ import jax
 from crazysim import Sim
 
 ACCELERATOR = os.environ.get("CRAZYSIM_ACCELERATOR", "gpu")
-"""Device that is compared with the CPU. With ``cpu:1`` the tests run anywhere, to be tested themselves."""
+"""Device that is compared with the CPU. With ``cpu:1`` the tests run on any machine."""
 NAMES = ("cpu", ACCELERATOR)
 DEVICES = {name: Sim(device=name).device for name in NAMES}
 
 
-def on(device, tree):
-    """Return a tree, all of which must be on a device."""
+def require_device(device, tree):
+    """Return a tree after asserting that all its leaves are on a device."""
     assert {x.device for x in jax.tree.leaves(tree)} == {DEVICES[device]}
     return tree

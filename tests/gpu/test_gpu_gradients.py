@@ -1,12 +1,12 @@
-"""Gradients on an accelerator, compared with those of the stages as they are written, on the CPU."""
+"""Gradients on an accelerator, compared with gradients of the plain engine on the CPU."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import centre, gap, repulsion, trees_equal
-from on_devices import ACCELERATOR, DEVICES, NAMES, on
-from sweep import agree, flying
+from on_devices import ACCELERATOR, DEVICES, NAMES, require_device
+from sweep import assert_agree, make_flying_sim
 
 from crazysim import Battery, Wind
 from crazysim.core import functional as F
@@ -15,11 +15,14 @@ from crazysim.engine import Step
 from crazysim.engine.backends import cuda
 
 ROUNDING = 1e-4
-"""Tolerance of 50 steps there and back in float32, relative to the largest component: see ``test_gpu_steps.py``."""
+"""Tolerance of gradients of 50 steps in float32, relative to the largest component; see ``sweep.ROUNDING``."""
 
 
-def gradient(sim, n_steps=50, of_params=False):
-    """Return the function from states, commands and perhaps parameters to a loss and its gradient, and where to."""
+def value_and_gradient(sim, n_steps=50, of_params=False):
+    """Return a function of states, commands and parameters to a loss and its gradient, and the point to evaluate it.
+
+    Parameters are None unless ``of_params``.
+    """
     start, step = sim.data, sim.build_step_fn()
     zeros = () if of_params else sim.step_fn.zeros(start)  # terms with a zero that may change are not left out
     level = sim.control.value
@@ -40,45 +43,45 @@ def gradient(sim, n_steps=50, of_params=False):
 
 
 def floats(tree):
-    """Return the leaves of a gradient that are numbers."""
+    """Return the floating-point leaves of a gradient."""
     return [x for x in jax.tree.leaves(tree) if x.dtype != jax.dtypes.float0]
 
 
-def both(build, tolerance=ROUNDING, **options):
+def compare_gradients(build, tolerance=ROUNDING, **options):
     """Compare gradients on the accelerator, in a kernel, with the reference on the CPU."""
 
     def run(device):
         sim = build(device, "plain" if device == "cpu" else "auto")
-        fn, at = gradient(sim, **options)
+        fn, at = value_and_gradient(sim, **options)
         out = jax.jit(fn)(at)
         if device == ACCELERATOR:
             assert "gradient: one kernel" in sim.explain()
         return floats(out)
 
-    expected, found = (on(name, run(name)) for name in NAMES)
+    expected, found = (require_device(name, run(name)) for name in NAMES)
     for x, y in zip(found, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * max(np.abs(y).max(), 1e-3))
 
 
 @pytest.mark.parametrize("control", ["state", "attitude", "rotor_vel"])
 def test_gradients_are_those_of_the_reference_on_the_cpu(control):
-    both(lambda device, engine: flying(device, control=control, engine=engine))
+    compare_gradients(lambda device, engine: make_flying_sim(device, control=control, engine=engine))
 
 
 def test_gradients_of_what_drones_share_are_sums():
-    both(lambda device, engine: flying(device, control="attitude", engine=engine), of_params=True)
+    compare_gradients(lambda device, engine: make_flying_sim(device, control="attitude", engine=engine), of_params=True)
 
 
 def test_gradients_in_float64_are_those_of_the_reference(x64):
-    both(lambda device, engine: flying(device, control="state", engine=engine), 1e-9)
+    compare_gradients(lambda device, engine: make_flying_sim(device, control="state", engine=engine), 1e-9)
 
 
 def test_gradients_go_through_the_states_of_plugins():
     def build(device, engine):
         plugins = [Battery(0.25, 0.1), Wind((2.0, 1.0, 0.0), speed_20ft=7.7, roughness=0.05)]
-        return flying(device, plugins=plugins, control="attitude", engine=engine)
+        return make_flying_sim(device, plugins=plugins, control="attitude", engine=engine)
 
-    both(build)
+    compare_gradients(build)
 
 
 @pytest.mark.parametrize(
@@ -87,22 +90,22 @@ def test_gradients_go_through_the_states_of_plugins():
     ids=lambda x: str(x),
 )
 def test_drones_that_act_on_each_other_are_differentiated(n_drones, stage):
-    """Within a warp and within a block, of which some threads have no drone."""
+    """Drones of a world are in one warp, or in a block in which some threads have no drone."""
 
     def build(device, engine):
-        sim = flying(device, 4, n_drones, control="attitude", engine=engine)
+        sim = make_flying_sim(device, 4, n_drones, control="attitude", engine=engine)
         insert_fn_before(sim.step_pipeline, "integration", stage)
         return sim
 
-    both(build, n_steps=20)
+    compare_gradients(build, n_steps=20)
 
 
 @pytest.mark.parametrize("n_drones", [1, 12, 33])
 def test_tangents_are_those_of_the_reference_on_the_cpu(n_drones):
-    """Of drones alone, of those that act on each other within a warp, and within a block."""
+    """Drones fly alone, or act on each other within a warp or within a block."""
 
     def run(name):
-        sim = flying(name, 4, n_drones, control="attitude", engine="plain" if name == "cpu" else "auto")
+        sim = make_flying_sim(name, 4, n_drones, control="attitude", engine="plain" if name == "cpu" else "auto")
         if n_drones > 1:
             insert_fn_before(sim.step_pipeline, "integration", repulsion)
         start, step = sim.data.states, sim.build_step_fn()
@@ -116,34 +119,34 @@ def test_tangents_are_those_of_the_reference_on_the_cpu(n_drones):
         assert name == "cpu" or "jvp: one kernel" in sim.explain()
         return out
 
-    expected, found = (on(name, run(name)) for name in NAMES)
+    expected, found = (require_device(name, run(name)) for name in NAMES)
     for x, y in zip(found, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=ROUNDING * max(np.abs(y).max(), 1e-3))
 
 
 def test_the_bits_depend_neither_on_the_run_nor_on_memory(monkeypatch):
-    """With little memory in intervals, and in fewer blocks of threads, each for several blocks of lanes."""
+    """With little memory, gradients are computed in intervals, and in fewer blocks of threads with more lanes each."""
     found = []
     for memory in (cuda.MAX_GRADIENT_MEMORY_BYTES, cuda.MAX_GRADIENT_MEMORY_BYTES, 2**18):
         monkeypatch.setattr(cuda, "MAX_GRADIENT_MEMORY_BYTES", memory)
-        fn, at = gradient(flying(ACCELERATOR, 100, control="attitude"), n_steps=100, of_params=True)
+        fn, at = value_and_gradient(make_flying_sim(ACCELERATOR, 100, control="attitude"), n_steps=100, of_params=True)
         found.append(floats(jax.jit(fn)(at)))
     assert trees_equal(found[0], found[1])
     assert trees_equal(found[0], found[2])
 
 
 def test_a_batch_of_worlds_is_more_worlds():
-    fn, at = gradient(flying(ACCELERATOR, 5, control="attitude"), n_steps=10)
+    fn, at = value_and_gradient(make_flying_sim(ACCELERATOR, 5, control="attitude"), n_steps=10)
     many = jax.tree.map(lambda x: jnp.stack([x, 1.01 * x, 0.99 * x]), at)
     found = floats(jax.jit(jax.vmap(fn))(many))
     for k in range(3):
-        agree([x[k] for x in found], floats(jax.jit(fn)(jax.tree.map(lambda x, k=k: x[k], many))), 1e-6)
+        assert_agree([x[k] for x in found], floats(jax.jit(fn)(jax.tree.map(lambda x, k=k: x[k], many))), 1e-6)
 
 
 @pytest.mark.parametrize("n_drones", [1, 12])
 def test_the_gradient_runs_where_the_state_is(n_drones):
-    """Not where the step was planned for; a kernel of the CPU has up to 8 drones that act on each other."""
-    sims = {name: flying(name, 2, n_drones, control="attitude") for name in NAMES}
+    """It does not matter where the step was planned to run; CPU kernels support up to 8 drones that interact."""
+    sims = {name: make_flying_sim(name, 2, n_drones, control="attitude") for name in NAMES}
     for sim in sims.values():
         insert_fn_before(sim.step_pipeline, "integration", repulsion)
     found = {}
@@ -155,8 +158,8 @@ def test_the_gradient_runs_where_the_state_is(n_drones):
             def loss(vel, step=step, data=data):
                 return jnp.sum(step(data.replace(states=data.states.replace(vel=vel)), 10).states.pos ** 2)
 
-            found[planned, name] = on(name, jax.jit(jax.grad(loss))(data.states.vel))
+            found[planned, name] = require_device(name, jax.jit(jax.grad(loss))(data.states.vel))
     expected = found["cpu", "cpu"]
     assert np.any(np.asarray(expected))
     for x in found.values():
-        agree(x, expected, 1e-5)
+        assert_agree(x, expected, 1e-5)

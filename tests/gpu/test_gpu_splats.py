@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from on_devices import ACCELERATOR, on
+from on_devices import ACCELERATOR, require_device
 from splat_files import one_splat, spot_alpha, write_splats
 
 from crazysim import Sim, SplatScene
@@ -35,7 +35,7 @@ def test_a_known_splat_is_its_analytic_projection(sim):
     camera = sim.mj_model.cam("fpv_cam:0")
     offset, deviation, opacity, color = np.array([2.0, 0.2, 0.1]), 0.1, 0.8, np.array([0.9, 0.5, 0.2])
     eye = np.array([camera.pos[0], camera.pos[1], camera.pos[2] + 1.0])
-    image = on(
+    image = require_device(
         ACCELERATOR, look(sim.data, jax.device_put(one_splat(eye + offset, deviation, opacity, color), sim.device))
     )
     focal = 33 / 2 / np.tan(np.deg2rad(float(camera.fovy[0])) / 2)

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 import sweep
 from cases import send, trees_equal
-from on_devices import ACCELERATOR, NAMES, on
-from sweep import ROUNDING, agree, flying
+from on_devices import ACCELERATOR, NAMES, require_device
+from sweep import ROUNDING, assert_agree, make_flying_sim
 
 from crazysim import Downwash, Kalman, Sim, Wind
 
 N_STEPS = 100
-FEW = "law_01 or law_10 or on_each_other_are_differentiated or tangents or what_drones_share"
-"""Tests of kernels of all kinds."""
+FALLBACK_TESTS = "law_01 or law_10 or on_each_other_are_differentiated or tangents or what_drones_share"
+"""Expression of pytest that selects tests with all kinds of kernels."""
 
 
-def both(run):
-    """Check that a function of a device returns arrays on that device, and the same on both."""
-    expected, found = (on(name, run(name)) for name in NAMES)
+def run_on_both(run):
+    """Return the results of a function of a device on the accelerator and on the CPU, after checking their devices."""
+    expected, found = (require_device(name, run(name)) for name in NAMES)
     return found, expected
 
 
@@ -37,7 +37,7 @@ def test_simulations_are_those_of_the_cpu(name):
         sim.step(40 if name == "impact" else N_STEPS)
         return sim.data
 
-    agree(*both(run), sweep.TOLERANCES.get(name, ROUNDING))
+    assert_agree(*run_on_both(run), sweep.TOLERANCES.get(name, ROUNDING))
 
 
 @pytest.mark.parametrize("n_drones", [3, 33, 256])
@@ -45,20 +45,20 @@ def test_drones_that_act_on_each_other_fly_as_on_the_cpu(n_drones):
     """Kernels exchange numbers within a warp, and within a block with fewer or all of its threads in use."""
 
     def run(device):
-        sim = flying(device, 4, n_drones, [Downwash()], control="attitude")
+        sim = make_flying_sim(device, 4, n_drones, [Downwash()], control="attitude")
         sim.step(20)
         return sim.data
 
-    agree(*both(run), ROUNDING)
+    assert_agree(*run_on_both(run), ROUNDING)
 
 
 def test_steps_in_float64_are_those_of_the_cpu(x64):
     def run(device):
-        sim = flying(device, control="state")
+        sim = make_flying_sim(device, control="state")
         sim.step(N_STEPS)
         return sim.data
 
-    agree(*both(run), 1e-12)
+    assert_agree(*run_on_both(run), 1e-12)
 
 
 def test_law_01_many_worlds_on_wide_blocks_fly_as_few():
@@ -74,10 +74,10 @@ def test_law_01_many_worlds_on_wide_blocks_fly_as_few():
 
 
 def test_law_01_one_world_flies_as_among_many():
-    many = flying(ACCELERATOR, 100, control="state")
+    many = make_flying_sim(ACCELERATOR, 100, control="state")
     start = many.data.states, many.data.controls.state.staged_cmd
     many.step(N_STEPS)
-    one = flying(ACCELERATOR, 1, control="state")
+    one = make_flying_sim(ACCELERATOR, 1, control="state")
     begin = one.data
     for world in (0, 37, 99):
         states, command = jax.tree.map(lambda x, w=world: x[w : w + 1], start)
@@ -87,7 +87,7 @@ def test_law_01_one_world_flies_as_among_many():
 
 
 def test_law_07_a_world_that_is_not_finite_touches_no_other():
-    sim = flying(ACCELERATOR, 100, plugins=[Downwash(), Wind(speed_20ft=7.7)], control="attitude")
+    sim = make_flying_sim(ACCELERATOR, 100, plugins=[Downwash(), Wind(speed_20ft=7.7)], control="attitude")
     start = sim.data
     sim.step(N_STEPS)
     healthy = sim.data.states
@@ -100,17 +100,17 @@ def test_law_07_a_world_that_is_not_finite_touches_no_other():
 
 
 def test_law_10_the_same_seed_gives_the_same_numbers():
-    flights = [flying(ACCELERATOR, n, plugins=[Wind(speed_20ft=7.7)], control="attitude") for n in (100, 100, 7)]
-    for sim in flights:
+    sims = [make_flying_sim(ACCELERATOR, n, plugins=[Wind(speed_20ft=7.7)], control="attitude") for n in (100, 100, 7)]
+    for sim in sims:
         sim.step(N_STEPS)
-    first, again, few = (sim.data.plugins for sim in flights)
+    first, again, few = (sim.data.plugins for sim in sims)
     assert trees_equal(first, again)
-    agree(jax.tree.map(lambda x: x[:7], first["wind"].gust), few["wind"].gust, 0)
+    assert_agree(jax.tree.map(lambda x: x[:7], first["wind"].gust), few["wind"].gust, 0)
 
 
 def test_queries_of_the_scene_are_those_of_the_cpu():
     def run(device):
-        sim = flying(device, control="attitude")
+        sim = make_flying_sim(device, control="attitude")
         ball = sim.scene.add("sphere", pos=(0.0, 0.0, 1.5), radius=0.2)
         sim.scene.add("wall", pos=(3, 0, 0), length=20, height=20, mocap=False)
         sim.step(1)
@@ -120,17 +120,17 @@ def test_queries_of_the_scene_are_those_of_the_cpu():
         moved = sim.contact_report(ball, floor=False)
         return report, depth, moved, sim.contacts()
 
-    found, expected = both(run)
+    found, expected = run_on_both(run)
     seen = [np.isfinite(x[1]) for x in (found, expected)]
-    agree(*seen, 0)
-    agree(*(jax.tree.map(lambda x: jnp.where(jnp.isinf(x), 0, x), x) for x in (found, expected)), 1e-5)
+    assert_agree(*seen, 0)
+    assert_agree(*(jax.tree.map(lambda x: jnp.where(jnp.isinf(x), 0, x), x) for x in (found, expected)), 1e-5)
 
 
 def test_kernels_are_launched_without_the_custom_call_of_xla():
-    """Steps, gradients and commands with CRAZYSIM_JAX_FALLBACKS=1, where a handler of ours launches all kernels."""
+    """With CRAZYSIM_JAX_FALLBACKS=1 a handler in Python launches all kernels."""
     tests = Path(__file__).parent
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", str(tests), "-p", "no:cacheprovider", "-n", "0", "-k", FEW],
+        [sys.executable, "-m", "pytest", str(tests), "-p", "no:cacheprovider", "-n", "0", "-k", FALLBACK_TESTS],
         env={k: v for k, v in os.environ.items() if "PYTEST" not in k} | {"CRAZYSIM_JAX_FALLBACKS": "1"},
         capture_output=True,
         text=True,

@@ -75,7 +75,7 @@ def test_torque_free_spins_gain_no_energy(integrator):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_convergence_order_of_position_and_attitude(integrator, x64):
-    """The order is the slope of log error over log step; the reference has steps at max_energy_ratio a quarter as long.
+    """The order is the slope of log error over log step; the reference has steps at most a quarter as long.
 
     The body tumbles about an axis that turns, with drag that depends on attitude. So the test covers rotations that do
     not commute, and the coupling of attitude to velocity.

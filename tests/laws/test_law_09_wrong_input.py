@@ -1,4 +1,4 @@
-"""Law 9: wrong input is an error at once, with expected, given and remedy, and the simulation does not change."""
+"""Law 9: wrong input is an error at once, with expected and given value and a remedy, and changes nothing."""
 
 import jax
 import jax.numpy as jnp
@@ -77,7 +77,7 @@ def test_wrong_settings_are_errors_at_construction(case):
 
 
 @pytest.fixture(scope="module", params=LEVELS)
-def at_level(request):
+def level_sim(request):
     return Sim(n_worlds=3, n_drones=2, control=request.param)
 
 
@@ -107,9 +107,9 @@ def wrong_commands(shape):
         yield command.tolist(), "NaN or infinite", f"world(s) [{world}]"
 
 
-def test_wrong_commands_leave_the_simulation_as_it_was(at_level):
-    sim, level = at_level, at_level.control.value
-    before, shape = sim.data, command_shape(at_level.data, at_level.control)
+def test_wrong_commands_leave_the_simulation_as_it_was(level_sim):
+    sim, level = level_sim, level_sim.control.value
+    before, shape = sim.data, command_shape(level_sim.data, level_sim.control)
     tried = 0
     for command, *fragments in wrong_commands(shape):
         for send in (getattr(sim, f"{level}_control"), lambda c: getattr(F, f"{level}_control")(sim.data, c)):
@@ -123,8 +123,8 @@ def test_wrong_commands_leave_the_simulation_as_it_was(at_level):
     assert tried == 21
 
 
-def test_a_command_of_another_level_names_both(at_level):
-    sim, before = at_level, at_level.data
+def test_a_command_of_another_level_names_both(level_sim):
+    sim, before = level_sim, level_sim.data
     for other in set(LEVELS) - {sim.control.value}:
         with pytest.raises(ConfigError) as error:
             getattr(sim, f"{other}_control")(np.zeros((3, 2, 16 if other == "state" else 4)))
@@ -133,9 +133,9 @@ def test_a_command_of_another_level_names_both(at_level):
         assert sim.data is before
 
 
-def test_device_commands_are_checked_only_on_request(at_level):
+def test_device_commands_are_checked_only_on_request(level_sim):
     """Reading a device array waits for the device, so it is done only with ``check_finite=True``."""
-    sim, before = at_level, at_level.data
+    sim, before = level_sim, level_sim.data
     set_command = getattr(sim, f"{sim.control.value}_control")
     command = jnp.zeros(command_shape(sim.data, sim.control)).at[2, 0, 1].set(jnp.nan)
     with pytest.raises(ValueError, match=r"NaN or infinite.* in world\(s\) \[2\]"):
@@ -146,13 +146,13 @@ def test_device_commands_are_checked_only_on_request(at_level):
     sim.data = before
 
 
-def test_commands_are_cast_to_the_type_of_the_state(at_level):
-    """The one conversion that is documented: nothing of the values is lost but digits, and nothing is clipped."""
-    before = at_level.data
-    level, shape = at_level.control.value, command_shape(at_level.data, at_level.control)
+def test_commands_are_cast_to_the_type_of_the_state(level_sim):
+    """The documented conversion: values may lose digits, and are never clipped."""
+    before = level_sim.data
+    level, shape = level_sim.control.value, command_shape(level_sim.data, level_sim.control)
     command = np.arange(np.prod(shape)).reshape(shape) * 1000
-    for given in (command, command.tolist(), command.astype(np.float64), jnp.asarray(command, jnp.int32)):
-        data = getattr(F, f"{level}_control")(before, given)
+    for equal_command in (command, command.tolist(), command.astype(np.float64), jnp.asarray(command, jnp.int32)):
+        data = getattr(F, f"{level}_control")(before, equal_command)
         staged = data.controls.rotor_vel if level == "rotor_vel" else getattr(data.controls, level).staged_cmd
         assert staged.dtype == before.states.pos.dtype
         np.testing.assert_array_equal(staged, command)

@@ -1,4 +1,4 @@
-"""Law 9 for every number of every plugin, sensor, filter, path controller and task: what cannot be is an error at once.
+"""Law 9 for every number of every plugin, sensor, filter, path controller and task: wrong values are errors at once.
 
 Fields are found by introspection, so that a new class is tested as soon as it is in the package.
 """
@@ -49,13 +49,13 @@ TABLES = {"heights"}
 """Fields of two axes of any lengths."""
 LISTS = {"elevation", "azimuth"}
 """Fields of one axis of any length."""
-FOUR = np.array([[0.0, 0, 2], [4, 0, 2], [0, 4, 2], [4, 4, 1]])
+FOUR_POINTS = np.array([[0.0, 0, 2], [4, 0, 2], [0, 4, 2], [4, 4, 1]])
 EXAMPLES = {
     "Cars": {"path": Path.of_points([(0, 0), (1, 0), (2, 1)])},
     "Follow": {"trajectories": circle(1.0)},
     "Hook": {"mass": 0.01},
     "Latency": {"delay": 2},
-    "Lighthouse": {"stations": FOUR[:2], "rpy": np.zeros((2, 3))},
+    "Lighthouse": {"stations": FOUR_POINTS[:2], "rpy": np.zeros((2, 3))},
     "Magnetometer": {"field": (0.0, 2e-5, -4.5e-5)},
     "Origin": {"latitude": 47.0, "longitude": 8.0, "altitude": 500.0},
     "Playback": {"handles": (), "pos": np.zeros((2, 1, 3)), "quat": np.zeros((2, 1, 4)), "freq": 10.0},
@@ -64,11 +64,11 @@ EXAMPLES = {
     "SharedLoad": {"mass": 0.01},
     "SlungLoad": {"mass": 0.01},
     "Terrain": {"heights": np.zeros((3, 3)), "size": (4.0, 4.0)},
-    "UWB": {"anchors": FOUR},
+    "UWB": {"anchors": FOUR_POINTS},
     "WindField": {"field": Grid(np.zeros((2, 2, 2, 3)))},
 }
-"""Settings of classes that cannot be made without."""
-NEEDS = {
+"""Settings that classes need."""
+REQUIRED_PLUGINS = {
     "BatteryVoltage": [Battery()],
     "MultiRanger": [RangeFinder()],
     "RotorJet": [SlungLoad(0.01)],
@@ -76,7 +76,7 @@ NEEDS = {
     "ESKF": [IMU(), MotionCapture()],
     "Kalman": [IMU(), MotionCapture()],
 }
-"""Plugins that others need."""
+"""Plugins that other plugins need."""
 NEVER_NEGATIVE = re.compile(
     r"(?<!mis)(noise|spread|mass|inertia|density|radius|length|size|range|reach|resistance|capacity|efficiency|charge"
     r"|voltage|friction|restitution|softness|damping|delay|jitter|dropout|time|iterations|resolution|bandwidth|limit"
@@ -86,23 +86,23 @@ NEVER_NEGATIVE = re.compile(
 
 
 UNCHECKED = ["Bicycles.members", "Cars.members", "FreeBodies.members", "Twin.fixed"]
-"""Settings whose annotation mixes numbers with others; their classes check them."""
+"""Settings whose annotation mixes numbers with other types; their classes check them."""
 
 
-def classes(base, package=crazysim.plugins):
+def concrete_classes(base, package=crazysim.plugins):
     """Return the concrete classes of a package that derive from a base."""
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
         importlib.import_module(module.name)
 
-    def below(kind):
-        return {kind, *[x for sub in kind.__subclasses__() for x in below(sub)]}
+    def subclasses_of(kind):
+        return {kind, *[x for sub in kind.__subclasses__() for x in subclasses_of(sub)]}
 
-    found = [kind for kind in below(base) - ABSTRACT - {base} if kind.__module__.startswith(package.__name__)]
+    found = [kind for kind in subclasses_of(base) - ABSTRACT - {base} if kind.__module__.startswith(package.__name__)]
     return sorted(found, key=lambda kind: kind.__name__)
 
 
-PLUGINS, TASKS = classes(Plugin), classes(Task, crazysim.envs.tasks)
-OTHERS = [Origin, Playback, Rules, Triad, Twin, *classes(PathController)]
+PLUGINS, TASKS = concrete_classes(Plugin), concrete_classes(Task, crazysim.envs.tasks)
+OTHER_CLASSES = [Origin, Playback, Rules, Triad, Twin, *concrete_classes(PathController)]
 
 
 def is_numeric(kind, name):
@@ -110,21 +110,21 @@ def is_numeric(kind, name):
 
 
 def numeric_fields(kind):
-    """Return the fields of a class with numbers, and what they may be."""
+    """Return the fields of a class that hold numbers, with their declarations."""
     return [(name, declared) for name, declared in collect_settings(kind).items() if is_numeric(kind, name)]
 
 
-def example(kind, **changes):
+def make_example(kind, **changes):
     """Return an instance of a class."""
     settings = dict(EXAMPLES.get(kind.__name__, {}))
     if issubclass(kind, Estimator):
-        settings["sensors"] = NEEDS[kind.__name__]
+        settings["sensors"] = REQUIRED_PLUGINS[kind.__name__]
     return kind(**(settings | changes))
 
 
-def impossible(kind, name, declared, rng):
-    """Yield values that no field of its kind may have: not finite ones, other types, and those out of its range."""
-    given, kinds = getattr(example(kind), name), allowed_types(kind)[name]
+def impossible_values(kind, name, declared, rng):
+    """Yield values that a field must refuse: not finite, of other types, and out of its range."""
+    example_value, kinds = getattr(make_example(kind), name), allowed_types(kind)[name]
     is_whole = declared.dtype is not None or int in kinds
     yield from () if str in kinds else ("1.0", "")
     yield from (
@@ -141,13 +141,14 @@ def impossible(kind, name, declared, rng):
         [None],
         True,
     )
-    if type(None) not in kinds and given is not None:
+    if type(None) not in kinds and example_value is not None:
         yield None
     if is_whole:
         yield 1.5
-    if np.ndarray in kinds and given is not None:
+    if np.ndarray in kinds and example_value is not None:
         array = np.resize(
-            np.asarray(given, float), rng.integers(1, 4, rng.integers(1, 3)) if np.ndim(given) == 0 else np.shape(given)
+            np.asarray(example_value, float),
+            rng.integers(1, 4, rng.integers(1, 3)) if np.ndim(example_value) == 0 else np.shape(example_value),
         )
         array.flat[rng.integers(array.size)] = rng.choice([np.nan, -np.inf])
         yield array
@@ -157,8 +158,8 @@ def impossible(kind, name, declared, rng):
             yield int(np.ceil(sign * beyond)) * sign if is_whole else float(beyond)
 
 
-def refused(call, what):
-    """Check that a call raises our error with expectation and value; return a description of what it did instead."""
+def describe_unless_refused(call, what):
+    """Return None if a call raises ``ConfigError`` with the given value, else a description of what it did."""
     try:
         call()
     except ConfigError as error:
@@ -168,21 +169,25 @@ def refused(call, what):
     return f"{what}: accepted"
 
 
-@pytest.mark.parametrize("kind", [*PLUGINS, *OTHERS, *TASKS], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [*PLUGINS, *OTHER_CLASSES, *TASKS], ids=lambda kind: kind.__name__)
 def test_impossible_numbers_are_refused_where_they_are_given(kind):
     rng, found = np.random.default_rng(len(kind.__name__)), []
     fields = numeric_fields(kind)
     for name, declared in fields:
-        for value in impossible(kind, name, declared, rng):
-            found.append(refused(lambda name=name, value=value: example(kind, **{name: value}), f"{name}={value!r}"))
+        for value in impossible_values(kind, name, declared, rng):
+            found.append(
+                describe_unless_refused(
+                    lambda name=name, value=value: make_example(kind, **{name: value}), f"{name}={value!r}"
+                )
+            )
     for name in allowed_types(kind):
         if name not in dict(fields) and type(None) not in allowed_types(kind)[name] and allowed_types(kind)[name]:
-            found += [refused(lambda name=name: example(kind, **{name: None}), f"{name}=None")]
-            found += [refused(lambda name=name: example(kind, **{name: np.nan}), f"{name}=nan")]
+            found += [describe_unless_refused(lambda name=name: make_example(kind, **{name: None}), f"{name}=None")]
+            found += [describe_unless_refused(lambda name=name: make_example(kind, **{name: np.nan}), f"{name}=nan")]
     assert not [text for text in found if text], "\n".join(text for text in found if text)
 
 
-@pytest.mark.parametrize("kind", [*PLUGINS, *OTHERS, *TASKS], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [*PLUGINS, *OTHER_CLASSES, *TASKS], ids=lambda kind: kind.__name__)
 def test_quantities_that_are_never_negative_are_declared_so(kind):
     fields = numeric_fields(kind)
     wrong = [name for name, declared in fields if NEVER_NEGATIVE.search(name) and declared.range.low < 0]
@@ -190,9 +195,9 @@ def test_quantities_that_are_never_negative_are_declared_so(kind):
 
 
 def test_every_setting_of_a_package_has_a_type_that_is_checked():
-    """Whatever has a number in its annotation is checked as one, whatever it is called."""
+    """A setting with a number in its annotation is checked as a number, whatever its name."""
     missed = []
-    for kind in [*PLUGINS, *OTHERS, *TASKS]:
+    for kind in [*PLUGINS, *OTHER_CLASSES, *TASKS]:
         for field in dataclasses.fields(kind):
             is_number = re.search(r"\b(float|int|ArrayLike)\b", str(field.type))
             if is_number and not allowed_types(kind)[field.name]:
@@ -202,25 +207,25 @@ def test_every_setting_of_a_package_has_a_type_that_is_checked():
 
 @pytest.fixture(scope="module")
 def sims():
-    """Simulations of two worlds of three drones, with the plugins that others need."""
-    found = {}
+    """Return a function from a class to a simulation of two worlds of three drones with the plugins it needs."""
+    sims_by_key = {}
 
-    def of(kind):
-        needs = NEEDS.get(kind.__name__, [])
+    def get_sim(kind):
+        needs = REQUIRED_PLUGINS.get(kind.__name__, [])
         control = "state" if kind.__name__ == "Follow" else "attitude"
         integrator = "symplectic_euler" if kind.__name__ == "SharedLoad" else "euler"
         key = (control, integrator, *[type(plugin) for plugin in needs])
-        if key not in found:
-            found[key] = Sim(2, 3, control=control, integrator=integrator)
+        if key not in sims_by_key:
+            sims_by_key[key] = Sim(2, 3, control=control, integrator=integrator)
             for plugin in needs:
-                found[key].add(plugin)
-        return found[key]
+                sims_by_key[key].add(plugin)
+        return sims_by_key[key]
 
-    return of
+    return get_sim
 
 
-def parts(sim):
-    """Return what the parts of a simulation are called, those of its scene included."""
+def part_names(sim):
+    """Return the names of the parts of a simulation and of its scene."""
     objects = sim.data.objects
     pipelines, records = (sim.step_pipeline, sim.reset_pipeline), (sim.data.plugins, sim.default_data.plugins)
     bodies = [body.name for body in sim.spec.worldbody.bodies]
@@ -235,7 +240,7 @@ def parts(sim):
 @pytest.mark.parametrize("kind", PLUGINS, ids=lambda kind: kind.__name__)
 def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added_and_change_nothing(kind, sims):
     sim, found = sims(kind), []
-    before = parts(sim)
+    before = part_names(sim)
     for name, declared in numeric_fields(kind):
         if np.ndarray not in allowed_types(kind)[name] and not declared.is_parameter:
             continue
@@ -246,13 +251,13 @@ def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added_and_change
                 continue
 
             def add(name=name, shape=shape, fill=fill):
-                sim.add(example(kind, **{name: np.full(shape, fill)}))
+                sim.add(make_example(kind, **{name: np.full(shape, fill)}))
 
-            found.append(refused(add, f"{name} of shape {shape}"))
+            found.append(describe_unless_refused(add, f"{name} of shape {shape}"))
             if kind.__name__ in [type(x).__name__ for x in sim.plugins.values()]:
-                sim.remove(example(kind).name)
-            elif parts(sim) != before:
+                sim.remove(make_example(kind).name)
+            elif part_names(sim) != before:
                 found.append(f"{name} of shape {shape} left something behind")
     assert not [text for text in found if text], "\n".join(text for text in found if text)
-    sim.add(example(kind))
-    sim.remove(example(kind).name)
+    sim.add(make_example(kind))
+    sim.remove(make_example(kind).name)
