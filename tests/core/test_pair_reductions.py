@@ -1,4 +1,4 @@
-"""Reductions over the drones of a world, against all pairs written out."""
+"""Reductions over the drones of a world, compared with explicit loops over all pairs."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from crazysim.engine.ir.program import UnfusedStage
 
 @stage("drone")
 def crowd(data):
-    """Push drones apart, harder where one is near, and let a bool and an integer take part."""
+    """Push drones apart, harder if one is near. The force also uses reductions of a bool and of an integer."""
     pos = data.states.pos
 
     def pair(other, is_self):
@@ -29,7 +29,7 @@ def crowd(data):
     return data.replace(states=data.states.replace(force=force))
 
 
-def crowd_by_hand(pos):
+def crowd_forces(pos):
     """Return the same forces, pair by pair in float64. (n_drones, 3)"""
     force = np.zeros_like(pos)
     for i, p in enumerate(pos):
@@ -48,8 +48,8 @@ def as_float64(data):
     return jax.tree.map(lambda x: np.asarray(x, np.float64) if x.dtype == np.float32 else x, data)
 
 
-def random_places(n_worlds, n_drones, seed=0):
-    """Return places in a cube of 2 m above the floor. (n_worlds, n_drones, 3)"""
+def random_positions(n_worlds, n_drones, seed=0):
+    """Return positions in a cube of 2 m above the floor. (n_worlds, n_drones, 3)"""
     return np.random.default_rng(seed).uniform(-1, 1, (n_worlds, n_drones, 3)) + [0, 0, 2]
 
 
@@ -61,10 +61,10 @@ def move(data):
     return data.replace(states=states.replace(vel=vel, pos=states.pos + 0.002 * vel))
 
 
-def simulation(n_worlds, n_drones, *plugins):
-    """Return drones in a crowd that push each other, and do nothing else but what the stages of plugins do."""
+def make_crowd_sim(n_worlds, n_drones, *plugins):
+    """Return a simulation whose only stages are ``crowd``, ``move`` and the stages of plugins."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel")
-    sim.data = with_states(sim.data, pos=random_places(n_worlds, n_drones), rotor_vel=15000.0)
+    sim.data = with_states(sim.data, pos=random_positions(n_worlds, n_drones), rotor_vel=15000.0)
     physics = set(sim.step_pipeline) - {"increment_steps"}
     for plugin in plugins:
         sim.add(plugin)
@@ -75,9 +75,9 @@ def simulation(n_worlds, n_drones, *plugins):
 
 @pytest.mark.parametrize("n_drones", [1, 2, 3, 9, 17])
 def test_all_pairs_are_computed(n_drones):
-    """Counts below, at and above the lanes of a vector and of a warp; rounding of float32 alone."""
-    sim = simulation(3, n_drones)
-    expected = np.stack([crowd_by_hand(pos) for pos in np.asarray(sim.data.states.pos, np.float64)])
+    """Test numbers of drones below, at and above the lanes of a vector; results differ by float32 rounding only."""
+    sim = make_crowd_sim(3, n_drones)
+    expected = np.stack([crowd_forces(pos) for pos in np.asarray(sim.data.states.pos, np.float64)])
     assert np.abs(expected).max() > 1e-4 or n_drones == 1
     step = Step(sim.step_pipeline, strict=True)
     found = step(sim.data, jnp.int32(1))
@@ -88,16 +88,16 @@ def test_all_pairs_are_computed(n_drones):
 @pytest.mark.parametrize("n_drones", [3, 9])
 def test_law_08_gradients_equal_central_differences(n_drones, x64):
     """In float64, in both directions."""
-    sim = simulation(2, n_drones, Downwash())
+    sim = make_crowd_sim(2, n_drones, Downwash())
     data = as_float64(sim.data)
-    pos, way = np.asarray(data.states.pos), np.random.default_rng(2).normal(size=data.states.pos.shape)
+    pos, direction = np.asarray(data.states.pos), np.random.default_rng(2).normal(size=data.states.pos.shape)
     step = Step(sim.step_pipeline)
 
     def score(after):
         return jnp.sum(after.states.vel[..., 2]) * 1e3 + jnp.sum(after.plugins["downwash"].air_vel ** 2)
 
     def loss(size):
-        return score(step(data.replace(states=data.states.replace(pos=pos + size * way)), 2))
+        return score(step(data.replace(states=data.states.replace(pos=pos + size * direction)), 2))
 
     forward, reverse = (jax.jit(fn) for fn in (lambda size: jax.jvp(loss, (size,), (1.0,)), jax.value_and_grad(loss)))
     slope, h = float(forward(0.0)[1]), 1e-6
@@ -108,9 +108,9 @@ def test_law_08_gradients_equal_central_differences(n_drones, x64):
 
 
 def test_the_order_of_the_drones_does_not_matter():
-    """What the drones of a world get is permuted along with them."""
+    """The forces are permuted with the drones."""
     order = np.random.default_rng(1).permutation(17)
-    sim = simulation(2, 17)
+    sim = make_crowd_sim(2, 17)
     permuted_data = with_states(sim.data, pos=np.asarray(sim.data.states.pos)[:, order])
     step = Step(sim.step_pipeline)
     a, b = step(sim.data, jnp.int32(1)), step(permuted_data, jnp.int32(1))
@@ -119,7 +119,7 @@ def test_the_order_of_the_drones_does_not_matter():
 
 @pytest.mark.parametrize("n_drones", [3, 9])
 def test_law_07_a_bad_world_does_not_touch_another(n_drones):
-    sim = simulation(3, n_drones)
+    sim = make_crowd_sim(3, n_drones)
     pos = np.array(sim.data.states.pos)
     pos[1, 0] = np.nan
     bad = with_states(sim.data, pos=pos)
@@ -131,8 +131,8 @@ def test_law_07_a_bad_world_does_not_touch_another(n_drones):
 
 
 def test_a_condition_selects_what_a_stage_computes():
-    """Drones publish at every step; a stage that acts at every third changes the others' numbers then alone."""
-    sim = simulation(2, 9)
+    """Drones publish at every step, but a stage that acts at every third step changes forces only then."""
+    sim = make_crowd_sim(2, 9)
     rare_crowd = stage("drone", when=lambda data: data.core.steps % 3 == 0)(crowd.fn)
     rare_crowd.__name__ = "crowd"
     sim.step_pipeline["crowd"] = rare_crowd
@@ -142,7 +142,7 @@ def test_a_condition_selects_what_a_stage_computes():
         forces.append(np.asarray(data.states.force))
     np.testing.assert_array_equal(forces[0], forces[2])
     assert np.any(forces[3] != forces[2])
-    expected = np.stack([crowd_by_hand(pos) for pos in np.asarray(before.states.pos, np.float64)])
+    expected = np.stack([crowd_forces(pos) for pos in np.asarray(before.states.pos, np.float64)])
     np.testing.assert_allclose(forces[3], expected, rtol=1e-4, atol=1e-9)
 
 
@@ -153,15 +153,17 @@ class Push(Plugin):
 
     def influence(self, data):
         pos, gains = data.states.pos, jnp.asarray([1e-3, 2e-3])
-        both = jax.vmap(lambda k: reduce_over_others(lambda other, me: k * (pos - other), pos))(gains)
-        return data.replace(states=data.states.replace(force=data.states.force + both.sum(0)))
+        forces = jax.vmap(lambda k: reduce_over_others(lambda other, me: k * (pos - other), pos))(gains)
+        return data.replace(states=data.states.replace(force=data.states.force + forces.sum(0)))
 
 
 def test_an_inner_vmap_and_an_influence_may_reduce():
-    """RK4 evaluates an influence four times a step, each time at the places of that time."""
+    """RK4 evaluates an influence four times per step, each time at the positions of its stage."""
     for n_drones in (3, 9):
         sim = Sim(n_worlds=2, n_drones=n_drones, control="rotor_vel", integrator="rk4")
-        sim.data = with_states(sim.data, pos=random_places(2, n_drones), vel=random_places(2, n_drones, 1) - [0, 0, 2])
+        sim.data = with_states(
+            sim.data, pos=random_positions(2, n_drones), vel=random_positions(2, n_drones, 1) - [0, 0, 2]
+        )
         sim.add(Push())
         found = Step(sim.step_pipeline)(sim.data, jnp.int32(3)).states
         pos = np.asarray(sim.data.states.pos, np.float64)
@@ -183,7 +185,7 @@ def test_law_09_wrong_uses_are_errors():
 
 def test_a_reduction_in_a_loop_is_not_fused():
     @stage("drone")
-    def looped(data):
+    def reduce_in_loop(data):
         pos = data.states.pos
 
         def body(_, x):
@@ -193,7 +195,7 @@ def test_a_reduction_in_a_loop_is_not_fused():
         return data.replace(states=data.states.replace(force=force))
 
     sim = Sim(n_worlds=2, n_drones=3)
-    insert_fn_before(sim.step_pipeline, "integration", looped)
+    insert_fn_before(sim.step_pipeline, "integration", reduce_in_loop)
     with pytest.warns(match="is in a loop"):
         (unfused,) = Step(sim.step_pipeline, "lanes").plan(sim.data).program.unfused_stages
     assert isinstance(unfused, UnfusedStage)

@@ -20,14 +20,14 @@ from crazysim.pytree import PyTree, check_axes, leaf, scopes
 COUNTS = [(1, 1, 1), (2, 2, 2), (3, 3, 3), (3, 2, 4), (2, 4, 3), (4, 3, 1), (2, 1, 2)]
 
 
-def of_masses(sim):
-    """Return the simulation with the stages of its masses alone, for a test of these: drones stand still."""
+def only_masses(sim):
+    """Return the simulation with only the stages of its masses, so that drones stand still."""
     stages = sim.step_pipeline.items()
     sim.step_pipeline = {name: fn for name, fn in stages if name.startswith("springs") or name == "increment_steps"}
     return sim
 
 
-def numbers(data):
+def states_by_name(data):
     """Return the states of drones and masses."""
     found = {"drones": data.states.pos, "speeds": data.states.vel}
     for name, record in data.plugins.items():
@@ -37,27 +37,27 @@ def numbers(data):
 
 @pytest.mark.parametrize(("n_worlds", "n_drones", "n_members"), COUNTS)
 def test_law_02_axes_are_the_declared_ones_for_any_counts(n_worlds, n_drones, n_members):
-    """Worlds, drones and members may be equally many: the first world flies as it does alone."""
+    """For equal and unequal numbers of worlds, drones and members, the first world flies as it does alone."""
     sim, alone = (build(KINDS, n, n_drones, n_members, engine="interpret") for n in (n_worlds, 1))
     for one in (sim, alone):
         one.step(7)
-    expected = numbers(alone.data)
-    for name, values in numbers(sim.data).items():
+    expected = states_by_name(alone.data)
+    for name, values in states_by_name(sim.data).items():
         assert np.all(np.isfinite(values)), name
         np.testing.assert_allclose(values[:1], expected[name], rtol=2e-5, atol=2e-6, err_msg=name)
         assert np.ptp(values) > 0 or name.startswith("ticks")
     for kind in ("springs", "crowd", "tied", "tying"):
-        np.testing.assert_array_equal(numbers(sim.data)[f"ticks of {kind}"], 2)  # 100 Hz: steps 0 and 5
+        np.testing.assert_array_equal(states_by_name(sim.data)[f"ticks of {kind}"], 2)  # 100 Hz: steps 0 and 5
 
 
 def test_a_member_moves_as_it_does_alone():
-    """Law 1."""
-    sim = of_masses(build(Springs, 3, 2, 4, engine="interpret"))
+    """Law 1: the motion of a member does not depend on the others."""
+    sim = only_masses(build(Springs, 3, 2, 4, engine="interpret"))
     sim.step(9)
     record = jax.device_get(sim.data.plugins["springs"])
     one = Sim(engine="interpret")
     one.add(Springs(1))
-    of_masses(one)
+    only_masses(one)
     mass, start = one.data.plugins["springs"], jax.device_get(sim.default_data.plugins["springs"])
     for world, member in ((0, 0), (2, 1), (1, 3)):
         own = mass.replace(pos=start.pos[world, member][None, None], cmd=start.cmd[world, member][None, None])
@@ -75,7 +75,7 @@ def test_integration_follows_the_scheme(integrator):
         for freq in freqs:
             sim = Sim(control="rotor_vel", freq=freq, integrator=integrator, engine="interpret")
             sim.add(Springs(1, rate=None))
-            of_masses(sim).step(2 * freq // 5)
+            only_masses(sim).step(2 * freq // 5)
             exact = np.cos(np.sqrt(STIFFNESS) * 0.4)
             errors.append(abs(np.asarray(sim.data.plugins["springs"].pos)[0, 0, 0] - exact))
     slope = np.polyfit(np.log(1 / np.asarray(freqs)), np.log(errors), 1)[0]
@@ -87,7 +87,7 @@ def test_semi_implicit_euler_keeps_energy():
     for integrator in ("euler", "symplectic_euler"):
         sim = Sim(integrator=integrator, engine="plain")
         sim.add(Springs(1, rate=None))
-        of_masses(sim).step(2000)
+        only_masses(sim).step(2000)
         record = jax.device_get(sim.data.plugins["springs"])
         energies[integrator] = np.sum(STIFFNESS * record.pos**2 + record.vel**2) / (3 * STIFFNESS)
     assert abs(energies["symplectic_euler"] - 1) < 0.02
@@ -96,7 +96,7 @@ def test_semi_implicit_euler_keeps_energy():
 
 @pytest.mark.long("compiles gradients in both directions")
 def test_gradients_pass_through_populations():
-    """In both directions, by central differences: the loss is quadratic."""
+    """Gradients in both modes equal central differences, which are exact, since the loss is quadratic."""
     cmd = np.ones((4, 2, 3, 3), np.float32)
 
     sim = build(KINDS, 2, 2, 3)
@@ -111,9 +111,9 @@ def test_gradients_pass_through_populations():
 
     gradient = np.asarray(jax.jit(jax.grad(loss))(cmd))
     assert np.all(np.abs(gradient) > 0)
-    way = np.float32(np.random.default_rng(1).uniform(0.5, 1, cmd.shape))
-    value_and_slope = jax.jit(lambda x: jax.jvp(loss, (x,), (way,)))
-    np.testing.assert_allclose(value_and_slope(cmd)[1], np.sum(way * gradient), rtol=1e-4)
+    direction = np.float32(np.random.default_rng(1).uniform(0.5, 1, cmd.shape))
+    value_and_slope = jax.jit(lambda x: jax.jvp(loss, (x,), (direction,)))
+    np.testing.assert_allclose(value_and_slope(cmd)[1], np.sum(direction * gradient), rtol=1e-4)
     for k in range(4):
         h = np.zeros(cmd.shape, np.float32)
         h[k, 1, 2, 0] = 0.5
@@ -148,13 +148,13 @@ def test_worlds_are_reset_with_their_members():
 def test_worlds_are_spread_over_devices():
     kinds = (Springs, Tying)
     alone = build(kinds, 4, 2, 3)
-    spread = build(kinds, 4, 2, 3, mesh=world_mesh(jax.devices("cpu")[:2]))
-    for sim in (alone, spread):
+    sharded_sim = build(kinds, 4, 2, 3, mesh=world_mesh(jax.devices("cpu")[:2]))
+    for sim in (alone, sharded_sim):
         sim.step(8)
-    for record in spread.data.plugins.values():
+    for record in sharded_sim.data.plugins.values():
         assert len(record.pos.sharding.device_set) == 2
-    for name, value in numbers(alone.data).items():
-        np.testing.assert_allclose(numbers(spread.data)[name], value, rtol=1e-6, atol=1e-7, err_msg=name)
+    for name, value in states_by_name(alone.data).items():
+        np.testing.assert_allclose(states_by_name(sharded_sim.data)[name], value, rtol=1e-6, atol=1e-7, err_msg=name)
 
 
 def test_random_numbers_are_those_of_world_and_member():
@@ -171,7 +171,7 @@ def test_random_numbers_are_those_of_world_and_member():
         sim = Sim(*counts[:2])
         sim.add(Springs(counts[2], stiffness=0.0))
         insert_fn_before(sim.step_pipeline, "integration", kick, "springs_kick")
-        of_masses(sim).step(3)
+        only_masses(sim).step(3)
         drawn.append(np.asarray(sim.data.plugins["springs"].vel))
     np.testing.assert_allclose(drawn[0][:2, :3], drawn[1], rtol=1e-6)
     assert len(np.unique(drawn[0])) == drawn[0].size
@@ -209,7 +209,7 @@ def test_parameters_may_differ_between_members():
     stiffness = np.float32([[[0.0], [10.0]], [[20.0], [0.0]]])
     sim.data = sim.plugins["springs"].write(sim.data, record.replace(stiffness=stiffness))
     assert jax.tree.leaves(scopes(sim.data.plugins["springs"]))[-1] == "springs"
-    of_masses(sim).step(10)
+    only_masses(sim).step(10)
     moved = np.any(np.asarray(sim.data.plugins["springs"].vel) != 0, axis=-1)
     np.testing.assert_array_equal(moved, [[False, True], [True, False]])
 
@@ -223,14 +223,14 @@ def test_many_members_that_read_the_drones_run_unfused_without_a_warning():
 
 def test_a_stage_that_no_engine_supports_is_reported_once():
     @stage("springs")
-    def turned(data):
+    def orthonormalise(data):
         record = data.plugins["springs"]
         q, _ = jnp.linalg.qr(jnp.eye(3) + jnp.outer(record.pos, record.pos))
         return data.replace(plugins=data.plugins | {"springs": record.replace(vel=record.vel + 0 * q[0])})
 
     sim = build(Springs, engine="interpret")
-    insert_fn_before(sim.step_pipeline, "integration", turned)
-    with pytest.warns(EngineWarning, match="'turned' is not fused") as caught:
+    insert_fn_before(sim.step_pipeline, "integration", orthonormalise)
+    with pytest.warns(EngineWarning, match="'orthonormalise' is not fused") as caught:
         sim.step(2)
     assert len(caught) == 1
 

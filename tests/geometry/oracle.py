@@ -21,7 +21,7 @@ SHAPES = {
 }
 
 
-def geom(shape):
+def geom_xml(shape):
     """Return a shape as MuJoCo's XML."""
     if shape.kind == "mesh":
         return '<geom type="mesh" mesh="mesh"/>'
@@ -31,8 +31,8 @@ def geom(shape):
     return f'<geom type="{shape.kind}" size="{size}"/>'
 
 
-def model(a, b):
-    """Return a model of shape ``b``, which is geom 0 and stays, and shape ``a``, which moves."""
+def make_model(a, b):
+    """Return a MuJoCo model with shape ``b`` as geom 0, which is fixed, and shape ``a``, which can move."""
     asset = ""
     if b.kind == "mesh":
         vertices = " ".join(map(str, b.vertices.ravel()))
@@ -45,8 +45,8 @@ def model(a, b):
           <option ccd_iterations="500" ccd_tolerance="1e-10"/>
           {asset}
           <worldbody>
-            {geom(b)}
-            <body mocap="true">{geom(a)}</body>
+            {geom_xml(b)}
+            <body mocap="true">{geom_xml(a)}</body>
           </worldbody>
         </mujoco>""")
     if b.kind == "hfield":
@@ -56,7 +56,7 @@ def model(a, b):
 
 def distances(a, b, pos, quat):
     """Return MuJoCo's signed distance of ``a`` at every pose, attitude wxyz, to ``b``. (n,)"""
-    m = model(a, b)
+    m = make_model(a, b)
     d = mujoco.MjData(m)
     out = np.empty(len(pos))
     for i, (p, q) in enumerate(zip(pos, quat, strict=True)):
@@ -66,9 +66,9 @@ def distances(a, b, pos, quat):
     return out
 
 
-def rays(shape, origin, direction):
-    """Return the distances of MuJoCo's rays, infinite where they miss, and the normals at the hits. (n,), (n, 3)"""
-    m = model(Shape("sphere", (1e-3,)), shape)
+def cast_rays(shape, origin, direction):
+    """Return distances of rays by MuJoCo, infinite for misses, and normals at the hits. (n,), (n, 3)"""
+    m = make_model(Shape("sphere", (1e-3,)), shape)
     d = mujoco.MjData(m)
     d.mocap_pos[0] = [0, 0, -1e4]
     mujoco.mj_kinematics(m, d)
@@ -90,13 +90,13 @@ def unit(x):
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
 
 
-def places(rng, n):
+def random_points(rng, n):
     """Return points near, in and far from shapes of about half a metre. (n, 3)"""
     reach = rng.choice([0.05, 0.5, 1.0, 10.0], (n, 1), p=[0.1, 0.4, 0.4, 0.1])
     return reach * rng.uniform(-1, 1, (n, 3))
 
 
-def reach(shape, n):
+def support(shape, n):
     """Return the support function of a shape along directions in its own frame, m. (..., 3) -> (...)"""
     x, y, z = np.moveaxis(np.abs(n), -1, 0)
     if shape.kind == "mesh":
@@ -111,7 +111,7 @@ def reach(shape, n):
     }[shape.kind](*size)
 
 
-def overlaps(a, b, pos, rot, rng, n_directions=1500, n_best=6, n_rounds=40):
+def overlap_depths(a, b, pos, rot, rng, n_directions=1500, n_best=6, n_rounds=40):
     """Return the depth of overlaps, m, by a search over directions that is refined around the best. (n,)
 
     It is a tight upper bound; MuJoCo defines the depth differently for some pairs, and estimates it for others.
@@ -121,7 +121,7 @@ def overlaps(a, b, pos, rot, rng, n_directions=1500, n_best=6, n_rounds=40):
     n = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=-1)
 
     def depth(n):
-        return reach(a, -n @ rot) + reach(b, n) - np.sum(n * pos[:, None], axis=-1)
+        return support(a, -n @ rot) + support(b, n) - np.sum(n * pos[:, None], axis=-1)
 
     everywhere = depth(np.broadcast_to(n, (len(pos), *n.shape)))
     best = n[np.argsort(everywhere, axis=1)[:, :n_best]]
@@ -150,7 +150,7 @@ def poses(rng, n):
     quat = rng.normal(size=(n, 4))
     quat[: n // 10] = [1, 0, 0, 0]
     quat[n // 10 : n // 5] = rng.choice([-1.0, 0, 1], (n // 5 - n // 10, 4)) + [1e-9, 0, 0, 0]
-    return places(rng, n), unit(quat)
+    return random_points(rng, n), unit(quat)
 
 
 @functools.cache
@@ -181,7 +181,7 @@ def check_pair(a, b, rng, n, apart_tolerance=1e-5, shallow=1e-6, deep=1e-6):
     np.testing.assert_array_equal(actual > 0, is_apart)
     np.testing.assert_allclose(actual[is_apart], expected[is_apart], atol=apart_tolerance)
     inside = np.flatnonzero(~is_apart)[:200]
-    depth = -expected[inside] if b.kind == "plane" else overlaps(a, b, pos[inside], rot[inside], rng)
+    depth = -expected[inside] if b.kind == "plane" else overlap_depths(a, b, pos[inside], rot[inside], rng)
     # The search must not find a shorter translation, and the computed one must separate the shapes.
     limit = np.where(depth < 0.05, shallow, deep)
     assert np.all(-actual[inside] - depth < limit), np.max(-actual[inside] - depth)

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from oracle import DRONES, SHAPES, check_finite, check_pair, check_slopes, distances, places, poses, rotations, unit
+from oracle import (
+    DRONES,
+    SHAPES,
+    check_finite,
+    check_pair,
+    check_slopes,
+    distances,
+    poses,
+    random_points,
+    rotations,
+    unit,
+)
 
 from crazysim import ConfigError
 from crazysim.geometry import Shape
@@ -18,12 +29,12 @@ from crazysim.geometry import point_distance as eager_point_distance
 distance = jax.jit(eager_distance, static_argnums=(0, 1))
 point_distance = jax.jit(eager_point_distance, static_argnums=0)
 
-CLOSED = ("plane", "sphere", "capsule", "box", "cylinder")
+CLOSED_FORM_KINDS = ("plane", "sphere", "capsule", "box", "cylinder")
 N = 2000
 
 
 @functools.cache
-def judge_points(kind):
+def compile_all_points(kind):
     """Return a compiled function from points to distances and gradients, for all points in one call. (N, 3)"""
 
     def total(points):
@@ -34,37 +45,37 @@ def judge_points(kind):
 
 
 @functools.cache
-def judge_each(kind):
-    """Return the same for a function of one point, mapped over points."""
+def compile_each_point(kind):
+    """Return a compiled function from points to distances and gradients, mapped over single points. (N, 3)"""
     return jax.jit(jax.vmap(jax.value_and_grad(functools.partial(eager_point_distance, SHAPES[kind]))))
 
 
-def by_points(kind, points, dtype=np.float64, each=False):
-    """Return distances and gradients at up to ``N`` points, by a function of all points or of each."""
+def evaluate_points(kind, points, dtype=np.float64, each=False):
+    """Return distances and gradients at up to ``N`` points, of all points at once or of each by itself."""
     n = len(points)
     with jax.enable_x64(dtype == np.float64):
         padded = np.resize(points, (N, 3)).astype(dtype)
         if each:
-            value, slope = judge_each(kind)(padded)
+            value, slope = compile_each_point(kind)(padded)
         else:
-            (_, value), slope = judge_points(kind)(padded)
+            (_, value), slope = compile_all_points(kind)(padded)
         assert value.dtype == slope.dtype == dtype
         return np.asarray(value)[:n], np.asarray(slope)[:n]
 
 
-def both_ways(found, expected, at_least=100):
-    """Check the signs, with enough separated and enough overlapping samples."""
+def assert_same_signs(found, expected, at_least=100):
+    """Assert that signs are equal, with enough separated and enough overlapping samples."""
     assert np.sum(expected > 0) > at_least
     assert np.sum(expected < 0) > at_least
     np.testing.assert_array_equal(found > 0, expected > 0)
 
 
-@pytest.mark.parametrize("kind", [*CLOSED, "ellipsoid", "mesh"])
+@pytest.mark.parametrize("kind", [*CLOSED_FORM_KINDS, "ellipsoid", "mesh"])
 def test_distance_of_a_sphere_equals_that_of_mujoco(x64, rng, kind):
     drone, (pos, quat) = DRONES["sphere"], poses(rng, N)
     found = np.asarray(distance(drone, SHAPES[kind], pos, rotations(quat)))
     expected = distances(drone, SHAPES[kind], pos, quat)
-    both_ways(found, expected)
+    assert_same_signs(found, expected)
     known = expected > 0 if kind in ("ellipsoid", "mesh") else slice(None)  # MuJoCo's depths in these are rough
     np.testing.assert_allclose(found[known], expected[known], atol=1e-5)
 
@@ -103,7 +114,7 @@ def test_distance_to_an_ellipsoid_is_that_of_where_the_point_was_lifted_from(x64
     lowest = -(a.min() ** 2) / a.max()  # the least radius of curvature: the foot is the nearest point up to there
     height = np.concatenate([rng.uniform(lowest, 0, N // 2), rng.uniform(0, 3, N - N // 2)])
     found = point_distance(Shape("ellipsoid", axes), foot + height[:, None] * normal)
-    both_ways(np.asarray(found), height)
+    assert_same_signs(np.asarray(found), height)
     np.testing.assert_allclose(found, height, atol=1e-6)
 
 
@@ -118,31 +129,31 @@ def test_distance_to_an_ellipsoid_from_its_middle_by_hand(x64):
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_float32_errs_by_rounding_only(rng, kind):
-    points = places(rng, N)
-    found, _ = by_points(kind, points, np.float32, each=True)
-    exact, _ = by_points(kind, np.float32(points))
+    points = random_points(rng, N)
+    found, _ = evaluate_points(kind, points, np.float32, each=True)
+    exact, _ = evaluate_points(kind, np.float32(points))
     size = 0.5 + np.linalg.norm(points, axis=1)
     assert np.max(np.abs(found - exact) / size) < 1e-6
 
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_law_01_one_drone_then_many(rng, kind):
-    """All points at once and each by itself: distances and gradients."""
+    """Distances and gradients of all points at once equal those of each point by itself."""
     points = (0.5 * rng.uniform(-1, 1, (N, 3))).astype(np.float32).astype(float)
-    many, slopes = by_points(kind, points)
-    one, slope = by_points(kind, points, each=True)
+    many, slopes = evaluate_points(kind, points)
+    one, slope = evaluate_points(kind, points, each=True)
     np.testing.assert_allclose(many, one, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(slopes, slope, atol=1e-9)
-    np.testing.assert_allclose(by_points(kind, points[:12], np.float32, each=True)[1], slope[:12], atol=1e-4)
+    np.testing.assert_allclose(evaluate_points(kind, points[:12], np.float32, each=True)[1], slope[:12], atol=1e-4)
     shape = jax.eval_shape(lambda p: eager_point_distance(SHAPES[kind], p), jnp.zeros((3, 4, 3)))
     assert shape.shape == (3, 4)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_law_08_gradient_equals_central_differences_and_has_length_one(rng, kind):
-    points, h = places(rng, N), 1e-6
-    _, slope = by_points(kind, points)
-    ahead, behind = ([by_points(kind, points + sign * h * axis)[0] for axis in np.eye(3)] for sign in (1, -1))
+    points, h = random_points(rng, N), 1e-6
+    _, slope = evaluate_points(kind, points)
+    ahead, behind = ([evaluate_points(kind, points + sign * h * axis)[0] for axis in np.eye(3)] for sign in (1, -1))
     differences = (np.array(ahead) - np.array(behind)).T / (2 * h)
     smooth = np.abs(np.linalg.norm(differences, axis=1) - 1) < 1e-4  # across a crease they are a mean of two sides
     assert np.sum(smooth) > 0.95 * N
@@ -171,7 +182,7 @@ def special_points(shape):
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_law_07_no_nan_at_degenerate_points(kind, dtype):
-    value, slope = by_points(kind, special_points(SHAPES[kind]), dtype, each=True)
+    value, slope = evaluate_points(kind, special_points(SHAPES[kind]), dtype, each=True)
     assert np.isfinite(value).all()
     assert np.isfinite(slope).all()
     length = np.linalg.norm(slope, axis=1)
@@ -180,13 +191,13 @@ def test_law_07_no_nan_at_degenerate_points(kind, dtype):
 
 
 @given(
-    kind=st.sampled_from(CLOSED),
+    kind=st.sampled_from(CLOSED_FORM_KINDS),
     a=st.tuples(*[st.floats(-1, 1)] * 3),
     b=st.tuples(*[st.floats(-1, 1)] * 3),
 )
 def test_no_distance_changes_faster_than_its_point(kind, a, b):
     a, b = np.float32(a), np.float32(b)
-    (at_a, at_b), _ = by_points(kind, np.stack([a, b]), np.float32, each=True)
+    (at_a, at_b), _ = evaluate_points(kind, np.stack([a, b]), np.float32, each=True)
     change = abs(float(at_a - at_b))
     assert change <= np.linalg.norm(a - b) * (1 + 1e-5) + 1e-6
 

@@ -7,7 +7,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from oracle import DRONES, SHAPES, check_finite, distance_and_slopes, geom, rotations, unit
+from oracle import DRONES, SHAPES, check_finite, distance_and_slopes, geom_xml, rotations, unit
 
 from crazysim.geometry import Shape, hfield
 from crazysim.geometry import distance as eager_distance
@@ -45,7 +45,7 @@ def distances_to_prisms(a, pos, quat):
         <mujoco>
           <option ccd_iterations="200" ccd_tolerance="1e-9"/>
           <asset>{meshes}</asset>
-          <worldbody>{geoms}<body mocap="true">{geom(a)}</body></worldbody>
+          <worldbody>{geoms}<body mocap="true">{geom_xml(a)}</body></worldbody>
         </mujoco>""")
     data, out = mujoco.MjData(model), np.empty(len(pos))
     for i in range(len(pos)):

@@ -21,8 +21,8 @@ def poses(rng, n):
     return rng.uniform(-0.25, 0.25, size=(n, 3)), rot[:n], rot[n:]
 
 
-def of_pairs(fn, *cores):
-    """Return a function of one pair, of arrays of these shapes, as one of a pair or of up to ``N`` pairs."""
+def compile_for_pairs(fn, *cores):
+    """Compile a function of one pair, with arguments of some shapes, for one pair or up to ``N`` pairs."""
     compiled = jax.jit(jax.vmap(fn))
 
     def call(*args):
@@ -35,16 +35,16 @@ def of_pairs(fn, *cores):
     return call
 
 
-boxes = of_pairs(manifold.box_contacts, *[(3,), (3,), (3, 3)] * 2)
-ball_on_box = of_pairs(manifold.ball_box_contacts, (), (3,), (3,), (3,), (3, 3))
+boxes = compile_for_pairs(manifold.box_contacts, *[(3,), (3,), (3, 3)] * 2)
+ball_on_box = compile_for_pairs(manifold.ball_box_contacts, (), (3,), (3,), (3,), (3, 3))
 
 
-def all_boxes(pos, rot_a, rot_b):
+def contacts_of_boxes(pos, rot_a, rot_b):
     return boxes(HALF_A, pos, rot_a, HALF_B, ZERO, rot_b)
 
 
-def least_overlap(pos, rot_a, rot_b):
-    """Return the largest separation over the fifteen axes, m, in float64 by loops."""
+def min_overlap(pos, rot_a, rot_b):
+    """Return the largest separation over the 15 axes, m, computed by loops in float64."""
     axes = [*rot_a.T, *rot_b.T, *(np.cross(x, y) for x in rot_b.T for y in rot_a.T)]
     found = []
     for axis in axes:
@@ -57,10 +57,10 @@ def least_overlap(pos, rot_a, rot_b):
 
 
 def test_boxes_overlap_where_no_axis_separates_them(rng):
-    """The deepest point is as deep as the least overlap, or for faces preferred to edges a little deeper."""
+    """The deepest point has the minimum overlap; if faces are preferred to edges, it is a little deeper."""
     pos, rot_a, rot_b = poses(rng, 500)
-    gap = all_boxes(pos, rot_a, rot_b).gap.min(axis=1)
-    exact = np.array([least_overlap(*x) for x in zip(pos, rot_a, rot_b, strict=True)])
+    gap = contacts_of_boxes(pos, rot_a, rot_b).gap.min(axis=1)
+    exact = np.array([min_overlap(*x) for x in zip(pos, rot_a, rot_b, strict=True)])
     touching = exact < 0
     assert 50 < touching.sum() < 450
     np.testing.assert_array_equal(gap[touching] < 0, True)
@@ -80,7 +80,7 @@ def test_a_box_on_a_box_rests_on_the_corners_of_their_overlap():
 
 
 def test_rounding_takes_no_face_for_an_edge(rng):
-    """Level faces that touch to rounding, apart and not: no point of two edges, and all points at the boxes."""
+    """If level faces touch up to rounding, there is no contact of two edges, and all points are at the boxes."""
     turned = rotations(np.array([[np.cos(x / 2), 0, 0, np.sin(x / 2)] for x in rng.uniform(0.05, 0.3, N)]))
     world = rotations(unit(rng.normal(size=(N, 4))))
     offset = np.stack([*rng.uniform(-0.01, 0.01, (2, N)), 0.2 + rng.uniform(-1e-7, 1e-7, N)], axis=-1)
@@ -91,7 +91,7 @@ def test_rounding_takes_no_face_for_an_edge(rng):
 
 
 def test_points_that_do_not_exist_are_at_the_boxes_too(rng):
-    """Edges that are parallel to a face but for rounding: their ends were kilometres away, as levers of impulses."""
+    """Edges may be parallel to a face up to rounding. Their ends were once kilometres away, as levers of impulses."""
     turned = rotations(unit(np.stack([np.ones(N), *rng.normal(size=(3, N)) * [[1e-8], [1.0], [1e-8]]], axis=-1)))
     found = boxes((0.1, 0.1, 0.1), rng.uniform(-0.2, 0.2, (N, 3)), turned, (0.1, 0.08, 0.05), ZERO, EYE)
     assert np.abs(found.point).max() < 1
@@ -124,7 +124,7 @@ def test_edges_that_cross_touch_at_one_point():
 def test_the_order_of_two_boxes_only_turns_the_normal(rng):
     pos, rot_a, rot_b = poses(rng, 50)
     other = boxes(HALF_B, ZERO, rot_b, HALF_A, pos, rot_a)
-    found = all_boxes(pos, rot_a, rot_b)
+    found = contacts_of_boxes(pos, rot_a, rot_b)
     np.testing.assert_allclose(found.gap.min(axis=1), other.gap.min(axis=1), atol=1e-5)
     deepest = np.argmin(found.gap, axis=1), np.argmin(other.gap, axis=1)
     rows = np.arange(50)
@@ -147,7 +147,7 @@ def test_a_ball_on_a_box_by_hand(centre, gap, normal):
 
 
 def test_gaps_are_those_of_mujoco(rng):
-    """Balls and boxes apart: MuJoCo's distance; of boxes the largest separation is at most that."""
+    """Gaps of separated balls and boxes equal distances of MuJoCo."""
     model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
         <body><freejoint/><geom type="sphere" size="0.05"/></body>
         <body><freejoint/><geom type="box" size="0.12 0.2 0.06"/></body></worldbody></mujoco>""")
@@ -177,9 +177,9 @@ def test_law_07_values_and_gradients_are_finite(rng):
             + jnp.sum(found.point)
         )
 
-    of_boxes = jax.jit(jax.vmap(jax.value_and_grad(total, argnums=(0, 1))))(pos, rot_a, rot_b)
-    of_balls = jax.jit(jax.value_and_grad(lambda p: jnp.sum(manifold.ball_contacts(0.1, p, 0.1, jnp.zeros(3)).gap)))(
-        ZERO
-    )
-    for leaf in jax.tree.leaves((of_boxes, of_balls)):
+    box_gradients = jax.jit(jax.vmap(jax.value_and_grad(total, argnums=(0, 1))))(pos, rot_a, rot_b)
+    ball_gradients = jax.jit(
+        jax.value_and_grad(lambda p: jnp.sum(manifold.ball_contacts(0.1, p, 0.1, jnp.zeros(3)).gap))
+    )(ZERO)
+    for leaf in jax.tree.leaves((box_gradients, ball_gradients)):
         assert np.isfinite(leaf).all()

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import SHAPES, places, rays, unit
+from oracle import SHAPES, cast_rays, random_points, unit
 
 from crazysim.geometry import ray_distance
 
@@ -28,7 +28,7 @@ def judge(kind):
     return jax.jit(answer)
 
 
-def by_rays(kind, origin, direction, dtype=np.float64):
+def trace_rays(kind, origin, direction, dtype=np.float64):
     """Return what ``judge`` does for up to ``N`` rays."""
     n = len(origin)
     with jax.enable_x64(dtype == np.float64):
@@ -37,9 +37,9 @@ def by_rays(kind, origin, direction, dtype=np.float64):
         return jax.tree.map(lambda x: np.asarray(x)[:n], found)
 
 
-def some_rays(rng, n=N):
+def draw_rays(rng, n=N):
     """Return rays from outside, aimed at the shape or past it, and rays from inside."""
-    origin = places(rng, n)
+    origin = random_points(rng, n)
     target = np.where(rng.uniform(size=(n, 1)) < 0.7, rng.uniform(-0.4, 0.4, (n, 3)), 10 * rng.normal(size=(n, 3)))
     direction = target - origin
     direction[: n // 8] = rng.choice([-1.0, 0.0, 1.0], (n // 8, 3))  # along axes and diagonals
@@ -49,9 +49,9 @@ def some_rays(rng, n=N):
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_rays_end_where_mujoco_has_it(rng, kind):
-    origin, direction = some_rays(rng)
-    t, normal, *_ = by_rays(kind, origin, direction)
-    expected, expected_normal = rays(SHAPES[kind], origin, direction)
+    origin, direction = draw_rays(rng)
+    t, normal, *_ = trace_rays(kind, origin, direction)
+    expected, expected_normal = cast_rays(SHAPES[kind], origin, direction)
     hit = np.isfinite(expected)
     assert np.sum(hit) > 1000
     assert np.sum(~hit) > 300
@@ -64,9 +64,9 @@ def test_rays_end_where_mujoco_has_it(rng, kind):
 @pytest.mark.parametrize("kind", SHAPES)
 def test_float32_rays_end_on_the_surface(rng, kind):
     """Rounding of an origin 10 m away is 1e-6 m; it moves the hit of a grazing ray by more."""
-    origin, direction = some_rays(rng)
-    exact, normal, *_ = by_rays(kind, origin, direction)
-    t, *_ = by_rays(kind, origin, direction, np.float32)
+    origin, direction = draw_rays(rng)
+    exact, normal, *_ = trace_rays(kind, origin, direction)
+    t, *_ = trace_rays(kind, origin, direction, np.float32)
     steep = np.abs(np.sum(normal * direction, axis=1)) > 0.05
     assert np.sum(steep) > 1000
     np.testing.assert_allclose(t[steep], exact[steep], atol=1e-4)
@@ -75,9 +75,9 @@ def test_float32_rays_end_on_the_surface(rng, kind):
 @pytest.mark.parametrize("kind", SHAPES)
 def test_law_01_one_ray_then_many(x64, rng, kind):
     """All rays at once, and a function of one ray mapped over them."""
-    rays = some_rays(rng)
+    rays = draw_rays(rng)
     each = jax.jit(jax.vmap(functools.partial(ray_distance, SHAPES[kind])))(*rays)
-    for x, y in zip(by_rays(kind, *rays), each, strict=False):
+    for x, y in zip(trace_rays(kind, *rays), each, strict=False):
         np.testing.assert_allclose(x, y, atol=1e-12)
     shapes = jax.eval_shape(functools.partial(ray_distance, SHAPES[kind]), *(jnp.zeros((3, 4, 3)),) * 2)
     assert [x.shape for x in shapes] == [(3, 4), (3, 4, 3)]
@@ -86,9 +86,9 @@ def test_law_01_one_ray_then_many(x64, rng, kind):
 @pytest.mark.parametrize("kind", SHAPES)
 def test_law_08_gradient_equals_central_differences(rng, kind):
     h = 1e-6
-    origin, direction = some_rays(rng)
-    _, normal, (slope, _), _ = by_rays(kind, origin, direction)
-    sides = np.array([[by_rays(kind, origin + s * h * e, direction)[0] for e in np.eye(3)] for s in (1, -1)])
+    origin, direction = draw_rays(rng)
+    _, normal, (slope, _), _ = trace_rays(kind, origin, direction)
+    sides = np.array([[trace_rays(kind, origin + s * h * e, direction)[0] for e in np.eye(3)] for s in (1, -1)])
     clear = (np.abs(np.sum(normal * direction, axis=1)) > 0.05) & np.isfinite(sides).all(axis=(0, 1))
     sides = np.moveaxis(sides[:, :, clear], 1, -1)
     differences = (sides[0] - sides[1]) / (2 * h)
@@ -106,7 +106,7 @@ def test_law_07_no_nan_in_degenerate_cases(kind):
     ways = np.concatenate([unit(ways[ways.any(axis=1)]), [[1e-15, 0, 1], [1, 1e-13, 0]]])
     for scale in (size, size[[1, 0, 2]], size[0]):
         origin, direction = np.repeat(grid * scale, len(ways), axis=0), np.tile(ways, (len(grid), 1))
-        t, normal, _, slopes = by_rays(kind, origin, direction, np.float32)
+        t, normal, _, slopes = trace_rays(kind, origin, direction, np.float32)
         assert not np.isnan(t).any()
         np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), np.isfinite(t), atol=1e-5)
         for slope in slopes:

@@ -29,7 +29,7 @@ def assert_unchanged(tree, before):
 
 
 @pytest.mark.parametrize(
-    "use",
+    "operation",
     [
         lambda sim: sim.step(),
         lambda sim: sim.step(20),
