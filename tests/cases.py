@@ -29,7 +29,7 @@ LEVELS = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")
 PAIRS = tuple(("first_principles", control) for control in LEVELS) + tuple(
     (dynamics, control) for dynamics in FITTED for control in ("state", "attitude")
 )
-"""Every dynamics and command level that go together: 11."""
+"""All 11 valid pairs of dynamics and command level."""
 INTEGRATORS = ("euler", "symplectic_euler", "rk4")
 COMPILED_ENGINES = ("lanes", "fused") if native.compiler() else ("lanes",)
 """Compiled engines that this machine can run."""
@@ -60,7 +60,7 @@ PLAIN_SCENE = f"""
   </worldbody>
 </mujoco>
 """
-"""A floor of one colour, without shadows, under a camera that looks straight down, and one 5 m beside it."""
+"""A floor of one colour without shadows, under two cameras that look straight down, 5 m apart."""
 
 
 def vectors(n=3, max_abs=10.0, **options):
@@ -75,7 +75,7 @@ def unit_quats(**options):
 
 
 def controller_params(record, **changes):
-    """Return the parameters of a controller for the usual airframe, some changed."""
+    """Return the parameters of a controller for the default airframe, with some changes."""
     params = record.create(load_airframe("cf21B_500"))
     return params.replace(**{k: jnp.asarray(v, float) for k, v in changes.items()})
 
@@ -110,7 +110,7 @@ def with_params(data, **changes):
 
 
 def with_airframes(sim, airframes):
-    """Return the data with the parameters and gains of one airframe in each world, of as many rotors as the sim's."""
+    """Return the data with the parameters and gains of an airframe for each world; numbers of rotors must be equal."""
 
     kinds = list(dict.fromkeys(airframes))
     kind_indices = [kinds.index(airframe) for airframe in airframes]
@@ -142,7 +142,7 @@ def hover_thrust(data):
 
 
 def hover_rotor_state(data):
-    """Return what ``states.rotor_vel`` is in hover: rpm, or the thrust that a fitted model keeps there, N."""
+    """Return ``states.rotor_vel`` in hover: rotor speeds, rpm, or for a fitted model the thrust, N."""
     p = data.params
     if isinstance(p, first_principles.Params):
         return np.asarray(first_principles.hover_rotor_vel(p), np.float64)
@@ -226,7 +226,7 @@ def centre(data):
 
 
 def by_stages(sim):
-    """Return a step without an engine: the stages as they are written, whose derivative compiles fastest."""
+    """Return a step that runs the stages without an engine; its derivative compiles fastest."""
     stages = as_stages(sim.step_pipeline)
 
     def step(data, n_steps):
@@ -252,7 +252,7 @@ def hovering(n_worlds=3, n_drones=2, **kwargs):
 
 @functools.cache
 def shared_sim(**settings):
-    """Return a simulation that several tests step: compiled once, and to be left as it was found."""
+    """Return a simulation that several tests share; it is compiled once, and tests must restore its data."""
     return Sim(**settings)
 
 

@@ -1,4 +1,4 @@
-"""How the tests compile: XLA and g++ with less optimisation, and persistent caches. Both are settings of a user."""
+"""Settings for compilation in tests: less optimisation by XLA and g++, and persistent caches."""
 
 import shutil
 import sys
@@ -9,7 +9,7 @@ from pathlib import Path
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 """Folder of compiled programs and kernels."""
 MIN_KEPT_COMPILE_S = 0.05
-"""Compile time from which XLA keeps a program, s: writing and reading one takes some 10 ms."""
+"""Minimum compile time of programs that XLA stores, s; writing and reading a program takes some 10 ms."""
 
 
 def environment(variables: Mapping[str, str]) -> dict[str, str]:

@@ -35,7 +35,7 @@ def pytest_xdist_auto_num_workers():
 
 
 def pytest_collection_finish():
-    """Look for garbage less often: tracing makes millions of objects, and looking at them took a tenth of all time."""
+    """Collect garbage less often: tracing makes millions of objects, and collections took a tenth of the time."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(100_000, 20, 100)
@@ -54,14 +54,14 @@ def _processor_time():
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item):
-    """Keep the processor time at which a test begins."""
+    """Store the processor time at which a test begins."""
     item.stash[START_TIME] = _processor_time()
     yield
 
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item, call):
-    """Report the processor time of a test, and fail a skip where none may be: in CI it would hide what never ran."""
+    """Report the processor time of a test, and fail skipped tests in CI, where they would hide tests that never run."""
     outcome = yield
     report = outcome.get_result()
     if report.skipped and os.environ.get("CRAZYSIM_NO_SKIP"):
@@ -134,7 +134,7 @@ def _chromium(tmp_path_factory):
 
 @pytest.fixture
 def chromium(_chromium, viser, monkeypatch):
-    """Return a browser that leaves its page when the test ends; pages of flights are lit simply meanwhile."""
+    """Return a browser that leaves its page when the test ends; pages of flights have simple lights."""
     from browsing import light_simply
 
     light_simply(monkeypatch.setattr)

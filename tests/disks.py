@@ -1,4 +1,4 @@
-"""A full disk for the tests of what writes files."""
+"""A full disk, for tests of functions that write files."""
 
 import resource
 import sys

@@ -1,16 +1,16 @@
-"""The machine that tests run on: how many processes of them it has cores and memory for."""
+"""The machine that tests run on: the number of test processes for which it has cores and memory."""
 
 import os
 from pathlib import Path
 
 WORKER_MEMORY = 4e9
-"""Memory for one process of tests, B: one of two held 3.1 GB when they had run two fifths of all tests."""
+"""Memory for one process of tests, B; a process used 3.1 GB after a fifth of all tests."""
 LIMITS = Path("/sys/fs/cgroup")
 """Folder of a Linux container's limits."""
 
 
 def n_workers(cores: float, memory: float) -> int:
-    """Return how many processes fit into these cores and this memory, B; at least one."""
+    """Return the number of processes that fit into these cores and this memory, B; at least one."""
     return max(1, int(min(cores, memory / WORKER_MEMORY)))
 
 

@@ -1,4 +1,4 @@
-"""Pictures and films: hues, places seen by the camera of the plain scene, frames of files, and PNG files."""
+"""Pictures and films: hues, pixels of points in the plain scene, frames of films, and PNG files."""
 
 import struct
 import subprocess
@@ -13,20 +13,20 @@ HEIGHT, WIDTH = 120, 160
 
 
 def has_colour(picture, rgba):
-    """Return which pixels have a colour's hue: its channels far above the others. (height, width)"""
+    """Return True for pixels with the hue of a colour: its channels are far above the others. (height, width)"""
     picture, is_high = picture.astype(int), np.asarray(rgba[:3]) > 0.5
     return picture[..., is_high].min(-1) > picture[..., ~is_high].max(-1) + 60
 
 
 def pixel(point, height=HEIGHT, width=WIDTH):
-    """Return row and column at which the camera of the plain scene that looks straight down sees a point."""
+    """Return row and column of a point in the picture of the plain scene's camera that looks straight down."""
     focal = 0.5 * height / np.tan(np.deg2rad(FOVY / 2))
     x, y, z = point
     return 0.5 * height - focal * y / (CAMERA_HEIGHT - z), 0.5 * width + focal * x / (CAMERA_HEIGHT - z)
 
 
 def read_frames(path, height, width, *filters):
-    """Return the frames of a film of a size that it has, or gets by filters of ffmpeg. (n, height, width, 3)"""
+    """Return the frames of a film, whose size after the filters of ffmpeg must be given. (n, height, width, 3)"""
     decode = [get_ffmpeg_exe(), "-loglevel", "fatal", "-i", path, *filters, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
     return pixels[: len(pixels) // (height * width * 3) * height * width * 3].reshape(-1, height, width, 3)

@@ -1,4 +1,4 @@
-"""A virtual screen for tests of windows, and what it shows."""
+"""A virtual screen for tests of windows, and its pixels."""
 
 import os
 import select
@@ -28,7 +28,7 @@ def virtual_screen(folder):
 
 
 def screen_pixels(path, wait=True):
-    """Return what a screen shows, by default once it is at rest, read from its X window dump. (height, width, 3)"""
+    """Return the pixels of a screen from its X window dump, by default once they are constant. (height, width, 3)"""
     raw, last_raw, deadline = path.read_bytes(), b"", time.monotonic() + 20
     while wait and raw != last_raw and time.monotonic() < deadline:  # the server draws an image strip by strip
         time.sleep(0.3)

@@ -59,7 +59,7 @@ class Springs(Population):
 
 
 class Crowd(Springs):
-    """The same, attracted by each other."""
+    """Springs whose masses also attract each other."""
 
     def derivative(self, data):
         rates, pos = super().derivative(data), self.read(data).pos
@@ -71,7 +71,7 @@ class Crowd(Springs):
 
 
 class Tied(Springs):
-    """The same, pulled by the drones too."""
+    """Springs whose masses the drones also pull."""
 
     def derivative(self, data):
         rates = super().derivative(data)
@@ -79,7 +79,7 @@ class Tied(Springs):
 
 
 class Tying(Springs):
-    """The same, pulling at the drones, and colliding with them in each world: momentum is exchanged."""
+    """Springs whose masses also pull the drones, and exchange momentum with them in each world."""
 
     def stages(self, sim):
         @stage("drone")
@@ -106,7 +106,7 @@ KINDS = (Springs, Crowd, Tied, Tying)
 
 
 def build(kinds, n_worlds=2, n_drones=2, n_members=3, **settings):
-    """Return a simulation of drones in the air, different ones, with a population.
+    """Return a simulation of drones at different positions in the air, with populations of masses.
 
     Args:
         kinds: Class of the population, which is added as "springs", or several, each added under the name of its class.

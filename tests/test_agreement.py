@@ -1,4 +1,4 @@
-"""One sweep over all stages of a step: every engine gives what ``plain`` gives.
+"""All stages of a step: every engine computes the same as ``plain``.
 
 ``tests/envs/test_env_step.py`` has the sweep over environments.
 """
@@ -20,9 +20,9 @@ ENGINES = ("interpret", *COMPILED_ENGINES)
 N_STEPS = 20
 """Steps of each simulation; sensors, controllers and delays have their ticks in them."""
 LONG_ON_LANES = ("sensors", "load", "bodies", "controllers", "complementary", "impact")
-"""Simulations whose lanes XLA takes more than five seconds to compile."""
+"""Simulations that take XLA more than 5 s to compile for ``lanes``."""
 NOT_ON_LANES = ("kalman", "eskf", "terrain")
-"""Simulations whose lanes XLA takes more than half a minute to compile."""
+"""Simulations that take XLA more than 30 s to compile for ``lanes``."""
 
 
 @pytest.mark.long("compiles every stage of the package for every engine")
@@ -38,7 +38,7 @@ def test_long_programs_on_lanes_give_what_plain_gives(name):
 
 
 def compare(name, engines):
-    """Compare a flight on some engines with that of the reference."""
+    """Compare a flight on some engines with the flight on the reference."""
     sim = sweep.CASES[name]()
     expected = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(N_STEPS))
     for engine in engines:

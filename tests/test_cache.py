@@ -1,4 +1,4 @@
-"""The cache of compiled programs: where it is, what it keeps, and what a user reads of it."""
+"""The cache of compiled programs: its location, its contents, and messages about it."""
 
 import os
 import shutil
@@ -74,7 +74,7 @@ def test_a_relative_folder_does_not_follow_the_working_directory(settings, monke
 
 
 def test_each_kind_of_cpu_has_a_folder_of_its_own(settings, monkeypatch, tmp_path):
-    """XLA's programs are machine code whose key does not hold the features of the CPU."""
+    """XLA's programs are machine code, but their key does not include the features of the CPU."""
     info = tmp_path / "cpuinfo"
     monkeypatch.setattr(cache, "CPU_INFO", info)
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "kept"))

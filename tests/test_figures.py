@@ -1,4 +1,4 @@
-"""Figures of the pages: each has a command and a place, and those that are older than what they measure are found."""
+"""Figures of the pages: each has a command and a place, and outdated figures are found."""
 
 import importlib
 import json

@@ -1,4 +1,4 @@
-"""What ``crazysim info`` prints, where everything is there and where little is."""
+"""Output of ``crazysim info``, on complete and incomplete installations."""
 
 import importlib.metadata
 import os

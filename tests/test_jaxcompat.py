@@ -194,7 +194,7 @@ def test_a_jaxpr_takes_what_it_closes_over():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.int32, bool])
 def test_an_array_of_the_host_is_put_on_a_device(dtype):
-    """As ``jax.device_put`` does: committed, of no weak type, and so of the same compiled program."""
+    """Arrays are committed and not weakly typed, as from ``jax.device_put``, so they need no other program."""
     x = np.arange(6).reshape(2, 3).astype(dtype)
     for device in jax.devices()[:2]:
         sharding = jax.sharding.SingleDeviceSharding(device)
@@ -299,7 +299,7 @@ def test_compilations_are_counted():
 
 
 def test_tracing_ahead_is_not_tracing_twice():
-    """Planning traces what the first call runs; JAX keeps the trace."""
+    """Planning traces the function of the first call, and JAX reuses the trace."""
     traces = []
     fn = jax.jit(lambda x: traces.append(1) or x + 1)
     x = jnp.ones(3)
@@ -331,7 +331,7 @@ def test_the_header_of_foreign_functions_is_there():
 
 
 def test_only_one_module_goes_beyond_the_public_interface():
-    """Whatever else a new JAX breaks, it breaks here."""
+    """Any other incompatibility with a new JAX shows here."""
     import crazysim
 
     private = ("jax.extend", "jax._src", "jax.interpreters", "jax.experimental", "jax.custom_batching", "SymbolicZero",

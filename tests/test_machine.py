@@ -1,4 +1,4 @@
-"""How tests run: as many at a time as the machine, or its container, has room for; what takes long says why."""
+"""How tests run: in as many processes as fit the machine or container; slow tests state a reason."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""The package as its users get it: what it needs, what it exports, what the wheel holds."""
+"""The package as users install it: its requirements, exports, and the contents of the wheel."""
 
 import ast
 import collections

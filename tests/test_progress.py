@@ -1,4 +1,4 @@
-"""Progress bars, on terminals alone: in the log file of a job each of their lines is one of thousands."""
+"""Progress bars are shown on terminals only, since they would add thousands of lines to a log file."""
 
 import io
 import sys

@@ -64,7 +64,7 @@ def test_law_02_scopes_are_declared_and_undeclared_means_whole():
 
 
 def test_law_02_a_parameter_is_shared_or_drone_by_its_dimensions():
-    """Law 2: never by its lengths: here three worlds of three drones have a parameter of length three."""
+    """Law 2: scopes do not follow from lengths; three worlds of three drones have a parameter of length three."""
     assert scopes(fleet(3, 3, curve=jnp.ones(3))).rotor.curve == "shared"
     assert scopes(fleet(3, 3, curve=jnp.ones((3, 3, 3)))).rotor.curve == "drone"
 

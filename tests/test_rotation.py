@@ -1,4 +1,4 @@
-"""Quaternion algebra: group laws, an independent program, and gradients that stay finite."""
+"""Quaternion algebra: group laws, comparison with SciPy, and finite gradients."""
 
 import functools
 
@@ -27,7 +27,7 @@ angles = st.floats(-3.1, 3.1)
 
 
 def same_rotation(p, q):
-    """Assert that two unit quaternions turn alike: up to their sign."""
+    """Assert that two unit quaternions are the same rotation, up to their sign."""
     np.testing.assert_allclose(np.abs(np.sum(np.asarray(p) * np.asarray(q), axis=-1)), 1.0, atol=1e-14)
 
 
@@ -51,7 +51,7 @@ def test_multiplication_is_a_group(p, q, r):
 
 @given(p=unit_quats, q=unit_quats, v=vectors())
 def test_rotations_act_on_vectors(p, q, v):
-    """A product turns by one after the other, lengths stay, and the inverse undoes it; scipy agrees."""
+    """A product applies one rotation after the other, keeps lengths, and has an inverse, as in SciPy."""
     np.testing.assert_allclose(rot.rotate(rot.multiply(p, q), v), rot.rotate(p, rot.rotate(q, v)), rtol=0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(rot.rotate(q, v)), np.linalg.norm(v), **ROUNDING)
     np.testing.assert_allclose(rot.rotate_inverse(q, rot.rotate(q, v)), v, rtol=0, atol=1e-12)

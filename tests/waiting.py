@@ -4,7 +4,7 @@ import time
 
 
 def wait_for(condition, seconds=300.0):
-    """Wait until a condition holds; the limit is for what never happens, and no test of speed."""
+    """Wait until a condition holds; the time limit is for events that never happen, not a test of speed."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "it did not come to be"

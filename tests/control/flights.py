@@ -10,7 +10,7 @@ from crazysim.core import functional as F
 
 
 def path_setpoint(path, t):
-    """Return the setpoint of a path (x, y, z, yaw) of time at an instant, differentiated by jax.jvp."""
+    """Return the setpoint at a time of a path, a function of time to (x, y, z, yaw), which jax.jvp differentiates."""
     values = []
     for _ in range(5):
         values.append(path)
@@ -20,7 +20,7 @@ def path_setpoint(path, t):
 
 
 def figure_eight(t, width=2.0, speed=2.0, height=1.0):
-    """Return a figure eight, ``width`` m wide, whose greatest speed is ``speed``; half as high as wide."""
+    """Return the point at a time of a figure eight, ``width`` m long in x, half as long in y, of maximum ``speed``."""
     rate = speed / (width / np.sqrt(2))
     x, y = width / 2 * jnp.sin(rate * t), width / 4 * jnp.sin(2 * rate * t)
     return jnp.stack([x, y, height + 0 * t, 0 * t])
@@ -32,7 +32,7 @@ def hover(t):
 
 
 def start_on_path(sim, path):
-    """Put every drone where a path begins, with its velocity, and rotors at hover."""
+    """Put every drone at the beginning of a path, with its velocity, and rotors at hover speed."""
     from crazysim.dynamics import first_principles
 
     sp = path_setpoint(path, jnp.float32(0))
@@ -71,12 +71,12 @@ def fly(sim, law, path, seconds, memory=None, change=None):
     return jax.tree.map(lambda x: np.asarray(x)[:, 0, 0], states), setpoints, np.asarray(outputs), data
 
 
-def rms(states, setpoints, start=0.0, total=1.0):
+def rms_error(states, setpoints, start=0.0, total=1.0):
     """Return the root of the mean square of the position error, m, in the part of a flight after a fraction of it."""
     error = np.linalg.norm(states.pos - np.asarray(setpoints.pos), axis=-1)
     return float(np.sqrt(np.mean(error[int(len(error) * start / total) :] ** 2)))
 
 
-def simulation(drone="cf21B_500", control="force_torque", **settings):
+def make_sim(drone="cf21B_500", control="force_torque", **settings):
     """Return a simulation of one drone."""
     return Sim(drone=drone, control=control, **settings)

@@ -16,18 +16,18 @@ GRAVITY = 9.81
 MIN_AUTHORITY = np.array([4.0, 4.0, 0.2])
 """Angular acceleration in hover below which an airframe is not drawn, rad/s^2; ``airframe check`` warns below 0.2."""
 
-SLOWEST = 0.2
-"""Longest time constant of rotors that are drawn, s; ``airframe check`` warns of longer ones."""
+MAX_TIME_CONSTANT = 0.2
+"""Maximum time constant of drawn rotors, s; ``airframe check`` warns of longer ones."""
 
-TURN = 2.0
-"""Body rate of the flights, rad/s, at which the net momentum of the rotors takes up to half of the authority."""
+MAX_BODY_RATE = 2.0
+"""Body rate, rad/s, at which the net momentum of the rotors needs at most half of the control authority."""
 
 
 def log_uniform(rng, low, high):
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def draw(rng, n, name):
+def draw_airframe(rng, n, name):
     """Return an airframe of n rotors: 20 g to 20 kg, thrust over weight 1.3 to 10, rotors of 2 to 200 ms.
 
     Half of the bodies are asymmetric: rotors off their angles and radii, and a centre of mass beside their middle.
@@ -54,7 +54,7 @@ def draw(rng, n, name):
         rise_rate, fall_rate = 1 / tau, 1 / tau * rng.uniform(0.5, 1.0) ** rng.choice([-1, 1])
         quadratic = rng.uniform(0.0, 0.8) * rng.choice([0, 1])
         lag = [rate * part for rate in (rise_rate, fall_rate) for part in (1 - quadratic, quadratic / 2 / hover)]
-        if min(rise_rate, fall_rate) < 1 / SLOWEST:
+        if min(rise_rate, fall_rate) < 1 / MAX_TIME_CONSTANT:
             continue
         if max(rise_rate, fall_rate) * (1 - quadratic + quadratic * np.sqrt(ratio * n * np.max(lift))) > 600:
             continue  # too quick for steps of 2 ms
@@ -79,20 +79,20 @@ def draw(rng, n, name):
         except ConfigError:
             continue
         acc = max_ang_acc(airframe)
-        if not np.all(acc > MIN_AUTHORITY) or 2 * TURN * precession_rate(airframe) > np.min(acc[:2]):
+        if not np.all(acc > MIN_AUTHORITY) or 2 * MAX_BODY_RATE * precession_rate(airframe) > np.min(acc[:2]):
             continue
         if precession_rate(airframe) < MAX_PRECESSION_RATIO * np.sqrt(Auto().params(airframe).stiffness[0]):
             return airframe
 
 
-def fleet(n, count, seed=0):
+def draw_airframes(n, count, seed=0):
     """Return random airframes of n rotors."""
     rng = np.random.default_rng([seed, n])
-    return [draw(rng, n, f"{n} rotors, number {k} of seed {seed}") for k in range(count)]
+    return [draw_airframe(rng, n, f"{n} rotors, number {k} of seed {seed}") for k in range(count)]
 
 
-def put_in_the_air(sim, pos=0.0, vel=0.0, quat=(0.0, 0.0, 0.0, 1.0), ang_vel=0.0):
-    """Put all drones into a state, with rotors that keep them level, without a floor."""
+def set_flying_states(sim, pos=0.0, vel=0.0, quat=(0.0, 0.0, 0.0, 1.0), ang_vel=0.0):
+    """Set the states of all drones, with hover speeds of rotors, and remove the floor."""
     if "clip_floor_pos" in sim.step_pipeline:
         remove_fn(sim.step_pipeline, "clip_floor_pos")
         sim.build_step_fn()
@@ -110,21 +110,21 @@ def put_in_the_air(sim, pos=0.0, vel=0.0, quat=(0.0, 0.0, 0.0, 1.0), ang_vel=0.0
     sim.data = sim.data.replace(states=states)
 
 
-def directions(rng, *shape):
+def random_directions(rng, *shape):
     """Return random unit vectors. (..., 3)"""
     vectors = rng.normal(size=(*shape, 3))
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def throw_drones(sim, seed, tilt=np.pi / 4, rate=2.0, speed=2.0, away=2.0, heading=np.pi):
-    """Throw all drones: a tilt, rad, about a random axis, body rates, rad/s, a speed, m/s, up to ``away`` m off."""
+    """Throw all drones up to ``away`` m off, with a tilt, rad, about a random axis, body rate, rad/s, and speed, m/s."""
     rng, shape = np.random.default_rng(seed), (sim.n_worlds, sim.n_drones)
-    axes = directions(rng, *shape) * [1, 1, 0]
+    axes = random_directions(rng, *shape) * [1, 1, 0]
     axes *= tilt / np.linalg.norm(axes, axis=-1, keepdims=True)
     yaws = Rotation.from_rotvec(rng.uniform(-heading, heading, (np.prod(shape), 1)) * [0, 0, 1])
     quat = (Rotation.from_rotvec(axes.reshape(-1, 3)) * yaws).as_quat().reshape(*shape, 4)
-    pos = away * directions(rng, *shape) * rng.uniform(0, 1, (*shape, 1))
-    put_in_the_air(sim, pos, speed * directions(rng, *shape), quat, rate * directions(rng, *shape))
+    pos = away * random_directions(rng, *shape) * rng.uniform(0, 1, (*shape, 1))
+    set_flying_states(sim, pos, speed * random_directions(rng, *shape), quat, rate * random_directions(rng, *shape))
 
 
 def alternation(sim):
@@ -137,7 +137,7 @@ def alternation(sim):
     return np.abs(np.diff(commands, 2, axis=0)).max((0, 1, 3)) / hover
 
 
-def flights(airframes, controller, worlds, seconds, seed, **start):
+def fly_airframes(airframes, controller, worlds, seconds, seed, **start):
     """Return the distances from the setpoint and heights after each 0.1 s, m, and the alternation of rotors at the end.
 
     (n_times, n_worlds, n_drones), the same, (n_drones,)

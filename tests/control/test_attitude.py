@@ -99,7 +99,7 @@ def test_the_integral_acts_and_is_limited():
 
 @given(cmd=vectors(4, 3.0), rates=vectors(3, 30))
 def test_law_09_thrusts_saturate_rotor_by_rotor_as_documented(cmd, rates):
-    """What comes out is what four rotors can give, each between pwm_min and full, or none at all."""
+    """The output is possible with four rotors, each between pwm_min and full thrust, or all of them off."""
     wrench, _ = hold(cmd, rates=rates)
     airframe = load_airframe("cf21B_500")
     mixing = np.vstack([np.ones(4), airframe.mixing_matrix * [[0.035355], [0.035355], [0.00593893393599368]]])

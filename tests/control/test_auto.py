@@ -1,4 +1,4 @@
-"""The default controller: what it achieves with every airframe at every level, and its parts."""
+"""The default controller: its accuracy with every airframe at every level, and its parts."""
 
 import functools
 import sys
@@ -59,7 +59,7 @@ def test_every_airframe_goes_where_it_is_sent():
 
 @pytest.mark.parametrize("dynamics", ["so_rpy", "so_rpy_rotor_drag"])
 def test_the_position_loop_flies_fitted_dynamics(dynamics):
-    """The same figures above the attitude response of the models; hb_x500, the slowest, tracks within 4 cm."""
+    """The figures also hold with fitted models; hb_x500, the slowest airframe, tracks within 4 cm."""
     names = [load_airframe(name) for name in supported_drones(dynamics)]
     for name, row in benchmark().fly_airframes("auto", names, 2.0, 1, dynamics).items():
         assert row["hover"] < 2e-3, (name, row)
@@ -80,7 +80,7 @@ def flying(level, worlds, controller="auto", **settings):
 
 @pytest.mark.parametrize("level", ["attitude", "body_rate"])
 def test_steps_of_the_command_settle_without_overshoot(level):
-    """At most 10%, within 2% after 2 s; half of the way within 0.3 s, for yaw within 0.6 s."""
+    """Overshoot is at most 10%, the error 2% after 2 s, and half of a step takes 0.3 s, for yaw 0.6 s."""
     y = benchmark().step_responses("auto", airframes(), level)
     assert y.max() < 1.1
     np.testing.assert_allclose(y[100:], 1.0, atol=0.02)
@@ -133,7 +133,7 @@ def test_an_unknown_torque_leaves_no_error():
 @pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy", "so_rpy_rotor_drag"])
 @pytest.mark.parametrize("acc", [-9.81, -9.5, -9.0])
 def test_a_fall_does_not_turn_a_drone_on_its_back(dynamics, acc):
-    """Drag and estimates then ask for more downward acceleration than gravity gives, or for any direction."""
+    """Compensation of drag and estimates may then need more downward acceleration than gravity, or any direction."""
     sim = Sim(dynamics=dynamics, control="state", controller="auto", engine="lanes")
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(100.0)))
@@ -155,7 +155,7 @@ def test_a_setpoint_that_falls_faster_than_gravity_turns_a_drone_over():
 
 
 def test_a_far_setpoint_is_approached_without_losing_height():
-    """30 m aside: the feedback keeps the tilt within what the rotors can carry."""
+    """For a setpoint 30 m aside, the feedback limits the tilt to what the rotors can carry."""
     sim, _ = flying("state", 1)
     command = np.zeros((1, len(airframes()), 16), np.float32)
     command[..., :3], command[..., 12] = [30.0, 0.0, HIGH], 1.0
@@ -197,7 +197,7 @@ jitted_quat = jax.jit(quat_error)
 
 
 def test_upside_down_the_error_is_a_full_turn_about_x():
-    """Where the direction of the shortest turn is undefined, so that such a drone does not stay there."""
+    """The direction of the shortest turn is undefined there, but the drone must not stay there."""
     np.testing.assert_allclose(jitted_quat(np.float32([1, 0, 0, 0])), [2, 0, 0])
     np.testing.assert_allclose(jitted_quat(np.float32([0, 0, 1, 0]))[2], 2.0, atol=1e-3)  # turned by 180 degrees
 
@@ -284,7 +284,7 @@ def test_the_drag_torque_over_thrust_of_the_curves_is_that_of_the_tables():
     quat=unit_quats(), pos=vectors(3, 100.0), vel=vectors(3, 50.0), ang_vel=vectors(3, 100.0), command=vectors(4, 20.0)
 )
 def test_any_state_and_command_give_finite_rotor_speeds(quat, pos, vel, ang_vel, command):
-    """At every level, with finite memory; from saturation to free fall."""
+    """Outputs are finite at every level, from saturation to free fall, and so is the memory."""
     for level, run in steppers().items():
         data, step = run
         s = data.states
@@ -366,7 +366,7 @@ def test_worlds_and_drones_fly_alike_alone_and_together(level):
 
 @pytest.mark.parametrize("drone", ["cf21B_500", "cf2x_T350", "bumblebee"])
 def test_a_slow_climb_beside_the_start_leaves_the_floor(drone):
-    """The floor of the simulation stops every motion of a drone on it: what is measured there must not tilt it."""
+    """The floor stops every motion of a drone on it, so measurements there must not tilt the drone."""
     sim = Sim(n_worlds=32, drone=drone, control="state")
     away = np.random.default_rng(0).uniform(-2.0, 2.0, (32, 1, 2))
     sim.data = with_states(sim.data, pos=np.concatenate([away, np.zeros((32, 1, 1))], axis=-1))

@@ -1,4 +1,4 @@
-"""Controllers in C: what they receive, what they command, and what they remember of each drone."""
+"""Controllers in C: their inputs, their commands, and their memory of each drone."""
 
 import os
 import subprocess
@@ -133,7 +133,7 @@ class Height(Controller):
 
 
 def flown(controller, n_steps=1000):
-    """Return a simulation whose drones rise to heights of their own."""
+    """Return a simulation whose drones rise to different heights."""
     sim = Sim(WORLDS, DRONES, control="state", controller=controller)
     pos = np.array(sim.data.states.pos)
     pos[..., 2] = np.linspace(0.5, 2.0, WORLDS * DRONES).reshape(WORLDS, DRONES)
@@ -284,7 +284,7 @@ def test_wrong_libraries_and_units_are_refused(library, tmp_path):
 
 
 def test_what_is_no_whole_library_is_refused_without_harm(library, tmp_path):
-    """A pipe would be read for ever, a device without end, and half a library would end this process."""
+    """Reading a pipe or a device would never end, and half a library would end this process."""
     pipe, half = tmp_path / "pipe.so", tmp_path / "half.so"
     os.mkfifo(pipe)
     whole = library("hover", HOVER).read_bytes()

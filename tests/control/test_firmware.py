@@ -1,4 +1,4 @@
-"""The firmware's PID and Mellinger controllers, against the compiled firmware and against what they are for."""
+"""The firmware's PID and Mellinger controllers, compared with the compiled firmware, and in flight."""
 
 import jax
 import jax.numpy as jnp

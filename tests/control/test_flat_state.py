@@ -74,7 +74,7 @@ def test_hover_takes_the_weight_and_no_torque():
 
 
 def test_law_01_and_07_many_setpoints_free_fall_and_finite_gradients():
-    """Free fall, nose down, upside down: finite values and gradients, and the same one by one as together."""
+    """In free fall, nose down and upside down, values and gradients are finite, and equal for one state and a batch."""
     accs = np.array([[0, 0, 0], [0, 0, -9.81], [9.81, 0, -9.81], [0, 0, -30.0], [1.0, 2.0, 3.0]])
     one = np.ones((5, 1))
     setpoints = Setpoint(*[np.ones((5, 3))] * 2, accs, *[np.ones((5, 3))] * 2, 0 * one, one, one)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import unit_quats, vectors
-from flights import figure_eight, fly, hover, path_setpoint, rms, simulation, start_on_path
+from flights import figure_eight, fly, hover, make_sim, path_setpoint, rms_error, start_on_path
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
@@ -49,7 +49,7 @@ def law(drone, gains="bandwidth", freq=500, feedforward=True):
 
 
 def lab_wrench(pos, matrix, vel, ang_vel, yaw, drone):
-    """Return the wrench of the facts on AIMotionLab-Virtual, section 2.3, in NumPy and apart from the code tested."""
+    """Return the wrench by section 2.3 of the facts on AIMotionLab-Virtual, in NumPy, without the tested code."""
     kr, kv, kR, kw = {"crazyflie": (0.15, 0.2, 0.007, 0.0015), "bumblebee_lab": (4.0, 2.0, 1.7, 0.2)}[drone]
     mass = {"crazyflie": 0.028, "bumblebee_lab": 0.605}[drone]
     inertia = np.diag({"crazyflie": [1.4e-5, 1.4e-5, 2.17e-5], "bumblebee_lab": [1.5e-3, 1.45e-3, 2.66e-3]}[drone])
@@ -117,7 +117,7 @@ def skew(w):
 
 @pytest.mark.usefixtures("x64")
 def test_drag_is_compensated():
-    """At 2 m/s along x a Crazyflie Brushless has 0.0433 N of drag, and leans into it by its ratio to the weight."""
+    """At 2 m/s along x a Crazyflie Brushless has 0.0433 N of drag, and tilts by its ratio to the weight."""
     p = params("cf21B_500", "bandwidth")
     wrench = control(ZERO, LEVEL, np.array([2.0, 0, 0]), ZERO, setpoint(vel=[2, 0, 0]), params=p)
     lean = np.arctan(0.021643637770852733 * 2 / (0.0434 * 9.81))
@@ -164,7 +164,7 @@ def test_a_wrench_is_brought_within_the_limits_by_priority(wrench):
 
 
 def test_full_thrust_keeps_the_torque():
-    """Clipping each rotor on its own would halve it: two rotors are at their limit already."""
+    """Clipping each rotor by itself would halve the torque, since two rotors are already at their limit."""
     p = params("cf21B_500", "bandwidth").allocation
     out = np.asarray(priority(np.array([0.8, 0.004, 0.0, 0.0]), params=p))
     np.testing.assert_allclose(out[1:], [0.004, 0, 0], atol=1e-7)
@@ -223,23 +223,23 @@ def test_gains_by_bandwidth_are_stable_and_damped(drone):
 @pytest.mark.parametrize(("drone", "freq", "bound"), [("cf21B_500", 500, 0.02), ("cf21B_500", 100, 0.02),
                                                       ("bumblebee", 500, 0.02)])  # fmt: skip
 def test_figure_eight_of_two_metres_at_two_metres_per_second(drone, freq, bound):
-    """2 cm RMS from the start, which is not at rest, with the full dynamics: rotor lag, drag and limits."""
-    sim = simulation(drone, force_torque_freq=freq)
+    """The error is 2 cm RMS, with the full dynamics (rotor lag, drag and limits), from a start that is not at rest."""
+    sim = make_sim(drone, force_torque_freq=freq)
     start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, law(drone, freq=freq), figure_eight, 9.0)
     assert 1.95 < np.linalg.norm(states.vel, axis=-1).max() < 2.15
-    assert rms(states, setpoints) < bound
+    assert rms_error(states, setpoints) < bound
 
 
 def test_without_feedforward_the_error_is_tens_of_centimetres():
-    sim = simulation("cf21B_500")
+    sim = make_sim("cf21B_500")
     start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, law("cf21B_500", feedforward=False), figure_eight, 9.0)
-    assert rms(states, setpoints) > 0.3
+    assert rms_error(states, setpoints) > 0.3
 
 
 def test_it_recovers_from_upside_down():
-    sim = simulation("cf21B_500")
+    sim = make_sim("cf21B_500")
     start_on_path(sim, hover)
     s = sim.data.states
     upside_down = np.broadcast_to([np.sqrt(0.99), 0, 0, 0.1], s.quat.shape)
@@ -252,7 +252,7 @@ def test_it_recovers_from_upside_down():
 
 @pytest.mark.parametrize("freq", [100, 500])
 def test_figure_eight_in_a_simulation(freq):
-    """By ``Follow`` and ``Sim(controller=Geometric(...))``: 2 cm RMS in the step itself, which is fused."""
+    """With ``Follow`` and ``Sim(controller=Geometric(...))`` in a fused step, the error is 2 cm RMS."""
     eight = curves.figure_eight(2.0, 1.0, speed=2.0)
     sim = Sim(control="state", controller=Geometric(freq=freq), strict=True)
     sim.add(Follow(eight))
@@ -268,7 +268,7 @@ def test_figure_eight_in_a_simulation(freq):
 
 @pytest.mark.parametrize("drone", ["cf21B_500", "bumblebee"])
 def test_an_integral_takes_up_a_push(drone):
-    """A tenth of the weight: with an integral under 1 cm after 5 s, without it the force over the gain on position."""
+    """The force is a tenth of the weight. With an integral the error is below 1 cm after 5 s, else force over gain."""
     offsets, gains = {}, Geometric().params(load_airframe(drone))
     for integral in (0.0, 0.6):
         sim = Sim(drone=drone, control="state", controller=Geometric(integral=integral), strict=True)
@@ -288,7 +288,7 @@ def test_an_integral_takes_up_a_push(drone):
 
 
 def test_an_integral_does_not_wind_up():
-    """A drone held beside its setpoint fills the integral up to its limit; far from it the integral stays empty."""
+    """A drone held near its setpoint fills the integral up to its limit; far from it the integral stays zero."""
     for distance, largest in ((0.5, 0.5 * 9.81), (10.0, 0.0)):
         sim = Sim(control="state", controller=Geometric(integral=1.0))
         start_on_path(sim, hover)

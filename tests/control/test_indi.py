@@ -1,4 +1,4 @@
-"""Incremental nonlinear dynamic inversion: its filter, its start, and what it compensates."""
+"""Incremental nonlinear dynamic inversion: its filter, its start, and the disturbances that it compensates."""
 
 import functools
 from types import SimpleNamespace
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
-from flights import figure_eight, fly, hover, path_setpoint, rms, simulation, start_on_path
+from flights import figure_eight, fly, hover, make_sim, path_setpoint, rms_error, start_on_path
 
 from crazysim import Sim, load_airframe
 from crazysim.control.geometric import GeometricParams, geometric_control
@@ -67,10 +67,10 @@ def test_a_return_to_the_controller_starts_its_filter_anew():
 
 
 def test_figure_eight_of_two_metres_at_two_metres_per_second():
-    sim = simulation("cf21B_500", "rotor_vel")
+    sim = make_sim("cf21B_500", "rotor_vel")
     start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, law("cf21B_500"), figure_eight, 9.0, memory())
-    assert rms(states, setpoints) < 0.02
+    assert rms_error(states, setpoints) < 0.02
 
 
 def pushed(data, t):
@@ -84,7 +84,7 @@ def pushed(data, t):
 
 def test_a_force_and_a_torque_are_compensated():
     """Within 1 mm after 7 s; geometric control without an integral stays decimetres away."""
-    sim = simulation("cf21B_500", "rotor_vel")
+    sim = make_sim("cf21B_500", "rotor_vel")
     start_on_path(sim, hover)
     states, setpoints, _, _ = fly(sim, law("cf21B_500"), hover, 9.0, memory(), pushed)
     error = np.linalg.norm(states.pos - np.asarray(setpoints.pos), axis=-1)
@@ -98,7 +98,7 @@ def test_a_force_and_a_torque_are_compensated():
         one = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0])
         return geometric_control(*one, setpoint, params=p), nothing
 
-    sim = simulation("cf21B_500")
+    sim = make_sim("cf21B_500")
     start_on_path(sim, hover)
     states, setpoints, _, _ = fly(sim, geometric, hover, 9.0, None, pushed)
     assert np.linalg.norm(states.pos[-1] - np.asarray(setpoints.pos)[-1]) > 0.2
@@ -120,7 +120,7 @@ def flown():
 
 @pytest.mark.parametrize("name", ["geometric", "indi", "lqr"])
 def test_from_the_floor_in_a_simulation(flown, name):
-    """By name, fused (``strict``), and alike in every world."""
+    """It can be chosen by name, is fused (``strict``), and flies alike in every world."""
     pos = np.asarray(flown[name].data.states.pos)
     np.testing.assert_allclose(pos[:, 0], np.broadcast_to([1.0, 0.5, 1.0], (4, 3)), atol=0.05)
     np.testing.assert_array_equal(pos, np.broadcast_to(pos[:1], pos.shape))

@@ -84,7 +84,7 @@ def test_a_load_that_hangs_off_the_centre(target):
 
 
 def test_an_empty_hook_is_the_load():
-    """Its load stands elsewhere: the tip of the hook goes to the setpoint, and its swing is damped."""
+    """The load stands elsewhere, so the tip of the hook flies to the setpoint, and its swing is damped."""
     sim = Sim(drone="bumblebee", control="state", controller=LoadLQR(load_mass=0.0203, length=LENGTH))
     sim.data = with_states(sim.data, pos=np.array([0.0, 0.0, 1.4]))
     hook = sim.add(Hook.bumblebee(LOAD, load_at=(2.0, 1.0, 0.0), in_scene=False))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flights import figure_eight, fly, hover, path_setpoint, rms, simulation, start_on_path
+from flights import figure_eight, fly, hover, make_sim, path_setpoint, rms_error, start_on_path
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
@@ -50,7 +50,7 @@ def test_gain_about_hover_as_the_lab():
 
 @pytest.mark.usefixtures("x64")
 def test_gain_with_load_as_the_lab():
-    """The same facts: 0.05 kg on a rod of 0.4 m, 100 Hz."""
+    """The gains are those of the facts on AIMotionLab-Virtual for 0.05 kg on a rod of 0.4 m, at 100 Hz."""
     params = LoadLQRParams.create(load_airframe("bumblebee"), 100, 0.05, 0.4, LAB_LOAD_Q, LAB_LOAD_R)
     gain = np.asarray(params.gain)
     assert rounded(gain[0, [2, 5]]) == [9.6398, 4.7304]
@@ -99,7 +99,7 @@ def test_wrong_weights(case):
 
 
 def test_weights_may_be_singular_matrices():
-    """A weight of the sum of two states, whose least eigenvalue is zero but for rounding."""
+    """A weight on the sum of two states has a smallest eigenvalue of zero, up to rounding."""
     direction = np.array([0.1, 0.7, 0.3])
     np.testing.assert_array_equal(weight_matrix("Q", np.outer(direction, direction), 3), np.outer(direction, direction))
 
@@ -140,7 +140,7 @@ def knots():
 
 @pytest.mark.usefixtures("x64")
 def test_error_dynamics_are_those_of_the_drone(knots):
-    """By differences: reference and disturbed drone both fly 1e-5 s, and the errors compare."""
+    """Derivatives equal differences of errors after 1e-5 s of flight of a reference drone and a disturbed one."""
     p = jax.tree.map(np.asarray, LQRParams.create(load_airframe("bumblebee"), 500))
     sp = jax.tree.map(lambda x: np.asarray(x, np.float64)[7], knots)
     sp = sp.replace(yaw_rate=np.array([0.7]), yaw_acc=np.array([-0.4]))
@@ -196,12 +196,12 @@ def state_of(data):
 
 @pytest.mark.parametrize(("drone", "bound"), [("cf21B_500", 0.04), ("bumblebee", 0.01)])
 def test_figure_eight(drone, bound, knots):
-    """Of 2 m at 2 m/s, with the gain about hover, and with that along the trajectory."""
-    sim = simulation(drone)
+    """It follows one of 2 m at 2 m/s, with the gain for hover and with gains along the trajectory."""
+    sim = make_sim(drone)
     p = LQRParams.create(load_airframe(drone), 500)
     start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, lambda d, sp, m: (lqr_control(*state_of(d), sp, params=p), m), figure_eight, 4.8)
-    assert rms(states, setpoints) < bound
+    assert rms_error(states, setpoints) < bound
 
     along = TrackingLQR(setpoints=knots, dt=0.1).params(load_airframe(drone))
     assert np.ptp(np.asarray(along.gains), axis=0).max() > 0.01 * np.abs(along.gains).max()
@@ -212,11 +212,11 @@ def test_figure_eight(drone, bound, knots):
     sim.reset()
     start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, law, figure_eight, 4.8, jnp.float32(0))
-    assert rms(states, setpoints) < bound
+    assert rms_error(states, setpoints) < bound
 
 
 def test_heading_turns_the_gain():
-    """Behind its setpoint along its nose, the drone pitches down to go there, whatever its yaw."""
+    """A drone with its setpoint ahead of its nose pitches down, for any yaw."""
     p = LQRParams.create(load_airframe("bumblebee"), 500)
     for yaw in (0.0, 1.0, -2.5):
         nose = np.float32([np.cos(yaw), np.sin(yaw), 0.0])
@@ -264,14 +264,14 @@ def fly_with_load(load_mass, length, seconds, freq=500):
 
 @pytest.mark.parametrize(("load_mass", "length", "freq"), [(0.05, 0.4, 500), (0.2, 0.57, 100)])
 def test_load_along_a_figure_eight(load_mass, length, freq):
-    """Of 2 m at 2 m/s, at the load: 5 cm RMS is the requirement, and 1 cm is reached."""
+    """The figure eight of 2 m at 2 m/s is tracked with 1 cm RMS at the load; 5 cm are required."""
     load, target = fly_with_load(load_mass, length, 9, freq)
     assert np.sqrt(np.mean(np.sum((load - target) ** 2, axis=-1))) < 0.01
 
 
 @pytest.mark.usefixtures("x64")
 def test_load_gain_at_zero_load_and_any_rod_is_that_of_the_drone():
-    """Without weights on the rod, which then moves nothing."""
+    """The rod has no weights, so it has no influence."""
     J, mass, none = np.diag([1.5e-3, 1.45e-3, 2.66e-3]), np.array([0.605]), np.zeros(1)
     Q = np.diag([*LAB_Q, 1e-9, 1e-9, 1e-9, 1e-9])
     gain = jax.jit(load_gain)(mass, J, none, np.array([0.4]), 1e-4, 1e-4 * Q, 1e-4 * np.diag(LAB_R).astype(float))
@@ -280,7 +280,7 @@ def test_load_gain_at_zero_load_and_any_rod_is_that_of_the_drone():
 
 
 def test_setpoints_of_the_drone_leave_it_where_they_say():
-    """At rest below its setpoint nothing turns; the load hangs, and the thrust carries both."""
+    """At rest below its setpoint the drone does not turn, and its thrust carries drone and load."""
     p = LoadLQRParams.create(load_airframe("bumblebee"), 500, 0.1, 0.4)
     zero, down, none = np.zeros(3, np.float32), np.float32([0, 0, -1.0]), np.zeros(1, np.float32)
     sp = Setpoint(zero, zero, zero, zero, zero, none, none, none)

@@ -1,10 +1,18 @@
-"""Hundreds of random airframes, thrown into the air: all controllers with gains from physics bring them home."""
+"""Hundreds of random airframes are thrown into the air, and all controllers with gains from physics recover them."""
 
 import tomllib
 
 import numpy as np
 import pytest
-from random_airframes import GRAVITY, alternation, fleet, flights, put_in_the_air, settling_time, throw_drones
+from random_airframes import (
+    GRAVITY,
+    alternation,
+    draw_airframes,
+    fly_airframes,
+    set_flying_states,
+    settling_time,
+    throw_drones,
+)
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
@@ -31,8 +39,8 @@ def test_setpoints_are_reached_from_any_throw(n, seed, count):
     That is the far part of the way at the speed from which the drone can stop, 14 time constants of the position loop,
     and half a turn of yaw.
     """
-    airframes = fleet(n, count, seed)
-    distances, heights, alternating = flights(airframes, "auto", 4, 40, seed)
+    airframes = draw_airframes(n, count, seed)
+    distances, heights, alternating = fly_airframes(airframes, "auto", 4, 40, seed)
     times = settling_time(distances, 2e-3)
     for k, airframe in enumerate(airframes):
         position = Auto().params(airframe).position
@@ -47,7 +55,7 @@ def test_setpoints_are_reached_from_any_throw(n, seed, count):
 @pytest.mark.parametrize(("level", "n", "seed", "count"), LEVELS)
 def test_commands_below_are_followed_without_overshoot(level, n, seed, count):
     """Steps overshoot by at most 10%, and thrown drones follow random commands after 36 s, which weak yaw needs."""
-    airframes, steps, throws = fleet(n, count, seed), STEPS[level], 4
+    airframes, steps, throws = draw_airframes(n, count, seed), STEPS[level], 4
     rng = np.random.default_rng(seed)
     sim = Sim(len(steps) + throws, drone=airframes, control=level)
     throw_drones(sim, seed)
@@ -55,7 +63,7 @@ def test_commands_below_are_followed_without_overshoot(level, n, seed, count):
     rest = np.arange(sim.n_worlds) < len(steps)
     quat, ang_vel = np.array(s.quat), np.array(s.ang_vel)
     quat[rest], ang_vel[rest] = [0, 0, 0, 1], 0
-    put_in_the_air(sim, s.pos, s.vel * ~rest[:, None, None], quat, ang_vel)
+    set_flying_states(sim, s.pos, s.vel * ~rest[:, None, None], quat, ang_vel)
     command = np.zeros((sim.n_worlds, count, 4), np.float32)
     if level == "attitude":
         command[..., :3] = rng.uniform(-1, 1, command[..., :3].shape) * [0.5, 0.5, 3]
@@ -105,8 +113,8 @@ ALL = [pytest.param(name, n, marks=SLOW) for name in OTHERS for n in (4, 5, 6, 8
 @pytest.mark.parametrize(("controller", "n"), [("geometric", 4), ("indi", 6), ("lqr", 4), *ALL])
 def test_other_controllers_by_bandwidth_catch_their_drones(controller, n):
     """99% of the flights end within 5 cm after 60 s, as position loops above slow rotors are slow; none alternates."""
-    airframes = fleet(n, 40, 0)
-    distances, heights, alternating = flights(airframes, controller, 4, 60, 0, **OTHERS[controller])
+    airframes = draw_airframes(n, 40, 0)
+    distances, heights, alternating = fly_airframes(airframes, controller, 4, 60, 0, **OTHERS[controller])
     assert np.mean(distances[-10:].max(0) < 0.05) >= 0.99, controller
     assert heights.max() < 4.0
     assert alternating.max() < 0.01
@@ -157,7 +165,7 @@ def test_quick_and_heavy_rotors_hover_and_reach_far_setpoints(controller):
     """Within 2 mm, with rotors at constant speeds: near, 30 m aside, which nothing lifts, and 30 m below."""
     sources = [HUMMINGBIRD, RACER, *(heavy(*each) for each in ((1, 1), (2, 1), (3, 1), (5, 1), (1, 0.25), (3, 0.25)))]
     sim = Sim(3, drone=[load_airframe(source) for source in sources], control="state", controller=controller)
-    put_in_the_air(sim)
+    set_flying_states(sim)
     goals = np.array([[1.0, 0.0, 1.0], [30.0, 0.0, 0.0], [0.0, 0.0, -30.0]])[:, None]
     if controller == "indi":
         goals[1:] /= 10  # its errors are not limited

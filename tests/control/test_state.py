@@ -30,7 +30,7 @@ def answer(cmd, pos=(0, 0, 0), quat=LEVEL, vel=(0, 0, 0), integral=(0, 0, 0), ct
 
 
 def test_at_the_setpoint_it_is_level_and_carries_the_mass_it_believes_in():
-    """The thrust comes out by the firmware's factors: 0.0393 * 9.81 N * 132000 PWM/N * 0.8 N / 65535 PWM."""
+    """The thrust follows from the firmware's factors: 0.0393 * 9.81 N * 132000 PWM/N * 0.8 N / 65535 PWM."""
     cmd, integral = answer(setpoint())
     np.testing.assert_allclose(cmd, [0, 0, 0, 0.0393 * 9.81 * 132000 * 4 * 0.2 / 65535], atol=1e-12)
     np.testing.assert_array_equal(integral, np.zeros(3))
@@ -54,7 +54,7 @@ def test_it_leans_towards_where_it_should_be(start, axis, angle, sign):
     quat=vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1),
 )
 def test_body_z_points_along_the_force_and_the_thrust_is_its_part_along_the_present_z(force, yaw, quat):
-    """Mellinger and Kumar 2011, eq. 6 to 9, by their geometry: the force is asked for through an acceleration."""
+    """The attitude follows equations 6 to 9 of Mellinger and Kumar 2011, with the force given by an acceleration."""
     p = params(mass=[0.04], thrust_scale=[1.0])
     desired = force + [0, 0, 0.04 * 9.81]
     quat = quat / np.linalg.norm(quat)

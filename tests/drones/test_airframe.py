@@ -1,4 +1,4 @@
-"""Airframes: what their files hold, the mixing that follows from rotor positions, and a user's own."""
+"""Airframes: their files, the mixing that follows from rotor positions, and airframes of users."""
 
 import copy
 import re
@@ -25,7 +25,7 @@ def raw(name):
 
 
 def numbers(node, path=""):
-    """Yield the path and entry of every key that is no table of further keys."""
+    """Yield path and entry of every key that is not a table of keys."""
     for key, entry in node.items():
         if isinstance(entry, dict) and "value" not in entry:
             yield from numbers(entry, f"{path}{key}.")
@@ -223,7 +223,7 @@ def test_a_hexacopter_from_a_dict_hovers(control):
 
 
 def test_a_toml_file_anywhere_on_disk_flies(tmp_path):
-    """No file of the package is touched, and none but the user's is needed."""
+    """No file of the package changes, and only the user's file is needed."""
     path = tmp_path / "heavy.toml"
     path.write_text(
         (AIRFRAME_FOLDER / "cf21B_500.toml").read_text(encoding="utf-8").replace("0.0434", "0.0500"), encoding="utf-8"
@@ -579,7 +579,7 @@ def test_a_base_gives_the_numbers_that_are_not_given(tmp_path):
     ],
 )
 def test_another_body_inherits_no_gains(changes):
-    """Gains and fits assume the body and rotors of the base; the heir says so where it is asked for one."""
+    """Gains and fits assume the body and rotors of the base; reading one from the derived airframe says so."""
     base, heir = load_airframe("cf2x_L250"), load_airframe({"base": "cf2x_L250", "name": "mine", **changes})
     changed = next(f"{table}.{key}" for table, keys in changes.items() for key in keys)
     message = rf"Its base 'cf2x_L250' has \[fitted\], \[controller\], \[mellinger\] and \[pid\], .* another {changed}"

@@ -1,4 +1,4 @@
-"""Air drag: linear in the body frame, and never a motor."""
+"""Air drag: linear in the body frame, and always dissipative."""
 
 import jax
 import numpy as np
@@ -33,7 +33,7 @@ def test_law_08_drag_only_dissipates(quat, vel):
 
 
 def test_drag_by_hand():
-    """Nose up by 90 degrees, flying up at 2 m/s: the air comes along body x, so the force is 0.02 * 2 N, down."""
+    """With the nose up by 90 degrees at 2 m/s upwards, air flows along body x, and the force is 0.02 * 2 N, down."""
     half = np.sqrt(0.5)
     out = force(np.array([0, -half, 0, half]), np.array([0, 0, 2.0]), D)
     np.testing.assert_allclose(out, [0, 0, -0.04], atol=1e-16)

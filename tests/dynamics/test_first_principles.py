@@ -1,4 +1,4 @@
-"""The first-principles model put together: against the same physics written in numpy, and at hover."""
+"""The complete first-principles model, compared with the same physics in NumPy, and at hover."""
 
 import jax
 import jax.numpy as jnp

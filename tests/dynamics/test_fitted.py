@@ -1,4 +1,4 @@
-"""The fitted models: the fit itself as far as it was flown, bounded and continuous beyond."""
+"""The fitted models: equal to the fit in the range that was flown, bounded and continuous beyond."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ def params(dynamics="so_rpy", name="cf21B_500"):
 
 
 def body_rates(rpy, rates):
-    """Return body rates by differences of scipy's rotations: an independent way to the Euler kinematics."""
+    """Return body rates by differences of SciPy's rotations, independent of the Euler kinematics."""
     h = 1e-6
     ahead, behind = (Rotation.from_euler("ZYX", (rpy + s * h * rates)[::-1]) for s in (1, -1))
     return (behind.inv() * ahead).as_rotvec() / (2 * h)
@@ -139,7 +139,7 @@ def over_the_top(n, first=79.0, last=101.0):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("dynamics", FITTED)
 def test_fault_04_angular_acceleration_is_continuous_and_bounded_over_90_degrees(dynamics, sign):
-    """Fault 4 of the peer: NaN at 90 degrees of pitch. Half the step, half the largest change: no jump."""
+    """Fault 4 of Crazyflow: NaN at 90 degrees of pitch. Half the step gives half the largest change, so no jump."""
     ang_vel, cmd = np.array([1.0, -2.0, 1.5]), np.array([0.1, 0.2, -0.3, 0.4])
     changes = []
     for n in (20_001, 40_001):

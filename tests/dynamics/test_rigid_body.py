@@ -1,4 +1,4 @@
-"""Equations of Newton and Euler: against numpy, the invariants of a free body, and the stability of its wobble."""
+"""Equations of Newton and Euler: compared with NumPy, invariants of a free body, and stability of its wobble."""
 
 import jax
 import numpy as np
