@@ -117,7 +117,7 @@ def random_directions(rng, *shape):
 
 
 def throw_drones(sim, seed, tilt=np.pi / 4, rate=2.0, speed=2.0, away=2.0, heading=np.pi):
-    """Throw all drones up to ``away`` m off, with a tilt, rad, about a random axis, body rate, rad/s, and speed, m/s."""
+    """Throw all drones up to ``away`` m off: with a tilt, rad, about a random axis, a rate, rad/s, and a speed, m/s."""
     rng, shape = np.random.default_rng(seed), (sim.n_worlds, sim.n_drones)
     axes = random_directions(rng, *shape) * [1, 1, 0]
     axes *= tilt / np.linalg.norm(axes, axis=-1, keepdims=True)
