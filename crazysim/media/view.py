@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import check_settings, color, positive_integer, setting
 from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError, short_repr
+from crazysim.media.top_view import TopView
 from crazysim.media.trail import Trail, choose_drone_colors
 from crazysim.media.worlds import world_indices
 from crazysim.sim.sim import Sim
@@ -58,7 +59,7 @@ class View:
     setpoints: bool = False
     """True to draw the positions of state commands, as spheres."""
     rgba: ArrayLike | None = color(per_item=True)
-    """Colour of trails and setpoints, one or one per drone; None for default colours."""
+    """Colour of trails, setpoints and drones on maps, one or one per drone; None for default colours."""
     text: str | None = None
     """ASCII text at the top left of each world, with the fields ``{world}`` and ``{time}``; None for none."""
     draw: Callable[[Sim, int], None] | None = None
@@ -66,11 +67,15 @@ class View:
     inset: Callable[[Sim, int], NDArray | None] | None = None
     """Function that returns a small picture of a world, ``inset(sim, world)``, uint8, (height, width, 3), which is
     drawn enlarged at the bottom right of that world; None for none."""
+    top_view: bool = False
+    """True to draw a map from above at the bottom left of each world that has obstacles, with the drones' paths since
+    the last reset."""
     columns: int | None = None
     """Worlds per row; None for about as many as there are rows."""
     border: int = setting(default=2, low=0)
     """Width of the lines between worlds, pixels."""
     _trail: Trail | None = field(default=None, init=False, repr=False)
+    _top_view: TopView | None = field(default=None, init=False, repr=False)
     _aim: dict[int, tuple[float, NDArray]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -96,6 +101,8 @@ class View:
             )
         if self.trail != 0:
             self._trail = Trail(self.trail)
+        if self.top_view:
+            self._top_view = TopView()
         _format_text(self.text, 0, 0.0)
 
     @property
@@ -140,6 +147,9 @@ class View:
                 config = self._cam_config(sim, k, time[k], pos[k])
                 tile = image[self.tile(k)]
                 tile[:] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
+                if self._top_view is not None:
+                    top_view = self._top_view.draw(sim, k, width // 2, 3 * height // 8, self.rgba)
+                    _draw_top_view(tile, top_view)
                 if self.inset is not None:
                     _draw_inset(tile, self.inset(sim, world))
         except Exception:
@@ -170,6 +180,8 @@ class View:
         )
         if self._trail is not None:
             self._trail.add(time, pos)
+        if self._top_view is not None:
+            self._top_view.paths.add(time, pos)
         return time, pos
 
     def _draw(self, sim: Sim, k: int, time: float) -> None:
@@ -220,6 +232,13 @@ def _draw_inset(tile: NDArray, picture: NDArray | None) -> None:
     picture = np.pad(picture.repeat(scale, axis=0).repeat(scale, axis=1), ((2, 0), (2, 0), (0, 0)))
     height, width = (min(n, limit) for n, limit in zip(picture.shape[:2], tile.shape[:2], strict=True))
     tile[tile.shape[0] - height :, tile.shape[1] - width :] = picture[:height, :width]
+
+
+def _draw_top_view(tile: NDArray, picture: NDArray | None) -> None:
+    """Draw a picture with a border at the bottom left of an image."""
+    if picture is not None:
+        picture = np.pad(picture, ((2, 0), (0, 2), (0, 0)))
+        tile[tile.shape[0] - picture.shape[0] :, : picture.shape[1]] = picture
 
 
 def _frame_points(points: NDArray, fovy: float) -> NDArray:

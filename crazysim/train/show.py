@@ -207,7 +207,8 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     """Film one episode of a policy in several worlds side by side, and return the number of frames.
 
     The first depth image among the observations of the first drone, or else the first segmentation that shows its
-    target, is drawn into each world: near pixels, or pixels of the target, are bright.
+    target, is drawn into each world: near pixels, or pixels of the target, are bright. Then worlds with obstacles also
+    have a map from above.
 
     Args:
         env: Environment to fly in.
@@ -270,6 +271,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         cam_config=camera,
         follow=camera.pop("follow", None),
         inset=draw_image,
+        top_view=bool(depths + masks),
         hold=None if "distance" in camera else points_in_view,
         lag=0.6,
     )

@@ -203,6 +203,63 @@ def test_an_inset_is_drawn_enlarged_at_the_bottom_right_of_each_world(sim):
     np.testing.assert_array_equal(shown, plain)
 
 
+def test_a_top_view_shows_obstacles_paths_and_headings_of_each_world(opengl, plain_scene):
+    """The posts are 6.2 m wide together. With the margins of 1 m, a pixel of the map, 80 x 45, is 8.2 / 80 m."""
+    sim = Sim(n_worlds=2, control="state", xml_path=plain_scene)
+    start = [[-3, 0.9, 0.5], [3, -0.9, 0.5], [0, 0, -100]]
+    posts = sim.scene.add("box", "post", count=3, pos=start, size=(0.2, 0.6, 1.0))
+    sim.scene.add("box", "marker", pos=[0, 0.8, 0.02], size=(0.4, 0.4, 0.04))
+    options = {"worlds": [0, 1], "width": 2 * WIDTH, "border": 0}
+    shown, plain, scale = view(**options, top_view=True, rgba=RED), view(**options), 8.2 / 80
+    north = jnp.broadcast_to(jnp.array([0, 0, 0.5**0.5, 0.5**0.5], jnp.float32), (2, 1, 4))
+    for k, x in enumerate(np.linspace(-2, 1, 7)):
+        place(sim, [[x, 0.0, 1], [x, 0.4, 1]], 0.1 * k)
+        sim.data = sim.data.replace(states=sim.data.states.replace(quat=north))
+        if k == 6:  # in the second world, after maps without it
+            sim.data = posts[2].set_pose(sim.data, pos=[-1.5, -0.9, 0.5], mask=[False, True])
+        picture = shown.render(sim)
+    without = plain.render(sim)
+    y, x = scale * (22.5 - np.arange(45)[:, None] - 0.5), scale * (np.arange(80) - 40 + 0.5)
+    for k, places in enumerate([[(-3, 0.9), (3, -0.9)], [(-3, 0.9), (3, -0.9), (-1.5, -0.9)]]):
+        path_y, tile = 0.4 * k, picture[shown.tile(k)].copy()
+        chart = tile[-45:, :80].copy()
+        assert not tile[-47:-45, :82].any()
+        assert not tile[-47:, 80:82].any()
+        tile[-47:, :82] = without[shown.tile(k)][-47:, :82]
+        np.testing.assert_array_equal(tile, without[shown.tile(k)], err_msg="beside the map")
+        gaps = [np.maximum(abs(x - post_x) - 0.1, abs(y - post_y) - 0.3) for post_x, post_y in places]
+        gap = np.min(gaps, axis=0)  # to the posts, m
+        on_path = (abs(y - path_y) < 0.15) & (x > -2.2) & (x < 1) | (np.hypot(x - 1, y - path_y) < 0.8)
+        is_clear = ~on_path & (abs(gap) > 0.6 * scale)
+        np.testing.assert_array_equal((chart.max(-1) < 150)[is_clear], (gap < 0)[is_clear])
+        rows, columns = np.nonzero(has_colour(chart, RED))
+        np.testing.assert_allclose(y[np.median(rows).astype(int), 0], path_y, atol=0.1)
+        np.testing.assert_allclose([x[columns.min()], x[columns.max()]], [-2, 1.2], atol=0.2)
+        ahead, behind = (chart[(abs(y - path_y - y_nose) < 0.1) & (abs(x - 1) < 0.1)] for y_nose in (0.5, -0.5))
+        assert (ahead < 100).any(), "a line points ahead"
+        assert not (behind < 100).any()
+    sim.close()
+
+
+def test_a_top_view_of_a_large_area_moves_along_with_the_first_drone(opengl, plain_scene):
+    """Of 60 m it shows 24 m around the drone, but nothing beyond the ends; a scene without obstacles has no map."""
+    sim = Sim(control="state", xml_path=plain_scene)
+    shown, plain = view(top_view=True, rgba=RED), view()
+    np.testing.assert_array_equal(shown.render(sim), plain.render(sim))
+    sim.scene.add("cylinder", "post", count=3, pos=[[0, 0, 0], [30, 0, 0], [60, 0, 0]], radius=0.5, height=2.0)
+    for at, drone, post in [(1, 2.5, 1.5), (25, 12.0, 17.0), (55, 17.5, 22.5)]:  # m from the left edge
+        sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.array([[[at, 3.0, 1.0]]])))
+        chart = shown.render(sim)[-45:, :80]
+        spots = np.nonzero(has_colour(chart, RED))[1].mean(), np.nonzero(chart[23:].max(-1) < 150)[1].mean()
+        np.testing.assert_allclose((np.array(spots) + 0.5) * 24 / 80, [drone, post], atol=0.3)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.array([[[1e30, 3.0, 1.0]]])))
+    chart = shown.render(sim)[-45:, :80]
+    assert not has_colour(chart, RED).any()
+    assert (chart.max(-1) < 150).any()
+    assert view(top_view=True, width=3, height=2).render(sim).shape == (2, 3, 3)
+    sim.close()
+
+
 def test_a_camera_may_move_with_time(sim):
     """Its settings may be a function of time: here the camera goes east by 0.1 m/s, and the drone west."""
     moving = view(

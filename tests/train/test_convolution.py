@@ -176,6 +176,24 @@ def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
     np.testing.assert_allclose(frame[np.ix_(rows, columns)], expected, atol=40)
 
 
+@pytest.mark.parametrize("options", [{}, {"depth_image": (5, 4)}])
+def test_a_film_has_maps_from_above_if_policies_observe_images(tmp_path, monkeypatch, meta, options):
+    class StoppedError(Exception):
+        """Raised instead of filming."""
+
+    views = []
+
+    def open_film(path, view, **_):
+        views.append(view)
+        raise StoppedError
+
+    monkeypatch.setattr("crazysim.train.show.Film", open_film)
+    env = make("hover", 1, engine="interpret", **options)
+    with pytest.raises(StoppedError):
+        film(env, make_policy(meta, memory=0, channels=(2,)), tmp_path / "film.gif", worlds=1)
+    assert views[0].top_view == bool(options)
+
+
 def train_quietly(folder, iterations=2, **options):
     """Train hover with images, a tiny convolution and a privileged critic."""
     config = SHORT | {"iterations": iterations, "memory": 3, "critic": "privileged"}
