@@ -32,7 +32,7 @@ from crazysim.control import TrackingLQR
 from crazysim.core import functional as F
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import supported_drones
-from crazysim.envs.actions import hover_rotors
+from crazysim.envs.actions import hover_rotor_states
 from crazysim.errors import ConfigError
 from crazysim.trajectories import figure_eight
 
@@ -151,7 +151,7 @@ def fly_airframes(
     start_setpoint, rng = path.evaluate(jnp.float32(0)), np.random.default_rng(0)
 
     pos, vel, quat, ang_vel = (np.array(x) for x in (s.pos, s.vel, s.quat, s.ang_vel))
-    rotor_vel = np.array(np.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
+    rotor_vel = np.array(np.broadcast_to(hover_rotor_states(params), s.rotor_vel.shape))
     pos[:], rotor_vel[TAKE_OFF_WORLD] = [0, 0, 1], 0
     pos[TAKE_OFF_WORLD, :, 2], pos[INVERTED_WORLD:, :, 2] = 0, START_HEIGHT
     pos[TRACKING_WORLD], vel[TRACKING_WORLD] = start_setpoint.pos, start_setpoint.vel
@@ -201,7 +201,7 @@ def step_responses(name: str, airframes: list[Airframe], level: str, device: str
     s, params = sim.data.states, sim.data.params
     start_pos = jnp.broadcast_to(jnp.array([0, 0, START_HEIGHT], s.pos.dtype), s.pos.shape)
     sim.data = sim.data.replace(
-        states=s.replace(pos=start_pos, rotor_vel=jnp.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
+        states=s.replace(pos=start_pos, rotor_vel=jnp.broadcast_to(hover_rotor_states(params), s.rotor_vel.shape))
     )
     command = np.zeros((len(steps), len(airframes), 4), np.float32)
     command[..., 3] = [9.81 * airframe.value("rigid_body.mass") for airframe in airframes]

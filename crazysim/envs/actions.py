@@ -87,8 +87,8 @@ def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: f
 
     Args:
         airframe: Airframe of all drones, or of each, for the limits of the rotors.
-        params: Parameters, for the hover command. If they differ between drones of one airframe, the first
-            drone's are used.
+        params: Parameters, for the hover command. If they differ between drones of one airframe, those of the
+            first drone are used.
         control: Command level.
         tilt: Largest roll and pitch of the attitude level, rad.
     """
@@ -132,6 +132,6 @@ def hover_thrust(params: SimParams) -> Array:
     return (weight - params.acc_coef) / params.cmd_f_coef if isinstance(params, fitted.Params) else weight
 
 
-def hover_rotors(params: SimParams) -> Array:
+def hover_rotor_states(params: SimParams) -> Array:
     """Return ``states.rotor_vel`` in hover: rpm, or the thrust, N, in fitted models. (..., n_rotors) or (..., 1)"""
     return hover_thrust(params) if isinstance(params, fitted.Params) else first_principles.hover_rotor_vel(params)

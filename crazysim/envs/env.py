@@ -26,7 +26,7 @@ from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.phases import Phases, select_states, vectorize_over_worlds
 from crazysim.envs.reset_policy import ResetPolicy
-from crazysim.envs.state import NAME, OUTPUTS, EnvState, state_of_data, validate_action, validate_goals
+from crazysim.envs.state import ENV_RECORD_NAME, RESULT_FIELDS, EnvState, state_of_data, validate_action, validate_goals
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
 from crazysim.errors import ConfigError
@@ -116,13 +116,12 @@ class Env(ABC):
 
         Args:
             key: Random key, as ``jax.random.key`` makes, (), or keys of blocks of worlds of equal size, (n_blocks,).
-                A block has the same episodes as an environment of its size with its key.
+                The episodes of a block are those of an environment with as many worlds, reset with the block's key.
 
         Raises:
             ConfigError: If the number of keys does not divide the number of worlds, or if the task begins in a state
-                that is not finite. A compiled reset, such as
-                ``jax.jit(env.reset)``, cannot raise: the episode of such a world ends at its first step, with
-                ``info["nonfinite"]``.
+                that is not finite. A compiled reset, such as ``jax.jit(env.reset)``, cannot raise: the episode of such
+                a world ends at its first step, with ``info["nonfinite"]``.
         """
         key = put_on_device(key, self.sim.device) if self.sim.mesh is None else key
         with use_device_of(key):
@@ -186,8 +185,8 @@ class Env(ABC):
     def flatten(self, state: EnvState) -> FlatData:
         """Return the state as flat data for ``advance``, which is faster in a loop than ``step``."""
         self._check_reset_mode(state)
-        record = leaf_indices(state.full_data).plugins[NAME]
-        outputs = jax.tree.leaves([getattr(record, name) for name in OUTPUTS])
+        record = leaf_indices(state.full_data).plugins[ENV_RECORD_NAME]
+        outputs = jax.tree.leaves([getattr(record, name) for name in RESULT_FIELDS])
         return self.step_fn.flatten(state.full_data, (), self.n_substeps, frozenset(outputs))
 
     def advance(self, flat: FlatData, action: Array) -> FlatData:
@@ -197,7 +196,7 @@ class Env(ABC):
             flat: Result of ``flatten`` or ``advance``.
             action: Action of every drone, with the dtype of the state's action; not checked. (n_worlds, n_drones, k)
         """
-        flat = flat.replace([flat.plan.leaf_indices.plugins[NAME].next_action], [action])
+        flat = flat.replace([flat.plan.leaf_indices.plugins[ENV_RECORD_NAME].next_action], [action])
         return self.step_fn.advance(flat, self.n_substeps)
 
     def _check_reset_mode(self, state: EnvState) -> None:
@@ -322,8 +321,10 @@ class DroneEnv(Env):
                 f"seconds={1 / freq:g} or more."
             )
         sim.plugins.check()
-        if NAME in sim.plugins:
-            raise ConfigError(f"expected no plugin of the name {NAME!r}, which is the name of the environment's record")
+        if ENV_RECORD_NAME in sim.plugins:
+            raise ConfigError(
+                f"expected no plugin of the name {ENV_RECORD_NAME!r}, which is the name of the environment's record"
+            )
         self.physics = sim.build_step_fn().without_stages(sim.plugins.reset_stages)  # every episode begins with a reset
         """The step of the physics."""
         self.episode_reset = EpisodeReset(sim)

@@ -26,19 +26,21 @@ class EpisodeReset:
     def __init__(self, sim: Sim):
         self._default = default = deduplicate(sim.default_data)
         first_stage, *other_stages = sim.reset_pipeline.items()
-        names = [name for name, fn in other_stages if not isinstance(fn, Stage)]
-        names += [] if first_stage[1] is reset else [first_stage[0]]
+        batched_stages = [name for name, fn in other_stages if not isinstance(fn, Stage)]
+        batched_stages += [] if first_stage[1] is reset else [first_stage[0]]
         self.has_foreign_record = "batched" in jax.tree.leaves(scopes(sim.default_data))
         """True if a record in ``data.plugins`` is of another library. Such a record is not divided among worlds."""
-        self.takes_all_worlds = bool(names) or self.has_foreign_record
+        self.takes_all_worlds = bool(batched_stages) or self.has_foreign_record
         """True if ``reset_data`` takes all worlds at once."""
         self.batched_reason: str | None = None
         """Reason why resets are computed in all worlds and then selected; None if each world is reset on its own."""
         rows = zip(*map(jax.tree.leaves, (scopes(default), default, leaf_indices(default))), strict=True)
         world_id = leaf_indices(default).core.world_id
-        if names:
-            self.batched_reason = f"{', '.join(map(repr, names))} of the reset pipeline takes all worlds at once"
-        elif any(n_batch_axes(kind) == 2 and x.shape[0] > 1 and i != world_id for kind, x, i in rows):
+        if batched_stages:
+            self.batched_reason = (
+                f"{', '.join(map(repr, batched_stages))} of the reset pipeline takes all worlds at once"
+            )
+        elif any(n_batch_axes(scope) == 2 and x.shape[0] > 1 and i != world_id for scope, x, i in rows):
             self.batched_reason = "episodes begin from different data in different worlds"
         movable = () if sim.data.objects is None else sim.data.objects.names
         keep_objects = len(moving_plugins(sim.plugins.values(), movable)) == len(movable)

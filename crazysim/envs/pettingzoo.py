@@ -93,8 +93,8 @@ class DroneParallelEnv(ParallelEnv):
         seed = as_seed(seed)
         if seed is not None:
             self._generator, _ = gymnasium.utils.seeding.np_random(seed)
-        number = seed if seed is not None else int(self._generator.integers(2**31))
-        self.env_state = self._reset(jax.random.key(number))
+        key_seed = seed if seed is not None else int(self._generator.integers(2**31))
+        self.env_state = self._reset(jax.random.key(key_seed))
         self.agents = list(self.possible_agents)
         obs, info = jax.device_get((self.env_state.obs, self.env_state.info))
         return self._split_by_agent(obs), self._split_by_agent(info)

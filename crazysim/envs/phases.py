@@ -26,7 +26,7 @@ from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.random import episode_key
 from crazysim.envs.reset_policy import ResetPolicy
-from crazysim.envs.state import NAME, EnvState, Obs
+from crazysim.envs.state import ENV_RECORD_NAME, EnvState, Obs
 from crazysim.envs.task import Task, sum_terms
 from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, select_worlds
@@ -69,12 +69,12 @@ class Phases:
     """``measure_states(data)``: the data that the task observes, of one world, or of all if it is batched; None for the
     true states."""
 
-    def stages(self, physics: Sequence[Stage], batched: str | None) -> list[Stage]:
+    def stages(self, physics: Sequence[Stage], batched_reason: str | None) -> list[Stage]:
         """Return the stages of an environment step.
 
         Args:
             physics: Stages of a physics step.
-            batched: Reason why all phases need all worlds at once; None if each runs in one world.
+            batched_reason: Reason why all phases need all worlds at once; None if each runs in one world.
         """
 
         def make_stage(
@@ -93,14 +93,14 @@ class Phases:
             )
 
         def must_reset(data: SimData) -> Array:
-            return data.plugins[NAME].must_reset
+            return data.plugins[ENV_RECORD_NAME].must_reset
 
         # The flag is set first, so that the task can read it and a new episode clears it.
         stages = [
-            make_stage("act", self._act, "before", batched),
+            make_stage("act", self._act, "before", batched_reason),
             *physics,
-            make_stage("flag nonfinite", _flag_nonfinite, "after", batched),
-            make_stage("observe", self._observe, "after", batched),
+            make_stage("flag nonfinite", _flag_nonfinite, "after", batched_reason),
+            make_stage("observe", self._observe, "after", batched_reason),
         ]
         if self.reset_policy is not None:
             stages.append(
@@ -108,7 +108,7 @@ class Phases:
                     "reset episode",
                     self._reset_episode,
                     "after",
-                    batched or self.episode_reset.batched_reason,
+                    batched_reason or self.episode_reset.batched_reason,
                     must_reset,
                 )
             )
@@ -123,10 +123,10 @@ class Phases:
         return any(type(wrapper).look is not Hooks.look for wrapper in self.wrappers)
 
     def _look(self, data: SimData) -> SimData:
-        before, state = EnvState(data), self.look(EnvState(data))
+        state_before, state = EnvState(data), self.look(EnvState(data))
         if "final_obs" in state.info:
-            over = before.done[:, None, None]
-            images = {name: jnp.where(over, before.obs[name], x) for name, x in state.record.images.items()}
+            is_over = state_before.done[:, None, None]
+            images = {name: jnp.where(is_over, state_before.obs[name], x) for name, x in state.record.images.items()}
             state = state.replace(info=state.info | {"final_obs": state.info["final_obs"] | images})
         return _restore_types(data, state)
 
@@ -162,7 +162,10 @@ class Phases:
         new_state = self.reset_episode(final_state, default, vectorize)
         new_state = new_state if self.reset_policy is None else self.reset_policy.after_reset(final_state, new_state)
         return _restore_types(
-            data, select_states(data.plugins[NAME].must_reset[:, 0], new_state, final_state) if batched else new_state
+            data,
+            select_states(data.plugins[ENV_RECORD_NAME].must_reset[:, 0], new_state, final_state)
+            if batched
+            else new_state,
         )
 
     def step_without_physics(self, state: EnvState) -> EnvState:
@@ -205,7 +208,7 @@ class Phases:
             reward = jnp.asarray(sum_terms(task.rewards(data, action, last_action)), action.dtype)
             return self._observe_task(data), reward, task.terminated(data), _step_info(task, data)
 
-        def conclude(state: EnvState, action: Array, results: Any) -> EnvState:
+        def fill_results(state: EnvState, action: Array, results: Any) -> EnvState:
             obs, reward, terminated, info = results
             nonfinite = state.data.core.nonfinite
             return state.replace(
@@ -218,7 +221,7 @@ class Phases:
             )
 
         results = vectorize(evaluate, task.batched)(state.data, action, state.action)
-        state = vectorize(conclude, False)(state, action, results)
+        state = vectorize(fill_results, False)(state, action, results)
         for wrapper in self.wrappers:
             state = vectorize(wrapper.after_step, wrapper.batched)(state)
         return state
@@ -241,12 +244,12 @@ class Phases:
 
         def fill_state(state: EnvState, obs: Obs, info: dict[str, Array]) -> EnvState:
             dtype = state.data.states.pos.dtype
-            is_done = jnp.zeros((), bool)
+            false = jnp.zeros((), bool)
             return state.replace(
                 obs=obs,
                 reward=jnp.zeros(shape[:1], dtype),
-                terminated=is_done,
-                truncated=is_done,
+                terminated=false,
+                truncated=false,
                 action=jnp.zeros(shape, dtype),
                 info=state.info | {"nonfinite": state.data.core.nonfinite} | info,
             )

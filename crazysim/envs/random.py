@@ -66,8 +66,8 @@ def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
         (*shape)
     """
     words = jax.random.key_data(key).astype(jnp.uint32)
-    count = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
-    x = uniform_at(words, count, jnp.zeros(()).dtype)
+    indices = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
+    x = uniform_at(words, indices, jnp.zeros(()).dtype)
     return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
 
 

@@ -23,9 +23,9 @@ from crazysim.errors import ConfigError
 from crazysim.storage import make_private, untrusted_reason
 
 GUIDE = "docs/guides/tasks.md"
-_CLASSES: dict[str, type[Task]] = {}
+_CLASSES_BY_REFERENCE: dict[str, type[Task]] = {}
 """Classes for which this process has made references, by reference."""
-_NAMED: set[str] = set()
+_NAMED_REFERENCES: set[str] = set()
 """References that were named in this process."""
 
 
@@ -56,7 +56,7 @@ def reference_of(task: type[Task]) -> str:
     in_package = "." in task.__module__
     location = str(Path(file).resolve()) if file is not None and is_in_file and not in_package else task.__module__
     reference = f"{location}:{name}"
-    _CLASSES[reference] = task
+    _CLASSES_BY_REFERENCE[reference] = task
     if is_in_file:
         _add_to_list(reference)
     return reference
@@ -76,8 +76,8 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
         ConfigError: If there is no such file, module or task.
     """
     reference = absolute_reference(reference)
-    if reference in _CLASSES:
-        return _CLASSES[reference]
+    if reference in _CLASSES_BY_REFERENCE:
+        return _CLASSES_BY_REFERENCE[reference]
     location, name = split_reference(reference)
     module = _import_file(Path(location)) if location.endswith(".py") else _import_module(location)
     classes = {k: x for k, x in vars(module).items() if _is_task(x) and x.__module__ == module.__name__}
@@ -90,7 +90,7 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
             f"expected the name of a task in {location}, got {name!r}; it defines {defined}. Write {location}:NAME "
             f"with a subclass of Task, or a name that the file registers; {GUIDE} has an example."
         )
-    _NAMED.add(reference)
+    _NAMED_REFERENCES.add(reference)
     _add_to_list(reference)
     return task_class if _is_task(task_class) else name  # type: ignore[return-value]
 
@@ -102,7 +102,7 @@ def load_listed_task(reference: str, names: Container[str]) -> type[Task] | str:
         ConfigError: If this user has not named it before, if others could have changed its file, or as ``load_task``.
     """
     location, name = split_reference(reference)
-    if reference in _CLASSES or reference in _NAMED:
+    if reference in _CLASSES_BY_REFERENCE or reference in _NAMED_REFERENCES:
         return load_task(reference, names)
     remedy = (
         f"Read the code of the task, and name it yourself: --task FILE.py:{name or 'NAME'} in a command, or "

@@ -121,8 +121,8 @@ def make(
         camera: Camera or lidar whose images the drones observe in addition, or several; see ``CameraImages``. None for
             the camera of the task, which few tasks have, and whose images are named ``"depth"`` and so on by output;
             ``()`` for no images.
-        depth_image: Width and height in pixels of depth images that the drones observe as ``"depth"``, short for a
-            ``Camera`` that takes one in every step, which takes the place of the task's. None for no such images.
+        depth_image: Width and height in pixels of depth images that the drones observe as ``"depth"``: short for a
+            ``Camera`` that takes an image in every step and replaces the camera of the task. None for no such images.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
     """
@@ -160,11 +160,11 @@ def make(
         sim.add(plugin)
     env = DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
     if camera is not None:
-        for source in [camera] if isinstance(camera, ImageSensor) else check_plugin_list("camera", camera):
-            env = CameraImages(env, source)  # type: ignore[arg-type]  # checked there
+        for image_sensor in [camera] if isinstance(camera, ImageSensor) else check_plugin_list("camera", camera):
+            env = CameraImages(env, image_sensor)  # type: ignore[arg-type]  # checked there
     if depth_image is None:
-        own_camera = task.policy_camera() if camera is None else None
-        return env if own_camera is None else CameraImages(env, own_camera, {x: x for x in own_camera.outputs})
+        task_camera = task.policy_camera() if camera is None else None
+        return env if task_camera is None else CameraImages(env, task_camera, {x: x for x in task_camera.outputs})
     if not isinstance(depth_image, (tuple, list)) or len(depth_image) != 2:
         raise ConfigError(
             f"expected depth_image as width and height in pixels, got {short_repr(depth_image)}. Try (16, 12)."
@@ -198,14 +198,14 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
     return entry.id
 
 
-def entry_of(task: str | Task, named: bool = True) -> Entry:
+def entry_of(task: str | Task, is_named: bool = True) -> Entry:
     """Return the registered entry of a task, or one with the usual command level for a custom class.
 
     Args:
         task: One of ``TASKS``, a name from the entry points of an installed package, the reference of your class, or
             a task.
-        named: True if this user has named the task; False for a reference from the files of a run, which may come from
-            other people, see ``crazysim.envs.references``.
+        is_named: True if this user has named the task; False for a reference from the files of a run, which may
+            come from other people, see ``crazysim.envs.references``.
 
     Raises:
         ConfigError: If there is no such file, module or class, or it may not be executed.
@@ -218,7 +218,7 @@ def entry_of(task: str | Task, named: bool = True) -> Entry:
     if task in TASKS:
         return TASKS[task]
     if is_reference(task):
-        loaded = load_task(task, TASKS) if named else load_listed_task(task, TASKS)
+        loaded = load_task(task, TASKS) if is_named else load_listed_task(task, TASKS)
         return TASKS[loaded] if isinstance(loaded, str) else Entry(_check_class(loaded), "")
     plugins = importlib.metadata.entry_points(group=ENTRY_POINTS)
     if task in plugins.names:

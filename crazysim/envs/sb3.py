@@ -61,7 +61,7 @@ class DroneVecEnv(VecEnv):
         self._reset_fn, self._step_fn = jax.jit(self._reset_state), jax.jit(self._step_state)
         self._generator, _ = gymnasium.utils.seeding.np_random()
         self._actions: np.ndarray | None = None
-        self._started = time.time()
+        self._start_time = time.time()
         self.state: EnvState | None = None
         _, obs = self._reset_fn.eval_shape(jax.random.key(0))  # ``reset`` reuses this trace
         spaces: dict[str, gymnasium.Space] = {
@@ -77,14 +77,14 @@ class DroneVecEnv(VecEnv):
     def reset(self) -> Any:
         """Start new episodes in all worlds, with the last seed passed to ``seed`` if it has not been used yet."""
         seed = as_seed(self._seeds[0])
-        number = seed if seed is not None else int(self._generator.integers(2**31))
+        key_seed = seed if seed is not None else int(self._generator.integers(2**31))
         if seed is not None:
             self._generator, _ = gymnasium.utils.seeding.np_random(seed)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        self._actions, self._started = None, time.time()
-        self.state, obs = self._reset_fn(jax.random.key(number))
+        self._actions, self._start_time = None, time.time()
+        self.state, obs = self._reset_fn(jax.random.key(key_seed))
         return self._to_numpy(jax.device_get(obs))
 
     def step_async(self, actions: ArrayLike) -> None:
@@ -99,17 +99,17 @@ class DroneVecEnv(VecEnv):
             raise ConfigError("expected actions before step_wait(), got none. Call step(actions).")
         self.state, arrays = self._step_fn(self.state, self._actions)
         self._actions = None
-        obs, final, reward, done, results = jax.device_get(arrays)
+        obs, final_obs, reward, done, results = jax.device_get(arrays)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for world in np.flatnonzero(done):
-            last = {name: x[world] for name, x in final.items()}
+            world_final_obs = {name: x[world] for name, x in final_obs.items()}
             infos[world] = {
-                "terminal_observation": self._to_numpy(last),
+                "terminal_observation": self._to_numpy(world_final_obs),
                 "TimeLimit.truncated": bool(results["out_of_time"][world]),
                 "episode": {
                     "r": float(results["return"][world]),
                     "l": int(results["length"][world]),
-                    "t": round(time.time() - self._started, 6),
+                    "t": round(time.time() - self._start_time, 6),
                 },
                 "error": float(results["error"][world]),
                 "nonfinite": bool(results["nonfinite"][world]),

@@ -7,7 +7,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.envs.actions import hover_rotors
+from crazysim.envs.actions import hover_rotor_states
 
 
 def flying(
@@ -30,7 +30,7 @@ def flying(
         quat=jnp.broadcast_to(level if quat is None else quat, s.quat.shape),
         vel=jnp.broadcast_to(vel, s.vel.shape),
         ang_vel=ang_vel,
-        rotor_vel=jnp.broadcast_to(hover_rotors(data.params), s.rotor_vel.shape),
+        rotor_vel=jnp.broadcast_to(hover_rotor_states(data.params), s.rotor_vel.shape),
     )
     # Otherwise the angular velocity would jump for the derivative terms of the controllers at their first tick.
     for level_name in ("attitude", "body_rate"):

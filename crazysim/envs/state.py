@@ -16,7 +16,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 from crazysim.tables import read_numbers
 
-NAME = "environment"
+ENV_RECORD_NAME = "environment"
 """Key of the environment's record in the plugins of its data."""
 
 PRIVILEGED = "privileged"
@@ -53,7 +53,7 @@ class EnvRecord(PyTree):
     """True where a new episode begins within the step. (n_worlds, 1)"""
 
 
-OUTPUTS = ("obs", "images", "reward", "terminated", "truncated", "drone_info", "world_info")
+RESULT_FIELDS = ("obs", "images", "reward", "terminated", "truncated", "drone_info", "world_info")
 """Fields of the record that are results of a step."""
 
 
@@ -71,12 +71,12 @@ class EnvState(PyTree):
     @property
     def record(self) -> EnvRecord:
         """The environment's record."""
-        return self.full_data.plugins[NAME]
+        return self.full_data.plugins[ENV_RECORD_NAME]
 
     @property
     def data(self) -> SimData:
         """The simulation, without the environment's record."""
-        return self.full_data.replace(plugins={k: x for k, x in self.full_data.plugins.items() if k != NAME})
+        return self.full_data.replace(plugins={k: x for k, x in self.full_data.plugins.items() if k != ENV_RECORD_NAME})
 
     @property
     def obs(self) -> Obs:
@@ -117,7 +117,7 @@ class EnvState(PyTree):
     @property
     def memory(self) -> dict[str, Any]:
         """State of the wrappers, by name of the wrapper. (n_worlds, ...) each; records declare their own axes"""
-        return _map_undeclared(self._squeeze_axis, self.record.memory)
+        return _map_outside_records(self._squeeze_axis, self.record.memory)
 
     @property
     def final_obs(self) -> Obs:
@@ -131,21 +131,21 @@ class EnvState(PyTree):
     def replace(self, **changes: Any) -> EnvState:
         """Return the state with new values of some properties."""
         full_data = changes.pop("full_data", self.full_data)
-        record = full_data.plugins[NAME]
+        record = full_data.plugins[ENV_RECORD_NAME]
         if "data" in changes:
             full_data = changes.pop("data")
         if "info" in changes:
             changes |= self._split_info(changes.pop("info"))
         if "obs" in changes:
-            changes["obs"] = self._without_images(changes["obs"])
+            changes["obs"] = self._drop_images(changes["obs"])
         if "memory" in changes:
-            changes["memory"] = _map_undeclared(self._add_axis, changes["memory"])
+            changes["memory"] = _map_outside_records(self._add_axis, changes["memory"])
         for name in {"terminated", "truncated", "must_reset"} & changes.keys():
             changes[name] = self._add_axis(changes[name])
         record = record.replace(**changes) if changes else record
-        return EnvState(full_data.replace(plugins=full_data.plugins | {NAME: record}))
+        return EnvState(full_data.replace(plugins=full_data.plugins | {ENV_RECORD_NAME: record}))
 
-    def _without_images(self, obs: Obs) -> Obs:
+    def _drop_images(self, obs: Obs) -> Obs:
         """Return observations without the images among them, which must be unchanged."""
         images = self.record.images
         if changed := [name for name, image in images.items() if name in obs and obs[name] is not image]:
@@ -188,7 +188,7 @@ def _reshape(x: Any, shape: tuple[int, ...]) -> Any:
     return jax.ShapeDtypeStruct(shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else jnp.reshape(x, shape)
 
 
-def _map_undeclared(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
+def _map_outside_records(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
     """Return the memory with a function applied to its arrays outside of records."""
 
     def is_record(x: object) -> bool:
@@ -201,7 +201,7 @@ def state_of_data(data: SimData) -> EnvState:
     """Return a state with an empty record, from which an episode begins."""
     no_array: Any = None
     record = EnvRecord({}, {}, no_array, no_array, no_array, no_array, {}, {}, {}, no_array, no_array)
-    return EnvState(data.replace(plugins=data.plugins | {NAME: record}))
+    return EnvState(data.replace(plugins=data.plugins | {ENV_RECORD_NAME: record}))
 
 
 def flatten(obs: Obs) -> Array:

@@ -17,7 +17,7 @@ from crazysim.cache import keep_programs
 from crazysim.core.sharding import WORLD_AXIS
 from crazysim.engine.step import FlatData
 from crazysim.envs.env import Env
-from crazysim.envs.state import NAME, OUTPUTS, EnvState
+from crazysim.envs.state import ENV_RECORD_NAME, RESULT_FIELDS, EnvState
 from crazysim.envs.task_check import require_finite_start
 from crazysim.errors import ConfigError
 from crazysim.pytree import replace_leaves
@@ -83,9 +83,9 @@ class EnvStepper:
     def _compile(self, flat: FlatData) -> None:
         """Compile the step. Its carry omits results that the next step does not read."""
         plan, env = flat.plan, self._env
-        record, n = plan.leaf_indices.plugins[NAME], len(flat.leaves)
+        record, n = plan.leaf_indices.plugins[ENV_RECORD_NAME], len(flat.leaves)
         flags = [record.terminated, record.truncated]
-        outputs = set(jax.tree.leaves([getattr(record, name) for name in OUTPUTS]))
+        outputs = set(jax.tree.leaves([getattr(record, name) for name in RESULT_FIELDS]))
         self._carried_indices = carried_indices = [
             i for i in plan.written_leaves if i not in outputs - set(plan.inputs) and i not in flags
         ]

@@ -19,7 +19,7 @@ from crazysim.sim.sim import Sim
 
 MAX_SECONDS = 1e5
 """Longest episode, s. A 32-bit counter of its physics steps does not overflow at up to 10,000 Hz."""
-NAME = "task"
+TASK_RECORD_NAME = "task"
 """Name of a task's record in ``data.plugins``."""
 
 
@@ -66,7 +66,7 @@ class Task:
             record: The record, for ``data.plugins["task"]``.
             placements: Stages with their positions, such as ``StagePlacement(stage, before="increment_steps")``.
         """
-        sim.add(FunctionPlugin(NAME, record, placements))
+        sim.add(FunctionPlugin(TASK_RECORD_NAME, record, placements))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return the data at the start of an episode, goals included.
@@ -91,7 +91,7 @@ class Task:
         )
 
     def before_step(self, data: SimData) -> SimData:
-        """Return the data before an environment step. Store here the initial values of rewards that are differences."""
+        """Return the data before an environment step. Store quantities here whose change is rewarded."""
         return data
 
     def observe(self, data: SimData) -> Obs:
@@ -99,7 +99,7 @@ class Task:
         raise NotImplementedError(self._undefined("observe(data)"))
 
     def privileged(self, data: SimData) -> Obs:
-        """Return what only a critic may see in training, besides the true state. (n_drones, k) each"""
+        """Return further observations for a critic, which policies must not use. (n_drones, k) each"""
         del data
         return {}
 

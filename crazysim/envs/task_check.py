@@ -15,13 +15,13 @@ from crazysim.core.data import SimData
 from crazysim.core.settings import check_settings
 from crazysim.core.sharding import fetch_arrays
 from crazysim.envs.state import EnvState
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.errors import ConfigError
 from crazysim.pytree import n_world_axes, scopes
 from crazysim.sim.sim import Sim
 
 GUIDE = "docs/guides/tasks.md"
-REQUIRED = ("spawn", "observe", "rewards", "terminated", "error")
+REQUIRED_METHODS = ("spawn", "observe", "rewards", "terminated", "error")
 """Methods that every task defines."""
 
 
@@ -30,7 +30,7 @@ def require_installed(sim: Sim, task: object) -> None:
     if not isinstance(task, Task):
         raise ConfigError(f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
     check_settings(task)
-    if task.Record is not None and not isinstance(sim.data.plugins.get(NAME), task.Record):
+    if task.Record is not None and not isinstance(sim.data.plugins.get(TASK_RECORD_NAME), task.Record):
         raise ConfigError(
             f"expected a simulation in which task {task.name!r} is installed, got one without its record. Call "
             f"task.install(sim) first, or use crazysim.envs.make."
@@ -50,23 +50,23 @@ def require_finite_start(task: Task, state: EnvState) -> None:
             )
 
 
-def check_record(state: EnvState, after: EnvState) -> None:
+def check_record(state: EnvState, stepped: EnvState) -> None:
     """Check that a step keeps observations, info and memory as they were at the start of an episode.
 
     Args:
         state: State at the start of an episode.
-        after: Shapes and types of the state after a step.
+        stepped: Shapes and types of the state after a step.
     """
-    kinds, n_drones = jax.tree.leaves(scopes(state.record)), state.full_data.core.n_drones
-    before, stepped_leaves = (dict(tree_leaves_with_path(x.record)) for x in (state, after))
-    for (path, x), kind in zip(before.items(), kinds, strict=True):
+    leaf_scopes, n_drones = jax.tree.leaves(scopes(state.record)), state.full_data.core.n_drones
+    before, stepped_leaves = (dict(tree_leaves_with_path(x.record)) for x in (state, stepped))
+    for (path, x), scope in zip(before.items(), leaf_scopes, strict=True):
         name = keystr(path).lstrip(".")
-        if kind in ("batched", "opaque"):
+        if scope in ("batched", "opaque"):
             raise ConfigError(
-                f"expected {name} to be declared for drones, worlds or as shared, got a field that is {kind!r}. "
+                f"expected {name} to be declared for drones, worlds or as shared, got a field that is {scope!r}. "
                 f'Declare it with leaf("drone"), leaf("world") or leaf("shared").'
             )
-        if kind == "drone" and x.shape[1:2] != (n_drones,):
+        if scope == "drone" and x.shape[1:2] != (n_drones,):
             raise ConfigError(
                 f"expected {name} of shape (n_drones, ...) in one world, with {n_drones} drones, got {x.shape[1:]}. "
                 f"Return one row for every drone."
@@ -78,10 +78,10 @@ def check_record(state: EnvState, after: EnvState) -> None:
                 f"{'none' if y is None else _describe(y)}. Tasks and wrappers must always return the "
                 f"same names and shapes."
             )
-    if added := [keystr(path).lstrip(".") for path in stepped_leaves if path not in before]:
+    if added_names := [keystr(path).lstrip(".") for path in stepped_leaves if path not in before]:
         raise ConfigError(
-            f"expected a step to return the entries that exist at the start of an episode, got {', '.join(added)} as "
-            f"well. Set it in after_reset, too."
+            f"expected a step to return the entries that exist at the start of an episode, got "
+            f"{', '.join(added_names)} as well. Set it in after_reset, too."
         )
 
 
@@ -96,10 +96,10 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         action_size: Length of the action of one drone.
     """
     title = f"task {task.name or type(task).__name__!r}"
-    undefined = [name for name in REQUIRED if getattr(type(task), name) is getattr(Task, name)]
+    undefined = [name for name in REQUIRED_METHODS if getattr(type(task), name) is getattr(Task, name)]
     if undefined:
         raise ConfigError(
-            f"{title}: expected class {type(task).__name__} to define {', '.join(REQUIRED)}, got no "
+            f"{title}: expected class {type(task).__name__} to define {', '.join(REQUIRED_METHODS)}, got no "
             f"{', '.join(undefined)}. {GUIDE} describes each method."
         )
     n_worlds, n_drones = data.states.pos.shape[:2]

@@ -12,9 +12,9 @@ from jax import Array
 from crazysim import rotation
 from crazysim.errors import ConfigError
 
-CELL = (1.0, 1.2)
+CELL_SIZE = (1.0, 1.2)
 """Size of the cells that a random course spreads its gates over, along x and y, m."""
-MARGIN = (0.5, 0.3)
+CELL_MARGIN = (0.5, 0.3)
 """Distance of the cells from the limits of the arena along x and y, m."""
 CELL_JITTER = 0.05
 """Largest component of a gate's offset from the middle of its cell, m."""
@@ -59,19 +59,19 @@ class Track:
     @property
     def grid(self) -> tuple[int, int]:
         """Numbers of cells of a random course along x and y."""
-        free_size = (np.asarray(self.high) - np.asarray(self.low))[:2] - 2 * np.array(MARGIN)
-        n_x, n_y = np.floor(free_size / CELL + 1e-6).astype(int)
+        free_size = (np.asarray(self.high) - np.asarray(self.low))[:2] - 2 * np.array(CELL_MARGIN)
+        n_x, n_y = np.floor(free_size / CELL_SIZE + 1e-6).astype(int)
         return int(n_x), int(n_y)
 
 
-def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
+def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> Track:
     """Check that a track can be flown from its starts, and return it.
 
     Args:
         track: The track.
         n_drones: Drones in a world.
         jitter: Largest sum of the horizontal displacements of a drone and of a gate or obstacle, m.
-        random: True if gates and obstacles are placed at random.
+        is_random: True if gates and obstacles are placed at random.
     """
     shapes = {"gates_pos": (-1, 3), "gates_rpy": (len(track.gates_pos), 3), "obstacles_pos": (-1, 3)}
     for name, shape in (shapes | {"start": (3,), "low": (3,), "high": (3,)}).items():
@@ -83,13 +83,13 @@ def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Tra
     low, high = np.asarray(track.low, float), np.asarray(track.high, float)
     if np.any(high <= low):
         raise ConfigError(f"expected upper limits of the arena above the lower ones, got {high} and {low}")
-    if random:
+    if is_random:
         n_x, n_y = track.grid
         if n_x * n_y < track.n_gates + 1 or (n_x + 1) * (n_y + 1) < track.n_obstacles:
             raise ConfigError(
                 f"expected an arena with room for a random course of {track.n_gates} gates and {track.n_obstacles} "
-                f"obstacles, got {n_x} x {n_y} cells of {CELL[0]} x {CELL[1]} m; start and gates take one each. Set "
-                f"wider limits with Track(low=..., high=...), or use fewer."
+                f"obstacles, got {n_x} x {n_y} cells of {CELL_SIZE[0]} x {CELL_SIZE[1]} m; start and gates take one "
+                f"each. Set wider limits with Track(low=..., high=...), or use fewer."
             )
         if n_drones > 8:
             raise ConfigError(f"expected at most 8 drones on a random course, got {n_drones}. Use level 0, 1 or 2.")
@@ -148,7 +148,7 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
         x, np.cumsum([n_x * n_y, (n_x + 1) * (n_y + 1), 2 * n]), axis=-1
     )
     middle = (np.asarray(track.low)[:2] + np.asarray(track.high)[:2]) / 2
-    size = np.array(CELL)
+    size = np.array(CELL_SIZE)
     origin = middle - size * (np.array([n_x, n_y]) - 1) / 2
 
     cell = ranks(cell_numbers, n + 1)

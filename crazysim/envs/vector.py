@@ -98,9 +98,9 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         if mask is not None:
             state = self._restart_fn(state_before, mask)
         else:
-            number = seed if seed is not None else int(self.np_random.integers(2**31))
+            key_seed = seed if seed is not None else int(self.np_random.integers(2**31))
             with announce_if_slow("compiling the environment", "2 to 4 s"):
-                state = self._reset_fn(jax.random.key(number))
+                state = self._reset_fn(jax.random.key(key_seed))
         self._stepper.state, self._outputs = state, self._output(state)
         obs, _, info = self._outputs
         return self._convert((obs, self._add_final_info(info)))

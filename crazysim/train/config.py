@@ -256,7 +256,7 @@ class TrainConfig:
         Raises:
             ConfigError: As ``make_env``; if a device does not exist, or if the worlds cannot be distributed evenly.
         """
-        entry_of(self.task, named=False)
+        entry_of(self.task, is_named=False)
         n_worlds = n_seeds * self.n_worlds
         devices = {} if self.devices is None else device_options(self.options["device"], self.devices, n_worlds)
         return make(self.task, n_worlds, **self.practice_options() | self.options | devices)
@@ -271,7 +271,7 @@ class TrainConfig:
         Raises:
             ConfigError: If the task is in a file that this user has not named before; see ``load_policy``.
         """
-        entry_of(self.task, named=False)
+        entry_of(self.task, is_named=False)
         return make(self.task, self.n_worlds if n_worlds is None else n_worlds, **defaults | self.options)
 
     def with_device(self, device: str | None) -> TrainConfig:

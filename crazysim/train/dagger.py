@@ -145,7 +145,7 @@ def wrap_with_teacher(env: Env, config: Config) -> TeacherObservation:
     if not config.teacher:
         raise ConfigError("expected the folder of a teacher, got none. Use --teacher out/hover, for example.")
     _, teacher_config, _ = load_policy(config.teacher)
-    entry = entry_of(teacher_config.task, named=False)
+    entry = entry_of(teacher_config.task, is_named=False)
     task = entry.task(**{name: x for name, x in teacher_config.options.items() if name in entry.options})
     teacher_record, student_record = type(task).Record, type(env.task).Record
     if teacher_record is not None and not (student_record is not None and issubclass(student_record, teacher_record)):

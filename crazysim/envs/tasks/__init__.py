@@ -1,1 +1,1 @@
-"""The tasks: each a function that furnishes a simulation and returns what is to be done in it."""
+"""Built-in tasks, a class each, and the parts that they share."""

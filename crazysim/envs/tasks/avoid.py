@@ -17,7 +17,7 @@ from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import install_rules, nearest_drones, nearest_entries, state_of, with_record
 from crazysim.envs.tracks import ranks
 from crazysim.errors import ConfigError
@@ -25,10 +25,10 @@ from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
-CELL, CELL_JITTER = 0.8, 0.15
+CELL_WIDTH, CELL_JITTER = 0.8, 0.15
 """Width of the cells that hold at most one obstacle each, and largest component of the offset of an obstacle from the
 middle of its cell, m: a drone fits between a pole and whatever is next to it."""
-FIELD_LENGTH = 4
+N_CELLS_ALONG = 4
 """Number of cells from the starts to the goals."""
 FIELD_GAP = 0.6
 """Distance of starts and goals from the field, m."""
@@ -36,7 +36,7 @@ POLE_RADIUS, BOX_WIDTH = 0.05, 0.3
 """Radius of a pole, and width of a box, m."""
 HEIGHT = 2.0
 """Height of poles and ceiling, m."""
-JITTER = 0.15
+START_JITTER = 0.15
 """Largest component of the offset of starts and goals from their mean positions, m."""
 CRUISE_SPEED = 2.0
 """Speed above which flying faster costs reward, m/s. Actions tilt a drone by at most 45 degrees, so that it brakes
@@ -111,12 +111,14 @@ class Avoid(Task):
     def field(self, n_drones: int) -> Field:
         """Return the dimensions of the field: a third of the cells stay free, and all drones fit next to each other."""
         n = self.n_poles + self.n_boxes
-        n_cells_across = max(4, -(-3 * n // (2 * FIELD_LENGTH)), -(-int(10 * SPACING * n_drones) // int(10 * CELL)))
-        size = CELL * np.array([FIELD_LENGTH, n_cells_across])
-        arena_half_size = np.array([size[0] / 2 + FIELD_GAP + JITTER + 0.5, size[1] / 2 + 0.5])
+        n_cells_across = max(
+            4, -(-3 * n // (2 * N_CELLS_ALONG)), -(-int(10 * SPACING * n_drones) // int(10 * CELL_WIDTH))
+        )
+        size = CELL_WIDTH * np.array([N_CELLS_ALONG, n_cells_across])
+        arena_half_size = np.array([size[0] / 2 + FIELD_GAP + START_JITTER + 0.5, size[1] / 2 + 0.5])
         row = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
         goals = np.stack(
-            [np.full(n_drones, size[0] / 2 + FIELD_GAP + JITTER), row, np.full(n_drones, HEIGHT / 2)], axis=-1
+            [np.full(n_drones, size[0] / 2 + FIELD_GAP + START_JITTER), row, np.full(n_drones, HEIGHT / 2)], axis=-1
         )
         return Field(n_cells_across, size, arena_half_size, goals)
 
@@ -151,11 +153,13 @@ class Avoid(Task):
         """Return drones in flight before the field, and obstacles in different cells."""
         n, n_drones, dtype = self.n_poles + self.n_boxes, data.core.n_drones, data.states.pos.dtype
         field = self.field(n_drones)
-        x = draw(key, cells=FIELD_LENGTH * field.n_cells_across, obstacles=(n, 4), drones=(n_drones, 12))
+        x = draw(key, cells=N_CELLS_ALONG * field.n_cells_across, obstacles=(n, 4), drones=(n_drones, 12))
         cell, shift = ranks(x["cells"], n), 2 * x["obstacles"] - 1
-        corner = jnp.asarray((CELL - field.size) / 2, dtype)
+        corner = jnp.asarray((CELL_WIDTH - field.size) / 2, dtype)
         cell_pos = (
-            corner + CELL * jnp.stack([cell % FIELD_LENGTH, cell // FIELD_LENGTH], axis=-1) + CELL_JITTER * shift[:, :2]
+            corner
+            + CELL_WIDTH * jnp.stack([cell % N_CELLS_ALONG, cell // N_CELLS_ALONG], axis=-1)
+            + CELL_JITTER * shift[:, :2]
         )
         height = (np.arange(n) >= self.n_poles) * jnp.asarray(HEIGHT / 2 + (HEIGHT / 2 - BOX_WIDTH) * shift[:, 2])
         angle = jnp.pi * shift[:, 3:] / 2
@@ -167,9 +171,9 @@ class Avoid(Task):
             data, first_row = handle.set_pose(data, pos[rows], quat[rows]), rows.stop
         offset, goal_shift, rpy, vel = jnp.split(2 * x["drones"] - 1, 4, axis=-1)
         goals = field.goals.astype(dtype)
-        start = goals * np.array([-1, 1, 1], dtype) + JITTER * offset
+        start = goals * np.array([-1, 1, 1], dtype) + START_JITTER * offset
         data = flying(data, start, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
-        return with_record(data, record.replace(goal=goals + JITTER * goal_shift))
+        return with_record(data, record.replace(goal=goals + START_JITTER * goal_shift))
 
     def before_step(self, data: SimData) -> SimData:
         record = crossing_of(data)
@@ -263,4 +267,4 @@ class Avoid(Task):
 
 def crossing_of(data: SimData) -> Crossing:
     """Return the task's record."""
-    return data.plugins[NAME]
+    return data.plugins[TASK_RECORD_NAME]

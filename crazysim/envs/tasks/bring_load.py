@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import with_record
 from crazysim.plugins.payloads import load_pos, load_vel
 from crazysim.pytree import PyTree, device_array, leaf
@@ -27,7 +27,7 @@ class Delivery(PyTree):
     """Goal of the load, world frame, m. (n_worlds, n_drones, 3)"""
     remaining_way_before: Array = leaf("drone", 0)
     """Result of ``remaining_way`` at the beginning of this environment step, m. (n_worlds, n_drones)"""
-    steps_there: Array = leaf("drone", 0)
+    steps_at_goal: Array = leaf("drone", 0)
     """Number of physics steps for which the load has been at its goal without a break. (n_worlds, n_drones)"""
     delivered: Array = leaf("drone", 0)
     """True where the load has stayed at its goal for ``hold`` seconds. (n_worlds, n_drones)"""
@@ -64,9 +64,9 @@ class BringLoad(Task):
         """
         record = delivery_of(data)
         crashed = record.crashed | crashed
-        steps = jnp.where(self.at_goal(data) & ~crashed, record.steps_there + 1, 0)
+        steps = jnp.where(self.at_goal(data) & ~crashed, record.steps_at_goal + 1, 0)
         delivered = record.delivered | (steps >= round(self.hold * data.core.freq))
-        return record.replace(crashed=crashed, steps_there=steps, delivered=delivered)
+        return record.replace(crashed=crashed, steps_at_goal=steps, delivered=delivered)
 
     def before_step(self, data: SimData) -> SimData:
         return with_record(data, delivery_of(data).replace(remaining_way_before=self.remaining_way(data)))
@@ -99,7 +99,7 @@ class BringLoad(Task):
 
 def delivery_of(data: SimData) -> Any:
     """Return the task's ``Delivery``, or the subclass of it that the task uses."""
-    return data.plugins[NAME]
+    return data.plugins[TASK_RECORD_NAME]
 
 
 def initial_outcome(data: SimData) -> dict[str, Array]:
@@ -110,7 +110,7 @@ def initial_outcome(data: SimData) -> dict[str, Array]:
     return {
         "goal": device_array(np.zeros(pos.shape), pos.dtype),
         "remaining_way_before": device_array(np.zeros(shape), pos.dtype),
-        "steps_there": device_array(np.zeros(shape), np.int32),
+        "steps_at_goal": device_array(np.zeros(shape), np.int32),
         "delivered": false,
         "crashed": false,
     }

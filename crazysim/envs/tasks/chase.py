@@ -29,11 +29,11 @@ SPACING = 6.0
 """Distance between the initial positions of the cars of several drones, m; a drone observes its own car only."""
 MAX_DISTANCE, CEILING = 3.0, 2.5
 """Largest horizontal distance of a drone from the roof of its car, and largest height of a drone, m."""
-MIN_SPEED_SHARE = 0.3
-"""Smallest speed of a car, as a share of the largest."""
+MIN_SPEED_FRACTION = 0.3
+"""Smallest speed of a car, as a fraction of the largest."""
 MAX_STEER = 0.25
 """Largest steering angle of a car, rad: circles of 1.3 m radius."""
-RADIUS = 0.12
+TOUCH_DOWN_RADIUS = 0.12
 """Largest horizontal distance of a drone from the middle of the roof at touch-down, m."""
 
 
@@ -60,25 +60,28 @@ class Chase(TouchDown):
         cars = Cars(sim.n_drones, vehicle=VEHICLE, pos=SPACING * grid_2d(sim.n_drones), level="speed", name=CARS)
         sim.add(cars)
         contacts = sim.scene.contact_fn([f"{CARS}:{k}" for k in range(sim.n_drones)], drones=False)
-        touch = StagePlacement(self.touch(contacts, RADIUS, "world"), before="increment_steps")
+        touch = StagePlacement(self.touch_down_stage(contacts, TOUCH_DOWN_RADIUS, "world"), before="increment_steps")
         self.add_record(sim, Landing(**initial_outcome(sim.data)), [touch])
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, and drones in flight around them."""
         n, car = data.core.n_drones, data.plugins[CARS]
         x = draw(key, n, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1)
-        speed, steer = self.speed * scale_to(x["speed"], MIN_SPEED_SHARE, 1.0), scale_symmetric(x["steer"], MAX_STEER)
+        speed, steer = (
+            self.speed * scale_to(x["speed"], MIN_SPEED_FRACTION, 1.0),
+            scale_symmetric(x["steer"], MAX_STEER),
+        )
         car = rolling_car(car, scale_symmetric(x["yaw"], np.pi), speed, steer)
         data = data.replace(plugins=data.plugins | {CARS: car})
         pos = car.pos + scale_symmetric(x["start"], np.array([1.0, 1.0, 0.4])) + np.array([0.0, 0.0, 1.1])
         return flying(data, pos, rotation.from_rpy(scale_symmetric(x["rpy"], 0.2)), scale_symmetric(x["vel"], 0.3))
 
-    def target_motion(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+    def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's roof, of one drone or one world. (..., 3) each"""
-        del ahead
+        del steps_ahead
         car: CarData = data.plugins[CARS]
-        top = jnp.asarray(roof(), car.pos.dtype)
-        arm = rotation.rotate(car.quat, jnp.broadcast_to(top, car.pos.shape))
+        roof_pos = jnp.asarray(roof_centre(), car.pos.dtype)
+        arm = rotation.rotate(car.quat, jnp.broadcast_to(roof_pos, car.pos.shape))
         turning = jnp.concatenate([0 * car.yaw_rate, 0 * car.yaw_rate, car.yaw_rate], axis=-1)
         vel = car.vel + rotation.cross(turning, arm)
         return pick_entry(car.pos + arm, data.core.drone_id), pick_entry(vel, data.core.drone_id)
@@ -115,17 +118,17 @@ def rolling_car(car: CarData, yaw: Array, speed: Array, steer: Array) -> CarData
         steer: Steering angle, rad. (n, 1)
     """
     vehicle = load_vehicle(VEHICLE)
-    side = jnp.tan(steer) * (vehicle.number("axles.rear") / vehicle.wheelbase)
+    lateral_ratio = jnp.tan(steer) * (vehicle.number("axles.rear") / vehicle.wheelbase)
     return car.replace(
         yaw=yaw,
-        body_vel=jnp.concatenate([speed, side * speed], axis=-1),
+        body_vel=jnp.concatenate([speed, lateral_ratio * speed], axis=-1),
         yaw_rate=speed * jnp.tan(steer) / vehicle.wheelbase,
         steer=steer,
         command=jnp.concatenate([speed, steer], axis=-1),
     )
 
 
-def roof() -> np.ndarray:
+def roof_centre() -> np.ndarray:
     """Return the middle of the roof in the frame of a car, m. (3,)"""
     vehicle = load_vehicle(VEHICLE)
     length, height = vehicle.number("shape.length"), vehicle.number("shape.height")

@@ -41,8 +41,8 @@ LOAD_SIZE, RING_HEIGHT = (0.08, 0.08, 0.05), 0.07
 HOOK_MASS, HOOK_DAMPING, HOOK_REACH, MAX_HOOK_SPEED = 0.003, 2e-4, 0.07, 0.6
 """Mass of the hook, kg; damping of its joint, N m s; largest distance, m, and speed relative to a ring, m/s, at
 which it picks up a load."""
-MIN_SPEED_SHARE = 0.3
-"""Smallest speed of a car, as a share of the largest."""
+MIN_SPEED_FRACTION = 0.3
+"""Smallest speed of a car, as a fraction of the largest."""
 MAX_STEER = 0.25
 """Largest steering angle of a car, rad: circles of 1.3 m radius."""
 GOAL_BOX = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
@@ -112,7 +112,10 @@ class Deliver(BringLoad):
         """Return cars that drive, loads on their trailers, drones in flight above, and goals."""
         car, load = data.plugins[CARS], data.plugins["load"]
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1, goal=3)
-        speed, steer = self.speed * scale_to(x["speed"], MIN_SPEED_SHARE, 1.0), scale_symmetric(x["steer"], MAX_STEER)
+        speed, steer = (
+            self.speed * scale_to(x["speed"], MIN_SPEED_FRACTION, 1.0),
+            scale_symmetric(x["steer"], MAX_STEER),
+        )
         yaw = scale_symmetric(x["yaw"], np.pi)
         car = car.replace(
             yaw=yaw,
@@ -162,10 +165,10 @@ class Deliver(BringLoad):
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         record, load, way = delivery_of(data), data.plugins["load"], self.remaining_way(data)
         distance = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
-        drift = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
+        relative_speed = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
         return {
             "progress": 5.0 * (record.remaining_way_before - way),
-            "meeting": jnp.where(record.taken, 1.0, 0.1 * jnp.exp(-4 * distance) * (1 + jnp.exp(-2 * drift))),
+            "meeting": jnp.where(record.taken, 1.0, 0.1 * jnp.exp(-4 * distance) * (1 + jnp.exp(-2 * relative_speed))),
             "proximity": 2.0 * record.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),

@@ -16,7 +16,7 @@ from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.chase import CARS, VEHICLE, rolling_car
 from crazysim.envs.tasks.goals import motion_of, with_record
 from crazysim.envs.tasks.target_camera import TargetCamera
@@ -28,14 +28,14 @@ from crazysim.sim.sim import Sim
 
 SPACING = 6.0
 """Distance between the lanes of the cars of several drones, m; a drone follows its own car."""
-BEHIND, ABOVE = 0.8, 0.7
+FOLLOW_DISTANCE, FOLLOW_HEIGHT = 0.8, 0.7
 """Distance of the point to keep behind a car's centre of mass, along its heading, and its height above it, m."""
 MAX_DISTANCE, MIN_HEIGHT = 2.0, 0.25
 """Largest distance of a drone from this point, and smallest height of a drone, which is higher than cars, m."""
 SPEED_RANGE = (0.2, 0.8)
-"""Smallest and largest mean speed of a car, as a share of ``speed``."""
+"""Smallest and largest mean speed of a car, as a fraction of ``speed``."""
 SPEED_AMPLITUDE = 0.2
-"""Amplitude of a car's speed, as a share of ``speed``."""
+"""Amplitude of a car's speed, as a fraction of ``speed``."""
 STEER_RANGE = (0.1, 0.25)
 """Smallest and largest amplitude of a car's steering angle, rad."""
 ANG_FREQS = ((0.5, 1.5), (1.0, 2.0))
@@ -88,8 +88,8 @@ class FollowCar(Task):
         pos = np.stack([np.zeros(sim.n_drones), lanes], axis=-1)
         sim.add(Cars(sim.n_drones, vehicle=VEHICLE, pos=pos, level="speed", name=CARS))
         shape, dtype = (sim.n_worlds, sim.n_drones), sim.data.states.pos.dtype
-        one, two = (device_array(np.zeros((*shape, n)), dtype) for n in (1, 2))
-        self.add_record(sim, Manoeuvre(one, two, two, two))
+        scalars, pairs = (device_array(np.zeros((*shape, n)), dtype) for n in (1, 2))
+        self.add_record(sim, Manoeuvre(scalars, pairs, pairs, pairs))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, and drones in flight behind them."""
@@ -121,15 +121,15 @@ class FollowCar(Task):
     def before_step(self, data: SimData) -> SimData:
         """Return the data with the commands of the cars for this environment step."""
         car = data.plugins[CARS]
-        command = data.plugins[NAME].command(data.core.steps / data.core.freq)
+        command = data.plugins[TASK_RECORD_NAME].command(data.core.steps / data.core.freq)
         return data.replace(plugins=data.plugins | {CARS: car.replace(command=command)})
 
     def target_motion(self, data: SimData) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of the point behind and above each drone's car. (n_drones, 3) each"""
         car: CarData = data.plugins[CARS]
-        arm = jnp.concatenate([jnp.cos(car.yaw), jnp.sin(car.yaw), 0 * car.yaw], axis=-1) * -BEHIND
-        turn = jnp.concatenate([-arm[..., 1:2], arm[..., :1], 0 * car.yaw], axis=-1) * car.yaw_rate
-        return car.pos + arm + np.array([0.0, 0.0, ABOVE], car.pos.dtype), car.vel + turn
+        arm = jnp.concatenate([jnp.cos(car.yaw), jnp.sin(car.yaw), 0 * car.yaw], axis=-1) * -FOLLOW_DISTANCE
+        turning_vel = jnp.concatenate([-arm[..., 1:2], arm[..., :1], 0 * car.yaw], axis=-1) * car.yaw_rate
+        return car.pos + arm + np.array([0.0, 0.0, FOLLOW_HEIGHT], car.pos.dtype), car.vel + turning_vel
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return attitude, velocities and height of the drone."""

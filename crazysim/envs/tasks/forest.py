@@ -19,7 +19,7 @@ from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import install_rules, motion_of, nearest_entries, on_floor, to_heading, with_record
 from crazysim.plugins.scenery.forest import Forest as Trees
 from crazysim.plugins.sensors.camera import Camera
@@ -32,17 +32,18 @@ HEIGHT = 1.5
 """Height of starts and goals, m."""
 TREE_HEIGHT = 5.0
 """Height of the trees, m."""
-EDGE = 2.0
+EDGE_DISTANCE = 2.0
 """Distance from the starts to the first trees, and from the goals beyond the goal line, m."""
-GAP = 0.6
+MIN_TREE_GAP = 0.6
 """Smallest distance between trees, m: see ``crazysim.plugins.scenery.Forest``."""
-JITTER = np.array([0.3, 1.0, 0.3])
+START_JITTER = np.array([0.3, 1.0, 0.3])
 """Largest components of the offset of starts and goals from their places, m."""
 SPACING = 1.5
 """Distance between the starts, and between the goals, of several drones, m: with the offsets they do not touch."""
 CHECK_FREQ = 100
-"""Rate at which drones are checked for contact, Hz. At 8 m/s a drone flies 8 cm between two checks, so a ball of the
-drone's 7 cm around a tree of 10 cm is missed where it enters by less than 0.08^2 / (8 * 0.17) = 5 mm."""
+"""Rate at which drones are checked for contact, Hz. At 8 m/s a drone flies 8 cm between two checks. A contact of
+its collision sphere, 7 cm in radius, with a tree of 10 cm radius can be missed if they overlap by less than
+0.08^2 / (8 * 0.17) = 5 mm."""
 VIEW_RANGE = 8.0
 """Distance beyond which trees do not matter, m."""
 PRIVILEGED_TREES = 4
@@ -88,7 +89,7 @@ class Forest(Task):
     radii: ArrayLike = setting(default=(0.1, 0.3), positive=True, shapes=((2,),))
     """Smallest and largest radius of the trees, m. (2,)"""
     difficulty: ArrayLike = setting(default=1.0, low=0.0, high=1.0, shapes=((), (2,)))
-    """Share of the trees that stand, or its range, lowest and highest, from which each episode draws. () or (2,)"""
+    """Fraction of the trees that stand, or its range, lowest and highest, from which each episode draws. () or (2,)"""
     trees_seen: int = setting(default=0, low=0, high=12)
     """Number of nearest trees among the observations; zero for policies that see them in images."""
     seconds: float = 12.0
@@ -111,9 +112,9 @@ class Forest(Task):
             density=self.density,
             radii=self.radii,
             size=size + [0.0, cell],  # columns are shifted by up to half a cell
-            center=(EDGE + size[0] / 2, 0.0),
+            center=(EDGE_DISTANCE + size[0] / 2, 0.0),
             height=TREE_HEIGHT,
-            gap=GAP,
+            gap=MIN_TREE_GAP,
             difficulty=self.difficulty,
             name="trees",
         )
@@ -122,7 +123,7 @@ class Forest(Task):
         trees, half_width = self.trees(sim.n_drones), self.half_width(sim.n_drones)
         sim.add(trees)
         shape, dtype = (sim.n_worlds, sim.n_drones), sim.data.states.pos.dtype
-        zero, no = device_array(np.zeros((*shape, 3)), dtype), device_array(np.zeros(shape), bool)
+        zero, false = device_array(np.zeros((*shape, 3)), dtype), device_array(np.zeros(shape), bool)
         radius = max(float(airframe.value("shape.collision_sphere")[3]) for airframe in sim.airframes)
         period = max(sim.freq // CHECK_FREQ, 1)
 
@@ -130,13 +131,13 @@ class Forest(Task):
         def update_record(data: SimData) -> SimData:
             """Disable a drone that touches something or leaves the corridor, and record where it reaches its goal."""
             record, pos = passage_of(data), data.states.pos
-            has_left = (jnp.abs(pos[1]) > half_width) | (pos[2] > CEILING) | (pos[0] < -EDGE) | on_floor(data)
-            hit = trees.clearance(data, pos) < radius
-            disabled = record.disabled | (~record.reached & (has_left | hit))
+            has_left = (jnp.abs(pos[1]) > half_width) | (pos[2] > CEILING) | (pos[0] < -EDGE_DISTANCE) | on_floor(data)
+            touches_tree = trees.clearance(data, pos) < radius
+            disabled = record.disabled | (~record.reached & (has_left | touches_tree))
             reached = record.reached | (~disabled & (pos[0] >= self.length))
             return with_record(data, record.replace(disabled=disabled, reached=reached))
 
-        install_rules(sim, Passage(zero, no, no, no), update_record, collisions=True)
+        install_rules(sim, Passage(zero, false, false, false), update_record, collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight before another forest."""
@@ -145,11 +146,11 @@ class Forest(Task):
         start, goal, rpy, vel = (2 * x[name] - 1 for name in ("start", "goal", "rpy", "vel"))
         row = np.zeros((n_drones, 3))
         row[:, 1], row[:, 2] = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2), HEIGHT
-        jitter = np.array([JITTER[0], JITTER[1] if n_drones == 1 else 0.2, JITTER[2]])
+        jitter = np.array([START_JITTER[0], START_JITTER[1] if n_drones == 1 else 0.2, START_JITTER[2]])
         data = self.trees(n_drones).sample_layout(data, jax.random.fold_in(key, 1))
         start_pos = (row + jitter * start).astype(dtype)
         data = flying(data, start_pos, rotation.from_rpy(0.1 * rpy), 0.3 * vel)
-        goal = (row + jitter * goal + np.array([self.length + EDGE, 0.0, 0.0])).astype(dtype)
+        goal = (row + jitter * goal + np.array([self.length + EDGE_DISTANCE, 0.0, 0.0])).astype(dtype)
         return with_record(data, passage_of(data).replace(goal=goal))
 
     def before_step(self, data: SimData) -> SimData:
@@ -179,12 +180,12 @@ class Forest(Task):
         gap = jnp.where(trees.is_standing, jnp.minimum(distance - trees.size, VIEW_RANGE), VIEW_RANGE)
         way = offset * (gap / jnp.maximum(distance, 1e-3))[..., None]
         ahead, left = rotation.heading(data.states.quat)
-        along = [jnp.sum(way * axis[:, None, :2], axis=-1) for axis in (ahead, left)]
-        entries = jnp.stack([*along, trees.size], axis=-1)
+        components = [jnp.sum(way * axis[:, None, :2], axis=-1) for axis in (ahead, left)]
+        entries = jnp.stack([*components, trees.size], axis=-1)
         return nearest_entries(gap, entries, n)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return velocity, attitude, angular velocity, height and the way to the goal, and the nearest trees if asked.
+        """Return attitude, velocities, height, the way to the goal, and the nearest ``trees_seen`` trees.
 
         Horizontal vectors are in the frame of the heading: ahead, left, up.
         """
@@ -208,7 +209,7 @@ class Forest(Task):
         approach = jnp.sum(s.vel * offset, axis=-1) / jnp.maximum(rotation.safe_norm(offset)[..., 0], 1e-3)
         speed = rotation.safe_norm(s.vel)[..., 0]
         gap = self.trees(data.core.n_drones).clearance(data, s.pos)
-        paid = {
+        reward_terms = {
             "progress": 0.13 * jnp.minimum(approach / self.speed, 1.0) - 0.03,
             "haste": -0.1 * jnp.maximum(speed - self.speed, 0),
             "closeness": -0.3 * jnp.exp(-5 * gap),
@@ -219,7 +220,7 @@ class Forest(Task):
             "reached": 10.0 * record.reached,
             "disabled": -10.0 * record.disabled,
         }
-        return terms.only_where(~record.flight_over_before, paid)
+        return terms.only_where(~record.flight_over_before, reward_terms)
 
     def terminated(self, data: SimData) -> Array:
         return jnp.all(passage_of(data).flight_over)
@@ -247,4 +248,4 @@ class Forest(Task):
 
 def passage_of(data: SimData) -> Passage:
     """Return the task's record."""
-    return data.plugins[NAME]
+    return data.plugins[TASK_RECORD_NAME]

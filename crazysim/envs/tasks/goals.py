@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import FunctionPlugin, StagePlacement
 from crazysim.core.stage import Stage, stage
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
@@ -71,12 +71,12 @@ def install_goal(sim: Sim) -> None:
     """Give every drone a goal, ``data.plugins["task"]``, at the origin and at rest."""
     pos = sim.data.states.pos
     zero = device_array(np.zeros(pos.shape), pos.dtype)
-    sim.add(FunctionPlugin(NAME, Goal(zero, zero)))
+    sim.add(FunctionPlugin(TASK_RECORD_NAME, Goal(zero, zero)))
 
 
 def goal_of(data: SimData) -> Goal:
     """Return the goals."""
-    return data.plugins[NAME]
+    return data.plugins[TASK_RECORD_NAME]
 
 
 def with_goal(data: SimData, pos: ArrayLike, vel: ArrayLike = 0.0) -> SimData:
@@ -87,7 +87,7 @@ def with_goal(data: SimData, pos: ArrayLike, vel: ArrayLike = 0.0) -> SimData:
 
 def with_record(data: SimData, record: PyTree) -> SimData:
     """Return the data with a new record of the task."""
-    return data.replace(plugins=data.plugins | {NAME: record})
+    return data.replace(plugins=data.plugins | {TASK_RECORD_NAME: record})
 
 
 def state_of(data: SimData) -> dict[str, Array]:
@@ -187,8 +187,10 @@ def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = Fal
     """
     placements = [StagePlacement(rules, before="increment_steps")]
     if collisions and sim.n_drones > 1:
-        placements.insert(0, StagePlacement(collision_stage(sim), before="increment_steps", name=f"{NAME}_collisions"))
-    sim.add(FunctionPlugin(NAME, record, placements))
+        placements.insert(
+            0, StagePlacement(collision_stage(sim), before="increment_steps", name=f"{TASK_RECORD_NAME}_collisions")
+        )
+    sim.add(FunctionPlugin(TASK_RECORD_NAME, record, placements))
 
 
 def collision_stage(sim: Sim) -> Stage:
@@ -201,7 +203,7 @@ def collision_stage(sim: Sim) -> Stage:
 
     @stage("world")
     def collide(data: SimData) -> SimData:
-        record, s = data.plugins[NAME], data.states
+        record, s = data.plugins[TASK_RECORD_NAME], data.states
         flight_over = record.flight_over
         # For this query only, drones whose flight is over are moved far away from each other and from all others.
         far_pos = 1000.0 * (1 + np.arange(len(flight_over)))[:, None] * np.array([0.0, 0.0, 1.0])

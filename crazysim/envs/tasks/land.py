@@ -17,7 +17,7 @@ from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME
+from crazysim.envs.task import TASK_RECORD_NAME
 from crazysim.envs.tasks.goals import pick_entry, with_record
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, initial_outcome, landing_of
 from crazysim.pytree import device_array, leaf, static
@@ -88,9 +88,9 @@ class Land(TouchDown):
 
         zero = device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)
         record = PadLanding(circle=zero, ang_vel=zero, phase=zero, pads=pads, **initial_outcome(sim.data))
-        placements = [StagePlacement(self.touch(contacts, self.radius), before="increment_steps")]
+        placements = [StagePlacement(self.touch_down_stage(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:
-            placements.insert(0, StagePlacement(move_pads, before="increment_steps", name=f"{NAME}_pads"))
+            placements.insert(0, StagePlacement(move_pads, before="increment_steps", name=f"{TASK_RECORD_NAME}_pads"))
         self.add_record(sim, record, placements)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
@@ -115,9 +115,9 @@ class Land(TouchDown):
         pos, pad_vel = self.pad_motion(data, data.core.steps)
         return record.pads.set_pose(data, pos, vel=pad_vel) if self.speed > 0 else data
 
-    def target_motion(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+    def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's pad, of one drone or one world. (..., 3) each"""
-        return self.pad_motion(data, data.core.steps + ahead if ahead else data.core.steps)
+        return self.pad_motion(data, data.core.steps + steps_ahead if steps_ahead else data.core.steps)
 
     def has_left_arena(self, data: SimData) -> Array:
         """Return true where a drone has left its part of the arena. (...)"""

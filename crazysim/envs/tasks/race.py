@@ -39,7 +39,7 @@ GATE_JITTER = (0.15, 0.15, 0.1, 0.05, 0.1, 0.2)
 """Largest displacement along x, y and z, m, and largest roll, pitch and yaw, rad, of a gate from level 2 on."""
 OBSTACLE_JITTER = (0.15, 0.15, 0.05)
 """Largest displacement of an obstacle along x, y and z from level 2 on, m."""
-FOOT = np.array([0.0, 0.0, POLE_HEIGHT])
+FOOT_TO_TOP = np.array([0.0, 0.0, POLE_HEIGHT])
 """Vector from the foot of an obstacle to its upper end, m."""
 
 Rewards = Callable[[SimData, Array, Array], dict[str, Array]]
@@ -88,11 +88,11 @@ class Race(Task):
             )
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
         course = check_track(self.track, sim.n_drones, float(jitter), self.level == 3)
-        tallest = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]
+        stand_height = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]
         # All posts have the same length, so that they are computed as one batch; they extend below the floor.
         gates = sim.scene.add("gate", count=course.n_gates, pos=course.gates_pos, quat=self._gates_quat(),
-                              stand=tallest, width=OPENING, height=OPENING)  # fmt: skip
-        obstacles_pos = np.asarray(course.obstacles_pos, float) - FOOT
+                              stand=stand_height, width=OPENING, height=OPENING)  # fmt: skip
+        obstacles_pos = np.asarray(course.obstacles_pos, float) - FOOT_TO_TOP
         obstacles = sim.scene.add("pole", "obstacle", count=course.n_obstacles, pos=obstacles_pos, height=POLE_HEIGHT)
         if self.level >= 1:
             _repeat_per_drone(sim, {"mass": 1, "J": 2, "J_inv": 2})
@@ -213,12 +213,12 @@ class Race(Task):
         if self.level == 3:
             start, pos, quat, poles = random_course(course, x["course"])
         start, pos, quat, poles = (jnp.asarray(v, dtype) for v in (start, pos, quat, poles))
-        gate_x = (2 * x["gates"] - 1) * np.array(GATE_JITTER, dtype)
-        pole_x = (2 * x["obstacles"] - 1) * np.array(OBSTACLE_JITTER, dtype)
+        gate_shift = (2 * x["gates"] - 1) * np.array(GATE_JITTER, dtype)
+        pole_shift = (2 * x["obstacles"] - 1) * np.array(OBSTACLE_JITTER, dtype)
         record = record.replace(nominal_pos=jnp.concatenate([pos, poles]), nominal_quat=quat)
-        gates_quat = rotation.multiply(quat, rotation.from_rpy(gate_x[..., 3:]))
-        data = record.gates.set_pose(data, pos + gate_x[..., :3], gates_quat)
-        data = record.obstacles.set_pose(data, poles + pole_x - FOOT.astype(dtype))
+        gates_quat = rotation.multiply(quat, rotation.from_rpy(gate_shift[..., 3:]))
+        data = record.gates.set_pose(data, pos + gate_shift[..., :3], gates_quat)
+        data = record.obstacles.set_pose(data, poles + pole_shift - FOOT_TO_TOP.astype(dtype))
         return with_record(data, record), start
 
 

@@ -24,7 +24,7 @@ AWAY_COST = 0.03
 HASTE_COST = 0.1
 """Cost of an environment step for each m/s beyond the task's speed. It exceeds the reward for faster progress: without
 it policies at body rates reach the side of a gate faster than they can turn, and end there."""
-PRIVILEGED = ("gate_corners", "obstacles_near")
+PRIVILEGED_NAMES = ("gate_corners", "obstacles_near")
 """Observations of the race that a privileged critic gets, and with ``gates_observed`` the policy."""
 
 
@@ -52,8 +52,8 @@ class RaceByCamera(Race):
         s, last_axis = data.states, pick_entry(axis, jnp.maximum(passed - 1, 0))
         ahead = jnp.where(passed[..., None] > 0, last_axis, gates_pos[0] - s.pos)
         yaw = rotation.safe_arctan2(ahead[..., 1], ahead[..., 0])
-        turn = rotation.from_rpy(rotation.along_z(yaw))
-        return flying(data, s.pos, rotation.multiply(turn, s.quat), s.vel)
+        yaw_quat = rotation.from_rpy(rotation.along_z(yaw))
+        return flying(data, s.pos, rotation.multiply(yaw_quat, s.quat), s.vel)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return attitude, velocity and angular velocity in the body frame, height, and which gate is the next.
@@ -75,7 +75,7 @@ class RaceByCamera(Race):
     def privileged(self, data: SimData) -> dict[str, Array]:
         """Return true vectors to the corners of the next two gates and to the nearest two obstacles, body frame, m."""
         obs = observe(data, np.inf)
-        return {name: obs[name] for name in PRIVILEGED}
+        return {name: obs[name] for name in PRIVILEGED_NAMES}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         s, (gate_pos, _) = data.states, next_gate(data)

@@ -23,8 +23,8 @@ def visited_objects(data: SimData, sensor_range: float) -> tuple[Array, Array]:
     record = race_of(data)
 
     def is_near(pos: Array) -> Array:
-        flat = (pos - data.states.pos[..., None, :])[..., :2]
-        return jnp.sum(flat * flat, axis=-1) < sensor_range**2
+        offset = (pos - data.states.pos[..., None, :])[..., :2]
+        return jnp.sum(offset * offset, axis=-1) < sensor_range**2
 
     return record.gates_visited | is_near(gates_of(data)[0]), record.obstacles_visited | is_near(obstacles_of(data))
 
@@ -50,15 +50,15 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
         poles = jnp.where(seen_obstacles[..., None], poles, nominal_pos[n_gates:])
     matrix = rotation.matrix(s.quat)
 
-    def in_body(world: Array) -> Array:
+    def to_body_frame(world: Array) -> Array:
         return rotation.matvec(jnp.swapaxes(matrix, -1, -2)[..., None, :, :], world)
 
     corners = []
     for k in (0, 1):
-        number = jnp.minimum(record.passed + k, n_gates - 1)
-        pos, quat = pick_entry(gates_pos, number)[..., None, :], pick_entry(gates_quat, number)[..., None, :]
+        index = jnp.minimum(record.passed + k, n_gates - 1)
+        pos, quat = pick_entry(gates_pos, index)[..., None, :], pick_entry(gates_quat, index)[..., None, :]
         gate_corners = pos + rotation.rotate(quat, jnp.asarray(CORNERS, pos.dtype))
-        corners.append(in_body(gate_corners - s.pos[..., None, :]))
+        corners.append(to_body_frame(gate_corners - s.pos[..., None, :]))
     to_poles = (poles - s.pos[..., None, :]) * np.array([1, 1, 0], s.pos.dtype)
     square_distance = jnp.sum(to_poles * to_poles, axis=-1)
     obs = {
@@ -73,10 +73,10 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
         "obstacles_pos": poles,
         "obstacles_visited": seen_obstacles,
         "rot": matrix,
-        "vel_body": in_body(s.vel[..., None, :]),
+        "vel_body": to_body_frame(s.vel[..., None, :]),
         "gate_corners": jnp.concatenate(corners, axis=-2),
-        "obstacles_near": in_body(nearest_entries(square_distance, to_poles, min(2, n_obstacles))),
+        "obstacles_near": to_body_frame(nearest_entries(square_distance, to_poles, min(2, n_obstacles))),
     }
     if n_drones > 1:
-        obs["drones_near"] = in_body(nearest_drones(data, 2, ~record.flight_over)[0])
+        obs["drones_near"] = to_body_frame(nearest_drones(data, 2, ~record.flight_over)[0])
     return {name: x.reshape(n_drones, -1).astype(s.pos.dtype) for name, x in obs.items()}

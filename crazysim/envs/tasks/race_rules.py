@@ -12,7 +12,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.envs import terms
-from crazysim.envs.task import NAME
+from crazysim.envs.task import TASK_RECORD_NAME
 from crazysim.envs.tasks.goals import pick_entry
 from crazysim.pytree import PyTree, leaf, static
 from crazysim.scene.objects import Handle
@@ -23,9 +23,9 @@ POLE_HEIGHT = 1.7
 """Length of an obstacle, m; if its upper end is lower than that, the rest is below the floor."""
 BYPASS_DISTANCE = 0.45
 """Distance from the middle of a gate at which a detour passes its frame, m."""
-FUNNEL = 0.15
-"""Radius around a gate's axis within which the way to the gate has no detour, m, at the gate itself; it grows by 1 m
-per metre before the gate."""
+FUNNEL_RADIUS = 0.15
+"""Radius of the funnel before a gate, in the gate's plane, m; it grows by 1 m per metre of distance from the plane.
+Within the funnel, the way to the gate has no detour."""
 
 
 class RaceRecord(PyTree):
@@ -69,7 +69,7 @@ class RaceRecord(PyTree):
 
 def race_of(data: SimData) -> RaceRecord:
     """Return the race's record."""
-    return data.plugins[NAME]
+    return data.plugins[TASK_RECORD_NAME]
 
 
 def gates_of(data: SimData) -> tuple[Array, Array]:
@@ -89,8 +89,8 @@ def obstacles_of(data: SimData) -> Array:
 def next_gate(data: SimData) -> tuple[Array, Array]:
     """Return position and attitude of each drone's next gate, the last one where it has finished. (..., 3), (..., 4)"""
     pos, quat = gates_of(data)
-    number = jnp.minimum(race_of(data).passed, pos.shape[-2] - 1)
-    return pick_entry(pos, number), pick_entry(quat, number)
+    index = jnp.minimum(race_of(data).passed, pos.shape[-2] - 1)
+    return pick_entry(pos, index), pick_entry(quat, index)
 
 
 def passes_gate(data: SimData) -> Array:
@@ -135,8 +135,8 @@ def way_to_gate(pos: Array) -> Array:
     bypass = BYPASS_DISTANCE * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1]], pos.dtype)
     bypass_distance = rotation.safe_norm(pos[..., None, :] - bypass)[..., 0]
     axis_distance = rotation.safe_norm(pos[..., 1:])[..., 0]
-    detour = jnp.maximum(axis_distance - (FUNNEL - pos[..., 0]), 0)
-    way_around = 2 * BYPASS_DISTANCE - FUNNEL + jnp.min(bypass_distance, axis=-1)
+    detour = jnp.maximum(axis_distance - (FUNNEL_RADIUS - pos[..., 0]), 0)
+    way_around = 2 * BYPASS_DISTANCE - FUNNEL_RADIUS + jnp.min(bypass_distance, axis=-1)
     return jnp.where(pos[..., 0] > 0, way_around, rotation.safe_norm(pos)[..., 0] + detour)
 
 

@@ -18,7 +18,7 @@ from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import install_rules, nearest_drones, on_floor, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf
@@ -55,10 +55,10 @@ class Swarm(Task):
     """Change places on a circle, or form a formation, at a distance from each other.
 
     The drones start on a circle that is turned at random. Without a formation, all of them must move by the same random
-    number of places along the circle. No drone may enter the ellipsoid around
-    another, with half axes of 0.24 m horizontally and 0.6 m vertically because of the downwash; that is checked at
-    every physics step. An episode ends when a drone enters one, if ``strict``, when it touches the floor, or
-    when it leaves the arena, whose limits are 1.5 m beyond the circle and the formation.
+    number of places along the circle. No drone may enter the ellipsoid around another, with half axes of 0.24 m
+    horizontally and 0.6 m vertically because of the downwash; that is checked at every physics step. An episode ends
+    when a drone enters one, if ``strict``, when it touches the floor, or when it leaves the arena, whose limits are
+    1.5 m beyond the circle and the formation.
     """
 
     name = "swarm"
@@ -179,7 +179,7 @@ class Swarm(Task):
 
 def swarm_of(data: SimData) -> SwarmRecord:
     """Return the task's record."""
-    return data.plugins[NAME]
+    return data.plugins[TASK_RECORD_NAME]
 
 
 def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndarray:

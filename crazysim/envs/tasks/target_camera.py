@@ -39,13 +39,13 @@ class TargetCamera(Camera):
                 f"expected target of {self.name!r} as the name of objects, one per drone, got {self.target!r} without "
                 f"an object {missing[0]!r}. Use sim.scene.add(..., name={self.target!r}, count=sim.n_drones)."
             )
-        index = np.array([names.index(name) for name in targets], np.int32)[:, None, None]
+        target_indices = np.array([names.index(name) for name in targets], np.int32)[:, None, None]
 
         def take_images(data: SimData) -> Images:
             images = take_all_bodies(data)
             if "segmentation" not in images:
                 return images
-            is_target = images["segmentation"] == index
+            is_target = images["segmentation"] == target_indices
             return images | {"segmentation": is_target.astype(np.int32)}
 
         return take_images

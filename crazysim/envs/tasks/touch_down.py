@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.stage import Stage, stage
 from crazysim.envs import terms
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import state_of, with_record
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.contact_report import ContactFn
@@ -60,13 +60,13 @@ class TouchDown(Task):
     seconds: float = 6.0
     """Length of an episode, s."""
 
-    def target_motion(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+    def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's place, of one drone or one world. (..., 3) each
 
         Args:
             data: Simulation.
-            ahead: Physics steps by which a place that moves by time is advanced: 1 in a stage after the integration and
-                before ``steps`` increases.
+            steps_ahead: Physics steps to add to ``steps`` for a place whose motion is a function of time: 1 in a stage
+                after the integration and before ``steps`` increases.
         """
         raise NotImplementedError(self._undefined("target_motion(data)"))
 
@@ -74,7 +74,7 @@ class TouchDown(Task):
         """Return true where a drone has left its part of the arena. (...)"""
         raise NotImplementedError(self._undefined("has_left_arena(data)"))
 
-    def touch(self, contacts: ContactFn, radius: float, scope: str = "drone") -> Stage:
+    def touch_down_stage(self, contacts: ContactFn, radius: float, scope: str = "drone") -> Stage:
         """Return the stage that decides at the first contact whether it is a landing; runs before ``steps`` increases.
 
         Args:
@@ -86,15 +86,15 @@ class TouchDown(Task):
         @stage(scope)
         def touch(data: SimData) -> SimData:
             record, s, report = landing_of(data), data.states, contacts(data)
-            pos, vel = self.target_motion(data, ahead=1)
+            pos, vel = self.target_motion(data, steps_ahead=1)
             if report.objects is None or report.floor is None:
                 raise TypeError("expected contacts with objects and floor, got None")
             is_own_target = np.arange(data.core.n_drones, dtype=np.int32) == data.core.drone_id[..., None]
             touches_target = jnp.any(report.objects & is_own_target, axis=-1)
             touches_other = jnp.any(report.objects & ~is_own_target, axis=-1) | report.floor
-            offset, drift = s.pos - pos, s.vel - vel
+            offset, relative_vel = s.pos - pos, s.vel - vel
             is_centred = offset[..., 0] * offset[..., 0] + offset[..., 1] * offset[..., 1] < radius**2
-            is_soft = (rotation.dot(drift, drift)[..., 0] <= MAX_TOUCH_DOWN_SPEED**2) & (
+            is_soft = (rotation.dot(relative_vel, relative_vel)[..., 0] <= MAX_TOUCH_DOWN_SPEED**2) & (
                 rotation.z_axis(s.quat)[..., 2] >= MIN_UP_AXIS_Z
             )
             has_landed = touches_target & (offset[..., 2] > 0) & is_centred & is_soft & ~touches_other
@@ -126,17 +126,17 @@ class TouchDown(Task):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        record, d = landing_of(data), self.error(data)
-        drift = rotation.safe_norm(self.target_motion(data)[1] - data.states.vel)[..., 0]
-        paid = {
-            "progress": self.progress_reward * (record.remaining_way_before - d),
-            "speed": -0.1 * drift * jnp.exp(-4 * d),
+        record, distance = landing_of(data), self.error(data)
+        relative_speed = rotation.safe_norm(self.target_motion(data)[1] - data.states.vel)[..., 0]
+        reward_terms = {
+            "progress": self.progress_reward * (record.remaining_way_before - distance),
+            "speed": -0.1 * relative_speed * jnp.exp(-4 * distance),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "landed": 10.0 * record.landed,
             "crashed": -self.crash_cost * record.crashed,
         }
-        return terms.only_where(~record.flight_over_before, paid)
+        return terms.only_where(~record.flight_over_before, reward_terms)
 
     def terminated(self, data: SimData) -> Array:
         return jnp.all(landing_of(data).flight_over)
@@ -157,11 +157,11 @@ class TouchDown(Task):
 
 def landing_of(data: SimData) -> Any:
     """Return the task's record."""
-    return data.plugins[NAME]
+    return data.plugins[TASK_RECORD_NAME]
 
 
 def initial_outcome(data: SimData) -> dict[str, Array]:
     """Return the fields of ``Landing`` for drones in the air, of all worlds."""
     pos = data.states.pos
-    zero, no = device_array(np.zeros(pos.shape[:2]), pos.dtype), device_array(np.zeros(pos.shape[:2]), bool)
-    return {"landed": no, "crashed": no, "flight_over_before": no, "remaining_way_before": zero}
+    zero, false = device_array(np.zeros(pos.shape[:2]), pos.dtype), device_array(np.zeros(pos.shape[:2]), bool)
+    return {"landed": false, "crashed": false, "flight_over_before": false, "remaining_way_before": zero}

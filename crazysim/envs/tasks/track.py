@@ -18,7 +18,7 @@ from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import on_floor, state_of, with_record
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
@@ -32,7 +32,7 @@ MAX_START_TIME = 20.0
 """Latest time on the trajectory at which an episode starts, s."""
 
 
-class Phase(PyTree):
+class TrajectoryStart(PyTree):
     """Start of an episode on the trajectory."""
 
     start_time: Array = leaf("drone", 1)
@@ -48,7 +48,7 @@ class TrackTrajectory(Task):
     """
 
     name = "track"
-    Record = Phase
+    Record = TrajectoryStart
 
     trajectory: Trajectory = field(default_factory=figure_eight)
     """The trajectory; by default a figure eight of 2 m by 1 m in 5 s, which repeats."""
@@ -66,7 +66,9 @@ class TrackTrajectory(Task):
     """Time at the end of an episode during which it must stay there, s."""
 
     def install(self, sim: Sim) -> None:
-        self.add_record(sim, Phase(device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)))
+        self.add_record(
+            sim, TrajectoryStart(device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype))
+        )
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones near the trajectory, moving along it."""
@@ -76,11 +78,13 @@ class TrackTrajectory(Task):
         rpy, vel = ((2 * x[name] - 1) * np.asarray(0.2, dtype) for name in ("rpy", "vel"))
         start_time = MAX_START_TIME * x["start_time"]
         pos, path_vel = self.motion(start_time[..., 0])
-        return with_record(flying(data, pos + offset, rotation.from_rpy(rpy), path_vel + vel), Phase(start_time))
+        return with_record(
+            flying(data, pos + offset, rotation.from_rpy(rpy), path_vel + vel), TrajectoryStart(start_time)
+        )
 
     def time(self, data: SimData) -> Array:
         """Return the time on the trajectory, s. (n_drones,)"""
-        return data.plugins[NAME].start_time[..., 0] + data.core.steps / data.core.freq
+        return data.plugins[TASK_RECORD_NAME].start_time[..., 0] + data.core.steps / data.core.freq
 
     def motion(self, t: Array) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, at times on the trajectory, s. (...) to (..., 3) each"""

@@ -132,11 +132,11 @@ class Transport(BringLoad):
             jnp.moveaxis(f, -1, 0) for f in (jnp.sin(angle), jnp.cos(angle), rate)
         )
         link = jnp.stack([sin_a * cos_b, sin_b, -cos_a * cos_b], axis=-1)
-        turning = jnp.stack(
+        link_rate = jnp.stack(
             [da * cos_a * cos_b - db * sin_a * sin_b, db * cos_b, da * sin_a * cos_b + db * cos_a * sin_b], axis=-1
         )
         s, load = data.states, data.plugins["load"]
-        load = load.replace(pos=s.pos + self.length * link, vel=s.vel + self.length * turning)
+        load = load.replace(pos=s.pos + self.length * link, vel=s.vel + self.length * link_rate)
         return data.replace(plugins=data.plugins | {"load": load})
 
     def remaining_way(self, data: SimData) -> Array:
@@ -147,8 +147,10 @@ class Transport(BringLoad):
         """
         pos, quat = gate_of(data)
         load, goal = load_pos(data), delivery_of(data).goal
-        aim = pos - np.array([0.0, 0.0, self.length / 2], pos.dtype)
-        way_through_gate = rotation.safe_norm(aim - load)[..., 0] + rotation.safe_norm(goal - aim)[..., 0]
+        passage_point = pos - np.array([0.0, 0.0, self.length / 2], pos.dtype)
+        way_through_gate = (
+            rotation.safe_norm(passage_point - load)[..., 0] + rotation.safe_norm(goal - passage_point)[..., 0]
+        )
         return jnp.where(is_behind(load, pos, quat), self.error(data), way_through_gate)
 
     def misses_gate(self, data: SimData) -> Array:

@@ -24,7 +24,7 @@ from crazysim.core.data import SimData, controls_of
 from crazysim.drones import Airframe, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
-from crazysim.envs.actions import hover_rotors
+from crazysim.envs.actions import hover_rotor_states
 from crazysim.lab.validate.closed_forms import with_states
 from crazysim.sim.functional import attitude_control
 from crazysim.sim.sim import Sim
@@ -330,7 +330,7 @@ def _torque_per_thrust(airframe: Airframe) -> float:
 
 def _hover_speed(sim: Sim) -> NDArray:
     """Return the rotor speeds of hover, rpm. (4,)"""
-    return np.asarray(hover_rotors(sim.data.params))
+    return np.asarray(hover_rotor_states(sim.data.params))
 
 
 def _world_rows(states: States) -> States:
