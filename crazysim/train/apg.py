@@ -21,7 +21,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Layers, Policies, Policy, all_finite, init_mlp
-from crazysim.train.seeds import Rates, for_each_seed, split_blocks, stack_rates
+from crazysim.train.seeds import SweptValues, for_each_seed, split_blocks, stack_swept_values
 
 T = TypeVar("T")
 STATS_ITERATIONS = 20
@@ -108,13 +108,13 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     instead of recomputing them under ``jax.checkpoint``: tens of steps fit in memory.
     """
     initial_state = env.restart(learner.env, learner.env.done)
-    agents, rates, config = learner.agents, stack_rates(configs), configs[0]
+    agents, swept_values, config = learner.agents, stack_swept_values(configs), configs[0]
     split_seeds = partial(split_blocks, n_seeds=len(configs))
-    n_copies = _copies_of_policy(env, len(configs))
+    n_copies = _count_policy_copies(env, len(configs))
 
     def loss(policies: Layers) -> tuple[Array, Any]:
         """Return the sum of the losses of all seeds. Its gradient is the stack of the gradients of all copies."""
-        seed_policies = Policies(Policy(_copy(agents.stats, n_copies, env), policies))
+        seed_policies = Policies(Policy(_copy_per_device(agents.stats, n_copies, env), policies))
 
         def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
             del key
@@ -129,7 +129,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
         state, _, (rewards, raw_obs, crashed) = rollout(
             env, initial_state, act, agents.key, config.n_steps, record_transition
         )
-        discounts = rates["discount"] ** jnp.arange(config.n_steps, dtype=rewards.dtype)[:, None]
+        discounts = swept_values["discount"] ** jnp.arange(config.n_steps, dtype=rewards.dtype)[:, None]
         error = jnp.nanmean(split_seeds(state.info["error"]), axis=(1, 2))
         rewards, crashed = rewards.mean(axis=(2, 3)), crashed.mean(axis=2)
         metrics = {"reward": rewards.mean(axis=0), "crashed": crashed.mean(axis=0), "error": error}
@@ -137,30 +137,30 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
         return losses.sum(), (losses, state, raw_obs, metrics)
 
     def update(
-        agent: Agent, loss: Array, grads: Layers, raw_obs: Array, rates: Rates
+        agent: Agent, loss: Array, grads: Layers, raw_obs: Array, swept_values: SweptValues
     ) -> tuple[Agent, dict[str, Array]]:
         grad_norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
-        transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
+        transform = _optimizer(config, swept_values["learning_rate"], swept_values["max_grad_norm"])
         updates, optimizer = transform.update(grads, agent.optimizer, agent.policy)
         updated_state = (optax.apply_updates(agent.policy, updates), optimizer)
         policy, optimizer = jax.tree.map(
             lambda x, old: jnp.where(jnp.isfinite(grad_norm), x, old), updated_state, (agent.policy, agent.optimizer)
         )
         # Normalisation that keeps shifting would degrade a policy that is already good, so it is frozen early.
-        updated_stats, updates_stats = agent.stats.update(raw_obs), learner.iteration < STATS_ITERATIONS
-        stats = jax.tree.map(lambda x, old: jnp.where(updates_stats, x, old), updated_stats, agent.stats)
+        updated_stats, is_updating_stats = agent.stats.update(raw_obs), learner.iteration < STATS_ITERATIONS
+        stats = jax.tree.map(lambda x, old: jnp.where(is_updating_stats, x, old), updated_stats, agent.stats)
         finite = all_finite((policy, optimizer, stats, loss))
         return Agent(policy, optimizer, stats, agent.key), {"gradient": grad_norm, "finite": finite}
 
-    policies = _copy(agents.policy, n_copies, env)
+    policies = _copy_per_device(agents.policy, n_copies, env)
     (_, (losses, state, raw_obs, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(policies)
     if n_copies > 1:
         grads = jax.tree.map(lambda x: x.reshape(-1, n_copies, *x.shape[1:]).sum(axis=1), grads)
-    agents, update_metrics = for_each_seed(update, agents, losses, grads, raw_obs, rates, axes=(0, 0, 0, 1, 0))
+    agents, update_metrics = for_each_seed(update, agents, losses, grads, raw_obs, swept_values, axes=(0, 0, 0, 1, 0))
     return Learner(agents, state, learner.iteration + 1), metrics | update_metrics
 
 
-def _copies_of_policy(env: Env, n_seeds: int) -> int:
+def _count_policy_copies(env: Env, n_seeds: int) -> int:
     """Return the number of copies of the policy of a seed, each of which controls worlds of one device.
 
     Devices sum the gradients of the copies once, after all steps; they would sum the gradients of a single policy in
@@ -170,7 +170,7 @@ def _copies_of_policy(env: Env, n_seeds: int) -> int:
     return 1 if mesh is None or n_seeds % mesh.size == 0 else mesh.size
 
 
-def _copy(tree: T, n_copies: int, env: Env) -> T:
+def _copy_per_device(tree: T, n_copies: int, env: Env) -> T:
     """Return copies of the arrays of each seed, on the devices that use them. (n_seeds * n_copies, ...) each"""
     mesh = env.sim.mesh
     if mesh is None or n_copies == 1:

@@ -17,8 +17,8 @@ from jax import Array
 
 from crazysim.errors import ConfigError
 
-KERNEL, STRIDE = 3, 2
-"""Side of a patch and distance between neighbouring patches, pixels. An image has a border of one zero."""
+KERNEL_SIZE, STRIDE = 3, 2
+"""Side of a patch, and distance between neighbouring patches, pixels. An image has a border of one zero."""
 
 
 class Image(NamedTuple):
@@ -107,7 +107,7 @@ def _patches(x: Array) -> Array:
     rows, columns = -(-height // STRIDE), -(-width // STRIDE)
     parts = [
         padded[i : i + STRIDE * rows - 1 : STRIDE, j : j + STRIDE * columns - 1 : STRIDE]
-        for i in range(KERNEL)
-        for j in range(KERNEL)
+        for i in range(KERNEL_SIZE)
+        for j in range(KERNEL_SIZE)
     ]
     return jnp.concatenate(parts, axis=-1)

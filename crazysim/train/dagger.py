@@ -35,7 +35,7 @@ from crazysim.train.convolution import find_images
 from crazysim.train.evaluation import as_tree
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Network, Policy, Weights, all_finite, choose_network, forward, init_weights
-from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates, take_seed
+from crazysim.train.seeds import SweptValues, for_each_seed, join_blocks, split_blocks, stack_swept_values, take_seed
 
 TEACHER_PREFIX = "teacher "
 """Beginning of the names of the teacher's observations."""
@@ -201,7 +201,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     the states of the rollout; ``finite`` is True if weights, optimiser state, statistics and losses are finite.
     """
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
-    agents, rates, config = learner.agents.replace(key=key), stack_rates(configs), configs[0]
+    agents, swept_values, config = learner.agents.replace(key=key), stack_swept_values(configs), configs[0]
     split_seeds = functools.partial(split_blocks, n_seeds=len(configs))
     teacher_probability = config.teacher_decay**learner.iteration
 
@@ -225,7 +225,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     state, _, records = rollout(env, learner.env, policy, k_fly, config.n_steps, record_transition)
     (raw_obs, labels, difference), (reward, error), (terminated, done) = records
     update_agent = functools.partial(_update_agent, config=config)
-    agents, finite = for_each_seed(update_agent, agents, raw_obs, labels, rates, k_learn, axes=(0, 1, 1, 0, 0))
+    agents, finite = for_each_seed(update_agent, agents, raw_obs, labels, swept_values, k_learn, axes=(0, 1, 1, 0, 0))
     metrics = {
         "reward": reward.mean(axis=0),
         "crashed": terminated.sum(axis=0) / jnp.maximum(done.sum(axis=0), 1),
@@ -297,8 +297,8 @@ def _load_teacher(folder: str, env: Env, teacher_obs: Obs) -> Policy:
             f"again with this version."
         )
     actions, spec = env.actions, meta["actions"]
-    same_layout = actions.control.value == spec["level"] and actions.centre.shape == np.shape(spec["centre"])
-    if not (same_layout and np.allclose([actions.centre, actions.scale], [spec["centre"], spec["scale"]])):
+    has_same_layout = actions.control.value == spec["level"] and actions.centre.shape == np.shape(spec["centre"])
+    if not (has_same_layout and np.allclose([actions.centre, actions.scale], [spec["centre"], spec["scale"]])):
         raise ConfigError(
             f"expected a teacher whose actions have the meaning of the student's, {actions}, got {folder} with "
             f"{spec['level']} commands of centre {spec['centre']} and scale "
@@ -308,7 +308,7 @@ def _load_teacher(folder: str, env: Env, teacher_obs: Obs) -> Policy:
 
 
 def _update_agent(
-    agent: Agent, raw_obs: Array, labels: Array, rates: Rates, key: Array, config: Config
+    agent: Agent, raw_obs: Array, labels: Array, swept_values: SweptValues, key: Array, config: Config
 ) -> tuple[Agent, Array]:
     """Return the student of one seed after the updates on its rollout, and True if all its numbers are finite.
 
@@ -316,11 +316,11 @@ def _update_agent(
         agent: The student before.
         raw_obs: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
         labels: Actions of the teacher. (n_steps, n_worlds, n_drones, n_actions)
-        rates: Hyperparameters of the seed. () each
+        swept_values: Hyperparameters of the seed that may differ between seeds. () each
         key: Random key.
-        config: Hyperparameters of the first seed; values in ``rates`` take precedence.
+        config: Hyperparameters of the first seed; values in ``swept_values`` take precedence.
     """
-    transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
+    transform = _optimizer(config, swept_values["learning_rate"], swept_values["max_grad_norm"])
     samples = agent.stats.normalize(raw_obs), labels
 
     def loss(student: Weights, batch: tuple[Array, Array]) -> Array:

@@ -23,13 +23,13 @@ Devices = str | int | Sequence[int]
 ``"2"`` and ``"0,2,3"``."""
 
 
-_COLLECTIVE = re.compile(
+_COLLECTIVE_PATTERN = re.compile(
     r" = (.*?) (all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast)(-start)?\("
 )
-_ARRAY_TYPE = re.compile(r"(pred|[a-z]+(\d+))\[([\d,]*)\]")
-_CALLED_COMPUTATIONS = re.compile(r"=\{?(%[\w.-]+(?:, %[\w.-]+)*)")
-_COMPUTATION = re.compile(r"^(?:ENTRY )?(%[\w.-]+) .*\{$")
-_TRIP_COUNT = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
+_ARRAY_TYPE_PATTERN = re.compile(r"(pred|[a-z]+(\d+))\[([\d,]*)\]")
+_CALLED_COMPUTATIONS_PATTERN = re.compile(r"=\{?(%[\w.-]+(?:, %[\w.-]+)*)")
+_COMPUTATION_PATTERN = re.compile(r"^(?:ENTRY )?(%[\w.-]+) .*\{$")
+_TRIP_COUNT_PATTERN = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
 
 
 def evaluation_device(device: str | None, devices: Devices) -> str:
@@ -49,7 +49,7 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
     """Return the devices of a training.
 
     Args:
-        device: Platform of the devices, or the first of a number of them.
+        device: Platform of the devices; if ``devices`` is a number, also the name of the first one.
         devices: The devices.
 
     Raises:
@@ -116,15 +116,17 @@ def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
         on_one_device = SingleDeviceSharding(sim.device)
         return jax.tree.map(lambda _: on_one_device, shapes)
     replicated, over_worlds = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
-    agents = over_worlds if are_seeds_divided(n_seeds, mesh) else replicated
+    agents_sharding = over_worlds if are_seeds_divided(n_seeds, mesh) else replicated
 
-    def sharding(name: str, tree: Any) -> Any:
+    def field_shardings(name: str, tree: Any) -> Any:
         if name == "env":
             return jax.tree.unflatten(jax.tree.structure(tree), jax.tree.leaves(shardings_of(tree.full_data, mesh)))
-        field_sharding = {"agents": agents, "memory": over_worlds}.get(name, replicated)
+        field_sharding = {"agents": agents_sharding, "memory": over_worlds}.get(name, replicated)
         return jax.tree.map(lambda _: field_sharding, tree)
 
-    return shapes.replace(**{f.name: sharding(f.name, getattr(shapes, f.name)) for f in dataclasses.fields(shapes)})
+    return shapes.replace(
+        **{f.name: field_shardings(f.name, getattr(shapes, f.name)) for f in dataclasses.fields(shapes)}
+    )
 
 
 def replicated_sharding(sim: Sim) -> jax.sharding.Sharding:
@@ -143,7 +145,7 @@ def exchanged_bytes(program: str) -> dict[str, int]:
     computations: dict[str, list[str]] = {}
     entry = name = ""
     for line in program.splitlines():
-        if heading := _COMPUTATION.match(line):
+        if heading := _COMPUTATION_PATTERN.match(line):
             name = heading[1]
             entry = name if line.startswith("ENTRY") else entry
         elif name:
@@ -153,17 +155,17 @@ def exchanged_bytes(program: str) -> dict[str, int]:
 
     def count_bytes(name: str, n_calls: int) -> None:
         for line in computations.get(name, ()):
-            if collective := _COLLECTIVE.search(line):
-                arrays, operation, started = collective.groups()
+            if collective := _COLLECTIVE_PATTERN.search(line):
+                arrays, operation, start_suffix = collective.groups()
                 sizes = [
                     math.prod(map(int, filter(None, shape.split(",")))) * max(int(bits or 8) // 8, 1)
-                    for _, bits, shape in _ARRAY_TYPE.findall(arrays)
+                    for _, bits, shape in _ARRAY_TYPE_PATTERN.findall(arrays)
                 ]
                 # The start of a gather also lists its operands, which are smaller than its result.
-                n_bytes = max(sizes) if started and operation != "all-reduce" else sum(sizes)
+                n_bytes = max(sizes) if start_suffix and operation != "all-reduce" else sum(sizes)
                 bytes_by_operation[operation] = bytes_by_operation.get(operation, 0) + n_calls * n_bytes
-            trip_count = _TRIP_COUNT.search(line) if " while(" in line else None
-            for names in [] if "-done(" in line or "-update(" in line else _CALLED_COMPUTATIONS.findall(line):
+            trip_count = _TRIP_COUNT_PATTERN.search(line) if " while(" in line else None
+            for names in [] if "-done(" in line or "-update(" in line else _CALLED_COMPUTATIONS_PATTERN.findall(line):
                 for computation in names.split(", "):
                     count_bytes(computation, n_calls * (int(trip_count[1]) if trip_count else 1))
 

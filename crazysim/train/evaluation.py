@@ -100,7 +100,10 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
     last_step = jnp.minimum(jnp.arange(env.max_steps)[:, None], was_over.shape[0] - was_over.sum(axis=0) - 1)[..., None]
 
     def split_blocks(x: Array) -> Array:
-        """(n_steps, n_worlds, n_drones) -> (n_steps, n_blocks, n_worlds / n_blocks, n_drones)"""
+        """Return numbers with an axis of blocks.
+
+        (n_steps, n_worlds, n_drones) -> (n_steps, n_blocks, n_worlds / n_blocks, n_drones)
+        """
         return x.reshape(x.shape[0], n_blocks, -1, x.shape[-1])
 
     flight = {
@@ -157,13 +160,15 @@ def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: i
 
 def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dict[str, float]:
     """Return the metrics of ``evaluate`` for the worlds of a block."""
-    task_decides = "succeeded" in flight
-    n_final_steps = 1 if task_decides else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
+    has_own_criterion = "succeeded" in flight
+    n_final_steps = 1 if has_own_criterion else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
     over_by_step = flight["over"][:, worlds]
     n_steps = 1 + (~over_by_step[:-1]).sum(axis=0)
     error, is_over = flight["error"][-n_final_steps:, worlds], over_by_step[-1]
     succeeded = (
-        flight["succeeded"][worlds] if task_decides else np.all(error < env.task.tolerance, axis=0) & ~is_over[:, None]
+        flight["succeeded"][worlds]
+        if has_own_criterion
+        else np.all(error < env.task.tolerance, axis=0) & ~is_over[:, None]
     )
     crashed = is_over & ~np.all(succeeded, axis=-1)
     error = error[:, ~crashed]

@@ -24,10 +24,10 @@ from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
 from crazysim.errors import ConfigError, not_installed
 from crazysim.storage import write_file
-from crazysim.train.convolution import KERNEL, STRIDE, Image
+from crazysim.train.convolution import KERNEL_SIZE, STRIDE, Image
 from crazysim.train.networks import Encoder, Gru, Policy
 
-OBSERVATIONS = {
+OBSERVATION_DESCRIPTIONS = {
     "pos": "position, world frame, m",
     "rot": "attitude, body to world, as a rotation matrix, row by row",
     "vel": "velocity, world frame, m/s",
@@ -43,14 +43,14 @@ OBSERVATIONS = {
     "difference_to_target_vel": "target velocity minus velocity, world frame, m/s",
 }
 """Descriptions of the common observations, with frame and unit."""
-COMMANDS: dict[Control, Sequence[str]] = {
+COMMAND_COMPONENTS: dict[Control, Sequence[str]] = {
     Control.state: ("x, m", "y, m", "z, m"),
     Control.attitude: ("roll, rad", "pitch, rad", "yaw, rad", "collective thrust, N"),
     Control.body_rate: ("rate about x, rad/s", "rate about y, rad/s", "rate about z, rad/s", "collective thrust, N"),
     Control.force_torque: ("collective thrust, N", "torque about x, N m", "about y, N m", "about z, N m"),
 }
 """Components of a command with their units; a rotor command is one speed per rotor, rpm."""
-GATES = ("reset", "update", "candidate")
+GRU_GATES = ("reset", "update", "candidate")
 """Gates of a gated recurrent unit, in the order of its weights."""
 OPSET, IR_VERSION = 17, 8
 """Versions of ONNX operators and of the file format, of 2022, so that older runtimes can read the files."""
@@ -151,7 +151,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         x = _add_convolutions(add_node, constants, numbers, x)
     if numbers.n_memory:
         constants["one"] = np.float32(1.0)
-        for gate, (inputs, recurrent, bias) in zip(GATES, numbers.gru, strict=True):
+        for gate, (inputs, recurrent, bias) in zip(GRU_GATES, numbers.gru, strict=True):
             constants |= {f"{gate}_inputs": inputs, f"{gate}_recurrent": recurrent, f"{gate}_bias": bias}
             add_node("Gemm", [x, f"{gate}_inputs", f"{gate}_bias"], f"{gate}_x")
             add_node("MatMul", ["memory", f"{gate}_recurrent"], f"{gate}_h")
@@ -222,7 +222,7 @@ def _add_convolutions(
         x = add_node("Reshape", [x, f"shape{i}"], f"pixels{i}")
         x = add_node("Transpose", [x], f"image{i}", perm=[0, 3, 1, 2])
         for k, (weight, bias) in enumerate(layers):
-            kernel = weight.reshape(KERNEL, KERNEL, -1, len(bias)).transpose(3, 2, 0, 1)
+            kernel = weight.reshape(KERNEL_SIZE, KERNEL_SIZE, -1, len(bias)).transpose(3, 2, 0, 1)
             constants |= {f"kernel{i}_{k}": np.ascontiguousarray(kernel), f"kernel_bias{i}_{k}": bias}
             inputs = [x, f"kernel{i}_{k}", f"kernel_bias{i}_{k}"]
             x = add_node("Conv", inputs, f"sum{i}_{k}", pads=[1] * 4, strides=[STRIDE] * 2)
@@ -267,7 +267,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     for i, layers in enumerate(numbers.convolutions):
         for k, (weight, bias) in enumerate(layers):
             constants |= {f"kernel{i}_{k}": weight, f"kernel_bias{i}_{k}": bias}
-    for gate, arrays in zip(GATES, numbers.gru, strict=False):
+    for gate, arrays in zip(GRU_GATES, numbers.gru, strict=False):
         constants |= {f"{gate}_{kind}": x for kind, x in zip(("inputs", "recurrent", "bias"), arrays, strict=True)}
     for i, (weight, bias) in enumerate(numbers.layers):
         constants |= {f"weight{i}": weight, f"bias{i}": bias}
@@ -316,13 +316,13 @@ def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     gru = []
     if isinstance(body, Gru):
         arrays = (body.inputs, body.recurrent, body.bias)
-        gru = list(zip(*(np.split(x, len(GATES), axis=-1) for x in arrays), strict=True))
+        gru = list(zip(*(np.split(x, len(GRU_GATES), axis=-1) for x in arrays), strict=True))
     return PolicyNumbers(mean, np.sqrt(var + np.float32(EPSILON)), policy.network.images, convolutions, gru, layers)
 
 
 def _action_units(actions: Mapping[str, Any]) -> list[str]:
     n = len(actions["centre"])
-    units = COMMANDS.get(Control(actions["level"]), [f"speed of rotor {i}, rpm" for i in range(n)])
+    units = COMMAND_COMPONENTS.get(Control(actions["level"]), [f"speed of rotor {i}, rpm" for i in range(n)])
     return [units[i] if i < len(units) else "?" for i in range(n)]
 
 
@@ -331,7 +331,7 @@ def _description_lines(meta: Mapping[str, Any]) -> Iterator[str]:
     yield "Observation, concatenated:"
     offset = 0
     for name, size in meta["observations"].items():
-        description = f": {OBSERVATIONS[name]}" if name in OBSERVATIONS else ""
+        description = f": {OBSERVATION_DESCRIPTIONS[name]}" if name in OBSERVATION_DESCRIPTIONS else ""
         if name in meta.get("images", {}):
             description = ": image, row by row: " + json.dumps(meta["images"][name])
         yield f"  [{offset}..{offset + size - 1}] {name}{description}"
@@ -361,7 +361,7 @@ def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
         offset += math.prod(list(image.shapes([len(bias) for _, bias in layers]))[-1])
     if n_memory:
         yield f"for (int j = 0; j < {n_memory}; ++j) {{"
-        for gate in GATES:
+        for gate in GRU_GATES:
             yield f"    float {gate} = {name}_{gate}_bias[j], {gate}_memory = 0.0f;"
             yield f"    for (int i = 0; i < {n_inputs}; ++i) {gate} += x0[i] * {name}_{gate}_inputs[i][j];"
             yield f"    for (int i = 0; i < {n_memory}; ++i)"
@@ -400,12 +400,12 @@ def _convolution_lines(name: str, i: int, image: Image, layers: Sequence[Any], o
         yield f"for (int r = 0; r < {rows}; ++r) for (int c = 0; c < {columns}; ++c)"
         yield f"for (int j = 0; j < {n_out}; ++j) {{"
         yield f"    float sum = {name}_kernel_bias{i}_{k}[j];"
-        yield f"    for (int a = 0; a < {KERNEL}; ++a) for (int b = 0; b < {KERNEL}; ++b) {{"
+        yield f"    for (int a = 0; a < {KERNEL_SIZE}; ++a) for (int b = 0; b < {KERNEL_SIZE}; ++b) {{"
         yield f"        const int y = {STRIDE} * r + a - 1, x = {STRIDE} * c + b - 1;"
         yield f"        if (y < 0 || y >= {height} || x < 0 || x >= {width}) continue;"
         yield f"        for (int m = 0; m < {n_in}; ++m)"
         yield f"            sum += image{i}_{k}[(y * {width} + x) * {n_in} + m]"
-        yield f"                * {name}_kernel{i}_{k}[(a * {KERNEL} + b) * {n_in} + m][j];"
+        yield f"                * {name}_kernel{i}_{k}[(a * {KERNEL_SIZE} + b) * {n_in} + m][j];"
         yield "    }"
         yield f"    {target}[{start} + (r * {columns} + c) * {n_out} + j] = sum > 0.0f ? sum : 0.0f;"
         yield "}"

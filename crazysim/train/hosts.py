@@ -31,7 +31,7 @@ def require_same_versions() -> None:
         ConfigError: On all hosts, if one of them has another version.
     """
     versions = {"crazysim": crazysim.__version__, "JAX": jaxcompat.versions()}
-    _require_same("versions", versions, "Install the same versions on all hosts.")
+    _require_same_values("versions", versions, "Install the same versions on all hosts.")
 
 
 def require_same_settings(settings: Mapping[str, Any]) -> None:
@@ -40,21 +40,21 @@ def require_same_settings(settings: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: On all hosts, if one of them has another setting.
     """
-    _require_same("settings", settings, "Start all hosts with the same settings, files and checkpoint.")
+    _require_same_values("settings", settings, "Start all hosts with the same settings, files and checkpoint.")
 
 
-def _require_same(what: str, values: Mapping[str, Any], remedy: str) -> None:
+def _require_same_values(kind: str, values: Mapping[str, Any], remedy: str) -> None:
     """Check that all hosts have the same values by name."""
     hosts = jaxcompat.connected_hosts()
     if hosts is None:
         return
-    first, *others = (json.loads(text) for text in _exchange_texts(json.dumps(dict(values)), hosts))
-    for host, other in enumerate(others, 1):
-        for name in {**first, **other}:
-            if first.get(name) != other.get(name):
+    first_values, *other_hosts = (json.loads(text) for text in _exchange_texts(json.dumps(dict(values)), hosts))
+    for host, other_values in enumerate(other_hosts, 1):
+        for name in {**first_values, **other_values}:
+            if first_values.get(name) != other_values.get(name):
                 raise ConfigError(
-                    f"expected the same {what} on all hosts, got {name} = {first.get(name)!r} on host 0 and "
-                    f"{other.get(name)!r} on host {host}. {remedy}"
+                    f"expected the same {kind} on all hosts, got {name} = {first_values.get(name)!r} on host 0 and "
+                    f"{other_values.get(name)!r} on host {host}. {remedy}"
                 )
 
 

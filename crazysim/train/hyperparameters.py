@@ -14,15 +14,15 @@ from crazysim.errors import ConfigError
 SWEEPABLE = ("learning_rate", "discount", "gae_lambda", "clip", "entropy", "value_weight", "max_grad_norm")
 """Hyperparameters that may differ between the seeds of one program, and may change when a run is resumed: shapes and
 counters of its state do not depend on them."""
-FRACTIONS = ("discount", "gae_lambda", "teacher_decay")
+FRACTION_NAMES = ("discount", "gae_lambda", "teacher_decay")
 """Hyperparameters from 0 to 1."""
-WEIGHTS = ("entropy", "value_weight")
+WEIGHT_NAMES = ("entropy", "value_weight")
 """Hyperparameters that are finite, and 0 or larger."""
-LIMITS = ("max_grad_norm",)
+LIMIT_NAMES = ("max_grad_norm",)
 """Hyperparameters that are larger than 0, and may be infinite. All other numbers are finite and larger than 0."""
-COUNTS = ("memory",)
+COUNT_NAMES = ("memory",)
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
-CHOICES = {"critic": ("observations", "privileged", "all_drones", "all_drones_privileged")}
+CHOICES_BY_NAME = {"critic": ("observations", "privileged", "all_drones", "all_drones_privileged")}
 """Values of the hyperparameters that are one of several words, by name."""
 
 
@@ -32,12 +32,12 @@ def check_hyperparameters(config: Any) -> None:
         value, default = getattr(config, field.name), field.default
         if isinstance(default, tuple):
             value = _check_sizes(field.name, value)
-        elif field.name in CHOICES:
-            value = _check_choice(field.name, value, CHOICES[field.name])
+        elif field.name in CHOICES_BY_NAME:
+            value = _check_choice(field.name, value, CHOICES_BY_NAME[field.name])
         elif isinstance(default, str):
             value = _check_text(field.name, value)
         elif isinstance(default, int):
-            value = (_check_count if field.name in COUNTS else positive_integer)(field.name, value)
+            value = (_check_count if field.name in COUNT_NAMES else positive_integer)(field.name, value)
         else:
             value = _check_number(field.name, value, default)
         object.__setattr__(config, field.name, value)
@@ -71,11 +71,11 @@ def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> str:
 
 
 def _check_number(name: str, value: Any, default: Any) -> float:
-    if name in FRACTIONS:
+    if name in FRACTION_NAMES:
         low, high, expected = 0.0, 1.0, "a number from 0 to 1"
-    elif name in WEIGHTS:
+    elif name in WEIGHT_NAMES:
         low, high, expected = 0.0, np.finfo(np.float32).max, "a finite number of at least 0"
-    elif name in LIMITS:
+    elif name in LIMIT_NAMES:
         low, high, expected = math.ulp(0.0), math.inf, "a number larger than 0"
     else:
         low, high, expected = np.finfo(np.float32).tiny, np.finfo(np.float32).max, "a finite number larger than 0"

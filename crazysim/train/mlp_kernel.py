@@ -28,7 +28,7 @@ from jax.sharding import Mesh, PartitionSpec
 from crazysim import jaxcompat
 from crazysim.core.sharding import WORLD_AXIS
 from crazysim.engine.backends import cuda
-from crazysim.train.networks import MEMORYLESS, ApplyLayers, Layers, Network, mlp
+from crazysim.train.networks import MEMORYLESS_NETWORK, ApplyLayers, Layers, Network, mlp
 from crazysim.train.seeds import are_seeds_divided
 
 MAX_WIDTH, MAX_UNITS, MAX_LAYERS = 128, 64, 4
@@ -295,7 +295,7 @@ def choose_mlp(network: Network, device: jax.Device, mesh: Mesh | None = None, n
         mesh: Devices of the training; None for one device.
         n_seeds: Number of seeds. If several cannot be divided among the devices, XLA computes the networks.
     """
-    is_usable = network is MEMORYLESS and not jaxcompat.FALLBACKS and device.platform == "gpu"
+    is_usable = network is MEMORYLESS_NETWORK and not jaxcompat.FALLBACKS and device.platform == "gpu"
     is_usable = is_usable and jaxcompat.compute_capability(device) == CAPABILITY and cuda.nvrtc() is not None
     if mesh is None or are_seeds_divided(n_seeds, mesh):
         return apply_mlp if is_usable else mlp
@@ -335,10 +335,10 @@ def apply_mlp(layers: Layers, x: Array) -> Array:
     Returns:
         Outputs. (..., n_out)
     """
-    x, sizes = jax.lax.stop_gradient(x), _sizes(layers)
+    x, sizes = jax.lax.stop_gradient(x), _layer_sizes(layers)
     dtypes = {array.dtype for array in jax.tree.leaves((layers, x))}
-    is_small = max(sizes) <= MAX_WIDTH and max(sizes[1:-1], default=0) <= MAX_UNITS and len(layers) <= MAX_LAYERS
-    if dtypes != {np.dtype(np.float32)} or not is_small or cuda_source(sizes, True)[1] > MAX_SHARED_BYTES:
+    fits_kernel = max(sizes) <= MAX_WIDTH and max(sizes[1:-1], default=0) <= MAX_UNITS and len(layers) <= MAX_LAYERS
+    if dtypes != {np.dtype(np.float32)} or not fits_kernel or cuda_source(sizes, True)[1] > MAX_SHARED_BYTES:
         return mlp(layers, x)
     return _apply(layers, x.reshape(-1, sizes[0])).reshape(*x.shape[:-1], sizes[-1])
 
@@ -372,8 +372,8 @@ def _forward(layers: Layers, x: Array) -> tuple[Array, Any]:
 
 def _backward(residuals: Any, cotangent: Array) -> Any:
     layers, x = residuals
-    largest = jnp.max(jnp.abs(cotangent))
-    exponent = jnp.where((largest > 0) & jnp.isfinite(largest), -jnp.floor(jnp.log2(largest)), 0.0)
+    max_cotangent = jnp.max(jnp.abs(cotangent))
+    exponent = jnp.where((max_cotangent > 0) & jnp.isfinite(max_cotangent), -jnp.floor(jnp.log2(max_cotangent)), 0.0)
     scale = jnp.exp2(jnp.clip(exponent, -100, 100))  # an infinite one would make zeros NaN
     sums = _gradients(layers, x, scale, cotangent).sum(axis=0) / scale
     ends = np.cumsum([array.size for layer in layers for array in layer])
@@ -405,7 +405,7 @@ def _launch(gradient: bool, layers: Layers, x: Array, *cotangent: Array) -> Arra
     Returns:
         Outputs, (n_seeds, n, n_out), or gradients of all weights, summed by blocks, (n_seeds, n_blocks, n_weights).
     """
-    (n_seeds, n, _), sizes = x.shape, _sizes(layers)
+    (n_seeds, n, _), sizes = x.shape, _layer_sizes(layers)
     source, shared_bytes = cuda_source(sizes, gradient)
     n_warps, n_resident = WARPS_AND_BLOCKS[sizes[0] > 64, gradient]
     n_blocks = min(-(-n_resident * MULTIPROCESSORS // n_seeds), -(-n // (16 * n_warps)))
@@ -425,6 +425,6 @@ def _run_kernel(source: str, name: str, grid: tuple[int, ...], arrays: list[Any]
     return run(*arrays, name=name, kernel_type="ptx", kernel_data=code, **integers)
 
 
-def _sizes(layers: Layers) -> tuple[int, ...]:
+def _layer_sizes(layers: Layers) -> tuple[int, ...]:
     """Return the number of inputs, the sizes of the hidden layers and the number of outputs."""
     return layers[0][0].shape[-2], *(weight.shape[-1] for weight, _ in layers)

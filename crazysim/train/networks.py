@@ -23,7 +23,7 @@ from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, float_dtype, select_worlds, static
-from crazysim.train.convolution import KERNEL, Image, convolve, scale_depth
+from crazysim.train.convolution import KERNEL_SIZE, Image, convolve, scale_depth
 from crazysim.train.seeds import for_each_seed, join_blocks, split_blocks
 
 Layers = list[tuple[Array, Array]]
@@ -99,7 +99,7 @@ class Network:
     def is_built_in(self) -> bool:
         """True if it is a built-in network, with or without convolution and memory."""
         apply = self.apply.func if isinstance(self.apply, functools.partial) else self.apply
-        return apply in (MEMORYLESS.apply, _apply_gru, _apply_convolution)
+        return apply in (MEMORYLESS_NETWORK.apply, _apply_gru, _apply_convolution)
 
     @property
     def pixels(self) -> tuple[range, ...]:
@@ -133,7 +133,7 @@ class Gru(PyTree):
         return update * memory + (1.0 - update) * candidate
 
 
-MEMORYLESS = Network(lambda _key, _n_obs: (), lambda _weights, obs, memory: (obs, memory))
+MEMORYLESS_NETWORK = Network(lambda _key, _n_obs: (), lambda _weights, obs, memory: (obs, memory))
 """The network without weights, whose features are the observations."""
 
 
@@ -177,7 +177,7 @@ def _convolution_network(channels: tuple[int, ...], images: tuple[Image, ...], b
         keys = jax.random.split(jax.random.fold_in(key, 2), (len(images), len(channels)))
         convolutions = tuple(
             [
-                init_mlp(keys[i, k], (KERNEL**2 * n_in, n_out), np.sqrt(2.0))[0]
+                init_mlp(keys[i, k], (KERNEL_SIZE**2 * n_in, n_out), np.sqrt(2.0))[0]
                 for k, (n_in, n_out) in enumerate(itertools.pairwise((image.channels, *channels)))
             ]
             for i, image in enumerate(images)
@@ -218,7 +218,7 @@ def choose_network(
             memory.
     """
     if network is None:
-        base = gru_network(memory) if memory else MEMORYLESS
+        base = gru_network(memory) if memory else MEMORYLESS_NETWORK
         return _convolution_network(tuple(convolution), images, base) if convolution else base
     if not isinstance(network, Network):
         raise ConfigError(f"expected a Network, got {network!r}. Use crazysim.train.Network(init, apply).")
@@ -340,7 +340,7 @@ class Policy(PyTree):
     """``Layers`` from the features of the network to actions before tanh."""
     body: Any = ()
     """Weights of the network."""
-    network: Network = static(default=MEMORYLESS)
+    network: Network = static(default=MEMORYLESS_NETWORK)
     """Network from normalised observations to features."""
 
     @property
@@ -386,16 +386,16 @@ class Policies(PyTree):
 
     def __call__(self, obs: dict[str, Array]) -> Array:
         """Return the action, between -1 and 1, for observations. (n_worlds, n_drones, n_obs) -> (..., n_actions)"""
-        return self._for_each(lambda policy, obs: policy(obs), obs)
+        return self._map_seeds(lambda policy, obs: policy(obs), obs)
 
     def act(self, obs: dict[str, Array], memory: Any) -> tuple[Array, Any]:
         """Return the action, between -1 and 1, and the memory after the step; see ``Policy.act``."""
-        return self._for_each(Policy.act, obs, memory)
+        return self._map_seeds(Policy.act, obs, memory)
 
     def initial_memory(self, *batch: int) -> Any:
         """Return the memory at the start of an episode, for a batch such as (n_worlds, n_drones). (*batch, ...) each"""
         return self.policies.initial_memory(*batch)
 
-    def _for_each(self, fn: Callable[..., Any], *args: Any) -> Any:
+    def _map_seeds(self, fn: Callable[..., Any], *args: Any) -> Any:
         blocks = split_blocks(args, self.policies.stats.mean.shape[0])
         return join_blocks(for_each_seed(fn, self.policies, *blocks))

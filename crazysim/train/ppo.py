@@ -34,7 +34,7 @@ from crazysim.train.networks import (
     mlp,
     unroll,
 )
-from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates
+from crazysim.train.seeds import SweptValues, for_each_seed, join_blocks, split_blocks, stack_swept_values
 
 PRIVILEGED_CRITICS = ("privileged", "all_drones_privileged")
 """Critics that receive the observation of ``PrivilegedObservation``."""
@@ -202,20 +202,20 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     The metric ``finite`` is True if weights, optimiser state, statistics and losses are finite.
     """
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
-    agents, rates = learner.agents.replace(key=key), stack_rates(configs)
-    state, memory, samples, raw_obs, metrics = _collect_samples(agents, learner, env, configs[0], rates, k_fly)
+    agents, swept_values = learner.agents.replace(key=key), stack_swept_values(configs)
+    state, memory, samples, raw_obs, metrics = _collect_samples(agents, learner, env, configs[0], swept_values, k_fly)
     final_critic_inputs = (_critic_obs(state.obs, configs[0]), memory[1])
     blocks = split_blocks((learner.memory, final_critic_inputs), len(configs))
     update_agent = partial(_update_agent, config=configs[0])
     axes = (0, 1, 1, 0, 0, 0, 0)
     agents, losses = for_each_seed(
-        update_agent, agents, samples, raw_obs, *blocks, rates, k_learn, axes=axes, mesh=env.sim.mesh
+        update_agent, agents, samples, raw_obs, *blocks, swept_values, k_learn, axes=axes, mesh=env.sim.mesh
     )
     return Learner(agents, state, memory, learner.iteration + 1), metrics | losses
 
 
 def _collect_samples(
-    agents: Agent, learner: Learner, env: Env, config: Config, rates: Rates, keys: Array
+    agents: Agent, learner: Learner, env: Env, config: Config, swept_values: SweptValues, keys: Array
 ) -> tuple[EnvState, tuple[Any, Any], Sample, Array, dict[str, Array]]:
     """Return state and memories after a rollout of all seeds, samples, observations before normalisation, and metrics.
 
@@ -260,7 +260,7 @@ def _collect_samples(
             memory,
             mesh=env.sim.mesh,
         )
-        discount = rates["discount"][:, None, None]
+        discount = swept_values["discount"][:, None, None]
         sample = Sample(
             normalized_obs,
             action,
@@ -291,7 +291,7 @@ def _update_agent(
     raw_obs: Array,
     memory: Any,
     final_critic_inputs: Any,
-    rates: Rates,
+    swept_values: SweptValues,
     key: Array,
     config: Config,
 ) -> tuple[Agent, dict[str, Array]]:
@@ -304,18 +304,18 @@ def _update_agent(
         memory: Memories of policy and value function before the rollout. (n_worlds, n_drones, ...) each
         final_critic_inputs: Observations, (n_worlds, n_drones, n_obs), and memory of the value function, after the
             rollout.
-        rates: Hyperparameters of the seed. () each
+        swept_values: Hyperparameters of the seed that may differ between seeds. () each
         key: Random key.
-        config: Hyperparameters of the first seed; values in ``rates`` take precedence.
+        config: Hyperparameters of the first seed; values in ``swept_values`` take precedence.
     """
     last_obs, last_memory = final_critic_inputs
     last_value, _ = _value(agent, agent.stats.normalize(last_obs), last_memory, config)
-    advantages, targets = _estimate_advantages(samples, last_value, rates)
+    advantages, targets = _estimate_advantages(samples, last_value, swept_values)
     returns = agent.returns.update(targets[..., None])
     targets = (targets - returns.mean) / _return_std(returns)
     parameters = (agent.policy, agent.log_std, _rescale_value(agent.value, agent.returns, returns))
     data = (samples, advantages, targets)
-    parameters, optimizer, losses = _run_epochs(agent, parameters, data, memory, rates, key, config)
+    parameters, optimizer, losses = _run_epochs(agent, parameters, data, memory, swept_values, key, config)
     policy, log_std, value = parameters
     stats = agent.stats.update(raw_obs)
     finite = all_finite((parameters, optimizer, stats, returns, losses))
@@ -325,7 +325,7 @@ def _update_agent(
     return agent, losses | {"std": jnp.exp(log_std).mean(), "finite": finite}
 
 
-def _estimate_advantages(samples: Sample, last_value: Array, rates: Rates) -> tuple[Array, Array]:
+def _estimate_advantages(samples: Sample, last_value: Array, swept_values: SweptValues) -> tuple[Array, Array]:
     """Return generalised advantage estimates and value targets. (n_steps, n_worlds, n_drones)"""
 
     def accumulate_advantage(
@@ -333,8 +333,8 @@ def _estimate_advantages(samples: Sample, last_value: Array, rates: Rates) -> tu
     ) -> tuple[tuple[Array, Array], Array]:
         advantage, value_after = carry
         reward, value, done = sample
-        discount = rates["discount"] * ~done
-        advantage = reward + discount * value_after - value + discount * rates["gae_lambda"] * advantage
+        discount = swept_values["discount"] * ~done
+        advantage = reward + discount * value_after - value + discount * swept_values["gae_lambda"] * advantage
         return (advantage, value), advantage
 
     sequence = (samples.reward, samples.value, samples.done)
@@ -343,12 +343,12 @@ def _estimate_advantages(samples: Sample, last_value: Array, rates: Rates) -> tu
 
 
 def _run_epochs(
-    agent: Agent, parameters: Any, data: Any, memory: Any, rates: Rates, key: Array, config: Config
+    agent: Agent, parameters: Any, data: Any, memory: Any, swept_values: SweptValues, key: Array, config: Config
 ) -> tuple[Any, Any, dict[str, Array]]:
     """Return parameters, optimiser state and mean losses after all epochs on the samples of one seed."""
     n_worlds, network, n_obs, apply_layers = data[1].shape[1], agent.network, agent.n_obs, agent.apply_layers
     n_groups = math.gcd(n_worlds // config.minibatches, MAX_GROUPS)
-    transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
+    transform = _optimizer(config, swept_values["learning_rate"], swept_values["max_grad_norm"])
 
     def select_minibatch(worlds: Array) -> Any:
         """Return the samples of some worlds, by their indices in each group, and their memories before the rollout.
@@ -374,10 +374,10 @@ def _run_epochs(
         values = unroll(network, value, critic_input, value_memory, sample.done, apply_layers)[..., 0]
         ratio = jnp.exp(_log_prob(mean, log_std, sample.action) - sample.log_prob)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
-        clipped_ratio = jnp.clip(ratio, 1 - rates["clip"], 1 + rates["clip"])
+        clipped_ratio = jnp.clip(ratio, 1 - swept_values["clip"], 1 + swept_values["clip"])
         objective = jnp.minimum(ratio * advantage, clipped_ratio * advantage).mean()
         value_loss = 0.5 * jnp.square(values - target).mean()
-        total_loss = -objective + rates["value_weight"] * value_loss - rates["entropy"] * log_std.sum()
+        total_loss = -objective + swept_values["value_weight"] * value_loss - swept_values["entropy"] * log_std.sum()
         return total_loss, {"value_error": value_loss, "ratio_off": jnp.abs(ratio - 1).mean()}
 
     def update(carry: Any, batch: Any) -> tuple[Any, dict[str, Array]]:

@@ -25,7 +25,7 @@ from crazysim.train.training import (
     train_many,
 )
 
-SETTINGS = ("algorithm", "seed", "n_worlds", "options", "config", "network", "devices")
+RUN_SETTINGS = ("algorithm", "seed", "n_worlds", "options", "config", "network", "devices")
 """Settings of ``TrainConfig.create`` that ``run`` takes."""
 
 
@@ -70,7 +70,7 @@ def run(
         DivergedError: If weights or losses become non-finite; the last checkpoint stays.
         KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
-    _check_settings(settings, SETTINGS)
+    _check_settings(settings, RUN_SETTINGS)
     config = TrainConfig.create(task, **settings)
     folder = Path("out") / config.title if folder is None else Path(folder)
     if resume:
@@ -136,7 +136,7 @@ def run_many(
         ConfigError, DivergedError, KeyboardInterrupt, SystemExit: As ``run``, but a training that diverges does not
             end the others; ``DivergedError`` is raised if all have diverged.
     """
-    _check_settings(settings, tuple(x for x in SETTINGS if x != "seed"))
+    _check_settings(settings, tuple(x for x in RUN_SETTINGS if x != "seed"))
     variants = make_variants(seeds, sweep or {}, settings.get("config") or {})
     config = TrainConfig.create(task, **settings)
     folder = Path("out") / config.title if folder is None else Path(folder)

@@ -16,11 +16,11 @@ from crazysim.pytree import float_dtype
 from crazysim.train.hyperparameters import SWEEPABLE
 
 T = TypeVar("T")
-Rates = dict[str, Any]
+SweptValues = dict[str, Any]
 """Values of the ``SWEEPABLE`` hyperparameters by name: of one seed, (), or of all seeds, (n_seeds,)."""
 
 
-def stack_rates(configs: Sequence[Any]) -> Rates:
+def stack_swept_values(configs: Sequence[Any]) -> SweptValues:
     """Return the hyperparameters that may differ between seeds. (n_seeds,) each
 
     They are host arrays, so that the values of a single seed are scalar constants of the compiled program.
@@ -60,9 +60,9 @@ def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | in
     n_seeds = jax.tree.leaves(args[0])[0].shape[axes[0]]
     if mesh is not None and are_seeds_divided(n_seeds, mesh):
         specs = tuple(PartitionSpec(*[None] * axis, WORLD_AXIS) for axis in axes)
-        fn_of_device = partial(for_each_seed, fn, axes=axes)
+        device_fn = partial(for_each_seed, fn, axes=axes)
         out_specs = PartitionSpec(WORLD_AXIS)
-        return jax.shard_map(fn_of_device, mesh=mesh, in_specs=specs, out_specs=out_specs, check_vma=False)(*args)
+        return jax.shard_map(device_fn, mesh=mesh, in_specs=specs, out_specs=out_specs, check_vma=False)(*args)
     if n_seeds > 1:
         return jax.vmap(fn, in_axes=axes)(*args)
     squeezed_args = [

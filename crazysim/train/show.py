@@ -55,9 +55,11 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
         axes[3].plot(steps, [point[name] for point in first_curve], label=name.removeprefix(TERM_PREFIX))
     axes[3].plot(steps, [point["reward"] for point in first_curve], "k--", label="sum")
     axes[3].legend(fontsize="small")
-    million = "environment steps, millions"
+    steps_label = "environment steps, millions"
     labels = ("success, %", "success, %", "mean error", "reward in an episode, by term")
-    for axis, x, y in zip(axes, (million, "time with compilation, s", million, million), labels, strict=True):
+    for axis, x, y in zip(
+        axes, (steps_label, "time with compilation, s", steps_label, steps_label), labels, strict=True
+    ):
         axis.set(xlabel=x, ylabel=y)
     if len(curves) > 1:
         axes[0].legend()
@@ -225,15 +227,15 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     sim, freq = env.sim, env.base.freq
     frame_steps = max(freq // 25, 1)
 
-    def points_of_world(read_points: Callable[[EnvState], Array | None], world: int) -> np.ndarray:
+    def read_world_points(read_points: Callable[[EnvState], Array | None], world: int) -> np.ndarray:
         positions = read_points(state)
         return np.zeros((0, 3)) if positions is None else np.asarray(positions[world]).reshape(-1, 3)
 
     def points_in_view(_: Sim, world: int) -> np.ndarray:
-        return np.concatenate([points_of_world(targets, world), points_of_world(subjects, world)])
+        return np.concatenate([read_world_points(targets, world), read_world_points(subjects, world)])
 
     def draw_target(sim: Sim, world: int) -> None:
-        target_pos = points_of_world(targets, world)
+        target_pos = read_world_points(targets, world)
         if len(target_pos):
             distance = np.abs(target_pos[:, None] - np.asarray(sim.data.states.pos[world])).max()
             draw_points(sim, target_pos, TARGET_COLOR, max(TARGET_SIZE, 0.02 * float(distance)))

@@ -251,7 +251,7 @@ def train_many(
         saved_iteration, save_time = int(learner.iteration), time.perf_counter()
 
     def evaluate_and_save(learner: Learner, metrics: dict[str, Array]) -> list[dict[str, Any]]:
-        """Evaluate the policies, keep those that no earlier one clearly beats, write all files, and return points."""
+        """Evaluate the policies, update the kept ones, write all files, and return the last point of each curve."""
         iteration, policies = int(learner.iteration), fetch_arrays(learner.as_policy())
         mark_diverged(metrics, iteration)
         is_planned = iteration % evaluation_period == 0 or iteration == n_iterations
@@ -512,8 +512,8 @@ def load_policy(
 
 def _run_metadata(config: TrainConfig) -> dict[str, Any]:
     """Return the metadata of the files of a run."""
-    stored = [f.name for f in dataclasses.fields(config) if f.name not in ("network", "devices")]
-    settings = {name: getattr(config, name) for name in stored}
+    stored_fields = [f.name for f in dataclasses.fields(config) if f.name not in ("network", "devices")]
+    settings = {name: getattr(config, name) for name in stored_fields}
     meta = {"crazysim": crazysim.__version__, "settings": settings, "code": code_digest(config.task)}
     try:
         return json.loads(json.dumps(meta))

@@ -18,7 +18,7 @@ from crazysim.core.sharding import world_mesh
 from crazysim.engine.backends import cuda
 from crazysim.train import mlp_kernel
 from crazysim.train.mlp_kernel import CAPABILITY, INTRINSICS, DistributedMlp, apply_mlp, choose_mlp, cuda_source
-from crazysim.train.networks import MEMORYLESS, gru_network, init_mlp, mlp
+from crazysim.train.networks import MEMORYLESS_NETWORK, gru_network, init_mlp, mlp
 
 HOST = Path(__file__).with_name("gpu_on_host.h")
 H100 = SimpleNamespace(platform="gpu", compute_capability=f"{CAPABILITY / 10}")
@@ -149,16 +149,16 @@ def test_other_dtypes_are_computed_by_xla():
 
 def test_kernels_are_used_on_h100s_without_a_network_before_the_layers(monkeypatch):
     monkeypatch.setattr(cuda, "nvrtc", lambda: "found")
-    assert choose_mlp(MEMORYLESS, H100) is apply_mlp
-    assert choose_mlp(MEMORYLESS, jax.devices("cpu")[0]) is mlp
-    assert choose_mlp(MEMORYLESS, SimpleNamespace(platform="gpu", compute_capability="8.9")) is mlp
+    assert choose_mlp(MEMORYLESS_NETWORK, H100) is apply_mlp
+    assert choose_mlp(MEMORYLESS_NETWORK, jax.devices("cpu")[0]) is mlp
+    assert choose_mlp(MEMORYLESS_NETWORK, SimpleNamespace(platform="gpu", compute_capability="8.9")) is mlp
     mesh = world_mesh(jax.devices()[:2])
-    assert choose_mlp(MEMORYLESS, H100, mesh) == DistributedMlp(mesh)
-    assert choose_mlp(MEMORYLESS, H100, mesh, 4) is apply_mlp
-    assert choose_mlp(MEMORYLESS, H100, mesh, 3) is mlp
+    assert choose_mlp(MEMORYLESS_NETWORK, H100, mesh) == DistributedMlp(mesh)
+    assert choose_mlp(MEMORYLESS_NETWORK, H100, mesh, 4) is apply_mlp
+    assert choose_mlp(MEMORYLESS_NETWORK, H100, mesh, 3) is mlp
     assert choose_mlp(gru_network(8), H100) is mlp
     monkeypatch.setattr(cuda, "nvrtc", lambda: None)
-    assert choose_mlp(MEMORYLESS, H100) is mlp
+    assert choose_mlp(MEMORYLESS_NETWORK, H100) is mlp
 
 
 def test_seeds_are_one_launch_of_each_kernel(monkeypatch):

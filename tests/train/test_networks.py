@@ -28,7 +28,7 @@ from crazysim.train.evaluation import evaluate
 from crazysim.train.export import to_c
 from crazysim.train.networks import Policies, gru_network, init_weights, unroll
 from crazysim.train.out_of_tree import to_out_of_tree
-from crazysim.train.seeds import stack_rates, take_seed
+from crazysim.train.seeds import stack_swept_values, take_seed
 from crazysim.train.show import film
 from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
 
@@ -64,7 +64,7 @@ def test_an_update_computes_the_outputs_of_the_rollout(rng):
     learner, config = init_learner(env, memory=5)
     memory = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), learner.memory)
     collect = jax.jit(ppo._collect_samples, static_argnums=(2, 3))
-    key, rates = jax.random.key(1)[None], stack_rates((config,))
+    key, rates = jax.random.key(1)[None], stack_swept_values((config,))
     _, after, samples, _, _ = collect(learner.agents, learner.replace(memory=memory), env, config, rates, key)
     agent, samples = take_seed(learner.agents, 0), jax.tree.map(lambda x: x[:, 0], samples)
     assert samples.done.sum() == 2 * 4

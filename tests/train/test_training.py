@@ -33,7 +33,7 @@ from crazysim.train.config import TrainConfig
 from crazysim.train.evaluation import describe_outcome, evaluate
 from crazysim.train.networks import Policies
 from crazysim.train.runs import run
-from crazysim.train.seeds import stack_rates, take_seed
+from crazysim.train.seeds import stack_swept_values, take_seed
 from crazysim.train.show import plot_curve, plot_episode, plot_spread, read_curve
 from crazysim.train.training import CHECKPOINT_FILE, POLICY_FILE, load_policy, train
 
@@ -529,7 +529,7 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
 
 def test_advantages_are_sums_of_discounted_errors(rng):
     """Generalised advantage: sum of (gamma lambda)^k delta_(t+k) up to the end of the episode, in NumPy."""
-    rates = stack_rates((ppo.Config(discount=0.9, gae_lambda=0.7),))
+    rates = stack_swept_values((ppo.Config(discount=0.9, gae_lambda=0.7),))
     reward, value = rng.normal(size=(2, 6, 3, 1)).astype(np.float32)
     last = rng.normal(size=(3, 1)).astype(np.float32)
     over = np.zeros((6, 3, 1), bool)
@@ -554,7 +554,9 @@ def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
     config = ppo.Config(n_steps=4, minibatches=4, discount=0.5, hidden=(8,))
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     collect = jax.jit(ppo._collect_samples, static_argnums=(2, 3))
-    _, _, samples, _, _ = collect(learner.agents, learner, env, config, stack_rates((config,)), jax.random.key(1)[None])
+    _, _, samples, _, _ = collect(
+        learner.agents, learner, env, config, stack_swept_values((config,)), jax.random.key(1)[None]
+    )
     agent = take_seed(learner.agents, 0)
     state, step = learner.env, jax.jit(env.step)
     n_truncated = 0
