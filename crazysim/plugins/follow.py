@@ -121,8 +121,8 @@ class Follow(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        ticks = stage("drone", when=lambda data: acts_now(data, data.controls.state.freq))
-        return [StagePlacement(ticks(self.stage_setpoint), before="state_controller")]
+        stage_at_ticks = stage("drone", when=lambda data: acts_now(data, data.controls.state.freq))
+        return [StagePlacement(stage_at_ticks(self.stage_setpoint), before="state_controller")]
 
     def stage_setpoint(self, data: SimData) -> SimData:
         """Stage the setpoint of one drone."""
@@ -192,10 +192,14 @@ class Follow(Plugin):
                 (n_worlds, n_drones)
             rate: Speeds at which they go through their trajectories, 1. (), (n_drones,) or (n_worlds, n_drones)
         """
-        new = {name: value for name, value in (("index", index), ("start", start), ("rate", rate)) if value is not None}
+        new_values = {
+            name: value for name, value in (("index", index), ("start", start), ("rate", rate)) if value is not None
+        }
         with sim.lock:
             record = self.read(sim.data)
-            numbers = {name: _check_slot_value(sim, name, value, len(record.ends)) for name, value in new.items()}
+            numbers = {
+                name: _check_slot_value(sim, name, value, len(record.ends)) for name, value in new_values.items()
+            }
             shapes = {name: np.broadcast_shapes(x.shape, getattr(record, name).shape) for name, x in numbers.items()}
             record = record.replace(**{name: jnp.broadcast_to(x, shapes[name]) for name, x in numbers.items()})
             sim.data = self.write(sim.data, record)

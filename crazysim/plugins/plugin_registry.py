@@ -50,7 +50,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._installed: dict[str, _Installed] = {}
         self._move_objects: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
         self._observe_fn: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
-        self._checked = True
+        self._is_checked = True
 
     def __getitem__(self, name: str) -> Plugin:
         """Return a plugin."""
@@ -84,8 +84,8 @@ class PluginRegistry(Mapping[str, Plugin]):
             )
         if name in self._sim.data.plugins:
             raise ConfigError(f"data.plugins already has a record {name!r}. Use sim.add(..., name=...).")
-        self._require_names(plugin, self._sim.names)
-        self._require_terms(plugin, self.values())
+        self._require_unused_names(plugin, self._sim.names)
+        self._require_unique_terms(plugin, self.values())
         with self._restore_on_error():
             record, default = plugin.record(self._sim), plugin.default_record(self._sim)
             pipeline, installed = _add_stages(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
@@ -124,13 +124,13 @@ class PluginRegistry(Mapping[str, Plugin]):
                 f"Use sim.remove({plugin.name!r}) first, or another name=."
             )
         sim, name = self._sim, plugin.name
-        self._require_names(plugin, [other for other in sim.names if other not in self.members_of(old_plugin)])
-        self._require_terms(plugin, [other for other in self.values() if other is not old_plugin])
+        self._require_unused_names(plugin, [other for other in sim.names if other not in self.members_of(old_plugin)])
+        self._require_unique_terms(plugin, [other for other in self.values() if other is not old_plugin])
         old_record, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
         if _have_same_code(old_plugin, plugin) and jax.tree.structure(old_record) == jax.tree.structure(record):
             self._put_records(name, _continue_states(record, old_record), default)
             self._installed[name] = self._installed[name]._replace(plugin=plugin)
-            self._checked = False
+            self._is_checked = False
             return plugin
         # The plugin's stages must be created for a pipeline without the plugin.
         sim.step_pipeline = _remove_stages(dict(sim.step_pipeline), self._installed[name])
@@ -176,7 +176,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         """Names of the members of all populations."""
         return tuple([name for plugin in self.values() for name in self.members_of(plugin)])
 
-    def _require_names(self, plugin: Plugin, used_names: Collection[str]) -> None:
+    def _require_unused_names(self, plugin: Plugin, used_names: Collection[str]) -> None:
         """Check that the names of a population's members are not in use."""
         used_names = set(used_names)
         duplicates = [name for name in self.members_of(plugin) if name in used_names]
@@ -187,7 +187,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             )
 
     @staticmethod
-    def _require_terms(plugin: Plugin, others: Iterable[Plugin]) -> None:
+    def _require_unique_terms(plugin: Plugin, others: Iterable[Plugin]) -> None:
         """Check that no other plugin replaces the same term of the model."""
         for other in others:
             if shared_terms := set(plugin.replaced_terms) & set(other.replaced_terms):
@@ -199,10 +199,10 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     def check(self) -> None:
         """Check the plugins that each plugin requires, if the plugins have changed since the last check."""
-        if not self._checked:
+        if not self._is_checked:
             for plugin in self.values():
                 plugin.check_plugins(self._sim)
-            self._checked = True
+            self._is_checked = True
 
     def build_records(self) -> None:
         """Put a new record of every plugin into the simulation's data."""
@@ -263,7 +263,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._sim.data = _with_record(self._sim.data, name, record)
 
     def _build(self, pipeline: Pipeline, resets: Pipeline) -> None:
-        self._checked = False
+        self._is_checked = False
         if resets != self._sim.reset_pipeline:
             self._sim.reset_pipeline = resets
         self._sim.step_pipeline = pipeline

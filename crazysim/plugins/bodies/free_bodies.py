@@ -174,12 +174,12 @@ class FreeBodies(Population):
     def derivative(self, data: SimData) -> Mapping[str, Array]:
         body = self.read(data)
         torque = rotation.rotate_inverse(body.quat, body.torque)
-        spin = body.inertia * body.ang_vel
+        ang_momentum = body.inertia * body.ang_vel
         return {
             "pos": body.vel,
             "quat": 0.5 * rotation.multiply(body.quat, jnp.concatenate([body.ang_vel, 0 * body.mass])),
             "vel": jnp.asarray(GRAVITY, body.pos.dtype) + body.force / body.mass,
-            "ang_vel": (torque - rotation.cross(body.ang_vel, spin)) / body.inertia,
+            "ang_vel": (torque - rotation.cross(body.ang_vel, ang_momentum)) / body.inertia,
         }
 
     def scheme(self, integrator: Integrator) -> Callable[..., FreeBodiesData]:

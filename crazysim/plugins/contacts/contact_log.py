@@ -65,18 +65,18 @@ class ContactLog(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return a stage for one drone, and one for one world with loads and other objects that plugins move.
+        """Return a stage of one drone, and a stage of one world for loads and other objects that plugins move.
 
-        There are two because a stage for one world computes everything for all its drones.
+        There are two because a stage of one world computes everything for all of its drones.
         """
         names, placements = self._names(sim), []
-        movers = moving_plugins(sim.scene.plugins(), names)
-        others = [name for name in names if name not in movers]
-        if others or self.floor or self.drones:
-            drone_stage = self._stage(sim.scene.contact_fn(others, self.floor, self.drones), "drone")
+        moved_names = moving_plugins(sim.scene.plugins(), names)
+        static_names = [name for name in names if name not in moved_names]
+        if static_names or self.floor or self.drones:
+            drone_stage = self._stage(sim.scene.contact_fn(static_names, self.floor, self.drones), "drone")
             placements.append(StagePlacement(drone_stage, before="increment_steps"))
-        if movers:
-            object_stage = self._stage(sim.scene.contact_fn(list(movers), floor=False, drones=False), "world")
+        if moved_names:
+            object_stage = self._stage(sim.scene.contact_fn(list(moved_names), floor=False, drones=False), "world")
             placements.append(StagePlacement(object_stage, before="increment_steps", name=f"{self.name}_of_moved"))
         return placements
 
@@ -88,7 +88,7 @@ class ContactLog(Plugin):
             log, report = self.read(data), contacts(data)
             new_log = log.replace(
                 floor=_logical_or(log.floor, report.floor),
-                objects=_with_objects(log, report),
+                objects=_merge_objects(log, report),
                 drones=_logical_or(log.drones, report.drones),
                 first_step=jnp.where((log.first_step < 0) & report.any, data.core.steps + 1, log.first_step),
             )
@@ -97,7 +97,7 @@ class ContactLog(Plugin):
         return Stage(check, scope)
 
 
-def _with_objects(log: ContactLogData, report: ContactReport) -> Array:
+def _merge_objects(log: ContactLogData, report: ContactReport) -> Array:
     """Return the log's objects, updated by a report of all or some of them. (..., n_objects)"""
     if report.objects is None or report.object_names == log.object_names:
         return _logical_or(log.objects, report.objects)

@@ -28,9 +28,9 @@ from crazysim.scene.contact_report import ObjectSelection, select_bodies
 
 FLAT_KINDS = ("plane", "box", "cylinder")
 """Kinds of geoms with flat faces, which the corners of a drone's box touch."""
-PLATE_SHARE = 0.05
-"""Height of the upper and lower plate of a drone's box, as a share of the box's height; both plates touch an object
-next to the drone."""
+PLATE_HEIGHT_FRACTION = 0.05
+"""Height of the upper and lower plate of a drone's box, as a fraction of the box's height; both plates touch an
+object next to the drone."""
 
 
 class Carrier(NamedTuple):
@@ -122,9 +122,9 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
     pos, quat = data.states.pos, data.states.quat
     dtype = pos.dtype
     corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
-    plate = Shape("box", (*box[3:5].tolist(), PLATE_SHARE * box[5]))
+    plate = Shape("box", (*box[3:5].tolist(), PLATE_HEIGHT_FRACTION * box[5]))
     plate_centres = [
-        jnp.asarray(box[:3] + np.array([0, 0, side * (1 - PLATE_SHARE) * box[5]]), dtype) for side in (-1, 1)
+        jnp.asarray(box[:3] + np.array([0, 0, side * (1 - PLATE_HEIGHT_FRACTION) * box[5]]), dtype) for side in (-1, 1)
     ]
     drone_quat = quat[..., None, :]
     world_corners = pos[..., None, :] + rotation.rotate(drone_quat, corners)

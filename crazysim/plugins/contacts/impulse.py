@@ -57,7 +57,7 @@ def velocity_after_contact(
     n, p, s = points.normal, points.point, points.vel
     is_active = points.gap < 0
     stiffness = PENALTY_STIFFNESS * mass
-    row = _with_torque(n, p)
+    normal_wrench = _with_torque(n, p)
     surface_speed = jnp.sum(n * s, axis=-1)
 
     def point_speeds(u: Array) -> tuple[Array, Array]:
@@ -75,16 +75,18 @@ def velocity_after_contact(
         is_pressed = is_active & (normal_speed < target_speed)
         normal_impulse = jnp.where(is_pressed, stiffness * (target_speed - normal_speed), 0.0)
         w_n = jnp.where(is_pressed, stiffness, 0.0)
-        # In the first iteration every point by itself stops the whole fall: the normal force, and so the friction
-        # force, is known only from the second on.
+        # In the first iteration every point stops the whole fall on its own. The normal forces, and hence the
+        # friction forces, are known only from the second iteration on.
         w_t = jnp.where(
             k == 0, 0.0, jnp.minimum(w_n, material.friction * normal_impulse / (slip_speed + STICKING_SPEED))
         )
         w_rest = w_n - w_t
-        normal_stiffness = jnp.sum(w_rest[..., None, None] * row[..., None] * row[..., None, :], axis=-3)
+        normal_stiffness = jnp.sum(
+            w_rest[..., None, None] * normal_wrench[..., None] * normal_wrench[..., None, :], axis=-3
+        )
         matrix = inertia + _weighted_inertia(w_t, p, n.dtype) + normal_stiffness
         friction_pull = w_t[..., None] * _with_torque(s, p)
-        normal_pull = (w_rest * surface_speed + w_n * target_speed)[..., None] * row
+        normal_pull = (w_rest * surface_speed + w_n * target_speed)[..., None] * normal_wrench
         return solve_symmetric(
             matrix, rotation.matvec(inertia, initial_vel) + jnp.sum(friction_pull + normal_pull, axis=-2)
         )
@@ -92,7 +94,7 @@ def velocity_after_contact(
     new_vel = jax.lax.fori_loop(0, iterations, iterate, initial_vel)
     normal_impulse = jnp.where(is_active, stiffness * jnp.maximum(target_speed - point_speeds(new_vel)[0], 0.0), 0.0)
     new_vel = new_vel + material.restitution * solve_symmetric(
-        inertia, jnp.sum(jnp.where(is_impact, normal_impulse, 0.0)[..., None] * row, axis=-2)
+        inertia, jnp.sum(jnp.where(is_impact, normal_impulse, 0.0)[..., None] * normal_wrench, axis=-2)
     )
     # Energy is measured relative to the surfaces that push.
     total_impulse = jnp.sum(normal_impulse, axis=-1, keepdims=True)

@@ -86,10 +86,10 @@ def resolve_drone_contacts(
 
     def to_box(box: np.ndarray) -> tuple[Array, Array]:
         target = Shape("box", tuple(map(float, box[3:])))
-        gap, pull = jax.vjp(lambda x: distance(shape, target, x - jnp.asarray(box[:3], x.dtype), rot), lever)
-        return gap[..., None], pull(jnp.ones_like(gap))[0]
+        gap, pull_back = jax.vjp(lambda x: distance(shape, target, x - jnp.asarray(box[:3], x.dtype), rot), lever)
+        return gap[..., None], pull_back(jnp.ones_like(gap))[0]
 
-    gap, normal = select_airframe([(kind, to_box(box)) for kind, box in boxes], data.core.drone_id)
+    gap, normal = select_airframe([(drone_group, to_box(box)) for drone_group, box in boxes], data.core.drone_id)
     gap = gap[..., 0]
     is_touching = (gap < 0) & ~collider.joined_mask(data)
     is_touching = is_touching if body.exists is None else is_touching & body.exists[:, None]
@@ -102,8 +102,8 @@ def resolve_drone_contacts(
     vel = rotation.rotate_inverse(quat, body.vel[:, None] - s.vel) - rotation.cross(s.ang_vel[None], lever)
     change = velocity_change(gap, normal, vel, material, response)
     n_load, n_drone = (jnp.sum(is_touching, axis=axis, keepdims=True, dtype=gap.dtype) for axis in (1, 0))
-    share = jnp.where(is_touching, 1 / jnp.maximum(jnp.maximum(n_load, n_drone), 1.0), 0.0)[..., None]
-    change = share * change
+    weight = jnp.where(is_touching, 1 / jnp.maximum(jnp.maximum(n_load, n_drone), 1.0), 0.0)[..., None]
+    change = weight * change
 
     turn_rate = rotation.matvec(p.J_inv, rotation.cross(lever, change))
     change = rotation.rotate(quat, change)
@@ -126,8 +126,8 @@ def velocity_change(
         response: Returns the change of the relative velocity for a change of the body's velocity, both m/s.
     """
     separation_speed = rotation.dot(vel, normal)
-    pushed_out = jnp.clip(-gap[..., None] / material.softness, 0.0, MAX_PUSH_SPEED)
-    target_speed = jnp.where(separation_speed < -BOUNCE_SPEED, -material.restitution * separation_speed, pushed_out)
+    push_speed = jnp.clip(-gap[..., None] / material.softness, 0.0, MAX_PUSH_SPEED)
+    target_speed = jnp.where(separation_speed < -BOUNCE_SPEED, -material.restitution * separation_speed, push_speed)
     response_along = response(normal)
     # The product is at least one, except where the normal is zero, between balls with the same centre.
     speed = jnp.maximum(target_speed - separation_speed, 0.0) / jnp.maximum(rotation.dot(normal, response_along), 1.0)
@@ -178,9 +178,9 @@ def resolve_load_contacts(data: SimData, colliders: Sequence[Collider], material
     changes: list[Array | float] = [0.0] * len(colliders)
     for (a, b), pairs in contacts.items():
         n = jnp.maximum(n_touches[a][:, None], n_touches[b][None])
-        share = jnp.where(pairs.is_touching, 1 / jnp.maximum(n, 1), 0.0)[..., None].astype(pairs.first.dtype)
-        changes[a] = changes[a] + jnp.sum(share * pairs.first, axis=1)
-        changes[b] = changes[b] + jnp.sum(share * pairs.second, axis=0)
+        weight = jnp.where(pairs.is_touching, 1 / jnp.maximum(n, 1), 0.0)[..., None].astype(pairs.first.dtype)
+        changes[a] = changes[a] + jnp.sum(weight * pairs.first, axis=1)
+        changes[b] = changes[b] + jnp.sum(weight * pairs.second, axis=0)
     vels = [collider.body(data).vel + change for collider, change in zip(colliders, changes, strict=True)]
     for collider, vel in zip(colliders, vels, strict=True):
         data = collider.with_vel(data, vel)
@@ -210,5 +210,5 @@ def _pair_contacts(
     vel = a.vel[:, None] - b.vel[None]
     change = velocity_change(gap, normal, vel, material, lambda change: change)
     total = a.mass[:, None] + b.mass[None]
-    weight = 1 / jnp.where(total > 0, total, 1.0)
-    return _PairContacts(is_touching, b.mass[None] * weight * change, -a.mass[:, None] * weight * change)
+    inv_total = 1 / jnp.where(total > 0, total, 1.0)
+    return _PairContacts(is_touching, b.mass[None] * inv_total * change, -a.mass[:, None] * inv_total * change)

@@ -142,8 +142,8 @@ def _n_points(contacts: PairContacts) -> int:
 
 def _distance_and_normal(shape: Shape, point: Array) -> tuple[Array, Array]:
     """Return the distance of points to a shape, and its normal there, in the shape's frame."""
-    gap, pull = jax.vjp(lambda p: point_distance(shape, p), point)
-    return gap, pull(jnp.ones_like(gap))[0]
+    gap, pull_back = jax.vjp(lambda p: point_distance(shape, p), point)
+    return gap, pull_back(jnp.ones_like(gap))[0]
 
 
 def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, shape_pos: Array, shape_rot: Array) -> Manifold:

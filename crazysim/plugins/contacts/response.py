@@ -92,8 +92,8 @@ class ContactResponse(Plugin):
 
         def respond(data: SimData) -> SimData:
             results = [
-                (kind, _respond_to_contacts(data, self.read(data), surfaces, box, self.iterations))
-                for kind, box in boxes
+                (drone_group, _respond_to_contacts(data, self.read(data), surfaces, box, self.iterations))
+                for drone_group, box in boxes
             ]
             states, record = select_airframe(results, data.core.drone_id)
             return self.write(data.replace(states=states), record)

@@ -61,8 +61,8 @@ class BodyContacts:
         n = sum(1 if any(pair) else N_BOX_POINTS for pair in pairs)
         for geom in geoms:
             if geom.shape.kind not in EXACT_KINDS:
-                only_corners = geom.shape.kind == "plane" or geom.name in terrains
-                n += sum(1 if ball else len(CORNERS) + (not only_corners) for ball in balls)
+                has_only_corners = geom.shape.kind == "plane" or geom.name in terrains
+                n += sum(1 if ball else len(CORNERS) + (not has_only_corners) for ball in balls)
         return n
 
     def respond(self, data: SimData) -> SimData:
@@ -75,10 +75,10 @@ class BodyContacts:
         n_free, n_drones = record.pos.shape[0], self.n_drones
         bodies, first_carrier = self._bodies(data, record), n_free + n_drones
         solids = self._solids(data, record)
-        dynamic = [k for k, body in enumerate(solids.body) if body < n_free]
+        free_solids = [k for k, body in enumerate(solids.body) if body < n_free]
         groups = contacts_between(solids, self._pairs(solids, n_free))
         for k, carrier in enumerate(self.carriers):
-            groups += self._contacts_on_carrier(data, solids, dynamic, carrier, first_carrier + k)
+            groups += self._contacts_on_carrier(data, solids, free_solids, carrier, first_carrier + k)
         if not groups:
             return data
         size = bodies.pos.shape[0]
@@ -116,7 +116,7 @@ class BodyContacts:
         """Return the shapes of free bodies and drones, and the balls and boxes of objects, at their poses."""
         n_free = record.pos.shape[0]
         dtype = record.pos.dtype
-        owners, balls, sizes = list(range(n_free)), [x.kind == "sphere" for x in self.shapes], []
+        owners, balls = list(range(n_free)), [x.kind == "sphere" for x in self.shapes]
         sizes = [np.resize(x.size, 3) for x in self.shapes]
         pos, rot = [record.pos], [rotation.matrix(record.quat)]
         if self.n_drones:
@@ -142,13 +142,13 @@ class BodyContacts:
         return np.array(pairs, np.int64).reshape(-1, 2)
 
     def _contacts_on_carrier(
-        self, data: SimData, solids: Solids, dynamic: list[int], carrier: Carrier, carrier_index: int
+        self, data: SimData, solids: Solids, free_solids: list[int], carrier: Carrier, carrier_index: int
     ) -> list[PairContacts]:
         """Return the contacts of free bodies with the geoms of a carrier that are neither balls nor boxes."""
         contacts = []
         for geom in carrier.geoms:
             terrain = data.plugins.get(geom.name) if carrier.row is None else None
-            for k in dynamic if geom.shape.kind not in EXACT_KINDS else ():
+            for k in free_solids if geom.shape.kind not in EXACT_KINDS else ():
                 if isinstance(terrain, TerrainData):
                     contacts.append(contacts_on_ground(solids, k, carrier_index, terrain.gap_at))
                 else:
@@ -191,10 +191,10 @@ def states_after_contact(states: Any, solved: SolvedBodies, rows: slice) -> Any:
 def drones_as_bodies(data: SimData) -> Bodies:
     """Return the drones of one world as bodies."""
     s, p, n = data.states, data.params, data.states.pos.shape[0]
-    rot, inverse = rotation.matrix(s.quat), jnp.broadcast_to(p.J_inv, (n, 3, 3))
-    inverse = matmul(matmul(rot, inverse), jnp.swapaxes(rot, -1, -2))
+    rot, inv_inertia = rotation.matrix(s.quat), jnp.broadcast_to(p.J_inv, (n, 3, 3))
+    inv_inertia = matmul(matmul(rot, inv_inertia), jnp.swapaxes(rot, -1, -2))
     inv_mass = jnp.broadcast_to(1 / p.mass, (n, 1))[:, 0]
-    return Bodies(s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inverse)
+    return Bodies(s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inv_inertia)
 
 
 def drone_box_extents(sim: Simulation) -> np.ndarray:

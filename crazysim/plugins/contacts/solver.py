@@ -115,7 +115,7 @@ def solve_contacts(
     dtype = bodies.pos.dtype
     a, b = contacts.first, contacts.second
     pair = np.repeat(np.arange(len(a)), contacts.n_points)
-    sums = [jnp.asarray(np.eye(n)[:, body_indices], dtype) for body_indices in (a, b)]  # (n, n_pairs)
+    sum_matrices = [jnp.asarray(np.eye(n)[:, body_indices], dtype) for body_indices in (a, b)]  # (n, n_pairs)
     normal = contacts.normal
     offset = bodies.pos[a] - bodies.pos[b]
     arm = contacts.point - bodies.pos[a][pair]
@@ -130,8 +130,8 @@ def solve_contacts(
         force, torque = contacts.sum_pairs(impulse), contacts.sum_pairs(rotation.cross(arm, impulse))
         second_torque = torque + rotation.cross(offset, force)
         force, torque = (
-            _sum_for_bodies(sums[0] - sums[1], force),
-            _sum_for_bodies(sums[0], torque) - _sum_for_bodies(sums[1], second_torque),
+            _sum_for_bodies(sum_matrices[0] - sum_matrices[1], force),
+            _sum_for_bodies(sum_matrices[0], torque) - _sum_for_bodies(sum_matrices[1], second_torque),
         )
         return bodies.inv_mass[:, None] * force, matvec(bodies.inv_inertia, torque)
 
@@ -143,7 +143,7 @@ def solve_contacts(
     target_speed = jnp.where(is_bouncing, -contacts.restitution * separation_speed, closing_speed)
 
     normal_response, slip_response = jnp.zeros(k, dtype), jnp.zeros(k, dtype)
-    for body_indices, sum_matrix, lever in ((a, sums[0], arm), (b, sums[1], arm + offset[pair])):
+    for body_indices, sum_matrix, lever in ((a, sum_matrices[0], arm), (b, sum_matrices[1], arm + offset[pair])):
         lever_matrix = rotation.cross_matrix(lever)
         inverse, inv_mass = bodies.inv_inertia[body_indices][pair], bodies.inv_mass[body_indices][pair]
         angular_response = matmul(inverse, lever_matrix)
@@ -154,12 +154,12 @@ def solve_contacts(
             3 * inv_mass + jnp.sum(lever_matrix * angular_response, axis=(-2, -1)) - normal_compliance
         )
         is_active = is_near & (normal_compliance > 0)
-        n_weight, s_weight = (
+        normal_weight, slip_weight = (
             jnp.where(is_active, 1 / jnp.where(is_active, x, 1.0), 0.0) for x in (normal_compliance, slip_compliance)
         )
-        shared_response = _shared_response(bodies, sum_matrix, contacts, normal, lever_matrix, n_weight, s_weight)[
-            body_indices
-        ][pair]
+        shared_response = _shared_response(
+            bodies, sum_matrix, contacts, normal, lever_matrix, normal_weight, slip_weight
+        )[body_indices][pair]
         normal_response, slip_response = (
             normal_response + shared_response * normal_compliance,
             slip_response + shared_response * slip_compliance,
@@ -182,8 +182,8 @@ def solve_contacts(
         # Momentum that points uphill is dropped (O'Donoghue and Candes 2015).
         normal_slope = (y - normal_impulse) * normal_response * (normal_impulse - current.normal)
         friction_slope = (z - friction_impulse) * slip_response[:, None] * (friction_impulse - current.friction)
-        uphill = jnp.sum(normal_slope) + jnp.sum(friction_slope)
-        return Impulses(normal_impulse, friction_impulse), current, jnp.where(uphill > 0, 0.0, n_accelerated + 1)
+        slope = jnp.sum(normal_slope) + jnp.sum(friction_slope)
+        return Impulses(normal_impulse, friction_impulse), current, jnp.where(slope > 0, 0.0, n_accelerated + 1)
 
     normal_start = jnp.where(is_near, initial_impulses.normal, 0.0)
     friction_start = jnp.where(
@@ -193,22 +193,24 @@ def solve_contacts(
     impulses, *_ = jax.lax.fori_loop(0, iterations, iterate, (initial, initial, jnp.zeros((), dtype)))
     total = impulses.normal[:, None] * normal + impulses.friction
     vel, ang_vel = velocity_change(total)
-    energy_share = _energy_share(total, initial_vel, contact_velocity(vel, ang_vel))
-    impulses, total, vel, ang_vel = jax.tree.map(lambda x: energy_share * x, (impulses, total, vel, ang_vel))
+    energy_factor = _energy_factor(total, initial_vel, contact_velocity(vel, ang_vel))
+    impulses, total, vel, ang_vel = jax.tree.map(lambda x: energy_factor * x, (impulses, total, vel, ang_vel))
 
     # One gradient step with exact line search reduces the overlaps; the next time step continues.
     separation_rate = separation_speed + rotation.dot(contact_velocity(vel, ang_vel), normal)[:, 0]
-    push = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, MAX_PUSH_SPEED) - jnp.maximum(separation_rate, 0.0)
-    push = jnp.maximum(push, 0.0)
-    vel_change, ang_vel_change = velocity_change((push / normal_response)[:, None] * normal)
-    slip_change = jnp.sum(
-        push / normal_response * rotation.dot(contact_velocity(vel_change, ang_vel_change), normal)[:, 0]
+    push_speed = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, MAX_PUSH_SPEED) - jnp.maximum(
+        separation_rate, 0.0
     )
-    size = dt * jnp.sum(push / normal_response * push) / jnp.where(slip_change > 0, slip_change, 1.0)
+    push_speed = jnp.maximum(push_speed, 0.0)
+    vel_change, ang_vel_change = velocity_change((push_speed / normal_response)[:, None] * normal)
+    gap_rate = jnp.sum(
+        push_speed / normal_response * rotation.dot(contact_velocity(vel_change, ang_vel_change), normal)[:, 0]
+    )
+    size = dt * jnp.sum(push_speed / normal_response * push_speed) / jnp.where(gap_rate > 0, gap_rate, 1.0)
     moved_bodies = bodies._replace(
         pos=bodies.pos + size * vel_change, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel
     )
-    impulse = _sum_for_bodies(sums[0] - sums[1], contacts.sum_pairs(total))
+    impulse = _sum_for_bodies(sum_matrices[0] - sum_matrices[1], contacts.sum_pairs(total))
     return SolvedBodies(moved_bodies, size * ang_vel_change, impulses, impulse)
 
 
@@ -221,7 +223,7 @@ def _shared_response(
     normal_weight: Array,
     slip_weight: Array,
 ) -> Array:
-    """Return for each body its contacts' response to all impulses, divided by their response to their own one. (n,)
+    """Return for each body the ratio of its contacts' response to all impulses to the response to their own. (n,)
 
     It is an upper bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, too large by at most a quarter. ``M`` is
     the inertia of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` holds the inverse
@@ -254,8 +256,8 @@ def _shared_response(
     return jnp.where(trace > 0, jnp.where(trace > 0, trace, 1.0) ** 0.125, 1.0)
 
 
-def _energy_share(impulse: Array, initial_vel: Array, vel_change: Array) -> Array:
-    """Return the share of impulses, at most one, with which they add no kinetic energy. ()
+def _energy_factor(impulse: Array, initial_vel: Array, vel_change: Array) -> Array:
+    """Return the factor, at most one, by which impulses are scaled so that they add no kinetic energy. ()
 
     The energy that the impulses add, in the frame of immovable bodies, is the sum of the products of each impulse with
     the mean of the contact's velocities before and after it.
@@ -270,6 +272,6 @@ def _energy_share(impulse: Array, initial_vel: Array, vel_change: Array) -> Arra
     return jnp.where(adds_energy, jnp.maximum(-2 * first, 0.0) / jnp.where(adds_energy, second, 1.0), 1.0)
 
 
-def _sum_for_bodies(sums: Array, values: Array) -> Array:
+def _sum_for_bodies(sum_matrix: Array, values: Array) -> Array:
     """Sum the pairs' values for every body, element-wise because a GPU may round matrix products. (n, m)"""
-    return jnp.sum(sums[:, :, None] * values[None], axis=1)
+    return jnp.sum(sum_matrix[:, :, None] * values[None], axis=1)

@@ -136,19 +136,19 @@ def read_image(path: str | Path) -> np.ndarray:
 
 def _set_height_field(scene: Any, plugin: Terrain, heights: np.ndarray, size: np.ndarray, pos: np.ndarray) -> None:
     """Add the height field to the scene, or change it if it exists already."""
-    spec, lowest = scene.spec, float(heights.min())
-    rise = max(float(np.ptp(heights)), MIN_HEIGHT_RANGE)
-    fractions = ((heights - lowest) / rise).astype(np.float32)
+    spec, min_height = scene.spec, float(heights.min())
+    height_range = max(float(np.ptp(heights)), MIN_HEIGHT_RANGE)
+    fractions = ((heights - min_height) / height_range).astype(np.float32)
     field, geom = spec.hfield(plugin.name), spec.geom(plugin.name)
     if (field is None) != (geom is None):
         raise ConfigError(f"expected a new name, got {plugin.name!r}, which the scene has. Use name=.")
     if field is None:
         field = spec.add_hfield(name=plugin.name)
         geom = spec.worldbody.add_geom(name=plugin.name, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=plugin.name)
-    field.size = [*(size / 2), rise, BASE_THICKNESS]
+    field.size = [*(size / 2), height_range, BASE_THICKNESS]
     field.nrow, field.ncol = heights.shape
     field.userdata = fractions.ravel()
-    geom.pos = [pos[0], pos[1], pos[2] + lowest]
+    geom.pos = [pos[0], pos[1], pos[2] + min_height]
     if plugin.rgba is not None:
         geom.rgba = as_rgba(plugin.rgba)
     elif spec.material("floor") is not None:

@@ -112,15 +112,15 @@ class Battery(Plugin):
             BatteryData,
             charge=charge,
             voltage=open_circuit_voltage(charge, cells),
-            capacity=check_parameter(sim, "capacity", self._own_or_airframe_value(sim, "capacity"), positive=True),
+            capacity=check_parameter(sim, "capacity", self._setting_or_airframe_value(sim, "capacity"), positive=True),
             resistance=check_parameter(
-                sim, "resistance", self._own_or_airframe_value(sim, "resistance"), positive=True
+                sim, "resistance", self._setting_or_airframe_value(sim, "resistance"), positive=True
             ),
             full_speed_voltage=check_parameter(sim, "full_speed_voltage", full_speed_voltage, positive=True),
             n_cells=cells,
         )
 
-    def _own_or_airframe_value(self, sim: Simulation, key: str) -> ArrayLike:
+    def _setting_or_airframe_value(self, sim: Simulation, key: str) -> ArrayLike:
         """Return the setting ``key``, or the airframes' value if the setting is None."""
         value = getattr(self, key)
         return airframe_numbers(sim, lambda a: a.value(f"battery.{key}", ())) if value is None else value

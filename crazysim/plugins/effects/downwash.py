@@ -28,7 +28,7 @@ from crazysim.plugins.effects.moving_air import (
 )
 from crazysim.pytree import device_array, leaf
 
-DECAY, SPREAD = 5.8, 0.094
+JET_DECAY, JET_SPREAD = 5.8, 0.094
 """Velocity decay constant B and spreading rate S of a round turbulent jet, 1 (Hussein, Capp and George 1994; Pope,
 Turbulent Flows, 2000, table 5.1)."""
 
@@ -75,7 +75,7 @@ class Downwash(Plugin):
     def sum_jets(self, data: SimData) -> SimData:
         """Add up the jets of all other drones of the world at one drone.
 
-        At the load of the drone, the jet of its own drone is included.
+        The load of a drone is also in the jet of the drone that carries it.
         """
         record, s = self.read(data), data.states
         bodies = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.air_vel is not None}
@@ -142,7 +142,7 @@ def jet_source(thrust: Array, diameter: Array, air_density: Array) -> JetSource:
     """Return the source of a drone's jet; for the arguments see ``hover_jet_speed``."""
     has_thrust = thrust > 0
     impulse = jnp.where(has_thrust, jnp.sqrt(jnp.where(has_thrust, thrust, 1.0) * 4 / (math.pi * air_density)), 0.0)
-    return JetSource(DECAY * impulse, DECAY * diameter, 1 / diameter)
+    return JetSource(JET_DECAY * impulse, JET_DECAY * diameter, 1 / diameter)
 
 
 def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
@@ -156,7 +156,7 @@ def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
     # Clamped to zero above the rotors, where the distance to the virtual origin would pass through zero.
     positive_depth = jnp.where(depth < 0, 0.0, depth)
     q = positive_depth + source.origin
-    w = q / (q * q + (math.sqrt(2) - 1) / SPREAD**2 * rotation.dot(off_axis, off_axis))
+    w = q / (q * q + (math.sqrt(2) - 1) / JET_SPREAD**2 * rotation.dot(off_axis, off_axis))
     x = positive_depth * source.inverse_diameter
     x = jnp.where(x > 1, 1.0, x)
     fade_in = x * x * (3 - 2 * x)

@@ -79,21 +79,21 @@ def interpolate(values: Array, position: Array) -> Array:
         (..., *core)
     """
     n_axes = position.shape[-1]
-    shares, nodes = [], []
+    axis_weights, nodes = [], []
     for k in range(n_axes):
         last_node = values.shape[k] - 1
         cells = safe_clip(position[..., k], 0.0, float(last_node))
         lower_node = jnp.clip(jnp.floor(cells), 0, max(last_node - 1, 0))
-        share, lower_node = cells - lower_node, lower_node.astype(jnp.int32)
+        fraction, lower_node = cells - lower_node, lower_node.astype(jnp.int32)
         nodes.append((lower_node, jnp.minimum(lower_node + 1, last_node)))
-        shares.append((1 - share, share))
+        axis_weights.append((1 - fraction, fraction))
     core = (1,) * (values.ndim - n_axes)
     total: Any = 0.0
     for corner in product((0, 1), repeat=n_axes):
         node = values.at[tuple(nodes[k][c] for k, c in enumerate(corner))]
         weight: Array | float = 1.0
         for k, c in enumerate(corner):
-            weight = weight * shares[k][c]
+            weight = weight * axis_weights[k][c]
         corner_values = node.get(mode="promise_in_bounds", wrap_negative_indices=False)
         total = total + weight.reshape(weight.shape + core) * corner_values
     return total

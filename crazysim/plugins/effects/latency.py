@@ -81,10 +81,10 @@ class Latency(Plugin):
         """Return a controller that uses the command that has arrived, and does not change the staged command."""
         scope: Any = controller.scope
 
-        def run_on_delayed_state(data: SimData) -> SimData:
+        def run_on_delayed_command(data: SimData) -> SimData:
             return _with_command(controller.fn(_with_command(data, self.read(data).arrived)), _staged_command(data))
 
-        return Stage(run_on_delayed_state, scope, controller.when, controller.batched, controller.__name__)
+        return Stage(run_on_delayed_command, scope, controller.when, controller.batched, controller.__name__)
 
     def _initial_record(self, sim: Simulation, data: SimData) -> LatencyData:
         delay, max_delay = np.asarray(self.delay), self.max_delay

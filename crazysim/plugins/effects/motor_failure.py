@@ -73,8 +73,8 @@ class MotorFailure(Plugin):
             is_due = (motors.fail_step >= 0) & (data.core.steps >= motors.fail_step)
             effectiveness = jnp.where(is_due, 0.0, effectiveness)
         if motors.rate is not None:
-            chance = uniform(drone_key(data, self.name), effectiveness.shape, effectiveness.dtype)
-            effectiveness = jnp.where(chance < jnp.exp(-motors.rate / data.core.freq), effectiveness, 0.0)
+            random_numbers = uniform(drone_key(data, self.name), effectiveness.shape, effectiveness.dtype)
+            effectiveness = jnp.where(random_numbers < jnp.exp(-motors.rate / data.core.freq), effectiveness, 0.0)
         return self.write(data, motors.replace(effectiveness=effectiveness))
 
     def fail(self, data: SimData, mask: ArrayLike | None) -> SimData:

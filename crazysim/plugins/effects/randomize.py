@@ -236,8 +236,10 @@ class Randomize(Plugin):
         n_rotors, dtype = record.thrust_factors.shape[-1], record.factors.dtype
         u = uniform(drone_key(data, self.name), (len(FACTOR_SETTINGS) + 5 + n_rotors,), dtype)
 
-        def draw_factor(limits: Array | None, share: Array) -> Array:
-            return jnp.ones_like(share) if limits is None else limits[0] + share * (limits[1] - limits[0])
+        def draw_factor(limits: Array | None, random_number: Array) -> Array:
+            return (
+                jnp.ones_like(random_number) if limits is None else limits[0] + random_number * (limits[1] - limits[0])
+            )
 
         single_factors = [draw_factor(getattr(record, name), u[k : k + 1]) for k, name in enumerate(FACTOR_SETTINGS)]
         other_draws = u[len(FACTOR_SETTINGS) :]

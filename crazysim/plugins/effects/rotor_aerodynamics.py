@@ -85,7 +85,7 @@ class RotorAerodynamics(Plugin):
         require_rotors(sim, "rotor aerodynamics")
         radius = checked_propeller_radius(sim, self.propeller_radius)
         density = check_parameter(sim, "air_density", self.air_density, positive=True)
-        inflow = np.asarray(self._own_or_drag_value(sim, "inflow", lambda drag: -drag[2, 2]), np.float64)
+        inflow = np.asarray(self._setting_or_drag_value(sim, "inflow", lambda drag: -drag[2, 2]), np.float64)
         thrust, speed = airframe_numbers(sim, hover_thrust)[..., None], airframe_numbers(sim, hover_speed)[..., None]
         disc = np.asarray(disc_factor(radius, density), np.float64)
         blade = blade_coefficient(inflow * speed, thrust, speed, disc)
@@ -104,13 +104,13 @@ class RotorAerodynamics(Plugin):
         return self.fill_record(
             sim,
             RotorAerodynamicsData,
-            drag=self._own_or_drag_value(sim, "drag", lambda drag: -0.5 * (drag[0, 0] + drag[1, 1])),
+            drag=self._setting_or_drag_value(sim, "drag", lambda drag: -0.5 * (drag[0, 0] + drag[1, 1])),
             blade=check_parameter(sim, "blade", blade),
             propeller_radius=radius,
             hub_pos=self._hub_positions(sim),
         )
 
-    def _own_or_drag_value(self, sim: Simulation, name: str, drag_value: Callable[[np.ndarray], float]) -> Array:
+    def _setting_or_drag_value(self, sim: Simulation, name: str, drag_value: Callable[[np.ndarray], float]) -> Array:
         """Return a coefficient from the setting, or else from the airframes' linear drag in hover."""
         value = getattr(self, name)
         if value is None:
@@ -143,18 +143,18 @@ class RotorAerodynamics(Plugin):
         speed = RPM_TO_RAD_S * s.rotor_vel
         static = quadratic_curve(s.rotor_vel, p.rpm2thrust)
         blade, drag = drag_factor(data) * record.blade, drag_factor(data) * record.drag
-        factor: Array | float = 1.0
+        ceiling_gain: Array | float = 1.0
         if record.ceiling is not None:
             height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.hub_pos)[..., 2]
-            factor = ceiling_factor(record.ceiling - height, record.propeller_radius)
+            ceiling_gain = ceiling_factor(record.ceiling - height, record.propeller_radius)
         thrust = thrust_in_flight(
-            static, speed, axial, u * u + v * v, blade, record.propeller_radius, record.air_density, factor
+            static, speed, axial, u * u + v * v, blade, record.propeller_radius, record.air_density, ceiling_gain
         )
         gain = jnp.where(blade > 0, thrust - jnp.where(static > 0, static, 0.0), 0.0)
 
-        loss, bend = drag * speed, record.flapping * speed
-        forces = jnp.stack([-loss * u, -loss * v, gain], axis=-1)
-        moments = jnp.stack([bend * v, -bend * u, jnp.zeros_like(bend)], axis=-1)
+        drag_per_vel, moment_per_vel = drag * speed, record.flapping * speed
+        forces = jnp.stack([-drag_per_vel * u, -drag_per_vel * v, gain], axis=-1)
+        moments = jnp.stack([moment_per_vel * v, -moment_per_vel * u, jnp.zeros_like(moment_per_vel)], axis=-1)
         force = jnp.sum(forces, axis=-2) - rotation.matvec(p.drag_matrix, vel)
         torque = jnp.sum(rotation.cross(record.hub_pos, forces) + moments, axis=-2)
         return data.replace(

@@ -19,8 +19,8 @@ from crazysim.plugins.effects.moving_air import MovingAir, require_drag, with_mo
 from crazysim.pytree import leaf
 from crazysim.rotation import dot, safe_clip, safe_normalize
 
-FOOT = 0.3048
-"""Metres per foot: the low-altitude model is stated in feet."""
+METRES_PER_FOOT = 0.3048
+"""Length of a foot, m, because the low-altitude model is stated in feet."""
 MIN_HEIGHT_FT, MAX_HEIGHT_FT = 10.0, 1000.0
 """Range of heights in which the low-altitude model holds, ft; heights outside are clipped to it."""
 MIN_PROFILE_HEIGHT = 0.01
@@ -86,7 +86,7 @@ class Wind(Plugin):
     exponent: ArrayLike | None = parameter(default=None, low=0.0)
     """Exponent of a mean that grows with a power of the height, 1, such as 0.2 over land (IEC 61400-1) and 0.14 over
     the sea (IEC 61400-3). None for no such growth. () or (n_worlds, n_drones)"""
-    reference_height: ArrayLike = parameter(default=20 * FOOT, positive=True)
+    reference_height: ArrayLike = parameter(default=20 * METRES_PER_FOOT, positive=True)
     """Height at which a mean that grows with height equals ``velocity``, m. () or (n_worlds, n_drones)"""
     name: str = "wind"
 
@@ -121,8 +121,8 @@ class Wind(Plugin):
         ground = ground_below(data)
         mean = wind.mean_at(s.pos, ground)
         length, deviation = low_altitude_gusts(s.pos[..., 2:] - ground, wind.speed_20ft)
-        relative = s.vel - mean
-        airspeed = jnp.sqrt(dot(relative, relative) + MIN_AIRSPEED**2)
+        relative_vel = s.vel - mean
+        airspeed = jnp.sqrt(dot(relative_vel, relative_vel) + MIN_AIRSPEED**2)
         step = airspeed / (data.core.freq * length)
 
         noise = normal(drone_key(data, self.name), (6,), s.vel.dtype)
@@ -188,10 +188,10 @@ def low_altitude_gusts(height: Array, speed_20ft: Array) -> tuple[Array, Array]:
     Returns:
         Scale lengths along the mean wind, across and vertically, m, and standard deviations, m/s. (..., 3) each
     """
-    h = safe_clip(height / FOOT, MIN_HEIGHT_FT, MAX_HEIGHT_FT)
+    h = safe_clip(height / METRES_PER_FOOT, MIN_HEIGHT_FT, MAX_HEIGHT_FT)
     log = jnp.log(0.177 + 0.000823 * h)
     horizontal, sigma = h * jnp.exp(-1.2 * log), 0.1 * speed_20ft
-    length = FOOT * jnp.concatenate([horizontal, horizontal, h], axis=-1)
+    length = METRES_PER_FOOT * jnp.concatenate([horizontal, horizontal, h], axis=-1)
     sigma_h = sigma * jnp.exp(-0.4 * log)
     return length, jnp.concatenate([sigma_h, sigma_h, sigma + jnp.zeros_like(h)], axis=-1)
 

@@ -119,12 +119,12 @@ class Complementary(Estimator):
             climb = (height - record.height) / dt
             return self.write(data, record.replace(height=height, climb=climb, over_surface=over_surface))
 
-        def fires_every(steps: int) -> Any:
+        def is_due_every(steps: int) -> Any:
             return lambda data: (data.core.steps + 1) % steps == 0
 
         return [
-            ("attitude", Stage(update_attitude, "drone", fires_every(period))),
-            ("", Stage(update_height, "drone", fires_every(height_period))),
+            ("attitude", Stage(update_attitude, "drone", is_due_every(period))),
+            ("", Stage(update_height, "drone", is_due_every(height_period))),
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:

@@ -32,15 +32,15 @@ N, N_BIASED = 9, 15
 MAX_COVARIANCE, MIN_VARIANCE = 100.0, {N: 1e-6, N_BIASED: 1e-12}
 """Upper bound of covariances, and lower bounds of variances by the number of errors (kalman_core.c; an assumption with
 biases, whose variances are smaller)."""
-EPS = 1e-6
-"""Added to a norm before a division by it (kalman_core.c)."""
+NORM_EPSILON = 1e-6
+"""Number that is added to a norm before a division by it (kalman_core.c)."""
 MAX_POS, MAX_VEL = 100.0, 10.0
 """Bounds of coordinates, m, and of velocities, body frame, m/s, beyond which the filter has failed
 (kalman_supervisor.c)."""
 SMALL_ANGLE, LARGE_ANGLE = 1e-4, 10.0
 """Smallest and largest attitude error that is moved into the attitude, rad (kalman_core.c)."""
-REVERSION_SHARE = 0.001
-"""Share of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
+REVERSION_FRACTION = 0.001
+"""Fraction of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
 
 
 class Estimate(PyTree):
@@ -196,14 +196,14 @@ def predict_biased(
         -dt * rotation.cross_matrix(predicted.vel),
     )
 
-    def rows(p: Array) -> Array:
+    def transform_errors(p: Array) -> Array:
         """Return the linearised step times a matrix."""
         rotated_att = error_rot @ p[6:9]
         pos_rows = p[:3] + vel_to_pos @ p[3:6] + att_to_pos @ p[6:9]
         vel_rows = error_rot @ p[3:6] + gravity_to_vel @ rotated_att + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
         return jnp.concatenate([pos_rows, vel_rows, rotated_att - dt * p[12:], p[9:]])
 
-    p = rows(rows(covariance(estimate.cov)).T)
+    p = transform_errors(transform_errors(covariance(estimate.cov)).T)
     gyro_noise = gyro_to_vel * gyro_variance
     vel_noise = (accel_to_vel * accel_variance) @ accel_to_vel.T + gyro_noise @ gyro_to_vel.T
     vel_att_noise = -dt * gyro_noise
@@ -296,15 +296,15 @@ def bound_covariance(p: Array) -> Array:
 def turn_attitude(quat: Array, angle: Array, resting_quat: Array | None = None) -> Array:
     """Return an attitude turned in the body frame by a rotation vector, rad, with the firmware's guards. (4,)
 
-    If ``resting_quat`` is given, a share of it is mixed in (``REVERSION_SHARE``).
+    If ``resting_quat`` is given, a fraction of it is mixed in (``REVERSION_FRACTION``).
     """
-    size = rotation.safe_norm(angle) + EPS
+    size = rotation.safe_norm(angle) + NORM_EPSILON
     half_angle = 0.5 * size
     step = jnp.concatenate([jnp.sin(half_angle) / size * angle, jnp.cos(half_angle)])
     quat = rotation.multiply(quat, step)
     if resting_quat is not None:
-        quat = (1 - REVERSION_SHARE) * quat + REVERSION_SHARE * resting_quat
-    return quat / (rotation.safe_norm(quat) + EPS)
+        quat = (1 - REVERSION_FRACTION) * quat + REVERSION_FRACTION * resting_quat
+    return quat / (rotation.safe_norm(quat) + NORM_EPSILON)
 
 
 def _limit_covariances(covariances: Array) -> Array:

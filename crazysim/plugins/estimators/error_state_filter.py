@@ -84,7 +84,7 @@ class ErrorStateFilter(Estimator):
     def fusion_stages(self) -> list[tuple[str, Stage]]:
         """Return the stages that use the measurements of the sensors, by their names."""
         return [
-            (s.name, Stage(self._fusion_stage(k, s), "drone", self._is_new(k, s)))
+            (s.name, Stage(self._fusion_fn(k, s), "drone", self._is_new(k, s)))
             for k, s in enumerate(self.aiding_sensors)
         ]
 
@@ -101,7 +101,7 @@ class ErrorStateFilter(Estimator):
     def _is_new(self, k: int, sensor: Sensor) -> Callable[[SimData], Array]:
         return lambda data: sensor.read(data).samples.taken_step[0] != self.read(data).used_steps[k]
 
-    def _fusion_stage(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
+    def _fusion_fn(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
         def fuse(data: SimData) -> SimData:
             """Use a new measurement of one sensor."""
             record, taken_step = self.read(data), sensor.read(data).samples.taken_step

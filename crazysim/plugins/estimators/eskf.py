@@ -110,11 +110,11 @@ class ESKF(ErrorStateFilter):
         period, is_due = self.prediction_schedule(freq)
         return [
             ("sample", Stage(self.add_sample, "drone")),
-            ("predict", Stage(self._prediction_stage(period), "drone", is_due)),
+            ("predict", Stage(self._prediction_fn(period), "drone", is_due)),
             *(
                 (
                     f"{sensor.name}_path",
-                    Stage(self._path_start_stage(sensor, period), "drone", _sampling_predicate(sensor)),
+                    Stage(self._path_start_fn(sensor, period), "drone", _sampling_predicate(sensor)),
                 )
                 for sensor in self.aiding_sensors
                 if sensor.is_late
@@ -149,15 +149,15 @@ class ESKF(ErrorStateFilter):
     ) -> Estimate:
         """Return the estimate of one drone before any measurement, with the mean biases of its ``IMU``."""
         imu = self.imu.read(data)
-        spreads = [
+        bias_stds = [
             x
             for triad in (imu.accel, imu.gyro)
             for x in _combined_std(triad.spread[:3], triad.instability, min_std=0.0)
         ]
         means = [rotation.rotate(imu.quat, triad.mean[:3]) for triad in (imu.accel, imu.gyro)]
-        return error_state.initial_estimate(pos, vel, quat, [*deviations, *spreads], *means)
+        return error_state.initial_estimate(pos, vel, quat, [*deviations, *bias_stds], *means)
 
-    def _prediction_stage(self, period: int) -> Callable[[SimData], SimData]:
+    def _prediction_fn(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
             """Predict the state of one drone; angular velocities are integrated by the trapezoidal rule."""
             record, imu, dt = self.read(data), self.imu.read(data), period / data.core.freq
@@ -176,7 +176,7 @@ class ESKF(ErrorStateFilter):
 
         return predict
 
-    def _path_start_stage(self, sensor: Sensor, period: int) -> Callable[[SimData], SimData]:
+    def _path_start_fn(self, sensor: Sensor, period: int) -> Callable[[SimData], SimData]:
         def start_path(data: SimData) -> SimData:
             """Start a path at a new measurement of one sensor.
 

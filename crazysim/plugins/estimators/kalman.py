@@ -118,7 +118,7 @@ class Kalman(ErrorStateFilter):
         period, is_due = self.prediction_schedule(freq)
         return [
             ("sample", Stage(self.add_sample, "drone")),
-            ("predict", Stage(self._prediction_stage(period), "drone", is_due)),
+            ("predict", Stage(self._prediction_fn(period), "drone", is_due)),
             ("noise", Stage(self._add_noise, "drone")),
             *self.fusion_stages(),
             ("finalize", Stage(self._finalize, "drone", self._is_updated)),
@@ -136,7 +136,7 @@ class Kalman(ErrorStateFilter):
         estimate = error_state.initial_estimate(s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, INITIAL_STD)
         return self.write(data, record.replace(estimate=estimate, previous_quat=s.quat))
 
-    def _prediction_stage(self, period: int) -> Callable[[SimData], SimData]:
+    def _prediction_fn(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
             """Predict the state of one drone from the mean of its inertial measurements."""
             record = self.read(data)

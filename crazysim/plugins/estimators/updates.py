@@ -25,7 +25,7 @@ HALF_CONE_ANGLE = 0.5 * 15 * math.pi / 180
 
 def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Estimate:
     """Return the estimate after a measured position, world frame, m, (3,), of a standard deviation, m. () or (3,)"""
-    for k, std in enumerate(_per_axis(deviation)):
+    for k, std in enumerate(_std_per_axis(deviation)):
         estimate = update(estimate, [k], jnp.ones_like(pos[:1]), pos[k] - estimate.pos[k], std)
     return estimate
 
@@ -36,7 +36,7 @@ def update_vel(estimate: Estimate, vel: Array, deviation: Array | float) -> Esti
     Its standard deviation along each axis is in m/s. () or (3,)
     """
     rot = rotation.matrix(estimate.quat)
-    for k, std in enumerate(_per_axis(deviation)):
+    for k, std in enumerate(_std_per_axis(deviation)):
         attitude_slope = rotation.cross(estimate.vel, rot[k])  # the derivative with respect to the attitude
         predicted = rotation.dot(rot[k], estimate.vel)[0] + rotation.dot(attitude_slope, estimate.att_error)[0]
         estimate = update(estimate, [*VEL, *ATT], jnp.concatenate([rot[k], attitude_slope]), vel[k] - predicted, std)
@@ -56,7 +56,7 @@ def update_direction(
     """
     predicted = rotation.rotate_inverse(estimate.quat, world_direction)
     slopes = rotation.cross_matrix(predicted)
-    for k, std in enumerate(_per_axis(deviation)):
+    for k, std in enumerate(_std_per_axis(deviation)):
         error = direction[k] - predicted[k] - rotation.dot(slopes[k], estimate.att_error)[0]
         estimate = update(estimate, ATT, slopes[k], error, std)
     return estimate
@@ -69,7 +69,7 @@ def update_quat(estimate: Estimate, quat: Array, deviation: Array | float) -> Es
     """
     residual = rotation.multiply(rotation.conjugate(estimate.quat), quat)
     error = 2 * residual[:3] / residual[3]
-    for k, std in enumerate(_per_axis(deviation)):
+    for k, std in enumerate(_std_per_axis(deviation)):
         estimate = update(estimate, [ATT[k]], jnp.ones_like(quat[:1]), error[k], std)
     return estimate
 
@@ -231,6 +231,6 @@ def update_sweep(
     return select_estimate(is_visible, update(estimate, POS, h, angle - predicted, deviation), estimate)
 
 
-def _per_axis(deviation: Array | float) -> Sequence[Array | float]:
+def _std_per_axis(deviation: Array | float) -> Sequence[Array | float]:
     """Return the standard deviation of each of three axes."""
     return [deviation] * 3 if jnp.ndim(deviation) == 0 else [deviation[k] for k in range(3)]  # type: ignore[index]

@@ -47,13 +47,13 @@ class JetTable(NamedTuple):
                 "expected a table of pressure or velocity, got neither. Use pressure=, velocity= or both."
             )
         arrays: dict[str, np.ndarray] = {}
-        for name, core in (("pressure", ()), ("velocity", (3,))):
+        for name, vector_shape in (("pressure", ()), ("velocity", (3,))):
             value = getattr(self, name)
             if value is None:
                 continue
             value = read_numbers(name, value)
-            if value.ndim != 4 + len(core) or len(value) != len(speeds) or value.shape[4:] != core:
-                shape = f"({len(speeds)}, n_x, n_y, n_z{', 3' if core else ''})"
+            if value.ndim != 4 + len(vector_shape) or len(value) != len(speeds) or value.shape[4:] != vector_shape:
+                shape = f"({len(speeds)}, n_x, n_y, n_z{', 3' if vector_shape else ''})"
                 raise ConfigError(f"expected {name} of shape {shape} for {len(speeds)} speeds, got {value.shape}")
             arrays[name] = value
         if len({x.shape[:4] for x in arrays.values()}) > 1:

@@ -30,9 +30,9 @@ MIN_SQUARED_LENGTH = 1e-20
 """Term added to the squared distance, m^2, so that the direction of a link without length is zero."""
 BOUNCE_SPEED = 0.1
 """Speed below which a cable that becomes taut does not bounce, m/s."""
-CORRECTION_RATE, MAX_CORRECTION_SHARE = 50.0, 0.5
-"""Rate at which a scheme of higher order removes errors in length, 1/s, and the largest share of an error that a step
-removes. The order of the scheme requires a rate that does not depend on the step."""
+CORRECTION_RATE, MAX_CORRECTION_FRACTION = 50.0, 0.5
+"""Rate at which a scheme of higher order removes errors in length, 1/s, and the largest fraction of an error that a
+step removes. The order of the scheme requires a rate that does not depend on the step."""
 SLACK_ACCELERATION = 1e9
 """Acceleration that no tension of a slack cable outweighs, m/s^2."""
 TAUT_BAND = 1e-4
@@ -215,11 +215,13 @@ def to_body_frame(rot: Array, vector: Array) -> Array:
     return matvec(jnp.swapaxes(rot, -1, -2), vector)
 
 
-def acceleration_at(state: SimState, deriv: SimStateDeriv, rot: Array, point: Array | None, share: float) -> Array:
-    """Return the acceleration of a point of the body, with a share of its centripetal part, m/s^2. (3,)"""
+def acceleration_at(
+    state: SimState, deriv: SimStateDeriv, rot: Array, point: Array | None, centripetal_factor: float
+) -> Array:
+    """Return the acceleration of a point of the body, with a fraction of its centripetal part, m/s^2. (3,)"""
     if point is None:
         return deriv.acc
-    centripetal = cross(state.ang_vel, share * cross(state.ang_vel, point))
+    centripetal = cross(state.ang_vel, centripetal_factor * cross(state.ang_vel, point))
     return matvec(rot, add_cross(centripetal, deriv.ang_acc, point), deriv.acc)
 
 
@@ -231,7 +233,7 @@ def _swing_velocities(state: SimState, geometry: LinkGeometry) -> tuple[Array, A
 
 def correction_rate(freq: int) -> float:
     """Return the rate at which a scheme of higher order removes errors in length, 1/s."""
-    return min(CORRECTION_RATE, MAX_CORRECTION_SHARE * freq)
+    return min(CORRECTION_RATE, MAX_CORRECTION_FRACTION * freq)
 
 
 def drag_rate(coefficient: Array, mass: Array, dt: float | None, freq: int) -> Array:

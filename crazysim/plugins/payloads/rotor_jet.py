@@ -109,8 +109,8 @@ class RotorJet(Plugin):
             torque = jnp.sum(rotation.cross(arm, force), axis=-2)
             return self.write(data, record.replace(force=jnp.sum(force, axis=-2), torque=torque))
 
-        numbers = 0 if self.table is None else sum(np.size(x) for x in (self.table.pressure, self.table.velocity))
-        scope = "world" if self.all_drones else "drone" if numbers <= MAX_FUSED_VALUES else "batch"
+        n_values = 0 if self.table is None else sum(np.size(x) for x in (self.table.pressure, self.table.velocity))
+        scope = "world" if self.all_drones else "drone" if n_values <= MAX_FUSED_VALUES else "batch"
         return [StagePlacement(Stage(apply_jets, scope, batched=not self.all_drones, unfused_reason=UNFUSED_REASON))]  # type: ignore[arg-type]
 
     def observations(self, data: SimData) -> dict[str, Array]:
@@ -166,7 +166,7 @@ def jet_pressure(
     drone_pos, quat, rotor_vel, thrust, diameter, density = (x[..., None, :] for x in drone_values)
     offset = pos - drone_pos
 
-    def momentum(air: Array) -> Array:
+    def momentum_flux(air: Array) -> Array:
         relative_vel = air - vel[..., None, :]
         closing_speed = -rotation.dot(relative_vel, normal)
         # Only air in the jet transfers momentum: still air outside it exerts no force on a load that moves.
@@ -175,7 +175,7 @@ def jet_pressure(
 
     if record.speeds is None:
         axis = rotation.z_axis(quat)
-        return momentum(-hover_jet_speed(offset, axis, thrust, diameter, density) * axis)
+        return momentum_flux(-hover_jet_speed(offset, axis, thrust, diameter, density) * axis)
     speed = rotor_vel * RPM_TO_RAD_S
     jet_factor, table = table_position(speed, record.speeds)
     # With tables, ``origin`` and ``spacing`` are arrays.
@@ -187,7 +187,7 @@ def jet_pressure(
     if record.pressure is not None:
         total = total - jet_factor * interpolate(record.pressure, table_index)[..., None] * normal
     if record.velocity is not None:
-        total = total + momentum(rotation.rotate(quat, jet_factor * interpolate(record.velocity, table_index)))
+        total = total + momentum_flux(rotation.rotate(quat, jet_factor * interpolate(record.velocity, table_index)))
     return total
 
 
@@ -201,9 +201,9 @@ def table_position(speed: Array, speeds: Array) -> tuple[Array, Array]:
     Returns:
         Factor, 0 to 1 (..., 1), and position in units of tables, 0 to k - 1 (..., 1).
     """
-    share = rotation.safe_clip(speed / speeds[0], 0.0, 1.0)
-    steps = [
+    jet_factor = rotation.safe_clip(speed / speeds[0], 0.0, 1.0)
+    intervals = [
         rotation.safe_clip((speed - speeds[i]) / (speeds[i + 1] - speeds[i]), 0.0, 1.0)
         for i in range(speeds.shape[0] - 1)
     ]
-    return share, sum(steps, jnp.zeros_like(speed))
+    return jet_factor, sum(intervals, jnp.zeros_like(speed))

@@ -151,9 +151,9 @@ class SharedLoad(PointLoad, Plugin):
         r = link_geometry(s, load.pos, load.vel, load.attach)
         q, radial_speed = r.direction, rotation.dot(r.direction, r.vel)
         pull = UnitPull.create(q, r.rot, p.J_inv, load.attach)
-        share = 1.0 if dt is None else 0.5
-        rel_acc = gravity - acceleration_at(s, deriv, r.rot, load.attach, share)
-        rhs = rotation.dot(q, rel_acc) + share / load.length * (
+        swing_factor = 1.0 if dt is None else 0.5
+        rel_acc = gravity - acceleration_at(s, deriv, r.rot, load.attach, swing_factor)
+        rhs = rotation.dot(q, rel_acc) + swing_factor / load.length * (
             rotation.dot(r.vel, r.vel) - radial_speed * radial_speed
         )
         is_active = load.attached

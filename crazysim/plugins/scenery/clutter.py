@@ -29,7 +29,7 @@ class Clutter(Scenery):
     An obstacle keeps a distance of ``gap / 2`` from the sides of its cell, so that aisles of width ``gap`` lead along
     all sides. The cells take boxes and balls, of 4 sizes each, and meshes in turn, the same in all worlds.
 
-    ``difficulty`` is the share of the obstacles that are there.
+    ``difficulty`` is the fraction of the obstacles that are present.
     """
 
     density: float = setting(default=1 / 8, positive=True)
@@ -87,8 +87,8 @@ class Clutter(Scenery):
         radius, *middle = jnp.asarray(np.concatenate([radius[:, None], self._middles()[cell]], axis=1).T, dtype)
         reach = self.cell - self.gap - 2 * radius
         pos = [middle[k] + self.wander(data, u[k], u[k + 3], reach) for k in range(3)]
-        is_there = (u[6] < record.difficulty) & self.is_free(pos[:2], middle[:2], radius, reach)
-        pos[2] = jnp.where(is_there, pos[2], pos[2] - HIDDEN_DEPTH)
+        is_present = (u[6] < record.difficulty) & self.is_free(pos[:2], middle[:2], radius, reach)
+        pos[2] = jnp.where(is_present, pos[2], pos[2] - HIDDEN_DEPTH)
         r1, r2 = jnp.sqrt(1 - u[7]), jnp.sqrt(u[7])
         a, b = 2 * jnp.pi * u[8], 2 * jnp.pi * u[9]
         quat = [r1 * jnp.sin(a), r1 * jnp.cos(a), r2 * jnp.sin(b), r2 * jnp.cos(b)]  # uniform: Shoemake 1992

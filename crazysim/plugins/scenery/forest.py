@@ -47,7 +47,7 @@ class StandingObstacles(Scenery):
     x. An obstacle keeps a distance of ``gap / 2`` from the edges of its cell: from every point beside the obstacles
     there is a path of width ``gap`` to every other. Which obstacle has which of 8 sizes is the same in all worlds.
 
-    ``difficulty`` is the share of the obstacles that stand.
+    ``difficulty`` is the fraction of the obstacles that stand.
     """
 
     density: float = setting(default=1 / 16, positive=True)
@@ -138,7 +138,7 @@ class StandingObstacles(Scenery):
         """
         record, (n_x, n_y) = self.read(data), self.n_cells
         cell = column * n_y + row
-        start_x, start_y, share = (record.uniform(3 * cell + k) for k in range(3))
+        start_x, start_y, random_number = (record.uniform(3 * cell + k) for k in range(3))
         turn, vel_x, vel_y = (record.uniform(4 * n_x * n_y + 3 * cell + k) for k in range(3))
         size = self._size(self._size_index(cell)).astype(start_x.dtype)
         reach = self.cell - self.gap - 2 * self.radius(size)
@@ -148,7 +148,7 @@ class StandingObstacles(Scenery):
         y = middle_y + self.wander(data, start_y, vel_y, reach)
         is_inside = (column >= 0) & (column < n_x) & (row >= 0) & (row < n_y)
         is_free = self.is_free((x, y), (middle_x, middle_y), self.radius(size), reach)
-        is_standing = is_inside & (share < record.difficulty) & is_free
+        is_standing = is_inside & (random_number < record.difficulty) & is_free
         return Columns(x, y, jnp.pi * turn, size, is_standing)
 
     def clearance(self, data: SimData, pos: Array) -> Array:
@@ -200,7 +200,7 @@ class Forest(StandingObstacles):
     x. A tree keeps a distance of ``gap / 2`` from the edges of its cell: from every point beside the trees there is a
     path of width ``gap`` to every other. Which tree has which of 8 radii is the same in all worlds.
 
-    ``difficulty`` is the share of the trees that stand.
+    ``difficulty`` is the fraction of the trees that stand.
     """
 
     radii: ArrayLike = setting(default=(0.1, 0.3), positive=True, shapes=((2,),))

@@ -1,8 +1,8 @@
 """Base of layouts of obstacles that differ between worlds and episodes.
 
 A layout is not stored: the pose of every obstacle follows from two random words of the world by ``uniform_at``. So the
-record of a world has three numbers, whatever the number of obstacles, and a drone that looks for the obstacles around
-it computes the poses of those alone.
+record of a world has three numbers, whatever the number of obstacles, and the obstacles around a drone can be found
+without the poses of all others.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MIN_REACH = 1e-3
 MAX_OBSTACLES = 10_000
 """Largest number of obstacles of a layout."""
 DIFFICULTY_INDEX = np.uint32(2**32 - 1)
-"""Index of the number of a world's stream that draws its difficulty."""
+"""Index of the random number of a world from which its difficulty is drawn."""
 
 
 class SceneryData(PyTree):

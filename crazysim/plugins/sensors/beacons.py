@@ -83,22 +83,24 @@ class UWB(Sensor):
 
     def ideal(self, data: SimData) -> Array:
         """Return the distances, or their differences, m. (n,)"""
-        return self._output(self._distances(data))
+        return self._to_measurement(self._distances(data))
 
     def measure(self, data: SimData, record: UWBData, key: Array) -> tuple[Array, UWBData]:
         distance = self._distances(data)
         keys, shape, dtype = jax.random.split(key), distance.shape, distance.dtype
-        chance = uniform(keys[0], (*shape, 2), dtype)
-        detour = jnp.where(chance[:, 1] < record.outliers, -record.detour * jnp.log(1 - chance[:, 0]), 0.0)
+        random_numbers = uniform(keys[0], (*shape, 2), dtype)
+        detour = jnp.where(
+            random_numbers[:, 1] < record.outliers, -record.detour * jnp.log(1 - random_numbers[:, 0]), 0.0
+        )
         distance = distance + record.bias + detour + record.noise * normal(keys[1], shape, dtype)
-        return self._output(distance), record
+        return self._to_measurement(distance), record
 
     def _distances(self, data: SimData) -> Array:
         """Return the distances of one antenna from the anchors, m. (n_anchors,)"""
         record, s = self.read(data), data.states
         return rotation.safe_norm(rotation.rotate(s.quat, record.pos, s.pos) - record.anchors)[:, 0]
 
-    def _output(self, distance: Array) -> Array:
+    def _to_measurement(self, distance: Array) -> Array:
         return distance[1:] - distance[0] if self.tdoa else distance
 
 

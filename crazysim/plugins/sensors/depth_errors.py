@@ -36,9 +36,9 @@ class StereoNoise:
     """Errors of a camera that measures depth by stereo matching.
 
     A disparity of ``d = f b / z`` pixels is matched with an error of ``disparity_noise`` pixels, so that the depth has
-    the standard deviation ``z^2 / (f b) * disparity_noise`` (Intel, *Tuning depth cameras for best performance*). What
-    the second imager, on the right, cannot see behind nearer objects has no depth: a pixel is a hole where another one,
-    on its right, has the same position or one further left in the image of that imager.
+    the standard deviation ``z^2 / (f b) * disparity_noise`` (Intel, *Tuning depth cameras for best performance*).
+    Points that nearer objects hide from the second imager, which is on the right, have no depth: a pixel is a hole if a
+    pixel on its right appears at the same position, or further left, in the second image.
     """
 
     focal: float = setting(default=D435_WIDTH / 2 / np.tan(np.radians(D435_HFOV / 2)), positive=True)

@@ -74,11 +74,11 @@ class OpticalFlow(Sensor):
     def ideal(self, data: SimData) -> Array:
         """Return the motion of the image, pixels per interval. (2,)"""
         record, s = self.read(data), data.states
-        distance, in_view = ground_distance(data, record.pos)
+        distance, is_in_view = ground_distance(data, record.pos)
         vel = rotation.rotate_inverse(s.quat, s.vel, rotation.cross(s.ang_vel, record.pos))
         turn_rate = jnp.stack([-s.ang_vel[1], s.ang_vel[0]])
         angular_rate = vel[:2] / jnp.where(distance > MIN_FLOW_DISTANCE, distance, MIN_FLOW_DISTANCE) + turn_rate
-        return jnp.where(in_view, record.scale * self.interval(data) * angular_rate, 0.0)
+        return jnp.where(is_in_view, record.scale * self.interval(data) * angular_rate, 0.0)
 
     def measure(self, data: SimData, record: OpticalFlowData, key: Array) -> tuple[Array, OpticalFlowData]:
         truth = self.ideal(data)
@@ -136,16 +136,16 @@ class TimeOfFlight(Sensor):
     def ideal(self, data: SimData) -> Array:
         """Return the distance to the ground, m. (1,)"""
         record = self.read(data)
-        distance, in_view = ground_distance(data, record.pos)
+        distance, is_in_view = ground_distance(data, record.pos)
         distance = jnp.where(distance > 0, distance, 0.0)
-        return jnp.where(in_view & (distance < record.max_range), distance, record.max_range)
+        return jnp.where(is_in_view & (distance < record.max_range), distance, record.max_range)
 
     def measure(self, data: SimData, record: TimeOfFlightData, key: Array) -> tuple[Array, TimeOfFlightData]:
         truth = self.ideal(data)
         deviation = record.noise + range_deviation(truth, record.far_noise)
-        in_range = truth < record.max_range
+        is_in_range = truth < record.max_range
         value = truth + deviation * normal(key, (1,), truth.dtype)
-        value = jnp.where(in_range, rotation.safe_clip(value, 0.0, record.max_range), record.max_range)
+        value = jnp.where(is_in_range, rotation.safe_clip(value, 0.0, record.max_range), record.max_range)
         return quantise(value, record.resolution), record
 
 
@@ -166,6 +166,6 @@ def ground_distance(data: SimData, pos: Array) -> tuple[Array, Array]:
     """
     s = data.states
     cosine = rotation.z_axis(s.quat)[2:]
-    in_view = cosine > MIN_TILT_COSINE
+    is_in_view = cosine > MIN_TILT_COSINE
     height = s.pos[2:] + rotation.rotate(s.quat, pos)[2:] - ground_below(data)
-    return height / jnp.where(in_view, cosine, 1.0), in_view
+    return height / jnp.where(is_in_view, cosine, 1.0), is_in_view

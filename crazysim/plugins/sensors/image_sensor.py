@@ -235,16 +235,16 @@ class ImageSensor(Plugin):
             jax.lax.cond(jnp.any(is_due), capture, lambda record: record, record) if period > 1 else capture(record)
         )
         # Images are numbered from the beginning of the episode; the first one is delivered at once.
-        delivered = jnp.maximum((steps - latency) // period, 0)
+        delivered_index = jnp.maximum((steps - latency) // period, 0)
         if latency:
-            row = steps // period - delivered
+            row = steps // period - delivered_index
 
             def read_row(queue: Array) -> Array:
                 index = row.reshape(-1, *(1,) * (queue.ndim - 1))
                 return jnp.take_along_axis(queue, index, axis=2)[:, :, 0]
 
             record = record.replace(images=jax.tree.map(read_row, record.transit))
-        return record.replace(taken_step=delivered * period)
+        return record.replace(taken_step=delivered_index * period)
 
     def record(self, sim: Simulation) -> ImageData:
         period = sampling_period(self, sim)

@@ -47,7 +47,7 @@ BMI088: dict[str, Any] = {
 }
 """Bosch BMI088, of the Crazyflie 2.1. Noise densities and offsets: data sheet BST-BMI088, revision 1.9, tables 4 and 5
 (typical values of offsets are used as standard deviations). Ranges of 2000 degrees/s and 24 g in 16 bits, and the
-filters, are those that the firmware sets (sensors_bmi088_bmp3xx.c of crazyflie-firmware, BW_116 and OSR4 at 1600 Hz).
+filters, are as the firmware sets them (sensors_bmi088_bmp3xx.c of crazyflie-firmware, BW_116 and OSR4 at 1600 Hz).
 The data sheet states no instability or random walk of the bias: they are zero."""
 
 _FIRMWARE_GYRO_BIAS = 0.014 * RAD_PER_DEGREE / math.sqrt(2 * 0.512)

@@ -47,7 +47,7 @@ class Lidar(ImageSensor):
     noise: float = setting(default=0.0, low=0.0)
     """Standard deviation of a distance, m."""
     relative_noise: float = setting(default=0.0, low=0.0)
-    """Standard deviation that grows with the distance, as a share of it, 1."""
+    """Standard deviation that grows with the distance, as a fraction of it, 1."""
     resolution: float = setting(default=0.0, low=0.0)
     """Steps of a distance, m; 0 for none."""
     dropout: float = setting(default=0.0, low=0.0, high=1.0)
@@ -114,6 +114,6 @@ class Lidar(ImageSensor):
             measured = quantise(measured, jnp.asarray(self.resolution, distance.dtype))
         has_return = (distance < self.max_range) & (distance >= self.min_range)
         if self.dropout:
-            chance = uniform(jax.random.fold_in(key, 1), distance.shape, distance.dtype)
-            has_return &= chance >= self.dropout
+            random_numbers = uniform(jax.random.fold_in(key, 1), distance.shape, distance.dtype)
+            has_return &= random_numbers >= self.dropout
         return jnp.where(has_return, jnp.clip(measured, 0.0, self.max_range), self.max_range)

@@ -84,16 +84,20 @@ class RangeFinder(Plugin):
         for all worlds if more geoms can move than a fused kernel can unroll.
         """
         visual, solid = sim.scene.visual_model, sim.scene.collision_model
-        movers = moving_plugins(sim.scene.plugins(), [body.name for body in visual.objects])
+        movers_by_name = moving_plugins(sim.scene.plugins(), [body.name for body in visual.objects])
         moved_objects = {body.name for body in solid.objects}
-        objects = tuple(body for body in visual.objects if body.name in moved_objects or body.name not in movers)
+        objects = tuple(
+            body for body in visual.objects if body.name in moved_objects or body.name not in movers_by_name
+        )
         # The collision shape of a drone is enough for a few rays.
         model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
-        movers = {name: plugin for name, plugin in movers.items() if name in moved_objects}
+        movers_by_name = {name: plugin for name, plugin in movers_by_name.items() if name in moved_objects}
         n_movable = sum(len(body.geoms) for body in objects if body.row is not None)
         if self.drones:
-            n_movable += sum(len(kind.geoms) * len(kind.drones or range(sim.n_drones)) for kind in model.drones)
-        scope = "batch" if n_movable > MAX_UNROLLED_GEOMS else "world" if self.drones or movers else "drone"
+            n_movable += sum(
+                len(drone_geoms.geoms) * len(drone_geoms.drones or range(sim.n_drones)) for drone_geoms in model.drones
+            )
+        scope = "batch" if n_movable > MAX_UNROLLED_GEOMS else "world" if self.drones or movers_by_name else "drone"
         period, scene = sampling_period(self, sim), sim.scene
 
         def is_due(data: SimData) -> Array:
@@ -102,9 +106,9 @@ class RangeFinder(Plugin):
 
         def measure(data: SimData) -> SimData:
             """Measure distances, with loads at their current positions."""
-            movers_present = {name: plugin for name, plugin in movers.items() if plugin.name in data.plugins}
-            current = with_moved_objects(data, movers_present)
-            return self.write(data, self._measure(model, current, scope == "drone", scene.ray_kernels))
+            movers_present = {name: plugin for name, plugin in movers_by_name.items() if plugin.name in data.plugins}
+            current_data = with_moved_objects(data, movers_present)
+            return self.write(data, self._measure(model, current_data, scope == "drone", scene.ray_kernels))
 
         def measure_at_times(data: SimData) -> SimData:
             """Measure in a call that is skipped if no world is due."""
@@ -113,8 +117,8 @@ class RangeFinder(Plugin):
         fn = measure_at_times if scope == "batch" and period > 1 else measure
         condition = None if period == 1 else is_due
         reason = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED_GEOMS}, are cast by a separate kernel"
-        measuring = Stage(fn, scope, condition, name="range_finder", unfused_reason=reason)
-        return [StagePlacement(measuring, before="increment_steps")]
+        measurement_stage = Stage(fn, scope, condition, name="range_finder", unfused_reason=reason)
+        return [StagePlacement(measurement_stage, before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the distances, m."""
@@ -130,10 +134,12 @@ class RangeFinder(Plugin):
         for points in np.stack(np.broadcast_arrays(start, end), axis=-2).reshape(-1, 2, 3):
             sim.scene.renderer.overlays.line(points, RAY_COLOR, 2.0, 2.0)
 
-    def _measure(self, model: CollisionModel, data: SimData, of_drone: bool, kernels: RayKernels) -> RangeFinderData:
+    def _measure(
+        self, model: CollisionModel, data: SimData, is_single_drone: bool, kernels: RayKernels
+    ) -> RangeFinderData:
         """Return the record with the distances of one drone, of one world, or of all worlds."""
         record, states = self.read(data), data.states
-        pos, quat = (states.pos[None], states.quat[None]) if of_drone else (states.pos, states.quat)
+        pos, quat = (states.pos[None], states.quat[None]) if is_single_drone else (states.pos, states.quat)
         direction = rotation.rotate(quat[..., None, :], record.direction)
         n_drones, n_rays = direction.shape[-3:-1]
         origin = jnp.broadcast_to(pos[..., None, :], direction.shape)
@@ -143,4 +149,4 @@ class RangeFinder(Plugin):
             model, data, origin, direction, ignored_drones, self.drones, kernels=kernels, limit=record.max_range
         )
         distance = jnp.minimum(hits.distance, record.max_range).reshape(*pos.shape[:-1], n_rays)
-        return record.replace(distance=distance[0] if of_drone else distance)
+        return record.replace(distance=distance[0] if is_single_drone else distance)

@@ -191,11 +191,11 @@ class Sensor(Plugin):
         """Take a measurement of one drone, and queue it, or hold it if there is no delay."""
         key, step = drone_key(data, self.name), data.core.steps
         value, record = self.measure(data, self.read(data), key)
-        samples, is_lost, jitter_share = record.samples, False, 0.0
+        samples, is_lost, jitter_fraction = record.samples, False, 0.0
         if samples.dropout is not None or samples.queue is not None:
-            chance = uniform(drone_key(data, f"{self.name}_arrival"), (2,), value.dtype)
-            is_lost = False if samples.dropout is None else chance[:1] < samples.dropout
-            jitter_share = chance[1:]
+            random_numbers = uniform(drone_key(data, f"{self.name}_arrival"), (2,), value.dtype)
+            is_lost = False if samples.dropout is None else random_numbers[:1] < samples.dropout
+            jitter_fraction = random_numbers[1:]
         if samples.queue is None:
             taken_step = jnp.broadcast_to(step, (1,))
             if samples.dropout is not None:
@@ -203,7 +203,7 @@ class Sensor(Plugin):
                 taken_step = jnp.where(is_lost, samples.taken_step, taken_step)
             samples = samples.replace(value=value, taken_step=taken_step)
         else:
-            arrival_step = step + jnp.round(data.core.freq * (samples.delay + jitter_share * samples.jitter)).astype(
+            arrival_step = step + jnp.round(data.core.freq * (samples.delay + jitter_fraction * samples.jitter)).astype(
                 jnp.int32
             )
             arrival_step = arrival_step if samples.dropout is None else jnp.where(is_lost, NEVER_ARRIVES, arrival_step)

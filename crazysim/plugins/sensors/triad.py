@@ -133,11 +133,11 @@ class Triad:
     def record(self, sim: Simulation, name: str) -> TriadData:
         """Return the record before the first measurement; ``name`` is the sensor's name in messages."""
 
-        def vector(field: str) -> Array:
+        def read_vector(field: str) -> Array:
             return check_parameter(sim, f"{field} of {name}", getattr(self, field), (3,), per_axis=True)
 
         def join_fields(*fields: str) -> Array:
-            parts = [np.asarray(vector(field)) for field in fields]
+            parts = [np.asarray(read_vector(field)) for field in fields]
             batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
             parts = [np.broadcast_to(x, (*batch, 3)) for x in parts]
             return check_parameter(sim, name, np.concatenate(parts, axis=-1), (9,))
@@ -155,9 +155,9 @@ class Triad:
             misalignment=means[..., 6:],
             wander=drone_array(sim, 0.0, 3),
             filtered=None if self.bandwidth is None else drone_array(sim, 0.0, 3),
-            noise=vector("noise"),
-            random_walk=vector("random_walk"),
-            instability=vector("instability"),
+            noise=read_vector("noise"),
+            random_walk=read_vector("random_walk"),
+            instability=read_vector("instability"),
             correlation_time=check_parameter(sim, f"correlation_time of {name}", self.correlation_time, (1,)),
             mean=mean,
             spread=join_fields("bias_spread", "scale_spread", "misalignment_spread"),

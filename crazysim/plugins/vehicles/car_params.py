@@ -35,7 +35,7 @@ class CarParams(PyTree):
     drive_max: Array = leaf("parameter", 1, (1,))
     """Largest force of the drive, N. (1,)"""
     front_share: Array = leaf("parameter", 1, (1,))
-    """Share of the drive's force that acts on the front axle, 1. (1,)"""
+    """Fraction of the drive's force that acts on the front axle, 1. (1,)"""
     rolling: Array = leaf("parameter", 1, (2,))
     """Resistance of the wheels: increase with speed, N s/m, and dry friction, N. (2,)"""
     towed_mass: Array = leaf("parameter", 1, (1,))
@@ -68,13 +68,13 @@ class CarParams(PyTree):
         front, rear, half_track = number("axles.front"), number("axles.rear"), number("axles.track") / 2
         mass = number("rigid_body.mass") + n * wheel_mass
         # Uniform cylinders: m (3 r^2 + w^2) / 12 about a diameter, m r^2 / 2 about the axis.
-        upright = wheel_mass * (3 * radius**2 + number("wheels.width") ** 2) / 12
+        wheel_yaw_inertia = wheel_mass * (3 * radius**2 + number("wheels.width") ** 2) / 12
         arms = wheel_mass * (half_track**2 + (front**2 + rear**2) / 2)
-        yaw_inertia = number("rigid_body.yaw_inertia") + n * (upright + arms)
-        spin = number("wheels.armature") + wheel_mass * radius**2 / 2
+        yaw_inertia = number("rigid_body.yaw_inertia") + n * (wheel_yaw_inertia + arms)
+        wheel_spin_inertia = number("wheels.armature") + wheel_mass * radius**2 / 2
         axle_loads = [-GRAVITY[2] * mass * x / (front + rear) for x in (rear, front)]
-        kinematic = vehicle.dynamics == "kinematic"
-        stiffness = [0.0, 0.0] if kinematic else [number("tyres.front"), number("tyres.rear")]
+        is_kinematic = vehicle.dynamics == "kinematic"
+        stiffness = [0.0, 0.0] if is_kinematic else [number("tyres.front"), number("tyres.rear")]
         moments = front**2 * stiffness[0] + rear**2 * stiffness[1]
         # The fastest rate of lateral motion is at most this divided by the speed; its product with the step must stay
         # below 1.
@@ -82,7 +82,7 @@ class CarParams(PyTree):
         drive, drive_max = drive_constants(vehicle)
         slip_speed = max(SLIP_SPEED, rate / freq)
         rolling = [n * number("wheels.damping") / radius**2, n * number("wheels.friction_loss") / radius]
-        towed_mass = n * spin / radius**2 + (number("trailer.mass") if trailer else 0.0)
+        towed_mass = n * wheel_spin_inertia / radius**2 + (number("trailer.mass") if trailer else 0.0)
         damping = (drive[1] + rolling[0]) / (mass + towed_mass)
         if damping > MAX_LAG_RATE * freq:
             raise ConfigError(

@@ -33,10 +33,11 @@ MAX_NEWTON_STEP = 0.5
 """Largest displacement in one Newton step, m."""
 STOPPING_LENGTH = 0.5
 """Length before the end of an open path in which a reference by arc length slows down, m."""
-MIN_SPEED_SHARE = 0.1
-"""Smallest speed of a reference by arc length, as a share of the path's largest, so that a vehicle at rest starts."""
-MIN_CURVED_SPEED_SHARE = 0.05
-"""Parametric speed, as a share of its maximum, below which the curvature is set to zero."""
+MIN_SPEED_FRACTION = 0.1
+"""Smallest speed of a reference by arc length, as a fraction of the path's largest speed. Vehicles at rest
+can then start."""
+MIN_CURVED_SPEED_FRACTION = 0.05
+"""Parametric speed, as a fraction of its maximum, below which the curvature is set to zero."""
 N_REPEATED_POINTS = 12
 """Number of points of a closed path that are repeated at both ends, so that its spline is smooth where it closes."""
 
@@ -62,8 +63,8 @@ class Path(PyTree):
     """
 
     coefficients: Array = leaf("shared", 4)
-    """Coefficients of x and y, m, in each piece, constant term first; the argument is the share of the piece's length.
-    Padding repeats the last piece. (n_paths, n_pieces, 2, 6)"""
+    """Coefficients of x and y, m, in each piece, constant term first; the argument is the fraction of the piece's
+    length. Padding repeats the last piece. (n_paths, n_pieces, 2, 6)"""
     length: Array = leaf("shared", 1)
     """Length of each path, m. (n_paths,)"""
     spacing: Array = leaf("shared", 1)
@@ -181,8 +182,8 @@ class Path(PyTree):
         """
         piece, _ = self._locate(index, s)
         slowdown = safe_clip((_entry_at(self.length, index) - s) / STOPPING_LENGTH, 0.0, 1.0)
-        share = jnp.where(_entry_at(self.closed, index), 1.0, slowdown)
-        return (share * _entry_at(self.speeds, index, piece))[None]
+        slowdown_factor = jnp.where(_entry_at(self.closed, index), 1.0, slowdown)
+        return (slowdown_factor * _entry_at(self.speeds, index, piece))[None]
 
     def time_reference(self, index: Array | int, t: Array) -> tuple[Array, Array]:
         """Return the arc length, m, and the speed, m/s, at a time.
@@ -265,7 +266,7 @@ class Path(PyTree):
         return np.asarray(point.pos, float), float(np.arctan2(y, x)), float(arc[0])
 
     def _locate(self, index: Array | int, s: Array) -> tuple[Array, Array]:
-        """Return the piece at an arc length, and the position in it as a share of its length."""
+        """Return the piece at an arc length, and the position in it as a fraction of its length."""
         length, spacing = _entry_at(self.length, index), _entry_at(self.spacing, index)
         local_s = s - length * lax.floor(s / length)
         local = jnp.where(_entry_at(self.closed, index), local_s, safe_clip(s, 0.0, length)) / spacing
@@ -337,14 +338,16 @@ def _path_of_curve(
     size = np.hypot(*vel.T)[:, None]
     tangent = vel / size
     curvature = (acc - np.sum(acc * tangent, axis=1, keepdims=True) * tangent) / size**2
-    curvature[size[:, 0] < MIN_CURVED_SPEED_SHARE * parametric_speed.max()] = (
+    curvature[size[:, 0] < MIN_CURVED_SPEED_FRACTION * parametric_speed.max()] = (
         0.0  # near rest the curvature of a polynomial grows without bound
     )
     spacing = arc[-1] / n
     derivatives = np.stack([pos, tangent, curvature], axis=1)
     coefficients = interpolation.unit_coefficients(derivatives, np.full(n, spacing))
     speeds = (
-        np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], MIN_SPEED_SHARE * parametric_speed.max())
+        np.full(n, speed)
+        if speed is not None
+        else np.maximum(size[:-1, 0], MIN_SPEED_FRACTION * parametric_speed.max())
     )
     duration = progress[-1, 0] / speed if speed is not None else parameters[-1]
     arrays = (coefficients, arc[-1], spacing, speeds * (-1 if backwards else 1), progress, duration)
@@ -358,7 +361,7 @@ def _arc_length(parameters: Floats, parametric_speed: Floats) -> Floats:
 
 
 def _evaluate(coefficients: Array, u: Array) -> PathPoint:
-    """Return position, tangent and curvature of a piece, (2, 6), at a share of its length. ()"""
+    """Return position, tangent and curvature of a piece, (2, 6), at a fraction of its length. ()"""
     x = [coefficients[:, k] for k in range(6)]
     pos = x[0] + u * (x[1] + u * (x[2] + u * (x[3] + u * (x[4] + u * x[5]))))
     derivative = x[1] + u * (2 * x[2] + u * (3 * x[3] + u * (4 * x[4] + u * 5 * x[5])))

@@ -12,9 +12,9 @@ from crazysim.rotation import safe_clip
 
 
 def drive_force(reference: Array, speed: Array, params: CarParams) -> Array:
-    """Return the force with which the wheels wrench the vehicle forwards on ground with enough grip, N. (..., 1)
+    """Return the force with which the wheels push the vehicle forwards on ground with enough grip, N. (..., 1)
 
-    The motor's force ``gain d - damping v - friction sgn(v)``, limited, minus the resistance of the wheels. A share of
+    The motor's force ``gain d - damping v - friction sgn(v)``, limited, minus the resistance of the wheels. Part of
     it accelerates wheels, motors and a trailer; the rest acts on the vehicle. The sign of the speed changes smoothly
     within ``slip_speed``.
 
@@ -48,8 +48,8 @@ def tyre_force(drive: Array, vel: Array, stiffness: Array, grip: Array, slip_spe
     """
     longitudinal_vel, lateral_vel = vel[..., :1], vel[..., 1:]
     lateral = -stiffness * lateral_vel * lax.rsqrt(longitudinal_vel * longitudinal_vel + slip_speed * slip_speed)
-    share = (drive * drive + lateral * lateral) / (grip * grip)
-    scale = lax.rsqrt(1 + share)
+    grip_ratio_square = (drive * drive + lateral * lateral) / (grip * grip)
+    scale = lax.rsqrt(1 + grip_ratio_square)
     return drive * scale, lateral * scale
 
 

@@ -20,17 +20,19 @@ def row_positions(n: int) -> NDArray:
     return np.stack([np.zeros(n), START_SPACING * (np.arange(n) - (n - 1) / 2)], axis=1)
 
 
-def member_array(name: str, value: ArrayLike, counts: tuple[int, int], core: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return checked positions or headings, one for all cars or one per car. (..., *core)
+def member_array(
+    name: str, value: ArrayLike, counts: tuple[int, int], member_shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Return checked positions or headings, one for all cars or one per car. (..., *member_shape)
 
     Args:
         name: Name of the setting, for errors.
         value: Positions, m, or headings, rad.
         counts: Numbers of worlds and of cars.
-        core: Shape for one car.
+        member_shape: Shape for one car.
     """
     array = np.asarray(value, float)
-    shapes, finite = [core, (counts[1], *core), (*counts, *core)], np.all(np.isfinite(array))
+    shapes, finite = [member_shape, (counts[1], *member_shape), (*counts, *member_shape)], np.all(np.isfinite(array))
     if array.shape not in shapes or not finite:
         raise ConfigError(
             f"expected {name} as finite numbers of shape {' or '.join(map(str, shapes))} = (n_worlds, n_members, ...), "
