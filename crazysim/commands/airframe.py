@@ -13,7 +13,7 @@ ESTIMATE_OPTIONS = (
     "time_constant", "cells", "capacity", "resistance",
 )  # fmt: skip
 """Options of ``new`` that are arguments of ``estimate_airframe``."""
-SPINS = {"ccw": 1, "cw": -1}
+SPIN_SIGNS = {"ccw": 1, "cw": -1}
 """Sign of each sense of rotation, seen from above."""
 
 
@@ -70,7 +70,7 @@ def estimate(options: argparse.Namespace) -> None:
     check_writable(path, (".toml",))
     if path.exists():
         raise ValueError(f"expected a new file, got {str(path)!r}, which exists; choose another name or remove it")
-    if unknown := [x for x in options.spins or () if x.lower() not in SPINS]:
+    if unknown := [x for x in options.spins or () if x.lower() not in SPIN_SIGNS]:
         raise ValueError(f"expected --spins of ccw and cw, got {unknown[0]!r}")
     try:
         texts = (options.positions or "").split()
@@ -80,7 +80,7 @@ def estimate(options: argparse.Namespace) -> None:
     text = estimate_airframe(
         **{name: getattr(options, name) for name in ESTIMATE_OPTIONS},
         positions=positions,
-        spins=options.spins and [SPINS[x.lower()] for x in options.spins],
+        spins=options.spins and [SPIN_SIGNS[x.lower()] for x in options.spins],
         name=options.name or path.stem,
     )
     tables = tomllib.loads(text)

@@ -36,8 +36,8 @@ MAX_PRECESSION_RATIO = 2.5
 """Ratio of the precession rate to the bandwidth of the attitude loop above which ``auto`` may be unstable
 (dimensionless). Of 1,960 random airframes with an odd number of rotors, all with ratios up to 2.45 fly, and the one
 with 4.3 does not."""
-MAX_PRECESSION_SHARE = 0.25
-"""Share of the roll or pitch authority that the gyroscopic torque of the rotors takes up at 1 rad/s, above which a
+MAX_PRECESSION_FRACTION = 0.25
+"""Fraction of the roll or pitch authority that the gyroscopic torque of the rotors takes up at 1 rad/s, above which a
 warning is given (dimensionless)."""
 MAX_TIME_CONSTANT = 0.2
 """Time constant of rotors above which a warning is given, s: the longest of the airframes in the tests."""
@@ -210,7 +210,7 @@ def _agility_warnings(airframe: Airframe) -> Iterator[str]:
                 f"{axis} has at most {acc:.2g} rad/s^2 under controller 'auto': a turn by 90 degrees takes "
                 f"{seconds:.2g} s at least"
             )
-    if precession_rate(airframe) > MAX_PRECESSION_SHARE * np.min(max_ang_acc(airframe)[:2]):
+    if precession_rate(airframe) > MAX_PRECESSION_FRACTION * np.min(max_ang_acc(airframe)[:2]):
         yield (
             f"rotors turn one way more than the other: at 1 rad/s of roll or pitch their momentum takes "
             f"{precession_rate(airframe):.2g} of {np.min(max_ang_acc(airframe)[:2]):.2g} rad/s^2 about the other axis"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crazysim.commands.options import DefaultsFormatter, given_options
+from crazysim.commands.options import DefaultsFormatter, specified_options
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
@@ -29,4 +29,6 @@ def run(options: argparse.Namespace) -> None:
     """Run the demonstration."""
     from crazysim.commands import demo_flight
 
-    demo_flight.run_demo_flight(**given_options(options, "n_worlds", "n_drones", "seconds", "device", "out", "film"))
+    demo_flight.run_demo_flight(
+        **specified_options(options, "n_worlds", "n_drones", "seconds", "device", "out", "film")
+    )

@@ -32,7 +32,7 @@ PERIOD = 5.0
 """Period of the figure eight, s."""
 SETTLING_TIME = 2.0
 """Start of the interval in which the tracking error is measured, s."""
-WIDTH, DEPTH = 1.4, 0.7
+X_AMPLITUDE, Y_AMPLITUDE = 1.4, 0.7
 """Amplitudes of the figure eight along x and y, m."""
 POLE_RADIUS = 0.03
 """Radius of a pole, m."""
@@ -73,7 +73,7 @@ def run_demo_flight(
     contacts_compile_s = perf_counter() - start_time
 
     recorder = Recorder(sim, worlds=[0])
-    errors, touched = [], []
+    errors, pole_contacts = [], []
     step_s = contacts_s = 0.0
     for _ in progress_bar(range(n_frames), "flying"):
         start_time = perf_counter()
@@ -81,14 +81,14 @@ def run_demo_flight(
         step_s += perf_counter() - start_time
         sim.data = data
         start_time = perf_counter()
-        touched.append(find_pole_contacts(sim))
+        pole_contacts.append(find_pole_contacts(sim))
         contacts_s += perf_counter() - start_time
         recorder.add()
         errors.append(np.asarray(error))
 
     n_steps = n_frames * (sim.freq // FPS)
     print_report(
-        np.concatenate(errors), np.stack(touched), n_steps * n_worlds * n_drones, step_s, contacts_s / n_frames
+        np.concatenate(errors), np.stack(pole_contacts), n_steps * n_worlds * n_drones, step_s, contacts_s / n_frames
     )
     print(f"compile time      {compile_s:.2f} s for the flight, {contacts_compile_s:.2f} s for contacts")
     out.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ def build_sim(n_worlds: int, n_drones: int, device: str) -> Sim:
     """Return a simulation with two randomly placed poles per world and drones already on the figure eight."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, drone="cf2x_L250", control="state", device=device)
     offset = np.random.default_rng(0).uniform(-0.4, 0.4, (n_worlds, 2, 3)) * [1, 1, 0]
-    pole_pos = offset + [[-0.6 * WIDTH, 0, 0], [0.6 * WIDTH, 0, 0]]
+    pole_pos = offset + [[-0.6 * X_AMPLITUDE, 0, 0], [0.6 * X_AMPLITUDE, 0, 0]]
     sim.scene.add("pole", count=2, pos=pole_pos, height=1.7, radius=POLE_RADIUS)
 
     start = figure_eight_setpoints(device_array(np.zeros((n_worlds, 1))), n_drones)
@@ -138,15 +138,15 @@ def figure_eight_setpoints(time: Array, n_drones: int) -> Array:
     """
     rate = 2 * jnp.pi / PERIOD
     drone = jnp.arange(n_drones)
-    a = rate * time + 0.5 * jnp.pi * drone
-    sin, cos, sin2, cos2 = jnp.sin(a), jnp.cos(a), jnp.sin(2 * a), jnp.cos(2 * a)
-    zero = jnp.zeros_like(a)
-    height = jnp.broadcast_to(0.7 + 0.25 * drone, a.shape)
+    angle = rate * time + 0.5 * jnp.pi * drone
+    sin, cos, sin2, cos2 = jnp.sin(angle), jnp.cos(angle), jnp.sin(2 * angle), jnp.cos(2 * angle)
+    zero = jnp.zeros_like(angle)
+    height = jnp.broadcast_to(0.7 + 0.25 * drone, angle.shape)
     return jnp.stack(
         [
-            *(WIDTH * sin, DEPTH * sin2, height),
-            *(WIDTH * rate * cos, 2 * DEPTH * rate * cos2, zero),
-            *(-WIDTH * rate**2 * sin, -4 * DEPTH * rate**2 * sin2, zero),
+            *(X_AMPLITUDE * sin, Y_AMPLITUDE * sin2, height),
+            *(X_AMPLITUDE * rate * cos, 2 * Y_AMPLITUDE * rate * cos2, zero),
+            *(-X_AMPLITUDE * rate**2 * sin, -4 * Y_AMPLITUDE * rate**2 * sin2, zero),
             *(zero, zero, zero, zero + 1.0),
             *(zero, zero, zero),
         ],
@@ -166,9 +166,9 @@ def jerk_feedforward(time: Array, n_drones: int) -> Array:
         Jerk, m/s^3, and zeros. (n_worlds, n_drones, 8)
     """
     rate = 2 * jnp.pi / PERIOD
-    a = rate * time + 0.5 * jnp.pi * jnp.arange(n_drones)
-    jerk = [-WIDTH * rate**3 * jnp.cos(a), -8 * DEPTH * rate**3 * jnp.cos(2 * a)]
-    return jnp.stack([*jerk, *[jnp.zeros_like(a)] * 6], axis=-1)
+    angle = rate * time + 0.5 * jnp.pi * jnp.arange(n_drones)
+    jerk = [-X_AMPLITUDE * rate**3 * jnp.cos(angle), -8 * Y_AMPLITUDE * rate**3 * jnp.cos(2 * angle)]
+    return jnp.stack([*jerk, *[jnp.zeros_like(angle)] * 6], axis=-1)
 
 
 def build_fly_frame(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
@@ -189,26 +189,29 @@ def build_fly_frame(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
     return jax.jit(lambda data: jax.lax.scan(tick, data, length=sim.control_freq // FPS))
 
 
-def print_report(errors: np.ndarray, touched: np.ndarray, n_steps: int, step_s: float, contact_s: float) -> None:
+def print_report(errors: np.ndarray, pole_contacts: np.ndarray, n_steps: int, step_s: float, contact_s: float) -> None:
     """Print step rate, tracking error and contacts of the flight.
 
     Args:
         errors: Distances from the setpoint, m. (n_ticks, n_worlds, n_drones)
-        touched: True where a drone touches a pole. (n_frames, n_worlds, n_drones, n_poles)
+        pole_contacts: True where a drone touches a pole. (n_frames, n_worlds, n_drones, n_poles)
         n_steps: Number of physics steps of all drones.
         step_s: Time of all steps, s.
         contact_s: Time of one contact query, s.
     """
-    start = round(SETTLING_TIME * FPS * len(errors) / len(touched))
+    start = round(SETTLING_TIME * FPS * len(errors) / len(pole_contacts))
     settled_errors = 100 * (errors[start:] if start < len(errors) else errors)
-    contact_starts = touched[1:] & ~touched[:-1]
+    contact_starts = pole_contacts[1:] & ~pole_contacts[:-1]
     print(f"steps per second  {n_steps / step_s / 1e6:.1f} M ({n_steps / 1e6:.1f} M drone steps in {step_s:.1f} s)")
     mean, percentile = settled_errors.mean(), np.percentile(settled_errors, 95)
     print(f"tracking error    {mean:.1f} cm mean, {percentile:.1f} cm 95th percentile")
-    n_begun, n_worlds = int(contact_starts.sum() + touched[0].sum()), int(touched.any((0, 2, 3)).sum())
+    n_contacts_begun, n_worlds = (
+        int(contact_starts.sum() + pole_contacts[0].sum()),
+        int(pole_contacts.any((0, 2, 3)).sum()),
+    )
     print(
-        f"contacts          {n_begun:,} begun, in {n_worlds:,} of {count_text(touched.shape[1], 'world')}; "
-        f"{1e3 * contact_s:.1f} ms a query"
+        f"contacts          {n_contacts_begun:,} begun, in {n_worlds:,} of "
+        f"{count_text(pole_contacts.shape[1], 'world')}; {1e3 * contact_s:.1f} ms a query"
     )
 
 

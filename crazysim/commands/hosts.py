@@ -174,22 +174,28 @@ def _explain_end(log: str, status: int, host: Host, arguments: Sequence[str]) ->
         )
     resume = shlex.join(["crazysim", *arguments, *(["--resume"] if "--resume" not in arguments else [])])
     remedy = f"The last checkpoint continues the training: start all hosts again, this one with\n  {resume}"
-    unhealthy = re.search(r"stopped sending heartbeats\)?:?\s*\n((?:[^\n]*\d+\n)+)", log)
-    lost = sorted({int(line.rpartition(":")[2]) for line in unhealthy[1].split()} - {host.host_id}) if unhealthy else []
-    if lost:
-        names = f"host{'s' if len(lost) > 1 else ''} {', '.join(map(str, lost))}"
+    unhealthy_match = re.search(r"stopped sending heartbeats\)?:?\s*\n((?:[^\n]*\d+\n)+)", log)
+    lost_hosts = (
+        sorted({int(line.rpartition(":")[2]) for line in unhealthy_match[1].split()} - {host.host_id})
+        if unhealthy_match
+        else []
+    )
+    if lost_hosts:
+        names = f"host{'s' if len(lost_hosts) > 1 else ''} {', '.join(map(str, lost_hosts))}"
         return f"host {host.host_id}: {names} lost: no heartbeat for {host.heartbeat_timeout} s. {remedy}"
     if "coordination" in log and host.host_id != 0:
         return f"host {host.host_id}: host 0 lost: {host.coordinator} does not answer. {remedy}"
-    last = "\n".join(log.strip().splitlines()[-20:])
-    return f"host {host.host_id} ended with status {status}. {remedy}" + (f"\nIts last messages:\n{last}" * bool(last))
+    last_lines = "\n".join(log.strip().splitlines()[-20:])
+    return f"host {host.host_id} ended with status {status}. {remedy}" + (
+        f"\nIts last messages:\n{last_lines}" * bool(last_lines)
+    )
 
 
 def _run_host(host: Host, command: Callable[[argparse.Namespace], int | None], options: argparse.Namespace) -> int:
     """Connect with the other hosts, run the command, and end with them; return the exit status."""
     log = int(os.environ.pop("CRAZYSIM_HOST_LOG"))
     sys.stdout, sys.stderr = (os.fdopen(os.dup(n), "w", buffering=1) for n in (1, 2))
-    for n in (1, 2):  # what libraries write below Python
+    for n in (1, 2):  # for output of libraries that are not written in Python
         os.dup2(log, n)
     os.close(log)
     parent = os.getppid()
@@ -235,9 +241,9 @@ def _run_host(host: Host, command: Callable[[argparse.Namespace], int | None], o
 
 def _stop_others(host: Host, error: BaseException) -> None:
     """Print an error, send it to the other hosts, and end the process when they have ended."""
-    expected = isinstance(error, (ValueError, ImportError, OSError, DivergedError))
-    text = str(error) if expected else f"{type(error).__name__}: {error}"
-    if not expected:
+    is_expected = isinstance(error, (ValueError, ImportError, OSError, DivergedError))
+    text = str(error) if is_expected else f"{type(error).__name__}: {error}"
+    if not is_expected:
         import traceback
 
         traceback.print_exception(error)

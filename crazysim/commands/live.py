@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given_options
+from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, specified_options
 from crazysim.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ def run(options: argparse.Namespace) -> None:
         raise ConfigError("expected --seconds with --headless, got none. Use --seconds 20, for example.")
     if not options.headless and not viewers:
         viewers = ["window" if _has_screen() else "browser"]
-    speed, piloted = _parse_speed(options.speed), options.pilot or options.gamepad
-    if options.commands and piloted:
+    speed, is_piloted = _parse_speed(options.speed), options.pilot or options.gamepad
+    if options.commands and is_piloted:
         raise ConfigError(
             "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad."
         )
@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> None:
     if policy_pilot is None:
         control_freq = 100 if options.control_freq is None else options.control_freq
         n_drones = 4 if options.drones is None else options.drones
-        settings: dict[str, Any] = {"freq": 500} | given_options(options, "freq", "drone", "controller", "device")
+        settings: dict[str, Any] = {"freq": 500} | specified_options(options, "freq", "drone", "controller", "device")
         sim = Sim(n_worlds, n_drones, control="state", state_freq=control_freq, **settings)
     else:
         sim, control_freq = policy_pilot.env.sim, policy_pilot.env.base.freq
@@ -82,8 +82,8 @@ def run(options: argparse.Namespace) -> None:
             fleet = Fleet(sim, teleport=False)
             live.add(RemoteCommands(fleet, stack.enter_context(CommandServer())), name="commands")
         else:
-            live.add(Circles(live, piloted), name="circles")
-        if piloted:
+            live.add(Circles(live, is_piloted), name="circles")
+        if is_piloted:
             sticks: list[Sticks] = [keyboard_sticks, *([Gamepad()] if options.gamepad else [])]
             pilot = Pilot(sticks)
             live.add(pilot, name="pilot")

@@ -31,6 +31,6 @@ def add_simulation(parser: argparse.ArgumentParser) -> None:
     add("--device", help="device: cpu, gpu; by default cpu")
 
 
-def given_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Return the values of the options that were given, by name."""
+def specified_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return the values of the options that a command line sets, by name."""
     return {name: x for name in names if (x := getattr(options, name)) is not None}

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from crazysim.commands import hosts
-from crazysim.commands.options import DefaultsFormatter, given_options
+from crazysim.commands.options import DefaultsFormatter, specified_options
 from crazysim.errors import ConfigError
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
@@ -154,8 +154,8 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> None:
         "algorithm": options.algorithm or (options.teacher and "dagger"),
         "n_worlds": options.worlds,
         "devices": options.devices or devices,
-        "options": _parse_pairs(options.set) | given_options(options, "device"),
-        "config": _parse_pairs(options.config) | given_options(options, "iterations", "teacher"),
+        "options": _parse_pairs(options.set) | specified_options(options, "device"),
+        "config": _parse_pairs(options.config) | specified_options(options, "iterations", "teacher"),
     }
     if options.seeds is None and not options.sweep:
         run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)

@@ -21,7 +21,7 @@ from crazysim.lab.validate.rows import Section
 from crazysim.lab.validate.sections import sections
 from crazysim.storage import check_writable, write_file
 
-PICTURES = "pictures"
+PICTURES_FOLDER = "pictures"
 """Name of the folder of the pictures, in the folder of the page."""
 
 
@@ -44,7 +44,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the page and its pictures; the exit status is 1 if a figure is out of its bound."""
     check_writable(options.out)
-    if (pictures := options.out.parent / PICTURES).exists():
+    if (pictures := options.out.parent / PICTURES_FOLDER).exists():
         check_writable(pictures / options.out.name)
     rows = validate(options.data, options.only)
     selected_sections = [section for section in sections(options.data) if section.name in options.only]
@@ -69,7 +69,7 @@ def _draw_sections(selected_sections: Sequence[Section], rows: Sequence[Row], fo
         section_rows = [row for row in rows if row.section == section.name]
         if not any(row.series for row in section_rows):
             continue
-        pictures[section.name] = f"{PICTURES}/validation_{section.name}.png"
+        pictures[section.name] = f"{PICTURES_FOLDER}/validation_{section.name}.png"
         try:
             draw_section(section, section_rows, folder / pictures[section.name])
         except ImportError as error:

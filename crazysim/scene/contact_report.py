@@ -118,13 +118,13 @@ def build_contact_fn(
         data = with_moved_objects(data, moving_plugins(plugins(), names))
         data = with_mocap_bodies(model, data, mocap)
         pos, quat = data.states.pos, data.states.quat
-        all_geoms = [geom for kind in model.drones for geom in kind.geoms]
+        all_geoms = [geom for drone_geoms in model.drones for geom in drone_geoms.geoms]
         drone_rot = rotation.matrix(quat) if any(geom.shape.kind != "sphere" for geom in all_geoms) else None
         parts = [
             (geom, pos + rotation.rotate(quat, jnp.asarray(geom.pos, pos.dtype)), is_present)
-            for kind in model.drones
-            for is_present in (kind.drone_mask(data.core.drone_id),)
-            for geom in kind.geoms
+            for drone_geoms in model.drones
+            for is_present in (drone_geoms.drone_mask(data.core.drone_id),)
+            for geom in drone_geoms.geoms
         ]
         fields: dict[str, Array | None] = dict.fromkeys(
             ("floor", "floor_distance", "objects", "object_distance", "nearest_object", "drones", "drone_distance",
@@ -232,7 +232,7 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
     pos, quat = objects.pos[..., row_selection, :], objects.quat[..., row_selection, :]
     rot = None
     if drone_rot is not None:
-        rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), drone_rot[..., None, :, :])
+        rot = _matrix_product(jnp.swapaxes(rotation.matrix(quat), -1, -2), drone_rot[..., None, :, :])
     gaps = []
     for part, part_pos, is_present in parts:
         local_pos = rotation.rotate_inverse(quat, part_pos[..., None, :] - pos)
@@ -351,16 +351,16 @@ def _geom_distance(
         columns = jnp.asarray(geom.rot, part_pos.dtype)
         x, y, z = (local_pos[..., k, None] * columns[..., k, :] for k in range(3))
         local_pos = x + y + z
-        rot = None if drone_rot is None else _product(jnp.swapaxes(columns, -1, -2), drone_rot)
+        rot = None if drone_rot is None else _matrix_product(jnp.swapaxes(columns, -1, -2), drone_rot)
     if rot is not None and part.rot is not None:
-        rot = _product(rot, jnp.asarray(part.rot, part_pos.dtype))
+        rot = _matrix_product(rot, jnp.asarray(part.rot, part_pos.dtype))
     shape: Shape | SizedShapes = geom.shape
     if isinstance(geom, StackedGeoms) and geom.box_sizes is not None:
         shape = SizedShapes("box", [jnp.asarray(half, part_pos.dtype) for half in geom.box_sizes.T])
     return distance(part.shape, shape, local_pos, jnp.eye(3) if rot is None else rot)  # type: ignore[arg-type]
 
 
-def _product(a: Array, b: Array) -> Array:
+def _matrix_product(a: Array, b: Array) -> Array:
     """Return ``a @ b`` of 3 x 3 matrices, by components: a GPU may round matrix products to 10 bits. (..., 3, 3)"""
     return jnp.stack([rotation.matvec(a, b[..., k]) for k in range(3)], axis=-1)
 
@@ -378,7 +378,7 @@ def _nearest_other(parts: DroneParts, drone_rot: Array | None) -> Array:
     def pair_distance(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
         positions, presences, rot = other
         inverse = None if rot is None else rot.T
-        relative_rot = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
+        relative_rot = jnp.eye(3) if inverse is None or drone_rot is None else _matrix_product(inverse, drone_rot)
         gaps = []
         for part, part_pos, is_present in parts:
             for (geom, *_), other_pos, other_present in zip(parts, positions, presences, strict=True):
@@ -417,7 +417,7 @@ def _nearest_drones(parts: DroneParts, drone_rot: Array | None) -> tuple[Array, 
                     continue
                 inverse = jnp.swapaxes(drone_rot, -1, -2)[..., None, :, :, :]
                 local_pos = rotation.matvec(inverse, offset)
-                rot = _product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
+                rot = _matrix_product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
                 gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, local_pos, rot)))
         gap = jnp.where(chunk[:, None] == indices, jnp.inf, _minimum(gaps, parts[0][1]))
         return jnp.min(gap, axis=-1), _argmin(gap)

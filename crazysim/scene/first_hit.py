@@ -125,10 +125,10 @@ class Targets:
         for index, body in enumerate(model.objects, start=1):
             carrier = "world" if body.row is None else "object"
             targets += [Target(geom, carrier, body.row or 0, index, body.initial_pos) for geom in body.geoms]
-        for kind in model.drones if drones else ():
-            for row in range(n_drones) if kind.drones is None else kind.drones:
+        for drone_geoms in model.drones if drones else ():
+            for row in range(n_drones) if drone_geoms.drones is None else drone_geoms.drones:
                 if row != ignored_drone:
-                    targets += [Target(geom, "drone", row, 1 + len(model.objects) + row) for geom in kind.geoms]
+                    targets += [Target(geom, "drone", row, 1 + len(model.objects) + row) for geom in drone_geoms.geoms]
         self.fixed_geoms = [x for x in targets if x.carrier == "world"]
         """Geoms that do not move."""
         self.movable_geoms = [x for carrier in ("object", "drone") for x in targets if x.carrier == carrier]
@@ -449,12 +449,12 @@ def _walk_hierarchy(
     def check_node(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
         node, best = carry
         box, next_node, geom = read_node(first_node + node)
-        meets = _meets_box(box[:3], box[3:], scaled, inverse, best[0])
+        meets_box = _meets_box(box[:3], box[3:], scaled, inverse, best[0])
 
         def descend(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
-            return node + 1, compute_where(geom >= 0, lambda best: hit_geom(geom, meets, best), carry[1])
+            return node + 1, compute_where(geom >= 0, lambda best: hit_geom(geom, meets_box, best), carry[1])
 
-        return compute_where(any_lane(meets), descend, (next_node, best))
+        return compute_where(any_lane(meets_box), descend, (next_node, best))
 
     return lax.while_loop(lambda carry: carry[0] < n_nodes, check_node, (jnp.int32(0), best))[1]
 

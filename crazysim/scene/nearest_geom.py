@@ -34,8 +34,8 @@ def nearest_geom(
     point = [lax.stop_gradient(x) for x in point]
 
     def check_node(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
-        k, best = carry
-        (after, geom), box = table_rows(links, k), table_rows(boxes, k)
+        node, best = carry
+        (next_node, geom), box = table_rows(links, node), table_rows(boxes, node)
         is_near = _box_distance(box[:3], box[3:], point) - reach < best[0]
 
         def compare(best: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -44,9 +44,9 @@ def nearest_geom(
             return jnp.where(is_nearer, gap, best[0]), jnp.where(is_nearer, geom, best[1])
 
         def descend(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
-            return k + 1, compute_where(geom >= 0, compare, carry[1])
+            return node + 1, compute_where(geom >= 0, compare, carry[1])
 
-        return compute_where(any_lane(is_near), descend, (after, best))
+        return compute_where(any_lane(is_near), descend, (next_node, best))
 
     start = jnp.int32(0), (jnp.full_like(point[0], jnp.inf), jnp.int32(0))
     return lax.while_loop(lambda carry: carry[0] < len(links), check_node, start)[1][1]

@@ -80,12 +80,12 @@ class Handle:
         mask = as_mask(mask, objects.pos.shape[:-3])
         if pos is not None and vel is None:
             vel = np.zeros(3)
-        new = {
+        new_arrays = {
             name: self._replace_checked_rows(getattr(objects, name), name, value, mask)
             for name, value in (("pos", pos), ("quat", quat), ("vel", vel))
             if value is not None
         }
-        return data.replace(objects=objects.replace(**new))
+        return data.replace(objects=objects.replace(**new_arrays))
 
     def pose(self, data: SimData) -> tuple[Array, Array]:
         """Return positions, m (n_worlds, n, 3), and attitudes, xyzw (n_worlds, n, 4)."""
@@ -120,13 +120,13 @@ def _replace_rows(
     value = jnp.broadcast_to(value[:, None] if value.ndim == 3 else value, (*old.shape[:-2], n, size))
     start, end = row_indices[0], row_indices[0] + n
     if row_indices == tuple(range(start, end)):  # compile time does not grow with the number of objects
-        new = jnp.concatenate([old[..., :start, :], value, old[..., end:, :]], axis=-2)
+        replaced = jnp.concatenate([old[..., :start, :], value, old[..., end:, :]], axis=-2)
     else:
         rows = [old[..., k, :] for k in range(old.shape[-2])]
         for i, k in enumerate(row_indices):
             rows[k] = value[..., i, :]
-        new = jnp.stack(rows, axis=-2)
-    return select_worlds(mask, new, old)
+        replaced = jnp.stack(rows, axis=-2)
+    return select_worlds(mask, replaced, old)
 
 
 @jit_unless_traced("row_indices")

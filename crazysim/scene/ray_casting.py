@@ -129,10 +129,10 @@ def cast_rays(
             best = _hit_bodies(best, geoms, pos, quat, np.array(group), origin, direction, None)
     if drones:
         pos, quat = data.states.pos, data.states.quat
-        for kind in model.drones:
-            rows = np.arange(data.core.n_drones) if kind.drones is None else np.asarray(kind.drones)
+        for drone_geoms in model.drones:
+            rows = np.arange(data.core.n_drones) if drone_geoms.drones is None else np.asarray(drone_geoms.drones)
             group = np.stack([rows, rows + 1 + len(model.objects)], axis=-1)
-            best = _hit_bodies(best, kind.geoms, pos, quat, group, origin, direction, ignored_drones)
+            best = _hit_bodies(best, drone_geoms.geoms, pos, quat, group, origin, direction, ignored_drones)
     return best.replace(point=_hit_points(origin, direction, best.distance))
 
 

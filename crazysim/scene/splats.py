@@ -146,12 +146,12 @@ def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
     values["color"] = np.concatenate([values["color"][:, None], rest.transpose(2, 1, 0)], axis=1)
     values["logit_opacity"] = values["logit_opacity"][:, 0]
     values = {field: np.asarray(x, np.float64) for field, x in values.items()}
-    is_bad = ~np.logical_and.reduce([np.isfinite(x).reshape(n, -1).all(axis=1) for x in values.values()])
-    is_bad |= ~values["quat"].any(axis=1)
-    if is_bad.any():
+    is_invalid = ~np.logical_and.reduce([np.isfinite(x).reshape(n, -1).all(axis=1) for x in values.values()])
+    is_invalid |= ~values["quat"].any(axis=1)
+    if is_invalid.any():
         raise ConfigError(
-            f"expected finite Gaussians with rotations, got {int(is_bad.sum())} of {n} without in {str(path)!r}. Drop "
-            f"them."
+            f"expected finite Gaussians with rotations, got {int(is_invalid.sum())} of {n} without in {str(path)!r}. "
+            f"Drop them."
         )
     return values
 

@@ -7,7 +7,7 @@ import pytest
 from crazysim import ConfigError, Sim
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
-from crazysim.envs.tasks.avoid import CELL, CELL_JITTER, HEIGHT, Avoid
+from crazysim.envs.tasks.avoid import CELL_WIDTH, CELL_JITTER, HEIGHT, Avoid
 
 N_WORLDS = 2048
 
@@ -50,7 +50,7 @@ def test_obstacles_have_other_positions_in_every_world_and_leave_gaps(start_stat
     _, state, _ = start_state
     pos = np.asarray(state.data.objects.pos)[:, 0]
     distances = np.linalg.norm(pos[:, :, None, :2] - pos[:, None, :, :2], axis=-1) + 9 * np.eye(12)
-    assert distances.min() >= CELL - 2 * CELL_JITTER - 1e-5
+    assert distances.min() >= CELL_WIDTH - 2 * CELL_JITTER - 1e-5
     assert np.all(np.ptp(pos[..., :2], axis=0) > 2.5)
     quat = np.asarray(state.data.objects.quat)
     np.testing.assert_allclose(1 - 2 * np.sum(quat[..., :2] ** 2, axis=-1), 1, atol=1e-5)  # upright

@@ -8,7 +8,7 @@ import pytest
 from crazysim import ConfigError
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, PrivilegedObservation, make
-from crazysim.envs.tasks.follow_car import ABOVE, BEHIND, MAX_DISTANCE, MIN_HEIGHT, FollowCar
+from crazysim.envs.tasks.follow_car import FOLLOW_HEIGHT, FOLLOW_DISTANCE, MAX_DISTANCE, MIN_HEIGHT, FollowCar
 from crazysim.train.evaluation import evaluate
 
 N_WORLDS, N_STEPS = 64, 100
@@ -66,9 +66,9 @@ def test_the_point_is_behind_and_above_the_car(start_state, step, target_motion)
     car = before.plugins["cars"]
     heading = np.concatenate([np.cos(car.yaw), np.sin(car.yaw), 0 * car.yaw], axis=-1)
     offset = pos - np.asarray(car.pos)
-    np.testing.assert_allclose(np.sum(offset * heading, axis=-1), -BEHIND, atol=1e-5)
-    np.testing.assert_allclose(offset[..., 2], ABOVE, atol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(offset[..., :2], axis=-1), BEHIND, atol=1e-5)
+    np.testing.assert_allclose(np.sum(offset * heading, axis=-1), -FOLLOW_DISTANCE, atol=1e-5)
+    np.testing.assert_allclose(offset[..., 2], FOLLOW_HEIGHT, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(offset[..., :2], axis=-1), FOLLOW_DISTANCE, atol=1e-5)
     np.testing.assert_allclose((later - pos) * 50, vel, atol=0.05)
 
 

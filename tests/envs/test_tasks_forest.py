@@ -8,7 +8,7 @@ import pytest
 from crazysim import ConfigError, rotation
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import PrivilegedObservation, make
-from crazysim.envs.tasks.forest import CEILING, EDGE, HALF_WIDTH, HEIGHT, PRIVILEGED_TREES, VIEW_RANGE, Forest
+from crazysim.envs.tasks.forest import CEILING, EDGE_DISTANCE, HALF_WIDTH, HEIGHT, PRIVILEGED_TREES, VIEW_RANGE, Forest
 
 N_WORLDS, SEEN = 64, 6
 
@@ -47,7 +47,7 @@ def test_every_world_has_its_own_forest_with_clear_starts(start_state):
     xy, radius, stands = standing_trees(env, state.data)
     assert stands.mean() > 0.98
     assert np.ptp(xy, axis=0).min() > 2.0, "trees stand elsewhere in every world"
-    assert xy[..., 0].min() > EDGE - 0.1
+    assert xy[..., 0].min() > EDGE_DISTANCE - 0.1
     assert xy[..., 0].max() > 30
     assert np.abs(xy[..., 1]).max() > HALF_WIDTH, "there are trees at the sides of the corridor"
     assert 0.1 <= radius.min() < 0.15 < 0.25 < radius.max() <= 0.3
@@ -122,7 +122,7 @@ def test_hits_disable_and_crossing_the_line_is_a_success(start_state):
     pos[4, 2] = CEILING + 0.01
     pos[5, 2] = 0.01
     pos[6] = [env.task.length + 0.01, 0, HEIGHT]
-    pos[7, 0] = -EDGE - 0.01
+    pos[7, 0] = -EDGE_DISTANCE - 0.01
     clear = np.asarray(vmap_worlds(lambda data: env.task.trees(1).clearance(data, data.states.pos))(
         place_drones(state, pos[:, None]).data))[:, 0]  # fmt: skip
     pos[6, 1] += 1.0 if clear[6] < 0.2 else 0.0

@@ -16,7 +16,7 @@ from crazysim.control import CFirmware
 from crazysim.drones import load_airframe
 from crazysim.engine.backends import native
 from crazysim.envs import make
-from crazysim.envs.actions import hover_rotors
+from crazysim.envs.actions import hover_rotor_states
 from crazysim.envs.statistics import RunningStats
 from crazysim.train.export import describe
 from crazysim.train.networks import Policy, init_mlp
@@ -176,7 +176,7 @@ def test_the_c_controller_flies_the_flight_of_the_policy_in_python(exported):
     in_c = Sim(n, control="state", controller=CFirmware(library, motors="rpm", freq=50))
     in_python = Sim(n, control="rotor_vel")
     for sim in (in_c, in_python):
-        sim.data = with_states(sim.data, pos=start, rotor_vel=np.asarray(hover_rotors(sim.data.params)))
+        sim.data = with_states(sim.data, pos=start, rotor_vel=np.asarray(hover_rotor_states(sim.data.params)))
     in_c.state_control(pos=goal)
     act = jax.jit(policy)
     for _ in range(50):

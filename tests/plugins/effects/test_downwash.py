@@ -141,7 +141,7 @@ def test_law_07_gradients_are_finite_where_drones_coincide_and_rotors_are_stoppe
 def test_law_07_above_the_drone_the_virtual_origin_does_no_harm():
     """Where the distance to the virtual origin is exactly zero, a formula of the far field would divide by it."""
     parameters = [jnp.array([x]) for x in (0.4, 0.125, 1.225)]
-    offset = np.float32([0.1, 0.0, downwash.DECAY * 0.125])  # a power of two: the product is exact
+    offset = np.float32([0.1, 0.0, downwash.JET_DECAY * 0.125])  # a power of two: the product is exact
     value, gradient = jax.jit(
         jax.value_and_grad(lambda x: downwash.hover_jet_speed(x, jnp.array([0, 0, 1.0]), *parameters)[0])
     )(offset)
