@@ -7,7 +7,7 @@ import pytest
 from crazysim import ConfigError, Sim
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
-from crazysim.envs.tasks.avoid import CELL_WIDTH, CELL_JITTER, HEIGHT, Avoid
+from crazysim.envs.tasks.avoid import CELL_JITTER, CELL_WIDTH, HEIGHT, Avoid
 
 N_WORLDS = 2048
 
