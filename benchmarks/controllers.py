@@ -6,7 +6,7 @@
 - tracking: figure eight of 2 m with ``--speed`` in its middle, from a start on it, RMS distance over 9 s, m
 - pushed: hover under a sideways force of a tenth of the weight from 2 s on, distance 5 s later, and its largest, m
 - heavier: hover with 20% more mass from 0 s on, distance after 5 s, m
-- home: share of the flights from random attitudes at 5 rad/s that end within 0.1 m of the setpoint, after 15 s
+- home: fraction of the flights from random attitudes at 5 rad/s that end within 0.1 m of the setpoint, after 15 s
 - lost_178: height lost from rest at a roll of 178 degrees, m
 - overshoot_attitude, overshoot_body_rate: largest overshoot after the steps of ``COMMAND_STEPS``, over their size
 - error_attitude, error_body_rate: largest error 2 s after these steps and later, over their size

@@ -143,7 +143,7 @@ def report_rates(
             measures[drones], last_results[drones] = measure, results
         steps = recipe.n_steps if name == "training" else n_steps
         for drones, seconds in medians(measures, repeats).items():
-            ended_share = (
+            ended_entry = (
                 {} if name == "training" else {"ended": round_digits(float(jnp.mean(last_results[drones][1][1])))}
             )
             report(
@@ -158,7 +158,7 @@ def report_rates(
                 engine=engine_name(base.sim),
                 compile_s=round(compile_s[drones], 2),
                 env_steps_per_s=round_digits(n_worlds * base.sim.n_drones * steps / seconds),
-                **ended_share,
+                **ended_entry,
             )
 
 

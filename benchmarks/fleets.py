@@ -21,7 +21,7 @@ from crazysim import Sim, __version__
 from crazysim.plugins.vehicles import Cars
 
 LEVELS = ("state", "attitude", "body_rate", "force_torque")
-PAIR = ("cf21B_500", "cf2x_L250")
+AIRFRAMES = ("cf21B_500", "cf2x_L250")
 
 
 def main() -> None:
@@ -33,7 +33,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100, help="physics steps per call")
     parser.add_argument("--repeats", type=int, default=9)
     args = parser.parse_args()
-    cases = {"cars": (drones(args), drones_and_cars(args)), "airframes": (drones(args, own=True), two_airframes(args))}
+    cases = {
+        "cars": (drones(args), drones_and_cars(args)),
+        "airframes": (drones(args, has_own_params=True), two_airframes(args)),
+    }
     for case, (reference, fleet) in cases.items():
         flights = {name: Flight(sim, "state", args.steps, args.device)
                    for name, sim in (("reference", reference), ("fleet", fleet))}  # fmt: skip
@@ -46,10 +49,10 @@ def main() -> None:
                ratio=round_digits(durations["reference"] / durations["fleet"]), crazysim=__version__)  # fmt: skip
 
 
-def drones(args: argparse.Namespace, own: bool = False) -> Sim:
-    """Return drones alone, with parameters of their own if asked."""
+def drones(args: argparse.Namespace, has_own_params: bool = False) -> Sim:
+    """Return drones alone, which share their parameters or have a set each."""
     sim = Sim(args.worlds, args.drones, control="state", device=args.device)
-    if own:
+    if has_own_params:
         shape = sim.data.states.pos.shape[:2]
 
         def repeat_per_drone(record: Any) -> Any:
@@ -64,13 +67,13 @@ def drones(args: argparse.Namespace, own: bool = False) -> Sim:
 
 
 def two_airframes(args: argparse.Namespace) -> Sim:
-    """Return drones of two airframes in turn."""
-    kinds = [PAIR[k % 2] for k in range(args.drones)]
-    return Sim(args.worlds, args.drones, drone=kinds, control="state", device=args.device)
+    """Return drones whose airframes alternate."""
+    airframes = [AIRFRAMES[k % 2] for k in range(args.drones)]
+    return Sim(args.worlds, args.drones, drone=airframes, control="state", device=args.device)
 
 
 def drones_and_cars(args: argparse.Namespace) -> Sim:
-    """Return drones and cars, which drive circles."""
+    """Return drones, and cars that drive circles."""
     sim = drones(args)
     cars = sim.add(Cars(args.cars, in_scene=False))
     command = np.tile(np.array([0.08, 0.2], np.float32), (args.worlds, args.cars, 1))

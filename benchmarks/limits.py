@@ -1,6 +1,6 @@
 """Lower bound of the time of each case on this machine, and the measured time relative to it.
 
-The lower bound is the larger of two n_copies: for the operations at the rate of multiply-adds measured here through
+The lower bound is the larger of two times: for the operations at the rate of multiply-adds measured here through
 the same engine, and for the data, with each number that a call reads or writes moved once at the bandwidth of a
 copy measured here. Both rates are the best of all repeats; the measured time is a median. Data that fits into a cache
 may move faster than the copy, which does not fit.

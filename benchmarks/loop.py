@@ -3,8 +3,8 @@
     python benchmarks/loop.py [--device gpu] [--worlds 1 64 1024 16384] [--controls state attitude]
 
 One JSON line for each command level and number of worlds, with the median time of an iteration and the shortest. The
-next lines show the share of JAX: one compiled addition to as many positions, read into NumPy. The last line is the loop
-of C MuJoCo with one free box: set its force, take 5 steps with ``mj_step``, read its position.
+next lines show how much of it JAX takes: one compiled addition to as many positions, read into NumPy. The last line is
+the loop of C MuJoCo with one free box: set its force, take 5 steps with ``mj_step``, read its position.
 """
 
 from __future__ import annotations

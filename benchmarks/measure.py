@@ -128,16 +128,16 @@ def report_flights(
     flights: dict[str, Flight],
     repeats: int,
     references: dict[str, str],
-    **line: Any,
+    **entries: Any,
 ) -> None:
-    """Time flights in turn; print rate, and ratio to the time of its reference, of each.
+    """Time flights alternately, and print the rate of each and the ratio of its time to that of its reference.
 
     Args:
         device: The platform.
         flights: Flights by name of the case.
         repeats: Number of times that each is measured.
         references: Name of the flight that each is compared with.
-        line: What else each line contains; a function is called with the simulation.
+        entries: Further entries of each line; one that is a function is called with the simulation.
     """
     durations = medians({name: flight.seconds for name, flight in flights.items()}, repeats)
     for name, flight in flights.items():
@@ -154,7 +154,7 @@ def report_flights(
             steps_per_s=round_digits(sim.n_worlds * sim.n_drones * flight.n_steps / durations[name]),
             reference=reference,
             ratio=round_digits(durations[name] / durations[reference]),
-            **{key: value(sim) if callable(value) else value for key, value in line.items()},
+            **{key: value(sim) if callable(value) else value for key, value in entries.items()},
         )
 
 
@@ -193,13 +193,13 @@ def _processor() -> str:
 
 
 def _vectors() -> str:
-    """Return the widest vectors of the processor that kernels use; CXXFLAGS can exclude some."""
+    """Return the widest vector instructions that kernels use on this processor; CXXFLAGS can exclude some."""
     features = [x for x in _cpu_info("flags").split() if f"-mno-{x}" not in os.environ.get("CXXFLAGS", "")]
     return next((name for flag, name in (("avx512f", "AVX-512"), ("avx2", "AVX2")) if flag in features), "128 bit")
 
 
 def _cpu_info(key: str) -> str:
-    """Return what Linux reports about the first processor, an empty text elsewhere."""
+    """Return an entry of /proc/cpuinfo for the first processor; empty on other systems than Linux."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")

@@ -3,7 +3,8 @@
     python benchmarks/mocap.py --objects 50 --freq 240 --seconds 10
 
 A thread sends frames in real time, and the simulation takes them between control steps, as a live one does. One JSON
-line has the time of the rules for a frame, and of an update of the scene, each as median and 99th percentile.
+line has the time that the rules take for a frame, and the time of an update of the scene, each as median and 99th
+percentile.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def main() -> None:
 
 
 def circling_bodies(n_objects: int) -> Callable[[float], dict]:
-    """Return a function of time, s, that gives the poses of objects that circle, each around a place of its own."""
+    """Return a function of time, s, that gives the poses of objects that circle, each around its own centre."""
     phases = np.arange(n_objects)
 
     def bodies(t: float) -> dict:
@@ -53,24 +54,24 @@ def measure(n_objects: int, freq: float, seconds: float) -> None:
     twins.update(sim)
 
     source.start()
-    updates, n_steps, start_time = [], 0, time.monotonic()
+    update_times, n_steps, start_time = [], 0, time.monotonic()
     while time.monotonic() - start_time < seconds:
         sim.step(5)
         jax.block_until_ready(sim.data.states.pos)
         step_start = time.perf_counter()
         twins.update(sim)
         jax.block_until_ready(sim.data.objects.pos)  # type: ignore[union-attr]
-        updates.append(time.perf_counter() - step_start)
+        update_times.append(time.perf_counter() - step_start)
         n_steps += 1
         time.sleep(max(start_time + n_steps / 100 - time.monotonic(), 0.0))
     twins.close()
 
     frames = [FunctionSource(bodies, freq).frame(100 + k / freq) for k in range(500)]
-    rules = []
+    rule_times = []
     for frame in frames:
         step_start = time.perf_counter()
         twins.tracker.accept(frame)
-        rules.append(time.perf_counter() - step_start)
+        rule_times.append(time.perf_counter() - step_start)
     report(
         "cpu",
         benchmark="mocap",
@@ -78,10 +79,10 @@ def measure(n_objects: int, freq: float, seconds: float) -> None:
         freq=freq,
         frames=twins.tracker.n_frames - len(frames),
         lost=twins.reports.count("overrun"),
-        frame_ms=round_digits(1e3 * float(np.median(rules))),
-        frame_p99_ms=round_digits(1e3 * float(np.percentile(rules, 99))),
-        update_ms=round_digits(1e3 * float(np.median(updates))),
-        update_p99_ms=round_digits(1e3 * float(np.percentile(updates, 99))),
+        frame_ms=round_digits(1e3 * float(np.median(rule_times))),
+        frame_p99_ms=round_digits(1e3 * float(np.percentile(rule_times, 99))),
+        update_ms=round_digits(1e3 * float(np.median(update_times))),
+        update_p99_ms=round_digits(1e3 * float(np.percentile(update_times, 99))),
     )
 
 

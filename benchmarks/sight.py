@@ -1,11 +1,12 @@
-"""Rates of flying by sight: the task ``forest`` with its convolution, and lidars amid trees.
+"""Rates of flying by sight: the task ``forest`` with its convolution, and lidars among trees.
 
     python benchmarks/sight.py [--device gpu] [--worlds 4096] [--repeats 7] [--small]
 
 ``policy``: rollouts of ``forest`` with automatic resets, in a corridor that is long enough for 200 trees, which every
-world draws anew in every episode; the policy has the convolution and the layers of the recipe and receives a depth
-image of 16 x 12 pixels in every step. ``lidar``: steps of hovering drones amid 200 trees, whose lidars take 16 x 360
-rays at 10 Hz; its realtime factor is of one world.
+world draws anew in every episode. The policy has the convolution and the layers of the recipe, and receives a depth
+image of 16 x 12 pixels in every step.
+``lidar``: steps of hovering drones among 200 trees, whose lidars take 16 x 360 rays at 10 Hz. ``realtime`` is the
+simulated time of one world divided by the real time.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from measure import digits, engine_name, hovering, medians, report
+from measure import engine_name, medians, report, round_digits, start_hovering
 
 import crazysim.envs as envs
 from crazysim import Forest, Lidar, Sim, __version__
@@ -35,7 +36,7 @@ CORRIDOR = 16.0
 LIDAR_FREQ = 10
 """Rate of the lidars, Hz."""
 N_CALLS = 5
-"""Calls that are timed together."""
+"""Number of calls that are timed together."""
 
 
 def main() -> None:
@@ -43,14 +44,14 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--worlds", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--small", action="store_true", help="few steps, for a try")
+    parser.add_argument("--small", action="store_true", help="few steps, to try the script")
     args = parser.parse_args()
     n_steps = 4 if args.small else 50
-    rollouts(args, n_steps)
-    lidars(args, 2 if args.small else 10)
+    measure_rollouts(args, n_steps)
+    measure_lidars(args, 2 if args.small else 10)
 
 
-def rollouts(args: argparse.Namespace, n_steps: int) -> None:
+def measure_rollouts(args: argparse.Namespace, n_steps: int) -> None:
     """Time rollouts of ``forest`` with its recipe's network."""
     length = N_TREES * AREA_OF_TREE / CORRIDOR
     env = envs.AutoReset(envs.make("forest", args.worlds, length=length, device=args.device))
@@ -73,35 +74,36 @@ def rollouts(args: argparse.Namespace, n_steps: int) -> None:
         state, _, done = envs.rollout(env, state, act, rollout_key, n_steps, lambda x: x.done.mean())
         return (state, key), done
 
-    call_s, first_s, done = timed(run, (state, jax.device_put(jax.random.key(2), env.sim.device)), args.repeats)
+    call_s, first_s, done = time_calls(run, (state, jax.device_put(jax.random.key(2), env.sim.device)), args.repeats)
     report(
         args.device, benchmark="sight", case="policy", engine=engine_name(env.sim), n_worlds=args.worlds,
-        n_trees=N_TREES, image=[16, 12], env_steps_per_s=digits(args.worlds * n_steps / call_s),
-        rays_per_s=digits(args.worlds * n_steps * 16 * 12 / call_s), done=digits(float(np.mean(done))),
+        n_trees=N_TREES, image=[16, 12], env_steps_per_s=round_digits(args.worlds * n_steps / call_s),
+        rays_per_s=round_digits(args.worlds * n_steps * 16 * 12 / call_s), done=round_digits(float(np.mean(done))),
         first_s=round(first_s, 1), crazysim=__version__,
     )  # fmt: skip
 
 
-def lidars(args: argparse.Namespace, n_images: int) -> None:
-    """Time steps of drones with lidars amid trees."""
+def measure_lidars(args: argparse.Namespace, n_images: int) -> None:
+    """Time steps of drones with lidars among trees."""
     side = (N_TREES * AREA_OF_TREE) ** 0.5
     trees = Forest(density=1 / AREA_OF_TREE, radii=(0.1, 0.3), size=(side, side))
     lidar = Lidar.vlp16(360, freq=LIDAR_FREQ)
     sim = Sim(args.worlds, control="attitude", device=args.device, plugins=[trees, lidar])
-    hovering(sim, "attitude")
+    start_hovering(sim, "attitude")
     step, n_steps = sim.build_step_fn(), n_images * sim.freq // LIDAR_FREQ
     run = jax.jit(lambda data: (step(data, n_steps), ()))
-    call_s, first_s, _ = timed(run, sim.data, args.repeats)
+    call_s, first_s, _ = time_calls(run, sim.data, args.repeats)
     n_rays = lidar.image_size[0] * lidar.image_size[1]
     report(
         args.device, benchmark="sight", case="lidar", engine=engine_name(sim), n_worlds=args.worlds, n_trees=N_TREES,
-        image=[*lidar.image_size[::-1]], realtime=digits(n_steps / sim.freq / call_s),
-        rays_per_s=digits(args.worlds * n_images * n_rays / call_s), first_s=round(first_s, 1), crazysim=__version__,
+        image=[*lidar.image_size[::-1]], realtime=round_digits(n_steps / sim.freq / call_s),
+        rays_per_s=round_digits(args.worlds * n_images * n_rays / call_s), first_s=round(first_s, 1),
+        crazysim=__version__,
     )  # fmt: skip
 
 
-def timed(run: Callable[[Any], Any], carry: Any, repeats: int) -> tuple[float, float, Any]:
-    """Return the time of a call and of the first one, s, and the last call's second result."""
+def time_calls(run: Callable[[Any], Any], carry: Any, repeats: int) -> tuple[float, float, Any]:
+    """Return the median time of a call, the time of the first one, s, and the second result of the last one."""
     results = [carry, None]
 
     def call(n_calls: int) -> float:

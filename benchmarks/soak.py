@@ -59,7 +59,7 @@ def measure(seconds: float, n_drones: int, n_objects: int) -> None:
         source.start()
         result = live.run(seconds)
         recorded = path.stat().st_size
-    times, memory_bytes = memory.samples(WARM_UP * seconds)
+    times, memory_mb = memory.samples(WARM_UP * seconds)
     report(
         "cpu",
         benchmark="soak",
@@ -67,8 +67,8 @@ def measure(seconds: float, n_drones: int, n_objects: int) -> None:
         n_objects=n_objects,
         seconds=seconds,
         factor=round_digits(result.factor),
-        memory_mb=[round(memory_bytes[0]), round(memory_bytes[-1])],
-        growth_mb_per_hour=round_digits(3600 * np.polyfit(times, memory_bytes, 1)[0]),
+        memory_mb=[round(memory_mb[0]), round(memory_mb[-1])],
+        growth_mb_per_hour=round_digits(3600 * np.polyfit(times, memory_mb, 1)[0]),
         frames=twins.tracker.n_frames,
         frames_lost=twins.reports.count("overrun"),
         pictures_per_s=round_digits(result.n_pictures / result.wall_s),
@@ -104,8 +104,8 @@ class Memory:
 
     def samples(self, start_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return times since the beginning, s, and memory, MB, of the readings after a time, s. (n,), (n,)"""
-        times, memory_bytes = np.asarray(self._readings).T
-        return times[times >= start_s], memory_bytes[times >= start_s]
+        times, memory_mb = np.asarray(self._readings).T
+        return times[times >= start_s], memory_mb[times >= start_s]
 
     def _read_memory(self) -> None:
         size = os.sysconf("SC_PAGE_SIZE")

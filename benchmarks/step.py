@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: int, n_drones: int) -> None:
-    """Print one line for each engine and number of steps; all numbers share one compilation."""
+    """Print one line for each engine and number of steps; all numbers of steps share one compilation."""
     cases = list(itertools.product(args.engine, args.controllers))
     sims = {case: build(args, *case, control, integrator, n_worlds, n_drones) for case in cases}
     compile_s: dict[tuple[str, str], float] = {}
@@ -90,14 +90,14 @@ def build(
     return sim
 
 
-def randomise_parameters(sim: Sim, deviation: float = 1e-4) -> None:
+def randomise_parameters(sim: Sim, max_deviation: float = 1e-4) -> None:
     """Give every drone its own value of every parameter, varied so little that all of them still hover."""
     batch, key = (sim.n_worlds, sim.n_drones), jax.random.key(0)
 
     def randomise_leaf(scope: str, x: jax.Array) -> jax.Array:
         if scope != "shared" or not jnp.issubdtype(x.dtype, jnp.floating):
             return x
-        return x * jax.random.uniform(key, (*batch, *x.shape), x.dtype, 1 - deviation, 1 + deviation)
+        return x * jax.random.uniform(key, (*batch, *x.shape), x.dtype, 1 - max_deviation, 1 + max_deviation)
 
     data = sim.data
     params = jax.tree.map(randomise_leaf, scopes(data.params), data.params)

@@ -65,7 +65,7 @@ def duration_text(seconds: float) -> str:
 
 
 def loops(lines: list[Line]) -> str:
-    """Return times of an iteration, with Crazyflow's over ours, or alone."""
+    """Return times of an iteration, followed by the ratio of Crazyflow's time to ours if it was measured."""
 
     def time_of(line: Line) -> str:
         if "ratio" in line:
@@ -177,7 +177,7 @@ range_finders = columns(
 
 
 def costs(lines: list[Line]) -> str:
-    """Return times of cases over their references', and their rates."""
+    """Return the ratios of the times of cases to those of their references, and the rates of the cases."""
     return columns(
         Case=lambda x: f"`{x['case']}`",
         Time_over_reference=lambda x: f"{x['ratio']:.3g}",
@@ -282,7 +282,7 @@ def control_rates(lines: list[Line]) -> str:
 
 
 def limits(lines: list[Line]) -> str:
-    """Return the part of the rate that arithmetic allows."""
+    """Return the measured rates as fractions of the highest possible ones."""
     lines = [line for line in lines if "ratio" in line]
     return pivot(lines, case_of, worlds_of, lambda x: f"{1 / x['ratio']:.0%}", "Commands, worlds")
 
@@ -305,7 +305,7 @@ def readme(records: list[Line]) -> str:
     head = ["", "two CPU cores (AVX2)", "one NVIDIA H100"]
 
     def lines_of(name: str, device: str, **case: Any) -> list[Line]:
-        """Return the lines of a figure's record that have some values."""
+        """Return the lines of a figure's records on a device that have the values of a case."""
         lines = [
             line
             for record in records
@@ -314,12 +314,12 @@ def readme(records: list[Line]) -> str:
         ]
         return [line for line in lines if all(line.get(key) == value for key, value in case.items())]
 
-    def span(values: Iterable[float]) -> str:
-        """Return the least and the largest number, of two digits."""
+    def range_text(values: Iterable[float]) -> str:
+        """Return the least and the largest number as text, with two digits."""
         ordered_values = sorted(round_digits(value, 2) for value in values)
         return f"{ordered_values[0]:g} to {ordered_values[-1]:g}" if ordered_values else ""
 
-    def join_rates(values: Iterable[str]) -> str:
+    def join_texts(values: Iterable[str]) -> str:
         return " and ".join(values)
 
     auto, crazyflow_control = (
@@ -332,34 +332,34 @@ def readme(records: list[Line]) -> str:
 
     def steps(device: str, case: Line) -> str:
         name, key, n_worlds = largest_case[device]
-        return join_rates(si_text(x[key]) for x in lines_of(name, device, n_worlds=n_worlds, **case, **euler))
+        return join_texts(si_text(x[key]) for x in lines_of(name, device, n_worlds=n_worlds, **case, **euler))
 
     def gym(device: str) -> str:
-        return join_rates(
+        return join_texts(
             si_text(x["n_worlds"] * x["n_steps"] / x["crazysim_s"])
             for x in lines_of("queries", device, benchmark="versus_crazyflow/gym")
         )
 
     rows = {
-        "one iteration of a script (attitude command, 5 steps, read), 64 and 1,024 worlds": lambda device: join_rates(
+        "one iteration of a script (attitude command, 5 steps, read), 64 and 1,024 worlds": lambda device: join_texts(
             duration_text(x.get("crazysim_call_s") or x["iteration_s"])
             for n in (64, 1024)
             for x in lines_of("loop", device, n_worlds=n, control="attitude")
             if x.get("controller", "auto") == "auto"
         ),
-        "the same, 1 to 16,384 worlds: Crazyflow 0.4.0's time over ours, same control": lambda device: span(
+        "the same, 1 to 16,384 worlds: Crazyflow 0.4.0's time over ours, same control": lambda device: range_text(
             x["ratio"] for x in lines_of("loop", device, **crazyflow_control)
         ),
         "physics steps per second, attitude commands, the default controller": lambda device: steps(device, auto),
         "the same with Crazyflow's control": lambda device: steps(device, crazyflow_control),
-        "physics steps per second: ours over Crazyflow 0.4.0's, same control": lambda device: span(
+        "physics steps per second: ours over Crazyflow 0.4.0's, same control": lambda device: range_text(
             x["ratio"] for x in lines_of("versus", device, **crazyflow_control, **euler)
         ),
-        "gradient of 100 steps of 1,024 worlds: Crazyflow 0.4.0's time over ours": lambda device: span(
+        "gradient of 100 steps of 1,024 worlds: Crazyflow 0.4.0's time over ours": lambda device: range_text(
             x["ratio"] for x in lines_of("gradient-versus", device, **crazyflow_control)
         ).partition(" to ")[0],
         "environment steps per second through Gymnasium, 4,096 worlds": gym,
-        "environment steps per second in compiled rollouts": lambda device: join_rates(
+        "environment steps per second in compiled rollouts": lambda device: join_texts(
             si_text(x["env_steps_per_s"])
             for x in lines_of("envs", device, actions="random", n_worlds=largest_n_worlds[device])
         ),

@@ -147,13 +147,13 @@ def group_runs(keys: list[tuple[Any, ...]], max_size: int) -> list[list[tuple[An
     groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
     for key in keys:
         groups.setdefault((key[0], *key[2:]), []).append(key)
-    parts = [group[i : i + max_size] for group in groups.values() for i in range(0, len(group), max_size)]
+    subgroups = [group[i : i + max_size] for group in groups.values() for i in range(0, len(group), max_size)]
 
-    def n_samples(part: list[tuple[Any, ...]]) -> int:
-        recipe = find_recipe(part[0][0])
-        return len(part) * recipe.n_worlds * recipe.config.get("iterations", 1) * recipe.config.get("n_steps", 1)
+    def n_samples(subgroup: list[tuple[Any, ...]]) -> int:
+        recipe = find_recipe(subgroup[0][0])
+        return len(subgroup) * recipe.n_worlds * recipe.config.get("iterations", 1) * recipe.config.get("n_steps", 1)
 
-    return sorted(parts, key=n_samples, reverse=True)
+    return sorted(subgroups, key=n_samples, reverse=True)
 
 
 def train_all(
@@ -217,7 +217,7 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
         folder.mkdir(parents=True)
         sources_file.write_text(run_info["sources"])
     command = [sys.executable, "-P", "-m", "crazysim", "train", task, "--seeds", seeds, "--out", str(folder)]
-    command += ["--resume"] if (folder / CHECKPOINT_FILE).exists() else []  # of a training that was interrupted
+    command += ["--resume"] if (folder / CHECKPOINT_FILE).exists() else []  # a training that was interrupted
     # By default each process would take three quarters of the memory of a GPU.
     environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if run_info["parallel"] > 1 else {}) | os.environ
     # The same package as here, whatever the folder in which this runs.
@@ -237,8 +237,8 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
     algorithm = next(iter(stored_configs(folder).values())).algorithm
     diverged = {row["seed"]: row["diverged"] for row in json.loads((folder / SEEDS_TABLE_FILE).read_text())}
     results = [read_result(folder / f"seed-{key[1]}", diverged[key[1]]) for key in group]
-    shared = {"algorithm": algorithm, "wall_s": round_digits(wall_s), "together": len(group)}
-    return [result | shared for result in results]
+    common = {"algorithm": algorithm, "wall_s": round_digits(wall_s), "together": len(group)}
+    return [result | common for result in results]
 
 
 def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
@@ -331,15 +331,15 @@ def time_text(row: dict[str, Any]) -> str:
 
 def check_success(runs: list[dict[str, Any]]) -> list[str]:
     """Return a message for each run whose success is below the lowest of the table by more than two standard errors."""
-    required = {row["task"]: row["least"] for row in json.loads(TABLE.read_text())}
+    least_success = {row["task"]: row["least"] for row in json.loads(TABLE.read_text())}
     failures = []
     for run in runs:
         task, success = run["task"], run["success"]
-        if task not in required:
+        if task not in least_success:
             failures.append(f"{task} has no row in {TABLE.name} to compare with. Add it with --tasks {task} --write.")
-        elif success < least_kept_success(required[task], N_STARTS):
+        elif success < least_kept_success(least_success[task], N_STARTS):
             failures.append(
-                f"{task}: expected at least {required[task]:.1%} as in {TABLE.name}, got {success:.1%} with seed "
+                f"{task}: expected at least {least_success[task]:.1%} as in {TABLE.name}, got {success:.1%} with seed "
                 f"{run['seed']}, lower by more than two standard errors of {N_STARTS:,} starts."
             )
     return failures

@@ -10,7 +10,7 @@ its compiled program. RSL-RL steps it with one compiled call a step, and shares 
 
 A JSON line for each trainer and number of worlds, with the median over the seeds of the environment steps a second, and
 the success of each seed on 1,000 held-out starts after the same number of steps. The rate is that of the last three
-quarters of a training: the first quarter includes the compilation, and none includes evaluations.
+quarters of a training, since the first quarter includes the compilation. No quarter includes evaluations.
 ``benchmarks/figures.py --write --only trainers`` puts the table into docs/concepts/training-results.md.
 
 The others are installed by ``pip install brax==0.14.2`` and ``pip install rsl-rl-lib==5.5.1``, the latter with PyTorch.
@@ -57,7 +57,7 @@ TrainingResult = tuple[float, Any]
 
 
 class PeerPolicy(PyTree):
-    """Deterministic policy with the numbers of another library."""
+    """Deterministic policy with the weights and statistics of another library."""
 
     mean: Array
     """Mean of the observations. (n_obs,)"""
@@ -215,11 +215,11 @@ def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
         runner.learn(config.iterations - quarter)
         seconds = synchronise() - start_time
     actor: Any = runner.get_inference_policy()
-    numbers = {name: jnp.asarray(x.detach().cpu().numpy()) for name, x in actor.state_dict().items()}
-    names = sorted(name.removesuffix(".weight") for name in numbers if name.endswith(".weight"))
-    layers = [(numbers[f"{name}.weight"].T, numbers[f"{name}.bias"]) for name in names]
+    arrays = {name: jnp.asarray(x.detach().cpu().numpy()) for name, x in actor.state_dict().items()}
+    names = sorted(name.removesuffix(".weight") for name in arrays if name.endswith(".weight"))
+    layers = [(arrays[f"{name}.weight"].T, arrays[f"{name}.bias"]) for name in names]
     normalizer = actor.obs_normalizer
-    mean, std = numbers["obs_normalizer._mean"][0], numbers["obs_normalizer._std"][0] + normalizer.eps
+    mean, std = arrays["obs_normalizer._mean"][0], arrays["obs_normalizer._std"][0] + normalizer.eps
     return seconds, PeerPolicy(mean, std, layers, False)
 
 

@@ -1,9 +1,9 @@
-"""Steps of cars per second: under commands, along paths, with trailers, and together with a drone.
+"""Steps of cars per second: under commands, along paths, with trailers, and beside a drone.
 
     python benchmarks/vehicles.py [--device gpu] [--worlds 1048576] [--cases drive kinematic path] [--steps 20]
 
-``alone`` in a line means that the stages of the drones are not in the pipeline. Cars drive on circles all the time; a
-case whose cars stop or leave their circle is an error.
+``alone`` is true in the lines of cases whose pipeline lacks the stages of the drones. Cars drive on circles all the
+time; a case whose cars stop or leave their circle is an error.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ def measure(case: str, args: argparse.Namespace) -> None:
     for _ in range(10):
         step()
     step_s = medians({"step": lambda: seconds(step)}, args.repeats)["step"]
-    record = cars.read(sim.data)
-    speed, turn = np.asarray(record.body_vel[..., 0]), np.asarray(record.yaw_rate)
-    if not (speed.min() > 0.5 and speed.max() < 3.0 and np.abs(turn).min() > 0.2):
+    cars_record = cars.read(sim.data)
+    speed, yaw_rate = np.asarray(cars_record.body_vel[..., 0]), np.asarray(cars_record.yaw_rate)
+    if not (speed.min() > 0.5 and speed.max() < 3.0 and np.abs(yaw_rate).min() > 0.2):
         raise SystemExit(f"{case}: expected cars on circles, got speeds from {speed.min()} to {speed.max()} m/s")
     report(
         args.device,

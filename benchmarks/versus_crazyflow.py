@@ -154,7 +154,7 @@ class Comparison:
             print(json.dumps(line | self.machine), flush=True)
 
     def compare_swarm(self, n_worlds: int, n_drones: int) -> None:
-        """Print the cost of drones that share worlds, compared with as many in separate worlds."""
+        """Print the rates of drones that share worlds and of as many in separate worlds, and their ratio."""
         case = {"control": "attitude", "integrator": "euler", "n_steps": 100}
         sizes = {"swarm": (n_worlds, n_drones), "single": (n_worlds * n_drones, 1)}
         for engine in self.engines:
