@@ -35,16 +35,16 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--arm", type=float, metavar="M", help="distance of the rotors from the centre")
     add("--rotors", type=int, default=4, dest="n_rotors", metavar="N", help="number of rotors on a circle")
     add("--layout", default="x", choices=("x", "+"), help="nose between two rotors, or on the first rotor")
-    positions = "rotors from the centre of mass, m, instead of --arm: X,Y or X,Y,Z each"
-    add("--positions", metavar="'X,Y ...'", help=positions)
-    spins = "sense of rotation of each rotor seen from above; by default they alternate from ccw"
-    add("--spins", nargs="+", metavar="CCW|CW", help=spins)
+    positions_help = "rotors from the centre of mass, m, instead of --arm: X,Y or X,Y,Z each"
+    add("--positions", metavar="'X,Y ...'", help=positions_help)
+    spins_help = "sense of rotation of each rotor seen from above; by default they alternate from ccw"
+    add("--spins", nargs="+", metavar="CCW|CW", help=spins_help)
     add("--thrust-to-weight", type=float, metavar="RATIO", help="largest thrust of all rotors over weight")
-    table = (
+    motor_table_help = (
         "data sheet of one motor with its propeller instead of --thrust-to-weight, .csv with columns thrust_g or "
         "thrust_n, and if known rpm, torque_nm, power_w"
     )
-    add("--motor-table", type=Path, metavar="FILE", help=table)
+    add("--motor-table", type=Path, metavar="FILE", help=motor_table_help)
     add("--pitch", type=float, metavar="M", help="pitch of the propellers; by default half the diameter")
     add("--inertia", type=float, nargs=3, metavar="KGM2", help="moments; by default estimated")
     add("--time-constant", type=float, metavar="S", help="of the rotors; by default estimated")

@@ -57,14 +57,14 @@ class Host:
 
 def add_options(add: Callable[..., Any]) -> None:
     """Add the options of a command that can run on several hosts."""
-    coordinator = "address of host 0, with which the other hosts connect; auto to read it from SLURM or Open MPI"
-    add("--coordinator", metavar="HOST:PORT|auto", help=coordinator)
+    coordinator_help = "address of host 0, with which the other hosts connect; auto to read it from SLURM or Open MPI"
+    add("--coordinator", metavar="HOST:PORT|auto", help=coordinator_help)
     add("--host-id", type=int, metavar="I", help="number of this host, from 0")
     add("--hosts", type=int, metavar="N", help="number of hosts")
-    heartbeat = "time without a sign of life after which a host counts as lost, s"
-    add("--heartbeat-timeout", type=int, default=100, metavar="SECONDS", help=heartbeat)
-    connect = "time within which all hosts must have connected, s"
-    add("--connect-timeout", type=int, default=300, metavar="SECONDS", help=connect)
+    heartbeat_help = "time without a sign of life after which a host counts as lost, s"
+    add("--heartbeat-timeout", type=int, default=100, metavar="SECONDS", help=heartbeat_help)
+    connect_help = "time within which all hosts must have connected, s"
+    add("--connect-timeout", type=int, default=300, metavar="SECONDS", help=connect_help)
 
 
 def has_several_hosts(options: argparse.Namespace) -> bool:

@@ -22,10 +22,10 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("live", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     add = parser.add_argument
-    policy = "folder of a training run; its policy flies to goals that you type (x y z, m) or click"
-    add("--policy", type=Path, metavar="FOLDER", help=policy)
-    goals = "goals of the policy, one after another: x,y,z in each line, m"
-    add("--goals", type=Path, metavar="FILE", help=goals)
+    policy_help = "folder of a training run; its policy flies to goals that you type (x y z, m) or click"
+    add("--policy", type=Path, metavar="FOLDER", help=policy_help)
+    goals_help = "goals of the policy, one after another: x,y,z in each line, m"
+    add("--goals", type=Path, metavar="FILE", help=goals_help)
     add("--drones", type=int, metavar="N", help="drones in each world; by default 4")
     add("--worlds", type=int, default=1, metavar="N", help="number of worlds")
     add("--seconds", type=float, help="simulated time, s; by default until all viewers are closed")

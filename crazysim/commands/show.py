@@ -25,8 +25,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--browser", action="store_true", help="play the show on a page in a browser, until Ctrl-C")
     add_page(parser)
     add("--window", action="store_true", help="play the show in a window")
-    live = "fly in real time while --window or --browser shows it; no report of distances"
-    add("--live", action="store_true", help=live)
+    live_help = "fly in real time while --window or --browser shows it; no report of distances"
+    add("--live", action="store_true", help=live_help)
     add("--report", type=Path, metavar="FILE", help="figures to write, .json")
     add("--seconds", type=float, help="duration of the flight, s; by default the show's")
     add("--fps", type=float, default=25.0, help="frames per second of the film")

@@ -22,27 +22,27 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("train", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=train)
     add = parser.add_argument
-    task = "name of a task, such as hover, or FILE.py:CLASS for your task; list prints all names"
-    add("task", help=task)
+    task_help = "name of a task, such as hover, or FILE.py:CLASS for your task; list prints all names"
+    add("task", help=task_help)
     add("--algorithm", help="ppo, apg or dagger; by default the recipe's, or dagger with a teacher")
-    teacher = "folder of a run whose policy teaches this one, which sees what the task observes (DAgger)"
-    add("--teacher", metavar="FOLDER", help=teacher)
+    teacher_help = "folder of a run whose policy teaches this one, which sees what the task observes (DAgger)"
+    add("--teacher", metavar="FOLDER", help=teacher_help)
     add("--seed", type=int, help="random seed; by default 0")
-    seeds = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in the folder of the run"
-    add("--seeds", type=parse_seeds, metavar="FIRST:END", help=seeds)
-    sweep = "values of hyperparameters, each trained with each seed in one program"
-    add("--sweep", nargs="+", default=[], metavar="NAME=VALUE,VALUE", help=sweep)
+    seeds_help = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in the folder of the run"
+    add("--seeds", type=parse_seeds, metavar="FIRST:END", help=seeds_help)
+    sweep_help = "values of hyperparameters, each trained with each seed in one program"
+    add("--sweep", nargs="+", default=[], metavar="NAME=VALUE,VALUE", help=sweep_help)
     add("--worlds", type=int, help="number of parallel worlds of a training; by default the recipe's")
-    iterations = "number of rollouts, each with its updates; by default the recipe's"
-    add("--iterations", type=int, help=iterations)
+    iterations_help = "number of rollouts, each with its updates; by default the recipe's"
+    add("--iterations", type=int, help=iterations_help)
     add("--out", type=Path, help="folder of the run; by default out/TASK")
-    resume = "continue from the checkpoint in that folder; settings that you leave out are the checkpoint's"
-    add("--resume", action="store_true", help=resume)
-    checkpoint_every = "write a checkpoint every so many seconds, in addition to the one at each evaluation"
-    add("--checkpoint-every", type=float, metavar="SECONDS", help=checkpoint_every)
+    resume_help = "continue from the checkpoint in that folder; settings that you leave out are the checkpoint's"
+    add("--resume", action="store_true", help=resume_help)
+    checkpoint_every_help = "write a checkpoint every so many seconds, in addition to the one at each evaluation"
+    add("--checkpoint-every", type=float, metavar="SECONDS", help=checkpoint_every_help)
     add("--device", help="device: cpu, gpu; by default cpu, or JAX's default platform with --devices")
-    devices = "devices to distribute the worlds over: all, their number, or their indices such as 0,2,3"
-    add("--devices", metavar="all|N|I,J", help=devices)
+    devices_help = "devices to distribute the worlds over: all, their number, or their indices such as 0,2,3"
+    add("--devices", metavar="all|N|I,J", help=devices_help)
     hosts.add_options(add)
     add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation")
     add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm")
@@ -58,8 +58,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add = _add_policy_command(commands, "export", text, export)
     add("--onnx", type=Path, metavar="FILE", help="ONNX file to write")
     add("--c", type=Path, metavar="FILE", help="C header to write; it includes only math.h")
-    out_of_tree = "existing folder for an out of tree controller of the Crazyflie's firmware"
-    add("--out-of-tree", type=Path, metavar="FOLDER", help=out_of_tree)
+    out_of_tree_help = "existing folder for an out of tree controller of the Crazyflie's firmware"
+    add("--out-of-tree", type=Path, metavar="FOLDER", help=out_of_tree_help)
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
     add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
