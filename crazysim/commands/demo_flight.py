@@ -156,7 +156,9 @@ def figure_eight_setpoints(time: Array, n_drones: int) -> Array:
 
 @jit_unless_traced("n_drones")
 def jerk_feedforward(time: Array, n_drones: int) -> Array:
-    """Return the jerk of every drone's setpoint, with zero snap and yaw rates. Without it, drones lag in turns.
+    """Return the jerk of every drone's setpoint; its snap and yaw rates are sent as zero.
+
+    Without the jerk, drones lag behind their setpoints in curves.
 
     Args:
         time: Time of every world, s. (n_worlds, 1)

@@ -73,7 +73,8 @@ def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, 
         p.allocation_matrix[..., 1:3] / lift_shares[..., None] / p.arms[..., None, :2], wrench[..., 1:3]
     )
 
-    # Rotor i allows collective thrusts F with low <= lift_i (F + s ratio_i) <= high. A masked rotor allows any F.
+    # Rotor i allows collective thrusts F with low <= F + s tilt_thrusts_i <= high, s being the scale of the tilt
+    # torque. A masked rotor allows any F.
     low = mask_rotors(p.rotors, p.thrust_min / lift_shares, -UNLIMITED_THRUST)
     high = mask_rotors(p.rotors, p.thrust_max / lift_shares, UNLIMITED_THRUST)
     low_untilted, high_untilted = _reduce_rotors(jnp.maximum, low), _reduce_rotors(jnp.minimum, high)

@@ -59,7 +59,7 @@ def test_body_rate_peaks_are_those_of_dense_samples():
 
 
 def test_values_by_hand():
-    """Derivatives at the start, largest there or constant: 3-4-5 triangles, and g along with 0.5 g upwards."""
+    """Derivatives at the start, largest there or constant: 3-4-5 triangles, and 0.75 g sideways."""
     g = 9.81
     moving = fly_from_derivatives([0, 0, 1, 0], [3, 0, -4, -0.5])
     found = check(moving, Limits()).peaks
