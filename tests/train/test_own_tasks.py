@@ -46,7 +46,7 @@ def own_list(tmp_path_factory, monkeypatch):
     """Give each test its own list of named tasks, and remove the tasks that it registers."""
     path = tmp_path_factory.mktemp("user") / "crazysim" / "tasks"
     monkeypatch.setattr(references, "_list_path", lambda: path)
-    monkeypatch.setattr(references, "_CLASSES", {})
+    monkeypatch.setattr(references, "_CLASSES_BY_REFERENCE", {})
     monkeypatch.setattr(references, "_NAMED", set())
     tasks, ids = dict(TASKS), dict(gymnasium.registry)
     yield path
@@ -65,7 +65,7 @@ def file(tmp_path):
 
 def forget_tasks(monkeypatch):
     """Forget the tasks that this process has named, as in another process."""
-    monkeypatch.setattr(references, "_CLASSES", {})
+    monkeypatch.setattr(references, "_CLASSES_BY_REFERENCE", {})
     monkeypatch.setattr(references, "_NAMED", set())
 
 
