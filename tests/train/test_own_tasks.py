@@ -47,7 +47,7 @@ def own_list(tmp_path_factory, monkeypatch):
     path = tmp_path_factory.mktemp("user") / "crazysim" / "tasks"
     monkeypatch.setattr(references, "_list_path", lambda: path)
     monkeypatch.setattr(references, "_CLASSES_BY_REFERENCE", {})
-    monkeypatch.setattr(references, "_NAMED", set())
+    monkeypatch.setattr(references, "_NAMED_REFERENCES", set())
     tasks, ids = dict(TASKS), dict(gymnasium.registry)
     yield path
     TASKS.clear()
@@ -66,7 +66,7 @@ def file(tmp_path):
 def forget_tasks(monkeypatch):
     """Forget the tasks that this process has named, as in another process."""
     monkeypatch.setattr(references, "_CLASSES_BY_REFERENCE", {})
-    monkeypatch.setattr(references, "_NAMED", set())
+    monkeypatch.setattr(references, "_NAMED_REFERENCES", set())
 
 
 def test_a_file_is_trained_evaluated_resumed_and_exported(file, tmp_path, monkeypatch, capsys):
