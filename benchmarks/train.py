@@ -6,7 +6,8 @@
     python benchmarks/train.py --tasks hover -- --worlds 2048 --config learning_rate=1e-3
 
 All seeds of a task are trained by one process, ``crazysim train TASK --seeds ...``, so its time includes imports,
-building, compilation and evaluation of all of them; ``--together`` limits the seeds of a process. When a process ends,
+building, compilation and evaluation of all of them; ``--together`` limits the seeds of a process. If the recipe of a
+task has a teacher, each seed has its own process and its own teacher, whose steps and time count. When a process ends,
 it prints a JSON line for each seed, and at the end one for each task, with medians over its seeds. A seed that diverges
 counts as no success, and is named.
 
@@ -45,7 +46,7 @@ from crazysim.commands.training import parse_seeds
 from crazysim.envs.registry import TASKS, entry_of
 from crazysim.train.config import find_recipe
 from crazysim.train.show import read_curve
-from crazysim.train.training import CHECKPOINT_FILE, kept_point, least_kept_success, stored_configs
+from crazysim.train.training import CHECKPOINT_FILE, TEACHER_FOLDER, kept_point, least_kept_success, stored_configs
 from crazysim.train.training import TABLE_FILE as SEEDS_TABLE_FILE
 
 PACKAGE = Path(crazysim.__file__).parent
@@ -143,11 +144,17 @@ def read_results(store: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
 
 
 def group_runs(keys: list[tuple[Any, ...]], max_size: int) -> list[list[tuple[Any, ...]]]:
-    """Return the runs to train in groups of at most ``max_size`` that differ only in the seed, the longest first."""
+    """Return the runs to train in groups of at most ``max_size`` that differ only in the seed, the longest first.
+
+    Runs of a recipe with a teacher are groups of their own, since all seeds of a process have the same teacher.
+    """
     groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
     for key in keys:
         groups.setdefault((key[0], *key[2:]), []).append(key)
-    subgroups = [group[i : i + max_size] for group in groups.values() for i in range(0, len(group), max_size)]
+    subgroups = []
+    for (task, *_), group in groups.items():
+        size = 1 if find_recipe(task).teacher else max_size
+        subgroups += [group[i : i + size] for i in range(0, len(group), size)]
 
     def n_samples(subgroup: list[tuple[Any, ...]]) -> int:
         recipe = find_recipe(subgroup[0][0])
@@ -244,12 +251,17 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
 def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
     """Return the results of one seed from its learning curve, with the seconds of its process for all its seeds.
 
+    Steps and seconds include those of a teacher that was trained first.
+
     Args:
         folder: Folder of the seed.
         diverged: Iteration in which its numbers became NaN or infinite, which counts as no success; None if they did
             not.
     """
-    curve = read_curve(folder)
+    curve, teacher_folder = read_curve(folder), folder.parent / TEACHER_FOLDER
+    if teacher_folder.exists():
+        teacher = read_curve(teacher_folder)[-1]
+        curve = [p | {name: p[name] + teacher[name] for name in ("env_steps", "seconds")} for p in curve]
     point, last_point = kept_point(curve), curve[-1]
     seconds_to_95_percent = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
     return {
@@ -298,7 +310,7 @@ def write_table(rows: list[dict[str, Any]]) -> None:
 
 def table_markdown(rows: list[dict[str, Any]]) -> str:
     """Return the table as the page shows it."""
-    names = {"ppo": "PPO", "apg": "analytic gradients"}
+    names = {"ppo": "PPO", "apg": "analytic gradients", "dagger": "teacher by PPO, student by DAgger"}
     lines = [
         "| Task | Algorithm, environment steps | Seeds | Least | Median | Mean error | Time | Commit, date | Machine |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",

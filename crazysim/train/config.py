@@ -42,6 +42,10 @@ class Recipe:
     """Options of the training environment that the evaluation environment does not have."""
     evaluate_every: int = 20
     """Iterations between evaluations; a checkpoint is written at each."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Options of ``crazysim.envs.make`` of a teacher, in addition to those of its student."""
+    teacher: Recipe | None = None
+    """Recipe of the teacher that ``run`` trains first; None if the recipe needs none."""
 
 
 _LONG_ROLLOUTS = {"n_steps": 64, "minibatches": 32, "hidden": (128, 128), "discount": 0.99}
@@ -71,15 +75,16 @@ RECIPES: dict[str, Recipe] = {
         practice={"practice": True},
     ),
     "race_by_camera": Recipe(
-        n_worlds=4096,
-        config={
-            **_LONG_ROLLOUTS,
-            "iterations": 400,
-            "entropy": 0.003,
-            "convolution": (8, 16, 16),
-            "critic": "privileged",
-        },
+        "dagger",
+        n_worlds=256,
+        config={"iterations": 350, "hidden": (128, 128), "convolution": (8, 16, 16)},
         practice={"practice": True},
+        evaluate_every=50,
+        teacher=Recipe(
+            n_worlds=2048,
+            config={**_LONG_ROLLOUTS, "iterations": 150, "minibatches": 16, "hidden": (64, 64), "entropy": 0.003},
+            options={"gates_observed": True, "camera": ()},
+        ),
     ),
     "avoid": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400, "minibatches": 64, "entropy": 0.003}),
     "forest": Recipe(
@@ -281,6 +286,14 @@ class TrainConfig:
     def practice_options(self) -> dict[str, Any]:
         """Return the options of the training environment that the recipe of the task adds."""
         return dict(RECIPES.get(self.task, Recipe()).practice)
+
+    def teacher_config(self) -> TrainConfig | None:
+        """Return the configuration of the teacher of the recipe; None if it has none, or if the run names a teacher."""
+        recipe = find_recipe(self.task, self.algorithm).teacher
+        if recipe is None or self.config["teacher"]:
+            return None
+        options = self.options | recipe.options
+        return TrainConfig.create(self.task, recipe.algorithm, self.seed, recipe.n_worlds, options, recipe.config)
 
     def algorithm_config(self) -> Any:
         """Return the ``Config`` of the algorithm."""

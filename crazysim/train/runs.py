@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,9 @@ from crazysim.train.training import (
     CURVE_FILE,
     POLICY_FILE,
     TABLE_FILE,
+    TEACHER_FOLDER,
     TrainResult,
+    require_no_run,
     stored_configs,
     train,
     train_many,
@@ -48,6 +51,10 @@ def run(
     ``policy.mp4``. Where matplotlib, the encoder or OpenGL is missing, the plots or the film are left out, and a line
     is logged. An interrupt (Ctrl-C) writes a checkpoint first, and so does a ``SystemExit`` from a signal handler.
 
+    If the recipe of the task has a teacher, such as that of ``race_by_camera``, and the settings name neither another
+    teacher nor another algorithm, the teacher is trained first, in the folder ``teacher`` of the run. ``options`` hold
+    for both; ``n_worlds``, ``config`` and ``on_iteration`` only for the student.
+
     Args:
         task: Name of a task, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task, such
             as ``TwoHoops(radius=0.4)``.
@@ -73,9 +80,12 @@ def run(
     _check_settings(settings, RUN_SETTINGS)
     config = TrainConfig.create(task, **settings)
     folder = Path("out") / config.title if folder is None else Path(folder)
-    if resume:
+    train_settings = (evaluation_worlds, log, progress, checkpoint_every)
+    if _train_teacher(config, folder, resume, *train_settings):
+        config, resume = _with_teacher(config, folder), False
+    elif resume:
         config = TrainConfig.create(task, **settings, resumed=_stored_config(folder))
-    result = train(config, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
+    result = train(config, folder, resume, *train_settings, on_iteration)
     if not is_first_host():
         return result
     log(f"wrote {folder / CHECKPOINT_FILE}, {folder / POLICY_FILE}")
@@ -113,7 +123,8 @@ def run_many(
     A seed gives the same training, to rounding, whichever other seeds are trained with it. The folder then has one
     ``checkpoint.npz`` of all trainings, ``seeds.csv`` and ``seeds.json`` with a row for each training, ``curve.png``
     with medians, quartiles and extremes, and for each training a folder with ``policy.npz`` and ``curve.json``, such as
-    ``seed-3`` or ``learning_rate-0.0003-seed-3``.
+    ``seed-3`` or ``learning_rate-0.0003-seed-3``. If the recipe has a teacher, as in ``run``, it is trained with the
+    first seed, and teaches all students.
 
     Args:
         task: As in ``run``.
@@ -138,14 +149,19 @@ def run_many(
     """
     _check_settings(settings, tuple(x for x in RUN_SETTINGS if x != "seed"))
     variants = make_variants(seeds, sweep or {}, settings.get("config") or {})
-    config = TrainConfig.create(task, **settings)
+    first_seed = next(iter(variants.values()))[0]
+    config = TrainConfig.create(task, **settings, seed=first_seed)
     folder = Path("out") / config.title if folder is None else Path(folder)
+    train_settings = (evaluation_worlds, log, progress, checkpoint_every)
+    has_teacher = _train_teacher(config, folder, resume, *train_settings)
+    resume = resume and not has_teacher
     stored_by_name = stored_configs(folder) if resume else {}
     configs = {}
     for name, (seed, changes) in variants.items():
         seed_settings = settings | {"seed": seed, "config": {**(settings.get("config") or {}), **changes}}
-        configs[name] = TrainConfig.create(task, **seed_settings, resumed=stored_by_name.get(name))
-    results = train_many(configs, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
+        config = TrainConfig.create(task, **seed_settings, resumed=stored_by_name.get(name))
+        configs[name] = _with_teacher(config, folder) if has_teacher else config
+    results = train_many(configs, folder, resume, *train_settings, on_iteration)
     if not is_first_host():
         return results
     log(
@@ -200,6 +216,29 @@ def make_variants(
         )
         for *values, seed in itertools.product(*(values_by_name[name] for name in names), values_by_name["seeds"])
     }
+
+
+def _train_teacher(student: TrainConfig, folder: Path, resume: bool, *settings: Any) -> bool:
+    """Train the teacher of the recipe, and return True; return False if the run needs none or its student has begun.
+
+    Args:
+        student: Configuration of the student.
+        folder: Folder of the student's run.
+        resume: True to continue an interrupted run, of the teacher or of the student.
+        settings: Settings of ``train`` from ``evaluation_worlds`` to ``checkpoint_every``.
+    """
+    teacher = student.teacher_config()
+    if teacher is None or (resume and (folder / CHECKPOINT_FILE).exists()):
+        return False
+    require_no_run(folder)
+    student.make_training_env()  # raises the errors of the student's settings before the teacher is trained
+    train(teacher, folder / TEACHER_FOLDER, resume, *settings)
+    return True
+
+
+def _with_teacher(student: TrainConfig, folder: Path) -> TrainConfig:
+    """Return the configuration of a student with the teacher in the folder of its run."""
+    return dataclasses.replace(student, config=student.config | {"teacher": str(folder / TEACHER_FOLDER)})
 
 
 def _check_settings(settings: Mapping[str, Any], names: Sequence[str]) -> None:

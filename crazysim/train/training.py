@@ -51,6 +51,9 @@ from crazysim.train.seeds import take_seed
 CHECKPOINT_FILE, POLICY_FILE, CURVE_FILE, TABLE_FILE = "checkpoint.npz", "policy.npz", "curve.json", "seeds.json"
 """Names of the files of a run: its checkpoint, the kept policy, the learning curve, and the table of all seeds."""
 
+TEACHER_FOLDER = "teacher"
+"""Folder, in that of a run, of the teacher that the recipe of a task trains first."""
+
 CHECK_SEED = 0xC4EC
 """Seed of the initial states of the check set, which differ from the held-out ones of ``EVALUATION_SEED``."""
 Learner = ppo.Learner | apg.Learner | dagger.Learner
@@ -158,11 +161,8 @@ def train_many(
         resume=resume,
         seconds_of_checkpoint=seconds_before,
     )
-    if path.exists() and not resume:
-        raise ConfigError(
-            f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
-            f"with --out"
-        )
+    if not resume:
+        require_no_run(folder)
     algorithm = ALGORITHMS[config.algorithm]
     hyperparameters = tuple([training.config.algorithm_config() for training in trainings])
     n_iterations, n_steps = hyperparameters[0].iterations, hyperparameters[0].n_steps
@@ -348,6 +348,15 @@ def train_many(
         policy = jax.device_put(training.kept_policy, eval_env.sim.device)
         results[training.name] = TrainResult(training.folder, point, policy, eval_env)
     return results
+
+
+def require_no_run(folder: Path) -> None:
+    """Raise ``ConfigError`` if a folder holds the checkpoint of a run."""
+    if (folder / CHECKPOINT_FILE).exists():
+        raise ConfigError(
+            f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
+            f"with --out"
+        )
 
 
 @dataclass

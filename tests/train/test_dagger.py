@@ -10,8 +10,9 @@ from crazysim import ConfigError, MotionCapture
 from crazysim.__main__ import main
 from crazysim.envs import Observe, make
 from crazysim.envs.state import flatten
-from crazysim.train import dagger, imitate
-from crazysim.train.config import TrainConfig
+from crazysim.train import config as configs
+from crazysim.train import dagger, imitate, run, run_many
+from crazysim.train.config import Recipe, TrainConfig
 from crazysim.train.training import load_policy, train
 
 STUDENT_OBSERVATIONS = ("rot", "difference_to_goal", "vel")
@@ -75,6 +76,70 @@ def test_the_command_trains_a_student_and_resumes(teacher, tmp_path, capsys):
     assert config.config["teacher"] == str(teacher.resolve())
     assert sum(meta["observations"].values()) == 21
     assert policy(jax.jit(config.make_env(2).reset)(jax.random.key(0)).obs).shape == (2, 1, 4)
+
+
+@pytest.fixture
+def recipe_with_teacher(monkeypatch):
+    """A recipe of hover with a teacher that flies shorter, and the settings of its small runs."""
+    teacher = Recipe(n_worlds=4, config=SMALL | {"iterations": 2}, options={"seconds": 0.1}, evaluate_every=1)
+    recipe = Recipe("dagger", n_worlds=2, config=SMALL | {"iterations": 1}, teacher=teacher)
+    monkeypatch.setitem(configs.RECIPES, "hover", recipe)
+    lines = []
+    return lines, {"evaluation_worlds": 4, "options": {"seconds": 0.2}, "log": lines.append, "progress": False}
+
+
+@pytest.mark.long("trains a teacher and its students")
+def test_a_recipe_trains_its_teacher_first(recipe_with_teacher, tmp_path):
+    lines, settings = recipe_with_teacher
+    iterations = []
+    folder = tmp_path / "run"
+    run("hover", folder, film=False, seed=3, on_iteration=lambda i, _: iterations.append(i), **settings)
+    headers = [line.partition(":")[0] for line in lines if " by " in line and "iterations of" in line]
+    assert headers == ["hover by ppo, seed 3", "hover by dagger, seed 3"]
+    assert iterations == [1]
+    _, student, _ = load_policy(folder)
+    _, teacher, _ = load_policy(folder / "teacher")
+    assert student.config["teacher"] == str((folder / "teacher").resolve())
+    assert (student.n_worlds, student.options, teacher.n_worlds, teacher.options) == (
+        2,
+        {"seconds": 0.2},
+        4,
+        {"seconds": 0.1},
+    )
+    run("hover", folder, film=False, resume=True, config={"iterations": 2}, **settings)
+    assert sum("by ppo" in line for line in lines) == 1
+    assert sum("by dagger" in line and "continues after iteration 1" in line for line in lines) == 1
+
+    students = run_many("hover", tmp_path / "many", seeds=[5, 6], **settings)
+    assert students.keys() == {"seed-5", "seed-6"}
+    assert load_policy(tmp_path / "many" / "teacher")[1].seed == 5
+    assert load_policy(tmp_path / "many" / "seed-6")[1].config["teacher"] == str(
+        (tmp_path / "many" / "teacher").resolve()
+    )
+
+
+@pytest.mark.long("trains a teacher")
+def test_an_interrupted_teacher_continues_and_then_teaches(recipe_with_teacher, tmp_path, monkeypatch):
+    lines, settings = recipe_with_teacher
+    with monkeypatch.context() as context:
+        context.setattr("crazysim.train.training.must_stop", lambda iteration: True)
+        with pytest.raises(SystemExit):
+            run("hover", tmp_path / "run", film=False, **settings)
+    with pytest.raises(ConfigError, match=r"a folder without a run, got .*teacher; continue the run with --resume"):
+        run("hover", tmp_path / "run", film=False, **settings)
+    run("hover", tmp_path / "run", film=False, resume=True, **settings)
+    headers = [line for line in lines if "iterations of" in line]
+    assert "continues after iteration 1" in headers[1]
+    assert "by dagger" in headers[2]
+
+
+def test_settings_of_a_student_are_checked_before_its_teacher_is_trained(recipe_with_teacher, tmp_path):
+    _, settings = recipe_with_teacher
+    with pytest.raises(ConfigError, match="expected hyperparameters of dagger, got entropy"):
+        run("hover", tmp_path / "run", config={"entropy": 0.1}, **settings)
+    with pytest.raises(ConfigError, match="has no option 'nothing'"):
+        run("hover", tmp_path / "run", **settings | {"options": {"nothing": 1}})
+    assert not (tmp_path / "run").exists()
 
 
 def test_teachers_that_do_not_fit_are_errors(teacher, tmp_path):
