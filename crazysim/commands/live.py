@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, specified_options
+from crazysim.commands.options import DefaultsFormatter, add_page_options, add_simulation_options, specified_options
 from crazysim.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--window", action="store_true", help="show a window; by default where there is a screen")
     add("--browser", action="store_true", help="show a page in a browser; by default where there is no screen")
     add("--headless", action="store_true", help="show nothing; requires --seconds")
-    add_page(parser)
+    add_page_options(parser)
     add("--fps", type=float, default=50.0, help="pictures per second, sent to viewers")
     add("--control-freq", type=int, metavar="HZ", help="rate of control steps, Hz; by default 100")
     add("--freq", type=int, metavar="HZ", help="rate of physics steps, Hz; by default 500")
@@ -41,7 +41,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--pilot", action="store_true", help="pilot the first drone with arrow keys, W, S, A, D and clicks")
     add("--gamepad", action="store_true", help="pilot the first drone with a gamepad and the keyboard")
     add("--commands", action="store_true", help="listen for commands over TCP, at ports 7000 and 7002")
-    add_simulation(parser)
+    add_simulation_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:

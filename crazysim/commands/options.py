@@ -17,13 +17,13 @@ class DefaultsFormatter(argparse.HelpFormatter):
         return f"{text} (default: %(default)s)"
 
 
-def add_page(parser: argparse.ArgumentParser) -> None:
+def add_page_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a command that serves a page."""
     parser.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any free port")
     parser.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
 
 
-def add_simulation(parser: argparse.ArgumentParser) -> None:
+def add_simulation_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a command that are settings of ``Sim``."""
     add = parser.add_argument
     add("--drone", help="airframe: a name or the path of a TOML file; by default cf21B_500")

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, specified_options
+from crazysim.commands.options import DefaultsFormatter, add_page_options, add_simulation_options, specified_options
 from crazysim.errors import ConfigError
 from crazysim.lab.show_files import Show, load_show
 from crazysim.storage import check_writable, write_file
@@ -23,14 +23,14 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--film", type=Path, metavar="FILE", help="film to write, .mp4 or .gif")
     add("--page", type=Path, metavar="FILE", help="page to write, .html, which plays the show in a browser")
     add("--browser", action="store_true", help="play the show on a page in a browser, until Ctrl-C")
-    add_page(parser)
+    add_page_options(parser)
     add("--window", action="store_true", help="play the show in a window")
     live_help = "fly in real time while --window or --browser shows it; no report of distances"
     add("--live", action="store_true", help=live_help)
     add("--report", type=Path, metavar="FILE", help="figures to write, .json")
     add("--seconds", type=float, help="duration of the flight, s; by default the show's")
     add("--fps", type=float, default=25.0, help="frames per second of the film")
-    add_simulation(parser)
+    add_simulation_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:

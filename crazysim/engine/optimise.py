@@ -25,8 +25,8 @@ def optimise(
 
     Args:
         program: The program, from ``lower_stages``.
-        select_rows: Function from the written leaves to the leaves to store as rows, each of one number of all drones.
-            None to store none as rows.
+        select_rows: Function that returns which of the written leaves to store as rows, each with one number of all
+            drones. None to store none as rows.
         pack: True to pack shared numbers in one leaf.
     """
     passes: list[Pass] = [fuse, join_ticks, hoist, *([pack_shared] if pack else [])]

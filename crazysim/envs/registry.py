@@ -119,10 +119,10 @@ def make(
         randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
             ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
         camera: Camera or lidar whose images the drones observe in addition, or several; see ``CameraImages``. None for
-            the camera of the task, which few tasks have, and whose images are named ``"depth"`` and so on by output;
-            ``()`` for no images.
-        depth_image: Width and height in pixels of depth images that the drones observe as ``"depth"``: short for a
-            ``Camera`` that takes an image in every step and replaces the camera of the task. None for no such images.
+            the camera of the task if it has one, with images named by their output, such as ``"depth"``; ``()`` for no
+            images.
+        depth_image: Width and height in pixels of depth images that the drones observe as ``"depth"``. It stands for
+            a ``Camera`` that takes an image in every step and replaces the camera of the task. None for no such images.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
     """

@@ -136,7 +136,7 @@ class DroneVecEnv(VecEnv):
         return list(self.get_images())
 
     def env_is_wrapped(self, wrapper_class: type, indices: ArrayLike | None = None) -> list[bool]:
-        """Return true for ``Monitor``, whose infos are provided; false for other wrappers of Stable-Baselines3."""
+        """Return True for ``Monitor``, whose infos are provided; False for other wrappers of Stable-Baselines3."""
         return [wrapper_class.__name__ == "Monitor"] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[np.ndarray | None]:

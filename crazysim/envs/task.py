@@ -114,7 +114,7 @@ class Task:
         raise NotImplementedError(self._undefined("rewards(data, action, last_action)"))
 
     def terminated(self, data: SimData) -> Array:
-        """Return true where the episode ended by success or failure. ()"""
+        """Return True where the episode ended by success or failure. ()"""
         raise NotImplementedError(self._undefined("terminated(data)"))
 
     def error(self, data: SimData) -> Array:
@@ -157,7 +157,7 @@ class Task:
         return None
 
     def succeeded(self, data: SimData) -> Array | None:
-        """Return true where a drone has succeeded; None if success means that ``error`` stays small. (n_drones,)"""
+        """Return True where a drone has succeeded; None if success means that ``error`` stays small. (n_drones,)"""
         del data
         return None
 

@@ -123,8 +123,8 @@ def start_offsets(n_drones: int) -> np.ndarray:
     return offsets - middle
 
 
-def random_count(track: Track) -> int:
-    """Return the number of random numbers that ``random_course`` takes."""
+def count_random_numbers(track: Track) -> int:
+    """Return how many random numbers ``random_course`` takes."""
     n_x, n_y = track.grid
     return n_x * n_y + (n_x + 1) * (n_y + 1) + 3 * track.n_gates
 
@@ -137,7 +137,7 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
 
     Args:
         track: Track with the heights and numbers of gates and obstacles, and the limits of the arena.
-        x: Random numbers in [0, 1). (..., random_count)
+        x: Random numbers in [0, 1), ``count_random_numbers(track)`` of them. (..., n)
 
     Returns:
         Start, m (..., 3), positions of gates, m (..., n_gates, 3), their attitudes, xyzw (..., n_gates, 4), positions

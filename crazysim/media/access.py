@@ -36,7 +36,7 @@ class Access:
 
         Args:
             host: Address that the server listens at.
-            port: Its port.
+            port: Port that the server listens at.
         """
         self.host, self.port = host, port
         self._token = secrets.token_urlsafe(16)
@@ -64,7 +64,7 @@ class Access:
             return "expected the address with its token, got another one. Use the address that the program printed."
         return ""
 
-    def answer(self, connection: Any, request: Any) -> Any:
+    def check_request(self, connection: Any, request: Any) -> Any:
         """Return a websockets response that refuses a request, or remove the token from its path and return None."""
         reason = self.refusal_reason(request.path, request.headers)
         if not reason:
@@ -131,12 +131,12 @@ def start_guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
         if not handler.__module__.startswith("viser."):
             return original_serve(handler, *args, process_request=process_request, **options)
 
-        def process_checked(connection: Any, request: Any) -> Any:
-            refusal = access.answer(connection, request)
+        def process_if_accepted(connection: Any, request: Any) -> Any:
+            refusal = access.check_request(connection, request)
             return process_request(connection, request) if refusal is None else refusal
 
         is_guarded = True
-        return original_serve(handler, *args, process_request=process_checked, **options)
+        return original_serve(handler, *args, process_request=process_if_accepted, **options)
 
     with _SERVE_LOCK:
         original_serve, server_module.serve = server_module.serve, serve

@@ -14,8 +14,9 @@ from crazysim.sim.sim import Sim
 
 BACKGROUND_COLOR, OBSTACLE_COLOR, OUTLINE_COLOR = (238, 238, 230), (40, 65, 40), (20, 20, 20)
 """Colours of a map, of obstacles, and of the outlines of drones, RGB."""
-MIN_TOP = 0.1
-"""Height of the lowest obstacles, m. Markers on the floor, and obstacles that a layout moves below it, are lower."""
+MIN_OBSTACLE_TOP = 0.1
+"""Smallest height of the top of an obstacle, m. Lower geoms are not drawn: markers on the floor, and obstacles that a
+layout has moved below it."""
 MARGIN = 1.0
 """Width of the margin around obstacles and paths, m."""
 MIN_WIDTH, MAX_WIDTH = 6.0, 24.0
@@ -72,7 +73,7 @@ class TopView:
             ~np.isin(model.body_rootid[model.geom_bodyid], drones)
             & np.isin(model.geom_group, VISIBLE_GROUPS)
             & ~np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD))
-            & (high[:, 2] > MIN_TOP)
+            & (high[:, 2] > MIN_OBSTACLE_TOP)
             & (np.abs(data.geom_xpos) < MAX_COORDINATE).all(-1)
         )
         if not is_obstacle.any() or min(width, height) < MIN_PIXELS:
@@ -84,15 +85,15 @@ class TopView:
         grid = _choose_grid(low.min(axis=0) - MARGIN, high.max(axis=0) + MARGIN, path[-1, 0], width, height)
         canvas = np.full((*grid.size[::-1], 3), BACKGROUND_COLOR, np.uint8)
         canvas[self._find_obstacles(model, data, k, is_obstacle, grid)] = OBSTACLE_COLOR
-        dot = SAMPLES * max(height / 40, 2.0)
+        dot_radius = SAMPLES * max(height / 40, 2.0)
         for drone, color in enumerate(choose_drone_colors(sim.n_drones, rgba)):
             pixels, rgb = grid.locate(path[:, drone]), 255 * color[:3]
             ahead = data.xmat[drones[drone]].reshape(3, 3)[:2, 0] * [1, -1]
-            nose = pixels[-1] + 3 * dot * ahead / max(float(np.linalg.norm(ahead)), 1e-6)
-            _draw_line(canvas, pixels, 0.4 * dot, rgb)
-            _draw_line(canvas, np.stack([pixels[-1], nose]), 0.4 * dot, OUTLINE_COLOR)
-            _draw_line(canvas, pixels[-1:], 1.4 * dot, OUTLINE_COLOR)
-            _draw_line(canvas, pixels[-1:], dot, rgb)
+            nose = pixels[-1] + 3 * dot_radius * ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+            _draw_line(canvas, pixels, 0.4 * dot_radius, rgb)
+            _draw_line(canvas, np.stack([pixels[-1], nose]), 0.4 * dot_radius, OUTLINE_COLOR)
+            _draw_line(canvas, pixels[-1:], 1.4 * dot_radius, OUTLINE_COLOR)
+            _draw_line(canvas, pixels[-1:], dot_radius, rgb)
         return canvas.reshape(height, SAMPLES, width, SAMPLES, 3).mean(axis=(1, 3)).astype(np.uint8)
 
     def _find_obstacles(
@@ -100,7 +101,8 @@ class TopView:
     ) -> NDArray:
         """Return which samples show obstacles. (size[1], size[0])
 
-        Rays are cast for an area of twice the size, which is used until the map leaves it or an obstacle moves.
+        Rays are cast over an area of twice the size. The result is reused until the map leaves the area or an obstacle
+        moves.
         """
         area = Grid(grid.start // grid.size * grid.size, 2 * grid.size, grid.scale)
         poses = (x[is_obstacle].ravel() for x in (data.geom_xpos, data.geom_xmat))

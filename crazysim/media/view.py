@@ -93,7 +93,7 @@ class View:
                 f"Show fewer worlds or increase the size."
             )
         if self.follow is not None and self.hold is not None:
-            raise ConfigError("expected a drone to follow or points to hold in view, got both. Return the drone's.")
+            raise ConfigError("expected a drone to follow or points to hold in view, got both. Use only one of them.")
         if (self.follow is not None or self.hold is not None) and self.camera != -1:
             raise ConfigError(
                 f"expected camera=-1, the free camera, to follow a drone or hold points in view, got "

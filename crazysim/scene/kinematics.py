@@ -24,9 +24,9 @@ def update_kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         model: Compiled scene.
         data: State of the scene in every world. (n_worlds, ...)
     """
-    n = data.mocap_pos.shape[:1]
-    pos = jnp.broadcast_to(model.body_pos, n + model.body_pos.shape)
-    quat = jnp.broadcast_to(_to_xyzw(model.body_quat), n + model.body_quat.shape)
+    batch_shape = data.mocap_pos.shape[:1]
+    pos = jnp.broadcast_to(model.body_pos, batch_shape + model.body_pos.shape)
+    quat = jnp.broadcast_to(_to_xyzw(model.body_quat), batch_shape + model.body_quat.shape)
     mocap = np.flatnonzero(model.body_mocapid >= 0)
     if len(mocap):
         ids = model.body_mocapid[mocap]

@@ -29,7 +29,7 @@ compile. XLA compiles any number in 1 s, but takes 1.4 times as long in each cal
 
 
 class SceneQueries:
-    """Queries with the arguments seen so far, compiled until the scene changes."""
+    """Queries that are compiled once for each set of arguments, and again after the scene has changed."""
 
     def __init__(self, scene: Scene):
         self._scene = scene
@@ -65,7 +65,7 @@ class SceneQueries:
             _, compiled = self._compiled = self._scene.mj_model, {}
         is_new = (name, *settings) not in compiled
         if is_new:
-            compiled[name, *settings] = jax.jit(_close_over_data(build(), data))
+            compiled[name, *settings] = jax.jit(_restrict_to_poses(build(), data))
         states, objects = data.states, data.objects
         # Only the arrays that the query needs, since the cost of a compiled call grows with their number.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
@@ -105,18 +105,18 @@ class SceneQueries:
         return contacts
 
 
-def _close_over_data(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
-    """Return a function of data and mocap poses as one of poses alone; the rest of the data is left out."""
-    poses_only = jax.tree.map(lambda _: None, data)
+def _restrict_to_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
+    """Return a function of poses that calls a function of data and mocap poses; all other data is None."""
+    empty_data = jax.tree.map(lambda _: None, data)
 
     def query_poses(
         pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None, mocap: MocapPoses
     ) -> Any:
-        states, objects = poses_only.states.replace(pos=pos, quat=quat), poses_only.objects
-        core = poses_only.core.replace(drone_id=jnp.broadcast_to(jnp.arange(pos.shape[-2]), pos.shape[:-1]))
+        states, objects = empty_data.states.replace(pos=pos, quat=quat), empty_data.objects
+        core = empty_data.core.replace(drone_id=jnp.broadcast_to(jnp.arange(pos.shape[-2]), pos.shape[:-1]))
         if objects is not None:
             # Plugins, whose records are not among the arguments, have moved their objects already.
             objects = objects.replace(pos=objects_pos, quat=objects_quat, recorded=True)
-        return fn(poses_only.replace(states=states, objects=objects, core=core, plugins={}), mocap)
+        return fn(empty_data.replace(states=states, objects=objects, core=core, plugins={}), mocap)
 
     return query_poses

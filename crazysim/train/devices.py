@@ -113,15 +113,15 @@ def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
     """
     mesh = sim.mesh
     if mesh is None:
-        on_one_device = SingleDeviceSharding(sim.device)
-        return jax.tree.map(lambda _: on_one_device, shapes)
-    replicated, over_worlds = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
-    agents_sharding = over_worlds if are_seeds_divided(n_seeds, mesh) else replicated
+        single_device_sharding = SingleDeviceSharding(sim.device)
+        return jax.tree.map(lambda _: single_device_sharding, shapes)
+    replicated, world_sharding = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
+    agents_sharding = world_sharding if are_seeds_divided(n_seeds, mesh) else replicated
 
     def field_shardings(name: str, tree: Any) -> Any:
         if name == "env":
             return jax.tree.unflatten(jax.tree.structure(tree), jax.tree.leaves(shardings_of(tree.full_data, mesh)))
-        field_sharding = {"agents": agents_sharding, "memory": over_worlds}.get(name, replicated)
+        field_sharding = {"agents": agents_sharding, "memory": world_sharding}.get(name, replicated)
         return jax.tree.map(lambda _: field_sharding, tree)
 
     return shapes.replace(

@@ -40,7 +40,8 @@ PRIVILEGED_CRITICS = ("privileged", "all_drones_privileged")
 """Critics that receive the observation of ``PrivilegedObservation``."""
 MAX_GROUPS = 64
 """Largest number of groups of neighbouring worlds. A minibatch takes the same number of worlds from every group. A
-device holds whole groups, so it needs no samples of others, and minibatches do not depend on the number of devices."""
+device holds whole groups, so it needs no samples of other devices, and minibatches do not depend on the number of
+devices."""
 
 
 @dataclass(frozen=True)
@@ -386,13 +387,13 @@ def _run_epochs(
         updates, optimizer = transform.update(grads, optimizer, parameters)
         return (optax.apply_updates(parameters, updates), optimizer), losses
 
-    def epoch(carry: Any, key: Array) -> tuple[Any, dict[str, Array]]:
+    def run_epoch(carry: Any, key: Array) -> tuple[Any, dict[str, Array]]:
         keys = jax.random.split(key, n_groups)
         orders = jax.vmap(lambda key: jax.random.permutation(key, n_worlds // n_groups))(keys)
         minibatches = jnp.moveaxis(orders.reshape(n_groups, config.minibatches, -1), 1, 0)
         return jax.lax.scan(lambda carry, worlds: update(carry, select_minibatch(worlds)), carry, minibatches)
 
-    carry, losses = jax.lax.scan(epoch, (parameters, agent.optimizer), jax.random.split(key, config.epochs))
+    carry, losses = jax.lax.scan(run_epoch, (parameters, agent.optimizer), jax.random.split(key, config.epochs))
     return *carry, jax.tree.map(jnp.mean, losses)
 
 
@@ -426,13 +427,13 @@ def _critic_obs(obs: Obs, config: Config) -> Array:
 
 
 def _policy_obs(obs: Obs, config: Config) -> Obs:
-    """Return the observations of the policy: all of them, without the one for a privileged critic."""
+    """Return the observations of the policy: all except the one that only a privileged critic gets."""
     is_hidden = config.critic in PRIVILEGED_CRITICS
     return {name: x for name, x in obs.items() if not (is_hidden and name == PRIVILEGED)}
 
 
 def _critic_input(obs: Array, config: Config) -> Array:
-    """Return the inputs of the value function for each drone. A critic of all drones also gets those of the others.
+    """Return the inputs of the value function for each drone. A critic of all drones also gets the other drones'.
 
     Args:
         obs: Result of ``_critic_obs``, normalised or not. (..., n_drones, k)

@@ -114,12 +114,12 @@ class LeafValues:
 
 def batch_counts(program: Program, leaves: list[Any]) -> tuple[int, int]:
     """Return the numbers of worlds and of drones per world; within a mesh, the numbers on this device."""
-    drone = next(
+    drone_leaf = next(
         i
         for i, (leaf, x) in enumerate(zip(program.leaves, leaves, strict=True))
         if leaf.scope == "drone" and x is not None and not leaf.row_leaves
     )
-    return leaves[drone].shape[0], leaves[drone].shape[1]
+    return leaves[drone_leaf].shape[0], leaves[drone_leaf].shape[1]
 
 
 def leaf_shape(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct:
@@ -168,7 +168,7 @@ def _run_drones(segment: Segment, values: LeafValues, constants: Sequence[Any]) 
 def _run_worlds(segment: Segment, values: LeafValues) -> None:
     """Run a segment with scope ``world``, with one lane per world.
 
-    Its slots of a leaf of drones count the scalars of all drones of a world, drone after drone.
+    In a leaf of drones, its slots number the scalars of all drones of a world, drone after drone.
     """
     leaves, shape, library = values.program.leaves, (values.n_worlds, values.n_drones), values.library
 
@@ -212,7 +212,7 @@ def run_steps(
 ) -> tuple[list[Any], Array]:
     """Return the written leaves after some steps, and True for worlds that are flagged as not finite. (n_worlds, 1)
 
-    With a Python number as the number of steps, the loop can be differentiated in reverse mode.
+    The loop can be differentiated in reverse mode if the number of steps is a Python integer.
 
     Args:
         program: The program.

@@ -77,7 +77,7 @@ class Chase(TouchDown):
         return flying(data, pos, rotation.from_rpy(scale_symmetric(x["rpy"], 0.2)), scale_symmetric(x["vel"], 0.3))
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
-        """Return position, m, and velocity, m/s, of each drone's roof, of one drone or one world. (..., 3) each"""
+        """Return position, m, and velocity, m/s, of each drone's roof, world frame. (..., 3) each"""
         del steps_ahead
         car: CarData = data.plugins[CARS]
         roof_pos = jnp.asarray(roof_centre(), car.pos.dtype)

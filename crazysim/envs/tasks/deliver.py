@@ -217,7 +217,7 @@ def initial_car_pos(data: SimData) -> Array:
 
 
 def has_left_arena(data: SimData) -> Array:
-    """Return true where a drone has left its part of the arena. (...)"""
+    """Return True where a drone has left its part of the arena. (...)"""
     pos = data.states.pos
     is_far = jnp.any(jnp.abs(pos - initial_car_pos(data))[..., :2] > HALF_WIDTH, axis=-1)
     return is_far | (pos[..., 2] < MIN_HEIGHT) | (pos[..., 2] > CEILING)

@@ -53,7 +53,7 @@ class GoalTask(Task):
         return state_of(data) | {"difference_to_goal": goal_of(data).pos - data.states.pos}
 
     def crashed(self, data: SimData) -> Array:
-        """Return true where a drone has left the arena. (..., n_drones)"""
+        """Return True where a drone has left the arena. (..., n_drones)"""
         return out_of_bounds(data, self.half_width, self.height)
 
     def terminated(self, data: SimData) -> Array:
@@ -133,12 +133,12 @@ def to_heading(data: SimData, vector: Array) -> Array:
 
 
 def on_floor(data: SimData) -> Array:
-    """Return true where a drone is on the floor or below. (..., n_drones)"""
+    """Return True where a drone is on the floor or below. (..., n_drones)"""
     return data.states.pos[..., 2] < FLOOR
 
 
 def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
-    """Return true where a drone is on the floor, too high, or too far from the z axis. (..., n_drones)"""
+    """Return True where a drone is on the floor, too high, or too far from the z axis. (..., n_drones)"""
     pos = data.states.pos
     return on_floor(data) | (pos[..., 2] > height) | jnp.any(jnp.abs(pos[..., :2]) > half_width, axis=-1)
 

@@ -116,11 +116,11 @@ class Land(TouchDown):
         return record.pads.set_pose(data, pos, vel=pad_vel) if self.speed > 0 else data
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
-        """Return position, m, and velocity, m/s, of each drone's pad, of one drone or one world. (..., 3) each"""
+        """Return position, m, and velocity, m/s, of each drone's pad, world frame. (..., 3) each"""
         return self.pad_motion(data, data.core.steps + steps_ahead if steps_ahead else data.core.steps)
 
     def has_left_arena(self, data: SimData) -> Array:
-        """Return true where a drone has left its part of the arena. (...)"""
+        """Return True where a drone has left its part of the arena. (...)"""
         pos = data.states.pos
         return jnp.any(jnp.abs(pos - self.path_centre(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
 

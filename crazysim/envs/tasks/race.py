@@ -23,7 +23,7 @@ from crazysim.envs.tasks import race_rules as rules
 from crazysim.envs.tasks.goals import install_rules, pick_entry, with_record
 from crazysim.envs.tasks.race_observations import observe, visited_objects
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
-from crazysim.envs.tracks import Track, check_track, random_count, random_course, start_offsets
+from crazysim.envs.tracks import Track, check_track, count_random_numbers, random_course, start_offsets
 from crazysim.errors import ConfigError
 from crazysim.pytree import device_array, host_array
 from crazysim.sim.sim import Sim
@@ -140,7 +140,7 @@ class Race(Task):
         if self.level >= 2:
             sizes |= {"gates": (course.n_gates, 6), "obstacles": (course.n_obstacles, 3)}
         if self.level == 3:
-            sizes["course"] = random_count(course)
+            sizes["course"] = count_random_numbers(course)
         if self.practice:
             sizes |= {"passed": 1, "behind": (n_drones, 2)}
         x = draw(key, **sizes)

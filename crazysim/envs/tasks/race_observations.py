@@ -19,7 +19,7 @@ CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]
 
 
 def visited_objects(data: SimData, sensor_range: float) -> tuple[Array, Array]:
-    """Return true for gates and obstacles that each drone is or has been near. (n_drones, n) each"""
+    """Return True for gates and obstacles that each drone is or has been near. (n_drones, n) each"""
     record = race_of(data)
 
     def is_near(pos: Array) -> Array:

@@ -141,7 +141,7 @@ class Swarm(Task):
         }
 
     def is_lost(self, data: SimData) -> Array:
-        """Return true where a drone is on the floor, outside of the arena, or too close to another. (n_drones,)"""
+        """Return True where a drone is on the floor, outside of the arena, or too close to another. (n_drones,)"""
         pos = data.states.pos
         is_outside = jnp.any(jnp.abs(pos) > self.limits(data.core.n_drones).astype(pos.dtype), axis=-1)
         return on_floor(data) | is_outside | (self.strict & (swarm_of(data).closest < 1))
@@ -154,7 +154,7 @@ class Swarm(Task):
         return np.maximum(radius, np.abs(np.asarray(self.formation, float)).max(axis=0)) + ARENA_MARGIN
 
     def terminated(self, data: SimData) -> Array:
-        """Return true where a drone is lost."""
+        """Return True where a drone is lost."""
         return jnp.any(self.is_lost(data))
 
     def error(self, data: SimData) -> Array:

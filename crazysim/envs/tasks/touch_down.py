@@ -61,17 +61,17 @@ class TouchDown(Task):
     """Length of an episode, s."""
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
-        """Return position, m, and velocity, m/s, of each drone's place, of one drone or one world. (..., 3) each
+        """Return position, m, and velocity, m/s, of each drone's place, world frame. (..., 3) each
 
         Args:
-            data: Simulation.
+            data: One world, or one drone.
             steps_ahead: Physics steps to add to ``steps`` for a place whose motion is a function of time: 1 in a stage
                 after the integration and before ``steps`` increases.
         """
         raise NotImplementedError(self._undefined("target_motion(data)"))
 
     def has_left_arena(self, data: SimData) -> Array:
-        """Return true where a drone has left its part of the arena. (...)"""
+        """Return True where a drone has left its part of the arena. (...)"""
         raise NotImplementedError(self._undefined("has_left_arena(data)"))
 
     def touch_down_stage(self, contacts: ContactFn, radius: float, scope: str = "drone") -> Stage:

@@ -154,7 +154,7 @@ class Transport(BringLoad):
         return jnp.where(is_behind(load, pos, quat), self.error(data), way_through_gate)
 
     def misses_gate(self, data: SimData) -> Array:
-        """Return true where a drone or its load is between the faces of its gate, but not in the opening. (...)"""
+        """Return True where a drone or its load is between the faces of its gate, but not in the opening. (...)"""
         pos, quat = gate_of(data)
         misses_opening = [
             (jnp.abs(local_pos[..., 0]) <= BAR_THICKNESS / 2)
@@ -232,7 +232,7 @@ def gate_axis(quat: Array) -> Array:
 
 
 def is_behind(point: Array, pos: Array, quat: Array) -> Array:
-    """Return true where a point is behind the plane of a gate. (...)
+    """Return True where a point is behind the plane of a gate. (...)
 
     Args:
         point: Position, m. (..., 3)
@@ -243,7 +243,7 @@ def is_behind(point: Array, pos: Array, quat: Array) -> Array:
 
 
 def out_of_lane(data: SimData) -> Array:
-    """Return true where a drone has left its lane, or its load touches the floor. (...)"""
+    """Return True where a drone has left its lane, or its load touches the floor. (...)"""
     pos = data.states.pos
     middle = pick_entry(jnp.asarray(lanes(data.core.n_drones), pos.dtype), data.core.drone_id)
     is_far = jnp.any(jnp.abs(pos - middle)[..., :2] > np.array(HALF_SIZE, pos.dtype), axis=-1) | (pos[..., 2] > CEILING)

@@ -56,7 +56,7 @@ FORCE_TERMS = (
 TORQUE_TERMS = (
     "centre of mass x", "centre of mass y", "torque z", *(f"torque {a} per velocity {b}" for a in "xyz" for b in "xyz"),
 )  # fmt: skip
-"""Parameters of the torque, m, N m and N s."""
+"""Parameters of the torque: coordinates in m, a torque in N m, and torques per velocity in N s."""
 PARAMETER_UNITS = dict(
     zip(
         (*FORCE_TERMS, *TORQUE_TERMS),
@@ -72,7 +72,7 @@ class Identification:
     """Result of ``identify``."""
 
     base: str
-    """Name or path of the airframe that the fit began with."""
+    """Name or path of the airframe that the fit started from."""
     airframe: Airframe
     """Airframe with the identified numbers."""
     model: Model
@@ -162,29 +162,31 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     windows(logs, WINDOW_DURATION, WINDOW_DURATION)
     check_turning(logs)
     if base.n_rotors <= 4:
-        _check_order(logs, base)
+        _check_rotor_order(logs, base)
     weight = float(base.value("rigid_body.mass")) if mass is None else float(mass)
     params = Model.create(base, weight).params
-    fast = fast_rotation(logs, params, float(_fit_forces(logs, params)[0][0]))
-    logs = [aligned(log, delay) for log, delay in zip(logs, fast.delays, strict=True)]
+    rotation_fit = fast_rotation(logs, params, float(_fit_forces(logs, params)[0][0]))
+    logs = [aligned(log, delay) for log, delay in zip(logs, rotation_fit.delays, strict=True)]
     force, force_spread = _fit_forces(logs, params)
     force_spread[0] = math.hypot(force_spread[0], SAMPLING_ERROR * force[0])
-    torque, torque_spread = _fit_torques(logs, params, float(force[0]), fast.values)
+    torque, torque_spread = _fit_torques(logs, params, float(force[0]), rotation_fit.values)
     delayed_logs = [aligned(log, SLOW_TORQUE_DELAY_STD * log.dt) for log in logs]
     torque_spread = np.hypot(
-        torque_spread, _fit_torques(delayed_logs, params, float(force[0]), fast.values)[0] - torque
+        torque_spread, _fit_torques(delayed_logs, params, float(force[0]), rotation_fit.values)[0] - torque
     )
-    for k, step in enumerate(fast.deviations):
+    for k, step in enumerate(rotation_fit.deviations):
         if math.isfinite(step):
-            shifted_torque = _fit_torques(logs, params, float(force[0]), fast.values + step * (np.arange(5) == k))[0]
+            shifted_torque = _fit_torques(
+                logs, params, float(force[0]), rotation_fit.values + step * (np.arange(5) == k)
+            )[0]
             torque_spread = np.hypot(torque_spread, shifted_torque - torque)
 
-    def name_parameters(force: NDArray, torque: NDArray, fast: NDArray) -> dict[str, float]:
-        numbers = [*force, *torque, *fast]
+    def name_parameters(force: NDArray, torque: NDArray, rotation_factors: NDArray) -> dict[str, float]:
+        numbers = [*force, *torque, *rotation_factors]
         return dict(zip((*FORCE_TERMS, *TORQUE_TERMS, *FACTOR_NAMES[1:]), map(float, numbers), strict=True))
 
-    values = name_parameters(force, torque, fast.values)
-    deviations = name_parameters(force_spread, torque_spread, fast.deviations)
+    values = name_parameters(force, torque, rotation_fit.values)
+    deviations = name_parameters(force_spread, torque_spread, rotation_fit.deviations)
     if unphysical := [
         f"{name} {values[name]:.3g}"
         for name in FACTOR_NAMES
@@ -211,7 +213,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         model=Model.create(new_airframe),
         values=values,
         deviations=deviations,
-        delays=dict(zip([log.name for log in logs], fast.delays.tolist(), strict=True)),
+        delays=dict(zip([log.name for log in logs], rotation_fit.delays.tolist(), strict=True)),
         changes=changes,
     )
 
@@ -233,18 +235,18 @@ def _fit_forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[N
 
 
 def _fit_torques(
-    logs: Sequence[Log], params: first_principles.Params, thrust_factor: float, fast: NDArray
+    logs: Sequence[Log], params: first_principles.Params, thrust_factor: float, rotation_factors: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Return the parameters of the torque, see ``TORQUE_TERMS``, and their deviations."""
     mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
-    root = np.sqrt(fast[:3])
+    root = np.sqrt(rotation_factors[:3])
     inertia = np.asarray(params.J, np.float64) * np.outer(root, root)
-    rotor_inertia = fast[4] * RPM_TO_RAD_S * np.asarray(params.prop_inertia, np.float64)
+    rotor_inertia = rotation_factors[4] * RPM_TO_RAD_S * np.asarray(params.prop_inertia, np.float64)
 
     def terms(log: Log) -> tuple[NDArray, NDArray]:
         speed = jnp.asarray(log.rotor_vel)
         thrust = thrust_factor * np.asarray(quadratic_curve(speed, params.rpm2thrust), np.float64)
-        drag = fast[3] * np.asarray(quadratic_curve(speed, params.rpm2torque), np.float64)
+        drag = rotation_factors[3] * np.asarray(quadratic_curve(speed, params.rpm2torque), np.float64)
         spin = np.zeros_like(log.ang_vel)
         spin[:, 2] = -(rotor_inertia * log.rotor_vel) @ mixing[2]
         momentum = log.ang_vel @ inertia + spin
@@ -265,14 +267,14 @@ def _to_body_frame(log: Log, vector: NDArray) -> NDArray:
 
 
 def _fit_regression(
-    logs: Sequence[Log], terms: Callable[[Log], tuple[NDArray, NDArray]], not_positive: NDArray
+    logs: Sequence[Log], terms: Callable[[Log], tuple[NDArray, NDArray]], is_nonpositive: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Return coefficients by robust linear least squares, and their deviations from the scatter between blocks.
 
     Args:
         logs: Logs.
         terms: From a log to the rate of momentum per coefficient, (n, 3, k), and the momentum, (n, 3).
-        not_positive: True for coefficients that are at most zero. (k,)
+        is_nonpositive: True for coefficients that are at most zero. (k,)
     """
     rates, changes, blocks = [], [], []
     for number, log in enumerate(logs):
@@ -294,7 +296,7 @@ def _fit_regression(
         while True:
             coefficients = np.zeros(k)
             coefficients[is_free] = np.linalg.lstsq(normal[np.ix_(is_free, is_free)], vector[is_free], rcond=None)[0]
-            is_wrong_sign = not_positive & (coefficients > 0)
+            is_wrong_sign = is_nonpositive & (coefficients > 0)
             if not np.any(is_wrong_sign):
                 break
             is_free &= ~is_wrong_sign
@@ -302,17 +304,17 @@ def _fit_regression(
         scale = 1.4826 * np.median(np.abs(residual), axis=0)  # standard deviation, if residuals are normal
         weights = 1 / np.maximum(scale, np.abs(residual) / 2) / np.maximum(scale, 1e-30)
     # Deviations by leaving out each block (jackknife), without bounds, which would hide the scatter of coefficients.
-    numbers = np.unique(block)
-    if len(numbers) < MIN_BLOCKS:
+    block_numbers = np.unique(block)
+    if len(block_numbers) < MIN_BLOCKS:
         return coefficients, np.full(k, np.nan)
     held_out_fits = []
-    for b in numbers:
-        is_training = block != b
+    for number in block_numbers:
+        is_training = block != number
         normal = np.einsum("wri,wr,wrj->ij", x[is_training], weights[is_training], x[is_training])
         vector = np.einsum("wri,wr,wr->i", x[is_training], weights[is_training], y[is_training])
         held_out_fits.append(np.linalg.lstsq(normal, vector, rcond=None)[0])
     deviations = np.array(held_out_fits) - np.mean(held_out_fits, axis=0)
-    n = len(numbers)
+    n = len(block_numbers)
     return coefficients, deviation_factor(n) * np.sqrt((n - 1) / n * np.sum(deviations**2, axis=0))
 
 
@@ -323,12 +325,12 @@ def _smooth_columns(x: NDArray, size: int = 9) -> NDArray:
 
 def _create_regressors(log: Log, params: first_principles.Params) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return smoothed accelerations without gravity, angular accelerations, body velocities, and thrusts."""
-    sl = slice(10, -10)
+    interior = slice(10, -10)
     acc = np.gradient(_smooth_columns(log.vel), log.t, axis=0) - np.asarray(params.gravity_vec)
     ang_acc = np.gradient(_smooth_columns(log.ang_vel), log.t, axis=0)
     body = np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(np.stack([acc, _smooth_columns(log.vel)]))))
     thrust = _smooth_columns(np.asarray(quadratic_curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64))
-    return body[0][sl], ang_acc[sl], body[1][sl], thrust[sl]
+    return body[0][interior], ang_acc[interior], body[1][interior], thrust[interior]
 
 
 def _check_logs(logs: Sequence[Log], airframe: Airframe) -> None:
@@ -357,7 +359,7 @@ def _check_logs(logs: Sequence[Log], airframe: Airframe) -> None:
             )
 
 
-def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
+def _check_rotor_order(logs: Sequence[Log], airframe: Airframe) -> None:
     """Check that no other order of the rotors explains the angular accelerations much better."""
     params = first_principles.Params.create(airframe)
     pieces = [_create_regressors(log, params) for log in logs]

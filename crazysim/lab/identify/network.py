@@ -53,7 +53,7 @@ def fit_residual(
         learning_rate: Largest learning rate; it decreases to zero with half a cosine.
         decay: Weight decay.
         validation: Logs that select the result and are not used for training.
-        seed: Seed of the first weights and of the batches.
+        seed: Seed of the initial weights and of the batches.
 
     Raises:
         ImportError: If optax is not installed.
@@ -68,7 +68,7 @@ def fit_residual(
             f"and {batch_size}. Leave them out for the defaults."
         )
     data, dt, params = windows(logs, WINDOW_DURATION, WINDOW_STRIDE), logs[0].dt, model.params
-    held_out = windows(validation, WINDOW_DURATION, 4 * WINDOW_STRIDE) if validation else None
+    validation_windows = windows(validation, WINDOW_DURATION, 4 * WINDOW_STRIDE) if validation else None
     inputs = jax.vmap(lambda q, v, w, r: residual_inputs(q, v, w, r, params))(
         data.quat[:, 0], data.vel[:, 0], data.ang_vel[:, 0], data.rotor_vel[:, 1]
     )
@@ -111,15 +111,15 @@ def fit_residual(
         "hidden": jax.random.normal(key, (n_hidden, n_inputs)) / np.sqrt(n_inputs),
         "output": jnp.zeros((6, n_hidden)),
     }
-    state, held_out_loss_fn = optimizer.init(weights), jax.jit(loss)
+    state, validation_loss_fn = optimizer.init(weights), jax.jit(loss)
     best_weights, least_loss = weights, np.inf
     for k in range(iterations):
         weights, state = update(weights, state, jax.random.fold_in(key, k))
-        if held_out is not None and (k % 100 == 99 or k == iterations - 1):
-            held_out_loss = float(held_out_loss_fn(weights, held_out))
-            if held_out_loss < least_loss:
-                best_weights, least_loss = weights, held_out_loss
-    return Model(params=params, residual=residual(weights if held_out is None else best_weights))
+        if validation_windows is not None and (k % 100 == 99 or k == iterations - 1):
+            validation_loss = float(validation_loss_fn(weights, validation_windows))
+            if validation_loss < least_loss:
+                best_weights, least_loss = weights, validation_loss
+    return Model(params=params, residual=residual(weights if validation_windows is None else best_weights))
 
 
 def scaled_errors(model: Model, window: Windows, dt: float) -> Array:

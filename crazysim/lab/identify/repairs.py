@@ -20,6 +20,7 @@ PERIOD_RANGE = (1e-4, 0.2)
 """Intervals between samples that a log of a flight can have, s: gyroscopes give up to 8 kHz; at less than 5 Hz nothing
 is left of the rotation."""
 TIME_UNITS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units in which times may be logged by mistake, s."""
 MIN_SAMPLES = 20
 """Least number of samples of a log."""
 GROUND_DURATION = 1.0

@@ -76,8 +76,8 @@ class Crazyflow(Simulator):
     def __init__(self, start: States) -> None:
         package: Any = importlib.import_module("crazyflow.sim")
         self._sim = package.Sim(n_worlds=len(start["pos"]), drone=AIRFRAME, control="attitude", freq=500)
-        ours = Sim(drone=AIRFRAME, control="attitude")
-        self._sim.data = with_states(self._sim.data, **_world_rows(start), rotor_vel=_hover_speed(ours))
+        own_sim = Sim(drone=AIRFRAME, control="attitude")
+        self._sim.data = with_states(self._sim.data, **_world_rows(start), rotor_vel=_hover_speed(own_sim))
 
     def fly_period(self, commands: NDArray) -> States:
         self._sim.attitude_control(np.asarray(commands[:, None], np.float32))
@@ -86,7 +86,7 @@ class Crazyflow(Simulator):
 
 
 class AttitudeController:
-    """Our default controller in the loop of another simulator, from attitudes to thrusts of the rotors."""
+    """Our default controller in the loop of another simulator: from attitude commands to thrusts of the rotors."""
 
     def __init__(self, n: int) -> None:
         """Create the controllers of ``n`` drones at rest."""
@@ -95,13 +95,13 @@ class AttitudeController:
         params = self._data.params
         self._curve, speed = params.rpm2thrust, float(_hover_speed(self._sim)[0])
         up, up2, down, down2 = np.asarray(params.rotor_dyn_coef, np.float64)[0]
-        self.hover = float(np.asarray(quadratic_curve(jnp.asarray([speed]), self._curve))[0])
+        self.hover_thrust = float(np.asarray(quadratic_curve(jnp.asarray([speed]), self._curve))[0])
         """Thrust of a rotor in hover, N."""
         self.lag = 1 / ((up + down) / 2 + (up2 + down2) * speed)
         """Time constant of small changes of the rotor speeds about hover, the mean of both directions, s."""
         pipeline = self._sim.step_pipeline
-        last = list(pipeline).index("clip_rotor_vel_cmd") + 1
-        stages = [*list(pipeline.values())[:last], pipeline["increment_steps"]]
+        n_stages = list(pipeline).index("clip_rotor_vel_cmd") + 1
+        stages = [*list(pipeline.values())[:n_stages], pipeline["increment_steps"]]
 
         @jax.jit
         def control(data: SimData, states: dict[str, Array], thrusts: Array) -> tuple[SimData, Array]:
@@ -117,7 +117,7 @@ class AttitudeController:
         """Stage attitude commands. (n, 4)"""
         self._data = attitude_control(self._data, commands[:, None])
 
-    def thrusts(self, states: States, thrusts: NDArray) -> NDArray:
+    def compute_thrusts(self, states: States, thrusts: NDArray) -> NDArray:
         """Advance the controller by a step, and return the commanded thrusts, N. (n, 4)
 
         Args:
@@ -125,8 +125,8 @@ class AttitudeController:
             thrusts: Present thrusts of the rotors, N. (n, 4)
         """
         rows = {name: x.astype(np.float32) for name, x in _world_rows(states).items()}
-        self._data, commanded = self._control(self._data, rows, thrusts[:, None].astype(np.float32))
-        return np.asarray(commanded, np.float64)[:, 0]
+        self._data, commanded_thrusts = self._control(self._data, rows, thrusts[:, None].astype(np.float32))
+        return np.asarray(commanded_thrusts, np.float64)[:, 0]
 
 
 class Mujoco(Simulator):
@@ -140,12 +140,12 @@ class Mujoco(Simulator):
         for k, body in enumerate(self._bodies):
             body.qpos[:3], body.qpos[3:] = start["pos"][k], np.roll(start["quat"][k], 1)
             body.qvel[:3], body.qvel[3:] = start["vel"][k], start["ang_vel"][k]
-            body.act[:] = self._controller.hover
+            body.act[:] = self._controller.hover_thrust
 
     def fly_period(self, commands: NDArray) -> States:
         self._controller.stage_command(commands)
         for _ in range(round(COMMAND_PERIOD / self._controller.dt)):
-            thrusts = self._controller.thrusts(self._states(), np.stack([body.act for body in self._bodies]))
+            thrusts = self._controller.compute_thrusts(self._states(), np.stack([body.act for body in self._bodies]))
             for body, thrust in zip(self._bodies, thrusts, strict=True):
                 body.ctrl[:] = thrust
                 mujoco.mj_step(self._model, body)
@@ -158,11 +158,11 @@ class Mujoco(Simulator):
 
 
 class RotorPy(Simulator):
-    """RotorPy's brushless Crazyflie, with its controller of attitudes (``cmd_ctatt``), its drag and its lag."""
+    """RotorPy's brushless Crazyflie, with its attitude controller (``cmd_ctatt``), its drag and its lag."""
 
     module = "torchdiffeq"
     level: ClassVar[str] = "cmd_ctatt"
-    """RotorPy's name of the commands."""
+    """RotorPy's name of the command level."""
 
     def __init__(self, start: States) -> None:
         self._torch: Any = importlib.import_module("torch")
@@ -207,13 +207,15 @@ class RotorPyRotors(RotorPy):
         self._controller.stage_command(commands)
         for _ in range(round(COMMAND_PERIOD / self._controller.dt)):
             current_thrust = self._k_eta * self._state["rotor_speeds"].numpy() ** 2
-            control = {"cmd_motor_thrusts": self._tensor(self._controller.thrusts(self._states(), current_thrust))}
+            control = {
+                "cmd_motor_thrusts": self._tensor(self._controller.compute_thrusts(self._states(), current_thrust))
+            }
             self._state = self._drones.step(self._state, control, self._controller.dt, self._indices)
         return self._states()
 
 
 class PyBullet(Simulator):
-    """gym-pybullet-drones' PyBullet model, with the controller of attitudes in its ``DSLPIDControl``.
+    """gym-pybullet-drones' PyBullet model, with the attitude controller of its ``DSLPIDControl``.
 
     The state of its body is only a pose and velocities, so one body flies all drones, one after another.
     """
@@ -223,7 +225,7 @@ class PyBullet(Simulator):
     def __init__(self, start: States) -> None:
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            self._p: Any = importlib.import_module("pybullet")
+            self._pybullet: Any = importlib.import_module("pybullet")
             envs: Any = importlib.import_module("gym_pybullet_drones.envs.CtrlAviary")
             control: Any = importlib.import_module("gym_pybullet_drones.control.DSLPIDControl")
             enums: Any = importlib.import_module("gym_pybullet_drones.utils.enums")
@@ -236,21 +238,28 @@ class PyBullet(Simulator):
         self._env.KM, self._env.MAX_RPM = self._env.KF * _torque_per_thrust(airframe), max_speed
         self._body, self._client = int(self._env.DRONE_IDS[0]), self._env.CLIENT
         mass, inertia = airframe.value("rigid_body.mass", ()), airframe.value("rigid_body.inertia", (3,))
-        self._p.changeDynamics(self._body, -1, mass=float(mass), localInertiaDiagonal=np.asarray(inertia).tolist(),
-                               physicsClientId=self._client)  # fmt: skip
-        self._now = {name: np.array(x, np.float64) for name, x in start.items()}
-        for controller, quat in zip(self._controllers, self._now["quat"], strict=True):
-            controller.last_rpy = np.array(self._p.getEulerFromQuaternion(quat))
+        self._pybullet.changeDynamics(
+            self._body,
+            -1,
+            mass=float(mass),
+            localInertiaDiagonal=np.asarray(inertia).tolist(),
+            physicsClientId=self._client,
+        )
+        self._current_states = {name: np.array(x, np.float64) for name, x in start.items()}
+        for controller, quat in zip(self._controllers, self._current_states["quat"], strict=True):
+            controller.last_rpy = np.array(self._pybullet.getEulerFromQuaternion(quat))
 
     def fly_period(self, commands: NDArray) -> States:
-        s = self._now
+        s = self._current_states
         ang_vel = np.array(
             rotation.rotate(jnp.asarray(s["quat"]), jnp.asarray(s["ang_vel"])), np.float64
         )  # PyBullet's angular velocity is in the world frame
         angles = _intrinsic_angles(commands[:, :3])
         for k, (command, controller) in enumerate(zip(commands, self._controllers, strict=True)):
-            self._p.resetBasePositionAndOrientation(self._body, s["pos"][k], s["quat"][k], physicsClientId=self._client)
-            self._p.resetBaseVelocity(self._body, s["vel"][k], ang_vel[k], physicsClientId=self._client)
+            self._pybullet.resetBasePositionAndOrientation(
+                self._body, s["pos"][k], s["quat"][k], physicsClientId=self._client
+            )
+            self._pybullet.resetBaseVelocity(self._body, s["vel"][k], ang_vel[k], physicsClientId=self._client)
             speed = np.sqrt(max(command[3], 0) / (4 * self._env.KF))
             pwm, quat = (speed - controller.PWM2RPM_CONST) / controller.PWM2RPM_SCALE, s["quat"][k]
             for _ in range(round(COMMAND_PERIOD / CONTROL_PERIOD)):
@@ -276,11 +285,11 @@ SIMULATORS: dict[str, type[Simulator]] = {
 
 def rotorpy_params(airframe: Airframe) -> dict[str, Any]:
     """Return RotorPy's parameters of its brushless Crazyflie, with mass, inertia and rotors of an airframe."""
-    theirs = importlib.import_module("rotorpy.vehicles.crazyfliebrushless_params").quad_params
+    defaults = importlib.import_module("rotorpy.vehicles.crazyfliebrushless_params").quad_params
     inertia = airframe.value("rigid_body.inertia", (3,))
-    hubs, max_speed = airframe.value("rotors.position", (4, 3)), theirs["rotor_speed_max"]
+    hubs, max_speed = airframe.value("rotors.position", (4, 3)), defaults["rotor_speed_max"]
     k_eta = _thrust_max(airframe) / max_speed**2
-    return theirs | {
+    return defaults | {
         "mass": float(airframe.value("rigid_body.mass", ())),
         **dict(zip(("Ixx", "Iyy", "Izz"), map(float, inertia), strict=True)),
         "rotor_pos": {f"r{k + 1}": np.asarray(hub, float) for k, hub in enumerate(hubs)},

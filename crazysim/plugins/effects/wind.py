@@ -52,7 +52,12 @@ class WindData(MovingAir):
         return self.velocity_at(data.states.pos, ground_below(data))
 
     def mean_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
-        """Return the mean wind at a position over ground at a height, m (..., 1), world frame, m/s. (..., 3)"""
+        """Return the mean wind at a position, world frame, m/s. (..., 3)
+
+        Args:
+            pos: Position, world frame, m. (..., 3)
+            ground: Height of the ground below the position, m. (..., 1)
+        """
         if self.reference_height is None:
             return self.velocity
         height = pos[..., 2:] - ground

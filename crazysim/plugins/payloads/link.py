@@ -119,7 +119,7 @@ class UnitPull(NamedTuple):
         return UnitPull(direction, lever, matvec(J_inv, lever))
 
     def response(self, other: UnitPull, mass: Array) -> Array:
-        """Return the acceleration of the body at this pull, along it, under the other. (1,)"""
+        """Return the acceleration of the body where this pull acts, along its direction, due to another pull. (1,)"""
         linear_response = dot(self.direction, other.direction) / mass
         if self.lever is None or other.ang_acc is None:
             return linear_response
@@ -261,11 +261,11 @@ def _damping_rate(link: LinkParams, dt: float | None, freq: int) -> Array:
 def _radial_term(
     geometry: LinkGeometry, radial_speed: Array, free_acc: Array, link: LinkParams, dt: float | None, freq: int
 ) -> Array:
-    """Return the term of the tension, before it is shared, that ends relative motion along the link."""
+    """Return the term of the right-hand side of the equation that ends relative motion along the link, m/s^2. (1,)"""
     if dt is None:
         if not link.is_cable:
             return 2 * correction_rate(freq) * radial_speed
-        # A faster tip gets the impulse of ``end_relative_motion`` in front of the next step.
+        # A faster tip gets the impulse of ``end_relative_motion`` before the next step.
         is_taut = (geometry.distance > (1 - TAUT_BAND) * link.length) & (radial_speed < BOUNCE_SPEED)
         return jnp.where(is_taut, 2 * correction_rate(freq) * radial_speed, -SLACK_ACCELERATION)
     if not link.is_cable:
@@ -346,13 +346,15 @@ def end_relative_motion(
     geometry = link_geometry(state, pos, vel, link.attach)
     radial_speed = dot(geometry.direction, geometry.vel)
     pull = UnitPull.create(geometry.direction, geometry.rot, J_inv, link.attach)
-    change = radial_speed / (1 + link.mass * pull.response(pull, mass))
+    speed_change = radial_speed / (1 + link.mass * pull.response(pull, mass))
     if link.is_cable:
         bounce_factor = 1.0 if link.restitution is None else 1 + link.restitution
         is_taut = (geometry.distance > (1 - TAUT_BAND) * link.length) & (radial_speed > 0)
-        change = jnp.where(is_taut, jnp.where(radial_speed > BOUNCE_SPEED, bounce_factor, 1.0) * change, 0.0)
-    change = change if link.is_attached is None else jnp.where(link.is_attached, change, 0.0)
-    state = state.replace(vel=state.vel + link.mass / mass * change * pull.direction)
+        speed_change = jnp.where(
+            is_taut, jnp.where(radial_speed > BOUNCE_SPEED, bounce_factor, 1.0) * speed_change, 0.0
+        )
+    speed_change = speed_change if link.is_attached is None else jnp.where(link.is_attached, speed_change, 0.0)
+    state = state.replace(vel=state.vel + link.mass / mass * speed_change * pull.direction)
     if pull.ang_acc is not None:
-        state = state.replace(ang_vel=state.ang_vel + link.mass * change * pull.ang_acc)
-    return state, vel - change * pull.direction
+        state = state.replace(ang_vel=state.ang_vel + link.mass * speed_change * pull.ang_acc)
+    return state, vel - speed_change * pull.direction

@@ -63,20 +63,21 @@ class Model(NamedTuple):
     shapes: Sequence[tuple[Shape, tuple[float, float, float]]]
     """Shapes of an obstacle, and their positions in its frame, m."""
     pos: np.ndarray
-    """Middles of the regions of the obstacles, m: their positions in the compiled scene, by which rays sort them.
+    """Middles of the regions of the obstacles, m: their positions in the compiled scene, by which ray casting sorts
+    them.
     (n, 3)"""
 
 
 class Scenery(Plugin):
     """Base class of layouts of obstacles, drawn again in every world at every reset.
 
-    A subclass defines ``models`` and ``poses``. Tasks call ``sample_layout`` where an episode starts. An obstacle that
+    A subclass defines ``models`` and ``poses``. Tasks call ``sample_layout`` when an episode starts. An obstacle that
     a layout leaves out is 100 m below its position.
     """
 
     difficulty: ArrayLike = parameter(default=1.0, low=0.0, high=1.0, shapes=((), (2,)))
-    """Difficulty, 0 to 1, or its range, lowest and highest, within which every world draws one at its resets. ()
-    or (2,)"""
+    """Difficulty, 0 to 1, or its range, lowest and highest, from which every world draws one at its resets. () or
+    (2,)"""
     speed: float = setting(default=0.0, low=0.0)
     """Largest component of the velocities of obstacles that move to and fro in their regions, m/s; 0 for obstacles that
     stand still."""
@@ -149,7 +150,7 @@ class Scenery(Plugin):
         for other in sim.scene.plugins():
             if other.name == self.name and isinstance(other, Scenery) and repr(other.models()) != repr(models):
                 raise ConfigError(
-                    f"expected the obstacles of {self.name!r} as they are in the scene, where they stay, got others. "
+                    f"expected the obstacles of {self.name!r} that the scene already has, got others. "
                     f"Use sim.replace only to change difficulty=; for the rest use another name= or a new simulation."
                 )
         for kind, model in zip(self.moved_kinds, models, strict=True):
@@ -197,8 +198,8 @@ class Scenery(Plugin):
         """Return True for obstacles that do not meet the discs of ``free``, wherever they move. (...)
 
         Args:
-            pos: Position, x and y, m. 2 of (...)
-            middle: Middle of the square region, x and y, m. 2 of (...)
+            pos: Position, x and y, m. Two arrays of shape (...)
+            middle: Middle of the square region, x and y, m. Two arrays of shape (...)
             radius: Radius of the circle around an obstacle, m. (...)
             reach: Length of the sides of the region, m. (...)
         """

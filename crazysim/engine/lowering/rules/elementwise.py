@@ -197,10 +197,10 @@ def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> lis
         infinity = ((1 << info.nexp) - 1) << info.nmant
         sign = bits.apply("and", x, 1 << (bits.n_bits - 1))
         size = bits.apply("and", x, infinity)
-        overflows = ctx.elementwise("gt", [size, constants((bias + largest) << info.nmant, bits.dtype)], bool)
-        underflows = ctx.elementwise("le", [size, constants((bias - largest) << info.nmant, bits.dtype)], bool)
-        x = ctx.elementwise("select_n", [overflows, x, bits.apply("or", sign, infinity)], bits.dtype)
-        x = ctx.elementwise("select_n", [underflows, x, sign], bits.dtype)
+        is_overflow = ctx.elementwise("gt", [size, constants((bias + largest) << info.nmant, bits.dtype)], bool)
+        is_underflow = ctx.elementwise("le", [size, constants((bias - largest) << info.nmant, bits.dtype)], bool)
+        x = ctx.elementwise("select_n", [is_overflow, x, bits.apply("or", sign, infinity)], bits.dtype)
+        x = ctx.elementwise("select_n", [is_underflow, x, sign], bits.dtype)
     rounded = ctx.elementwise("bitcast_convert_type", [x], dtype)
     is_nan = ctx.elementwise("ne", [args[0], args[0]], bool)
     return [ctx.elementwise("select_n", [is_nan, rounded, args[0]], dtype)]

@@ -2,7 +2,7 @@
 
     python worker.py SYSTEM HOSTNAME
 
-It ends with the process that reads its output.
+It ends after the process that reads its output.
 """
 
 import json
