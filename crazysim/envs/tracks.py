@@ -101,7 +101,7 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
             k = int(np.argwhere(distance < clearance + jitter)[0, 1])
             raise ConfigError(
                 f"expected {kind} {k} of the track at least {clearance + jitter:.2f} m from every start in the plane, "
-                f"got {distance.min():.2f} m. Move it, or set Track(start=...)."
+                f"got {distance[:, k].min():.2f} m. Move it, or set Track(start=...)."
             )
     if np.any(starts < low + [0.2, 0.2, 0.2]) or np.any(starts > high - 0.2):
         raise ConfigError(

@@ -351,6 +351,10 @@ def test_a_track_of_the_user_can_be_raced():
         ({"level": 4}, "level of Race to be from 0 to 3, got 4"),
         ({"track": Track(gates_rpy=[(0, 0, 0)])}, "expected gates_rpy of the track as"),
         ({"track": Track(start=(0.3, 0.25, 0.7))}, "expected gate 0 of the track at least"),
+        (
+            {"track": Track(gates_pos=[(0, 0, 1), (0.2, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, start=(0.3, 0, 1))},
+            "gate 0 .* got 0.30 m",
+        ),
         ({"track": Track(obstacles_pos=[(-1.5, 0.7, 1.5)])}, "expected obstacle 0 of the track at least"),
         ({"track": Track(start=(-2.4, 0.75, 0.4))}, "within the limits"),
         ({"track": Track(low=(3, 0, 0))}, "upper limit"),
