@@ -82,7 +82,14 @@ RECIPES: dict[str, Recipe] = {
         evaluate_every=50,
         teacher=Recipe(
             n_worlds=2048,
-            config={**_LONG_ROLLOUTS, "iterations": 150, "minibatches": 16, "hidden": (64, 64), "entropy": 0.003},
+            config={
+                "iterations": 300,
+                "n_steps": 64,
+                "minibatches": 16,
+                "discount": 0.95,
+                "entropy": 0.01,
+                "init_std": 0.7,
+            },
             options={"gates_observed": True, "camera": ()},
         ),
     ),

@@ -86,6 +86,8 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> 
             for row, curve in zip(values, curves, strict=True):
                 row[: len(curve)] = [point[metric] for point in curve]
             has_value = ~np.isnan(values).all(axis=0)
+            if not has_value.any():  # if all drones crash in all evaluations, there is no mean error
+                continue
             values, plotted_steps = values[:, has_value] * (100 if metric == "success" else 1), steps[has_value]
             minimum, quartile_1, median, quartile_3, maximum = np.nanquantile(values, (0, 0.25, 0.5, 0.75, 1), axis=0)
             (line,) = axis.plot(

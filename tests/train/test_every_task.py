@@ -17,10 +17,14 @@ N_WORLDS, ITERATIONS = {"ppo": 256, "apg": 64}, {"ppo": 30, "apg": 15}
 def test_the_reward_rises(task):
     """In the last ten iterations it exceeds that of an untrained policy by more than two standard errors.
 
-    All episodes begin together, so rewards of different iterations are of different times of an episode.
+    All episodes begin together, so rewards of different iterations are of different times of an episode. If the recipe
+    has a teacher, the teacher is trained.
     """
-    name = TrainConfig.create(task).algorithm
-    config = TrainConfig.create(task, n_worlds=N_WORLDS[name], config={"iterations": ITERATIONS[name]})
+    recipe = TrainConfig.create(task)
+    recipe = recipe.teacher_config() or recipe
+    name = recipe.algorithm
+    hyperparameters = recipe.config | {"iterations": ITERATIONS[name]}
+    config = TrainConfig.create(task, name, n_worlds=N_WORLDS[name], options=recipe.options, config=hyperparameters)
     algorithm, hyperparameters = ALGORITHMS[name], config.algorithm_config()
     env = config.make_env(**config.practice_options())
     env = PrivilegedObservation(env) if config.config.get("critic") == "privileged" else env

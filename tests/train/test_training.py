@@ -681,10 +681,12 @@ def test_a_run_finds_its_airframe_from_any_folder(tmp_path, monkeypatch):
     assert config.make_env(1).sim.drone == "mine"
 
 
-def test_curves_of_a_race_without_an_error_are_plotted_without_a_warning(tmp_path):
-    """The error is undefined while all drones crash, and zero once all have finished."""
+@pytest.mark.parametrize("n_crashed", [1, 2])
+def test_curves_of_a_race_without_an_error_are_plotted_without_a_warning(n_crashed, tmp_path):
+    """The error is undefined while all drones crash, perhaps to the end, and zero once all have finished."""
     point = {"env_steps": 1.0, "seconds": 1.0, "success": 0.0, "reward": 1.0, "error": np.nan}
-    curve = [point, point | {"env_steps": 2.0, "seconds": 2.0, "success": 1.0, "error": 0.0}]
+    finished = point | {"env_steps": 2.0, "seconds": 2.0, "success": 1.0, "error": 0.0}
+    curve = [point] * n_crashed + [finished] * (2 - n_crashed)
     plot_curve({"race": curve}, tmp_path / "curve.png")
     plot_spread({"race": [curve, curve]}, tmp_path / "spread.png")
     assert (tmp_path / "curve.png").stat().st_size > 1000 < (tmp_path / "spread.png").stat().st_size
