@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def jit_unless_traced(*static: str) -> Callable[[F], F]:
+def jit_eager_calls(*static: str) -> Callable[[F], F]:
     """Return a decorator that compiles a function for calls with arrays, and does not change calls with tracers.
 
     Outside of ``jit``, JAX compiles each operation separately, which takes 10 ms to 30 ms per operation and shape; the

@@ -89,7 +89,7 @@ def safe_normalize(x: Array, fallback: Array) -> Array:
     return jnp.where(is_zero, fallback, x / jnp.where(is_zero, 1.0, norm))
 
 
-def safe_clip(x: Array, low: Array | float, high: Array | float) -> Array:
+def clip(x: Array, low: Array | float, high: Array | float) -> Array:
     """Return ``x`` clipped to limits, with gradient one at the limits, as between them. (...)
 
     The gradient of ``jnp.clip`` at a limit is one half, the slope of neither side.

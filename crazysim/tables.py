@@ -127,7 +127,7 @@ def _is_allowed_shape(shape: tuple[int, ...], allowed: tuple[int | str, ...]) ->
     return len(shape) == len(allowed) and all(a in ("any", b) for a, b in zip(allowed, shape, strict=True))
 
 
-def as_numbers(owner: str, path: str, value: Any) -> NDArray[np.float64]:
+def as_number_array(owner: str, path: str, value: Any) -> NDArray[np.float64]:
     """Return a number or an array of numbers in float64, read-only.
 
     Args:
@@ -197,7 +197,7 @@ class Layout:
                         f"{owner}: expected {path} as a number, an array or {{ value, unit, source }}, got "
                         f"{short_repr(dict(item))}. {self.guide} shows both forms."
                     )
-                yield path, as_numbers(owner, path, item)
+                yield path, as_number_array(owner, path, item)
             elif isinstance(item, Mapping) and "value" not in item:
                 suggestion = self._did_you_mean(f"[{table}]" for table in difflib.get_close_matches(path, self.tables))
                 raise ConfigError(f"{owner}: expected a table that exists, got [{path}]. {suggestion}")

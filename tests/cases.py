@@ -178,14 +178,14 @@ def repeat_command(data, command):
 
 def trees_equal(a, b):
     """Return whether two trees hold equal values; NaN equals NaN."""
-    leaves_a, leaves_b = (jax.tree.leaves(jax.tree.map(as_numbers, tree)) for tree in (a, b))
+    leaves_a, leaves_b = (jax.tree.leaves(jax.tree.map(leaf_on_host, tree)) for tree in (a, b))
     return jax.tree.structure(a) == jax.tree.structure(b) and all(
         np.array_equal(x, y, equal_nan=np.issubdtype(x.dtype, np.floating))
         for x, y in zip(leaves_a, leaves_b, strict=True)
     )
 
 
-def as_numbers(x):
+def leaf_on_host(x):
     """Return a leaf on the host, random keys as their data."""
     is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return np.asarray(jax.random.key_data(x) if is_key else x)
@@ -225,7 +225,7 @@ def centre(data):
     return data.replace(states=data.states.replace(force=1e-2 * (jnp.mean(pos, axis=0) - pos)))
 
 
-def by_stages(sim):
+def build_stagewise_step(sim):
     """Return a step that runs the stages without an engine; its derivative compiles fastest."""
     stages = as_stages(sim.step_pipeline)
 

@@ -6,7 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from cases import as_numbers
+from cases import leaf_on_host
 
 from crazysim.envs import TASKS, AutoReset, make
 from crazysim.pytree import map_batched
@@ -63,15 +63,15 @@ def array_types(tree):
 
 def select_state(state, mask, without=()):
     """Return the part of a state that belongs to some worlds, without some of its fields."""
-    data = map_batched(lambda x: as_numbers(x)[mask], state.data)
+    data = map_batched(lambda x: leaf_on_host(x)[mask], state.data)
     names = {"obs", "reward", "terminated", "truncated", "action", "info", "memory"} - set(without)
     fields = {name: getattr(state, name) for name in sorted(names)}
-    return data, jax.tree.map(lambda x: as_numbers(x)[mask], fields)
+    return data, jax.tree.map(lambda x: leaf_on_host(x)[mask], fields)
 
 
 def select_obs(state, mask):
     """Return the observations of some worlds."""
-    return jax.tree.map(lambda x: as_numbers(x)[mask], state.obs)
+    return jax.tree.map(lambda x: leaf_on_host(x)[mask], state.obs)
 
 
 def task_names(classes_once=False):

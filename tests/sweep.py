@@ -6,7 +6,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from cases import INTEGRATORS, PAIRS, as_numbers, centre, gap, hover_command, repulsion, send, with_states
+from cases import INTEGRATORS, PAIRS, centre, gap, hover_command, leaf_on_host, repulsion, send, with_states
 from springs import KINDS, Tied, build
 
 from crazysim import (
@@ -113,7 +113,7 @@ def assert_agree(actual, expected, tolerance, label=""):
     leaves, structure = jax.tree_util.tree_flatten_with_path(actual)
     assert structure == jax.tree.structure(expected)
     for (path, x), y in zip(leaves, jax.tree.leaves(expected), strict=True):
-        x, y, name = as_numbers(x), as_numbers(y), f"{label} {jax.tree_util.keystr(path)}"
+        x, y, name = leaf_on_host(x), leaf_on_host(y), f"{label} {jax.tree_util.keystr(path)}"
         if np.issubdtype(y.dtype, np.floating):
             size = np.abs(y[np.isfinite(y)]).max(initial=1.0)
             np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * size, err_msg=name)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 
 
 @pytest.fixture
@@ -13,7 +13,7 @@ def traced():
     """Return a function, and the list of types of its arguments in each run of its Python code."""
     found = []
 
-    @jit_unless_traced("is_turned")
+    @jit_eager_calls("is_turned")
     def rotated(x, table, is_turned=False):
         """Return a product."""
         found.append((type(x), type(table)))

@@ -113,7 +113,7 @@ def test_wrong_arguments_are_one_line(arguments, word, capsys):
 def test_the_poles_are_where_drones_can_hit_them():
     """Contacts are found in some worlds and not in all: the check would be worthless otherwise."""
     sim = demo_flight.build_sim(64, 4, "cpu")
-    fly = demo_flight.build_fly_frame(sim)
+    fly = demo_flight.build_frame_step(sim)
     touched = np.zeros(64, bool)
     for _ in range(75):
         sim.data, _ = fly(sim.data)

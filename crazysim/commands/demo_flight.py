@@ -15,7 +15,7 @@ from jax import Array
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.dynamics import first_principles
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.errors import RenderError, not_installed
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
@@ -60,13 +60,13 @@ def run_demo_flight(
         raise ValueError(f"expected --seconds of at least {1 / FPS}, got {seconds}; use a longer flight")
     n_frames = round(seconds * FPS)
     sim = build_sim(n_worlds, n_drones, device)
-    fly_frame = build_fly_frame(sim)
+    step_frame = build_frame_step(sim)
     engine = sim.explain().splitlines()[0]
     fleet = f"{count_text(n_worlds, 'world')} of {count_text(n_drones, 'drone')}"
     print(f"{fleet}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
 
     start_time = perf_counter()
-    compiled_frame = fly_frame.lower(sim.data).compile()
+    compiled_frame = step_frame.lower(sim.data).compile()
     compile_s = perf_counter() - start_time
     start_time = perf_counter()
     find_pole_contacts(sim)
@@ -125,7 +125,7 @@ def find_pole_contacts(sim: Sim) -> np.ndarray:
     return np.asarray(sim.contact_report(floor=False, drones=False).objects)
 
 
-@jit_unless_traced("n_drones")
+@jit_eager_calls("n_drones")
 def figure_eight_setpoints(time: Array, n_drones: int) -> Array:
     """Return the setpoint of every drone: figure eights offset by a quarter of a period and by 0.25 m in height.
 
@@ -154,7 +154,7 @@ def figure_eight_setpoints(time: Array, n_drones: int) -> Array:
     )
 
 
-@jit_unless_traced("n_drones")
+@jit_eager_calls("n_drones")
 def jerk_feedforward(time: Array, n_drones: int) -> Array:
     """Return the jerk of every drone's setpoint; its snap and yaw rates are sent as zero.
 
@@ -173,7 +173,7 @@ def jerk_feedforward(time: Array, n_drones: int) -> Array:
     return jnp.stack([*jerk, *[jnp.zeros_like(angle)] * 6], axis=-1)
 
 
-def build_fly_frame(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
+def build_frame_step(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
     """Return a jitted function that flies for 1 / FPS seconds, with one setpoint per tick of the state controller.
 
     It returns the data, and the distance from the setpoint at every tick, m. (n_ticks, n_worlds, n_drones)

@@ -11,7 +11,7 @@ from crazysim.drones import Airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import matvec, safe_clip
+from crazysim.rotation import clip, matvec
 
 
 class AllocationParams(PyTree):
@@ -21,12 +21,12 @@ class AllocationParams(PyTree):
     """Minimum thrust of a rotor that is on, N. (1,)"""
     thrust_max: Array = leaf("parameter", 1)
     """Maximum thrust of one rotor, N. (1,)"""
-    arms: Array = leaf("parameter", 1)
+    torque_arms: Array = leaf("parameter", 1)
     """Torque per thrust about x and y (the arm) and about z (drag torque over thrust), m. (3,)"""
     rpm2thrust: Array = leaf("parameter", 2)
     """Coefficients of the thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
     allocation_matrix: Array = leaf("parameter", 2)
-    """Matrix from collective thrust, and torque divided by ``arms``, to rotor thrusts, 1. (n_rotors, 4)"""
+    """Matrix from collective thrust, and torque divided by ``torque_arms``, to rotor thrusts, 1. (n_rotors, 4)"""
     rotors: Array | None = leaf("parameter", 1, default=None)
     """True for the rotors that the drone has; None if all drones have the same number of rotors. (n_rotors,)"""
     weight: Array | None = leaf("parameter", 1, (1,), default=None)
@@ -43,7 +43,7 @@ class AllocationParams(PyTree):
         return AllocationParams(
             thrust_min=as_parameter(airframe.value("rotors.thrust_min", ())),
             thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
-            arms=as_parameter(torque_arms(airframe)),
+            torque_arms=as_parameter(torque_arms(airframe)),
             rpm2thrust=as_parameter(curve.reshape(-1, 3)),
             allocation_matrix=as_parameter(allocation_matrix(airframe)),
         )
@@ -83,14 +83,14 @@ def yaw_arm(airframe: Airframe) -> float:
     return float(np.mean(slopes[0] / slopes[1]))
 
 
-def hover_arms(airframe: Airframe) -> np.ndarray:
+def hover_torque_arms(airframe: Airframe) -> np.ndarray:
     """Return the torque per thrust about x, y and z around hover, m, with ``yaw_arm`` as the third entry. (3,)"""
     return np.array([airframe.arm, airframe.arm, yaw_arm(airframe)])
 
 
 def wrench_matrix(airframe: Airframe) -> np.ndarray:
     """Return the matrix from rotor thrusts to collective thrust, 1, and torque around hover, m. (4, n_rotors)"""
-    return np.vstack([np.ones(airframe.n_rotors), hover_arms(airframe)[:, None] * airframe.mixing_matrix])
+    return np.vstack([np.ones(airframe.n_rotors), hover_torque_arms(airframe)[:, None] * airframe.mixing_matrix])
 
 
 def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
@@ -110,6 +110,6 @@ def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     """
     p = params
     force = cmd[..., :1]
-    thrusts = matvec(p.allocation_matrix, jnp.concatenate([force, cmd[..., 1:] / p.arms], axis=-1))
-    rotor_vel = rotor_vel_of_thrust(safe_clip(thrusts, p.thrust_min, p.thrust_max), p.rpm2thrust)
+    thrusts = matvec(p.allocation_matrix, jnp.concatenate([force, cmd[..., 1:] / p.torque_arms], axis=-1))
+    rotor_vel = rotor_vel_of_thrust(clip(thrusts, p.thrust_min, p.thrust_max), p.rpm2thrust)
     return jnp.where(force <= 0, 0.0, rotor_vel)  # NaN passes through, so that the world is flagged

@@ -42,7 +42,7 @@ class AttitudeParams(PyTree):
     """Minimum PWM of a rotor that is on. (1,)"""
     pwm_max: Array = leaf("parameter", 1)
     """Maximum PWM. (1,)"""
-    arms: Array = leaf("parameter", 1)
+    torque_arms: Array = leaf("parameter", 1)
     """Torque per thrust about x and y (arm) and z (drag torque over thrust), m. (3,)"""
     mixing_matrix: Array = leaf("parameter", 2)
     """Mixing matrix, rotor thrusts to torque over the arms, 1. (3, n_rotors)"""
@@ -66,7 +66,7 @@ class AttitudeParams(PyTree):
             thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
             pwm_min=as_parameter(airframe.value("controller.pwm_min", ())),
             pwm_max=as_parameter(airframe.value("controller.pwm_max", ())),
-            arms=as_parameter([airframe.arm, airframe.arm, float(yaw_arm)]),
+            torque_arms=as_parameter([airframe.arm, airframe.arm, float(yaw_arm)]),
             mixing_matrix=as_parameter(airframe.mixing_matrix),
             torque_allocation=as_parameter(allocation),
         )
@@ -110,19 +110,19 @@ def attitude2force_torque(
     error = rotation.multiply(rotation.conjugate(desired), quat)
     rotation_error = 4 * error[..., 3:] * error[..., :3]  # vee(Rd^T R - R^T Rd)
     rate_error_dot = ((ang_vel_des - prev_ang_vel_des) - (ang_vel - prev_ang_vel)) * ctrl_freq
-    r_int_error = rotation.safe_clip(r_int_error - rotation_error / ctrl_freq, -p.int_err_max, p.int_err_max)
+    r_int_error = rotation.clip(r_int_error - rotation_error / ctrl_freq, -p.int_err_max, p.int_err_max)
     torque_pwm = -p.kR * rotation_error + p.kw * (ang_vel_des - ang_vel) + p.ki_m * r_int_error
     # The firmware has no derivative about yaw.
     torque_pwm = torque_pwm + p.kd_omega * rate_error_dot * jnp.asarray([1.0, 1.0, 0.0], quat.dtype)
-    torque_pwm = rotation.safe_clip(torque_pwm, -p.torque_pwm_max, p.torque_pwm_max)
+    torque_pwm = rotation.clip(torque_pwm, -p.torque_pwm_max, p.torque_pwm_max)
 
     thrust = cmd[..., 3:4]
     n_rotors = count_rotors(p.rotors, p.mixing_matrix.shape[-1])
     newton_per_pwm = p.thrust_max / p.pwm_max
     pwm = thrust / (n_rotors * newton_per_pwm) + matvec(p.torque_allocation, torque_pwm)
-    thrusts = rotation.safe_clip(pwm, p.pwm_min, p.pwm_max) * jnp.where(thrust <= 0, 0.0, newton_per_pwm)
+    thrusts = rotation.clip(pwm, p.pwm_min, p.pwm_max) * jnp.where(thrust <= 0, 0.0, newton_per_pwm)
     thrusts = mask_rotors(p.rotors, thrusts, 0.0)
-    torque = p.arms * matvec(p.mixing_matrix, thrusts)
+    torque = p.torque_arms * matvec(p.mixing_matrix, thrusts)
     return jnp.concatenate([jnp.sum(thrusts, axis=-1, keepdims=True), torque], axis=-1), r_int_error
 
 

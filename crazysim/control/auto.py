@@ -43,10 +43,10 @@ import numpy as np
 from jax import Array, lax
 
 from crazysim import rotation
-from crazysim.control.allocation import AllocationParams, hover_arms, wrench_matrix
+from crazysim.control.allocation import AllocationParams, hover_torque_arms, wrench_matrix
 from crazysim.control.bandwidth import YAW_RATE_RATIO, fastest_rotor_rate, reaction_time, rotor_rate, turn_rates
 from crazysim.control.fitted_auto import FittedAuto
-from crazysim.control.flatness import MIN_HEADING_SINE, MIN_THRUST
+from crazysim.control.flatness import MIN_HEADING_SINE, MIN_SPECIFIC_THRUST
 from crazysim.control.levels import Control
 from crazysim.control.position import PositionMemory, PositionParams, keep_upright, specific_force
 from crazysim.control.priority import prioritized_thrusts
@@ -57,7 +57,7 @@ from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.rotor import quadratic_curve, thrust_slope
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import cross, dot, matvec, safe_clip
+from crazysim.rotation import clip, cross, dot, matvec
 
 ROTOR_RATE = 50.0
 """Rate of the rotors with feedback of their speeds, 1/s, where ``MAX_LEAD`` suffices and authority allows."""
@@ -127,7 +127,7 @@ class AutoParams(RigidBodyParams):
             position = PositionParams.create(airframe, delay + 0.5 / outer_freq, outer_freq)
         return AutoParams(
             **body,
-            allocation=allocation.replace(arms=as_parameter(hover_arms(airframe))),
+            allocation=allocation.replace(torque_arms=as_parameter(hover_torque_arms(airframe))),
             mixing_matrix=as_parameter(wrench_matrix(airframe)[1:]),
             stiffness=as_parameter(stiffness),
             damping=as_parameter(damping),
@@ -248,17 +248,17 @@ class Auto(Controller):
         # The heading of a state command follows from its quaternion, which needs no angles.
         forward, left = rotation.heading(data.controls.state.cmd[..., 9:13])
         squared = dot(specific_thrust, specific_thrust)
-        is_falling = squared < MIN_THRUST**2
+        is_falling = squared < MIN_SPECIFIC_THRUST**2
         inverse = jnp.where(is_falling, 0.0, lax.rsqrt(jnp.where(is_falling, 1.0, squared)))
         z = jnp.where(is_falling, jnp.asarray([0.0, 0.0, 1.0], specific_thrust.dtype), specific_thrust * inverse)
         z_cross_forward = cross(z, forward)
         x_forward = rotation.safe_norm(z_cross_forward)
-        is_parallel = x_forward < MIN_THRUST
+        is_parallel = x_forward < MIN_SPECIFIC_THRUST
         y = jnp.where(is_parallel, left, z_cross_forward / jnp.where(is_parallel, 1.0, x_forward))
         z_rate = (sp.jerk - dot(z, sp.jerk) * z) * inverse
         heading_terms = sp.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, forward)
         yaw_rate = heading_terms / jnp.maximum(x_forward, MIN_HEADING_SINE)
-        ang_vel = cross(z, z_rate) + safe_clip(yaw_rate, -YAW_RATE_MAX, YAW_RATE_MAX) * z
+        ang_vel = cross(z, z_rate) + clip(yaw_rate, -YAW_RATE_MAX, YAW_RATE_MAX) * z
         attitude, thrust = rotation.quat_from_axes(cross(y, z), y, z), p.mass * squared * inverse
         return memory.replace(target=AutoTarget(position, attitude, matvec(to_body, ang_vel), thrust))
 

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crazysim.control.allocation import hover_arms, hover_rotor_vel
+from crazysim.control.allocation import hover_rotor_vel, hover_torque_arms
 from crazysim.control.levels import allocation_matrix
 from crazysim.drones import Airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
@@ -94,7 +94,7 @@ def max_ang_acc(airframe: Airframe) -> np.ndarray:
 
     Roll and pitch may lower the collective thrust below hover, as in ``prioritized_thrusts``; yaw may not.
     """
-    thrusts_per_wrench = allocation_matrix(airframe) / np.concatenate([[1.0], hover_arms(airframe)])
+    thrusts_per_wrench = allocation_matrix(airframe) / np.concatenate([[1.0], hover_torque_arms(airframe)])
     low, high = (float(airframe.value(f"rotors.thrust_{end}", ())) for end in ("min", "max"))
     weight = GRAVITY_MAGNITUDE * float(airframe.value("rigid_body.mass", ()))
     lift_shares, yaw_shares = thrusts_per_wrench[:, 0], thrusts_per_wrench[:, 3]

@@ -20,8 +20,8 @@ As the angle approaches zero, the heading no longer determines the attitude, and
 grows without bound. The limit takes effect below 3 degrees.
 """
 
-MIN_THRUST = 1e-3
-"""Thrust over mass below which the direction of thrust counts as undefined, m/s^2: 1/10000 of the thrust in hover."""
+MIN_SPECIFIC_THRUST = 1e-3
+"""Thrust over mass below which the direction of the thrust counts as undefined, m/s^2. Hover needs 9.8."""
 
 
 class Attitude(NamedTuple):
@@ -36,7 +36,7 @@ class Attitude(NamedTuple):
 
 
 class FlatState(PyTree):
-    """Attitude, its derivatives and wrench of a drone that tracks a setpoint exactly."""
+    """Attitude, angular velocity, angular acceleration and wrench of a drone that tracks a setpoint exactly."""
 
     quat: Array = leaf("drone", 1)
     """Attitude, body to world, unit, xyzw. (..., 4)"""
@@ -53,7 +53,7 @@ class FlatState(PyTree):
 def flat_state(
     setpoint: Setpoint, mass: Array | float, inertia: Array, gravity_vec: Array | tuple[float, ...] = GRAVITY
 ) -> FlatState:
-    """Return the attitude, its derivatives and the wrench with which a drone without drag tracks a setpoint exactly.
+    """Return attitude, angular velocity, angular acceleration and wrench of a drag-free drone that tracks a setpoint.
 
     Position and yaw are flat outputs of a multirotor: with their derivatives they determine its state and its inputs
     (Mellinger and Kumar 2011, section III). The thrust is ``m |acc - g|`` along ``acc - g``, and the torque follows
@@ -87,7 +87,9 @@ def attitude_of_thrust(
     yaw_rate: Array,
     yaw_acc: Array,
 ) -> Attitude:
-    """Return the attitude whose z axis is along a thrust vector and whose x axis is as close as possible to a heading.
+    """Return the attitude with the z axis along a thrust vector and the x axis as close as possible to a heading.
+
+    The angular velocity and acceleration follow from the derivatives of thrust and heading.
 
     With the thrust ``f``, the heading ``c = (cos yaw, sin yaw, 0)`` and ``l = e_z x c``, the axes are ``z = f / |f|``,
     ``y = z x c / |z x c|`` and ``x = y x z`` (Mellinger and Kumar 2011). The body rates ``w`` about x and y follow from
@@ -95,10 +97,10 @@ def attitude_of_thrust(
 
         w_z x.c = w_x z.c + yaw' y.l
 
-    The angular acceleration follows from the derivatives of these equations.
+    The derivatives of these equations give the angular acceleration.
 
-    A thrust below ``MIN_THRUST`` is replaced by one along the vertical that does not change. Where thrust and heading
-    are parallel, y is the horizontal ``l``, and the rate about z is limited (``MIN_HEADING_SINE``).
+    A specific thrust below ``MIN_SPECIFIC_THRUST`` is replaced by a constant vertical one. Where thrust and heading are
+    parallel, y is the horizontal ``l``. Near there, the rate about z is limited (``MIN_HEADING_SINE``).
 
     Args:
         specific_thrust: Thrust vector over the mass, world frame, m/s^2. (..., 3)
@@ -131,7 +133,7 @@ def thrust_direction(
 ) -> tuple[Array, Array, Array]:
     """Return the unit vector along a thrust vector, with its first two derivatives.
 
-    Below ``MIN_THRUST`` it is e_z, with derivatives of zero.
+    Where the specific thrust is below ``MIN_SPECIFIC_THRUST``, the unit vector is e_z with derivatives of zero.
 
     Args:
         specific_thrust: Thrust vector over the mass, m/s^2. (..., 3)
@@ -141,7 +143,7 @@ def thrust_direction(
     Returns:
         Direction, its derivative, 1/s, and its second derivative, 1/s^2. (..., 3) each
     """
-    is_undefined = dot(specific_thrust, specific_thrust) < MIN_THRUST**2
+    is_undefined = dot(specific_thrust, specific_thrust) < MIN_SPECIFIC_THRUST**2
     inverse = jnp.where(is_undefined, 0.0, 1 / rotation.safe_norm(jnp.where(is_undefined, 1.0, specific_thrust)))
     z = jnp.where(is_undefined, jnp.asarray([0.0, 0.0, 1.0], specific_thrust.dtype), specific_thrust * inverse)
     growth = dot(z, specific_thrust_rate) * inverse

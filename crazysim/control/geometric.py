@@ -20,7 +20,7 @@ from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import cross, dot, matvec, safe_clip
+from crazysim.rotation import clip, cross, dot, matvec
 
 Gains = Literal["bandwidth", "airframe"]
 """Rule for the gains: by bandwidth, or from the airframe's table ``[geometric]``."""
@@ -218,7 +218,7 @@ class Geometric(Controller):
             limit = -MAX_INTEGRAL_RATIO * GRAVITY[2]
             acc = params.kr * (command.pos - s.pos) / params.mass
             acc = jnp.where(jnp.abs(acc) < limit, acc, 0.0)  # Larger errors are transients, not disturbances.
-            memory = GeometricMemory(safe_clip(memory.acc + self.integral / self.freq * acc, -limit, limit))
+            memory = GeometricMemory(clip(memory.acc + self.integral / self.freq * acc, -limit, limit))
         state = (s.pos, s.quat, s.vel, s.ang_vel)
         acc = memory.acc if self.integral else None
         return geometric_control(*state, command, params=params, feedforward=self.feedforward, integral=acc), memory

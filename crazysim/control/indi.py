@@ -180,13 +180,13 @@ def indi_control(
     acc, rotor_acc, momentum_rate, torque = (signals[..., i : i + 3] for i in (0, 3, 6, 9))
 
     feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
-    disturbance = rotation.safe_clip(acc - rotor_acc - p.gravity_vec, -DISTURBANCE_MAX, DISTURBANCE_MAX)
+    disturbance = rotation.clip(acc - rotor_acc - p.gravity_vec, -DISTURBANCE_MAX, DISTURBANCE_MAX)
     specific_thrust = sp.acc - p.gravity_vec + feedback - disturbance
     attitude = attitude_of_thrust(specific_thrust, sp.jerk, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
     rotation_error, rate_error, ang_acc_des = attitude_errors(matrix, ang_vel, attitude)
     torque_des = matvec(p.J, ang_acc_des) - p.kR * rotation_error - p.kw * rate_error
     limit = TORQUE_MAX * p.kR
-    torque = torque_des - rotation.safe_clip(momentum_rate - torque, -limit, limit)
+    torque = torque_des - rotation.clip(momentum_rate - torque, -limit, limit)
 
     thrust = p.mass * dot(specific_thrust, matrix[..., 2])
     yaw_drag_torque = yaw_torque + params.drag_torque_share * (torque[..., 2:] - yaw_torque)

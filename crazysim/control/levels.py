@@ -43,7 +43,7 @@ def command_size(control: Control, n_rotors: int) -> int:
 
 
 def count_rotors(rotors: Array | None, n: int) -> Array | int:
-    """Return the number of rotors of a drone from the mask of those it has, (..., 1), or ``n`` without a mask."""
+    """Return the number of True entries of a mask of rotors, (..., 1), or ``n`` if the mask is None."""
     return n if rotors is None else jnp.sum(jnp.where(rotors, 1.0, 0.0), axis=-1, keepdims=True)
 
 
@@ -53,10 +53,10 @@ def mask_rotors(rotors: Array | None, x: Array, fill_value: float) -> Array:
 
 
 def allocation_matrix(airframe: Airframe) -> np.ndarray:
-    """Return the least-norm allocation of collective thrust and torque over the arms to rotor thrusts. (n_rotors, 4)
+    """Return the matrix from collective thrust and torque over the torque arms to rotor thrusts. (n_rotors, 4)
 
-    The pseudoinverse of the mixing matrix with a row of ones. For a quadrotor in X these are the signs of each rotor
-    over four.
+    It is the pseudoinverse of the mixing matrix with a row of ones above it, so the rotor thrusts have the least norm.
+    For a quadrotor in X its entries are the signs of the rotors divided by four.
     """
     mixing = airframe.mixing_matrix
     return np.linalg.pinv(np.vstack([np.ones(mixing.shape[1]), mixing]))

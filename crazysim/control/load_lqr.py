@@ -322,6 +322,6 @@ class LoadLQR(Controller):
             *(s.pos, s.quat, s.vel, s.ang_vel, direction, direction_rate, command),
             params=params,
             target=self.target,
-            rod_jerk=rotation.safe_clip(rod_jerk, -ROD_JERK_MAX, ROD_JERK_MAX),
+            rod_jerk=rotation.clip(rod_jerk, -ROD_JERK_MAX, ROD_JERK_MAX),
         )
         return wrench, memory.replace(rod_acc=rod_acc, started=jnp.ones_like(memory.started))

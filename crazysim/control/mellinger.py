@@ -24,7 +24,7 @@ from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import dot, safe_clip
+from crazysim.rotation import clip, dot
 
 _GAINS = ("kp", "kd", "ki", "integral_max", "kR", "kw", "ki_m", "kd_omega", "integral_m_max", "torque_max")
 KEYS = (*(f"mellinger.{key}" for key in ("mass", "mass_thrust", *_GAINS)), *power_distribution.KEYS)
@@ -109,7 +109,7 @@ def desired_force(
         params: Gains.
     """
     p, error = params, setpoint.pos - pos
-    integral = safe_clip(integral + error / freq, -p.integral_max, p.integral_max)
+    integral = clip(integral + error / freq, -p.integral_max, p.integral_max)
     force = p.mass * (setpoint.acc - p.gravity_vec) + p.kp * error + p.kd * (setpoint.vel - vel) + p.ki * integral
     return force, integral
 
@@ -140,11 +140,11 @@ def torque_of_rotation(
     """
     p, m = params, memory
     error = rotation_error(axes, axes_des)
-    integral = safe_clip(m.integral_m - error / freq, -p.integral_m_max, p.integral_m_max)
+    integral = clip(m.integral_m - error / freq, -p.integral_m_max, p.integral_m_max)
     rate_error_dot = ((ang_vel_des - m.ang_vel_des) - (ang_vel - m.ang_vel)) * freq
     torque = -p.kR * error + p.kw * (ang_vel_des - ang_vel) + p.ki_m * integral + p.kd_omega * rate_error_dot
     new_memory = m.replace(integral_m=integral, ang_vel=ang_vel, ang_vel_des=ang_vel_des)
-    return safe_clip(torque, -p.torque_max, p.torque_max), new_memory
+    return clip(torque, -p.torque_max, p.torque_max), new_memory
 
 
 class Mellinger(Controller):
@@ -199,12 +199,12 @@ class Mellinger(Controller):
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
         _, _, _, force = self._command(data, command, initial_memory, p)
         current_force = thrust / p.mass_thrust * rotation.z_axis(s.quat)
-        integral = safe_clip(_divide_by_gain(current_force - force, p.ki), -p.integral_max, p.integral_max)
+        integral = clip(_divide_by_gain(current_force - force, p.ki), -p.integral_max, p.integral_max)
         integral = integral if isinstance(command, Setpoint) else zero
         initial_memory = initial_memory.replace(integral=integral)
         _, torque_without_integral, _, _ = self._command(data, command, initial_memory, p)
         return initial_memory.replace(
-            integral_m=safe_clip(
+            integral_m=clip(
                 _divide_by_gain(torque - torque_without_integral, p.ki_m), -p.integral_m_max, p.integral_m_max
             )
         )

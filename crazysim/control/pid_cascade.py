@@ -15,7 +15,7 @@ from crazysim.control.pid_loop import PIDLoop, PIDLoopMemory, pid_step
 from crazysim.control.power_distribution import PowerDistributionParams
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import safe_clip
+from crazysim.rotation import clip
 
 THRUST_SCALE = 1000.0
 """PWM per unit of the vertical velocity loop's output (``thrustScale``)."""
@@ -32,16 +32,20 @@ KEYS = (
 
 
 class PIDParams(PyTree):
-    """Gains and limits of the cascade, each shared or one per drone. Angles are in degrees, as in the firmware."""
+    """Gains and limits of the cascade, each shared or one per drone. Angles are in degrees, as in the firmware.
+
+    The heading frame has x along the yaw, y to the left and z up (``to_heading_frame``).
+    """
 
     position: PIDLoop
-    """Position loop, along and across the current heading and up, m to m/s."""
+    """Position loop in the heading frame: position error, m, to desired velocity, m/s."""
     velocity: PIDLoop
-    """Velocity loop, along and across the heading and up: m/s to pitch and roll, degrees, and thrust, 1000 PWM."""
+    """Velocity loop in the heading frame: velocity error, m/s, to pitch and negative roll, degrees, and thrust, 1000 PWM.
+    """
     attitude: PIDLoop
-    """Attitude loop, degrees to degrees/s."""
+    """Attitude loop: error of roll, pitch and yaw, degrees, to desired body rates, degrees/s."""
     rate: PIDLoop
-    """Rate loop, degrees/s to PWM."""
+    """Rate loop: error of the body rates, degrees/s, to torque, PWM."""
     tilt_max: Array = leaf("parameter", 1)
     """Limits of the desired roll and pitch, degrees. (2,)"""
     thrust_base: Array = leaf("parameter", 1, (1,))
@@ -83,7 +87,7 @@ class PIDMemory(PyTree):
     thrust: Array = leaf("drone", 1)
     """Desired thrust, PWM. (n_worlds, n_drones, 1)"""
     started: Array = leaf("drone", 1)
-    """True from the first tick on. (n_worlds, n_drones, 1)"""
+    """True after the first tick. (n_worlds, n_drones, 1)"""
 
     @staticmethod
     def create(params: PIDParams) -> PIDMemory:
@@ -97,7 +101,7 @@ class PIDMemory(PyTree):
 def desired_velocity(
     pos: Array, heading: Array, pos_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
 ) -> tuple[Array, PIDLoopMemory]:
-    """Run the position loop: return the desired velocity, along and across the heading and up, and the memory.
+    """Return the desired velocity in the heading frame, and the new memory of the position loop.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -108,7 +112,7 @@ def desired_velocity(
         loop: Gains and limits.
 
     Returns:
-        Desired velocity, m/s (..., 3); the memory.
+        Desired velocity, heading frame, m/s (..., 3); new memory.
     """
     error = to_heading_frame(heading, pos_des - pos)
     return pid_step(error, to_heading_frame(heading, pos), memory, freq, loop=loop)
@@ -117,30 +121,30 @@ def desired_velocity(
 def desired_attitude(
     vel: Array, heading: Array, vel_des: Array, memory: PIDLoopMemory, freq: float, *, params: PIDParams
 ) -> tuple[Array, Array, PIDLoopMemory]:
-    """Run the velocity loop: return the desired roll and pitch, the thrust, and the memory.
+    """Return the desired roll and pitch, the thrust, and the new memory of the velocity loop.
 
     Args:
         vel: Velocity, world frame, m/s. (..., 3)
         heading: Cosine and sine of the yaw. (..., 2)
-        vel_des: Desired velocity along and across the heading and up, m/s. (..., 3)
+        vel_des: Desired velocity, heading frame, m/s. (..., 3)
         memory: Memory of the loop.
         freq: Rate of this loop, Hz.
         params: Gains and limits of the cascade.
 
     Returns:
-        Desired roll and pitch, degrees (..., 2); thrust of each motor, PWM (..., 1); the memory.
+        Desired roll and pitch, degrees (..., 2); thrust of each motor, PWM (..., 1); new memory.
     """
     p, measured = params, to_heading_frame(heading, vel)
     output, memory = pid_step(vel_des - measured, measured, memory, freq, loop=p.velocity)
     tilt = jnp.stack([-output[..., 1], output[..., 0]], axis=-1)
-    thrust = safe_clip(THRUST_SCALE * output[..., 2:] + p.thrust_base, p.thrust_min, p.motors.pwm_max)
-    return safe_clip(tilt, -p.tilt_max, p.tilt_max), thrust, memory
+    thrust = clip(THRUST_SCALE * output[..., 2:] + p.thrust_base, p.thrust_min, p.motors.pwm_max)
+    return clip(tilt, -p.tilt_max, p.tilt_max), thrust, memory
 
 
 def desired_rates(
     rpy: Array, rpy_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
 ) -> tuple[Array, PIDLoopMemory]:
-    """Run the attitude loop, on Euler angles: return the desired body rates, degrees/s, and the memory.
+    """Return the desired body rates, degrees/s, and the new memory of the attitude loop, which uses Euler angles.
 
     Args:
         rpy: Roll, pitch, yaw, degrees. (..., 3)
@@ -155,7 +159,7 @@ def desired_rates(
 def desired_torque(
     ang_vel: Array, ang_vel_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
 ) -> tuple[Array, PIDLoopMemory]:
-    """Run the rate loop: return the torque that follows the desired body rates, PWM, and the memory.
+    """Return the torque that tracks the desired body rates, PWM, and the new memory of the rate loop.
 
     Args:
         ang_vel: Angular velocity, body frame, degrees/s. (..., 3)
@@ -165,7 +169,7 @@ def desired_torque(
         loop: Gains and limits.
     """
     torque, memory = pid_step(ang_vel_des - ang_vel, ang_vel, memory, freq, loop=loop)
-    return safe_clip(torque, -TORQUE_MAX, TORQUE_MAX), memory
+    return clip(torque, -TORQUE_MAX, TORQUE_MAX), memory
 
 
 def to_heading_frame(heading: Array, vector: Array) -> Array:

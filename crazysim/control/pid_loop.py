@@ -12,7 +12,7 @@ from jax import Array
 from crazysim.control.low_pass import butterworth
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import safe_clip
+from crazysim.rotation import clip
 
 DEFAULT_INTEGRAL_MAX = 5000.0
 """Limit of the integral of a loop that sets no limit (``DEFAULT_PID_INTEGRATION_LIMIT``)."""
@@ -135,10 +135,10 @@ def pid_step(
         output = output + loop.kd * derivative
     if loop.ki is not None:
         integral_max: Any = loop.integral_max
-        integral = safe_clip(memory.integral + error / freq, -integral_max, integral_max)
+        integral = clip(memory.integral + error / freq, -integral_max, integral_max)
         memory = memory.replace(integral=integral)
         output = output + loop.ki * integral
-    return (output if loop.output_max is None else safe_clip(output, -loop.output_max, loop.output_max)), memory
+    return (output if loop.output_max is None else clip(output, -loop.output_max, loop.output_max)), memory
 
 
 def continue_integral(memory: PIDLoopMemory, output: Array, desired: Array, *, loop: PIDLoop) -> PIDLoopMemory:
@@ -154,7 +154,7 @@ def continue_integral(memory: PIDLoopMemory, output: Array, desired: Array, *, l
     if loop.ki is None:
         return memory
     missing_integral = jnp.where(loop.ki == 0, 0.0, (desired - output) / jnp.where(loop.ki == 0, 1.0, loop.ki))
-    return memory.replace(integral=safe_clip(memory.integral + missing_integral, -integral_max, integral_max))
+    return memory.replace(integral=clip(memory.integral + missing_integral, -integral_max, integral_max))
 
 
 def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import dot, safe_clip, safe_norm
+from crazysim.rotation import clip, dot, safe_norm
 
 POSITION_RATE_RATIO = 0.4
 """Natural frequency of the position loop times the delay of the loop below it, 1."""
@@ -128,15 +128,15 @@ def specific_force(
     """
     p = params
     limit = -MAX_DISTURBANCE_RATIO * GRAVITY[2]
-    unknown_acc = safe_clip((vel - memory.vel) * freq, -limit, limit)
+    unknown_acc = clip((vel - memory.vel) * freq, -limit, limit)
     horizontal_acc = jnp.where(dot(vel, vel) == 0, 0.0, unknown_acc[..., :2])
     unknown_acc = _join_vertical(horizontal_acc, unknown_acc[..., 2:])
     disturbance = memory.disturbance + p.observer * (unknown_acc - memory.disturbance)
 
     error, reach = setpoint.pos - pos, p.reach[..., 1:]
-    error = _join_vertical(_limit_length(error[..., :2], p.reach[..., :1]), safe_clip(error[..., 2:], -reach, reach))
+    error = _join_vertical(_limit_length(error[..., :2], p.reach[..., :1]), clip(error[..., 2:], -reach, reach))
     acc = p.stiffness * error + p.damping * (setpoint.vel - vel)
-    vertical_acc = safe_clip(acc[..., 2:], -p.acc_max[..., 2:], p.acc_max[..., 1:2])
+    vertical_acc = clip(acc[..., 2:], -p.acc_max[..., 2:], p.acc_max[..., 1:2])
     acc = _join_vertical(_limit_length(acc[..., :2], p.acc_max[..., :1]), vertical_acc)
     specific_thrust = setpoint.acc + acc - p.gravity_vec - disturbance
     return specific_thrust, PositionMemory(vel + (known_acc + p.gravity_vec) / freq, disturbance)

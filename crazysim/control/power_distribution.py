@@ -12,7 +12,7 @@ from crazysim.control.levels import allocation_matrix, count_rotors, mask_rotors
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import matvec, safe_clip
+from crazysim.rotation import clip, matvec
 
 KEYS = ("controller.pwm_max", "rotors.thrust_max", "rotors.thrust_curve")
 """Values of an airframe that the power distribution needs."""
@@ -105,7 +105,7 @@ def rotor_vel_of_pwm(pwm: Array, *, params: PowerDistributionParams) -> Array:
         params: Parameters, shared or with the leading axes of the command.
     """
     p = params
-    rotor_vel = rotor_vel_of_thrust(safe_clip(pwm, 0.0, p.pwm_max) * (p.thrust_max / p.pwm_max), p.rpm2thrust)
+    rotor_vel = rotor_vel_of_thrust(clip(pwm, 0.0, p.pwm_max) * (p.thrust_max / p.pwm_max), p.rpm2thrust)
     return jnp.where(pwm <= 0, 0.0, rotor_vel)
 
 

@@ -10,16 +10,16 @@ from jax import Array
 
 from crazysim.control.allocation import AllocationParams
 from crazysim.control.levels import mask_rotors
-from crazysim.rotation import matvec, safe_clip
+from crazysim.rotation import clip, matvec
 
 UNLIMITED_THRUST = 1e9
 """Collective thrust beyond the limits of any rotors, N."""
 
 
 def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
-    """Return the wrench within the limits of the rotors for a desired one, by the priority of ``prioritized_thrusts``.
+    """Return a desired wrench limited to what the rotors can give, with the priority of ``prioritized_thrusts``.
 
-    A wrench that every rotor can give, with its yaw torque in either direction, is returned unchanged.
+    A wrench is returned unchanged if the rotors can give it both with its yaw torque and with the opposite yaw torque.
 
     Args:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
@@ -29,20 +29,20 @@ def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
         Collective thrust, N, and body torque, N m. (..., 4)
     """
     force, scale, yaw, _ = _prioritize(wrench, params)
-    return jnp.concatenate([force, scale * wrench[..., 1:3], yaw * params.arms[..., 2:]], axis=-1)
+    return jnp.concatenate([force, scale * wrench[..., 1:3], yaw * params.torque_arms[..., 2:]], axis=-1)
 
 
 def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
-    """Return the thrusts within the limits of the rotors that give a desired wrench by priority, N. (..., n_rotors)
+    """Return rotor thrusts within their limits that give a desired wrench by priority, N. (..., n_rotors)
 
     ``force_torque2rotor_vel`` clips each rotor on its own, which changes the torque. Roll and pitch determine the
     direction of the thrust and yaw does not, so this order of priority keeps a saturated drone stable (Faessler,
-    Falanga and Scaramuzza 2017). Roll and pitch torque are scaled down only if no collective thrust makes room for
-    them, the collective thrust is moved to where they fit, and the yaw torque is limited to the remaining room that
-    every rotor has in both directions. Rotors are never switched off.
+    Falanga and Scaramuzza 2017). Roll and pitch torque are scaled down only if no collective thrust lets the rotors
+    give them. The collective thrust is clipped to the range in which the rotors can. The yaw torque is limited to what
+    the remaining range of every rotor allows in both directions. Rotors are never switched off.
 
-    Roll and pitch torque raise the collective thrust up to the weight at most. Rotors that could carry ten times the
-    weight would otherwise throw the drone up as long as they turn it.
+    Roll and pitch torque raise the collective thrust at most to the weight. Otherwise rotors that can carry ten times
+    the weight would accelerate the drone upwards while they turn it.
 
     If all rotors carry the same fraction of the collective thrust, and the weight does not limit it, the scale of roll
     and pitch torque is the largest that fits; otherwise it may be smaller.
@@ -57,24 +57,25 @@ def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
 
 
 def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, Array, Array]:
-    """Return collective thrust, scale of the tilt torque, yaw torque over its arm, and thrusts for the tilt torque.
+    """Return the collective thrust, the scale of roll and pitch torque, the yaw force and the tilt thrusts.
 
-    The last are the thrusts that the rotors add for the unscaled tilt torque, each divided by the rotor's share of the
-    collective thrust, N. (..., n_rotors)
+    Returns:
+        Collective thrust, N (..., 1); factor in [0, 1] of roll and pitch torque (..., 1); yaw torque over its torque
+        arm, N (..., 1); thrust of each rotor for the unscaled roll and pitch torque, over the rotor's share of the
+        collective thrust, N (..., n_rotors).
     """
     p = params
-    lift_shares = mask_rotors(
-        p.rotors, p.allocation_matrix[..., 0], 1.0
-    )  # rotor thrust per collective thrust, positive
-    max_yaw_share = _reduce_rotors(
-        jnp.maximum, jnp.abs(p.allocation_matrix[..., 3] / lift_shares)
-    )  # largest collective thrust per yaw torque over its arm
+    # Thrust of each rotor divided by the collective thrust, positive.
+    lift_shares = mask_rotors(p.rotors, p.allocation_matrix[..., 0], 1.0)
+    # Largest change of a rotor's thrust over its lift share, per yaw force.
+    max_yaw_share = _reduce_rotors(jnp.maximum, jnp.abs(p.allocation_matrix[..., 3] / lift_shares))
     tilt_thrusts = matvec(
-        p.allocation_matrix[..., 1:3] / lift_shares[..., None] / p.arms[..., None, :2], wrench[..., 1:3]
+        p.allocation_matrix[..., 1:3] / lift_shares[..., None] / p.torque_arms[..., None, :2], wrench[..., 1:3]
     )
 
-    # Rotor i allows collective thrusts F with low <= F + s tilt_thrusts_i <= high, s being the scale of the tilt
-    # torque. A masked rotor allows any F.
+    # The thrust of rotor i is lift_shares_i (F + s tilt_thrusts_i), with the collective thrust F and the scale s of
+    # roll and pitch torque. It is within its limits if low_i <= F + s tilt_thrusts_i <= high_i. Rotors that the drone
+    # lacks get limits that allow any F.
     low = mask_rotors(p.rotors, p.thrust_min / lift_shares, -UNLIMITED_THRUST)
     high = mask_rotors(p.rotors, p.thrust_max / lift_shares, UNLIMITED_THRUST)
     low_untilted, high_untilted = _reduce_rotors(jnp.maximum, low), _reduce_rotors(jnp.minimum, high)
@@ -85,19 +86,19 @@ def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, 
     weight = high_untilted if p.weight is None else p.weight
     limit = jnp.maximum(wrench[..., :1], jnp.maximum(weight, low_untilted))
 
-    # The room between the bounds is concave in s, so it is at least the chord from s = 0, where it is positive, to 1.
+    # The length of the interval of allowed F ("room") is a concave function of s. It is therefore at least its linear
+    # interpolation between s = 0, where it is positive, and s = 1. The scale is 1 if the room at s = 1 is not negative,
+    # and otherwise the s at which the interpolation is zero.
     room_untilted, room_tilted = (
         jnp.minimum(high_untilted, limit) - low_untilted,
         jnp.minimum(high_tilted, limit) - low_tilted,
     )
     scale = room_untilted / jnp.maximum(room_untilted - jnp.minimum(room_tilted, 0.0), 1 / UNLIMITED_THRUST)
     force_low = low_untilted + scale * (low_tilted - low_untilted)
-    force = safe_clip(
-        wrench[..., :1], force_low, jnp.where(room_tilted < 0, force_low, jnp.minimum(high_tilted, limit))
-    )
+    force = clip(wrench[..., :1], force_low, jnp.where(room_tilted < 0, force_low, jnp.minimum(high_tilted, limit)))
 
     yaw_room = jnp.maximum(jnp.minimum(force - force_low, high_tilted - force), 0.0) / max_yaw_share
-    return force, scale, safe_clip(wrench[..., 3:] / p.arms[..., 2:], -yaw_room, yaw_room), tilt_thrusts
+    return force, scale, clip(wrench[..., 3:] / p.torque_arms[..., 2:], -yaw_room, yaw_room), tilt_thrusts
 
 
 def _reduce_rotors(function: Callable[[Array, Array], Array], x: Array) -> Array:

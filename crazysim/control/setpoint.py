@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.pytree import PyTree, leaf
 
 
@@ -34,7 +34,7 @@ class Setpoint(PyTree):
     yaw_acc: Array = leaf("drone", 1)
     """Second derivative of the yaw, rad/s^2. (..., 1)"""
 
-    @jit_unless_traced()
+    @jit_eager_calls()
     def command(self) -> Array:
         """Return the state command: position, velocity, acceleration, quaternion of the yaw, body rates. (..., 16)
 
@@ -44,13 +44,13 @@ class Setpoint(PyTree):
         quat = [zeros, jnp.sin(self.yaw / 2), jnp.cos(self.yaw / 2)]
         return jnp.concatenate([self.pos, self.vel, self.acc, *quat, zeros, self.yaw_rate], axis=-1)
 
-    @jit_unless_traced()
+    @jit_eager_calls()
     def feedforward(self) -> Array:
         """Return the feedforward of the state command: jerk, snap, yaw rate, second derivative of the yaw. (..., 8)"""
         return jnp.concatenate([self.jerk, self.snap, self.yaw_rate, self.yaw_acc], axis=-1)
 
     @staticmethod
-    @jit_unless_traced()
+    @jit_eager_calls()
     def of_command(cmd: Array, feedforward: Array | None = None) -> Setpoint:
         """Return the setpoint of a state command.
 

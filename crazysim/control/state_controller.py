@@ -87,7 +87,7 @@ def state2attitude(
     """
     p = params
     pos_err, vel_err = cmd[..., 0:3] - pos, cmd[..., 3:6] - vel
-    pos_err_i = rotation.safe_clip(pos_err_i + pos_err / ctrl_freq, -p.int_err_max, p.int_err_max)
+    pos_err_i = rotation.clip(pos_err_i + pos_err / ctrl_freq, -p.int_err_max, p.int_err_max)
     force = p.mass * (cmd[..., 6:9] - p.gravity_vec) + p.kp * pos_err + p.kd * vel_err + p.ki * pos_err_i
 
     forward, left = rotation.heading(cmd[..., 9:13])

@@ -139,7 +139,7 @@ def tracking_gains(
 def interpolate_gain(time: Array, gains: Array, dt: Array) -> Array:
     """Return the gain at a time, s, interpolated linearly between knots ``dt`` apart and held at the ends. (4, 12)"""
     last_index = gains.shape[-3] - 1
-    knot = rotation.safe_clip(time / dt, 0.0, float(last_index))
+    knot = rotation.clip(time / dt, 0.0, float(last_index))
     gains, index = jnp.asarray(gains), jnp.minimum(jnp.floor(knot).astype(jnp.int32), last_index - 1)
     weight = knot - index
     return (1 - weight) * gains[index] + weight * gains[index + 1]

@@ -9,7 +9,7 @@ from jax import Array
 from crazysim.control import Control, Controller, Setpoint
 from crazysim.core.data import SimData, controls_of
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.stage import Stage, acts_now
+from crazysim.core.stage import Stage, is_tick
 
 
 def controller_stages(controller: Controller, control: Control) -> Pipeline:
@@ -22,10 +22,10 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
     level = control.value
 
     def is_command_tick(data: SimData) -> Array | None:
-        return acts_now(data, getattr(data.controls, level).freq)
+        return is_tick(data, getattr(data.controls, level).freq)
 
     def is_controller_tick(data: SimData) -> Array | None:
-        return acts_now(data, getattr(data.controls, level).controller.freq)
+        return is_tick(data, getattr(data.controls, level).controller.freq)
 
     def run_outer(data: SimData) -> SimData:
         data = _apply_staged_command(data, control)

@@ -16,7 +16,7 @@ from crazysim import jaxcompat
 from crazysim.control import COMMAND_FIELDS, Control, Setpoint
 from crazysim.core.data import SimData, command_shape
 from crazysim.core.settings import check_flag
-from crazysim.core.stage import acts_now
+from crazysim.core.stage import is_tick
 from crazysim.errors import ConfigError, short_repr
 
 FEEDFORWARD_FIELDS = "jerk x, y, z [m/s^3], snap x, y, z [m/s^4], yaw rate [rad/s], yaw acceleration [rad/s^2]"
@@ -34,23 +34,24 @@ def state_control(
     yaw: ArrayLike | None = None,
     feedforward: ArrayLike | None = None,
 ) -> SimData:
-    """Stage a full-state setpoint for every drone: one vector per drone, or ``pos`` and optional parts.
+    """Stage a full-state setpoint for every drone.
 
-    ``pos``, ``vel`` and ``acc`` broadcast to (n_worlds, n_drones, 3) by NumPy's rules, ``yaw`` to (n_worlds, n_drones):
-    (3,) is one position for all, (n_drones, 3) one for each drone, (n_worlds, 1, 3) one for each world. Omitted parts
-    are zero.
+    Pass either one vector of 16 numbers per drone as ``controls``, or ``pos`` and optionally ``vel``, ``acc`` and
+    ``yaw``. These broadcast by NumPy's rules, ``yaw`` to (n_worlds, n_drones) and the others to
+    (n_worlds, n_drones, 3): a ``pos`` of shape (3,) is shared by all drones, (n_drones, 3) has one position per drone,
+    and (n_worlds, 1, 3) one per world. Omitted quantities are zero.
 
     Args:
         data: Data of a simulation built with ``control="state"``.
         controls: Position, velocity, acceleration, quaternion (xyzw), body rates; None with ``pos``.
             (n_worlds, n_drones, 16)
-        check_finite: True to check device arrays too, which waits for the device; host input is always checked.
+        check_finite: True to also check JAX arrays, which waits for the device. Other input is always checked.
         pos: Position, world frame, m; None with ``controls``. (..., 3)
         vel: Velocity, world frame, m/s, with ``pos``. (..., 3)
         acc: Acceleration, world frame, m/s^2, with ``pos``. (..., 3)
         yaw: Yaw, rad, with ``pos``. (...)
         feedforward: Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2. None for the yaw rate of the
-            setpoint, and zeros for the rest. Must be None with controllers without feedforward, such as Crazyflow's.
+            setpoint and zeros for the rest. Must be None if the controller has no feedforward, as Crazyflow's.
             (n_worlds, n_drones, 8)
     """
     command, feedforward = check_setpoint(
@@ -70,7 +71,7 @@ def check_setpoint(
 ) -> tuple[Array | NDArray, Array | NDArray | None]:
     """Return a full-state setpoint and its feedforward as arrays of the state's dtype, for ``stage_command``.
 
-    Arguments and errors as in ``state_control``; leaves of ``data`` may be ``jax.ShapeDtypeStruct`` instead of arrays.
+    Arguments and errors are those of ``state_control``, but leaves of ``data`` may also be ``jax.ShapeDtypeStruct``.
     """
     explicit_parts = {name: x for name, x in parts.items() if x is not None}
     if controls is None:
@@ -133,7 +134,7 @@ _device_setpoint = jax.jit(functools.partial(_setpoint, jnp), static_argnums=(0,
 def attitude_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Stage roll, pitch, yaw, rad, and collective thrust, N, for every drone. (n_worlds, n_drones, 4)
 
-    Arguments and errors as in ``state_control``.
+    Arguments and errors are those of ``state_control``.
     """
     return stage_command(data, put_command(data, check_command(data, Control.attitude, controls, check_finite)))
 
@@ -141,7 +142,7 @@ def attitude_control(data: SimData, controls: ArrayLike, check_finite: bool = Fa
 def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Stage body rates, rad/s, and collective thrust, N, for every drone. (n_worlds, n_drones, 4)
 
-    Arguments and errors as in ``state_control``.
+    Arguments and errors are those of ``state_control``.
     """
     return stage_command(data, put_command(data, check_command(data, Control.body_rate, controls, check_finite)))
 
@@ -149,7 +150,7 @@ def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Stage collective thrust, N, and body torque, N m, for every drone. (n_worlds, n_drones, 4)
 
-    Arguments and errors as in ``state_control``.
+    Arguments and errors are those of ``state_control``.
     """
     return stage_command(data, put_command(data, check_command(data, Control.force_torque, controls, check_finite)))
 
@@ -157,13 +158,13 @@ def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool 
 def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Command rotor speeds, rpm, for every drone; they take effect at the next step. (n_worlds, n_drones, n_rotors)
 
-    Arguments and errors as in ``state_control``.
+    Arguments and errors are those of ``state_control``.
     """
     return stage_command(data, put_command(data, check_command(data, Control.rotor_vel, controls, check_finite)))
 
 
 def stage_command(data: SimData, command: Array, feedforward: Array | None = None) -> SimData:
-    """Return the data with a command staged at its command level; the command is not checked.
+    """Return the data with a command staged for the controller of its command level, without checking it.
 
     The data may be of one drone, of one world or of all worlds. Rotor speeds take effect at the next step, other
     commands at the next tick of their controller.
@@ -205,7 +206,7 @@ def staged_leaves(data: SimData) -> list[Any]:
 
 
 def default_feedforward(command: Any) -> Any:
-    """Return the feedforward of a setpoint without an explicit one: its yaw rate, and zeros for the rest. (..., 8)"""
+    """Return the default feedforward of a setpoint: its yaw rate, and zeros for the rest. (..., 8)"""
     if isinstance(command, np.ndarray):
         feedforward = np.zeros((*command.shape[:-1], 8), command.dtype)
         feedforward[..., 6] = command[..., 15]
@@ -226,7 +227,7 @@ def time(data: SimData) -> Array:
 def controllable(data: SimData) -> Array:
     """Return True in worlds where a staged command takes effect at the next step. (n_worlds, 1)"""
     mode = data.controls.mode
-    mask = None if mode == Control.rotor_vel else acts_now(data, getattr(data.controls, mode.value).freq)
+    mask = None if mode == Control.rotor_vel else is_tick(data, getattr(data.controls, mode.value).freq)
     return jnp.ones_like(data.core.steps, bool) if mask is None else mask
 
 
@@ -249,7 +250,7 @@ def check_command(data: SimData, control: Control, command: ArrayLike, check_fin
 def _as_command(
     data: SimData, name: str, shape: tuple[int, ...], fields: str, command: ArrayLike, check_finite: bool
 ) -> Array | NDArray:
-    """Return a command of the given shape as an array of the state's dtype; see ``check_command``."""
+    """Return a command as an array of the state's dtype, after checking shape, type and values."""
     is_on_host = not isinstance(command, jax.Array)
     try:
         array = np.asarray(command) if is_on_host else command

@@ -111,7 +111,7 @@ def advance_record(record: R, rates: Mapping[str, Array], dt: float) -> R:
 def limit_ang_vel(ang_vel: Array, freq: float) -> Array:
     """Return angular velocities, rad/s, limited to ``MAX_ROTATION`` per step about each body axis. (..., 3)"""
     limit = MAX_ROTATION * freq
-    return rotation.safe_clip(ang_vel, -limit, limit)
+    return rotation.clip(ang_vel, -limit, limit)
 
 
 INTEGRATORS: dict[Integrator, Callable[..., SimData]] = {

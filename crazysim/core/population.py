@@ -22,7 +22,7 @@ from crazysim.core.influence import plugin_rates
 from crazysim.core.integration import Integrator, advance_record
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.settings import dividing_rate
-from crazysim.core.stage import RESERVED_SCOPES, Stage, acts_now
+from crazysim.core.stage import RESERVED_SCOPES, Stage, is_tick
 from crazysim.errors import ConfigError
 from crazysim.pytree import Members, PyTree, float_dtype
 
@@ -148,7 +148,7 @@ class Population(Plugin):
         cls, placements = type(self), []
         if cls.control is not Population.control:
             control_freq = self.control_freq
-            condition = None if control_freq is None else functools.partial(acts_now, freq=control_freq)
+            condition = None if control_freq is None else functools.partial(is_tick, freq=control_freq)
             name = f"{self.name}_control"
             placements.append(StagePlacement(Stage(self._run_controller, self.name, condition, name=name), name=name))
         if cls.derivative is not Population.derivative:

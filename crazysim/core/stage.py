@@ -138,7 +138,7 @@ def stage(
     return lambda fn: Stage(fn, scope, when, phase=phase)
 
 
-def acts_now(data: SimData, freq: int) -> Array | None:
+def is_tick(data: SimData, freq: int) -> Array | None:
     """Return True in worlds in which a stage with a rate, Hz, acts at this step; None if it acts at every step.
 
     Returns:

@@ -17,7 +17,7 @@ from crazysim.core.data import SimData, SimState, SimStateDeriv, controls_of
 from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integrator
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
-from crazysim.core.stage import Stage, StageScope, acts_now
+from crazysim.core.stage import Stage, StageScope, is_tick
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.pytree import Members, has_members, n_batch_axes, scopes, select_worlds
 
@@ -32,7 +32,7 @@ def _built_in_stage(scope: StageScope, when: Callable[[SimData], Array | None] |
 
 def _rate_condition(controller: str) -> Callable[[SimData], Array | None]:
     """Return the condition under which a controller acts: at its own rate."""
-    return lambda data: acts_now(data, getattr(data.controls, controller).freq)
+    return lambda data: is_tick(data, getattr(data.controls, controller).freq)
 
 
 def build_step_pipeline(

@@ -19,7 +19,7 @@ from crazysim.dynamics.rotor import (
     rotor_torque,
     rotor_vel_of_thrust,
 )
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import along_z
 
@@ -144,10 +144,10 @@ def saturate(cmd: Array, params: Params) -> Array:
     Returns:
         Rotor speeds, rpm. (..., n_rotors)
     """
-    return jnp.where(cmd <= 0, 0.0, rotation.safe_clip(cmd, params.rotor_vel_min, params.rotor_vel_max))
+    return jnp.where(cmd <= 0, 0.0, rotation.clip(cmd, params.rotor_vel_min, params.rotor_vel_max))
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def hover_rotor_vel(params: Params) -> Array:
     """Return the rotor speeds of hover, equal thrust on every rotor, rpm. (..., n_rotors)"""
     n_rotors = params.mixing_matrix.shape[-1]

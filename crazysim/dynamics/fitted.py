@@ -144,7 +144,7 @@ def dynamics(
 def saturate(cmd: Array, params: Params) -> Array:
     """Return the attitude command with its thrust within the limits of the rotors; zero or less is off. (..., 4)"""
     thrust = cmd[..., 3:4]
-    clipped_thrust = jnp.where(thrust <= 0, 0.0, rotation.safe_clip(thrust, params.thrust_min, params.thrust_max))
+    clipped_thrust = jnp.where(thrust <= 0, 0.0, rotation.clip(thrust, params.thrust_min, params.thrust_max))
     return jnp.concatenate([cmd[..., :3], clipped_thrust], axis=-1)
 
 

@@ -16,7 +16,7 @@ from crazysim.dynamics import first_principles, fitted
 from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
-from crazysim.rotation import safe_clip
+from crazysim.rotation import clip
 
 MAX_TILT = np.pi / 4
 """Largest roll and pitch of an action, rad."""
@@ -70,7 +70,7 @@ class Actions:
         """Return the command of an action, in the units of the command level. (..., k) -> (..., n)"""
         dtype = action.dtype
         centre, scale = jnp.asarray(self.centre, dtype), jnp.asarray(self.scale, dtype)
-        command = centre + scale * safe_clip(action, -1.0, 1.0)
+        command = centre + scale * clip(action, -1.0, 1.0)
         if self.control != Control.state:
             return command
         zero_fields = jnp.zeros((*command.shape[:-1], 13), dtype).at[..., 9].set(1.0)

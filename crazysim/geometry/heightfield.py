@@ -16,7 +16,7 @@ from crazysim.geometry.points import maximum, triangles_distance
 from crazysim.geometry.segments import segment_to_box
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.vector import Vector, to_vector
-from crazysim.rotation import safe_clip, safe_sqrt
+from crazysim.rotation import clip, safe_sqrt
 
 OUTSIDE_DISTANCE = 1e3
 """Distance assigned to points beyond the border of a field, m: too large for a contact, but finite for solvers."""
@@ -44,7 +44,7 @@ def field_distance(shape: Shape, point: Array, radius: float = 0.0) -> Array:
     grid = nearby_corners(shape, position, radius)
     surface = triangles_distance(position, *triangles(grid))
     # The walls and the bottom can be nearer than the surface.
-    qx, qy = safe_clip(position.x, -x_half, x_half), safe_clip(position.y, -y_half, y_half)
+    qx, qy = clip(position.x, -x_half, x_half), clip(position.y, -y_half, y_half)
     is_below = position.z < height_at(shape, lax.stop_gradient(qx), lax.stop_gradient(qy))
     dx, dy, dz = position.x - qx, position.y - qy, maximum(-base - position.z, 0.0)
     border_distance = safe_sqrt(dx * dx + dy * dy + dz * dz)
@@ -166,8 +166,8 @@ def surface_at(heights: Array, half: Array, point: Array) -> tuple[Array, Array,
     x, y = point[..., 0], point[..., 1]
     is_on_field = (jnp.abs(x) <= half[0]) & (jnp.abs(y) <= half[1])
     side_x, side_y = 2 * half[0] / (n_columns - 1), 2 * half[1] / (n_rows - 1)
-    cell_x = safe_clip((x + half[0]) / side_x, 0.0, float(n_columns - 1))
-    cell_y = safe_clip((y + half[1]) / side_y, 0.0, float(n_rows - 1))
+    cell_x = clip((x + half[0]) / side_x, 0.0, float(n_columns - 1))
+    cell_y = clip((y + half[1]) / side_y, 0.0, float(n_rows - 1))
     u, v, rise_x, rise_y, origin = triangle_at(heights, cell_x, cell_y)
     slope_x, slope_y = rise_x / side_x, rise_y / side_y
     normal_z = 1 / jnp.sqrt(1 + slope_x * slope_x + slope_y * slope_y)

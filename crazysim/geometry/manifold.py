@@ -62,7 +62,7 @@ def ball_box_contacts(radius: Array, pos: Array, size: Array, pos_box: Array, ro
         rot_box: Rotation matrix from its frame to the world. (3, 3)
     """
     centre = matvec(rot_box.T, pos - pos_box)
-    nearest = rotation.safe_clip(centre, -size, size)
+    nearest = rotation.clip(centre, -size, size)
     offset = centre - nearest
     distance = rotation.safe_norm(offset)
     # A centre inside the box leaves through the nearest face.
@@ -203,8 +203,8 @@ def _edge_contact(
     offset_pq = p - q
     c, d, e = (jnp.sum(x * y) for x, y in ((u, v), (u, offset_pq), (v, offset_pq)))
     det = jnp.maximum(1 - c * c, MIN_EDGE_SINE**2)
-    s = rotation.safe_clip((c * e - d) / det, -half_p, half_p)
-    t = rotation.safe_clip((e - c * d) / det, -half_q, half_q)
+    s = rotation.clip((c * e - d) / det, -half_p, half_p)
+    t = rotation.clip((e - c * d) / det, -half_q, half_q)
     point_a, point_b = p + s * u, q + t * v
     return jnp.sum((point_a - point_b) * normal), normal, 0.5 * (point_a + point_b)
 

@@ -13,7 +13,7 @@ from jax import Array, lax
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.triangle import closest_point, from_barycentric
 from crazysim.geometry.vector import Vector, to_vector
-from crazysim.rotation import safe_clip, safe_sqrt
+from crazysim.rotation import clip, safe_sqrt
 
 ELLIPSOID_STEPS = 12
 """Newton steps for the nearest point of an ellipsoid. The error is 3e-6 of its size for a ratio of semi-axes of 1,000,
@@ -51,7 +51,7 @@ def _sphere(shape: Shape, point: Array) -> Array:
 def _capsule(shape: Shape, point: Array) -> Array:
     radius, half = shape.size
     x, y, z = components(point)
-    outside_z = z - safe_clip(z, -half, half)
+    outside_z = z - clip(z, -half, half)
     return safe_sqrt(x * x + y * y + outside_z * outside_z) - radius
 
 

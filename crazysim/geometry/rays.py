@@ -11,7 +11,7 @@ from jax import Array
 from crazysim.geometry.fieldrays import MIN_COMPONENT, field_ray
 from crazysim.geometry.points import Components, components
 from crazysim.geometry.shapes import Shape
-from crazysim.rotation import safe_clip, safe_normalize, safe_sqrt
+from crazysim.rotation import clip, safe_normalize, safe_sqrt
 
 Interval = tuple[Array, Array, Array]
 """Distances along a line at which it enters and leaves a convex shape, and True where it meets the shape at all."""
@@ -218,7 +218,7 @@ def _sphere_normal(_: Shape | SizedShapes, point: Array) -> Array:
 def _capsule_normal(shape: Shape | SizedShapes, point: Array) -> Array:
     x, y, z = components(point)
     half = shape.size[1]
-    return safe_normalize(jnp.stack([x, y, z - safe_clip(z, -half, half)], axis=-1), _z_axis(point))
+    return safe_normalize(jnp.stack([x, y, z - clip(z, -half, half)], axis=-1), _z_axis(point))
 
 
 def _box_normal(shape: Shape | SizedShapes, point: Array) -> Array:

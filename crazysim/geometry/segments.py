@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from crazysim.geometry.points import Components, magnitude, maximum
-from crazysim.rotation import safe_clip, safe_sqrt
+from crazysim.rotation import clip, safe_sqrt
 
 MIN_SQUARED_SINE = 1e-12
 """Square of a sine below which two directions count as parallel."""
@@ -27,9 +27,9 @@ def segment_to_segment(middle: Components, axis: Components, half: float, other_
     (cx, cy, cz), (x, y, z) = map(_stop_gradient, (middle, axis))
     squared_sine = x * x + y * y
     s = -(cx * x + cy * y) / jnp.where(squared_sine > MIN_SQUARED_SINE, squared_sine, 1.0)
-    s = safe_clip(jnp.where(squared_sine > MIN_SQUARED_SINE, s, 0.0), -half, half)
-    t = safe_clip(cz + s * z, -other_half, other_half)
-    s = safe_clip(t * z - (cx * x + cy * y + cz * z), -half, half)
+    s = clip(jnp.where(squared_sine > MIN_SQUARED_SINE, s, 0.0), -half, half)
+    t = clip(cz + s * z, -other_half, other_half)
+    s = clip(t * z - (cx * x + cy * y + cz * z), -half, half)
     # Moving the nearest points along the segments does not change the distance to first order, so they are held fixed.
     x, y, z = (c + s * a for c, a in zip(middle, axis, strict=True))
     return safe_sqrt(x * x + y * y + (z - t) ** 2)

@@ -17,7 +17,7 @@ from crazysim.core.functional import stage_command
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
-from crazysim.core.stages import acts_now
+from crazysim.core.stages import is_tick
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.trajectories.trajectory import Trajectory
@@ -121,7 +121,7 @@ class Follow(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        stage_at_ticks = stage("drone", when=lambda data: acts_now(data, data.controls.state.freq))
+        stage_at_ticks = stage("drone", when=lambda data: is_tick(data, data.controls.state.freq))
         return [StagePlacement(stage_at_ticks(self.stage_setpoint), before="state_controller")]
 
     def stage_setpoint(self, data: SimData) -> SimData:

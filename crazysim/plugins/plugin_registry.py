@@ -21,7 +21,7 @@ from crazysim.core.plugin import Plugin, Simulation, StagePlacement, with_measur
 from crazysim.core.population import Population
 from crazysim.core.settings import collect_settings
 from crazysim.core.stage import Axes, Stage, is_first_step, vmap_drones, vmap_worlds
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.pytree import PyTree, n_batch_axes
@@ -219,7 +219,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         plugins = tuple(self.values())
         is_changed = [*map(id, plugins)] != [*map(id, self._observe_fn[0])]
         if is_changed:
-            self._observe_fn = plugins, jit_unless_traced("measured")(functools.partial(_observations, plugins))
+            self._observe_fn = plugins, jit_eager_calls("measured")(functools.partial(_observations, plugins))
         with keep_programs(enabled=is_changed):
             return self._observe_fn[1](data, measured=measured)
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import mujoco
 from jax import Array
 
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.errors import UnknownNameError
 from crazysim.scene import mjx
 
@@ -23,7 +23,7 @@ def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) 
     return _slot_flags(contact.dist, contact.geom1, contact.geom2, belongs_to_body)
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def _slot_flags(dist: Array, geom1: Array, geom2: Array, belongs_to_body: Array) -> Array:
     """Return True for every slot that touches and has a geom where ``belongs_to_body``. (n_worlds, n_slots)"""
     belongs_to_body = jnp.asarray(belongs_to_body)

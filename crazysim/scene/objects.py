@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import Objects, SimData
 from crazysim.core.settings import as_mask, check_flag, positive_integer
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import device_array, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
@@ -108,7 +108,7 @@ class Handle:
         return _replace_rows(old, value, mask, self.rows, field == "quat")
 
 
-@jit_unless_traced("row_indices", "is_quat")
+@jit_eager_calls("row_indices", "is_quat")
 def _replace_rows(
     old: Array, value: Array | NDArray, mask: Array | None, row_indices: tuple[int, ...], is_quat: bool
 ) -> Array:
@@ -129,7 +129,7 @@ def _replace_rows(
     return select_worlds(mask, replaced, old)
 
 
-@jit_unless_traced("row_indices")
+@jit_eager_calls("row_indices")
 def _select_rows(poses: Array, row_indices: tuple[int, ...]) -> Array:
     """Return positions or attitudes of some objects. (n, k), or (n_worlds, n, k) for all worlds"""
     return (poses if poses.ndim == 2 else poses[:, 0])[..., np.array(row_indices), :]

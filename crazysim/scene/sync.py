@@ -10,7 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import SimData
-from crazysim.eager import fetch_rows, jit_unless_traced
+from crazysim.eager import fetch_rows, jit_eager_calls
 from crazysim.scene import mjx
 from crazysim.scene.kinematics import N_DUMMY_JOINTS, update_kinematics
 
@@ -60,7 +60,7 @@ def _poses(data: SimData) -> list[tuple[Array, Array, Array]]:
     return poses
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def _drop_drone_axis(pos: Array, quat: Array) -> tuple[Array, Array]:
     """Return poses of objects without the axis of drones. (n_worlds, n, k)"""
     return pos[:, 0], quat[:, 0]
@@ -81,7 +81,7 @@ def _model_with_mocap_poses(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
     )
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """Return poses of bodies and joints in some worlds, with the poses of drones and handles from the data.
 

@@ -19,7 +19,7 @@ from crazysim.core import functional as F
 from crazysim.core.data import command_shape
 from crazysim.core.plugin import Simulation
 from crazysim.core.population import Population
-from crazysim.eager import is_on_host, jit_unless_traced
+from crazysim.eager import is_on_host, jit_eager_calls
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.plugins.plugin_registry import PluginRegistry
 from crazysim.pytree import PyTree
@@ -157,12 +157,12 @@ def _replace_row(x: Array, index: int, value: ArrayLike) -> Array | NDArray:
     return _replace_row_on_device(x, index, value)
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def _read_row_on_device(x: Array, index: Array | int) -> Array:
     return x[:, index]
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def _replace_row_on_device(x: Array, index: Array | int, value: ArrayLike) -> Array:
     return x.at[:, index].set(value)
 

@@ -215,7 +215,7 @@ class MPPI:
         shape = (n_worlds, self.samples, *plan.shape[1:])
         noise = jax.random.normal(key, shape, plan.dtype) * jnp.asarray(self.noise, plan.dtype)
         noise = noise.at[:, 0].set(0.0)  # the plan itself is a sample
-        knots = rotation.safe_clip(plan[:, None] + noise, jnp.asarray(self.low), jnp.asarray(self.high))
+        knots = rotation.clip(plan[:, None] + noise, jnp.asarray(self.low), jnp.asarray(self.high))
 
         setpoints = jax.tree.map(lambda x: jnp.broadcast_to(x, (n_worlds, n_drones, x.shape[-1])), setpoint)
         record = RolloutRecord(

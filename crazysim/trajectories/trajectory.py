@@ -14,7 +14,7 @@ from jax import Array, lax
 from numpy.typing import ArrayLike
 
 from crazysim.control.setpoint import Setpoint
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, float_dtype, leaf
 from crazysim.trajectories.interpolation import unit_coefficients
@@ -91,7 +91,7 @@ class Trajectory(PyTree):
         """Time from the start to the end, s. (...)"""
         return self.ends[..., -1]
 
-    @jit_unless_traced()
+    @jit_eager_calls()
     def evaluate(self, t: ArrayLike) -> Setpoint:
         """Return the setpoint of one trajectory at one time, with derivatives up to snap.
 

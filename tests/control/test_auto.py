@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, unit_quats, vectors, with_states
+from cases import build_stagewise_step, unit_quats, vectors, with_states
 from hypothesis import example, given
 from scipy.spatial.transform import Rotation
 
@@ -314,7 +314,7 @@ def test_gradients_equal_central_differences(level, rng):
     """Of the height, place and attitude after 20 ms by state, command and estimates, in float64, in free flight."""
     sim = Sim(control=level, controller="auto", engine="plain")
     command = getattr(F, f"{level}_control")
-    step, s = by_stages(sim), sim.data.states
+    step, s = build_stagewise_step(sim), sim.data.states
     rotor_vel = first_principles.hover_rotor_vel(sim.data.params)
     wanted = {"state": [*rng.normal(size=9), 0, 0, 0.3, 0.9, 0, 0, 0.2], "attitude": [0.2, -0.1, 0.3, 0.5]}
     wanted["body_rate"] = wanted["attitude"]

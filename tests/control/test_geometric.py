@@ -128,7 +128,7 @@ def test_drag_is_compensated():
 
 
 def thrusts_of(wrench, p):
-    return np.asarray(p.allocation_matrix) @ np.concatenate([wrench[:1], wrench[1:] / np.asarray(p.arms)])
+    return np.asarray(p.allocation_matrix) @ np.concatenate([wrench[:1], wrench[1:] / np.asarray(p.torque_arms)])
 
 
 priority = jax.jit(prioritized_wrench)

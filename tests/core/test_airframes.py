@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, with_states
+from cases import build_stagewise_step, with_states
 from sweep import FLEET, HEXAROTOR
 
 import crazysim as cs
@@ -131,7 +131,7 @@ def test_gradients_of_a_mixed_fleet_are_finite(control, controller, engine):
     """Law 7: missing rotors are no division by zero, and nothing depends on them; in stages, and in an engine."""
     settings = {"control": control, "controller": controller, "engine": engine or "plain"}
     sim = in_flight(Sim(1, drone=FLEET, **settings), positions(1, 4))
-    step = sim.step_fn if engine else by_stages(sim)
+    step = sim.step_fn if engine else build_stagewise_step(sim)
 
     def height(command):
         data = getattr(cs.functional, f"{control}_control")(sim.data, command)

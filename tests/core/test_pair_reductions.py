@@ -54,7 +54,7 @@ def random_positions(n_worlds, n_drones, seed=0):
 
 
 @stage("drone")
-def move(data):
+def move_by_force(data):
     """Move a drone of 40 g by the force on it: rotors and attitude do not matter here."""
     states = data.states
     vel = states.vel + 0.05 * states.force
@@ -62,14 +62,14 @@ def move(data):
 
 
 def make_crowd_sim(n_worlds, n_drones, *plugins):
-    """Return a simulation whose only stages are ``crowd``, ``move`` and the stages of plugins."""
+    """Return a simulation whose only stages are ``crowd``, ``move_by_force`` and the stages of plugins."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel")
     sim.data = with_states(sim.data, pos=random_positions(n_worlds, n_drones), rotor_vel=15000.0)
     physics = set(sim.step_pipeline) - {"increment_steps"}
     for plugin in plugins:
         sim.add(plugin)
     own = {name: fn for name, fn in sim.step_pipeline.items() if name not in physics}
-    sim.step_pipeline = {"crowd": crowd, "move": move, **own}
+    sim.step_pipeline = {"crowd": crowd, "move": move_by_force, **own}
     return sim
 
 

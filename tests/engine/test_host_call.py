@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import as_numbers, needs_compiler, trees_equal
+from cases import leaf_on_host, needs_compiler, trees_equal
 
 from crazysim import Cars, Downwash, Sim
 from crazysim.core.sharding import world_mesh
@@ -117,7 +117,7 @@ def test_a_non_finite_drone_flags_its_world_alone(sim):
 
 def test_what_is_read_late_is_what_it_was(sim):
     """A record makes its fields when they are read; later steps and commands do not change them."""
-    expected = [np.array(as_numbers(x)) for x in jax.tree.leaves(step_on_xla(sim, 3))]
+    expected = [np.array(leaf_on_host(x)) for x in jax.tree.leaves(step_on_xla(sim, 3))]
     sim.step(3)
     unread, half = sim.data, sim.data.states
     pos = half.pos
@@ -126,7 +126,7 @@ def test_what_is_read_late_is_what_it_was(sim):
         sim.step(3)
         assert not np.array_equal(sim.data.states.pos, pos)
     for x, y in zip(jax.tree.leaves(unread), expected, strict=True):
-        np.testing.assert_array_equal(as_numbers(x), y)
+        np.testing.assert_array_equal(leaf_on_host(x), y)
     assert unread.states is half
     assert half.pos is pos
 

@@ -6,7 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import COMPILED_ENGINES, by_stages, hover_command, repeat_command, send, shared_sim, with_params, with_states
+from cases import (
+    COMPILED_ENGINES,
+    build_stagewise_step,
+    hover_command,
+    repeat_command,
+    send,
+    shared_sim,
+    with_params,
+    with_states,
+)
 
 from crazysim import ConfigError, Sim
 from crazysim.control import Control, command_size
@@ -292,7 +301,7 @@ def test_gradients_equal_those_of_the_stages_in_float64(x64):
         jax.jit(derivative(functools.partial(loss, step, data=data, n=40)))(command)
         for step, derivative in (
             (Step(sim.step_pipeline, COMPILED_ENGINES[-1]), jax.grad),
-            (by_stages(sim), jax.jacfwd),
+            (build_stagewise_step(sim), jax.jacfwd),
         )
     )
     assert_gradients_equal(found, expected)
@@ -313,7 +322,8 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
 
     at = 1e-4 * at[0], at[1]
     unfused, fast = (
-        functools.partial(energy, step) for step in (by_stages(sim), Step(sim.step_pipeline, COMPILED_ENGINES[-1]))
+        functools.partial(energy, step)
+        for step in (build_stagewise_step(sim), Step(sim.step_pipeline, COMPILED_ENGINES[-1]))
     )
     expected = jax.jit(jax.jacfwd(unfused, (0, 1)))(*at)
     assert abs(float(expected[1][0, 1])) > 0

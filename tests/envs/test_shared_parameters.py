@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, with_params
+from cases import build_stagewise_step, with_params
 
 import crazysim.envs as envs
 from crazysim import ConfigError, SlungLoad
@@ -64,7 +64,7 @@ def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_val
     auto, sim, n = envs.AutoReset(env), env.sim, env.n_substeps
     key = jax.random.key(0)
     start, start_state, before = env.reset(key), auto.reset(key), sim.data
-    plain = jax.jit(by_stages(sim), static_argnums=1)
+    plain = jax.jit(build_stagewise_step(sim), static_argnums=1)
     step = sim.step_fn
     paths = {
         "env.step": jax.jit(env.step),
@@ -133,7 +133,7 @@ def test_an_environment_refuses_to_begin_episodes_after_its_default_data_was_rep
 def test_gradients_of_an_environment_step_by_parameters_that_are_zero():
     """Derivatives of velocities by gravity, and of rates by the inverse inertia, are those of the stages."""
     env = make_env("rotor_vel")
-    auto, stages = envs.AutoReset(env), by_stages(env.sim)
+    auto, stages = envs.AutoReset(env), build_stagewise_step(env.sim)
     start = env.reset(jax.random.key(0))
     action = 0.3 * jnp.ones_like(start.action).at[..., 0].set(0.2)
     parameters = {name: getattr(start.data.params, name) for name in ("gravity_vec", "J_inv")}

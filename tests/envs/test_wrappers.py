@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import as_numbers, trees_equal
+from cases import leaf_on_host, trees_equal
 from env_cases import random_action, select_state, set_last_step
 
 from crazysim import ConfigError
@@ -37,7 +37,7 @@ def env():
 def assert_same_world(a, b):
     """Compare states of a world by two programs, with and without a wrapper, up to the rounding of a few steps."""
     assert jax.tree.structure(a) == jax.tree.structure(b)
-    for x, y in zip(*(jax.tree.leaves(jax.tree.map(as_numbers, tree)) for tree in (a, b)), strict=True):
+    for x, y in zip(*(jax.tree.leaves(jax.tree.map(leaf_on_host, tree)) for tree in (a, b)), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)
 
 

@@ -10,10 +10,10 @@ from cases import (
     FITTED,
     INTEGRATORS,
     PAIRS,
-    as_numbers,
     hover_command,
     hover_rotor_state,
     hover_thrust,
+    leaf_on_host,
     repeat_command,
     send,
     shared_sim,
@@ -301,7 +301,7 @@ def used_data():
 
 
 def named_leaves(data):
-    return {jax.tree_util.keystr(k): as_numbers(v) for k, v in jax.tree_util.tree_leaves_with_path(data)}
+    return {jax.tree_util.keystr(k): leaf_on_host(v) for k, v in jax.tree_util.tree_leaves_with_path(data)}
 
 
 def test_fault_16_a_full_reset_is_that_of_all_worlds_and_of_what_they_share(used_data):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages
+from cases import build_stagewise_step
 
 from crazysim import Sim, load_airframe
 from crazysim.core import functional as F
@@ -35,7 +35,7 @@ def make_losses(dynamics, control, engine, n_worlds, n_steps=100):
     The loss has one number per world, (n_worlds,). The quaternion is normalised first.
     """
     sim = Sim(n_worlds, dynamics=dynamics, control=control, engine="plain" if engine == "stages" else engine)
-    step = by_stages(sim) if engine == "stages" else sim.build_step_fn()
+    step = build_stagewise_step(sim) if engine == "stages" else sim.build_step_fn()
     n = sim.data.states.rotor_vel.shape[-1]
     hover = 15_864.0 if dynamics == "first_principles" else WEIGHT
     start = {
@@ -161,7 +161,7 @@ def test_at_saturation_the_gradient_is_one_side(limit_name, x64):
 def test_on_the_floor_and_at_rest_gradients_are_finite():
     """The drones rest, hit the floor, hover, and fall with their motors off."""
     sim = Sim(n_worlds=4, control="attitude")
-    step = by_stages(sim)
+    step = build_stagewise_step(sim)
 
     def loss(x):
         pos, vel, thrust = x

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, hover_command, repeat_command, trees_equal, with_states
+from cases import build_stagewise_step, hover_command, repeat_command, trees_equal, with_states
 
 from crazysim import Sim, dynamics
 from crazysim.core import functional as F
@@ -122,7 +122,7 @@ def test_vmap_over_commands_is_a_loop(start):
 def test_grad_is_finite_and_points_up(start):
     """Law 3: the thrust command of a drone lifts only that drone; the stages run without an engine."""
     sim, data, _, _, commands = start
-    step = by_stages(sim)
+    step = build_stagewise_step(sim)
 
     def height(command):
         return step(F.attitude_control(data, command), 10).states.vel[1, 0, 2]

@@ -11,7 +11,7 @@ import pytest
 from cases import (
     INTEGRATORS,
     PAIRS,
-    by_stages,
+    build_stagewise_step,
     hover_command,
     hover_rotor_state,
     send,
@@ -105,7 +105,7 @@ def make_situations(dynamics, control, engine="auto"):
 def make_flight(dynamics, control, engine):
     """Return a compiled flight: gradients of positions and velocities at its end, and the data there."""
     sim = make_situations(dynamics, control, engine)[0]
-    step = by_stages(sim) if engine == "stages" else sim.build_step_fn()
+    step = build_stagewise_step(sim) if engine == "stages" else sim.build_step_fn()
 
     @jax.jit
     @functools.partial(jax.grad, has_aux=True)

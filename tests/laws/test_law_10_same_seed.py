@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import as_numbers
+from cases import leaf_on_host
 
 from crazysim import Sim
 from crazysim.core.pipeline import append_fn
@@ -87,21 +87,21 @@ def test_the_seed_of_construction_and_of_seed_are_one(four):
 def test_resets_and_steps_leave_the_seeds_key(four):
     """Stages of the batch may split the key. A reset that changed it would make worlds depend on each other."""
     masses_after_resets(four, None, [True, False, False, True])
-    np.testing.assert_array_equal(as_numbers(four.data.core.rng_key), as_numbers(jax.random.key(7)))
+    np.testing.assert_array_equal(leaf_on_host(four.data.core.rng_key), leaf_on_host(jax.random.key(7)))
     four.step(2)
-    np.testing.assert_array_equal(as_numbers(four.data.core.rng_key), as_numbers(jax.random.key(7)))
+    np.testing.assert_array_equal(leaf_on_host(four.data.core.rng_key), leaf_on_host(jax.random.key(7)))
 
 
 def test_seed_survives_new_data(four):
     four.seed(11)
     before = four.data
     four.build_data()
-    np.testing.assert_array_equal(as_numbers(four.data.core.rng_key), as_numbers(jax.random.key(11)))
+    np.testing.assert_array_equal(leaf_on_host(four.data.core.rng_key), leaf_on_host(jax.random.key(11)))
     four.data = before
 
 
 def key_numbers(data, name="wind"):
-    return as_numbers(world_keys(data, name)), as_numbers(drone_keys(data, name))
+    return leaf_on_host(world_keys(data, name)), leaf_on_host(drone_keys(data, name))
 
 
 def test_keys_differ_by_world_drone_stage_name_and_step(four):

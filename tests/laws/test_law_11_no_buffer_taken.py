@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import as_numbers, hover_command, repeat_command
+from cases import hover_command, leaf_on_host, repeat_command
 
 from crazysim import Sim
 from crazysim.core import functional as F
@@ -17,7 +17,7 @@ def sim():
 
 def snapshot(tree):
     """Return host copies of all leaves, which no device can change any more."""
-    return [np.array(as_numbers(x)) for x in jax.tree.leaves(tree)]
+    return [np.array(leaf_on_host(x)) for x in jax.tree.leaves(tree)]
 
 
 def assert_unchanged(tree, before):
@@ -25,7 +25,7 @@ def assert_unchanged(tree, before):
     assert len(leaves) == len(before) > 20
     for x, kept in zip(leaves, before, strict=True):
         assert not x.is_deleted()
-        np.testing.assert_array_equal(as_numbers(x), kept)
+        np.testing.assert_array_equal(leaf_on_host(x), kept)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, with_states
+from cases import build_stagewise_step, with_states
 
 from crazysim import ConfigError, Sim
 from crazysim.plugins.follow import Follow
@@ -189,7 +189,7 @@ def test_settings_change_without_compiling():
 def test_trajectories_have_gradients_through_the_step():
     sim = build(n_worlds=1, n_drones=1)
     plugin = sim.add(Follow(UP))
-    step = by_stages(sim)
+    step = build_stagewise_step(sim)
 
     @jax.jit
     @jax.value_and_grad

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import INTEGRATORS, PAIRS, by_stages, hover_command, hover_rotor_state
+from cases import INTEGRATORS, PAIRS, build_stagewise_step, hover_command, hover_rotor_state
 
 from crazysim import Battery, Downwash, Sim
 from crazysim.core import functional as F
@@ -68,7 +68,7 @@ def on_host(data):
 def compare(sim, step, data):
     """Compare the exported step with the reference, drone by drone, each field to 1e-12 of its size."""
     data = F.stage_command(data, F.staged_leaves(data)[0])
-    after = on_host(jax.jit(by_stages(sim), static_argnums=1)(data, 1))
+    after = on_host(jax.jit(build_stagewise_step(sim), static_argnums=1)(data, 1))
     for world in range(sim.n_worlds):
         for drone in range(sim.n_drones):
             index = world, drone
@@ -103,7 +103,7 @@ def test_the_exported_step_is_the_step(dynamics, control, integrator):
 def test_the_jacobian_is_that_of_jax(dynamics, control, integrator):
     """By x and u, at a state where nothing switches."""
     sim = Sim(dynamics=dynamics, control=control, integrator=integrator)
-    exported, step = to_casadi(sim), by_stages(sim)
+    exported, step = to_casadi(sim), build_stagewise_step(sim)
     rng = np.random.default_rng(1)
     start = exported.x.of(sim.data)
     x = start + 0.05 * rng.normal(size=len(exported.x))

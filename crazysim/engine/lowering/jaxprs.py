@@ -25,10 +25,10 @@ from crazysim.engine.ir.algebra import known_zero
 from crazysim.engine.ir.blocks import Block, Builder, Element, Value, constant
 from crazysim.jaxcompat import ClosedJaxpr, Literal, is_key
 
-Elements = np.ndarray
+ElementArray = np.ndarray
 """An array of elements, of type object. A random key is a pair of elements."""
 
-Rule = Callable[["Lowering", Any, list[Elements]], Sequence[Elements]]
+Rule = Callable[["Lowering", Any, list[ElementArray]], Sequence[ElementArray]]
 """Function from the lowering, an equation and its operands to its results."""
 RULES: dict[str, Rule] = {}
 """Rules by the name of the primitive."""
@@ -79,15 +79,15 @@ class Lowering:
         self.shared: set[Value] = set()
         """Inputs that are the same for all drones."""
 
-    def lower(self, jaxpr: ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
+    def lower(self, jaxpr: ClosedJaxpr, args: Sequence[ElementArray]) -> list[ElementArray]:
         """Return the results of a jaxpr for arrays of elements.
 
         Raises:
             UnsupportedError: If it has a primitive without a rule.
         """
-        env: dict[Any, Elements] = {}
+        env: dict[Any, ElementArray] = {}
 
-        def read(v: Any) -> Elements:
+        def read(v: Any) -> ElementArray:
             return constants(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
 
         inner = jaxpr.jaxpr
@@ -98,7 +98,7 @@ class Lowering:
             env.update(zip(eqn.outvars, outs, strict=True))
         return [read(v) for v in inner.outvars]
 
-    def lower_eqn(self, eqn: Any, args: list[Elements]) -> Sequence[Elements]:
+    def lower_eqn(self, eqn: Any, args: list[ElementArray]) -> Sequence[ElementArray]:
         """Return the results of one equation of a jaxpr."""
         name = eqn.primitive.name
         if name not in RULES:
@@ -109,7 +109,7 @@ class Lowering:
         except UnsupportedError as error:
             raise error.with_location(name) from None
 
-    def elementwise(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
+    def elementwise(self, op: str, args: Sequence[ElementArray], dtype: Any, params: tuple = ()) -> ElementArray:
         """Return the results of an operation on every element; operands are broadcast."""
         shapes = {x.shape for x in args}
         shape = args[0].shape if len(shapes) == 1 else np.broadcast_shapes(*shapes)
@@ -144,7 +144,7 @@ class Lowering:
         self.entries[number] = TableEntry(table, base, offset, aligned)
         return number
 
-    def finish(self, outputs: Sequence[Elements]) -> Block:
+    def finish(self, outputs: Sequence[ElementArray]) -> Block:
         """Return the block, with these outputs."""
         return self.builder.finish(scalars(*outputs))
 
@@ -162,7 +162,7 @@ class TableRows:
         self._size = int(aval.shape[1])
         self._table = builder.input(aval.dtype, self._size)
 
-    def row(self, ctx: Lowering, index: Element, sizes: Sequence[int]) -> Elements:
+    def row(self, ctx: Lowering, index: Element, sizes: Sequence[int]) -> ElementArray:
         """Return the row at an index, which must be in range. (1, row_size)"""
         if tuple(sizes) != (1, self._size):
             raise UnsupportedError(f"a part of shape {tuple(sizes)} of a table; only whole rows are read")
@@ -171,7 +171,7 @@ class TableRows:
         return as_elements(numbers, (1, self._size))
 
 
-def as_elements(items: Sequence[Element], shape: tuple[int, ...]) -> Elements:
+def as_elements(items: Sequence[Element], shape: tuple[int, ...]) -> ElementArray:
     """Return a flat sequence of elements as an array. NumPy must not convert them."""
     out = np.empty(len(items), dtype=object)
     for i, item in enumerate(items):
@@ -179,13 +179,13 @@ def as_elements(items: Sequence[Element], shape: tuple[int, ...]) -> Elements:
     return out.reshape(shape)
 
 
-def scalars(*arrays: Elements) -> list[Element]:
+def scalars(*arrays: ElementArray) -> list[Element]:
     """Return the single elements of arrays, one after the other; a random key is two 32-bit integers."""
     items = [x for array in arrays for x in np.asarray(array, object).reshape(-1)]
     return [half for x in items for half in (x if isinstance(x, tuple) else (x,))]
 
 
-def constants(x: Any, dtype: Any) -> Elements:
+def constants(x: Any, dtype: Any) -> ElementArray:
     """Return an array of numbers, or of random keys, as elements."""
     if jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key):
         halves = np.asarray(jax.random.key_data(x)).reshape(-1, 2)
@@ -194,7 +194,7 @@ def constants(x: Any, dtype: Any) -> Elements:
     return as_elements([constant(item, dtype) for item in array.reshape(-1)], array.shape)
 
 
-def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> Elements:
+def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> ElementArray:
     """Return an array as new inputs of a block.
 
     Args:

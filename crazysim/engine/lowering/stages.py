@@ -15,7 +15,7 @@ from crazysim.core.stage import PHASES, Axes, Phase, Stage, is_first_step
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
 from crazysim.engine.ir.program import TABLE_INDEX, Leaf, Program, Segment, Slot, UnfusedStage, Zeros
-from crazysim.engine.lowering.jaxprs import Elements, Lowering, TableEntry, as_elements, inputs, scalars
+from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, TableEntry, as_elements, inputs, scalars
 from crazysim.engine.lowering.relative import RelativeAxes, view_leaves
 from crazysim.engine.lowering.tracing import TracedStage, Tracer
 from crazysim.jaxcompat import equations, is_key
@@ -170,7 +170,7 @@ def _make_segment(
     return Segment(scope, (stage.__name__,), phase, block, tuple([slots[x] for x in block.inputs]), tuple(writes))
 
 
-def _add_table(lowering: Lowering, elements: Elements) -> Value:
+def _add_table(lowering: Lowering, elements: ElementArray) -> Value:
     """Return a table of the elements of a shared array, and register the entry of each element in it."""
     items = elements.reshape(-1)
     table = lowering.builder.input(items[0].dtype, len(items))
@@ -180,8 +180,8 @@ def _add_table(lowering: Lowering, elements: Elements) -> Value:
 
 
 def _lower_guarded(
-    lowering: Lowering, mask: Element, traced: TracedStage, args: list[Elements], old: list[Elements]
-) -> list[Elements]:
+    lowering: Lowering, mask: Element, traced: TracedStage, args: list[ElementArray], old: list[ElementArray]
+) -> list[ElementArray]:
     """Return the written leaves after a stage that acts where a mask is true.
 
     A stage that reduces over other drones is computed at every step, and its results are selected by the mask, because
@@ -204,7 +204,7 @@ def _lower_guarded(
     return [_replace_scalars(x, [next(flat) for _ in scalars(x)]) for x in old]
 
 
-def _replace_scalars(template: Elements, items: Sequence[Element]) -> Elements:
+def _replace_scalars(template: ElementArray, items: Sequence[Element]) -> ElementArray:
     """Return the scalars as elements with the shape of the template; a key consists of two integers."""
     row = iter(items)
     pairs = [(next(row), next(row)) if isinstance(x, tuple) else next(row) for x in template.reshape(-1)]

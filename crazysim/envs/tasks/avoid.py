@@ -199,7 +199,7 @@ class Avoid(Task):
         pos, quat = (x[..., rows, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
         local_pos = rotation.rotate_inverse(quat, data.states.pos[..., None, :] - pos) - middle.astype(dtype)
         half_size = jnp.asarray(size, dtype)
-        nearest = rotation.safe_clip(local_pos, -half_size, half_size)
+        nearest = rotation.clip(local_pos, -half_size, half_size)
         distance = rotation.safe_norm(nearest - local_pos)
         gap = distance - radius[:, None].astype(dtype)
         to_nearest = rotation.rotate(quat, nearest - local_pos) * (gap / jnp.where(distance > 1e-3, distance, 1))

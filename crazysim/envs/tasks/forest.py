@@ -170,7 +170,7 @@ class Forest(Task):
         n_cells, cell = forest.n_cells, forest.cell
         corner = np.asarray(forest.center) - cell * np.asarray(n_cells) / 2
         index = [
-            jnp.floor(rotation.safe_clip((pos[:, k] - corner[k]) / cell, -4.0, n_cells[k] + 4.0)).astype(jnp.int32)
+            jnp.floor(rotation.clip((pos[:, k] - corner[k]) / cell, -4.0, n_cells[k] + 4.0)).astype(jnp.int32)
             for k in range(2)
         ]
         columns, rows = np.repeat(np.arange(-1, 3), 3).astype(np.int32), np.tile(np.arange(-1, 2), 4).astype(np.int32)

@@ -28,7 +28,7 @@ def commonroad_params(car: Any) -> CommonRoadParams:
     numbers = {
         "friction": car.tire.p_dy1,
         "stiffness": [-car.tire.p_ky1 / car.tire.p_dy1] * 2,
-        "arms": [car.a, car.b],
+        "axle_distances": [car.a, car.b],
         "height": car.h_s,
         "mass": car.m,
         "yaw_inertia": car.I_z,
@@ -56,9 +56,9 @@ def crazysim_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParam
     x, p = jnp.asarray(state), params
     limited_rates = commonroad_rates(state, command, params)
     zero, speed, slip = jnp.zeros(1), x[3:4], x[6:7]
-    loads = p.mass * GRAVITY_MAGNITUDE * p.arms[..., ::-1] / jnp.sum(p.arms)
+    loads = p.mass * GRAVITY_MAGNITUDE * p.axle_distances[..., ::-1] / jnp.sum(p.axle_distances)
     car = CarParams(
-        mass=p.mass, yaw_inertia=p.yaw_inertia, front=p.arms[..., :1], rear=p.arms[..., 1:],
+        mass=p.mass, yaw_inertia=p.yaw_inertia, front=p.axle_distances[..., :1], rear=p.axle_distances[..., 1:],
         stiffness=p.friction * p.stiffness * loads, grip=p.friction * loads, drive=jnp.stack([p.mass[0], 0, 0]),
         drive_max=jnp.full(1, jnp.inf), front_share=zero, rolling=jnp.zeros(2), towed_mass=zero,
         steer_max=p.steer[..., 1:], steer_rate_max=p.steer_rate[..., 1:], steer_bandwidth=zero,

@@ -21,7 +21,7 @@ from crazysim.core.plugin import (
 )
 from crazysim.core.stage import stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.pytree import PyTree, leaf
 
@@ -174,7 +174,7 @@ class Battery(Plugin):
         return self.write(data, battery)
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def open_circuit_voltage(charge: Array, n_cells: Array) -> Array:
     """Return the open-circuit voltage of lithium-polymer cells in series, V.
 

@@ -13,7 +13,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
-from crazysim.rotation import safe_clip
+from crazysim.rotation import clip
 from crazysim.storage import read_text
 from crazysim.tables import ANY_NUMBER, MAX_NUMBER, POSITIVE, read_numbers
 
@@ -82,7 +82,7 @@ def interpolate(values: Array, position: Array) -> Array:
     axis_weights, nodes = [], []
     for k in range(n_axes):
         last_node = values.shape[k] - 1
-        cells = safe_clip(position[..., k], 0.0, float(last_node))
+        cells = clip(position[..., k], 0.0, float(last_node))
         lower_node = jnp.clip(jnp.floor(cells), 0, max(last_node - 1, 0))
         fraction, lower_node = cells - lower_node, lower_node.astype(jnp.int32)
         nodes.append((lower_node, jnp.minimum(lower_node + 1, last_node)))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.geometry.heightfield import OUTSIDE_DISTANCE, surface_at
 from crazysim.pytree import PyTree, leaf, static
 
@@ -25,7 +25,7 @@ class TerrainData(PyTree):
     floor: bool = static()
     """True if a flat floor at z = 0 surrounds the terrain; False if its border extends outwards without end."""
 
-    @jit_unless_traced()
+    @jit_eager_calls()
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
         """Return height and normal of the ground at a position, whose z is ignored.
 
@@ -59,7 +59,7 @@ class TerrainData(PyTree):
         return jnp.where(is_inside, gap, OUTSIDE_DISTANCE) if self.floor else gap, normal
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
     """Return height and normal of the ground at a position, whose z is ignored; zero and upwards without terrain.
 

@@ -17,7 +17,7 @@ from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import ground_below
 from crazysim.plugins.effects.moving_air import MovingAir, require_drag, with_moving_air
 from crazysim.pytree import leaf
-from crazysim.rotation import dot, safe_clip, safe_normalize
+from crazysim.rotation import clip, dot, safe_normalize
 
 METRES_PER_FOOT = 0.3048
 """Length of a foot, m, because the low-altitude model is stated in feet."""
@@ -193,7 +193,7 @@ def low_altitude_gusts(height: Array, speed_20ft: Array) -> tuple[Array, Array]:
     Returns:
         Scale lengths along the mean wind, across and vertically, m, and standard deviations, m/s. (..., 3) each
     """
-    h = safe_clip(height / METRES_PER_FOOT, MIN_HEIGHT_FT, MAX_HEIGHT_FT)
+    h = clip(height / METRES_PER_FOOT, MIN_HEIGHT_FT, MAX_HEIGHT_FT)
     log = jnp.log(0.177 + 0.000823 * h)
     horizontal, sigma = h * jnp.exp(-1.2 * log), 0.1 * speed_20ft
     length = METRES_PER_FOOT * jnp.concatenate([horizontal, horizontal, h], axis=-1)

@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, drone_array
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage, acts_now
+from crazysim.core.stage import Stage, is_tick
 from crazysim.plugins.estimators import error_state, inertial_path, updates
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
@@ -243,7 +243,7 @@ def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
 
 def _sampling_predicate(sensor: Sensor) -> Callable[[SimData], Array | None]:
     """Return a function that returns True in the steps in which a sensor measures, or None if it always does."""
-    return lambda data: acts_now(data, sensor.freq or data.core.freq)
+    return lambda data: is_tick(data, sensor.freq or data.core.freq)
 
 
 def _bias_walk(triad: TriadData, dt: float) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape
-from crazysim.tables import LENGTH, as_numbers
+from crazysim.tables import LENGTH, as_number_array
 
 
 class LoadBody(NamedTuple):
@@ -90,7 +90,7 @@ class CollidingPlugin:
 
 def load_shape(size: ArrayLike) -> Shape:
     """Return a ball of a radius, or a box of three full lengths, m."""
-    lengths = as_numbers("a body", "size", size)
+    lengths = as_number_array("a body", "size", size)
     if lengths.shape not in ((), (3,)) or not np.all((lengths >= LENGTH.low) & (lengths <= LENGTH.high)):
         raise ConfigError(
             f"expected size as a positive radius, or as three positive lengths of a box, {LENGTH.text}, got "

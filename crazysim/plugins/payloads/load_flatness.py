@@ -16,7 +16,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.flatness import attitude_of_thrust
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 
 MAX_ORDER = 6
 """Highest derivative of the load's path that is needed."""
@@ -49,7 +49,7 @@ class LoadedState(NamedTuple):
     """Torque, body frame, N m. (..., 3)"""
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def load_flat_state(
     path: Array, yaw: Array, mass: Array, load_mass: Array, length: Array, inertia: Array, gravity_vec: Array
 ) -> LoadedState:

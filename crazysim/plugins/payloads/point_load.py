@@ -15,7 +15,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData, SimState
 from crazysim.core.plugin import Simulation
 from crazysim.core.settings import as_mask, as_rgba
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.plugins.effects.ground import ground_height
 from crazysim.plugins.effects.moving_air import BodiesInAir
 from crazysim.plugins.effects.wind import wind_at
@@ -144,7 +144,7 @@ def clip_to_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> 
     return jnp.concatenate([pos[..., :2], jnp.maximum(height, clearance)], axis=-1), vel
 
 
-@jit_unless_traced("is_cable")
+@jit_eager_calls("is_cable")
 def hanging_state(
     state: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool
 ) -> tuple[Array, Array]:
@@ -170,7 +170,7 @@ def hanging_state(
     return attach_pos + offset, vel
 
 
-@jit_unless_traced("name")
+@jit_eager_calls("name")
 def direction(data: SimData, name: str = "load") -> tuple[Array, Array]:
     """Return the unit vector from attachment to load, world frame, and its rate, 1/s, for one drone or all. (..., 3)
 

@@ -201,9 +201,8 @@ def table_position(speed: Array, speeds: Array) -> tuple[Array, Array]:
     Returns:
         Factor, 0 to 1 (..., 1), and position in units of tables, 0 to k - 1 (..., 1).
     """
-    jet_factor = rotation.safe_clip(speed / speeds[0], 0.0, 1.0)
+    jet_factor = rotation.clip(speed / speeds[0], 0.0, 1.0)
     intervals = [
-        rotation.safe_clip((speed - speeds[i]) / (speeds[i + 1] - speeds[i]), 0.0, 1.0)
-        for i in range(speeds.shape[0] - 1)
+        rotation.clip((speed - speeds[i]) / (speeds[i + 1] - speeds[i]), 0.0, 1.0) for i in range(speeds.shape[0] - 1)
     ]
     return jet_factor, sum(intervals, jnp.zeros_like(speed))

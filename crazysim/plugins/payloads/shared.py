@@ -16,7 +16,7 @@ from crazysim.core.integration import euler
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
 from crazysim.core.settings import color, setting
 from crazysim.core.stage import Stage
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError
 from crazysim.geometry.small_matrices import solve_symmetric
 from crazysim.plugins.payloads.colliders import LoadBody, rest_height
@@ -61,7 +61,7 @@ class SharedLoadData(PyTree):
     """Height of the load above the floor where it rests, m. (1,)"""
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Array, Array]:
     """Return position and velocity of a load at rest below the drones of each world.
 

@@ -189,7 +189,7 @@ def sweep_angle(pos: Array, tilt: float) -> Array:
     """
     horizontal_distance = rotation.safe_norm(pos[..., :2])[..., 0]
     sine = pos[..., 2] * math.tan(tilt) / jnp.where(horizontal_distance > 1e-6, horizontal_distance, 1e-6)
-    sine = rotation.safe_clip(sine, -MAX_SINE, MAX_SINE)
+    sine = rotation.clip(sine, -MAX_SINE, MAX_SINE)
     return rotation.safe_arctan2(pos[..., 1], pos[..., 0]) + jnp.arcsin(sine)
 
 

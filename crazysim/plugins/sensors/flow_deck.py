@@ -145,7 +145,7 @@ class TimeOfFlight(Sensor):
         deviation = record.noise + range_deviation(truth, record.far_noise)
         is_in_range = truth < record.max_range
         value = truth + deviation * normal(key, (1,), truth.dtype)
-        value = jnp.where(is_in_range, rotation.safe_clip(value, 0.0, record.max_range), record.max_range)
+        value = jnp.where(is_in_range, rotation.clip(value, 0.0, record.max_range), record.max_range)
         return quantise(value, record.resolution), record
 
 

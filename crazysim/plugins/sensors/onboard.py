@@ -153,4 +153,4 @@ class MultiRanger(NoisySensor):
     def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, NoisyData]:
         value, record = super().measure(data, record, key)
         max_range = data.plugins[self.range_finder].max_range
-        return jnp.where(self.ideal(data) < max_range, rotation.safe_clip(value, 0.0, max_range), max_range), record
+        return jnp.where(self.ideal(data) < max_range, rotation.clip(value, 0.0, max_range), max_range), record

@@ -14,10 +14,10 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
 from crazysim.core.stage import Stage
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf
-from crazysim.rotation import safe_clip, safe_norm
+from crazysim.rotation import clip, safe_norm
 
 CLEAR_COLOR, ALARM_COLOR = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)
 """RGBA colours of an empty lobe, and of a lobe with a drone in it."""
@@ -41,7 +41,7 @@ class RadarData(PyTree):
     exposure: Array = leaf("drone", 1)
     """Time that a drone has been within each lobe since the last reset, s. (n_worlds, n_drones, n_radars)"""
 
-    @jit_unless_traced()
+    @jit_eager_calls()
     def margin_at(self, pos: Array) -> Array:
         """Return the depth of a point within each lobe, m, negative outside; see ``lobe_margin``. (..., n_radars)"""
         offset = pos[..., None, :] - self.pos
@@ -116,7 +116,7 @@ class Radar(Plugin):
                 sim.scene.renderer.overlays.line(pos + curve, ALARM_COLOR if detected[k] else CLEAR_COLOR, 2.0, 2.0)
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: Array, tilt: Array) -> Array:
     """Return the depth of a point within a radar's lobe along the normal to its axis, m, negative outside. (...)
 
@@ -138,7 +138,7 @@ def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: 
     def margin(level_distance: Array) -> Array:
         axial, lateral = c * level_distance + s * height, c * height - s * level_distance
         u = axial / half_range
-        clipped = safe_clip(u, 1e-6, 2.0)
+        clipped = clip(u, 1e-6, 2.0)
         root = rotation.safe_sqrt(2 - clipped)
         limit = (
             height_scale

@@ -18,7 +18,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, drone_array, parameter
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import dividing_rate, setting
-from crazysim.core.stage import Stage, acts_now
+from crazysim.core.stage import Stage, is_tick
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf
 
@@ -135,9 +135,7 @@ class Sensor(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         end, placements = "increment_steps", []
-        condition = (
-            None if sampling_period(self, sim) == 1 else lambda data: acts_now(data, self.freq or data.core.freq)
-        )
+        condition = None if sampling_period(self, sim) == 1 else lambda data: is_tick(data, self.freq or data.core.freq)
         placements.append(StagePlacement(Stage(self._take_measurement, "drone", condition), before=end))
         if self.is_late:
             placements.append(

@@ -84,7 +84,7 @@ class TriadData(PyTree):
             value = self.filtered + (1 - jnp.exp(-2 * math.pi * dt * self.bandwidth)) * (value - self.filtered)
             triad = triad.replace(filtered=value)
         if self.limit is not None:
-            value = rotation.safe_clip(value, -self.limit, self.limit)
+            value = rotation.clip(value, -self.limit, self.limit)
         value = quantise(value, self.resolution)
         return value, triad
 

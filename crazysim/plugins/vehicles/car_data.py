@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 from crazysim.plugins.vehicles.car_params import CarParams
 from crazysim.plugins.vehicles.car_state import CarState, tilted_quat, to_body_frame, to_world_frame
 from crazysim.plugins.vehicles.path import Path
@@ -89,13 +89,13 @@ class CarData(Members):
         return self.replace(body_vel=to_body_frame(self.yaw, vel[..., :2]), yaw_rate=ang_vel[..., 2:])
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def _level_vel(yaw: Array, body_vel: Array) -> Array:
     level = to_world_frame(yaw, body_vel)
     return jnp.concatenate([level, jnp.zeros_like(yaw)], axis=-1)
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def _about_z(yaw_rate: Array) -> Array:
     zero = jnp.zeros_like(yaw_rate)
     return jnp.concatenate([zero, zero, yaw_rate], axis=-1)

@@ -69,8 +69,8 @@ class CarParams(PyTree):
         mass = number("rigid_body.mass") + n * wheel_mass
         # Uniform cylinders: m (3 r^2 + w^2) / 12 about a diameter, m r^2 / 2 about the axis.
         wheel_yaw_inertia = wheel_mass * (3 * radius**2 + number("wheels.width") ** 2) / 12
-        arms = wheel_mass * (half_track**2 + (front**2 + rear**2) / 2)
-        yaw_inertia = number("rigid_body.yaw_inertia") + n * (wheel_yaw_inertia + arms)
+        offset_yaw_inertia = wheel_mass * (half_track**2 + (front**2 + rear**2) / 2)
+        yaw_inertia = number("rigid_body.yaw_inertia") + n * (wheel_yaw_inertia + offset_yaw_inertia)
         wheel_spin_inertia = number("wheels.armature") + wheel_mass * radius**2 / 2
         axle_loads = [-GRAVITY[2] * mass * x / (front + rear) for x in (rear, front)]
         is_kinematic = vehicle.dynamics == "kinematic"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from crazysim import rotation
-from crazysim.eager import jit_unless_traced
+from crazysim.eager import jit_eager_calls
 
 
 class CarState(NamedTuple):
@@ -36,7 +36,7 @@ def heading_quat(yaw: Array) -> Array:
     return jnp.concatenate([zero, zero, jnp.sin(yaw / 2), jnp.cos(yaw / 2)], axis=-1)
 
 
-@jit_unless_traced()
+@jit_eager_calls()
 def tilted_quat(yaw: Array, normal: Array) -> Array:
     """Return the attitude of a vehicle on a slope: turned by its heading, then by the tilt of the ground. (..., 4)
 

@@ -17,7 +17,7 @@ from crazysim.core.data import Objects, SimData
 from crazysim.core.plugin import Simulation, StagePlacement, parameter
 from crazysim.core.population import Population
 from crazysim.core.settings import color, default_rates
-from crazysim.core.stage import Stage, acts_now
+from crazysim.core.stage import Stage, is_tick
 from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import TerrainData, ground_at
@@ -173,7 +173,7 @@ class Cars(Population):
             return placements
         name, condition = (
             f"{self.name}_control",
-            functools.partial(acts_now, freq=self.control_freq_in(sim.data.core.freq)),
+            functools.partial(is_tick, freq=self.control_freq_in(sim.data.core.freq)),
         )
         return [StagePlacement(Stage(self._run_controller, self.name, condition, name=name), name=name), *placements]
 

@@ -21,7 +21,7 @@ class CommonRoadParams(PyTree):
     """Friction coefficient, 1. (1,)"""
     stiffness: Array = leaf("parameter", 1, (2,))
     """Cornering stiffness of front and rear axle divided by friction and load, 1/rad. (2,)"""
-    arms: Array = leaf("parameter", 1, (2,))
+    axle_distances: Array = leaf("parameter", 1, (2,))
     """Distances of front and rear axle from the centre of mass, m. (2,)"""
     height: Array = leaf("parameter", 1, (1,))
     """Height of the centre of mass, m. (1,)"""
@@ -46,7 +46,7 @@ class CommonRoadParams(PyTree):
         return CommonRoadParams(
             friction=as_parameter(1.0489),
             stiffness=as_parameter([4.718, 5.4562]),
-            arms=as_parameter([0.15875, 0.17145]),
+            axle_distances=as_parameter([0.15875, 0.17145]),
             height=as_parameter(0.074),
             mass=as_parameter(3.74),
             yaw_inertia=as_parameter(0.04712),
@@ -91,7 +91,7 @@ def commonroad_single_track(state: CommonRoadState, command: Array, params: Comm
     p, v, d, g = params, state.speed, state.steer, -GRAVITY[2]
     steer_rate = limited_steer_rate(d, command[..., :1], p)
     acc = limited_acceleration(v, command[..., 1:], p)
-    front, rear = p.arms[..., :1], p.arms[..., 1:]
+    front, rear = p.axle_distances[..., :1], p.axle_distances[..., 1:]
     wheelbase = front + rear
     # Slip forces divided by the mass: for an axle of load m (g l -+ a h) / L, friction times stiffness times load times
     # angle.

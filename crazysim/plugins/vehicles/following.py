@@ -15,7 +15,7 @@ from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
 from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.plugins.vehicles.path import Path
 from crazysim.pytree import PyTree
-from crazysim.rotation import safe_arctan2, safe_clip
+from crazysim.rotation import clip, safe_arctan2
 
 
 class PathState(NamedTuple):
@@ -187,8 +187,8 @@ class PathController:
     ) -> tuple[Array, Any]:
         """Return motor reference and steering angle, rad (2,), and the memory."""
         steer, memory = self.steering(state, tracking, memory, gains, car)
-        drive = safe_clip(self.driving(state, tracking, gains, car), -self.reference_max, self.reference_max)
-        return jnp.concatenate([drive, safe_clip(steer, -car.steer_max, car.steer_max)]), memory
+        drive = clip(self.driving(state, tracking, gains, car), -self.reference_max, self.reference_max)
+        return jnp.concatenate([drive, clip(steer, -car.steer_max, car.steer_max)]), memory
 
 
 class PurePursuit(PathController):

@@ -15,7 +15,7 @@ from crazysim.plugins.vehicles.car_state import CarState
 from crazysim.plugins.vehicles.following import PathController, PathState
 from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import safe_arctan2, safe_clip
+from crazysim.rotation import clip, safe_arctan2
 
 LATERAL_GAINS = {
     "aiml_apr24": ((0.00127, -0.00864, 0.0192, 0.0159), (0.172, -1.17, 2.59, 2.14), (0.00423, 0.0948, 0.463, 0.00936)),
@@ -95,7 +95,7 @@ class LPV(PathController):
         self, state: CarState, tracking: PathState, memory: LPVMemory, gains: LPVGains, car: CarParams
     ) -> tuple[Array, LPVMemory]:
         right_offset, speed = -tracking.offset, state.body_vel[:1]
-        integral = safe_clip(memory.integral + INTEGRAL_FREQ * gains.period * right_offset, -INTEGRAL_MAX, INTEGRAL_MAX)
+        integral = clip(memory.integral + INTEGRAL_FREQ * gains.period * right_offset, -INTEGRAL_MAX, INTEGRAL_MAX)
         raw_offset_rate = (right_offset - memory.offset) / gains.period
         offset_rate = memory.started * (memory.offset_rate + RATE_WEIGHT * (raw_offset_rate - memory.offset_rate))
         terms = (integral, right_offset, offset_rate)

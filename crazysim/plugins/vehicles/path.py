@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, float_dtype, leaf
-from crazysim.rotation import safe_clip
+from crazysim.rotation import clip
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.splines import spline
@@ -181,7 +181,7 @@ class Path(PyTree):
         It decreases linearly to zero over the last ``STOPPING_LENGTH`` of an open path.
         """
         piece, _ = self._locate(index, s)
-        slowdown = safe_clip((_entry_at(self.length, index) - s) / STOPPING_LENGTH, 0.0, 1.0)
+        slowdown = clip((_entry_at(self.length, index) - s) / STOPPING_LENGTH, 0.0, 1.0)
         slowdown_factor = jnp.where(_entry_at(self.closed, index), 1.0, slowdown)
         return (slowdown_factor * _entry_at(self.speeds, index, piece))[None]
 
@@ -200,7 +200,7 @@ class Path(PyTree):
         """
         duration, is_closed = _entry_at(self.duration, index), _entry_at(self.closed, index)
         laps = jnp.where(is_closed, lax.floor(t / duration), 0.0)
-        local = safe_clip(t - laps * duration, 0.0, duration)
+        local = clip(t - laps * duration, 0.0, duration)
         step = duration / (N_TIMES - 1)
         node = jnp.minimum(lax.floor(local / step), N_TIMES - 2.0)
         k, u = node.astype(jnp.int32), local / step - node
@@ -234,10 +234,10 @@ class Path(PyTree):
             offset = pos - point.pos
             along_error = offset[0] * point.tangent[0] + offset[1] * point.tangent[1]
             lateral = point.tangent[0] * offset[1] - point.tangent[1] * offset[0]
-            s = s + safe_clip(
+            s = s + clip(
                 along_error / jnp.maximum(1 - point.curvature[0] * lateral, 0.2), -MAX_NEWTON_STEP, MAX_NEWTON_STEP
             )
-            s = jnp.where(is_closed, s, safe_clip(s, 0.0, length))
+            s = jnp.where(is_closed, s, clip(s, 0.0, length))
         return s
 
     def nearest_arc(self, index: int, pos: ArrayLike) -> float:
@@ -269,8 +269,8 @@ class Path(PyTree):
         """Return the piece at an arc length, and the position in it as a fraction of its length."""
         length, spacing = _entry_at(self.length, index), _entry_at(self.spacing, index)
         local_s = s - length * lax.floor(s / length)
-        local = jnp.where(_entry_at(self.closed, index), local_s, safe_clip(s, 0.0, length)) / spacing
-        piece = safe_clip(lax.floor(local), 0.0, lax.floor(length / spacing - 0.5))
+        local = jnp.where(_entry_at(self.closed, index), local_s, clip(s, 0.0, length)) / spacing
+        piece = clip(lax.floor(local), 0.0, lax.floor(length / spacing - 0.5))
         return piece.astype(jnp.int32), local - piece
 
 

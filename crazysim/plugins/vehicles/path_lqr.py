@@ -22,7 +22,7 @@ from crazysim.plugins.vehicles.kinematic import kinematic
 from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.plugins.vehicles.single_track import single_track
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import safe_clip
+from crazysim.rotation import clip
 
 SPEED_STEP, N_SPEEDS = 0.25, 24
 """Interval between the speeds in the table of gains, m/s, and their number: the table extends to 6 m/s."""
@@ -66,7 +66,7 @@ class PathLQR(PathController):
     def steering(
         self, state: CarState, tracking: PathState, memory: Any, gains: PathLQRGains, car: CarParams
     ) -> tuple[Array, Any]:
-        cell = safe_clip(jnp.abs(state.body_vel[0]) / SPEED_STEP - 1, 0.0, N_SPEEDS - 1.001)
+        cell = clip(jnp.abs(state.body_vel[0]) / SPEED_STEP - 1, 0.0, N_SPEEDS - 1.001)
         k = lax.floor(cell)
         direction, node = (tracking.speed[0] < 0).astype(jnp.int32), k.astype(jnp.int32)
         table = jnp.asarray(gains.table)

@@ -8,7 +8,7 @@ from jax import Array, lax
 from crazysim.plugins.vehicles.car_params import CarParams
 from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
 from crazysim.plugins.vehicles.trailer import trailer_rates
-from crazysim.rotation import safe_clip
+from crazysim.rotation import clip
 
 
 def drive_force(reference: Array, speed: Array, params: CarParams) -> Array:
@@ -26,7 +26,7 @@ def drive_force(reference: Array, speed: Array, params: CarParams) -> Array:
     p = params
     sign = speed * lax.rsqrt(speed * speed + p.slip_speed * p.slip_speed)
     motor = p.drive[..., :1] * reference - p.drive[..., 1:2] * speed - p.drive[..., 2:] * sign
-    motor = safe_clip(motor, -p.drive_max, p.drive_max)
+    motor = clip(motor, -p.drive_max, p.drive_max)
     resistance = p.rolling[..., :1] * speed + p.rolling[..., 1:] * sign
     return (motor - resistance) * (p.mass / (p.mass + p.towed_mass))
 
@@ -56,8 +56,8 @@ def tyre_force(drive: Array, vel: Array, stiffness: Array, grip: Array, slip_spe
 def steer_rate(state: CarState, command: Array, params: CarParams) -> Array:
     """Return the rate of the steering angle towards its command within the limits of the servo, rad/s. (..., 1)"""
     p = params
-    target = safe_clip(command[..., 1:2], -p.steer_max, p.steer_max)
-    return safe_clip(p.steer_bandwidth * (target - state.steer), -p.steer_rate_max, p.steer_rate_max)
+    target = clip(command[..., 1:2], -p.steer_max, p.steer_max)
+    return clip(p.steer_bandwidth * (target - state.steer), -p.steer_rate_max, p.steer_rate_max)
 
 
 def single_track(state: CarState, command: Array, params: CarParams, wrench: Array | None = None) -> CarState:

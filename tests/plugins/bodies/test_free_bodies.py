@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from cases import by_stages, with_params, with_states
+from cases import build_stagewise_step, with_params, with_states
 from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, ContactResponse, FreeBodies, Sim, Terrain
@@ -456,7 +456,7 @@ def test_law_07_a_body_under_a_constant_torque_stays_finite():
 def test_law_08_gradients_equal_central_differences(x64):
     """The length of a slide with friction by the speed at the start, d(v^2 / (2 mu g)) / dv."""
     sim, plugin = build(1, (0.2, 0.2, 0.1), 0.5, pos=(0, 0, 0.05))
-    step = by_stages(sim)
+    step = build_stagewise_step(sim)
 
     def end(speed):
         record = plugin.read(sim.data)

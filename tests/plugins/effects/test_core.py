@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, hover_command, hovering, n_documented, repeat_command, trees_equal, with_states
+from cases import build_stagewise_step, hover_command, hovering, n_documented, repeat_command, trees_equal, with_states
 from sweep import EFFECTS
 
 from crazysim import (
@@ -256,7 +256,7 @@ def test_law_07_values_and_gradients_are_finite(sim_with_effects):
     )[:3]
     sim.data = data
     sim.attitude_control(command)
-    step = by_stages(sim)
+    step = build_stagewise_step(sim)
 
     def sum_of_states(data):
         end = step(data, 40)

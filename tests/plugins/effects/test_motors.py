@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, hover_rotor_state, with_states
+from cases import build_stagewise_step, hover_rotor_state, with_states
 
 from crazysim import ConfigError, MotorFailure, Sim
 
@@ -113,7 +113,7 @@ def test_fail_stops_the_rotors_of_its_mask(weak):
 
 def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak):
     """dv_z / de_i = dt thrust_i / m: a fault can be identified by descent."""
-    step = by_stages(weak)
+    step = build_stagewise_step(weak)
 
     def climb(e):
         data = weak.data.replace(plugins={"motors": weak.data.plugins["motors"].replace(effectiveness=e)})

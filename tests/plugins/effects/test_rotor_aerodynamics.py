@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, hover_rotor_state, vectors, with_states
+from cases import build_stagewise_step, hover_rotor_state, vectors, with_states
 from hypothesis import given
 
 from crazysim import ConfigError, RotorAerodynamics, Sim, Wind, load_airframe, stage
@@ -234,7 +234,7 @@ def test_law_08_gradients_equal_central_differences(x64):
     plugin = sim.add(RotorAerodynamics(flapping=1e-8, ceiling=1.2))
     sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=0.98 * hover_rotor_state(sim.data))
     rotor_vel = jnp.asarray(hover_rotor_state(sim.data) * [1.0, 1.001, 0.999, 1.002])
-    step = by_stages(sim)
+    step = build_stagewise_step(sim)
     scales = {"drag": 3e-6, "blade": 1e-5, "flapping": 1e-8, "ceiling": 1.2, "propeller_radius": 0.0275, "vel": 1.0}
 
     def loss(x):

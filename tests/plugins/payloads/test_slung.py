@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import INTEGRATORS, broadcast_like, by_stages, with_params, with_states
+from cases import INTEGRATORS, broadcast_like, build_stagewise_step, with_params, with_states
 from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, Downwash, Sim, Wind
@@ -178,7 +178,10 @@ def test_law_08_gradients_are_central_differences(cable, x64):
     sim = build(height=2.0, engine="plain")
     load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, damping=0.001, cable=cable, in_scene=False))
     sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
-    step, data = by_stages(sim) if cable else sim.build_step_fn(), sim.data  # each compiles sooner in its mode
+    step, data = (
+        build_stagewise_step(sim) if cable else sim.build_step_fn(),
+        sim.data,
+    )  # each compiles sooner in its mode
 
     def end(x):
         record = load.read(data)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, hover_rotor_state, with_states
+from cases import build_stagewise_step, hover_rotor_state, with_states
 from sweep import REQUIRED_BY, SENSORS
 
 from crazysim import Sim
@@ -82,7 +82,7 @@ def test_law_10_measurements_do_not_depend_on_other_worlds(sim):
 def test_law_08_gradients_are_central_differences(x64):
     """Derivatives of each measurement by position, velocity, attitude, rates and rotor speeds at the start."""
     sim = build(1, SENSORS)
-    step, names = by_stages(sim), ("pos", "vel", "quat", "ang_vel", "rotor_vel")
+    step, names = build_stagewise_step(sim), ("pos", "vel", "quat", "ang_vel", "rotor_vel")
     start = {k: jnp.asarray(getattr(sim.data.states, k)) for k in names}
     all_sensors = [sim.plugins[name] for name in SENSORS]
     rng = np.random.default_rng(1)
@@ -121,7 +121,7 @@ def test_gradients_pass_through_rounding(x64):
     """The gradient of a rounded measurement is that before rounding, and finite."""
     sim = build(1, [])
     rounding_sensors = [sim.add(make()) for make in (IMU.bmi088, lambda: sensors.RotorSpeeds.telemetry(6))]
-    step = by_stages(sim)
+    step = build_stagewise_step(sim)
 
     @jax.jit
     @jax.jacrev

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, with_states
+from cases import build_stagewise_step, with_states
 
 from crazysim import ConfigError, Sim, Terrain
 from crazysim.plugins.vehicles import LPV, Bicycles, Cars, Path, PathLQR, PurePursuit, Stanley, ackermann
@@ -124,7 +124,7 @@ def test_a_car_drives_as_it_does_alone():
 
 def test_gradients_reach_commands_and_parameters():
     sim, cars = build(1, in_scene=False)
-    step = by_stages(sim)
+    step = build_stagewise_step(sim)
 
     def end(command, mass):
         data = cars.with_command(sim.data, command)

@@ -84,10 +84,10 @@ def test_single_track_tends_to_the_gym_at_small_angles(seed):
     """Both are the same model to first order in slip, steering angle and yaw rate: the difference is of order three."""
     with jax.enable_x64(True):
         gym = jax.tree.map(np.asarray, CommonRoadParams.create())
-        g, (front, rear) = 9.81, np.asarray(gym.arms)
+        g, (front, rear) = 9.81, np.asarray(gym.axle_distances)
         loads = gym.mass * g * np.array([rear, front]) / (front + rear)
         car = CarParams(
-            mass=gym.mass, yaw_inertia=gym.yaw_inertia, front=gym.arms[:1], rear=gym.arms[1:],
+            mass=gym.mass, yaw_inertia=gym.yaw_inertia, front=gym.axle_distances[:1], rear=gym.axle_distances[1:],
             stiffness=gym.friction * gym.stiffness * loads, grip=np.full(2, np.inf), drive=np.array([1.0, 0, 0]),
             drive_max=np.array([np.inf]), front_share=np.zeros(1), rolling=np.zeros(2), towed_mass=np.zeros(1),
             steer_max=np.ones(1), steer_rate_max=np.ones(1), steer_bandwidth=np.ones(1), slip_speed=np.zeros(1),

@@ -12,7 +12,7 @@ from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Element, constant, is_constant
 from crazysim.engine.lowering.jaxprs import (
     MAX_UNROLL,
-    Elements,
+    ElementArray,
     Lowering,
     UnsupportedError,
     as_elements,
@@ -24,23 +24,23 @@ from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn, as_function, close_jaxpr, 
 
 
 @rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")
-def _call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _call(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     return ctx.lower(close_jaxpr(eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]), args)
 
 
 @rule("pure_callback", "io_callback")
-def _host_call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _host_call(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Refuse a callback to the host: its stage stays unfused, and the step is split around it."""
     raise LimitError("it calls a function on the host")
 
 
 @rule("custom_jvp_call")
-def _custom_jvp(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _custom_jvp(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     return _lower_with_derivative(ctx, eqn, args, close_jaxpr(eqn.params["call_jaxpr"]))
 
 
 @rule("stop_gradient")
-def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Return the operands unchanged, with a derivative of zero."""
     aval = eqn.invars[0].aval
     if not jax.numpy.issubdtype(aval.dtype, np.inexact) or all(map(is_constant, args[0].reshape(-1))):
@@ -50,7 +50,7 @@ def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
 
 
 @rule("call_hi_primitive")
-def _expand(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _expand(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Expand a primitive that is defined in terms of other primitives (JAX 0.12 and later).
 
     If the results have no derivative, such as the indices from ``jnp.searchsorted``, the expansion is lowered like any
@@ -64,8 +64,8 @@ def _expand(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
 
 
 def _lower_with_derivative(
-    ctx: Lowering, eqn: JaxprEqn, args: list[Elements], called_jaxpr: ClosedJaxpr
-) -> list[Elements]:
+    ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray], called_jaxpr: ClosedJaxpr
+) -> list[ElementArray]:
     """Lower a call with a custom derivative. The derivative itself is lowered only when it is requested."""
     body = ctx.make_inner()
     block = body.finish(body.lower(called_jaxpr, [_add_inputs(body, x) for x in args]))
@@ -84,7 +84,7 @@ def _lower_with_derivative(
 
 
 @rule("custom_linear_solve")
-def _linear_solve(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _linear_solve(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     n_before_solve = lengths.matvec + lengths.vecmat
     solve_consts = args[n_before_solve : n_before_solve + lengths.solve]
@@ -93,7 +93,7 @@ def _linear_solve(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[El
 
 
 @rule("cond")
-def _cond(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _cond(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Compute all branches and select one in each lane."""
     index_array, *operands = args
     branches = [close_jaxpr(b) for b in eqn.params["branches"]]
@@ -113,7 +113,7 @@ def _cond(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
 
 
 @rule("platform_index")
-def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Return the index of the default branch, since a program is lowered once for all platforms."""
     platforms = list(eqn.params["platforms"])
     named = sorted({name for names in platforms for name in names or ()} & {"cpu", "gpu", "cuda", "rocm"})
@@ -125,7 +125,7 @@ def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[
 
 
 @rule("scan")
-def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     p, length = eqn.params, eqn.params["length"]
     body = close_jaxpr(p["jaxpr"])
     # The parameters with the sizes of these groups have different names in different versions of JAX, so the sizes are
@@ -143,7 +143,7 @@ def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
         raise UnsupportedError(
             f"primitive 'scan' with operands for each of {length} iterations; at most {MAX_UNROLL} are unrolled"
         )
-    stacked: list[list[Elements]] = []
+    stacked: list[list[ElementArray]] = []
     for i in range(length)[::-1] if p["reverse"] else range(length):
         outs = ctx.lower(body, [*consts, *carry, *(x[i, ...] for x in xs)])
         carry = outs[:n_carry]
@@ -157,7 +157,7 @@ def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
 
 
 @rule("while")
-def _while(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _while(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     p = eqn.params
     n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
     cond_consts, body_consts, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
@@ -170,12 +170,12 @@ def _while(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
 
 
 @rule("any_lane")
-def _any_lane(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _any_lane(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     (condition,) = args
     return [condition if is_constant(condition[()]) else as_elements([ctx.scalar("any_lane", condition[()])], ())]
 
 
-def _add_inputs(ctx: Lowering, template: Elements) -> Elements:
+def _add_inputs(ctx: Lowering, template: ElementArray) -> ElementArray:
     """Return new inputs of a block, with the shape and types of an array of elements."""
 
     def new_input(x: Any) -> Any:
@@ -186,7 +186,7 @@ def _add_inputs(ctx: Lowering, template: Elements) -> Elements:
 
 def _add_operation(
     ctx: Lowering, op: str, eqn: JaxprEqn, args: list[Element], blocks: tuple[Block, ...], params: tuple = ()
-) -> list[Elements]:
+) -> list[ElementArray]:
     """Add an operation with the results of an equation, and return the results as arrays of elements."""
     keys = [jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in eqn.outvars]
     sizes = [int(np.prod(v.aval.shape)) * (2 if is_key else 1) for v, is_key in zip(eqn.outvars, keys, strict=True)]

@@ -8,7 +8,7 @@ from numpy.typing import DTypeLike
 
 from crazysim import jaxcompat
 from crazysim.engine.ir import ops
-from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError, constants, rule
+from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedError, constants, rule
 from crazysim.jaxcompat import JaxprEqn
 
 PRIMITIVES_WITH_RULES = frozenset(
@@ -18,19 +18,19 @@ PRIMITIVES_WITH_RULES = frozenset(
 
 
 @rule(*(name for name, row in ops.TABLE.items() if not row.structured and name not in PRIMITIVES_WITH_RULES))
-def _elementwise(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _elementwise(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     return [ctx.elementwise(eqn.primitive.name, args, eqn.outvars[0].aval.dtype)]
 
 
 @rule("pow")
-def _pow(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _pow(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Raise to a power; an integer exponent is first converted to the type of the result, as in JAX."""
     dtype = eqn.outvars[0].aval.dtype
     return [ctx.elementwise("pow", [args[0], ctx.elementwise("convert_element_type", [args[1]], dtype)], dtype)]
 
 
 @rule("digamma")
-def _digamma(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _digamma(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Return the digamma function, whose value at zero depends on the version of JAX."""
     dtype = eqn.outvars[0].aval.dtype
     is_zero = ctx.elementwise("eq", [args[0], constants(0, dtype)], bool)
@@ -39,18 +39,18 @@ def _digamma(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
 
 
 @rule("round")
-def _round(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _round(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     to_even = RoundingMethod(eqn.params["rounding_method"]) == RoundingMethod.TO_NEAREST_EVEN
     return [ctx.elementwise("round_even" if to_even else "round_away", args, eqn.outvars[0].aval.dtype)]
 
 
 @rule("convert_element_type")
-def _convert(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _convert(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     return [ctx.elementwise("convert_element_type", args, eqn.params["new_dtype"])]
 
 
 @rule("select_n")
-def _select_n(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _select_n(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Select one of two cases by a bool, or one of several by an integer."""
     which, *cases = args
     dtype, kind = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
@@ -64,7 +64,7 @@ def _select_n(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
 
 
 @rule("bitcast_convert_type")
-def _bitcast(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _bitcast(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     old_dtype, new_dtype = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
     if old_dtype == new_dtype:
         return args
@@ -74,12 +74,12 @@ def _bitcast(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
 
 
 @rule("square")
-def _square(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _square(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     return [ctx.elementwise("mul", [args[0], args[0]], eqn.outvars[0].aval.dtype)]
 
 
 @rule("integer_pow")
-def _integer_pow(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _integer_pow(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     y, dtype = eqn.params["y"], eqn.outvars[0].aval.dtype
     if y not in (2, 3, 4):
         return [ctx.elementwise("integer_pow", args, dtype, (("y", y),))]
@@ -88,18 +88,18 @@ def _integer_pow(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Ele
 
 
 @rule("one_minus_square")
-def _one_minus_square(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _one_minus_square(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     dtype = eqn.outvars[0].aval.dtype
     return [ctx.elementwise("sub", [constants(1, dtype), ctx.elementwise("mul", [args[0], args[0]], dtype)], dtype)]
 
 
 @rule("add_any")
-def _add_any(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _add_any(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     return [ctx.elementwise("add", args, eqn.outvars[0].aval.dtype)]
 
 
 @rule("lt_to", "le_to", "eq_to")
-def _total_order(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _total_order(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Compare in an order in which NaN is the largest number, and equal to itself."""
     name = eqn.primitive.name.removesuffix("_to")
     if eqn.invars[0].aval.dtype.kind != "f":
@@ -114,20 +114,20 @@ def _total_order(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Ele
 
 
 @rule("optimization_barrier")
-def _barrier(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _barrier(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     ctx.builder.barrier()
     return args
 
 
 @rule("device_put")
-def _device_put(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _device_put(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     if any(device is not None for device in eqn.params["devices"]):
         raise UnsupportedError("primitive 'device_put' to a device that is named")
     return args
 
 
 @rule("copy", "copy_p", "pvary", "reshard", "random_clone", "name")
-def _identity(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _identity(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     return args
 
 
@@ -138,14 +138,14 @@ class _Bits:
         self.ctx, self.dtype = ctx, np.dtype(f"u{np.dtype(dtype).itemsize}")
         self.n_bits = 8 * self.dtype.itemsize
 
-    def from_number(self, x: Elements) -> Elements:
+    def from_number(self, x: ElementArray) -> ElementArray:
         return self.ctx.elementwise("bitcast_convert_type", [x], self.dtype)
 
-    def apply(self, op: str, a: Elements, b: Elements | int) -> Elements:
+    def apply(self, op: str, a: ElementArray, b: ElementArray | int) -> ElementArray:
         b = constants(b, self.dtype) if isinstance(b, int) else b
         return self.ctx.elementwise(op, [a, b], self.dtype)
 
-    def count(self, x: Elements) -> Elements:
+    def count(self, x: ElementArray) -> ElementArray:
         """Count the bits that are set: add them up in pairs, fours and bytes, and sum the bytes by a product."""
         pairs, fours, eights, ones = (self.mask(byte) for byte in (0x55, 0x33, 0x0F, 0x01))
         x = self.apply("sub", x, self.apply("and", self.apply("shift_right_logical", x, 1), pairs))
@@ -160,14 +160,14 @@ class _Bits:
 
 
 @rule("population_count")
-def _population_count(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _population_count(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     dtype = eqn.outvars[0].aval.dtype
     bits = _Bits(ctx, dtype)
     return [ctx.elementwise("bitcast_convert_type", [bits.count(bits.from_number(args[0]))], dtype)]
 
 
 @rule("clz")
-def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Set all bits below the highest set bit, and count the bits that are still zero."""
     dtype = eqn.outvars[0].aval.dtype
     bits = _Bits(ctx, dtype)
@@ -180,7 +180,7 @@ def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
 
 
 @rule("reduce_precision")
-def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Round the mantissa to nearest even; overflow gives infinity, underflow a signed zero."""
     dtype, exponent, mantissa = eqn.outvars[0].aval.dtype, eqn.params["exponent_bits"], eqn.params["mantissa_bits"]
     if dtype not in ops.DTYPES:

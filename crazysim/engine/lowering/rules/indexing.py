@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike
 from crazysim.engine.ir.blocks import Element, constant, is_constant
 from crazysim.engine.lowering.jaxprs import (
     MAX_UNROLL,
-    Elements,
+    ElementArray,
     Lowering,
     TableRows,
     UnsupportedError,
@@ -22,12 +22,12 @@ from crazysim.engine.lowering.jaxprs import (
     rule,
 )
 from crazysim.engine.lowering.rules import tables
-from crazysim.engine.lowering.rules.movement import evaluate, move_many
+from crazysim.engine.lowering.rules.movement import evaluate, move_by_indices
 from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn
 
 
 @rule("dynamic_slice")
-def _dynamic_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _dynamic_slice(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     x, sizes = args[0], eqn.params["slice_sizes"]
     if isinstance(x, TableRows):
         return [x.row(ctx, args[1][()], sizes)]
@@ -36,7 +36,7 @@ def _dynamic_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
     return [x]
 
 
-def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> Elements:
+def _take(ctx: Lowering, x: ElementArray, start: Element, size: int, axis: int) -> ElementArray:
     """Return ``size`` elements along an axis, beginning at a start that is clamped to the array."""
     last = x.shape[axis] - size
     if is_constant(start) or last == 0:
@@ -56,7 +56,7 @@ def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> E
 
 
 @rule("dynamic_update_slice")
-def _dynamic_update_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _dynamic_update_slice(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     x, update = args[:2]
     starts = [a[()] for a in args[2:]]
     ranges = []
@@ -74,20 +74,20 @@ def _dynamic_update_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) ->
     return [out]
 
 
-def _is_at(ctx: Lowering, index: Element, k: int, last: int) -> Elements:
+def _is_at(ctx: Lowering, index: Element, k: int, last: int) -> ElementArray:
     """Return True where an index, clamped to 0 to ``last``, is ``k``."""
     op = "le" if k == 0 else "ge" if k == last else "eq"
     return as_elements([ctx.scalar(op, index, constant(k, index.dtype), dtype=bool)], ())
 
 
-def _conjunction(ctx: Lowering, conditions: Iterable[Elements]) -> Elements | None:
+def _conjunction(ctx: Lowering, conditions: Iterable[ElementArray]) -> ElementArray | None:
     result = None
     for condition in conditions:
         result = condition if result is None else ctx.elementwise("and", [result, condition], bool)
     return result
 
 
-def _select(ctx: Lowering, condition: Elements, yes: Elements, no: Elements) -> Elements:
+def _select(ctx: Lowering, condition: ElementArray, yes: ElementArray, no: ElementArray) -> ElementArray:
     first = no.reshape(-1)[0] if no.size else constant(0, np.float32)
     dtype = np.uint32 if isinstance(first, tuple) else first.dtype
     return ctx.elementwise("select_n", [condition, no, yes], dtype)
@@ -101,13 +101,13 @@ def _check_range(n: int) -> None:
 
 
 @rule("gather")
-def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     x, indices = args
     if is_known(indices):
         p = eqn.params
         if p["mode"] == GatherScatterMode.FILL_OR_DROP:
             return [_gather_filled(eqn, x, known_values(indices))]
-        return move_many(eqn, [x], [known_values(indices)])
+        return move_by_indices(eqn, [x], [known_values(indices)])
     dims, mode, sizes = eqn.params["dimension_numbers"], eqn.params["mode"], eqn.params["slice_sizes"]
     limits = [x.shape[axis] - sizes[axis] for axis in dims.start_index_map]
     n_places = int(np.prod([limit + 1 for limit in limits]))
@@ -124,7 +124,7 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
     table = tables.find_table(ctx, x, dims.start_index_map, n_places)
     if table is not None:
         zeros = np.zeros(indices.shape, np.int32)
-        offsets = move_many(eqn, [table.offsets.astype(object)], [zeros])[0].reshape(-1)
+        offsets = move_by_indices(eqn, [table.offsets.astype(object)], [zeros])[0].reshape(-1)
         bases = [table.get_base(list(row), limits) for row in rows]
         result = list(table.look_up(offsets, [bases[k] for k in row_by_element]))
     else:
@@ -141,9 +141,9 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
 def _select_windows(
     ctx: Lowering,
     eqn: JaxprEqn,
-    x: Elements,
+    x: ElementArray,
     shape: tuple[int, ...],
-    rows: Elements,
+    rows: ElementArray,
     row_by_element: np.ndarray,
     limits: Sequence[int],
 ) -> list[Element]:
@@ -152,7 +152,7 @@ def _select_windows(
     result: list[Element] = []
     for corner in itertools.product(*(range(limit + 1) for limit in limits)):
         corner_indices = np.broadcast_to(np.array(corner, np.int32), shape)
-        window = move_many(eqn, [x], [corner_indices])[0].reshape(-1)
+        window = move_by_indices(eqn, [x], [corner_indices])[0].reshape(-1)
         if not result:
             result = list(window)
             continue
@@ -167,7 +167,7 @@ def _select_windows(
     return result
 
 
-def _gather_filled(eqn: JaxprEqn, x: Elements, indices: np.ndarray) -> Elements:
+def _gather_filled(eqn: JaxprEqn, x: ElementArray, indices: np.ndarray) -> ElementArray:
     """Gather at known indices; elements at indices outside the array have the fill value."""
     numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     (positions,) = evaluate(eqn, [numbers, indices], fill_value=-1)
@@ -187,7 +187,7 @@ def _fill_value(dtype: DTypeLike) -> Any:
     return np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
 
 
-def _is_inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:
+def _is_inside(ctx: Lowering, row: ElementArray, limits: list[int]) -> ElementArray:
     tests = []
     for i, limit in zip(row, limits, strict=True):
         tests.append(as_elements([ctx.scalar("ge", i, constant(0, i.dtype), dtype=bool)], ()))
@@ -197,7 +197,7 @@ def _is_inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:
 
 
 @rule("scatter", *(f"scatter{mark}{op}" for mark in "-_" for op in ("add", "sub", "mul", "min", "max")))
-def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Write windows of ``updates`` into the operand, one row of ``indices`` after the other.
 
     A window whose position is computed at run time is compared with every position that it may have. A window that is
@@ -250,7 +250,7 @@ def _window_positions(index: Element, limit: int, clip: bool) -> Sequence[int]:
     return [int(index)] if 0 <= index <= limit else []
 
 
-def _combine(ctx: Lowering, eqn: JaxprEqn, old: Elements, new: Elements) -> Elements:
+def _combine(ctx: Lowering, eqn: JaxprEqn, old: ElementArray, new: ElementArray) -> ElementArray:
     """Return the numbers that a scatter writes over ``old``: ``new``, or a combination of both such as their sum."""
     combination = eqn.params["update_jaxpr"]
     if combination is None:
@@ -262,11 +262,11 @@ def _combine(ctx: Lowering, eqn: JaxprEqn, old: Elements, new: Elements) -> Elem
     )
 
 
-def is_known(x: Elements) -> bool:
+def is_known(x: ElementArray) -> bool:
     """Return True where all elements are constants."""
     return all(map(is_constant, x.reshape(-1)))
 
 
-def known_values(x: Elements) -> np.ndarray:
+def known_values(x: ElementArray) -> np.ndarray:
     """Return known elements as numbers."""
     return np.array(x.reshape(-1).tolist(), x.reshape(-1)[0].dtype if x.size else np.int32).reshape(x.shape)

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from crazysim.engine.ir.blocks import constant
-from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError, as_elements, rule
+from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedError, as_elements, rule
 from crazysim.jaxcompat import JaxprEqn
 
 MAX_SYSTEM_SIZE = 6
@@ -19,12 +19,12 @@ def _check_size(eqn: JaxprEqn, n: int) -> None:
         raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; at most {MAX_SYSTEM_SIZE} is supported")
 
 
-def _matrices(x: Elements) -> list[Elements]:
+def _matrices(x: ElementArray) -> list[ElementArray]:
     return list(x.reshape(-1, *x.shape[-2:]))
 
 
 @rule("cholesky")
-def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Return the lower factor; its lower triangle is NaN if the matrix is not positive definite."""
     n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
     _check_size(eqn, n)
@@ -51,7 +51,7 @@ def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
 
 
 @rule("triangular_solve")
-def _triangular_solve(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _triangular_solve(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     p = eqn.params
     _check_size(eqn, args[0].shape[-1])
     out = []
@@ -65,7 +65,7 @@ def _triangular_solve(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> lis
     return [as_elements([e for x in out for e in x.reshape(-1)], args[1].shape)]
 
 
-def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool) -> Elements:
+def _substitute(ctx: Lowering, a: ElementArray, b: ElementArray, lower: bool, unit: bool) -> ElementArray:
     n, x = len(a), np.empty(b.shape, object)
     order = list(range(n)) if lower else list(range(n))[::-1]
     for column in range(b.shape[1]):
@@ -78,7 +78,7 @@ def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool
 
 
 @rule("lu")
-def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Factorise with partial pivoting; rows are exchanged by selection."""
     n, m = args[0].shape[-2:]
     if n != m:

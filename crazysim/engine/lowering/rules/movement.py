@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from crazysim.engine.lowering.jaxprs import Elements, Lowering, as_elements, constants, rule
+from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, as_elements, constants, rule
 from crazysim.jaxcompat import JaxprEqn, bind
 
 MOVING_PRIMITIVES = (
@@ -18,11 +18,11 @@ MOVING_PRIMITIVES = (
 
 
 @rule(*MOVING_PRIMITIVES)
-def _move(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    return move_many(eqn, args) if eqn.primitive.multiple_results else [move(eqn, args)]
+def _move(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
+    return move_by_indices(eqn, args) if eqn.primitive.multiple_results else [move_elements(eqn, args)]
 
 
-def move(eqn: JaxprEqn, args: list[Elements]) -> Elements:
+def move_elements(eqn: JaxprEqn, args: list[ElementArray]) -> ElementArray:
     """Return the result of a primitive that only moves elements."""
     p, x = eqn.params, args[0]
     match eqn.primitive.name:
@@ -44,10 +44,10 @@ def move(eqn: JaxprEqn, args: list[Elements]) -> Elements:
             return np.concatenate(args, axis=p["dimension"])
         case "stack":
             return np.stack(args, axis=p["axis"])
-    return move_many(eqn, args)[0]
+    return move_by_indices(eqn, args)[0]
 
 
-def move_many(eqn: JaxprEqn, args: list[Elements], known_operands: Sequence[Any] = ()) -> list[Elements]:
+def move_by_indices(eqn: JaxprEqn, args: list[ElementArray], known_operands: Sequence[Any] = ()) -> list[ElementArray]:
     """Return the results of a primitive that only moves elements, by running it on their indices.
 
     Args:
@@ -100,6 +100,6 @@ def evaluate(eqn: JaxprEqn, args: Sequence[Any], **params: Any) -> list[np.ndarr
 
 
 @rule("iota", "iota_2x32_shape")
-def _iota(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _iota(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     outs = evaluate(eqn, [])
     return [constants(x, x.dtype) for x in outs]

@@ -7,12 +7,12 @@ from typing import Any
 
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Value, constant, is_constant
-from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError, as_elements, rule, scalars
+from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedError, as_elements, rule, scalars
 from crazysim.jaxcompat import JaxprEqn
 
 
 @rule("reduce_over_others")
-def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Add a loop over the drones of the world; numbers that all drones share are not published."""
     n_captured, n = eqn.params["n_captured"], ctx.n_members
     if not n:
@@ -43,7 +43,7 @@ def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> l
     return [as_elements([next(outs) for _ in scalars(x)], x.shape) for x in results]
 
 
-def _replace_elements(x: Elements, replacements: dict[Value, Value]) -> Elements:
+def _replace_elements(x: ElementArray, replacements: dict[Value, Value]) -> ElementArray:
     def replace(item: Any) -> Any:
         return (
             tuple(map(replace, item))

@@ -8,24 +8,24 @@ import jax
 import numpy as np
 
 from crazysim.engine.ir.blocks import is_constant
-from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError, as_elements, rule
+from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedError, as_elements, rule
 from crazysim.engine.lowering.rules.movement import evaluate
 from crazysim.jaxcompat import JaxprEqn, bits_generator, threefry_prng_impl
 
 
 @rule("random_wrap")
-def _random_wrap(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _random_wrap(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     pairs = args[0].reshape(-1, 2)
     _check_generator(eqn.params["impl"])
     return [as_elements([(a, b) for a, b in pairs], args[0].shape[:-1])]
 
 
 @rule("random_unwrap")
-def _random_unwrap(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _random_unwrap(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     return [_halves(args[0])]
 
 
-def _halves(keys: Elements) -> Elements:
+def _halves(keys: ElementArray) -> ElementArray:
     return as_elements([half for key in keys.reshape(-1) for half in key], (*keys.shape, 2))
 
 
@@ -35,7 +35,7 @@ def _check_generator(impl: Any) -> None:
 
 
 @rule("random_fold_in", "random_split", "random_bits", "random_seed")
-def _random(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _random(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Lower the functions of JAX's generator, which are integer arithmetic and a cipher on the two halves of a key."""
     name, p, impl = eqn.primitive.name, eqn.params, threefry_prng_impl
     takes_keys = name != "random_seed"
@@ -62,7 +62,7 @@ def _random(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
 
 
 @rule("threefry2x32")
-def _threefry(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _threefry(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     shape = np.broadcast_shapes(*(x.shape for x in args))
     rows = [np.broadcast_to(x, shape).reshape(-1) for x in args]
     first, second = [], []

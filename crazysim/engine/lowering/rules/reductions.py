@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike
 from crazysim.engine.ir.blocks import Element, constant
 from crazysim.engine.lowering.jaxprs import (
     MAX_UNROLL,
-    Elements,
+    ElementArray,
     Lowering,
     UnsupportedError,
     as_elements,
@@ -30,7 +30,7 @@ OPERATION_OF_REDUCTION = {
 
 
 @rule(*OPERATION_OF_REDUCTION)
-def _reduce(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _reduce(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     op, dtype, axes = OPERATION_OF_REDUCTION[eqn.primitive.name], eqn.outvars[0].aval.dtype, eqn.params["axes"]
     x = np.moveaxis(args[0], axes, range(len(axes)))
     result_shape = x.shape[len(axes) :]
@@ -43,7 +43,7 @@ def _reduce(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
 
 
 @rule("reduce")
-def _reduce_by(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _reduce_by(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Reduce by a function of accumulated and new operands, starting from the initial values."""
     axes, n = eqn.params["dimensions"], len(args) // 2
     arrays = [np.moveaxis(x, axes, range(len(axes))) for x in args[:n]]
@@ -60,7 +60,7 @@ def _reduce_by(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Eleme
 
 
 @rule("cumsum", "cumprod", "cummax", "cummin")
-def _cumulate(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _cumulate(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     op = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}[eqn.primitive.name]
     x = np.moveaxis(args[0], eqn.params["axis"], 0).copy()
     order = range(len(x))[::-1] if eqn.params["reverse"] else range(len(x))
@@ -70,7 +70,7 @@ def _cumulate(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
 
 
 @rule("argmax", "argmin")
-def _argmax(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _argmax(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Return the index of the first extreme element, or of the first NaN, as XLA does."""
     (axis,), index = eqn.params["axes"], eqn.params["index_dtype"]
     comparison = "gt" if eqn.primitive.name == "argmax" else "lt"
@@ -88,12 +88,12 @@ def _argmax(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
 
 
 @rule("sort")
-def _sort(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _sort(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     return _sort_rows(ctx, eqn, args, eqn.params["dimension"], eqn.params["num_keys"])
 
 
 @rule("top_k")
-def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Return the k largest elements in descending order, and their indices. Of equal elements the first comes first.
 
     XLA orders floats by their bits: -NaN, -inf, ..., -0, 0, ..., inf, NaN.
@@ -114,8 +114,8 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
 
 
 def _sort_rows(
-    ctx: Lowering, eqn: JaxprEqn, args: list[Elements], axis: int, n_keys: int, descending: bool = False
-) -> list[Elements]:
+    ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray], axis: int, n_keys: int, descending: bool = False
+) -> list[ElementArray]:
     """Sort by odd-even transposition: it only exchanges neighbours, so it is stable. NaN goes last.
 
     Args:
@@ -144,7 +144,7 @@ def _sort_rows(
     return [np.moveaxis(c, 0, axis) for c in columns]
 
 
-def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Elements]) -> Elements:
+def _precedes(ctx: Lowering, first: Sequence[ElementArray], second: Sequence[ElementArray]) -> ElementArray:
     """Return where the first of two sets of keys precedes the second in ascending order, in which NaN is last."""
     precedes, is_tied = constants(False, bool), constants(True, bool)
     for a, b in zip(first, second, strict=True):
@@ -160,13 +160,15 @@ def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Element
 
 
 @rule("dot_general")
-def _dot(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _dot(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     (lhs_axes, rhs_axes), (lhs_batch, rhs_batch) = eqn.params["dimension_numbers"]
     dtype, (a, b) = eqn.outvars[0].aval.dtype, args
     if any(v.aval.dtype.kind == "f" for v in eqn.invars) and dtype.kind != "f":
         raise UnsupportedError(f"primitive 'dot_general' of floating-point numbers with a result of type {dtype}")
 
-    def as_matrices(x: Elements, batch: Sequence[int], summed: Sequence[int]) -> tuple[Elements, tuple[int, ...]]:
+    def as_matrices(
+        x: ElementArray, batch: Sequence[int], summed: Sequence[int]
+    ) -> tuple[ElementArray, tuple[int, ...]]:
         free = [i for i in range(x.ndim) if i not in (*batch, *summed)]
         sizes = tuple(x.shape[i] for i in free)
         x = x.transpose(*batch, *free, *summed)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from crazysim.engine.ir.blocks import Element, TableEntries, Value, constant, is_constant
-from crazysim.engine.lowering.jaxprs import MAX_UNROLL, Elements, Lowering, TableEntry, as_elements
+from crazysim.engine.lowering.jaxprs import MAX_UNROLL, ElementArray, Lowering, TableEntry, as_elements
 
 MAX_SELECTED = 4
 """Maximum number of elements from which an entry of a shared array is selected: they are already in registers."""
@@ -47,7 +47,7 @@ class TableView:
             base = self.ctx.scalar("add", base, step)
         return base
 
-    def look_up(self, offsets: np.ndarray, bases: Sequence[Element]) -> Elements:
+    def look_up(self, offsets: np.ndarray, bases: Sequence[Element]) -> ElementArray:
         """Return the entries at some offsets, each relative to its base."""
         flat = [int(k) for k in offsets.reshape(-1)]
         numbers = [
@@ -59,7 +59,7 @@ class TableView:
         return as_elements(numbers, offsets.shape)
 
 
-def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) -> TableView | None:
+def find_table(ctx: Lowering, x: ElementArray, axes: Sequence[int], n_indices: int) -> TableView | None:
     """Return an array as a view of a table in which an index along some axes moves all entries by the same offset.
 
     Return None if it is not such a view, or if it has so few elements that selecting among them is faster.
@@ -88,7 +88,7 @@ def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) 
     return None if strides is None else TableView(ctx, first_location, offsets, strides)
 
 
-def _table_of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> TableView | None:
+def _table_of_constants(ctx: Lowering, x: ElementArray, axes: Sequence[int]) -> TableView | None:
     """Return an array of constants as a table. Entries that are equal at all indices stay constants."""
     numbers = np.array([item.item() for item in x.reshape(-1)], x.reshape(-1)[0].dtype)
     if not np.all(np.isfinite(numbers)):

@@ -72,9 +72,9 @@ class Playback(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         del sim
-        return [StagePlacement(stage("world")(self.move))]
+        return [StagePlacement(stage("world")(self.set_object_poses))]
 
-    def move(self, data: SimData) -> SimData:
+    def set_object_poses(self, data: SimData) -> SimData:
         """Return the data of one world with the objects at their poses."""
         record = self.read(data)
         last = record.pos.shape[0] - 1
