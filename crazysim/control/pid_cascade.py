@@ -40,8 +40,8 @@ class PIDParams(PyTree):
     position: PIDLoop
     """Position loop in the heading frame: position error, m, to desired velocity, m/s."""
     velocity: PIDLoop
-    """Velocity loop in the heading frame: velocity error, m/s, to pitch and negative roll, degrees, and thrust, 1000 PWM.
-    """
+    """Velocity loop in the heading frame: velocity error, m/s, to pitch and negative roll, degrees, and thrust,
+    1000 PWM."""
     attitude: PIDLoop
     """Attitude loop: error of roll, pitch and yaw, degrees, to desired body rates, degrees/s."""
     rate: PIDLoop
