@@ -11,6 +11,7 @@ import pytest
 
 from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
 from crazysim.core.stage import vmap_worlds
+from crazysim.engine.backends import native
 from crazysim.errors import EngineWarning
 from crazysim.scene.depth import pixel_directions
 
@@ -421,34 +422,38 @@ def test_rays_of_all_worlds_equal_those_of_each_world(x64, mixed_scene, rng):
     direction[:, 40:100] = to_drones / np.linalg.norm(to_drones, axis=-1, keepdims=True)
     weight, slant = rng.uniform(size=(2, n)), rng.normal(size=(2, n, 3))
 
-    def answer(cast_all):
-        def weighed(pos, quat, moved, start, along):
+    def value_and_gradients(cast_all):
+        def weighted_sum(pos, quat, object_pos, ray_origin, ray_direction):
             states = data.states.replace(pos=pos, quat=quat)
-            hits = cast_all(data.replace(states=states, objects=data.objects.replace(pos=moved)), start, along)
+            hits = cast_all(
+                data.replace(states=states, objects=data.objects.replace(pos=object_pos)), ray_origin, ray_direction
+            )
             lengths = jnp.sum(jnp.where(jnp.isfinite(hits.distance), weight * hits.distance, 0.0))
             return lengths + jnp.sum(slant * hits.normal), hits
 
         args = data.states.pos, data.states.quat, data.objects.pos, origin, direction
-        return jax.jit(jax.value_and_grad(weighed, (0, 1, 2, 3, 4), has_aux=True))(*args)
+        return jax.jit(jax.value_and_grad(weighted_sum, (0, 1, 2, 3, 4), has_aux=True))(*args)
 
     by_kernel, by_xla, by_world = cast_functions(mixed_scene, own)
-    ((_, together), slopes), ((_, each), expected) = map(answer, (by_kernel, by_world))
-    seen = {together.names[k].partition(":")[0] for k in np.unique(together.body_index) if k >= 0}
-    assert seen == {"floor", "fixed", "moving", "drone"}
-    np.testing.assert_array_equal(together.body_index, each.body_index)
-    np.testing.assert_allclose(together.distance, each.distance, rtol=1e-9)
-    np.testing.assert_allclose(together.normal, each.normal, atol=1e-9)
-    unfused = jax.jit(by_xla)(data, origin, direction)
+    ((_, kernel_hits), gradients), ((_, hits_by_world), expected_gradients) = map(
+        value_and_gradients, (by_kernel, by_world)
+    )
+    hit_kinds = {kernel_hits.names[k].partition(":")[0] for k in np.unique(kernel_hits.body_index) if k >= 0}
+    assert hit_kinds == {"floor", "fixed", "moving", "drone"}
+    np.testing.assert_array_equal(kernel_hits.body_index, hits_by_world.body_index)
+    np.testing.assert_allclose(kernel_hits.distance, hits_by_world.distance, rtol=1e-9)
+    np.testing.assert_allclose(kernel_hits.normal, hits_by_world.normal, atol=1e-9)
+    xla_hits = jax.jit(by_xla)(data, origin, direction)
     for name in ("body_index", "distance", "normal", "point"):
-        np.testing.assert_allclose(getattr(unfused, name), getattr(together, name), rtol=1e-9, atol=1e-9)
-    far = np.where(np.isfinite(each.distance), each.distance, 0.0)[..., None]
-    np.testing.assert_allclose(together.point, np.where(far > 0, origin + far * direction, 0.0), atol=1e-9)
-    for slope, known in zip(slopes, expected, strict=True):
-        assert np.abs(known).max() > 0.1
-        np.testing.assert_allclose(slope, known, rtol=1e-6, atol=1e-8 * np.abs(known).max())
+        np.testing.assert_allclose(getattr(xla_hits, name), getattr(kernel_hits, name), rtol=1e-9, atol=1e-9)
+    distance = np.where(np.isfinite(hits_by_world.distance), hits_by_world.distance, 0.0)[..., None]
+    np.testing.assert_allclose(kernel_hits.point, np.where(distance > 0, origin + distance * direction, 0.0), atol=1e-9)
+    for gradient, expected_gradient in zip(gradients, expected_gradients, strict=True):
+        assert np.abs(expected_gradient).max() > 0.1
+        np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-6, atol=1e-8 * np.abs(expected_gradient).max())
 
 
-def test_rays_meet_geoms_of_every_kind_where_those_of_c_mujoco_do(mixed_scene, rng):
+def test_rays_hit_geoms_of_every_kind_where_rays_of_c_mujoco_do(mixed_scene, rng):
     """Distance to 1e-5, normal and body of 10,000 rays, except rays that graze a surface or pass an edge."""
     from crazysim.scene.ray_casting import RayKernels, cast_rays
 
@@ -462,25 +467,25 @@ def test_rays_meet_geoms_of_every_kind_where_those_of_c_mujoco_do(mixed_scene, r
     mixed_scene.scene.sync_one(mixed_scene.data, 1)
     mj_model, group = mixed_scene.mj_model, np.array([1, 1, 0, 0, 0, 0], np.uint8)
     origin, direction = (x[1].astype(np.float64) for x in rays)
-    far, normal, geoms = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 1), np.int32)
+    expected_distance, normal, geoms = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 1), np.int32)
     for k in range(n):
-        far[k] = mujoco.mj_ray(
+        expected_distance[k] = mujoco.mj_ray(
             mj_model, mixed_scene.mj_data, origin[k], direction[k], group, 1, -1, geoms[k], normal[k]
         )
-    far = np.where(far < 0, np.inf, far)
+    expected_distance = np.where(expected_distance < 0, np.inf, expected_distance)
     bodies = [mj_model.body(mj_model.body_rootid[body]).name for body in mj_model.geom_bodyid]
     names = np.array([*("floor" if body == "world" else body for body in bodies), "nothing"])[geoms[:, 0]]
-    found = np.array([*hits.names, "nothing"])[hits.body_index[1]]
-    differs = (found != names) | ~np.isclose(hits.distance[1], far, rtol=1e-2, atol=0)
-    assert differs.mean() < 1e-3, "rays that pass by an edge on the other side of it"
-    clear = ~differs & np.isfinite(far) & (np.abs(np.sum(normal * direction, axis=-1)) > 0.05)
-    assert clear.mean() > 0.7
+    hit_names = np.array([*hits.names, "nothing"])[hits.body_index[1]]
+    differs = (hit_names != names) | ~np.isclose(hits.distance[1], expected_distance, rtol=1e-2, atol=0)
+    assert differs.mean() < 1e-3, "rays that pass an edge on its other side"
+    is_comparable = ~differs & np.isfinite(expected_distance) & (np.abs(np.sum(normal * direction, axis=-1)) > 0.05)
+    assert is_comparable.mean() > 0.7
     # Coordinates of 4 m have a spacing of 5e-7 m in float32.
-    np.testing.assert_allclose(hits.distance[1][clear], far[clear], rtol=1e-5, atol=5e-7)
+    np.testing.assert_allclose(hits.distance[1][is_comparable], expected_distance[is_comparable], rtol=1e-5, atol=5e-7)
     # Rounding moves a ray across the edge between two faces, or between the triangles of a height field.
-    turned = np.abs(hits.normal[1] - normal)[clear].max(axis=-1) > 1e-3
-    assert turned.mean() < 2e-3
-    assert len(np.unique(mj_model.geom_type[geoms[clear]])) == 8
+    has_other_normal = np.abs(hits.normal[1] - normal)[is_comparable].max(axis=-1) > 1e-3
+    assert has_other_normal.mean() < 2e-3
+    assert len(np.unique(mj_model.geom_type[geoms[is_comparable]])) == 8
 
 
 @pytest.fixture(scope="module")
@@ -501,7 +506,7 @@ def forest():
 
 @pytest.mark.parametrize("platform", [None, "cpu"])
 def test_rays_return_the_right_one_of_many_equal_geoms(forest, rng, platform):
-    """Rays and those of C MuJoCo meet the same one of 140 bodies, so an index that is off by one is noticed."""
+    """Rays hit the same one of 140 bodies as rays of C MuJoCo do, so the test finds an index that is off by one."""
     from crazysim.scene.ray_casting import RayKernels, cast_rays
 
     n, sim = 500, forest
@@ -541,17 +546,18 @@ def test_rays_whose_kernel_is_refused_are_cast_by_xla_with_a_warning(monkeypatch
     top = 0.5 + np.random.default_rng().uniform() / 2
     wedge = f"""<mujoco><asset><mesh name="wedge" vertex="0 0 0 .4 0 0 0 .5 0 0 0 {top!r}"/></asset>
     <worldbody><geom type="mesh" mesh="wedge"/></worldbody></mujoco>"""
-    found = []
+    depths = []
+    native.toolchain(tuple(native.compiler_command()))  # asks the compiler for its version, which has the same limit
     monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "1e-6")
     for engine in ("plain", "auto"):
         sim = Sim(engine=engine)
         sim.scene.add(wedge, "wedge", pos=[1, 0, 1])
         place_drones(sim, [[[0, 0, 1]]])
         if engine == "plain":
-            found.append(sim.depth("fpv_cam", 13, 9))
+            depths.append(sim.depth("fpv_cam", 13, 9))
         else:
             with pytest.warns(EngineWarning, match="rays have no kernel: a kernel of .* lines takes .* longer"):
-                found.append(sim.depth("fpv_cam", 13, 9))
+                depths.append(sim.depth("fpv_cam", 13, 9))
         assert sim.scene.ray_kernels.last_used.startswith("XLA, without a kernel")
-    np.testing.assert_array_equal(*found)
-    assert np.min(found) < 2
+    np.testing.assert_array_equal(*depths)
+    assert np.min(depths) < 2
