@@ -19,7 +19,8 @@ def articulated_car(vehicle: VehicleModel, trailer: bool = False) -> str:
     for name, (ahead, left) in WHEELS.items():
         x = number("axles.front") if ahead > 0 else -number("axles.rear")
         y = left * number("axles.track") / 2
-        # The kingpins are in the middle of the wheels; elsewhere the inertia of the motors would turn a steering car.
+        # The kingpins are in the middle of the wheels, not at `axles.kingpin_track`: wheels that roll about a kingpin
+        # while they are steered turn the car by the inertia of their motors, which vehicle models do not describe.
         hinge = f'<joint name="steer_{name}" axis="0 0 1" damping="4" armature="0.001"/>'
         wheels += f"""<body pos="{x} {y} 0">{hinge if ahead > 0 else ""}
             <joint name="{name}" axis="0 1 0" {spin}/>
@@ -83,7 +84,7 @@ class Articulated:
             self.data.actuator(name).ctrl[0] = torque
 
     def steer(self, angle: float) -> None:
-        """Set the steering angles for that of a wheel in the middle of the front axle, rad."""
+        """Set the steering angles of the front wheels from the angle of a wheel in the middle of their axle, rad."""
         number = self.vehicle.number
         left, right = np.asarray(ackermann(np.array([angle]), self.vehicle.wheelbase, number("axles.track")))
         self.data.actuator("steer_fl").ctrl[0] = left

@@ -42,7 +42,7 @@ def _path(model, start, command, car, n_steps):
 
 
 @pytest.mark.parametrize(("reference", "steer"), [(0.1, 0.2), (0.2, 0.1), (0.2, 0.3), (0.3, -0.2)])
-def test_circles(reference, steer):
+def test_steady_circles_agree(reference, steer):
     """Speed, yaw rate and radius agree within 1%: MuJoCo's slip is about 0.01 rad at 3 m/s^2."""
     car = Articulated(vehicle())
     car.steer(steer)
@@ -57,7 +57,7 @@ def test_circles(reference, steer):
         assert speed / yaw_rate == pytest.approx(car.body_vel[0] / car.yaw_rate, rel=0.012)
 
 
-def test_step_steer():
+def test_yaw_rates_after_a_step_of_the_steering_agree():
     """The yaw rate reaches 90% at the same time within 30 ms, and ends at the same value within 1%.
 
     The difference in time is that of the servos: MuJoCo's turns the wheels at once, ours at 3.2 rad/s at most.
@@ -118,7 +118,7 @@ def test_braking_with_locked_wheels():
     assert float(path.pos[stop, 0]) == pytest.approx((speed**2 - 0.3**2) / (2 * 0.3 * 9.81), rel=0.01)
 
 
-def test_trailer():
+def test_joint_angles_of_a_trailer_agree():
     """Angles of both joints agree within 0.004 rad, in the turn-in and in steady cornering.
 
     Trailer axles roll without slip in both. MuJoCo's trailer has little mass, as only its kinematics are compared.
