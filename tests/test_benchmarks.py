@@ -115,7 +115,7 @@ def test_a_batch_begins_where_the_one_before_began(benchmarks, device, n_calls):
     assert ends == [50 * n_calls] * 3
 
 
-def test_medians_take_turns(benchmarks):
+def test_measured_functions_alternate(benchmarks):
     import measure
 
     order = []

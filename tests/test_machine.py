@@ -15,7 +15,7 @@ def test_processes_fit_into_cores_and_memory(cores, memory, expected):
     assert machine.n_workers(cores, memory) == expected
 
 
-def test_limits_of_a_container_count(tmp_path):
+def test_processes_keep_the_limits_of_a_container(tmp_path):
     free = machine.cores(tmp_path), machine.memory(tmp_path)
     assert min(free) >= 1
     (tmp_path / "cpu.max").write_text("max 100000\n")

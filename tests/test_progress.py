@@ -34,6 +34,6 @@ def test_without_tqdm_items_are_returned_or_it_is_named(monkeypatch, capsys):
         progress_bar(required=True)
 
 
-def test_bars_are_made_in_one_place():
+def test_only_progress_py_imports_tqdm():
     package = Path(crazysim.__file__).parent
     assert [x.name for x in package.rglob("*.py") if "tqdm import" in x.read_text()] == ["progress.py"]

@@ -112,7 +112,7 @@ def f(x):
 '''
 
 
-def test_the_check_finds_each_kind():
+def test_the_check_finds_each_kind_of_violation():
     complaints = [complaint for _, complaint in violations(BAD)]
     for expected in (
         "a flag docstring begins with 'Whether'",

@@ -329,12 +329,12 @@ def test_incomplete_controllers_are_refused():
             freq: int = 100
 
 
-def test_it_shards():
+def test_controllers_run_on_two_devices():
     one, two = (take_off("pid", 50, mesh=mesh, n_worlds=4) for mesh in (None, world_mesh(jax.devices()[:2])))
     np.testing.assert_allclose(one.data.states.rotor_vel, two.data.states.rotor_vel, rtol=1e-5)
 
 
-def test_an_environment_uses_it():
+def test_an_environment_uses_the_controller():
     env = make("hover", n_worlds=2, control="body_rate", controller="pid")
     state = jax.jit(env.reset)(jax.random.key(0))
     state = jax.jit(env.step)(state, np.zeros((2, 1, 4), np.float32))

@@ -49,7 +49,7 @@ def test_gain_about_hover_as_the_lab():
 
 
 @pytest.mark.usefixtures("x64")
-def test_gain_with_load_as_the_lab():
+def test_gains_with_a_load_equal_those_of_the_lab():
     """The gains are those of the facts on AIMotionLab-Virtual for 0.05 kg on a rod of 0.4 m, at 100 Hz."""
     params = LoadLQRParams.create(load_airframe("bumblebee"), 100, 0.05, 0.4, LAB_LOAD_Q, LAB_LOAD_R)
     gain = np.asarray(params.gain)

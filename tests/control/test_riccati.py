@@ -26,7 +26,7 @@ def problem(n, m, seed):
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("kind", SOLVERS)
 @pytest.mark.parametrize(("n", "m"), SIZES)
-def test_as_scipy(kind, n, m):
+def test_solutions_equal_those_of_scipy(kind, n, m):
     solve, reference = SOLVERS[kind]
     for seed in range(5):
         expected = reference(*problem(n, m, seed))
@@ -35,7 +35,7 @@ def test_as_scipy(kind, n, m):
 
 @pytest.mark.parametrize("kind", SOLVERS)
 @pytest.mark.parametrize(("n", "m"), SIZES)
-def test_in_float32(kind, n, m):
+def test_solutions_in_float32_are_accurate_to_half_a_percent(kind, n, m):
     """To half a percent: 30 doublings of matrices of up to 16 x 16 add up some 1e5 roundings of 6e-8."""
     solve, reference = SOLVERS[kind]
     for seed in range(5):

@@ -24,25 +24,25 @@ def setpoint(pos=(0, 0, 0), vel=(0, 0, 0), acc=(0, 0, 0), quat=(0, 0, 0, 1), rat
     return np.array([*pos, *vel, *acc, *quat, *rates], np.float64)
 
 
-def answer(cmd, pos=(0, 0, 0), quat=LEVEL, vel=(0, 0, 0), integral=(0, 0, 0), ctrl_freq=100, p=None):
+def run_controller(cmd, pos=(0, 0, 0), quat=LEVEL, vel=(0, 0, 0), integral=(0, 0, 0), ctrl_freq=100, p=None):
     state = (np.array(pos, float), np.asarray(quat), np.array(vel, float))
     return controller(*state, cmd, np.array(integral, float), ctrl_freq, params=params() if p is None else p)
 
 
-def test_at_the_setpoint_it_is_level_and_carries_the_mass_it_believes_in():
+def test_at_the_setpoint_the_command_is_level_and_carries_the_assumed_mass():
     """The thrust follows from the firmware's factors: 0.0393 * 9.81 N * 132000 PWM/N * 0.8 N / 65535 PWM."""
-    cmd, integral = answer(setpoint())
+    cmd, integral = run_controller(setpoint())
     np.testing.assert_allclose(cmd, [0, 0, 0, 0.0393 * 9.81 * 132000 * 4 * 0.2 / 65535], atol=1e-12)
     np.testing.assert_array_equal(integral, np.zeros(3))
 
 
 @pytest.mark.parametrize("axis, angle, sign", [(0, 1, 1), (1, 0, -1)])
 @pytest.mark.parametrize("start", [0, 3])
-def test_it_leans_towards_where_it_should_be(start, axis, angle, sign):
-    """A setpoint ahead (x) is reached nose down, a positive pitch; one to the left (y) by rolling left, negative."""
+def test_the_drone_tilts_towards_its_setpoint(start, axis, angle, sign):
+    """Towards a setpoint ahead (x) the pitch is positive, nose down; to the left (y) the roll is negative."""
     cmd = setpoint()
     cmd[start + axis] = 0.1
-    rpy = np.array(answer(cmd)[0][:3])
+    rpy = np.array(run_controller(cmd)[0][:3])
     assert sign * rpy[angle] > 0
     rpy[angle] = 0
     np.testing.assert_allclose(rpy, 0, atol=1e-12)
@@ -53,12 +53,12 @@ def test_it_leans_towards_where_it_should_be(start, axis, angle, sign):
     yaw=st.floats(-3, 3),
     quat=vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1),
 )
-def test_body_z_points_along_the_force_and_the_thrust_is_its_part_along_the_present_z(force, yaw, quat):
+def test_body_z_points_along_the_force_and_the_thrust_is_its_component_along_the_present_z(force, yaw, quat):
     """The attitude follows equations 6 to 9 of Mellinger and Kumar 2011, with the force given by an acceleration."""
     p = params(mass=[0.04], thrust_scale=[1.0])
     desired = force + [0, 0, 0.04 * 9.81]
     quat = quat / np.linalg.norm(quat)
-    cmd, _ = answer(setpoint(acc=force / 0.04, quat=Rotation.from_euler("z", yaw).as_quat()), quat=quat, p=p)
+    cmd, _ = run_controller(setpoint(acc=force / 0.04, quat=Rotation.from_euler("z", yaw).as_quat()), quat=quat, p=p)
     axes = Rotation.from_euler("ZYX", np.asarray(cmd[:3])[::-1]).as_matrix().T
     np.testing.assert_allclose(axes[2], desired / np.linalg.norm(desired), atol=1e-9)
     # The new x axis lies in the plane of the desired heading and the new z axis.
@@ -68,20 +68,20 @@ def test_body_z_points_along_the_force_and_the_thrust_is_its_part_along_the_pres
 
 
 @pytest.mark.parametrize("freq", [50, 100, 500])
-def test_the_integral_grows_with_the_error_and_its_own_rate_and_stays_within_its_limit(freq):
-    _, integral = answer(setpoint(pos=(0.1, -0.2, 0.3)), integral=(0.5, 0, 0), ctrl_freq=freq)
+def test_the_integral_sums_errors_over_the_control_rate_and_stays_within_its_limit(freq):
+    _, integral = run_controller(setpoint(pos=(0.1, -0.2, 0.3)), integral=(0.5, 0, 0), ctrl_freq=freq)
     np.testing.assert_allclose(integral, [0.5 + 0.1 / freq, -0.2 / freq, 0.3 / freq], rtol=1e-12)
-    _, integral = answer(setpoint(pos=(1000, -1000, 1000)), integral=(1.9, -1.9, 0.3), ctrl_freq=freq)
+    _, integral = run_controller(setpoint(pos=(1000, -1000, 1000)), integral=(1.9, -1.9, 0.3), ctrl_freq=freq)
     np.testing.assert_allclose(integral, [2, -2, 0.4], rtol=1e-12)
 
 
-def test_gains_act_each_on_its_error():
-    """Straight up, so that force and thrust are one: kp, kd, ki and mass, each by hand."""
+def test_each_gain_acts_on_its_error():
+    """The setpoint is straight above, so the thrust is the force: kp, kd, ki and mass are each checked by hand."""
     p = params(thrust_scale=[1.0])
     mass, kp, kd, ki = 0.0393, 1.25, 0.5, 0.05
 
     def thrust(**kwargs):
-        return float(answer(setpoint(**kwargs.pop("to", {})), p=p, **kwargs)[0][3])
+        return float(run_controller(setpoint(**kwargs.pop("to", {})), p=p, **kwargs)[0][3])
 
     hover = thrust()
     assert thrust(to={"pos": (0, 0, 0.1)}) - hover == pytest.approx(0.1 * kp + ki * 0.1 / 100)
@@ -92,27 +92,27 @@ def test_gains_act_each_on_its_error():
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3, -7.0])
-def test_of_the_quaternion_only_yaw_counts_whatever_its_length(scale):
+def test_only_the_yaw_of_a_commanded_quaternion_of_any_length_is_used(scale):
     yaw, tilt = Rotation.from_euler("z", 0.7), Rotation.from_euler("ZYX", [0.7, 0.4, -0.3])
-    expected, _ = answer(setpoint(quat=yaw.as_quat()))
-    np.testing.assert_allclose(answer(setpoint(quat=scale * tilt.as_quat()))[0], expected, atol=1e-12)
+    expected, _ = run_controller(setpoint(quat=yaw.as_quat()))
+    np.testing.assert_allclose(run_controller(setpoint(quat=scale * tilt.as_quat()))[0], expected, atol=1e-12)
     assert float(expected[2]) == pytest.approx(0.7)
 
 
 def test_fault_02_a_zero_quaternion_means_yaw_zero():
-    expected, _ = answer(setpoint(pos=(0.1, 0.2, 0.3)))
-    np.testing.assert_array_equal(answer(setpoint(pos=(0.1, 0.2, 0.3), quat=(0, 0, 0, 0)))[0], expected)
+    expected, _ = run_controller(setpoint(pos=(0.1, 0.2, 0.3)))
+    np.testing.assert_array_equal(run_controller(setpoint(pos=(0.1, 0.2, 0.3), quat=(0, 0, 0, 0)))[0], expected)
 
 
 @jax.jit
 @functools.partial(jax.value_and_grad, argnums=(0, 1))
-def total(cmd, pos, p):
+def sum_of_command(cmd, pos, p):
     return jnp.sum(state2attitude(pos, jnp.asarray(LEVEL), jnp.zeros(3), cmd, jnp.zeros(3), 100, params=p)[0])
 
 
 @pytest.mark.parametrize("acc", [(0, 0, -9.81), (5, 0, -9.81), (0, 0, -20)])
 @pytest.mark.parametrize("quat", [(0, 0, 0, 1), (0, 0, 0, 0)])
 def test_law_07_values_and_gradients_are_finite_where_the_force_vanishes_or_points_along_the_heading(acc, quat):
-    value, gradients = total(setpoint(acc=acc, quat=quat), np.zeros(3), params(mass=[0.04]))
+    value, gradients = sum_of_command(setpoint(acc=acc, quat=quat), np.zeros(3), params(mass=[0.04]))
     assert np.isfinite(value)
     assert all(np.all(np.isfinite(g)) for g in gradients)

@@ -404,7 +404,7 @@ def test_law_01_methods_get_one_drone():
     assert set(shapes) == {((3,), ())}
 
 
-def test_a_plugin_of_functions():
+def test_functions_can_be_a_plugin():
     sim = Sim(n_worlds=2)
 
     @stage("drone")

@@ -16,7 +16,7 @@ def test_page_runs(page, tmp_path, monkeypatch, opengl):
 
 
 SCENE_PAGES = ("docs/concepts/scene.md", "docs/guides/obstacles.md", "docs/guides/pictures.md")
-PEER_CODE = (
+CRAZYFLOW_LINES = (
     "sim = Sim(n_worlds=1, n_drones=1)",
     '<geom type="box" size="0.1 0.1 0.1" rgba="0.8 0.2 0.2 1"/>',
     "mujoco.MjSpec.from_string(box_xml)",
@@ -42,7 +42,7 @@ PEER_CODE = (
 
 def test_scene_code_of_crazyflow_is_on_the_pages():
     code = "".join(block.code for page in SCENE_PAGES for block in outputs.blocks((ROOT / page).read_text()))
-    for line in PEER_CODE:
+    for line in CRAZYFLOW_LINES:
         assert line in code, line
 
 
@@ -73,7 +73,7 @@ def test_outputs_are_compared_to_the_digits_that_a_page_shows(shown, printed, sa
     assert outputs.is_same_output(shown, printed) is same
 
 
-def test_an_example_has_the_words_of_the_output_and_other_numbers():
+def test_an_example_output_may_differ_in_its_numbers():
     text = '```python\nprint(1)\n```\n\n```text title="for example"\nsuccess 0.5% in 12 s\n```\n'
     (block,) = outputs.blocks(text)
     assert block.example
@@ -87,7 +87,7 @@ def test_an_output_belongs_to_the_block_before_it():
     assert [block.output for block in outputs.blocks(text)] == ["1\n", None]
 
 
-def test_a_block_with_a_title_is_a_file_of_its_own(tmp_path, monkeypatch):
+def test_a_block_with_a_title_is_a_separate_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = (
         '```python title="mine.py"\nx = 1\nif __name__ == "__main__":\n    print("main")\n```\n\n'

@@ -19,7 +19,7 @@ force = jax.jit(drag_force)
 
 
 @given(quat=quats, vel=vectors)
-def test_drag_is_r_d_rt_v(quat, vel):
+def test_drag_is_the_matrix_in_body_axes(quat, vel):
     quat = quat / np.linalg.norm(quat)
     matrix = Rotation.from_quat(quat).as_matrix()
     np.testing.assert_allclose(force(quat, vel, D), matrix @ D @ matrix.T @ vel, atol=1e-13)

@@ -71,40 +71,40 @@ def fuzzer():
     return Fuzzer(0)
 
 
-def cases(programs, scope="drone"):
+def make_cases(programs, scope="drone"):
     return [Case(Program(inputs, (line,)), scope) for inputs, line in programs.values()]
 
 
 @pytest.mark.parametrize("scope", ["drone", "world"])
-def test_programs_that_were_wrong_give_what_they_give_plain(scope):
+def test_programs_that_were_wrong_give_the_results_of_plain(scope):
     fuzzer = Fuzzer(1)
-    chosen = (
+    programs = (
         PROGRAMS_ONCE_WRONG
         if scope == "drone"
         else {name: PROGRAMS_ONCE_WRONG[name] for name in ("sort by bools", "top_k of equals")}
     )
-    finds = list(fuzzer.check(cases(chosen, scope)))
+    finds = list(fuzzer.check(make_cases(programs, scope)))
     assert not finds, "\n".join(map(str, finds))
     assert not fuzzer.counts["refused"], fuzzer.refused
-    assert fuzzer.counts["compared on lanes"] == len(chosen)
+    assert fuzzer.counts["compared on lanes"] == len(programs)
 
 
 def test_refused_programs_are_refused_when_the_step_is_planned(fuzzer):
     for name, program in REFUSED_PROGRAMS.items():
         fuzzer.refused.clear()
-        assert not list(fuzzer.check(cases({name: program})))
+        assert not list(fuzzer.check(make_cases({name: program})))
         (reason,) = fuzzer.refused
         assert name in reason
 
 
-def test_random_programs_give_what_they_give_plain(fuzzer):
+def test_random_programs_give_the_results_of_plain(fuzzer):
     """This is a small run; ``python tests/engine/fuzz.py --programs 20000`` is a large one."""
     finds = list(fuzzer.check(fuzzer.draw(16)))
     assert not finds, "\n".join(map(str, finds))
     assert fuzzer.counts["compared on lanes"] > 8
 
 
-def minimum(ctx, eqn, args):
+def compute_minimum(ctx, eqn, args):
     return [ctx.elementwise("min", args, args[0].reshape(-1)[0].dtype)]
 
 
@@ -117,7 +117,7 @@ def subtract_from_zero(ctx, eqn, args):
     ("name", "wrong", "line"),
     [
         ("rev", lambda ctx, eqn, args: args, "jnp.flip(v0)"),
-        ("max", minimum, "jnp.maximum(v0, 1.0)"),
+        ("max", compute_minimum, "jnp.maximum(v0, 1.0)"),
         ("neg", subtract_from_zero, "-v0"),
         ("cumprod", lambda ctx, eqn, args: args, "lax.cumprod(v0, 1)"),
         ("lgamma", lambda ctx, eqn, args: [ctx.elementwise("digamma", args, np.float32)], "lax.lgamma(v0)"),
@@ -131,7 +131,7 @@ def test_a_wrong_rule_is_found(monkeypatch, name, wrong, line):
     assert line in str(find)
 
 
-def test_a_rule_that_fails_is_found_and_what_jax_refuses_is_not(monkeypatch):
+def test_a_rule_that_fails_is_found_and_a_program_that_jax_refuses_is_not(monkeypatch):
     monkeypatch.setitem(RULES, "rev", lambda ctx, eqn, args: 1 / 0)
     fuzzer = Fuzzer(2, engines=("interpret",))
     (find,) = fuzzer.check([Case(Program(("f33",), ("jnp.flip(v0)",)), "drone")])

@@ -99,7 +99,7 @@ def test_a_transposed_block_is_what_jax_makes_of_the_function(name, x64):
 
 @pytest.mark.long("compiles four gradients as kernels, and by XLA to compare")
 @needs_compiler
-def test_a_kernel_goes_back(x64, monkeypatch):
+def test_a_kernel_computes_the_gradient(x64, monkeypatch):
     """Gradients are repeatable to the bit, also in intervals, and for batches of worlds."""
     ((fast, step, data), (plain, *_)), at = make_losses(n_steps=3, n_drones=2)
     kernel_gradient = jit_gradient(fast)

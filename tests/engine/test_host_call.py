@@ -32,9 +32,9 @@ def step_on_xla(sim, n):
     return sim.step_fn(sim.data, jnp.int32(n))
 
 
-@pytest.mark.parametrize("n_worlds", [3, 700], ids=["one piece of memory", "one for each array"])
+@pytest.mark.parametrize("n_worlds", [3, 700], ids=["one buffer", "a buffer for each array"])
 @pytest.mark.parametrize("n_drones", [1, 2])
-def test_it_gives_the_numbers_of_the_compiled_step(n_worlds, n_drones):
+def test_host_calls_give_the_numbers_of_the_compiled_step(n_worlds, n_drones):
     sim = Sim(n_worlds, n_drones, control="state")
     for _ in range(3):
         expected = step_on_xla(sim, 7)
@@ -45,7 +45,7 @@ def test_it_gives_the_numbers_of_the_compiled_step(n_worlds, n_drones):
 @pytest.mark.parametrize(("n_drones", "control"), [(1, "state"), (3, "attitude"), (9, "rotor_vel")])
 def test_numbers_depend_neither_on_blocks_nor_on_threads(n_drones, control):
     """13 worlds end within a block of lanes; 1,400 worlds are distributed over the cores."""
-    n_worlds, after = 1400, []
+    n_worlds, end_states = 1400, []
     rng = np.random.default_rng(n_drones)
     shapes = {"pos": 3, "vel": 3, "ang_vel": 3, "rotor_vel": 4}
     start = {name: rng.normal(1, 0.3, (n_worlds, n_drones, k)).astype(np.float32) for name, k in shapes.items()}
@@ -57,8 +57,8 @@ def test_numbers_depend_neither_on_blocks_nor_on_threads(n_drones, control):
         states = {name: jnp.asarray(x[:n]) for name, x in start.items()}
         sim.data = sim.data.replace(states=sim.data.states.replace(**states))
         sim.step(3)
-        after.append(sim.data.states)
-    many, few = after
+        end_states.append(sim.data.states)
+    many, few = end_states
     assert trees_equal(jax.tree.map(lambda x: x[:13], many), few)
 
 
@@ -86,7 +86,7 @@ def test_a_kernel_without_memory_is_an_error(monkeypatch):
         jax.block_until_ready(step_on_xla(sim, 1))
 
 
-def test_populations_that_do_not_depend_on_each_other_are_stepped_alike():
+def test_independent_populations_give_the_numbers_of_the_compiled_step():
     sim = Sim(3, 2)
     sim.add(Cars(2))
     sim.step(5)
@@ -104,7 +104,7 @@ def test_subnormal_numbers_are_zero_as_in_the_compiled_step(sim):
     expected = step_on_xla(sim, 1)
     sim.step()
     assert trees_equal(sim.data, expected)
-    assert np.float32(1e-38) / np.float32(100) > 0  # and the caller's arithmetic is as it was
+    assert np.float32(1e-38) / np.float32(100) > 0  # the caller's arithmetic keeps subnormal numbers
 
 
 def test_a_non_finite_drone_flags_its_world_alone(sim):
@@ -115,23 +115,23 @@ def test_a_non_finite_drone_flags_its_world_alone(sim):
     np.testing.assert_array_equal(sim.data.core.nonfinite[:, 0], [False, True, False])
 
 
-def test_what_is_read_late_is_what_it_was(sim):
-    """A record makes its fields when they are read; later steps and commands do not change them."""
+def test_fields_that_are_read_later_keep_their_values(sim):
+    """A record creates its fields when they are read, and later steps and commands do not change them."""
     expected = [np.array(leaf_on_host(x)) for x in jax.tree.leaves(step_on_xla(sim, 3))]
     sim.step(3)
-    unread, half = sim.data, sim.data.states
-    pos = half.pos
+    unread, states = sim.data, sim.data.states
+    pos = states.pos
     for k in range(4):
         sim.attitude_control(COMMAND * (k + 2))
         sim.step(3)
         assert not np.array_equal(sim.data.states.pos, pos)
     for x, y in zip(jax.tree.leaves(unread), expected, strict=True):
         np.testing.assert_array_equal(leaf_on_host(x), y)
-    assert unread.states is half
-    assert half.pos is pos
+    assert unread.states is states
+    assert states.pos is pos
 
 
-def test_leaves_are_made_once(sim):
+def test_arrays_of_a_record_are_created_once(sim):
     assert sim.data is sim.data
     assert sim.data.states.pos is sim.data.states.pos
 
@@ -147,7 +147,7 @@ def test_a_record_that_was_not_read_can_be_copied(sim):
 
 
 @pytest.mark.parametrize("field", ["states", "params", "controls"])
-def test_arrays_that_their_reader_donates_stay_those_of_the_simulation(sim, field):
+def test_donating_arrays_that_were_read_does_not_change_the_simulation(sim, field):
     twin = Sim(3, 2, control="attitude")
     twin.attitude_control(COMMAND)
     twin.step(2)
@@ -169,14 +169,14 @@ def test_a_command_of_the_device_may_be_donated_later(sim):
     np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, COMMAND.astype(np.float32))
 
 
-def test_threads_read_whole_moments_while_another_steps(sim):
+def test_threads_read_consistent_records_while_another_steps(sim):
     """Height and step count in every record belong to the same moment."""
-    seen, done = [], threading.Event()
+    samples, stopped = [], threading.Event()
 
     def read():
-        while not done.is_set():
+        while not stopped.is_set():
             data = sim.data
-            seen.append((int(data.core.steps[0, 0]), float(data.states.pos[0, 0, 2])))
+            samples.append((int(data.core.steps[0, 0]), float(data.states.pos[0, 0, 2])))
 
     threads = [threading.Thread(target=read) for _ in range(2)]
     for thread in threads:
@@ -185,11 +185,11 @@ def test_threads_read_whole_moments_while_another_steps(sim):
     for _ in range(200):
         sim.step()
         heights[int(sim.data.core.steps[0, 0])] = float(sim.data.states.pos[0, 0, 2])
-    done.set()
+    stopped.set()
     for thread in threads:
         thread.join()
-    assert len(seen) > 10
-    assert all(heights[steps] == height for steps, height in seen)
+    assert len(samples) > 10
+    assert all(heights[steps] == height for steps, height in samples)
 
 
 def test_other_devices_and_engines_keep_the_compiled_step():

@@ -47,7 +47,7 @@ WRITES = [
 """Functions of a zero vector and the number of the step, which is zero, and their results."""
 
 
-def test_writes_at_places(sim):
+def test_updates_at_indices_equal_those_of_plain(sim):
     """One stage of a drone computes all functions."""
 
     @stage("drone")

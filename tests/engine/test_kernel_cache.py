@@ -1,4 +1,4 @@
-"""Folders of kernels belong to this user alone, and remains of killed processes are removed from them."""
+"""Folders of kernels are private to the user, and files that killed processes left in them are removed."""
 
 import os
 import stat
@@ -28,14 +28,14 @@ def cache(tmp_path, monkeypatch):
     return tmp_path
 
 
-def finished_process():
+def finished_process_id():
     """Return the number of a process that has ended."""
     process = subprocess.Popen(["true"])
     process.wait()
     return process.pid
 
 
-def mode(path):
+def permissions(path):
     return stat.S_IMODE(path.stat().st_mode)
 
 
@@ -45,8 +45,8 @@ def test_the_folder_is_made_for_this_user_alone(cache):
         assert kernel_cache.folder() == cache / "crazysim"
     finally:
         os.umask(mask)
-    assert mode(cache / "crazysim") == 0o700
-    assert mode(kernel_cache.temporary_folder()) == 0o700
+    assert permissions(cache / "crazysim") == 0o700
+    assert permissions(kernel_cache.temporary_folder()) == 0o700
 
 
 @pytest.mark.parametrize("bits", [0o777, 0o775, 0o702])
@@ -102,16 +102,16 @@ def test_a_file_of_another_user_is_not_loaded(cache):
     assert library.exists()
 
 
-def test_a_folder_that_is_asked_for_is_checked_at_once(tmp_path):
+def test_enable_cache_checks_its_folder_at_once(tmp_path):
     """With ``enable_cache``, an error rather than a warning."""
     mask = os.umask(0)
     try:
-        opened = tmp_path / "open"
-        opened.mkdir()
+        shared_folder = tmp_path / "open"
+        shared_folder.mkdir()
     finally:
         os.umask(mask)
     with pytest.raises(ConfigError, match=r"only this user can write, got .*open': other users can write to it"):
-        enable_cache(opened)
+        enable_cache(shared_folder)
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"expected a folder for compiled programs, got .*file'"):
         enable_cache(tmp_path / "file")
@@ -135,7 +135,7 @@ def make_remains(tmp_path):
 
 
 def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
-    here, other, gone = kernel_cache.process_name(), "0" * 8, finished_process()
+    here, other, gone = kernel_cache.process_name(), "0" * 8, finished_process_id()
     machine = here.split("-")[0]
     day = 1.01 * kernel_cache.ABANDONMENT_AGE
     remains = [
@@ -157,20 +157,20 @@ def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
     assert not any(path.exists() for path in remains)
 
 
-def test_no_process_is_asked_for_on_windows(monkeypatch):
+def test_processes_are_not_signalled_on_windows(monkeypatch):
     """On Windows, the call that tests for a process on POSIX systems would send Ctrl+C."""
     name = f"key.{kernel_cache.process_name()}-140.tmp"
     with monkeypatch.context() as faked:
         faked.setattr(kernel_cache.os, "kill", None)
         faked.setattr(kernel_cache.os, "name", "nt")
-        found = [kernel_cache._is_abandoned(name, age * kernel_cache.ABANDONMENT_AGE) for age in (0.9, 1.1)]
-    assert found == [False, True]
+        is_abandoned = [kernel_cache._is_abandoned(name, age * kernel_cache.ABANDONMENT_AGE) for age in (0.9, 1.1)]
+    assert is_abandoned == [False, True]
 
 
 def test_the_folders_are_swept_at_the_next_start(cache, make_remains):
     (cache / "crazysim").mkdir(mode=0o700)
     machine = kernel_cache.process_name().split("-")[0]
-    remains = make_remains(f"crazysim/key.{machine}-{finished_process()}-1.tmp")
+    remains = make_remains(f"crazysim/key.{machine}-{finished_process_id()}-1.tmp")
     assert kernel_cache.folder() == cache / "crazysim"
     assert not remains.exists()
 
@@ -196,4 +196,4 @@ def test_a_child_that_ends_leaves_the_folder_of_its_parent(tmp_path):
     status, folder = done.stdout.splitlines()
     assert status == "0 True"
     assert folder.startswith(str(tmp_path))
-    assert not list(tmp_path.iterdir()), "each removes its own"
+    assert not list(tmp_path.iterdir()), "each process removes its own folder"

@@ -248,7 +248,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("what", BROKEN)
-def test_verification_finds(what):
+def test_verification_finds_each_defect(what):
     program, message = BROKEN[what]
     with pytest.raises(VerificationError, match=message):
         verify(program)

@@ -42,7 +42,7 @@ def test_a_static_number_of_steps_gives_what_a_dynamic_one_gives(data, step):
     np.testing.assert_array_equal(dynamic.core.steps, np.full((3, 1), 7))
 
 
-def test_no_step_is_no_motion(data, step):
+def test_zero_steps_change_nothing(data, step):
     after = step(data, jnp.int32(0))
     assert trees_equal(after.states, data.states)
     assert trees_equal(after.core.steps, data.core.steps)

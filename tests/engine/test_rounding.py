@@ -37,7 +37,7 @@ def is_within_rounding(fn, values, found, dtype=np.float32):
         pytest.param(lax.div, [0.0, DENORMAL], 0.0, None, id="division by a denormal number"),
     ],
 )
-def test_what_rounding_explains(fn, values, found, wrong):
+def test_differences_by_rounding_are_told_from_wrong_results(fn, values, found, wrong):
     """``wrong`` is what it must not explain; None where any number can come out."""
     assert is_within_rounding(fn, values, found)
     assert wrong is None or not is_within_rounding(fn, values, wrong)

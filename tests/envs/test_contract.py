@@ -233,7 +233,7 @@ def test_the_same_seed_gives_the_same_numbers(env, start_state):
     assert trees_equal(select_state(some_anew, ~IS_ENDING), select_state(start_state, ~IS_ENDING))
 
 
-def test_gymnasium_makes_it(name):
+def test_gymnasium_makes_every_task(name):
     vector_env = vector(name)
     assert isinstance(vector_env.unwrapped, DroneVectorEnv)
     assert (vector_env.spec.id, vector_env.num_envs) == (TASKS[name].id, N_FLYING)

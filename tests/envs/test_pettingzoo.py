@@ -127,7 +127,7 @@ def test_wrong_settings_are_refused(drone_env):
 
 
 @pytest.mark.usefixtures("opengl")
-def test_pictures(drone_env):
+def test_rendering_returns_an_image(drone_env):
     env = DroneParallelEnv(drone_env, "rgb_array", (64, 48))
     env.reset(seed=0)
     picture = env.render()

@@ -40,7 +40,7 @@ def test_an_environment_needs_the_task_installed(installed):
         DroneEnv(sim, Land())
 
 
-def test_names_are_no_tasks():
+def test_the_name_of_a_task_is_refused_where_a_task_is_expected():
     with pytest.raises(ConfigError, match="expected a Task, got 'hover'"):
         DroneEnv(Sim(control="attitude"), "hover")
 

@@ -14,10 +14,10 @@ def test_shapes_are_equal_by_content():
     assert hash(Shape("sphere", (0.5, 0, 0))) == hash(Shape("sphere", (0.5,)))  # as MuJoCo has it in geom_size
     assert Shape("capsule", (1, 2)) != Shape("cylinder", (1, 2))
     heights = np.array([[0.0, 0.1], [0.2, 0.3]])
-    one, same, other = (hfield(h, (1, 1, 0.5, 0.1)) for h in (heights, heights.copy(), heights + 0.1))
-    assert one == same
-    assert hash(one) == hash(same)
-    assert one != other
+    field, equal_field, higher_field = (hfield(h, (1, 1, 0.5, 0.1)) for h in (heights, heights.copy(), heights + 0.1))
+    assert field == equal_field
+    assert hash(field) == hash(equal_field)
+    assert field != higher_field
     assert hull(CUBE) == hull(CUBE.copy())
     assert hull(CUBE) != hull(2 * CUBE)
 
@@ -42,19 +42,19 @@ def test_hull_of_a_cube():
 
 
 @pytest.mark.parametrize("n", [4, 12, 40])
-def test_a_hull_is_closed_and_holds_its_vertices(rng, n):
+def test_a_hull_is_closed_and_contains_its_vertices(rng, n):
     vertices = rng.normal(size=(n, 3))
     shape = hull(vertices)
     assert np.max(vertices @ shape.normals.T - shape.offsets) < 1e-12
     np.testing.assert_allclose(np.linalg.norm(shape.normals, axis=1), 1)
     corners = shape.vertices[shape.faces]
-    # Divergence theorem: outward triangles of a closed surface add up to nothing, and to the volume.
+    # Divergence theorem: the areas of a closed surface add up to zero, and outward triangles give a positive volume.
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     np.testing.assert_allclose(area.sum(axis=0), 0, atol=1e-12)
     assert np.sum(area * corners[:, 0]) > 0
     assert len(shape.vertices) - 1.5 * len(shape.faces) + len(shape.faces) == 2  # Euler
-    turned = shape.faces[:, [0, 2, 1]]
-    assert set(map(tuple, np.round(hull(shape.vertices, turned).normals, 9))) == set(
+    flipped_faces = shape.faces[:, [0, 2, 1]]
+    assert set(map(tuple, np.round(hull(shape.vertices, flipped_faces).normals, 9))) == set(
         map(tuple, np.round(shape.normals, 9))
     )
 

@@ -117,7 +117,7 @@ def draw_arguments(module, function, model, rng, per_drone):
 
 @pytest.mark.parametrize("per_drone", [False, True], ids=["shared", "per_drone"])
 @pytest.mark.parametrize("module, function, model", CASES)
-def test_a_batch_is_its_drones(module, function, model, per_drone, x64, rng):
+def test_functions_of_a_batch_equal_those_of_each_drone(module, function, model, per_drone, x64, rng):
     """Law 1 for every function of dynamics and control, with shared parameters and parameters per drone."""
     batched, shared_arguments = draw_arguments(module, function, model, rng, per_drone)
     if not batched:  # a function of parameters alone: without batch axes there is nothing to compare

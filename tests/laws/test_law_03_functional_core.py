@@ -188,7 +188,7 @@ def test_the_shell_computes_nothing(module):
         "up = rotation_matrix @ thrust",
     ],
 )
-def test_arithmetic_is_recognised(line):
+def test_the_check_finds_arithmetic(line):
     """The test above can fail: each line is physics that somebody might write into ``Sim``."""
     assert len(find_arithmetic(line)) > 0
     assert find_arithmetic("def f(x: int | None = -1):\n    return not x") == []

@@ -258,7 +258,7 @@ def test_what_sync_returns_may_be_assigned(two, syncs):
 # What does not --------------------------------------------------------------------------------------------------
 
 
-def test_questions_share_one_sync_and_a_step_between_forces_two(one, syncs):
+def test_queries_share_a_sync_until_the_next_step(one, syncs):
     """Two questions after a step need one sync, and two syncs if there is a step between them."""
     one.step(5)
     syncs.clear()
@@ -309,7 +309,7 @@ def test_wrong_questions_change_nothing(two, syncs):
     assert two.mjx_data is mjx_data
 
 
-def test_asking_reads_no_device(two, syncs):
+def test_queries_read_no_flag_from_the_device(two, syncs):
     """The host knows whether a sync is due, so the flag on the device is never read."""
 
     sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)

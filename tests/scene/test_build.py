@@ -95,8 +95,8 @@ def test_every_airframe_has_a_body(name):
     for led in ("led_top:0", "led_bot:0"):
         assert np.sum(model.geom_matid == model.material(led).id) == 1
     assert {model.camera(i).name for i in range(model.ncam)} == {"fpv_cam:0", "track_cam:0"}
-    touches = belongs_to_drone & ((model.geom_contype | model.geom_conaffinity) > 0)
-    assert [model.geom(i).name for i in np.flatnonzero(touches)] == ["col_sphere:0"]
+    has_contacts = belongs_to_drone & ((model.geom_contype | model.geom_conaffinity) > 0)
+    assert [model.geom(i).name for i in np.flatnonzero(has_contacts)] == ["col_sphere:0"]
     assert model.geom("col_sphere:0").size[0] >= np.linalg.norm(rotors[:, :2], axis=-1).max()
 
 
@@ -202,7 +202,7 @@ def test_mocap_ids_follow_when_bodies_are_added_before_the_drones():
     assert sim.default_data.core.drone_mocap_ids.tolist() == expected
 
 
-# Scenes of one's own --------------------------------------------------------------------------------------------
+# Scene files of users --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("as_type", [str, lambda path: path], ids=["str", "Path"])
@@ -237,17 +237,20 @@ BROKEN = {
     "empty": ("", "expected a scene that MuJoCo can read"),
     "cut off": ("<mujoco><worldbody>", "expected a scene that MuJoCo can read"),
     "unknown element": (WORLD.format("<wall/>"), "expected a scene that MuJoCo can read"),
-    "include that is not there": (
+    "missing include": (
         "<mujoco><include file='none.xml'/></mujoco>",
         "expected a scene that MuJoCo can read",
     ),
-    "mesh that is not there": (
+    "missing mesh": (
         "<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>",
         "expected a scene that compiles.*none.stl",
     ),
     "geom without size": (WORLD.format("<geom type='sphere'/>"), "expected a scene that compiles"),
-    "a drone of its own": (WORLD.format("<body name='drone:0'/>"), "reserved for the drones, got .'drone:0'."),
-    "a drone deep in the tree": (
+    "body with the name of a drone": (
+        WORLD.format("<body name='drone:0'/>"),
+        "reserved for the drones, got .'drone:0'.",
+    ),
+    "nested body with the name of a drone": (
         WORLD.format("<body name='a'><body name='drone:7'/></body>"),
         "reserved for the drones, got .'drone:7'.",
     ),
@@ -278,10 +281,10 @@ def test_a_scene_with_names_of_the_drones_is_refused(tmp_path):
             Sim(xml_path=broken_scene(tmp_path, mjcf))
 
 
-# Rebuilds that cannot be ----------------------------------------------------------------------------------------
+# Rebuilds that fail --------------------------------------------------------------------------------------------
 
 
-def test_after_a_spec_that_does_not_compile_the_old_scene_stays(sim):
+def test_after_a_spec_that_does_not_compile_the_old_scene_stays():
     """After a refused rebuild the simulation continues with the old scene, and a corrected spec replaces it."""
     sim = Sim(n_worlds=3)
     model, data = sim.mj_model, sim.data

@@ -38,7 +38,7 @@ def test_the_name_of_the_renderer_tells_a_cpu_from_a_gpu(opengl, renderer, name,
     assert software.film_size(960, 544) == ((640, 362) if expected else (960, 544))
 
 
-def test_the_variable_decides_first(opengl, renderer, monkeypatch):
+def test_the_variable_takes_precedence_over_the_renderer(opengl, renderer, monkeypatch):
     renderer(b"llvmpipe")
     monkeypatch.setenv(software.QUALITY_VARIABLE, "full")
     assert not software.uses_cpu_quality()

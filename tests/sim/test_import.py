@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-LIST = """
+PROGRAM = """
 import json, sys
 import jax, mujoco
 def packages():
@@ -36,7 +36,7 @@ assert not {"warp", "trimesh"} & sys.modules.keys()
 def printed_lines():
     """Return the lines that the program prints."""
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", LIST], capture_output=True, text=True, env=os.environ, check=False
+        [sys.executable, "-W", "error", "-c", PROGRAM], capture_output=True, text=True, env=os.environ, check=False
     )
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout.splitlines()

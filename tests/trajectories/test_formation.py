@@ -30,7 +30,7 @@ def test_neighbours_are_one_spacing_from_each_other(name, n, spacing, yaw):
     np.testing.assert_allclose(positions[:, :2] - [1.0, -2.0], level[:, :2] @ turn.T, atol=1e-9)
 
 
-def test_by_hand():
+def test_line_circle_and_grid_by_hand():
     np.testing.assert_allclose(formation.line(3, 0.5), [[-0.5, 0, 1], [0, 0, 1], [0.5, 0, 1]])
     np.testing.assert_allclose(
         formation.circle(4, radius=2.0, center=(0, 0, 1)), [[2, 0, 1], [0, 2, 1], [-2, 0, 1], [0, -2, 1]], atol=1e-12

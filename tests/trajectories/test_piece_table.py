@@ -52,7 +52,7 @@ def test_a_batch_is_evaluated_as_one_by_one():
     np.testing.assert_array_equal(together, alone)
 
 
-def test_padding_has_no_pieces():
+def test_padding_adds_no_pieces():
     padded = TRAJECTORIES[0].padded(9, 7)
     assert len(PieceTable.create([padded]).start) == 3
 

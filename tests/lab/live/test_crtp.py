@@ -112,7 +112,7 @@ def test_log_configurations_and_the_synchronous_logger(running, uri):
     assert received[0][2] == "other"
 
 
-def test_parameters(running, uri):
+def test_parameters_are_set_and_read(running, uri):
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
     with SyncCrazyflie(uri) as scf:
@@ -168,7 +168,7 @@ def test_a_reset_of_the_estimator_sets_the_initial_pose(running, uri):
         commander.stop()
 
 
-def test_decks_and_memories(running, uri):
+def test_clients_read_decks_and_memories(running, uri):
     from cflib.crazyflie.mem import MemoryElement
     from cflib.crazyflie.mem.deck_memory import SyncDeckMemoryManager
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
@@ -265,7 +265,7 @@ def test_scripts_use_udp_with_a_changed_uri(running):
         cflib.crtp.CLASSES.clear()
 
 
-def test_scanning(running, uri):
+def test_scanning_lists_the_drones(running, uri):
     import cflib.crtp
 
     assert cflib.crtp.CLASSES[0]().scan_interface() == [["sim://cf1", ""], ["sim://cf2", ""]]

@@ -35,7 +35,7 @@ EXPECTED = [expected for _, expected in STREAM]
 
 
 @pytest.mark.parametrize(("message", "expected"), STREAM, ids=[repr(m[:24]) for m, _ in STREAM])
-def test_every_message(message, expected):
+def test_every_message_is_decoded(message, expected):
     buffer = MessageBuffer()
     assert list(buffer.feed(message)) == [expected]
     assert not buffer.has_partial_message or message.endswith(b"\n")
@@ -48,7 +48,7 @@ def test_messages_together_and_byte_by_byte():
 
 
 @given(st.lists(st.integers(0, len(BYTES)), max_size=12), st.permutations(range(len(STREAM))))
-def test_any_split_and_order(cuts, order):
+def test_messages_are_decoded_at_any_split_and_in_any_order(cuts, order):
     stream = b"".join(STREAM[k][0] for k in order)
     buffer, messages, start = MessageBuffer(), [], 0
     for end in [*sorted(cuts), len(stream)]:

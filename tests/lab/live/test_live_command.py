@@ -36,7 +36,7 @@ def test_circles_are_consistent():
     assert not start[3:9].any()
 
 
-def test_piloted_and_commanded(capsys):
+def test_the_live_command_takes_a_pilot(capsys):
     assert main(["live", "--drones", "2", "--seconds", "0.5", "--headless", "--speed", "max", "--pilot"]) == 0
     assert "pilot" in capsys.readouterr().out
 

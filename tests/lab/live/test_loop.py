@@ -96,7 +96,7 @@ def test_a_pause_stops_time_and_a_single_step_moves_it(live):
     assert report.simulated_s == pytest.approx(0.2)
 
 
-def test_keys(live):
+def test_keys_pause_step_and_stop_the_loop(live):
     for key in ("space", ".", ".", "+"):
         live.keyboard.press(key)
     live.call_at(0.02, lambda live: live.keyboard.press("escape"))
@@ -345,7 +345,7 @@ def test_commands_from_the_network_and_resets():
         np.testing.assert_array_equal(live.lights, 0.0)  # a fleet without a show has no light
 
 
-def test_other_command_levels(live):
+def test_the_loop_runs_at_the_attitude_level(live):
     with Live(Sim(control="attitude"), speed="max") as other:
         other.command[..., 3] = 0.6
         other.run(0.5)

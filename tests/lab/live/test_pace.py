@@ -44,7 +44,7 @@ def test_a_late_step_is_counted_and_caught_up(clock):
     np.testing.assert_allclose((pace.max_lateness, pace.max_lateness_time), (0.015, 0.01))
 
 
-def test_a_long_lag_is_given_up(clock):
+def test_a_lag_beyond_the_limit_is_not_caught_up(clock):
     pace = Pace(0.01, 1.0, clock)
     pace.record_step(0.0)
     clock.now += 1.01

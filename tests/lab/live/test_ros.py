@@ -142,7 +142,7 @@ def test_poses_speeds_and_clock(swarm, bridge):
     np.testing.assert_allclose([car.x, car.y, car.z], [1, 2, 0.1], atol=1e-6)
 
 
-def test_commands(swarm, bridge):
+def test_messages_command_the_drones(swarm, bridge):
     def climb(message):
         message.linear.z, message.angular.z = 0.5, 0.3
 
@@ -194,7 +194,7 @@ def test_attitudes_and_thrust():
     np.testing.assert_allclose(command, [0.1, -0.2, 0.3, 0.4], atol=1e-9)
 
 
-def test_wrong_bridges(swarm):
+def test_wrong_arguments_of_a_bridge_are_refused(swarm):
     with pytest.raises(ConfigError, match="movable objects"):
         RosBridge(swarm, Node(), STAND_IN, objects=["bus"])
     with pytest.raises(ConfigError, match="positive rate"):

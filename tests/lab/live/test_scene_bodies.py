@@ -48,7 +48,7 @@ def test_parts_belong_to_their_bodies(sim, bodies):
     assert bodies.owner[names["cars_wheel:3"]] == car - 1
 
 
-def test_sizes_and_marks(bodies):
+def test_bodies_have_boxes_radii_and_trails(bodies):
     gate, drone = bodies.find("ball_gate", 0).mocap, bodies.find("drone", 0).mocap
     np.testing.assert_allclose([bodies.low[gate], bodies.high[gate]], [[-0.1, -0.2, -0.3], [0.1, 0.2, 0.3]], atol=1e-6)
     assert bodies.radius(gate) == pytest.approx(np.sqrt(0.01 + 0.04 + 0.09))

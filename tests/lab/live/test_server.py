@@ -90,7 +90,7 @@ def test_one_drone_has_one_client(server, caplog):
         DroneClient(0, port=server.drone_port)
 
 
-def test_the_stream_of_all(server, tmp_path):
+def test_one_stream_commands_all_drones(server, tmp_path):
     eight = figure_eight()
     show = Show(("a",), Trajectory.stack([eight]), Lights.stack([Lights.constant()]))
     save_show(show, tmp_path / "show.skyc")

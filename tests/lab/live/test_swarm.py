@@ -183,7 +183,7 @@ def test_moves_continue_from_the_setpoint_in_force():
     assert tick(commander, 20.0)[0] == pytest.approx(command[0])
 
 
-def test_groups():
+def test_a_mask_selects_the_groups_of_a_commander():
     commander = Commander()
     commander.group = 0b101
     assert [commander.in_group(mask) for mask in (0, 1, 2, 4, 6)] == [True, True, False, True, True]

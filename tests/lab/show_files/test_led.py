@@ -53,7 +53,7 @@ CASES = {  # program, times, colours
 
 
 @pytest.mark.parametrize(("program", "times", "expected"), CASES.values(), ids=CASES)
-def test_commands(program, times, expected):
+def test_light_commands_give_their_colours(program, times, expected):
     np.testing.assert_allclose(colors(program, *times, until=10.0), expected, atol=1e-4)
 
 
@@ -66,7 +66,7 @@ PUBLIC = "DAMHBQYFDQwACAAA/zIKMgj/AAAyCjIIAP8AMgoyCP//ADIKMggA//8yCjII/wD/MgoyCz
 """color_cycle.json of pyledctrl's tests: three white flashes, then fades to blue, red, green, ... and back to black."""
 
 
-def test_public_program():
+def test_a_public_light_program_gives_its_colours():
     lights = Lights.stack([decode_lights(PUBLIC, 20.0)])
     got = lights.colors([0.05, 0.15, 0.25, 0.6, 1.1, 1.6, 3.1, 3.6, 13.6, 14.6])[:, 0]
     blue, red = (0, 0, 1), (1, 0, 0)
@@ -95,7 +95,7 @@ def test_wrong_programs(program, message):
         decode_lights(bytes(program))
 
 
-def test_not_base64_and_too_long():
+def test_text_that_is_not_base64_and_too_long_programs_are_refused():
     with pytest.raises(ConfigError, match="base64"):
         decode_lights("?")
     with pytest.raises(ConfigError, match="at most 1048576 bytes"):
@@ -133,7 +133,7 @@ def test_lights_survive_the_code(pieces):
     np.testing.assert_allclose(seen[:, 0], seen[:, 1], atol=1e-4)
 
 
-def test_code_is_short():
+def test_encoded_lights_use_the_shortest_commands():
     white = Lights.of_pieces([0.0, 1.0, 2.0, 3.0], [(1, 1, 1), (0, 0, 0), (0.2,) * 3, (1, 0, 0)])
     assert list(encode_lights(white)) == [
         led.SET_WHITE,

@@ -52,7 +52,7 @@ def test_trajectories_are_the_curves_of_the_file(make):
     assert show.duration == pytest.approx(points[-1][0])
 
 
-def test_lab_show():
+def test_the_lab_show_is_read():
     show = parse_show(skyc_files.archive(skyc_files.lab()))
     assert show.names == ("cf0", "cf1")
     assert [(cue.time, cue.name) for cue in show.cues] == [(0.0, "start"), (4.0, "land")]
@@ -202,7 +202,7 @@ def test_files_that_are_no_shows(tmp_path):
         save_show(parse_show(skyc_files.archive(skyc_files.lab())), tmp_path / "show.zip")
 
 
-def test_bombs_are_refused():
+def test_archives_that_decompress_to_too_much_are_refused():
     zeros = b"0" * (17 * 2**20)
     with pytest.raises(ConfigError, match="at most 16777216 bytes"):
         parse_show(skyc_files.archive({"show.json": zeros}))

@@ -134,7 +134,7 @@ def test_a_window_plays_the_show_from_its_start_until_it_is_closed(screen, tmp_p
     assert seen == ["red", "blue"]
 
 
-def test_planned_is_the_show(flight):
+def test_planned_positions_and_colours_are_those_of_the_show(flight):
     assert flight.times[0] == 0.0
     assert flight.duration == pytest.approx(2.0)
     np.testing.assert_allclose(flight.planned[0], [[0, 0, 1], [1, 0.02, 1], [0.5, 2, 0.5]], atol=1e-6)
@@ -145,7 +145,7 @@ def test_planned_is_the_show(flight):
     np.testing.assert_allclose(flight.colors[at, 1, 0], [0.25, 0.5, 0.75], atol=1e-6)
 
 
-def test_report(flight):
+def test_a_report_lists_distances_and_durations(flight):
     figures = json.loads(json.dumps(report(flight)))
     assert set(figures) == {"planned", "flown"}
     assert set(figures["planned"]) == {"closest", "duration"}
@@ -230,7 +230,7 @@ def test_page_has_lights_that_change(flight, viser):
         web.page(recorded, lights=flight.colors[:3])
 
 
-def test_command(tmp_path, capsys):
+def test_the_show_command_writes_a_report(tmp_path, capsys):
     save_show(SHOW, tmp_path / "show.skyc")
     arguments = ["show", str(tmp_path / "show.skyc"), "--report", str(tmp_path / "report.json")]
     assert main([*arguments, "--seconds", "1.2"]) == 0

@@ -53,7 +53,7 @@ def test_factors_are_uniform_in_their_ranges_and_independent(thousand_worlds):
 
 
 def test_factors_act_as_changed_parameters(thousand_worlds):
-    """Drones fly as in a simulation whose parameters and wind are set to what was drawn."""
+    """Drones fly as in a simulation whose parameters and wind are set to the drawn values."""
     sim, plugin = thousand_worlds
     record = jax.tree.map(np.asarray, plugin.read(sim.data))
     other = Sim(1000, control="rotor_vel", engine="interpret")
@@ -85,20 +85,20 @@ def test_factors_act_as_changed_parameters(thousand_worlds):
 
 
 def test_law_10_numbers_depend_on_the_episode_and_not_on_other_worlds():
-    found = []
+    factors = []
     for n_worlds in (2, 3):
         sim, plugin = build(n_worlds, **RANGES)
         sim.step()
-        found.append(np.asarray(plugin.read(sim.data).factors))
-    np.testing.assert_array_equal(found[0], found[1][:2])
-    assert len(np.unique(found[1][..., 0])) == 6
+        factors.append(np.asarray(plugin.read(sim.data).factors))
+    np.testing.assert_array_equal(factors[0], factors[1][:2])
+    assert len(np.unique(factors[1][..., 0])) == 6
     sim.step()
-    np.testing.assert_array_equal(plugin.read(sim.data).factors, found[1])
+    np.testing.assert_array_equal(plugin.read(sim.data).factors, factors[1])
     sim.reset(np.array([False, True, False]))
     sim.step()
-    after = np.asarray(plugin.read(sim.data).factors)
-    np.testing.assert_array_equal(after[::2], found[1][::2])
-    assert np.all(after[1] != found[1][1])
+    factors_after_reset = np.asarray(plugin.read(sim.data).factors)
+    np.testing.assert_array_equal(factors_after_reset[::2], factors[1][::2])
+    assert np.all(factors_after_reset[1] != factors[1][1])
 
 
 def test_charges_of_batteries_and_delays_are_drawn():
@@ -135,13 +135,13 @@ def test_a_task_draws_new_drones_in_every_episode():
     assert "splits the step" not in env.explain(), "draws at resets are fused too"
     assert "randomize_begin" not in [s.__name__ for s in env.step_fn.stages], "and nothing is drawn again in a step"
     state = jax.jit(env.reset)(jax.random.key(0))
-    step, seen = jax.jit(env.step), [np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0]]
+    step, factors_by_step = jax.jit(env.step), [np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0]]
     for _ in range(8):
         state = step(state, jnp.zeros_like(state.action))
-        seen.append(np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0])
-    np.testing.assert_array_equal(seen[0], seen[1])
-    assert len(np.unique(seen[0])) == 4
-    assert np.all(seen[-1] != seen[0])
+        factors_by_step.append(np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0])
+    np.testing.assert_array_equal(factors_by_step[0], factors_by_step[1])
+    assert len(np.unique(factors_by_step[0])) == 4
+    assert np.all(factors_by_step[-1] != factors_by_step[0])
 
 
 def test_law_09_wrong_ranges_and_missing_plugins_are_errors():
@@ -177,7 +177,7 @@ def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
             core=data.core.replace(steps=jnp.where(steps == 2, 0, steps), episode=data.core.episode + 1)
         )
 
-    def flown(*stages):
+    def fly_with(*stages):
         sim = Sim(n_worlds=2, control="rotor_vel", engine="interpret")
         sim.add(Randomize.crazyflie())
         for fn in stages:
@@ -186,7 +186,7 @@ def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
         sim.step(5)
         return sim
 
-    drawn, reset = flown(), flown(restart_episode)
+    drawn, reset = fly_with(), fly_with(restart_episode)
     phases = [[s.phase for s in sim.step_fn.plan(sim.data).program.fused_segments] for sim in (drawn, reset)]
     assert phases[0] == ["before", "each"]
     assert "before" not in phases[1]
@@ -227,7 +227,7 @@ def test_delays_are_drawn_in_any_order_of_adding(latency_first):
 
 def test_factors_are_drawn_at_the_reset():
     """Observations after a reset are those of the new episode, in its worlds only, in any number of worlds."""
-    seen = []
+    observations_by_count = []
     for n_worlds in (2, 3):
         sim, plugin = build(n_worlds, charge=(0.2, 0.6), **RANGES)
         battery = sim.add(Battery())
@@ -236,30 +236,30 @@ def test_factors_are_drawn_at_the_reset():
         assert np.ptp(first["battery.charge"]) > 0.01
         expected = open_circuit_voltage(first["battery.charge"], battery.read(sim.data).n_cells)
         np.testing.assert_allclose(first["battery.voltage"], expected, rtol=1e-6)
-        seen.append({key: np.asarray(x) for key, x in first.items() if key.startswith("randomize")})
+        observations_by_count.append({key: np.asarray(x) for key, x in first.items() if key.startswith("randomize")})
         sim.step()
-        for key, x in seen[-1].items():  # rounded by another engine
+        for key, x in observations_by_count[-1].items():  # rounded by another engine
             np.testing.assert_allclose(sim.plugins.observations(sim.data)[key], x, rtol=1e-6, atol=1e-6, err_msg=key)
-    assert np.unique(seen[1]["randomize.factors"][..., 0]).size == 6
-    for key, x in seen[0].items():
-        np.testing.assert_array_equal(x, seen[1][key][:2])
+    assert np.unique(observations_by_count[1]["randomize.factors"][..., 0]).size == 6
+    for key, x in observations_by_count[0].items():
+        np.testing.assert_array_equal(x, observations_by_count[1][key][:2])
     sim.reset(np.array([False, True, False]))
     again = np.asarray(plugin.read(sim.data).factors)
-    np.testing.assert_allclose(again[::2], seen[1]["randomize.factors"][::2], rtol=1e-6)
-    assert np.all(again[1] != seen[1]["randomize.factors"][1])
+    np.testing.assert_allclose(again[::2], observations_by_count[1]["randomize.factors"][::2], rtol=1e-6)
+    assert np.all(again[1] != observations_by_count[1]["randomize.factors"][1])
     sim.remove(plugin)
     assert list(sim.reset_pipeline) == ["reset"]
 
 
 def test_a_factor_of_the_drag_acts_on_rotor_aerodynamics():
     """A factor of two acts as twice the coefficient of rotor drag, whose moment tips the drone back."""
-    found = []
+    velocities = []
     for factor, drag in ((2.0, 1e-6), (1.0, 2e-6)):
         sim, _ = build(1, 1, drag=(factor, factor))
         sim.add(RotorAerodynamics(drag=drag, inflow=0.0))
         sim.data = with_states(sim.data, vel=[2.0, 0, 0])
         sim.rotor_vel_control(sim.data.states.rotor_vel)
         sim.step(10)
-        found.append(np.concatenate([sim.data.states.vel[0, 0], sim.data.states.ang_vel[0, 0]]))
-    assert found[0][0] < 2.0 - 1e-4
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-5, atol=1e-6)
+        velocities.append(np.concatenate([sim.data.states.vel[0, 0], sim.data.states.ang_vel[0, 0]]))
+    assert velocities[0][0] < 2.0 - 1e-4
+    np.testing.assert_allclose(velocities[0], velocities[1], rtol=1e-5, atol=1e-6)

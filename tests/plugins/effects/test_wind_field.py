@@ -35,7 +35,7 @@ def test_a_field_pushes_as_a_steady_wind_of_the_same_velocity():
     np.testing.assert_allclose(np.asarray(field.data.plugins["wind_field"].air_vel)[1, 1], [2, 0, 1])
 
 
-def test_offset_scale_and_outside():
+def test_a_field_is_displaced_scaled_and_constant_outside():
     sim = build(offset=np.array([[[0, 0, 0], [0, 0, 0.5]], [[0, 0, 5.0], [0, 0, -5.0]]]), scale=2.0)
     sim.step()
     expected = [[[4, 0, 2], [2, 0, 1]], [[0, 0, 0], [8, 0, 4]]]  # the last two are outside, where the wind is constant

@@ -113,7 +113,7 @@ def test_finer_panels_converge():
     assert abs(forces[1] - forces[2]) < 0.02 * abs(forces[2]) < abs(forces[0]) / 10
 
 
-def test_the_force_moves_the_load():
+def test_the_force_of_a_jet_accelerates_the_load():
     """A released load under a jet falls faster by F dt / m; the record holds the force of that step."""
     sim, plugin = build(table=pressure_table(400.0, 400.0))
     load = sim.plugins["load"]
@@ -134,7 +134,7 @@ def test_the_force_moves_the_load():
     np.testing.assert_allclose(fall, (force / 0.2 - 9.81) / 500, rtol=1e-4)
 
 
-def test_jets_of_all_drones():
+def test_a_load_gets_the_jets_of_all_drones_above():
     """A drone flies above another: the load of the lower drone gets both jets, that of the upper one only its own."""
     sim, _plugin = build(n_drones=2, n_worlds=1, all_drones=True)
     sim.data = with_states(sim.data, pos=np.array([[[0, 0, 2.0], [0.0, 0, 3.0]]]))

@@ -125,7 +125,7 @@ def test_crazyswarm_csv(tmp_path):
     assert load_csv(path).coefficients.shape == (1, 4, 8)
 
 
-def test_samples(tmp_path):
+def test_saved_samples_become_a_trajectory(tmp_path):
     times = np.array([5.0, 5.5, 6.5, 7.0])
     pos = np.array([[0, 0, 0], [0, 0, 1], [1, 2, 1], [1, 2, 0.5]], float)
     yaw = np.array([3.0, 3.1, -3.1, -3.0])  # through the half turn

@@ -21,7 +21,7 @@ def test_y_up_by_hand():
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_turned_points_agree(convention):
+def test_points_turn_alike_in_both_frames(convention):
     """A point of the body has the same place, whichever frame the turn is computed in."""
     rng = np.random.default_rng(0)
     quat, point = rng.normal(size=(20, 4)), rng.normal(size=(20, 3))

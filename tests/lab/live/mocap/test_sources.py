@@ -181,7 +181,7 @@ def connect(system, settings):
     np.testing.assert_array_equal(frames[0].quat, [[0.1, 0.2, 0.3, 0.9]])
 
 
-def test_unknown_systems():
+def test_unknown_systems_are_refused():
     with pytest.raises(ConfigError, match="expected one of optitrack"):
         MotionCaptureSource("kinect", "127.0.0.1")
 

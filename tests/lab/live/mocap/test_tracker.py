@@ -72,7 +72,7 @@ def test_late_frames_are_used():
     np.testing.assert_allclose(tracker.pos[0], [t, 0, 1])
 
 
-def test_clocks_may_differ():
+def test_the_clock_of_the_source_may_differ():
     tracker = Tracker(["a"])
     for k in range(100):
         tracker.accept(create_frame(1e6 + k / 100, received=k / 100, a=(0, 0, 0)))

@@ -108,7 +108,7 @@ def test_offset_turn_and_fixed_angles(sim):
     np.testing.assert_allclose(twins.pose("b")[1], from_rpy([0, 0, np.pi / 2]), atol=1e-12)
 
 
-def test_skeletons(sim):
+def test_twins_with_a_parent_hang_at_its_joint(sim):
     """A hook hangs at its joint below a drone; a trailer stays at the length of its drawbar."""
     source = ManualSource()
     kinds = {
@@ -138,7 +138,7 @@ def test_wrong_skeletons_and_names(sim):
         twins.freeze("b")
 
 
-def test_freezing(sim):
+def test_a_frozen_twin_keeps_its_pose(sim):
     source = ManualSource()
     twins = Twins(sim, source, {"": BOX}, ["a", "b"])
     source.send(a=(1, 0, 1), b=(2, 0, 1))
