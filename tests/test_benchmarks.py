@@ -104,7 +104,7 @@ def test_crashed_drones_are_detected(benchmarks):
 
 
 @pytest.mark.parametrize(("device", "n_calls"), [("cpu", 2), ("gpu", 20)])
-def test_a_batch_begins_where_the_one_before_began(benchmarks, device, n_calls):
+def test_each_timed_batch_starts_from_the_same_data(benchmarks, device, n_calls):
     import measure
 
     from crazysim import Sim

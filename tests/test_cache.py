@@ -221,7 +221,7 @@ def test_off_keeps_nothing_unless_a_folder_is_named(settings, monkeypatch, tmp_p
     assert capsys.readouterr().err == ""
 
 
-def test_a_command_tells_once_and_leaves_the_cache_that_jax_has(settings, monkeypatch, tmp_path, capsys):
+def test_a_command_prints_its_cache_once_and_keeps_the_cache_of_jax(settings, monkeypatch, tmp_path, capsys):
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "kept"))
     enable_for_command()
     told = capsys.readouterr().err
@@ -265,7 +265,7 @@ def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path
 
 
 @pytest.mark.long("three processes import JAX")
-def test_a_second_command_reads_the_cache_in_silence(tmp_path):
+def test_a_second_command_prints_nothing_when_it_reads_the_cache(tmp_path):
     """XLA writes errors about features of the CPU for each program that it reads, if it is not told otherwise."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "TF_CPP", "CRAZYSIM"))}
     environment["XDG_CACHE_HOME"] = str(tmp_path)

@@ -26,7 +26,7 @@ def test_processes_keep_the_limits_of_a_container(tmp_path):
     assert (machine.cores(tmp_path), machine.memory(tmp_path)) == (0.5, 1e6)
 
 
-def test_what_took_long_is_listed_with_its_reason():
+def test_long_tests_are_listed_with_their_reason():
     def report(name, seconds, **reason):
         return SimpleNamespace(nodeid=name, user_properties=[("processor_s", seconds), *reason.items()])
 

@@ -26,12 +26,12 @@ def test_without_a_command_it_lists_what_there_is(capsys):
     assert all(f"\n    {name} " in out for name in COMMANDS)
 
 
-def test_as_a_module_in_a_process_of_its_own():
+def test_python_m_crazysim_prints_its_help():
     out = subprocess.run([sys.executable, "-m", "crazysim", "--help"], capture_output=True, text=True, check=True)
     assert "demo" in out.stdout
 
 
-def test_a_reader_may_have_read_enough():
+def test_a_closed_pipe_is_no_traceback():
     command = [sys.executable, "-m", "crazysim", "airframe", "check", "crazyflie"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()

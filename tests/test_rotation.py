@@ -87,7 +87,7 @@ def test_offsets_are_added(v, w, offset):
 
 
 @given(roll=angles, pitch=st.floats(-1.57, 1.57), yaw=angles)
-def test_roll_pitch_yaw_there_and_back(roll, pitch, yaw):
+def test_from_rpy_and_to_rpy_are_inverses(roll, pitch, yaw):
     """Up to 1e-3 rad short of 90 degrees of pitch; there 1/cos(pitch) magnifies the rounding to 1e-12."""
     rpy = np.array([roll, pitch, yaw])
     q = rot.from_rpy(jnp.asarray(rpy))

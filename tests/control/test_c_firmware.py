@@ -283,7 +283,7 @@ def test_wrong_libraries_and_units_are_refused(library, tmp_path):
         CFirmware(library("hover", HOVER), motors="volt")
 
 
-def test_what_is_no_whole_library_is_refused_without_harm(library, tmp_path):
+def test_incomplete_libraries_pipes_and_devices_are_refused(library, tmp_path):
     """Reading a pipe or a device would never end, and half a library would end this process."""
     pipe, half = tmp_path / "pipe.so", tmp_path / "half.so"
     os.mkfifo(pipe)

@@ -158,7 +158,7 @@ def test_data_copied_to_each_device_is_stepped_on_each(whole, mesh):
     np.testing.assert_allclose(after.states.pos, step(data, jnp.int32(6)).states.pos, rtol=1e-5, atol=1e-6)
 
 
-def test_spread_data_inside_jit_means_the_same(whole, mesh):
+def test_sharded_data_gives_the_same_numbers_inside_jit(whole, mesh):
     """There the devices of the data are unknown to the step: the numbers are the same all the same."""
     step = whole.build_step_fn()
     data = F.attitude_control(whole.data, COMMAND)
@@ -166,7 +166,7 @@ def test_spread_data_inside_jit_means_the_same(whole, mesh):
     np.testing.assert_allclose(run(shard(data, mesh)), run(data), rtol=1e-5, atol=1e-6)
 
 
-def test_a_simulation_can_be_spread_later(whole, mesh):
+def test_a_simulation_can_be_sharded_after_steps(whole, mesh):
     sim = Sim(**SETTINGS)
     sim.step(2)
     steps = np.asarray(sim.data.core.steps)

@@ -53,7 +53,7 @@ def test_a_quadrotor_is_that_of_the_built_in_airframes():
 @pytest.mark.parametrize(
     ("name", "propeller", "pitch"), [("cf21B_500", 0.055, 0.035), ("bumblebee", 0.127, None), ("hb_x500", 0.254, 0.114)]
 )
-def test_estimates_are_near_what_is_known(name, propeller, pitch):
+def test_estimates_are_near_the_numbers_of_built_in_airframes(name, propeller, pitch):
     """Inertias within 45%, thrust at a speed and torque over thrust within 35%, of the built-in airframes."""
     true = load_airframe(name)
     mass = float(true.value("rigid_body.mass"))

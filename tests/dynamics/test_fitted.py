@@ -73,7 +73,7 @@ def test_up_to_100_rad_and_100_rad_a_second_the_fit_holds(cmd, rates):
 
 
 @pytest.mark.parametrize("what", ["rate", "command"])
-def test_beyond_the_fit_is_handed_over_without_a_jump(what):
+def test_beyond_the_fit_the_model_changes_to_spring_and_damper_without_a_jump(what):
     """From 90 to 210 rad/s, or rad: half the step, half the largest change; at 200 it is the spring and damper."""
     changes, p = [], params()
     quat, fixed = np.asarray(rotation.from_rpy(jnp.array([0.2, 0.9, 0.3]))), np.array([0.6, 0.0, 0.8])

@@ -123,7 +123,7 @@ def test_a_kernel_computes_the_gradient(x64, monkeypatch):
 
 @pytest.mark.long("compiles kernels with many tangents")
 @needs_compiler
-def test_a_kernel_takes_tangents_along(x64):
+def test_a_kernel_computes_tangents(x64):
     """Tangents in one direction and in many, with respect to numbers of drones and to shared numbers."""
     ((fast, step, data), (plain, *_)), at = make_losses(n_steps=3, n_drones=2)
     of = lambda losses: jax.jit(jax.jacfwd(lambda x, mass: losses(x, mass=mass), (0, 1)))  # noqa: E731

@@ -400,7 +400,7 @@ print(repr(float(sim.data.states.rotor_vel[0, 0, 2])))
 """
 
 
-def test_two_machines_share_a_home(tmp_path):
+def test_machines_that_share_a_home_never_call_kernels_of_each_other(tmp_path):
     """JAX's own cache has programs that call kernels by name; a kernel of another machine must never be called.
 
     The second process runs on another CPU, so its key differs; the third uses the kernel of the first again.

@@ -409,7 +409,7 @@ def climb_policy(gain, data):
     return jnp.concatenate([jnp.zeros_like(data.states.pos), thrust], axis=-1)
 
 
-def test_a_rollout_is_the_loop_it_stands_for(capfd):
+def test_a_rollout_equals_its_loop_of_steps(capfd):
     """Its records equal those of a loop, at the requested rate, and the simulation continues from its end."""
     sim = Sim(n_worlds=3, n_drones=2, control="attitude", attitude_freq=100)
     start, gain = sim.data, jnp.float32(0.3)

@@ -126,7 +126,7 @@ def test_data_from_outside_is_placed_and_counts_as_unsynced(stepper):
     assert stepper.data.core.mjx_synced is flag  # known to be false: nothing is transferred
 
 
-def test_commands_to_data_that_was_spread_since_are_spread():
+def test_commands_to_data_that_was_sharded_since_are_sharded():
     sim = Sim(2, control="attitude")
     command = np.full((2, 1, 4), 0.3)
     for mesh in (None, world_mesh(jax.devices("cpu")[:2])):

@@ -148,7 +148,7 @@ WORLD_CASES = ["a matrix, then a row of it", "constants", "places from a table"]
 
 
 @pytest.mark.parametrize(("scope", "names"), [("drone", list(CASES)), ("world", WORLD_CASES)])
-def test_a_lowered_stage_reads_what_it_reads_as_it_is_written(scope, names):
+def test_a_lowered_stage_reads_the_same_elements_as_the_stage(scope, names):
     """Each case runs by itself, in the interpreter."""
 
     def each(data):
@@ -164,7 +164,7 @@ def test_a_lowered_stage_reads_what_it_reads_as_it_is_written(scope, names):
 
 
 @pytest.mark.parametrize(("scope", "names"), [("drone", KERNEL_CASES), ("world", WORLD_CASES)])
-def test_a_kernel_reads_what_a_stage_reads_as_it_is_written(scope, names):
+def test_a_kernel_reads_the_same_elements_as_the_stage(scope, names):
     """One stage sums up all cases."""
     total = sum_stage(names, scope)
     found = Step({"total": total})(make_data(), jnp.int32(1)).plugins["tables"].out

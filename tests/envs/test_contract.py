@@ -148,7 +148,7 @@ def test_shapes_and_types_are_those_of_the_spaces(name, env, start_state):
     np.testing.assert_array_equal([space.low, space.high], [-np.ones(space.shape), np.ones(space.shape)])
 
 
-def test_an_episode_begins_with_nothing_done(env, start_state):
+def test_an_episode_begins_without_reward_action_or_end(env, start_state):
     assert not start_state.done.any()
     assert not start_state.action.any()
     assert not start_state.reward.any()

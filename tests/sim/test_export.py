@@ -251,7 +251,7 @@ def test_wrong_input_is_an_error(options, words):
         to_casadi(Sim(control="rotor_vel"), **options)
 
 
-def test_a_vector_says_where_its_fields_are():
+def test_a_vector_returns_the_slice_of_a_field():
     x = to_casadi(Sim(control="rotor_vel")).x
     assert len(x) == 17
     assert x["states.quat"] == slice(3, 7)

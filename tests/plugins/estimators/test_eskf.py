@@ -134,7 +134,7 @@ def test_propagation_back_in_time_undoes_propagation(estimate):
         np.testing.assert_allclose(getattr(back, name), getattr(estimate, name), rtol=0, atol=2e-5)
 
 
-def test_a_path_carries_covariance_and_state(estimate):
+def test_a_path_propagates_covariance_and_state(estimate):
     """``F P F'`` with F by automatic differentiation, along a path and back; a turn by 0.27 rad in 0.2 s.
 
     Derivatives with respect to the biases assume a force that does not rotate.

@@ -37,6 +37,6 @@ def test_wrong_conventions(wrong):
         Convention(**wrong)
 
 
-def test_wrong_pose():
+def test_a_pose_of_wrong_shape_is_refused():
     with pytest.raises(ConfigError, match="expected a position of 3"):
         Frame.of(0.0, {"a": ([0, 0], [0, 0, 0, 1])})

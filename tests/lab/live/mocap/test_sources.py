@@ -233,7 +233,7 @@ def test_what_is_before_a_damage_is_read(tmp_path, caplog):
 
 @settings(max_examples=100, deadline=None)
 @given(tail=st.binary(max_size=200))
-def test_any_tail_is_refused_or_ignored(tail, tmp_path_factory):
+def test_bytes_after_a_recording_are_refused_or_ignored(tail, tmp_path_factory):
     path = write_recording(tmp_path_factory.mktemp("m") / "a.mocap")
     path.write_bytes(path.read_bytes() + tail)
     assert_polls_equal(list(read_polls(path)), create_polls())

@@ -132,7 +132,7 @@ def test_lost_bodies_rest_until_they_are_found():
     np.testing.assert_allclose(tracker.pos[0], [t + 0.4, 0, 1])
 
 
-def test_a_stalled_source():
+def test_a_source_that_stalls_or_ends_is_reported():
     tracker, t = create_tracker()
     tracker.advance(t + 0.5)
     tracker.advance(t + 0.6, ended="unplugged")
