@@ -167,9 +167,9 @@ class Planner(NamedTuple):
             lower_stages(g.stages, data, shared_zeros, _watched_leaves, population=g.population, tracer=tracer)
             for g in groups
         ]
-        one_kernel = self._has_kernels and [x.fused for x in lowered_programs] == [True]
+        has_one_kernel = self._has_kernels and [x.fused for x in lowered_programs] == [True]
         select_rows = None
-        if separate is not None and one_kernel:
+        if separate is not None and has_one_kernel:
             separate_leaves = {*separate, leaf_indices(data).core.mjx_synced}
             select_rows = lambda written: [i for i in written if i not in separate_leaves]  # noqa: E731
         programs = tuple([optimise(program, select_rows, pack=k == 0) for k, program in enumerate(lowered_programs)])
@@ -196,8 +196,8 @@ class Planner(NamedTuple):
         run, written = _join_runs(groups, programs, runs)
         plan = self._make_plan(engine, reason, data, programs, inputs, written, run, len(programs[0].leaves))
         kernels = [run.kernels for run in runs if isinstance(run, fused.FusedRun) and run.kernels is not None]
-        on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
-        if on_host and is_host_call_possible(kernels):
+        is_on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
+        if is_on_host and is_host_call_possible(kernels):
             owned = [group.owned_leaves for group in groups]
             host_call = HostCall(kernels, owned, jax.tree.leaves(data), int(plan.leaf_indices.core.nonfinite))
             plan = dataclasses.replace(plan, host_call=host_call)

@@ -73,8 +73,8 @@ class FlatData:
         """
         leaf_indices = self.plan.leaf_indices
         indices, values = staged_leaves(leaf_indices), staged_fields(leaf_indices, command, feedforward)
-        on_host = isinstance(self.leaves, HostLeaves)
-        return self.replace(indices, [x if on_host else put_command(reference, x) for x in values.values()])
+        is_on_host = isinstance(self.leaves, HostLeaves)
+        return self.replace(indices, [x if is_on_host else put_command(reference, x) for x in values.values()])
 
     def inputs(self) -> list[Any]:
         """Return the arguments of the compiled step other than the number of steps."""
@@ -213,7 +213,7 @@ class Step:
         with keep_programs(enabled=call_key not in self._called):
             outputs = step(inputs, n_steps)
         self._called.add(call_key)
-        leaves = replace_leaves(flat.leaves, plan.written_leaves, outputs)  # type: ignore[arg-type]  # a list, but for a host call
+        leaves = replace_leaves(flat.leaves, plan.written_leaves, outputs)  # type: ignore[arg-type]  # a list, except for a host call
         leaves[plan.synced_leaf] = self._make_false_flag(leaves[plan.synced_leaf])
         return FlatData(leaves, plan)
 

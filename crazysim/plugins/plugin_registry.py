@@ -32,7 +32,7 @@ _SETTING_SCOPES = ("parameter", "shared")
 """Scopes of leaves that hold settings; the others hold states."""
 
 
-class _Installed(NamedTuple):
+class _InstalledPlugin(NamedTuple):
     """A plugin with the stages that it put into the step pipeline."""
 
     plugin: Plugin
@@ -47,7 +47,7 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     def __init__(self, sim: Simulation):
         self._sim = sim
-        self._installed: dict[str, _Installed] = {}
+        self._installed: dict[str, _InstalledPlugin] = {}
         self._move_objects: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
         self._observe_fn: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
         self._is_checked = True
@@ -282,7 +282,7 @@ def _placements(plugin: Plugin, sim: Simulation) -> object:
         return placements
     episode_stage = Stage(plugin.reset_episode, plugin.scope, is_first_step)
     before = plugin.reset_before
-    if before is None:  # in front of all stages that do not begin an episode
+    if before is None:  # before all stages that do not begin an episode
         before = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not is_first_step)
     return [StagePlacement(episode_stage, before=before, name=_reset_stage_name(plugin)), *placements]
 
@@ -295,20 +295,20 @@ def _reset_stage_name(plugin: Plugin) -> str:
     return f"{plugin.name}_begin"
 
 
-def _add_stages(pipeline: Pipeline, plugin: Plugin, placements: object) -> tuple[Pipeline, _Installed]:
+def _add_stages(pipeline: Pipeline, plugin: Plugin, placements: object) -> tuple[Pipeline, _InstalledPlugin]:
     """Return the pipeline with the stages of a plugin, and the plugin with its changes to the pipeline."""
     if not isinstance(placements, (list, tuple)) or not all(isinstance(x, StagePlacement) for x in placements):
         raise ConfigError(
             f"expected stages of plugin {plugin.name!r} to return a list of StagePlacement, got {placements!r}. Use "
             f"[StagePlacement(stage, before='increment_steps')]."
         )
-    installed = _Installed(plugin, {}, {})
+    installed = _InstalledPlugin(plugin, {}, {})
     for placement in placements:
         pipeline = _add_stage(pipeline, placement, placement.name or plugin.name, installed)
     return pipeline, installed
 
 
-def _add_stage(pipeline: Pipeline, placement: StagePlacement, name: str, installed: _Installed) -> Pipeline:
+def _add_stage(pipeline: Pipeline, placement: StagePlacement, name: str, installed: _InstalledPlugin) -> Pipeline:
     replaced = placement.replaces if placement.replaces in pipeline else None
     if name in pipeline and name != replaced:
         raise ConfigError(f"the step pipeline already has a stage {name!r}. Use sim.add(..., name=...).")
@@ -322,7 +322,7 @@ def _add_stage(pipeline: Pipeline, placement: StagePlacement, name: str, install
     }
 
 
-def _remove_stages(pipeline: Pipeline, installed: _Installed) -> Pipeline:
+def _remove_stages(pipeline: Pipeline, installed: _InstalledPlugin) -> Pipeline:
     """Return the pipeline without the stages of a plugin, and with the stages that it had replaced."""
     for name, stage in installed.stages.items():
         if pipeline.get(name, stage) is not stage:
@@ -337,16 +337,16 @@ def _remove_stages(pipeline: Pipeline, installed: _Installed) -> Pipeline:
 
 def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | None = None) -> Pipeline:
     """Return the pipeline whose integration applies the influences and derivatives of plugins."""
-    dynamic = tuple(sorted((p for p in plugins if p.is_dynamic), key=lambda p: (p.order, p.name)))
-    constraining = [p.name for p in dynamic if p.constrains]
-    if len(constraining) > 1:
+    dynamic_plugins = tuple(sorted((p for p in plugins if p.is_dynamic), key=lambda p: (p.order, p.name)))
+    constraining_names = [p.name for p in dynamic_plugins if p.constrains]
+    if len(constraining_names) > 1:
         raise ConfigError(
-            f"expected at most one plugin that joins bodies to the drones, got {' and '.join(constraining)}. Use one "
-            f"plugin for all drones; its parameters can differ between them."
+            f"expected at most one plugin that joins bodies to the drones, got {' and '.join(constraining_names)}. Use "
+            f"one plugin for all drones; its parameters can differ between them."
         )
     integration = getattr(pipeline.get("integration"), "fn", None)
     if isinstance(integration, Integration):
-        return pipeline | {"integration": dataclasses.replace(integration, plugins=dynamic).stage()}
+        return pipeline | {"integration": dataclasses.replace(integration, plugins=dynamic_plugins).stage()}
     if added is not None and added.is_dynamic:
         raise ConfigError(
             f"{added.name} acts on the time derivative within the stage 'integration', which is "

@@ -80,7 +80,7 @@ class Scene:
             n_drones: Number of drones per world.
             freq: Physics steps per second, Hz.
             device: Device of the scene of all worlds.
-            mesh: Devices over which the worlds are spread instead; None for one device.
+            mesh: Devices over which the worlds are distributed; None for one device.
             plugins: Function that returns the plugins of the simulation.
             ray_kernels: Kernels that cast rays and answer contact reports.
 
@@ -96,7 +96,7 @@ class Scene:
         self.plugins = plugins
         self.ray_kernels = ray_kernels
         self.splats = None
-        self.revision = self._compiled = 0
+        self.revision = self._compiled_revision = 0
         self._compile()
 
     def add(
@@ -121,7 +121,7 @@ class Scene:
             count: Number of objects.
             pos: Initial positions in every world, world frame, m. (3,), (count, 3) or (n_worlds, count, 3)
             quat: Initial attitudes, body to world, xyzw. The same shapes with 4
-            mocap: True for objects that can be moved, in each world on their own; others stay at ``pos`` everywhere.
+            mocap: True for objects that can be moved, independently in each world; others stay at ``pos`` everywhere.
             **options: Settings of a primitive: lengths in m, ``rgba``. ``crazysim.scene.primitives`` lists them.
         """
         with self.restore_on_error():
@@ -192,24 +192,24 @@ class Scene:
             raise
 
     def compile(self) -> None:
-        """Compile the spec; closes the window and returns bodies moved through ``mjx_data`` to where the spec has them.
+        """Compile the spec; closes the window and returns bodies moved through ``mjx_data`` to their poses in the spec.
 
         Raises:
             ConfigError: If the spec does not compile or lacks a drone; the scene is then unchanged.
         """
         self._compile()
         self.revision += 1  # the spec may have been edited by hand
-        self._compiled = self.revision
+        self._compiled_revision = self.revision
 
     def compile_if_edited(self) -> None:
         """Compile the spec if objects were added since the last compilation."""
         if self._is_edited:
             self._compile()
-            self._compiled = self.revision
+            self._compiled_revision = self.revision
 
     @property
     def _is_edited(self) -> bool:
-        return self._compiled != self.revision
+        return self._compiled_revision != self.revision
 
     def _compile(self) -> None:
         self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
@@ -297,7 +297,7 @@ class Scene:
 
         Bodies that were attached to ``spec`` and are moved through ``mjx_data`` are not part of the data: for those
         pass ``mocap=mjx_data``, or the pair ``(mocap_pos, mocap_quat)`` as ``mjx_data`` has them. Objects of plugins,
-        such as loads, are where the plugins' records in ``data`` have them; they need the data of a world.
+        such as loads, get their poses from the plugins' records in ``data``; they need the data of a world.
 
         Args:
             objects: Handles, or names of bodies; None for all, () for none.
@@ -319,9 +319,9 @@ class Scene:
 
         ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), along with ``normal``, ``point`` and
         ``body_index``, the index of the body that was hit. Inside jit, fields that are not used are not computed.
-        Objects of plugins, such as loads, are where the plugins' records in ``data`` have them. In a function of one
-        world, such as the observations of a task, images have no axis n_worlds, and rays are cast without a kernel of
-        their own.
+        Objects of plugins, such as loads, get their poses from the plugins' records in ``data``. In a function of one
+        world, such as the observations of a task, images have no axis n_worlds, and no separate kernel casts the
+        rays.
 
         Args:
             camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); or the name
@@ -422,7 +422,7 @@ class Scene:
         return self._mjx.poses()[:2]
 
     def shard(self, mesh: Mesh) -> None:
-        """Spread the scene of all worlds over devices."""
+        """Distribute the scene of all worlds over devices."""
         self.mesh, self.ray_kernels = mesh, dataclasses.replace(self.ray_kernels, mesh=mesh)
         self._mjx.shard(mesh)
 

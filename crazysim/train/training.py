@@ -237,14 +237,14 @@ def train_many(
     if n_done >= n_iterations:
         log(f"nothing is left to train after {n_done} iterations; continue with more: --iterations {2 * n_done or 100}")
 
-    def seconds() -> float:
+    def elapsed_seconds() -> float:
         return seconds_before + time.perf_counter() - start_time
 
     def save_checkpoint(learner: Learner) -> None:
         """Write the checkpoint."""
         nonlocal saved_iteration, save_time
         runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.divergence_iteration} for x in trainings}
-        meta = {"crazysim": crazysim.__version__, "code": code, "runs": runs, "seconds": seconds()}
+        meta = {"crazysim": crazysim.__version__, "code": code, "runs": runs, "seconds": elapsed_seconds()}
         files = fetch_arrays({"learner": learner, "kept": [training.kept_policy for training in trainings]})
         if is_first_host():
             checkpoint.save(path, files, meta)
@@ -256,7 +256,7 @@ def train_many(
         mark_diverged(metrics, iteration)
         is_planned = iteration % evaluation_period == 0 or iteration == n_iterations
         results, checks = evaluate_policies(policies, None), evaluate_policies(policies, check_key)
-        counters = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds()}
+        counters = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": elapsed_seconds()}
         for i, training in enumerate(trainings):
             if training.divergence_iteration is None:
                 point = counters | results[i] | {"compile_seconds": compile_s, "check": checks[i]["success"]}

@@ -297,8 +297,8 @@ class Live(Interaction, Closeable):
         wait = self._pace.time_until_due()
         if wait > 0:
             if not viewers.draw(self, viewers.next_picture_time):
-                until_picture = viewers.next_picture_time - perf_counter() if viewers else MAX_SLEEP
-                sleep(max(min(wait, until_picture, MAX_SLEEP), 0.0))
+                picture_wait = viewers.next_picture_time - perf_counter() if viewers else MAX_SLEEP
+                sleep(max(min(wait, picture_wait, MAX_SLEEP), 0.0))
             return 0.0
         lateness = self._pace.record_step(self.time)
         if lateness > WARNING_LATENESS and self._may_warn():
