@@ -24,7 +24,7 @@ import jax
 
 from crazysim import jaxcompat
 from crazysim.errors import ConfigError
-from crazysim.storage import FOLDER_REMEDY, make_private, untrusted_reason
+from crazysim.storage import FOLDER_REMEDY, make_private_folder, untrusted_reason
 
 CACHE_VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
@@ -138,7 +138,7 @@ def _prepare_folder(root: Path, path: Path) -> None:
     """
     try:
         for folder in (root, path):
-            make_private(folder)
+            make_private_folder(folder)
         free_bytes = shutil.disk_usage(path).free
     except OSError as error:
         raise ConfigError(

@@ -14,7 +14,7 @@ SKIPPED_PACKAGES = ("crazysim", "jax", "contextlib", "functools", "importlib")
 
 
 def short_repr(value: object) -> str:
-    """Return a value for a message, at most ``MAX_REPR_LENGTH`` characters of it."""
+    """Return the representation of a value for a message, cut to ``MAX_REPR_LENGTH`` characters."""
     try:
         text = (
             repr(value)
@@ -31,7 +31,7 @@ def _describe_type(value: object) -> str:
 
 
 def warn(text: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the user's line that led here, the nearest one outside of ``SKIPPED_PACKAGES``."""
+    """Issue a warning at the user's line: the line of the nearest caller outside of ``SKIPPED_PACKAGES``."""
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in SKIPPED_PACKAGES:
         frame = frame.f_back
@@ -82,7 +82,7 @@ class AirframeWarning(UserWarning):
 
 
 class EngineWarning(UserWarning):
-    """A step that runs on a slower engine than the one that was chosen, which does not support all of it."""
+    """Warning that a step runs on a slower engine, because the chosen engine does not support all of it."""
 
 
 class UnsupportedError(Exception):

@@ -400,7 +400,7 @@ def is_key(x: Any) -> bool:
 
 
 def bits_generator(dtype: Any) -> str:
-    """Return the name of the random number generator of a type of keys."""
+    """Return the name of the random number generator of keys of a dtype."""
     impl = getattr(dtype, "_impl", dtype)
     return getattr(impl, "name", str(impl))
 

@@ -98,8 +98,8 @@ def read_toml(path: str | Path, guide: str) -> dict[str, Any]:
 
 
 @contextmanager
-def reading(path: str | Path, content: str, remedy: str) -> Iterator[None]:
-    """Convert errors in a block that reads a file to errors of crazysim that name the file.
+def wrap_read_errors(path: str | Path, content: str, remedy: str) -> Iterator[None]:
+    """Convert errors raised in a block that reads a file to errors of crazysim that name the file.
 
     Damaged files raise errors of almost any type in the libraries that read them. A ``ConfigError``, and the
     ``ImportError`` of a missing library, are passed on.
@@ -132,7 +132,7 @@ def unfinished_path(path: Path) -> Path:
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[BinaryIO]:
+def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
     """Open a file for writing that takes the place of ``path`` at the end of the block.
 
     If writing fails, or the block raises an error, ``path`` is unchanged, and no other file is left.
@@ -168,7 +168,7 @@ def write_file(path: str | Path, content: bytes | str) -> None:
     Raises:
         ConfigError: If the folder does not exist, or the file cannot be written.
     """
-    with replacing(path) as file:
+    with open_replacement(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
@@ -180,7 +180,7 @@ def write_figure(figure: Any, path: str | Path, dpi: float) -> None:
             written.
     """
     check_writable(path, PICTURE_SUFFIXES)
-    with replacing(path) as file:
+    with open_replacement(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower(), dpi=dpi)
 
 
@@ -202,7 +202,7 @@ def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
         raise ConfigError(
             f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}. Use another name."
         )
-    with suppress(_NothingToWriteError), replacing(path):
+    with suppress(_NothingToWriteError), open_replacement(path):
         raise _NothingToWriteError
 
 
@@ -221,7 +221,7 @@ class ZipReader:
 
         Raises:
             ConfigError: If it has more files.
-            Exception: Of any type, if it is damaged; see ``reading``.
+            Exception: Of any type, if it is damaged; see ``wrap_read_errors``.
         """
         self._zip = zipfile.ZipFile(file)
         self._name, self._max_file_bytes, self._max_total_bytes, self._n_unpacked_bytes = (
@@ -242,7 +242,7 @@ class ZipReader:
 
         Raises:
             ConfigError: If the file is too large, or all files that have been read are.
-            Exception: Of any type, if it is damaged; see ``reading``.
+            Exception: Of any type, if it is damaged; see ``wrap_read_errors``.
         """
         member = self._members[name]
         self._n_unpacked_bytes += member.file_size
@@ -264,7 +264,7 @@ def read_arrays(file: BinaryIO, name: str) -> dict[str, NDArray]:
 
     Raises:
         ConfigError: If it unpacks to much more than its size.
-        Exception: Of any type, if it is damaged; see ``reading``.
+        Exception: Of any type, if it is damaged; see ``wrap_read_errors``.
     """
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * file.seek(0, os.SEEK_END))
     archive = ZipReader(file, name, MAX_ARRAYS, limit, limit)
@@ -290,7 +290,7 @@ def _parse_array(content: bytes, name: str) -> NDArray:
     return np.lib.format.read_array(file, allow_pickle=False)
 
 
-def make_private(folder: Path) -> None:
+def make_private_folder(folder: Path) -> None:
     """Make a folder that only this user can enter, and its parents with default permissions; it may exist.
 
     Raises:

@@ -10,23 +10,23 @@ import pytest
 from disks import full_disk
 
 from crazysim.errors import ConfigError, DamagedFileError
-from crazysim.storage import check_writable, read_arrays, reading, replacing, write_figure, write_file
+from crazysim.storage import check_writable, open_replacement, read_arrays, wrap_read_errors, write_figure, write_file
 
 
 def write_to_a_full_disk(path):
-    with full_disk(), replacing(path) as file:
+    with full_disk(), open_replacement(path) as file:
         file.write(bytes(1000))
 
 
 def write_and_stop(path):
-    with replacing(path) as file:
+    with open_replacement(path) as file:
         file.write(b"sec")
         raise KeyboardInterrupt
 
 
 def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
     path = tmp_path / "a.bin"
-    with replacing(path) as file:
+    with open_replacement(path) as file:
         file.write(b"first")
     with pytest.raises(ConfigError, match=r"expected a file that can be written, got .*a\.bin.*too large"):
         write_to_a_full_disk(path)
@@ -34,9 +34,9 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
         write_and_stop(path)
     assert path.read_bytes() == b"first"
     assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
-    with pytest.raises(ConfigError, match="expected an existing folder"), replacing(tmp_path / "b" / "a"):
+    with pytest.raises(ConfigError, match="expected an existing folder"), open_replacement(tmp_path / "b" / "a"):
         pass
-    with pytest.raises(ConfigError, match="expected a file that can be written"), replacing(tmp_path):
+    with pytest.raises(ConfigError, match="expected a file that can be written"), open_replacement(tmp_path):
         pass
 
 
@@ -47,7 +47,7 @@ def packed(save=np.savez, **arrays):
 
 
 def read(content):
-    with reading("a.npz", "some arrays", "Use another copy."):
+    with wrap_read_errors("a.npz", "some arrays", "Use another copy."):
         return read_arrays(io.BytesIO(content), "a.npz")
 
 
@@ -93,7 +93,7 @@ def test_small_files_do_not_take_all_memory():
 
 def test_a_missing_file_is_named(tmp_path):
     path, message = tmp_path / "none", r"expected an existing file with some arrays, got .*none'\. Use another"
-    with pytest.raises(ConfigError, match=message) as error, reading(path, "some arrays", "Use another copy."):
+    with pytest.raises(ConfigError, match=message) as error, wrap_read_errors(path, "some arrays", "Use another copy."):
         path.read_bytes()
     assert not isinstance(error.value, DamagedFileError)
 

@@ -21,7 +21,7 @@ from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics import Dynamics, supported_dynamics
 from crazysim.dynamics.models import require_freq
 from crazysim.errors import ConfigError, not_installed
-from crazysim.storage import replacing
+from crazysim.storage import open_replacement
 
 STATE_CONTROLLERS = ("auto", "geometric", "indi", "lqr", "pid", "mellinger")
 """Controllers that follow state commands, besides Crazyflow's cascade."""
@@ -78,7 +78,7 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
         sim.data = sim.data.replace(states=states.replace(pos=states.pos + np.array([0, 0, 3 * reach])))
         view = {"lookat": [0, 0, 3 * reach], "distance": 5 * reach, "azimuth": 215, "elevation": -35}
         image: Any = sim.render("rgb_array", cam_config=view, width=960, height=640)
-        with replacing(path) as file:
+        with open_replacement(path) as file:
             imsave(file, image, format=path.suffix[1:])
     finally:
         sim.close()

@@ -1,4 +1,4 @@
-"""The default controller, which follows commands of every level with any airframe, from its physics alone.
+"""The default controller. It follows commands of every level, with gains from the physics of any airframe.
 
 A force follows from the errors of position and velocity (``crazysim.control.position``), a torque from the errors of
 attitude and body rates. Forces and torques that the model lacks, such as wind, a load, a wrong mass or a shifted centre
@@ -19,8 +19,8 @@ The rate has two limits. The first is lag: ``1 / a`` is at least the lag of the 
 and at least 1.5 periods of the controller. The second is the authority: a large error turns the drone along the line
 on which kp e + kd e' = 0, so that the rotors must brake it with (kp / kd)^2 e = 0.04 a^2 e. They can stop it from every
 error if this value at the largest e is at most the angular acceleration that they give in hover (``turn_rates``).
-Without this limit, a drone with quick rotors turns faster than it can stop, saturates to both sides in turn, and never
-settles.
+Without this limit, a drone with quick rotors turns faster than it can stop. Its rotors then saturate in one direction
+and the other, and it never settles.
 
 A rotor that speeds up turns the body the other way. For rotors of inertia I whose drag torque has the slope q over
 speed, a drag torque y comes with the yaw torque y + z y' with z = I / q, up to a second for heavy rotors. Under
@@ -71,11 +71,11 @@ STIFFNESS_RATIO = 0.12
 """Angular acceleration per rotation error over the squared rate about the axis, 1."""
 OBSERVER_RATE_RATIO = 0.6
 """Rate of the estimate of unknown torques over the largest rate about an axis, 1."""
-TORQUE_MAX = 0.5
-"""Largest unknown torque that is compensated, as the rotation error to which it is the response, rad."""
+MAX_COMPENSATED_ERROR = 0.5
+"""Rotation error whose commanded torque is the largest unknown torque that is compensated, rad."""
 YAW_RATE_MAX = 35.0
 """Largest rate about body z that holds a heading, rad/s: the range of a Crazyflie's gyroscope (BMI088, data sheet)."""
-INVERTED_COSINE = 1e-6
+MIN_TILT_COSINE_PLUS_ONE = 1e-6
 """One plus the cosine of the tilt error below which its direction counts as undefined, 1: 0.08 degrees."""
 
 
@@ -131,7 +131,7 @@ class AutoParams(RigidBodyParams):
             mixing_matrix=as_parameter(wrench_matrix(airframe)[1:]),
             stiffness=as_parameter(stiffness),
             damping=as_parameter(damping),
-            torque_max=as_parameter(TORQUE_MAX * np.diag(airframe.inertia) * stiffness),
+            torque_max=as_parameter(MAX_COMPENSATED_ERROR * np.diag(airframe.inertia) * stiffness),
             observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO * np.max(axis_rates) / freq)),
             lead=as_parameter(lead),
             reaction=as_parameter(reaction),
@@ -195,8 +195,8 @@ def quat_error(quat: Array) -> Array:
     """
     x, y, z, w = (quat[..., i : i + 1] for i in range(4))
     squared = w * w + z * z
-    factor = 2 * lax.rsqrt(jnp.maximum(squared, INVERTED_COSINE / 2))
-    roll = jnp.where(squared < INVERTED_COSINE / 2, 2.0, (w * x - y * z) * factor)
+    factor = 2 * lax.rsqrt(jnp.maximum(squared, MIN_TILT_COSINE_PLUS_ONE / 2))
+    roll = jnp.where(squared < MIN_TILT_COSINE_PLUS_ONE / 2, 2.0, (w * x - y * z) * factor)
     yaw = jnp.where(w < 0, -z, z) * factor
     return jnp.concatenate([roll, (w * y + x * z) * factor, yaw], axis=-1)
 
@@ -235,7 +235,7 @@ class Auto(Controller):
         drag = matvec(matrix, matvec(p.drag_matrix, matvec(to_body, s.vel))) / p.mass
         rotor_acc = jnp.sum(quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust), axis=-1, keepdims=True) / p.mass
         known_acc = drag + rotor_acc * matrix[..., 2]
-        # There is an outer loop, so none of these is None.
+        # None of these is None, since ``outer`` is only called with an ``outer_freq``.
         freq, loop, target = (
             cast(int, self.outer_freq),
             cast(PositionParams, p.position),

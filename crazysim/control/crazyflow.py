@@ -38,7 +38,7 @@ class AttitudeMemory(PyTree):
 
 
 class CrazyflowState(Controller):
-    """State controller of Crazyflow (``state2attitude``), which ``Crazyflow`` puts in front of itself."""
+    """State controller of Crazyflow (``state2attitude``), which precedes ``Crazyflow`` at the level ``state``."""
 
     name: ClassVar[str] = "crazyflow"
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
@@ -47,7 +47,7 @@ class CrazyflowState(Controller):
     freq: int = 100
     """Rate, Hz."""
     inner: Controller | None = None
-    """Controller that follows the attitude commands; None with fitted dynamics, which follow them themselves."""
+    """Controller that follows the attitude commands; None with fitted dynamics, which take attitude commands."""
 
     def params(self, airframe: Airframe) -> StateParams:
         keys = (*state_controller.KEYS, *(() if self.inner is None else attitude_controller.KEYS))
@@ -103,7 +103,7 @@ class Crazyflow(Controller):
             )
         else:
             rates = data.controls.attitude.staged_ang_vel_des
-            if rates is None:  # one of several controllers
+            if rates is None:  # without them, as one of several controllers
                 rates = jnp.zeros_like(s.ang_vel)
             wrench, r_int_error = attitude2force_torque(
                 s.quat, s.ang_vel, cmd, rates, m.prev_ang_vel, m.ang_vel_des, m.r_int_error, self.freq, params=params

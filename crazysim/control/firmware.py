@@ -24,7 +24,7 @@ from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.storage import read_bytes, replacing
+from crazysim.storage import open_replacement, read_bytes
 
 INTERFACE_VERSION = 1
 """Version of the interface in ``firmware.h``."""
@@ -162,7 +162,7 @@ def copy_library(library: str | Path) -> str:
         raise ConfigError(f"expected a shared library at {path}: {error}. {remedy}") from error
     copy_path = Path(_copies_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
     if not copy_path.exists():  # a library that is loaded must not be overwritten
-        with replacing(copy_path) as file:
+        with open_replacement(copy_path) as file:
             file.write(content)
         if reason := _loading_error(copy_path):
             copy_path.unlink()

@@ -16,7 +16,7 @@ from crazysim.rotation import clip, dot, safe_norm
 POSITION_RATE_RATIO = 0.4
 """Natural frequency of the position loop times the delay of the loop below it, 1."""
 OBSERVER_RATE_RATIO = 1.5
-"""Rate of the estimate of unknown forces times the same delay, 1."""
+"""Rate of the estimate of unknown forces times the delay of the loop below the position loop, 1."""
 MAX_THRUST_SHARE = 0.9
 """Fraction of the largest thrust that the feedback uses, 1; the rest is for the attitude."""
 MAX_HORIZONTAL_RATIO = 1.0
@@ -26,13 +26,13 @@ MAX_FALL_RATIO = 0.5
 MIN_UPWARD_RATIO = 0.1
 """Upward force of the rotors over the weight that keeps a falling drone upright, 1.
 
-Of the built-in airframes, the ones named ``cf...`` and ``hb_x500`` have 1.6 to 2.1 times as much with all rotors at
-their least thrust, the others nothing.
+Of the built-in airframes, ``cf...`` and ``hb_x500`` have 1.6 to 2.1 times this force with all rotors at their least
+thrust. The other airframes then have none.
 """
 MIN_FEEDBACK_RATIO = 0.1
 """Lower bound on the upward and horizontal limits of the feedback over gravity, 1, for drones with little lift."""
 MAX_DISTURBANCE_RATIO = 0.5
-"""Largest compensated acceleration by unknown forces along an axis, over gravity, 1."""
+"""Largest acceleration by unknown forces along an axis that is compensated, over gravity, 1."""
 
 
 class PositionParams(PyTree):
@@ -45,7 +45,7 @@ class PositionParams(PyTree):
     damping: Array = leaf("parameter", 1, (1,))
     """Acceleration per velocity error, 1/s. (1,)"""
     reach: Array = leaf("parameter", 1)
-    """Largest position error that counts, horizontal and vertical, m. (2,)"""
+    """Limits of the position error, horizontal and vertical, m. (2,)"""
     acc_max: Array = leaf("parameter", 1)
     """Largest acceleration by feedback, horizontal, up and down, m/s^2. (3,)"""
     observer: Array = leaf("parameter", 1, (1,))

@@ -13,7 +13,7 @@ from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree
 
-OUTPUTS = (Control.attitude, Control.force_torque, Control.rotor_vel)
+OUTPUT_LEVELS = (Control.attitude, Control.force_torque, Control.rotor_vel)
 """Levels of the commands that controllers return."""
 
 
@@ -106,8 +106,8 @@ class Controller:
         missing = [key for key in ("name", "levels", "output") if not hasattr(cls, key)]
         if missing:
             raise TypeError(f"controller {cls.__name__} has no class variables {missing}; add them")
-        if cls.output not in OUTPUTS:
-            raise TypeError(f"controller {cls.__name__}: expected output as one of {OUTPUTS}, got {cls.output!r}")
+        if cls.output not in OUTPUT_LEVELS:
+            raise TypeError(f"controller {cls.__name__}: expected output as one of {OUTPUT_LEVELS}, got {cls.output!r}")
 
     def params(self, airframe: Airframe) -> PyTree | None:
         """Return gains and constants for an airframe, in a record of leaves of scope ``parameter``, or None.

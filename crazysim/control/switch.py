@@ -27,7 +27,7 @@ class SwitchParams(PyTree):
     allocation: AllocationParams
     """Allocation of controllers that return a wrench."""
     index: Array | None = leaf("parameter", 1, (1,))
-    """Number of the controller to use; None with a switch function. (1,)"""
+    """Index of the controller to use; None with a switch function. (1,)"""
 
 
 class SwitchMemory(PyTree):
@@ -36,7 +36,7 @@ class SwitchMemory(PyTree):
     controllers: tuple[Any, ...]
     """Memory of each controller."""
     active: Array = leaf("drone", 1)
-    """Number of the active controller; -1 before the first tick. (n_worlds, n_drones, 1)"""
+    """Index of the active controller; -1 before the first tick. (n_worlds, n_drones, 1)"""
     rotor_vel: Array = leaf("drone", 1)
     """Rotor speeds that were commanded last, rpm. (n_worlds, n_drones, n_rotors)"""
 
@@ -45,7 +45,7 @@ class Switch(Controller):
     """Several controllers that take turns in commanding a drone. ``Sim(controller=[...], switch=...)`` creates it.
 
     Only the active controller's memory changes. When a controller becomes active, its ``take_over`` sets its memory, so
-    that its first command can continue the last one. Wrenches are allocated to the rotors here.
+    that its first command can continue the last one. The switch also allocates wrenches to the rotors.
     """
 
     name: ClassVar[str] = "switch"
@@ -78,7 +78,7 @@ class Switch(Controller):
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: SwitchMemory, params: SwitchParams
     ) -> tuple[Array, SwitchMemory]:
-        index = self._index(data, command, params)
+        index = self._active_index(data, command, params)
         has_switched = (memory.active[0] >= 0) & (memory.active[0] != index)
         rotor_vel, new_memories = memory.rotor_vel, []
         for k, (controller, m, p) in enumerate(
@@ -88,9 +88,9 @@ class Switch(Controller):
             takes_over = is_selected & has_switched
             m = _select_tree(takes_over, controller.take_over(data, command, m, p, memory.rotor_vel), m)
             if isinstance(command, Setpoint) and controller.has_outer:
-                is_due = is_selected & (takes_over | _is_due(data, controller.outer_freq))
+                is_due = is_selected & (takes_over | _is_tick(data, controller.outer_freq))
                 m = _select_tree(is_due, controller.outer(data, command, m, p), m)
-            is_due = is_selected & (takes_over | _is_due(data, controller.freq))
+            is_due = is_selected & (takes_over | _is_tick(data, controller.freq))
             output, new_memory = controller.update(data, command, m, p)
             if controller.output == Control.force_torque:
                 output = force_torque2rotor_vel(output, params=params.allocation)
@@ -99,8 +99,8 @@ class Switch(Controller):
         active = jnp.full_like(memory.active, index)
         return rotor_vel, SwitchMemory(tuple(new_memories), active, rotor_vel)
 
-    def _index(self, data: DroneData, command: Setpoint | Array, params: SwitchParams) -> Array:
-        """Return the number of the controller to use. ()"""
+    def _active_index(self, data: DroneData, command: Setpoint | Array, params: SwitchParams) -> Array:
+        """Return the index of the controller to use. ()"""
         if params.index is not None:
             index = params.index[0]
         else:
@@ -135,8 +135,8 @@ def _check_indices(switch: Any, n: int) -> np.ndarray:
     return indices[..., None].astype(np.int32)
 
 
-def _is_due(data: DroneData, freq: Any) -> Array | bool:
-    """Return True where a rate fires at this step. ()"""
+def _is_tick(data: DroneData, freq: Any) -> Array | bool:
+    """Return True if this step is a tick of a rate, Hz. ()"""
     return data.core.steps % (data.core.freq // freq) == 0
 
 

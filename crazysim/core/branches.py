@@ -16,9 +16,9 @@ Carry = TypeVar("Carry")
 def any_lane(condition: Array) -> Array:
     """Return True where a condition holds for this element or, by choice of the engine, for another in its vector.
 
-    The result may be True where the condition is False, depending on which elements are computed together. Use it only
-    to decide what is computed, never what the result is: a loop whose path all elements of a vector share reads its
-    tables once for all of them.
+    The result may be True where the condition is False, depending on which elements are computed together. It may
+    decide what is computed, but must not change the result. For example, if all elements of a vector take the same path
+    through a loop, the loop reads its tables once for all of them.
 
     Args:
         condition: The condition. ()

@@ -69,32 +69,32 @@ def rk4(data: SimData, deriv_fn: DerivFn) -> SimData:
     """
     dt = 1 / data.core.freq
     k1 = deriv_fn(data)
-    k2 = deriv_fn(apply_derivative(data, k1, dt / 2, final=False))
+    k2 = deriv_fn(apply_derivative(data, k1, dt / 2, is_final=False))
     commutator = dt / 4 * rotation.cross(k1.ang_vel, k2.ang_vel)
-    k3 = deriv_fn(apply_derivative(data, k2.replace(ang_vel=k2.ang_vel + commutator), dt / 2, final=False))
-    k4 = deriv_fn(apply_derivative(data, k3, dt, final=False))
+    k3 = deriv_fn(apply_derivative(data, k2.replace(ang_vel=k2.ang_vel + commutator), dt / 2, is_final=False))
+    k4 = deriv_fn(apply_derivative(data, k3, dt, is_final=False))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
     commutator = dt / 12 * rotation.cross(k1.ang_vel, k4.ang_vel)
     return apply_derivative(data, mean.replace(ang_vel=mean.ang_vel + commutator), dt)
 
 
-def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, final: bool = True) -> SimData:
+def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, is_final: bool = True) -> SimData:
     """Return the data advanced by ``dt`` seconds along a derivative.
 
     Args:
         data: Data at the start of the step.
         deriv: Derivative of the states.
         dt: Duration, s.
-        final: True at the end of a step, to normalise quaternions and limit angular velocities. False at intermediate
-            points of a step.
+        is_final: True at the end of a step, to normalise quaternions and limit angular velocities. False at
+            intermediate points of a step.
     """
     s = data.states
     ang_vel = s.ang_vel + dt * deriv.ang_acc
     states = s.replace(
         pos=s.pos + dt * deriv.vel,
-        quat=rotation.integrate_attitude(s.quat, deriv.ang_vel, dt, normalize=final),
+        quat=rotation.integrate_attitude(s.quat, deriv.ang_vel, dt, normalize=is_final),
         vel=s.vel + dt * deriv.acc,
-        ang_vel=limit_ang_vel(ang_vel, data.core.freq) if final else ang_vel,
+        ang_vel=limit_ang_vel(ang_vel, data.core.freq) if is_final else ang_vel,
         rotor_vel=s.rotor_vel + dt * deriv.rotor_acc,
     )
     if not deriv.plugins:
@@ -144,9 +144,9 @@ class Integration:
     def derivative(self, data: SimData) -> SimStateDeriv:
         """Return the derivative of the states of drones and plugins, under all influences and the constraint."""
         if self.couples_world:
-            influenced_data, deriv = data, vmap_drones(lambda drone_data: self._without_constraint(drone_data)[1])(data)
+            influenced_data, deriv = data, vmap_drones(lambda drone: self._unconstrained_derivative(drone)[1])(data)
         else:
-            influenced_data, deriv = self._without_constraint(data)
+            influenced_data, deriv = self._unconstrained_derivative(data)
         constraining_plugins = [plugin for plugin in self.plugins if plugin.constrains]
         if not constraining_plugins:
             return deriv
@@ -156,7 +156,7 @@ class Integration:
             deriv = deriv.replace(vel=vel, ang_vel=ang_vel)
         return apply_constraint(constraining_plugins[0], influenced_data, deriv, None if self.method is rk4 else dt)
 
-    def _without_constraint(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
+    def _unconstrained_derivative(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
         """Return the data with all influences applied, and the derivative without constraints."""
         for plugin in self.plugins:
             data = apply_influence(plugin, data)

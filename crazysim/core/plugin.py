@@ -99,7 +99,7 @@ def parameter(
 
 
 def airframe_numbers(sim: Simulation, get_number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
-    """Return a number of the airframes for ``check_parameter``: one for all drones, or one for each.
+    """Return a quantity of the airframes for ``check_parameter``: one value for all drones, or one per drone.
 
     Args:
         sim: The simulation.
@@ -139,8 +139,8 @@ def check_parameter(
         low: Smallest value allowed.
         high: Largest value allowed.
         dtype: Type; None for the type of the states.
-        positive: Refuse zero and negative values.
-        per_axis: Accept one number for all axes of a vector.
+        positive: True to refuse zero and negative values.
+        per_axis: True to accept one number for all axes of a vector.
 
     Returns:
         (*core) or (n_worlds, n_drones, *core)
@@ -180,13 +180,13 @@ class Plugin:
     name: str
     """Name of the plugin: the key of its record in ``data.plugins``, and the name of its stage."""
     order: ClassVar[int] = 0
-    """Influences are applied in ascending order, and by name within the same order. Negative: replaces commands that
-    the others limit."""
+    """Influences are applied in ascending order, and by name within the same order. Plugins that replace commands
+    have a negative order, so that the others can limit the new commands."""
     coupling: ClassVar[Literal["drone", "world"]] = "drone"
     """Scope that ``constrain`` is written for: the data of one drone, or of one world."""
     reset_before: ClassVar[str | None] = None
-    """Name of the stage of an episode's first step before which ``reset_episode`` is called, if it uses results of
-    that step; None to call it at resets, and before all stages in worlds that were not reset."""
+    """Name of the stage before which ``reset_episode`` is called in the first step of an episode, because it uses
+    results of earlier stages. None to call it at resets, and before all stages in worlds that were not reset."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass."""
@@ -233,14 +233,14 @@ class Plugin:
         return None
 
     def default_record(self, sim: Simulation) -> PyTree | None:
-        """Return the record that resets restore; by default the same as ``record``."""
+        """Return the record that resets restore; by default the result of ``record``."""
         return self.record(sim)
 
     def fill_record(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
         """Return a record for all worlds; fields that are not passed follow from their declarations.
 
         A parameter has the value of the plugin's setting of that name, checked; without a fixed core shape it has one
-        number for each rotor. A state of drones with a fixed core shape is zero. A setting of None is None.
+        number for each rotor. A state of drones with a fixed core shape is zero. A setting of None gives None.
 
         Args:
             sim: The simulation.
@@ -286,7 +286,7 @@ class Plugin:
         return type(self).reset_episode is not Plugin.reset_episode
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data of one drone as the dynamics are to use it: other forces, commands or parameters.
+        """Return the data of one drone with changed forces, commands or parameters, for the dynamics to use.
 
         It may write ``states.force``, ``states.torque``, ``controls.rotor_vel`` (``controls.attitude.cmd`` in fitted
         dynamics) and any field of ``params``; all other fields are returned as they are. The integrator evaluates it

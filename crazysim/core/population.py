@@ -50,7 +50,7 @@ class Population(Plugin):
     prefix: ClassVar[str] = "Member"
     """Beginning of the names of members that are given by number: ``Member_0``."""
     positions: ClassVar[tuple[str, ...]] = ("pos",)
-    """States that the scheme ``symplectic_euler`` moves with the new values of the others."""
+    """Fields that the scheme ``symplectic_euler`` advances with the new values of the other states."""
     command_field: ClassVar[str | None] = None
     """Field of the record that ``command`` writes; None for a population without commands."""
 
@@ -95,7 +95,7 @@ class Population(Plugin):
         return type(self).influence is not Plugin.influence or self.constrains
 
     def create(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
-        """Return a record for all worlds, with values repeated along axes of worlds and members that they lack.
+        """Return a record for all worlds. Values without axes of worlds or members are repeated along them.
 
         Args:
             sim: The simulation.
@@ -133,7 +133,7 @@ class Population(Plugin):
         return {}
 
     def scheme(self, integrator: Integrator) -> Callable[..., Any]:
-        """Return the function ``(record, rates, dt) -> record`` by which the integration advances one member.
+        """Return the function ``(record, rates_fn, dt) -> record`` by which the integration advances one member.
 
         Override it for states that another method advances better, such as fast rotation under Euler's schemes.
         """
@@ -182,41 +182,43 @@ class Population(Plugin):
         return self.write(data, self.control(data))
 
     def _integrate(self, scheme: Callable[..., Members], data: SimData) -> SimData:
-        def rates(record: Members) -> dict[str, Array]:
+        def rates_fn(record: Members) -> dict[str, Array]:
             return plugin_rates(self, self.write(data, record))
 
-        advanced_record = scheme(self.read(data), rates, 1 / data.core.freq)
+        advanced_record = scheme(self.read(data), rates_fn, 1 / data.core.freq)
         return self.write(data, self.finish(advanced_record))
 
 
-Rates = Callable[[R], dict[str, Array]]
-"""From the record of one member to its derivatives by field."""
+RatesFn = Callable[[R], dict[str, Array]]
+"""Function from the record of one member to the time derivatives of its fields, by name."""
 
 
-def euler(record: R, rates: Rates, dt: float) -> R:
+def euler(record: R, rates_fn: RatesFn, dt: float) -> R:
     """Return a record one explicit Euler step later."""
-    return advance_record(record, rates(record), dt)
+    return advance_record(record, rates_fn(record), dt)
 
 
-def symplectic_euler(record: R, rates: Rates, dt: float, positions: Sequence[str]) -> R:
+def symplectic_euler(record: R, rates_fn: RatesFn, dt: float, positions: Sequence[str]) -> R:
     """Return a record one semi-implicit Euler step later: positions move with the new values of the other states."""
-    advanced_record = advance_record(record, {k: rate for k, rate in rates(record).items() if k not in positions}, dt)
+    advanced_record = advance_record(
+        record, {k: rate for k, rate in rates_fn(record).items() if k not in positions}, dt
+    )
     return advance_record(
-        advanced_record, {k: rate for k, rate in rates(advanced_record).items() if k in positions}, dt
+        advanced_record, {k: rate for k, rate in rates_fn(advanced_record).items() if k in positions}, dt
     )
 
 
-def rk4(record: R, rates: Rates, dt: float) -> R:
+def rk4(record: R, rates_fn: RatesFn, dt: float) -> R:
     """Return a record one step of the classical Runge-Kutta method of order 4 later."""
-    k1 = rates(record)
-    k2 = rates(advance_record(record, k1, dt / 2))
-    k3 = rates(advance_record(record, k2, dt / 2))
-    k4 = rates(advance_record(record, k3, dt))
+    k1 = rates_fn(record)
+    k2 = rates_fn(advance_record(record, k1, dt / 2))
+    k3 = rates_fn(advance_record(record, k2, dt / 2))
+    k4 = rates_fn(advance_record(record, k3, dt))
     return advance_record(record, jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), dt)
 
 
 def choose_scheme(integrator: Integrator, positions: Sequence[str]) -> Callable[..., Any]:
-    """Return the function ``(record, rates, dt) -> record`` of an integration scheme."""
+    """Return the function ``(record, rates_fn, dt) -> record`` of an integration scheme."""
     semi_implicit_euler = functools.partial(symplectic_euler, positions=positions)
     return {
         Integrator.euler: euler,

@@ -149,7 +149,7 @@ def saturate(cmd: Array, params: Params) -> Array:
 
 @jit_eager_calls()
 def hover_rotor_vel(params: Params) -> Array:
-    """Return the rotor speeds of hover, equal thrust on every rotor, rpm. (..., n_rotors)"""
+    """Return the rotor speeds at which equal thrusts of all rotors carry the weight, rpm. (..., n_rotors)"""
     n_rotors = params.mixing_matrix.shape[-1]
     weight = params.mass * rotation.safe_norm(params.gravity_vec)
     if params.rotor_vel_max.shape[-1] == 1:
@@ -162,7 +162,7 @@ def hover_rotor_vel(params: Params) -> Array:
 
 
 def pad_rotors(params: Params, n_rotors: int) -> Params:
-    """Return the parameters of an airframe with rotors added that do not exist: no thrust, no torque, no speed."""
+    """Return the parameters of an airframe padded to ``n_rotors``; added rotors have no thrust, torque or speed."""
     n_present = params.mixing_matrix.shape[-1]
     if n_present == n_rotors:
         return params

@@ -11,8 +11,9 @@ from crazysim.drones import Airframe, AirframeSource, Drone, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, UnknownNameError
 
-MAX_LAG_RATE = 1.5
-"""Largest product of a rate and a step. Euler steps diverge from 2 on; at 1.5, a lag overshoots by half its error."""
+MAX_LAG_STEP = 1.5
+"""Longest time step over the time constant of a lag, 1. Euler steps diverge from 2 on; at 1.5, a lag overshoots by
+half its error."""
 GRAVITY = (0.0, 0.0, -GRAVITY_MAGNITUDE)
 """Gravitational acceleration, world frame, m/s^2."""
 
@@ -60,7 +61,7 @@ def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
     """Check that the lags and the damping of an airframe are slow enough for the rate of the physics.
 
     Raises:
-        ConfigError: If a rate is above ``MAX_LAG_RATE * freq``; the message states the lowest ``freq`` that suffices.
+        ConfigError: If a rate is above ``MAX_LAG_STEP * freq``; the message states the lowest ``freq`` that suffices.
     """
     numbers, mass = airframe.values, airframe.value("rigid_body.mass")
     rates_by_path: dict[str, np.ndarray] = {}
@@ -85,8 +86,8 @@ def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
         rates_by_path[drag_path] = numbers[drag_path] / mass
     for path, rates in rates_by_path.items():
         max_rate = float(np.max(np.abs(rates)))
-        if max_rate > MAX_LAG_RATE * freq:
+        if max_rate > MAX_LAG_STEP * freq:
             raise ConfigError(
                 f"expected {path} of airframe {airframe.name!r} to be slow for steps of 1/{freq} s, got a rate of "
-                f"{max_rate:.4g} 1/s. Use freq={math.ceil(max_rate / MAX_LAG_RATE)} or more, or a smaller number."
+                f"{max_rate:.4g} 1/s. Use freq={math.ceil(max_rate / MAX_LAG_STEP)} or more, or a smaller number."
             )

@@ -20,7 +20,7 @@ from types import ModuleType
 from crazysim.cache import caches_folder
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError
-from crazysim.storage import make_private, untrusted_reason
+from crazysim.storage import make_private_folder, untrusted_reason
 
 GUIDE = "docs/guides/tasks.md"
 _CLASSES_BY_REFERENCE: dict[str, type[Task]] = {}
@@ -188,7 +188,7 @@ def _add_to_list(reference: str) -> None:
     """Add a reference to the list. If that is impossible, the user must name it again in another process."""
     with contextlib.suppress(OSError, ConfigError):
         path = _list_path()
-        make_private(path.parent)
+        make_private_folder(path.parent)
         if untrusted_reason(path.parent) or reference in _read_list():
             return
         with open(path, "a", encoding="utf-8", opener=lambda p, flags: os.open(p, flags, 0o600)) as file:

@@ -94,14 +94,14 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
     offset = pos_a - pos_b
     relative_rot = matmul(rot_b.T, rot_a)
     abs_rot = jnp.abs(relative_rot)
-    along_a, along_b = matvec(rot_a.T, offset), matvec(rot_b.T, offset)
-    faces = jnp.concatenate([
-        jnp.abs(along_a) - half_a - matvec(abs_rot.T, half_b),
-        jnp.abs(along_b) - half_b - matvec(abs_rot, half_a),
+    offset_in_a, offset_in_b = matvec(rot_a.T, offset), matvec(rot_b.T, offset)
+    face_gaps = jnp.concatenate([
+        jnp.abs(offset_in_a) - half_a - matvec(abs_rot.T, half_b),
+        jnp.abs(offset_in_b) - half_b - matvec(abs_rot, half_a),
     ])  # fmt: skip
     min_half = jnp.minimum(jnp.min(half_a), jnp.min(half_b))
     best_face = jnp.argmax(
-        lax.stop_gradient(faces + FACE_BIAS * min_half * jnp.asarray([1, 1, 1, 0, 0, 0], faces.dtype))
+        lax.stop_gradient(face_gaps + FACE_BIAS * min_half * jnp.asarray([1, 1, 1, 0, 0, 0], face_gaps.dtype))
     )
     axes = rotation.cross(rot_b.T[:, None], rot_a.T[None])  # (3 of b, 3 of a, 3)
     length = rotation.safe_norm(axes)
@@ -109,13 +109,15 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
     axes = axes / jnp.where(length > MIN_EDGE_SINE, length, 1.0)
     half_extent = jnp.sum(half_a * jnp.abs(jnp.sum(axes[..., None] * rot_a, axis=-2)), axis=-1)
     half_extent = half_extent + jnp.sum(half_b * jnp.abs(jnp.sum(axes[..., None] * rot_b, axis=-2)), axis=-1)
-    edges = jnp.where(is_defined, jnp.abs(jnp.sum(axes * offset, axis=-1)) - half_extent, -OUTSIDE_DISTANCE).reshape(-1)
-    pair = jnp.argmax(lax.stop_gradient(edges))
-    is_edge_contact = edges[pair] > EDGE_SHARE * faces[best_face] + EDGE_BIAS * min_half
+    edge_gaps = jnp.where(
+        is_defined, jnp.abs(jnp.sum(axes * offset, axis=-1)) - half_extent, -OUTSIDE_DISTANCE
+    ).reshape(-1)
+    pair = jnp.argmax(lax.stop_gradient(edge_gaps))
+    is_edge_contact = edge_gaps[pair] > EDGE_SHARE * face_gaps[best_face] + EDGE_BIAS * min_half
     # If the boxes are apart, the axis with the largest distance counts, face or edge. Without the bias, rounding would
     # choose between level faces that touch.
     is_edge_contact = jnp.where(
-        faces[best_face] > 0, edges[pair] > faces[best_face] + FACE_BIAS * min_half, is_edge_contact
+        face_gaps[best_face] > 0, edge_gaps[pair] > face_gaps[best_face] + FACE_BIAS * min_half, is_edge_contact
     )
 
     is_a = best_face < 3
@@ -190,7 +192,7 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
 def _edge_contact(
     boxes: tuple[tuple[Array, ...], ...], pair: Array, axis: Array, offset: Array
 ) -> tuple[Array, Array, Array]:
-    """Return gap, normal and point of two edges, whose numbers are ``pair // 3`` of b and ``pair % 3`` of a."""
+    """Return gap, normal and point of the contact of two edges, number ``pair // 3`` of b and ``pair % 3`` of a."""
     normal = jnp.where(jnp.sum(axis * offset) < 0, -1.0, 1.0) * axis
     ends = []
     for (half, pos, rot), number, side in zip(boxes, (pair % 3, pair // 3), (-1.0, 1.0), strict=True):

@@ -14,7 +14,7 @@ from crazysim.geometry.shapes import Shape
 from crazysim.rotation import clip, safe_normalize, safe_sqrt
 
 Interval = tuple[Array, Array, Array]
-"""Distances along a line at which it enters and leaves a convex shape, and True where it meets the shape at all."""
+"""Distances along a line at which it enters and leaves a convex shape, and True if it meets the shape. (...) each"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ def hit_distance(shape: Shape | SizedShapes, origin: Components, direction: Comp
         direction: Unit direction of each ray, in the frame of the shape. 3 of (...)
     """
     if shape.kind != "plane":
-        return first_distance(LINE_INTERVAL[shape.kind](shape, origin, direction))
+        return first_distance(LINE_INTERVALS[shape.kind](shape, origin, direction))
     t, is_hit = _plane_distance(origin, direction)
     return first_distance((t, t, is_hit))
 
@@ -78,7 +78,7 @@ def hit_normal(shape: Shape | SizedShapes, origin: Array, direction: Array, dist
     """
     is_hit = jnp.isfinite(distance)
     t = jnp.where(is_hit, distance, 0.0)
-    normal = SURFACE_NORMAL[shape.kind](shape, origin + t[..., None] * direction)
+    normal = SURFACE_NORMALS[shape.kind](shape, origin + t[..., None] * direction)
     return jnp.where(is_hit[..., None], normal, 0.0)
 
 
@@ -89,7 +89,7 @@ def _plane_distance(origin: Components, direction: Components) -> tuple[Array, A
     return height / jnp.where(is_hit, descent_rate, 1.0), is_hit
 
 
-def slab_line(origin: Array, direction: Array, half: Array | float) -> Interval:
+def slab_interval(origin: Array, direction: Array, half: Array | float) -> Interval:
     """Return the interval of a line between the planes at ``-half`` and ``half``, from its normal components."""
     is_parallel = jnp.abs(direction) < MIN_COMPONENT
     inverse = 1 / jnp.where(is_parallel, MIN_COMPONENT, direction)
@@ -110,7 +110,7 @@ def union(p: Interval, q: Interval) -> Interval:
     return near, far, p[2] | q[2]
 
 
-def _ball_line(origin: Sequence[Array], direction: Sequence[Array], radius: Array | float) -> Interval:
+def _ball_interval(origin: Sequence[Array], direction: Sequence[Array], radius: Array | float) -> Interval:
     """Return the interval of a line in a ball, or in a cylinder if two components are given.
 
     It uses the point of the line nearest to the centre, because the usual discriminant loses its
@@ -128,33 +128,33 @@ def _ball_line(origin: Sequence[Array], direction: Sequence[Array], radius: Arra
     return middle - half_chord, middle + half_chord, jnp.where(is_parallel, ~is_outside, squared_half_chord >= 0)
 
 
-def _sphere_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
-    return _ball_line(origin, direction, shape.size[0])
+def _sphere_interval(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
+    return _ball_interval(origin, direction, shape.size[0])
 
 
-def _capsule_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
+def _capsule_interval(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
     radius, half = shape.size
     (x, y, z), d = origin, direction
-    out = intersection(_ball_line([x, y], d[:2], radius), slab_line(z, d[2], half))
+    interval = intersection(_ball_interval([x, y], d[:2], radius), slab_interval(z, d[2], half))
     for end in (-half, half):
-        out = union(out, _ball_line([x, y, z - end], d, radius))
-    return out
+        interval = union(interval, _ball_interval([x, y, z - end], d, radius))
+    return interval
 
 
-def _box_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
-    x, y, z = (slab_line(o, d, h) for o, d, h in zip(origin, direction, shape.size, strict=True))
+def _box_interval(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
+    x, y, z = (slab_interval(o, d, h) for o, d, h in zip(origin, direction, shape.size, strict=True))
     return intersection(intersection(x, y), z)
 
 
-def _cylinder_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
+def _cylinder_interval(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
     radius, half = shape.size
     (x, y, z), (u, v, w) = origin, direction
-    return intersection(_ball_line([x, y], [u, v], radius), slab_line(z, w, half))
+    return intersection(_ball_interval([x, y], [u, v], radius), slab_interval(z, w, half))
 
 
-def _ellipsoid_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
+def _ellipsoid_interval(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
     scaled_origin, scaled_direction = ([x / a for x, a in zip(v, shape.size, strict=True)] for v in (origin, direction))
-    return _ball_line(scaled_origin, scaled_direction, 1.0)
+    return _ball_interval(scaled_origin, scaled_direction, 1.0)
 
 
 def _plane_products(shape: Shape, v: Components) -> Array:
@@ -166,7 +166,7 @@ def _plane_products(shape: Shape, v: Components) -> Array:
     return x + y + z
 
 
-def _mesh_line(shape: Shape, origin: Components, direction: Components) -> Interval:
+def _mesh_interval(shape: Shape, origin: Components, direction: Components) -> Interval:
     """Return the interval of a line below all planes of a mesh (Kay and Kajiya 1986)."""
     depths = jnp.asarray(shape.offsets, origin[0].dtype) - _plane_products(shape, origin)
     rates = _plane_products(shape, direction)
@@ -188,13 +188,13 @@ def first_distance(interval: Interval) -> Array:
     return jnp.where(is_hit, jnp.where(is_hit, jnp.where(near >= 0, near, far), 0.0), jnp.inf)
 
 
-LINE_INTERVAL = {
-    "sphere": _sphere_line,
-    "capsule": _capsule_line,
-    "box": _box_line,
-    "cylinder": _cylinder_line,
-    "ellipsoid": _ellipsoid_line,
-    "mesh": _mesh_line,
+LINE_INTERVALS = {
+    "sphere": _sphere_interval,
+    "capsule": _capsule_interval,
+    "box": _box_interval,
+    "cylinder": _cylinder_interval,
+    "ellipsoid": _ellipsoid_interval,
+    "mesh": _mesh_interval,
 }
 
 
@@ -252,7 +252,7 @@ def _mesh_normal(shape: Shape, point: Array) -> Array:
     return jnp.take(jnp.asarray(shape.array("normals"), point.dtype), jnp.argmax(heights, axis=-1), axis=0)
 
 
-SURFACE_NORMAL = {
+SURFACE_NORMALS = {
     "plane": _plane_normal,
     "sphere": _sphere_normal,
     "capsule": _capsule_normal,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 from crazysim.media.journal import is_journal, pack_arrays, read_journal, unpack_arrays
 from crazysim.scene.visual_geoms import GEOM_KINDS, VisualGeom
-from crazysim.storage import read_arrays, reading, replacing
+from crazysim.storage import open_replacement, read_arrays, wrap_read_errors
 
 FORMAT = 1
 """Version of the file format."""
@@ -95,7 +95,7 @@ class Flight:
             raise ConfigError(f"expected the name of a recording to end with .npz, got {str(path)!r}")
         arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shapes"}
         arrays |= shape_arrays(self.shapes)
-        with replacing(path) as file:
+        with open_replacement(path) as file:
             np.savez_compressed(file, format=FORMAT, **arrays)
 
     @classmethod
@@ -107,7 +107,7 @@ class Flight:
             DamagedFileError: If it is damaged or not a recorded flight.
         """
         path = Path(path)
-        with reading(path, "a recorded flight", "Save it again, or use another copy."):
+        with wrap_read_errors(path, "a recorded flight", "Save it again, or use another copy."):
             if is_journal(path):
                 arrays = _read_samples(path)
             else:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.storage import read_bytes, reading
+from crazysim.storage import read_bytes, wrap_read_errors
 
 MAX_FILE_BYTES = 2**32
 """Largest file, bytes. A scene of five million splats has 1.2 GB."""
@@ -51,7 +51,7 @@ def read_map(path: str | Path) -> MapFile:
     reader = MAP_READERS.get(Path(path).suffix.lower())
     if reader is None:
         raise ConfigError(f"expected a file {', '.join(MAP_READERS)}, got {str(path)!r}. Convert it to one of these.")
-    with reading(path, "a point cloud or mesh", READ_REMEDY):
+    with wrap_read_errors(path, "a point cloud or mesh", READ_REMEDY):
         points, triangles = reader(read_bytes(path, MAX_FILE_BYTES))
         points = np.asarray(points, np.float64).reshape(-1, 3)
         if triangles is not None:

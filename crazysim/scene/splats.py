@@ -16,7 +16,7 @@ from crazysim.pytree import PyTree
 from crazysim.scene.map_files import MAX_FILE_BYTES, read_ply
 from crazysim.scene.maps import read_frame
 from crazysim.scene.objects import IDENTITY_QUAT
-from crazysim.storage import read_bytes, reading
+from crazysim.storage import read_bytes, wrap_read_errors
 from crazysim.tables import range_between, read_number
 
 N_COLORS = (1, 4, 9, 16)
@@ -119,7 +119,7 @@ def spherical_harmonics(direction: Any, n: int) -> list[Any]:
 
 def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
     """Return the fields of ``Gaussians`` in the frame and unit of the file."""
-    with reading(path, "a scene of Gaussian splats", "Use a .ply file of a program for Gaussian splatting."):
+    with wrap_read_errors(path, "a scene of Gaussian splats", "Use a .ply file of a program for Gaussian splatting."):
         vertex = read_ply(read_bytes(path, MAX_FILE_BYTES))["vertex"]
     names = {
         "pos": ["x", "y", "z"],

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.storage import read_arrays, reading, replacing
+from crazysim.storage import open_replacement, read_arrays, wrap_read_errors
 
 T = TypeVar("T")
 META_ENTRY = "meta"
@@ -33,7 +33,7 @@ def save(path: str | Path, tree: Any, meta: dict[str, Any]) -> None:
         ConfigError: If the file cannot be written; no partial file is left.
     """
     arrays = {name: np.asarray(_key_data(x)) for name, x in _named_leaves(tree)}
-    with replacing(path) as file:
+    with open_replacement(path) as file:
         np.savez(file, allow_pickle=False, **{META_ENTRY: np.array(json.dumps(meta))}, **arrays)
 
 
@@ -44,15 +44,15 @@ def read(path: str | Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
         ConfigError: If the file does not exist.
         DamagedFileError: If it is damaged or not a checkpoint.
     """
-    with reading_checkpoint(path), open(path, "rb") as file:
+    with wrap_checkpoint_errors(path), open(path, "rb") as file:
         arrays = read_arrays(file, str(path))
         return arrays, dict(json.loads(str(arrays.pop(META_ENTRY))))
 
 
-def reading_checkpoint(path: str | Path) -> AbstractContextManager[None]:
-    """Return a context manager that raises errors of reading a checkpoint as ``crazysim.storage.reading`` does."""
+def wrap_checkpoint_errors(path: str | Path) -> AbstractContextManager[None]:
+    """Return a context manager that converts errors of reading a checkpoint, as ``wrap_read_errors`` does."""
     remedy = "Use the folder of an intact run, or train again: crazysim train TASK --out FOLDER."
-    return reading(path, "a checkpoint of crazysim", remedy)
+    return wrap_read_errors(path, "a checkpoint of crazysim", remedy)
 
 
 def restore(path: str | Path, arrays: Mapping[str, NDArray], template: T) -> T:
@@ -72,7 +72,7 @@ def restore(path: str | Path, arrays: Mapping[str, NDArray], template: T) -> T:
     leaves = []
     for name, x in named_leaves:
         is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        with reading_checkpoint(path):
+        with wrap_checkpoint_errors(path):
             value = jax.device_put(arrays[name])
             value = jax.random.wrap_key_data(value) if is_key else value
         if value.shape != x.shape or value.dtype != x.dtype:

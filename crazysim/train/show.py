@@ -18,7 +18,7 @@ from crazysim.media import Film, View
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points
-from crazysim.storage import reading, write_figure
+from crazysim.storage import wrap_read_errors, write_figure
 from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, act, as_tree, fly_episodes, initial_memory
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE_FILE
@@ -187,7 +187,7 @@ def read_curve(folder: Path) -> list[dict[str, float]]:
         DamagedFileError: If it is damaged.
     """
     path = folder / CURVE_FILE
-    with reading(path, "a learning curve", "Write it again with 'crazysim train TASK --resume'."):
+    with wrap_read_errors(path, "a learning curve", "Write it again with 'crazysim train TASK --resume'."):
         curve = json.loads(path.read_bytes())
         return [{"iteration" if name == "round" else name: x for name, x in point.items()} for point in curve]
 

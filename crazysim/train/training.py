@@ -35,7 +35,7 @@ from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
 from crazysim.errors import ConfigError, DivergedError
 from crazysim.progress import progress_bar
 from crazysim.sim.sim import Sim
-from crazysim.storage import replacing, write_file
+from crazysim.storage import open_replacement, write_file
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
@@ -422,13 +422,13 @@ class _Training:
 def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
     """Write the table of the trainings of a program as JSON and CSV, with empty cells where a value is missing."""
     rows = [{name: None if x != x else x for name, x in row.items()} for row in rows]
-    with replacing(folder / TABLE_FILE) as file:
+    with open_replacement(folder / TABLE_FILE) as file:
         file.write(json.dumps(rows, indent=1).encode())
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with replacing((folder / TABLE_FILE).with_suffix(".csv")) as file:
+    with open_replacement((folder / TABLE_FILE).with_suffix(".csv")) as file:
         file.write(text.getvalue().encode())
 
 
@@ -496,7 +496,7 @@ def load_policy(
     """
     path = Path(folder) / POLICY_FILE
     arrays, meta = checkpoint.read(path)
-    with checkpoint.reading_checkpoint(path):
+    with checkpoint.wrap_checkpoint_errors(path):
         config = TrainConfig(**meta["settings"])
         if task is not None:
             config = dataclasses.replace(config, task=TrainConfig.create(task).task)
@@ -549,7 +549,7 @@ def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
     """
     path = Path(folder) / CHECKPOINT_FILE
     meta = checkpoint.read(path)[1]
-    with checkpoint.reading_checkpoint(path):
+    with checkpoint.wrap_checkpoint_errors(path):
         return {name: TrainConfig(**run["settings"]) for name, run in meta["runs"].items()}
 
 
@@ -562,7 +562,7 @@ def _read_run(
         ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.
     """
     arrays, meta = checkpoint.read(path)
-    with checkpoint.reading_checkpoint(path):
+    with checkpoint.wrap_checkpoint_errors(path):
         if meta["crazysim"] != crazysim.__version__:
             raise ConfigError(
                 f"expected a checkpoint of crazysim {crazysim.__version__}, got {path} of {meta['crazysim']}; start a "

@@ -29,7 +29,7 @@ from pathlib import Path
 
 from crazysim import cache
 from crazysim.errors import warn
-from crazysim.storage import FOLDER_REMEDY, make_private, untrusted_reason
+from crazysim.storage import FOLDER_REMEDY, make_private_folder, untrusted_reason
 
 DIGEST_LENGTH = 24
 """Hexadecimal digits of a hash in a name: 96 bits."""
@@ -53,7 +53,7 @@ def folder() -> Path:
     if programs is not None:
         kernel_folder = programs / "crazysim"
         with contextlib.suppress(OSError):
-            make_private(kernel_folder)
+            make_private_folder(kernel_folder)
         if kernel_folder.is_dir():
             if reason := untrusted_reason(kernel_folder):
                 _warn_once(kernel_folder, reason)
@@ -81,7 +81,7 @@ def _sweep_once(kernel_folder: Path) -> None:
 def temporary_folder() -> Path:
     """Return a folder of this process, which is removed when the process ends. A forked process has its own folder."""
     folder = _make_temporary_folder(os.getpid())
-    make_private(folder)  # again, in case the system has removed it
+    make_private_folder(folder)  # again, in case the system has removed it
     return folder
 
 

@@ -18,7 +18,7 @@ from crazysim.lab.identify.delimited import read_delimited
 from crazysim.lab.identify.readers import read_crazyflie
 from crazysim.lab.identify.repairs import check_period
 from crazysim.lab.identify.ulog import read_ulog
-from crazysim.storage import read_arrays, reading
+from crazysim.storage import read_arrays, wrap_read_errors
 
 MAX_LOG_BYTES = 2**31
 """Largest log file, bytes. ROS bags have no limit, since they are not read into memory as a whole."""
@@ -58,7 +58,7 @@ def _read_source(
         return "log", _convert_time("log", source, columns)
     path = Path(source)
     if is_bag(path) and path.exists():
-        with reading(path.name, "a ROS bag", "Record it again, or run ros2 bag reindex."):
+        with wrap_read_errors(path.name, "a ROS bag", "Record it again, or run ros2 bag reindex."):
             return path.stem, read_bag(path, repairs, columns)
     if not path.is_file():
         raise ConfigError(f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
@@ -66,7 +66,7 @@ def _read_source(
         raise ConfigError(
             f"{path.name}: expected a log of at most {MAX_LOG_BYTES} bytes, got {size}. Cut it into flights."
         )
-    with reading(path.name, "a log of a flight", "Copy or export it again."):
+    with wrap_read_errors(path.name, "a log of a flight", "Copy or export it again."):
         if path.suffix == ".ulg":
             return path.stem, read_ulog(path, repairs)
         if path.suffix == ".npz":

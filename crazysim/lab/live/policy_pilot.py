@@ -23,7 +23,7 @@ from crazysim.envs.task import Task
 from crazysim.envs.tasks.goals import FLOOR, GoalTask
 from crazysim.errors import ConfigError
 from crazysim.lab.live.loop import Live
-from crazysim.storage import reading
+from crazysim.storage import wrap_read_errors
 from crazysim.train.evaluation import act, initial_memory
 
 ARRIVAL_DISTANCE = 0.15
@@ -212,7 +212,7 @@ def read_points(path: str | Path) -> NDArray:
     Raises:
         ConfigError: If the file does not exist, or a line is not a point.
     """
-    with reading(path, "a list of points", "Write x,y,z in each line, m."):
+    with wrap_read_errors(path, "a list of points", "Write x,y,z in each line, m."):
         lines = Path(path).read_text().splitlines()
     points = []
     for number, line in enumerate(lines, 1):

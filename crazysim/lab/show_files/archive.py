@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from crazysim.errors import ConfigError, short_repr
-from crazysim.storage import ZipReader, reading, write_file
+from crazysim.storage import ZipReader, wrap_read_errors, write_file
 from crazysim.trajectories.files import checks
 
 MAX_MEMBERS = 20_100
@@ -43,7 +43,7 @@ class Archive:
         self.location = location
         self._parsed: dict[str, Any] = {}
         limit = min(MAX_TOTAL_BYTES, max(MIN_TOTAL_BYTES, MAX_RATIO * len(content)))
-        with reading(location, "a zip archive", REMEDY):
+        with wrap_read_errors(location, "a zip archive", REMEDY):
             self._zip = ZipReader(io.BytesIO(content), location, MAX_MEMBERS, MAX_MEMBER_BYTES, limit)
 
     def json(self, name: str) -> Any:
@@ -58,7 +58,7 @@ class Archive:
         location = f"{self.location}: {name}"
         if name not in self._zip.names:
             raise ConfigError(f"expected a file {name!r} in {self.location}, got an archive without it")
-        with reading(location, "a file that can be unpacked", REMEDY):
+        with wrap_read_errors(location, "a file that can be unpacked", REMEDY):
             self._parsed[name] = checks.parse_json(self._zip.read(name), location)
         return self._parsed[name]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from crazysim.errors import not_installed
 from crazysim.lab.validate.rows import Row, Section
-from crazysim.storage import replacing
+from crazysim.storage import open_replacement
 
 
 def draw_section(section: Section, rows: Sequence[Row], path: Path) -> None:
@@ -61,5 +61,5 @@ def draw_section(section: Section, rows: Sequence[Row], path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=110)
     path.parent.mkdir(exist_ok=True)
-    with replacing(path) as file:
+    with open_replacement(path) as file:
         Image.open(buffer).convert("RGB").quantize(64).save(file, format="PNG", optimize=True)

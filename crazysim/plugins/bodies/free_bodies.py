@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import Objects, SimData
 from crazysim.core.integration import Integrator, limit_ang_vel
 from crazysim.core.plugin import Simulation, StagePlacement, parameter
-from crazysim.core.population import Population, Rates
+from crazysim.core.population import Population, RatesFn
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, as_rgba, check_softness, color, setting
 from crazysim.core.stage import Stage
 from crazysim.dynamics.models import GRAVITY
@@ -186,11 +186,11 @@ class FreeBodies(Population):
         """Return the scheme of the simulation, in which bodies turn by ``free_rotation`` if it is an Euler scheme."""
         scheme = super().scheme(integrator)
 
-        def integrate_motion(body: FreeBodiesData, rates: Rates, dt: float) -> FreeBodiesData:
+        def integrate_motion(body: FreeBodiesData, rates_fn: RatesFn, dt: float) -> FreeBodiesData:
             if integrator == Integrator.rk4:
-                new_body = scheme(body, rates, dt)
+                new_body = scheme(body, rates_fn, dt)
                 return new_body.replace(ang_vel=limit_ang_vel(new_body.ang_vel, 1 / dt))
-            new_body = scheme(body, lambda state: {name: rates(state)[name] for name in ("pos", "vel")}, dt)
+            new_body = scheme(body, lambda state: {name: rates_fn(state)[name] for name in ("pos", "vel")}, dt)
             torque = rotation.rotate_inverse(body.quat, body.torque)
             ang_vel = limit_ang_vel(body.ang_vel + dt * torque / body.inertia, 1 / dt)
             quat, ang_vel = free_rotation(body.quat, ang_vel, body.inertia, dt)

@@ -6,7 +6,7 @@ import math
 
 from jax import Array
 
-from crazysim.dynamics.models import GRAVITY, MAX_LAG_RATE
+from crazysim.dynamics.models import GRAVITY, MAX_LAG_STEP
 from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.pytree import PyTree, as_parameter, leaf
@@ -84,10 +84,10 @@ class CarParams(PyTree):
         rolling = [n * number("wheels.damping") / radius**2, n * number("wheels.friction_loss") / radius]
         towed_mass = n * wheel_spin_inertia / radius**2 + (number("trailer.mass") if trailer else 0.0)
         damping = (drive[1] + rolling[0]) / (mass + towed_mass)
-        if damping > MAX_LAG_RATE * freq:
+        if damping > MAX_LAG_STEP * freq:
             raise ConfigError(
                 f"expected damping of vehicle {vehicle.name!r} to be slow for steps of 1/{freq} s, got {damping:.4g} "
-                f"1/s. Use freq={math.ceil(damping / MAX_LAG_RATE)} or more, or less damping of drive and wheels."
+                f"1/s. Use freq={math.ceil(damping / MAX_LAG_STEP)} or more, or less damping of drive and wheels."
             )
         return CarParams(
             mass=as_parameter(mass),

@@ -16,7 +16,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.mocap.source import MocapSource, Poll
 from crazysim.media.journal import Journal, read_journal
-from crazysim.storage import Closeable, reading
+from crazysim.storage import Closeable, wrap_read_errors
 
 NAMES_CHUNK, POLL_CHUNK = b"NAME", b"POLL"
 """Kinds of chunks: names of bodies that were not seen before, and a poll."""
@@ -65,7 +65,7 @@ def read_polls(path: str | Path) -> Iterator[Poll]:
     """
     remedy = "Write a recording with Twins(..., record=path)."
     names: list[str] = []
-    with reading(path, "a recording of motion capture", remedy):
+    with wrap_read_errors(path, "a recording of motion capture", remedy):
         for kind, content in read_journal(path):
             if kind == NAMES_CHUNK:
                 names += json.loads(content)
