@@ -76,7 +76,7 @@ CRAZYFLOW_MEMORY = {
 
 
 @pytest.mark.parametrize("control", CRAZYFLOW_MEMORY)
-def test_the_cascade_of_crazyflow_keeps_its_memory_where_all_do_and_is_read_under_crazyflows_names(control):
+def test_memory_of_crazyflows_cascade_is_read_under_crazyflows_names(control):
     sim = Sim(control=control, controller="crazyflow", engine="interpret")
     stages = [f"{level}_controller" for level in (*CRAZYFLOW_MEMORY[control], "force_torque")]
     assert list(sim.step_pipeline)[: len(stages)] == stages

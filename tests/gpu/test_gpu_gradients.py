@@ -42,7 +42,7 @@ def value_and_gradient(sim, n_steps=50, of_params=False):
     return jax.value_and_grad(loss, allow_int=True), at
 
 
-def floats(tree):
+def floating_leaves(tree):
     """Return the floating-point leaves of a gradient."""
     return [x for x in jax.tree.leaves(tree) if x.dtype != jax.dtypes.float0]
 
@@ -56,7 +56,7 @@ def compare_gradients(build, tolerance=ROUNDING, **options):
         out = jax.jit(fn)(at)
         if device == ACCELERATOR:
             assert "gradient: one kernel" in sim.explain()
-        return floats(out)
+        return floating_leaves(out)
 
     expected, found = (require_device(name, run(name)) for name in NAMES)
     for x, y in zip(found, expected, strict=True):
@@ -68,7 +68,7 @@ def test_gradients_are_those_of_the_reference_on_the_cpu(control):
     compare_gradients(lambda device, engine: make_flying_sim(device, control=control, engine=engine))
 
 
-def test_gradients_of_what_drones_share_are_sums():
+def test_gradients_of_shared_parameters_are_sums():
     compare_gradients(lambda device, engine: make_flying_sim(device, control="attitude", engine=engine), of_params=True)
 
 
@@ -124,13 +124,13 @@ def test_tangents_are_those_of_the_reference_on_the_cpu(n_drones):
         np.testing.assert_allclose(x, y, rtol=0, atol=ROUNDING * max(np.abs(y).max(), 1e-3))
 
 
-def test_the_bits_depend_neither_on_the_run_nor_on_memory(monkeypatch):
+def test_gradients_are_equal_to_the_bit_in_any_run_and_with_little_memory(monkeypatch):
     """With little memory, gradients are computed in intervals, and in fewer blocks of threads with more lanes each."""
     found = []
     for memory in (cuda.MAX_GRADIENT_MEMORY_BYTES, cuda.MAX_GRADIENT_MEMORY_BYTES, 2**18):
         monkeypatch.setattr(cuda, "MAX_GRADIENT_MEMORY_BYTES", memory)
         fn, at = value_and_gradient(make_flying_sim(ACCELERATOR, 100, control="attitude"), n_steps=100, of_params=True)
-        found.append(floats(jax.jit(fn)(at)))
+        found.append(floating_leaves(jax.jit(fn)(at)))
     assert trees_equal(found[0], found[1])
     assert trees_equal(found[0], found[2])
 
@@ -138,9 +138,9 @@ def test_the_bits_depend_neither_on_the_run_nor_on_memory(monkeypatch):
 def test_a_batch_of_worlds_is_more_worlds():
     fn, at = value_and_gradient(make_flying_sim(ACCELERATOR, 5, control="attitude"), n_steps=10)
     many = jax.tree.map(lambda x: jnp.stack([x, 1.01 * x, 0.99 * x]), at)
-    found = floats(jax.jit(jax.vmap(fn))(many))
+    found = floating_leaves(jax.jit(jax.vmap(fn))(many))
     for k in range(3):
-        assert_agree([x[k] for x in found], floats(jax.jit(fn)(jax.tree.map(lambda x, k=k: x[k], many))), 1e-6)
+        assert_agree([x[k] for x in found], floating_leaves(jax.jit(fn)(jax.tree.map(lambda x, k=k: x[k], many))), 1e-6)
 
 
 @pytest.mark.parametrize("n_drones", [1, 12])

@@ -97,8 +97,8 @@ def concrete_classes(base, package=crazysim.plugins):
     def subclasses_of(kind):
         return {kind, *[x for sub in kind.__subclasses__() for x in subclasses_of(sub)]}
 
-    found = [kind for kind in subclasses_of(base) - ABSTRACT - {base} if kind.__module__.startswith(package.__name__)]
-    return sorted(found, key=lambda kind: kind.__name__)
+    classes = [kind for kind in subclasses_of(base) - ABSTRACT - {base} if kind.__module__.startswith(package.__name__)]
+    return sorted(classes, key=lambda kind: kind.__name__)
 
 
 PLUGINS, TASKS = concrete_classes(Plugin), concrete_classes(Task, crazysim.envs.tasks)
