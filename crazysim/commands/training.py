@@ -25,15 +25,19 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     task_help = "name of a task, such as hover, or FILE.py:CLASS for your task; list prints all names"
     add("task", help=task_help)
     add("--algorithm", help="ppo, apg or dagger; by default the recipe's, or dagger with a teacher")
-    teacher_help = "folder of a run whose policy teaches this one, which sees what the task observes (DAgger)"
+    teacher_help = (
+        "folder of a run whose policy teaches this one, which sees what the task observes (DAgger); by default the "
+        "recipe's teacher, if it has one, which is trained first"
+    )
     add("--teacher", metavar="FOLDER", help=teacher_help)
     add("--seed", type=int, help="random seed; by default 0")
     seeds_help = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in the folder of the run"
     add("--seeds", type=parse_seeds, metavar="FIRST:END", help=seeds_help)
     sweep_help = "values of hyperparameters, each trained with each seed in one program"
     add("--sweep", nargs="+", default=[], metavar="NAME=VALUE,VALUE", help=sweep_help)
-    add("--worlds", type=int, help="number of parallel worlds of a training; by default the recipe's")
-    iterations_help = "number of rollouts, each with its updates; by default the recipe's"
+    worlds_help = "number of parallel worlds of a training, but not of a recipe's teacher; by default the recipe's"
+    add("--worlds", type=int, help=worlds_help)
+    iterations_help = "number of rollouts, each with its updates, as --worlds; by default the recipe's"
     add("--iterations", type=int, help=iterations_help)
     add("--out", type=Path, help="folder of the run; by default out/TASK")
     resume_help = "continue from the checkpoint in that folder; settings that you leave out are the checkpoint's"
@@ -45,7 +49,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--devices", metavar="all|N|I,J", help=devices_help)
     hosts.add_options(add)
     add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation")
-    add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm")
+    add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm, as --worlds")
     add("--no-film", action="store_true", help="write no film")
 
     add = _add_policy_command(commands, "evaluate", "evaluate a trained policy on held-out initial states", evaluate)

@@ -19,6 +19,9 @@ from crazysim.scene.software import rendering_quality
 MAX_SIZES = 4
 """Largest number of image sizes whose contexts are kept."""
 
+FREE_CAMERA_SHAPES = {"lookat": (3,), "distance": (), "azimuth": (), "elevation": ()}
+"""Shapes of the settings of the free camera, which ``cam_config`` may contain."""
+
 RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
 """Modes of ``Sim.render``."""
 
@@ -97,18 +100,24 @@ class ModelRenderer:
                 f"Use {{'lookat': (0, 0, 1), 'distance': 3.0}}."
             )
         for key, value in (cam_config or {}).items():
-            if not hasattr(cam, key):
-                raise UnknownNameError(f"expected lookat, distance, azimuth or elevation in cam_config, got {key!r}")
+            if key not in FREE_CAMERA_SHAPES:  # wrong values of others can make MuJoCo end the process
+                names = ", ".join(FREE_CAMERA_SHAPES)
+                raise UnknownNameError(f"expected names among {names} in cam_config, got {short_repr(key)}")
             try:
-                setattr(cam, key, value if np.ndim(value) == 0 else np.asarray(value, float))
-            except (TypeError, ValueError) as error:
-                raise ConfigError(f"expected numbers for {key} of the camera, got {value!r}") from error
+                numbers = np.asarray(value, float)
+            except (TypeError, ValueError):
+                numbers = np.array(np.nan)
+            if numbers.shape != FREE_CAMERA_SHAPES[key] or not np.isfinite(numbers).all():
+                n = "3" if FREE_CAMERA_SHAPES[key] else "1"
+                raise ConfigError(f"expected numbers for {key} of the camera, {n} and finite, got {short_repr(value)}")
+            setattr(cam, key, numbers if numbers.ndim else float(numbers))
         return cam
 
     def _renderer(self, width: int, height: int) -> mujoco.Renderer:
         if (width, height) not in self._renderers:
             buffers = self._model.vis.global_
             # Buffers are made once per context; a larger image than any before needs a new context.
+            sizes_before = buffers.offwidth, buffers.offheight
             buffers.offwidth, buffers.offheight = max(buffers.offwidth, width), max(buffers.offheight, height)
             try:
                 with rendering_quality(self._model):
@@ -116,6 +125,12 @@ class ModelRenderer:
             except ConfigError:
                 raise
             except Exception as error:  # OpenGL bindings raise errors of any type
+                buffers.offwidth, buffers.offheight = sizes_before
+                if "framebuffer" in str(error):
+                    raise RenderError(
+                        f"expected an image of a size that OpenGL can draw here, got {width} x {height} pixels: "
+                        f"{error}. Use a smaller one."
+                    ) from error
                 raise RenderError(
                     f"expected a working OpenGL, got {type(error).__name__}: {error}. On a machine without a screen "
                     f"set MUJOCO_GL=egl and install libegl1 and Mesa's drivers (Debian: apt-get install libegl1 "

@@ -8,9 +8,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, RenderError
 from crazysim.train.config import TrainConfig
+from crazysim.train.convolution import find_images
 from crazysim.train.hosts import is_first_host
 from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.show import film as film_policy
@@ -53,7 +56,8 @@ def run(
 
     If the recipe of the task has a teacher, such as that of ``race_by_camera``, and the settings name neither another
     teacher nor another algorithm, the teacher is trained first, in the folder ``teacher`` of the run. ``options`` hold
-    for both; ``n_worlds``, ``config`` and ``on_iteration`` only for the student.
+    for both; ``n_worlds``, ``config`` and ``on_iteration`` only for the student. If the teacher is interrupted, call
+    ``run`` again with the same settings and ``resume=True``.
 
     Args:
         task: Name of a task, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task, such
@@ -218,22 +222,45 @@ def make_variants(
     }
 
 
-def _train_teacher(student: TrainConfig, folder: Path, resume: bool, *settings: Any) -> bool:
+def _train_teacher(
+    student: TrainConfig,
+    folder: Path,
+    resume: bool,
+    evaluation_worlds: int,
+    log: Callable[[str], None],
+    progress: bool,
+    checkpoint_every: float | None,
+) -> bool:
     """Train the teacher of the recipe, and return True; return False if the run needs none or its student has begun.
 
     Args:
         student: Configuration of the student.
         folder: Folder of the student's run.
         resume: True to continue an interrupted run, of the teacher or of the student.
-        settings: Settings of ``train`` from ``evaluation_worlds`` to ``checkpoint_every``.
+        evaluation_worlds: As in ``run``, and so are the rest.
+        log: Function that is called with each line of output.
+        progress: True to show progress bars.
+        checkpoint_every: Time between checkpoints, s.
     """
     teacher = student.teacher_config()
     if teacher is None or (resume and (folder / CHECKPOINT_FILE).exists()):
         return False
     require_no_run(folder)
-    student.make_training_env()  # raises the errors of the student's settings before the teacher is trained
-    train(teacher, folder / TEACHER_FOLDER, resume, *settings)
+    _check_student(student)
+    log(
+        f"first the teacher of {student.title}, then the student by {student.algorithm}; if the teacher is "
+        f"interrupted, repeat the command with --resume"
+    )
+    train(teacher, folder / TEACHER_FOLDER, resume, evaluation_worlds, log, progress, checkpoint_every)
     return True
+
+
+def _check_student(student: TrainConfig) -> None:
+    """Raise the errors of a student's settings, which would otherwise be raised after its teacher has been trained."""
+    env = student.make_training_env()
+    if student.config["convolution"]:
+        obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
+        find_images({name: x.shape[-1] for name, x in obs.items()}, env.image_formats())
 
 
 def _with_teacher(student: TrainConfig, folder: Path) -> TrainConfig:

@@ -256,6 +256,9 @@ def test_images_belong_to_the_caller(sim):
         ({"camera": -1, "cam_config": {"zoom": 2}}, "in cam_config, got 'zoom'"),
         ({"camera": -1, "cam_config": {"lookat": [1, 2]}}, "expected numbers for lookat"),
         ({"camera": -1, "cam_config": {"distance": "far"}}, "expected numbers for distance"),
+        ({"camera": -1, "cam_config": {"distance": np.nan}}, "expected numbers for distance"),
+        ({"camera": -1, "cam_config": {"lookat": 1.0}}, "expected numbers for lookat of the camera, 3 and finite"),
+        ({"camera": -1, "cam_config": {"type": 1}}, "in cam_config, got 'type'"),
         ({"camera": -1, "cam_config": 3}, "expected cam_config as a dict, got 3. Use {"),
     ],
 )
@@ -461,6 +464,15 @@ def test_without_opengl_an_image_is_refused_in_one_line(monkeypatch):
     with pytest.raises(RenderError, match="MUJOCO_GL=egl and install libegl1") as caught:
         sim.render("rgb_array")
     assert "\n" not in str(caught.value)
+
+
+def test_an_image_that_is_too_large_for_opengl_leaves_other_sizes_as_they_were():
+    sim = Sim(engine="plain")
+    sim.render("rgb_array", width=32, height=24)
+    with pytest.raises(RenderError, match="of a size that OpenGL can draw here, got 33000 x 24 pixels"):
+        sim.render("rgb_array", width=33000, height=24)
+    assert sim.render("rgb_array", width=64, height=48).shape == (48, 64, 3)
+    sim.close()
 
 
 def test_any_thread_draws_and_frees_what_another_has_drawn_with(opengl, plain_scene):

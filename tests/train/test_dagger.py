@@ -139,6 +139,8 @@ def test_settings_of_a_student_are_checked_before_its_teacher_is_trained(recipe_
         run("hover", tmp_path / "run", config={"entropy": 0.1}, **settings)
     with pytest.raises(ConfigError, match="has no option 'nothing'"):
         run("hover", tmp_path / "run", **settings | {"options": {"nothing": 1}})
+    with pytest.raises(ConfigError, match="expected an image among the observations"):
+        run("hover", tmp_path / "run", config={"convolution": (2,)}, **settings)
     assert not (tmp_path / "run").exists()
 
 
