@@ -23,7 +23,7 @@ from crazysim.core.branches import table_rows
 from crazysim.core.data import SimData
 from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.settings import check_flag
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape, distance
 from crazysim.geometry.points import components
 from crazysim.geometry.rays import SizedShapes
@@ -151,6 +151,19 @@ def build_contact_fn(
     return contacts
 
 
+def list_objects(objects: ObjectSelection) -> tuple[Handle | str, ...] | None:
+    """Return selected objects as a tuple, after checking their types; None, for all, stays None."""
+    if objects is None:
+        return None
+    is_single = isinstance(objects, (Handle, str)) or not isinstance(objects, Iterable)
+    listed = (objects,) if is_single else tuple(objects)
+    if not all(isinstance(x, (Handle, str)) for x in listed):
+        raise ConfigError(
+            f"expected objects as handles or names of bodies, got {short_repr(objects)}. Use None for all, () for none."
+        )
+    return listed  # type: ignore[return-value]
+
+
 def select_bodies(model: CollisionModel, objects: ObjectSelection, in_data: bool = True) -> list[CollisionBody]:
     """Return the selected objects of a model.
 
@@ -160,10 +173,10 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, in_data: bool
         in_data: True to refuse bodies whose poses are not part of the data, for use in a step.
     """
     by_name = {body.name: body for body in model.objects}
-    if objects is None:
+    listed = list_objects(objects)
+    if listed is None:
         names = list(by_name)
     else:
-        listed = [objects] if isinstance(objects, (Handle, str)) else list(objects)
         names = [name for x in listed for name in (x.bodies if isinstance(x, Handle) else (x,))]
     for name in names:
         if name not in by_name:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.settings import as_rgba
 from crazysim.errors import ConfigError
-from crazysim.tables import LENGTH
+from crazysim.tables import LENGTH, range_between, read_numbers
 
 DRONE_TOUCH_BITS = {"contype": 0, "conaffinity": 2}
 """Bits of geoms that touch drones only, so that no object is in contact with the floor it stands on."""
@@ -103,13 +103,19 @@ def primitive_geoms(name: str, options: dict[str, Any]) -> Geoms:
     make, rgba = PRIMITIVES[name]
     settings = {"rgba": rgba} | options
     rgba = as_rgba(settings.pop("rgba"))
+    parameters = inspect.signature(make).parameters
+    all_settings = ", ".join([*(f"{p.name}={p.default}" for p in parameters.values()), "rgba"])
+    for key in settings.keys() & parameters.keys():
+        if settings[key] is None and parameters[key].default is None:
+            continue
+        shape, remedy = np.shape(parameters[key].default or 0.0), f"Settings of {name!r} are {all_settings}."
+        settings[key] = read_numbers(
+            f"{key} of {name!r}", settings[key], range_between(positive=True), (shape,), remedy=remedy
+        ).tolist()
     try:
         geoms = make(**settings)
-    except ConfigError:
-        raise
-    except (TypeError, ValueError) as error:
-        defaults = [f"{p.name}={p.default}" for p in inspect.signature(make).parameters.values()]
-        raise ConfigError(f"expected settings {', '.join([*defaults, 'rgba'])} of {name!r}, got: {error}") from error
+    except TypeError as error:
+        raise ConfigError(f"expected settings {all_settings} of {name!r}, got: {error}") from error
     for geom in geoms:
         lengths = np.asarray(geom["size"], float)
         if not np.all((lengths > 0) & (lengths <= LENGTH.high)):

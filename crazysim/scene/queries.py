@@ -13,6 +13,7 @@ from jax import Array
 
 from crazysim.cache import keep_programs
 from crazysim.core.data import SimData
+from crazysim.core.settings import check_flag
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.query import Query, query
 from crazysim.scene import contact_report
@@ -20,7 +21,6 @@ from crazysim.scene.collision import CollisionModel
 from crazysim.scene.contact_report import ContactReport, ObjectSelection
 from crazysim.scene.depth import Along
 from crazysim.scene.mocap import MocapPoses, with_mocap_bodies
-from crazysim.scene.objects import Handle
 from crazysim.scene.scene import Scene
 
 MAX_KERNEL_SIZE = 256
@@ -38,8 +38,7 @@ class SceneQueries:
 
     def contact_report(self, data: SimData, objects: ObjectSelection, floor: bool, drones: bool) -> ContactReport:
         """Return the contacts of every drone; see ``Sim.contact_report``."""
-        key = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
-        settings = (key, floor, drones)
+        settings = (contact_report.list_objects(objects), check_flag("floor", floor), check_flag("drones", drones))
         return self._run(
             "contacts", lambda: self._build_contacts(*settings), self._scene.collision_model, data, *settings
         )

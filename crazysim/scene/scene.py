@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 import jax
 import mujoco
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.data import Objects, SimData
 from crazysim.core.settings import check_image_size
 from crazysim.drones.airframe import Airframe
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.scene import build, collision, contact_report, depth, mjx, splat_images
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.maps import MAP_RGBA, MapSource, map_spec
@@ -433,8 +433,8 @@ class Scene:
 
     def sync_one(self, data: SimData, world: int) -> None:
         """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used."""
-        if not 0 <= world < self.n_worlds:
-            raise ConfigError(f"expected a world from 0 to {self.n_worlds - 1}, got {world}")
+        if not isinstance(world, SupportsIndex) or not 0 <= world < self.n_worlds:
+            raise ConfigError(f"expected a world from 0 to {self.n_worlds - 1}, got {short_repr(world)}")
         self.compile_if_edited()
         sync_one_world(data, world, self._mjx.poses(world), self._mj_model, self._mj_data)
 

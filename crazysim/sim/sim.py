@@ -32,6 +32,7 @@ from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Reset, Step, Stepper, explain
 from crazysim.engine.rollout import Policy, RecordFunction, get_states, run_rollout
+from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.plugin_registry import P, PluginRegistry
 from crazysim.pytree import device_array
 from crazysim.scene import mjx
@@ -384,7 +385,10 @@ class Sim:
         yaw: ArrayLike | None = None,
         feedforward: ArrayLike | None = None,
     ) -> None:
-        """Stage a full-state setpoint: (n_worlds, n_drones, 16), or ``pos`` and other parts, which broadcast."""
+        """Stage a full-state setpoint: (n_worlds, n_drones, 16), or ``pos`` and other parts.
+
+        ``pos``, ``vel``, ``acc`` and ``yaw`` broadcast; ``feedforward`` has its full shape, (n_worlds, n_drones, 8).
+        """
         data = self._stepper.data_or_shapes
         self._stepper.stage_command(
             *F.check_setpoint(data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward)
@@ -498,6 +502,9 @@ class Sim:
         Returns:
             The results of ``keep``, with time in front. (n_control_steps // every, ...)
         """
+        for name, function in (("policy", policy), ("keep", keep)):
+            if not callable(function):
+                raise ConfigError(f"expected {name} as a function, got {short_repr(function)}")
         n_substeps = self.freq // self.control_freq
         self._stepper.count_steps(n_substeps, positive_integer("n_control_steps", n_control_steps))
         data, records = run_rollout(
@@ -575,7 +582,8 @@ class Sim:
 
     @max_geom_pairs.setter
     def max_geom_pairs(self, n_pairs: int) -> None:
-        self._scene.max_geom_pairs = n_pairs
+        is_all = isinstance(n_pairs, (int, np.integer)) and n_pairs == -1
+        self._scene.max_geom_pairs = -1 if is_all else positive_integer("max_geom_pairs", n_pairs)
 
     @property
     def overlays(self) -> Overlays:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import LEVELS
 
-from crazysim import Cars, ConfigError, Sim, SlungLoad, Terrain, Wind
+from crazysim import Cars, ConfigError, ContactLog, ContactResponse, FreeBodies, Sim, SlungLoad, Terrain, Wind
 from crazysim.control.geometric import Geometric
 from crazysim.core import functional as F
 from crazysim.core.data import command_shape
@@ -183,13 +183,29 @@ WRONG_CALLS = [
     (lambda sim: sim.render("rgb_array", world=3), "expected a world from 0 to 2", "got 3"),
     (lambda sim: sim.render("rgb_array", world=-1), "expected a world from 0 to 2", "got -1"),
     (lambda sim: setattr(sim, "max_visual_geom", 0), "max_visual_geom is 0", "positive whole number"),
+    (lambda sim: sim.render("rgb_array", world=1.0), "expected a world from 0 to 2", "got 1.0"),
+    (lambda sim: sim.sync(1.0), "expected a world from 0 to 2, got 1.0"),
+    (lambda sim: setattr(sim, "max_geom_pairs", "a"), "max_geom_pairs is 'a'", "positive whole number"),
+    (lambda sim: setattr(sim, "max_geom_pairs", -2), "max_geom_pairs is -2", "positive whole number"),
+    (lambda sim: sim.rollout(None, None, 4), "expected policy as a function, got None"),
+    (lambda sim: sim.rollout(lambda params, data: 0, None, 4, keep=3), "expected keep as a function, got 3"),
+    (lambda sim: sim.contact_report(3), "expected objects as handles or names of bodies, got 3"),
+    (lambda sim: sim.contact_report([[1], [2, 3]]), "expected objects as handles or names", "got [[1], [2, 3]]"),
+    (lambda sim: sim.contact_report(floor=[1]), "expected floor as True or False", "got [1]"),
+    (lambda sim: sim.add(ContactLog(objects=3)), "expected objects as handles or names of bodies,", "got 3"),
+    (lambda sim: sim.add(ContactResponse(objects=[[1]])), "expected objects as handles or names", "got [[1]]"),
+    (lambda sim: sim.add(FreeBodies(1, objects=3)), "expected objects as handles or names of bodies, ", "got 3"),
     (lambda sim: setattr(sim, "step_pipeline", []), "expected step_pipeline as a dict", "got []"),
     (lambda sim: setattr(sim, "step_pipeline", {}), "expected step_pipeline as a dict", "got {}"),
     (lambda sim: setattr(sim, "step_pipeline", {"still": 3}), "expected names and functions", "'still': 3"),
     (lambda sim: setattr(sim, "reset_pipeline", None), "expected reset_pipeline as a dict", "got None"),
     (lambda sim: sim.scene.add("box", rgba="red"), "expected rgba as a number or array", "Use (1, 0, 0, 1)"),
-    (lambda sim: sim.scene.add("box", size="big"), "expected settings size=", "'big'"),
-    (lambda sim: sim.scene.add("box", size=(np.nan, 1, 1)), "expected positive lengths", "nan"),
+    (lambda sim: sim.scene.add("box", size="big"), "expected size of 'box' as a number or array", "'big'"),
+    (lambda sim: sim.scene.add("box", size=(np.nan, 1, 1)), "expected size of 'box' to be positive", "nan"),
+    (lambda sim: sim.scene.add("box", size=[1, 1]), "expected size of 'box' of shape (3,), got (2,)"),
+    (lambda sim: sim.scene.add("sphere", radius="1"), "expected radius of 'sphere' as a number, got '1'"),
+    (lambda sim: sim.scene.add("sphere", radius=[0.1, 0.1]), "expected radius of 'sphere' of shape ()", "got (2,)"),
+    (lambda sim: sim.scene.add("gate", stand="a"), "expected stand of 'gate' as a number, got 'a'"),
     (lambda sim: sim.scene.add("box", count=10**9), "count is 1000000000", "at most 100000"),
     (lambda sim: sim.scene.add("box", mocap="no"), "expected mocap as True or False", "got 'no'"),
     (lambda sim: sim.contact_report(floor="no"), "expected floor as True or False", "got 'no'"),

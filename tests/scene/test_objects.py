@@ -150,7 +150,7 @@ BAD = {
     "second": (lambda s: s.scene.add([TOWER, "<mujoco>"], "q", count=2), "expected an object that compiles"),
     "what": (lambda s: s.scene.add(3, "q"), "or a body of one, got 3"),
     "setting": (lambda s: s.scene.add("box", "q", length=3), "expected settings size=(0.2, 0.2, 0.2), rgba"),
-    "size": (lambda s: s.scene.add("sphere", "q", radius=-1), "expected positive lengths"),
+    "size": (lambda s: s.scene.add("sphere", "q", radius=-1), "expected radius of 'sphere' to be positive, got -1"),
     "mjcf setting": (lambda s: s.scene.add(TOWER, "q", radius=1), "expected no settings, which only gate"),
     "count": (lambda s: s.scene.add("box", "q", count=0), "count"),
     "pos": (
