@@ -79,7 +79,7 @@ class ImageSensor(Plugin):
     def __post_init__(self) -> None:
         super().__post_init__()
         outputs = self.outputs
-        is_list = isinstance(outputs, (list, tuple)) and len(outputs) > 0
+        is_list = isinstance(outputs, (list, tuple)) and len(outputs) > 0 and all(isinstance(x, str) for x in outputs)
         if not is_list or len({*outputs}) < len(outputs) or not {*outputs} <= {*OUTPUTS}:
             raise ConfigError(
                 f"expected outputs of {self.name!r} as a list of {', '.join(map(repr, OUTPUTS))}, got "
@@ -292,7 +292,7 @@ class ImageSensor(Plugin):
         return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64))
 
     def _latency_steps(self, data: SimData) -> int:
-        return math.floor(self.latency * data.core.freq + 0.5)
+        return math.floor(float(self.latency) * data.core.freq + 0.5)
 
     def _n_rows(self, data: SimData, period: int) -> int:
         """Return the number of images in transit that the record has room for; zero without latency."""

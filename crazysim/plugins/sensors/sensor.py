@@ -182,8 +182,8 @@ class Sensor(Plugin):
     def _max_delay(self) -> float:
         """Longest delay that a record has room for, s."""
         if self.max_delay is not None:
-            return self.max_delay
-        return float(np.max(np.asarray(self.delay)) + np.max(np.asarray(self.jitter)))
+            return float(self.max_delay)
+        return float(np.max(np.asarray(self.delay, np.float64)) + np.max(np.asarray(self.jitter, np.float64)))
 
     def _take_measurement(self, data: SimData) -> SimData:
         """Take a measurement of one drone, and queue it, or hold it if there is no delay."""

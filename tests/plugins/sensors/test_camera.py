@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from crazysim import Camera, ConfigError, Sim, rotation
+from crazysim import Camera, ConfigError, Lidar, Sim, rotation
 
 SIZE = {"width": 9, "height": 6}
 
@@ -91,9 +91,12 @@ def test_law_09_wrong_cameras_are_errors():
         (lambda: Camera(outputs=()), "expected outputs of 'camera' as a list of 'depth', 'distance'"),
         (lambda: Camera(outputs=("rgb",)), "got ('rgb',)"),
         (lambda: Camera(outputs="depth"), "got 'depth'"),
+        (lambda: Camera(outputs=[[1], [2, 3]]), "got [[1], [2, 3]]"),
+        (lambda: Lidar(outputs=[[1], [2, 3]]), "got [[1], [2, 3]]"),
         (lambda: Camera(latency=-1.0), "latency of Camera"),
         (lambda: sim.add(Camera(freq=333)), "Use the nearest rate below, 250 Hz"),
         (lambda: sim.add(Camera(latency=1.0)), "expected a latency of 'camera' of at most 63 images"),
+        (lambda: sim.add(Camera(4, 3, latency=np.int16(100), freq=50)), "expected a latency of 'camera' of at most 63"),
         (lambda: sim.add(Camera(10**6, 10**6)), "got 2 of 1000000 x 1000000 pixels, which need"),
         (lambda: sim.depth("fpv_cam", 10**6, 10**6), "got 2 of 1000000 x 1000000 pixels, which need 29802.3 GiB"),
         (lambda: Camera().read(sim.data), "expected data with a record of plugin 'camera', got records of none"),

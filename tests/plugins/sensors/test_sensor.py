@@ -107,6 +107,8 @@ def test_another_delay_up_to_max_delay_compiles_nothing():
     ({"freq": 300}, "expected freq of 'clock' to divide"),
     ({"delay": -0.1, "max_delay": 0.1}, "expected delay"),
     ({"delay": 1.0}, "expected a delay of 'clock' of zero to 62 measurements"),
+    ({"delay": 0.1, "max_delay": np.int16(100)}, "expected a delay of 'clock' of zero to 62 measurements"),
+    ({"delay": np.int8(100), "jitter": np.int8(100)}, "zero to 62 measurements, with its jitter, got 200"),
     ({"delay": np.nan}, "expected delay of Clock to be from 0 to 100, got nan"),
     ({"delay": 0.02, "max_delay": 0.01}, "expected delay"),
     ({"max_delay": -1.0}, "expected max_delay of Clock to be from 0 to 100, got -1"),
