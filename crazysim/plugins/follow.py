@@ -224,7 +224,8 @@ class Follow(Plugin):
         """Return the setting ``trajectories`` as a list of single trajectories."""
         trajectories = self.trajectories
         trajectories = trajectories.unstacked() if isinstance(trajectories, Trajectory) else trajectories
-        if not trajectories or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in trajectories):
+        is_list = isinstance(trajectories, (list, tuple)) and len(trajectories) > 0
+        if not is_list or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in trajectories):
             raise ConfigError(f"expected one or more trajectories of one vehicle each, got {self.trajectories!r}")
         return list(trajectories)
 

@@ -235,6 +235,8 @@ def test_wrong_levels_trajectories_and_uploads_are_errors():
         Sim(control="attitude").add(Follow(EIGHT))
     with pytest.raises(ConfigError, match="one or more"):
         build().add(Follow([]))
+    with pytest.raises(ConfigError, match="one or more trajectories of one vehicle each, got 3"):
+        build().add(Follow(3))
     with pytest.raises(ConfigError, match="one or more"):
         build().add(Follow([Trajectory.stack([EIGHT, UP])]))
     sim = build()

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape, hull
 from crazysim.plugins.scenery.scenery import HIDDEN_DEPTH, Model, Scenery
+from crazysim.tables import read_numbers
 
 N_SIZES = 4
 """Number of sizes of boxes, and of balls."""
@@ -58,6 +59,7 @@ class Clutter(Scenery):
                 f"got a diameter of {diameter:.3g} m and a gap of {self.gap:g} m. Use a lower density, or a smaller "
                 f"gap."
             )
+        self.check_count(float(np.prod(np.ceil(np.asarray(self.size, np.float64) / self.cell - 1e-6))))
 
     @property
     def cell(self) -> float:
@@ -108,10 +110,10 @@ class Clutter(Scenery):
                 ("box", {"size": (size, size, size)}, Shape("box", (size / 2, size / 2, size / 2))),
                 ("sphere", {"radius": size / 2}, Shape("sphere", (size / 2,))),
             ]
+        if not isinstance(self.meshes, (list, tuple, np.ndarray)):
+            raise ConfigError(f"expected meshes as a list of corners (n, 3), m, got {short_repr(self.meshes)}")
         for corners in self.meshes:
-            array = np.asarray(corners, np.float64)
-            if array.ndim != 2 or array.shape[1] != 3 or not np.all(np.isfinite(array)):
-                raise ConfigError(f"expected a mesh as corners (n, 3), m, got shape {array.shape}")
+            array = read_numbers("a mesh as corners (n, 3), m,", corners, shapes=(("any", 3),))
             kinds.append((_mesh_xml(array), {}, hull(array)))
         return kinds
 

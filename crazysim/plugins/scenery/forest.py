@@ -94,6 +94,7 @@ class StandingObstacles(Scenery):
                 f"got a diameter of {2 * self.radius(high):.3g} m and a gap of {self.gap:g} m. Use a lower density, or "
                 f"a smaller gap."
             )
+        self.check_count(float(np.prod(np.ceil(np.asarray(self.size, np.float64) / self.cell - 1e-6))))
 
     @property
     def cell(self) -> float:

@@ -46,6 +46,7 @@ class Rooms(Scenery):
                 f"expected rooms at least twice as wide as a door, got rooms of {self.room:g} m and doors of "
                 f"{self.door:g} m"
             )
+        self.check_count(4 + self.n_walls * self.n_panels, "Use fewer or smaller rooms, or wider doors.")
 
     @property
     def n_panels(self) -> int:

@@ -108,6 +108,13 @@ class Scenery(Plugin):
         """
         raise NotImplementedError
 
+    def check_count(self, n: float, remedy: str = "Use a smaller size, or a lower density.") -> None:
+        """Check that a layout has few enough obstacles; subclasses do so before they allocate anything."""
+        if n > MAX_OBSTACLES:
+            raise ConfigError(
+                f"expected at most {MAX_OBSTACLES} obstacles in {type(self).__name__}, got {n:.6g}. {remedy}"
+            )
+
     def clearance(self, data: SimData, pos: Array) -> Array:
         """Return the distance from points to the surface of the nearest obstacle, m, negative inside. (...)
 
@@ -141,12 +148,7 @@ class Scenery(Plugin):
 
     def record(self, sim: Simulation) -> SceneryData:
         models = self.models()
-        n = sum(len(model.pos) for model in models)
-        if n > MAX_OBSTACLES:
-            raise ConfigError(
-                f"expected at most {MAX_OBSTACLES} obstacles in {type(self).__name__}, got {n}. Use a smaller size, or "
-                f"a lower density."
-            )
+        self.check_count(sum(len(model.pos) for model in models))
         for other in sim.scene.plugins():
             if other.name == self.name and isinstance(other, Scenery) and repr(other.models()) != repr(models):
                 raise ConfigError(

@@ -128,6 +128,11 @@ WRONG_SETTINGS = {
     "sizes": (lambda: Clutter(sizes=(0.5, 0.2)), "expected sizes as smallest and largest"),
     "clutter": (lambda: Clutter(density=2.0), "Use a lower density, or a smaller gap"),
     "mesh": (lambda: Clutter(meshes=[[0.0, 1.0]]), r"expected a mesh as corners \(n, 3\)"),
+    "meshes": (lambda: Clutter(meshes=0), r"expected meshes as a list of corners \(n, 3\), m, got 0"),
+    "large clutter": (lambda: Clutter(size=(1e30, 1e6, 1e6)), "expected at most 10000 obstacles in Clutter"),
+    "large forest": (lambda: Forest(size=(1e30, 1e6)), "expected at most 10000 obstacles in Forest"),
+    "large rooms": (lambda: Rooms(room=1e12), r"expected at most 10000 obstacles in Rooms, got 7e\+12. Use fewer"),
+    "narrow doors": (lambda: Rooms(door=1e-12), "expected at most 10000 obstacles in Rooms"),
     "gates": (lambda: Gates(start=(0, 0, 0.5)), "expected gates above the floor"),
     "rooms": (lambda: Rooms(room=1.5, door=1.0), "expected rooms at least twice as wide as a door"),
 }
