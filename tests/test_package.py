@@ -31,6 +31,13 @@ def test_public_names_exist_once():
     assert crazysim.__version__ == PROJECT["version"]
 
 
+@pytest.mark.parametrize("module", ["crazysim", "crazysim.control", "crazysim.envs", "crazysim.train"])
+def test_a_star_import_needs_no_optional_package(module, monkeypatch):
+    for name in ("stable_baselines3", "crazysim.envs.pettingzoo", "crazysim.envs.sb3"):
+        monkeypatch.setitem(sys.modules, name, None)
+    exec(f"from {module} import *", {})
+
+
 ALIASES = {
     "control.parameters": ["dynamics.parameter_tables"],
     "dynamics.parameters": ["dynamics.parameter_tables"],

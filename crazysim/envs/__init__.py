@@ -36,9 +36,10 @@ from crazysim.startup import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.envs.brax import BraxEnv
-    from crazysim.envs.pettingzoo import make_parallel
-    from crazysim.envs.sb3 import DroneVecEnv
+    from crazysim.envs.pettingzoo import make_parallel as make_parallel
+    from crazysim.envs.sb3 import DroneVecEnv as DroneVecEnv
 
+# Without names that need optional packages, with which ``from crazysim.envs import *`` would fail.
 __all__ = [
     "TASKS",
     "ActionDelay",
@@ -49,7 +50,6 @@ __all__ = [
     "CameraImages",
     "DroneEnv",
     "DroneSingleEnv",
-    "DroneVecEnv",
     "DroneVectorEnv",
     "Env",
     "EnvState",
@@ -68,7 +68,6 @@ __all__ = [
     "flatten",
     "flying",
     "make",
-    "make_parallel",
     "register",
     "rollout",
     "state_of",

@@ -29,7 +29,7 @@ from crazysim.envs.reset_policy import ResetPolicy
 from crazysim.envs.state import ENV_RECORD_NAME, RESULT_FIELDS, EnvState, state_of_data, validate_action, validate_goals
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import leaf_indices
 from crazysim.sim.sim import Sim
 
@@ -298,6 +298,11 @@ class DroneEnv(Env):
             raise ConfigError(
                 f"expected a freq that divides the rate of {sim.control.value} commands, {sim.control_freq} Hz, got "
                 f"{freq} Hz: some actions would never reach the controller. Use a divisor."
+            )
+        if actions is not None and not isinstance(actions, Actions):
+            raise ConfigError(
+                f"expected actions as Actions, got {short_repr(actions)}. Use None for the usual ones of the command "
+                f"level."
             )
         self._sim, self._task, self.freq = sim, task, freq
         self._actions = actions_of(sim.airframes, sim.default_data.params, sim.control) if actions is None else actions
