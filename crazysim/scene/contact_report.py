@@ -155,13 +155,14 @@ def list_objects(objects: ObjectSelection) -> tuple[Handle | str, ...] | None:
     """Return selected objects as a tuple, after checking their types; None, for all, stays None."""
     if objects is None:
         return None
-    is_single = isinstance(objects, (Handle, str)) or not isinstance(objects, Iterable)
-    listed = (objects,) if is_single else tuple(objects)
+    if isinstance(objects, (Handle, str)):
+        return (objects,)
+    listed = tuple(objects) if isinstance(objects, Iterable) else (objects,)
     if not all(isinstance(x, (Handle, str)) for x in listed):
         raise ConfigError(
             f"expected objects as handles or names of bodies, got {short_repr(objects)}. Use None for all, () for none."
         )
-    return listed  # type: ignore[return-value]
+    return listed
 
 
 def select_bodies(model: CollisionModel, objects: ObjectSelection, in_data: bool = True) -> list[CollisionBody]:
