@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import socket
 import sys
 import warnings
 
@@ -51,6 +53,22 @@ def not_installed(use: str, package: str, extra: str) -> str:
         extra: Extra of crazysim that installs it.
     """
     return f"{use} {package}, which is not installed. Run pip install 'crazysim[{extra}]'."
+
+
+def address_message(host: str, port: int, error: Exception, prefix: str = "") -> str:
+    """Return the message about an address at which a server cannot listen.
+
+    Args:
+        host: Host of the address.
+        port: Port of the address.
+        error: The error that was raised when the server tried to listen.
+        prefix: Text before the name of the setting, such as ``"--"`` for an option of a command.
+    """
+    is_host_wrong = isinstance(error, socket.gaierror) or getattr(error, "errno", None) == errno.EADDRNOTAVAIL
+    return (
+        f"expected a free address, got {host}:{port}: {str(error).rstrip('.')}. "
+        f"Choose another {prefix}{'host' if is_host_wrong else 'port'}."
+    )
 
 
 class ConfigError(ValueError):

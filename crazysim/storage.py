@@ -290,6 +290,19 @@ def _parse_array(content: bytes, name: str) -> NDArray:
     return np.lib.format.read_array(file, allow_pickle=False)
 
 
+def make_folder(folder: Path) -> None:
+    """Make the folder of the files of a command, and its parents; it may exist.
+
+    Raises:
+        ConfigError: If it cannot be made, or is a file.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = "which is a file" if folder.is_file() else str(error)
+        raise ConfigError(f"expected a folder, got {str(folder)!r}: {reason}. Use another --out.") from error
+
+
 def make_private_folder(folder: Path) -> None:
     """Make a folder that only this user can enter, and its parents with default permissions; it may exist.
 

@@ -101,9 +101,18 @@ def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, mon
 
 @pytest.mark.parametrize(
     ("arguments", "word"),
-    [(["--seconds", "0"], "--seconds"), (["--worlds", "0"], "n_worlds"), (["--device", "toaster"], "toaster")],
+    [
+        (["--seconds", "0"], "--seconds"),
+        (["--seconds", "inf"], "expected --seconds of at least 0.04, and finite, got inf"),
+        (["--seconds", "nan"], "expected --seconds of at least 0.04, and finite, got nan"),
+        (["--out", "flight.txt"], "expected a folder, got 'flight.txt': which is a file"),
+        (["--worlds", "0"], "n_worlds"),
+        (["--device", "toaster"], "toaster"),
+    ],
 )
-def test_wrong_arguments_are_one_line(arguments, word, capsys):
+def test_wrong_arguments_are_one_line(arguments, word, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("flight.txt").touch()
     assert main(["demo", *arguments]) == 2
     error = capsys.readouterr().err.strip()
     assert word in error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
@@ -16,7 +17,7 @@ from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.dynamics import first_principles
 from crazysim.eager import jit_eager_calls
-from crazysim.errors import RenderError, not_installed
+from crazysim.errors import ConfigError, RenderError, not_installed
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
 from crazysim.progress import progress_bar
@@ -24,7 +25,7 @@ from crazysim.pytree import device_array
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material
-from crazysim.storage import write_figure
+from crazysim.storage import make_folder, write_figure
 
 FPS = 25
 """Rate of frames, Hz."""
@@ -56,8 +57,9 @@ def run_demo_flight(
         out: Folder of the files.
         film: True to write a film.
     """
-    if seconds < 1 / FPS:
-        raise ValueError(f"expected --seconds of at least {1 / FPS}, got {seconds}; use a longer flight")
+    if not 1 / FPS <= seconds < math.inf:
+        raise ConfigError(f"expected --seconds of at least {1 / FPS}, and finite, got {seconds}. Use 10, for example.")
+    make_folder(out)
     n_frames = round(seconds * FPS)
     sim = build_sim(n_worlds, n_drones, device)
     step_frame = build_frame_step(sim)
@@ -91,7 +93,6 @@ def run_demo_flight(
         np.concatenate(errors), np.stack(pole_contacts), n_steps * n_worlds * n_drones, step_s, contacts_s / n_frames
     )
     print(f"compile time      {compile_s:.2f} s for the flight, {contacts_compile_s:.2f} s for contacts")
-    out.mkdir(parents=True, exist_ok=True)
     flight = recorder.flight()
     flight.save(out / "flight.npz")
     print(f"wrote {out / 'flight.npz'}")

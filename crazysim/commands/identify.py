@@ -146,6 +146,8 @@ def _write_file(path: Path, text: str) -> None:
 def _split_interval(text: str) -> tuple[str, tuple[float, float]]:
     """Return path, start and end of ``LOG@START:END``; start and end may be left out."""
     match = re.fullmatch(r"(.+)@(\d*\.?\d*):(\d*\.?\d*)", text)
+    if match is None and re.fullmatch(r".+@[^@/]*:[^@/]*", text) and not Path(text).exists():
+        raise ConfigError(f"expected LOG@START:END with times in s, got {text!r}. Use for example flight.csv@10:25.")
     if match is None or Path(text).exists():
         return text, (0.0, math.inf)
     return match[1], (float(match[2] or 0), float(match[3] or math.inf))

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crazysim.commands.options import DefaultsFormatter, add_page_options, add_simulation_options, specified_options
+from crazysim.commands.options import (
+    DefaultsFormatter,
+    add_page_options,
+    add_simulation_options,
+    has_screen,
+    require_screen,
+    specified_options,
+)
 from crazysim.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,7 +63,9 @@ def run(options: argparse.Namespace) -> None:
     if options.headless and options.seconds is None:
         raise ConfigError("expected --seconds with --headless, got none. Use --seconds 20, for example.")
     if not options.headless and not viewers:
-        viewers = ["window" if _has_screen() else "browser"]
+        viewers = ["window" if has_screen() else "browser"]
+    if options.window:
+        require_screen("--browser or --headless")
     speed, is_piloted = _parse_speed(options.speed), options.pilot or options.gamepad
     if options.commands and is_piloted:
         raise ConfigError(
@@ -111,11 +118,13 @@ def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
     if names := [f"--{name.replace('_', '-')}" for name in excluded if getattr(options, name) not in (None, False)]:
         raise ConfigError(f"expected the settings of the run with --policy, got {', '.join(names)}. Leave them out.")
     from crazysim.lab.live.policy_pilot import PolicyPilot, read_points
-    from crazysim.train.training import load_policy
+    from crazysim.train.training import check_observations, load_policy
 
     points = None if options.goals is None else read_points(options.goals)
-    policy, config, _ = load_policy(options.policy)
-    return PolicyPilot(config.with_device(options.device).make_env(options.worlds), policy, points)
+    policy, config, meta = load_policy(options.policy)
+    env = config.with_device(options.device).make_env(options.worlds)
+    check_observations(env, options.policy, config.title, meta)
+    return PolicyPilot(env, policy, points)
 
 
 def _parse_speed(text: str) -> float | Literal["max"]:
@@ -124,7 +133,3 @@ def _parse_speed(text: str) -> float | Literal["max"]:
         return "max" if text == "max" else float(text)
     except ValueError:
         raise ConfigError(f"expected a positive speed or max, got {text!r}") from None
-
-
-def _has_screen() -> bool:
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 from typing import Any
+
+from crazysim.errors import ConfigError
 
 
 class DefaultsFormatter(argparse.HelpFormatter):
@@ -34,3 +38,21 @@ def add_simulation_options(parser: argparse.ArgumentParser) -> None:
 def specified_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Return the values of the options that a command line sets, by name."""
     return {name: x for name in names if (x := getattr(options, name)) is not None}
+
+
+def has_screen() -> bool:
+    """Return True if there may be a screen for a window; on Linux, if a variable of the environment names one."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def require_screen(remedy: str) -> None:
+    """Check that there may be a screen for ``--window``.
+
+    Args:
+        remedy: Options to use instead, for the message.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    if not has_screen():
+        raise ConfigError(f"expected a screen for --window, got none. Use {remedy}.")

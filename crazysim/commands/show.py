@@ -7,7 +7,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from crazysim.commands.options import DefaultsFormatter, add_page_options, add_simulation_options, specified_options
+from crazysim.commands.options import (
+    DefaultsFormatter,
+    add_page_options,
+    add_simulation_options,
+    require_screen,
+    specified_options,
+)
 from crazysim.errors import ConfigError
 from crazysim.lab.show_files import Show, load_show
 from crazysim.storage import check_writable, write_file
@@ -43,6 +49,8 @@ def run(options: argparse.Namespace) -> None:
         if path is not None:
             check_writable(path, suffixes)
     show = load_show(options.file)
+    if options.window:
+        require_screen("--browser or --film FILE")
     settings = specified_options(options, "drone", "controller", "device")
     if options.live:
         _run_live(show, options, settings)

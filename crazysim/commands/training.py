@@ -137,7 +137,9 @@ def train(options: argparse.Namespace) -> int | None:
 
     if options.task == "list":
         for name, entry in TASKS.items():
-            print(f"{name:12} {(entry.task.__doc__ or '').splitlines()[0]}")
+            text = (entry.task.__doc__ or "").splitlines()[0].replace("``", "")
+            n_drones = f" {entry.n_drones} drones by default." if entry.n_drones > 1 else ""
+            print(f"{name:{max(map(len, TASKS))}} {text}{n_drones}")
         return None
     if hosts.has_several_hosts(options):
         return hosts.run_on_hosts(partial(_train, devices="all"), options)
@@ -182,12 +184,13 @@ def evaluate(options: argparse.Namespace) -> None:
 
     from crazysim.train.evaluation import TERM_PREFIX, describe_outcome, evaluate
     from crazysim.train.show import plot_episode
-    from crazysim.train.training import load_policy
+    from crazysim.train.training import check_observations, load_policy
 
     if options.plot is not None:
         check_writable(options.plot, PICTURE_SUFFIXES)
-    policy, config, _ = load_policy(options.folder, options.task)
+    policy, config, meta = load_policy(options.folder, options.task)
     env = config.with_device(options.device).make_env(options.worlds)
+    check_observations(env, options.folder, config.title, meta)
     key = None if options.seed is None else jax.random.key(options.seed)
     metrics = evaluate(env, policy, key)
     terms = ", ".join(f"{k.removeprefix(TERM_PREFIX)} {x:.4g}" for k, x in metrics.items() if k.startswith(TERM_PREFIX))
@@ -207,6 +210,9 @@ def export(options: argparse.Namespace) -> None:
 
     if options.onnx is None and options.c is None and options.out_of_tree is None:
         raise ValueError("expected a file to write, got none; use --onnx FILE, --c FILE, or --out-of-tree FOLDER")
+    for path, suffix in ((options.onnx, ".onnx"), (options.c, ".h")):
+        if path is not None:
+            check_writable(path, (suffix,))
     policy, config, meta = load_policy(options.folder)
     for path, write in ((options.onnx, to_onnx), (options.c, to_c)):
         if path is not None:
@@ -223,10 +229,11 @@ def export(options: argparse.Namespace) -> None:
 def render(options: argparse.Namespace) -> None:
     """Film a policy."""
     from crazysim.train.show import film
-    from crazysim.train.training import load_policy
+    from crazysim.train.training import check_observations, load_policy
 
-    policy, config, _ = load_policy(options.folder, options.task)
+    policy, config, meta = load_policy(options.folder, options.task)
     path = options.film or options.folder / "policy.mp4"
     env = config.with_device(options.device).make_env(options.worlds)
+    check_observations(env, options.folder, config.title, meta)
     film(env, policy, path, options.worlds, options.seed, progress=True)
     print(f"wrote {path}")

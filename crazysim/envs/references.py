@@ -159,6 +159,8 @@ def _import_module(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
+        if Path(name).is_file():
+            raise ConfigError(f"expected the file of a task to end with .py, got {name!r}. Rename it.") from error
         if name in sys.modules or error.name not in (name, name.partition(".")[0]):
             raise
         raise ConfigError(

@@ -130,11 +130,12 @@ def make(
     name = task if isinstance(task, str) else entry.task.name or entry.task.__name__
     for option in options:
         if option not in SIM_OPTIONS + entry.options:
-            close_names = difflib.get_close_matches(option, SIM_OPTIONS + entry.options, 1)
+            make_options = [name for name in inspect.signature(make).parameters if name not in ("task", "options")]
+            close_names = difflib.get_close_matches(option, [*SIM_OPTIONS, *entry.options, *make_options], 1)
             hint = f"; did you mean {close_names[0]}?" if close_names else "."
             raise ConfigError(
-                f"task {name!r} has no option {option!r}{hint} It has {', '.join(entry.options)}; the simulation has "
-                f"{', '.join(SIM_OPTIONS)}"
+                f"task {name!r} has no option {option!r}{hint} It has {', '.join(entry.options)}; every task has "
+                f"{', '.join(make_options)}; the simulation has {', '.join(SIM_OPTIONS)}"
             )
     settings = {"control": entry.control, "n_drones": entry.n_drones}
     settings |= {k: v for k, v in options.items() if k in SIM_OPTIONS}

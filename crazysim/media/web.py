@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, RenderError, not_installed
+from crazysim.errors import ConfigError, RenderError, address_message, not_installed
 from crazysim.media.access import LOOPBACK_ADDRESSES, Access, is_own_name, start_guarded_server, wrong_name_message
 from crazysim.media.flight import Flight
 from crazysim.media.trail import choose_drone_colors
@@ -102,7 +102,7 @@ def create_server(html: str, port: int, host: str = "127.0.0.1") -> http.server.
     try:
         return http.server.ThreadingHTTPServer((host, port), Handler)
     except (OSError, OverflowError) as error:
-        raise RenderError(f"expected a free address, got {host}:{port}: {error}. Choose another --port.") from error
+        raise RenderError(address_message(host, port, error, "--")) from error
 
 
 def initial_camera_pose(flight: Flight, k: int) -> tuple[NDArray, NDArray]:

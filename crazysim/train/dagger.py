@@ -140,11 +140,9 @@ def wrap_with_teacher(env: Env, config: Config) -> TeacherObservation:
     Raises:
         ConfigError: If there is no teacher, or the student's task does not have the teacher's task record.
     """
-    from crazysim.train.training import load_policy
-
     if not config.teacher:
         raise ConfigError("expected the folder of a teacher, got none. Use --teacher out/hover, for example.")
-    _, teacher_config, _ = load_policy(config.teacher)
+    _, teacher_config, _ = _load_teacher_run(config.teacher)
     entry = entry_of(teacher_config.task, is_named=False)
     task = entry.task(**{name: x for name, x in teacher_config.options.items() if name in entry.options})
     teacher_record, student_record = type(task).Record, type(env.task).Record
@@ -285,11 +283,21 @@ def split_obs(obs: Obs) -> tuple[Obs, Obs]:
     return {name: x for name, x in obs.items() if not name.startswith(TEACHER_PREFIX)}, teacher_obs
 
 
-def _load_teacher(folder: str, env: Env, teacher_obs: Obs) -> Policy:
-    """Return the policy of a run, after checking that its observations and actions match the environment."""
+def _load_teacher_run(folder: str) -> tuple[Policy, Any, dict[str, Any]]:
+    """Return what ``load_policy`` returns for the folder of a teacher; the message of an error names the teacher."""
     from crazysim.train.training import load_policy
 
-    policy, _, meta = load_policy(folder)
+    if not Path(folder).exists():
+        raise ConfigError(
+            f"expected the run of the teacher in {folder!r}, got no such folder. Move it back there; a resumed "
+            f"training keeps its teacher."
+        )
+    return load_policy(folder)
+
+
+def _load_teacher(folder: str, env: Env, teacher_obs: Obs) -> Policy:
+    """Return the policy of a run, after checking that its observations and actions match the environment."""
+    policy, _, meta = _load_teacher_run(folder)
     sizes = {name: x.shape[-1] for name, x in teacher_obs.items()}
     if sizes != meta["observations"]:
         raise ConfigError(

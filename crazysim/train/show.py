@@ -132,7 +132,7 @@ def plot_episode(
     error = flight["error"].reshape(len(is_over), -1)
     axes[2].plot(t, np.nanquantile(error, (0.1, 0.5, 0.9), axis=1).T, label=["best tenth", "median", "worst tenth"])
     axes[2].axhline(env.task.tolerance, color="grey", linestyle=":", label="tolerance")
-    labels = ("reward of a step, by term", "reward until then, by term", "error")
+    labels = ("reward of a step, by term", "reward until then, by term", f"error, {env.task.unit}")
     for axis, y in zip(axes, labels, strict=True):
         axis.set(xlabel="time in the episode, s", ylabel=y)
         axis.legend(fontsize="small")

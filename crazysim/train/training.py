@@ -35,7 +35,7 @@ from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
 from crazysim.errors import ConfigError, DivergedError
 from crazysim.progress import progress_bar
 from crazysim.sim.sim import Sim
-from crazysim.storage import open_replacement, write_file
+from crazysim.storage import make_folder, open_replacement, write_file
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
@@ -185,7 +185,7 @@ def train_many(
     policy_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
     kept_shapes = [jax.eval_shape(lambda policies: take_seed(policies, 0), policy_shapes)] * n_trainings
     for training in trainings if is_first_host() else ():
-        _make_folder(training.folder)
+        make_folder(training.folder)
 
     @keep_programs()
     def load_or_init() -> tuple[Learner, list[Policy]]:
@@ -228,14 +228,18 @@ def train_many(
     times = "" if n_trainings == 1 else f"{n_trainings} times "
     log(
         f"{config.title} by {config.algorithm}, {f'seed {config.seed}' if n_trainings == 1 else ', '.join(configs)}: "
-        f"{n_iterations} iterations of {times}{steps_per_iteration:,} steps in {times}{config.n_worlds:,} worlds, "
+        f"{_iterations_text(n_iterations)} of {times}{steps_per_iteration:,} steps "
+        f"in {times}{config.n_worlds:,} worlds, "
         f"{_describe_devices(base_env.sim, iterate)}"
         f"{base_env.sim.control.value} commands, {engine}" + (f"; continues after iteration {n_done}" if n_done else "")
     )
     if stored_code != code:
         log("the file of the task has changed since the checkpoint was written; it is used as it is now")
     if n_done >= n_iterations:
-        log(f"nothing is left to train after {n_done} iterations; continue with more: --iterations {2 * n_done or 100}")
+        log(
+            f"nothing is left to train after {_iterations_text(n_done)}; "
+            f"continue with more: --iterations {2 * n_done or 100}"
+        )
 
     def elapsed_seconds() -> float:
         return seconds_before + time.perf_counter() - start_time
@@ -494,6 +498,8 @@ def load_policy(
     Raises:
         ConfigError: If the folder holds no policy that this version can read, or its policy has another network.
     """
+    if Path(folder).is_file():
+        raise ConfigError(f"expected the folder of a run, got the file {str(folder)!r}. Use {Path(folder).parent}.")
     path = Path(folder) / POLICY_FILE
     arrays, meta = checkpoint.read(path)
     with checkpoint.wrap_checkpoint_errors(path):
@@ -519,6 +525,35 @@ def load_policy(
     return checkpoint.restore(path, arrays, jax.eval_shape(make_policy)), config, meta
 
 
+def _iterations_text(n: int) -> str:
+    return "1 iteration" if n == 1 else f"{n} iterations"
+
+
+def check_observations(env: Env, folder: str | Path, title: str, meta: dict[str, Any]) -> None:
+    """Check that an environment has the observations of the policy of a run.
+
+    Args:
+        env: The environment.
+        folder: Folder of the run, for the message.
+        title: Title of the task of the environment, for the message.
+        meta: Description of the policy, from ``load_policy``.
+
+    Raises:
+        ConfigError: If their names or sizes differ.
+    """
+    sizes, expected = describe(env)["observations"], meta["observations"]
+    if sizes != expected:
+        raise ConfigError(
+            f"expected a task with the observations of the policy in {folder}, {_sizes_text(expected)}, got those of "
+            f"{title}, {_sizes_text(sizes)}. Use the task of the training, or train a policy of this task."
+        )
+
+
+def _sizes_text(sizes: dict[str, int]) -> str:
+    n = sum(sizes.values())
+    return f"{n} number{'s' * (n != 1)} ({', '.join(f'{name} {n}' for name, n in sizes.items())})"
+
+
 def _run_metadata(config: TrainConfig) -> dict[str, Any]:
     """Return the metadata of the files of a run."""
     stored_fields = [f.name for f in dataclasses.fields(config) if f.name not in ("network", "devices")]
@@ -531,14 +566,6 @@ def _run_metadata(config: TrainConfig) -> dict[str, Any]:
             f"expected options that a checkpoint can hold, got {config.options!r}: {error}. Use numbers, texts and "
             f"lists, and add plugins in install of a custom task."
         ) from error
-
-
-def _make_folder(folder: Path) -> None:
-    """Make the folder of a run."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"expected a folder for the run, got {str(folder)!r}: {error}. Use another --out.") from error
 
 
 def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:

@@ -208,6 +208,7 @@ def test_wrong_resets_are_errors(next_step, kwargs, error, message):
         ({"render_worlds": [2]}, r"expected render_worlds as a list of worlds from 0 to 1, got \[2\]"),
         ({"render_worlds": 0}, "expected render_worlds as a list of worlds from 0 to 1, got 0"),
         ({"color": "red"}, "task 'hover' has no option 'color'"),
+        ({"color": "red"}, "effects, randomize, camera, depth_image; the simulation has"),
         ({"n_world": 2}, "did you mean n_worlds"),
         ({"freq": "fast", "max_episode_steps": 5}, "freq is 'fast'; it must be a positive whole number"),
         ({"seconds": 2.0, "max_episode_steps": 5}, "expected max_episode_steps or seconds, got 5 and 2.0: both"),

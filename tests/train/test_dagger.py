@@ -72,6 +72,10 @@ def test_the_command_trains_a_student_and_resumes(teacher, tmp_path, capsys):
     assert "hover by dagger, seed 0: 2 iterations" in capsys.readouterr().out
     assert main([*arguments, "--resume", "--iterations", "3"]) == 0
     assert "continues after iteration 2" in capsys.readouterr().out
+    moved = teacher.rename(tmp_path / "moved")
+    assert main([*arguments, "--resume", "--iterations", "4"]) == 2
+    assert f"expected the run of the teacher in '{teacher.resolve()}', got no such folder" in capsys.readouterr().err
+    moved.rename(teacher)
     policy, config, meta = load_policy(tmp_path / "run")
     assert config.config["teacher"] == str(teacher.resolve())
     assert sum(meta["observations"].values()) == 21

@@ -305,10 +305,13 @@ def test_law_09_wrong_places_and_names_are_errors(file, tmp_path):
     class Bare(Task):
         radius: float = 1.0
 
+    text_file = tmp_path / "task.txt"
+    text_file.touch()
     for given, message in (
         (f"{tmp_path / 'no.py'}:High", "expected a file with a task, got .*no.py': No such file"),
         (f"{file}:Hihg", "expected the name of a task in .*, got 'Hihg'; it defines High"),
         (f"{file}:Hover2", "it defines High"),
+        (f"{text_file}:High", "expected the file of a task to end with .py, got .*task.txt'. Rename it"),
         ("no_such_module:High", "expected a module with a task, got 'no_such_module'"),
         (Hover, r"expected the name of a task or a task, got <class.*Task\(\)"),
     ):

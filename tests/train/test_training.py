@@ -26,6 +26,7 @@ from crazysim.envs.state import flatten
 from crazysim.envs.tasks.hover import Hover
 from crazysim.errors import DamagedFileError, DivergedError, UnknownNameError
 from crazysim.pytree import PyTree
+from crazysim.storage import write_figure
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import config as configs
 from crazysim.train import training as runs
@@ -270,14 +271,23 @@ def test_metrics_of_each_iteration_are_passed_on(uninterrupted_run, tmp_path, mo
     assert len(seen) == 3
 
 
-def test_evaluations_hold_the_terms_of_the_reward(uninterrupted_run, tmp_path):
+def test_evaluations_hold_the_terms_of_the_reward(uninterrupted_run, tmp_path, monkeypatch):
     """They add up to the return, and the plot of an episode returns them over time."""
     point = read_curve(uninterrupted_run.folder)[-1]
     terms = [x for name, x in point.items() if name.startswith("reward ")]
     assert len(terms) == 4
     np.testing.assert_allclose(sum(terms), point["reward"], rtol=1e-5)
+    labels = []
+    monkeypatch.setattr(
+        "crazysim.train.show.write_figure",
+        lambda *args, **kwargs: (
+            labels.extend(axis.get_ylabel() for axis in args[0].axes),
+            write_figure(*args, **kwargs),
+        ),
+    )
     over_time = plot_episode(uninterrupted_run.env, uninterrupted_run.policy, tmp_path / "episode.png")
     assert (tmp_path / "episode.png").stat().st_size > 5000
+    assert labels[-1] == "error, m"
     assert {name: x.shape for name, x in over_time.items()} == dict.fromkeys(
         ("proximity", "spin", "action_rate", "crash"), (20,)
     )
@@ -396,7 +406,7 @@ def test_invalid_settings_of_a_run_are_refused(tmp_path):
         with pytest.raises(ConfigError, match=message):
             small_config(**{name: value})
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"expected a folder for the run, got .*file'.* Use another --out"):
+    with pytest.raises(ConfigError, match=r"expected a folder, got .*file'.* Use another --out"):
         train_quietly(tmp_path / "file", small_config())
     with pytest.raises(ConfigError, match=r"expected minibatches that divide the 8 worlds, got 7. Use for example 8"):
         train_quietly(tmp_path / "run", small_config(config={"n_steps": 16, "minibatches": 7}))
@@ -627,8 +637,19 @@ def test_analytic_gradients_follow_the_eight():
     assert not apg.iterate(learner.replace(agents=broken), env, (config,))[1]["finite"]
 
 
+SIGHT = """
+from crazysim.envs.tasks.hover import Hover
+
+class Sight(Hover):
+    def observe(self, data):
+        return {"height": data.states.pos[..., 2:]}
+"""
+"""Task whose observations are others than those of hover."""
+
+
 def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
-    folder = str(tmp_path / "hover")
+    folder, task_file = str(tmp_path / "hover"), tmp_path / "sight.py"
+    task_file.write_text(SIGHT, encoding="utf-8")
     small_options = [f"{k}={json.dumps(v)}" for k, v in SMALL.items()]
     done = main(["train", "hover", "--worlds", "8", "--iterations", "2", "--set", "seconds=0.4", "--out", folder,
                  "--no-film", "--config", *small_options])  # fmt: skip
@@ -648,10 +669,20 @@ def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
     assert "device 'tpu' does not exist" in capsys.readouterr().err
     assert main(["export", folder, "--c", str(tmp_path / "p.h")]) == 0
     assert "void policy(" in (tmp_path / "p.h").read_text()
-    assert main(["export", folder]) == 2
-    assert "--onnx FILE, --c FILE" in capsys.readouterr().err
+    for arguments, message in (
+        (["export", folder], "--onnx FILE, --c FILE"),
+        (["export", folder, "--c", "policy.txt"], "ends with .h, got 'policy.txt'"),
+        (["export", folder, "--onnx", "policy.h"], "ends with .onnx, got 'policy.h'"),
+        (["evaluate", f"{folder}/policy.npz"], f"got the file '{folder}/policy.npz'. Use {folder}."),
+        (["evaluate", folder, "--task", str(task_file)], "got those of sight, 1 number (height 1). Use"),
+    ):
+        assert main(arguments) == 2
+        assert message in capsys.readouterr().err
     assert main(["train", "list"]) == 0
-    assert "Reach a random point and hover there" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "hover          Reach a random point and hover there."
+    assert len({line[:15].rstrip() for line in lines}) == len({line[15:] for line in lines}) == len(lines)
+    assert not any("`" in line for line in lines)
     assert main(["train", "hover", "--set", "secnds=1", "--out", str(tmp_path / "x")]) == 2
     assert "did you mean seconds?" in capsys.readouterr().err
 

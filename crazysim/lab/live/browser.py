@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.errors import ConfigError, RenderError
+from crazysim.errors import ConfigError, RenderError, address_message
 from crazysim.lab.live.browser_panel import BrowserPanel
 from crazysim.lab.live.browser_scene import BrowserScene
 from crazysim.lab.live.loop import Live
@@ -176,5 +176,5 @@ def _require_free_port(host: str, port: int) -> int:
             probe.bind((host, port))
             probe.listen()
     except (OSError, OverflowError) as error:
-        raise RenderError(f"expected a free address, got {host}:{port}: {error}. Choose another port.") from error
+        raise RenderError(address_message(host, port, error)) from error
     return port

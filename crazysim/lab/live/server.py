@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, address_message
 from crazysim.lab.live.commands import Command, parse_command
 from crazysim.lab.live.framing import FramingError, Message, MessageBuffer, Request, ShowFile
 from crazysim.storage import Closeable
@@ -104,7 +104,7 @@ class CommandServer(CommandQueue):
                 listener = _Listener((host, port), serve)
             except (OSError, OverflowError) as error:
                 self.close()
-                raise ConfigError(f"expected a free address, got {host}:{port}: {error}. Use another port.") from error
+                raise ConfigError(address_message(host, port, error)) from error
             self._listeners.append(listener)
             threading.Thread(target=listener.serve_forever, args=(POLL_INTERVAL,), daemon=True).start()
 

@@ -54,9 +54,11 @@ def test_the_live_command_takes_a_pilot(capsys):
         ),
         (["--headless", "--seconds", "1", "--record", "nowhere/f"], "file that can be created"),
         (["--headless", "--seconds", "1", "--pilot", "--commands"], "or a pilot, got both"),
+        (["--window", "--seconds", "1"], "expected a screen for --window, got none. Use --browser or --headless."),
     ],
 )
-def test_wrong_options_are_refused_in_one_line(arguments, message, capsys):
+def test_wrong_options_are_refused_in_one_line(arguments, message, monkeypatch, capsys):
+    monkeypatch.setattr("crazysim.commands.options.has_screen", lambda: False)
     assert main(["live", *arguments]) == 2
     error = capsys.readouterr().err.strip()
     assert message in error

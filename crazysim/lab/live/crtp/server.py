@@ -11,7 +11,7 @@ import selectors
 import socket
 import threading
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, address_message
 from crazysim.lab.live.crtp.device import CrtpDevice
 from crazysim.lab.live.swarm import Swarm
 from crazysim.storage import Closeable
@@ -54,9 +54,7 @@ class CrtpServer(Closeable):
                 server_socket.bind((host, port + k if port else 0))
             except (OSError, OverflowError) as error:
                 self._close_sockets()
-                raise ConfigError(
-                    f"expected a free address, got {host}:{port + k}: {error}. Use another port."
-                ) from error
+                raise ConfigError(address_message(host, port + k, error)) from error
             server_socket.setblocking(False)
             self._selector.register(server_socket, selectors.EVENT_READ, k)
         swarm.listeners.append(self._send_due_packets)
