@@ -32,6 +32,12 @@ NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 TOKEN = re.compile(rf"(?<![\w.]){NUMBER.pattern}(?!\w)|[A-Za-z_]\w*|\S")
 
 
+TOLERANCE = 0.02
+"""Largest relative difference between a number on a page and the printed one."""
+CLOSE_TOLERANCE = 2e-4
+"""The same for the pages that are read first, and for the outputs that are written again."""
+
+
 class Block(NamedTuple):
     """Python block of a page."""
 
@@ -88,26 +94,28 @@ def _as_file(block: Block) -> Iterator[dict[str, Any] | None]:
                 del sys.modules[name]
 
 
-def is_same_output(page_text: str, printed: str, example: bool = False) -> bool:
+def is_same_output(page_text: str, printed: str, example: bool = False, tolerance: float = TOLERANCE) -> bool:
     """Return True if a page shows the output of its block.
 
     An example has the same words, whatever the numbers. In other outputs ``...`` stands for any text. Spaces and line
-    breaks do not count. Integers are equal. Other numbers may differ by 2%, by 2 in the last digit that the page shows,
-    or by 2e-5: processors and versions of JAX round differently.
+    breaks do not count. Integers are equal. Other numbers may differ by ``tolerance`` times the larger one, by
+    2 in the last digit that the page shows, or by 2e-5: processors and versions of JAX round differently.
     """
     if example:
         return _words(page_text) == _words(printed)
     parts = [TOKEN.findall(part) for part in page_text.split("...")]
     tokens = TOKEN.findall(printed)
     if len(parts) == 1:
-        return _equal(parts[0], tokens)
+        return _equal(parts[0], tokens, tolerance)
     first_part, *middle, last_part = parts
     start, end = len(first_part), len(tokens) - len(last_part)
-    if start > end or not (_equal(first_part, tokens[:start]) and _equal(last_part, tokens[end:])):
+    if start > end or not (
+        _equal(first_part, tokens[:start], tolerance) and _equal(last_part, tokens[end:], tolerance)
+    ):
         return False
     for part in middle:
         places = range(start, end - len(part) + 1)
-        position = next((i for i in places if _equal(part, tokens[i : i + len(part)])), None)
+        position = next((i for i in places if _equal(part, tokens[i : i + len(part)], tolerance)), None)
         if position is None:
             return False
         start = position + len(part)
@@ -118,11 +126,13 @@ def _words(text: str) -> set[str]:
     return {token for token in TOKEN.findall(text) if not NUMBER.fullmatch(token)}
 
 
-def _equal(page_tokens: list[str], printed: list[str]) -> bool:
-    return len(page_tokens) == len(printed) and all(map(_token_equal, page_tokens, printed))
+def _equal(page_tokens: list[str], printed: list[str], tolerance: float) -> bool:
+    return len(page_tokens) == len(printed) and all(
+        _token_equal(x, y, tolerance) for x, y in zip(page_tokens, printed, strict=True)
+    )
 
 
-def _token_equal(page_token: str, printed: str) -> bool:
+def _token_equal(page_token: str, printed: str, tolerance: float) -> bool:
     if page_token == printed:
         return True
     if not (NUMBER.fullmatch(page_token) and NUMBER.fullmatch(printed)):
@@ -132,7 +142,7 @@ def _token_equal(page_token: str, printed: str) -> bool:
     mantissa, _, exponent = page_token.lower().partition("e")
     last_digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
     a, b = float(page_token), float(printed)
-    return abs(a - b) <= max(0.02 * max(abs(a), abs(b)), 2.1 * last_digit, 2e-5)
+    return abs(a - b) <= max(tolerance * max(abs(a), abs(b)), 2.1 * last_digit, 2e-5)
 
 
 def _update(page: Path) -> int:
@@ -144,7 +154,9 @@ def _update(page: Path) -> int:
         printed = run_block(block, page, namespace)
         piece = text[start : block.end]
         start = block.end
-        if printed and not (block.output is not None and is_same_output(block.output, printed, block.example)):
+        if printed and not (
+            block.output is not None and is_same_output(block.output, printed, block.example, CLOSE_TOLERANCE)
+        ):
             if block.output is not None:
                 piece = piece[: piece.rindex("\n```text")]
             title = ' title="for example"' if block.example else ""

@@ -15,7 +15,7 @@ outputs = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(outputs)
 
 
-def run(page):
+def run(page, tolerance=outputs.TOLERANCE):
     """Run the blocks of a page in order and in one namespace, and compare their outputs with those of the page."""
     text = page.read_text()
     for package, line in (("casadi", "import casadi"), ("viser", "from crazysim.media import web")):
@@ -25,7 +25,7 @@ def run(page):
     for block in outputs.blocks(text):
         printed = outputs.run_block(block, page, namespace)
         line_number = text[: block.end].count("\n")
-        if block.output is not None and not outputs.is_same_output(block.output, printed, block.example):
+        if block.output is not None and not outputs.is_same_output(block.output, printed, block.example, tolerance):
             name = page.relative_to(ROOT)
             pytest.fail(
                 f"the block that ends at line {line_number} prints\n{printed}; run `python docs/outputs.py {name}`"

@@ -73,6 +73,11 @@ def test_outputs_are_compared_to_the_digits_that_a_page_shows(shown, printed, sa
     assert outputs.is_same_output(shown, printed) is same
 
 
+def test_numbers_of_the_first_pages_are_compared_more_closely():
+    assert outputs.is_same_output("[0.49969438]", "[0.49951503]")
+    assert not outputs.is_same_output("[0.49969438]", "[0.49951503]", tolerance=outputs.CLOSE_TOLERANCE)
+
+
 def test_an_example_output_may_differ_in_its_numbers():
     text = '```python\nprint(1)\n```\n\n```text title="for example"\nsuccess 0.5% in 12 s\n```\n'
     (block,) = outputs.blocks(text)
