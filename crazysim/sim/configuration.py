@@ -15,7 +15,7 @@ from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
 from crazysim.core.airframes import AirframeSource, is_airframe_list, load_airframes
 from crazysim.core.controls import check_command_level, check_controller, check_same_controllers
-from crazysim.core.data import SimData
+from crazysim.core.data import SimData, SimState
 from crazysim.core.integration import Integrator
 from crazysim.core.plugin import Plugin, check_plugin_list
 from crazysim.core.settings import (
@@ -32,10 +32,15 @@ from crazysim.core.settings import (
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.models import require_freq, require_support
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 
 if TYPE_CHECKING:
     from crazysim.plugins.estimators import Estimator
+
+STATE_FIELDS = tuple(field.name for field in dataclasses.fields(SimState))  # type: ignore[arg-type]
+COMMAND_LEVELS = ("state", "attitude", "body_rate", "force_torque")
+COMMAND_FIELDS = ("cmd", "staged_cmd", "feedforward", "staged_feedforward", "staged_ang_vel_des")
+"""Fields of the commands of a level, if it has them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,9 +75,10 @@ class Configuration:
     """True to raise an error where a slower engine would be used with a warning."""
 
     def check(self, data: Any, reference: SimData) -> None:
-        """Check that data belong to a simulation with these settings; it takes some microseconds.
+        """Check that data belong to a simulation with these settings; it takes some tens of microseconds.
 
-        The axes of each leaf are checked by the step.
+        Of states and commands, last axes and types are checked too; the batch axes of all leaves are checked by the
+        step.
 
         Args:
             data: Data to check.
@@ -93,6 +99,12 @@ class Configuration:
                 f"{_describe_settings(*settings)}. Use data of this simulation, or of one with the same settings."
             )
         check_same_controllers(controls, reference.controls, getattr(self.controller, "name", None))
+        _check_fields("data.states", data.states, reference.states, STATE_FIELDS)
+        for level in COMMAND_LEVELS:
+            record, expected_record = getattr(controls, level), getattr(reference.controls, level)
+            if record is not expected_record:
+                _check_fields(f"data.controls.{level}", record, expected_record, COMMAND_FIELDS)
+        _check_fields("data.controls", controls, reference.controls, ("rotor_vel",))
 
     @staticmethod
     def create(
@@ -158,6 +170,30 @@ def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None
 
         shorthand_plugins.append(Residual())
     return [*shorthand_plugins, *check_plugin_list("plugins", plugins)]
+
+
+def _check_fields(name: str, record: Any, reference: Any, fields: Sequence[str]) -> None:
+    """Check that fields of a record are arrays with the last axis and the kind of numbers of those of a reference."""
+    for field in fields:
+        value, expected = getattr(record, field, None), getattr(reference, field, None)
+        if value is expected:
+            continue
+        try:
+            is_alike = value.shape[-1:] == expected.shape[-1:] and value.dtype.kind == expected.dtype.kind
+        except AttributeError:
+            is_alike = False
+        if not is_alike:
+            expected_text, actual_text = map(_describe_leaf, (expected, value))
+            raise ConfigError(
+                f"expected {name}.{field} as {expected_text}, got {actual_text}. Use an array like that of "
+                f"sim.default_data."
+            )
+
+
+def _describe_leaf(leaf: Any) -> str:
+    """Return shape and type of an array for a message."""
+    has_type = hasattr(leaf, "shape") and hasattr(leaf, "dtype")
+    return f"an array of shape {leaf.shape} and type {leaf.dtype}" if has_type else short_repr(leaf)
 
 
 def _describe_settings(n_worlds: int, n_drones: int, freq: int, control: Control, is_fitted: bool) -> str:

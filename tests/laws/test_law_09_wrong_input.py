@@ -275,6 +275,15 @@ def test_data_with_axes_of_its_own_is_refused_at_the_next_step(sim, edit, fragme
     sim.data = before
 
 
+def with_state(sim, **fields):
+    return sim.data.replace(states=sim.data.states.replace(**fields))
+
+
+def with_command(sim, **fields):
+    controls = sim.data.controls
+    return sim.data.replace(controls=controls.replace(attitude=controls.attitude.replace(**fields)))
+
+
 @pytest.mark.parametrize(
     "wrong, fragments",
     [
@@ -299,6 +308,17 @@ def test_data_with_axes_of_its_own_is_refused_at_the_next_step(sim, edit, fragme
                 )
             ),
             ("of shapes [(3, 1, 3), ", "got memory AutoMemory of shapes [(3, 1, 2), "),
+        ),
+        (lambda sim: with_state(sim, pos=jnp.zeros((3, 1, 2))), ("data.states.pos", "shape (3, 1, 3)", "got an array")),
+        (lambda sim: with_state(sim, vel=jnp.zeros((3, 1, 3), int)), ("data.states.vel", "(3, 1, 3) and type int32")),
+        (lambda sim: with_state(sim, quat=None), ("data.states.quat as an array of shape (3, 1, 4)", "got None")),
+        (lambda sim: with_state(sim, force=0.0), ("data.states.force as an array of shape (3, 1, 3)", "got 0.0")),
+        (lambda sim: sim.data.replace(states=None), ("data.states.pos as an array", "got None")),
+        (lambda sim: with_command(sim, cmd=jnp.zeros((3, 1, 3))), ("data.controls.attitude.cmd", "(3, 1, 3)")),
+        (lambda sim: with_command(sim, staged_cmd=None), ("data.controls.attitude.staged_cmd", "got None")),
+        (
+            lambda sim: sim.data.replace(controls=sim.data.controls.replace(rotor_vel=jnp.zeros((3, 1, 4), bool))),
+            ("data.controls.rotor_vel as an array of shape (3, 1, 4)", "bool"),
         ),
     ],
 )
