@@ -98,7 +98,7 @@ def test_a_recipe_trains_its_teacher_first(recipe_with_teacher, tmp_path):
     iterations = []
     folder = tmp_path / "run"
     run("hover", folder, film=False, seed=3, on_iteration=lambda i, _: iterations.append(i), **settings)
-    headers = [line.partition(":")[0] for line in lines if " by " in line and "iterations of" in line]
+    headers = [line.partition(":")[0] for line in lines if " by " in line and "engine: " in line]
     assert headers == ["hover by ppo, seed 3", "hover by dagger, seed 3"]
     assert iterations == [1]
     _, student, _ = load_policy(folder)
@@ -132,7 +132,7 @@ def test_an_interrupted_teacher_continues_and_then_teaches(recipe_with_teacher, 
     with pytest.raises(ConfigError, match=r"a folder without a run, got .*teacher; continue the run with --resume"):
         run("hover", tmp_path / "run", film=False, **settings)
     run("hover", tmp_path / "run", film=False, resume=True, **settings)
-    headers = [line for line in lines if "iterations of" in line]
+    headers = [line for line in lines if " by " in line and "engine: " in line]
     assert "continues after iteration 1" in headers[1]
     assert "by dagger" in headers[2]
 
@@ -157,7 +157,7 @@ def test_teachers_that_do_not_fit_are_errors(teacher, tmp_path):
 
     with pytest.raises(ConfigError, match="expected the folder of a teacher, got none"):
         run("hover", "")
-    with pytest.raises(ConfigError, match="an existing file with a checkpoint"):
+    with pytest.raises(ConfigError, match="expected the run of the teacher in"):
         run("hover", str(tmp_path / "nothing"))
     with pytest.raises(ConfigError, match="a teacher whose task has the same record as 'track'"):
         run("track", str(teacher))
