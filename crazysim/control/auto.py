@@ -18,7 +18,7 @@ the gains of the position loop follow.
 The rate has two limits. The first is lag: ``1 / a`` is at least the lag of the rotors, with feedback of their speeds,
 and at least 1.5 periods of the controller. The second is the authority: a large error turns the drone along the line
 on which kp e + kd e' = 0, so that the rotors must brake it with (kp / kd)^2 e = 0.04 a^2 e. They can stop it from every
-error if this value at the largest e is at most the angular acceleration that they give in hover (``turn_rates``).
+error if this value at the largest e is at most the angular acceleration that they give in hover (``max_gain_ratios``).
 Without this limit, a drone with quick rotors turns faster than it can stop. Its rotors then saturate in one direction
 and the other, and it never settles.
 
@@ -44,7 +44,13 @@ from jax import Array, lax
 
 from crazysim import rotation
 from crazysim.control.allocation import AllocationParams, hover_torque_arms, wrench_matrix
-from crazysim.control.bandwidth import YAW_RATE_RATIO, fastest_rotor_rate, reaction_time, rotor_rate, turn_rates
+from crazysim.control.bandwidth import (
+    YAW_RATE_RATIO,
+    fastest_rotor_rate,
+    max_gain_ratios,
+    momentum_per_torque,
+    rotor_rate,
+)
 from crazysim.control.fitted_auto import FittedAuto
 from crazysim.control.flatness import MIN_HEADING_SINE, MIN_SPECIFIC_THRUST
 from crazysim.control.levels import Control
@@ -113,13 +119,13 @@ class AutoParams(RigidBodyParams):
             freq: Rate of the controller, Hz.
             outer_freq: Rate of its position loop, Hz, whose command is half a period old on average; None without one.
         """
-        lag_rate, rate_limits = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * turn_rates(airframe)
+        lag_rate, rate_limits = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * max_gain_ratios(airframe)
         needed_rate = 1 / max(1 / np.max(rate_limits[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
         lead = max(min(needed_rate / lag_rate, MAX_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
         loop_rate = 1 / (1 / (lead * lag_rate) + 1.5 / freq)
         axis_rates = np.minimum(loop_rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), rate_limits)
         stiffness, damping = STIFFNESS_RATIO * axis_rates**2, DAMPING_RATIO * axis_rates
-        delay, reaction = DAMPING_RATIO / STIFFNESS_RATIO / np.min(axis_rates[:2]), reaction_time(airframe)
+        delay, reaction = DAMPING_RATIO / STIFFNESS_RATIO / np.min(axis_rates[:2]), momentum_per_torque(airframe)
         body = rigid_body_params(airframe)
         allocation: AllocationParams = body.pop("allocation")
         position = None

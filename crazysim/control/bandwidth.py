@@ -1,21 +1,21 @@
-"""Gains by bandwidth, as far as rotors, their lag and the rate of a controller allow.
+"""Gains of controllers: the highest bandwidth that the rotors and the rate of a controller allow.
 
 A drone whose rotors have the lag rate ``a``, under feedback of attitude and body rate with gains per inertia kp and kd,
 has the characteristic polynomial ``s^3 / a + s^2 + kd s + kp``. The rule here is
 
-    kd = a,   kp = 0.3 a^2,   and at most half of these rates about yaw, where rotors have less authority,
+    kd = a,   kp = 0.3 a^2,   about yaw with a / 2 or less in place of a, since rotors have less authority there,
 
-which puts the slowest mode of the attitude at about 0.4 a. The position loop is critically damped with a natural
-frequency of 0.12 a: together the five modes then have damping ratios of 0.39 and more (``test_geometric.py`` computes
+which puts the poles of the attitude at -0.39 a and (-0.30 +- 0.82i) a. The position loop is critically damped with a
+natural frequency of 0.12 a: together the five modes then have damping ratios of 0.39 and more (``test_geometric.py`` computes
 them). A controller that runs every 1/freq s acts half a period late, and its input is one period old at worst, which
 counts as lag: ``1 / a = 1 / rotor_rate + 1.5 / freq``.
 
 Two limits lower these rates. First, a large error e turns the drone along the line on which kp e + kd e' = 0, so the
 rotors have to brake it with (kp / kd)^2 e. If they cannot give as much (``max_ang_acc``), the drone turns faster than
-it can stop; therefore ``turn_rates`` bounds kp / kd. Second, a rotor that speeds up turns the body the other way at
-once. With the lag rate r and the ratio z of the changes of a rotor's angular momentum and drag torque
-(``reaction_time``), a demand of yaw torque has 1 + r z times its effect in the first tick. A controller without a model
-of this may remove no more than ``MAX_REACTION`` of an error of the yaw rate in a tick.
+it can stop; therefore ``max_gain_ratios`` bounds kp / kd. Second, a rotor that speeds up turns the body the other way
+at once. With the lag rate r and the ratio z of the changes of a rotor's angular momentum and drag torque
+(``momentum_per_torque``), a demanded yaw torque acts up to 1 + r z times as strongly as demanded in the first tick. A
+controller without a model of this may remove no more than ``MAX_YAW_CORRECTION`` of an error of the yaw rate in a tick.
 """
 
 from __future__ import annotations
@@ -31,19 +31,21 @@ from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 
 ATTITUDE_STIFFNESS = 0.3
-"""Attitude gain per inertia over the squared lag rate, 1."""
-MAX_REACTION = 1 / 3
-"""Largest fraction of an error of the yaw rate that the reaction to accelerating rotors removes in a tick, 1."""
+"""Stiffness over the squared damping of an axis, 1."""
+MAX_YAW_CORRECTION = 1 / 3
+"""Largest fraction of an error of the yaw rate that the demanded torque and the reaction to accelerating rotors remove
+together in a tick, 1."""
 YAW_RATE_RATIO = 0.5
-"""Ratio of the rate of the yaw loop to the rate of roll and pitch, 1."""
+"""Largest damping about yaw over the lag rate, 1."""
 STOPPABLE_ERRORS = np.array([2.0, 2.0, 1.0])
-"""Rotation errors about x, y and z from which a turn can be stopped, 1: 2 sin(angle / 2) for half a turn, and 1 rad."""
+"""Rotation errors about x, y and z, 2 sin(angle / 2), from which a turn can be stopped: half a turn about x and y, and
+60 degrees about z."""
 POSITION_RATE_RATIO = 0.12
-"""Natural frequency of the position loop over the lag rate, 1."""
+"""Natural frequency of the position loop over the smaller damping of roll and pitch, 1."""
 
 
 class Bandwidth(NamedTuple):
-    """Rates of the loops of an airframe."""
+    """Bandwidth of the loops of an airframe, as a natural frequency and gains per inertia."""
 
     position: float
     """Natural frequency of the critically damped position loop, rad/s."""
@@ -56,7 +58,7 @@ class Bandwidth(NamedTuple):
 def rotor_rate(airframe: Airframe) -> float:
     """Return the rate of the lag of the rotors around hover, in the slower direction, 1/s.
 
-    The lag is ``a (cmd - r) + b (cmd^2 - r^2)``; its slope at the hover speed is ``a + 2 b r``.
+    The lag is ``c1 (cmd - n) + c2 (cmd^2 - n^2)`` at the speed n; its slope at the hover speed is ``c1 + 2 c2 n``.
     """
     return float(np.min(_lag_rates(airframe, hover_rotor_vel(airframe))))
 
@@ -72,7 +74,7 @@ def _lag_rates(airframe: Airframe, rotor_vel: np.ndarray) -> np.ndarray:
     return lag[:, 0::2] + 2 * lag[:, 1::2] * rotor_vel[:, None]
 
 
-def reaction_time(airframe: Airframe) -> float:
+def momentum_per_torque(airframe: Airframe) -> float:
     """Return the ratio of the changes of a rotor's angular momentum and drag torque around hover, s."""
     hover = hover_rotor_vel(airframe)
     _, k1, k2 = np.atleast_2d(airframe.value("rotors.torque_curve")).T
@@ -113,13 +115,13 @@ def max_ang_acc(airframe: Airframe) -> np.ndarray:
     return np.array(torques) / np.diag(airframe.inertia)
 
 
-def turn_rates(airframe: Airframe) -> np.ndarray:
+def max_gain_ratios(airframe: Airframe) -> np.ndarray:
     """Return the largest ratio of attitude gain to damping whose turns the rotors can stop, 1/s. (3,)"""
     return np.sqrt(max_ang_acc(airframe) / STOPPABLE_ERRORS)
 
 
 def bandwidth(airframe: Airframe, freq: int, lag_rate: float | None = None, limits_reaction: bool = True) -> Bandwidth:
-    """Return the rates of the loops of an airframe under a controller that runs at ``freq`` Hz.
+    """Return the bandwidth of the loops of an airframe under a controller that runs at ``freq`` Hz.
 
     Args:
         airframe: The airframe.
@@ -128,9 +130,13 @@ def bandwidth(airframe: Airframe, freq: int, lag_rate: float | None = None, limi
         limits_reaction: True for a controller that does not compensate the reaction to accelerating rotors.
     """
     loop_rate = 1 / (1 / (rotor_rate(airframe) if lag_rate is None else lag_rate) + 1.5 / freq)
-    axis_rates = np.minimum(loop_rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turn_rates(airframe) / ATTITUDE_STIFFNESS)
+    axis_rates = np.minimum(
+        loop_rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), max_gain_ratios(airframe) / ATTITUDE_STIFFNESS
+    )
     if limits_reaction:
-        axis_rates[2] = min(axis_rates[2], MAX_REACTION * freq / (1 + rotor_rate(airframe) * reaction_time(airframe)))
+        axis_rates[2] = min(
+            axis_rates[2], MAX_YAW_CORRECTION * freq / (1 + rotor_rate(airframe) * momentum_per_torque(airframe))
+        )
     return Bandwidth(
         float(POSITION_RATE_RATIO * np.min(axis_rates[:2])), ATTITUDE_STIFFNESS * axis_rates**2, axis_rates
     )

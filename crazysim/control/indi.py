@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.allocation import force_torque2rotor_vel, wrench_matrix
-from crazysim.control.bandwidth import bandwidth, fastest_rotor_rate, reaction_time, rotor_rate
+from crazysim.control.bandwidth import bandwidth, fastest_rotor_rate, momentum_per_torque, rotor_rate
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.control.geometric import GeometricParams, attitude_errors, bandwidth_gains
 from crazysim.control.levels import Control
@@ -67,7 +67,7 @@ class INDIParams(PyTree):
         if not 0 < cutoff < math.inf:
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
         params = GeometricParams.create(airframe, freq)
-        rotor_lag_rate, reaction = rotor_rate(airframe), reaction_time(airframe)
+        rotor_lag_rate, reaction = rotor_rate(airframe), momentum_per_torque(airframe)
         lead = max(min(ROTOR_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
         gains = bandwidth_gains(airframe, bandwidth(airframe, freq, lead * rotor_lag_rate, limits_reaction=False))
         return INDIParams(

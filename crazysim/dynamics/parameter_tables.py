@@ -1,4 +1,4 @@
-"""Parameters of an airframe for dynamics and for the firmware's controllers, as dicts under the names of Crazyflow."""
+"""Parameters of an airframe for dynamics models and for Crazyflow's controllers, as dicts under Crazyflow's names."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.errors import ConfigError, UnknownNameError
 
 CASCADE_NAME = "mellinger"
-"""Crazyflow's name for its cascade of controllers."""
+"""Crazyflow's name for its cascade, which is ``controller="crazyflow"`` here; not the controller ``Mellinger``."""
 _CORE_KEYS = ("mass", "mass_thrust", "pwm_min", "pwm_max", "torque_pwm_max", "thrust2torque")
 _ROTOR_NAMES = {
     "thrust_curve": "rpm2thrust",
@@ -37,7 +37,9 @@ CRAZYFLOW_TABLES: tuple[tuple[str, str, dict[str, str]], ...] = (
 def load_params(
     dynamics: Dynamics | str, drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
 ) -> dict:
-    """Return the parameters of a drone for a dynamics model, in SI units; thrusts are per rotor.
+    """Return the parameters of a drone for a dynamics model, in SI units, but rotor speeds in rpm.
+
+    ``thrust_min`` and ``thrust_max`` are of one rotor.
 
     Args:
         dynamics: Dynamics model.
@@ -105,7 +107,7 @@ def load_controller_params(
     Parameters that the airframe lacks are left out.
 
     Args:
-        controller: ``"mellinger"``.
+        controller: ``"mellinger"``, Crazyflow's cascade; other controllers have parameters of their own.
         drone: Airframe, or anything that ``load_airframe`` accepts.
         xp: Array module of the values, such as ``jax.numpy``; None for NumPy.
         device: Device of the values; None for the module's default.
@@ -126,7 +128,7 @@ def load_controller_params(
 def load_controller_fn_params(
     fn: Callable[..., Any], drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
 ) -> dict:
-    """Return the parameters of one function of the cascade, including ``core``.
+    """Return the parameters of one function of the cascade: ``core``, and its own table if it has one.
 
     Args:
         fn: Function of ``crazysim.control``, such as ``state2attitude``.
@@ -139,7 +141,10 @@ def load_controller_fn_params(
 
 
 def rotor_vel_limits(dynamics: Dynamics | str, drone: AirframeSource) -> tuple[float, float]:
-    """Return the limits of ``states.rotor_vel``: rpm, or collective thrust in N in a fitted model."""
+    """Return the limits of ``states.rotor_vel`` of rotors that are on.
+
+    They are the first rotor's speeds, rpm, or for fitted models the collective thrusts, N.
+    """
     params = load_params(dynamics, drone)
     thrusts = np.array([params["thrust_min"], params["thrust_max"]])
     if dynamics != Dynamics.first_principles:

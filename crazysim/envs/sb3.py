@@ -31,10 +31,11 @@ except ImportError as error:
 class DroneVecEnv(VecEnv):
     """Vector environment of Stable-Baselines3 over a functional environment; each world is one of its environments.
 
-    A new episode starts within the step that ends one. The infos of worlds whose episode ended have the entries of
-    ``Monitor`` and ``DummyVecEnv``, ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` with ``r``, ``l``
-    and ``t``, and also ``error`` and ``nonfinite``; other infos are empty. With several drones the reward is their
-    mean, and observations and actions are concatenated, drone after drone.
+    A new episode starts within the step that ends one. The infos of worlds whose episode ended have what
+    ``DummyVecEnv`` adds (``terminal_observation``, ``TimeLimit.truncated``), what ``Monitor`` adds (``episode`` with
+    ``r``, ``l`` and ``t``), ``error``, the task's error at the end, and ``nonfinite``, which is True if a number was
+    not finite. Other infos are empty. With several drones reward and error are their means, and observations and actions
+    are concatenated, drone after drone.
     """
 
     def __init__(
@@ -75,7 +76,10 @@ class DroneVecEnv(VecEnv):
         )
 
     def reset(self) -> Any:
-        """Start new episodes in all worlds, with the last seed passed to ``seed`` if it has not been used yet."""
+        """Start new episodes in all worlds, from the seed last passed to ``seed``.
+
+        If that has been used, the seed is the next random number of the generator that it seeded.
+        """
         seed = as_seed(self._seeds[0])
         key_seed = seed if seed is not None else int(self._generator.integers(2**31))
         if seed is not None:
@@ -88,7 +92,7 @@ class DroneVecEnv(VecEnv):
         return self._to_numpy(jax.device_get(obs))
 
     def step_async(self, actions: ArrayLike) -> None:
-        """Store the actions for the next step, (num_envs, k)."""
+        """Store the actions for the next step. (num_envs, numbers of all drones)"""
         if self.state is None:
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
         self._actions = check_actions(actions, (self.num_envs, *(self.action_space.shape or ())))
@@ -152,7 +156,7 @@ class DroneVecEnv(VecEnv):
         return self.env.explain()
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window, and free the renderers."""
         self.sim.close()
 
     def _reset_state(self, key: Array) -> tuple[EnvState, Obs]:

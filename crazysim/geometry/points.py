@@ -1,7 +1,8 @@
-"""Signed distances from a point to each kind of shape, negative inside.
+"""Signed distances from a point to shapes of each kind but height fields, negative inside.
 
-The formulas are in components, with selections instead of branches, so that one drone takes a few dozen scalar
-operations. At a switch the gradient is taken from one side.
+Formulas are in components, with selections instead of branches. Most take a few dozen scalar operations for a point, an
+ellipsoid a few hundred; those of a mesh grow with its planes and triangles. At a switch the gradient is taken from one
+side.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ and rounding for a ratio of 10."""
 
 
 Components = tuple[Array, Array, Array]
-"""The three components of vectors. 3 of (...)"""
+"""The three components of vectors. (...) each"""
 
 
 def components(x: Array) -> Components:
-    """Return the three components of vectors. 3 of (...)"""
+    """Return the three components of vectors. (...) each"""
     return x[..., 0], x[..., 1], x[..., 2]
 
 
@@ -79,7 +80,8 @@ def _cylinder(shape: Shape, point: Array) -> Array:
 def _ellipsoid(shape: Shape, point: Array) -> Array:
     """Return the distance to the tangent plane of the ellipsoid at the nearest point, m. (...)
 
-    An error e of the normal n gives an error e^2 of the distance ``(n.p - |a n|) / |n|``.
+    For the point p and the semi-axes a it is ``(n.p - |a n|) / |n|``. It is stationary in the normal n, so an error of
+    n changes it only in second order.
     """
     normal = ellipsoid_normal(shape, components(point))
     projection = sum(n * p for n, p in zip(normal, components(point), strict=True))
@@ -88,7 +90,7 @@ def _ellipsoid(shape: Shape, point: Array) -> Array:
 
 
 def ellipsoid_normal(shape: Shape, point: Components) -> Components:
-    """Return the normal, not normalised, of an ellipsoid at its point nearest to a point. 3 of (...)
+    """Return the normal, not normalised, of an ellipsoid at its point nearest to a point. (...) each
 
     The nearest point to p has the normal w_i = p_i / (t + a_i^2), where t solves |a w| = 1 (Eberly 2013, Distance from
     a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid). 1 / |a w| is concave in t, so Newton's steps from below
@@ -98,7 +100,8 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
     """
     axes = np.asarray(shape.size)
     gaps = (axes**2 - axes.min() ** 2).tolist()
-    # A point of the symmetry plane has two nearest points: it is displaced by less than a rounding error.
+    # A point on a plane of symmetry may have two nearest points. Every point is therefore moved away from these planes,
+    # by twice the machine epsilon times the semi-axis.
     displacements = (2 * float(jnp.finfo(point[0].dtype).eps) * axes).tolist()
     displaced = [p + jnp.where(p < 0, -e, e) for p, e in zip(point, displacements, strict=True)]
     scaled = [a * p for a, p in zip(shape.size, displaced, strict=True)]

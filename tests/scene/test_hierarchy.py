@@ -1,4 +1,4 @@
-"""The hierarchy of boxes and its orders."""
+"""The hierarchy of bounding boxes, and its eight orders of nodes, one for each octant of directions of rays."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_boxes_of_nodes_contain_the_boxes_of_their_subtrees(boxes):
 
 
 def test_nearer_boxes_of_an_octant_come_first():
-    """Boxes in a row along the diagonal: each order visits them from one end to the other."""
+    """Boxes in a row along x: orders of rays towards negative x visit them from the far end, others from the near."""
     low = np.arange(20.0)[:, None] * [1.0, 1e-3, 1e-3]
     _, links = build_hierarchy(low, low + 0.5)
     for order, geom in enumerate(links[..., 1]):

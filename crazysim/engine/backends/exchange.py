@@ -1,4 +1,8 @@
-"""Exchange of numbers between the lanes of a kernel: drones of one world are in one warp, block or set of vectors."""
+"""Exchange of numbers between the lanes of a kernel: drones of one world are in one warp, block or set of vectors.
+
+Functions and macros of the source, such as ``of_drone`` (a number of another drone in a register), ``of_place`` (in
+memory) and ``SWEEP`` (a loop over the vectors of a world), are defined in ``targets/``.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +56,7 @@ class LineWriter(Protocol):
         ...
 
     def forget_intermediate_results(self) -> None:
-        """Forget intermediate results, whose variables are not defined after the last line."""
+        """Forget intermediate results: the loop in which their variables were defined has been closed."""
         ...
 
 
@@ -69,7 +73,7 @@ class Exchange(Protocol):
             writer: Writer that the lines are added to.
             values: The numbers.
             live: Values that are defined here and used later, with their types.
-            depth: Depth of the lines.
+            depth: Indentation of the lines.
         """
         ...
 
@@ -134,9 +138,11 @@ class SharedMemory(UnsplitLane):
     """Threads of one block of a GPU, which exchange numbers through the block's memory."""
 
     def __init__(self, lanes: int):
-        """Exchange numbers between the ``lanes`` threads of a block."""
+        """Exchange numbers between the first ``lanes`` threads of a block, which have a drone each."""
         if lanes > MAX_THREADS:
-            raise UnsupportedError(f"the drones of a world read each other's numbers, up to {MAX_THREADS} on a GPU")
+            raise UnsupportedError(
+                f"the {lanes} drones of a world read each other's numbers; on a GPU at most {MAX_THREADS} can"
+            )
         self.lanes = lanes
         self._records: dict[str, int] = {}
 
@@ -147,7 +153,7 @@ class SharedMemory(UnsplitLane):
         size = sum(math.ceil(_record_bytes(text) / 16) * 16 for text in self._records) * self.lanes
         if size > SHARED_MEMORY_BYTES:
             raise UnsupportedError(
-                f"the drones of a world publish {size} bytes for each other, and a GPU's block has "
+                f"the drones of a block publish {size} bytes for each other, and a block's static shared memory has "
                 f"{SHARED_MEMORY_BYTES}"
             )
         array = f"shared_{record}"
@@ -220,8 +226,9 @@ def make_exchange(target: str, group_size: int) -> Exchange:
 def lanes_of_block(group_size: int) -> tuple[int, int]:
     """Return the number of threads of a block on a GPU, and how many of them are lanes.
 
-    A world of up to ``WARP_THREADS`` drones stays in one warp. For larger worlds, a block has the size of up to 256
-    threads (more only if one world needs them) that leaves the smallest share of threads without a drone.
+    A world of up to ``WARP_THREADS`` drones stays in one warp. For larger worlds, sizes up to 256 threads are compared,
+    larger ones only if one world needs them. The block gets the size with the smallest share of threads without a
+    drone, to the nearest percent; of equal ones the smallest.
 
     Args:
         group_size: Drones of a world that read each other's numbers.

@@ -18,9 +18,10 @@ PUBLISHED_ERRORS = {
     "position": {"rigid body at constant body rates": (0.0126, 0.1269), "hybrid model": (0.0166, 0.1119)},
     "attitude": {"rigid body at constant body rates": (1.175, 14.58), "hybrid model": (2.154, 13.21)},
 }
-"""Mean errors over the melon flights after 0.1 and 0.5 s, m and degrees, of IDSIA's rigid body and of its learned model
-with the least error of position: rows Physics and Hybrid of the last table in ``results/model_comparison.ipynb``,
-repository idsia-robotics/nanodrone-sysid-benchmark at commit 2d921b5; angles there in rad."""
+"""Published mean errors over IDSIA's three flights named melon after 0.1 and 0.5 s, m and degrees, of its rigid body
+and of its learned model with the least error of position. They are the rows Physics and Hybrid of the last table in
+``results/model_comparison.ipynb``, repository idsia-robotics/nanodrone-sysid-benchmark at commit 2d921b5, converted
+from rad."""
 IDSIA_MASS = 0.045
 """Mass of IDSIA's drone, kg."""
 
@@ -34,19 +35,24 @@ def find_logs(folder: Path, pattern: str) -> list[Path]:
     paths = sorted(path for ending in ("npz", "csv") for path in folder.glob(f"{pattern}.{ending}"))
     if not paths:
         raise ConfigError(
-            f"expected logs {pattern}.npz or .csv in {folder.name}, got none. docs/validation.md has them."
+            f"expected logs {pattern}.npz or .csv in {folder.name}, got none. docs/validation.md says where to get "
+            f"them."
         )
     return paths
 
 
 def open_loop(folder: Path) -> Iterable[Row]:
-    """Yield mean errors of predictions of a melon flight from rotor speeds, at ``HORIZONS``, and published errors."""
+    """Yield mean errors of predictions of a flight from its rotor speeds, and published ones after 0.1 and 0.5 s.
+
+    The predictions are for ``HORIZONS``, from the first flight named melon in the folder of IDSIA's logs.
+    """
     path = find_logs(folder, "melon*")[0]
     log = read_log(path)
     series_errors: dict[str, dict[str, NDArray]] = {"position": {}, "attitude": {}}
     errors: dict[str, NDArray] = {}
     for name in ("cf21B_500", "cf21B_500_idsia"):
         model = Model.create(load_airframe(name), IDSIA_MASS)
+        # Rotor speeds are shifted by the delay that explains the angular acceleration in the log.
         flight = aligned(log, fast_rotation([log], model.params).delays[0])
         errors = prediction_errors([flight], model)
         errors = {key.removesuffix(" (mean)"): x for key, x in errors.items() if key.endswith("(mean)")}
@@ -66,7 +72,10 @@ def open_loop(folder: Path) -> Iterable[Row]:
 
 
 def closed_loop(folder: Path) -> Iterable[Row]:
-    """Yield the ratio of simulated to logged tracking error of each flight."""
+    """Yield the ratio of simulated to logged tracking error of each flight in a folder with NanoBench's logs.
+
+    Flights are circles, figure eights and trefoils. If the real drone crashed, there is no bound.
+    """
     paths = [path for name in ("circle", "figure8", "trefoil") for path in find_logs(folder, f"*{name}*")]
     for row in compare_tracking([read_flight(path) for path in paths], estimator=laboratory_estimator()):
         remark = f"real {row.logged_error:.3f} m, simulated {row.simulated_error:.3f} m"
