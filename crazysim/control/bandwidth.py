@@ -6,8 +6,8 @@ has the characteristic polynomial ``s^3 / a + s^2 + kd s + kp``. The rule here i
     kd = a,   kp = 0.3 a^2,   about yaw with a / 2 or less in place of a, since rotors have less authority there,
 
 which puts the poles of the attitude at -0.39 a and (-0.30 +- 0.82i) a. The position loop is critically damped with a
-natural frequency of 0.12 a: together the five modes then have damping ratios of 0.39 and more (``test_geometric.py`` computes
-them). A controller that runs every 1/freq s acts half a period late, and its input is one period old at worst, which
+natural frequency of 0.12 a: together the five modes then have damping ratios of 0.39 and more
+(``test_geometric.py`` computes them). A controller that runs every 1/freq s acts half a period late, and its input is one period old at worst, which
 counts as lag: ``1 / a = 1 / rotor_rate + 1.5 / freq``.
 
 Two limits lower these rates. First, a large error e turns the drone along the line on which kp e + kd e' = 0, so the

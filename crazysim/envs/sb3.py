@@ -34,8 +34,8 @@ class DroneVecEnv(VecEnv):
     A new episode starts within the step that ends one. The infos of worlds whose episode ended have what
     ``DummyVecEnv`` adds (``terminal_observation``, ``TimeLimit.truncated``), what ``Monitor`` adds (``episode`` with
     ``r``, ``l`` and ``t``), ``error``, the task's error at the end, and ``nonfinite``, which is True if a number was
-    not finite. Other infos are empty. With several drones reward and error are their means, and observations and actions
-    are concatenated, drone after drone.
+    not finite. Other infos are empty. With several drones reward and error are their means, and observations and
+    actions are concatenated, drone after drone.
     """
 
     def __init__(
