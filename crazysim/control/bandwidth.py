@@ -7,8 +7,8 @@ has the characteristic polynomial ``s^3 / a + s^2 + kd s + kp``. The rule here i
 
 which puts the poles of the attitude at -0.39 a and (-0.30 +- 0.82i) a. The position loop is critically damped with a
 natural frequency of 0.12 a: together the five modes then have damping ratios of 0.39 and more
-(``test_geometric.py`` computes them). A controller that runs every 1/freq s acts half a period late, and its input is one period old at worst, which
-counts as lag: ``1 / a = 1 / rotor_rate + 1.5 / freq``.
+(``test_geometric.py`` computes them). A controller that runs every 1/freq s acts half a period late, and its input is
+one period old at worst, which counts as lag: ``1 / a = 1 / rotor_rate + 1.5 / freq``.
 
 Two limits lower these rates. First, a large error e turns the drone along the line on which kp e + kd e' = 0, so the
 rotors have to brake it with (kp / kd)^2 e. If they cannot give as much (``max_ang_acc``), the drone turns faster than
