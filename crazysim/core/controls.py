@@ -64,7 +64,7 @@ class _LevelData(PyTree):
     """Base class with fields of the level's controller as properties, under Crazyflow's names; None if it lacks one."""
 
     controller: ControllerData | None
-    """Controller that follows the commands; None in fitted dynamics, which follow attitudes."""
+    """Controller that follows the commands; None for attitudes in fitted dynamics, which follow them themselves."""
 
     @property
     def params(self) -> Any:

@@ -45,7 +45,8 @@ def state_control(
         data: Data of a simulation built with ``control="state"``.
         controls: Position, velocity, acceleration, quaternion (xyzw), body rates; None with ``pos``.
             (n_worlds, n_drones, 16)
-        check_finite: True to also check JAX arrays, which waits for the device. Other input is always checked.
+        check_finite: True to also check JAX arrays that are not traced, which waits for the device. Other input is
+            always checked.
         pos: Position, world frame, m; None with ``controls``. (..., 3)
         vel: Velocity, world frame, m/s, with ``pos``. (..., 3)
         acc: Acceleration, world frame, m/s^2, with ``pos``. (..., 3)

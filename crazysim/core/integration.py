@@ -24,9 +24,9 @@ DerivFn = Callable[[SimData], SimStateDeriv]
 MAX_ROTATION = 1.0
 """Largest rotation per step about a body axis, rad. Angular velocities are limited to ``MAX_ROTATION * freq``.
 
-No model has damping that would bound the angular velocity under a constant torque. This limit bounds it, to 500 rad/s
-at 500 Hz. For comparison, the gyroscope of a Crazyflie measures up to 35 rad/s (2000 degrees per second; BMI088, data
-sheet).
+The model from first principles has no damping that would bound the angular velocity under a constant torque. This
+limit bounds it, to 500 rad/s at 500 Hz. For comparison, the gyroscope of a Crazyflie measures up to 35 rad/s (2000
+degrees per second; BMI088, data sheet).
 """
 
 

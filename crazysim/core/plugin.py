@@ -1,7 +1,7 @@
 """Plugins: optional parts of a simulation, such as effects, sensors and logs, all added with ``sim.add``.
 
-A plugin is a frozen record of settings. Everything that changes, and every number that the compiled step reads, is in
-its record, ``data.plugins[plugin.name]``. Its methods are written for one drone.
+A plugin is a frozen record of settings. Everything that changes, and every number that may be replaced without
+compiling the step again, is in its record, ``data.plugins[plugin.name]``. Most methods are written for one drone.
 """
 
 from __future__ import annotations
@@ -173,8 +173,8 @@ class Plugin:
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
 
     A subclass lists its settings as annotated fields, including ``name``; it becomes a frozen dataclass. It
-    overrides the methods below that it needs. All methods that take ``data`` are written for one drone: leaves of
-    drones and worlds come without batch axes, ``data.states.pos`` is (3,).
+    overrides the methods below that it needs. Methods that take ``data`` are written for one drone, unless they say
+    otherwise: leaves of drones and worlds come without batch axes, ``data.states.pos`` is (3,).
     """
 
     name: str
@@ -299,7 +299,8 @@ class Plugin:
         """Return the time derivatives of fields of the record that are states of the plugin's own, per second.
 
         The integrator advances them together with the drone's states, in every scheme. ``data`` is of one drone, with
-        all influences applied. A rate has the shape of its field, which is declared with ``leaf("drone", ...)``.
+        the influences of all plugins applied. A rate has the shape of its field, which is declared with
+        ``leaf("drone", ...)``.
         """
         return {}
 
@@ -350,7 +351,7 @@ class Plugin:
         """Draw overlays into the next image of a world, on ``sim.scene``."""
 
     def read(self, data: SimData) -> Any:
-        """Return the plugin's record in the given data.
+        """Return the plugin's record in data of any scope.
 
         Raises:
             UnknownNameError: If the data has none: the plugin was not added, or was removed.
@@ -364,7 +365,7 @@ class Plugin:
         return data.plugins[self.name]
 
     def write(self, data: SimData, record: PyTree) -> SimData:
-        """Return the data with another record of this plugin."""
+        """Return data of any scope with another record of this plugin."""
         return data.replace(plugins=data.plugins | {self.name: record})
 
 

@@ -1,6 +1,6 @@
 """Populations: all things of one kind in a world besides its drones, such as cars, loads or free bodies.
 
-A population is a plugin whose record has one row for each member. Its methods are written for one member; scopes,
+A population is a plugin whose record has one row for each member. Most methods are written for one member; scopes,
 masks, seeds, sharding, engines and gradients treat members as they treat drones.
 """
 
@@ -35,9 +35,10 @@ R = TypeVar("R", bound=Members)
 class Population(Plugin):
     """Base class of populations, which ``sim.add`` adds.
 
-    A subclass overrides ``record``, ``derivative`` and any other method it needs. The methods that take ``data`` are
-    written for one member: leaves of the population and of worlds come without batch axes, leaves of other populations,
-    drones included, as (n_members, ...), which they may only read. ``self.read(data)`` is the record of the member.
+    A subclass overrides ``record``, ``derivative`` and any other method it needs. ``control``, ``derivative`` and
+    ``reset_episode`` are written for one member: leaves of the population and of worlds come without batch axes, leaves
+    of other populations, drones included, as (n_members, ...), which they may only read. ``self.read(data)`` is the
+    record of the member. ``influence`` is written for one drone, as in other plugins.
 
     A population has up to two stages, whose scope is its name: its controller runs before the integration of the
     drones, its own integration after it.
@@ -52,7 +53,7 @@ class Population(Plugin):
     positions: ClassVar[tuple[str, ...]] = ("pos",)
     """Fields that the scheme ``symplectic_euler`` advances with the new values of the other states."""
     command_field: ClassVar[str | None] = None
-    """Field of the record that ``command`` writes; None for a population without commands."""
+    """Field of the record that ``with_command`` writes; None for a population without commands."""
 
     @property
     def scope(self) -> str:

@@ -28,7 +28,7 @@ from crazysim.tables import ANY_NUMBER, Range, Shapes, range_between, read_numbe
 E = TypeVar("E", bound=Enum)
 
 MAX_ITERATIONS = 1000
-"""Largest number of iterations of a contact solver; the defaults are 8 to 20."""
+"""Largest number of iterations of a contact solver; the defaults are 8 to 30."""
 MAX_FRICTION = 1000.0
 """Largest coefficient of friction; rubber has about 1."""
 MAX_SOFTNESS = 10.0
@@ -258,7 +258,7 @@ def find_device(device: str | jax.Device) -> jax.Device:
     """Return the device with a name such as ``cpu`` or ``gpu:1``.
 
     Raises:
-        ConfigError: If there is no such device, or on another host; the message lists all devices of this host.
+        ConfigError: If there is no such device on this host.
     """
     if isinstance(device, jax.Device):
         if device.process_index != jax.process_index():
@@ -341,8 +341,10 @@ def control_freqs(
     Args:
         control: Command level.
         freq: Rate of physics steps, Hz.
-        rates: Requested rates, Hz; None for the default, the largest divisor of ``freq`` up to 500 Hz.
-        controller: Controller of the command level, from ``controller_at_rates``; None if commands need none.
+        rates: Requested rates, Hz, of which the rate of the last level is used; None for the default, the largest
+            divisor of ``freq`` up to 500 Hz.
+        controller: Controller of the command level, from ``controller_at_rates``, which has the rates of its levels;
+            None if commands need none.
     """
     followers, last_level = controller_chain(controller, control)
     freqs = {}

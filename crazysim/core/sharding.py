@@ -35,7 +35,7 @@ class Location(NamedTuple):
 
     @property
     def is_distributed(self) -> bool:
-        """True for several devices."""
+        """True for several devices, or with a mesh."""
         return self.mesh is not None or (self.devices is not None and len(self.devices) > 1)
 
 

@@ -34,14 +34,14 @@ Phase = Literal["before", "each", "after"]
 PHASES: tuple[Phase, ...] = ("before", "each", "after")
 
 RESERVED_SCOPES = ("batch", "batched", "shared", "opaque", "parameter", "member")
-"""Names of other scopes, which are not allowed as the scope of a stage or the name of a population."""
+"""Names of scopes that ``stage`` does not accept, and that no population may have as its name."""
 
 
 class Stage:
     """A function ``SimData -> SimData``, with the scope that the function is written for.
 
     When the stage is called with the data of a simulation, it applies the function to every drone, to every member of a
-    population, or to every world.
+    population, or to every world; with the scope ``"batch"``, to the data of all worlds at once.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Stage:
         return _apply_in_all_worlds(self, data)
 
     def apply_unbatched(self, data: SimData) -> SimData:
-        """Return the data after the stage, for data of the scope that the stage is written for."""
+        """Return the data after the stage, for data of its scope, or with any leading axes if it is ``batched``."""
         data_after = self.fn(data)
         mask = None if self.when is None else self.when(data)
         if mask is None:
@@ -123,8 +123,8 @@ def stage(
 
     Args:
         scope: ``"drone"``, ``"world"`` or the name of a population.
-        when: Condition ``when(data)``, (): True if the stage acts at this step. None for a stage that always acts. An
-            engine skips a stage at steps at which it acts nowhere.
+        when: Condition ``when(data)``, (): True if the stage acts at this step. None for a stage that always acts. At
+            steps at which it acts nowhere, an engine may skip the stage.
         phase: Time within a call of the step function: ``"before"`` the first physics step, at ``"each"`` physics step,
             or ``"after"`` the last.
     """

@@ -166,13 +166,16 @@ def increment_steps(data: SimData) -> SimData:
 
 
 def watched_records(data: SimData) -> Any:
-    """Return the records in which NaN or infinity flags a world: states and commands of drones, other populations."""
+    """Return the records in which NaN or infinity flags a world: states and controls of drones, other populations."""
     populations = [record for record in data.plugins.values() if isinstance(record, Members)]
     return data.states, data.controls, populations
 
 
 def nonfinite_worlds(data: SimData) -> Array:
-    """Return True for worlds that are flagged, hold NaN or infinity in a state or command, or exceed ``MAX_STEPS``.
+    """Return True for worlds that are flagged, hold NaN or infinity, or exceed ``MAX_STEPS``.
+
+    NaN and infinity count in ``watched_records``, in all leaves of drones and members: states, commands, memory of
+    controllers, and gains that are one per drone.
 
     A count of steps beyond ``MAX_STEPS`` wraps around and is negative, as one call takes at most that many. The data
     may be of all worlds or of one world.

@@ -10,11 +10,11 @@ from crazysim.errors import ConfigError, EngineWarning, UnsupportedError, warn
 
 
 class LimitError(UnsupportedError):
-    """A documented limit of the engine, for which a stage runs unfused without a warning."""
+    """A documented limit of the engine: a stage runs unfused, or a derivative on lanes, without a warning."""
 
 
 class KernelError(UnsupportedError):
-    """A kernel that its compiler refused, or did not finish in time."""
+    """A kernel that could not be compiled, loaded or launched."""
 
 
 def report_unsupported(problems: Sequence[str], strict: bool, reported: set[str], remedy: str) -> None:

@@ -64,7 +64,8 @@ class ZerosCache:
 
     Only parameters of drones and controllers, and parameters of plugins that are declared sparse, are examined.
 
-    Values are read once for each array. Under a trace they are unknown, and no element counts as zero.
+    Values are read again only after one of the arrays was replaced. Under a trace they are unknown, and no element
+    counts as zero.
     """
 
     def __init__(self) -> None:

@@ -5,7 +5,7 @@ steps and reads uses few of them as JAX arrays, so a JAX array is made only when
 
 Memory that a kernel has read or written does not change afterwards. A kernel reads JAX arrays through NumPy views; as
 long as a view exists, JAX copies the buffer instead of reusing it for a donated array. It also reads commands, which
-are copies, and results of the previous call. It writes into new memory, which is never written again.
+are copies, and results of earlier calls. It writes into new memory, which is never written again.
 """
 
 from __future__ import annotations

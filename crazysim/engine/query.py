@@ -37,7 +37,8 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     """Return the results of some functions for every drone. (n_worlds, n_drones, ...) each
 
     Args:
-        queries: The functions. They receive data as stages do: a function of one world gets leaves (n_drones, ...).
+        queries: The functions. They receive data as stages do, but without records of plugins: a function of one world
+            gets leaves (n_drones, ...).
         data: The simulation.
         platform: ``"cpu"`` or ``"gpu"``.
 

@@ -127,7 +127,7 @@ class Step:
             strict: True to raise an error instead of an ``EngineWarning`` and the use of a slower engine.
 
         Raises:
-            ConfigError: If the engine cannot run here.
+            ConfigError: If there is no engine of that name, or it cannot run here.
         """
         if engine not in ENGINES:
             raise ConfigError(f"engine {engine!r} does not exist; choose one of {', '.join(ENGINES)}")
@@ -250,7 +250,7 @@ class Step:
 
     @property
     def engines(self) -> list[str]:
-        """Engines that have run it so far, sorted and without repetition."""
+        """Engines of all plans so far, sorted and without repetition."""
         return sorted({plan.engine for plan in self._plans.values()})
 
     def _cache_size(self) -> int:

@@ -18,7 +18,7 @@ Run = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
 """Function that takes the leaves of all worlds and a number of steps. It returns the written leaves after these steps,
 and True for worlds that are flagged as not finite, (n_worlds, 1).
 
-If the number of steps is a Python number, the loop can be differentiated in reverse mode.
+If the number of steps is a Python number, the loop can be differentiated in reverse mode, except in ``interpret``.
 """
 
 

@@ -54,7 +54,8 @@ MAX_GRADIENT_MEMORY_BYTES = 2**30
 """Maximum memory for the states that the kernel of a gradient stores, bytes."""
 
 RESIDENT_LANES = 2**16
-"""Maximum number of lanes that run at once on a GPU with 132 multiprocessors; gradients get memory for this number."""
+"""Number of lanes that run at once on a GPU with 132 multiprocessors, about 500 on each; gradients get memory for this
+number."""
 
 DEFAULT_ARCHITECTURE = "compute_90"
 """Architecture to compile for on a machine without a GPU."""

@@ -84,8 +84,8 @@ class DerivativeSpec(NamedTuple):
     """Description of a derivative of a program, which the primitives take as a static parameter.
 
     The operands are the leaves in ``array_leaves``, then the tangents of ``perturbed``, or the cotangents of the floats
-    that are written. Under ``vmap`` arrays of drones or worlds hold ``size`` batches of worlds, one after another;
-    tangents and cotangents of shared leaves have a leading axis for the batches. (size, ...)
+    that are written. Under ``vmap`` arrays of drones or worlds hold ``n_batches`` batches of worlds, one after
+    another. Tangents and cotangents of shared leaves always have a leading axis for the batches. (n_batches, ...)
     """
 
     kernels: DerivativeKernels

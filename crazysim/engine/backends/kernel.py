@@ -1,6 +1,7 @@
 """One kernel for many steps: the source of a program, from loads to stores.
 
 From the first step to the last, the numbers of one drone stay in variables, which are registers if there are enough.
+In worlds of more coupled drones than fit into a vector, kernels on the host keep them in memory.
 """
 
 from __future__ import annotations

@@ -277,7 +277,11 @@ def repeat(iterate: Callable[[Any], Any], carry: Any, n: int) -> Any:
 
 
 def nonfinite_worlds(program: Program, values: LeafValues) -> Array:
-    """Return True for worlds that were flagged before or have a watched value that is not finite. (n_worlds, 1)"""
+    """Return True for worlds that were flagged, hold a watched value that is not finite, or took too many steps.
+
+    Returns:
+        (n_worlds, 1), False for all without a check
+    """
     check = program.check_segment
     if check is None:
         return values.library.zeros((values.n_worlds, 1), bool)

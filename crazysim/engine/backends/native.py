@@ -99,8 +99,8 @@ class HostLaunch:
     def on_memory(self) -> Callable[[int, int, Any, int], int]:
         """Return the kernel as a function on memory, which does not use XLA and returns when the kernel is done.
 
-        It takes the numbers of lanes and of steps, the addresses of inputs and outputs (a ``ctypes`` array), and the
-        number of inputs. It returns 0 if it could not allocate memory.
+        It takes the numbers of lanes and of steps, the addresses of inputs and outputs as pointers in ``bytes``, and
+        the number of inputs. It returns 0 if it could not allocate memory.
         """
         call = _LIBRARIES[self._name].crazysim_call
         call.restype = ctypes.c_int

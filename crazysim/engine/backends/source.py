@@ -149,7 +149,7 @@ class Writer(LineWriter):
         self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
 
     def _lookup(self, op: Operation, args: list[str], depth: int) -> None:
-        """Write a read of an entry, with its three neighbours if they are read too."""
+        """Write a read of an entry, with the others of its group of four if at least two of them are read too."""
         offset, key = op.param("offset"), _entry_group(op)
         if key not in self.entry_groups:
             name = self.names[op.results[0]] = self.new_name()

@@ -1,4 +1,4 @@
-"""Blocks as XLA operations: every value is an array over lanes, one for each drone."""
+"""Blocks as XLA operations: a value is an array over lanes, a scalar that all lanes share, or a table."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Algebraic simplification of operations with constant operands.
 
-Only identities that hold for every number are used: ``x * 1``, ``x / 1``, ``x - 0`` and, as in XLA, ``x + 0``, although
-it loses the sign of a negative zero. ``x * 0`` is not simplified, because it is NaN where x is infinite.
+Only identities that hold for every number are used, such as ``x * 1``, ``x / 1``, ``x - 0`` and, as in XLA, ``x + 0``,
+although it loses the sign of a negative zero. ``x * 0`` of floats is not simplified, because it is NaN where x is
+infinite.
 
 Zeros of shared parameters are an exception (``known_zero``): terms that they multiply are removed, such as terms of a
 diagonal inertia or of an absent drag. If a state in such a term is infinite or NaN, the result is the sum of the other

@@ -21,11 +21,11 @@ def is_enabled() -> bool:
 
 
 def write(name: str, text: str) -> Path | None:
-    """Write a text into the folder, in a file whose name begins with a running number.
+    """Write a text into the folder, in a file whose name begins with the process ID and a running number.
 
     Args:
-        name: Name of the text, such as ``"attitude_controller.jaxpr"``; characters other than letters and digits
-            become underscores.
+        name: Name of the text, such as ``"attitude_controller.jaxpr"``; characters other than letters, digits, points
+            and hyphens become underscores.
         text: Text to write.
 
     Returns:

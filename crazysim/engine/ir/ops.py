@@ -1,8 +1,8 @@
 """The table of operations: meaning and name of each one in every target.
 
 Programs contain no other operations. A row gives the types of numbers that an operation takes, its form in NumPy (for
-constants and for the interpreter), in XLA, in C++ and CUDA, and in CasADi, and its cost. When a step is planned, a
-target refuses programs with operations that it has no form for (``unsupported_error``).
+constants and for the interpreter), in XLA, in C++ and CUDA, and in CasADi, and its cost. A target
+refuses programs with operations that it has no form for.
 
 Integers and conversions follow XLA, which defines what C leaves undefined: the quotient of a division by zero is -1
 (all bits set), its remainder the dividend; a shift by the size of the type or more gives 0, or all sign bits; a float
@@ -54,7 +54,7 @@ class OperationForm:
     cost: float = 1
     """Cost in multiply-adds."""
     structured: bool = False
-    """True where each target implements the operation separately, because it runs blocks or has several results."""
+    """True where each target implements the operation separately, because it is not one expression of its operands."""
 
     def accepts(self, dtypes: Sequence[np.dtype]) -> bool:
         """Return True if the operation is defined for operands of these types."""

@@ -40,7 +40,7 @@ class Leaf:
     name: str
     """Path of the field in ``SimData``."""
     scope: str
-    """Scope of the field: ``drone``, ``world``, ``shared`` or ``opaque``."""
+    """Scope of the field: ``drone``, ``world``, ``batched``, ``shared`` or ``opaque``."""
     shape: tuple[int, ...]
     """Shape, for all worlds."""
     dtype: Any

@@ -39,7 +39,8 @@ class _Access(NamedTuple):
 def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Group]:
     """Return the groups of populations that do not depend on each other. The group of the drones comes first.
 
-    Two stages depend on each other if one reads or writes a leaf that the other writes. Stages that only use leaves of
+    Two stages depend on each other if they act on the same population, or if one reads or writes a leaf that the other
+    writes. Stages that only use leaves of
     worlds, such as the clock, are repeated in every group that reads their results.
 
     Args:
@@ -90,7 +91,7 @@ def _find_clocks(accesses: Sequence[_Access], axes: Axes) -> set[int]:
 
 
 def _find_components(stages: Iterable[int], accesses: Sequence[_Access]) -> list[set[int]]:
-    """Return sets of stages that depend on each other, or write the same populations."""
+    """Return sets of stages that depend on each other, directly or through other stages."""
     parts: list[set[int]] = []
     for k in stages:
         component, other_parts = {k}, []

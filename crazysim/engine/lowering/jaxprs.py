@@ -5,7 +5,7 @@ NumPy object array of elements (``ir``). A rule defines a primitive on elements.
 primitives need no rule of their own:
 
 - element-wise: the same operation for every element;
-- movement: nothing is computed, so the primitive is run once on the indices of the elements;
+- movement: nothing is computed, so the primitive is run once, on the elements themselves or on their indices;
 - reduction: the operations are unrolled;
 - structure: calls are inlined, branches become selections, and loops remain loops.
 """
@@ -34,7 +34,8 @@ RULES: dict[str, Rule] = {}
 """Rules by the name of the primitive."""
 
 MAX_UNROLL = 64
-"""Longest scan with inputs or outputs per iteration, and largest range of a run-time index, that is unrolled."""
+"""Longest scan with inputs or outputs per iteration, longest sort, and largest range of a run-time index, that is
+unrolled."""
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
@@ -83,7 +84,7 @@ class Lowering:
         """Return the results of a jaxpr for arrays of elements.
 
         Raises:
-            UnsupportedError: If it has a primitive without a rule.
+            UnsupportedError: If it has a primitive without a rule, or a use of one that its rule does not support.
         """
         env: dict[Any, ElementArray] = {}
 
@@ -220,7 +221,7 @@ def lower_function(fn: Callable[..., Any], *avals: Any) -> Block:
         avals: Shapes and types of the arguments.
 
     Raises:
-        UnsupportedError: If it has a primitive without a rule.
+        UnsupportedError: If it has a primitive without a rule, or a use of one that its rule does not support.
     """
     lowering = Lowering()
     args = [inputs(lowering.builder, x) for x in jax.tree.leaves(avals)]

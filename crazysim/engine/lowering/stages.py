@@ -22,7 +22,8 @@ from crazysim.jaxcompat import equations, is_key
 from crazysim.pytree import leaf_flags
 
 MAX_UNROLLED_DRONES = 8
-"""Maximum number of drones per world for which stages of scope ``world`` are lowered; blocks grow as its square."""
+"""Maximum number of drones per world for which stages of scope ``world`` that use leaves of drones are lowered, and of
+members of other populations that a stage uses; blocks grow as its square."""
 
 
 def lower_stages(

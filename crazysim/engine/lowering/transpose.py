@@ -2,7 +2,7 @@
 
 The derivatives of operations come from JAX: the VJP of an operation is traced once for each combination of types, and
 lowered like any other function. The returned block first computes the whole block forward. The backward pass then goes
-through it part by part. For each part, it recomputes the results that the derivatives need.
+through it part by part. For each part but the last, it recomputes the results that the derivatives need.
 """
 
 from __future__ import annotations

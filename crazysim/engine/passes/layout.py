@@ -16,8 +16,8 @@ from crazysim.jaxcompat import is_key
 def pack_shared(program: Program) -> Program:
     """Read the numbers that all drones share from one additional leaf, which concatenates the shared leaves.
 
-    A call of a compiled step takes longer the more arrays it has. Leaves that unfused stages read, and
-    leaves that are read as tables, stay separate.
+    A call of a compiled step takes longer the more arrays it has. Leaves that unfused stages read, that stages write,
+    that are read as tables, or whose type is not that of the first leaf, stay separate.
     """
     leaves = program.leaves
     separate_leaves = {leaf for stage in program.unfused_stages for leaf in stage.input_leaves} | program.tables

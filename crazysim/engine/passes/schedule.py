@@ -128,7 +128,8 @@ def _add_barriers_to_block(block: Block) -> Block:
 def hoist(program: Program) -> Program:
     """Move expensive values that no step changes out of the loop over steps.
 
-    A division by such a value becomes a product with its inverse, which adds one rounding error.
+    A division of a changing value by a constant, or by a value that no step changes, becomes a product with the
+    inverse, which adds one rounding error.
     """
     changing = program.changing_slots()
     return dataclasses.replace(

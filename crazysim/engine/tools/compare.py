@@ -42,8 +42,8 @@ class Difference:
     engines: tuple[str, str]
     """Names of the engines."""
     operation: str = ""
-    """First operation of the stage whose result differs from that of the interpreter; empty if there is none, or if
-    neither engine runs a program."""
+    """First operation of the stage whose result differs from that of the interpreter; empty if there is none, if
+    neither engine compiles programs, or if the stage is not fused."""
 
     def __str__(self) -> str:
         (a, b), (x, y) = self.engines, self.values

@@ -1,4 +1,4 @@
-"""Rules for primitives that only move elements: they are run once, on the indices of the elements."""
+"""Rules for primitives that only move elements: they are run once, on the elements themselves or on their indices."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _source_indices(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
         case "pad":
             return [_pad(x, args[1], p["padding_config"])]
         case "gather":
-            return evaluate(eqn, args, fill_value=0)  # never used: all indices are in bounds
+            return evaluate(eqn, args, fill_value=0)  # not used: in bounds, or a mode that does not fill
     return evaluate(eqn, args)
 
 
