@@ -29,7 +29,8 @@ from crazysim.storage import FOLDER_REMEDY, make_private_folder, untrusted_reaso
 CACHE_VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
 MAX_CACHE_BYTES = 1_000_000_000
-"""Size of all files, bytes, above which the oldest are removed when the cache is first used: about 5,000 programs."""
+"""Size of all files, bytes, above which the least recently used are removed when the cache is first used: about 5,000
+programs."""
 TRIMMED_FRACTION = 0.8
 """Fraction of the limit to which a removal reduces the size, so that not every process has to remove files."""
 MIN_FREE_BYTES = 50_000_000
@@ -62,7 +63,7 @@ def default_cache() -> Path | None:
     has a subfolder of its own.
 
     Raises:
-        ConfigError: If ``CRAZYSIM_CACHE`` is not set and the user has no home folder.
+        ConfigError: If the path depends on a home folder that does not exist.
     """
     root = _root_folder()
     return None if root is None else root / f"cpu-{hashlib.sha256(cpu_features().encode()).hexdigest()[:8]}"

@@ -76,7 +76,7 @@ class ConfigError(ValueError):
 
 
 class UnknownNameError(ConfigError, KeyError):
-    """A name that does not exist: an airframe, a mode, a body, a camera or a stage."""
+    """A name that does not exist, such as one of an airframe, a controller, a mode, a body, a camera or a stage."""
 
     def __str__(self) -> str:
         """Return the message itself; ``KeyError`` would show its quoted form."""

@@ -103,8 +103,8 @@ _TEMPLATE, _READ = "_template", "_read"
 def lazy_record(template: T, read: Callable[[Any], Any]) -> T:
     """Return the record whose leaves are ``read(x)`` for the leaves of a template, each made when it is first read.
 
-    It behaves like any other record: JAX, ``replace`` and ``copy`` read all fields. To list its fields, use
-    ``dataclasses.fields``: ``vars`` returns only fields that have been read.
+    Leaves of fields with a default are made at once. The record behaves like any other: JAX, ``replace`` and ``copy``
+    read all fields. To list its fields, use ``dataclasses.fields``: ``vars`` returns only fields that have been read.
 
     Args:
         template: A record of the same structure.

@@ -159,12 +159,12 @@ def z_axis(q: Array) -> Array:
 
 
 def integrate_attitude(q: Array, ang_vel: Array, dt: float, normalize: bool = True) -> Array:
-    """Return the attitude after a rotation with a constant angular velocity, for small angles. (..., 4)
+    """Return the attitude after a rotation with a constant angular velocity by at most half a turn. (..., 4)
 
     The result is ``q (sin(h) ang_vel / |ang_vel|, cos(h))`` with half the angle ``h = |ang_vel| dt / 2``, up to
-    rounding, for rotations of at most half a revolution. ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of a
-    physics step. A normalised result needs only their ratio, which is the ratio of imaginary to real part of the
-    numerator of the Pade approximation of ``exp(2ih)``. Otherwise both are Taylor polynomials.
+    rounding. ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of a physics step. A normalised result needs
+    only their ratio, which is the ratio of imaginary to real part of the numerator of the Pade approximation of
+    ``exp(2ih)``. Otherwise both are Taylor polynomials.
 
     Args:
         q: Attitude, body to world, unit, xyzw. (..., 4)

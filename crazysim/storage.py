@@ -110,8 +110,8 @@ def wrap_read_errors(path: str | Path, content: str, remedy: str) -> Iterator[No
         remedy: Sentence about what to do.
 
     Raises:
-        DamagedFileError: If the block raises another error than ``ConfigError``.
         ConfigError: If the file does not exist.
+        DamagedFileError: If it exists, and the block raises an error other than ``ConfigError`` and ``ImportError``.
     """
     try:
         yield
@@ -263,7 +263,8 @@ def read_arrays(file: BinaryIO, name: str) -> dict[str, NDArray]:
         name: Name of the file, for messages.
 
     Raises:
-        ConfigError: If it unpacks to much more than its size.
+        ConfigError: If it has more than ``MAX_ARRAYS`` arrays, unpacks to much more than its size, or has an array with
+            fewer bytes than its header states.
         Exception: Of any type, if it is damaged; see ``wrap_read_errors``.
     """
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * file.seek(0, os.SEEK_END))
@@ -314,6 +315,8 @@ def make_private_folder(folder: Path) -> None:
 
 def untrusted_reason(path: Path) -> str:
     """Return the reason why another user could have written a file or folder, for a message; empty if none could.
+
+    Groups that can write to a parent folder are trusted.
 
     Args:
         path: The file or folder. One that cannot be read is not trusted.

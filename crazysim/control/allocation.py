@@ -37,7 +37,7 @@ class AllocationParams(PyTree):
     def create(airframe: Airframe) -> AllocationParams:
         """Return the parameters of an airframe, shared by all drones.
 
-        ``torque_arms`` documents where the drag torque over thrust comes from.
+        The function ``torque_arms`` documents where the drag torque over thrust comes from.
         """
         curve = airframe.value("rotors.thrust_curve")
         return AllocationParams(

@@ -22,7 +22,7 @@ CONTROLLERS = {
     "load_lqr": "crazysim.control.load_lqr:LoadLQR",
     "tracking_lqr": "crazysim.control.tracking_lqr:TrackingLQR",
 }
-"""Controllers by name, as ``"module:class"``; each is imported at its first use."""
+"""Controllers by name, as ``"module:class"``, which ``find_controller`` imports."""
 
 
 def find_controller(controller: Any, switch: Any = None) -> Controller:

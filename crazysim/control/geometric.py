@@ -202,7 +202,7 @@ class Geometric(Controller):
     """Rate at which the integral of the position error compensates a constant force, 1/s: the ratio of the integral
     gain to the position gain on each axis. 0 for no integral and no memory. Without delays, the loop is stable below
     the ratio of ``kv`` to the mass. Errors for which the position gain alone demands more than ``MAX_INTEGRAL_RATIO``
-    are not integrated."""
+    times gravity are not integrated."""
 
     def params(self, airframe: Airframe) -> GeometricParams:
         if not (np.isfinite(self.integral) and self.integral >= 0):

@@ -69,9 +69,9 @@ def lqr_weights(
     The default follows Bryson's rule: each weight is one over the square of an acceptable error. The acceptable
     position error is 1 m. The acceptable velocity, tilt, body rates, thrust and torque are the values with which the
     rule of ``crazysim.control.bandwidth`` would answer such an error: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with
-    the natural frequency w of the position loop and the attitude stiffness k. Yaw has the same value as roll and pitch.
-    The acceptable angle of a rod shifts its load by 1 m, which is 1 / length rad; the acceptable rate is w times as
-    much.
+    the natural frequency w of the position loop, the attitude stiffness k, and the mass m with the load. Yaw has the
+    same value as roll and pitch. The acceptable angle of a rod shifts its load by 1 m, which is 1 / length rad; the
+    acceptable rate is w times as much.
 
     Args:
         airframe: The airframe.

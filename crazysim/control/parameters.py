@@ -1,4 +1,4 @@
-"""Parameters of the firmware's controllers, where Crazyflow has them."""
+"""Parameters of Crazyflow's controllers, importable under the same module path as in Crazyflow."""
 
 from crazysim.dynamics.parameter_tables import load_controller_fn_params as load_fn_params
 from crazysim.dynamics.parameter_tables import load_controller_params as load_params

@@ -93,7 +93,8 @@ class Controller:
     inner: Controller | None = None
     """Controller that follows the commands of this one; None if the allocation, rotors or fitted dynamics do."""
     follows_feedforward: ClassVar[bool] = True
-    """True if it follows the ``feedforward`` of a state command; if False, a command with feedforward is an error."""
+    """True if a state command may have a ``feedforward``, which ``PID`` and ``Mellinger`` accept but do not use. If
+    False, a command with feedforward is an error."""
     follows_rates: ClassVar[bool] = False
     """True if it follows an attitude command together with ``data.controls.attitude.staged_ang_vel_des``."""
 

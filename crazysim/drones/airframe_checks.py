@@ -14,7 +14,7 @@ MAX_ROTORS = 64
 MAX_THRUST_TO_WEIGHT = 1000
 """Largest ratio of thrust to weight; racers have about 20."""
 MAX_ANG_ACC = 1e6
-"""Largest angular acceleration by the rotors, rad/s^2; built-in airframes have up to 14,000."""
+"""Largest angular acceleration by the rotors, rad/s^2; built-in airframes have up to 3,600."""
 MAX_ROTOR_VEL = 1e6
 """Largest rotor speed, rpm; built-in airframes have up to 40,000."""
 MIN_SINGULAR_VALUE = 1e-3

@@ -24,11 +24,12 @@ AIR_DENSITY = 1.225
 PITCH_RATIO = 0.5
 """Pitch over diameter of a propeller whose pitch is not given, 1."""
 OUTER_MASS_SHARE = 0.4
-"""Fraction of the mass that is located at the rotors, 1; the built-in airframes have 0.31 to 0.52."""
+"""Fraction of the mass that is located at the rotors, 1; the inertias about z of the built-in airframes correspond to
+0.31 to 0.53."""
 MERIT_DIAMETERS, FIGURES_OF_MERIT = (0.127, 0.254), (0.44, 0.68)
 """Diameters of propellers of 5 and 10 inches, m, and their figures of merit in hover, 1."""
 DRAG_RATE = 0.45
-"""Linear drag over mass, 1/s; the built-in airframes that were identified from flights have 0.35 to 0.58."""
+"""Linear drag over mass, 1/s; the built-in airframes that were identified from flights have 0.29 to 0.58."""
 ROTOR_TIME_CONSTANT = 0.05
 """Time constant of rotors up to 10 inches, s."""
 MAX_TABLE_ERROR = 0.05

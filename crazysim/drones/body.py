@@ -23,7 +23,7 @@ MATERIALS = {
 """Colours that all drones share, rgba."""
 
 BATTERY_VOLUME = 1.2e-4
-"""Volume of a derived battery over the mass of the drone, m^3/kg; the built-in airframes have 0.8e-4 to 1.5e-4."""
+"""Volume of a derived battery over the mass of the drone, m^3/kg; the built-in airframes have 0.8e-4 to 1.7e-4."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ def body_shape(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
 
 
 def body_geoms(airframe: Airframe) -> list[BodyGeom]:
-    """Return arms, motors, propeller discs, plate, battery, two LEDs, and the two collision geoms.
+    """Return plate, battery, nose bar, arms, motors, propeller discs, two LEDs, and the two collision geoms.
 
     Only ``col_sphere`` and ``col_box`` collide; all other geoms are rendered.
     """

@@ -32,7 +32,8 @@ def load_airframe(source: AirframeSource) -> Airframe:
 
     A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
     the key ``base``, the name or path of another airframe, only the numbers that differ from it are given. If one of
-    ``BODY_KEYS`` differs, gains and fits (``TUNED_TABLES``) are not inherited.
+    ``BODY_KEYS`` differs, gains and fits (``TUNED_TABLES``) are not inherited, except for ``controller.thrust2torque``
+    where neither the thrust curve nor the torque curve is given.
 
     Args:
         source: Name of a built-in airframe, path of a ``.toml`` file, dict, or an airframe (returned as is).

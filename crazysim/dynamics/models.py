@@ -61,7 +61,8 @@ def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
     """Check that the lags and the damping of an airframe are slow enough for the rate of the physics.
 
     Raises:
-        ConfigError: If a rate is above ``MAX_LAG_STEP * freq``; the message states the lowest ``freq`` that suffices.
+        ConfigError: If a rate is above ``MAX_LAG_STEP * freq``; the message states the lowest ``freq`` that suffices
+            for the first such rate.
     """
     numbers, mass = airframe.values, airframe.value("rigid_body.mass")
     rates_by_path: dict[str, np.ndarray] = {}

@@ -13,7 +13,7 @@ MAX_EXPLICIT_ANGLE = 0.04
 This is 20 rad/s at 500 Hz. A free wobble then grows by at most 0.04^2 / 2 of its size per step.
 """
 MIN_STABLE_ANGLE = 0.06
-"""Rotation per step, rad, above which no free wobble grows with ``stable_angular_acceleration``."""
+"""Rotation per step, rad, from which on, up to 1 rad, no free wobble grows with ``stable_angular_acceleration``."""
 
 
 def linear_acceleration(force: Array, mass: Array, gravity_vec: Array) -> Array:

@@ -20,7 +20,7 @@ def field_ray(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Arr
     """Return the distance along rays to a height field, and its outward normal at the hit.
 
     As in MuJoCo, a height field is a box up to z = 0, a surface above it, and walls between them. A ray from inside
-    ends on the surface, on a wall, or at z = 0, even though the ground continues below.
+    ends on the surface, on a wall, on the bottom, or at z = 0, even though the ground continues there.
 
     Args:
         shape: Height field.

@@ -112,7 +112,7 @@ def _best_face_normal(pair: ShapePair) -> BestDirection:
 
 
 def _best_ellipsoid_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
-    """Return the best of a direction and the normals of an ellipsoid at its points nearest to corners of the other."""
+    """Return the best of a direction and of an ellipsoid's normals nearest to corners of the box or segment."""
     shortest = min(range(3), key=lambda k: pair.other.size[k])
 
     def try_corner(k: Array, best: BestDirection) -> BestDirection:

@@ -14,7 +14,7 @@ from crazysim.errors import ConfigError
 LEVEL_DURATION = 0.1
 """Duration at the start of a log over which its attitude is taken to be level, s."""
 OUTLIER_DISTANCE = 0.3
-"""Distance from the median over ``MEDIAN_DURATION`` beyond which a position is an outlier, m."""
+"""Distance along an axis from the median over ``MEDIAN_DURATION`` beyond which a position is an outlier, m."""
 MEDIAN_DURATION = 0.1
 """Duration over which the median is taken, s; over longer ones, fast turns look like outliers."""
 CUTOFFS = {"translation": 6.0, "rotation": 8.0}
@@ -32,7 +32,7 @@ def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
         The same, with ``dt``, s, (n - 1,), and ``rpy``, rad, (n, 3).
 
     Raises:
-        ConfigError: If a column is missing or the time does not increase.
+        ConfigError: If a column is missing, the time does not increase, or nearly all positions are outliers.
     """
     keys = ("time", "pos", "quat", "cmd_rpy", "cmd_f")
     if missing := [key for key in keys if key not in data]:

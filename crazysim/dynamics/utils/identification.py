@@ -21,7 +21,8 @@ logger = logging.getLogger(__name__)
 RATE_RANGE = (0.5, 500.0)
 """Range of the rate of the thrust's lag that is searched, 1/s."""
 BLOCK_DURATION = 5.0
-"""Duration of the blocks whose scatter gives the standard deviations, s."""
+"""Duration of the blocks whose scatter gives the standard deviations of the rotation, s. The translation has ten blocks
+for each log on average."""
 EDGE_DURATION = 0.5
 """Duration at both ends of a log, s, that is omitted: the 6 Hz filters start there at rest, with a wrong velocity."""
 FITTED_MODELS = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
