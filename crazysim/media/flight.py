@@ -24,7 +24,7 @@ class Flight:
     """Poses in some worlds over time, and the geoms to draw."""
 
     time: NDArray
-    """Times, s; the first is 0. (n,)"""
+    """Times, s; the first is 0, unless ``Recorder.add`` was called with other times. (n,)"""
     pos: NDArray
     """Positions of the drones, world frame, m. (n, n_worlds, n_drones, 3)"""
     quat: NDArray

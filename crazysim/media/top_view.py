@@ -27,7 +27,8 @@ MIN_PIXELS = 8
 SAMPLES = 2
 """Number of samples along each side of a pixel."""
 EYE_HEIGHT = 1e4
-"""Height from which rays are cast, m: they deviate from the vertical by less than 3 mm for each metre of height."""
+"""Height from which rays are cast, m. They deviate from the vertical by at most 3 mm for each metre of height, unless a
+view is higher than wide."""
 PATH_SECONDS = 1e6
 """Largest duration of a path, s."""
 MAX_COORDINATE = 1e5

@@ -70,7 +70,9 @@ class Trail:
         return (point_time < time - self.seconds - 1e-6) | (point_time > time)
 
     def path(self, world: int) -> NDArray:
-        """Return the positions of the drones of a world since its last reset, oldest first, m. (n, n_drones, 3)
+        """Return the positions of the drones of a world, oldest first, m. (n, n_drones, 3)
+
+        They begin ``seconds`` before the last sample, or at the last reset of the world if that is later.
 
         Args:
             world: Index of the world in the arrays that ``add`` receives.

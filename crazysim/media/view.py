@@ -225,7 +225,10 @@ class View:
 
 
 def _draw_inset(tile: NDArray, picture: NDArray | None) -> None:
-    """Draw a picture with a border at the bottom right of an image, whole pixels enlarged to a third of its width."""
+    """Draw a picture with a border at the bottom right of an image.
+
+    Its pixels are repeated as often as fits into a third of the image's width and half of its height.
+    """
     if picture is None:
         return
     scale = max(min(tile.shape[1] // (3 * picture.shape[1]), tile.shape[0] // (2 * picture.shape[0])), 1)

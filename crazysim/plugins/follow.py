@@ -66,7 +66,8 @@ class Follow(Plugin):
     """State commands from trajectories, each drone with its own trajectory, start and rate.
 
     At every tick of the state controller it stages the setpoint of that time. A drone waits at the first point of its
-    trajectory until it starts, and stays at the last one after the end. Needs ``Sim(control="state")``.
+    trajectory until it starts, and stays at the last one after the end, unless the trajectory repeats. Needs
+    ``Sim(control="state")``.
     """
 
     trajectories: Trajectory | Sequence[Trajectory]

@@ -167,7 +167,7 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     @property
     def reset_stages(self) -> tuple[str, ...]:
-        """Names of the stages that reset plugins in the first step of an episode."""
+        """Names of the stages that repeat, in the first step of an episode, what the reset pipeline does to plugins."""
         resets = self._sim.reset_pipeline
         return tuple([_reset_stage_name(p) for p in self.values() if _in_reset_pipeline(p) and p.name in resets])
 

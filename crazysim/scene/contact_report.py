@@ -292,7 +292,7 @@ class StackedGeoms(NamedTuple):
     """Geoms of one shape, or boxes, at different poses."""
 
     shape: Shape
-    """Shape of all, in its own frame."""
+    """Shape of all, in its own frame; of boxes that differ, the shape of the first."""
     pos: NDArray | Array
     """Origins, m. (n, 3)"""
     rot: NDArray | Array | None

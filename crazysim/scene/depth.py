@@ -72,13 +72,13 @@ class CarriedCamera:
     row: int
     """Index of the drone, or row of the object in ``data.objects``."""
     pos: tuple[float, ...]
-    """Position in the frame of that body, m. (3,)"""
+    """Position relative to that body, in its frame, m; along the world's axes if ``follows_rotation`` is False. (3,)"""
     rot: tuple[tuple[float, ...], ...]
-    """Rotation matrix whose columns are the camera's right, up and back in that frame. (3, 3)"""
+    """Rotation matrix whose columns are the camera's right, up and back along the same axes. (3, 3)"""
     follows_rotation: bool
     """True if the camera turns with that body; False if it only follows the body's position."""
     fovy: float
-    """Vertical field of view, degrees."""
+    """Vertical field of view, degrees; 0 for a ``DroneCamera``, which has directions of its own."""
 
     @classmethod
     def on_drone(cls, camera: DroneCamera, drone: int) -> CarriedCamera:

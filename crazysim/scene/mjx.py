@@ -1,4 +1,4 @@
-"""MJX, imported on first use, since only contacts need it.
+"""MJX, imported on first use, since only contact slots, ``mjx_model`` and ``mjx_data`` need it.
 
 It is imported without NVIDIA Warp: nothing here runs MJX on Warp, whose import would take two more seconds. A program
 that runs MJX on Warp imports ``mujoco.mjx`` or ``warp`` itself, before the first contacts. MJX calls trimesh and

@@ -38,7 +38,8 @@ class Scene:
     """The MuJoCo scene of a simulation.
 
     The scene is updated lazily: ``sync`` does so for all worlds when contacts are requested and the data's flag is
-    clear, ``sync_one`` for the world of an image. Nothing is allocated per world before the first ``contacts``.
+    clear, ``sync_one`` for the world of an image. MJX allocates nothing per world before the first ``contacts`` or use
+    of ``mjx_data``.
     """
 
     spec: mujoco.MjSpec
@@ -202,7 +203,7 @@ class Scene:
         self._compiled_revision = self.revision
 
     def compile_if_edited(self) -> None:
-        """Compile the spec if objects were added since the last compilation."""
+        """Compile the spec if it has another ``revision`` than the compiled model."""
         if self._is_edited:
             self._compile()
             self._compiled_revision = self.revision
@@ -231,7 +232,7 @@ class Scene:
 
     @property
     def mj_data(self) -> mujoco.MjData:
-        """State of the world that was drawn last."""
+        """State of the world that ``sync_one`` wrote last, such as for an image."""
         self.compile_if_edited()
         return self._mj_data
 

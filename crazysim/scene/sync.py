@@ -15,7 +15,7 @@ from crazysim.scene import mjx
 from crazysim.scene.kinematics import N_DUMMY_JOINTS, update_kinematics
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
-"""Modes of cameras that follow a centre of mass. A sync computes centres of mass only for these cameras."""
+"""Modes of cameras that follow a centre of mass. A sync of all worlds computes centres of mass only for these."""
 
 
 @jax.jit

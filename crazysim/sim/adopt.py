@@ -22,7 +22,7 @@ VehicleKind = AirframeSource | type[Population]
 
 
 def known_kinds() -> dict[str, VehicleKind]:
-    """Return the built-in airframes and populations by the prefix of their vehicles' names."""
+    """Return the airframes and populations that need no entry in ``kinds``, by the prefix of their vehicles' names."""
     from crazysim.plugins.vehicles import Bicycles, Cars  # imported only when an MJCF file is read
 
     return {"Crazyflie": "crazyflie", "Bumblebee": "bumblebee", Cars.prefix: Cars, Bicycles.prefix: Bicycles}

@@ -333,7 +333,8 @@ class Sim:
         """Add an effect, a sensor, a log or any other plugin, and return it.
 
         Its record is added to ``data.plugins`` of the data and the default data, its stages to the step pipeline, its
-        influences and states to the integration. Nothing else in the data changes. The step is compiled again.
+        influences and states to the integration, and its objects, if it adds any to the scene, to ``data.objects``.
+        Nothing else in the data changes. The step is compiled again.
 
         Args:
             plugin: The plugin, such as ``crazysim.Wind(velocity=(2, 0, 0))``.
@@ -553,7 +554,7 @@ class Sim:
 
     @property
     def mj_data(self) -> mujoco.MjData:
-        """State of the world that was drawn last."""
+        """State of the world that was drawn last, or passed to ``sync``."""
         return self._scene.mj_data
 
     @property

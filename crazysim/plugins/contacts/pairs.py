@@ -76,7 +76,9 @@ def contacts_between(solids: Solids, pairs: np.ndarray) -> list[PairContacts]:
 def contacts_on_surface(
     solids: Solids, solid_index: int, geom: CollisionGeom, carrier: int, pose: tuple[Array, Array]
 ) -> PairContacts:
-    """Return the contact points of a solid with a geom of any kind: corners and the nearest point.
+    """Return the contact points of a solid with a geom of any kind.
+
+    A ball has one point; a box has its corners and, unless the geom is a plane, its point nearest to the geom.
 
     Args:
         solids: The solids.

@@ -115,7 +115,7 @@ def read_image(path: str | Path) -> np.ndarray:
     MuJoCo reads it, with 8 bits per pixel.
 
     Raises:
-        ConfigError: If MuJoCo cannot read the file as an image.
+        ConfigError: If the file cannot be read, is no PNG image, or has more than ``MAX_PIXELS`` pixels.
     """
     content = read_bytes(path, MAX_FILE_BYTES)
     size = struct.unpack(">II", content[16:24]) if content[:8] == PNG_SIGNATURE and len(content) >= 24 else (0, 0)

@@ -20,7 +20,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf
 
 MAX_DELAY = 100_000
-"""Longest delay, steps; the queue of each drone has one row more than that."""
+"""Longest delay, steps; a queue has one row more than the largest delay that it is made for."""
 
 
 class LatencyData(PyTree):

@@ -1,4 +1,4 @@
-"""Helpers that effects share: requirements on the model, forces of moving air, arrays per drone."""
+"""Helpers that effects share: requirements on the model, records and forces of moving air, radii of propellers."""
 
 from __future__ import annotations
 

@@ -136,6 +136,8 @@ class Randomize(Plugin):
     def generic(cls, **changes: ArrayLike | None) -> Randomize:
         """Return ranges of 30 % either way for the factors, the widest of Ferede et al. 2025 (arXiv 2504.21586).
 
+        The factor of each rotor's thrust has a range of 5 % either way, and the charge the range 0.1 to 1.
+
         Args:
             changes: Other settings, by name.
         """

@@ -25,8 +25,8 @@ class Estimator(Plugin):
     """Base class of filters that estimate the state of every drone from an ``IMU`` and other sensors.
 
     A subclass defines ``kinds``, ``record``, ``reset_episode``, ``filter_stages`` and ``estimated_states``. With
-    ``control``, controllers use the estimate in place of the state, and so do policies of tasks that observe
-    measurements.
+    ``control``, controllers use the estimate in place of the state. Environments that observe measured states observe
+    the estimate, also without ``control``.
     """
 
     sensors: Sequence[Sensor]

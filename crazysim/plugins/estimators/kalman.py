@@ -74,7 +74,7 @@ class KalmanData(PyTree):
 class Kalman(ErrorStateFilter):
     """The Crazyflie's extended Kalman filter: position, velocity and attitude of every drone from its sensors.
 
-    It begins at the true state of a world's first step, with the uncertainty of the firmware after switching on.
+    It begins at the true state after a world's first step, with the uncertainty of the firmware after switching on.
     Predictions run at ``freq`` on the mean of the inertial measurements between them; a measurement of another sensor
     is used in the step in which it arrives. Besides an ``IMU`` it takes any of ``MotionCapture``, ``OpticalFlow``,
     ``TimeOfFlight``, ``UWB`` and ``Lighthouse``.

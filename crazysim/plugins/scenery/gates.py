@@ -17,7 +17,7 @@ from crazysim.plugins.scenery.scenery import MAX_OBSTACLES, Model, Scenery
 
 
 class Gates(Scenery):
-    """Gates one behind the other along x, each moved to the sides and up, and turned.
+    """Gates one behind the other along x, each displaced along x, y and z, and turned.
 
     ``difficulty`` scales displacements and turns: with 0 the gates are in a line. All gates are always there, so
     ``free`` has no effect.

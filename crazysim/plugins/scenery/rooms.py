@@ -22,7 +22,7 @@ class Rooms(Scenery):
     So there is a path between any two rooms. A wall consists of panels as wide as a door, one of which is left out.
     The outer walls have no doors. ``free`` and ``speed`` have no effect.
 
-    ``difficulty`` is the fraction of the walls that are present: with 0 the building is a hall.
+    ``difficulty`` is the fraction of the walls between rooms that are present: with 0 the building is a hall.
     """
 
     count: ArrayLike = setting(default=(3, 2), low=1, high=100, shapes=((2,),))

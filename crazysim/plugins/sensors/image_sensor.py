@@ -110,7 +110,7 @@ class ImageSensor(Plugin):
         """Return the distances of one drone as the sensor measures them, m. (height, width)
 
         Args:
-            distance: True distances, m, at most ``far``. (height, width)
+            distance: True distances, m, at most ``far * far_ratio``. (height, width)
             key: Random key of the drone at this step.
         """
         del key

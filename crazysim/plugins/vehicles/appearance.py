@@ -57,7 +57,10 @@ def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
 
 
 def wheel_positions(vehicle: VehicleModel) -> np.ndarray:
-    """Return the positions of the wheels, body frame: front left, front right, rear left, rear right, m. (n, 2)"""
+    """Return the positions of the wheels, body frame, m. (n, 2)
+
+    Four wheels are front left, front right, rear left and rear right; otherwise there are two, front and rear.
+    """
     front, rear = vehicle.number("axles.front"), -vehicle.number("axles.rear")
     half_track = vehicle.number("axles.track") / 2
     sides = (half_track, -half_track) if vehicle.number("wheels.number") == 4 else (0.0,)
@@ -136,7 +139,10 @@ def _geom(
 
 
 def _body(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
-    """Return geoms of a car in the frame of its centre of mass: a plate, a hood, a cabin with a flat roof, bumpers."""
+    """Return geoms of a vehicle in the frame of its centre of mass.
+
+    With four wheels they are a plate, a hood, a cabin with a flat roof, and bumpers; otherwise one box.
+    """
     length, width, height = (vehicle.number(f"shape.{x}") / 2 for x in ("length", "width", "height"))
     front, floor = vehicle.number("axles.front"), 0.02
     if vehicle.number("wheels.number") != 4:

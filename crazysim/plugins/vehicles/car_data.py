@@ -71,7 +71,7 @@ class CarData(Members):
 
     @property
     def vel(self) -> Array:
-        """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_members, 3)"""
+        """Velocity of the centre of mass, world frame, m/s; z is zero, on slopes too. (n_worlds, n_members, 3)"""
         return _level_vel(self.yaw, self.body_vel)
 
     @property

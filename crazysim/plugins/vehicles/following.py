@@ -195,8 +195,9 @@ class PurePursuit(PathController):
     """Pure pursuit: the rear axle drives on the circle to a point ahead on the path.
 
     ``tan(d) = L 2 y / (x^2 + y^2)`` with the wheelbase L and the point (x, y) relative to the rear axle; the formula
-    also holds backwards. Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm", 1992. It cuts corners
-    by about the square of the look-ahead distance times the curvature over 6, and needs no gains.
+    also holds backwards. Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm", 1992. It needs no
+    gains, and cuts corners: where the curvature jumps, by about a tenth of the jump times the square of the look-ahead
+    distance.
     """
 
     lookahead: float = setting(default=0.3, positive=True)

@@ -34,8 +34,8 @@ MAX_NEWTON_STEP = 0.5
 STOPPING_LENGTH = 0.5
 """Length before the end of an open path in which a reference by arc length slows down, m."""
 MIN_SPEED_FRACTION = 0.1
-"""Smallest speed of a reference by arc length, as a fraction of the path's largest speed. Vehicles at rest
-can then start."""
+"""Smallest speed of a reference by arc length on a path of a trajectory, as a fraction of the path's largest speed, so
+that vehicles at rest can start. Only the slowdown at the end of an open path goes below it."""
 MIN_CURVED_SPEED_FRACTION = 0.05
 """Parametric speed, as a fraction of its maximum, below which the curvature is set to zero."""
 N_REPEATED_POINTS = 12
