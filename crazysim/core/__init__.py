@@ -1,6 +1,6 @@
 """The core: records, stages, pipelines, integrators, plugins, random numbers and settings.
 
-Exported here are the functions with which stages and resets are written.
+It exports what plugins, stages and resets are written with, and the distribution of worlds over devices.
 """
 
 from crazysim.core.pipeline import append_fn, insert_fn_after, insert_fn_before, prepend_fn, remove_fn, replace_fn

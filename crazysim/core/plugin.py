@@ -186,7 +186,7 @@ class Plugin:
     """Scope that ``constrain`` is written for: the data of one drone, or of one world."""
     reset_before: ClassVar[str | None] = None
     """Name of the stage before which ``reset_episode`` is called in the first step of an episode, because it uses
-    results of earlier stages. None to call it at resets, and before all stages in worlds that were not reset."""
+    results of earlier stages. None to call it at resets, and again in the first step, before all other stages."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass."""
@@ -274,9 +274,11 @@ class Plugin:
     def reset_episode(self, data: SimData) -> SimData:
         """Return the data of one drone, or of ``scope``, at the beginning of an episode.
 
-        It may write leaves of that scope, such as values that are drawn for an episode. It is called at resets, and in
-        the first step of worlds that were not reset, before all other stages and with the same random numbers. With
-        ``reset_before``, it is called in every first step instead, in front of that stage.
+        It may write leaves of that scope, such as values that are drawn for an episode. It is called at resets, and
+        again in the first step of every episode, also of worlds that were never reset, before all other stages and with
+        the same random numbers. So a second call must not change the result of the first, as adding to a leaf would.
+        Environments leave out the call in the first step, since all of their episodes begin with a reset. With
+        ``reset_before``, it is called in the first step only, in front of that stage.
         """
         return data
 

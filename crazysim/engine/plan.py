@@ -50,7 +50,7 @@ BACKENDS: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "inter
 
 
 SeparateLeaves = frozenset[int] | None
-"""Leaves that stay separate arrays when the others are stored as rows of one array; None to store none as rows."""
+"""Leaves that stay separate arrays when the others are stored as rows of few arrays; None to store none as rows."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -367,7 +367,7 @@ def _join_runs(
 
 
 def _watched_leaves(data: SimData) -> list[Any]:
-    """Return the leaves in which NaN or infinity flags a world: states and commands of drones, other populations."""
+    """Return the leaves in which NaN or infinity flags a world: states and controls of drones, other populations."""
     return jax.tree.leaves(watched_records(data))
 
 

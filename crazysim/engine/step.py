@@ -186,8 +186,9 @@ class Step:
             data: The simulation.
             zeros: As in ``__call__``.
             n_steps: Any number of steps of the type that will be passed to ``advance``; None for an array.
-            separate: Leaves that remain separate arrays. The other leaves that a call writes are stored as rows of one
-                array, which makes loops over calls faster. None to store none as rows.
+            separate: Leaves that remain separate arrays. If one kernel runs the whole step, the other leaves that it
+                writes, except random keys, are stored as rows of few arrays, one for each scope and type, which makes
+                loops over calls faster. None to store none as rows.
         """
         return self._flatten(data, *jax.tree.flatten(data), zeros, n_steps, separate)
 

@@ -163,7 +163,7 @@ def _numpy_function(op: Operation) -> Callable[..., Any] | None:
 
 
 def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Sequence[_Run]) -> list[Any]:
-    """Return the results of a structured operation, which runs blocks, reads a table, or has several results.
+    """Return the results of a structured operation, which is not one NumPy function of its operands.
 
     Args:
         op: The operation.

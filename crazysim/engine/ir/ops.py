@@ -1,8 +1,8 @@
 """The table of operations: meaning and name of each one in every target.
 
 Programs contain no other operations. A row gives the types of numbers that an operation takes, its form in NumPy (for
-constants and for the interpreter), in XLA, in C++ and CUDA, and in CasADi, and its cost. A target
-refuses programs with operations that it has no form for.
+constants and for the interpreter), in XLA, in C++ and CUDA, and in CasADi, and its cost. A target refuses programs
+with operations that it has no form for.
 
 Integers and conversions follow XLA, which defines what C leaves undefined: the quotient of a division by zero is -1
 (all bits set), its remainder the dividend; a shift by the size of the type or more gives 0, or all sign bits; a float

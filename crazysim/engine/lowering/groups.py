@@ -40,8 +40,8 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     """Return the groups of populations that do not depend on each other. The group of the drones comes first.
 
     Two stages depend on each other if they act on the same population, or if one reads or writes a leaf that the other
-    writes. Stages that only use leaves of
-    worlds, such as the clock, are repeated in every group that reads their results.
+    writes. Stages that only use leaves of worlds, such as the clock, are repeated in every group that reads their
+    results.
 
     Args:
         stages: Stages of a step, in order.
