@@ -36,7 +36,7 @@ class BraxEnv:
 
     Brax batches an environment of one world with ``vmap``. Here the worlds are batched already, so this class
     corresponds to an environment after Brax's ``training.wrap``. Keys, observations and actions have an axis over
-    worlds. Episodes end at their time limit, and the step that ends an episode also starts the next one. ``info`` has
+    worlds. Episodes also end at their time limit, and the step that ends one also starts the next. ``info`` has
     the entries that Brax's wrappers add.
 
     Pass it to an algorithm with ``wrap_env=False`` and ``num_envs`` equal to the number of worlds. Pass another

@@ -37,8 +37,9 @@ from crazysim.sim.sim import Sim
 class Env(ABC):
     """A batched environment of many worlds, wrapped or not. Its functions are pure, for jit, scan, vmap and grad.
 
-    A step has four phases: ``act`` stages the command of an action, the physics advances the simulation, ``observe``
-    evaluates the task, and, inside ``AutoReset``, ``reset_episode`` starts a new episode where one is over.
+    In a step, ``act`` stages the command of an action, the physics advances the simulation, ``observe`` evaluates the
+    task, inside ``AutoReset`` ``reset_episode`` starts a new episode where one is over, and ``look`` takes images if a
+    wrapper needs them.
     """
 
     @property

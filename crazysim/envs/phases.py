@@ -1,7 +1,7 @@
 """Phases of an environment step: act, (physics), observe, reset episode, look.
 
-All but the last are written for one world, and become stages of the step: ``act`` before the physics, ``observe``
-after it, and ``reset_episode`` where an episode is over. ``look`` takes the images of all worlds. ``Env.reset`` and
+They become stages of the step: ``act`` before the physics, ``observe`` after it, and ``reset_episode`` where a new
+episode begins. These are written for one world; ``look`` takes the images of all worlds. ``Env.reset`` and
 ``Env.restart`` also call ``reset_episode`` and ``look``, for all worlds.
 """
 

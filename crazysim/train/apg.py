@@ -103,9 +103,9 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
 def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Learner, dict[str, Array]]:
     """Return the learner after one rollout and one update, and the metrics of the iteration. (n_seeds,) each
 
-    The metric ``finite`` is True if weights and loss are finite. The rollout starts where the previous one ended;
-    worlds whose episode is over start a new one. A non-finite gradient is skipped. The scan stores its intermediates
-    instead of recomputing them under ``jax.checkpoint``: tens of steps fit in memory.
+    The metric ``finite`` is True if weights, optimiser state, statistics and loss are finite. The rollout starts where
+    the previous one ended; worlds whose episode is over start a new one. A non-finite gradient is skipped. The scan
+    stores its intermediates instead of recomputing them under ``jax.checkpoint``: tens of steps fit in memory.
     """
     initial_state = env.restart(learner.env, learner.env.done)
     agents, swept_values, config = learner.agents, stack_swept_values(configs), configs[0]

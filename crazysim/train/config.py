@@ -51,7 +51,7 @@ class Recipe:
 _LONG_ROLLOUTS = {"n_steps": 64, "minibatches": 32, "hidden": (128, 128), "discount": 0.99}
 """Hyperparameters of tasks in which a reward follows seconds after the actions that earn it."""
 _BY_CAMERA = {**_LONG_ROLLOUTS, "entropy": 0.003, "convolution": (8, 16), "critic": "privileged"}
-"""Hyperparameters of tasks that are flown by the images of a camera."""
+"""Hyperparameters with which PPO learns to fly by the images of a camera."""
 
 RECIPES: dict[str, Recipe] = {
     "hover": Recipe(config={"iterations": 80, "minibatches": 16, "learning_rate": 2e-3}),

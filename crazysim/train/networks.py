@@ -76,8 +76,8 @@ def mlp(layers: Layers, x: Array) -> Array:
 class Network:
     """A network from the normalised observations of one drone to features, in place of the built-in one.
 
-    Its functions are pure and written for one drone. A linear layer from the features to the actions, or to the
-    value, follows it. ``Network(init, apply)`` has no memory; its ``apply`` returns the memory that it gets, ``()``.
+    Its functions are pure and written for one drone. A linear layer from the features to the actions before tanh, or to
+    the value, follows. ``Network(init, apply)`` has no memory; its ``apply`` returns the memory that it gets, ``()``.
     """
 
     init: Callable[[Array, int], Any]
@@ -239,7 +239,7 @@ class Weights(PyTree):
     layers: Layers
     """Layers from the features to the outputs."""
     body: Any = ()
-    """Weights of the network; ``()`` for the built-in one without memory."""
+    """Weights of the network; ``()`` for the built-in one without convolution and memory."""
 
 
 def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int], last_scale: float) -> Weights:

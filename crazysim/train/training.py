@@ -52,7 +52,7 @@ CHECKPOINT_FILE, POLICY_FILE, CURVE_FILE, TABLE_FILE = "checkpoint.npz", "policy
 """Names of the files of a run: its checkpoint, the kept policy, the learning curve, and the table of all seeds."""
 
 TEACHER_FOLDER = "teacher"
-"""Folder, in that of a run, of the teacher that the recipe of a task trains first."""
+"""Name of the folder, within the folder of a run, of the teacher that the recipe of a task trains first."""
 
 CHECK_SEED = 0xC4EC
 """Seed of the initial states of the check set, which differ from the held-out ones of ``EVALUATION_SEED``."""

@@ -31,7 +31,7 @@ middle of its cell, m: a drone fits between a pole and whatever is next to it.""
 N_CELLS_ALONG = 4
 """Number of cells from the starts to the goals."""
 FIELD_GAP = 0.6
-"""Distance of starts and goals from the field, m."""
+"""Smallest distance of starts and goals from the field, m."""
 POLE_RADIUS, BOX_WIDTH = 0.05, 0.3
 """Radius of a pole, and width of a box, m."""
 HEIGHT = 2.0
@@ -42,7 +42,7 @@ CRUISE_SPEED = 2.0
 """Speed above which flying faster costs reward, m/s. Actions tilt a drone by at most 45 degrees, so that it brakes
 with up to g and stops from this speed within v^2 / (2 g) = 0.2 m, a quarter of a cell."""
 SPACING = 0.6
-"""Distance between the starts, and between the goals, of several drones, m."""
+"""Distance between the mean positions of the starts, and of the goals, of several drones, m."""
 
 
 class Crossing(PyTree):
@@ -82,7 +82,7 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Avoid(Task):
-    """Fly about 4.5 m through a field of obstacles, which have new positions in every episode.
+    """Fly about 4.7 m through a field of obstacles, which have new positions in every episode.
 
     Poles reach from the floor to the ceiling; boxes hang in the air. A drone is disabled when it touches one, the floor
     or another drone, or leaves the arena; contacts are checked at every physics step. An episode ends when every drone
@@ -97,7 +97,7 @@ class Avoid(Task):
     n_boxes: int = setting(default=4, low=0)
     """Number of boxes."""
     n_seen: int = setting(default=4, low=1)
-    """Number of nearest obstacles that a drone observes."""
+    """Largest number of nearest obstacles that a drone observes."""
     seconds: float = 8.0
     """Length of an episode, s."""
     tolerance: float = 0.2
@@ -109,7 +109,7 @@ class Avoid(Task):
             raise ConfigError("expected at least one obstacle, got n_poles=0 and n_boxes=0. Set one of them.")
 
     def field(self, n_drones: int) -> Field:
-        """Return the dimensions of the field: a third of the cells stay free, and all drones fit next to each other."""
+        """Return the dimensions of the field: a third of the cells or more are free, and all drones fit side by side."""
         n = self.n_poles + self.n_boxes
         n_cells_across = max(
             4, -(-3 * n // (2 * N_CELLS_ALONG)), -(-int(10 * SPACING * n_drones) // int(10 * CELL_WIDTH))

@@ -69,8 +69,8 @@ class FollowCar(Task):
     Speed and steering angle of the car change differently in every episode; on average it drives along the x axis. A
     drone starts near the point 0.8 m behind and 0.7 m above the car. It succeeds if its distance from this point is
     below the tolerance during the last second. An episode ends when a drone is lower than 0.25 m, or more than 2 m away
-    from its point. Policies observe neither the car's position nor their own: ``segmentation`` is 1 where a pixel of
-    the camera, which ``make`` adds, shows the car's body, and ``depth`` is its depth image.
+    from its point. Policies observe neither the car's position nor their own position over ground: ``segmentation`` is
+    1 where a pixel of the camera, which ``make`` adds, shows the car's body, and ``depth`` is its depth image.
     """
 
     name = "follow_car"

@@ -25,8 +25,8 @@ MIDDLE = np.array([0.0, 0.0, 1.2])
 class Hover(GoalTask):
     """Reach a random point and hover there.
 
-    A drone starts in flight, slightly tilted and moving, in a box around (0, 0, 1.2); so does its goal. An episode ends
-    when a drone touches the floor, rises above 3 m, or is more than 3 m from the z axis along x or y.
+    A drone starts in flight, slightly tilted and moving, in a box around (0, 0, 1.2), which also contains its goal. An
+    episode ends when a drone touches the floor, rises above 3 m, or is more than 3 m from the z axis along x or y.
     """
 
     name = "hover"

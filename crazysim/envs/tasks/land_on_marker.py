@@ -18,7 +18,8 @@ class LandOnMarker(Land):
     """Land on a marker on the ground, 2 cm thick, seen by a camera that looks down.
 
     Rules and settings are those of ``land``, with a marker instead of the pad. Policies observe neither the marker's
-    position nor their own: ``segmentation`` is 1 where a pixel of the camera, which ``make`` adds, shows the marker.
+    position nor their own position over ground: ``segmentation`` is 1 where a pixel of the camera, which ``make`` adds,
+    shows the marker.
     """
 
     name = "land_on_marker"

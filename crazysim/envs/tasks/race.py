@@ -185,7 +185,7 @@ class Race(Task):
         return jnp.all(race_of(data).flight_over)
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the next gate, m."""
+        """Return the distance from the next gate, m; zero where all are passed."""
         return rules.next_gate_distance(data)
 
     def info(self, data: SimData) -> dict[str, Array]:

@@ -35,7 +35,7 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
     The further ones are ``rot``, the attitude as a matrix, body to world (9); and in the drone's frame ``vel_body``,
     m/s (3), ``gate_corners``, vectors to the corners of the next two gates, m (24), ``obstacles_near``, horizontal
     vectors to the axes of the nearest two poles, m (6), and with several drones ``drones_near``, vectors to the nearest
-    two that are still in the race, m (6). Gates and poles have their observed poses.
+    two that are still in the race, m (6, or 3 with two drones). Gates and poles have their observed poses.
     """
     record, s, n_drones = race_of(data), data.states, data.core.n_drones
     gates_pos, gates_quat, poles = (

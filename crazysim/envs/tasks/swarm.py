@@ -32,7 +32,7 @@ CROWDING_SEPARATION = 2.5
 """Separation below which another drone costs reward, in half axes of the ellipsoid. With 1.5, drones that cross the
 middle evade too late: a third of the episodes ended in a crash."""
 MIN_START_SPACING = 0.9
-"""Smallest distance between neighbours on the circle of the starts, m."""
+"""Smallest distance between neighbours on the circle of the starts, and smallest radius of the circle, m."""
 HEIGHT = 1.2
 """Height of the circle, m."""
 ARENA_MARGIN = 1.5
@@ -67,7 +67,7 @@ class Swarm(Task):
     formation: Sequence[Sequence[float]] | None = None
     """Goals of the drones, in their order, m; None to change places. (n_drones, 3)"""
     n_seen: int = setting(default=3, low=1)
-    """Number of nearest other drones that a drone observes."""
+    """Largest number of nearest other drones that a drone observes."""
     strict: bool = True
     """True to end an episode when two drones come too close; they are penalised in any case."""
     seconds: float = 8.0
@@ -196,8 +196,8 @@ def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndar
     if separations.min() < 1.2:
         pair = sorted(np.argsort(separations)[:2].tolist())
         raise ConfigError(
-            f"expected places of the formation at 1.2 times the smallest separation, {SEPARATION[0]} m horizontally "
-            f"and {SEPARATION[2]} m vertically, got {separations.min():.2f} between places {pair}"
+            f"expected places of the formation at least 1.2 times the smallest separation apart, {SEPARATION[0]} m "
+            f"horizontally and {SEPARATION[2]} m vertically, got {separations.min():.2f} between places {pair}"
         )
     return slots
 

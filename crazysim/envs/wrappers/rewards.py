@@ -54,7 +54,7 @@ class EpisodeStatistics(Wrapper):
 
 
 class RewardTerms(Wrapper):
-    """Record the terms of the reward by name: ``info["reward near"]`` and so on. (n_drones,) each"""
+    """Record the terms of the reward by name: ``info["reward proximity"]`` and so on. (n_drones,) each"""
 
     def __init__(self, env: Env):
         super().__init__(env)

@@ -48,7 +48,7 @@ class MocapSource(Closeable):
         """Return the frames that have arrived since the last call.
 
         Args:
-            step: Number of physics steps of the simulation since its start.
+            step: Number of physics steps of the simulation since its last reset.
             freq: Physics steps per second, Hz.
         """
         raise NotImplementedError

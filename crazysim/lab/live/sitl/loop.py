@@ -29,7 +29,7 @@ from crazysim.tables import NOT_NEGATIVE, read_number
 MAGNETIC_FIELD = np.array([0.0, 2e-5, -4.5e-5])
 """Magnetic field without a ``Magnetometer``, world frame, T: roughly the field in central Europe."""
 SILENCE_LIMIT = 1.0
-"""Time of a run within which a firmware must send motor commands, s."""
+"""Duration of a run beyond which every firmware must have sent motor commands, s."""
 GPS_FREQ = 5
 """Rate of satellite navigation without a ``GPS``, Hz."""
 SENSOR_KINDS = (IMU, Barometer, Magnetometer, GPS)
