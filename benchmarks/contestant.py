@@ -48,7 +48,7 @@ def main(package: str) -> None:
 
 
 def build(package: str, task: str, case: dict[str, Any], device: str) -> Any:
-    """Return the case to time: a flight or its gradient."""
+    """Return the case to time, such as a flight, its gradient or a scene query."""
     from measure import Flight
 
     if task == "gym":

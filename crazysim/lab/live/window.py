@@ -48,8 +48,8 @@ class Window(Viewer[Live]):
     The mouse turns, moves and zooms the view. A double click on a drone selects it, one on a vehicle, load or object
     makes viewers follow it, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses,
     a full stop makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [
-    and ] move the chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window draws
-    in a separate process, at the highest rate possible, and never delays the simulation.
+    and ] move the chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window is
+    drawn by a separate process, which skips pictures that it has no time for, and never delays the simulation.
     """
 
     worlds: Sequence[int] = (0,)
@@ -67,7 +67,7 @@ class Window(Viewer[Live]):
     trail: float = 2.0
     """Duration of trails, s; 0 for none."""
     setpoints: bool = True
-    """True to draw the positions of state commands."""
+    """True to draw the goals of the loop, or else the positions of state commands."""
     contacts: bool = False
     """True to mark drones that touch something, which is computed for every picture."""
     wind: bool = True

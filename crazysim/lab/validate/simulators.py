@@ -1,7 +1,8 @@
 """Other simulators that fly attitude commands: C MuJoCo, Crazyflow, RotorPy and gym-pybullet-drones.
 
 Each flies one drone per start, with the mass, the inertia and the largest thrust of our airframe. Drag, lag, gravity
-and the controller that follows the commands are the simulator's own.
+and the controller that follows the commands are the simulator's own, except that C MuJoCo has our controller and lag,
+and ``RotorPyRotors`` our controller.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ AIRFRAME = "cf21B_500"
 COMMAND_PERIOD = 0.02
 """Time between two commands, s."""
 CONTROL_PERIOD = 0.004
-"""Period of the controller in simulators that do not use our controller, s."""
+"""Period of the controllers of RotorPy and gym-pybullet-drones, s."""
 
 States = dict[str, NDArray]
 """``pos``, ``quat``, ``vel`` and ``ang_vel`` of all drones, with our frames, units and components. (n, k) each"""
