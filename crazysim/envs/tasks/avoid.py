@@ -109,7 +109,7 @@ class Avoid(Task):
             raise ConfigError("expected at least one obstacle, got n_poles=0 and n_boxes=0. Set one of them.")
 
     def field(self, n_drones: int) -> Field:
-        """Return the dimensions of the field: at least a third of the cells is free, and all drones fit side by side."""
+        """Return the dimensions of the field: at least a third of the cells is free, and all drones fit in a row."""
         n = self.n_poles + self.n_boxes
         n_cells_across = max(
             4, -(-3 * n // (2 * N_CELLS_ALONG)), -(-int(10 * SPACING * n_drones) // int(10 * CELL_WIDTH))

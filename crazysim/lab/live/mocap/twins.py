@@ -92,7 +92,7 @@ class Twins(Closeable):
 
     ``update`` reads all frames that have arrived, applies the rules of ``Tracker``, and writes all poses and velocities
     into ``data.objects`` of every world at once. Contact reports, ``ContactResponse``, range finders and images then
-    include them like any other objects. A reset returns objects to their first poses until the next update.
+    include them like any other objects. A reset hides objects below the floor until the next update.
     """
 
     def __init__(
