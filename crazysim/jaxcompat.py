@@ -1,7 +1,8 @@
 """All use of JAX beyond its documented, stable interface; new releases of JAX should require changes here only.
 
-Each name has a test in ``tests/test_jaxcompat.py``, which continuous integration runs on the oldest and the
-newest JAX that are supported. How each use would be replaced if a release removed it:
+Most names have a test in ``tests/test_jaxcompat.py``, which continuous integration runs on the oldest and the newest
+JAX that are supported; others are tested with the code that uses them. How each use would be replaced if a release
+removed it:
 
 - **The constructor of Jaxpr** (``select_inputs``, ``constants_to_inputs``): the function is traced again by
   ``jax.make_jaxpr``. A fallback here.
@@ -20,7 +21,8 @@ newest JAX that are supported. How each use would be replaced if a release remov
   JAX is configured with. It is used where these names are missing.
 - **The coordinator of several hosts** (``connected_hosts``, ``detect_hosts``): exchanges of arrays instead of its store
   of texts, and the variables of SLURM. ``jax.experimental.multihost_utils``: programs with replicated results.
-- **_cache_size** (``n_compilations``): only tests need it.
+- **_cache_size** (``n_compilations``): a counter in the traced function. Tests need it, and ``envs/stepper.py`` to keep
+  the program of its first step. No fallback.
 
 ``CRAZYSIM_JAX_FALLBACKS=1`` selects all fallbacks, to try them.
 """

@@ -1,4 +1,4 @@
-"""Several controllers on one drone. A function of state, setpoint and time chooses one at each tick."""
+"""Several controllers on one drone. A function of state, setpoint and time, or a fixed index, chooses one."""
 
 from __future__ import annotations
 
