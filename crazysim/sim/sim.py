@@ -118,7 +118,8 @@ class Sim:
             control: Command level.
             integrator: Integration scheme.
             freq: Physics steps per second, Hz.
-            state_freq: Rate of the state controller, Hz; 100, or the largest divisor of ``freq`` below.
+            state_freq: Rate of the state controller, Hz; 100 for ``"auto"``, ``"pid"`` and ``"crazyflow"``, 500 for
+                other controllers, or the largest divisor of ``freq`` below.
             attitude_freq: Rate of the attitude controller, Hz; 500, or the largest divisor of ``freq`` below.
             body_rate_freq: Rate of the body-rate controller, Hz; as ``attitude_freq``.
             force_torque_freq: Rate of the allocation, Hz; as ``attitude_freq``.
@@ -566,8 +567,9 @@ class Sim:
     def mjx_data(self) -> mjx.Data:
         """The scene's state in every world at its last sync; created on first read, and returned without a sync.
 
-        Assigning to it makes the scene stale. Poses of bodies other than drones, ``mocap_pos`` and ``mocap_quat``,
-        must be one per world and finite, or it raises a ValueError.
+        Assigning to it makes the scene stale. It raises a ValueError if ``mocap_pos`` and ``mocap_quat``, which also
+        hold the poses of bodies other than drones, are not one per world and body, or are NumPy arrays with NaN or
+        infinity.
         """
         return self._scene.mjx_data
 

@@ -78,7 +78,8 @@ KEYS: dict[str, Key] = {
 }
 """Shapes and ranges of all numbers, by table and key."""
 OPTIONAL_KEYS = ("tyres.front", "tyres.rear", "drive.", "trailer.")
-"""Prefixes of the keys that a vehicle may lack; ``drive`` needs its force or its torque."""
+"""Prefixes of the keys without which a vehicle can be loaded; of ``drive`` it needs the force or the torque.
+``CarParams.create`` needs the limit of the drive and ``drive.front_share`` too."""
 LAYOUT = Layout(KEYS, ("name", "base", "model", "sources"), GUIDE)
 """Keys of vehicles."""
 
