@@ -1,11 +1,22 @@
-"""All parts of a live simulation together for a long time: memory, lateness of control steps, lost frames.
+"""A live simulation with all its parts, run for a long time: memory, lateness of control steps, lost frames.
 
     python benchmarks/soak.py [--seconds 3600] [--drones 30] [--objects 50]
 
 Drones circle in real time while motion capture sends 240 frames a second, 50 pictures a second are sent to a client of
-the page, and poses are recorded. The program prints one JSON line. ``memory_mb`` is the memory after a tenth of the
-time and at the end, MB; ``growth_mb_per_hour`` is the slope of a line fitted to all readings between, MB/h. The first
-tenth is left out, because programs are compiled and the snapshots of the last minute fill in it. Linux only.
+the page, and poses are recorded. Linux only. The program prints one JSON line with these keys, among others:
+
+- ``factor``: simulated seconds per second;
+- ``memory_mb``: resident memory of the process, MB, at the first reading after a tenth of the time and at the last;
+- ``growth_mb_per_hour``: slope of a line fitted to all readings after that tenth, MB/h;
+- ``frames``, ``frames_lost``: frames of motion capture that were accepted, and polls that found frames lost;
+- ``pictures_per_s``, ``recorded_mb``: pictures sent per second, and size of the recording, MB;
+- ``late``, ``lateness_999_ms``, ``worst_ms``: control steps that began more than 2 ms late, lateness that 99.9% of them
+  did not exceed, and the greatest, ms;
+- ``lost_s``: time that was given up because the simulation could not catch up, s;
+- ``failures``: errors that were logged without ending the run.
+
+The first tenth is left out of the memory, because programs are compiled in it. In a run of ten minutes or more, it also
+contains the first minute, in which the snapshots of the loop reach their largest number.
 """
 
 from __future__ import annotations
@@ -29,7 +40,7 @@ from crazysim.lab.live.circles import Circles
 FREQ = 240.0
 """Frames per second of motion capture, Hz."""
 WARM_UP = 0.1
-"""Fraction of the time at the beginning whose memory readings are left out."""
+"""Fraction of the time, from the beginning, whose readings of the memory are left out."""
 
 
 def main() -> None:
@@ -42,7 +53,7 @@ def main() -> None:
 
 
 def measure(seconds: float, n_drones: int, n_objects: int) -> None:
-    """Run for a time, s, and print the figures."""
+    """Run the simulation for a time, s, and print the line."""
     sim = Sim(n_drones=n_drones, control="state", freq=500)
     source = RealTimeSource(FunctionSource(circling_bodies(n_objects), FREQ))
     names = [f"cf{k}" for k in range(n_objects)]
@@ -82,10 +93,10 @@ def measure(seconds: float, n_drones: int, n_objects: int) -> None:
 
 
 class Memory:
-    """Memory of this process over time, read by a thread."""
+    """Resident memory of this process over time, read by a thread."""
 
     def __init__(self, period_s: float):
-        """Prepare.
+        """Create an empty series of readings.
 
         Args:
             period_s: Time between two readings, s.
@@ -93,17 +104,17 @@ class Memory:
         self._period_s, self._readings, self._stop_event = period_s, [], threading.Event()
 
     def __enter__(self) -> Memory:
-        """Begin to read."""
+        """Start the thread."""
         self._start_time = time.monotonic()
         threading.Thread(target=self._read_memory, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop reading."""
+        """Stop the thread."""
         self._stop_event.set()
 
     def samples(self, start_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return times since the beginning, s, and memory, MB, of the readings after a time, s. (n,), (n,)"""
+        """Return times, s, and memory, MB, of the readings from a time on; times begin with the thread. (n,), (n,)"""
         times, memory_mb = np.asarray(self._readings).T
         return times[times >= start_s], memory_mb[times >= start_s]
 

@@ -92,7 +92,8 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
 def _refuse_outside(*args: object, **params: object) -> NoReturn:
     raise ConfigError(
         "expected reduce_over_others in a function of one drone that a stage applies to all drones of a world, got a "
-        "call outside of one. Use it in stage('drone') or in the influence of a plugin."
+        "call outside of one, or in the function of another reduction. Use it in stage('drone') or in the influence of "
+        "a plugin."
     )
 
 

@@ -1,12 +1,14 @@
 """Plans, which state the engine that steps data of one structure, and the reason why no faster engine was chosen.
 
-If an engine cannot run a step, this is found here, before the first step. There are three cases:
+What an engine cannot run is found here, before the first step. There are three cases:
 
-- A documented limit, such as a stage without a scope or a machine without a compiler. A slower engine runs, and
-  ``explain`` names the limit.
-- Something unsupported (``UnsupportedError``): a primitive without a rule, a parameter of a primitive that a newer JAX
-  has renamed, or a kernel that its compiler refuses. A slower engine runs, with one ``EngineWarning``. With ``strict``,
-  an error is raised instead.
+- A documented limit, which ``explain`` names. A stage without a scope splits the step: it runs unfused, between kernels
+  of the stages before and after it. On a machine without a compiler, ``lanes`` runs. For data on several devices,
+  ``plain`` runs if a stage is unfused, or if the data is not distributed by a mesh.
+- Something unsupported (``UnsupportedError``). A stage with a primitive without a rule, or with a parameter of a
+  primitive that a newer JAX has renamed, splits the step too, or with a mesh ``plain`` runs. If a kernel cannot be
+  written, or its compiler refuses it, ``lanes`` runs. There is one ``EngineWarning``; with ``strict``, a
+  ``ConfigError`` is raised instead. With ``engine="fused"``, a missing compiler or kernel is a ``ConfigError``.
 - Any other exception (except ``ConfigError`` and ``MemoryError``, which are raised as they are). It is a bug in a stage
   or in the engine. With ``strict``, or with an engine chosen by name, it is raised. Otherwise ``plain`` is tried. If
   ``plain`` fails too, the bug is in the stage, and the error of ``plain`` is raised. If not, ``plain`` runs, with a
@@ -50,7 +52,8 @@ BACKENDS: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "inter
 
 
 SeparateLeaves = frozenset[int] | None
-"""Leaves that stay separate arrays when the others are stored as rows of few arrays; None to store none as rows."""
+"""Leaves that stay separate arrays when the other written leaves are stored as rows of a few arrays. With an empty set
+every written leaf is stored as rows, except for random keys and ``core.mjx_synced``; None stores none."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,7 +125,7 @@ class Planner(NamedTuple):
                 writes are stored as rows. None to store none as rows.
 
         Raises:
-            ConfigError: If an engine chosen by name cannot run the stages; with ``strict``, if a stage is unsupported.
+            ConfigError: If ``fused`` was chosen and has no kernel; with ``strict``, if something is unsupported.
         """
         if self.engine == "plain":
             return self._plan_plain(data, "it was chosen")
@@ -374,8 +377,8 @@ def _watched_leaves(data: SimData) -> list[Any]:
 def _input_leaves(program: Program) -> list[int]:
     """Return the indices of the leaves that must be passed to a program.
 
-    These are the leaves that it reads, and a leaf of the drones, whose shape gives the number of worlds. If unfused
-    stages split the step, leaves that are written before they are read are passed too.
+    These are the leaves that it reads, and one leaf of the drones, because its shape gives the number of worlds. If
+    unfused stages split the step, all leaves that are written or checked are passed too.
     """
     in_rows = {i for leaf in program.leaves for i in leaf.row_leaves}
     separate = [i for i, leaf in enumerate(program.leaves) if not leaf.row_leaves and i not in in_rows]

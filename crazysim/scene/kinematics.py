@@ -15,14 +15,15 @@ N_DUMMY_JOINTS = 1
 
 
 def update_kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Return the scene with the poses of bodies, their centres of mass, geoms and sites.
+    """Return MJX data with the poses of bodies, of their inertial frames, of geoms and of sites.
 
-    It equals ``mjx.kinematics`` for a scene that defines no joints, with two differences: it takes a quarter of the
-    time to trace and compile, and children of mocap bodies follow each world's poses, not the model's as in MJX 3.17.
+    It equals ``mjx.kinematics`` for a scene that defines no joints, with three differences. It takes a quarter of the
+    time to trace and compile. Children of a mocap body follow its pose in each world; MJX 3.17 places them by the pose
+    in the model. ``xanchor`` and ``xaxis`` of the dummy joint are left as they are.
 
     Args:
         model: Compiled scene.
-        data: State of the scene in every world. (n_worlds, ...)
+        data: MJX data of every world. (n_worlds, ...)
     """
     batch_shape = data.mocap_pos.shape[:1]
     pos = jnp.broadcast_to(model.body_pos, batch_shape + model.body_pos.shape)

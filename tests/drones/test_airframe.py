@@ -1,4 +1,4 @@
-"""Airframes: their files, the mixing that follows from rotor positions, and airframes of users."""
+"""Airframes: their files, the mixing that follows from rotor positions, airframes of users, and errors (law 9)."""
 
 import copy
 import re
@@ -20,26 +20,26 @@ from crazysim.errors import AirframeWarning
 FILES = sorted(AIRFRAME_FOLDER.glob("*.toml"))
 
 
-def raw(name):
+def read_tables(name):
     return tomllib.loads((AIRFRAME_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
 
 
-def numbers(node, path=""):
+def iterate_numbers(node, path=""):
     """Yield path and entry of every key that is not a table of keys."""
     for key, entry in node.items():
         if isinstance(entry, dict) and "value" not in entry:
-            yield from numbers(entry, f"{path}{key}.")
+            yield from iterate_numbers(entry, f"{path}{key}.")
         else:
             yield f"{path}{key}", entry
 
 
-def plain(name):
-    """Return a built-in airframe as a user would write it: a dict of plain numbers."""
+def plain_tables(name):
+    """Return the tables of a built-in airframe without a base, with plain numbers, as a user would write them."""
 
     def strip(node):
         return {k: (v["value"] if "value" in v else strip(v)) for k, v in node.items()}
 
-    return strip({k: v for k, v in raw(name).items() if k != "sources"})
+    return strip({k: v for k, v in read_tables(name).items() if k != "sources"})
 
 
 def test_every_file_is_an_airframe_and_the_other_way_round():
@@ -49,12 +49,12 @@ def test_every_file_is_an_airframe_and_the_other_way_round():
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_every_number_has_a_unit_and_a_source(path):
-    tables = raw(path.stem)
+    tables = read_tables(path.stem)
     sources = tables.pop("sources")
     assert tables.pop("base", None) in (None, *airframe_names())
     assert tables.pop("name", path.stem) == path.stem
-    found = list(numbers(tables))
-    assert len(list(numbers(load_airframe(path.stem).tables))) > 30
+    found = list(iterate_numbers(tables))
+    assert len(list(iterate_numbers(load_airframe(path.stem).tables))) > 30
     for key, entry in found:
         assert isinstance(entry, dict), f"{key} is a bare number"
         assert set(entry) == {"value", "unit", "source"}, key
@@ -84,8 +84,10 @@ def test_every_airframe_gives_parameters_for_all_it_supports(name):
     assert supported
     assert supported == supported_dynamics(name)
     for dynamics in Dynamics:
-        is_full = dynamics == Dynamics.first_principles
-        create = first_principles.Params.create if is_full else lambda a, d=dynamics: fitted.Params.create(a, d)
+        is_first_principles = dynamics == Dynamics.first_principles
+        create = (
+            first_principles.Params.create if is_first_principles else lambda a, d=dynamics: fitted.Params.create(a, d)
+        )
         if dynamics in supported:
             create(airframe)
         else:
@@ -99,7 +101,11 @@ def test_every_airframe_gives_parameters_for_all_it_supports(name):
 
 @pytest.mark.parametrize("name", airframe_names())
 def test_every_airframe_has_a_battery(name):
-    """It is part of the drone, of 80 to 200 W h/kg as lithium-polymer batteries are, and not shorted by its motors."""
+    """Its mass is 10 to 40% of the drone's.
+
+    Like a lithium-polymer battery it holds 80 to 200 W h/kg, and the resistance of a cell times its capacity is 0.01 to
+    0.05 ohm A h.
+    """
     airframe = load_airframe(name)
     cells, capacity, resistance, mass = (
         float(airframe.value(f"battery.{key}", ())) for key in ("cells", "capacity", "resistance", "mass")
@@ -111,10 +117,16 @@ def test_every_airframe_has_a_battery(name):
 
 @pytest.mark.parametrize("name", airframe_names())
 def test_numbers_of_an_airframe_are_plausible(name):
-    """Thrust to weight between 1.3 and 12 (a racer), drag that dissipates, and curves that rise."""
+    """Thrust over weight is from 1.3 to 12 (a racer), and half of the rotors turn each way.
+
+    A rigid body can have the moments of inertia. From first principles, drag brakes, and the speed of hover is between
+    the limits of the rotors.
+    """
     airframe = load_airframe(name)
-    to_weight = airframe.n_rotors * airframe.value("rotors.thrust_max") / (airframe.value("rigid_body.mass") * 9.81)
-    assert 1.3 < to_weight < 12
+    thrust_to_weight = (
+        airframe.n_rotors * airframe.value("rotors.thrust_max") / (airframe.value("rigid_body.mass") * 9.81)
+    )
+    assert 1.3 < thrust_to_weight < 12
     moments = np.sort(np.linalg.eigvalsh(airframe.inertia))
     assert moments[0] + moments[1] >= moments[2] * (1 - 1e-9), "no rigid body has such moments of inertia"
     assert sorted(np.abs(airframe.value("rotors.yaw_torque_sign"))) == [1] * airframe.n_rotors
@@ -136,7 +148,7 @@ def test_mixing_matrix_by_hand():
     A thrust at (x, y) pushes up along z, so its torque is (y, -x, 0): left rotors roll to the right, rotors ahead
     raise the nose, which is a negative torque about y.
     """
-    tables = plain("cf21B_500")
+    tables = plain_tables("cf21B_500")
     tables["rotors"]["position"] = [[0.1, 0.2, 0.0], [0.3, -0.2, 0.0], [-0.4, 0.0, 0.1]]
     tables["rotors"]["yaw_torque_sign"] = [1, -1, 1]
     airframe = load_airframe(tables)
@@ -152,10 +164,11 @@ def test_mixing_matrix_of_a_crazyflie():
 
 @pytest.mark.parametrize("name", airframe_names())
 def test_rotors_of_built_in_airframes_are_in_bitcrazes_order_and_turn_as_its_motors(name):
-    """Clockwise from ahead-right; a torque to the left needs less of rotors 1 and 3 and more of 2 and 4.
+    """Rotors 1 to 4 go clockwise from ahead-right, seen from above.
 
-    As powerDistributionForceTorque of Bitcraze's firmware and of the lab's bumblebee-firmware have it. PX4's X500 turns
-    its motors ahead right and behind left counter-clockwise.
+    A torque to the left lowers the thrusts of rotors 1 and 3, and raises those of 2 and 4, as in
+    powerDistributionForceTorque of Bitcraze's firmware and of the lab's bumblebee-firmware. It agrees with PX4's X500,
+    whose motors ahead-right and behind-left turn counter-clockwise.
     """
     mixing = load_airframe(name).mixing_matrix
     np.testing.assert_array_equal(np.sign(mixing), [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
@@ -166,17 +179,17 @@ def test_names_files_and_dicts_give_the_same_airframe(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(text, encoding="utf-8")
     by_name, by_str, by_path = load_airframe(Drone.cf2x_L250), load_airframe(str(path)), load_airframe(path)
-    by_dict = load_airframe(plain("cf2x_L250"))
+    by_dict = load_airframe(plain_tables("cf2x_L250"))
     assert (by_name.name, by_str.name, by_path.name, by_dict.name) == ("cf2x_L250", "mine", "mine", "custom")
-    assert load_airframe(plain("cf2x_L250") | {"name": "named"}).name == "named"
+    assert load_airframe(plain_tables("cf2x_L250") | {"name": "named"}).name == "named"
     for other in (by_str, by_path, by_dict):
-        for key, entry in numbers(by_name.tables):
+        for key, entry in iterate_numbers(by_name.tables):
             np.testing.assert_array_equal(entry, other.value(key), key)
     assert load_airframe(by_name) is by_name
 
 
 def test_a_users_dict_is_left_alone_and_an_airframe_cannot_be_changed():
-    tables = plain("cf21B_500") | {"name": "mine"}
+    tables = plain_tables("cf21B_500") | {"name": "mine"}
     before = copy.deepcopy(tables)
     airframe = load_airframe(tables)
     assert tables == before
@@ -185,8 +198,8 @@ def test_a_users_dict_is_left_alone_and_an_airframe_cannot_be_changed():
 
 
 def hexacopter():
-    """Return a Crazyflie with six rotors on a circle of 60 mm, the first ahead, neighbours turning against."""
-    tables = plain("cf21B_500") | {"name": "hexa"}
+    """Return a drone of 60 g with six rotors of a Crazyflie on a circle of radius 60 mm, the first of them ahead."""
+    tables = plain_tables("cf21B_500") | {"name": "hexa"}
     angle = np.pi / 3 * np.arange(6)
     position = 0.06 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
     rotors = tables["rotors"] | {"position": position.tolist(), "yaw_torque_sign": [1, -1, 1, -1, 1, -1]}
@@ -275,21 +288,21 @@ WRONG = {
     "mass huge": (setting("rigid_body.mass", 10**400), "rigid_body.mass as a number or array, got 1000"),
     "too light": (setting("rigid_body.mass", 1e-6), "expected rotors that lift 1e-06 kg, .* 1000 times its weight"),
     "too heavy": (setting("rigid_body.mass", 0.2), "expected rotors that lift 0.2 kg, .*, got 4 rotors of .* to 0.2 N"),
-    "always up": (setting("rotors.thrust_min", 0.15), "expected rotors that lift 0.0434 kg, between"),
-    "inertia of no body": (
+    "least thrust above weight": (setting("rotors.thrust_min", 0.15), "expected rotors that lift 0.0434 kg, between"),
+    "inertia of no rigid body": (
         setting("rigid_body.inertia", [1e-5, 1e-5, 9e-5]),
         "moment is at most the sum of the others",
     ),
     "inertia tiny": (setting("rigid_body.inertia", [1e-14] * 3), "turn the body with at most 1e[+]06 rad/s"),
     "inertia zero": (setting("rigid_body.inertia", [1e-300] * 3), "three positive moments"),
-    "rotor of a mill": (setting("rotors.inertia", 1.0), "propellers with a smaller inertia than the whole drone"),
+    "rotor inertia large": (setting("rotors.inertia", 1.0), "propellers with a smaller inertia than the whole drone"),
     "rotor inertia negative": (setting("rotors.inertia", -1e-8), "rotors.inertia to be at least zero, got -1e-08"),
     "thrust curve zero": (setting("rotors.thrust_curve", [0, 0, 0]), "expected thrust_curve with a positive quadratic"),
     "thrust curve falls": (setting("rotors.thrust_curve", [0.2, 0, -1e-10]), "expected thrust_curve with a positive"),
     "thrust curve linear": (setting("rotors.thrust_curve", [0, 1e-5, 0]), "expected thrust_curve with a positive"),
     "thrust at rest": (setting("rotors.thrust_curve", [0.1, 0, 4e-10]), "rises from thrust_min to thrust_max"),
     "thrust curve tiny": (setting("rotors.thrust_curve", [0, 0, 1e-28]), "between 0 and 1e[+]06 rpm"),
-    "thrust curve of one rotor": (
+    "thrust curve zero for one rotor": (
         setting("rotors.thrust_curve", [[0, 0, 4e-10]] * 3 + [[0, 0, 0]]),
         "thrust_curve with",
     ),
@@ -322,8 +335,8 @@ WRONG = {
     ),
     "rotors far away": (setting("rotors.position", [[1e9, 0, 0]] * 4), "rotors.position to be from -1e3 to 1e3 m"),
     "drag that pushes": (setting("drag.coefficients", [0.02, -0.02, -0.02]), "expected drag.coefficients that brakes"),
-    "drag of a wall": (setting("drag.coefficients", [-1e3] * 3), "drag.coefficients .* slow for steps of 1/500 s"),
-    "drag askew": (
+    "drag large": (setting("drag.coefficients", [-1e3] * 3), "drag.coefficients .* slow for steps of 1/500 s"),
+    "drag matrix that pushes": (
         setting("drag.coefficients", [[-0.01, 0.03, 0], [0.03, -0.01, 0], [0, 0, -0.01]]),
         "expected drag.coefficients that brakes",
     ),
@@ -343,7 +356,7 @@ WRONG = {
         r"rigid_body.inertia of shape \(3,\) or \(3, 3\), got \(2,\)",
     ),
     "inertia negative": (setting("rigid_body.inertia", [1e-5, 1e-5, -1e-5]), "three positive moments"),
-    "inertia askew": (
+    "inertia not symmetric": (
         setting("rigid_body.inertia", [[1e-5, 1e-6, 0], [0, 1e-5, 0], [0, 0, 1e-5]]),
         "symmetric positive definite",
     ),
@@ -403,7 +416,7 @@ WRONG = {
         setting("rigid_body.mass", {"value": 0.03, "units": "kg"}),
         r"as a number, an array or \{ value, unit, source \}, got \{'value': 0.03, 'units': 'kg'\}",
     ),
-    "a table of one's own": (setting("paint", {"colour": 3}), r"expected a table that exists, got \[paint\]. docs"),
+    "table unknown": (setting("paint", {"colour": 3}), r"expected a table that exists, got \[paint\]. docs"),
     "a coefficient of another model": (
         setting("fitted.so_rpy.thrust_dyn_coef", 16.0),
         "got 'fitted.so_rpy.thrust_dyn_coef'. Did you mean 'fitted.so_rpy_rotor.thrust_dyn_coef'",
@@ -417,9 +430,9 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_law_09_a_wrong_airframe_is_refused(case):
     change, message = WRONG[case]
-    tables = plain("cf21B_500")
+    tables = plain_tables("cf21B_500")
     change(tables)
-    controller = "crazyflow" if case in ("no gain", "no controller") else "auto"  # which needs no gains
+    controller = "crazyflow" if case in ("no gain", "no controller") else "auto"  # "auto" needs no gains
     with pytest.raises(ConfigError, match=message):
         Sim(drone=tables, controller=controller)
 
@@ -565,7 +578,7 @@ def test_a_base_gives_the_numbers_that_are_not_given(tmp_path):
     named = load_airframe({"base": str(tmp_path / "light.toml"), "name": "named", "rotors": {"inertia": 1e-6}})
     changed = {"rotors.thrust_min": (0.5, 0.5), "rotors.inertia": (lab.value("rotors.inertia"), 1e-6)}
     assert (light.name, named.name) == ("light", "named")
-    for path, value in numbers(lab.tables):
+    for path, value in iterate_numbers(lab.tables):
         for airframe, expected in zip((light, named), changed.get(path, (value, value)), strict=True):
             np.testing.assert_array_equal(airframe.value(path), expected)
 
@@ -601,7 +614,7 @@ def test_another_body_inherits_no_gains(changes):
 def test_figure_of_merit_at_hover(name):
     """Ideal over actual power of a rotor at hover, ``T^1.5 / sqrt(2 rho A) / (Q w)``, as the files state it.
 
-    Lower than 0.2 are the two that keep a preset of a lab: their files say so.
+    It is below 0.2 for the two airframes whose ratio of torque to thrust is that of a preset of AIMotionLab.
     """
     airframe = load_airframe(name)
     params = first_principles.Params.create(airframe)
@@ -619,7 +632,7 @@ def test_figure_of_merit_at_hover(name):
 
 
 def test_full_thrust_voltage_is_that_of_the_firmwares_curves():
-    """Their cubic meets the largest thrust: worked out with numpy.roots from the firmware's four coefficients."""
+    """At it, the firmware's cubic of thrust over voltage gives thrust_max; the numbers were found with numpy.roots."""
     expected = {"cf21B_500": 3.1257, "cf2x_P250": 3.0799, "cf2x_T350": 2.8166, "cf2x_L250": 2.9836, "crazyflie": 3.3482}
     for name, volts in expected.items():
         assert load_airframe(name).full_thrust_voltage == pytest.approx(volts, abs=1e-4)
@@ -629,7 +642,7 @@ def test_full_thrust_voltage_is_that_of_the_firmwares_curves():
 @pytest.mark.parametrize("name", ["cf21B_500", "cf2x_L250", "bumblebee", "hb_x500"])
 def test_a_body_without_a_shape_is_about_as_large_as_the_real_one(name):
     """Lengths that are left out follow from mass and rotors: within a factor of 2.1, spheres of contact within 20%."""
-    tables = plain(name)
+    tables = plain_tables(name)
     true = body_shape(load_airframe(tables))
     derived = body_shape(load_airframe({k: v for k, v in tables.items() if k != "shape"}))
     assert set(derived) == set(TABLES["shape"])
@@ -643,8 +656,8 @@ def test_a_body_without_a_shape_is_about_as_large_as_the_real_one(name):
     np.testing.assert_allclose(some["plate"], derived["plate"])
 
 
-def test_a_drone_without_a_shape_flies_and_is_rendered_and_touches():
-    tables = plain("cf21B_500")
+def test_a_drone_without_a_shape_steps_and_has_all_geoms():
+    tables = plain_tables("cf21B_500")
     del tables["shape"]
     sim = Sim(drone=tables)
     sim.step(5)

@@ -1,4 +1,4 @@
-"""Actions as an affine map to commands, whose zero makes every airframe hover."""
+"""Actions, which an affine map turns into commands: with an action of zero every airframe hovers."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ CASES = [
     for dynamics, control in PAIRS
     if dynamics in supported_dynamics(drone)
 ]
-LEVEL = jnp.array([0.0, 0.0, 0.0, 1.0])
+LEVEL_QUAT = jnp.array([0.0, 0.0, 0.0, 1.0])
 STILL = jnp.zeros(3)
 
 
@@ -30,7 +30,7 @@ def params_of(airframe, dynamics):
 
 @pytest.mark.parametrize(("drone", "dynamics", "control"), CASES)
 def test_a_zero_action_is_the_command_that_hovers(drone, dynamics, control):
-    """The derivatives of a level drone at rest vanish under it: checked in the equations of motion themselves."""
+    """A state command is 1 m above the origin; with any other, the derivatives of a level drone at rest are zero."""
     params = params_of(load_airframe(drone), dynamics)
     actions = actions_of(load_airframe(drone), params, Control(control))
     command = actions.command(jnp.zeros(actions.size))
@@ -48,8 +48,8 @@ def test_a_zero_action_is_the_command_that_hovers(drone, dynamics, control):
     else:
         rotor_vel, command_of_motors = command[3:], command
     model = first_principles.dynamics if dynamics == "first_principles" else fitted.dynamics
-    slopes = model(STILL, LEVEL, STILL, STILL, command_of_motors, rotor_vel, params=params)
-    vel, acc, ang_acc, rotor_acc = map(np.asarray, slopes)
+    derivatives = model(STILL, LEVEL_QUAT, STILL, STILL, command_of_motors, rotor_vel, params=params)
+    vel, acc, ang_acc, rotor_acc = map(np.asarray, derivatives)
     np.testing.assert_array_equal(vel, np.zeros(3))
     np.testing.assert_allclose(acc, np.zeros(3), atol=2e-5)
     np.testing.assert_allclose(ang_acc, np.zeros(3), atol=1e-3)
@@ -57,7 +57,7 @@ def test_a_zero_action_is_the_command_that_hovers(drone, dynamics, control):
 
 
 @pytest.mark.parametrize("control", LEVELS)
-def test_the_map_is_affine_and_ends_at_one(control):
+def test_the_map_is_affine_from_minus_one_to_one_and_clipped_beyond(control):
     airframe = load_airframe("cf21B_500")
     actions = actions_of(airframe, first_principles.Params.create(airframe), Control(control))
     n = 3 if control == "state" else 4
@@ -98,10 +98,10 @@ def test_any_leading_axes_and_gradients_everywhere():
     assert (commands.shape, commands.dtype) == ((3, 2, 4), jnp.float32)
     np.testing.assert_array_equal(np.asarray(commands)[1, 1], actions.command(action[1, 1]))
     values = np.float32([-2, -1, 0, 1, 2])
-    slopes = np.asarray(jax.jit(jax.vmap(jax.jacobian(actions.command)))(np.tile(values[:, None], 4)))
-    assert np.isfinite(slopes).all()
-    assert not slopes[:, ~np.eye(4, dtype=bool)].any()
-    np.testing.assert_allclose(np.diag(slopes[2]), actions.scale, rtol=1e-6)
+    jacobians = np.asarray(jax.jit(jax.vmap(jax.jacobian(actions.command)))(np.tile(values[:, None], 4)))
+    assert np.isfinite(jacobians).all()
+    assert not jacobians[:, ~np.eye(4, dtype=bool)].any()
+    np.testing.assert_allclose(np.diag(jacobians[2]), actions.scale, rtol=1e-6)
 
 
 def test_the_text_of_actions_has_their_level_and_limits():

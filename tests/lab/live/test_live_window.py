@@ -1,4 +1,4 @@
-"""A live window on a virtual screen: its picture, keys and clicks, and a window that is closed or killed."""
+"""A live window on a virtual screen: its picture, windows that are killed, errors, LEDs and reports of clicks."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ def screen(tmp_path_factory):
     yield from virtual_screen(tmp_path_factory.mktemp("screen"))
 
 
-WINDOW_PROGRAM = textwrap.dedent("""
+SIMULATION_SCRIPT = textwrap.dedent("""
     import sys, threading, time
     import numpy as np
     from crazysim import Sim
@@ -48,7 +48,7 @@ WINDOW_PROGRAM = textwrap.dedent("""
         if line.strip() == "kill":
             window._process.kill()
             window._process.wait()
-        if line.strip() == "close":
+        if line.strip() == "kill_other":
             other._process.kill()
             thread.join(300)
             assert not thread.is_alive() and not other.is_open, "the run ends with its last window"
@@ -67,7 +67,7 @@ def mark_columns(pixels):
 def test_a_window_shows_worlds_and_the_run_continues_when_it_is_killed(screen, opengl):
     display, path = screen
     environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": "egl", "PYTHONPATH": ":".join(sys.path)}
-    command = [sys.executable, "-c", WINDOW_PROGRAM]
+    command = [sys.executable, "-c", SIMULATION_SCRIPT]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
     ) as program:
@@ -83,12 +83,13 @@ def test_a_window_shows_worlds_and_the_run_continues_when_it_is_killed(screen, o
             columns = mark_columns(screen_pixels(path))
             if len(columns) > 50:
                 break
-        # The right tile shows world 1, whose drone is 0.3 m beside the middle, and is selected. From 2 m with 45
-        # degrees of height for 200 pixels a metre has 200 / (2 * 2 * tan 22.5) = 121 pixels: 36 beside the middle.
+        # The right tile shows world 1, whose drone is selected. It is 0.3 m to the right of the point that the camera
+        # looks at from a distance of 2 m. The camera's 45 degrees fill 200 pixels, so a metre takes
+        # 200 / (2 * 2 * tan 22.5 deg) = 121 pixels, and the mark is 36 pixels to the right of the middle.
         assert len(columns) > 50, "no mark of the selected drone"
         np.testing.assert_allclose(columns.mean(), 200 + 100 + 36, atol=6)
         assert send("kill") == ["kill", "0", "False"]
-        assert send("close")[0] == "close"
+        assert send("kill_other")[0] == "kill_other"
         program.stdin.close()
         assert program.wait(300) == 0
 
@@ -97,7 +98,7 @@ def test_without_a_screen_a_window_is_refused(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     if sys.platform != "linux":
-        pytest.skip("screens are known by name on Linux only")
+        pytest.skip("only on Linux do environment variables name the screen")
     with Live(Sim()) as live, pytest.raises(RenderError, match="expected a screen"):
         live.show(Window())
 
@@ -136,7 +137,7 @@ def test_leds_have_the_colours_of_the_picture():
 
 
 def test_a_double_click_reports_the_body_below_it():
-    """A click on a wheel reports its car; a click on a fixed geom reports the ground."""
+    """A click on a wheel reports its car, one on a fixed geom its point, and one on nothing is not reported."""
     sim = Sim(n_drones=2, control="state")
     sim.add(Cars(2))
     sim.scene.compile_if_edited()

@@ -13,12 +13,17 @@ from crazysim.jaxcompat import JaxprEqn
 
 @rule("reduce_over_others")
 def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Add a loop over the drones of the world; numbers that all drones share are not published."""
+    """Add a loop over the drones of the world; in a world of one drone, apply the function to that drone.
+
+    A drone publishes only the numbers that the function uses and that may differ between drones.
+    """
     n_captured, n = eqn.params["n_captured"], ctx.n_members
     if not n:
         raise UnsupportedError("it needs a stage with scope 'drone'")
     if ctx.builder.outer is not None:
-        raise UnsupportedError("it is in a loop, or in a function with a custom derivative")
+        raise UnsupportedError(
+            "it is in a loop, in a function with a custom derivative, or in the function of another reduction"
+        )
     if n == 1:
         return ctx.lower(eqn.params["jaxpr"], [*args, as_elements([constant(True, bool)], ())])
     published = [x for x in scalars(*args[n_captured:]) if not is_constant(x)]

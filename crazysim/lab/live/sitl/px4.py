@@ -32,16 +32,16 @@ CHUNK_BYTES = 65536
 
 
 class Px4(FirmwareLink):
-    """A process of PX4 that was started without a simulator, as ``make px4_sitl none_iris``.
+    """Link to a process of PX4 that was started without a simulator, for example by ``make px4_sitl none_iris``.
 
     PX4 is the client of a TCP connection, and in lockstep with the simulation: it advances its clock when a
     ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. While it starts, it needs the clock but does not
     answer; until the first answer, the simulation runs in real time with its motors off. PX4 answers only to new
     measurements of the gyroscope; without one from the ``IMU``, its last motor commands stay in force.
 
-    It receives each new measurement of ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS``. It treats a sensor whose
-    measurements never change as broken, so give every sensor noise. The true state in
-    ``HIL_STATE_QUATERNION`` is for its log; its accelerations are the ``IMU``'s.
+    PX4 receives each new measurement of ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS``. It treats a sensor whose
+    measurements never change as broken, so give every sensor noise. ``HIL_STATE_QUATERNION`` holds the true state, for
+    PX4's log; only the accelerations in it are measurements of the ``IMU``.
     """
 
     positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))
@@ -58,7 +58,8 @@ class Px4(FirmwareLink):
             host: Address to listen at.
             port: Port, 4560 plus the number of the instance.
             origin: Geodetic position of the world's origin.
-            connect_timeout: Time to wait for PX4 when the first measurements are sent, s.
+            connect_timeout: Time to wait for PX4 to connect when the first measurements are sent, s, and time limit of
+                each message that is sent.
 
         Raises:
             ConfigError: If pymavlink is not installed, an argument is out of range, or the port is in use.
@@ -95,7 +96,10 @@ class Px4(FirmwareLink):
         return self._server.getsockname()
 
     def send(self, measured: Measurements) -> None:
-        """Send ``HIL_SENSOR``, ``HIL_GPS`` where there is a new position, and ``HIL_STATE_QUATERNION``."""
+        """Send ``HIL_SENSOR``, ``HIL_GPS`` if there is a new position, and ``HIL_STATE_QUATERNION``.
+
+        The first call waits until PX4 connects.
+        """
         origin, mav, micros = self.origin, self._mavlink, round(measured.time * 1e6)
         field = to_frd(measured.field) / GAUSS
         altitude = origin.altitude + measured.height
@@ -144,7 +148,12 @@ class Px4(FirmwareLink):
                 connection.close()
 
     def _newest_commands(self, deadline: float) -> NDArray | None:
-        """Return the newest motor commands, or None if none arrived until a time of ``time.monotonic``. (4,)"""
+        """Return the newest motor commands, zero while PX4 is not armed; None if none arrived in time. (4,)
+
+        Args:
+            deadline: Time of ``time.monotonic`` until which to wait for commands. Later, only those that have already
+                arrived are read, for at most ``MAX_DRAIN_TIME``.
+        """
         motors, now = None, time.monotonic()
         end = max(deadline, now) + MAX_DRAIN_TIME
         while now < end and self._has_data(max(deadline - now, 0.0) if motors is None else 0.0):
@@ -202,4 +211,5 @@ class Px4(FirmwareLink):
 
 
 def _closed_error() -> ConfigError:
+    """Return the error for a connection that PX4 closed, or from which it did not read a message in time."""
     return ConfigError("expected PX4 to stay connected, got a closed connection. Start it again.")
