@@ -114,13 +114,17 @@ def test_a_world_that_does_not_fit_into_a_block_runs_on_lanes():
     sim = Sim(n_worlds=1, n_drones=1025, control="rotor_vel", engine="lanes")
     sim.add(Downwash())
     program = sim.build_step_fn().plan(sim.data).program
-    with pytest.raises(UnsupportedError, match="up to 1024 on a GPU"):
+    with pytest.raises(
+        UnsupportedError, match="the 1025 drones of a world read each other's numbers; on a GPU at most 1024 can"
+    ):
         kernel.write(program, "cuda")
 
 
 def test_records_that_do_not_fit_into_a_block_are_refused():
     exchange = make_exchange("cuda", 1024)
-    with pytest.raises(UnsupportedError, match="a GPU's block has 49152"):
+    with pytest.raises(
+        UnsupportedError, match=r"the drones of a block publish 65536 bytes .* block's static shared memory has 49152"
+    ):
         exchange.publish(Writer(exchange), [("f32", "0")] * 13, [], 1)
 
 
@@ -173,7 +177,7 @@ def test_compiling_for_one_platform_needs_no_compiler_of_another(monkeypatch):
 def test_a_step_without_a_kernel_where_jax_compiles_it_is_an_error():
     sim = Sim(n_worlds=1, n_drones=1025, control="rotor_vel")
     sim.add(Downwash())
-    with pytest.raises(ConfigError, match=r"expected a kernel for the GPU, .*up to 1024 .*\. Use engine='lanes'"):
+    with pytest.raises(ConfigError, match=r"expected a kernel for the GPU, .*at most 1024 .*\. Use engine='lanes'"):
         lowered_text(sim, "cpu", "cuda")
 
 
