@@ -12,6 +12,7 @@ from crazysim.commands.options import (
     add_page_options,
     add_simulation_options,
     has_screen,
+    load_policy_and_env,
     require_screen,
     specified_options,
 )
@@ -118,12 +119,9 @@ def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
     if names := [f"--{name.replace('_', '-')}" for name in excluded if getattr(options, name) not in (None, False)]:
         raise ConfigError(f"expected the settings of the run with --policy, got {', '.join(names)}. Leave them out.")
     from crazysim.lab.live.policy_pilot import PolicyPilot, read_points
-    from crazysim.train.training import check_observations, load_policy
 
     points = None if options.goals is None else read_points(options.goals)
-    policy, config, meta = load_policy(options.policy)
-    env = config.with_device(options.device).make_env(options.worlds)
-    check_observations(env, options.policy, config.title, meta)
+    policy, _, env = load_policy_and_env(options.policy, options.device, options.worlds)
     return PolicyPilot(env, policy, points)
 
 

@@ -1,13 +1,19 @@
-"""Help texts and options that several commands have."""
+"""Help texts and options of several commands, and the policy of a run with its environment."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from crazysim.errors import ConfigError
+
+if TYPE_CHECKING:
+    from crazysim.envs.env import Env
+    from crazysim.train.config import TrainConfig
+    from crazysim.train.networks import Policy
 
 
 class DefaultsFormatter(argparse.HelpFormatter):
@@ -56,3 +62,25 @@ def require_screen(remedy: str) -> None:
     """
     if not has_screen():
         raise ConfigError(f"expected a screen for --window, got none. Use {remedy}.")
+
+
+def load_policy_and_env(
+    folder: Path, device: str | None, n_worlds: int, task: str | None = None
+) -> tuple[Policy, TrainConfig, Env]:
+    """Return the policy of a run, its configuration, and an environment with the observations of the policy.
+
+    Args:
+        folder: Folder of the run.
+        device: Device of the environment; None for the training's.
+        n_worlds: Number of worlds of the environment.
+        task: Reference of the task, if it has moved since training; None for the reference in the run.
+
+    Raises:
+        ConfigError: If the run is damaged, or if the task has other observations.
+    """
+    from crazysim.train.training import check_observations, load_policy
+
+    policy, config, meta = load_policy(folder, task)
+    env = config.with_device(device).make_env(n_worlds)
+    check_observations(env, folder, config.title, meta)
+    return policy, config, env

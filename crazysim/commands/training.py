@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from crazysim.commands import hosts
-from crazysim.commands.options import DefaultsFormatter, specified_options
+from crazysim.commands.options import DefaultsFormatter, load_policy_and_env, specified_options
 from crazysim.errors import ConfigError
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
@@ -184,13 +184,10 @@ def evaluate(options: argparse.Namespace) -> None:
 
     from crazysim.train.evaluation import TERM_PREFIX, describe_outcome, evaluate
     from crazysim.train.show import plot_episode
-    from crazysim.train.training import check_observations, load_policy
 
     if options.plot is not None:
         check_writable(options.plot, PICTURE_SUFFIXES)
-    policy, config, meta = load_policy(options.folder, options.task)
-    env = config.with_device(options.device).make_env(options.worlds)
-    check_observations(env, options.folder, config.title, meta)
+    policy, config, env = load_policy_and_env(options.folder, options.device, options.worlds, options.task)
     key = None if options.seed is None else jax.random.key(options.seed)
     metrics = evaluate(env, policy, key)
     terms = ", ".join(f"{k.removeprefix(TERM_PREFIX)} {x:.4g}" for k, x in metrics.items() if k.startswith(TERM_PREFIX))
@@ -229,11 +226,8 @@ def export(options: argparse.Namespace) -> None:
 def render(options: argparse.Namespace) -> None:
     """Film a policy."""
     from crazysim.train.show import film
-    from crazysim.train.training import check_observations, load_policy
 
-    policy, config, meta = load_policy(options.folder, options.task)
+    policy, _, env = load_policy_and_env(options.folder, options.device, options.worlds, options.task)
     path = options.film or options.folder / "policy.mp4"
-    env = config.with_device(options.device).make_env(options.worlds)
-    check_observations(env, options.folder, config.title, meta)
     film(env, policy, path, options.worlds, options.seed, progress=True)
     print(f"wrote {path}")
