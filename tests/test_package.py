@@ -31,7 +31,7 @@ def test_public_names_exist_once():
     assert crazysim.__version__ == PROJECT["version"]
 
 
-@pytest.mark.parametrize("module", ["crazysim", "crazysim.control", "crazysim.envs", "crazysim.train"])
+@pytest.mark.parametrize("module", ["crazysim", "crazysim.control", "crazysim.envs"])
 def test_a_star_import_needs_no_optional_package(module, monkeypatch):
     for name in ("stable_baselines3", "crazysim.envs.pettingzoo", "crazysim.envs.sb3"):
         monkeypatch.setitem(sys.modules, name, None)
