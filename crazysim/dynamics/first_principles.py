@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -167,15 +169,16 @@ def pad_rotors(params: Params, n_rotors: int) -> Params:
     if n_present == n_rotors:
         return params
 
-    def extend(x: Array, axis: int) -> np.ndarray:
+    def extend(x: Array, axis: int, mode: Any = "constant") -> np.ndarray:
         array = np.asarray(x)
         per_rotor = (
             np.broadcast_to(array, [*array.shape[:axis], n_present, *array.shape[axis + 1 :]])
             if array.shape[axis] == 1
             else array
         )
-        return np.pad(per_rotor, [(0, n_rotors - n_present if k == axis else 0) for k in range(array.ndim)])
+        return np.pad(per_rotor, [(0, n_rotors - n_present if k == axis else 0) for k in range(array.ndim)], mode)
 
     curves = {name: extend(getattr(params, name), 0) for name in ("rpm2thrust", "rpm2torque")}
     limits = {name: extend(getattr(params, name), 0) for name in ("rotor_vel_min", "rotor_vel_max")}
-    return params.replace(mixing_matrix=extend(params.mixing_matrix, 1), **curves, **limits)
+    inertia_and_lag = {name: extend(getattr(params, name), 0, "edge") for name in ("prop_inertia", "rotor_dyn_coef")}
+    return params.replace(mixing_matrix=extend(params.mixing_matrix, 1), **curves, **limits, **inertia_and_lag)

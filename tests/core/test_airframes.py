@@ -72,6 +72,24 @@ def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fle
         np.testing.assert_array_equal(got[n:], 0)
 
 
+@pytest.mark.parametrize("name", ["bumblebee", "hexarotor"])
+@pytest.mark.parametrize("key", ["inertia", "lag"])
+def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, name):
+    """The number of each rotor is of the airframe with fewer or with more rotors."""
+    fleet = {"bumblebee": load_airframe("bumblebee"), "hexarotor": load_airframe(HEXAROTOR)}
+    n, value = fleet[name].n_rotors, np.asarray(fleet[name].value(f"rotors.{key}"))
+    factors = np.linspace(0.9, 1.1, n).reshape(n, *[1] * (value.ndim if key == "lag" else 0))
+    fleet[name] = load_airframe({"base": fleet[name], "rotors": {key: (value * factors).tolist()}})
+    pos = positions(1, 2)
+    mixed = in_flight(Sim(drone=list(fleet.values()), control="body_rate", engine="interpret"), pos)
+    mixed.step(25)
+    for k, airframe in enumerate(fleet.values()):
+        alone = in_flight(Sim(drone=airframe, control="body_rate", engine="interpret"), pos[:, k : k + 1])
+        alone.step(25)
+        found, expected = mixed.data.states.ang_vel[0, k], alone.data.states.ang_vel[0, 0]
+        np.testing.assert_allclose(found, expected, rtol=3e-5, atol=3e-5)
+
+
 @pytest.mark.parametrize("dynamics", ["so_rpy", "so_rpy_rotor"])
 def test_fitted_models_may_be_mixed(dynamics):
     fleet = ("cf21B_500", "cf2x_L250")

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -365,6 +366,28 @@ def compilers(folder):
     """Return the commands of running compilers whose files are in a folder."""
     done = subprocess.run(["ps", "-eww", "-o", "args"], capture_output=True, text=True, check=True)
     return [line for line in done.stdout.splitlines() if str(folder) in line and "kernel.cpp" in line]
+
+
+def test_a_compiler_that_is_killed_by_an_interrupt_does_not_refuse_its_kernel():
+    """``KernelError`` would make another engine compile for minutes in a program that is to end."""
+    slow = "constexpr long f() { long s = 0; for (long i = 0; i < 1000000000; i++) s += i; return s; }"
+    slow += "constexpr long x = f();"
+    flags = ["-fconstexpr-ops-limit=1000000000000", "-fconstexpr-loop-limit=2000000000"]
+    command = [*native.compiler_command(), *flags]
+    futures = []
+
+    def interrupt_when_the_compiler_runs():
+        with native.compiling_threads(1) as pool:
+            futures.append(pool.submit(native._compile, command, slow))
+            while not native._COMPILER_PIPES:
+                time.sleep(0.01)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupt_when_the_compiler_runs()
+    assert isinstance(futures[0].exception(), RuntimeError)
+    assert not isinstance(futures[0].exception(), KernelError)
+    assert not native._INTERRUPTED.is_set()
 
 
 @pytest.mark.parametrize(

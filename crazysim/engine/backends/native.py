@@ -293,19 +293,27 @@ def _check_settings(work: Path) -> None:
 def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
     """Provide threads that compile. If the ``with`` block is interrupted, their compilers are killed.
 
+    A kernel whose compiler was killed raises ``RuntimeError``, so that no other engine compiles in its place.
+
     Args:
         n: Number of threads; None for the default.
     """
-    with ThreadPoolExecutor(n) as executor:
-        try:
-            yield executor
-        except (KeyboardInterrupt, SystemExit):
-            executor.shutdown(wait=False, cancel_futures=True)
-            for pipe in list(_COMPILER_PIPES):
-                pipe.close()
-            raise
+    try:
+        with ThreadPoolExecutor(n) as executor:
+            try:
+                yield executor
+            except (KeyboardInterrupt, SystemExit):
+                executor.shutdown(wait=False, cancel_futures=True)
+                _INTERRUPTED.set()
+                for pipe in list(_COMPILER_PIPES):
+                    pipe.close()
+                raise
+    finally:
+        _INTERRUPTED.clear()
 
 
+_INTERRUPTED = threading.Event()
+"""Set while threads that compile end because they were interrupted."""
 _COMPILER_PIPES: set[IO[str]] = set()
 """Pipes of the running compilers; closing a pipe kills its compiler."""
 
@@ -343,4 +351,6 @@ def _run_compiler(
             finally:
                 _COMPILER_PIPES.discard(write_end)
                 write_end.close()
+    if _INTERRUPTED.is_set():
+        raise RuntimeError(f"{words[0]} was interrupted")
     return subprocess.CompletedProcess(list(words), process.returncode, stdout, stderr)

@@ -149,8 +149,7 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
             )
         if geom.shape.kind not in ("plane", "hfield"):
             points += [
-                _nearest_plate_point(data, geom, to_geom, plate, plate_centre, surface_vel[..., :1, :])
-                for plate_centre in plate_centres
+                _nearest_plate_point(data, geom, to_geom, plate, plate_centre, vel) for plate_centre in plate_centres
             ]
     arrays = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*points, strict=True)))
     return ContactPoints(*arrays)
@@ -205,7 +204,7 @@ def _extent_along(shape: Shape, direction: Array) -> Array:
 
 
 def _nearest_plate_point(
-    data: SimData, geom: CollisionGeom, to_geom: Callable, shape: Shape, plate_centre: Array, vel: Array
+    data: SimData, geom: CollisionGeom, to_geom: Callable, shape: Shape, plate_centre: Array, vel: Callable | None
 ) -> ContactPoints:
     """Return the point of a plate that is nearest to a geom.
 
@@ -226,7 +225,10 @@ def _nearest_plate_point(
     normal = rotation.rotate_inverse(quat, force)
     reach = jnp.sum(jnp.abs(normal) * jnp.asarray(shape.size, pos.dtype), axis=-1, keepdims=True)
     point = rotation.cross(normal, torque) - reach * normal
-    return ContactPoints(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
+    if vel is None:
+        return ContactPoints(gap, normal, point, jnp.zeros_like(normal))
+    surface_vel = rotation.rotate_inverse(quat, vel(pos + rotation.rotate(quat, point)))
+    return ContactPoints(gap, normal, point, surface_vel)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
