@@ -289,8 +289,8 @@ def _load_teacher_run(folder: str) -> tuple[Policy, Any, dict[str, Any]]:
 
     if not Path(folder).exists():
         raise ConfigError(
-            f"expected the run of the teacher in {folder!r}, got no such folder. Move it back there; a resumed "
-            f"training keeps its teacher."
+            f"expected the run of the teacher in {folder!r}, got no such folder. Use the folder of a run; if you "
+            f"resume a student, move its teacher back there."
         )
     return load_policy(folder)
 

@@ -246,6 +246,8 @@ def _train_teacher(
     if teacher is None or (resume and (folder / CHECKPOINT_FILE).exists()):
         return False
     require_no_run(folder)
+    if resume and not (folder / TEACHER_FOLDER / CHECKPOINT_FILE).exists():
+        raise ConfigError(f"expected a run to resume in {folder}, got none. Train without --resume first.")
     _check_student(student)
     log(
         f"first the teacher of {student.title}, then the student by {student.algorithm}; if the teacher is "

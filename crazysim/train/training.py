@@ -501,6 +501,12 @@ def load_policy(
     if Path(folder).is_file():
         raise ConfigError(f"expected the folder of a run, got the file {str(folder)!r}. Use {Path(folder).parent}.")
     path = Path(folder) / POLICY_FILE
+    if not path.exists() and (Path(folder) / TABLE_FILE).exists():
+        names = [row["name"] for row in json.loads((Path(folder) / TABLE_FILE).read_text())]
+        raise ConfigError(
+            f"expected the folder of one training, got {str(folder)!r} with several. Use one of its folders: "
+            f"{', '.join(names)}."
+        )
     arrays, meta = checkpoint.read(path)
     with checkpoint.wrap_checkpoint_errors(path):
         config = TrainConfig(**meta["settings"])

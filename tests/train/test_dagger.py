@@ -114,7 +114,11 @@ def test_a_recipe_trains_its_teacher_first(recipe_with_teacher, tmp_path):
     assert sum("by ppo" in line for line in lines) == 1
     assert sum("by dagger" in line and "continues after iteration 1" in line for line in lines) == 1
 
+    with pytest.raises(ConfigError, match=r"expected a run to resume in .*none, got none"):
+        run("hover", tmp_path / "none", resume=True, **settings)
     students = run_many("hover", tmp_path / "many", seeds=[5, 6], **settings)
+    with pytest.raises(ConfigError, match=r"the folder of one training, .* Use one of its folders: seed-5, seed-6"):
+        load_policy(tmp_path / "many")
     assert students.keys() == {"seed-5", "seed-6"}
     assert load_policy(tmp_path / "many" / "teacher")[1].seed == 5
     assert load_policy(tmp_path / "many" / "seed-6")[1].config["teacher"] == str(
