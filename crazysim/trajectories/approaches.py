@@ -10,15 +10,15 @@ from crazysim.trajectories.bezier import bernstein_matrix
 from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 
 CELL_DURATION = 0.4
-"""Length of a cell at the first level, s."""
+"""Length of the cells at the start of the search, s. A cell is an interval of time in the flight of one pair."""
 N_SPLITS = 4
-"""Number of parts into which a cell is split."""
+"""Number of cells into which a cell is split."""
 CELLS_PER_BATCH = 500_000
-"""Number of cells, of all pairs, that are examined at once, which bounds the memory."""
+"""Largest number of cells that are examined at once; it bounds the memory."""
 MAX_TABLE_CELLS = 4_000_000
-"""Largest number of cells, of all drones, for which the motion of every drone is computed once and looked up."""
+"""Largest size of a table with the motion of every drone in every cell. Otherwise motion is computed for each pair."""
 MIN_CELL_DURATION = 1e-6
-"""Length below which a cell is not split, s. Only cells with a jump of a position become so short."""
+"""Length below which the search ends, s. Only cells in which a position jumps become so short."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,15 @@ class Approach:
 def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Approach]:
     """Return the closest approach of every pair, nearest pair first.
 
-    In a cell of time, the relative motion deviates from its chord by at most ``dt^2 / 8`` times its largest
-    acceleration, plus ``dt / 4`` times the jumps of the velocity, plus the jumps of the position. The distance to the
-    chord minus this bound is a lower bound of the distance. Cells whose lower bound is at least the smallest distance
-    found minus the tolerance are dropped, and the others split. The relative acceleration is bounded by acceleration
-    and jerk in the middle and the largest snaps, so that drones in formation need no short cells.
+    In a cell, the relative motion deviates from its chord by at most ``dt^2 / 8`` times its largest acceleration, plus
+    ``dt / 4`` times the jumps of the velocity, plus the jumps of the position. The distance to the chord minus this
+    bound is a lower bound of the distance. If it is less than the pair's smallest distance so far minus the tolerance,
+    the cell is split; otherwise it is dropped. The relative acceleration is bounded by acceleration and jerk in the
+    middle of the cell and the largest snaps, so that drones in formation need no short cells.
 
     Args:
         pieces: Trajectories.
-        tolerance: Largest error of a distance, m. A distance is never too small, since it is evaluated at its ``time``.
+        tolerance: Largest error of a distance, m. It is never too small, since it is evaluated at ``time``.
     """
     n = pieces.n_drones
     first, second = np.triu_indices(n, 1)
@@ -56,12 +56,12 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
     pair, cell = np.repeat(np.arange(len(first)), n_cells), np.tile(np.arange(n_cells), len(first))
     while len(pair) and dt > MIN_CELL_DURATION:
         uses_table = n_cells * pieces.n_drones <= min(MAX_TABLE_CELLS, len(pair))
-        table = motion.table(n_cells, dt) if uses_table else None
+        motion_table = motion.tabulate(n_cells, dt) if uses_table else None
         is_kept = np.zeros(len(pair), bool)
         for k in range(0, len(pair), CELLS_PER_BATCH):
             part = slice(k, k + CELLS_PER_BATCH)
             i, j = first[pair[part]], second[pair[part]]
-            motion_i, motion_j = (motion.motion_in_cells(drone, cell[part], dt, table) for drone in (i, j))
+            motion_i, motion_j = (motion.motion_in_cells(drone, cell[part], dt, motion_table) for drone in (i, j))
             lower_bound = _lower_bounds(
                 pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, min_distance, best_time
             )
@@ -76,7 +76,7 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
 
 
 class _Motion:
-    """Motion of single drones in cells of time: positions at both ends, derivatives in the middle, and a bound."""
+    """Motion of single drones in cells: positions at both ends, derivatives in the middle, and a bound of the rest."""
 
     def __init__(self, pieces: PieceTable) -> None:
         self.pieces = pieces
@@ -91,26 +91,25 @@ class _Motion:
             summed_jumps[order, piece + 1] = np.linalg.norm((start_values - end_values)[:, :3], axis=-1)
         self.summed_jumps = np.cumsum(summed_jumps, axis=1)
 
-    def table(self, n_cells: int, dt: float) -> tuple[Floats, ...]:
+    def tabulate(self, n_cells: int, dt: float) -> tuple[Floats, ...]:
         """Return the motion of every drone in every cell. (n_drones, n_cells, ...)"""
         return self.motion_in_cells(np.arange(self.pieces.n_drones)[:, None], np.arange(n_cells), dt, None)
 
     def motion_in_cells(
-        self, drone: Ints, cell: Ints, dt: float, table: tuple[Floats, ...] | None
+        self, drone: Ints, cell: Ints, dt: float, motion_table: tuple[Floats, ...] | None
     ) -> tuple[Floats, ...]:
-        """Return positions at start and end, acceleration and jerk in the middle (..., 3) and bound (...) of each cell.
+        """Return positions at start and end, acceleration and jerk in the middle (..., 3), and a bound (...), per cell.
 
-        The bound is for the deviation from the chord beyond the part due to the derivatives in the middle.
+        The bound limits the deviation from the chord, less the part due to acceleration and jerk in the middle, m.
         """
-        if table is not None:
-            return tuple(x[drone, cell] for x in table)
+        if motion_table is not None:
+            return tuple(x[drone, cell] for x in motion_table)
         drone, cell = np.broadcast_arrays(drone, cell)
         start, end = cell * dt, (cell + 1) * dt
         a, b = self.pieces.find_pieces(drone, start), self.pieces.find_pieces(drone, end)
         summed_jumps = self.summed_jumps[:, b] - self.summed_jumps[:, a]
-        snap = self.summed_snaps[b] - np.where(
-            a > 0, self.summed_snaps[a - 1], 0.0
-        )  # the sum over all pieces of the cell
+        # The sum over all pieces in the cell is at least the largest snap.
+        snap = self.summed_snaps[b] - np.where(a > 0, self.summed_snaps[a - 1], 0.0)
         acc_change = dt / 2 * (dt / 2 * snap + summed_jumps[3]) + summed_jumps[2]
         bound = dt**2 / 8 * acc_change + dt / 4 * summed_jumps[1] + summed_jumps[0]
         times = ((start, 0), (end, 0), (start + dt / 2, 2), (start + dt / 2, 3))
@@ -125,10 +124,10 @@ def _lower_bounds(
     pair: Ints,
     cell: Ints,
     dt: float,
-    upper_bound: Floats,
+    min_distances: Floats,
     best_time: Floats,
 ) -> Floats:
-    """Return a lower bound of the distance in each cell; update the smallest distance of each pair in place."""
+    """Return a lower bound of the distance in each cell; update the least distance and time of each pair in place."""
     start, end, acc, jerk = (a - b for a, b in zip(motion_i[:4], motion_j[:4], strict=True))
     deviation = dt**2 / 8 * (_norm(acc) + dt / 2 * _norm(jerk)) + motion_i[4] + motion_j[4]
     step = end - start
@@ -136,12 +135,13 @@ def _lower_bounds(
     u = np.clip(-_dot(start, step) / np.where(square > 0, square, 1.0), 0.0, 1.0)
     chord_distance = _norm(start + u[:, None] * step)
 
-    order = np.lexsort((chord_distance, pair))  # the cell in which each pair comes closest is evaluated exactly
+    # The distance is evaluated only in the cell of each pair with the nearest chord.
+    order = np.lexsort((chord_distance, pair))
     k = order[np.unique(pair[order], return_index=True)[1]]
     t = (cell[k] + u[k]) * dt
     distance = _norm((pieces.evaluate(drones[0][k], t) - pieces.evaluate(drones[1][k], t))[:, :3])
-    is_closer = distance < upper_bound[pair[k]]
-    upper_bound[pair[k[is_closer]]], best_time[pair[k[is_closer]]] = distance[is_closer], t[is_closer]
+    is_closer = distance < min_distances[pair[k]]
+    min_distances[pair[k[is_closer]]], best_time[pair[k[is_closer]]] = distance[is_closer], t[is_closer]
     return chord_distance - deviation
 
 

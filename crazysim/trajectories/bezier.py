@@ -1,4 +1,4 @@
-"""Polynomials in Bernstein and in power form, on the host in float64."""
+"""Conversions of polynomials between Bernstein and power form, on the host in float64."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 @lru_cache
 def _power_matrix(degree: int) -> NDArray:
-    """Return the matrix from control points to coefficients. (degree + 1, degree + 1)"""
+    """Return the matrix that converts control points to power coefficients. (degree + 1, degree + 1)"""
     matrix = np.zeros((degree + 1, degree + 1))
     for j in range(degree + 1):
         for i in range(j + 1):
@@ -21,7 +21,7 @@ def _power_matrix(degree: int) -> NDArray:
 
 @lru_cache
 def bernstein_matrix(degree: int) -> NDArray:
-    """Return the matrix from coefficients to control points. (degree + 1, degree + 1)"""
+    """Return the matrix that converts power coefficients to control points. (degree + 1, degree + 1)"""
     matrix = np.zeros((degree + 1, degree + 1))
     for i in range(degree + 1):
         for j in range(i + 1):
@@ -42,7 +42,7 @@ def power_coefficients(points: NDArray) -> NDArray:
 
 
 def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
-    """Return the control points of polynomials of u in [0, 1], of their own degree or a higher one.
+    """Return the control points of polynomials of u in [0, 1], whose degree may be raised.
 
     Args:
         coefficients: Constant term first. (k, n)
@@ -58,12 +58,12 @@ def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
 
 
 def restrict_interval(coefficients: NDArray, start: float, end: float) -> NDArray:
-    """Return polynomials of u in [0, 1] as polynomials on the part from ``start`` to ``end``, scaled to [0, 1].
+    """Return polynomials restricted to the interval from ``start`` to ``end``, which is rescaled to [0, 1].
 
     Args:
         coefficients: Constant term first. (k, n)
-        start: Argument where the part starts.
-        end: Argument where the part ends.
+        start: Start of the interval.
+        end: End of the interval.
 
     Returns:
         (k, n)
@@ -81,7 +81,7 @@ def significant_degree(coefficients: NDArray, tolerance: float) -> int:
 
     Args:
         coefficients: Constant term first. (k, n)
-        tolerance: Largest sum of the omitted coefficients.
+        tolerance: Largest sum of the magnitudes of the omitted coefficients.
     """
     tail_sums = np.cumsum(np.abs(coefficients)[:, ::-1], axis=1)[:, ::-1].max(axis=0)
     significant_orders = np.flatnonzero(tail_sums[1:] > tolerance)

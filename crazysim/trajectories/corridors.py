@@ -1,4 +1,4 @@
-"""Minimum-derivative polynomials that stay near the straight lines between their waypoints, and between two heights."""
+"""Minimum-derivative polynomials inside corridors around the lines between waypoints, and between two heights."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from crazysim.trajectories import interpolation
 from crazysim.trajectories.interpolation import Floats
 
 Deviations = tuple[Floats, Floats, Floats]
-"""Vectors from line segments to curves, their feet on the segments, and their lengths."""
+"""Vectors from the nearest points of line segments to curves, these nearest points, and the lengths of the vectors."""
 
 N_SAMPLES = 65
 """Number of times at which the deviation is sampled along each piece, and again around each maximum."""
 RADIUS_MARGIN = 0.01
-"""Fraction of the radius by which half-spaces are inside the corridor. Curves may use up half of it, so that the
-iteration ends."""
+"""Fraction of the radius by which half-spaces are inside the corridor. Curves may exceed the half-spaces by half of
+this fraction, so that the iteration ends."""
 HEIGHT_TOLERANCE = 2e-5
 """Distance by which a curve may be below the smallest height or above the largest one, m."""
 MAX_ITERATIONS = 100
@@ -31,13 +31,13 @@ class OutsideError(ConfigError):
 def fill_in_corridors(
     nodes: Floats, durations: Floats, radii: Floats, heights: tuple[float, float] = (-np.inf, np.inf)
 ) -> Floats:
-    """Return the derivatives at all waypoints that minimise the cost within corridors and between two heights.
+    """Return the derivatives at all waypoints that minimise the cost within corridors and heights. (n_pieces + 1, k, 3)
 
-    The corridor of a piece contains all points up to its radius from the line segment between its waypoints. It is
-    convex, and therefore an intersection of half-spaces, as is the space between two heights. Each iteration adds the
-    half-spaces where the curve is farthest outside to a quadratic program over the free derivatives, until the curve
-    stays inside (cutting planes, Kelley 1960). The program finds the point of least distance in the metric of the cost,
-    which reduces to non-negative least squares (Lawson and Hanson, *Solving Least Squares Problems*, 1974, section
+    The corridor of a piece contains all points up to its radius from the line segment between its waypoints. A corridor
+    is convex, and therefore an intersection of half-spaces; so is the space between two heights. Each iteration adds
+    the half-spaces where the curve is farthest outside to a quadratic program over the free derivatives, until the
+    curve stays inside (cutting planes, Kelley 1960). The program finds the point of least distance in the metric of the
+    cost. This reduces to non-negative least squares (Lawson and Hanson, *Solving Least Squares Problems*, 1974, section
     23.4).
 
     Args:
@@ -50,11 +50,11 @@ def fill_in_corridors(
         OutsideError: If fixed derivatives lead out of the corridor or beyond a height, or if the curve is still outside
             after ``MAX_ITERATIONS`` iterations.
     """
-    unit = float(np.mean(durations))
-    powers = unit ** np.arange(nodes.shape[1])[:, None]
-    scaled_nodes, lengths = nodes * powers, durations / unit
+    time_unit = float(np.mean(durations))
+    powers = time_unit ** np.arange(nodes.shape[1])[:, None]
+    scaled_nodes, lengths = nodes * powers, durations / time_unit
     filled_nodes = interpolation.fill_derivatives(scaled_nodes, lengths)
-    program = _Program(scaled_nodes, filled_nodes, lengths)
+    program = _QuadraticProgram(scaled_nodes, filled_nodes, lengths)
     inner_radii, max_radii = radii * (1 - RADIUS_MARGIN), radii * (1 - RADIUS_MARGIN / 2)
     for _ in range(MAX_ITERATIONS):
         paths = interpolation.unit_coefficients(filled_nodes, lengths)
@@ -72,10 +72,10 @@ def fill_in_corridors(
         half_spaces += [
             _height_half_spaces(paths[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)
         ]
-        piece, u, normal, reach = (np.concatenate(parts) for parts in zip(*half_spaces, strict=True))
+        piece, u, normal, bound = (np.concatenate(parts) for parts in zip(*half_spaces, strict=True))
         if not len(piece):
             return filled_nodes / powers
-        program.add_half_spaces(piece, u, normal, reach)
+        program.add_half_spaces(piece, u, normal, bound)
         filled_nodes = program.solve()
     raise OutsideError(
         f"expected a curve inside its corridors and heights after {MAX_ITERATIONS} iterations, got one whose piece "
@@ -83,31 +83,31 @@ def fill_in_corridors(
     )
 
 
-def _height_half_spaces(heights: Floats, limit: float, sign: int) -> tuple[np.ndarray, Floats, Floats, Floats]:
-    """Return the half-spaces bounded by a height, at the times at which curves are farthest beyond it.
+def _height_half_spaces(coefficients: Floats, limit: float, sign: int) -> tuple[np.ndarray, Floats, Floats, Floats]:
+    """Return the half-spaces that are bounded by a height, at the times at which curves are farthest beyond it.
 
     Args:
-        heights: Coefficients of z. (n_pieces, degree + 1)
+        coefficients: Coefficients of z. (n_pieces, degree + 1)
         limit: Height, m.
         sign: 1 for the largest height, -1 for the smallest.
 
     Returns:
-        Pieces, times within them, normals and ``normal . pos`` of the limit. (n,), (n,), (n, 3), (n,)
+        Pieces, times within them, normals, and bounds of ``normal . pos``. (n,), (n,), (n, 3), (n,)
     """
 
     def height_excess(piece: np.ndarray, u: Floats) -> Floats:
         return sign * (
-            np.einsum("n...k,nk->n...", u[..., None] ** np.arange(heights.shape[-1]), heights[piece]) - limit
+            np.einsum("n...k,nk->n...", u[..., None] ** np.arange(coefficients.shape[-1]), coefficients[piece]) - limit
         )
 
-    piece, u = _find_maxima(height_excess, np.full(len(heights), -np.inf if np.isfinite(limit) else np.inf))
+    piece, u = _find_maxima(height_excess, np.full(len(coefficients), -np.inf if np.isfinite(limit) else np.inf))
     is_beyond = height_excess(piece, u) > HEIGHT_TOLERANCE
     n = int(np.sum(is_beyond))
     return piece[is_beyond], u[is_beyond], np.tile([0.0, 0.0, float(sign)], (n, 1)), np.full(n, sign * limit)
 
 
 def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Deviations:
-    """Return the vectors from line segments to curves, their feet on the segments, and their lengths.
+    """Return the vectors from line segments to curves, the nearest points on the segments, and the vectors' lengths.
 
     Args:
         paths: Coefficients. (n, 3, degree + 1)
@@ -116,7 +116,7 @@ def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Deviatio
         u: Time within each piece over its length. (n,) or (n, n_times)
 
     Returns:
-        (n, 3) or (n, n_times, 3), twice, and the same without the last axis.
+        Vectors and points: (n, 3) or (n, n_times, 3) each; lengths: (n,) or (n, n_times).
     """
     u, segment = np.asarray(u), end - start
     shape = (len(u), *[1] * (u.ndim - 1), 3)
@@ -128,25 +128,25 @@ def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Deviatio
     return pos - nearest_point, nearest_point, np.linalg.norm(pos - nearest_point, axis=-1)
 
 
-def _find_maxima(value: Callable[[np.ndarray, Floats], Floats], thresholds: Floats) -> tuple[np.ndarray, Floats]:
+def _find_maxima(quantity: Callable[[np.ndarray, Floats], Floats], thresholds: Floats) -> tuple[np.ndarray, Floats]:
     """Return pieces, and times within them, of the local maxima of a quantity along curves. (n,) each
 
     Args:
-        value: Function from pieces (n,) and times within them (n, n_times) to the quantity (n, n_times).
-        thresholds: Value of each piece below which maxima do not count. (n_pieces,)
+        quantity: Function from pieces (n,) and times within them (n, n_times) to the quantity (n, n_times).
+        thresholds: Threshold of each piece; maxima that do not exceed it are left out. (n_pieces,)
     """
     samples = np.linspace(0.0, 1.0, N_SAMPLES)
-    sampled_values = value(np.arange(len(thresholds)), np.broadcast_to(samples, (len(thresholds), N_SAMPLES)))
+    sampled_values = quantity(np.arange(len(thresholds)), np.broadcast_to(samples, (len(thresholds), N_SAMPLES)))
     padded = np.pad(sampled_values, ((0, 0), (1, 1)), constant_values=-np.inf)
     is_peak = (
         (sampled_values >= padded[:, :-2]) & (sampled_values >= padded[:, 2:]) & (sampled_values > thresholds[:, None])
     )
     piece, sample = np.nonzero(is_peak)
     fine_times = np.clip(samples[sample][:, None] + (2 * samples - 1) / (N_SAMPLES - 1), 0.0, 1.0)
-    return piece, fine_times[np.arange(len(piece)), np.argmax(value(piece, fine_times), axis=-1)]
+    return piece, fine_times[np.arange(len(piece)), np.argmax(quantity(piece, fine_times), axis=-1)]
 
 
-class _Program:
+class _QuadraticProgram:
     """Quadratic program of least distance to the unconstrained minimum, in the metric of the cost."""
 
     def __init__(self, nodes: Floats, filled_nodes: Floats, durations: Floats) -> None:
@@ -158,18 +158,18 @@ class _Program:
         for p, block in enumerate(interpolation.cost_matrices(durations, self.order)):
             part = slice(p * self.order, (p + 2) * self.order)
             matrix[part, part] += block
-        free_nodes = [self.is_free[..., axis].ravel() for axis in range(3)]
-        self.factors = [np.linalg.cholesky(matrix[np.ix_(f, f)]) for f in free_nodes]
-        self.rows, self.slack = np.zeros((0, sum(map(np.sum, free_nodes)))), np.zeros(0)
+        free_masks = [self.is_free[..., axis].ravel() for axis in range(3)]
+        self.factors = [np.linalg.cholesky(matrix[np.ix_(mask, mask)]) for mask in free_masks]
+        self.rows, self.slack = np.zeros((0, sum(map(np.sum, free_masks)))), np.zeros(0)
 
-    def add_half_spaces(self, piece: np.ndarray, u: Floats, normal: Floats, reach: Floats) -> None:
-        """Add half-spaces: ``normal . pos <= reach`` at one time ``u`` within each piece. (n,), (n,), (n, 3), (n,)"""
+    def add_half_spaces(self, piece: np.ndarray, u: Floats, normal: Floats, bound: Floats) -> None:
+        """Add half-spaces: ``normal . pos <= bound`` at one time ``u`` within each piece. (n,), (n,), (n, 3), (n,)"""
         n = len(piece)
         weights = u[:, None] ** np.arange(2 * self.order) @ interpolation.hermite_basis(self.order)
         rows = np.zeros((n, self.is_free.shape[0], self.order, 3))
         values = ((weights * self.powers[piece])[..., None] * normal[:, None]).reshape(n, 2, self.order, 3)
         rows[np.arange(n), piece], rows[np.arange(n), piece + 1] = values[:, 0], values[:, 1]
-        slack = reach - np.einsum("nika,ika->n", rows, self.filled_nodes)
+        slack = bound - np.einsum("nika,ika->n", rows, self.filled_nodes)
         columns = [
             np.linalg.solve(factor, rows[..., axis].reshape(n, -1)[:, self.is_free[..., axis].ravel()].T)
             for axis, factor in enumerate(self.factors)
@@ -183,7 +183,7 @@ class _Program:
         self.slack = np.concatenate([self.slack, slack / row_norms])
 
     def solve(self) -> Floats:
-        """Return the derivatives of the nearest point in all half-spaces."""
+        """Return the derivatives inside all half-spaces that are nearest to the minimum. (n_pieces + 1, k, 3)"""
         from scipy.optimize import nnls  # a fifth of a second to import
 
         scale = float(np.max(np.abs(self.slack)))

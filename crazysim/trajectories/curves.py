@@ -1,8 +1,8 @@
 """Trajectories of standard shapes: figure eight, Lissajous, circle, helix, line, hover.
 
-Curves are fitted piecewise by polynomials of degree 7 that have the curve's position and first three derivatives at
-both ends of each piece, in float64. The remainder of Hermite's interpolation in a piece of length h,
-``p^(8)(s) t^4 (t - h)^4 / 8!``, is at most ``max |p^(8)| (h / 2)^8 / 8!``, which determines the number of pieces.
+Curves are fitted in float64 by pieces of degree 7. At both ends of a piece, position and first three derivatives equal
+the curve's. The remainder of Hermite interpolation in a piece of length h, ``p^(8)(s) t^4 (t - h)^4 / 8!``, is at most
+``max |p^(8)| (h / 2)^8 / 8!``. This bound determines the number of pieces.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from crazysim.errors import ConfigError
 from crazysim.trajectories.trajectory import Trajectory
 
 FIT_TOLERANCE = 5e-6
-"""Largest error of the position of a fitted curve, m; float32 adds its rounding, 6e-8 of a coordinate."""
+"""Largest error of the position of a fitted curve, m. Rounding to float32 adds 6e-8 of a coordinate."""
 MAX_PIECES = 20_000
 """Largest number of pieces of a fitted curve."""
 MAX_SIZE = 1e6
@@ -28,7 +28,7 @@ DEFAULT_PERIOD = 5.0
 """Default period, s."""
 
 Curve = Callable[[np.ndarray, int], np.ndarray]
-"""Function from times, s (n,), and an order to this derivative of x, y, z, m, and yaw, rad. (n, 4)"""
+"""Function from times, s (n,), and an order to the derivative of that order of x, y, z, m, and yaw, rad (n, 4)."""
 
 
 def figure_eight(
@@ -65,7 +65,7 @@ def lissajous(
         frequencies: Oscillations along each axis in one period, whole numbers. (3,)
         phases: Phase of each oscillation, rad. (3,)
         period: Period, s; None for 5 s, or for the period that ``speed`` requires.
-        speed: Upper bound of the speed, m/s, instead of the period: the speed if all axes were fastest at once.
+        speed: Upper bound of the speed, m/s, instead of the period. It is reached if all axes are fastest at once.
         center: Centre, world frame, m. (3,)
     """
     a, k, phi, c = (require_vector(n, x) for n, x in zip(("amplitudes", "frequencies", "phases", "center"),
@@ -163,7 +163,7 @@ def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 
     Args:
         pos: The point, world frame, m. (3,)
         yaw: Yaw, rad.
-        duration: Duration, s, after which a trajectory appended with ``then`` starts.
+        duration: Duration, s. A trajectory that is appended with ``then`` starts after it.
     """
     _resolve_period(duration, None, 0.0, "duration")
     return Trajectory.of_pieces(
@@ -172,10 +172,10 @@ def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 
 
 
 def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repeats: bool = False) -> Trajectory:
-    """Return a smooth curve as a trajectory of pieces of equal length, each within ``FIT_TOLERANCE``.
+    """Return a smooth curve as a trajectory of pieces of equal length, with errors of at most ``FIT_TOLERANCE``.
 
     Args:
-        curve: The curve with its derivatives up to the third.
+        curve: The curve; derivatives up to the third are used.
         duration: Length of the curve, s.
         max_eighth_derivative: Upper bound of the eighth derivative of the curve, m/s^8.
         repeats: True to start again after the end.
@@ -205,7 +205,7 @@ def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repea
 
 
 def _resolve_period(period: float | None, speed: float | None, length: float, name: str = "period") -> float:
-    """Return the period, s: the given one, the default, or ``length`` over ``speed``, where ``length`` is in m."""
+    """Return ``period``, s, or ``length``, m, divided by ``speed``; the default period if both are None."""
     if period is not None and speed is not None:
         raise ConfigError(f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.")
     if speed is None:
@@ -221,7 +221,7 @@ def _resolve_period(period: float | None, speed: float | None, length: float, na
 
 
 def require_positive(name: str, value: float) -> float:
-    """Return a setting as a positive number."""
+    """Return the value of a setting as a float after a check that it is positive and finite."""
     is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     if not is_number or not np.isfinite(value) or value <= 0:
         raise ConfigError(f"expected {name} as a positive number, got {value!r}")
@@ -229,7 +229,7 @@ def require_positive(name: str, value: float) -> float:
 
 
 def require_vector(name: str, value: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[np.float64]:
-    """Return a setting as an array of finite numbers of a given shape."""
+    """Return the value of a setting as an array after a check of its shape, and of its numbers against ``MAX_SIZE``."""
     array = np.asarray(value)
     if array.shape != shape or array.dtype.kind not in "iuf" or not np.all(np.abs(array.astype(float)) <= MAX_SIZE):
         kind = "3 finite numbers" if shape else "a finite number"

@@ -1,4 +1,4 @@
-"""Formations: positions of several drones, as starts, targets or offsets of trajectories. (n, 3) each"""
+"""Formations: positions of n drones (n, 3), as starts, targets or offsets of trajectories."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def circle(
         spacing: Distance between neighbours, m; None for 1 m, or for the distance that ``radius`` gives.
         radius: Radius, m, instead of the spacing.
         center: Centre, world frame, m. (3,)
-        yaw: Angle by which the circle is rotated, rad.
+        yaw: Angle by which the circle is rotated around its centre, rad.
     """
     if spacing is not None and radius is not None:
         raise ConfigError(f"expected spacing or radius, got both: {spacing!r} and {radius!r} m. Leave one out.")

@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 def hermite_basis(order: int) -> Floats:
     """Return the polynomials on [0, 1] with one of the first k derivatives at the ends equal to 1 and all others zero.
 
-    ``u^j / j! (1 - u)^k sum_i C(k - 1 + i, i) u^i`` for derivative j at 0, with i below k - j; mirrored for 1.
+    For derivative j at 0 it is ``u^j / j! (1 - u)^k sum_i C(k - 1 + i, i) u^i`` with i < k - j; at 1, its mirror image.
 
     Args:
         order: Number k of derivatives at each end, the zeroth included.
@@ -83,27 +83,30 @@ def cost_matrices(durations: Floats, order: int) -> Floats:
 def fill_derivatives(nodes: Floats, durations: Floats) -> Floats:
     """Return the derivatives at all waypoints that minimise the integral of the squared k-th derivative.
 
-    Each axis is solved on its own, since different derivatives may be free in each. Times are scaled by the mean
-    duration; a Cholesky factorisation needs no further scaling, as its error does not depend on the scaling of
-    rows and columns (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.1).
+    Each axis is solved separately, since its free derivatives may differ from the other axes'. Times are scaled by the
+    mean duration. A Cholesky factorisation needs no further scaling: its error does not depend on the scaling of rows
+    and columns (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.1).
 
     Args:
         nodes: Derivatives 0 to k - 1 at each waypoint, NaN where free. (n_pieces + 1, k, n_axes)
         durations: Length of each piece, s. (n_pieces,)
 
+    Returns:
+        Derivatives, as ``nodes`` but without NaN. (n_pieces + 1, k, n_axes)
+
     Raises:
         numpy.linalg.LinAlgError: If too little is fixed for a unique minimum.
     """
     order = nodes.shape[1]
-    unit = float(np.mean(durations))
-    powers = unit ** np.arange(order)[:, None]
+    time_unit = float(np.mean(durations))
+    powers = time_unit ** np.arange(order)[:, None]
     scaled_nodes = nodes * powers
-    blocks = cost_matrices(durations / unit, order)
+    blocks = cost_matrices(durations / time_unit, order)
     return np.stack([_fill_axis(scaled_nodes[..., axis], blocks) for axis in range(nodes.shape[2])], axis=-1) / powers
 
 
 def _fill_axis(nodes: Floats, blocks: Floats) -> Floats:
-    """Return the derivatives of one axis. (n_pieces + 1, k)"""
+    """Return the derivatives at all waypoints for one axis, with the cost matrices in ``blocks``. (n_pieces + 1, k)"""
     from scipy.linalg import solveh_banded  # a fifth of a second to import
 
     order = nodes.shape[1]
@@ -137,9 +140,9 @@ def derivative_cost(nodes: Floats, durations: Floats) -> float:
 
 
 def cost_gradient(nodes: Floats, durations: Floats) -> Floats:
-    """Return the derivative of the minimum of the cost with respect to the durations. (n_pieces,)
+    """Return the gradient of the minimum of the cost with respect to the durations. (n_pieces,)
 
-    At a minimum over the free derivatives, it equals the partial derivative with these held fixed (envelope theorem).
+    At the minimum it equals the partial derivative for constant ``nodes`` (envelope theorem).
 
     Args:
         nodes: Derivatives at the minimum, as from ``fill_derivatives``. (n_pieces + 1, k, n_axes)
@@ -157,14 +160,14 @@ def end_derivatives(nodes: Floats) -> Floats:
 
 
 def unit_coefficients(nodes: Floats, durations: Floats) -> Floats:
-    """Return the polynomials in each piece's time divided by its length, constant term first.
+    """Return the coefficients of the polynomials in u in [0, 1], the time in each piece divided by its length.
 
     Args:
         nodes: Derivatives at the waypoints, without NaN. (n_pieces + 1, k, n_axes)
         durations: Length of each piece, s. (n_pieces,)
 
     Returns:
-        (n_pieces, n_axes, 2k)
+        Coefficients, constant term first. (n_pieces, n_axes, 2k)
     """
     order = nodes.shape[1]
     powers = durations[:, None] ** np.tile(np.arange(order), 2)
@@ -172,6 +175,6 @@ def unit_coefficients(nodes: Floats, durations: Floats) -> Floats:
 
 
 def pad_degree(coefficients: ArrayLike, degree: int) -> Floats:
-    """Return polynomials with zeros appended, up to a degree. (..., degree + 1)"""
+    """Return coefficients with zeros appended up to a degree. (..., degree + 1)"""
     c = np.asarray(coefficients, float)
     return np.concatenate([c, np.zeros((*c.shape[:-1], degree + 1 - c.shape[-1]))], axis=-1)

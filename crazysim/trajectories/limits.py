@@ -19,8 +19,8 @@ from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.trajectory import Trajectory
 
 LIMIT_TOLERANCE = 1e-4
-"""Fraction of a limit by which a value may exceed it; height limits below 1 m count as 1 m. It allows for the errors of
-derivatives of polynomials in float32."""
+"""Fraction of a limit by which a value may exceed it, for the errors of float32. For a height limit below 1 m it is a
+fraction of 1 m."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Limits:
     jerk: float | None = setting(default=None, positive=True)
     """Largest third derivative of the position, m/s^3."""
     thrust: float | None = setting(default=None, positive=True)
-    """Largest collective thrust over the weight, more than 1."""
+    """Largest collective thrust divided by the weight, more than 1."""
     min_thrust: float | None = setting(default=None, low=0.0)
-    """Smallest collective thrust over the weight, less than 1."""
+    """Smallest collective thrust divided by the weight, less than 1."""
     body_rate: float | None = setting(default=None, positive=True)
     """Largest angular velocity, rad/s."""
     yaw_rate: float | None = setting(default=None, positive=True)
@@ -50,7 +50,7 @@ class Limits:
     separation: float | None = setting(default=None, positive=True)
     """Smallest distance between the positions of two drones, m."""
     floor: float | None = 0.0
-    """Smallest height, m, negative in a pit."""
+    """Smallest height, m; may be negative."""
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -73,7 +73,7 @@ class Limits:
         return {field.name: getattr(self, field.name) for field in fields if getattr(self, field.name) is not None}
 
     def of_airframe(self, airframe: AirframeSource) -> Limits:
-        """Return these limits with the thrusts of an airframe where a thrust limit is None.
+        """Return these limits, with the thrust range of an airframe where a thrust limit is None.
 
         Args:
             airframe: Name of a built-in airframe, path, dict or airframe.
@@ -124,11 +124,11 @@ class Report:
     """Result of a check."""
 
     violations: tuple[Violation, ...]
-    """Violations: one for each drone and limit, and one for each pair that comes too close."""
+    """Violations: one for each drone and limit that it exceeds, and one for each pair that comes too close."""
     closest: tuple[Approach, ...]
     """Closest approach of every pair, nearest pair first; empty for one drone."""
     peaks: Mapping[str, Peak]
-    """Largest value of each quantity of every drone, with its time; the smallest for ``min_thrust`` and ``floor``."""
+    """Largest value of each quantity for every drone, smallest for ``min_thrust`` and ``floor``, with its time."""
     names: tuple[str, ...]
     """Names of the drones. (n_drones,)"""
     duration: float
@@ -171,16 +171,16 @@ def check(
 ) -> Report:
     """Check trajectories against limits, and find the closest approach of every pair.
 
-    Thrust and body rate belong to a drone without drag that flies its trajectory exactly (differential flatness).
+    Thrust and body rate are computed for a drone without drag that flies its trajectory exactly (differential
+    flatness).
 
     Args:
         trajectories: One trajectory, or one for each drone: a sequence, or a record with one leading axis. One
             trajectory with several ``starts`` is flown by as many drones.
         limits: Limits.
-        airframe: Airframe whose thrusts are limits where ``limits`` has none; None for no such limits.
+        airframe: Airframe that provides the thrust limits that ``limits`` leaves None; None for no such limits.
         starts: Start of each drone, s, as in ``Follow``; negative if it began before time zero. () or (n_drones,)
-        duration: Duration, s; None for the time at which the last drone ends, where only the first round of a
-            repeating trajectory counts.
+        duration: Duration, s; None to end with the last trajectory. A repeating trajectory then ends after one round.
         names: Names of the drones for the report; None for their numbers.
         tolerance: Largest error of a distance, m.
     """
@@ -196,9 +196,9 @@ def check(
     if not 0 < tolerance < np.inf:
         raise ConfigError(f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3.")
     limit_values = (limits if airframe is None else limits.of_airframe(airframe)).as_dict()
-    extremes, closest = find_peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
+    peaks, closest = find_peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
     violations = []
-    for name, peak in extremes.items():
+    for name, peak in peaks.items():
         if name not in limit_values:
             continue
         limit, sign = limit_values[name], QUANTITIES[name].sign
@@ -211,4 +211,4 @@ def check(
         if pair.distance < separation * (1 - LIMIT_TOLERANCE):
             pair_names = tuple(labels[k] for k in pair.drones)
             violations.append(Violation("separation", pair.drones, pair.time, pair.distance, separation, pair_names))
-    return Report(tuple(violations), closest, extremes, labels, table.duration)
+    return Report(tuple(violations), closest, peaks, labels, table.duration)

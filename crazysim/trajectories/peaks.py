@@ -13,15 +13,15 @@ from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 
 N_INTERVALS = 64
-"""Number of intervals into which each piece is divided by the samples."""
+"""Number of sampling intervals per piece."""
 REFINED_PART = 0.05
-"""Local maxima are refined if they are at most this fraction of the samples' range below the largest sample."""
+"""Fraction of the range of a drone's samples: local maxima at most this much below its largest sample are refined."""
 N_SECTIONS = 40
-"""Number of golden sections. They shorten two intervals to about 1e-10 of a piece."""
+"""Number of golden sections. They shorten two sampling intervals to about 1e-10 of a piece."""
 BATCH_SIZES = (64, 4096)
-"""Numbers of times, few or many, at which rates are computed at once, so that two compilations suffice."""
+"""Small and large number of body rates that are computed in one call, so that there are only two compilations."""
 PIECES_PER_BATCH = 2048
-"""Number of pieces that are sampled at once, which bounds the memory."""
+"""Number of pieces that are sampled at once; it bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class Quantity:
     """A function of position, yaw and their derivatives that has a limit."""
 
     unit: str
-    """Unit."""
+    """Unit of the values."""
     orders: tuple[int, ...]
-    """Orders of the derivatives from which it is computed."""
+    """Orders of the derivatives that ``compute`` takes."""
     compute: Callable[..., Floats]
-    """Function of these derivatives of x, y, z and yaw, (..., 4) each. (...)"""
+    """Function from these derivatives of x, y, z and yaw, (..., 4) each, to the quantity (...)."""
     sign: int = 1
-    """1 if the largest value is limited, -1 if the smallest is."""
+    """1 if the largest value is limited, -1 if the smallest value is."""
 
 
 def _specific_thrust(acc: Floats) -> Floats:
@@ -47,7 +47,7 @@ def _thrust(acc: Floats) -> Floats:
 
 
 def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:
-    """Return the size of the angular velocity of a drone that flies these derivatives exactly."""
+    """Return the angular speed of a drone that flies these derivatives exactly, rad/s. (...)"""
     columns = (_specific_thrust(acc), jerk[..., :3], pos[..., 3:], vel[..., 3:])
     rows = np.concatenate(columns, axis=-1).reshape(-1, 8)
     small_batch, large_batch = BATCH_SIZES
@@ -93,13 +93,13 @@ class Peak:
 
 
 def find_peaks(table: PieceTable, names: Sequence[str]) -> dict[str, Peak]:
-    """Return the peaks of some quantities.
+    """Return the peaks of quantities, by name.
 
-    Each piece is sampled at ``N_INTERVALS + 1`` times; every local maximum of the samples that lies at most
-    ``REFINED_PART`` of their range below the largest is refined by golden sections. The squares of speed,
-    acceleration and jerk are polynomials of degree 12 at most, whose maxima the samples separate, so that the error
-    is rounding, about 1e-9 of the value. Body rates can have narrower peaks, where the thrust almost
-    vanishes or is almost horizontal; one narrower than an interval may be missed.
+    Each piece is sampled at ``N_INTERVALS + 1`` times. Every local maximum of the samples near the largest sample (see
+    ``REFINED_PART``) is refined by golden sections. The squares of speed, acceleration and jerk are polynomials of
+    degree 12 at most. The samples separate the maxima of such polynomials, so that only rounding errors remain, about
+    1e-9 of the value. Body rates can have narrow peaks where the thrust almost vanishes or is almost horizontal; a peak
+    narrower than a sampling interval may be missed.
 
     Args:
         table: Trajectories.
@@ -131,22 +131,23 @@ def _find_peak(table: PieceTable, quantity: Quantity) -> Peak:
         value, np.maximum(u[sample] - u[1], 0.0), np.minimum(u[sample] + u[1], 1.0)
     )
     is_better = refined_value > samples[piece, sample]
-    best, best_u = np.where(is_better, refined_value, samples[piece, sample]), np.where(is_better, best_u, u[sample])
-    order = np.lexsort((-best, table.drone[piece]))
-    first = order[np.searchsorted(table.drone[piece][order], np.arange(table.n_drones))]
+    best_value = np.where(is_better, refined_value, samples[piece, sample])
+    best_u = np.where(is_better, best_u, u[sample])
+    order = np.lexsort((-best_value, table.drone[piece]))
+    peak = order[np.searchsorted(table.drone[piece][order], np.arange(table.n_drones))]
     time = table.start[piece] + best_u * table.length[piece]
-    return Peak(quantity.sign * best[first], time[first])
+    return Peak(quantity.sign * best_value[peak], time[peak])
 
 
 def _find_candidates(samples: Floats, threshold: Floats) -> tuple[Ints, Ints]:
-    """Return piece and sample of the local maxima of pieces above their thresholds; a plateau by its first sample."""
+    """Return piece and sample of each local maximum at or above its piece's threshold. A plateau gives one."""
     padded_samples = np.pad(samples, ((0, 0), (1, 1)), constant_values=-np.inf)
     is_maximum = (samples > padded_samples[:, :-2]) & (samples >= padded_samples[:, 2:])
     return np.nonzero(is_maximum & (samples >= threshold[:, None]))  # type: ignore[return-value]
 
 
 def _golden_sections(function: Callable[[Floats], Floats], low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return the maxima of a function in intervals with one maximum each, and their arguments. (n,) each"""
+    """Return the maximum of a function in each interval, with a single local maximum, and its argument. (n,) each"""
     ratio = (np.sqrt(5) - 1) / 2
     left, right = high - ratio * (high - low), low + ratio * (high - low)
     left_value, right_value = function(left), function(right)

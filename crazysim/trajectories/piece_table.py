@@ -1,4 +1,4 @@
-"""Several trajectories on one clock, in float64 on the host, for checks at many times of many drones."""
+"""Several trajectories on a common clock, in float64 on the host, to evaluate many drones at many times."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class PieceTable:
-    """Pieces of several trajectories on one clock, sorted by drone and time."""
+    """Pieces of several trajectories on a common clock, sorted by drone and time."""
 
     duration: float
     """Duration, s."""
@@ -37,13 +37,13 @@ class PieceTable:
     def create(
         trajectories: Sequence[Trajectory], starts: ArrayLike = 0.0, duration: float | None = None
     ) -> PieceTable:
-        """Return the pieces of trajectories, with pieces at rest before their start and after their end.
+        """Return the pieces of trajectories, with pieces at rest before the start and after the end of each trajectory.
 
         Args:
             trajectories: Trajectories, one for each drone.
             starts: Start of each trajectory, s; negative if it began before time zero. () or (n_drones,)
-            duration: Duration, s; None for the time at which the last trajectory ends, where only the first round of a
-                repeating trajectory counts.
+            duration: Duration, s; None to end with the last trajectory. A repeating trajectory then ends after one
+                round.
         """
         if not trajectories:
             raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
@@ -60,8 +60,10 @@ class PieceTable:
             raise ConfigError(
                 f"expected a positive, finite duration, s, got {actual_text}. Use for example duration=10.0."
             )
-        size = max(t.coefficients.shape[-1] for t in host_trajectories)
-        parts = [_collect_pieces(t, start, end, size) for t, start in zip(host_trajectories, starts, strict=True)]
+        n_coefficients = max(t.coefficients.shape[-1] for t in host_trajectories)
+        parts = [
+            _collect_pieces(t, start, end, n_coefficients) for t, start in zip(host_trajectories, starts, strict=True)
+        ]
         drone = np.repeat(np.arange(n_drones), [len(part[0]) for part in parts])
         return PieceTable(end, drone, *(np.concatenate(x) for x in zip(*parts, strict=True)))
 
@@ -77,7 +79,7 @@ class PieceTable:
 
     @functools.cached_property
     def _keys(self) -> Floats:
-        """Starts on a common axis, on which one search finds the pieces of all drones. (n_pieces,)"""
+        """Starts of the pieces, offset by drone, so that one binary search finds pieces of all drones. (n_pieces,)"""
         return self.drone * (self.duration + 1) + self.start
 
     @functools.cached_property
@@ -95,7 +97,7 @@ class PieceTable:
         return self._derivatives[order]
 
     def find_pieces(self, drone: Ints, t: NDArray) -> Ints:
-        """Return the piece that contains each drone's time; the later one where two pieces meet. (...)"""
+        """Return the piece that contains each drone's time; the later piece where two pieces meet. (...)"""
         t = np.clip(t, 0.0, self.duration)
         index = np.searchsorted(self._keys, np.asarray(drone) * (self.duration + 1) + t, side="right") - 1
         return np.maximum(index, self.first_pieces[drone])
@@ -105,7 +107,7 @@ class PieceTable:
 
         Args:
             piece: Indices of pieces. (...)
-            u: Time since the start of the piece over its duration. (...)
+            u: Time since the start of the piece divided by its duration. (...)
             order: Order of the derivative.
 
         Returns:
@@ -123,34 +125,36 @@ class PieceTable:
         return self.evaluate_pieces(piece, (t - self.start[piece]) / self.length[piece], order)
 
 
-def _collect_pieces(t: Trajectory, start: float, duration: float, size: int) -> tuple[Floats, Floats, Floats]:
-    """Return starts, lengths and coefficients of the pieces of one trajectory up to a duration."""
-    ends = np.asarray(t.ends, float)
+def _collect_pieces(
+    trajectory: Trajectory, start: float, duration: float, n_coefficients: int
+) -> tuple[Floats, Floats, Floats]:
+    """Return starts, lengths and coefficients of the pieces of one trajectory between time zero and ``duration``."""
+    ends = np.asarray(trajectory.ends, float)
     starts = np.concatenate([[0.0], ends[:-1]])
-    has_length = ends > starts  # others are padding
+    has_length = ends > starts  # the others are padding
     starts, lengths = starts[has_length], (ends - starts)[has_length]
-    c = np.zeros((len(starts), 4, size))
-    c[..., : t.coefficients.shape[-1]] = t.coefficients[has_length]
+    c = np.zeros((len(starts), 4, n_coefficients))
+    c[..., : trajectory.coefficients.shape[-1]] = trajectory.coefficients[has_length]
     period = ends[-1]
-    if t.repeats:
-        start -= period * max(0.0, np.floor(-start / period))  # rounds that have ended before time zero
-    n_rounds = max(1, int(np.ceil((duration - start) / period - 1e-9))) if t.repeats else 1
+    if trajectory.repeats:
+        start -= period * max(0.0, np.floor(-start / period))  # omits rounds that end before time zero
+    n_rounds = max(1, int(np.ceil((duration - start) / period - 1e-9))) if trajectory.repeats else 1
     starts = (start + period * np.arange(n_rounds)[:, None] + starts).ravel()
     after_zero = _cut_at_zero(starts, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))
     parts = [after_zero]
     first_pose, last_pose = c[0, :, :1], c[-1].sum(axis=-1, keepdims=True)
     end = max(start + period * n_rounds, 0.0)
     if start > 0:
-        parts.insert(0, _resting_piece(0.0, start, first_pose, size))
+        parts.insert(0, _resting_piece(0.0, start, first_pose, n_coefficients))
     if end < duration:
-        parts.append(_resting_piece(end, duration - end, last_pose, size))
+        parts.append(_resting_piece(end, duration - end, last_pose, n_coefficients))
     starts, lengths, c = (np.concatenate(x) for x in zip(*parts, strict=True))
     is_before_end = starts < duration
     return starts[is_before_end], lengths[is_before_end], c[is_before_end]
 
 
 def _cut_at_zero(starts: Floats, lengths: Floats, coefficients: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the pieces that end after time zero; the first one is cut there."""
+    """Return the pieces that end after time zero; a piece that starts before time zero is cut there."""
     ends_after_zero = starts + lengths > 0
     starts, lengths, coefficients = starts[ends_after_zero], lengths[ends_after_zero], coefficients[ends_after_zero]
     if len(starts) and starts[0] < 0:
@@ -159,6 +163,6 @@ def _cut_at_zero(starts: Floats, lengths: Floats, coefficients: Floats) -> tuple
     return starts, lengths, coefficients
 
 
-def _resting_piece(start: float, length: float, pose: Floats, size: int) -> tuple[Floats, Floats, Floats]:
+def _resting_piece(start: float, length: float, pose: Floats, n_coefficients: int) -> tuple[Floats, Floats, Floats]:
     """Return a piece that stays at one position and yaw, (4, 1)."""
-    return np.array([start]), np.array([length]), np.pad(pose, ((0, 0), (0, size - 1)))[None]
+    return np.array([start]), np.array([length]), np.pad(pose, ((0, 0), (0, n_coefficients - 1)))[None]

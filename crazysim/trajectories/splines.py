@@ -13,7 +13,7 @@ from crazysim.trajectories.bezier import power_coefficients
 from crazysim.trajectories.trajectory import Trajectory
 
 SPLINE_ORDERS = {3: 2, 5: 3, 7: 4}
-"""Order of the derivative whose squared integral a spline minimises, by the degree of the spline."""
+"""Order of the derivative that a spline minimises (the integral of its square), by the degree of the spline."""
 
 
 def spline(
@@ -21,16 +21,16 @@ def spline(
 ) -> Trajectory:
     """Return the smoothest spline through points at given times.
 
-    Of all curves through the points, the spline of degree 3, 5 or 7 has the smallest integral of the squared
-    acceleration, jerk or snap, and continuous derivatives up to the second, fourth or sixth.
+    Of all curves through the points, the spline of degree 3, 5 or 7 minimises the integral of the squared acceleration,
+    jerk or snap, respectively. Its derivatives are continuous up to the second, fourth or sixth.
 
     Args:
         times: Time of each point, s, ascending. The trajectory starts at the first. (n_points,)
         points: Positions, world frame, m. (n_points, 3)
         degree: Degree of the polynomials: 3, 5 or 7.
-        yaw: Yaw, rad: one for all points, or one for each, between which the drone turns the shorter way. () or
+        yaw: Yaw, rad: one value for all points, or one per point. The drone turns the shorter way between points. () or
             (n_points,)
-        at_rest: True to start and end at rest; otherwise the derivatives at the ends are free, as of a natural spline.
+        at_rest: True to start and end at rest; False for a natural spline, with free derivatives at both ends.
     """
     if degree not in SPLINE_ORDERS:
         raise ConfigError(f"expected a spline of degree 3, 5 or 7, got {degree!r}. Use spline(times, points, 7).")
@@ -66,8 +66,8 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
 
     Args:
         ends: End of each curve, s since the start of the trajectory, ascending. (n_pieces,)
-        control_points: Control points of each curve, including the first and the last: x, y, z, m, and optionally yaw,
-            rad, in all curves or in none. The degrees may differ. n_pieces times (degree + 1, 3) or (degree + 1, 4)
+        control_points: Control points of each curve, including its ends: x, y, z, m, and optionally yaw, rad. Yaw is in
+            all curves or in none. The degrees may differ. n_pieces times (degree + 1, 3) or (degree + 1, 4)
         repeats: True to start again after the end.
     """
     end_times = np.asarray(ends, float)
@@ -98,7 +98,7 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
 
 
 def trajectory_from_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
-    """Return the trajectory of polynomials in each piece's time divided by its length.
+    """Return the trajectory of polynomials in the time since the start of each piece, divided by its length.
 
     Args:
         durations: Length of each piece, s. (n_pieces,)
@@ -110,10 +110,10 @@ def trajectory_from_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, r
 
 
 def unwrap_yaw(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
-    """Return the yaw at each point, rad, without jumps of a revolution. (n_points,)
+    """Return the yaw at each point, rad, unwrapped so that neighbours differ by at most pi. (n_points,)
 
     Args:
-        yaw: One yaw for all points, or one for each, rad. () or (n_points,)
+        yaw: One yaw for all points, or one per point, rad. () or (n_points,)
         n_points: Number of points.
     """
     angles = require_finite(np.asarray(yaw, float), "yaw")
@@ -130,7 +130,7 @@ def require_finite(values: NDArray[np.float64], name: str) -> NDArray[np.float64
 
     Args:
         values: Numbers. (...)
-        name: Name for the message.
+        name: Name of the values for the message.
     """
     if not np.all(np.isfinite(values)):
         index = np.argwhere(~np.isfinite(values))[0].tolist()

@@ -15,21 +15,21 @@ from crazysim.trajectories.peaks import QUANTITIES, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
 
 LIMIT_MARGIN = 1e-4
-"""Fraction of a limit that is left unused to allow for rounding in float32. Limits of height may be exceeded by half of
-this fraction instead, since waypoints may lie on them."""
+"""Fraction of a limit that is left unused to allow for rounding in float32. A height limit may instead be exceeded by
+half of this fraction, since waypoints may be exactly at the limit."""
 DURATION_TOLERANCE = 1e-5
 """Relative precision of the factor by which durations are scaled."""
 DURATION_FACTOR = 1.25
-"""Factor by which the durations are changed until the limits are met, then until they are not."""
+"""Factor by which durations are multiplied until the limits are met, then divided until they are not."""
 MAX_SCALINGS = 50
-"""Largest number of such changes, which together are a factor of 70,000."""
+"""Largest number of multiplications, and of divisions, by ``DURATION_FACTOR``: together a factor of 70,000."""
 
 
 def trapezoid_durations(distances: Floats, limits: Limits) -> Floats:
-    """Return the shortest durations from rest to rest over distances at bounded speed and acceleration. (n_pieces,)
+    """Return the shortest durations from rest to rest over distances at bounded speed and acceleration, s. (n_pieces,)
 
-    Only the ratios matter. A missing limit of speed is therefore replaced by 1 m/s, and a missing limit of acceleration
-    by one that reaches the limit of speed in one second.
+    Only the ratios matter. A missing speed limit is therefore replaced by 1 m/s, and a missing acceleration limit by
+    the acceleration that reaches the speed limit in one second.
     """
     speed = limits.speed or 1.0
     acceleration = limits.acceleration or speed
@@ -38,7 +38,7 @@ def trapezoid_durations(distances: Floats, limits: Limits) -> Floats:
 
 
 def optimal_durations(nodes: Floats, durations: Floats) -> Floats:
-    """Return the durations that minimise the cost for the same total duration.
+    """Return the durations that minimise the cost for the same total duration, s. (n_pieces,)
 
     A quasi-Newton method over the logarithms of the ratios, with the exact gradient (``interpolation.cost_gradient``),
     finds a local minimum.
@@ -75,7 +75,7 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
         durations: Length of each piece, s. (n_pieces,)
         coefficients: Coefficients of x, y, z and yaw, in a piece's time divided by its length.
             (n_pieces, 4, degree + 1)
-        limits: Limits; the separation concerns several trajectories and is not checked.
+        limits: Limits; ``separation`` is not checked.
     """
     checked_limits = {name: limit for name, limit in limits.as_dict().items() if name in QUANTITIES}
     ends = np.cumsum(durations)
@@ -91,14 +91,13 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
 
 
 def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:
-    """Return the durations, in the same ratios, at which a trajectory just meets its limits.
+    """Return the shortest durations, in the same ratios, at which a trajectory meets its limits, s. (n_pieces,)
 
-    The search slows the flight until the limits are met, then speeds it up until they are not. A smallest thrust can be
-    violated at one speed and met again at a higher one, where the thrust turns faster than the drone falls; such speeds
-    are not searched for.
+    The search slows the flight until the limits are met, then speeds it up until they are not. ``min_thrust`` can be
+    violated at one speed and met again at a higher speed; the search does not find such a higher speed.
 
     Args:
-        solve: Function that returns the coefficients for durations.
+        solve: Function from durations, s (n_pieces,), to coefficients (n_pieces, 4, degree + 1).
         durations: First guess, s. (n_pieces,)
         limits: Limits.
 
@@ -109,7 +108,7 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
     def exceeded_limits(factor: float) -> list[str]:
         try:
             return violated_limits(durations * factor, solve(durations * factor), limits)
-        except OutsideError:  # fixed velocities lead out at this speed
+        except OutsideError:  # the fixed derivatives lead out of the corridors or heights
             return ["corridors or heights"]
 
     high = 1.0

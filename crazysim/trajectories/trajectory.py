@@ -20,7 +20,7 @@ from crazysim.pytree import PyTree, float_dtype, leaf
 from crazysim.trajectories.interpolation import unit_coefficients
 
 MAX_COUNTED_PIECES = 16
-"""Largest number of pieces for which the piece at a time is found by counting; above it, by bisection."""
+"""Largest number of pieces of a single trajectory at which ``_find_piece`` counts ends instead of bisecting."""
 N_DERIVATIVES = 4
 """Highest derivative of a setpoint: snap."""
 
@@ -28,21 +28,22 @@ N_DERIVATIVES = 4
 class Trajectory(PyTree):
     """Position and yaw of one vehicle as piecewise polynomials of time; leading axes hold several trajectories.
 
-    Each piece is a polynomial of the time since its start, scaled to ``u`` in [0, 1], which suits float32. Before its
-    start a trajectory is at rest at its first point; after its end it is at rest at its last point, or starts again.
+    Each piece is a polynomial of ``u`` in [0, 1], the time since its start divided by its length; this limits rounding
+    errors in float32. Before its start a trajectory is at rest at its first point. After its end it is at rest at its
+    last point, or starts again if ``repeats`` is True.
     """
 
     ends: Array = leaf("shared", 1)
-    """End of each piece, s since the start of the trajectory, ascending. Padding repeats the last one. (n_pieces,)"""
+    """End of each piece, s since the start of the trajectory, ascending. Padding repeats the last end. (n_pieces,)"""
     coefficients: Array = leaf("shared", 3)
-    """Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, as polynomials in the piece's time
-    divided by its length. (n_pieces, 4, degree + 1)"""
+    """Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, as polynomials in ``u``.
+    (n_pieces, 4, degree + 1)"""
     repeats: Array = leaf("shared", 0)
     """True where the trajectory starts again after its end. ()"""
 
     @staticmethod
     def of_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
-        """Return the trajectory of polynomials in the time in seconds, computed in float64 on the host.
+        """Return the trajectory of pieces that are polynomials in seconds, computed in float64 on the host.
 
         Args:
             durations: Length of each piece, s. (n_pieces,)
@@ -95,7 +96,7 @@ class Trajectory(PyTree):
     def evaluate(self, t: ArrayLike) -> Setpoint:
         """Return the setpoint of one trajectory at one time, with derivatives up to snap.
 
-        Where two pieces meet, the later one counts. Use ``jax.vmap`` for several trajectories or times.
+        Where two pieces meet, the later piece is evaluated. Use ``jax.vmap`` for several trajectories or times.
 
         Args:
             t: Time since the start of the trajectory, s. ()
@@ -109,7 +110,7 @@ class Trajectory(PyTree):
         trajectories.
 
         Args:
-            index: Index along the one leading axis, clipped to the trajectories that exist. ()
+            index: Index along the single leading axis, clipped to the valid range. ()
             t: Time since the start of the trajectory, s. ()
         """
         return self.evaluate_at_rate(index, t, 1.0)
@@ -117,14 +118,14 @@ class Trajectory(PyTree):
     def evaluate_at_rate(
         self, index: Array | int, t: ArrayLike, rate: Array | float, degrees: Sequence[int] | None = None
     ) -> Setpoint:
-        """Return the setpoint of one of several trajectories that is flown faster or slower.
+        """Return the setpoint of one of several trajectories, flown ``rate`` times as fast.
 
         Args:
-            index: Index along the one leading axis, as for ``evaluate_one``. ()
-            t: Time since the start of the trajectory, at its own speed, s. ()
-            rate: Time of the trajectory that passes in one second, s. ()
+            index: Index along the single leading axis, as for ``evaluate_one``. ()
+            t: Time since the start in the trajectory's own time, s. ()
+            rate: Advance of the trajectory's own time per second of flight. ()
             degrees: Largest degrees of x, y, z and yaw over all pieces, -1 for an axis that is zero; coefficients of
-                higher degrees are ignored. None for ``degree`` on every axis. (4,)
+                higher degrees are ignored. None to use ``degree`` for all axes. (4,)
         """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
         end, repeats = _clipped_entry(ends, index, ends.shape[1] - 1), _clipped_entry(jnp.asarray(self.repeats), index)
@@ -189,13 +190,13 @@ class Trajectory(PyTree):
         return jax.tree.map(lambda *leaves: xp.stack(leaves), *padded_trajectories)
 
     def unstacked(self) -> list[Trajectory]:
-        """Return the trajectories of all vehicles, one by one."""
+        """Return the trajectories along the leading axis; a single trajectory as a list of one."""
         if np.ndim(self.ends) == 1:
             return [self]
         return [jax.tree.map(lambda x, k=k: x[k], self) for k in range(len(self.ends))]
 
     def padded(self, n_pieces: int, degree: int) -> Trajectory:
-        """Return the same trajectory with at least this number of pieces and this degree, for one vehicle.
+        """Return this trajectory of one vehicle, padded to at least ``n_pieces`` pieces and a degree of ``degree``.
 
         Added pieces have no length and stay at the last point.
         """
@@ -209,13 +210,13 @@ class Trajectory(PyTree):
         return self.replace(ends=ends, coefficients=xp.concatenate([coefficients, rest_piece]))
 
     def repeat(self, n: int | None = None) -> Trajectory:
-        """Return this trajectory flown several times, one after the other; for one vehicle.
+        """Return this trajectory of one vehicle, flown several times in succession.
 
         A closed curve such as a circle repeats without end. ``repeat(n)`` ends it after n rounds, so that another
         trajectory can follow by ``then``; ``repeat()`` makes any trajectory start again after its end.
 
         Args:
-            n: Number of rounds, after which the trajectory ends; None for no end.
+            n: Number of rounds before the trajectory ends; None to repeat without end.
         """
         if n is None:
             return self.replace(repeats=np.bool_(True))
@@ -230,21 +231,21 @@ class Trajectory(PyTree):
         )
 
     def then(self, other: Trajectory, transition: float = 0.0) -> Trajectory:
-        """Return this trajectory followed by another one, which starts when this one ends; for one vehicle.
+        """Return this trajectory of one vehicle, followed by another one that starts when this one ends.
 
         Without a transition, a difference between this trajectory's end and the other one's start is a jump of the
         position, or of the velocity, for example from rest into a curve.
 
         Args:
             other: The trajectory that follows.
-            transition: Time between the two, s, during which an additional piece of degree 7 connects them, with
-                continuous velocity, acceleration and jerk, and yaw turned the shorter way; 0 for none.
+            transition: Duration of an additional piece of degree 7 that connects the two trajectories, s; 0 for none.
+                Velocity, acceleration and jerk are continuous, and the yaw turns the shorter way.
         """
         if self.repeats or other.repeats:
-            order = "first" if self.repeats else "second"
+            position = "first" if self.repeats else "second"
             raise ConfigError(
-                f"expected trajectories that end, got a {order} one that repeats without end. Use its repeat(n), such "
-                f"as repeat(1) for one round."
+                f"expected trajectories that end, got a {position} one that repeats without end. Use its repeat(n), "
+                f"such as repeat(1) for one round."
             )
         is_number = isinstance(transition, (int, float, np.number)) and not isinstance(transition, bool)
         if not is_number or not 0 <= transition < np.inf:
@@ -279,11 +280,11 @@ class Trajectory(PyTree):
         return np.array([[p.deriv(m)(u) / lengths[k] ** m for p in polynomials] for m in range(4)])
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), yaw: ArrayLike = 0.0) -> Trajectory:
-        """Return the trajectory rotated around the z axis of the world, then translated, with any leading axes.
+        """Return the trajectory rotated around the z axis of the world, then translated; leading axes are allowed.
 
         Args:
             offset: Displacement, m. (3,)
-            yaw: Angle by which the curve, and the yaw along it, are rotated, rad. ()
+            yaw: Angle of the rotation, rad, which is also added to the yaw. ()
         """
         for name, value, shape in (("offset", offset, (3,)), ("yaw", yaw, ())):
             is_concrete = not isinstance(value, jax.core.Tracer)
@@ -301,7 +302,7 @@ class Trajectory(PyTree):
 
 
 def _array_module(tree: object) -> Any:
-    """Return ``jax.numpy`` if there is a JAX array, else NumPy, which compiles nothing."""
+    """Return ``jax.numpy`` if a pytree contains a JAX array, else ``numpy``, which needs no compilation."""
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(tree)) else np
 
 
@@ -311,9 +312,9 @@ def _clipped_entry(x: Array, *index: Array | int) -> Array:
 
 
 def _local_time(t: Array, end: Array, repeats: Array) -> tuple[Array, Array]:
-    """Return a time mapped into the duration of a trajectory, s, and True if the trajectory is active then. () each"""
+    """Return a time mapped into the duration of a trajectory, s, and True while the trajectory is flown. () each"""
     local_time = jnp.where(t < 0, 0.0, t)
-    # Computed with floor, which is a vector instruction, since lax.rem calls a function for each number.
+    # floor is a vector instruction; lax.rem would call a function for each number.
     local_time = local_time - jnp.where(repeats, end * lax.floor(local_time / end), 0.0)
     local_time = jnp.where(local_time > end, end, jnp.where(local_time < 0, 0.0, local_time))
     return local_time, (t >= 0) & (repeats | (t <= end))
@@ -329,7 +330,7 @@ def _scale_derivatives(derivatives: list[Array], rate: Array) -> list[Array]:
 
     Args:
         derivatives: Value, first derivative, and so on. (4,) each
-        rate: Scaled time of the piece that passes in one second, 1/s. ()
+        rate: Change of the scaled time per second, 1/s. ()
     """
     factors = itertools.accumulate([rate] * (len(derivatives) - 1), lambda a, b: a * b)
     return [derivatives[0], *(x * factor for x, factor in zip(derivatives[1:], factors, strict=True))]
@@ -345,7 +346,7 @@ def _build_setpoint(derivatives: list[Array]) -> Setpoint:
 
 
 def _find_piece(ends: Array, index: Array | int, t: Array) -> Array:
-    """Return the index of the piece at a time: the number of ends up to it, at most the last index. ()"""
+    """Return the index of the piece at a time: the number of ends at or before it, at most the last index. ()"""
     n = ends.shape[1]
     if len(ends) == 1 and n <= MAX_COUNTED_PIECES:
         return jnp.sum(ends[0, :-1] <= t, dtype=jnp.int32)

@@ -1,4 +1,4 @@
-"""Trajectories of minimum snap or jerk through waypoints, with corridors, durations and limits; a variant in JAX."""
+"""Trajectories of minimum snap or jerk through waypoints, with corridors and limits, and a differentiable variant."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from crazysim.trajectories.splines import require_finite, trajectory_from_unit_p
 from crazysim.trajectories.trajectory import Trajectory
 
 YAW_ORDER = 2
-"""Order of the yaw derivative whose squared integral is minimised. The torque depends on the second derivative
+"""Order of the yaw derivative that is minimised (the integral of its square): the torque depends on the second
 (Mellinger and Kumar 2011)."""
 
 
@@ -43,12 +43,12 @@ def minimum_snap(
         waypoints: Positions, world frame, m. (n, 3)
         durations: Time from each waypoint to the next, s. None for the shortest durations that meet the limits, in
             ratios that minimise the snap. (n - 1,)
-        limits: Limits, needed without durations. The path stays between floor and height. With durations, the other
-            limits are checked. The separation between drones is not; use ``check`` for it.
-        yaw: Yaw at the waypoints, rad: one for all, or one for each, between which the drone turns the shorter way with
-            the smallest integral of the squared angular acceleration. () or (n,)
-        corridors: Largest distance from the line segment between two waypoints, m, infinite for no bound: one for all
-            or one for each. None for no corridors. () or (n - 1,)
+        limits: Limits; required if ``durations`` is None. The path stays between floor and height. The trajectory of
+            given durations is checked against the other limits. The separation is not checked; use ``check`` for it.
+        yaw: Yaw at the waypoints, rad: one value for all, or one per waypoint. Between waypoints the drone turns the
+            shorter way, with the smallest integral of the squared angular acceleration. () or (n,)
+        corridors: Largest distance from the line segment between two waypoints, m, infinite for no bound: one value for
+            all segments, or one per segment. None for no corridors. () or (n - 1,)
         velocities: Velocities at the waypoints, world frame, m/s, NaN where free. None for rest at both ends and free
             elsewhere. (n, 3)
         accelerations: Accelerations, likewise, m/s^2. (n, 3)
@@ -72,8 +72,8 @@ def minimum_jerk(
 ) -> Trajectory:
     """Return the trajectory through waypoints with the smallest integral of the squared jerk.
 
-    As ``minimum_snap``, with pieces of degree 5 and continuous derivatives up to the fourth: closer to the straight
-    lines, with less smooth body rates.
+    The pieces have degree 5, and derivatives up to the fourth are continuous. Compared with ``minimum_snap``, the path
+    is closer to the straight lines and the body rates are less smooth.
 
     Args:
         waypoints: Positions, world frame, m. (n, 3)
@@ -93,15 +93,15 @@ def minimum_jerk(
 def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Trajectory, Array]:
     """Return the trajectory through waypoints with the smallest integral of a squared derivative, and this integral.
 
-    The trajectory equals ``minimum_snap`` for order 4 and ``minimum_jerk`` for order 3, at rest at both ends and free
-    elsewhere, without corridors and with zero yaw. It has gradients with respect to waypoints and durations, and works
+    For order 4 it is the trajectory of ``minimum_snap``, for order 3 that of ``minimum_jerk``: at rest at both ends,
+    without limits or corridors, and with zero yaw. It has gradients with respect to waypoints and durations, and works
     in ``jax.jit`` and ``jax.vmap``. Nothing is checked. In float32, up to about ten pieces whose durations vary by less
     than a factor of five are accurate to 1e-3 of the distances; use float64 for more.
 
     Args:
         waypoints: Positions, world frame, m. (n, 3)
         durations: Time from each waypoint to the next, s. (n - 1,)
-        order: Order of the derivative whose squared integral is minimised: 2, 3 or 4.
+        order: Order of the derivative: 2, 3 or 4.
 
     Returns:
         The trajectory, and the integral, m^2 / s^(2 order - 1). ()
@@ -109,8 +109,8 @@ def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Traje
     n_pieces, k = len(durations), order
     dtype = jnp.result_type(waypoints, durations, float)
     waypoints, durations = jnp.asarray(waypoints, dtype), jnp.asarray(durations, dtype)
-    unit = jnp.mean(durations)
-    lengths = (durations / unit)[:, None]
+    time_unit = jnp.mean(durations)
+    lengths = (durations / time_unit)[:, None]
     powers = jnp.concatenate([lengths**j for j in range(k)] * 2, axis=-1)  # (n_pieces, 2k)
     cost_blocks = (
         jnp.asarray(interpolation.unit_cost(k), dtype)
@@ -132,7 +132,9 @@ def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Traje
     )
 
     end_derivatives = values[entries]  # (n_pieces, 2k, 3)
-    cost = jnp.sum(end_derivatives * jnp.einsum("pij,pja->pia", cost_blocks, end_derivatives)) * unit ** (1 - 2 * k)
+    cost = jnp.sum(end_derivatives * jnp.einsum("pij,pja->pia", cost_blocks, end_derivatives)) * time_unit ** (
+        1 - 2 * k
+    )
     paths = jnp.einsum("cj,pj,pja->pac", jnp.asarray(interpolation.hermite_basis(k), dtype), powers, end_derivatives)
     coefficients = jnp.concatenate([paths, jnp.zeros_like(paths[:, :1])], axis=1)
     return Trajectory(jnp.cumsum(durations), coefficients, jnp.zeros((), bool)), cost
@@ -231,7 +233,7 @@ def _corridor_radii(corridors: ArrayLike | None, n_pieces: int) -> Floats:
 
 
 def _height_bounds(limits: Limits | None, heights: Floats) -> tuple[float, float]:
-    """Return the smallest and the largest height, m, between which waypoints are; infinite for no limit."""
+    """Return the smallest and largest height of the limits, m, infinite for none, after a check of the waypoints."""
     low, high = (None, None) if limits is None else (limits.floor, limits.height)
     bounds = -np.inf if low is None else low, np.inf if high is None else high
     for k, z in enumerate(heights):
@@ -245,7 +247,7 @@ def _height_bounds(limits: Limits | None, heights: Floats) -> tuple[float, float
 
 
 def _check_durations(durations: ArrayLike, n_pieces: int) -> Floats:
-    """Return the durations of the pieces, s. (n_pieces,)"""
+    """Return the durations of the pieces, s, after a check. (n_pieces,)"""
     lengths = np.asarray(durations, float)
     if lengths.shape != (n_pieces,) or not np.all(np.isfinite(lengths)) or not np.all(lengths > 0):
         raise ConfigError(

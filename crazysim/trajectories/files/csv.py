@@ -19,12 +19,13 @@ POLYNOMIAL_HEADER = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y",
 
 
 def load_csv(path: str | Path) -> Trajectory:
-    """Return the trajectory in a CSV file. The number of columns determines which of two kinds it is.
+    """Return the trajectory in a CSV file. The number of columns determines the format.
 
     - 33 or 25: Crazyswarm's polynomials. Duration, s, and eight coefficients, constant term first, in the time since
       the start of the piece, s, for each of x, y, z, m, and, with 33 columns, yaw, rad.
-    - 4 or 5: samples. Time, s, x, y, z, m, and, with 5 columns, yaw, rad. Times count from the first row. Between the
-      samples the trajectory is cubic, with velocities by central differences, and at rest at both ends.
+    - 4 or 5: samples. Time, s, x, y, z, m, and, with 5 columns, yaw, rad. The trajectory
+      starts at the first row. It is cubic between the samples, with velocities from central differences, and at rest at
+      both ends.
 
     Lines that are empty, begin with ``#``, or contain a header of names are ignored.
 
@@ -36,7 +37,7 @@ def load_csv(path: str | Path) -> Trajectory:
 
 
 def _parse_table(lines: list[str], location: str) -> NDArray:
-    """Return the numbers of the lines. (n, n_columns)"""
+    """Return the numbers in the lines. (n_rows, n_columns)"""
     rows: list[list[float]] = []
     for i, line in enumerate(lines, start=1):
         cells = [cell.strip() for cell in line.strip().rstrip(",").split(",")]
@@ -101,7 +102,7 @@ def save_csv(trajectory: Trajectory, path: str | Path) -> None:
 
 
 def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayLike | None = None) -> None:
-    """Write positions with time stamps, for example of a flight, as ``load_csv`` reads them.
+    """Write positions with time stamps, for example of a flight, as a file that ``load_csv`` reads.
 
     Args:
         path: File to write.

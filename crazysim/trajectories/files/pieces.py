@@ -10,7 +10,8 @@ from crazysim.trajectories.bezier import restrict_interval
 from crazysim.trajectories.trajectory import Trajectory
 
 MAX_JUMPS = np.array([1e-3, 1e-3, 1e-3, np.deg2rad(0.1)])
-"""Largest difference between a piece's start and the previous end that is not a jump: x, y, z, m, and yaw, rad."""
+"""Largest difference between the start of a piece and the end of the previous piece that is not regarded as a jump: x,
+y, z, m, and yaw, rad. (4,)"""
 
 ROUNDING = 1e-5
 """Fraction of a coordinate that may be due to float32 rounding."""
@@ -25,8 +26,8 @@ def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
         trajectory: Trajectory of one vehicle.
 
     Returns:
-        Ends, s (n_pieces,), and coefficients of x, y, z, m, and yaw, rad, constant term first, in the pieces' times
-        scaled to [0, 1]. (n_pieces, 4, degree + 1)
+        Ends, s (n_pieces,), and coefficients of x, y, z, m, and yaw, rad, constant term first, in each piece's time
+        scaled to [0, 1] (n_pieces, 4, degree + 1).
     """
     ends = np.asarray(trajectory.ends)
     if ends.ndim != 1:
@@ -40,7 +41,7 @@ def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
 
 
 def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
-    """Check that every piece begins where the one before ends, for formats that store only the ends of pieces.
+    """Check that every piece begins where the previous piece ends, for formats that store only the ends of pieces.
 
     Args:
         ends: End of each piece, s. (n_pieces,)
@@ -48,7 +49,7 @@ def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
             degree + 1)
 
     Raises:
-        ConfigError: If a piece begins further than a millimetre or a tenth of a degree, plus rounding, from that end.
+        ConfigError: If a piece begins more than a millimetre or 0.1 degrees, plus rounding, from the previous end.
     """
     end_values = coefficients[:-1].sum(axis=-1)
     jumps = np.abs(coefficients[1:, :, 0] - end_values)
@@ -64,7 +65,7 @@ def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
 
 
 def split_pieces(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the same pieces, split at further times.
+    """Return pieces that are also split at ``times``, as their ends and coefficients.
 
     Args:
         ends: End of each piece, s. (n_pieces,)

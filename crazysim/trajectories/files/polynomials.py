@@ -31,7 +31,7 @@ DURATION_UNIT = 1e-3
 MAX_PIECE_DURATION = 65.0
 """Longest compressed piece, s: durations have 16 bits."""
 STORED_DEGREES = (0, 1, 3, 7)
-"""Degree of an axis for each two-bit code. All control points but the first are stored, as many as the degree."""
+"""Degree of an axis for each two-bit code, and number of stored control points: all except the first."""
 AXIS_UNITS = np.array([DISTANCE_UNIT, DISTANCE_UNIT, DISTANCE_UNIT, ANGLE_UNIT])
 """Units of compressed x, y, z, m, and yaw, rad. (4,)"""
 
@@ -66,7 +66,7 @@ def unpack_poly4d(content: bytes, location: str = "a trajectory memory") -> Traj
 
 
 def trajectory_from_rows(rows: NDArray, location: str) -> Trajectory:
-    """Return the trajectory of rows as ``trajectory_rows`` returns them.
+    """Return the trajectory of rows in the format of ``trajectory_rows``.
 
     Args:
         rows: Duration, s, and coefficients of x, y, z, m, and yaw, rad, for the time in seconds. (n_pieces, 33), or
@@ -93,9 +93,7 @@ def trajectory_from_rows(rows: NDArray, location: str) -> Trajectory:
 
 
 def _crazyflie_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
-    """Return ends, s (n_pieces,), and coefficients for each piece's time scaled to [0, 1] (n_pieces, 4, degree + 1),
-    after a check that the Crazyflie can fly polynomials of their degree.
-    """
+    """Return what ``trajectory_pieces`` returns, after a check that the degree is at most 7."""
     ends, c = trajectory_pieces(trajectory)
     if c.shape[2] > 8:
         raise ConfigError(
@@ -122,8 +120,8 @@ def pack_compressed(trajectory: Trajectory) -> bytes:
         trajectory: Trajectory of one vehicle, of degree 7 at most.
 
     Raises:
-        ConfigError: If its degree is higher, a piece is shorter than 1 ms or does not begin where the one before ends,
-            or a coordinate exceeds the 32.767 m or 3276.7 degrees that 16 bits can hold.
+        ConfigError: If its degree is higher, a piece is shorter than 1 ms or does not begin where the previous piece
+            ends, or a coordinate exceeds 32.767 m or 3276.7 degrees, the largest values of 16 bits.
     """
     ends, c = _crazyflie_pieces(trajectory)
     require_no_jumps(ends, c)
@@ -209,11 +207,11 @@ def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = Fal
 
 
 def load_memory(path: str | Path, compressed: bool = False) -> Trajectory:
-    """Return the trajectory in a file that ``save_memory`` has written, or that was read from a Crazyflie.
+    """Return the trajectory in a file from ``save_memory``, or in a copy of a Crazyflie's trajectory memory.
 
     Args:
         path: File.
-        compressed: True for the compressed format; the contents do not show which it is.
+        compressed: True for the compressed format, which the contents do not identify.
 
     Raises:
         ConfigError: If the file does not exist or is not of that format.
