@@ -16,6 +16,7 @@ from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
+from crazysim.jaxcompat import set_xla_log_level
 from crazysim.pytree import Members, PyTree, leaf, static
 from crazysim.sim.sim import Sim
 from crazysim.startup import __version__, lazy_getattr
@@ -119,6 +120,8 @@ __all__ = [
     "stage",
     "static",
 ]
+
+set_xla_log_level()
 
 __getattr__ = lazy_getattr(
     __name__,

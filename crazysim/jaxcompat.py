@@ -19,6 +19,8 @@ removed it:
 - **Threefry's primitive** (``threefry2x32_p``): its rounds written out, as in ``engine/backends/interpret.py``.
 - **The compilation cache of one thread** (``compilation_cache``): without it, programs are only kept in the folder that
   JAX is configured with. It is used where these names are missing.
+- **The log level of XLA** (``set_xla_log_level``): the variable ``TF_CPP_MIN_LOG_LEVEL`` alone, which has no effect if
+  JAX was imported before crazysim. It is used where jaxlib lacks the function.
 - **The coordinator of several hosts** (``connected_hosts``, ``detect_hosts``): exchanges of arrays instead of its store
   of texts, and the variables of SLURM. ``jax.experimental.multihost_utils``: programs with replicated results.
 - **_cache_size** (``n_compilations``): a counter in the traced function. Tests need it, and ``envs/stepper.py`` to keep
@@ -95,6 +97,7 @@ __all__ = [
     "read_equation",
     "register_target",
     "select_inputs",
+    "set_xla_log_level",
     "threefry2x32_p",
     "threefry_prng_impl",
     "versions",
@@ -438,6 +441,16 @@ def n_compilations(jitted: Callable[..., Any]) -> int:
 def cache_folder() -> str | None:
     """Return the folder of JAX's persistent compilation cache; None if there is none."""
     return jax.config.jax_compilation_cache_dir or None  # type: ignore[attr-defined]
+
+
+def set_xla_log_level() -> None:
+    """Hide XLA's errors if ``startup`` has chosen that, even where JAX was imported before crazysim."""
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL") != "3":
+        return
+    with contextlib.suppress(ImportError, AttributeError):
+        from jax._src.lib import utils
+
+        utils.absl_set_min_log_level(3)
 
 
 @contextlib.contextmanager

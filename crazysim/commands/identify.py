@@ -52,7 +52,12 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--test", nargs="+", default=[], metavar="LOG", help="held-out logs to report prediction errors on")
     add("--motion", type=Path, nargs="+", default=[], metavar="FILE", help="motion capture of each log, also of --test")
     add("--mass", type=float, metavar="KG", help="mass; by default the airframe's")
-    add("--dynamics", choices=["first_principles", *FITTED_MODELS], default="first_principles", help="model to fit")
+    add(
+        "--dynamics",
+        choices=["first_principles", *(x.value for x in FITTED_MODELS)],
+        default="first_principles",
+        help="model to fit",
+    )
     add("--network", type=int, metavar="N", help="train a residual with N hidden units, 0 for linear terms")
     add("--iterations", type=int, default=1000, metavar="N", help="iterations of the training of --network")
     add("--plot", type=Path, metavar="FILE", help="picture of the errors of held-out logs, or else of the fitted ones")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crazysim.commands.options import (
+    SIMULATION_OPTIONS,
     DefaultsFormatter,
     add_page_options,
     add_simulation_options,
@@ -76,7 +77,7 @@ def run(options: argparse.Namespace) -> None:
     if policy_pilot is None:
         control_freq = 100 if options.control_freq is None else options.control_freq
         n_drones = 4 if options.drones is None else options.drones
-        settings: dict[str, Any] = {"freq": 500} | specified_options(options, "freq", "drone", "controller", "device")
+        settings: dict[str, Any] = {"freq": 500} | specified_options(options, "freq", *SIMULATION_OPTIONS)
         sim = Sim(n_worlds, n_drones, control="state", state_freq=control_freq, **settings)
     else:
         sim, control_freq = policy_pilot.env.sim, policy_pilot.env.base.freq
@@ -111,7 +112,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
     """Return the pilot of the policy to fly; None for a flight without one."""
-    excluded = ("drones", "control_freq", "freq", "drone", "controller", "pilot", "gamepad", "commands")
+    excluded = ("drones", "control_freq", "freq", "drone", "dynamics", "controller", "pilot", "gamepad", "commands")
     if options.policy is None:
         if options.goals is not None:
             raise ConfigError("expected --policy with --goals, got none. Use --policy out/hover, for example.")

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -33,10 +34,15 @@ def add_page_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
 
 
+SIMULATION_OPTIONS = ("drone", "dynamics", "controller", "device")
+"""Names of the options that ``add_simulation_options`` adds."""
+
+
 def add_simulation_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a command that are settings of ``Sim``."""
     add = parser.add_argument
     add("--drone", help="airframe: a name or the path of a TOML file; by default cf21B_500")
+    add("--dynamics", choices=[x.value for x in Dynamics], help="dynamics model; by default first_principles")
     add("--controller", help="controller that follows the setpoints, such as mellinger; by default auto")
     add("--device", help="device: cpu, gpu; by default cpu")
 

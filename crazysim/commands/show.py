@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from crazysim.commands.options import (
+    SIMULATION_OPTIONS,
     DefaultsFormatter,
     add_page_options,
     add_simulation_options,
@@ -51,7 +52,7 @@ def run(options: argparse.Namespace) -> None:
     show = load_show(options.file)
     if options.window:
         require_screen("--browser or --film FILE")
-    settings = specified_options(options, "drone", "controller", "device")
+    settings = specified_options(options, *SIMULATION_OPTIONS)
     if options.live:
         _run_live(show, options, settings)
         return

@@ -32,7 +32,7 @@ OBSERVATION_DESCRIPTIONS = {
     "rot": "attitude, body to world, as a rotation matrix, row by row",
     "vel": "velocity, world frame, m/s",
     "ang_vel": "angular velocity, body frame, rad/s",
-    "difference_to_goal": "goal minus position, world frame, m",
+    "difference_to_goal": "goal minus position (of the load in transport and deliver), world frame, m",
     "heading": "horizontal unit vector along the yaw, world frame, x and y",
     "heading_vel": "velocity along the heading: ahead, left, up, m/s",
     "goal_direction": "unit vector to the goal along the heading: ahead, left, up",

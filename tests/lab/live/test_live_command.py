@@ -36,6 +36,13 @@ def test_circles_are_consistent():
     assert not start[3:9].any()
 
 
+def test_an_airframe_with_fitted_models_alone_flies(capsys):
+    arguments = ["live", "--drone", "hb_x500", "--drones", "1", "--seconds", "0.1", "--headless", "--speed", "max"]
+    assert main(arguments) == 2
+    assert "so_rpy_rotor_drag), got 'first_principles'" in capsys.readouterr().err
+    assert main([*arguments, "--dynamics", "so_rpy_rotor_drag"]) == 0
+
+
 def test_the_live_command_takes_a_pilot(capsys):
     assert main(["live", "--drones", "2", "--seconds", "0.5", "--headless", "--speed", "max", "--pilot"]) == 0
     assert "pilot" in capsys.readouterr().out
