@@ -267,8 +267,8 @@ def find_device(device: str | jax.Device) -> jax.Device:
     platform, colon, index = device.partition(":") if isinstance(device, str) else ("", "", "")
     if not platform or (colon and not index.isdecimal()):
         raise ConfigError(
-            f"expected a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, got {short_repr(device)}; use "
-            f"device='cpu'"
+            f"expected a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, got {short_repr(device)}. Use "
+            f"device='cpu'."
         )
     try:
         devices = jax.local_devices(backend="gpu" if platform == "cuda" else platform)
@@ -276,8 +276,8 @@ def find_device(device: str | jax.Device) -> jax.Device:
     except (RuntimeError, ValueError, IndexError) as error:
         available = ", ".join(str(d) for d in jax.local_devices())
         raise ConfigError(
-            f"device {device!r} does not exist ({error}); there is {available}. Use a platform such as 'cpu' or 'gpu', "
-            f"or 'gpu:1' for its second device. GPUs need the CUDA packages of JAX: pip install 'crazysim[gpu]'."
+            f"expected a device of this host ({available}), got {device!r}: {error}. Use a platform such as 'cpu' or "
+            f"'gpu', or 'gpu:1' for its second device. GPUs need the CUDA packages of JAX: pip install 'crazysim[gpu]'."
         ) from None
 
 

@@ -130,7 +130,7 @@ class Step:
             ConfigError: If there is no engine of that name, or it cannot run here.
         """
         if engine not in ENGINES:
-            raise ConfigError(f"engine {engine!r} does not exist; choose one of {', '.join(ENGINES)}")
+            raise ConfigError(f"expected an engine of {', '.join(ENGINES)}, got {engine!r}. Use 'auto'.")
         if engine == "fused" and (reason := fused.unavailable_reason(platform)):
             raise ConfigError(f"engine 'fused' cannot run here: {reason}. Use engine='lanes', or 'auto'.")
         self.engine, self.platform, self.mesh, self.strict = engine, platform, mesh, strict

@@ -44,7 +44,8 @@ def sections(data: Path | None = None) -> Sequence[Section]:
 
     return (
         Section(
-            "closed", "Closed forms and orders", "In float64, at 500 Hz.", closed_forms.CHECKS,
+            "closed", "Closed forms and orders",
+            "In float64, at 500 Hz; orders of integrators are estimated from several rates.", closed_forms.CHECKS,
         ),
         Section(
             "mujoco", "C MuJoCo", "In float64, steps of 1 ms.", (peers.compare_with_mujoco,),
