@@ -14,11 +14,11 @@ from pictures import has_colour
 from waiting import wait_for
 
 MAX_PIXEL_DISTANCE = 12
-"""Pixels between where something is seen and where it is."""
+"""Tolerance of positions in the window, pixels."""
 
 
 class Browser:
-    """A browser without a screen, spoken to over its debugging protocol."""
+    """A headless browser, controlled by its debugging protocol."""
 
     def __init__(self, program, folder):
         from websockets.sync.client import connect
@@ -78,13 +78,16 @@ class Browser:
         return np.frombuffer(pixels, np.uint8).reshape(size[1], size[0], 3).astype(int)
 
     def mask(self, rgb):
-        """Return rows and columns of what has a hue."""
+        """Return rows and columns of the pixels with the hue of a colour."""
         return np.nonzero(has_colour(self.picture(), rgb))
 
-    def find(self, rgb, tolerance):
-        """Return column and row of the middle of what has a hue, once that is near a place."""
+    def find(self, rgb, expected):
+        """Return column and row of the centre of all pixels of a hue.
+
+        Wait up to 300 s until the centre is near an expected position.
+        """
         centre, deadline = np.full(2, np.inf), time.monotonic() + 300
-        while time.monotonic() < deadline and not np.allclose(centre, tolerance, atol=MAX_PIXEL_DISTANCE):
+        while time.monotonic() < deadline and not np.allclose(centre, expected, atol=MAX_PIXEL_DISTANCE):
             rows, columns = self.mask(rgb)
             if len(rows) > 20:
                 centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
@@ -104,10 +107,10 @@ def start_browser(folder):
     return Browser(program, folder)
 
 
-def light_simply(patch=setattr):
-    """Let pages of viser that are made from now on have light from everywhere, without shadows and reflections.
+def use_simple_lights(patch=setattr):
+    """Let new servers of viser light their pages from all directions, without shadows and reflections.
 
-    Those take seconds for the first image where no GPU draws.
+    Without a GPU, shadows and reflections take seconds for the first image.
     """
     import viser
 

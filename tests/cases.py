@@ -24,10 +24,10 @@ from crazysim.dynamics import first_principles
 from crazysim.engine.backends import native
 from crazysim.pytree import PyTree
 
-FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
+FITTED_DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
 LEVELS = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")
 PAIRS = tuple(("first_principles", control) for control in LEVELS) + tuple(
-    (dynamics, control) for dynamics in FITTED for control in ("state", "attitude")
+    (dynamics, control) for dynamics in FITTED_DYNAMICS for control in ("state", "attitude")
 )
 """All 11 valid pairs of dynamics and command level."""
 INTEGRATORS = ("euler", "symplectic_euler", "rk4")
@@ -64,14 +64,14 @@ PLAIN_SCENE = f"""
 
 
 def vectors(n=3, max_abs=10.0, **options):
-    """Return a strategy for vectors of ``n`` numbers, of at most an absolute value."""
+    """Return a strategy for vectors of ``n`` numbers between ``-max_abs`` and ``max_abs``."""
     return arrays(np.float64, n, elements=st.floats(-max_abs, max_abs, **options))
 
 
 def unit_quats(**options):
     """Return a strategy for attitudes, xyzw."""
-    longer = vectors(4, 1.0, **options).filter(lambda q: np.linalg.norm(q) > 0.1)
-    return longer.map(lambda q: q / np.linalg.norm(q))
+    nonzero_vectors = vectors(4, 1.0, **options).filter(lambda q: np.linalg.norm(q) > 0.1)
+    return nonzero_vectors.map(lambda q: q / np.linalg.norm(q))
 
 
 def controller_params(record, **changes):
@@ -81,31 +81,31 @@ def controller_params(record, **changes):
 
 
 def send(data, command, **kwargs):
-    """Return the data with a command of its own level."""
+    """Return the data after a command at the command level of the simulation."""
     return getattr(F, f"{data.controls.mode.value}_control")(data, command, **kwargs)
 
 
 def command_in_force(data):
-    """Return the command that the simulation's own level currently follows."""
+    """Return the command that the controller of the simulation's command level currently follows."""
     mode = data.controls.mode.value
     return data.controls.rotor_vel if mode == "rotor_vel" else getattr(data.controls, mode).cmd
 
 
 def with_states(data, **changes):
-    """Return the data with other states, broadcast to every drone and cast."""
+    """Return the data with some states replaced; values are broadcast to all drones and cast."""
     states = data.states
     return data.replace(states=states.replace(**{k: broadcast_like(v, getattr(states, k)) for k, v in changes.items()}))
 
 
 def broadcast_like(value, template):
-    """Return an array of the shape and the type of another; NumPy's are broadcast without a compiled call."""
+    """Return a value as an array of a template's shape and type; NumPy arrays are broadcast without a compiled call."""
     if isinstance(value, jax.Array):
         return jnp.broadcast_to(value.astype(template.dtype), template.shape)
     return jax.device_put(np.array(np.broadcast_to(np.asarray(value, template.dtype), template.shape)))
 
 
 def with_params(data, **changes):
-    """Return the data with other parameters of its dynamics, without broadcasting."""
+    """Return the data with some parameters of the dynamics replaced, without broadcasting."""
     return data.replace(params=data.params.replace(**{k: jnp.asarray(v) for k, v in changes.items()}))
 
 
@@ -150,7 +150,7 @@ def hover_rotor_state(data):
 
 
 def hover_command(data, pos=(0.0, 0.0, 1.0)):
-    """Return the command of one drone that hovers at its place. (k,)"""
+    """Return the command with which one drone hovers; at state level, it hovers at a position. (k,)"""
     mode = data.controls.mode.value
     if mode == "state":
         return np.array([*pos, *np.zeros(6), 0, 0, 0, 1, 0, 0, 0], np.float64)
@@ -208,7 +208,7 @@ def repulsion(data):
 def gap(data):
     """Push a drone up by the squared distance to its nearest neighbour.
 
-    For its gradient, a term of value zero is added whose maximum is tied.
+    A term of value zero is added, which contains a maximum of equal numbers: a special case for gradients.
     """
     pos = data.states.pos
     square_distance = reduce_over_others(
@@ -241,7 +241,7 @@ def build_stagewise_step(sim):
     return step
 
 
-def hovering(n_worlds=3, n_drones=2, **kwargs):
+def make_hovering_sim(n_worlds=3, n_drones=2, **kwargs):
     """Return a simulation of drones that hover at different positions."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, rng_key=4, **kwargs)
     grid = 0.1 * np.arange(n_worlds * n_drones * 3).reshape(n_worlds, n_drones, 3) + [0, 0, 1.0]
@@ -256,7 +256,7 @@ def shared_sim(**settings):
     return Sim(**settings)
 
 
-def n_documented(record, **sizes):
+def count_documented_arrays(record, **sizes):
     """Check that the docstring of every array of a record ends with its shape, and return the number of arrays.
 
     Args:
@@ -268,7 +268,7 @@ def n_documented(record, **sizes):
         value = getattr(record, field.name)
         for part in value if isinstance(value, tuple) else (value,):
             if isinstance(part, PyTree):
-                n_arrays += n_documented(part, **sizes)
+                n_arrays += count_documented_arrays(part, **sizes)
             elif isinstance(part, (jax.Array, np.ndarray)):
                 words, title = shapes[field.name], f"{type(record).__name__}.{field.name}"
                 assert words is not None, f"{title} has no shape in its docstring"

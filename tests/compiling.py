@@ -15,7 +15,7 @@ MIN_KEPT_COMPILE_S = 0.05
 def environment(variables: Mapping[str, str]) -> dict[str, str]:
     """Return the environment of the tests: four host devices, persistent caches, and quick compilers.
 
-    ``XLA_FLAGS`` that set ``xla_backend_optimization_level`` keep all optimisations; CI runs laws and engines so.
+    ``XLA_FLAGS`` that set ``xla_backend_optimization_level`` keep all optimisations, which CI uses for laws and engine.
     """
     flags = variables.get("XLA_FLAGS", "")
     settings = {
@@ -34,7 +34,7 @@ def environment(variables: Mapping[str, str]) -> dict[str, str]:
 
 
 def _quick_cxxflags(variables: Mapping[str, str]) -> str:
-    """Return options of g++ that take 0.6 of the time of -O1, and as little as -O0, whose kernels are slow."""
+    """Return options for quick compilation: those of g++ take 0.6 of the time of -O1, as little as -O0."""
     name = variables.get("CXX", "g++")
     is_gcc = sys.platform == "linux" and "clang" not in name and shutil.which(name) is not None
     return "-Og -fira-algorithm=priority -fira-region=one" if is_gcc else "-O1"

@@ -49,7 +49,7 @@ START_TIME = pytest.StashKey[float]()
 
 
 def _processor_time():
-    return sum(os.times()[:4])  # of this process, and of those that it waited for
+    return sum(os.times()[:4])  # of this process and of its children that have ended
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -77,14 +77,14 @@ def pytest_terminal_summary(terminalreporter):
     reports_with_times = (
         r for reports in terminalreporter.stats.values() for r in reports if getattr(r, "user_properties", None)
     )
-    took = {report.nodeid: dict(report.user_properties) for report in reports_with_times}
+    properties = {report.nodeid: dict(report.user_properties) for report in reports_with_times}
     slow_tests = sorted(
-        (-entry["processor_s"], name) for name, entry in took.items() if entry["processor_s"] > MAX_UNEXPLAINED_S
+        (-entry["processor_s"], name) for name, entry in properties.items() if entry["processor_s"] > MAX_UNEXPLAINED_S
     )
     if slow_tests:
         terminalreporter.section(f"tests over {MAX_UNEXPLAINED_S} s of processor time")
     for seconds, name in slow_tests:
-        reason = took[name].get("reason", "no reason given: share what it builds, or mark it long")
+        reason = properties[name].get("reason", "no reason given: share what it builds, or mark it long")
         terminalreporter.write_line(f"{-seconds:5.1f} s  {name}: {reason}")
 
 
@@ -135,9 +135,9 @@ def _chromium(tmp_path_factory):
 @pytest.fixture
 def chromium(_chromium, viser, monkeypatch):
     """Return a browser that leaves its page when the test ends; pages of flights have simple lights."""
-    from browsing import light_simply
+    from browsing import use_simple_lights
 
-    light_simply(monkeypatch.setattr)
+    use_simple_lights(monkeypatch.setattr)
     yield _chromium
     _chromium.call("Page.navigate", url="about:blank")
 

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def full_disk(size=100):
-    """Let every file end at `size` bytes, as the system does for a quota.
+    """Limit the size of every file that is written to ``size`` bytes, as a quota does.
 
-    Python writes no bytecode meanwhile: it would keep the cut file and fail to import it ever after.
+    Python writes no bytecode meanwhile: every later import would fail at a truncated file.
     """
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     bytecode = sys.dont_write_bytecode

@@ -74,6 +74,6 @@ def select_obs(state, mask):
     return jax.tree.map(lambda x: leaf_on_host(x)[mask], state.obs)
 
 
-def task_names(classes_once=False):
+def task_names(one_per_class=False):
     """Return the names of all tasks, or one for each class of tasks."""
-    return list({TASKS[name].task: name for name in reversed(TASKS)}.values() if classes_once else TASKS)
+    return list({TASKS[name].task: name for name in reversed(TASKS)}.values() if one_per_class else TASKS)

@@ -28,8 +28,8 @@ def memory(limits: Path = LIMITS) -> float:
     return total if limit == "max" else min(total, int(limit))
 
 
-def _words(path: Path, otherwise: str) -> list[str]:
+def _words(path: Path, default: str) -> list[str]:
     try:
         return path.read_text().split()
     except OSError:
-        return otherwise.split()
+        return default.split()

@@ -26,7 +26,7 @@ def pixel(point, height=HEIGHT, width=WIDTH):
 
 
 def read_frames(path, height, width, *filters):
-    """Return the frames of a film, whose size after the filters of ffmpeg must be given. (n, height, width, 3)"""
+    """Return the frames of a film with this size after the filters of ffmpeg. (n, height, width, 3)"""
     decode = [get_ffmpeg_exe(), "-loglevel", "fatal", "-i", path, *filters, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
     return pixels[: len(pixels) // (height * width * 3) * height * width * 3].reshape(-1, height, width, 3)

@@ -14,17 +14,17 @@ def virtual_screen(folder):
     """Yield the display of a virtual screen, and the file in a folder that holds its pixels."""
     if shutil.which("Xvfb") is None:
         pytest.skip("no Xvfb")
-    read, write = os.pipe()
-    options = ["-displayfd", str(write), "-screen", "0", "1280x720x24", "-fbdir", str(folder), "-nolisten", "tcp"]
-    server = subprocess.Popen(["Xvfb", *options], pass_fds=[write], stderr=subprocess.DEVNULL)
-    os.close(write)
-    ready, _, _ = select.select([read], [], [], 30)
-    number = os.read(read, 16).decode().strip() if ready else ""
+    read_end, write_end = os.pipe()
+    options = ["-displayfd", str(write_end), "-screen", "0", "1280x720x24", "-fbdir", str(folder), "-nolisten", "tcp"]
+    server = subprocess.Popen(["Xvfb", *options], pass_fds=[write_end], stderr=subprocess.DEVNULL)
+    os.close(write_end)
+    ready, _, _ = select.select([read_end], [], [], 30)
+    number = os.read(read_end, 16).decode().strip() if ready else ""
     assert number, "Xvfb did not start"
     yield f":{number}", folder / "Xvfb_screen0"
     server.terminate()
     server.wait(10)
-    os.close(read)
+    os.close(read_end)
 
 
 def screen_pixels(path, wait=True):

@@ -7,7 +7,10 @@ from crazysim.scene.splats import Gaussians
 
 
 def write_splats(path, n=30, n_colors=16, seed=0, **changes):
-    """Write a scene of random splats around (2, 0, 1), and return its columns."""
+    """Write a scene of random splats around (2, 0, 1), and return its columns.
+
+    ``changes`` replaces columns by name; None removes a column.
+    """
     rng = np.random.default_rng(seed)
     columns = {axis: rng.normal(mean, 0.5, n) for axis, mean in (("x", 2), ("y", 0), ("z", 1))}
     columns |= {f"f_dc_{k}": rng.normal(0, 1, n) for k in range(3)}
@@ -21,8 +24,8 @@ def write_splats(path, n=30, n_colors=16, seed=0, **changes):
     return columns
 
 
-def one_splat(pos, deviation, opacity, color):
-    """Return a round Gaussian of one colour from everywhere."""
+def make_splat(pos, deviation, opacity, color):
+    """Return a round Gaussian that has the same colour from all directions."""
     return Gaussians(
         jnp.asarray([pos], jnp.float32),
         jnp.array([[0, 0, 0, 1.0]]),
@@ -33,7 +36,7 @@ def one_splat(pos, deviation, opacity, color):
 
 
 def spot_alpha(offset, deviation, opacity, focal, n):
-    """Return the alpha of ``one_splat`` in a square image of n x n pixels: its linear projection, plus 0.3 pixels^2.
+    """Return the alpha of ``make_splat`` in a square image of n x n pixels: its linear projection, plus 0.3 pixels^2.
 
     Args:
         offset: Position relative to a camera that looks along x, with y to its left and z up, m. (3,)

@@ -27,7 +27,7 @@ class Masses(Members):
 
 
 class Springs(Population):
-    """Masses of 1 kg, each on a spring towards the command that its controller has taken over."""
+    """Masses of 1 kg. A spring pulls each mass to the command that its controller has taken over at a tick."""
 
     members: int | Sequence[str] = 1
     name: str = "springs"
@@ -105,14 +105,14 @@ class Tying(Springs):
 KINDS = (Springs, Crowd, Tied, Tying)
 
 
-def build(kinds, n_worlds=2, n_drones=2, n_members=3, **settings):
+def build_springs(kinds, n_worlds=2, n_drones=2, n_members=3, **settings):
     """Return a simulation of drones at different positions in the air, with populations of masses.
 
     Args:
         kinds: Class of the population, which is added as "springs", or several, each added under the name of its class.
         n_worlds: Number of worlds.
-        n_drones: Number of drones in each.
-        n_members: Number of members of each population.
+        n_drones: Number of drones in each world.
+        n_members: Number of members of each population in each world.
         **settings: Other settings of the simulation.
     """
     sim = cs.Sim(n_worlds, n_drones, control="rotor_vel", **settings)

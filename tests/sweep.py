@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from cases import INTEGRATORS, PAIRS, centre, gap, hover_command, leaf_on_host, repulsion, send, with_states
-from springs import KINDS, Tied, build
+from springs import KINDS, Tied, build_springs
 
 from crazysim import (
     IMU,
@@ -61,7 +61,7 @@ from crazysim.trajectories import figure_eight
 ROUNDING = 1e-4
 """Tolerance after 100 steps in float32: some 1,000 roundings of 1e-7, since errors in the speeds of rotors and in
 angular velocities add up in attitudes and positions. Two engines of the CPU differ by 2e-5 at most."""
-LOADS = 1e-3
+LOAD_TOLERANCE = 1e-3
 """Tolerance of flights with loads, as slack cables and friction enlarge roundings.
 
 Two engines of the CPU differ by 8e-5 with cables. Kernels of GPUs divide to 2 units in the last place; with exact
@@ -144,7 +144,7 @@ SHAPES = [
     Shape("ellipsoid", (0.5, 0.3, 0.15)),
     hull([[0.4, 0, 0], [-0.3, 0.3, 0], [-0.2, -0.4, 0.1], [0, 0.1, 0.5], [0.1, 0, -0.3]]),
 ]
-EIGHT = figure_eight(2.0, 1.0, speed=1.0)
+FIGURE_EIGHT = figure_eight(2.0, 1.0, speed=1.0)
 HILLS = 0.5 * (1 + np.sin(np.arange(41) / 6)[:, None] * np.cos(np.arange(41) / 5))
 FIELD = Grid(np.arange(54).reshape(3, 3, 2, 3) % 7 - 3.0, (-1.0, -1.0, 0.0), (1.0, 1.0, 4.0))
 EFFECTS = {
@@ -163,7 +163,7 @@ EFFECTS = {
     Wind: {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7, "roughness": 0.05},
     WindField: {"field": FIELD, "spread": (0.5, 0.5, 0.0)},
 }
-"""Every effect, with settings for which it has an effect."""
+"""Every effect, with settings that change the flight."""
 RANGES = {
     "mass": (0.9, 1.2),
     "inertia": (0.8, 1.1),
@@ -174,7 +174,7 @@ RANGES = {
     "drag": (0.0, 3.0),
     "wind": (1.0, 3.0),
 }
-"""Every factor that ``Randomize`` draws by itself."""
+"""Ranges of all quantities that ``Randomize`` draws without the help of another plugin."""
 
 
 def triad_errors(size):
@@ -221,7 +221,7 @@ def biased_imu():
 
 def kalman():
     """Return every kind of sensor that the filter uses, and the filter."""
-    measured_by = [
+    filter_inputs = [
         biased_imu(),
         MotionCapture(noise=0.01, freq=100),
         OpticalFlow(noise=0.2),
@@ -230,18 +230,18 @@ def kalman():
         UWB(ANCHORS, noise=0.1, tdoa=True, name="tdoa"),
         Lighthouse(ANCHORS[:1], STATIONS[1:], noise=4e-4),
     ]
-    return [*measured_by, Kalman(measured_by)]
+    return [*filter_inputs, Kalman(filter_inputs)]
 
 
 def eskf():
     """Return a filter and sensors of one number each, since each number adds an update of 15 states to compile."""
-    measured_by = [biased_imu(), UWB(ANCHORS[:1], noise=0.1), TimeOfFlight(noise=0.01)]
-    return [*measured_by, ESKF(measured_by)]
+    filter_inputs = [biased_imu(), UWB(ANCHORS[:1], noise=0.1), TimeOfFlight(noise=0.01)]
+    return [*filter_inputs, ESKF(filter_inputs)]
 
 
 def complementary():
-    measured_by = [IMU.bmi088(), Barometer(noise=2.0), TimeOfFlight(noise=0.01)]
-    return [*measured_by, Complementary(measured_by)]
+    filter_inputs = [IMU.bmi088(), Barometer(noise=2.0), TimeOfFlight(noise=0.01)]
+    return [*filter_inputs, Complementary(filter_inputs)]
 
 
 def add_drifting_pad(sim):
@@ -278,7 +278,7 @@ def distances(data):
 
 
 def replace_stages(**stages):
-    """Return a function that replaces all stages but the count of steps."""
+    """Return a function that replaces all stages of a simulation except ``increment_steps``."""
 
     def prepare(sim):
         sim.step_pipeline = stages | {"increment_steps": sim.step_pipeline["increment_steps"]}
@@ -286,8 +286,8 @@ def replace_stages(**stages):
     return prepare
 
 
-def before_integration(*stages):
-    """Return a function that inserts stages."""
+def insert_before_integration(*stages):
+    """Return a function that inserts stages into a simulation before ``integration``."""
 
     def prepare(sim):
         for fn in stages:
@@ -296,7 +296,7 @@ def before_integration(*stages):
     return prepare
 
 
-def undeclared(data):
+def mean_torque(data):
     """Add a torque that depends on the drones of all worlds."""
     mean = jnp.mean(data.states.pos, axis=(0, 1))
     return data.replace(states=data.states.replace(torque=0 * data.states.torque + 1e-6 * mean))
@@ -323,12 +323,12 @@ def make_builder(plugins=list, **settings):
 
 def build_tracking_sim(**more):
     t = np.linspace(0, 1, 11)
-    controller = TrackingLQR(setpoints=jax.vmap(EIGHT.evaluate)(t), dt=0.1)
+    controller = TrackingLQR(setpoints=jax.vmap(FIGURE_EIGHT.evaluate)(t), dt=0.1)
     return make_flying_sim(plugins=follow(), control="state", controller=controller, **more)
 
 
 def follow():
-    return [Follow([EIGHT])]
+    return [Follow([FIGURE_EIGHT])]
 
 
 build_tracking_sim.plugins = follow
@@ -395,19 +395,19 @@ CASES |= {
     "objects": make_builder(control="attitude", prepare=add_drifting_pad),
     "distances": make_builder(height=0.0, control="rotor_vel", prepare=replace_stages(distances=distances)),
     "fleet": build_fleet,
-    "populations": lambda **more: build(KINDS, 3, 2, 4, **more),
-    "populations of equal sizes": lambda **more: build(KINDS, 2, 2, 2, **more),
-    "many members": lambda **more: build(Tied, 2, 2, 9, **more),
+    "populations": lambda **more: build_springs(KINDS, 3, 2, 4, **more),
+    "populations of equal sizes": lambda **more: build_springs(KINDS, 2, 2, 2, **more),
+    "many members": lambda **more: build_springs(Tied, 2, 2, 9, **more),
     "stages of all scopes": make_builder(
-        n_drones=4, control="attitude", prepare=before_integration(repulsion, centre, undeclared)
+        n_drones=4, control="attitude", prepare=insert_before_integration(repulsion, centre, mean_torque)
     ),
-    "pairs of 17": make_builder(n_worlds=3, n_drones=17, control="rotor_vel", prepare=before_integration(gap)),
+    "pairs of 17": make_builder(n_worlds=3, n_drones=17, control="rotor_vel", prepare=insert_before_integration(gap)),
     "downwash of 9": make_builder(lambda: [Downwash()], n_worlds=4, n_drones=9, control="attitude"),
 }  # fmt: skip
 """Functions that return the simulations, by name."""
 PLUGINS = {name: build.plugins for name, build in CASES.items() if hasattr(build, "plugins")}
 """Functions that return the plugins of these simulations."""
-SPLIT = ("bodies", "collisions", "stages of all scopes", "many members")
+SPLIT_CASES = ("bodies", "collisions", "stages of all scopes", "many members")
 """Simulations with stages that no engine fuses."""
 TOLERANCES = {"impact": 0.005}
 """Tolerances other than ``ROUNDING``. Corners of boxes that touch a floor amplify rounding: starts that differ by 1e-7

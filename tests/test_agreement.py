@@ -18,7 +18,7 @@ from crazysim.plugins.sensors.image_sensor import ImageSensor
 
 ENGINES = ("interpret", *COMPILED_ENGINES)
 N_STEPS = 20
-"""Steps of each simulation; sensors, controllers and delays have their ticks in them."""
+"""Number of steps of each simulation; all sensors and controllers have ticks within them."""
 LONG_ON_LANES = ("sensors", "load", "bodies", "controllers", "complementary", "impact")
 """Simulations that take XLA more than 5 s to compile for ``lanes``."""
 NOT_ON_LANES = ("kalman", "eskf", "terrain")

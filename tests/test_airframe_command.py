@@ -117,7 +117,7 @@ def test_a_picture_of_another_kind_is_refused_first(tmp_path, capsys):
 
 
 def test_a_drone_is_checked_by_hand():
-    """Largest torques at hover: the rotors may change by what is left to their limits, with lever arms."""
+    """The largest torques at hover are the thrust left to the limits of the rotors times their lever arms."""
     airframe = load_airframe("cf21B_500")
     hover = 0.0434 * 9.81 / 4
     spare = min(hover - airframe.value("rotors.thrust_min"), 0.2 - hover)
@@ -129,14 +129,14 @@ def test_a_drone_is_checked_by_hand():
     assert fitted["auto"].startswith("state")
 
 
-def test_what_estimates_assume_is_in_the_file(tmp_path):
+def test_the_file_states_the_assumptions_of_its_estimates(tmp_path):
     path = tmp_path / "mine.toml"
     assert main(["airframe", "new", str(path), *NUMBERS, "--arm", "0.12"]) == 0
     sources = tomllib.loads(path.read_text(encoding="utf-8"))["sources"]
     assert "figure of merit of 0.44" in sources["torque_curve"]
 
 
-def test_what_makes_flights_slow_is_warned_of_with_its_figure():
+def test_warnings_state_what_makes_flights_slow():
     """Weak yaw: 9.81 / 4 - 0.5 N of spare thrust, 0.1 mm of drag torque over thrust, four times, over 0.02 kg m^2."""
     quad = {
         "rigid_body": {"mass": 1.0, "inertia": [0.01, 0.01, 0.02]},

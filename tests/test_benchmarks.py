@@ -1,4 +1,4 @@
-"""Benchmarks measure drones that fly: the scripts run, small, and refuse to report crashed ones."""
+"""The scripts of ``benchmarks/`` run with small settings, and refuse to report crashed drones."""
 
 import importlib
 import json
@@ -152,7 +152,7 @@ def test_scaling_measures_both_series_and_draws_them(run, tmp_path):
     assert picture.stat().st_size > 1000
 
 
-def test_limits_prints_a_floor_and_how_far_from_it(monkeypatch, benchmarks, capsys):
+def test_limits_prints_the_least_possible_time_and_the_ratio_to_it(monkeypatch, benchmarks, capsys):
     import limits
 
     monkeypatch.setattr(limits, "COPY_SIZES", {"cpu": 2**16})
@@ -241,7 +241,7 @@ def test_main_scripts_print_their_help(script, run, capsys):
 
 
 def write_results(train, out, successes, **changes):
-    """Write the results of trainings of hover that ended with these successes."""
+    """Write the results of trainings of ``hover`` with these success rates, one for each seed."""
     out.mkdir(exist_ok=True)
     for seed, success in enumerate(successes):
         result = {
@@ -278,8 +278,8 @@ def test_learning_curves_of_several_seeds_are_drawn_and_summarised(run, train, t
         assert (np.abs(pixels - color).max(axis=-1) < 40).sum() > 20, color
 
 
-def test_the_table_gets_the_rows_of_which_all_seeds_are_finished(run, train, tmp_path):
-    """The page shows the same; rows of other tasks stay, in the order of the tasks."""
+def test_the_table_gets_the_tasks_whose_seeds_are_all_finished(run, train, tmp_path):
+    """The page shows the same rows as the table. Rows of other tasks stay. Rows are in the order of the tasks."""
     other = {"task": "track", "algorithm": "apg", "env_steps": 256_000, "seeds": [3, 7], "least": 1.0, "tenth": 1.0,
              "median": 1.0, "error": None, "unit": "m", "seconds": 5.0, "parallel": 12, "commit": "0000000",
              "date": "2026-11-25", "machine": "another", "jax": "0.11.2"}  # fmt: skip
@@ -301,7 +301,7 @@ def test_the_table_gets_the_rows_of_which_all_seeds_are_finished(run, train, tmp
 
 
 def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, train, tmp_path, capsys):
-    """Two standard errors of 1,000 starts at 99% are 0.69 points, with two more successes and failures."""
+    """With two successes and two failures added, two standard errors of 1,000 starts at 99% are 0.69 points."""
     table = [{"task": "hover", "least": 0.99}]
     train.TABLE.write_text(json.dumps(table))
     check = ("train.py", "--check", "--tasks", "hover")
@@ -327,7 +327,7 @@ def test_the_page_shows_the_committed_table(benchmarks):
 
 
 def test_a_seed_that_diverged_is_named_and_counts_as_no_success(run, train, tmp_path):
-    """Its last kept policy may succeed, but its training did not end; before, it was a row like any other."""
+    """Its last stored policy may succeed, but its training did not end."""
     curve = [{"iteration": 20, "success": 0.97, "crashed": 0.0, "error": 0.01, "env_steps": 10, "seconds": 1.0,
               "compile_seconds": 0.5, "kept": True}]  # fmt: skip
     (tmp_path / "curve.json").write_text(json.dumps(curve))
@@ -348,7 +348,7 @@ def test_a_seed_that_diverged_is_named_and_counts_as_no_success(run, train, tmp_
 
 
 @pytest.mark.long("trains in a process of its own")
-def test_a_training_that_fails_leaves_the_others_which_are_not_trained_again(run, train, tmp_path, capsys):
+def test_a_training_that_fails_stops_no_other_and_finished_ones_are_not_repeated(run, train, tmp_path, capsys):
     options = ("--seeds", "0:2", "--parallel", "2", "--out", tmp_path, "--")
     small = ("--iterations", "1", "--worlds", "2", "--set", "seconds=0.1", "--config", "n_steps=4", "minibatches=2")
     with pytest.raises(SystemExit, match=r"^nothing: training with seeds 0, 1 failed$"):
@@ -387,7 +387,7 @@ def test_controllers_are_compared_on_the_same_flights(run):
     flown, cost = run("controllers.py", "--controllers", "geometric", *small)
     assert (flown["controller"], flown["drone"]) == ("geometric", "cf21B_500")  # the other one has no rotors
     assert flown["tracking"] < 0.02
-    assert "error_attitude" not in flown  # it takes states alone
+    assert "error_attitude" not in flown  # it takes states only
     assert flown["pushed"] == pytest.approx(0.289, abs=0.02)
     assert cost["steps_per_s"] > 0
 
@@ -422,7 +422,7 @@ def test_first_results_are_measured_without_and_with_a_cache(run):
     assert all(line["cpu_s"] > 0 for line in lines)
 
 
-def test_gradients_are_timed_beside_the_steps_that_they_go_through(run):
+def test_gradients_are_timed_together_with_the_steps_that_they_differentiate(run):
     (line,) = run("gradient.py", "--worlds", "4", "--controls", "rotor_vel", "--steps", "3", "--repeats", "1")
     assert line["steps_per_s"] == pytest.approx(12 / line["gradient_s"], rel=0.01)
     assert line["forward_passes"] == pytest.approx(line["gradient_s"] / line["forward_s"], rel=0.01)

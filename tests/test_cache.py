@@ -37,7 +37,7 @@ sys.exit(main([sys.argv[1], *["hover"] * (sys.argv[1] == "train")]))
 
 @pytest.fixture
 def settings(monkeypatch):
-    """Restore JAX's settings after the test, in which there is no cache and no variable."""
+    """Restore JAX's settings after the test, which begins without a cache and without the variables that choose one."""
     names = ("min_entry_size_bytes", "min_compile_time_secs", "enable_xla_caches")
     names = ("jax_compilation_cache_dir", *(f"jax_persistent_cache_{name}" for name in names))
     before = {name: getattr(jax.config, name) for name in names}
@@ -205,10 +205,10 @@ def test_without_a_usable_folder_there_is_one_line_and_everything_works(settings
             jax.jit(_inner)(jnp.ones(3))
         assert kernel_cache.folder() == kernel_cache.temporary_folder()
         assert enable_cache() is None
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert told.startswith("compiled programs are not kept: expected ")
-    assert cache.CACHE_VARIABLE in told
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert printed.startswith("compiled programs are not kept: expected ")
+    assert cache.CACHE_VARIABLE in printed
     cache._prepared_default_folder.cache_clear()
 
 
@@ -224,10 +224,10 @@ def test_off_keeps_nothing_unless_a_folder_is_named(settings, monkeypatch, tmp_p
 def test_a_command_prints_its_cache_once_and_keeps_the_cache_of_jax(settings, monkeypatch, tmp_path, capsys):
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "kept"))
     enable_for_command()
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert str(tmp_path / "kept") in told
-    assert "1 GB" in told
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert str(tmp_path / "kept") in printed
+    assert "1 GB" in printed
     jax.config.update("jax_compilation_cache_dir", None)
     enable_for_command()
     kept = str(default_cache())
@@ -247,10 +247,10 @@ def test_a_command_runs_where_the_folder_cannot_be_used(settings, monkeypatch, t
 
 
 def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path):
-    tuned = "xla_gpu_per_fusion_autotune_cache_dir"  # where JAX lets XLA keep what it has tried on a GPU
-    for folder in ("crazysim", tuned):
+    autotuning = "xla_gpu_per_fusion_autotune_cache_dir"  # folder of XLA's measurements on GPUs
+    for folder in ("crazysim", autotuning):
         (tmp_path / folder).mkdir()
-    names = ("jit_a-cache", f"{tuned}/b", "crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache")
+    names = ("jit_a-cache", f"{autotuning}/b", "crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache")
     for age, name in enumerate(reversed(names)):
         (tmp_path / name).write_bytes(bytes(10))
         os.utime(tmp_path / name, (time.time() - 1000 * age,) * 2)
@@ -267,7 +267,7 @@ def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path
 @pytest.mark.long("three processes import JAX")
 @pytest.mark.parametrize("first_import", ["", "import jax"])
 def test_a_second_command_prints_nothing_when_it_reads_the_cache(tmp_path, first_import):
-    """XLA writes errors about features of the CPU for each program that it reads, if it is not told otherwise."""
+    """For each program that it reads, XLA writes errors about features of the CPU unless its log level is set."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "TF_CPP", "CRAZYSIM"))}
     environment["XDG_CACHE_HOME"] = str(tmp_path)
     environment["TF_CPP_MIN_LOG_LEVEL"] = "1"  # as JAX sets it, for the children of a process that has imported it
@@ -293,9 +293,9 @@ def test_a_second_command_prints_nothing_when_it_reads_the_cache(tmp_path, first
 def test_long_work_is_announced_once_for_each_kind(settings, capsys):
     for work in ("compiling this", "compiling this", "compiling that"):
         announce(work, "5 s")
-    told = capsys.readouterr().err.splitlines()
-    assert [line.split(":")[0] for line in told] == ["compiling this", "compiling that"]
-    assert all("5 s on two cores, less in later runs" in line for line in told)
+    printed = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[0] for line in printed] == ["compiling this", "compiling that"]
+    assert all("5 s on two cores, less in later runs" in line for line in printed)
 
 
 def test_work_that_lasts_is_announced_and_work_that_ends_at_once_is_not(settings, capsys, monkeypatch):

@@ -1,4 +1,4 @@
-"""Functions that are compiled as a whole outside of compiled code, and part of the code around them inside."""
+"""Functions that are compiled as a whole when Python calls them, and inlined within compiled code."""
 
 import jax
 import jax.numpy as jnp

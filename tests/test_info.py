@@ -38,9 +38,9 @@ def test_it_prints_versions_devices_compiler_and_caches(capsys):
 
 
 def test_missing_parts_are_lines_with_the_reason(tmp_path):
-    """No compiler, no OpenGL, no cache, whatever the machine has; its other variables may be how Python finds JAX."""
-    given = {name: value for name, value in os.environ.items() if name not in (*VARIABLES, "DISPLAY")}
-    environment = given | {
+    """The process has no compiler, OpenGL or cache. Other variables stay, since Python may need them to find JAX."""
+    other_variables = {name: value for name, value in os.environ.items() if name not in (*VARIABLES, "DISPLAY")}
+    environment = other_variables | {
         "PATH": str(tmp_path), "HOME": str(tmp_path), "MUJOCO_GL": "disable", "JAX_PLATFORMS": "cpu"
     }  # fmt: skip
     program = "import sys; sys.modules['ziglang'] = None; from crazysim.__main__ import main; sys.exit(main(['info']))"

@@ -80,14 +80,14 @@ def test_an_attribute_of_a_parameter_that_is_gone_is_unsupported():
     assert error.value.primitive == "scatter-add"
 
 
-@pytest.mark.parametrize("slip, kind", [
+@pytest.mark.parametrize("mistake, kind", [
     (lambda read: {}["mine"], KeyError), (lambda read: np.zeros(3).nothing, AttributeError),
     (lambda read: read.nothing, AttributeError), (lambda read: 1 / 0, ZeroDivisionError),
 ])  # fmt: skip
-def test_a_slip_of_a_rule_is_not_taken_for_a_new_jax(slip, kind):
+def test_a_mistake_in_a_rule_is_not_taken_for_a_new_jax(mistake, kind):
     eqn = equation(lambda x: x.reshape(3, 2), jnp.ones(6), name="reshape")
     with pytest.raises(kind), jaxcompat.read_equation(eqn) as read:
-        slip(read)
+        mistake(read)
 
 
 def test_a_primitive_runs_again_on_other_operands():
@@ -114,7 +114,7 @@ def test_a_call_keeps_its_own_derivative():
 
 
 def test_primitives_written_in_terms_of_others_are_expanded():
-    """``call_hi_primitive`` is there from JAX 0.12 on; what it expands to computes the same."""
+    """JAX has ``call_hi_primitive`` from 0.12 on. Its expansion computes the same."""
     found = []
     for fn in (jax.nn.relu, jax.nn.silu, jax.nn.softplus, jnp.linalg.det, jax.scipy.special.logsumexp):
         x = jnp.eye(3) + 0.1
@@ -331,7 +331,7 @@ def test_the_header_of_foreign_functions_is_there():
 
 
 def test_only_one_module_goes_beyond_the_public_interface():
-    """Any other incompatibility with a new JAX shows here."""
+    """A new JAX can then break this module only."""
     import crazysim
 
     private = ("jax.extend", "jax._src", "jax.interpreters", "jax.experimental", "jax.custom_batching", "SymbolicZero",
@@ -369,7 +369,7 @@ def test_digamma_at_zero_is_that_of_this_version():
 
 
 def test_a_process_alone_is_its_only_host():
-    """Several hosts are those of ``tests/train/test_hosts.py``."""
+    """``tests/train/test_hosts.py`` tests several hosts."""
     assert jaxcompat.connected_hosts() is None
     assert not jaxcompat.is_stop_requested(1)
     assert [jaxcompat.broadcast_from_first(flag) for flag in (True, False)] == [True, False]

@@ -87,13 +87,13 @@ def test_import_paths_of_crazyflow_are_aliases_without_logic():
              "dynamics.parameters.load_fn_params", "drones.Drone", "utils.leaf_replace", "utils.enable_cache",
              "dynamics.supported_drones", "dynamics.supported_dynamics", "exception.CrazyflowError"],
 )  # fmt: skip
-def test_the_peers_import_paths_lead_somewhere(path):
+def test_import_paths_of_crazyflow_exist(path):
     module, _, name = path.rpartition(".")
     assert hasattr(importlib.import_module(f"crazysim.{module}"), name)
 
 
 def test_gravity_is_written_once():
-    """In numbers of the code; an MJCF text has its own."""
+    """As a number in the code. Texts of MJCF are not checked."""
     named = [source for source in SOURCES if "9.81" in source.read_text()]
     nodes = [(source, node) for source in named for node in ast.walk(ast.parse(source.read_text()))]
     places = [source.stem for source, node in nodes if isinstance(node, ast.Constant) and node.value == 9.81]
@@ -121,7 +121,7 @@ def test_extras_that_messages_and_pages_name_exist():
     assert {extra for extras in named for extra in extras.split(",")} <= PROJECT["optional-dependencies"].keys()
 
 
-def undocumented(sources):
+def undocumented_methods(sources):
     """Return the public methods of public classes that neither the class nor a base of the package documents."""
     classes = [node for source in sources for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]
     methods, bases = collections.defaultdict(dict), collections.defaultdict(set)
@@ -142,9 +142,9 @@ def undocumented(sources):
 
 def test_public_methods_are_documented_where_they_are_defined_or_in_a_base():
     """Ruff's D102 also complains about overrides."""
-    assert not undocumented(source.read_text() for source in SOURCES)
-    assert undocumented(["class A:\n    def f(self): ...\nclass B(A):\n    def f(self): ..."]) == ["A.f", "B.f"]
-    assert not undocumented(["class A:\n    def f(self): 'Return 1.'\nclass B(A):\n    def f(self): ..."])
+    assert not undocumented_methods(source.read_text() for source in SOURCES)
+    assert undocumented_methods(["class A:\n    def f(self): ...\nclass B(A):\n    def f(self): ..."]) == ["A.f", "B.f"]
+    assert not undocumented_methods(["class A:\n    def f(self): 'Return 1.'\nclass B(A):\n    def f(self): ..."])
 
 
 def test_the_wheel_holds_scene_airframes_and_type_marker(tmp_path):
@@ -174,7 +174,7 @@ def test_every_target_of_make_that_is_named_exists(path):
     assert named <= targets
 
 
-def made(*arguments):
+def commands_of_make(*arguments):
     """Return the commands that make would run."""
     make = ["make", "--dry-run", "--no-print-directory", *arguments]
     return subprocess.run(make, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines()
@@ -193,20 +193,20 @@ def made(*arguments):
 )
 def test_a_target_installs_its_extra_once(target, extra, tmp_path):
     settings = f"VENV={tmp_path}", "PINS=jax<0.12 casadi"
-    installed = [re.findall(r'"(.+?)"', line) for line in made(target, *settings) if " install " in line]
+    installed = [re.findall(r'"(.+?)"', line) for line in commands_of_make(target, *settings) if " install " in line]
     assert installed == [[f".[{extra}]", "jax<0.12", "casadi"]]
     (tmp_path / f"installed-{extra}").touch()
-    lines = made(target, *settings)
+    lines = commands_of_make(target, *settings)
     assert lines
     assert not [line for line in lines if " install " in line]
 
 
 def test_the_rest_is_what_make_test_leaves_out():
-    chosen = made("test")[-1].split('"not slow" ')[1].split()
-    rest = made("test-rest")[-1].split('"not slow" ')[1].split()
+    chosen = commands_of_make("test")[-1].split('"not slow" ')[1].split()
+    rest = commands_of_make("test-rest")[-1].split('"not slow" ')[1].split()
     assert rest == [f"--ignore={path}" for path in chosen]
     assert all((ROOT / path).exists() for path in chosen)
-    assert made("test", "TESTS=tests/control")[-1].endswith('"not slow" tests/control')
+    assert commands_of_make("test", "TESTS=tests/control")[-1].endswith('"not slow" tests/control')
 
 
 def test_workflows_and_templates_are_complete():

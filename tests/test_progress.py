@@ -11,14 +11,14 @@ from crazysim.progress import progress_bar
 
 
 class Terminal(io.StringIO):
-    """Text that counts as a terminal."""
+    """A text stream that is a terminal."""
 
     def isatty(self):
         return True
 
 
 @pytest.mark.parametrize("stream", [io.StringIO, Terminal])
-def test_a_bar_is_shown_on_a_terminal_alone(stream, monkeypatch):
+def test_a_bar_is_shown_on_terminals_only(stream, monkeypatch):
     pytest.importorskip("tqdm")
     monkeypatch.setattr(sys, "stderr", stream())
     assert list(progress_bar(range(3), "flying")) == [0, 1, 2]

@@ -50,7 +50,9 @@ def test_replace_leaves_the_original_alone():
 def test_static_fields_are_part_of_the_type_and_arrays_are_leaves():
     assert jax.tree.structure(fleet()) == jax.tree.structure(fleet())
     assert jax.tree.structure(fleet(rate=100)) != jax.tree.structure(fleet())
-    assert len(jax.tree.leaves(fleet())) == 2 + 3 + 3  # rotor, own arrays, the extras; None and the rate are none
+    assert (
+        len(jax.tree.leaves(fleet())) == 2 + 3 + 3
+    )  # rotor, time, wind and table, extras; None and the rate are no leaves
 
 
 def test_law_02_scopes_are_declared_and_undeclared_means_whole():
@@ -94,7 +96,7 @@ def test_law_02_a_leaf_with_other_axes_is_refused_by_name(change):
         check_axes(change(fleet()), 3, 2)
 
 
-def test_map_batched_touches_what_belongs_to_a_world_only():
+def test_map_batched_changes_leaves_of_drones_and_worlds_only():
     old = fleet(curve=jnp.ones((3, 2, 3)))
     new = map_batched(lambda x: x + 5, old)
     changed = [bool(jnp.any(a != b)) for a, b in zip(jax.tree.leaves(old), jax.tree.leaves(new), strict=True)]

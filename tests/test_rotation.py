@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from crazysim import rotation as rot
 from crazysim.lab.live import attitude
 
-# Everything below runs in float64, so what is left is its rounding (1.1e-16) times a few operations.
+# All tests run in float64, whose rounding is 1.1e-16.
 ROUNDING = {"rtol": 1e-12, "atol": 1e-12}
 
 
@@ -26,7 +26,7 @@ unit_quats = cases.unit_quats(allow_subnormal=False)
 angles = st.floats(-3.1, 3.1)
 
 
-def same_rotation(p, q):
+def assert_same_rotation(p, q):
     """Assert that two unit quaternions are the same rotation, up to their sign."""
     np.testing.assert_allclose(np.abs(np.sum(np.asarray(p) * np.asarray(q), axis=-1)), 1.0, atol=1e-14)
 
@@ -69,7 +69,7 @@ def test_integrated_attitude_is_a_rotation_about_a_body_axis(q, rotvec):
     by_hand = np.array([*(0.5 * rotvec * np.sinc(angle / 2 / np.pi)), np.cos(angle / 2)])
     np.testing.assert_allclose(out, rot.multiply(q, by_hand), rtol=0, atol=1e-15)
     expected = (Rotation.from_quat(q) * Rotation.from_rotvec(rotvec)).as_quat()
-    same_rotation(out, expected)
+    assert_same_rotation(out, expected)
 
 
 def test_integrated_attitude_is_normalised():
@@ -91,7 +91,7 @@ def test_from_rpy_and_to_rpy_are_inverses(roll, pitch, yaw):
     """Up to 1e-3 rad short of 90 degrees of pitch; there 1/cos(pitch) magnifies the rounding to 1e-12."""
     rpy = np.array([roll, pitch, yaw])
     q = rot.from_rpy(jnp.asarray(rpy))
-    same_rotation(q, Rotation.from_euler("ZYX", rpy[::-1]).as_quat())
+    assert_same_rotation(q, Rotation.from_euler("ZYX", rpy[::-1]).as_quat())
     np.testing.assert_allclose(rot.to_rpy(q), rpy, rtol=0, atol=1e-11)
     axes = [rot.rotate(q, axis) for axis in jnp.eye(3)]
     np.testing.assert_allclose(rot.rpy_from_axes(*axes), rpy, rtol=0, atol=1e-11)
@@ -104,8 +104,8 @@ def test_to_rpy_gives_the_same_rotation_back(q):
     """At a pitch of 90 degrees too, where roll and yaw are not unique."""
     rpy = rot.to_rpy(jnp.asarray(q))
     assert np.all(np.abs(rpy) <= np.array([1, 0.5, 1]) * np.pi)
-    same_rotation(rot.from_rpy(rpy), q)
-    same_rotation(rot.from_rpy(jnp.asarray(attitude.to_rpy(q))), q)
+    assert_same_rotation(rot.from_rpy(rpy), q)
+    assert_same_rotation(rot.from_rpy(jnp.asarray(attitude.to_rpy(q))), q)
 
 
 @given(q=unit_quats, scale=st.floats(0.1, 10))
@@ -129,7 +129,7 @@ def test_heading_is_along_the_yaw(q, scale):
 
 @jax.jit
 def heading_and_gradient(q):
-    """Return the heading, and the derivatives of where it points."""
+    """Return the direction ahead, and its derivatives by the quaternion."""
     return rot.heading(q)[0], jax.jacobian(lambda q: rot.heading(q)[0])(q)
 
 
@@ -158,12 +158,14 @@ def test_law_07_safe_functions_have_gradient_zero_at_zero():
             jax.grad(rot.safe_arctan2, argnums=(0, 1))(y, y),
         )
 
-    (norm, direction, angle), of_norm, of_direction, of_angle = values_and_gradients(np.zeros(3), fallback, 0.0)
+    (norm, direction, angle), norm_gradient, direction_jacobian, angle_gradients = values_and_gradients(
+        np.zeros(3), fallback, 0.0
+    )
     assert norm == angle == 0
     np.testing.assert_array_equal(direction, fallback)
-    np.testing.assert_array_equal(of_norm, np.zeros(3))
-    np.testing.assert_array_equal(of_direction, np.zeros((3, 3)))
-    assert of_angle == (0, 0)
+    np.testing.assert_array_equal(norm_gradient, np.zeros(3))
+    np.testing.assert_array_equal(direction_jacobian, np.zeros((3, 3)))
+    assert angle_gradients == (0, 0)
 
 
 @given(y=st.floats(-5, 5, allow_subnormal=False), x=st.floats(-5, 5, allow_subnormal=False))
@@ -215,15 +217,15 @@ def test_law_07_yaw_of_a_quaternion_next_to_zero_has_finite_gradients(tiny, dtyp
 @pytest.mark.parametrize("tiny", TINY)
 def test_law_07_jacobians_are_finite_for_tiny_rotations(tiny, dtype):
     small = np.full(3, tiny, dtype)
-    of_rpy, *of_turn = jacobians_of_small_turns(small, np.array([0.0, 0.0, 0.0, 1.0], dtype), small)
-    np.testing.assert_allclose(of_rpy[:3], 0.5 * np.eye(3), rtol=0, atol=1e-3)
-    for jacobian in of_turn:
+    rpy_jacobian, *turn_jacobians = jacobians_of_small_turns(small, np.array([0.0, 0.0, 0.0, 1.0], dtype), small)
+    np.testing.assert_allclose(rpy_jacobian[:3], 0.5 * np.eye(3), rtol=0, atol=1e-3)
+    for jacobian in turn_jacobians:
         assert np.all(np.isfinite(jacobian))
 
 
 @given(q=unit_quats)
 def test_quaternion_of_axes_gives_the_same_rotation_back(q):
-    same_rotation(rot.quat_from_axes(*np.swapaxes(rot.matrix(q), -1, -2)), q)
+    assert_same_rotation(rot.quat_from_axes(*np.swapaxes(rot.matrix(q), -1, -2)), q)
 
 
 @jax.jit
@@ -241,6 +243,6 @@ def quaternion_of_turned_axes(q, rotvec):
 def test_quaternion_of_axes_is_accurate_at_half_turns(q):
     q = np.asarray(q) / np.linalg.norm(q)
     back, slope = quaternion_of_turned_axes(q, np.zeros(3))
-    same_rotation(back, q)
+    assert_same_rotation(back, q)
     expected = np.stack([rot.multiply(back, np.append(0.5 * axis, 0.0)) for axis in np.eye(3)], axis=-1)
     np.testing.assert_allclose(slope, expected, atol=1e-12)

@@ -17,8 +17,8 @@ print(os.environ["MUJOCO_GL"], Sim().render("rgb_array", width=64, height=48).sh
 
 
 @pytest.fixture
-def bare(monkeypatch):
-    """An environment without a screen or a choice."""
+def bare_environment(monkeypatch):
+    """Remove the variables of screens and backends, and return ``monkeypatch``."""
     for name in VARIABLES:
         monkeypatch.delenv(name, raising=False)
     return monkeypatch
@@ -32,18 +32,18 @@ def test_images_need_no_setting_without_a_screen():
 
 
 @pytest.mark.parametrize("variable", VARIABLES)
-def test_a_screen_or_a_choice_is_kept(bare, variable):
-    bare.setenv(variable, "osmesa")
+def test_a_screen_or_a_choice_is_kept(bare_environment, variable):
+    bare_environment.setenv(variable, "osmesa")
     before = dict(os.environ)
     startup.set_variables()
     assert dict(os.environ) == before
 
 
-def test_without_egl_nothing_is_chosen(bare):
+def test_without_egl_nothing_is_chosen(bare_environment):
     def missing(name):
         raise OSError(name)
 
-    bare.setattr(startup.ctypes, "CDLL", missing)
+    bare_environment.setattr(startup.ctypes, "CDLL", missing)
     startup.set_variables()
     assert "MUJOCO_GL" not in os.environ
 

@@ -40,7 +40,7 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
         pass
 
 
-def packed(save=np.savez, **arrays):
+def pack(save=np.savez, **arrays):
     file = io.BytesIO()
     save(file, **arrays)
     return file.getvalue()
@@ -54,7 +54,7 @@ def read(content):
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_damaged_arrays_are_refused_wherever_the_damage_is(save):
     arrays = {"x": np.arange(8.0), "n": np.array(3), "text": np.array("meta")}
-    content = packed(save, **arrays)
+    content = pack(save, **arrays)
     assert read(content).keys() == arrays.keys()
     for length in range(0, len(content), 7):
         with pytest.raises(DamagedFileError, match=r"expected some arrays, got 'a\.npz', which .* Use another copy\."):
@@ -72,7 +72,7 @@ def test_damaged_arrays_are_refused_wherever_the_damage_is(save):
 
 def test_objects_are_not_unpickled():
     with pytest.raises(DamagedFileError, match="Object arrays cannot be loaded"):
-        read(packed(x=np.array([{}])))
+        read(pack(x=np.array([{}])))
 
 
 def test_small_files_do_not_take_all_memory():

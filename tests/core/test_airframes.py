@@ -14,21 +14,21 @@ from crazysim.dynamics import first_principles
 from crazysim.errors import UnknownNameError
 from crazysim.pytree import check_axes
 
-FIRMWARE = (HEXAROTOR, "cf2x_L250")
-UNLIKE = ("bumblebee", HEXAROTOR)
+FIRMWARE_PAIR = (HEXAROTOR, "cf2x_L250")
+MIXED_PAIR = ("bumblebee", HEXAROTOR)
 STATES = ("pos", "quat", "vel", "ang_vel")
 CASES = [
     ("attitude", "crazyflow", FLEET),
     ("state", "crazyflow", FLEET),
-    ("body_rate", "crazyflow", UNLIKE),
-    ("force_torque", "crazyflow", UNLIKE),
+    ("body_rate", "crazyflow", MIXED_PAIR),
+    ("force_torque", "crazyflow", MIXED_PAIR),
     ("rotor_vel", "crazyflow", FLEET),
-    ("state", "geometric", UNLIKE),
-    ("state", "lqr", UNLIKE),
-    ("state", "indi", UNLIKE),
-    ("state", "mellinger", FIRMWARE),
-    ("state", "pid", FIRMWARE),
-    ("attitude", "mellinger", FIRMWARE),
+    ("state", "geometric", MIXED_PAIR),
+    ("state", "lqr", MIXED_PAIR),
+    ("state", "indi", MIXED_PAIR),
+    ("state", "mellinger", FIRMWARE_PAIR),
+    ("state", "pid", FIRMWARE_PAIR),
+    ("attitude", "mellinger", FIRMWARE_PAIR),
 ]
 COMMANDS = {
     "attitude": [0.1, 0.05, 0.2, 0.35],
@@ -39,8 +39,8 @@ COMMANDS = {
 }
 
 
-def in_flight(sim, pos):
-    """Return the simulation with drones at positions, moving, with a command."""
+def set_flying(sim, pos):
+    """Place moving drones at positions, send them a command, and return the simulation."""
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos, vel=np.full_like(pos, 0.1)))
     n_rotors = sim.data.states.rotor_vel.shape[-1]
     command = COMMANDS[sim.control.value][: n_rotors if sim.control == "rotor_vel" else None]
@@ -48,18 +48,18 @@ def in_flight(sim, pos):
     return sim
 
 
-def positions(n_worlds, n_drones):
+def random_positions(n_worlds, n_drones):
     return np.float32(np.random.default_rng(0).uniform(0.9, 1.1, (n_worlds, n_drones, 3)))
 
 
 @pytest.mark.parametrize(("control", "controller", "fleet"), CASES)
 def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fleet):
-    pos = positions(1, len(fleet))
-    mixed = in_flight(Sim(drone=fleet, control=control, controller=controller, engine="interpret"), pos)
+    pos = random_positions(1, len(fleet))
+    mixed = set_flying(Sim(drone=fleet, control=control, controller=controller, engine="interpret"), pos)
     mixed.step(25)
     flown = jax.device_get(mixed.data.states)
     for k, airframe in enumerate(fleet):
-        own = in_flight(
+        own = set_flying(
             Sim(drone=airframe, control=control, controller=controller, engine="interpret"), pos[:, k : k + 1]
         )
         own.step(25)
@@ -80,11 +80,11 @@ def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, n
     n, value = fleet[name].n_rotors, np.asarray(fleet[name].value(f"rotors.{key}"))
     factors = np.linspace(0.9, 1.1, n).reshape(n, *[1] * (value.ndim if key == "lag" else 0))
     fleet[name] = load_airframe({"base": fleet[name], "rotors": {key: (value * factors).tolist()}})
-    pos = positions(1, 2)
-    mixed = in_flight(Sim(drone=list(fleet.values()), control="body_rate", engine="interpret"), pos)
+    pos = random_positions(1, 2)
+    mixed = set_flying(Sim(drone=list(fleet.values()), control="body_rate", engine="interpret"), pos)
     mixed.step(25)
     for k, airframe in enumerate(fleet.values()):
-        alone = in_flight(Sim(drone=airframe, control="body_rate", engine="interpret"), pos[:, k : k + 1])
+        alone = set_flying(Sim(drone=airframe, control="body_rate", engine="interpret"), pos[:, k : k + 1])
         alone.step(25)
         found, expected = mixed.data.states.ang_vel[0, k], alone.data.states.ang_vel[0, 0]
         np.testing.assert_allclose(found, expected, rtol=3e-5, atol=3e-5)
@@ -93,27 +93,27 @@ def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, n
 @pytest.mark.parametrize("dynamics", ["so_rpy", "so_rpy_rotor"])
 def test_fitted_models_may_be_mixed(dynamics):
     fleet = ("cf21B_500", "cf2x_L250")
-    pos = positions(2, 2)
-    mixed = in_flight(Sim(2, drone=fleet, dynamics=dynamics, engine="interpret"), pos)
+    pos = random_positions(2, 2)
+    mixed = set_flying(Sim(2, drone=fleet, dynamics=dynamics, engine="interpret"), pos)
     mixed.step(50)
     for k, airframe in enumerate(fleet):
-        own = in_flight(Sim(2, drone=airframe, dynamics=dynamics, engine="interpret"), pos[:, k : k + 1])
+        own = set_flying(Sim(2, drone=airframe, dynamics=dynamics, engine="interpret"), pos[:, k : k + 1])
         own.step(50)
         expected, got = np.asarray(own.data.states.pos)[:, 0], np.asarray(mixed.data.states.pos)[:, k]
         np.testing.assert_allclose(got, expected, rtol=1e-6)
 
 
-def test_alike_airframes_share_their_parameters():
-    """Nothing changes where all are alike, named once or once for each."""
-    one, each = Sim(2, 2), Sim(2, drone=["cf21B_500", "cf21B_500"])
-    assert each.n_drones == 2
-    assert each.airframe.name == "cf21B_500"
-    shapes = [[x.shape for x in jax.tree.leaves(sim.data)] for sim in (one, each)]
+def test_equal_airframes_share_their_parameters():
+    """The data are the same if the airframe is named once or once for each drone."""
+    named_once, named_twice = Sim(2, 2), Sim(2, drone=["cf21B_500", "cf21B_500"])
+    assert named_twice.n_drones == 2
+    assert named_twice.airframe.name == "cf21B_500"
+    shapes = [[x.shape for x in jax.tree.leaves(sim.data)] for sim in (named_once, named_twice)]
     assert shapes[0] == shapes[1]
-    assert jax.tree.structure(one.data) == jax.tree.structure(each.data)
+    assert jax.tree.structure(named_once.data) == jax.tree.structure(named_twice.data)
 
 
-def test_only_what_differs_is_one_per_drone():
+def test_only_parameters_that_differ_have_an_axis_of_drones():
     params = Sim(3, drone=FLEET).data.params
     assert params.gravity_vec.shape == (3,)
     assert params.mass.shape == (3, 4, 1)
@@ -146,9 +146,9 @@ def test_hover_of_a_mixed_fleet_carries_the_weight_of_each():
     [("state", "crazyflow", None), ("state", "geometric", None), ("rotor_vel", "crazyflow", "lanes")],
 )
 def test_gradients_of_a_mixed_fleet_are_finite(control, controller, engine):
-    """Law 7: missing rotors are no division by zero, and nothing depends on them; in stages, and in an engine."""
+    """Law 7, without and with an engine: missing rotors cause no division by zero, and nothing depends on them."""
     settings = {"control": control, "controller": controller, "engine": engine or "plain"}
-    sim = in_flight(Sim(1, drone=FLEET, **settings), positions(1, 4))
+    sim = set_flying(Sim(1, drone=FLEET, **settings), random_positions(1, 4))
     step = sim.step_fn if engine else build_stagewise_step(sim)
 
     def height(command):
@@ -201,8 +201,7 @@ def test_contacts_and_rays_meet_the_shape_of_each_drone():
     near = pos.copy()
     near[0, 2] = pos[0, 1] + [0.0, radii[1] + radii[2] - 0.01, 0]
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=near))
-    alone = cs.RangeFinder(directions=[[0.0, 0, -1]])
-    sim.add(alone)
+    sim.add(cs.RangeFinder(directions=[[0.0, 0, -1]]))
     sim.step()
     np.testing.assert_array_equal(np.asarray(log.read(sim.data).drones)[0], [False, True, True])
     assert sim.contact_report().nearest_drone.shape == (1, 3)
@@ -227,7 +226,7 @@ def test_drones_of_a_mixed_fleet_stand_on_the_floor():
         np.testing.assert_allclose(np.asarray(sim.data.states.pos)[0, k, 2], box[5] - box[2], atol=5e-3)
 
 
-def test_one_airframe_is_asked_for_where_there_are_several():
+def test_the_airframe_of_a_mixed_fleet_is_an_error_that_lists_them():
     sim = Sim(drone=("cf21B_500", "bumblebee"))
     for name in ("airframe", "drone"):
         with pytest.raises(ConfigError, match=r"'cf21B_500', 'bumblebee'\. Use sim\.airframes, one for each"):
@@ -253,15 +252,14 @@ def test_wrong_lists_are_refused(n_drones, fleet, error, message):
 def test_airframes_that_lack_gains_are_named():
     with pytest.raises(ConfigError, match=r"airframe 'bumblebee' lacks \[mellinger\] mass, mass_thrust, kp, "):
         Sim(drone=FLEET, control="state", controller="mellinger")
-    lacking = create_per_drone
     records = {"cf21B_500": first_principles.Params.create(load_airframe("cf21B_500"))}
     records["bumblebee"] = records["cf21B_500"].replace(L=None)
     with pytest.raises(ConfigError, match="the same numbers for Params, got 'cf21B_500' and 'bumblebee'"):
-        lacking([load_airframe(name) for name in records], lambda airframe: records[airframe.name], 1)
+        create_per_drone([load_airframe(name) for name in records], lambda airframe: records[airframe.name], 1)
 
 
 def test_resets_keep_the_airframes():
-    sim = in_flight(Sim(2, drone=FLEET), positions(2, 4))
+    sim = set_flying(Sim(2, drone=FLEET), random_positions(2, 4))
     mass = np.asarray(sim.data.params.mass)
     sim.step(5)
     sim.reset(np.array([True, False]))

@@ -25,14 +25,14 @@ def test_a_command_is_staged_and_nothing_else_changes(dynamics, control):
     command = np.arange(np.prod(command_shape(data, control)), dtype=np.float32).reshape(command_shape(data, control))
     after = send(data, command)
     if control == "rotor_vel":
-        staged, back = after.controls.rotor_vel, {"rotor_vel": data.controls.rotor_vel}
+        staged, old = after.controls.rotor_vel, {"rotor_vel": data.controls.rotor_vel}
     else:
         ctrl = getattr(after.controls, control)
-        staged, back = ctrl.staged_cmd, {control: getattr(data.controls, control)}
+        staged, old = ctrl.staged_cmd, {control: getattr(data.controls, control)}
         new = {"staged_cmd"} | ({"staged_feedforward"} if control == "state" else set())
-        assert trees_equal(ctrl.replace(**{name: getattr(back[control], name) for name in new}), back[control])
+        assert trees_equal(ctrl.replace(**{name: getattr(old[control], name) for name in new}), old[control])
     np.testing.assert_array_equal(staged, command)
-    assert trees_equal(after.replace(controls=after.controls.replace(**back)), data)
+    assert trees_equal(after.replace(controls=after.controls.replace(**old)), data)
 
 
 PARTS = [

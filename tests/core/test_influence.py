@@ -95,7 +95,7 @@ WRITES = {
 
 
 @pytest.mark.parametrize("case", WRITES)
-def test_law_09_an_influence_writes_what_the_dynamics_use_alone(case):
+def test_law_09_an_influence_may_only_write_inputs_of_the_dynamics(case):
     act, words = WRITES[case]
     sim = Sim(control="attitude")
     sim.add(Tilt(act))
@@ -104,15 +104,15 @@ def test_law_09_an_influence_writes_what_the_dynamics_use_alone(case):
 
 
 def test_an_influence_may_write_forces_commands_and_parameters():
-    """The drone hovers without thrust, at a mass of 2 N weight that a force of 2 N carries."""
-    half = with_fields(
+    """Without thrust, a force of 2 N carries a drone that weighs 2 N."""
+    replace_inputs = with_fields(
         states={"force": lambda x: x + jnp.array([0, 0, 2.0]), "torque": lambda x: x * 1.0},
         params={"mass": lambda x: 2.0 / 9.81 * jnp.ones_like(x), "rpm2thrust": lambda x: jnp.zeros((4, 3))},
         controls={"rotor_vel": lambda x: 0 * x},
     )
     sim = Sim(control="rotor_vel")
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.ones((1, 1, 3))))
-    sim.add(Tilt(half))
+    sim.add(Tilt(replace_inputs))
     sim.step(50)
     np.testing.assert_allclose(sim.data.states.vel, 0.0, atol=1e-5)
     fitted = Sim(control="attitude", dynamics="so_rpy")

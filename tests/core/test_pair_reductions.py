@@ -14,7 +14,7 @@ from crazysim.engine.ir.program import UnfusedStage
 
 @stage("drone")
 def crowd(data):
-    """Push drones apart, harder if one is near. The force also uses reductions of a bool and of an integer."""
+    """Push drones apart. The force also uses a minimum, and reductions of a bool and of an integer."""
     pos = data.states.pos
 
     def pair(other, is_self):
@@ -22,15 +22,17 @@ def crowd(data):
         return jnp.where(is_self, 0.0, other["gain"] * offset / (jnp.dot(offset, offset) + 0.1))
 
     push = reduce_over_others(pair, {"pos": pos, "gain": 1e-3 * jnp.exp(-jnp.abs(pos[2]))})
-    square = reduce_over_others(lambda other, me: jnp.where(me, jnp.inf, jnp.sum((pos - other) ** 2)), pos, "min")
-    higher = reduce_over_others(lambda other, me: other > pos[2], pos[2], "max")
-    count = reduce_over_others(lambda other, me: jnp.int32(other > pos[2]), pos[2])
+    square = reduce_over_others(
+        lambda other, is_self: jnp.where(is_self, jnp.inf, jnp.sum((pos - other) ** 2)), pos, "min"
+    )
+    higher = reduce_over_others(lambda other, is_self: other > pos[2], pos[2], "max")
+    count = reduce_over_others(lambda other, is_self: jnp.int32(other > pos[2]), pos[2])
     force = push + jnp.where(higher, 1e-4, 0.0) * jnp.minimum(square, 2.0) + 1e-5 * count
     return data.replace(states=data.states.replace(force=force))
 
 
 def crowd_forces(pos):
-    """Return the same forces, pair by pair in float64. (n_drones, 3)"""
+    """Return the forces of ``crowd`` in one world, pair by pair in float64. (n_drones, 3)"""
     force = np.zeros_like(pos)
     for i, p in enumerate(pos):
         others = [j for j in range(len(pos)) if j != i]
@@ -87,7 +89,7 @@ def test_all_pairs_are_computed(n_drones):
 
 @pytest.mark.parametrize("n_drones", [3, 9])
 def test_law_08_gradients_equal_central_differences(n_drones, x64):
-    """In float64, in both directions."""
+    """In float64, in forward and in reverse mode."""
     sim = make_crowd_sim(2, n_drones, Downwash())
     data = as_float64(sim.data)
     pos, direction = np.asarray(data.states.pos), np.random.default_rng(2).normal(size=data.states.pos.shape)
@@ -118,7 +120,7 @@ def test_the_order_of_the_drones_does_not_matter():
 
 
 @pytest.mark.parametrize("n_drones", [3, 9])
-def test_law_07_a_bad_world_does_not_touch_another(n_drones):
+def test_law_07_a_bad_world_does_not_change_another(n_drones):
     sim = make_crowd_sim(3, n_drones)
     pos = np.array(sim.data.states.pos)
     pos[1, 0] = np.nan
@@ -153,7 +155,7 @@ class Push(Plugin):
 
     def influence(self, data):
         pos, gains = data.states.pos, jnp.asarray([1e-3, 2e-3])
-        forces = jax.vmap(lambda k: reduce_over_others(lambda other, me: k * (pos - other), pos))(gains)
+        forces = jax.vmap(lambda k: reduce_over_others(lambda other, is_self: k * (pos - other), pos))(gains)
         return data.replace(states=data.states.replace(force=data.states.force + forces.sum(0)))
 
 
@@ -176,11 +178,11 @@ def test_an_inner_vmap_and_an_influence_may_reduce():
 
 def test_law_09_wrong_uses_are_errors():
     with pytest.raises(ConfigError, match="expected reduce_over_others in a function of one drone"):
-        reduce_over_others(lambda other, me: other, jnp.ones(3))
+        reduce_over_others(lambda other, is_self: other, jnp.ones(3))
     with pytest.raises(ConfigError, match="'sum', 'min' or 'max', got 'mean'"):
-        reduce_over_others(lambda other, me: other, jnp.ones(3), "mean")
+        reduce_over_others(lambda other, is_self: other, jnp.ones(3), "mean")
     with pytest.raises(ConfigError, match="got bools"):
-        reduce_over_others(lambda other, me: other > 0, jnp.ones(3))
+        reduce_over_others(lambda other, is_self: other > 0, jnp.ones(3))
 
 
 def test_a_reduction_in_a_loop_is_not_fused():
@@ -189,7 +191,7 @@ def test_a_reduction_in_a_loop_is_not_fused():
         pos = data.states.pos
 
         def body(_, x):
-            return x + reduce_over_others(lambda other, me: other, pos)
+            return x + reduce_over_others(lambda other, is_self: other, pos)
 
         force = jax.lax.fori_loop(0, 3, body, jnp.zeros(3)) * 1e-4
         return data.replace(states=data.states.replace(force=force))

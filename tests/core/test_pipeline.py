@@ -94,7 +94,7 @@ def test_replace_keeps_the_place_and_exchanges_the_function(pipeline):
         (lambda p: append_fn(p, 3), ValueError, "expected a function as a stage, got 3"),
     ],
 )
-def test_changes_that_cannot_be_leave_the_pipeline_as_it_was(pipeline, change, error, fragment):
+def test_invalid_changes_leave_the_pipeline_as_it_was(pipeline, change, error, fragment):
     with pytest.raises(error) as raised:
         change(pipeline)
     assert fragment in str(raised.value)
@@ -141,16 +141,16 @@ def still(data):
     return data
 
 
-@pytest.mark.parametrize("build", [False, True])
+@pytest.mark.parametrize("is_rebuilt", [False, True])
 @pytest.mark.parametrize("edit", EDITS)
-def test_an_edit_takes_effect_at_the_next_step(sim, edit, build):
+def test_an_edit_takes_effect_at_the_next_step(sim, edit, is_rebuilt):
     sim.step_pipeline = {"still": still, "increment_steps": sim.step_pipeline["increment_steps"]}
     before_editing = sim.build_step_fn()
     start = sim.data
     sim.step(2)
     np.testing.assert_array_equal(sim.data.states.pos, start.states.pos)
     EDITS[edit](sim)
-    if build:
+    if is_rebuilt:
         sim.build_step_fn()
     sim.step(3)
     np.testing.assert_allclose(heights(sim.data), heights(start) + 3)
@@ -210,15 +210,15 @@ def test_rollouts_and_explanations_are_of_the_edited_pipeline(sim):
     np.testing.assert_allclose(heights(sim.data), start + 2 * sim.freq // sim.control_freq)
 
 
-@pytest.mark.parametrize("build", [False, True])
-def test_an_edit_takes_effect_at_the_next_reset(sim, build):
+@pytest.mark.parametrize("is_rebuilt", [False, True])
+def test_an_edit_takes_effect_at_the_next_reset(sim, is_rebuilt):
     def raise_them(data, default_data, mask=None):
         del default_data, mask
         return lift(data)
 
     before_editing = sim.build_reset_fn()
     append_fn(sim.reset_pipeline, raise_them)
-    if build:
+    if is_rebuilt:
         sim.build_reset_fn()
     sim.reset()
     np.testing.assert_allclose(heights(sim.data), heights(sim.default_data) + 1)

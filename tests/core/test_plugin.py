@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import hover_command, hovering, repeat_command, trees_equal, with_states
+from cases import hover_command, make_hovering_sim, repeat_command, trees_equal, with_states
 from jax import Array
 from scipy.linalg import expm
 
@@ -57,7 +57,7 @@ class WakeData(PyTree):
 
 
 class Wake(Plugin):
-    """A state of its own that the drone drives, and a force back: z' = vel - rate z, F = -strength z."""
+    """A state that the drone drives, and the force of this state on the drone: z' = vel - rate z, F = -strength z."""
 
     rate: float = parameter(default=6.0)
     strength: float = 0.8
@@ -81,7 +81,7 @@ class Wake(Plugin):
 
 @partial(jax.jit, static_argnames="integrator")
 def fly(data, integrator):
-    """Return drones that each take another number of steps for the same time, under drag-free first principles."""
+    """Return the states and wakes of drones that fly for the same time with different numbers of steps."""
     n_steps = STEPS[None, :, None]
     integrate = Integration(INTEGRATORS[integrator], first_principles_derivative, (Wake(),))
 
@@ -121,7 +121,7 @@ def fly_on(sim, n_steps=20):
     return sim.data
 
 
-EVERYTHING = [
+PLUGINS = [
     Wind((2.0, 1.0, 0.0), 7.7),
     Downwash(),
     GroundEffect(),
@@ -135,10 +135,10 @@ EVERYTHING = [
 
 
 def test_the_order_of_adding_does_not_matter():
-    """One multiplication may come before another: float32 over 10 steps."""
+    """Products of several factors differ by rounding of float32."""
     flights = []
-    for plugins in (EVERYTHING, EVERYTHING[::-1], EVERYTHING[4:] + EVERYTHING[:4]):
-        sim = hovering(engine="interpret")
+    for plugins in (PLUGINS, PLUGINS[::-1], PLUGINS[4:] + PLUGINS[:4]):
+        sim = make_hovering_sim(engine="interpret")
         for plugin in plugins:
             sim.add(plugin)
         flights.append(fly_on(sim, 10))
@@ -172,16 +172,16 @@ def test_law_09_plugins_of_a_simulation_are_a_list(plugins):
 
 
 def test_remove_restores_what_was_there_before():
-    """In any order: the stages, the records, and every bit of the flight."""
-    sim = hovering(engine="interpret")
+    """Plugins are removed in any order. Stages, records and every bit of a flight are as before."""
+    sim = make_hovering_sim(engine="interpret")
     before, data, default = dict(sim.step_pipeline), sim.data, sim.default_data
     expected = fly_on(sim)
     sim.data = data
-    for plugin in EVERYTHING:
+    for plugin in PLUGINS:
         sim.add(plugin)
     fly_on(sim, 2)
     for k in (0, 5, 2, 3, 1, 8, 7, 6, 4):
-        sim.remove(EVERYTHING[k] if k % 2 else EVERYTHING[k].name)
+        sim.remove(PLUGINS[k] if k % 2 else PLUGINS[k].name)
     assert list(sim.step_pipeline) == list(before)
     for name, fn in before.items():
         assert name == "integration" or sim.step_pipeline[name] is fn
@@ -194,7 +194,7 @@ def test_remove_restores_what_was_there_before():
 
 
 def test_replace_changes_numbers_without_compiling_and_keeps_states():
-    sim = hovering()
+    sim = make_hovering_sim()
     sim.add(Wind((2.0, 0, 0), 7.7))
     sim.add(Wake())
     fly_on(sim)
@@ -211,13 +211,13 @@ def test_replace_changes_numbers_without_compiling_and_keeps_states():
     np.testing.assert_array_equal(sim.default_data.plugins["wind"].gust, 0.0)
     fly_on(sim, 60)
     assert sim.step_fn._cache_size() == n
-    # After 7 time constants the lagging velocity is the drone's over the rate, which changes by some 10% meanwhile.
+    # After 7 time constants the wake's velocity is the drone's over the rate. The drone's changes by 10% meanwhile.
     np.testing.assert_allclose(sim.data.plugins["wake"].vel, np.asarray(sim.data.states.vel) / 60, rtol=0.15, atol=2e-4)
 
 
 def test_replace_changes_the_step_where_it_must():
-    """Gusts that were off, and a strength that is part of the code."""
-    sim = hovering(engine="interpret")
+    """Gusts need a stage, and ``strength`` is a constant of the compiled step."""
+    sim = make_hovering_sim(engine="interpret")
     sim.add(Wind((2.0, 0, 0)))
     sim.add(Wake())
     assert "wind" not in sim.step_pipeline
@@ -230,7 +230,7 @@ def test_replace_changes_the_step_where_it_must():
     data = sim.data
     fly_on(sim)
     assert np.abs(sim.data.plugins["wind"].gust).max() > 0.1
-    without = hovering(engine="interpret")
+    without = make_hovering_sim(engine="interpret")
     without.add(Wind((2.0, 0, 0), 20.0))
     without.data = data.replace(plugins={"wind": data.plugins["wind"]})
     fly_on(without)
@@ -239,7 +239,7 @@ def test_replace_changes_the_step_where_it_must():
 
 
 def test_replace_finds_the_controller_that_latency_had_wrapped():
-    sim = hovering(engine="interpret")
+    sim = make_hovering_sim(engine="interpret")
     controller = sim.step_pipeline["attitude_controller"]
     sim.add(Latency(3))
     sim.replace(Latency(2, max_delay=8))
@@ -254,7 +254,7 @@ def test_replace_finds_the_controller_that_latency_had_wrapped():
 
 
 def test_a_replacement_that_fails_changes_nothing():
-    sim = hovering()
+    sim = make_hovering_sim()
     sim.add(Wind((2.0, 0, 0)))
     step, plugin, data = sim.step_pipeline, sim.plugins["wind"], sim.data
     with pytest.raises(ConfigError, match="speed_20ft"):
@@ -266,7 +266,7 @@ def test_a_replacement_that_fails_changes_nothing():
 
 def test_two_of_a_kind_have_two_names():
     """Gusts of different names are different, and drag adds up."""
-    sim = hovering(engine="interpret")
+    sim = make_hovering_sim(engine="interpret")
     first = sim.add(Wind((1.0, 0, 0), 7.7))
     second = sim.add(Wind((0, 2.0, 0), 7.7), name="thermal")
     assert (first.name, second.name) == ("wind", "thermal")
@@ -280,7 +280,7 @@ def test_two_of_a_kind_have_two_names():
 
 
 def test_observations_are_those_of_each_drone():
-    sim = hovering(engine="interpret")
+    sim = make_hovering_sim(engine="interpret")
     sim.add(Wake())
     sim.add(Battery(0.25, 0.1))
     fly_on(sim)
@@ -304,8 +304,8 @@ def test_plugins_draw_into_images():
     assert finder.visible
 
 
-def test_a_reset_restores_states_of_plugins_in_its_worlds_alone():
-    sim = hovering(engine="interpret")
+def test_a_reset_restores_states_of_plugins_in_its_worlds_only():
+    sim = make_hovering_sim(engine="interpret")
     sim.add(Wake())
     flown = np.asarray(fly_on(sim).plugins["wake"].vel)
     sim.reset(np.array([True, False, True]))
@@ -315,14 +315,14 @@ def test_a_reset_restores_states_of_plugins_in_its_worlds_alone():
 
 
 class PlaceData(PyTree):
-    """Where an episode began."""
+    """Positions at which episodes began."""
 
     pos: Array = leaf("drone", 1, (3,))
     """Position, world frame, m. (n_worlds, n_drones, 3)"""
 
 
 class Place(Plugin):
-    """Note where an episode begins."""
+    """A plugin that stores where an episode begins."""
 
     name: str = "place"
 
@@ -334,14 +334,14 @@ class Place(Plugin):
 
 
 class LatePlace(Place):
-    """Note where a drone is after the integration of the first step."""
+    """A plugin that stores where a drone is after the integration of the first step."""
 
     reset_before: ClassVar[str | None] = "increment_steps"
     name: str = "late"
 
 
 def test_episodes_begin_at_resets_or_in_front_of_a_stage_of_their_first_step():
-    sim = hovering(engine="interpret")
+    sim = make_hovering_sim(engine="interpret")
     place, late = sim.add(Place()), sim.add(LatePlace())
     assert [*sim.reset_pipeline] == ["reset", "place"]
     sim.data = with_states(sim.data, vel=[0, 0, 1.0])
@@ -372,7 +372,7 @@ def test_all_parts_of_the_package_begin_episodes_by_one_method():
 
 
 def test_new_data_has_new_records():
-    sim = hovering(engine="interpret")
+    sim = make_hovering_sim(engine="interpret")
     sim.add(Wake())
     fly_on(sim)
     sim.build_data()
@@ -384,7 +384,7 @@ def test_law_01_methods_get_one_drone():
     shapes = []
 
     class Probe(Plugin):
-        """Looks at the shapes that it gets."""
+        """A plugin that stores the shapes of its data."""
 
         name: str = "probe"
 
@@ -426,7 +426,7 @@ def test_functions_can_be_a_plugin():
 
 
 class Nameless(FunctionPlugin):
-    """A plugin whose stage takes the name of another."""
+    """A plugin whose stage has the name of another stage."""
 
     name: str = "nameless"
     order: ClassVar[int] = 3

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from springs import KINDS, STIFFNESS, Crowd, Masses, Springs, Tied, Tying, build
+from springs import KINDS, STIFFNESS, Crowd, Masses, Springs, Tied, Tying, build_springs
 
 from crazysim import ConfigError, Sim, stage
 from crazysim.core.pipeline import insert_fn_before
@@ -20,7 +20,7 @@ from crazysim.pytree import PyTree, check_axes, leaf, scopes
 COUNTS = [(1, 1, 1), (2, 2, 2), (3, 3, 3), (3, 2, 4), (2, 4, 3), (4, 3, 1), (2, 1, 2)]
 
 
-def only_masses(sim):
+def keep_mass_stages(sim):
     """Return the simulation with only the stages of its masses, so that drones stand still."""
     stages = sim.step_pipeline.items()
     sim.step_pipeline = {name: fn for name, fn in stages if name.startswith("springs") or name == "increment_steps"}
@@ -38,7 +38,7 @@ def states_by_name(data):
 @pytest.mark.parametrize(("n_worlds", "n_drones", "n_members"), COUNTS)
 def test_law_02_axes_are_the_declared_ones_for_any_counts(n_worlds, n_drones, n_members):
     """For equal and unequal numbers of worlds, drones and members, the first world flies as it does alone."""
-    sim, alone = (build(KINDS, n, n_drones, n_members, engine="interpret") for n in (n_worlds, 1))
+    sim, alone = (build_springs(KINDS, n, n_drones, n_members, engine="interpret") for n in (n_worlds, 1))
     for one in (sim, alone):
         one.step(7)
     expected = states_by_name(alone.data)
@@ -52,12 +52,12 @@ def test_law_02_axes_are_the_declared_ones_for_any_counts(n_worlds, n_drones, n_
 
 def test_a_member_moves_as_it_does_alone():
     """Law 1: the motion of a member does not depend on the others."""
-    sim = only_masses(build(Springs, 3, 2, 4, engine="interpret"))
+    sim = keep_mass_stages(build_springs(Springs, 3, 2, 4, engine="interpret"))
     sim.step(9)
     record = jax.device_get(sim.data.plugins["springs"])
     one = Sim(engine="interpret")
     one.add(Springs(1))
-    only_masses(one)
+    keep_mass_stages(one)
     mass, start = one.data.plugins["springs"], jax.device_get(sim.default_data.plugins["springs"])
     for world, member in ((0, 0), (2, 1), (1, 3)):
         own = mass.replace(pos=start.pos[world, member][None, None], cmd=start.cmd[world, member][None, None])
@@ -75,7 +75,7 @@ def test_integration_follows_the_scheme(integrator):
         for freq in freqs:
             sim = Sim(control="rotor_vel", freq=freq, integrator=integrator, engine="interpret")
             sim.add(Springs(1, rate=None))
-            only_masses(sim).step(2 * freq // 5)
+            keep_mass_stages(sim).step(2 * freq // 5)
             exact = np.cos(np.sqrt(STIFFNESS) * 0.4)
             errors.append(abs(np.asarray(sim.data.plugins["springs"].pos)[0, 0, 0] - exact))
     slope = np.polyfit(np.log(1 / np.asarray(freqs)), np.log(errors), 1)[0]
@@ -87,7 +87,7 @@ def test_semi_implicit_euler_keeps_energy():
     for integrator in ("euler", "symplectic_euler"):
         sim = Sim(integrator=integrator, engine="plain")
         sim.add(Springs(1, rate=None))
-        only_masses(sim).step(2000)
+        keep_mass_stages(sim).step(2000)
         record = jax.device_get(sim.data.plugins["springs"])
         energies[integrator] = np.sum(STIFFNESS * record.pos**2 + record.vel**2) / (3 * STIFFNESS)
     assert abs(energies["symplectic_euler"] - 1) < 0.02
@@ -99,7 +99,7 @@ def test_gradients_pass_through_populations():
     """Gradients in both modes equal central differences, which are exact, since the loss is quadratic."""
     cmd = np.ones((4, 2, 3, 3), np.float32)
 
-    sim = build(KINDS, 2, 2, 3)
+    sim = build_springs(KINDS, 2, 2, 3)
     step = sim.step_fn
 
     def loss(cmd):
@@ -122,7 +122,7 @@ def test_gradients_pass_through_populations():
 
 
 def test_a_derivative_reaches_the_drones_from_a_mass():
-    sim = build(Tying, 2, 2, 3, engine="fused")
+    sim = build_springs(Tying, 2, 2, 3, engine="fused")
 
     def height(pos):
         record = sim.data.plugins["springs"].replace(pos=pos)
@@ -134,7 +134,7 @@ def test_a_derivative_reaches_the_drones_from_a_mass():
 
 
 def test_worlds_are_reset_with_their_members():
-    sim = build(Tying, 3, 2, 2, engine="interpret")
+    sim = build_springs(Tying, 3, 2, 2, engine="interpret")
     sim.step(20)
     before = jax.device_get(sim.data.plugins["springs"])
     sim.reset(np.array([True, False, True]))
@@ -147,8 +147,8 @@ def test_worlds_are_reset_with_their_members():
 
 def test_worlds_are_spread_over_devices():
     kinds = (Springs, Tying)
-    alone = build(kinds, 4, 2, 3)
-    sharded_sim = build(kinds, 4, 2, 3, mesh=world_mesh(jax.devices("cpu")[:2]))
+    alone = build_springs(kinds, 4, 2, 3)
+    sharded_sim = build_springs(kinds, 4, 2, 3, mesh=world_mesh(jax.devices("cpu")[:2]))
     for sim in (alone, sharded_sim):
         sim.step(8)
     for record in sharded_sim.data.plugins.values():
@@ -171,7 +171,7 @@ def test_random_numbers_are_those_of_world_and_member():
         sim = Sim(*counts[:2])
         sim.add(Springs(counts[2], stiffness=0.0))
         insert_fn_before(sim.step_pipeline, "integration", kick, "springs_kick")
-        only_masses(sim).step(3)
+        keep_mass_stages(sim).step(3)
         drawn.append(np.asarray(sim.data.plugins["springs"].vel))
     np.testing.assert_allclose(drawn[0][:2, :3], drawn[1], rtol=1e-6)
     assert len(np.unique(drawn[0])) == drawn[0].size
@@ -182,9 +182,9 @@ def test_random_numbers_are_those_of_world_and_member():
     assert world_key(one, "kick") != member_key(one, "springs", "kick")
 
 
-def test_what_depends_on_each_other_runs_together():
+def test_populations_that_depend_on_each_other_share_a_program():
     for kind, n in ((Springs, 2), (Crowd, 2), (Tied, 1), (Tying, 1)):
-        sim = build(kind, engine="lanes")
+        sim = build_springs(kind, engine="lanes")
         assert len(sim.step_fn.plan(sim.data).programs) == n, kind
 
 
@@ -203,13 +203,13 @@ def test_two_populations_are_two_programs():
 
 
 def test_parameters_may_differ_between_members():
-    sim = build(Springs, 2, 1, 2)
+    sim = build_springs(Springs, 2, 1, 2)
     record = sim.data.plugins["springs"]
     assert jax.tree.leaves(scopes(record)) == ["springs"] * 5 + ["shared"]
     stiffness = np.float32([[[0.0], [10.0]], [[20.0], [0.0]]])
     sim.data = sim.plugins["springs"].write(sim.data, record.replace(stiffness=stiffness))
     assert jax.tree.leaves(scopes(sim.data.plugins["springs"]))[-1] == "springs"
-    only_masses(sim).step(10)
+    keep_mass_stages(sim).step(10)
     moved = np.any(np.asarray(sim.data.plugins["springs"].vel) != 0, axis=-1)
     np.testing.assert_array_equal(moved, [[False, True], [True, False]])
 
@@ -217,7 +217,7 @@ def test_parameters_may_differ_between_members():
 def test_many_members_that_read_the_drones_run_unfused_without_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error", EngineWarning)
-        sim = build(Tied, 2, 2, 9)
+        sim = build_springs(Tied, 2, 2, 9)
         assert sim.step_fn.plan(sim.data).program.unfused_stages
 
 
@@ -228,15 +228,15 @@ def test_a_stage_that_no_engine_supports_is_reported_once():
         q, _ = jnp.linalg.qr(jnp.eye(3) + jnp.outer(record.pos, record.pos))
         return data.replace(plugins=data.plugins | {"springs": record.replace(vel=record.vel + 0 * q[0])})
 
-    sim = build(Springs, engine="interpret")
+    sim = build_springs(Springs, engine="interpret")
     insert_fn_before(sim.step_pipeline, "integration", orthonormalise)
     with pytest.warns(EngineWarning, match="'orthonormalise' is not fused") as caught:
         sim.step(2)
     assert len(caught) == 1
 
 
-def test_a_mass_that_is_not_finite_flags_its_world_alone():
-    sim = build(Springs, 3, 2, 2)
+def test_a_mass_that_is_not_finite_flags_its_world_only():
+    sim = build_springs(Springs, 3, 2, 2)
     record = sim.data.plugins["springs"]
     vel = np.array(record.vel)
     vel[1, 0, 0] = np.nan
@@ -272,7 +272,7 @@ def test_a_population_is_added_replaced_and_removed():
 
 def test_ten_calls_are_one_trace():
     """Law 6."""
-    sim = build(Springs, engine="lanes")
+    sim = build_springs(Springs, engine="lanes")
     for n in range(10):
         sim.step(n + 1)
     assert sim.step_fn._cache_size() == 1
@@ -322,8 +322,8 @@ def test_a_stage_of_a_population_that_does_not_exist_is_refused():
         sim.step()
 
 
-def test_a_stage_writes_its_own_population_alone():
-    sim = build(Springs, engine="plain")
+def test_a_stage_may_write_its_own_population_only():
+    sim = build_springs(Springs, engine="plain")
 
     @stage("springs")
     def greedy(data):
@@ -335,7 +335,7 @@ def test_a_stage_writes_its_own_population_alone():
 
 
 def test_commands_of_another_shape_are_refused():
-    sim = build(Springs, 2, 2, 3)
+    sim = build_springs(Springs, 2, 2, 3)
     springs = sim.plugins["springs"]
     with pytest.raises(ValueError, match=r"expected a command of shape \(2, 3, 3\) for 'springs', got \(3,\)"):
         springs.with_command(sim.data, np.zeros(3))
@@ -353,7 +353,7 @@ def test_commands_of_another_shape_are_refused():
 
 
 def test_leaves_have_the_axes_of_their_population():
-    sim = build(Springs, 2, 2, 3)
+    sim = build_springs(Springs, 2, 2, 3)
     record = sim.data.plugins["springs"]
     few = np.asarray(record.pos)[:, :2]
     for wrong in (record.replace(pos=few), record.replace(stiffness=np.ones((2, 2, 1), np.float32))):
@@ -368,7 +368,7 @@ def test_records_within_a_record_belong_to_its_population():
     class Outer(Masses):
         inner: Inner
 
-    record = build(Springs).data.plugins["springs"]
+    record = build_springs(Springs).data.plugins["springs"]
     values = {name: getattr(record, name) for name in ("member_id", "pos", "vel", "cmd", "ticks", "stiffness")}
     outer = Outer("springs", 3, inner=Inner(record.ticks), **values)
     assert scopes(outer).inner.x == "springs"
@@ -386,7 +386,7 @@ def test_a_rate_of_something_else_is_refused():
 
 
 def test_the_step_is_used_inside_jit_and_vmap():
-    sim = build(Tying, 2, 2, 3, engine="lanes")
+    sim = build_springs(Tying, 2, 2, 3, engine="lanes")
     step = Step(sim.step_pipeline, "lanes")
 
     def final(cmd):

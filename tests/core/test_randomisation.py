@@ -19,14 +19,14 @@ def draw(keys, low, high, shape=(1,)):
     return jax.vmap(jax.vmap(one))(keys)
 
 
-def drawn_mass(data, default_data, mask=None):
+def draw_mass(data, default_data, mask=None):
     """Scale every drone's mass by 0.7 to 1.4."""
     mass = default_data.params.mass * draw(drone_keys(data, "mass"), 0.7, 1.4)
     return data.replace(params=data.params.replace(mass=select_worlds(mask, mass, data.params.mass)))
 
 
-def drawn_inertia(data, default_data, mask=None):
-    """Scale every drone's inertia by 0.5 to 2, and its inverse along."""
+def draw_inertia(data, default_data, mask=None):
+    """Scale every drone's inertia by 0.5 to 2, and its inverse by one over that."""
     scale, p = draw(drone_keys(data, "inertia"), 0.5, 2.0, (1, 1)), default_data.params
     J, J_inv = p.J * scale, p.J_inv / scale
     params = data.params.replace(
@@ -35,14 +35,14 @@ def drawn_inertia(data, default_data, mask=None):
     return data.replace(params=params)
 
 
-def drawn_motors(data, default_data, mask=None):
+def draw_motors(data, default_data, mask=None):
     """Scale the thrust of each of the four rotors of every drone by 0.8 to 1.2."""
     curve = default_data.params.rpm2thrust * draw(drone_keys(data, "motors"), 0.8, 1.2, (4, 1))
     return data.replace(params=data.params.replace(rpm2thrust=select_worlds(mask, curve, data.params.rpm2thrust)))
 
 
-def build(*reset_stages, control="rotor_vel"):
-    """Return hovering drones whose parameters were drawn by the stages, and their step."""
+def make_drawn_sim(*reset_stages, control="rotor_vel"):
+    """Return a simulation of hovering drones whose parameters the reset stages drew, and the data before the reset."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control=control, rng_key=5, engine="interpret")
     sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=hover_rotor_state(sim.data))
     nominal = sim.build_default_data()
@@ -56,7 +56,7 @@ def build(*reset_stages, control="rotor_vel"):
 
 def test_a_drawn_mass_sinks_or_climbs_by_newtons_law():
     """At the thrust that carries the nominal mass m0 a mass m accelerates by g (m0 / m - 1), less drag."""
-    sim, nominal = build(drawn_mass)
+    sim, nominal = make_drawn_sim(draw_mass)
     mass = np.asarray(sim.data.params.mass, np.float64)
     assert mass.shape == (N_WORLDS, N_DRONES, 1)
     assert len(np.unique(mass)) == N_WORLDS * N_DRONES
@@ -80,7 +80,7 @@ def test_a_drawn_mass_sinks_or_climbs_by_newtons_law():
 
 def test_angular_acceleration_is_inverse_to_a_drawn_inertia():
     """A small external torque turns a drone at rest by J w' = tau: twice the inertia, half the rate."""
-    sim, nominal = build(drawn_inertia)
+    sim, nominal = make_drawn_sim(draw_inertia)
     p = sim.data.params
     eye = np.broadcast_to(np.eye(3), (N_WORLDS, N_DRONES, 3, 3))
     np.testing.assert_allclose(p.J @ p.J_inv, eye, atol=1e-5)  # float32 product of inverses
@@ -96,7 +96,7 @@ def test_angular_acceleration_is_inverse_to_a_drawn_inertia():
 
 def test_drawn_motors_accelerate_and_tilt_by_their_thrusts():
     """Rotors at hover speed with thrusts off by drawn factors: acceleration by their mean, roll by left over right."""
-    sim, nominal = build(drawn_motors)
+    sim, nominal = make_drawn_sim(draw_motors)
     scale = np.asarray(sim.data.params.rpm2thrust[..., 2] / nominal.params.rpm2thrust[0, 2], np.float64)
     assert scale.shape == (N_WORLDS, N_DRONES, 4)
     assert 0.8 <= scale.min() < 0.95
@@ -106,8 +106,8 @@ def test_drawn_motors_accelerate_and_tilt_by_their_thrusts():
     acc = 9.81 * (scale.mean(axis=-1) - 1)
     # float32: the last bits of a hover force, 1e-6 of 9.81 m/s^2 over 2 ms
     np.testing.assert_allclose(sim.data.states.vel[..., 2], acc * dt, atol=1e-6, rtol=1e-4)
-    each, p = float(nominal.params.mass[0]) * 9.81 / 4, nominal.params
+    hover_thrust, p = float(nominal.params.mass[0]) * 9.81 / 4, nominal.params
     arm, mixing = float(p.L[0]), np.asarray(p.mixing_matrix, np.float64)
-    torque = (scale * each * arm) @ mixing[:2].T
+    torque = (scale * hover_thrust * arm) @ mixing[:2].T
     expected = dt * torque / np.diag(p.J)[:2]
     np.testing.assert_allclose(sim.data.states.ang_vel[..., :2], expected, rtol=1e-3, atol=1e-4)

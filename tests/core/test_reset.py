@@ -39,7 +39,7 @@ class Counter:
 
 
 class Own(PyTree):
-    """A record of this project, next to the other kind."""
+    """A record that declares its scopes as this project does."""
 
     count: jax.Array = leaf("world")
     """Steps. (n_worlds, 1)"""
@@ -51,8 +51,8 @@ def count(data):
 
 
 @pytest.fixture(scope="module")
-def counting():
-    """A simulation whose plugins, one of each kind, count steps."""
+def counting_sim():
+    """Return a simulation whose plugins count steps: records of both kinds, a tuple, and arrays."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, engine="plain")
     plugins = {"foreign": Counter.create(), "own": Own(jnp.zeros((N_WORLDS, 1))), "bare": jnp.zeros(2)}
     sim.data = sim.data.replace(plugins=plugins | {"nested": (Counter.create(), jnp.zeros(()))})
@@ -62,11 +62,11 @@ def counting():
     return sim
 
 
-def test_a_masked_reset_restores_the_declared_leaves_of_its_worlds_and_a_full_one_all(counting):
+def test_a_masked_reset_restores_the_declared_leaves_of_its_worlds_and_a_full_one_all(counting_sim):
     """Crazyflow's metadata declare an axis over worlds as ``leaf`` does; undeclared and shared arrays stay."""
-    counting.step(5)
-    counting.reset(MASK)
-    plugins = jax.device_get(counting.data.plugins)
+    counting_sim.step(5)
+    counting_sim.reset(MASK)
+    plugins = jax.device_get(counting_sim.data.plugins)
     expected = np.where(MASK, 0, 5)
     for record in (plugins["foreign"], plugins["nested"][0]):
         np.testing.assert_array_equal(record.count[:, 0], expected)
@@ -75,24 +75,24 @@ def test_a_masked_reset_restores_the_declared_leaves_of_its_worlds_and_a_full_on
         np.testing.assert_array_equal(record.note, 5)
     np.testing.assert_array_equal(plugins["own"].count[:, 0], expected)
     np.testing.assert_array_equal(plugins["bare"], 5)
-    counting.reset()
-    for x in jax.tree.leaves(counting.data.plugins):
+    counting_sim.reset()
+    for x in jax.tree.leaves(counting_sim.data.plugins):
         np.testing.assert_array_equal(x, 0)
 
 
-def test_a_declared_axis_that_is_not_over_worlds_is_refused(counting):
-    data = counting.data
+def test_a_declared_axis_that_is_not_over_worlds_is_refused(counting_sim):
+    data = counting_sim.data
     wrong = dataclasses.replace(Counter.create(), count=jnp.zeros((N_WORLDS + 1, 1)))
-    counting.data = data.replace(plugins=data.plugins | {"foreign": wrong})
+    counting_sim.data = data.replace(plugins=data.plugins | {"foreign": wrong})
     with pytest.raises(ConfigError, match=r"data.plugins\['foreign'\].count .* got shape \(4, 1\)"):
-        counting.step()
-    counting.data = data
+        counting_sim.step()
+    counting_sim.data = data
 
 
-def test_metadata_on_a_field_that_holds_a_record_are_refused(counting):
+def test_metadata_on_a_field_that_holds_a_record_are_refused(counting_sim):
     nested = dataclasses.replace(Counter.create(), count=Counter.create())
     with pytest.raises(ConfigError, match=r"\['foreign'\].count, whose metadata have 'core_ndim', got a Counter"):
-        scopes(counting.data.replace(plugins={"foreign": nested}))
+        scopes(counting_sim.data.replace(plugins={"foreign": nested}))
 
 
 def test_a_full_reset_restores_shared_parameters_and_a_masked_one_leaves_them():

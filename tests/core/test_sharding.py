@@ -28,20 +28,20 @@ def mesh():
 
 
 @pytest.fixture
-def spread(mesh):
+def sharded_sim(mesh):
     sim = Sim(**SETTINGS, mesh=mesh)
     sim.data = with_states(sim.data, pos=[0, 0, 1.0])
     return sim
 
 
 @pytest.fixture(scope="module")
-def whole():
+def single_sim():
     sim = Sim(**SETTINGS)
     sim.data = with_states(sim.data, pos=[0, 0, 1.0])
     return sim
 
 
-def assert_spread(data, mesh):
+def assert_sharded(data, mesh):
     """Assert that each device holds its half of the worlds and a copy of every shared leaf."""
     for scope, x in zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(data), strict=True):
         assert set(x.sharding.device_set) == set(mesh.devices.flat)
@@ -51,43 +51,43 @@ def assert_spread(data, mesh):
         assert local == ((2, *x.shape[1:]) if scope in ("drone", "world") else x.shape)
 
 
-def test_law_02_leaves_go_where_their_scope_says(spread, whole, mesh):
-    assert_spread(spread.data, mesh)
-    assert_spread(spread.default_data, mesh)
-    assert_spread(shard(whole.data, mesh), mesh)
-    randomised = whole.data.params.replace(mass=jnp.full((4, 2, 1), 0.04))
-    assert_spread(shard(whole.data.replace(params=randomised), mesh), mesh)
+def test_law_02_leaves_go_where_their_scope_says(sharded_sim, single_sim, mesh):
+    assert_sharded(sharded_sim.data, mesh)
+    assert_sharded(sharded_sim.default_data, mesh)
+    assert_sharded(shard(single_sim.data, mesh), mesh)
+    randomised = single_sim.data.params.replace(mass=jnp.full((4, 2, 1), 0.04))
+    assert_sharded(shard(single_sim.data.replace(params=randomised), mesh), mesh)
 
 
-def test_steps_commands_and_resets_keep_it_spread_and_give_the_same_numbers(spread, whole, mesh):
-    """The same arithmetic on each half: equal to what fusing differently rounds, 1e-6 of a metre after 0.1 s."""
-    for sim in (spread, whole):
+def test_steps_commands_and_resets_keep_the_sharding_and_give_the_same_numbers(sharded_sim, single_sim, mesh):
+    """XLA may fuse the same arithmetic differently, which leaves rounding of 1e-6 m after 0.1 s."""
+    for sim in (sharded_sim, single_sim):
         sim.attitude_control(COMMAND)
         sim.step(30)
         sim.reset(np.array([True, False, False, True]))
         sim.attitude_control(COMMAND)
         sim.step(20)
-    assert_spread(spread.data, mesh)
+    assert_sharded(sharded_sim.data, mesh)
     for name in ("pos", "quat", "vel"):
         np.testing.assert_allclose(
-            getattr(spread.data.states, name), getattr(whole.data.states, name), rtol=1e-5, atol=1e-6
+            getattr(sharded_sim.data.states, name), getattr(single_sim.data.states, name), rtol=1e-5, atol=1e-6
         )
-    np.testing.assert_array_equal(spread.data.core.steps[:, 0], [20, 50, 50, 20])
+    np.testing.assert_array_equal(sharded_sim.data.core.steps[:, 0], [20, 50, 50, 20])
 
 
-def test_the_functional_api_keeps_it_spread(spread, mesh):
-    step, reset = spread.build_step_fn(), spread.build_reset_fn()
+def test_the_functional_api_keeps_the_sharding(sharded_sim, mesh):
+    step, reset = sharded_sim.build_step_fn(), sharded_sim.build_reset_fn()
 
     def rollout(data, command):
         return step(F.attitude_control(data, command), 3)
 
-    out = jax.jit(rollout)(spread.data, jnp.asarray(COMMAND))
-    assert_spread(F.attitude_control(spread.data, COMMAND), mesh)
-    assert_spread(reset(out, spread.default_data, jnp.array([True, True, False, False])), mesh)
+    out = jax.jit(rollout)(sharded_sim.data, jnp.asarray(COMMAND))
+    assert_sharded(F.attitude_control(sharded_sim.data, COMMAND), mesh)
+    assert_sharded(reset(out, sharded_sim.default_data, jnp.array([True, True, False, False])), mesh)
     assert out.states.pos.addressable_shards[0].data.shape == (2, 2, 3)
 
 
-def test_law_06_sharded_steps_trace_once(spread):
+def test_law_06_sharded_steps_trace_once(sharded_sim):
     """Law 6 with a mesh: commands, steps, resets and edits trace no second program."""
     traces = []
 
@@ -95,86 +95,86 @@ def test_law_06_sharded_steps_trace_once(spread):
         traces.append(None)
         return data
 
-    append_fn(spread.step_pipeline, count)
-    spread.build_step_fn()
+    append_fn(sharded_sim.step_pipeline, count)
+    sharded_sim.build_step_fn()
     for k in range(3):
-        spread.attitude_control(COMMAND if k else COMMAND.tolist())
-        spread.step(k + 1)
-        spread.reset(np.array([True, False, False, False]))
-        spread.data = with_states(spread.data, pos=[0, 0, 1.0])
+        sharded_sim.attitude_control(COMMAND if k else COMMAND.tolist())
+        sharded_sim.step(k + 1)
+        sharded_sim.reset(np.array([True, False, False, False]))
+        sharded_sim.data = with_states(sharded_sim.data, pos=[0, 0, 1.0])
     assert len(traces) == 1
 
 
-def test_a_step_needs_no_communication_between_devices(spread):
+def test_a_step_needs_no_communication_between_devices(sharded_sim):
     """Worlds are independent, so the compiled step holds no collective operation."""
-    step = spread.build_step_fn()
-    text = step.lower(spread.data, 2).compile().as_text()
+    step = sharded_sim.build_step_fn()
+    text = step.lower(sharded_sim.data, 2).compile().as_text()
     assert not [word for word in COLLECTIVES if word in text]
     # A program that does combine worlds is recognised.
-    text = jax.jit(jnp.sum).lower(spread.data.states.pos).compile().as_text()
+    text = jax.jit(jnp.sum).lower(sharded_sim.data.states.pos).compile().as_text()
     assert [word for word in COLLECTIVES if word in text]
 
 
-def test_a_step_built_for_one_device_takes_data_of_several(whole, mesh):
-    """The pattern of the functional guide: build on one device, shard the data, step it; each device its own worlds."""
-    step, reset = whole.build_step_fn(), whole.build_reset_fn()
-    data = F.attitude_control(whole.data, COMMAND)
-    spread = shard(data, mesh)
+def test_a_step_built_for_one_device_takes_data_of_several(single_sim, mesh):
+    """As in the functional guide: a step is built on one device, and each device steps its worlds of sharded data."""
+    step, reset = single_sim.build_step_fn(), single_sim.build_reset_fn()
+    data = F.attitude_control(single_sim.data, COMMAND)
+    sharded_data = shard(data, mesh)
     for n_steps in (6, jnp.int32(6)):
-        after, expected = step(spread, n_steps), step(data, n_steps)
-        assert_spread(after, mesh)
+        after, expected = step(sharded_data, n_steps), step(data, n_steps)
+        assert_sharded(after, mesh)
         for name in ("pos", "quat", "vel"):
             np.testing.assert_allclose(
                 getattr(after.states, name), getattr(expected.states, name), rtol=1e-5, atol=1e-6
             )
-    assert step.plan(spread).engine == step.plan(data).engine
-    text = step.lower(spread, 2).compile().as_text()
+    assert step.plan(sharded_data).engine == step.plan(data).engine
+    text = step.lower(sharded_data, 2).compile().as_text()
     assert not [word for word in COLLECTIVES if word in text]
-    assert_spread(reset(after, spread), mesh)
-    again = step(step(spread, jnp.int32(1)), jnp.int32(5))  # what a step returns is where it was
+    assert_sharded(reset(after, sharded_data), mesh)
+    again = step(step(sharded_data, jnp.int32(1)), jnp.int32(5))  # the result has the sharding of the data
     np.testing.assert_allclose(again.states.pos, after.states.pos, rtol=1e-5, atol=1e-6)
 
 
-def test_the_mesh_is_that_of_the_data_whatever_its_axes_are_called(whole):
+def test_the_mesh_is_that_of_the_data_whatever_its_axes_are_called(single_sim):
     """Users of plain JAX name their own axes, and may have more than one."""
     mesh = jax.make_mesh((2, 1), ("batch", "model"), axis_types=(AxisType.Auto,) * 2, devices=jax.devices("cpu")[:2])
-    data = F.attitude_control(whole.data, COMMAND)
+    data = F.attitude_control(single_sim.data, COMMAND)
     split, shared = PartitionSpec("batch"), PartitionSpec()
     kinds = jax.tree.map(lambda s: split if s in ("drone", "world") else shared, scopes(data))
-    spread = jax.device_put(data, jax.tree.map(lambda spec: NamedSharding(mesh, spec), kinds))
-    step = whole.build_step_fn()
-    after = step(spread, jnp.int32(6))
+    sharded_data = jax.device_put(data, jax.tree.map(lambda spec: NamedSharding(mesh, spec), kinds))
+    step = single_sim.build_step_fn()
+    after = step(sharded_data, jnp.int32(6))
     assert after.states.pos.addressable_shards[0].data.shape == (2, 2, 3)
     np.testing.assert_allclose(after.states.pos, step(data, jnp.int32(6)).states.pos, rtol=1e-5, atol=1e-6)
 
 
-def test_data_copied_to_each_device_is_stepped_on_each(whole, mesh):
+def test_data_copied_to_each_device_is_stepped_on_each(single_sim, mesh):
     """A sharding that splits no worlds is legal, and every device computes all of them."""
-    data = F.attitude_control(whole.data, COMMAND)
+    data = F.attitude_control(single_sim.data, COMMAND)
     copied = jax.device_put(data, NamedSharding(mesh, PartitionSpec()))
-    step = whole.build_step_fn()
+    step = single_sim.build_step_fn()
     after = step(copied, jnp.int32(6))
     assert after.states.pos.addressable_shards[1].data.shape == (4, 2, 3)
     np.testing.assert_allclose(after.states.pos, step(data, jnp.int32(6)).states.pos, rtol=1e-5, atol=1e-6)
 
 
-def test_sharded_data_gives_the_same_numbers_inside_jit(whole, mesh):
-    """There the devices of the data are unknown to the step: the numbers are the same all the same."""
-    step = whole.build_step_fn()
-    data = F.attitude_control(whole.data, COMMAND)
+def test_sharded_data_gives_the_same_numbers_inside_jit(single_sim, mesh):
+    """Inside ``jit`` the step cannot read the devices of the data."""
+    step = single_sim.build_step_fn()
+    data = F.attitude_control(single_sim.data, COMMAND)
     run = jax.jit(lambda d: step(d, 6).states.pos)
     np.testing.assert_allclose(run(shard(data, mesh)), run(data), rtol=1e-5, atol=1e-6)
 
 
-def test_a_simulation_can_be_sharded_after_steps(whole, mesh):
+def test_a_simulation_can_be_sharded_after_steps(single_sim, mesh):
     sim = Sim(**SETTINGS)
     sim.step(2)
     steps = np.asarray(sim.data.core.steps)
-    assert_spread(sim.shard(mesh), mesh)
-    assert_spread(sim.default_data, mesh)
+    assert_sharded(sim.shard(mesh), mesh)
+    assert_sharded(sim.default_data, mesh)
     np.testing.assert_array_equal(sim.data.core.steps, steps)
     sim.step(2)
-    assert_spread(sim.data, mesh)
+    assert_sharded(sim.data, mesh)
 
 
 def test_law_09_worlds_that_cannot_be_split_evenly_are_refused(mesh):
@@ -182,10 +182,10 @@ def test_law_09_worlds_that_cannot_be_split_evenly_are_refused(mesh):
         Sim(n_worlds=3, mesh=mesh)
 
 
-def test_law_09_a_mesh_with_another_axis_is_refused(whole):
+def test_law_09_a_mesh_with_another_axis_is_refused(single_sim):
     other = jax.make_mesh((2,), ("batch",), axis_types=(AxisType.Auto,), devices=jax.devices("cpu")[:2])
     with pytest.raises(ConfigError, match=f"an axis '{WORLD_AXIS}', got axes \\('batch',\\)"):
-        shardings_of(whole.data, other)
+        shardings_of(single_sim.data, other)
     with pytest.raises(ConfigError, match="batch"):
         Sim(**SETTINGS, mesh=other)
 

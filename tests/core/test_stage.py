@@ -26,15 +26,15 @@ def numbers(n_worlds, n_drones):
 
 
 @pytest.mark.parametrize(("n_worlds", "n_drones"), [(1, 1), (2, 2), (2, 3), (3, 2)])
-def test_every_world_is_treated_as_the_function_says(n_worlds, n_drones):
+def test_the_function_is_applied_to_every_world(n_worlds, n_drones):
     """Law 2: axes are the declared ones, also where worlds and drones are equally many."""
     record, factor = numbers(n_worlds, n_drones), np.arange(1, n_worlds + 1, dtype=np.float32)
 
-    def fn(one, factor):
-        assert [x.shape for x in jax.tree.leaves(one)] == [(n_drones, 2), (2,), (5,), (2,), (n_worlds,)]
+    def fn(world, factor):
+        assert [x.shape for x in jax.tree.leaves(world)] == [(n_drones, 2), (2,), (5,), (2,), (n_worlds,)]
         assert factor.shape == ()
-        new = one.replace(own=factor * one.own + one.ours, ours=one.ours + one.all, row=one.row[::-1])
-        return new, {"sum": one.own.sum(), "opaque": one.opaque}["sum"], one.ours
+        new = world.replace(own=factor * world.own + world.ours, ours=world.ours + world.all, row=world.row[::-1])
+        return new, world.own.sum(), world.ours
 
     after, total, ours = vmap_worlds(fn)(record, factor)
     np.testing.assert_allclose(after.own, factor[:, None, None] * record.own + record.ours, rtol=1e-6)
@@ -48,18 +48,18 @@ def test_every_world_is_treated_as_the_function_says(n_worlds, n_drones):
 
 def test_a_leaf_that_is_not_written_is_returned_as_it_came():
     record = numbers(2, 3)
-    after = vmap_worlds(lambda one: one.replace(own=one.own + 1))(record)
+    after = vmap_worlds(lambda world: world.replace(own=world.own + 1))(record)
     assert all(getattr(after, name) is getattr(record, name) for name in ("ours", "row", "all", "opaque"))
 
 
 def test_a_shared_leaf_may_be_returned_for_every_world():
-    np.testing.assert_array_equal(vmap_worlds(lambda one: one.all)(numbers(3, 1)).shape, (3, 2))
+    np.testing.assert_array_equal(vmap_worlds(lambda world: world.all)(numbers(3, 1)).shape, (3, 2))
 
 
 @pytest.mark.parametrize("name", ["all", "opaque"])
-def test_what_all_worlds_share_cannot_be_changed(name):
-    def greedy(one):
-        return one.replace(**{name: getattr(one, name) + 1})
+def test_leaves_that_all_worlds_share_cannot_be_changed(name):
+    def greedy(world):
+        return world.replace(**{name: getattr(world, name) + 1})
 
     with pytest.raises(ConfigError, match=f"'greedy' is written for one world and changes {name}, which all worlds"):
         vmap_worlds(greedy)(numbers(2, 2))
@@ -68,10 +68,10 @@ def test_what_all_worlds_share_cannot_be_changed(name):
 def test_a_world_of_a_simulation_has_no_batch_axes():
     data = Sim(n_worlds=2, n_drones=2).data
 
-    def fn(one):
-        assert one.states.pos.shape == (2, 3)
-        assert one.core.steps.shape == ()
-        assert one.params.mass.shape == data.params.mass.shape
-        return one.replace(core=one.core.replace(steps=one.core.steps + one.core.world_id))
+    def fn(world):
+        assert world.states.pos.shape == (2, 3)
+        assert world.core.steps.shape == ()
+        assert world.params.mass.shape == data.params.mass.shape
+        return world.replace(core=world.core.replace(steps=world.core.steps + world.core.world_id))
 
     np.testing.assert_array_equal(vmap_worlds(fn)(data).core.steps, [[0], [1]])

@@ -34,7 +34,7 @@ def iterate_numbers(node, path=""):
 
 
 def plain_tables(name):
-    """Return the tables of a built-in airframe without a base, with plain numbers, as a user would write them."""
+    """Return the tables of a built-in airframe without units and sources, as a user would write them."""
 
     def strip(node):
         return {k: (v["value"] if "value" in v else strip(v)) for k, v in node.items()}
@@ -42,7 +42,7 @@ def plain_tables(name):
     return strip({k: v for k, v in read_tables(name).items() if k != "sources"})
 
 
-def test_every_file_is_an_airframe_and_the_other_way_round():
+def test_every_file_is_an_airframe_and_every_airframe_has_a_file():
     assert {path.stem for path in FILES} == set(airframe_names())
     assert len(FILES) >= 7
 
@@ -246,7 +246,7 @@ def test_a_toml_file_anywhere_on_disk_flies(tmp_path):
     np.testing.assert_allclose(sim.data.params.mass, [0.05])
 
 
-def without(path):
+def remove_key(path):
     def change(tables):
         *parents, key = path.split(".")
         node = tables
@@ -257,7 +257,7 @@ def without(path):
     return change
 
 
-def setting(path, value):
+def set_key(path, value):
     def change(tables):
         *parents, key = path.split(".")
         node = tables
@@ -268,168 +268,168 @@ def setting(path, value):
     return change
 
 
-WRONG = {
-    "no rigid body": (without("rigid_body"), r"no table \[rigid_body\]"),
+WRONG_AIRFRAMES = {
+    "no rigid body": (remove_key("rigid_body"), r"no table \[rigid_body\]"),
     "no mass": (
-        without("rigid_body.mass"),
+        remove_key("rigid_body.mass"),
         r"has no value 'rigid_body.mass'. Add mass to its table \[rigid_body\]; docs",
     ),
-    "mass a list": (setting("rigid_body.mass", [0.03]), r"expected rigid_body.mass of shape \(\), got \(1,\)"),
+    "mass a list": (set_key("rigid_body.mass", [0.03]), r"expected rigid_body.mass of shape \(\), got \(1,\)"),
     "mass a table": (
-        setting("rigid_body.mass", {"kilos": 0.03}),
+        set_key("rigid_body.mass", {"kilos": 0.03}),
         r"expected rigid_body.mass as a number, an array or \{ value, unit, source \}, got \{'kilos': 0.03\}",
     ),
-    "mass as text": (setting("rigid_body.mass", "0.03"), "rigid_body.mass as a number or array, got '0.03'"),
-    "mass true": (setting("rigid_body.mass", True), "rigid_body.mass as a number or array, got True"),
-    "mass negative": (setting("rigid_body.mass", -0.03), "rigid_body.mass to be from 1e-6 to 1e6 kg, got -0.03"),
-    "mass zero": (setting("rigid_body.mass", 0.0), "rigid_body.mass to be from 1e-6 to 1e6 kg, got 0.0"),
-    "mass nan": (setting("rigid_body.mass", float("nan")), "rigid_body.mass to be from 1e-6 to 1e6 kg, got nan"),
-    "mass tiny": (setting("rigid_body.mass", 1e-300), "rigid_body.mass to be from 1e-6 to 1e6 kg, got 1e-300"),
-    "mass huge": (setting("rigid_body.mass", 10**400), "rigid_body.mass as a number or array, got 1000"),
-    "too light": (setting("rigid_body.mass", 1e-6), "expected rotors that lift 1e-06 kg, .* 1000 times its weight"),
-    "too heavy": (setting("rigid_body.mass", 0.2), "expected rotors that lift 0.2 kg, .*, got 4 rotors of .* to 0.2 N"),
-    "least thrust above weight": (setting("rotors.thrust_min", 0.15), "expected rotors that lift 0.0434 kg, between"),
+    "mass as text": (set_key("rigid_body.mass", "0.03"), "rigid_body.mass as a number or array, got '0.03'"),
+    "mass true": (set_key("rigid_body.mass", True), "rigid_body.mass as a number or array, got True"),
+    "mass negative": (set_key("rigid_body.mass", -0.03), "rigid_body.mass to be from 1e-6 to 1e6 kg, got -0.03"),
+    "mass zero": (set_key("rigid_body.mass", 0.0), "rigid_body.mass to be from 1e-6 to 1e6 kg, got 0.0"),
+    "mass nan": (set_key("rigid_body.mass", float("nan")), "rigid_body.mass to be from 1e-6 to 1e6 kg, got nan"),
+    "mass tiny": (set_key("rigid_body.mass", 1e-300), "rigid_body.mass to be from 1e-6 to 1e6 kg, got 1e-300"),
+    "mass huge": (set_key("rigid_body.mass", 10**400), "rigid_body.mass as a number or array, got 1000"),
+    "too light": (set_key("rigid_body.mass", 1e-6), "expected rotors that lift 1e-06 kg, .* 1000 times its weight"),
+    "too heavy": (set_key("rigid_body.mass", 0.2), "expected rotors that lift 0.2 kg, .*, got 4 rotors of .* to 0.2 N"),
+    "least thrust above weight": (set_key("rotors.thrust_min", 0.15), "expected rotors that lift 0.0434 kg, between"),
     "inertia of no rigid body": (
-        setting("rigid_body.inertia", [1e-5, 1e-5, 9e-5]),
+        set_key("rigid_body.inertia", [1e-5, 1e-5, 9e-5]),
         "moment is at most the sum of the others",
     ),
-    "inertia tiny": (setting("rigid_body.inertia", [1e-14] * 3), "turn the body with at most 1e[+]06 rad/s"),
-    "inertia zero": (setting("rigid_body.inertia", [1e-300] * 3), "three positive moments"),
-    "rotor inertia large": (setting("rotors.inertia", 1.0), "propellers with a smaller inertia than the whole drone"),
-    "rotor inertia negative": (setting("rotors.inertia", -1e-8), "rotors.inertia to be at least zero, got -1e-08"),
-    "thrust curve zero": (setting("rotors.thrust_curve", [0, 0, 0]), "expected thrust_curve with a positive quadratic"),
-    "thrust curve falls": (setting("rotors.thrust_curve", [0.2, 0, -1e-10]), "expected thrust_curve with a positive"),
-    "thrust curve linear": (setting("rotors.thrust_curve", [0, 1e-5, 0]), "expected thrust_curve with a positive"),
-    "thrust at rest": (setting("rotors.thrust_curve", [0.1, 0, 4e-10]), "rises from thrust_min to thrust_max"),
-    "thrust curve tiny": (setting("rotors.thrust_curve", [0, 0, 1e-28]), "between 0 and 1e[+]06 rpm"),
+    "inertia tiny": (set_key("rigid_body.inertia", [1e-14] * 3), "turn the body with at most 1e[+]06 rad/s"),
+    "inertia zero": (set_key("rigid_body.inertia", [1e-300] * 3), "three positive moments"),
+    "rotor inertia large": (set_key("rotors.inertia", 1.0), "propellers with a smaller inertia than the whole drone"),
+    "rotor inertia negative": (set_key("rotors.inertia", -1e-8), "rotors.inertia to be at least zero, got -1e-08"),
+    "thrust curve zero": (set_key("rotors.thrust_curve", [0, 0, 0]), "expected thrust_curve with a positive quadratic"),
+    "thrust curve falls": (set_key("rotors.thrust_curve", [0.2, 0, -1e-10]), "expected thrust_curve with a positive"),
+    "thrust curve linear": (set_key("rotors.thrust_curve", [0, 1e-5, 0]), "expected thrust_curve with a positive"),
+    "thrust at rest": (set_key("rotors.thrust_curve", [0.1, 0, 4e-10]), "rises from thrust_min to thrust_max"),
+    "thrust curve tiny": (set_key("rotors.thrust_curve", [0, 0, 1e-28]), "between 0 and 1e[+]06 rpm"),
     "thrust curve zero for one rotor": (
-        setting("rotors.thrust_curve", [[0, 0, 4e-10]] * 3 + [[0, 0, 0]]),
+        set_key("rotors.thrust_curve", [[0, 0, 4e-10]] * 3 + [[0, 0, 0]]),
         "thrust_curve with",
     ),
     "torque curve negative": (
-        setting("rotors.torque_curve", [0, 0, -1e-12]),
+        set_key("rotors.torque_curve", [0, 0, -1e-12]),
         "expected torque_curve that rises at the speed of hover",
     ),
-    "torque curve zero": (setting("rotors.torque_curve", [0, 0, 0]), "torque_curve that rises at the speed of hover"),
-    "torque curve below zero": (setting("rotors.torque_curve", [-1, 0, 2e-12]), "torque_curve of at least 0 N m"),
-    "torque curve huge": (setting("rotors.torque_curve", [0, 0, 1.0]), "torque_curve of at least 0 N m .* at most"),
-    "lag negative": (setting("rotors.lag", [-14, 0, 14, 0]), "rotors.lag to be at least zero, got .-14.0"),
-    "lag without spin-up": (setting("rotors.lag", [0, 0, 14, 0]), "lag with a positive linear or quadratic term"),
+    "torque curve zero": (set_key("rotors.torque_curve", [0, 0, 0]), "torque_curve that rises at the speed of hover"),
+    "torque curve below zero": (set_key("rotors.torque_curve", [-1, 0, 2e-12]), "torque_curve of at least 0 N m"),
+    "torque curve huge": (set_key("rotors.torque_curve", [0, 0, 1.0]), "torque_curve of at least 0 N m .* at most"),
+    "lag negative": (set_key("rotors.lag", [-14, 0, 14, 0]), "rotors.lag to be at least zero, got .-14.0"),
+    "lag without spin-up": (set_key("rotors.lag", [0, 0, 14, 0]), "lag with a positive linear or quadratic term"),
     "lag too fast": (
-        setting("rotors.lag", [1e4, 0, 14, 0]),
+        set_key("rotors.lag", [1e4, 0, 14, 0]),
         r"rotors.lag .* slow for steps of 1/500 s, .*freq=6667 or",
     ),
-    "signs of two": (setting("rotors.yaw_torque_sign", [2, -1, 1, -1]), "yaw_torque_sign to be 1 or -1 for each rotor"),
-    "signs of a half": (setting("rotors.yaw_torque_sign", [0.5, -1, 1, -1]), "yaw_torque_sign as 1 or -1"),
-    "signs alike": (setting("rotors.yaw_torque_sign", [1, 1, 1, 1]), "yaw_torque_sign as 1 or -1 .* not all equal"),
-    "rotors in the middle": (setting("rotors.position", [[0, 0, 0.1]] * 4), "rotors beside the centre of mass"),
-    "rotors at one side": (setting("rotors.position", [[0.1, 0, 0]] * 4), "turn it about x, y and z, each alone, got"),
+    "signs of two": (set_key("rotors.yaw_torque_sign", [2, -1, 1, -1]), "yaw_torque_sign to be 1 or -1 for each rotor"),
+    "signs of a half": (set_key("rotors.yaw_torque_sign", [0.5, -1, 1, -1]), "yaw_torque_sign as 1 or -1"),
+    "signs alike": (set_key("rotors.yaw_torque_sign", [1, 1, 1, 1]), "yaw_torque_sign as 1 or -1 .* not all equal"),
+    "rotors in the middle": (set_key("rotors.position", [[0, 0, 0.1]] * 4), "rotors beside the centre of mass"),
+    "rotors at one side": (set_key("rotors.position", [[0.1, 0, 0]] * 4), "turn it about x, y and z, each alone, got"),
     "rotors in a row": (
-        setting("rotors.position", [[x, 0, 0] for x in (-0.1, -0.05, 0.05, 0.1)]),
+        set_key("rotors.position", [[x, 0, 0] for x in (-0.1, -0.05, 0.05, 0.1)]),
         "turn it about x, y and z, each alone, got",
     ),
-    "signs side by side": (setting("rotors.yaw_torque_sign", [1, 1, -1, -1]), "turn it about x, y and z, each alone"),
+    "signs side by side": (set_key("rotors.yaw_torque_sign", [1, 1, -1, -1]), "turn it about x, y and z, each alone"),
     "rotors off centre": (
-        setting("rotors.position", [[0.1, -0.03, 0], [0.02, -0.03, 0], [0.02, 0.03, 0], [0.1, 0.03, 0]]),
+        set_key("rotors.position", [[0.1, -0.03, 0], [0.02, -0.03, 0], [0.02, 0.03, 0], [0.1, 0.03, 0]]),
         r"level in hover with 0.02.* to 0.2 N each, got \[-",
     ),
-    "rotors far away": (setting("rotors.position", [[1e9, 0, 0]] * 4), "rotors.position to be from -1e3 to 1e3 m"),
-    "drag that pushes": (setting("drag.coefficients", [0.02, -0.02, -0.02]), "expected drag.coefficients that brakes"),
-    "drag large": (setting("drag.coefficients", [-1e3] * 3), "drag.coefficients .* slow for steps of 1/500 s"),
+    "rotors far away": (set_key("rotors.position", [[1e9, 0, 0]] * 4), "rotors.position to be from -1e3 to 1e3 m"),
+    "drag that pushes": (set_key("drag.coefficients", [0.02, -0.02, -0.02]), "expected drag.coefficients that brakes"),
+    "drag large": (set_key("drag.coefficients", [-1e3] * 3), "drag.coefficients .* slow for steps of 1/500 s"),
     "drag matrix that pushes": (
-        setting("drag.coefficients", [[-0.01, 0.03, 0], [0.03, -0.01, 0], [0, 0, -0.01]]),
+        set_key("drag.coefficients", [[-0.01, 0.03, 0], [0.03, -0.01, 0], [0, 0, -0.01]]),
         "expected drag.coefficients that brakes",
     ),
-    "stiffness that repels": (setting("fitted.so_rpy.rpy_coef", [150.0] * 3), "fitted.so_rpy.rpy_coef to be negative"),
+    "stiffness that repels": (set_key("fitted.so_rpy.rpy_coef", [150.0] * 3), "fitted.so_rpy.rpy_coef to be negative"),
     "fit that does not lift": (
-        setting("fitted.so_rpy.cmd_f_coef", 0.1),
+        set_key("fitted.so_rpy.cmd_f_coef", 0.1),
         "cmd_f_coef of fitted.so_rpy to lift 0.4258 N",
     ),
-    "battery without force": (setting("battery.thrust_over_voltage", [0, 0, 0, 0]), "reach thrust_max at a positive"),
-    "gain negative": (setting("controller.attitude.kR", [-1, 1, 1]), "controller.attitude.kR to be at least zero"),
-    "PWM reversed": (setting("controller.pwm_min", 70000.0), "pwm_min below pwm_max, got 70000.0 and 65535.0"),
-    "plate without size": (setting("shape.plate", [0.03, 0.0, 0.02]), "shape.plate to be from 1e-6 to 1e3 m"),
-    "sphere without size": (setting("shape.collision_sphere", [0, 0, 0, -1]), "coordinates and a positive radius"),
-    "camera above": (setting("shape.track_camera", [0, 0, 1]), "track_camera behind or ahead of the drone"),
+    "battery without force": (set_key("battery.thrust_over_voltage", [0, 0, 0, 0]), "reach thrust_max at a positive"),
+    "gain negative": (set_key("controller.attitude.kR", [-1, 1, 1]), "controller.attitude.kR to be at least zero"),
+    "PWM reversed": (set_key("controller.pwm_min", 70000.0), "pwm_min below pwm_max, got 70000.0 and 65535.0"),
+    "plate without size": (set_key("shape.plate", [0.03, 0.0, 0.02]), "shape.plate to be from 1e-6 to 1e3 m"),
+    "sphere without size": (set_key("shape.collision_sphere", [0, 0, 0, -1]), "coordinates and a positive radius"),
+    "camera above": (set_key("shape.track_camera", [0, 0, 1]), "track_camera behind or ahead of the drone"),
     "inertia of two": (
-        setting("rigid_body.inertia", [1e-5, 1e-5]),
+        set_key("rigid_body.inertia", [1e-5, 1e-5]),
         r"rigid_body.inertia of shape \(3,\) or \(3, 3\), got \(2,\)",
     ),
-    "inertia negative": (setting("rigid_body.inertia", [1e-5, 1e-5, -1e-5]), "three positive moments"),
+    "inertia negative": (set_key("rigid_body.inertia", [1e-5, 1e-5, -1e-5]), "three positive moments"),
     "inertia not symmetric": (
-        setting("rigid_body.inertia", [[1e-5, 1e-6, 0], [0, 1e-5, 0], [0, 0, 1e-5]]),
+        set_key("rigid_body.inertia", [[1e-5, 1e-6, 0], [0, 1e-5, 0], [0, 0, 1e-5]]),
         "symmetric positive definite",
     ),
-    "rotors a number": (setting("rotors", 4), r"expected a table \[rotors\], got 4"),
+    "rotors a number": (set_key("rotors", 4), r"expected a table \[rotors\], got 4"),
     "positions flat": (
-        setting("rotors.position", [0.1, 0.1]),
+        set_key("rotors.position", [0.1, 0.1]),
         r"expected rotors.position of shape \(n, 3\), got \(2,\)",
     ),
-    "ragged positions": (setting("rotors.position", [[0.1, 0.1], [0.1]]), "as a number or array, got"),
+    "ragged positions": (set_key("rotors.position", [[0.1, 0.1], [0.1]]), "as a number or array, got"),
     "three signs": (
-        setting("rotors.yaw_torque_sign", [1, -1, 1]),
+        set_key("rotors.yaw_torque_sign", [1, -1, 1]),
         r"expected rotors.yaw_torque_sign of shape \(4,\), got \(3,\)",
     ),
-    "thrust negative": (setting("rotors.thrust_max", -0.1), "rotors.thrust_max to be positive, got -0.1"),
-    "thrusts reversed": (setting("rotors.thrust_max", 0.01), "expected 0 <= thrust_min < thrust_max, got"),
+    "thrust negative": (set_key("rotors.thrust_max", -0.1), "rotors.thrust_max to be positive, got -0.1"),
+    "thrusts reversed": (set_key("rotors.thrust_max", 0.01), "expected 0 <= thrust_min < thrust_max, got"),
     "curve of two": (
-        setting("rotors.thrust_curve", [0.0, 1e-10]),
+        set_key("rotors.thrust_curve", [0.0, 1e-10]),
         r"expected rotors.thrust_curve of shape \(3,\) or \(4, 3\), got \(2,\)",
     ),
     "one drag": (
-        setting("drag.coefficients", [-0.02]),
+        set_key("drag.coefficients", [-0.02]),
         r"expected drag.coefficients of shape \(3,\) or \(3, 3\), got \(1,\)",
     ),
-    "lag of two": (setting("rotors.lag", [14.0, 1e-4]), r"expected rotors.lag of shape \(4,\) or \(4, 4\), got \(2,\)"),
+    "lag of two": (set_key("rotors.lag", [14.0, 1e-4]), r"expected rotors.lag of shape \(4,\) or \(4, 4\), got \(2,\)"),
     "stiffness": (
-        setting("fitted.so_rpy.rpy_coef", -150.0),
+        set_key("fitted.so_rpy.rpy_coef", -150.0),
         r"expected fitted.so_rpy.rpy_coef of shape \(3,\), got \(\)",
     ),
     "no gain": (
-        without("controller.attitude.kR"),
+        remove_key("controller.attitude.kR"),
         r"lacks \[controller.attitude\] kR, which controller 'crazyflow' needs. Use controller='auto', which needs no",
     ),
     "no controller": (
-        without("controller"),
+        remove_key("controller"),
         r"lacks \[controller.attitude\] kR, kw, ki_m, kd_omega, int_err_max; \[controller\] torque_pwm_max, "
         r"thrust2torque, pwm_min, pwm_max, which",
     ),
     "shape misspelt": (
-        setting("shape.propellor_radius", 0.02),
+        set_key("shape.propellor_radius", 0.02),
         "expected a key that exists, got 'shape.propellor_radius'. Did you mean 'shape.propeller_radius'",
     ),
     "table misspelt": (
-        setting("rigidbody", {"mass": 0.05}),
+        set_key("rigidbody", {"mass": 0.05}),
         r"airframe 'custom': expected a table that exists, got \[rigidbody\]. Did you mean \[rigid_body\]\? docs",
     ),
     "inner table misspelt": (
-        setting("controller.atitude", {"kR": [1, 1, 1]}),
+        set_key("controller.atitude", {"kR": [1, 1, 1]}),
         r"got \[controller.atitude\]. Did you mean \[controller.attitude\]",
     ),
     "mass misspelt": (
-        setting("rigid_body.mas", 0.05),
+        set_key("rigid_body.mas", 0.05),
         "expected a key that exists, got 'rigid_body.mas'. Did you mean 'rigid_body.mass'",
     ),
-    "base misspelt": (setting("bse", "cf2x_L250"), "expected a key that exists, got 'bse'. Did you mean 'base'"),
-    "mass in no table": (setting("mass", 0.05), "got 'mass'. Did you mean 'rigid_body.mass' or 'battery.mass' or 'con"),
+    "base misspelt": (set_key("bse", "cf2x_L250"), "expected a key that exists, got 'bse'. Did you mean 'base'"),
+    "mass in no table": (set_key("mass", 0.05), "got 'mass'. Did you mean 'rigid_body.mass' or 'battery.mass' or 'con"),
     "unit misspelt": (
-        setting("rigid_body.mass", {"value": 0.03, "units": "kg"}),
+        set_key("rigid_body.mass", {"value": 0.03, "units": "kg"}),
         r"as a number, an array or \{ value, unit, source \}, got \{'value': 0.03, 'units': 'kg'\}",
     ),
-    "table unknown": (setting("paint", {"colour": 3}), r"expected a table that exists, got \[paint\]. docs"),
+    "table unknown": (set_key("paint", {"colour": 3}), r"expected a table that exists, got \[paint\]. docs"),
     "a coefficient of another model": (
-        setting("fitted.so_rpy.thrust_dyn_coef", 16.0),
+        set_key("fitted.so_rpy.thrust_dyn_coef", 16.0),
         "got 'fitted.so_rpy.thrust_dyn_coef'. Did you mean 'fitted.so_rpy_rotor.thrust_dyn_coef'",
     ),
-    "shape of two": (setting("shape.plate", [0.03, 0.03]), r"expected shape.plate of shape \(3,\), got \(2,\)"),
-    "no drag": (without("drag"), "has no value 'drag.coefficients'"),
-    "no thrust curve": (without("rotors.thrust_curve"), r"has parameters for \(so_rpy.*\), got 'first_principles'"),
+    "shape of two": (set_key("shape.plate", [0.03, 0.03]), r"expected shape.plate of shape \(3,\), got \(2,\)"),
+    "no drag": (remove_key("drag"), "has no value 'drag.coefficients'"),
+    "no thrust curve": (remove_key("rotors.thrust_curve"), r"has parameters for \(so_rpy.*\), got 'first_principles'"),
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
+@pytest.mark.parametrize("case", WRONG_AIRFRAMES)
 def test_law_09_a_wrong_airframe_is_refused(case):
-    change, message = WRONG[case]
+    change, message = WRONG_AIRFRAMES[case]
     tables = plain_tables("cf21B_500")
     change(tables)
     controller = "crazyflow" if case in ("no gain", "no controller") else "auto"  # "auto" needs no gains
@@ -443,9 +443,9 @@ def test_moments_of_inertia_that_are_slightly_wrong_are_a_warning_with_the_figur
     def body(z):
         return {"base": "cf2x_L250", "rigid_body": {"mass": 0.03, "inertia": [1.43e-5, 1.43e-5, z]}}
 
-    with pytest.warns(AirframeWarning, match=r"largest moment is at most the sum .* 1\.0% more\. Measure") as given:
+    with pytest.warns(AirframeWarning, match=r"largest moment is at most the sum .* 1\.0% more\. Measure") as caught:
         assert Sim(drone=body(2.89e-5)).data.params.J[..., 2, 2] == np.float32(2.89e-5)
-    assert given[0].filename == __file__, "a warning points to the user's line"
+    assert caught[0].filename == __file__, "a warning points to the user's line"
     with pytest.raises(ConfigError, match="largest moment is at most the sum of the others"):
         load_airframe(body(3.04e-5))
     load_airframe(body(2.86e-5 * 1.000005))
@@ -469,7 +469,7 @@ def test_law_09_a_broken_toml_file_is_named(tmp_path):
 
 
 def nested(depth):
-    """Return a list in a list in a list and so on."""
+    """Return a list that is nested to a depth."""
     value = []
     for _ in range(depth):
         value = [value]
@@ -596,9 +596,9 @@ def test_another_body_inherits_no_gains(changes):
     base, heir = load_airframe("cf2x_L250"), load_airframe({"base": "cf2x_L250", "name": "mine", **changes})
     changed = next(f"{table}.{key}" for table, keys in changes.items() for key in keys)
     message = rf"Its base 'cf2x_L250' has \[fitted\], \[controller\], \[mellinger\] and \[pid\], .* another {changed}"
-    for ask in (lambda: heir.value("controller.mass"), lambda: heir.table("pid.rate")):
+    for read in (lambda: heir.value("controller.mass"), lambda: heir.table("pid.rate")):
         with pytest.raises(ConfigError, match=message):
-            ask()
+            read()
     assert not {"fitted", "mellinger", "pid"} & set(heir.tables)
     ratios = [airframe.values.get("controller.thrust2torque") for airframe in (base, heir)]
     assert (ratios[1] is None) if "thrust_curve" in changed else ratios[0] == ratios[1]
@@ -632,7 +632,7 @@ def test_figure_of_merit_at_hover(name):
 
 
 def test_full_thrust_voltage_is_that_of_the_firmwares_curves():
-    """At it, the firmware's cubic of thrust over voltage gives thrust_max; the numbers were found with numpy.roots."""
+    """At this voltage, the firmware's cubic of thrust over voltage gives thrust_max (by ``numpy.roots``)."""
     expected = {"cf21B_500": 3.1257, "cf2x_P250": 3.0799, "cf2x_T350": 2.8166, "cf2x_L250": 2.9836, "crazyflie": 3.3482}
     for name, volts in expected.items():
         assert load_airframe(name).full_thrust_voltage == pytest.approx(volts, abs=1e-4)
@@ -651,9 +651,9 @@ def test_a_body_without_a_shape_is_about_as_large_as_the_real_one(name):
         assert np.all((ratio > 1 / 2.1) & (ratio < 2.1)), (key, ratio)
     np.testing.assert_allclose(derived["collision_sphere"][3], true["collision_sphere"][3], rtol=0.2)
     assert {key: value.shape for key, value in derived.items()} == {k: v.shapes[0] for k, v in TABLES["shape"].items()}
-    some = body_shape(load_airframe(tables | {"shape": {"propeller_radius": 0.02}}))
-    assert some["propeller_radius"] == 0.02
-    np.testing.assert_allclose(some["plate"], derived["plate"])
+    partly_derived = body_shape(load_airframe(tables | {"shape": {"propeller_radius": 0.02}}))
+    assert partly_derived["propeller_radius"] == 0.02
+    np.testing.assert_allclose(partly_derived["plate"], derived["plate"])
 
 
 def test_a_drone_without_a_shape_steps_and_has_all_geoms():

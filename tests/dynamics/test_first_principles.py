@@ -103,7 +103,7 @@ def test_no_disturbance_is_a_disturbance_of_zero():
 
 
 def test_external_wrench_acts_in_the_world_frame():
-    """A drone lying on its side, body z along world x: a world torque about z is one about body -x... by hand.
+    """A drone on its side, with body z along world x, by hand.
 
     q turns by 90 degrees about y: body x points along world -z, so a torque of 1e-3 N m about world z is -1e-3 about
     body x; J_x = 25e-6, so -40 rad/s^2. A force of m newton along world y accelerates by 1 m/s^2 along world y.

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FITTED, vectors
+from cases import FITTED_DYNAMICS, vectors
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -55,7 +55,7 @@ def test_below_80_degrees_the_angles_obey_the_fit(rpy, rates, cmd):
 
 @pytest.mark.parametrize("pitch", [-79.9, -70, 60, 70, 79.9])
 @pytest.mark.parametrize("rates", [(0, 0, 0), (1.0, -2.0, 1.5)])
-def test_up_to_80_degrees_the_fit_is_not_touched_by_what_lies_beyond(pitch, rates):
+def test_the_fit_holds_up_to_80_degrees_of_pitch(pitch, rates):
     rpy, cmd = np.array([0.5, np.deg2rad(pitch), -0.7]), np.array([0.1, 0.2, -0.3])
     expected = fit_ang_acc(rpy, np.array(rates), cmd, params())
     np.testing.assert_allclose(model_ang_acc(rpy, np.array(rates), cmd, params()), expected, rtol=1e-4, atol=0.05)
@@ -65,7 +65,7 @@ def test_up_to_80_degrees_the_fit_is_not_touched_by_what_lies_beyond(pitch, rate
 def test_up_to_100_rad_and_100_rad_a_second_the_fit_holds(cmd, rates):
     """Three equal numbers of 57 have a length of 98.7; three angles that change by 50 rad/s turn the body by 92.
 
-    Differences are off by 2e-4 of themselves here.
+    The finite differences have relative errors of 2e-4 here.
     """
     rpy, cmd, rates = np.array([0.5, -0.2, -0.7]), np.full(3, cmd), np.full(3, rates)
     expected = fit_ang_acc(rpy, rates, cmd, params())
@@ -91,15 +91,15 @@ def test_beyond_the_fit_the_model_changes_to_spring_and_damper_without_a_jump(wh
     np.testing.assert_allclose(ang_acc[-1], expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("dynamics", FITTED)
+@pytest.mark.parametrize("dynamics", FITTED_DYNAMICS)
 def test_translation_by_hand(dynamics):
     """Nose down by 0.2 rad at 3 m/s along x, commanded thrust 0.5 N, thrust by now 0.3 N."""
     p = params(dynamics)
     quat = rotation.from_rpy(jnp.array([0.0, 0.2, 0.0]))
     vel = np.array([3.0, 0, 0])
     out = model(np.zeros(3), quat, vel, np.zeros(3), np.array([0, 0, 0, 0.5]), np.full(4, 0.3), params=p)
-    by_now = 0.5 if dynamics == "so_rpy" else 0.3
-    thrust = float(p.acc_coef[0] + p.cmd_f_coef[0] * by_now)
+    lagged_thrust = 0.5 if dynamics == "so_rpy" else 0.3
+    thrust = float(p.acc_coef[0] + p.cmd_f_coef[0] * lagged_thrust)
     force = thrust * np.array([np.sin(0.2), 0, np.cos(0.2)])
     if dynamics == "so_rpy_rotor_drag":
         along, across = np.array([np.cos(0.2), 0, -np.sin(0.2)]), np.array([np.sin(0.2), 0, np.cos(0.2)])
@@ -120,7 +120,7 @@ def test_external_wrench_acts_in_the_world_frame():
     np.testing.assert_allclose(pushed[2] - free[2], [0, -1e-3 / 28e-6, 0], atol=1e-9)
 
 
-def test_saturate_cuts_the_thrust_alone():
+def test_saturate_limits_the_thrust_only():
     p = params()
     low, high = float(p.thrust_min[0]), float(p.thrust_max[0])
     thrust = np.array([-1.0, 0.0, 1e-6, 0.3, 10.0])
@@ -137,7 +137,7 @@ def over_the_top(n, first=79.0, last=101.0):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("dynamics", FITTED)
+@pytest.mark.parametrize("dynamics", FITTED_DYNAMICS)
 def test_fault_04_angular_acceleration_is_continuous_and_bounded_over_90_degrees(dynamics, sign):
     """Fault 4 of Crazyflow: NaN at 90 degrees of pitch. Half the step gives half the largest change, so no jump."""
     ang_vel, cmd = np.array([1.0, -2.0, 1.5]), np.array([0.1, 0.2, -0.3, 0.4])
@@ -147,7 +147,7 @@ def test_fault_04_angular_acceleration_is_continuous_and_bounded_over_90_degrees
         still, rates, commands = np.zeros((n, 3)), np.tile(ang_vel, (n, 1)), np.tile(cmd, (n, 1))
         ang_acc = model(still, quats, still, rates, commands, np.zeros((n, 4)), params=params(dynamics))[2]
         assert np.all(np.isfinite(ang_acc))
-        # Three times what the fit itself has at 79 degrees (196 and 259 rad/s^2), where 1/cos(pitch) is 5 already.
+        # The fit itself has 196 and 259 rad/s^2 at 79 degrees, where 1/cos(pitch) is 5.
         assert np.max(np.abs(ang_acc)) < 1000
         changes.append(np.max(np.abs(np.diff(ang_acc, axis=0))))
     assert changes[0] < 0.5  # rad/s^2 in 0.001 degrees: 10 degrees of pitch take it through its whole range
@@ -171,13 +171,13 @@ def test_law_07_gradients_are_finite_over_90_degrees():
     for dtype in (jnp.float64, jnp.float32):
         p = jax.tree.map(lambda x, d=dtype: x.astype(d), params("so_rpy_rotor_drag"))
 
-        def pulled(quat, ang_vel, cmd, p=p, dtype=dtype):
+        def sum_of_ang_acc(quat, ang_vel, cmd, p=p, dtype=dtype):
             zero = jnp.zeros(3, dtype)
             return jnp.sum(fitted.dynamics(zero, quat, zero, ang_vel, cmd, jnp.zeros(4, dtype), params=p)[2])
 
-        gradient = jax.jit(jax.vmap(jax.grad(pulled, argnums=(0, 1, 2)), (0, None, None)))
-        at = jnp.concatenate([quats, jnp.asarray(exact)]).astype(dtype)
-        for values in gradient(at, jnp.array([1.0, -2.0, 1.5], dtype), jnp.array([0.1, 0.2, -0.3, 0.4], dtype)):
+        gradient = jax.jit(jax.vmap(jax.grad(sum_of_ang_acc, argnums=(0, 1, 2)), (0, None, None)))
+        attitudes = jnp.concatenate([quats, jnp.asarray(exact)]).astype(dtype)
+        for values in gradient(attitudes, jnp.array([1.0, -2.0, 1.5], dtype), jnp.array([0.1, 0.2, -0.3, 0.4], dtype)):
             assert np.all(np.isfinite(values))
             assert np.max(np.abs(values)) < 1e6
 

@@ -66,8 +66,8 @@ def test_slow_rotation_has_the_exact_derivative(torque, rotor_momentum, ang_vel,
 def test_law_08_a_fast_spin_does_not_feed_its_wobble(rotation_per_step):
     """Law 8: a disc wobbles as fast as it spins, the worst case: |1 + z| of explicit Euler is 1 + x^2 / 2 and more.
 
-    With ``theta = (1 + x^2) / 2`` the squared factor is ``1 - x^4 (3 - 2 x^2 - x^4) / 4``, whose size is worked out
-    here: it damps in fourth order, and not at all where a step rotates by 1 rad.
+    With ``theta = (1 + x^2) / 2`` the squared factor is ``1 - x^4 (3 - 2 x^2 - x^4) / 4``: damping of fourth order,
+    which vanishes where a step rotates by 1 rad.
     """
     x, wobble, inertia = rotation_per_step, 1e-6, np.diag([1.0, 1.0, 2.0])
     dt = x / 60.0

@@ -97,7 +97,7 @@ def test_rotor_torque_is_the_sum_of_lever_arms_times_thrusts(position, thrust):
 
 
 def test_law_08_gyroscopic_torque_of_a_rotor_by_hand():
-    """The size, to which a test of its work is blind.
+    """Size and sign, which a test of its work would not find: it does no work.
 
     One rotor of 4e-8 kg m^2 at 15,000 rpm = 500 pi rad/s whose drag turns the body to the left spins to the right:
     h = -2e-5 pi along z. Rolling with 2 rad/s: -w x h = -(2, 0, 5) x (0, 0, h) = (0, 2 h, 0) = (0, -4e-5 pi, 0).

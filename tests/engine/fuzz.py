@@ -37,7 +37,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from programs import Program, draw, evaluate, prune_program
+from programs import Program, draw_program, evaluate, prune_program
 from rounding import allow_gpu_results, are_within_rounding, is_close, keeps_sign_of_zero
 
 from crazysim import Sim
@@ -230,7 +230,7 @@ class Fuzzer:
         cases = []
         for _ in range(n):
             scope = "drone" if self.rng.random() < 0.8 else "world"
-            cases.append(Case(draw(self.rng, input_shapes(scope), int(self.rng.integers(1, 5))), scope))
+            cases.append(Case(draw_program(self.rng, input_shapes(scope), int(self.rng.integers(1, 5))), scope))
         return cases
 
     def check(self, cases: Sequence[Case]) -> Iterator[Finding]:
@@ -374,31 +374,31 @@ def main() -> None:
         description="Compare the engines on random programs.",
         epilog="5,000 programs on a GPU: python tests/engine/fuzz.py --programs 5000 --seed 1 --device gpu. Where a "
         "command may not take that long, run parts with --programs 1000 and seeds 1 to 5. It exits with 1 if there is "
-        "a find.",
+        "a finding.",
     )
     parser.add_argument("--programs", type=int, default=1000, help="number of programs")
     parser.add_argument("--seed", type=int, default=0, help="seed of programs and inputs")
     parser.add_argument("--batch", type=int, default=40, help="programs that are compiled together")
     parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu", help="platform that runs the programs")
     args = parser.parse_args()
-    fuzzer, start_time, n_finds = Fuzzer(args.seed, device=args.device), time.perf_counter(), 0
+    fuzzer, start_time, n_findings = Fuzzer(args.seed, device=args.device), time.perf_counter(), 0
     jax.config.update("jax_default_device", fuzzer.device)  # for the computations that explain a difference
     if args.device == "gpu":
         allow_gpu_results()
     print(f"# {', '.join(fuzzer.engines)} against plain on {fuzzer.device.device_kind}", flush=True)
     for n_done in range(0, args.programs, args.batch):
         for finding in fuzzer.check(fuzzer.draw(min(args.batch, args.programs - n_done))):
-            n_finds += 1
+            n_findings += 1
             print(finding, flush=True)
         print(
-            f"# {fuzzer.counts['programs']} programs, {n_finds} finds, {time.perf_counter() - start_time:.0f} s",
+            f"# {fuzzer.counts['programs']} programs, {n_findings} findings, {time.perf_counter() - start_time:.0f} s",
             flush=True,
         )
         jax.clear_caches()
     for reason, n in fuzzer.refused.most_common():
         print(f"# refused {n}: {reason}")
-    print(f"# {args.programs} programs, seed {args.seed}, {n_finds} finds; {dict(fuzzer.counts)}")
-    sys.exit(bool(n_finds))
+    print(f"# {args.programs} programs, seed {args.seed}, {n_findings} findings; {dict(fuzzer.counts)}")
+    sys.exit(bool(n_findings))
 
 
 if __name__ == "__main__":

@@ -534,7 +534,7 @@ def random_numbers(d: Draw) -> str:
     ])  # fmt: skip
 
 
-def draw(rng: np.random.Generator, input_shapes: dict[str, jax.ShapeDtypeStruct], n_lines: int) -> Program:
+def draw_program(rng: np.random.Generator, input_shapes: dict[str, jax.ShapeDtypeStruct], n_lines: int) -> Program:
     """Return a random program.
 
     Args:

@@ -254,7 +254,7 @@ def random_numbers(key, g):
     return jnp.concatenate([*numbers, jax.random.bernoulli(a, 0.3)[None], jax.random.permutation(b, g.x)])
 
 
-RANDOM = {"random_bits": random_bits, "random_numbers": random_numbers}
+RANDOM_CASES = {"random_bits": random_bits, "random_numbers": random_numbers}
 
 
 def make_inputs():
@@ -284,7 +284,7 @@ def drone_shapes(g):
 
 def case_function(name):
     """Return a case as a function of one drone's arrays, to a flat array."""
-    fn = (lambda g: RANDOM[name](jax.random.key(3), g)) if name in RANDOM else CASES[name]
+    fn = (lambda g: RANDOM_CASES[name](jax.random.key(3), g)) if name in RANDOM_CASES else CASES[name]
     return lambda g: jnp.ravel(fn(g))
 
 

@@ -101,8 +101,8 @@ def test_a_wider_block_has_more_whole_worlds():
     assert ".maxntid 256" in cuda.ptx(wide_kernel, cuda.DEFAULT_ARCHITECTURE)
 
 
-def test_a_gpu_reads_what_drones_share_where_it_is_used_if_registers_are_too_few(source):
-    """A kernel with an estimator needs it; in a short kernel each such read would cost more than a register."""
+def test_long_kernels_on_a_gpu_read_shared_numbers_where_they_use_them(source):
+    """A kernel with an estimator has too few registers for them. In a short kernel, reads would cost more."""
     sim = Sim(2, 1, control="state", estimator=Kalman.default(), engine="lanes")
     long_kernel = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
     texts = [k.text[k.text.index(" advance(") :] for k in (long_kernel, source)]

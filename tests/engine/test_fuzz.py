@@ -83,8 +83,8 @@ def test_programs_that_were_wrong_give_the_results_of_plain(scope):
         if scope == "drone"
         else {name: PROGRAMS_ONCE_WRONG[name] for name in ("sort by bools", "top_k of equals")}
     )
-    finds = list(fuzzer.check(make_cases(programs, scope)))
-    assert not finds, "\n".join(map(str, finds))
+    findings = list(fuzzer.check(make_cases(programs, scope)))
+    assert not findings, "\n".join(map(str, findings))
     assert not fuzzer.counts["refused"], fuzzer.refused
     assert fuzzer.counts["compared on lanes"] == len(programs)
 
@@ -99,8 +99,8 @@ def test_refused_programs_are_refused_when_the_step_is_planned(fuzzer):
 
 def test_random_programs_give_the_results_of_plain(fuzzer):
     """This is a small run; ``python tests/engine/fuzz.py --programs 20000`` is a large one."""
-    finds = list(fuzzer.check(fuzzer.draw(16)))
-    assert not finds, "\n".join(map(str, finds))
+    findings = list(fuzzer.check(fuzzer.draw(16)))
+    assert not findings, "\n".join(map(str, findings))
     assert fuzzer.counts["compared on lanes"] > 8
 
 
@@ -126,17 +126,17 @@ def subtract_from_zero(ctx, eqn, args):
 )
 def test_a_wrong_rule_is_found(monkeypatch, name, wrong, line):
     monkeypatch.setitem(RULES, name, wrong)
-    (find,) = Fuzzer(2, engines=("interpret",)).check([Case(Program(("f33",), (line,)), "drone")])
-    assert find.engine == "interpret"
-    assert line in str(find)
+    (finding,) = Fuzzer(2, engines=("interpret",)).check([Case(Program(("f33",), (line,)), "drone")])
+    assert finding.engine == "interpret"
+    assert line in str(finding)
 
 
 def test_a_rule_that_fails_is_found_and_a_program_that_jax_refuses_is_not(monkeypatch):
     monkeypatch.setitem(RULES, "rev", lambda ctx, eqn, args: 1 / 0)
     fuzzer = Fuzzer(2, engines=("interpret",))
-    (find,) = fuzzer.check([Case(Program(("f33",), ("jnp.flip(v0)",)), "drone")])
-    assert find.engine == "lowering"
-    assert "ZeroDivisionError" in find.description
+    (finding,) = fuzzer.check([Case(Program(("f33",), ("jnp.flip(v0)",)), "drone")])
+    assert finding.engine == "lowering"
+    assert "ZeroDivisionError" in finding.description
     monkeypatch.setattr(fuzzer, "run", lambda *args: 1 / 0)
     assert not list(fuzzer.check([Case(Program(("f33",), ("jnp.flip(v0)",)), "drone")]))
     assert fuzzer.counts["refused by JAX"] == 1

@@ -44,8 +44,8 @@ def make_losses(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
 
         found.append((losses, step, sim.data))
     rng = np.random.default_rng(0)
-    at = np.tile(COMMAND, (n_worlds, n_drones, 1)), rng.normal(size=(n_worlds, n_drones, 3))
-    return found, jax.tree.map(jnp.asarray, at)
+    point = np.tile(COMMAND, (n_worlds, n_drones, 1)), rng.normal(size=(n_worlds, n_drones, 3))
+    return found, jax.tree.map(jnp.asarray, point)
 
 
 def assert_close(found, expected):
@@ -74,8 +74,8 @@ def branching(x, y):
 
 
 @pytest.mark.parametrize("fn", [*OPERATIONS.values(), branching], ids=[*OPERATIONS, "branching"])
-def test_a_block_with_tangents_is_what_jax_makes_of_the_function(fn, x64):
-    """The tangents are with respect to both operands, and to the second alone."""
+def test_tangents_of_a_block_equal_those_of_jax(fn, x64):
+    """The tangents are with respect to both operands, or to the second operand only."""
     block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
     x, y, dx, dy = map(jnp.asarray, np.random.default_rng(1).normal(size=(4, 16)))
     for indices, direction in (((0, 1), (dx, dy)), ((1,), (jnp.zeros(16), dy))):
@@ -87,7 +87,7 @@ def test_a_block_with_tangents_is_what_jax_makes_of_the_function(fn, x64):
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
-def test_a_transposed_block_is_what_jax_makes_of_the_function(name, x64):
+def test_a_transposed_block_equals_the_vjp_of_jax(name, x64):
     fn = OPERATIONS[name]
     block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
     x, y, ct = np.random.default_rng(1).normal(size=(3, 16))
@@ -101,20 +101,20 @@ def test_a_transposed_block_is_what_jax_makes_of_the_function(name, x64):
 @needs_compiler
 def test_a_kernel_computes_the_gradient(x64, monkeypatch):
     """Gradients are repeatable to the bit, also in intervals, and for batches of worlds."""
-    ((fast, step, data), (plain, *_)), at = make_losses(n_steps=3, n_drones=2)
+    ((fast, step, data), (plain, *_)), point = make_losses(n_steps=3, n_drones=2)
     kernel_gradient = jit_gradient(fast)
-    found = kernel_gradient(at)
+    found = kernel_gradient(point)
     assert "gradient: one kernel" in explain(step, data)
-    assert_close(found, jit_gradient(plain)(at))
-    for a, b in zip(found, kernel_gradient(at), strict=True):
+    assert_close(found, jit_gradient(plain)(point))
+    for a, b in zip(found, kernel_gradient(point), strict=True):
         np.testing.assert_array_equal(a, b)
 
     monkeypatch.setattr(native, "GRADIENT_MEMORY_BYTES", 0)
-    ((in_intervals, step, data), (plain, *_)), at = make_losses(n_steps=10)
-    assert_close(jit_gradient(in_intervals)(at), jit_gradient(plain)(at))
+    ((in_intervals, step, data), (plain, *_)), point = make_losses(n_steps=10)
+    assert_close(jit_gradient(in_intervals)(point), jit_gradient(plain)(point))
     assert "gradient: one kernel" in explain(step, data)
 
-    many = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), at)
+    many = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), point)
     expected = jax.vmap(jit_gradient(plain))(many)
     assert_close(jax.vmap(jit_gradient(in_intervals))(many), expected)
     assert_close(jit_gradient(jax.vmap(in_intervals))(many), expected)
@@ -125,18 +125,18 @@ def test_a_kernel_computes_the_gradient(x64, monkeypatch):
 @needs_compiler
 def test_a_kernel_computes_tangents(x64):
     """Tangents in one direction and in many, with respect to numbers of drones and to shared numbers."""
-    ((fast, step, data), (plain, *_)), at = make_losses(n_steps=3, n_drones=2)
-    of = lambda losses: jax.jit(jax.jacfwd(lambda x, mass: losses(x, mass=mass), (0, 1)))  # noqa: E731
+    ((fast, step, data), (plain, *_)), point = make_losses(n_steps=3, n_drones=2)
+    jacobian = lambda losses: jax.jit(jax.jacfwd(lambda x, mass: losses(x, mass=mass), (0, 1)))  # noqa: E731
     mass = data.params.mass
-    expected = of(plain)(at, mass)
-    assert_close(of(fast)(at, mass), expected)
-    slope = jax.jit(lambda mass, way: jax.jvp(lambda mass: fast(at, mass=mass), (mass,), (way,))[1])
+    expected = jacobian(plain)(point, mass)
+    assert_close(jacobian(fast)(point, mass), expected)
+    slope = jax.jit(lambda mass, way: jax.jvp(lambda mass: fast(point, mass=mass), (mass,), (way,))[1])
     assert_close(slope(mass, 3.0 * mass), 3.0 * expected[1] @ mass)
     descriptions = [line for line in explain(step, data).splitlines() if "jvp" in line]
     assert descriptions
     assert all(line.startswith("jvp: one kernel") for line in descriptions)
-    _, tangent = jax.linearize(lambda vel: fast((at[0], vel)), at[1])
-    assert_close(jax.jit(tangent)(at[1]), jnp.einsum("wvdi,vdi->w", expected[0][1], at[1]))
+    _, tangent = jax.linearize(lambda vel: fast((point[0], vel)), point[1])
+    assert_close(jax.jit(tangent)(point[1]), jnp.einsum("wvdi,vdi->w", expected[0][1], point[1]))
 
 
 @pytest.mark.long("compiles second derivatives")
@@ -145,21 +145,21 @@ def test_second_derivatives_are_those_of_lanes(x64):
     """Forward over forward, and forward over reverse."""
     pairs, (cmd, vel) = make_losses(n_worlds=1, n_steps=1, dynamics="so_rpy")
 
-    def twice(losses):
+    def second_derivatives(losses):
         loss = lambda x: jnp.sum(losses((cmd, x)))  # noqa: E731
         forward = lambda x: jax.jvp(loss, (x,), (vel,))[1]  # noqa: E731
         return jax.jit(lambda x: [jax.jvp(fn, (x,), (vel,))[1] for fn in (forward, jax.grad(loss))])(vel)
 
-    assert_close(*(twice(losses) for losses, *_ in pairs))
+    assert_close(*(second_derivatives(losses) for losses, *_ in pairs))
 
 
 @needs_compiler
 @pytest.mark.long("compiles derivatives in both directions, as a kernel and by XLA")
 def test_drones_that_act_on_each_other_are_differentiated_in_the_kernel(x64):
-    ((fast, step, data), (plain, *_)), at = make_losses(n_drones=3, stages=[repulsion, centre, gap], n_steps=4)
-    assert_close(jit_gradient(fast)(at), jit_gradient(plain)(at))
-    direction = jax.tree.map(jnp.sin, at)
-    slope = [jax.jit(lambda x, losses=losses: jax.jvp(losses, (x,), (direction,)))(at) for losses in (fast, plain)]
+    ((fast, step, data), (plain, *_)), point = make_losses(n_drones=3, stages=[repulsion, centre, gap], n_steps=4)
+    assert_close(jit_gradient(fast)(point), jit_gradient(plain)(point))
+    direction = jax.tree.map(jnp.sin, point)
+    slope = [jax.jit(lambda x, losses=losses: jax.jvp(losses, (x,), (direction,)))(point) for losses in (fast, plain)]
     assert_close(*slope)
     assert [line.split(",")[0] for line in explain(step, data).splitlines()[-2:]] == [
         "gradient: one kernel",
@@ -177,14 +177,14 @@ def long_loop(data):
 @pytest.mark.long("compiles a gradient in two engines")
 @needs_compiler
 def test_what_has_no_kernel_is_differentiated_on_lanes(x64):
-    ((fast, step, data), (plain, *_)), at = make_losses(stages=[long_loop], n_steps=1, dynamics="so_rpy")
+    ((fast, step, data), (plain, *_)), point = make_losses(stages=[long_loop], n_steps=1, dynamics="so_rpy")
     with pytest.warns(EngineWarning, match="the gradient of the step runs on 'lanes'"):
-        found = jit_gradient(fast)(at)
-    assert_close(found, jit_gradient(plain)(at))
+        found = jit_gradient(fast)(point)
+    assert_close(found, jit_gradient(plain)(point))
     assert "a loop of 3000 iterations is too long to be reversed" in explain(step, data)
 
 
-def undeclared(data):
+def undeclared_stage(data):
     """Push drones, in a stage of all worlds."""
     return data.replace(states=data.states.replace(force=1e-2 * jnp.sin(data.states.pos)))
 
@@ -192,9 +192,9 @@ def undeclared(data):
 @pytest.mark.long("compiles a gradient in two engines")
 @needs_compiler
 def test_a_step_that_splits_is_differentiated_on_lanes(x64):
-    ((fast, step, data), (plain, *_)), at = make_losses(stages=[undeclared], n_steps=1, dynamics="so_rpy")
-    assert_close(jit_gradient(fast)(at), jit_gradient(plain)(at))
-    assert "gradient: on lanes ('undeclared' is not fused)" in explain(step, data)
+    ((fast, step, data), (plain, *_)), point = make_losses(stages=[undeclared_stage], n_steps=1, dynamics="so_rpy")
+    assert_close(jit_gradient(fast)(point), jit_gradient(plain)(point))
+    assert "gradient: on lanes ('undeclared_stage' is not fused)" in explain(step, data)
 
 
 @pytest.mark.parametrize(("dynamics", "control"), PAIRS)
@@ -229,12 +229,12 @@ def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():
             return jnp.sum(step(data.replace(states=data.states.replace(vel=vel)), 2).states.pos ** 2)
 
         traced = jax.jit(jax.grad(loss)).trace(sim.data.states.vel)
-        ways = []
+        counts = []
         for platform in ("cuda", "cpu"):
             text = traced.lower(lowering_platforms=(platform,)).as_text()
-            ways.append([text.count(name) for name in (cuda.PTX_TARGET, "crazysim_advance")])
+            counts.append([text.count(name) for name in (cuda.PTX_TARGET, "crazysim_advance")])
         forward_and_back, kernels_of_cpu = 2, 2 if n_drones == 1 else 1
-        assert ways == [[forward_and_back, 0], [0, kernels_of_cpu]]
+        assert counts == [[forward_and_back, 0], [0, kernels_of_cpu]]
         descriptions = [line for line in explain(step, sim.data).splitlines() if line.startswith("gradient: ")]
         assert descriptions[0].startswith("gradient: one kernel, compiled for compute_90")
         assert descriptions[1].startswith(
@@ -247,7 +247,7 @@ def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():
     [(100, 10, 2, 10), (2**20, 100, 2**14 // 2, 100), (2**20, 1000, 2**14 // 2, 32), (100, 0, 2, 1)],
 )
 def test_a_gradient_on_a_gpu_has_limited_memory(n_lanes, n_steps, n_blocks, interval):
-    """24 numbers of 2**20 lanes at once, as 100 and as 32 + 32 states, would take 10 and 6 GB."""
+    """If 2**20 lanes ran at once, 24 numbers of 100 states would take 10 GB, and of 32 + 32 states 6 GB."""
     kernel = Kernel("", (), (), state_bytes=24 * 4)
     blocks, count, (memory,) = cuda._plan_memory(kernel, n_lanes, n_steps)
     assert blocks * kernel.lanes * -(-n_lanes // (blocks * kernel.lanes)) >= n_lanes
@@ -260,6 +260,6 @@ def test_a_gradient_on_a_gpu_has_limited_memory(n_lanes, n_steps, n_blocks, inte
 @pytest.mark.long("compiles tangents in two engines")
 @needs_compiler
 def test_forward_mode_takes_a_number_of_steps_that_is_an_array(x64):
-    ((fast, *_), (plain, *_)), at = make_losses(n_steps=jnp.int32(3))
-    for direction in (at, jax.tree.map(jnp.ones_like, at)):
-        assert_close(jax.jvp(fast, (at,), (direction,)), jax.jvp(plain, (at,), (direction,)))
+    ((fast, *_), (plain, *_)), point = make_losses(n_steps=jnp.int32(3))
+    for direction in (point, jax.tree.map(jnp.ones_like, point)):
+        assert_close(jax.jvp(fast, (point,), (direction,)), jax.jvp(plain, (point,), (direction,)))

@@ -107,7 +107,7 @@ def test_subnormal_numbers_are_zero_as_in_the_compiled_step(sim):
     assert np.float32(1e-38) / np.float32(100) > 0  # the caller's arithmetic keeps subnormal numbers
 
 
-def test_a_non_finite_drone_flags_its_world_alone(sim):
+def test_a_non_finite_drone_flags_its_world_only(sim):
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(vel=states.vel.at[1, 1].set(jnp.nan)))
     sim.step()

@@ -20,7 +20,7 @@ def tables():
     return [jnp.asarray(numbers), jnp.asarray(rng.integers(0, 9, (50, 1)), jnp.int32)]
 
 
-def longest_run(index, numbers, places):
+def sum_positive_rows(index, numbers, places):
     """Sum rows whose first number is positive; the number of rows depends on the index, and differs between lanes."""
     (place,) = table_rows(places, jax.lax.rem(index, jnp.int32(50)))
     own = table_row(numbers, place)
@@ -35,7 +35,7 @@ def longest_run(index, numbers, places):
     return [total, k, last, jax.lax.div(index, jnp.int32(7))]
 
 
-def by_hand(numbers, places):
+def compute_by_hand(numbers, places):
     out = []
     for i in range(N):
         rows = numbers[: i % 10]
@@ -46,22 +46,22 @@ def by_hand(numbers, places):
 
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_lanes_stop_and_skip_on_their_own(tables, platform):
-    found = jax.jit(lambda *tables: map_indices(longest_run, N, tables, platform))(*tables)
-    for x, y in zip(found, by_hand(*map(np.asarray, tables)), strict=True):
+    found = jax.jit(lambda *tables: map_indices(sum_positive_rows, N, tables, platform))(*tables)
+    for x, y in zip(found, compute_by_hand(*map(np.asarray, tables)), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_a_batch_of_tables_is_a_batch_of_calls(tables, platform):
     numbers = jnp.stack([tables[0], 2 * tables[0]])
-    found = jax.jit(jax.vmap(lambda x: map_indices(longest_run, N, [x, tables[1]], platform)))(numbers)
+    found = jax.jit(jax.vmap(lambda x: map_indices(sum_positive_rows, N, [x, tables[1]], platform)))(numbers)
     for k in range(2):
-        expected = by_hand(np.asarray(numbers[k]), np.asarray(tables[1]))
+        expected = compute_by_hand(np.asarray(numbers[k]), np.asarray(tables[1]))
         np.testing.assert_allclose(found[0][k], expected[0], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)
-def test_lanes_that_walk_together_find_what_each_finds(tables, platform):
+def test_lanes_that_loop_together_compute_what_each_computes_alone(tables, platform):
     """A row is skipped if no lane needs it, and an initial number that all lanes share differs between lanes later."""
 
     def fn(index, numbers):
@@ -85,7 +85,7 @@ def test_lanes_that_walk_together_find_what_each_finds(tables, platform):
 
 
 def test_a_kernel_for_a_gpu_is_compiled_without_one(tables):
-    fn = jax.jit(lambda *tables: map_indices(longest_run, N, tables, "cpu"))
+    fn = jax.jit(lambda *tables: map_indices(sum_positive_rows, N, tables, "cpu"))
     assert ".visible .entry advance" in fn.trace(*tables).lower(lowering_platforms=("cuda",)).as_text()
 
 

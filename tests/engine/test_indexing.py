@@ -123,15 +123,11 @@ PROGRAMS = {
 
 
 def test_windows_batches_and_modes(fuzzer):
-    cases = [Case(Program(*_program_parts(inputs, line)), "drone") for inputs, line in PROGRAMS.values()]
-    finds = list(fuzzer.check(cases))
-    assert not finds, "\n".join(map(str, finds))
+    cases = [Case(Program(inputs, (line,)), "drone") for inputs, line in PROGRAMS.values()]
+    findings = list(fuzzer.check(cases))
+    assert not findings, "\n".join(map(str, findings))
     assert not fuzzer.counts["refused"]
     assert fuzzer.counts["compared on lanes"] == len(cases)
-
-
-def _program_parts(inputs, line):
-    return inputs, (line,)
 
 
 def test_too_many_places_are_refused_when_the_step_is_planned(sim):

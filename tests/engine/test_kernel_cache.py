@@ -21,7 +21,7 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """JAX's compilation cache, and no folder that was refused or swept before."""
+    """Return an empty folder as JAX's compilation cache; no folder has been refused or swept before."""
     monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path))
     kernel_cache._warn_once.cache_clear()
     kernel_cache._sweep_once.cache_clear()
@@ -39,7 +39,7 @@ def permissions(path):
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def test_the_folder_is_made_for_this_user_alone(cache):
+def test_the_folder_is_made_for_this_user_only(cache):
     mask = os.umask(0)
     try:
         assert kernel_cache.folder() == cache / "crazysim"

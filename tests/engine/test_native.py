@@ -452,6 +452,6 @@ def test_a_kernel_takes_any_number_of_lanes(source):
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
     step = Step(sim.step_pipeline, "fused")
     for n_worlds in (1, 5):
-        some = shared_sim(n_worlds=n_worlds, n_drones=1, control="rotor_vel")
-        after = step(some.data, jnp.int32(2))
+        sim_of_size = shared_sim(n_worlds=n_worlds, n_drones=1, control="rotor_vel")
+        after = step(sim_of_size.data, jnp.int32(2))
         np.testing.assert_array_equal(after.core.steps, np.full((n_worlds, 1), 2))

@@ -48,7 +48,7 @@ def test_zero_steps_change_nothing(data, step):
     assert trees_equal(after.core.steps, data.core.steps)
 
 
-def test_what_no_stage_writes_comes_back_as_the_very_arrays_that_went_in(data, step):
+def test_leaves_that_no_stage_writes_are_returned_as_the_same_arrays(data, step):
     """Parameters and external forces are inputs only: nothing is copied, and no output is made for them."""
     for n_steps in (2, jnp.int32(2)):
         after = step(data, n_steps)
@@ -106,7 +106,7 @@ def test_a_reset_runs_its_stages_in_order_with_default_and_mask(sim, data):
     assert seen == [("first", True), ("second", True), ("first", False), ("second", False)]
 
 
-def test_every_step_and_reset_tells_the_scene_that_it_is_stale(sim, data, step):
+def test_every_step_and_reset_marks_the_scene_as_stale(sim, data, step):
     fresh = data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True)))
     reset = Reset(sim.reset_pipeline)
     for after in (step(fresh, 1), step(fresh, jnp.int32(1)), reset(fresh, sim.default_data)):

@@ -96,7 +96,7 @@ def raise_error(*args):
 
 
 @pytest.mark.parametrize("settings", [{"strict": True}, {"engine": "lanes"}])
-def test_a_bug_is_raised_where_it_is_asked_for(sim, monkeypatch, settings):
+def test_a_bug_is_raised_if_the_step_is_strict_or_its_engine_is_named(sim, monkeypatch, settings):
     monkeypatch.setitem(RULES, "sin", raise_error)
     with pytest.raises(ZeroDivisionError, match="a slip"):
         Step(make_pipeline(sim, sway), **settings).plan(sim.data)
@@ -128,7 +128,7 @@ def test_planning_traces_what_the_first_call_runs(sim):
         assert step._cache_size() == 1
 
 
-def test_an_error_of_the_stage_is_its_own(sim):
+def test_an_error_of_a_stage_is_raised_unchanged(sim):
     """No engine could run the stage, so its error is raised unchanged, without a warning."""
 
     @stage("drone")
@@ -268,17 +268,17 @@ def test_the_kernel_is_compiled_when_the_step_is_planned(sim, monkeypatch):
 # Explaining ----------------------------------------------------------------------------------------------------------
 
 
-def undeclared(data):
+def undeclared_stage(data):
     """Set a torque that depends on all drones of all worlds."""
     return data.replace(states=data.states.replace(torque=1e-6 * jnp.mean(data.states.pos) + 0 * data.states.torque))
 
 
 def test_explaining_runs_nothing_unless_asked_to_measure():
     sim = Sim(n_worlds=2, control="rotor_vel")
-    append_fn(sim.step_pipeline, undeclared)
+    append_fn(sim.step_pipeline, undeclared_stage)
     step = sim.build_step_fn()
     text = sim.explain()
-    assert "'undeclared' is not fused" in text
+    assert "'undeclared_stage' is not fused" in text
     assert "cost of the split" not in text
     assert step._cache_size() == 0
     assert "cost of the split, measured: a step takes" in sim.explain(measure=True)

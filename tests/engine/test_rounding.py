@@ -38,7 +38,7 @@ def is_within_rounding(fn, values, found, dtype=np.float32):
     ],
 )
 def test_differences_by_rounding_are_told_from_wrong_results(fn, values, found, wrong):
-    """``wrong`` is what it must not explain; None where any number can come out."""
+    """Rounding must not explain ``wrong``, which is None where any number is possible."""
     assert is_within_rounding(fn, values, found)
     assert wrong is None or not is_within_rounding(fn, values, wrong)
 

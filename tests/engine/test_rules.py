@@ -9,7 +9,7 @@ from cases import COMPILED_ENGINES
 from rule_cases import (
     CASES,
     N_LANES,
-    RANDOM,
+    RANDOM_CASES,
     ULP,
     assert_agree,
     case_function,
@@ -36,7 +36,7 @@ def lane_numbers(g):
             for x in (np.asarray(array) if name == "table" else np.asarray(array).reshape(N_LANES, -1).T)]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [*CASES, *RANDOM])
+@pytest.mark.parametrize("name", [*CASES, *RANDOM_CASES])
 def test_a_case_gives_what_jax_gives(name):
     """Integers, bools and random bits are equal, floats equal up to rounding."""
     g = make_inputs()
@@ -50,7 +50,7 @@ def test_a_case_gives_what_jax_gives(name):
 @pytest.mark.parametrize("engine", COMPILED_ENGINES)
 def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
     """Run the cases whose operations run blocks or have several results; test_targets has all other operations."""
-    names = ["cond", "loops", "while_loops", "uniform_loop", "nested_calls", "gradient", *RANDOM]
+    names = ["cond", "loops", "while_loops", "uniform_loop", "nested_calls", "gradient", *RANDOM_CASES]
 
     def run_all(g):
         return [case_function(name)(g) for name in names]

@@ -1,4 +1,4 @@
-"""Simplification when a program is made uses only identities that hold for every number."""
+"""A builder simplifies operations only by identities that hold for every number."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from crazysim.engine.ir.blocks import Builder
 F = np.float32
 
 
-def build(name, *args, dtype=F):
-    """Return the result of an operation, and the operations that computing it takes."""
+def build_operation(name, *args, dtype=F):
+    """Return the result of an operation on inputs, the input in place of ``...``, and the number of operations."""
     b = Builder()
     x = b.input(dtype)
     out = b.add(name, [x if a is ... else a for a in args], dtype)
@@ -33,32 +33,32 @@ def build(name, *args, dtype=F):
     ],
 )
 def test_neutral_elements_are_left_out(name, args):
-    out, x, n = build(name, *args)
+    out, x, n = build_operation(name, *args)
     assert out is x
     assert n == 0
 
 
 @pytest.mark.parametrize("name, args", [("mul", (..., F(0))), ("div", (F(0), ...)), ("sub", (F(0), ...))])
-def test_a_constant_zero_is_computed_with(name, args):
+def test_operations_with_a_constant_zero_are_computed(name, args):
     """A product with zero is NaN where the other number is infinite."""
-    assert build(name, *args)[2] == 1
+    assert build_operation(name, *args)[2] == 1
 
 
 @pytest.mark.parametrize("dtype", [F, np.float64])
-def test_a_zero_of_a_shared_parameter_takes_its_term_with_it(dtype):
+def test_a_term_with_a_known_zero_is_removed(dtype):
     zero = known_zero(dtype)
-    product, _, n = build("mul", zero, ..., dtype=dtype)
+    product, _, n = build_operation("mul", zero, ..., dtype=dtype)
     assert (product.dtype, float(product), n) == (dtype, 0.0, 0)
-    assert build("add", product, ..., dtype=dtype)[2] == 0
-    assert build("div", product, ..., dtype=dtype)[2] == 0
-    assert build("mul", build("neg", product, dtype=dtype)[0], ..., dtype=dtype)[2] == 0
-    assert build("sub", zero, ..., dtype=dtype)[2] == 1  # the sign of the other operand changes
-    assert build("div", ..., zero, dtype=dtype)[2] == 1
+    assert build_operation("add", product, ..., dtype=dtype)[2] == 0
+    assert build_operation("div", product, ..., dtype=dtype)[2] == 0
+    assert build_operation("mul", build_operation("neg", product, dtype=dtype)[0], ..., dtype=dtype)[2] == 0
+    assert build_operation("sub", zero, ..., dtype=dtype)[2] == 1  # the sign of the other operand changes
+    assert build_operation("div", ..., zero, dtype=dtype)[2] == 1
 
 
 def test_only_floats_have_known_zeros():
     assert known_zero(np.int32) is None
-    assert build("mul", ..., np.int32(0), dtype=np.int32)[0] == 0  # no integer is NaN
+    assert build_operation("mul", ..., np.int32(0), dtype=np.int32)[0] == 0  # no integer is NaN
 
 
 def test_angles_of_zero_are_exact():

@@ -99,7 +99,7 @@ def test_a_parameter_of_each_drone_is_its_own():
     assert len(np.unique(vel[..., 2])) == 6
 
 
-def test_zeros_of_parameters_are_seen_anew_when_a_parameter_changes():
+def test_zeros_of_parameters_are_found_again_when_a_parameter_changes():
     """Terms of a diagonal inertia are left out only as long as the inertia is diagonal."""
     sim = shared_sim(n_worlds=1, n_drones=1, control="rotor_vel")
     step = Step(sim.step_pipeline)
@@ -195,13 +195,13 @@ def separation(data):
     return data.replace(states=data.states.replace(force=force))
 
 
-def undeclared(data):
+def undeclared_stage(data):
     """Set a torque that depends on all drones of all worlds."""
     mean = jnp.mean(data.states.pos, axis=(0, 1))
     return data.replace(states=data.states.replace(torque=0 * data.states.torque + 1e-6 * mean))
 
 
-def with_stages(n_drones, *stages):
+def make_sim_with_stages(n_drones, *stages):
     sim = Sim(n_worlds=3, n_drones=n_drones, control="attitude", rng_key=4)
     shape = (3, n_drones)
     record = Gust(
@@ -218,22 +218,22 @@ def with_stages(n_drones, *stages):
 
 
 @pytest.mark.parametrize("stages, n_segments", [
-    ((gust,), 1), ((separation,), 3), ((undeclared,), 3), ((gust, separation, undeclared), 4),
+    ((gust,), 1), ((separation,), 3), ((undeclared_stage,), 3), ((gust, separation, undeclared_stage), 4),
 ])  # fmt: skip
 def test_a_stage_of_one_drone_or_one_world_fuses_and_an_undeclared_one_splits_the_step(stages, n_segments):
-    sim, data = with_stages(4, *stages)
+    sim, data = make_sim_with_stages(4, *stages)
     step = Step(sim.step_pipeline)
     assert len(step.plan(data).program.segments) == n_segments
     text = explain(step, data)
-    assert ("'undeclared' is not fused: it is not declared for one drone or one world" in text) == (
-        undeclared in stages
+    assert ("'undeclared_stage' is not fused: it is not declared for one drone or one world" in text) == (
+        undeclared_stage in stages
     )
 
 
 @pytest.mark.parametrize("n_drones", [1, 3, MAX_UNROLLED_DRONES])
 def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
     """The force equals that of the unfused stage, in worlds that fill a vector and in worlds that do not."""
-    _, data = with_stages(n_drones, separation)
+    _, data = make_sim_with_stages(n_drones, separation)
     step = Step({"separation": separation})
     assert step.plan(data).program.fused
     found = step(data, jnp.int32(1)).states.force
@@ -242,7 +242,7 @@ def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
 
 
 def test_a_stage_of_one_world_splits_a_large_swarm():
-    sim, data = with_stages(MAX_UNROLLED_DRONES + 1, separation)
+    sim, data = make_sim_with_stages(MAX_UNROLLED_DRONES + 1, separation)
     assert f"unrolled for at most {MAX_UNROLLED_DRONES} drones" in explain(Step(sim.step_pipeline), data)
 
 
@@ -314,22 +314,22 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
     sim = Sim(n_worlds=2, n_drones=1, control="rotor_vel")
     data = scatter_drones(sim, dtype=np.float64)
     data = data.replace(states=data.states.replace(pos=data.states.pos + 5.0))  # off the floor
-    at = (data.controls.rotor_vel, data.params.J)
+    inputs = (data.controls.rotor_vel, data.params.J)
 
     def energy(step, command, J):
         ready = F.rotor_vel_control(data.replace(params=data.params.replace(J=J)), 1e4 * command)
         return jnp.sum(step(ready, 36).states.ang_vel ** 2)
 
-    at = 1e-4 * at[0], at[1]
+    inputs = 1e-4 * inputs[0], inputs[1]
     unfused, fast = (
         functools.partial(energy, step)
         for step in (build_stagewise_step(sim), Step(sim.step_pipeline, COMPILED_ENGINES[-1]))
     )
-    expected = jax.jit(jax.jacfwd(unfused, (0, 1)))(*at)
+    expected = jax.jit(jax.jacfwd(unfused, (0, 1)))(*inputs)
     assert abs(float(expected[1][0, 1])) > 0
-    assert_gradients_equal(jax.jit(jax.grad(fast, (0, 1)))(*at), expected)
-    slope = jax.jit(lambda *x: jax.jvp(fast, x, x)[1])(*at)
-    assert_gradients_equal(slope, sum(np.sum(gradient * x) for gradient, x in zip(expected, at, strict=True)))
+    assert_gradients_equal(jax.jit(jax.grad(fast, (0, 1)))(*inputs), expected)
+    slope = jax.jit(lambda *x: jax.jvp(fast, x, x)[1])(*inputs)
+    assert_gradients_equal(slope, sum(np.sum(gradient * x) for gradient, x in zip(expected, inputs, strict=True)))
 
 
 @pytest.mark.parametrize("n", [1, 15, 16, 18, 25])
@@ -466,8 +466,8 @@ def test_a_rollout_has_a_gradient():
     def height(gain):
         return rollout(step, data, climb_policy, gain, 20, 5)[0].states.pos[0, 0, 2]
 
-    both = jax.jit(jax.value_and_grad(height))
-    (low, _), (_, slope), (high, _) = (both(jnp.float32(gain)) for gain in (0.29, 0.3, 0.31))
+    value_and_slope = jax.jit(jax.value_and_grad(height))
+    (low, _), (_, slope), (high, _) = (value_and_slope(jnp.float32(gain)) for gain in (0.29, 0.3, 0.31))
     central = float(high - low) / 0.02
     assert slope > 0.01
     np.testing.assert_allclose(slope, central, rtol=2e-2)  # float32: 1e-7 m over 0.02
@@ -484,7 +484,7 @@ def test_law_09_rollouts_refuse_what_cannot_be(settings, words):
         sim.rollout(climb_policy, jnp.float32(0.3), **settings)
 
 
-def test_law_09_a_policy_of_another_shape_is_told():
+def test_law_09_a_command_of_another_shape_from_a_policy_is_an_error():
     sim = shared_sim(n_worlds=2, n_drones=1, control="attitude")
     with pytest.raises(ValueError, match=r"attitude command has shape \(2, 1, 3\); expected \(2, 1, 4\)"):
         sim.rollout(lambda params, data: data.states.pos, None, 3)
@@ -515,7 +515,7 @@ def test_without_a_compiler_auto_takes_lanes_and_says_why(monkeypatch):
 
 
 def test_law_09_an_engine_that_does_not_exist_is_refused():
-    with pytest.raises(ConfigError, match="expected an engine of auto, plain, lanes, fused.*, got 'warp'"):
+    with pytest.raises(ConfigError, match=r"expected an engine of auto, plain, lanes, fused.*, got 'warp'"):
         Sim(engine="warp")
 
 
@@ -557,10 +557,10 @@ def test_every_pipeline_compiles_for_a_gpu(settings):
     assert lowered.as_text().count(cuda.PTX_TARGET) == 1  # one kernel for all stages and steps
 
 
-def test_appended_stages_are_seen():
+def test_appended_stages_are_explained_and_run():
     sim = Sim(n_worlds=2, n_drones=1, control="rotor_vel")
-    assert "undeclared" not in sim.explain()
-    append_fn(sim.step_pipeline, undeclared)
+    assert "undeclared_stage" not in sim.explain()
+    append_fn(sim.step_pipeline, undeclared_stage)
     text = sim.explain()
-    assert "'undeclared' is not fused" in text
+    assert "'undeclared_stage' is not fused" in text
     sim.step(2)

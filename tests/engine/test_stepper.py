@@ -28,7 +28,7 @@ def stepper(sim):
     return stepper
 
 
-def test_a_record_is_put_together_once_when_it_is_read(stepper):
+def test_a_record_is_created_once_when_it_is_read(stepper):
     assert stepper.data is stepper.data
     before = stepper.data
     stepper.advance(2)
@@ -115,7 +115,7 @@ def test_a_new_step_takes_over_the_data(stepper, sim):
     assert step._cache_size() == 1
 
 
-def test_data_from_outside_is_placed_and_counts_as_unsynced(stepper):
+def test_assigned_data_is_moved_to_the_device_and_marked_as_unsynced(stepper):
     far = jax.devices("cpu")[1]
     states = stepper.data.states.replace(pos=jax.device_put(np.ones((3, 2, 3), np.float32), far))
     stepper.assign(stepper.data.replace(states=states, core=stepper.data.core.replace(mjx_synced=np.True_)))

@@ -151,15 +151,15 @@ WORLD_CASES = ["a matrix, then a row of it", "constants", "places from a table"]
 def test_a_lowered_stage_reads_the_same_elements_as_the_stage(scope, names):
     """Each case runs by itself, in the interpreter."""
 
-    def each(data):
+    def read_all(data):
         return {name: read(data).plugins["tables"].out for name, read in make_pipeline(names, scope).items()}
 
-    for name, expected in jax.jit(each)(make_data()).items():
+    for name, expected in jax.jit(read_all)(make_data()).items():
         program = optimise(lower_stages(as_stages(make_pipeline([name], scope)), make_data()))
         verify(program)
         assert program.fused, program.unfused_stages[0].explanation
         leaves = jax.tree.leaves(make_data())
-        (out,), _ = interpret.run_steps(program, [*leaves, _packed(program, leaves)], 1)
+        (out,), _ = interpret.run_steps(program, [*leaves, pack_leaves(program, leaves)], 1)
         np.testing.assert_array_equal(out, expected, err_msg=name)
 
 
@@ -171,7 +171,7 @@ def test_a_kernel_reads_the_same_elements_as_the_stage(scope, names):
     np.testing.assert_allclose(found, jax.jit(total)(make_data()).plugins["tables"].out, rtol=1e-5, atol=1e-3)
 
 
-def _packed(program, leaves):
+def pack_leaves(program, leaves):
     return np.concatenate([np.ravel(leaves[i]) for i in program.packed]) if program.packed else np.zeros(0)
 
 

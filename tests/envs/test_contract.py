@@ -40,7 +40,7 @@ IS_ENDING = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
 
 SAME_CLASS = pytest.mark.slow("another task of its class does it")
-FLIGHT_TASKS = [x if x in task_names(classes_once=True) else pytest.param(x, marks=SAME_CLASS) for x in task_names()]
+FLIGHT_TASKS = [x if x in task_names(one_per_class=True) else pytest.param(x, marks=SAME_CLASS) for x in task_names()]
 """Names of the tasks of the random flights."""
 
 
@@ -160,7 +160,7 @@ def test_an_episode_begins_without_reward_action_or_end(env, start_state):
 
 
 def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(name, start_state):
-    """For any device of the environment: JAX runs a compiled function where its arguments are."""
+    """JAX runs a compiled function on the device of its arguments, which may differ from that of the environment."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     step = jax.jit(make(name, N_WORLDS).step).trace(start_state, start_state.action)
@@ -188,14 +188,14 @@ for name in sys.argv[1:]:
 """
 
 
-WITH_INDICES = ("race", "avoid", "chase", "deliver")
+TASKS_WITH_INDICES = ("race", "avoid", "chase", "deliver")
 """Tasks with counts and indices."""
 
 
 @pytest.mark.long("plans steps in a process of its own")
 @pytest.mark.parametrize(
     "names",
-    [WITH_INDICES, pytest.param([*TASKS], marks=pytest.mark.slow("the other case has the tasks with indices"))],
+    [TASKS_WITH_INDICES, pytest.param([*TASKS], marks=pytest.mark.slow("the other case has the tasks with indices"))],
     ids=["indices", "all"],
 )
 def test_every_step_is_one_kernel_where_x64_is_enabled(names):
@@ -297,13 +297,13 @@ def test_episodes_end_in_time_and_are_counted(env, random_flight):
         np.testing.assert_allclose(returns[ends, world], sums, rtol=1e-3, atol=1e-3)
 
 
-BY_STAGES = pytest.mark.slow("other tasks have all operations, and tests/gpu compares all tasks")
+SLOW_STAGES = pytest.mark.slow("other tasks have all operations, and tests/gpu compares all tasks")
 
 
 @pytest.mark.long("compiles the batched step of each task")
 @pytest.mark.parametrize(
     "name",
-    [x if x in WITH_INDICES else pytest.param(x, marks=BY_STAGES) for x in task_names()],
+    [x if x in TASKS_WITH_INDICES else pytest.param(x, marks=SLOW_STAGES) for x in task_names()],
     indirect=True,
 )
 def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, random_flight):
@@ -403,7 +403,7 @@ def test_disabled_begins_episodes_only_in_restarts(task_name):
     assert trees_equal(select_state(state, ~mask), select_state(later, ~mask))
 
 
-def test_a_nonfinite_world_ends_alone(env, start_state):
+def test_a_nonfinite_world_ends_and_changes_no_other(env, start_state):
     """Law 7: it is terminated and reported, and other worlds do not change."""
     action = random_action(start_state)
     bad = np.array(action)
@@ -433,7 +433,7 @@ def test_a_nonfinite_world_is_observed_as_zeros_and_finite_in_its_next_episode(t
 
 
 @pytest.mark.long("compiles the gradient of each task")
-@pytest.mark.parametrize("name", task_names(classes_once=True), indirect=True)
+@pytest.mark.parametrize("name", task_names(one_per_class=True), indirect=True)
 def test_the_gradient_of_the_reward_is_finite(env, start_state, random_flight):
     """Law 7, by actions and states, at the beginning of an episode and at states of the random flight.
 
@@ -468,14 +468,14 @@ class AtRest(Hover):
 
 
 @functools.cache
-def at_rest(control):
+def make_resting_env(control):
     """Return the hover task for a drone that starts level and at rest, 1 m above the origin, and its goal there."""
     return DroneEnv(make("hover", 1, control=control).sim, AtRest())
 
 
 @pytest.mark.parametrize("control", LEVELS)
 def test_a_zero_action_hovers(control):
-    env = at_rest(control)
+    env = make_resting_env(control)
 
     @jax.jit
     def fly(key):

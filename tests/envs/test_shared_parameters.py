@@ -26,7 +26,7 @@ def make_env(control):
     return envs.make("hover", N_WORLDS, control=control, effects=effects)
 
 
-CONSTANTS = {"rpm2thrust": 2e-3, "rpm2torque": 1e-5}
+CONSTANT_TERMS = {"rpm2thrust": 2e-3, "rpm2torque": 1e-5}
 """Sizes of the constant terms of polynomials in the rotor speed, N and N m."""
 
 
@@ -37,7 +37,7 @@ def with_random_parameters(data, rng):
         if scope != "shared" or not jnp.issubdtype(x.dtype, jnp.floating):
             return x
         x = np.asarray(x)
-        zero = CONSTANTS.get(path[-1].name, 0.03 * np.abs(x).max() or 1e-3)
+        zero = CONSTANT_TERMS.get(path[-1].name, 0.03 * np.abs(x).max() or 1e-3)
         factor = rng.uniform(0.3, 1.0, x.shape) * rng.choice([-1, 1], x.shape)
         return jnp.asarray(np.where(x == 0, zero * factor, x * (1 + 0.03 * factor)), x.dtype)
 

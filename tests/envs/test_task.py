@@ -83,11 +83,11 @@ def test_named_draws_are_parts_of_one_draw():
     key = jax.random.wrap_key_data(jnp.array([1, 2], jnp.uint32))
 
     @jax.jit
-    def drawn(key):
+    def draw_all(key):
         others = draw(key, turn=1, places=(2, 3)), draw(key, turn=1, places=(2, 3), more=4)
         return draw(key, 3, start=2, yaw=1, pose=(2, 2)), uniform(key, 3, 7), *others
 
-    x, row, world, more = jax.device_get(drawn(key))
+    x, row, world, more = jax.device_get(draw_all(key))
     assert {name: v.shape for name, v in x.items()} == {"start": (3, 2), "yaw": (3, 1), "pose": (3, 2, 2)}
     np.testing.assert_array_equal(x["start"], row[:, :2])
     np.testing.assert_array_equal(x["yaw"], row[:, 2:3])

@@ -68,21 +68,21 @@ def test_observations_are_the_nearest_points_of_the_nearest_obstacles(start_stat
     env.sim.data = inside
     gaps = np.sort(np.asarray(env.sim.contact_report().object_distance), axis=-1)[..., :4]
     obs = jax.jit(vmap_worlds(env.task.observe))(inside)
-    ways, to_middle = (np.asarray(obs[f"obstacles_{x}"]).reshape(N_WORLDS, 2, 4, 3) for x in ("near", "middle"))
+    to_surface, to_middle = (np.asarray(obs[f"obstacles_{x}"]).reshape(N_WORLDS, 2, 4, 3) for x in ("near", "middle"))
     # A report measures from the ball around the drone, whose middle is 2 cm above the start of the vectors.
-    far = np.linalg.norm(ways, axis=-1) - 0.086
+    far = np.linalg.norm(to_surface, axis=-1) - 0.086
     outside = gaps > 0.05
     assert outside.mean() > 0.5
     assert np.abs(far - gaps)[outside].max() < 0.021
     is_box = np.any(to_middle != 0, axis=-1)
     assert 0.2 < is_box.mean() < 0.5, "a third of the obstacles"
-    middle = np.asarray(inside.states.pos)[:, :, None] + ways + to_middle
+    middle = np.asarray(inside.states.pos)[:, :, None] + to_surface + to_middle
     boxes = np.asarray(inside.objects.pos)[:, 0, None, None, 8:] - middle[..., None, :]
-    outside_box = is_box & (np.linalg.norm(ways, axis=-1) > 0.01)
+    outside_box = is_box & (np.linalg.norm(to_surface, axis=-1) > 0.01)
     np.testing.assert_allclose(np.linalg.norm(boxes, axis=-1).min(axis=-1)[outside_box], 0, atol=1e-5)
     # A short step along such a vector reduces the distance by its length.
-    length = np.maximum(np.linalg.norm(ways[:, :, 0], axis=-1, keepdims=True), 0.01)
-    ahead = inside.states.pos + 0.1 * ways[:, :, 0] / length
+    length = np.maximum(np.linalg.norm(to_surface[:, :, 0], axis=-1, keepdims=True), 0.01)
+    ahead = inside.states.pos + 0.1 * to_surface[:, :, 0] / length
     env.sim.data = inside.replace(states=inside.states.replace(pos=ahead))
     nearer = np.asarray(env.sim.contact_report().object_distance).min(axis=-1)
     assert np.abs(gaps[..., 0] - nearer - 0.1)[gaps[..., 0] > 0.15].max() < 0.022

@@ -1,4 +1,4 @@
-"""Following a car: how it drives, what the camera shows of it, what counts as following it and what as losing it."""
+"""Following a car: the motion of the car, images of it, rewards, and ends of episodes."""
 
 import jax
 import jax.numpy as jnp

@@ -29,10 +29,10 @@ CASES = {
     "high": ((0.0, 0.0, 2.31), (0, 0, 0.0), 0.0),
     "hover": ((0.0, 0.0, 0.3), (0, 0, 0.0), 0.0),
 }
-"""One world each."""
+"""Cases, each in its own world."""
 
 
-def environment(n_worlds, n_drones=1, **options):
+def make_env(n_worlds, n_drones=1, **options):
     """Return an environment."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
     task = Land(**options)
@@ -43,7 +43,7 @@ def environment(n_worlds, n_drones=1, **options):
 @pytest.fixture(scope="module")
 def touch_downs():
     """Return an environment of all cases, the world of each case, the states before and after a step, and the step."""
-    env, step = environment(len(CASES)), None
+    env, step = make_env(len(CASES)), None
     state = jax.jit(env.reset)(jax.random.key(0))
     offset, vel, tilt = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
     quat = Rotation.from_euler("x", tilt[:, None]).as_quat().astype(np.float32)
@@ -80,7 +80,7 @@ def test_landing_is_rewarded_and_crashing_costs_once(touch_downs):
 @pytest.fixture(scope="module")
 def moving_pads():
     """Return an environment with moving pads and two drones in each world, and data at the start of episodes."""
-    env = environment(N_SPAWNS, 2, speed=SPEED)
+    env = make_env(N_SPAWNS, 2, speed=SPEED)
     return env, jax.jit(env.reset)(jax.random.key(5)).data
 
 
@@ -112,7 +112,7 @@ def test_a_moving_pad_moves_in_the_data_at_its_speed(moving_pads):
 
 
 def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes():
-    env = environment(2, speed=SPEED, seconds=3.0)
+    env = make_env(2, speed=SPEED, seconds=3.0)
 
     class Above(Land):
         """Start over the pad, with its velocity; the second world upside down."""

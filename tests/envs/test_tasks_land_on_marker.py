@@ -23,7 +23,7 @@ CASES = {
     "turned": ((0.8, 0.0, 1.0), (0, 0, 0), np.pi / 2),
     "too far to see it": ((1.3, 0.0, 0.2), (0, 0, 0), 0.0),
 }
-"""One world each."""
+"""Cases, each in its own world."""
 LANDED, CRASHED = {"soft", "edge"}, {"fast", "floor"}
 SIDE, FOCAL = 16, 8 / np.tan(np.radians(60))
 """Side of the image and focal length, pixels."""

@@ -32,10 +32,10 @@ CASES = {
     "outside": (None, (2.51, 0.0, 1.0), 0.0, 0),
     "over the top": (None, (0.0, 0.0, 2.01), 0.0, 0),
 }
-"""One world each."""
+"""Cases, each in its own world."""
 
 
-def environment(n_worlds, n_drones=1, engine="interpret", **options):
+def make_env(n_worlds, n_drones=1, engine="interpret", **options):
     """Return an environment, interpreted by default, as compiling would take longer than a few steps."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude", engine=engine)
     race = task.Race(**options)
@@ -56,15 +56,15 @@ def place_drones(state, pos, vel=0.0, **changes):
 @pytest.fixture(scope="module")
 def cases():
     """Return an environment of all cases, the world of each case, the states before and after a step, and the step."""
-    env = environment(len(CASES))
+    env = make_env(len(CASES))
     pos, vel = np.zeros((len(CASES), 1, 3)), np.zeros((len(CASES), 1, 3))
     passed = np.zeros((len(CASES), 1), np.int32)
     turns = Rotation.from_euler("xyz", TRACK.gates_rpy)
-    for world, (gate, at, speed, before) in enumerate(CASES.values()):
+    for world, (gate, offset, speed, before) in enumerate(CASES.values()):
         passed[world] = before
-        pos[world] = at
+        pos[world] = offset
         if gate is not None:
-            pos[world] = np.asarray(TRACK.gates_pos[gate]) + turns[gate].apply(at)
+            pos[world] = np.asarray(TRACK.gates_pos[gate]) + turns[gate].apply(offset)
             vel[world] = speed * turns[gate].apply([1.0, 0.0, 0.0])
     before = place_drones(jax.jit(env.reset)(jax.random.key(0)), pos, vel, passed=jnp.asarray(passed))
     step = jax.jit(env.step)
@@ -143,13 +143,13 @@ def test_observations_in_the_drones_frame_are_those_of_the_course(cases):
 
 
 def test_drones_out_of_the_race_do_not_matter_to_others():
-    env = environment(4, n_drones=2)
-    at = np.broadcast_to([[-1.5, 0.6, 1.0], [-1.5, 0.65, 1.0]], (4, 2, 3)).copy()
-    at[3, 1] += [0.5, 0, 0]
+    env = make_env(4, n_drones=2)
+    offset = np.broadcast_to([[-1.5, 0.6, 1.0], [-1.5, 0.65, 1.0]], (4, 2, 3)).copy()
+    offset[3, 1] += [0.5, 0, 0]
     passed = jnp.array([[0, 0], [0, 0], [4, 0], [4, 0]])
     disabled = jnp.array([[False, False], [True, False], [False, False], [False, True]])
     step = jax.jit(env.step)
-    state = place_drones(jax.jit(env.reset)(jax.random.key(0)), at, passed=passed, disabled=disabled)
+    state = place_drones(jax.jit(env.reset)(jax.random.key(0)), offset, passed=passed, disabled=disabled)
     after = step(state, state.action)
     #           both collide     one is out already      one has finished      one finished, one out
     expected = [[True, True], [True, False], [False, False], [False, True]]
@@ -166,7 +166,7 @@ def data_of_levels():
     """Return an environment of each level, and data at the start of episodes in many worlds."""
     data_of_levels = {}
     for level, n_worlds, n_drones in ((0, 64, 1), (1, 64, 2), (2, 2048, 1), (3, 2048, 2)):
-        env = environment(n_worlds, n_drones, level=level)
+        env = make_env(n_worlds, n_drones, level=level)
         data_of_levels[level] = env, jax.jit(lambda key, env=env: env.reset(key).data)(jax.random.key(5))
     return data_of_levels
 
@@ -276,8 +276,8 @@ def test_the_way_leads_around_a_gate_from_behind_and_back_from_beside_it():
     beside = np.array([[1e-7, 0.45, 0.0], [-1e-7, 0.45, 0.0]])
     places = [[-1.0, 0.0, 0.0], [-4.0, 3.0, 0.0], [-3.0, 4.0, 0.0], [0.5, 0.0, 0.0], [0.3, 0.9, 0.0], *beside]
     before_the_frame = np.array([-0.01, 0.38, 0.1])
-    way = jax.jit(lambda places, pos: (rules.way_to_gate(places), jax.grad(rules.way_to_gate)(pos)))
-    ahead, slope = way(jnp.asarray(places), jnp.asarray(before_the_frame))
+    way_and_slope = jax.jit(lambda places, pos: (rules.way_to_gate(places), jax.grad(rules.way_to_gate)(pos)))
+    ahead, slope = way_and_slope(jnp.asarray(places), jnp.asarray(before_the_frame))
     around = 2 * 0.45 - 0.15  # from beside the frame, where both ways are the same
     expected = [1.0, 5.0, 5.0 + 0.85, np.hypot(0.5, 0.45) + around, np.hypot(0.3, 0.45) + around]
     np.testing.assert_allclose(ahead, [*expected, around, around], rtol=1e-6)
@@ -325,7 +325,7 @@ def test_a_track_of_the_user_can_be_raced():
     track = Track(
         gates_pos=[(-1, 0, 1), (0.0, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, obstacles_pos=[(1, 1, 1.5)], start=(-2, 0, 1)
     )
-    env = environment(3, engine="auto", track=track, seconds=1.2)
+    env = make_env(3, engine="auto", track=track, seconds=1.2)
 
     class Thrown(task.Race):
         """Start in flight towards the gates; the third world away from them."""

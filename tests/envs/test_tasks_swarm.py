@@ -1,4 +1,4 @@
-"""A swarm: slots, starts, separation and what ends an episode."""
+"""A swarm: starts, goals, separation, and ends of episodes."""
 
 import jax
 import jax.numpy as jnp

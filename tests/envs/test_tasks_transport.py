@@ -33,7 +33,7 @@ CASES = {
     "aside": ((1.0, 1.41, 0.0), DOWN, (0.0, 0.0, 0.0)),
     "high": ((-1.0, 0.0, 1.21), DOWN, (0.0, 0.0, 0.0)),
 }
-"""One world each, with an unturned gate."""
+"""Cases, each in its own world with an unturned gate."""
 SAFE = {"through", "backwards", "before", "behind", "load just inside"}
 AT_GOAL = {
     # Position of the load relative to its goal, m, velocity, m/s, and x of the goal, m.
@@ -42,10 +42,10 @@ AT_GOAL = {
     "fast": ((0.0, 0.0, 0.0), (0.0, 0.25, 0.0), 1.4),
     "before the gate": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), -0.6),
 }
-"""One world each."""
+"""Cases, each in its own world."""
 
 
-def environment(n_worlds, n_drones=1, **options):
+def make_env(n_worlds, n_drones=1, **options):
     """Return an environment whose gate has an opening of 0.8 m."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
     task = Transport(opening=0.8, **options)
@@ -69,7 +69,7 @@ def place_drones(state, drone, load, vel, goal=GOAL):
 @pytest.fixture(scope="module")
 def recorded_flight():
     """Return the world of each case, and the state after a step."""
-    env = environment(len(CASES))
+    env = make_env(len(CASES))
     place, hang, vel = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
     before = place_drones(jax.jit(env.reset)(jax.random.key(0)), GATE + place, GATE + place + hang, vel)
     return {name: k for k, name in enumerate(CASES)}, jax.jit(env.step)(before, before.action)
@@ -90,7 +90,7 @@ def test_a_gate_is_passed_where_the_load_is_behind_it_without_a_crash(recorded_f
 
 
 def test_a_load_is_delivered_after_it_has_stayed_at_its_goal_slowly_and_behind_the_gate():
-    env = environment(len(AT_GOAL))
+    env = make_env(len(AT_GOAL))
     offset, vel, x = (np.array(v, np.float32) for v in zip(*AT_GOAL.values(), strict=True))
     goal = np.broadcast_to(GOAL, offset.shape) * [0, 1, 1] + x[:, None] * [1, 0, 0]
     state = place_drones(jax.jit(env.reset)(jax.random.key(0)), goal + offset - DOWN, goal + offset, vel, goal)
@@ -109,32 +109,32 @@ def test_a_load_is_delivered_after_it_has_stayed_at_its_goal_slowly_and_behind_t
 
 def test_progress_is_rewarded_by_its_length_and_passing_the_gate_never_costs(rng):
     """The remaining way decreases, or does not change, where the gate is passed."""
-    env = environment(64)
+    env = make_env(64)
     state = jax.jit(env.reset)(jax.random.key(0))
     corner = np.array([0.0, 0.35, 0.35])
     at = GATE + rng.uniform(-corner, corner, (64, 3))
     aim = GATE - np.array([0.0, 0.0, LENGTH / 2], np.float32)
     at[0] = aim
-    ways, to_go = [], jax.jit(vmap_worlds(env.task.remaining_way))
+    remaining_ways, remaining_way = [], jax.jit(vmap_worlds(env.task.remaining_way))
     for x in (-1.0, -1e-3, 1e-3, 1.0):
         load = (at + np.array([x, 0.0, 0.0])).astype(np.float32)
-        ways.append(np.asarray(to_go(place_drones(state, load - DOWN, load, 0.0).data))[:, 0])
+        remaining_ways.append(np.asarray(remaining_way(place_drones(state, load - DOWN, load, 0.0).data))[:, 0])
         around = np.linalg.norm(load - aim, axis=-1) + np.linalg.norm(GOAL - aim)
         expected = around if x < 0 else np.linalg.norm(load - GOAL, axis=-1)
-        np.testing.assert_allclose(ways[-1], expected, atol=1e-5)
-    assert np.all(ways[1] - ways[2] > -1e-3)
-    np.testing.assert_allclose(ways[1][0], ways[2][0], atol=3e-3)
+        np.testing.assert_allclose(remaining_ways[-1], expected, atol=1e-5)
+    assert np.all(remaining_ways[1] - remaining_ways[2] > -1e-3)
+    np.testing.assert_allclose(remaining_ways[1][0], remaining_ways[2][0], atol=3e-3)
     data = place_drones(state, GOAL - DOWN, GOAL, 0.0).data
-    own = data.plugins["task"].replace(remaining_way_before=jnp.asarray(ways[0])[:, None])
+    own = data.plugins["task"].replace(remaining_way_before=jnp.asarray(remaining_ways[0])[:, None])
     data = data.replace(plugins=data.plugins | {"task": own})
     paid = jax.jit(vmap_worlds(env.task.rewards))(data, state.action, state.action)
-    np.testing.assert_allclose(paid["progress"][:, 0], 5 * ways[0], rtol=1e-4)
+    np.testing.assert_allclose(paid["progress"][:, 0], 5 * remaining_ways[0], rtol=1e-4)
     np.testing.assert_allclose(paid["proximity"], 1.5, rtol=1e-3)
     assert not np.any(paid["crash"])
 
 
 def test_starts_are_clear_of_the_gates_and_links_are_taut():
-    env = environment(N_SPAWNS, 2, swing=0.6)
+    env = make_env(N_SPAWNS, 2, swing=0.6)
     data = jax.jit(env.reset)(jax.random.key(3)).data
     env.sim.data = data
     report = env.sim.contact_report()
@@ -180,7 +180,7 @@ class Pilot(PyTree):
 
 
 def test_a_pilot_that_aims_at_the_opening_and_damps_the_swing_delivers_and_one_that_idles_does_not():
-    env = environment(64, seconds=9.0)
+    env = make_env(64, seconds=9.0)
     metrics, idle = (evaluate(env, Pilot(jnp.float32(gain))) for gain in (1.0, 0.0))
     assert metrics["success"] > 0.95
     assert metrics["crashed"] < 0.05

@@ -1,4 +1,4 @@
-"""Every wrapper, by numbers, and environments that wrappers refuse."""
+"""Every wrapper, compared with expected numbers, and environments that wrappers refuse."""
 
 import jax
 import jax.numpy as jnp
@@ -157,10 +157,10 @@ def test_the_terms_of_a_reward_add_up_to_it(env):
 def test_randomised_episodes_are_observed_through_other_wrappers(env):
     """RandomizeWith may be inside or outside: episodes are randomised before they are observed."""
 
-    def lifted(data, key):
+    def lift(data, key):
         return data.replace(states=data.states.replace(pos=data.states.pos + jnp.array([0.0, 0.0, 0.5])))
 
-    inside, outside = FrameStack(RandomizeWith(env, lifted), 2), RandomizeWith(FrameStack(env, 2), lifted)
+    inside, outside = FrameStack(RandomizeWith(env, lift), 2), RandomizeWith(FrameStack(env, 2), lift)
     a, b = (wrapped.reset(jax.random.key(0)) for wrapped in (inside, outside))
     assert trees_equal(a.obs, b.obs)
     plain = env.reset(jax.random.key(0))
@@ -300,10 +300,10 @@ def test_frames_are_stacked_oldest_first(env):
             assert_same_world(x, np.concatenate([frame[name] for frame in seen[-3:]], axis=-1))
         state, plain = wrapped.step(state, random_action(plain, i)), env.step(plain, random_action(plain, i))
         seen.append(plain.obs)
-    anew = wrapped.restart(state, jnp.asarray(FIRST))
+    restarted = wrapped.restart(state, jnp.asarray(FIRST))
     first = env.restart(plain, jnp.asarray(FIRST)).obs["pos"][0]
-    assert_same_world(anew.obs["pos"][0], np.tile(first, 3))
-    assert trees_equal(select_state(anew, ~FIRST), select_state(state, ~FIRST))
+    assert_same_world(restarted.obs["pos"][0], np.tile(first, 3))
+    assert trees_equal(select_state(restarted, ~FIRST), select_state(state, ~FIRST))
 
 
 def test_delayed_actions_arrive_after_their_steps(env):

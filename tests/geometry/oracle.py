@@ -72,9 +72,9 @@ def cast_rays(shape, origin, direction):
     d = mujoco.MjData(m)
     d.mocap_pos[0] = [0, 0, -1e4]
     mujoco.mj_kinematics(m, d)
-    t, normals, which = np.empty(len(origin)), np.zeros((len(origin), 3)), np.zeros(1, np.int32)
+    t, normals, geom_id = np.empty(len(origin)), np.zeros((len(origin), 3)), np.zeros(1, np.int32)
     for i in range(len(origin)):
-        t[i] = mujoco.mj_ray(m, d, origin[i], direction[i], None, 1, 1, which, normals[i])
+        t[i] = mujoco.mj_ray(m, d, origin[i], direction[i], None, 1, 1, geom_id, normals[i])
     return np.where(t < 0, np.inf, t), normals
 
 
@@ -86,7 +86,7 @@ def rotations(quat):
     return out.reshape(-1, 3, 3)
 
 
-def unit(x):
+def normalize(x):
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
 
 
@@ -127,7 +127,7 @@ def overlap_depths(a, b, pos, rot, rng, n_directions=1500, n_best=6, n_rounds=40
     best = n[np.argsort(everywhere, axis=1)[:, :n_best]]
     value, width = depth(best), 3 / np.sqrt(n_directions)
     for _ in range(n_rounds):
-        tried = unit(best[:, :, None] + width * rng.normal(size=(*best.shape[:2], 12, 3)))
+        tried = normalize(best[:, :, None] + width * rng.normal(size=(*best.shape[:2], 12, 3)))
         values = depth(tried.reshape(len(pos), -1, 3)).reshape(*best.shape[:2], 12)
         first = np.argmin(values, axis=2)[..., None]
         new = np.take_along_axis(values, first, axis=2)[..., 0]
@@ -150,11 +150,11 @@ def poses(rng, n):
     quat = rng.normal(size=(n, 4))
     quat[: n // 10] = [1, 0, 0, 0]
     quat[n // 10 : n // 5] = rng.choice([-1.0, 0, 1], (n // 5 - n // 10, 4)) + [1e-9, 0, 0, 0]
-    return random_points(rng, n), unit(quat)
+    return random_points(rng, n), normalize(quat)
 
 
 @functools.cache
-def distance_and_slopes(a, b):
+def compile_distance_and_slopes(a, b):
     """Return a function from poses to distances and their gradients with respect to position and rotation."""
 
     def total(pos, rot):
@@ -163,18 +163,18 @@ def distance_and_slopes(a, b):
 
     value_and_slopes = jax.jit(jax.value_and_grad(total, (0, 1), has_aux=True))
 
-    def answer(pos, rot):
+    def evaluate(pos, rot):
         (_, value), slopes = value_and_slopes(pos, rot)
         return tuple(map(np.asarray, (value, *slopes)))
 
-    return answer
+    return evaluate
 
 
 def check_pair(a, b, rng, n, apart_tolerance=1e-5, shallow=1e-6, deep=1e-6):
     """Check distances of separated shapes against MuJoCo, depths against a search over directions, and all signs."""
     pos, quat = poses(rng, n)
-    rot, answer = rotations(quat), distance_and_slopes(a, b)
-    (actual, by_pos, _), expected = answer(pos, rot), distances(a, b, pos, quat)
+    rot, evaluate = rotations(quat), compile_distance_and_slopes(a, b)
+    (actual, by_pos, _), expected = evaluate(pos, rot), distances(a, b, pos, quat)
     is_apart = expected > 0
     counts = np.sum(is_apart), np.sum(~is_apart), np.sum(np.abs(expected) < 0.02)
     assert min(counts) > 0.01 * n, counts
@@ -195,17 +195,17 @@ def check_slopes(a, b, rng, n, deepest=-np.inf):
     Shapes that overlap by more than ``-deepest`` are excluded.
     """
     pos, quat = poses(rng, n)
-    rot, answer, h = rotations(quat), distance_and_slopes(a, b), 1e-6
-    spin = unit(rng.normal(size=(n, 3)))
+    rot, evaluate, h = rotations(quat), compile_distance_and_slopes(a, b), 1e-6
+    spin = normalize(rng.normal(size=(n, 3)))
     cross = np.zeros((n, 3, 3))
     cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = spin, -spin
-    value, by_pos, by_rot = answer(pos, rot)
+    value, by_pos, by_rot = evaluate(pos, rot)
     assert np.isfinite(by_pos).all()
     assert np.isfinite(by_rot).all()
     np.testing.assert_array_less(np.linalg.norm(by_pos, axis=1), 1 + 1e-6)
-    sides = np.array([[answer(pos + s * h * e, rot)[0] for e in np.eye(3)] for s in (1, -1)])
+    sides = np.array([[evaluate(pos + s * h * e, rot)[0] for e in np.eye(3)] for s in (1, -1)])
     differences = (sides[0] - sides[1]).T / (2 * h)
-    forward, backward = (answer(pos, rot + s * h * cross @ rot)[0] for s in (1, -1))
+    forward, backward = (evaluate(pos, rot + s * h * cross @ rot)[0] for s in (1, -1))
     turning = (forward - backward) / (2 * h)
     smooth = np.abs(np.linalg.norm(differences, axis=1) - 1) < 1e-3
     smooth = smooth & (value > deepest)
@@ -227,9 +227,9 @@ def check_finite(a, b, dtype, n):
     turns = np.array([[1, 0, 0, 0], [1, 1, 0, 0], [0, 1, 1, 0], [1, 1, 1, 1], [1, 1e-4, 0, 0]], float)
     reach = size + np.asarray([*a.size, 0.1, 0.1])[:3]
     pos = np.concatenate([np.repeat(grid * scale, len(turns), axis=0) for scale in (size, reach)])
-    rot = np.tile(rotations(unit(turns)), (2 * len(grid), 1, 1))
+    rot = np.tile(rotations(normalize(turns)), (2 * len(grid), 1, 1))
     with jax.enable_x64(dtype == np.float64):
-        for x in distance_and_slopes(a, b)(
+        for x in compile_distance_and_slopes(a, b)(
             np.resize(pos, (n, 3)).astype(dtype), np.resize(rot, (n, 3, 3)).astype(dtype)
         ):
             assert x.dtype == dtype

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import DRONES, SHAPES, check_finite, check_pair, check_slopes, distance_and_slopes, poses, rotations
+from oracle import DRONES, SHAPES, check_finite, check_pair, check_slopes, compile_distance_and_slopes, poses, rotations
 
 from crazysim.geometry import Shape, distance
 from crazysim.geometry.shapes import N_SIZES
@@ -23,7 +23,7 @@ def test_convex_pairs(x64, rng, a, b):
 @pytest.mark.parametrize("a, b", PAIRS)
 def test_law_08_gradients_equal_central_differences(x64, rng, a, b):
     by_pos, by_rot = check_slopes(DRONES[a], SHAPES[b], rng, N, deepest=-0.05)
-    # A direction's error is the square root of a distance's; on parallel faces any point may be nearest.
+    # A direction errs by the square root of the error of a distance. On parallel faces any point may be nearest.
     assert np.mean(by_pos > 5e-3) < 0.005
     assert np.mean(by_rot > 5e-3) < 0.02
 
@@ -38,9 +38,9 @@ def test_float32_errs_by_little(rng, a, b):
     check_finite(DRONES[a], SHAPES[b], np.float32, N)
     pos, quat = poses(rng, N)
     rot = rotations(quat)
-    found, *_ = distance_and_slopes(DRONES[a], SHAPES[b])(np.float32(pos), np.float32(rot))
+    found, *_ = compile_distance_and_slopes(DRONES[a], SHAPES[b])(np.float32(pos), np.float32(rot))
     with jax.enable_x64(True):
-        exact, *_ = distance_and_slopes(DRONES[a], SHAPES[b])(pos, rot)
+        exact, *_ = compile_distance_and_slopes(DRONES[a], SHAPES[b])(pos, rot)
     size = 1 + np.linalg.norm(pos, axis=1)
     assert np.max(np.abs(found - exact) / size) < 1e-3
     clear = np.abs(exact) > 2e-5 * size
@@ -50,9 +50,9 @@ def test_float32_errs_by_little(rng, a, b):
 def test_law_01_one_drone_then_many(x64, rng):
     pos, quat = poses(rng, N)
     rot, pair = rotations(quat), (DRONES["capsule"], SHAPES["mesh"])
-    many = distance_and_slopes(*pair)(pos, rot)[0]
+    many = compile_distance_and_slopes(*pair)(pos, rot)[0]
     for i in range(0, N, 200):  # in a batch of equal poses
-        one = distance_and_slopes(*pair)(np.broadcast_to(pos[i], (N, 3)), np.broadcast_to(rot[i], (N, 3, 3)))[0]
+        one = compile_distance_and_slopes(*pair)(np.broadcast_to(pos[i], (N, 3)), np.broadcast_to(rot[i], (N, 3, 3)))[0]
         np.testing.assert_allclose(one, many[i], atol=1e-6)
     shape = jax.eval_shape(lambda p, r: distance(*pair, p, r), jnp.zeros((2, 4, 3)), jnp.zeros((2, 4, 3, 3)))
     assert shape.shape == (2, 4)

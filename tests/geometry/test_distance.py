@@ -15,10 +15,10 @@ from oracle import (
     check_pair,
     check_slopes,
     distances,
+    normalize,
     poses,
     random_points,
     rotations,
-    unit,
 )
 
 from crazysim import ConfigError
@@ -50,12 +50,12 @@ def compile_each_point(kind):
     return jax.jit(jax.vmap(jax.value_and_grad(functools.partial(eager_point_distance, SHAPES[kind]))))
 
 
-def evaluate_points(kind, points, dtype=np.float64, each=False):
-    """Return distances and gradients at up to ``N`` points, of all points at once or of each by itself."""
+def evaluate_points(kind, points, dtype=np.float64, one_by_one=False):
+    """Return distances and gradients at up to ``N`` points, computed at once or one by one."""
     n = len(points)
     with jax.enable_x64(dtype == np.float64):
         padded = np.resize(points, (N, 3)).astype(dtype)
-        if each:
+        if one_by_one:
             value, slope = compile_each_point(kind)(padded)
         else:
             (_, value), slope = compile_all_points(kind)(padded)
@@ -94,7 +94,7 @@ def test_closed_forms_of_two_shapes(x64, rng, a, b):
 @pytest.mark.parametrize("a, b", PAIRS)
 def test_law_08_gradients_of_closed_forms_equal_central_differences(x64, rng, a, b):
     by_pos, by_rot = check_slopes(DRONES[a], SHAPES[b], rng, N)
-    # Across a crease, a difference may look like a distance's; there are few.
+    # Across a crease, differences may have length one by chance; such points are few.
     assert np.mean(by_pos > 1e-4) < 0.005
     assert np.mean(by_rot > 1e-4) < 0.02
 
@@ -106,11 +106,11 @@ def test_law_07_no_nan_in_two_shapes(a, b, dtype):
 
 
 @pytest.mark.parametrize("axes", [(0.5, 0.3, 0.15), (0.3, 0.3, 0.3), (0.1, 0.1, 1.0), (1.0, 0.03, 1.0)])
-def test_distance_to_an_ellipsoid_is_that_of_where_the_point_was_lifted_from(x64, rng, axes):
-    """Points are lifted by any height outside, and by less than the smallest radius of curvature inside."""
+def test_distance_to_an_ellipsoid_is_the_height_above_its_surface(x64, rng, axes):
+    """Points are above the surface by any height, or below it by less than the smallest radius of curvature."""
     a = np.asarray(axes)
-    foot = a * unit(rng.normal(size=(N, 3)))
-    normal = unit(foot / a**2)
+    foot = a * normalize(rng.normal(size=(N, 3)))
+    normal = normalize(foot / a**2)
     lowest = -(a.min() ** 2) / a.max()  # the least radius of curvature: the foot is the nearest point up to there
     height = np.concatenate([rng.uniform(lowest, 0, N // 2), rng.uniform(0, 3, N - N // 2)])
     found = point_distance(Shape("ellipsoid", axes), foot + height[:, None] * normal)
@@ -130,7 +130,7 @@ def test_distance_to_an_ellipsoid_from_its_middle_by_hand(x64):
 @pytest.mark.parametrize("kind", SHAPES)
 def test_float32_errs_by_rounding_only(rng, kind):
     points = random_points(rng, N)
-    found, _ = evaluate_points(kind, points, np.float32, each=True)
+    found, _ = evaluate_points(kind, points, np.float32, one_by_one=True)
     exact, _ = evaluate_points(kind, np.float32(points))
     size = 0.5 + np.linalg.norm(points, axis=1)
     assert np.max(np.abs(found - exact) / size) < 1e-6
@@ -141,10 +141,12 @@ def test_law_01_one_drone_then_many(rng, kind):
     """Distances and gradients of all points at once equal those of each point by itself."""
     points = (0.5 * rng.uniform(-1, 1, (N, 3))).astype(np.float32).astype(float)
     many, slopes = evaluate_points(kind, points)
-    one, slope = evaluate_points(kind, points, each=True)
+    one, slope = evaluate_points(kind, points, one_by_one=True)
     np.testing.assert_allclose(many, one, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(slopes, slope, atol=1e-9)
-    np.testing.assert_allclose(evaluate_points(kind, points[:12], np.float32, each=True)[1], slope[:12], atol=1e-4)
+    np.testing.assert_allclose(
+        evaluate_points(kind, points[:12], np.float32, one_by_one=True)[1], slope[:12], atol=1e-4
+    )
     shape = jax.eval_shape(lambda p: eager_point_distance(SHAPES[kind], p), jnp.zeros((3, 4, 3)))
     assert shape.shape == (3, 4)
 
@@ -161,9 +163,9 @@ def test_law_08_gradient_equals_central_differences_and_has_length_one(rng, kind
     np.testing.assert_allclose(np.linalg.norm(slope, axis=1), 1, atol=1e-6)
 
 
-def test_curvature_of_an_ellipsoid_is_right_too(x64, rng):
+def test_second_derivatives_of_an_ellipsoid_equal_differences(x64, rng):
     """The gradient is a contact normal, so the derivative of a contact force is a second derivative."""
-    points, h = unit(rng.normal(size=(50, 3))), 1e-5
+    points, h = normalize(rng.normal(size=(50, 3))), 1e-5
     one = jax.grad(lambda p: point_distance(SHAPES["ellipsoid"], p))
     normal = jax.jit(jax.grad(lambda p: jnp.sum(point_distance(SHAPES["ellipsoid"], p))))
     found = jax.jit(jax.vmap(jax.jacfwd(one)))(points)
@@ -182,7 +184,7 @@ def special_points(shape):
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_law_07_no_nan_at_degenerate_points(kind, dtype):
-    value, slope = evaluate_points(kind, special_points(SHAPES[kind]), dtype, each=True)
+    value, slope = evaluate_points(kind, special_points(SHAPES[kind]), dtype, one_by_one=True)
     assert np.isfinite(value).all()
     assert np.isfinite(slope).all()
     length = np.linalg.norm(slope, axis=1)
@@ -197,7 +199,7 @@ def test_law_07_no_nan_at_degenerate_points(kind, dtype):
 )
 def test_no_distance_changes_faster_than_its_point(kind, a, b):
     a, b = np.float32(a), np.float32(b)
-    (at_a, at_b), _ = evaluate_points(kind, np.stack([a, b]), np.float32, each=True)
+    (at_a, at_b), _ = evaluate_points(kind, np.stack([a, b]), np.float32, one_by_one=True)
     change = abs(float(at_a - at_b))
     assert change <= np.linalg.norm(a - b) * (1 + 1e-5) + 1e-6
 

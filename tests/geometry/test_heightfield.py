@@ -7,7 +7,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from oracle import DRONES, SHAPES, check_finite, distance_and_slopes, geom_xml, rotations, unit
+from oracle import DRONES, SHAPES, check_finite, compile_distance_and_slopes, geom_xml, normalize, rotations
 
 from crazysim.geometry import Shape, hfield
 from crazysim.geometry import distance as eager_distance
@@ -56,16 +56,16 @@ def distances_to_prisms(a, pos, quat):
     return out
 
 
-def near(rng, n):
+def draw_poses_near_surface(rng, n):
     """Return poses around the surface, its rim included."""
-    return rng.uniform(-1, 1, (n, 3)) * [0.7, 0.6, 0.4] + [0, 0, 0.3], unit(rng.normal(size=(n, 4)))
+    return rng.uniform(-1, 1, (n, 3)) * [0.7, 0.6, 0.4] + [0, 0, 0.3], normalize(rng.normal(size=(n, 4)))
 
 
 @pytest.mark.parametrize("kind", DRONES)
 def test_drones_over_a_height_field(x64, rng, kind):
-    pos, quat = near(rng, N)
+    pos, quat = draw_poses_near_surface(rng, N)
     pos[:, :2] = np.clip(pos[:, :2], -0.4, 0.4) if kind != "sphere" else pos[:, :2]
-    found, by_pos, _ = (x[:200] for x in distance_and_slopes(DRONES[kind], FIELD)(pos, rotations(quat)))
+    found, by_pos, _ = (x[:200] for x in compile_distance_and_slopes(DRONES[kind], FIELD)(pos, rotations(quat)))
     expected = distances_to_prisms(DRONES[kind], pos[:200], quat[:200])
     apart = expected > 0
     assert min(np.sum(apart & (expected < 0.1)), np.sum(~apart)) > 30
@@ -78,8 +78,8 @@ def test_drones_over_a_height_field(x64, rng, kind):
 
 def test_depth_below_a_height_field_is_that_of_the_nearest_surface(x64, rng):
     """Lifted off the ground along the gradient by its depth, a point is on the surface, a wall or the bottom."""
-    points = near(rng, N)[0]
-    sphere = lambda p: distance_and_slopes(DRONES["sphere"], FIELD)(p, np.tile(np.eye(3), (N, 1, 1)))  # noqa: E731
+    points = draw_poses_near_surface(rng, N)[0]
+    sphere = lambda p: compile_distance_and_slopes(DRONES["sphere"], FIELD)(p, np.tile(np.eye(3), (N, 1, 1)))  # noqa: E731
     depth, slope, _ = sphere(points)
     depth = depth + 0.1
     shallow = (depth < 0) & (depth > -min(CELL))
@@ -87,7 +87,7 @@ def test_depth_below_a_height_field_is_that_of_the_nearest_surface(x64, rng):
     lifted = points - depth[:, None] * slope
     np.testing.assert_allclose((sphere(lifted)[0] + 0.1)[shallow], 0, atol=1e-9)
     # No neighbour is deeper by more than its distance: nothing nearer was overlooked.
-    moved = points + 0.02 * unit(rng.normal(size=points.shape))
+    moved = points + 0.02 * normalize(rng.normal(size=points.shape))
     assert np.max(np.abs(sphere(moved)[0] + 0.1 - depth)[shallow]) < 0.02 + 1e-9
 
 
@@ -107,7 +107,7 @@ def test_law_07_no_nan(kind):
 
 
 def test_law_01_one_drone_then_many(x64, rng):
-    pos, quat = near(rng, 4)
+    pos, quat = draw_poses_near_surface(rng, 4)
     rot = rotations(quat)
     many = distance(DRONES["sphere"], FIELD, pos.reshape(2, 2, 3), rot.reshape(2, 2, 3, 3))
     one = [distance(DRONES["sphere"], FIELD, p, r) for p, r in zip(pos, rot, strict=True)]

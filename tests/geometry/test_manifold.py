@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from oracle import rotations, unit
+from oracle import normalize, rotations
 
 from crazysim.geometry import manifold
 from crazysim.geometry.heightfield import OUTSIDE_DISTANCE
@@ -17,7 +17,7 @@ N = 500
 
 
 def poses(rng, n):
-    rot = rotations(unit(rng.normal(size=(2 * n, 4))))
+    rot = rotations(normalize(rng.normal(size=(2 * n, 4))))
     return rng.uniform(-0.25, 0.25, size=(n, 3)), rot[:n], rot[n:]
 
 
@@ -79,10 +79,10 @@ def test_a_box_on_a_box_rests_on_the_corners_of_their_overlap():
     np.testing.assert_allclose(points[:, 2], 0.0595, atol=1e-6)
 
 
-def test_rounding_takes_no_face_for_an_edge(rng):
-    """If level faces touch up to rounding, there is no contact of two edges, and all points are at the boxes."""
+def test_rounding_does_not_turn_contacts_of_faces_into_contacts_of_edges(rng):
+    """If parallel faces touch up to rounding, there is no contact of two edges."""
     turned = rotations(np.array([[np.cos(x / 2), 0, 0, np.sin(x / 2)] for x in rng.uniform(0.05, 0.3, N)]))
-    world = rotations(unit(rng.normal(size=(N, 4))))
+    world = rotations(normalize(rng.normal(size=(N, 4))))
     offset = np.stack([*rng.uniform(-0.01, 0.01, (2, N)), 0.2 + rng.uniform(-1e-7, 1e-7, N)], axis=-1)
     first = (0.1, 0.1, 0.1), np.einsum("nij,nj->ni", world, offset), world @ turned
     found = boxes(*first, (0.1, 0.1, 0.1), ZERO, world)
@@ -90,9 +90,9 @@ def test_rounding_takes_no_face_for_an_edge(rng):
     assert (found.gap[:, :-1] < OUTSIDE_DISTANCE).sum(axis=1).min() >= 4
 
 
-def test_points_that_do_not_exist_are_at_the_boxes_too(rng):
-    """Edges may be parallel to a face up to rounding. Their ends were once kilometres away, as levers of impulses."""
-    turned = rotations(unit(np.stack([np.ones(N), *rng.normal(size=(3, N)) * [[1e-8], [1.0], [1e-8]]], axis=-1)))
+def test_points_without_contact_are_near_the_boxes_too(rng):
+    """Edges may be parallel to a face up to rounding, but the lever arms of impulses must stay short."""
+    turned = rotations(normalize(np.stack([np.ones(N), *rng.normal(size=(3, N)) * [[1e-8], [1.0], [1e-8]]], axis=-1)))
     found = boxes((0.1, 0.1, 0.1), rng.uniform(-0.2, 0.2, (N, 3)), turned, (0.1, 0.08, 0.05), ZERO, EYE)
     assert np.abs(found.point).max() < 1
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import SHAPES, cast_rays, random_points, unit
+from oracle import SHAPES, cast_rays, normalize, random_points
 
 from crazysim.geometry import ray_distance
 
@@ -14,10 +14,11 @@ N = 4000
 
 
 @functools.cache
-def judge(kind):
-    """Return a compiled function from rays to distances, normals, gradients of the distances, and of both. (N, 3)
+def compile_rays(kind):
+    """Return a compiled function from rays to distances, normals and two gradients. (N, 3)
 
-    The gradients are of the sum of distances of rays that hit, and of that sum and the sum of cubes of the normals.
+    The first gradient is of the sum of the distances of rays that hit. The second is of that sum plus the sum of the
+    cubes of the normals.
     """
 
     def answer(origin, direction):
@@ -29,10 +30,10 @@ def judge(kind):
 
 
 def trace_rays(kind, origin, direction, dtype=np.float64):
-    """Return what ``judge`` does for up to ``N`` rays."""
+    """Return the distances, normals and gradients of up to ``N`` rays."""
     n = len(origin)
     with jax.enable_x64(dtype == np.float64):
-        found = judge(kind)(*(np.resize(x, (N, 3)).astype(dtype) for x in (origin, direction)))
+        found = compile_rays(kind)(*(np.resize(x, (N, 3)).astype(dtype) for x in (origin, direction)))
         assert {x.dtype for x in jax.tree.leaves(found)} == {np.dtype(dtype)}
         return jax.tree.map(lambda x: np.asarray(x)[:n], found)
 
@@ -44,11 +45,11 @@ def draw_rays(rng, n=N):
     direction = target - origin
     direction[: n // 8] = rng.choice([-1.0, 0.0, 1.0], (n // 8, 3))  # along axes and diagonals
     direction[~direction.any(axis=1)] = [0, 0, 1]
-    return origin, unit(direction)
+    return origin, normalize(direction)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_rays_end_where_mujoco_has_it(rng, kind):
+def test_rays_hit_where_those_of_mujoco_hit(rng, kind):
     origin, direction = draw_rays(rng)
     t, normal, *_ = trace_rays(kind, origin, direction)
     expected, expected_normal = cast_rays(SHAPES[kind], origin, direction)
@@ -57,7 +58,7 @@ def test_rays_end_where_mujoco_has_it(rng, kind):
     assert np.sum(~hit) > 300
     np.testing.assert_array_equal(np.isfinite(t), hit)
     np.testing.assert_allclose(t[hit], expected[hit], atol=1e-5)
-    np.testing.assert_allclose(normal[hit], unit(expected_normal[hit]), atol=1e-5)
+    np.testing.assert_allclose(normal[hit], normalize(expected_normal[hit]), atol=1e-5)
     np.testing.assert_array_equal(normal[~hit], 0)
 
 
@@ -102,10 +103,10 @@ def test_law_07_no_nan_in_degenerate_cases(kind):
     """From the centre, from edges, along faces, past corners: every value and gradient is finite, or a miss."""
     size = np.asarray([*SHAPES[kind].size, 0.3, 0.3, 0.3])[:3]
     grid = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0, 3.0]] * 3), axis=-1).reshape(-1, 3)
-    ways = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
-    ways = np.concatenate([unit(ways[ways.any(axis=1)]), [[1e-15, 0, 1], [1, 1e-13, 0]]])
+    directions = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    directions = np.concatenate([normalize(directions[directions.any(axis=1)]), [[1e-15, 0, 1], [1, 1e-13, 0]]])
     for scale in (size, size[[1, 0, 2]], size[0]):
-        origin, direction = np.repeat(grid * scale, len(ways), axis=0), np.tile(ways, (len(grid), 1))
+        origin, direction = np.repeat(grid * scale, len(directions), axis=0), np.tile(directions, (len(grid), 1))
         t, normal, _, slopes = trace_rays(kind, origin, direction, np.float32)
         assert not np.isnan(t).any()
         np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), np.isfinite(t), atol=1e-5)

@@ -124,19 +124,19 @@ def rotor_limits(dynamics: str, params: dict) -> tuple[float, float]:
     return 4.0 * low, 4.0 * high
 
 
-def signed(rng: np.random.Generator, low: float, high: float, size: int = 3) -> np.ndarray:
+def draw_signed(rng: np.random.Generator, low: float, high: float, size: int = 3) -> np.ndarray:
     """Draw numbers of a size in [low, high] with either sign, so that none is close to zero."""
     return rng.uniform(low, high, size) * rng.choice((-1.0, 1.0), size)
 
 
-def nearly_level_rotors(rng: np.random.Generator) -> np.ndarray:
+def draw_balanced_rotors(rng: np.random.Generator) -> np.ndarray:
     """Draw four different relative rotor speeds whose roll and pitch torque is tiny.
 
     A drone that no controller holds turns over within a second when its rotors differ by one percent at
     random, but not when opposite rotors agree: that difference only yaws it.
     """
-    twist = signed(rng, 0.003, 0.008, 1)
-    tilt = signed(rng, 5e-5, 1e-4, 2)
+    twist = draw_signed(rng, 0.003, 0.008, 1)
+    tilt = draw_signed(rng, 5e-5, 1e-4, 2)
     return 1.0 + twist * YAW + tilt[0] * ROLL + tilt[1] * PITCH
 
 
@@ -157,13 +157,13 @@ def draw_world(dynamics: str, control: str, params: dict, world: int) -> dict[st
     # and loses its attitude when it has to brake a fast fall and to right itself at once.
     vel = rng.uniform(-0.5, 0.5, 3) * (0.5 if control == "state" else 1.0)
     ang_vel = rng.uniform(-1.0, 1.0, 3) * (0.1 if open_loop else 0.5 if control == "state" else 1.0)
-    force = signed(rng, 0.01, 0.04) * weight
-    torque = signed(rng, 1e-6, 3e-6 if open_loop else 1e-5) * inertia_ratio
+    force = draw_signed(rng, 0.01, 0.04) * weight
+    torque = draw_signed(rng, 1e-6, 3e-6 if open_loop else 1e-5) * inertia_ratio
 
     if dynamics == "first_principles":
         hover = force_to_rpm(weight / 4.0, params)
         if open_loop:
-            rotor_vel = hover * rng.uniform(0.95, 1.05) * nearly_level_rotors(rng)
+            rotor_vel = hover * rng.uniform(0.95, 1.05) * draw_balanced_rotors(rng)
         else:
             rotor_vel = hover * rng.uniform(0.95, 1.05, 4)
     elif dynamics == "so_rpy":
@@ -172,29 +172,29 @@ def draw_world(dynamics: str, control: str, params: dict, world: int) -> dict[st
         rotor_vel = np.full(4, thrust * rng.uniform(0.95, 1.05))
 
     if control == "state":
-        # The controller answers an error in height with far more thrust than one to the side, and a target
+        # The controller answers an error in height with far more thrust than an error to the side, and a target
         # 0.3 m above would hold the rotors at their limit for most of the flight.
         direction = rng.normal(size=3) * (1.0, 1.0, 0.3)
-        yaw = signed(rng, 0.25, 0.35, 1)
+        yaw = draw_signed(rng, 0.25, 0.35, 1)
         command = np.concatenate(
             (
                 pos + 0.3 * direction / np.linalg.norm(direction),
-                signed(rng, 0.02, 0.1),
-                signed(rng, 0.02, 0.2),
+                draw_signed(rng, 0.02, 0.1),
+                draw_signed(rng, 0.02, 0.2),
                 np.zeros(2),
                 np.sin(yaw / 2.0),
                 np.cos(yaw / 2.0),
-                signed(rng, 0.05, 0.2),
+                draw_signed(rng, 0.05, 0.2),
             )
         )
     elif control == "attitude":
-        command = np.append(signed(rng, 0.05, 0.2), thrust * rng.uniform(0.95, 1.1))
+        command = np.append(draw_signed(rng, 0.05, 0.2), thrust * rng.uniform(0.95, 1.1))
     elif control == "body_rate":
-        command = np.append(signed(rng, 0.1, 0.5), thrust * rng.uniform(0.98, 1.05))
+        command = np.append(draw_signed(rng, 0.1, 0.5), thrust * rng.uniform(0.98, 1.05))
     elif control == "force_torque":
-        command = np.append(weight * rng.uniform(0.98, 1.05), signed(rng, 5e-6, 1e-5))
+        command = np.append(weight * rng.uniform(0.98, 1.05), draw_signed(rng, 5e-6, 1e-5))
     elif control == "rotor_vel":
-        command = hover * nearly_level_rotors(rng)
+        command = hover * draw_balanced_rotors(rng)
     else:
         raise ValueError(f"unknown command level {control}")
     return {
@@ -223,7 +223,7 @@ def check_dtypes(sim, dtype: np.dtype, where: str) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(sim.data):
         if jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype != dtype:
             raise RuntimeError(f"{where}: {jax.tree_util.keystr(path)} is {leaf.dtype} and not {dtype}")
-    # A step that goes through another float type returns the right one all the same, so look inside.
+    # A step may compute in another float type and still return the right one, so its jaxpr is checked too.
     other = "f32[" if dtype == np.float64 else "f64["
     if other in str(sim._step.trace(sim.data, n_steps=SAMPLE_EVERY).jaxpr):
         raise RuntimeError(f"{where}: the step computes in another float type than {dtype}")
@@ -360,19 +360,19 @@ def merge(pair: tuple[str, str], double: dict[str, np.ndarray], single: dict[str
             continue
         label = key.removeprefix(prefix)
         golden[label] = value
-        flight, what = label.rsplit("/", 1)
-        if what in FIELDS:
+        flight, field = label.rsplit("/", 1)
+        if field in FIELDS:
             error = np.abs(single[key] - value).max(axis=(1, 2, 3))
-            golden[f"{flight}/float32_error_{what}"] = error
+            golden[f"{flight}/float32_error_{field}"] = error
             variant = flight.split("/")[0]
-            worst[variant, what] = max(worst.get((variant, what), 0.0), float(error.max()))
+            worst[variant, field] = max(worst.get((variant, field), 0.0), float(error.max()))
         elif not np.array_equal(single[key], value):
             raise RuntimeError(f"{key} differs between the passes")
     path = FOLDER / f"{name}.npz"
     np.savez_compressed(path, **golden)
     print(f"{path.name}: {len(golden)} arrays, {path.stat().st_size / 1000:.0f} kB")
     for variant in dict.fromkeys(variant for variant, _ in worst):
-        errors = "  ".join(f"{what} {worst[variant, what]:.1e}" for what in FIELDS)
+        errors = "  ".join(f"{field} {worst[variant, field]:.1e}" for field in FIELDS)
         print(f"  float32 error, {variant:<16}  {errors}")
 
 

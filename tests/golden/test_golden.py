@@ -54,7 +54,7 @@ def crazyflow_rk4(data, deriv_fn):
     return apply_derivative(data, mean, dt)
 
 
-def fly(stem, variant, like_crazyflow=True):
+def fly(stem, variant, with_crazyflow_rk4=True):
     """Fly every airframe and start of a recording in its own world.
 
     Returns:
@@ -75,7 +75,7 @@ def fly(stem, variant, like_crazyflow=True):
         controller="crazyflow",
         **rates,
     )
-    if integrator == "rk4" and like_crazyflow:
+    if integrator == "rk4" and with_crazyflow_rk4:
         deriv_fn = sim.step_pipeline["integration"].fn.deriv_fn
         replace_fn(sim.step_pipeline, stage("drone")(partial(crazyflow_rk4, deriv_fn=deriv_fn)), "integration")
     step = sim.build_step_fn()
@@ -134,6 +134,6 @@ def test_float32_is_as_near_to_float64_as_the_peers_own(stem, variant):
 
 def test_our_rk4_differs_from_the_peers_by_its_order_in_attitude_only(x64):
     """The commutators in crazysim's Runge-Kutta are a correction of second order in the step, and not zero."""
-    mine, theirs, _ = fly("first_principles-attitude", "rk4", like_crazyflow=False)
+    mine, theirs, _ = fly("first_principles-attitude", "rk4", with_crazyflow_rk4=False)
     difference = np.max(np.abs(align_signs(mine["quat"], theirs["quat"]) - theirs["quat"]))
     assert 1e-9 < difference < 1e-3

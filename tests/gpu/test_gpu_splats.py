@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from on_devices import ACCELERATOR, require_device
-from splat_files import one_splat, spot_alpha, write_splats
+from splat_files import make_splat, spot_alpha, write_splats
 
 from crazysim import Sim, SplatScene
 from crazysim.sim.sensors.splat import render_splat_rgbd
@@ -36,7 +36,7 @@ def test_a_known_splat_is_its_analytic_projection(sim):
     offset, deviation, opacity, color = np.array([2.0, 0.2, 0.1]), 0.1, 0.8, np.array([0.9, 0.5, 0.2])
     eye = np.array([camera.pos[0], camera.pos[1], camera.pos[2] + 1.0])
     image = require_device(
-        ACCELERATOR, look(sim.data, jax.device_put(one_splat(eye + offset, deviation, opacity, color), sim.device))
+        ACCELERATOR, look(sim.data, jax.device_put(make_splat(eye + offset, deviation, opacity, color), sim.device))
     )
     focal = 33 / 2 / np.tan(np.deg2rad(float(camera.fovy[0])) / 2)
     alpha = spot_alpha(offset, deviation, opacity, focal, 33)

@@ -33,7 +33,7 @@ def test_simulations_are_those_of_the_cpu(name):
         sim = sweep.CASES[name](device=device)
         lines = sim.explain().splitlines()
         assert lines[0] == "engine: fused"
-        assert lines[-1].startswith("kernel: ") or name in sweep.SPLIT
+        assert lines[-1].startswith("kernel: ") or name in sweep.SPLIT_CASES
         sim.step(40 if name == "impact" else N_STEPS)
         return sim.data
 

@@ -1,4 +1,4 @@
-"""Faults of Crazyflow that crazysim does not have, numbered as in the list of faults not to inherit."""
+"""Faults of Crazyflow 0.4.0 that crazysim does not have; each test describes its fault."""
 
 import functools
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import (
-    FITTED,
+    FITTED_DYNAMICS,
     INTEGRATORS,
     PAIRS,
     hover_command,
@@ -36,11 +36,11 @@ def build_program(dynamics="first_principles", control="attitude", **settings):
 
 
 def run_steps(step, data, n_steps):
-    # Committed to one device, whatever an edit was committed to, or the step would be compiled again.
+    # An edit may have committed arrays to another device, for which the step would be compiled again.
     return step(jax.device_put(data, jax.devices()[0]), jnp.int32(n_steps))
 
 
-@pytest.mark.parametrize("dynamics", FITTED)
+@pytest.mark.parametrize("dynamics", FITTED_DYNAMICS)
 def test_fault_01_attitude_freq_holds_for_fitted_dynamics(dynamics):
     """At 50 Hz of 500 Hz, a command takes effect at every tenth step; in Crazyflow it does so at once."""
     sim = Sim(dynamics=dynamics, attitude_freq=50, engine="interpret")
@@ -78,7 +78,7 @@ def test_fault_02_a_zero_quaternion_means_yaw_zero(dynamics):
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(from_zeros.states))
     assert not from_zeros.core.nonfinite.any()
     assert trees_equal(from_zeros.states, from_level.states)
-    if dynamics in FITTED:
+    if dynamics in FITTED_DYNAMICS:
         attitude = from_zeros.controls.attitude.cmd
         np.testing.assert_allclose(attitude[..., 2], 0.0, atol=1e-4)  # float32, and a small drift
     yaw = 2 * np.arctan2(from_zeros.states.quat[..., 2], from_zeros.states.quat[..., 3])
@@ -91,7 +91,7 @@ def test_fault_03_nan_commands_are_refused_flagged_and_healed(dynamics, control)
     data = with_states(data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(data))
     good = repeat_command(data, hover_command(data)).astype(np.float32)
     # Fitted dynamics contain the attitude controller and ignore the last three numbers, the desired body rates.
-    used = 13 if dynamics in FITTED and control == "state" else good.shape[-1]
+    used = 13 if dynamics in FITTED_DYNAMICS and control == "state" else good.shape[-1]
     for component in range(used):
         bad = good.copy()
         bad[1, 0, component] = np.nan
@@ -176,20 +176,20 @@ def test_fault_06_zero_thrust_stops_the_motors_at_every_level(dynamics, control)
         data = fly_without_force(step, data)
     else:
         data = run_steps(step, send(data, repeat_command(data, zero_thrust_command(data))), 250)
-    commanded = data.controls.attitude.cmd[..., 3] if dynamics in FITTED else data.controls.rotor_vel
+    commanded = data.controls.attitude.cmd[..., 3] if dynamics in FITTED_DYNAMICS else data.controls.rotor_vel
     np.testing.assert_array_equal(commanded, 0.0)
     z, v, r = simulate_fall(data, 250)
     assert_falls(data.states, z, v, r)
     assert v < -3.5, "gravity alone gives 4.905 m/s; thrust of the slowing rotors and drag reduce it"
 
 
-@pytest.mark.parametrize("dynamics", ["first_principles", *FITTED])
+@pytest.mark.parametrize("dynamics", ["first_principles", *FITTED_DYNAMICS])
 def test_fault_06_the_default_controller_keeps_the_rotors_at_their_least_speed(dynamics):
     """Rotors that stand still cannot turn a drone, and start late. Compensation of drag does not tilt it."""
     data, step, _ = build_program(dynamics, "state")
     data = with_states(data, pos=[0, 0, 100.0], rotor_vel=hover_rotor_state(data))
     after_fall = fly_without_force(step, data)
-    if dynamics in FITTED:
+    if dynamics in FITTED_DYNAMICS:
         least = float(data.params.thrust_min[0])
         commanded, z_v_r = after_fall.controls.attitude.cmd[..., 3], simulate_fall(data, 250, lambda r: least)
     else:
@@ -304,7 +304,7 @@ def named_leaves(data):
     return {jax.tree_util.keystr(k): leaf_on_host(v) for k, v in jax.tree_util.tree_leaves_with_path(data)}
 
 
-def test_fault_16_a_full_reset_is_that_of_all_worlds_and_of_what_they_share(used_data):
+def test_fault_16_a_full_reset_restores_all_worlds_and_shared_leaves(used_data):
     default, used, reset = used_data
     full, masked = reset(used, default), reset(used, default, jnp.ones(3, bool))
     assert jax.tree.structure(full) == jax.tree.structure(masked)
@@ -328,7 +328,7 @@ def test_fault_16_a_full_reset_is_that_of_all_worlds_and_of_what_they_share(used
             np.testing.assert_array_equal(full[name], value, err_msg=name)
 
 
-def test_fault_16_a_reset_touches_its_worlds_and_what_belongs_to_them_only(used_data):
+def test_fault_16_a_masked_reset_changes_its_worlds_only(used_data):
     default, used, reset = used_data
     mask = np.array([True, False, True])
     before, after, default_leaves = (

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FITTED
+from cases import FITTED_DYNAMICS
 
 import crazysim
 from crazysim import Dynamics, Sim, load_airframe
@@ -42,7 +42,7 @@ CASES = [
     )
     for module in MODULES
     for function in public_functions(module)
-    for model in (FITTED if module is fitted else (None,))
+    for model in (FITTED_DYNAMICS if module is fitted else (None,))
 ]
 
 

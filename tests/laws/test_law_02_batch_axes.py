@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import LEVELS, PAIRS, n_documented, shared_sim, with_params, with_states
+from cases import LEVELS, PAIRS, count_documented_arrays, shared_sim, with_params, with_states
 
 from crazysim import ConfigError, Control, Sim
 from crazysim.core.data import SimData
@@ -138,7 +138,7 @@ def test_a_mass_of_a_world_alone_is_refused(three_by_three, shape):
 def test_docstrings_give_the_shapes(dynamics, control):
     """Law 2: every array field of every record documents its shape correctly."""
     data = make_data(shared_sim(dynamics=dynamics, control=control), 2, 3)
-    assert n_documented(data, n_worlds=2, n_drones=3, n_rotors=4) == len(jax.tree.leaves(data))
+    assert count_documented_arrays(data, n_worlds=2, n_drones=3, n_rotors=4) == len(jax.tree.leaves(data))
 
 
 @pytest.mark.parametrize("controller", ["pid", "mellinger", "crazyflow", ("pid", "mellinger")], ids=str)
@@ -147,4 +147,4 @@ def test_docstrings_of_controllers_give_the_shapes(controller):
     switch = {} if isinstance(controller, str) else {"switch": 0}
     sim = Sim(2, 3, control="state", controller=controller if isinstance(controller, str) else [*controller], **switch)
     record = sim.data.controls
-    assert n_documented(record, n_worlds=2, n_drones=3, n_rotors=4) == len(jax.tree.leaves(record))
+    assert count_documented_arrays(record, n_worlds=2, n_drones=3, n_rotors=4) == len(jax.tree.leaves(record))

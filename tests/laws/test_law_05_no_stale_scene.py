@@ -33,13 +33,13 @@ class Unreadable:
 
 
 @pytest.fixture(scope="module")
-def one():
+def one_world_sim():
     """Return a simulation of one world with one drone."""
     return Sim()
 
 
 @pytest.fixture(scope="module")
-def two():
+def two_world_sim():
     """Return a simulation of two worlds with one drone, and a ball that the tests move."""
     sim = Sim(n_worlds=2)
     add_ball(sim)
@@ -85,7 +85,7 @@ def scene_with_ball(sim, *heights):
 
 
 def drone_touches(sim):
-    """Return in which worlds the drone touches anything."""
+    """Return whether the drone touches anything, for each world."""
     return np.asarray(sim.contacts("drone:0")).any(-1).tolist()
 
 
@@ -101,13 +101,13 @@ def sync_scene(sim, *heights):
 # What clears the flag -------------------------------------------------------------------------------------------
 
 
-def test_contacts_after_a_teleport_are_those_of_the_new_place(two, syncs):
+def test_contacts_after_a_teleport_are_those_of_the_new_place(two_world_sim, syncs):
     """Fault 7: assigning sim.data makes the scene stale, whatever flag the assigned data carries."""
-    sync_scene(two, 0.0, FREE_HEIGHT)
-    assert drone_touches(two) == [True, False]
-    assert bool(two.data.core.mjx_synced), "the data that is assigned next claims to be synced"
-    two.data = with_heights(two.data, FREE_HEIGHT, 0.0)
-    assert drone_touches(two) == [False, True]
+    sync_scene(two_world_sim, 0.0, FREE_HEIGHT)
+    assert drone_touches(two_world_sim) == [True, False]
+    assert bool(two_world_sim.data.core.mjx_synced), "the data that is assigned next claims to be synced"
+    two_world_sim.data = with_heights(two_world_sim.data, FREE_HEIGHT, 0.0)
+    assert drone_touches(two_world_sim) == [False, True]
 
 
 def test_contacts_after_a_rebuild_are_those_of_the_new_scene(syncs):
@@ -125,28 +125,28 @@ def test_contacts_after_a_rebuild_are_those_of_the_new_scene(syncs):
     assert len(syncs) == 4
 
 
-def test_contacts_after_box_collision_are_those_of_boxes(one):
+def test_contacts_after_box_collision_are_those_of_boxes(one_world_sim):
     """At a height of 5 cm, the sphere of 8.6 cm touches the floor, and the box of 2 cm half height does not."""
-    sync_scene(one, 0.05)
-    assert drone_touches(one) == [True]
-    slots = one.contacts().shape
-    use_box_collision(one)
+    sync_scene(one_world_sim, 0.05)
+    assert drone_touches(one_world_sim) == [True]
+    slots = one_world_sim.contacts().shape
+    use_box_collision(one_world_sim)
     try:
-        assert one.contacts().shape != slots
-        assert drone_touches(one) == [False]
+        assert one_world_sim.contacts().shape != slots
+        assert drone_touches(one_world_sim) == [False]
     finally:
-        use_box_collision(one, False)
-    assert drone_touches(one) == [True]
+        use_box_collision(one_world_sim, False)
+    assert drone_touches(one_world_sim) == [True]
 
 
-def test_contacts_after_a_body_was_moved_are_those_of_its_new_place(two, syncs):
+def test_contacts_after_a_body_was_moved_are_those_of_its_new_place(two_world_sim, syncs):
     """Assigning sim.mjx_data makes the scene stale: a ball put on the drone of world 1 touches it."""
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
-    assert drone_touches(two) == [False, False]
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
+    assert drone_touches(two_world_sim) == [False, False]
     syncs.clear()
-    two.mjx_data = scene_with_ball(two, 5, FREE_HEIGHT)
-    assert drone_touches(two) == [False, True]
-    assert drone_touches(two) == [False, True]
+    two_world_sim.mjx_data = scene_with_ball(two_world_sim, 5, FREE_HEIGHT)
+    assert drone_touches(two_world_sim) == [False, True]
+    assert drone_touches(two_world_sim) == [False, True]
     assert len(syncs) == 1
 
 
@@ -167,42 +167,44 @@ def test_contacts_after_a_body_was_moved_are_those_of_its_new_place(two, syncs):
         pytest.param(lambda sim: sim.build_mjx(), id="build_mjx"),
     ],
 )
-def test_a_change_has_the_next_question_sync_once(two, syncs, change):
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
+def test_the_next_query_after_a_change_syncs_once(two_world_sim, syncs, change):
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
-    change(two)
+    change(two_world_sim)
     assert not syncs, "a change alone syncs nothing"
-    two.contacts()
+    two_world_sim.contacts()
     assert len(syncs) == 1
-    two.contacts()
+    two_world_sim.contacts()
     assert len(syncs) == 1
 
 
-def test_the_flag_of_the_data_follows(two):
+def test_the_flag_of_the_data_follows(two_world_sim):
     """``data.core.mjx_synced`` is set by a question, and cleared by whatever makes the scene stale."""
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
-    synced = two.data
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
+    synced = two_world_sim.data
     changes = {
-        "step": two.step,
-        "reset": two.reset,
-        "build_mjx": two.build_mjx,
-        "the same data": lambda: setattr(two, "data", two.data),
-        "data that was synced": lambda: setattr(two, "data", synced),
+        "step": two_world_sim.step,
+        "reset": two_world_sim.reset,
+        "build_mjx": two_world_sim.build_mjx,
+        "the same data": lambda: setattr(two_world_sim, "data", two_world_sim.data),
+        "data that was synced": lambda: setattr(two_world_sim, "data", synced),
         "data that claims to be": lambda: setattr(
-            two, "data", two.data.replace(core=two.data.core.replace(mjx_synced=np.True_))
+            two_world_sim, "data", two_world_sim.data.replace(core=two_world_sim.data.core.replace(mjx_synced=np.True_))
         ),
-        "mjx_data": lambda: setattr(two, "mjx_data", two.mjx_data),
-        "what a sync returns": lambda: setattr(two, "data", sync_sim2mjx(two.data, two.mjx_data, two.mjx_model)[0]),
+        "mjx_data": lambda: setattr(two_world_sim, "mjx_data", two_world_sim.mjx_data),
+        "what a sync returns": lambda: setattr(
+            two_world_sim, "data", sync_sim2mjx(two_world_sim.data, two_world_sim.mjx_data, two_world_sim.mjx_model)[0]
+        ),
     }
     for name, change in changes.items():
-        two.contacts()
-        assert bool(two.data.core.mjx_synced), name
+        two_world_sim.contacts()
+        assert bool(two_world_sim.data.core.mjx_synced), name
         for _ in range(2):
             change()
-            assert not bool(two.data.core.mjx_synced), name
+            assert not bool(two_world_sim.data.core.mjx_synced), name
 
 
-def test_an_edit_of_the_scene_has_the_next_question_sync_once(syncs):
+def test_the_next_query_after_an_edit_of_the_scene_syncs_once(syncs):
     """An edit compiles the scene at the next question, and clears the one flag."""
     sim = Sim(n_worlds=2)
     edits = {
@@ -221,113 +223,119 @@ def test_an_edit_of_the_scene_has_the_next_question_sync_once(syncs):
         assert len(syncs) == 1, name
 
 
-def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two):
+def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two_world_sim):
     """Any flag is replaced by a cleared one; a flag that is known to be clear stays, so edits need no transfer."""
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
-    two.step()
-    compiled = two.step_fn._cache_size()
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
+    two_world_sim.step()
+    compiled = two_world_sim.step_fn._cache_size()
     for flag in (Unreadable(), False, True, jnp.asarray(True), np.asarray(True)):
-        two.data = two.data.replace(core=two.data.core.replace(mjx_synced=flag))
-        two.step()
-    assert two.step_fn._cache_size() == compiled
-    clear = two.data.core.mjx_synced
-    two.data = with_heights(two.data, FREE_HEIGHT, FREE_HEIGHT)
-    assert two.data.core.mjx_synced is clear
+        two_world_sim.data = two_world_sim.data.replace(core=two_world_sim.data.core.replace(mjx_synced=flag))
+        two_world_sim.step()
+    assert two_world_sim.step_fn._cache_size() == compiled
+    clear = two_world_sim.data.core.mjx_synced
+    two_world_sim.data = with_heights(two_world_sim.data, FREE_HEIGHT, FREE_HEIGHT)
+    assert two_world_sim.data.core.mjx_synced is clear
 
 
-def test_a_cleared_flag_is_an_array_of_its_own(two):
+def test_a_cleared_flag_is_an_array_of_its_own(two_world_sim):
     """A user who donates data read from ``sim.data`` must not invalidate other data, such as the default data."""
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
-    flags = [two.default_data.core.mjx_synced]
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
+    flags = [two_world_sim.default_data.core.mjx_synced]
     for _ in range(3):
-        two.contacts()
-        two.data = two.data
-        flags.append(two.data.core.mjx_synced)
+        two_world_sim.contacts()
+        two_world_sim.data = two_world_sim.data
+        flags.append(two_world_sim.data.core.mjx_synced)
     assert len(set(map(id, flags))) == len(flags)
 
 
-def test_what_sync_returns_may_be_assigned(two, syncs):
+def test_what_sync_returns_may_be_assigned(two_world_sim, syncs):
     """After the results of sync_sim2mjx are assigned, one redundant sync is allowed, but no stale answer."""
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
-    two.data, two.mjx_data = sync_sim2mjx(with_heights(two.data, 0.0, FREE_HEIGHT), two.mjx_data, two.mjx_model)
-    assert drone_touches(two) == [True, False]
+    two_world_sim.data, two_world_sim.mjx_data = sync_sim2mjx(
+        with_heights(two_world_sim.data, 0.0, FREE_HEIGHT), two_world_sim.mjx_data, two_world_sim.mjx_model
+    )
+    assert drone_touches(two_world_sim) == [True, False]
     assert len(syncs) <= 1
 
 
 # What does not --------------------------------------------------------------------------------------------------
 
 
-def test_queries_share_a_sync_until_the_next_step(one, syncs):
+def test_queries_share_a_sync_until_the_next_step(one_world_sim, syncs):
     """Two questions after a step need one sync, and two syncs if there is a step between them."""
-    one.step(5)
+    one_world_sim.step(5)
     syncs.clear()
-    one.contacts()
-    one.contacts("drone:0")
+    one_world_sim.contacts()
+    one_world_sim.contacts("drone:0")
     assert len(syncs) == 1
 
-    one.step(5)
+    one_world_sim.step(5)
     syncs.clear()
-    one.contacts()
-    one.step(5)
-    one.contacts()
+    one_world_sim.contacts()
+    one_world_sim.step(5)
+    one_world_sim.contacts()
     assert len(syncs) == 2
 
 
-def test_pictures_show_the_world_as_it_is_and_leave_mjx_alone(one, syncs, opengl):
+def test_pictures_show_the_world_as_it_is_and_leave_mjx_alone(one_world_sim, syncs, opengl):
     """An image after a step shows that step, whether the contacts were up to date or not."""
-    one.reset()
-    one.contacts()
+    one_world_sim.reset()
+    one_world_sim.contacts()
     syncs.clear()
-    before = one.mjx_data
+    before = one_world_sim.mjx_data
     for height in (0.5, 1.0):
-        one.data = with_heights(one.data, height)
-        one.render(**SMALL_IMAGE)
-        np.testing.assert_allclose(one.mj_data.body("drone:0").xpos[2], height, atol=1e-6)
-        assert not one.data.core.mjx_synced
-    assert one.mjx_data is before
+        one_world_sim.data = with_heights(one_world_sim.data, height)
+        one_world_sim.render(**SMALL_IMAGE)
+        np.testing.assert_allclose(one_world_sim.mj_data.body("drone:0").xpos[2], height, atol=1e-6)
+        assert not one_world_sim.data.core.mjx_synced
+    assert one_world_sim.mjx_data is before
     assert not syncs
 
 
-def test_commands_leave_the_scene_fresh(two, syncs):
+def test_commands_leave_the_scene_fresh(two_world_sim, syncs):
     """A command moves nothing, so no flag is cleared."""
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
-    two.attitude_control(np.zeros((2, 1, 4)))
-    assert bool(two.data.core.mjx_synced)
-    two.contacts()
+    two_world_sim.attitude_control(np.zeros((2, 1, 4)))
+    assert bool(two_world_sim.data.core.mjx_synced)
+    two_world_sim.contacts()
     assert not syncs
 
 
-def test_wrong_questions_change_nothing(two, syncs):
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
-    data, mjx_data = two.data, two.mjx_data
-    for wrong in (lambda: two.contacts("gate"), lambda: two.render("film"), lambda: two.render("rgb_array", world=2)):
+def test_wrong_questions_change_nothing(two_world_sim, syncs):
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
+    data, mjx_data = two_world_sim.data, two_world_sim.mjx_data
+    for wrong in (
+        lambda: two_world_sim.contacts("gate"),
+        lambda: two_world_sim.render("film"),
+        lambda: two_world_sim.render("rgb_array", world=2),
+    ):
         with pytest.raises(ValueError):
             wrong()
-    assert two.data is data
-    assert two.mjx_data is mjx_data
+    assert two_world_sim.data is data
+    assert two_world_sim.mjx_data is mjx_data
 
 
-def test_queries_read_no_flag_from_the_device(two, syncs):
+def test_queries_read_no_flag_from_the_device(two_world_sim, syncs):
     """The host knows whether a sync is due, so the flag on the device is never read."""
 
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
-    fine = two._stepper.data
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
+    valid_data = two_world_sim._stepper.data
     try:
-        two._stepper.data = fine.replace(core=fine.core.replace(mjx_synced=Unreadable()))
+        two_world_sim._stepper.data = valid_data.replace(core=valid_data.core.replace(mjx_synced=Unreadable()))
         syncs.clear()
-        two.contacts()
-        two.contacts("drone:0")
+        two_world_sim.contacts()
+        two_world_sim.contacts("drone:0")
         assert not syncs
     finally:
-        two._stepper.data = fine
+        two_world_sim._stepper.data = valid_data
 
 
 # What is allocated ----------------------------------------------------------------------------------------------
 
 
-def test_nothing_of_the_scene_is_held_per_world_before_it_is_asked_for():
+def test_no_scene_state_of_worlds_is_allocated_before_it_is_needed():
     """Steps, resets and rebuilds allocate no MuJoCo state of any world; contacts do."""
     n_worlds = 977  # a number that no other test uses, so arrays with this number of rows belong to this simulation
     sim = Sim(n_worlds=n_worlds)
@@ -397,7 +405,7 @@ def test_a_spec_that_lost_a_drone_is_refused_by_name():
         _ = sim.data
 
 
-def test_drawing_one_world_of_several_holds_none_of_the_others(opengl, syncs):
+def test_drawing_one_world_allocates_nothing_for_the_others(opengl, syncs):
     """A picture needs one world's poses: no MJX, no scene state, no sync of all worlds."""
     sim = Sim(n_worlds=2)
     sim.step()
@@ -407,17 +415,21 @@ def test_drawing_one_world_of_several_holds_none_of_the_others(opengl, syncs):
     assert not syncs
 
 
-def test_the_scene_is_returned_as_it_is(two, syncs):
+def test_the_scene_is_returned_as_it_is(two_world_sim, syncs):
     """Reading sim.mjx_data syncs nothing: it returns the same object, as of the last sync."""
-    sync_scene(two, FREE_HEIGHT, FREE_HEIGHT)
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
-    before = two.mjx_data
-    two.data = with_heights(two.data, 0.25, 0.5)
-    assert two.mjx_data is before
-    np.testing.assert_allclose(two.mjx_data.mocap_pos[:, two.data.core.drone_mocap_ids[0], 2], FREE_HEIGHT)
+    before = two_world_sim.mjx_data
+    two_world_sim.data = with_heights(two_world_sim.data, 0.25, 0.5)
+    assert two_world_sim.mjx_data is before
+    np.testing.assert_allclose(
+        two_world_sim.mjx_data.mocap_pos[:, two_world_sim.data.core.drone_mocap_ids[0], 2], FREE_HEIGHT
+    )
     assert not syncs
-    two.contacts()
-    np.testing.assert_allclose(two.mjx_data.mocap_pos[:, two.data.core.drone_mocap_ids[0], 2], [0.25, 0.5])
+    two_world_sim.contacts()
+    np.testing.assert_allclose(
+        two_world_sim.mjx_data.mocap_pos[:, two_world_sim.data.core.drone_mocap_ids[0], 2], [0.25, 0.5]
+    )
 
 
 # Any order ------------------------------------------------------------------------------------------------------
@@ -465,12 +477,12 @@ class SceneMachine(RuleBasedStateMachine):
         self.sim.attitude_control(np.zeros((2, 1, 4)))
 
     @rule()
-    def read(self):
+    def read_scene(self):
         assert self.sim.mjx_data is self.sim.mjx_data
 
     @precondition(lambda self: hasattr(self, "ball"))
     @rule()
-    def ask(self):
+    def query_contacts(self):
         assert bool(self.sim.data.core.mjx_synced) != self.changed, "the flag says whether a question syncs"
         z = np.asarray(self.sim.data.states.pos[:, 0, 2]) + 0.02
         expected = (z < 0.086) | (np.abs(z - self.ball) < 0.186)

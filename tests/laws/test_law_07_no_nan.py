@@ -81,21 +81,21 @@ def make_situations(dynamics, control, engine="auto"):
     pos, quat, rotor_vel = np.zeros((n, 1, 3)), np.zeros((n, 1, 4)), np.zeros((n, 1, 4))
     pos[..., 2], quat[..., 3] = 1.0, 1.0
     commands = np.broadcast_to(hover_command(sim.data), (n, 1, len(hover_command(sim.data)))).copy()
-    world_of = {name: i for i, name in enumerate(SITUATIONS)}
-    rotor_vel[world_of["hover"]] = hover_rotor_state(sim.data)
+    world_ids = {name: i for i, name in enumerate(SITUATIONS)}
+    rotor_vel[world_ids["hover"]] = hover_rotor_state(sim.data)
     for name, height in (("rest at zero", 0.0), ("rest on floor", FLOOR_HEIGHT), ("below floor", -1.0)):
-        pos[world_of[name], 0, 2] = height
-        commands[world_of[name]] = 0.0
-    quat[world_of["pitch +90"]] = 0, SQRT_HALF, 0, SQRT_HALF
-    quat[world_of["pitch -90"]] = 0, -SQRT_HALF, 0, SQRT_HALF
-    quat[world_of["upside down"]] = 1, 0, 0, 0
-    quat[world_of["zero thrust, tilted"]] = np.sin(0.4), 0, 0, np.cos(0.4)
-    commands[world_of["zero command"]] = 0.0
+        pos[world_ids[name], 0, 2] = height
+        commands[world_ids[name]] = 0.0
+    quat[world_ids["pitch +90"]] = 0, SQRT_HALF, 0, SQRT_HALF
+    quat[world_ids["pitch -90"]] = 0, -SQRT_HALF, 0, SQRT_HALF
+    quat[world_ids["upside down"]] = 1, 0, 0, 0
+    quat[world_ids["zero thrust, tilted"]] = np.sin(0.4), 0, 0, np.cos(0.4)
+    commands[world_ids["zero command"]] = 0.0
     for name, sign in (("saturated", 1), ("saturated below", -1)):
-        commands[world_of[name]] = sign * (1e6 if control == "rotor_vel" else 100.0)
+        commands[world_ids[name]] = sign * (1e6 if control == "rotor_vel" else 100.0)
         if control == "attitude":  # angles do not saturate; these are the largest there are
-            commands[world_of[name], 0, :3] = sign * np.pi * np.array([1.0, 0.5, -1.0])
-    commands[world_of["zero thrust, tilted"]] = tilt_command(sim.data)
+            commands[world_ids[name], 0, :3] = sign * np.pi * np.array([1.0, 0.5, -1.0])
+    commands[world_ids["zero thrust, tilted"]] = tilt_command(sim.data)
     arrays = {"pos": pos, "quat": quat, "rotor_vel": rotor_vel}
     states = sim.data.states.replace(**{k: np.float32(v) for k, v in arrays.items()})
     return sim, *jax.device_put((sim.data.replace(states=states), np.float32(commands)), sim.device)
@@ -228,7 +228,7 @@ def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integr
 
 
 @pytest.mark.parametrize("dynamics, control, engine", ENGINES)
-def test_a_bad_world_touches_no_other(dynamics, control, engine):
+def test_a_bad_world_changes_no_other(dynamics, control, engine):
     """Law 7: NaN in world 1 changes no bit of other worlds and of their gradients, and only world 1 is flagged."""
     _, data, commands = make_situations(dynamics, control, engine)
     fly = make_flight(dynamics, control, engine)
@@ -258,7 +258,7 @@ def drone_leaves(tree, worlds):
 
 
 @pytest.mark.parametrize("control", ["state", "attitude", "body_rate"])
-def test_a_reset_heals_the_bad_world_alone(control):
+def test_a_reset_heals_the_bad_world_only(control):
     """Law 7: a reset of the world removes NaN everywhere, also from integrals, and resets no other world."""
     sim, data, commands = make_situations("first_principles", control, "interpret")
     mask = np.arange(len(SITUATIONS)) == 1

@@ -158,15 +158,15 @@ def impossible_values(kind, name, declared, rng):
             yield int(np.ceil(sign * beyond)) * sign if is_whole else float(beyond)
 
 
-def describe_unless_refused(call, what):
+def describe_unless_refused(call, label):
     """Return None if a call raises ``ConfigError`` with the given value, else a description of what it did."""
     try:
         call()
     except ConfigError as error:
-        return None if "got" in str(error) else f"{what}: {error}"
+        return None if "got" in str(error) else f"{label}: {error}"
     except Exception as error:
-        return f"{what}: {type(error).__name__}: {error}"
-    return f"{what}: accepted"
+        return f"{label}: {type(error).__name__}: {error}"
+    return f"{label}: accepted"
 
 
 @pytest.mark.parametrize("kind", [*PLUGINS, *OTHER_CLASSES, *TASKS], ids=lambda kind: kind.__name__)

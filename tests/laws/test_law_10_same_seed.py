@@ -30,7 +30,7 @@ def make_sim(n_worlds, seed=7, mesh=None):
 
 
 @pytest.fixture(scope="module")
-def four():
+def four_world_sim():
     return make_sim(4)
 
 
@@ -43,69 +43,69 @@ def masses_after_resets(sim, *masks, seed=7):
     return np.asarray(sim.data.params.mass[..., 0])
 
 
-def test_a_world_draws_the_same_with_other_numbers_of_worlds(four):
+def test_a_world_draws_the_same_with_other_numbers_of_worlds(four_world_sim):
     two = make_sim(2)
     for n_resets in (1, 2, 3):
         masks = [None] * n_resets
-        np.testing.assert_array_equal(masses_after_resets(two, *masks), masses_after_resets(four, *masks)[:2])
+        np.testing.assert_array_equal(masses_after_resets(two, *masks), masses_after_resets(four_world_sim, *masks)[:2])
 
 
-def test_a_world_draws_the_same_whichever_worlds_are_reset_along(four):
-    alone = masses_after_resets(four, [False, False, True, False])
-    together = masses_after_resets(four, [True, False, True, True])
-    everyone = masses_after_resets(four, None)
-    np.testing.assert_array_equal(alone[2], everyone[2])
-    np.testing.assert_array_equal(together[[0, 2, 3]], everyone[[0, 2, 3]])
+def test_a_world_draws_the_same_whichever_other_worlds_are_reset(four_world_sim):
+    alone = masses_after_resets(four_world_sim, [False, False, True, False])
+    together = masses_after_resets(four_world_sim, [True, False, True, True])
+    all_worlds = masses_after_resets(four_world_sim, None)
+    np.testing.assert_array_equal(alone[2], all_worlds[2])
+    np.testing.assert_array_equal(together[[0, 2, 3]], all_worlds[[0, 2, 3]])
     # Worlds that the mask leaves out keep their masses.
     np.testing.assert_array_equal(alone[[0, 1, 3]], np.float32(0.0434))
     # World 2 in its second episode draws as it does when all worlds are in theirs.
-    twice = masses_after_resets(four, [False, False, True, False], [False, True, True, False])
-    np.testing.assert_array_equal(twice[2], masses_after_resets(four, None, None)[2])
-    np.testing.assert_array_equal(twice[1], everyone[1])
+    twice = masses_after_resets(four_world_sim, [False, False, True, False], [False, True, True, False])
+    np.testing.assert_array_equal(twice[2], masses_after_resets(four_world_sim, None, None)[2])
+    np.testing.assert_array_equal(twice[1], all_worlds[1])
 
 
-def test_worlds_drones_and_episodes_draw_different_numbers(four):
+def test_worlds_drones_and_episodes_draw_different_numbers(four_world_sim):
     """Two of 36 draws of 24 bits are equal by chance with a probability of 4e-5, and the seed is fixed."""
-    draws = np.stack([masses_after_resets(four, *[None] * n) for n in (1, 2, 3)])
+    draws = np.stack([masses_after_resets(four_world_sim, *[None] * n) for n in (1, 2, 3)])
     assert draws.shape == (3, 4, 3)
     assert len(np.unique(draws)) == draws.size
     assert 0.03 <= draws.min() < draws.max() <= 0.06
 
 
-def test_seeds_give_their_numbers_again_and_differ_from_each_other(four):
-    first, other, again = (masses_after_resets(four, None, seed=seed) for seed in (7, 8, 7))
+def test_seeds_give_their_numbers_again_and_differ_from_each_other(four_world_sim):
+    first, other, again = (masses_after_resets(four_world_sim, None, seed=seed) for seed in (7, 8, 7))
     np.testing.assert_array_equal(first, again)
     assert not np.any(first == other)
 
 
-def test_the_seed_of_construction_and_of_seed_are_one(four):
+def test_the_seed_of_construction_and_of_seed_are_one(four_world_sim):
     sim = make_sim(4, seed=7)
     sim.reset()
-    np.testing.assert_array_equal(sim.data.params.mass[..., 0], masses_after_resets(four, None, seed=7))
+    np.testing.assert_array_equal(sim.data.params.mass[..., 0], masses_after_resets(four_world_sim, None, seed=7))
 
 
-def test_resets_and_steps_leave_the_seeds_key(four):
+def test_resets_and_steps_leave_the_seeds_key(four_world_sim):
     """Stages of the batch may split the key. A reset that changed it would make worlds depend on each other."""
-    masses_after_resets(four, None, [True, False, False, True])
-    np.testing.assert_array_equal(leaf_on_host(four.data.core.rng_key), leaf_on_host(jax.random.key(7)))
-    four.step(2)
-    np.testing.assert_array_equal(leaf_on_host(four.data.core.rng_key), leaf_on_host(jax.random.key(7)))
+    masses_after_resets(four_world_sim, None, [True, False, False, True])
+    np.testing.assert_array_equal(leaf_on_host(four_world_sim.data.core.rng_key), leaf_on_host(jax.random.key(7)))
+    four_world_sim.step(2)
+    np.testing.assert_array_equal(leaf_on_host(four_world_sim.data.core.rng_key), leaf_on_host(jax.random.key(7)))
 
 
-def test_seed_survives_new_data(four):
-    four.seed(11)
-    before = four.data
-    four.build_data()
-    np.testing.assert_array_equal(leaf_on_host(four.data.core.rng_key), leaf_on_host(jax.random.key(11)))
-    four.data = before
+def test_seed_survives_new_data(four_world_sim):
+    four_world_sim.seed(11)
+    before = four_world_sim.data
+    four_world_sim.build_data()
+    np.testing.assert_array_equal(leaf_on_host(four_world_sim.data.core.rng_key), leaf_on_host(jax.random.key(11)))
+    four_world_sim.data = before
 
 
 def key_numbers(data, name="wind"):
     return leaf_on_host(world_keys(data, name)), leaf_on_host(drone_keys(data, name))
 
 
-def test_keys_differ_by_world_drone_stage_name_and_step(four):
-    data = four.default_data
+def test_keys_differ_by_world_drone_stage_name_and_step(four_world_sim):
+    data = four_world_sim.default_data
     by_world, by_drone = key_numbers(data)
     assert by_world.shape == (4, 2)
     assert by_drone.shape == (4, 3, 2)
@@ -117,8 +117,8 @@ def test_keys_differ_by_world_drone_stage_name_and_step(four):
     assert len(np.unique(keys, axis=0)) == len(keys)
 
 
-def test_keys_do_not_depend_on_where_another_world_is_in_its_time(four):
-    data = four.default_data
+def test_keys_do_not_depend_on_the_time_of_another_world(four_world_sim):
+    data = four_world_sim.default_data
     moved = data.replace(
         core=data.core.replace(steps=data.core.steps.at[1].set(99), episode=data.core.episode.at[2].set(5))
     )
@@ -127,9 +127,9 @@ def test_keys_do_not_depend_on_where_another_world_is_in_its_time(four):
         assert not np.any(np.all(before[[1, 2]] == after[[1, 2]], axis=-1))
 
 
-def test_two_devices_give_the_same_numbers_as_one(four):
+def test_two_devices_give_the_same_numbers_as_one(four_world_sim):
     assert len(jax.devices()) >= 2, "conftest forces four host devices"
     split = make_sim(4, mesh=world_mesh(jax.devices()[:2]))
     for masks in ([None], [None, [True, False, True, False]]):
-        np.testing.assert_array_equal(masses_after_resets(split, *masks), masses_after_resets(four, *masks))
+        np.testing.assert_array_equal(masses_after_resets(split, *masks), masses_after_resets(four_world_sim, *masks))
     assert len(split.data.params.mass.sharding.device_set) == 2

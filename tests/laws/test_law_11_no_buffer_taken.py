@@ -107,5 +107,5 @@ def test_nothing_is_donated_in_the_compiled_programs(sim):
         for mark in ("donated", "tf.aliasing_output", "jax.buffer_donor"):
             assert mark not in text
     # Positive control: a program that does donate a buffer has one of the marks.
-    taking = jax.jit(lambda x: x + 1, donate_argnums=0).lower(jnp.ones(3)).as_text()
-    assert "tf.aliasing_output" in taking or "jax.buffer_donor" in taking
+    donating = jax.jit(lambda x: x + 1, donate_argnums=0).lower(jnp.ones(3)).as_text()
+    assert "tf.aliasing_output" in donating or "jax.buffer_donor" in donating

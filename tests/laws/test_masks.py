@@ -16,8 +16,8 @@ sim = Sim(N_WORLDS, n_drones=2)
 gates = sim.scene.add("gate", pos=[0, 0, 1])
 load = sim.add(SlungLoad(mass=0.005, length=0.3))
 motors = sim.add(MotorFailure())
-hooked = Sim(N_WORLDS)
-hook = hooked.add(Hook(0.01))
+hook_sim = Sim(N_WORLDS)
+hook = hook_sim.add(Hook(0.01))
 
 
 WORLD_MASK_FUNCTIONS = {
@@ -28,7 +28,7 @@ WORLD_MASK_FUNCTIONS = {
     "Handle.set_pose": lambda mask: gates.set_pose(sim.data, [1, 0, 1], mask=mask),
     "SlungLoad.hang": lambda mask: load.hang(sim.data, mask),
     "SlungLoad.release": lambda mask: load.release(sim.data, mask),
-    "Hook.hang": lambda mask: hook.hang(hooked.data, mask),
+    "Hook.hang": lambda mask: hook.hang(hook_sim.data, mask),
     "leaf_replace": lambda mask: leaf_replace(sim.data.states, mask, pos=np.ones((N_WORLDS, 2, 3), np.float32)),
     "pytree_replace": lambda mask: pytree_replace(sim.data, sim.default_data, world_mask(sim.data), mask),
 }

@@ -98,7 +98,7 @@ def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
     flight.save(tmp_path / "flight.npz")
     # Programs that a shell started in the background ignore SIGINT, and so would this one.
     start = "import browsing, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    start += "browsing.light_simply(); "
+    start += "browsing.use_simple_lights(); "
     start += "from crazysim.__main__ import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", start, "replay", "flight.npz", "--world", "1", "--port", "0"]
     program = subprocess.Popen(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from splat_files import one_splat, spot_alpha, write_splats
+from splat_files import make_splat, spot_alpha, write_splats
 
 from crazysim import ConfigError, Sim
 from crazysim.scene import splat_images
@@ -61,7 +61,7 @@ def test_one_splat_is_its_analytic_projection(sim):
     ahead = float(sim.mj_model.cam("fpv_cam:0").pos[0])
     z, s, opacity, color = 2.0, 0.1, 0.8, np.array([0.9, 0.5, 0.2])
     eye = np.array([ahead, 0, float(sim.mj_model.cam("fpv_cam:0").pos[2]) + 1.0])
-    spot = one_splat(eye + [z, 0.2, 0.1], s, opacity, color)
+    spot = make_splat(eye + [z, 0.2, 0.1], s, opacity, color)
     image = look(sim.data, spot)
     assert image.color.shape == (2, 1, 33, 33, 3)
     focal = 33 / 2 / np.tan(np.deg2rad(float(sim.mj_model.cam("fpv_cam:0").fovy[0])) / 2)

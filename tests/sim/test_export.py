@@ -15,11 +15,11 @@ from crazysim.sim.export import STATES, to_casadi
 pytestmark = pytest.mark.usefixtures("casadi", "x64")
 
 N_WORLDS, N_DRONES = 6, 2
-RK4 = [("first_principles", c, "rk4") for c in ("rotor_vel", "attitude", "state")] + [
+OTHER_INTEGRATORS = [("first_principles", c, "rk4") for c in ("rotor_vel", "attitude", "state")] + [
     ("so_rpy_rotor_drag", "attitude", "rk4"),
     ("first_principles", "attitude", "symplectic_euler"),
 ]
-assert all(integrator in INTEGRATORS for *_, integrator in RK4)
+assert all(integrator in INTEGRATORS for *_, integrator in OTHER_INTEGRATORS)
 
 
 def fields(data, names):
@@ -82,7 +82,9 @@ def compare(sim, step, data):
                 np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * scale, err_msg=f"{name} of {index}")
 
 
-@pytest.mark.parametrize(("dynamics", "control", "integrator"), [(*pair, "euler") for pair in PAIRS] + RK4)
+@pytest.mark.parametrize(
+    ("dynamics", "control", "integrator"), [(*pair, "euler") for pair in PAIRS] + OTHER_INTEGRATORS
+)
 def test_the_exported_step_is_the_step(dynamics, control, integrator):
     sim = Sim(N_WORLDS, N_DRONES, dynamics=dynamics, control=control, integrator=integrator)
     step = to_casadi(sim)

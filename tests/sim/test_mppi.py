@@ -27,7 +27,7 @@ def mppi(sim):
     return MPPI(sim, samples=256, freq=125)
 
 
-def place(sim, pos, quat=(0, 0, 0, 1), vel=(0, 0, 0)):
+def place_drones(sim, pos, quat=(0, 0, 0, 1), vel=(0, 0, 0)):
     sim.reset()
     s = sim.data.states
     new = {"pos": pos, "quat": quat, "vel": vel}
@@ -35,7 +35,7 @@ def place(sim, pos, quat=(0, 0, 0, 1), vel=(0, 0, 0)):
     sim.data = sim.data.replace(states=s.replace(**new, rotor_vel=np.full_like(s.rotor_vel, 15900.0)))
 
 
-def errors(sim, mppi, setpoint_at, seconds):
+def fly_and_return_errors(sim, mppi, setpoint_at, seconds):
     """Return the distance of every drone from its setpoint after each control step. (n, n_worlds)"""
     n_steps, found = round(mppi.period * sim.freq), []
     for k in range(round(seconds / mppi.period)):
@@ -49,8 +49,8 @@ def errors(sim, mppi, setpoint_at, seconds):
 def test_it_hovers_from_a_bad_start(sim, mppi):
     """1.5 m away and rolled by 69 degrees."""
     mppi.reset()
-    place(sim, [1.0, -1.0, 1.5], [np.sin(0.6), 0, 0, np.cos(0.6)])
-    found = errors(sim, mppi, lambda t: setpoint(), 4.0)
+    place_drones(sim, [1.0, -1.0, 1.5], [np.sin(0.6), 0, 0, np.cos(0.6)])
+    found = fly_and_return_errors(sim, mppi, lambda t: setpoint(), 4.0)
     assert found[0].min() > 1.0
     assert found[-50:].max() < 0.3
     assert mppi._compiled_plan._cache_size() == 1
@@ -61,13 +61,13 @@ def test_it_follows_a_figure_eight(sim, mppi):
     eight = figure_eight(2.0, 1.0, speed=2.0)
     start = jax.tree.map(np.asarray, eight.evaluate(jnp.float32(0)))
     mppi.reset()
-    place(sim, start.pos, vel=start.vel)
-    found = errors(sim, mppi, jax.jit(eight.evaluate), 4.0)
+    place_drones(sim, start.pos, vel=start.vel)
+    found = fly_and_return_errors(sim, mppi, jax.jit(eight.evaluate), 4.0)
     assert np.sqrt(np.mean(found**2)) < 0.25
 
 
 def test_equal_seeds_give_equal_commands(sim, mppi):
-    place(sim, [0.3, 0.2, 1.0])
+    place_drones(sim, [0.3, 0.2, 1.0])
     first, memory = jax.jit(mppi.plan)(mppi.init(2, 1), sim.data, setpoint())
     again, _ = jax.jit(mppi.plan)(mppi.init(2, 1), sim.data, setpoint())
     np.testing.assert_array_equal(first, again)
@@ -78,7 +78,7 @@ def test_equal_seeds_give_equal_commands(sim, mppi):
 
 def test_the_command_follows_from_the_cost(sim):
     """A cost of the thrust alone drops the drone; the command is within the limits."""
-    place(sim, [0, 0, 1.0])
+    place_drones(sim, [0, 0, 1.0])
     mppi = MPPI(sim, samples=256, freq=125, horizon=20, cost=lambda states, setpoint, command: command[3] ** 2)
     for _ in range(20):
         command = np.asarray(mppi.command(sim.data, setpoint()))
@@ -87,7 +87,7 @@ def test_the_command_follows_from_the_cost(sim):
 
 
 def test_a_sample_that_is_not_finite_has_no_weight(sim):
-    place(sim, [0, 0, 1.0])
+    place_drones(sim, [0, 0, 1.0])
     partly_nan = MPPI(
         sim, samples=64, freq=125, horizon=10, cost=lambda s, p, u: jnp.where(u[0] > 0, jnp.nan, 1 + u[0] ** 2)
     )
@@ -108,7 +108,7 @@ def test_the_setpoint_moves_along_its_taylor_polynomial():
 
 
 def test_the_cost_of_a_drone_on_its_setpoint_is_zero(sim):
-    place(sim, [0, 0, 1.0])
+    place_drones(sim, [0, 0, 1.0])
     states = jax.tree.map(lambda x: x[0, 0], sim.data.states)
     assert tracking_cost(states, setpoint(), jnp.zeros(4)) == 0
     assert tracking_cost(states, setpoint(2.0), jnp.zeros(4)) == 4

@@ -4,7 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import build_stagewise_step, hover_command, hovering, n_documented, repeat_command, trees_equal, with_states
+from cases import (
+    build_stagewise_step,
+    count_documented_arrays,
+    hover_command,
+    make_hovering_sim,
+    repeat_command,
+    trees_equal,
+    with_states,
+)
 from sweep import EFFECTS
 
 from crazysim import (
@@ -37,7 +45,7 @@ def add_effects(sim, settings=EFFECTS):
 @pytest.fixture(scope="module")
 def sim_with_effects():
     """Return a simulation of hovering drones with all effects."""
-    sim = hovering()
+    sim = make_hovering_sim()
     add_effects(sim)
     return sim
 
@@ -63,7 +71,7 @@ def test_all_effects_are_tested_and_sorted():
 
 def test_effects_without_strength_change_nothing():
     """The flight is that without effects, except for rounding, as the step is fused differently."""
-    plain, idle = hovering(engine="interpret"), hovering(engine="interpret")
+    plain, idle = make_hovering_sim(engine="interpret"), make_hovering_sim(engine="interpret")
     stages = list(plain.step_pipeline)
     add_effects(idle, IDLE)
     assert set(idle.step_pipeline) - set(stages) == {"battery", "latency"}, (
@@ -185,7 +193,7 @@ def test_docstrings_of_records_give_the_shapes(sim_with_effects):
         "n_hidden": 2,
     }
     for record in sim_with_effects.data.plugins.values():
-        assert n_documented(record, **sizes) == len(jax.tree.leaves(record))
+        assert count_documented_arrays(record, **sizes) == len(jax.tree.leaves(record))
 
 
 def test_every_effect_is_fused(sim_with_effects):
@@ -193,7 +201,7 @@ def test_every_effect_is_fused(sim_with_effects):
     assert program.unfused_stages == ()
     fused = {name for s in program.fused_segments for name in s.stages}
     assert {*STAGES} <= fused
-    own = set(sim_with_effects.step_pipeline) - set(hovering(engine="interpret").step_pipeline)
+    own = set(sim_with_effects.step_pipeline) - set(make_hovering_sim(engine="interpret").step_pipeline)
     assert own == {*STAGES} - {"integration"}, "an effect's stages are listed in STAGES"
     assert [(s.scope, s.phase) for s in program.fused_segments] == [("drone", "before"), ("drone", "each")]
 
@@ -299,7 +307,7 @@ def test_law_09_effects_need_the_built_in_integration():
 
 def test_default_data_get_the_record_and_nothing_else():
     """An effect that is added in flight does not change the states that resets return to."""
-    sim = hovering()
+    sim = make_hovering_sim()
     sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     sim.step(3)
     default = sim.default_data

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from cases import FITTED, LEVELS, hover_command, hover_rotor_state, repeat_command, with_states
+from cases import FITTED_DYNAMICS, LEVELS, hover_command, hover_rotor_state, repeat_command, with_states
 
 from crazysim import ConfigError, Latency, MotorFailure, Sim
 
@@ -35,7 +35,8 @@ def build(control, dynamics="first_principles", engine="auto"):
 
 
 @pytest.mark.parametrize(
-    "control, dynamics", [(c, "first_principles") for c in LEVELS] + [("attitude", "so_rpy"), ("state", FITTED[-1])]
+    "control, dynamics",
+    [(c, "first_principles") for c in LEVELS] + [("attitude", "so_rpy"), ("state", FITTED_DYNAMICS[-1])],
 )
 def test_a_command_arrives_exactly_after_its_delay(control, dynamics):
     """With a delay of k steps a drone flies as if the initial command had been sent k times before the others."""

@@ -34,7 +34,7 @@ def follow(data):
     return data.replace(states=data.states.replace(force=jnp.stack([force[0], force[0]])))
 
 
-def undeclared(data):
+def undeclared_stage(data):
     return data.replace(states=data.states.replace(torque=2 * data.states.torque))
 
 
@@ -65,7 +65,7 @@ def test_a_packed_number_keeps_the_name_of_its_field(data):
 def test_segments_of_worlds_name_the_drone_and_unfused_stages_their_reason(data):
     from crazysim.core.stage import as_stages
 
-    text = listing.list_program(optimise(lower_stages(as_stages({"follow": follow, "mine": undeclared}), data)))
+    text = listing.list_program(optimise(lower_stages(as_stages({"follow": follow, "mine": undeclared_stage}), data)))
     assert "states.force[0] of drone 1 = " in text
     assert "each stage mine of all worlds, unfused: it is not declared for one drone or one world\n" in text
     assert "  writes states.torque\n" in text
@@ -146,21 +146,24 @@ def test_a_leaf_of_a_type_that_kernels_do_not_have_is_named(x64):
 
 
 @pytest.fixture
-def moving(data):
+def moving_data(data):
     return with_states(data, pos=[0.1, 0.2, 0.7], vel=[0.3, -0.2, 0.1])
 
 
-def test_equal_engines_do_not_differ(moving):
-    assert compare.first_difference({"sway": sway, "mine": undeclared}, moving, engines=("plain", "lanes")) is None
+def test_equal_engines_do_not_differ(moving_data):
+    assert (
+        compare.first_difference({"sway": sway, "mine": undeclared_stage}, moving_data, engines=("plain", "lanes"))
+        is None
+    )
 
 
-def test_the_first_difference_has_stage_field_element_and_operation(moving, monkeypatch):
+def test_the_first_difference_has_stage_field_element_and_operation(moving_data, monkeypatch):
     """A defect in XLA's form of one operation."""
     import dataclasses
 
     wrong = dataclasses.replace(ops.TABLE["sin"], xla=lambda x: jax.lax.sin(x) + 0.01)
     monkeypatch.setitem(ops.TABLE, "sin", wrong)
-    found = compare.first_difference({"mine": undeclared, "sway": sway}, moving, engines=("plain", "lanes"))
+    found = compare.first_difference({"mine": undeclared_stage, "sway": sway}, moving_data, engines=("plain", "lanes"))
     assert found is not None
     assert (found.stage, found.leaf, found.index[2:]) == ("sway", "states.force", (0,))
     assert abs(found.values[1] - found.values[0]) > 1e-4
@@ -168,6 +171,6 @@ def test_the_first_difference_has_stage_field_element_and_operation(moving, monk
     assert str(found).startswith("stage 'sway': states.force")
 
 
-def test_nan_is_equal_to_nan(moving):
-    bad = moving.replace(states=moving.states.replace(pos=moving.states.pos.at[1, 1, 2].set(jnp.nan)))
+def test_nan_is_equal_to_nan(moving_data):
+    bad = moving_data.replace(states=moving_data.states.replace(pos=moving_data.states.pos.at[1, 1, 2].set(jnp.nan)))
     assert compare.first_difference({"sway": sway}, bad, engines=("plain", "lanes")) is None
