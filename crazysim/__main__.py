@@ -41,13 +41,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes stdout at exit
         return 141
     except (ValueError, ImportError, OSError, DivergedError, RenderError) as error:
-        print(f"crazysim: {_named_extra(error, options.command)}", file=sys.stderr)
+        print(f"crazysim: {_error_message(error, options.command)}", file=sys.stderr)
         return 2
     return status or 0
 
 
-def _named_extra(error: Exception, command: str) -> str:
-    """Return the message of an error, or, for a missing package, a message with the extra that installs it."""
+def _error_message(error: Exception, command: str) -> str:
+    """Return the message of an error. For a missing package it names the extra of crazysim that installs it."""
     package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if package not in EXTRAS:
         return str(error)

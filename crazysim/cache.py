@@ -1,8 +1,8 @@
 """The folder in which compiled programs and kernels are kept between processes.
 
-The engine keeps its kernels there by default, and crazysim the XLA programs that it compiles itself
-(``keep_programs``). ``enable_cache`` keeps all programs of the process, the user's own included. A cache folder in
-JAX's configuration takes precedence: it then holds the kernels, too. Only ``enable_cache`` changes that configuration.
+By default, the folder holds the kernels of the engine and the XLA programs that crazysim compiles itself
+(``keep_programs``). ``enable_cache`` keeps all programs of the process, including the user's own. A cache folder in
+JAX's configuration takes precedence, also for kernels. Only ``enable_cache`` changes that configuration.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from crazysim.storage import FOLDER_REMEDY, make_private_folder, untrusted_reaso
 CACHE_VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
 MAX_CACHE_BYTES = 1_000_000_000
-"""Size of all files, bytes, above which the least recently used are removed when the cache is first used: about 5,000
-programs."""
+"""Size of all files, bytes, of about 5,000 programs. If a folder exceeds it when a process first uses the folder, the
+least recently used files are removed."""
 TRIMMED_FRACTION = 0.8
-"""Fraction of the limit to which a removal reduces the size, so that not every process has to remove files."""
+"""Fraction of ``MAX_CACHE_BYTES`` to which a removal reduces the size, so that not every process removes files."""
 MIN_FREE_BYTES = 50_000_000
-"""Free space below which a disk counts as full, bytes: the programs of some simulations."""
+"""Smallest free space of a disk on which programs are kept, bytes; the programs of a few simulations need it."""
 CACHE_FILE_PATTERNS = ("*-cache", "*-atime", "xla_gpu_per_fusion_autotune_cache_dir/*", "xla_gpu_kernel_cache_file",
             "crazysim/*.so", "crazysim/*.ptx", "crazysim/*.cubin")  # fmt: skip
 """Names of the files that JAX, XLA and the engine write; other files in the folder are never removed."""
@@ -59,8 +59,8 @@ def caches_folder() -> Path:
 def default_cache() -> Path | None:
     """Return the folder that is used by default; None where ``CRAZYSIM_CACHE`` is ``off``.
 
-    XLA's programs are machine code, and their keys do not contain the features of the CPU. Therefore each kind of CPU
-    has a subfolder of its own.
+    XLA's programs are machine code, but their names do not depend on the features of the CPU. Therefore each kind of
+    CPU has a subfolder of its own.
 
     Raises:
         ConfigError: If the path depends on a home folder that does not exist.
@@ -95,7 +95,7 @@ def cpu_features() -> str:
 
 
 def folder() -> Path | None:
-    """Return the folder of this process: of JAX's configuration, else the default one; None without one.
+    """Return the folder that this process uses: the one in JAX's configuration, or else the default; None for neither.
 
     A default folder that cannot be used is reported on stderr, once; the process then keeps no programs.
     """
@@ -111,7 +111,7 @@ def _usable_default_folder() -> Path | None:
 
 @functools.cache
 def _prepared_default_folder(*environment: str | None) -> Path | None:
-    """Return the default folder, prepared, if it can be used in this environment."""
+    """Make and return the default folder; None if the cache is off or the folder cannot be used."""
     del environment  # the key under which the result is cached
     try:
         path = default_cache()
@@ -128,18 +128,18 @@ def _prepared_default_folder(*environment: str | None) -> Path | None:
 
 
 def _prepare_folder(root: Path, path: Path) -> None:
-    """Make the folder of a cache, and remove the oldest files if they are too many.
+    """Make the folder of a cache, and remove the least recently used files if the cache is too large.
 
     Args:
-        root: Folder whose size is limited.
-        path: The same folder, or one in it.
+        root: Folder with a limited size.
+        path: The folder of the cache: ``root`` or a subfolder.
 
     Raises:
         ConfigError: If it cannot be made or written, belongs to another user, or its disk is full.
     """
     try:
-        for folder in (root, path):
-            make_private_folder(folder)
+        for private_folder in (root, path):
+            make_private_folder(private_folder)
         free_bytes = shutil.disk_usage(path).free
     except OSError as error:
         raise ConfigError(
@@ -165,15 +165,16 @@ def enable_cache(
     min_compile_time_secs: float = 0.0,
     enable_xla_caches: bool = False,
 ) -> Path | None:
-    """Keep all programs that this process compiles from now on, your own included, and return the folder.
+    """Keep all programs that this process compiles from now on, including your own, and return the folder.
 
     Programs that crazysim compiles itself are kept without this call. The contents of the folder are executed, so only
     this user may write to it. If it holds more than ``MAX_CACHE_BYTES``, the least recently used files are removed.
 
     Args:
-        cache_path: Folder; None for the environment variable ``CRAZYSIM_CACHE``, or else ``crazysim/jax`` in
-            the user's folder of caches, with a folder for each kind of CPU. Where the variable is ``off``, or where
-            this folder cannot be used, which a line on stderr explains, None keeps no programs and returns None.
+        cache_path: Folder. None for the folder in the environment variable ``CRAZYSIM_CACHE``, or else ``crazysim/jax``
+            in the user's folder of caches; in it, each kind of CPU has a subfolder. If the variable is ``off``, or if
+            the default folder cannot be used, no programs are kept and None is returned. A line on stderr reports a
+            folder that cannot be used.
         min_entry_size_bytes: Smallest program to keep; -1 for all.
         min_compile_time_secs: Shortest compilation whose program is kept, s.
         enable_xla_caches: True to let XLA keep files, too, in addition to JAX's.
@@ -198,9 +199,9 @@ def enable_cache(
 
 
 class keep_programs(contextlib.ContextDecorator):
-    """Block or function in which the programs that this thread compiles are kept.
+    """Context manager or decorator that keeps the programs that this thread compiles in a block or function.
 
-    If JAX has a cache already, nothing changes. Programs that the thread compiles outside are not kept.
+    If JAX has a cache already, nothing changes.
     """
 
     _thread_state = threading.local()
@@ -282,16 +283,16 @@ def announce_if_slow(work: str, duration: str, delay: float = ANNOUNCE_DELAY) ->
         timer.cancel()
 
 
-def trim(folder: Path, limit: int = MAX_CACHE_BYTES) -> None:
-    """Remove the least recently used programs of a folder if they take more than a number of bytes.
+def trim(root: Path, limit: int = MAX_CACHE_BYTES) -> None:
+    """Remove the least recently used programs of a folder and its subfolders if they take more than ``limit`` bytes.
 
     Args:
-        folder: Folder of the cache.
+        root: Folder of the cache.
         limit: Largest size of all programs, bytes.
     """
     files = []
     for pattern in CACHE_FILE_PATTERNS:
-        for path in (*folder.glob(pattern), *folder.glob(f"cpu-*/{pattern}")):
+        for path in (*root.glob(pattern), *root.glob(f"cpu-*/{pattern}")):
             with contextlib.suppress(OSError):  # another process has removed it
                 status = path.lstat()
                 if stat.S_ISREG(status.st_mode):

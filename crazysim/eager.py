@@ -1,4 +1,4 @@
-"""Calls outside of compiled code, without a program for each operation."""
+"""Calls outside of compiled code: functions compiled as a whole, and rows read without compilation."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def jit_eager_calls(*static: str) -> Callable[[F], F]:
     """Return a decorator that compiles a function for calls with arrays, and does not change calls with tracers.
 
     Outside of ``jit``, JAX compiles each operation separately, which takes 10 ms to 30 ms per operation and shape; the
-    decorated function is compiled once instead. Within ``jit``, ``grad`` and the engine's stages its operations become
-    part of the surrounding code, and constants remain constants.
+    decorated function is compiled as a whole instead. Within ``jit``, ``grad`` and the engine's stages, the operations
+    of the function become part of the surrounding code, and constant arguments remain constants.
 
     Args:
         *static: Names of arguments that are Python values.
@@ -49,5 +49,5 @@ def is_on_host(x: Any) -> bool:
 
 
 def is_traced(values: Sequence[Any]) -> bool:
-    """Return True where one of the leaves is traced: within ``jit``, ``grad`` or a stage of the engine."""
+    """Return True if a leaf of the values is traced: within ``jit``, ``grad`` or a stage of the engine."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))

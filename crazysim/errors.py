@@ -88,15 +88,15 @@ class DamagedFileError(ConfigError):
 
 
 class DivergedError(RuntimeError):
-    """A training whose weights or losses became non-finite."""
+    """Training in which weights or losses became non-finite."""
 
 
 class RenderError(RuntimeError):
-    """A missing or broken screen or OpenGL."""
+    """A screen or OpenGL library that is missing or broken."""
 
 
 class AirframeWarning(UserWarning):
-    """Warning about numbers of an airframe that no real drone has, but that are close enough to fly with."""
+    """Warning about numbers of an airframe that no real drone can have, but that can still be simulated."""
 
 
 class EngineWarning(UserWarning):
@@ -104,10 +104,9 @@ class EngineWarning(UserWarning):
 
 
 class UnsupportedError(Exception):
-    """A primitive, or a use of one, that the engine cannot lower.
+    """A primitive, or a use of a primitive, that the engine cannot lower.
 
-    Rules raise it with the reason alone. Lowering adds the primitive and the stage, so that the caller can
-    name them.
+    Rules raise the error with its cause only. Lowering adds the names of the primitive and the stage.
     """
 
     def __init__(self, cause: str, primitive: str = "", stage: str = ""):
@@ -123,16 +122,16 @@ class UnsupportedError(Exception):
 
     @property
     def jax_version(self) -> str:
-        """Version of JAX whose jaxpr was read."""
+        """Version of JAX that traced the jaxpr."""
         return jax.__version__
 
     def with_location(self, primitive: str = "", stage: str = "") -> UnsupportedError:
-        """Return the error with a primitive and a stage, where it has none yet."""
+        """Return a copy of the error that also names a primitive and a stage; names that it has already stay."""
         return type(self)(self.cause, self.primitive or primitive, self.stage or stage)
 
     @property
     def reason(self) -> str:
-        """Reason, with the primitive."""
+        """Cause, with the name of the primitive if it is known."""
         is_complete = not self.primitive or f"'{self.primitive}'" in self.cause
         return self.cause if is_complete else f"primitive {self.primitive!r}: {self.cause}"
 

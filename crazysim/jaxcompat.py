@@ -2,29 +2,31 @@
 
 Most names have a test in ``tests/test_jaxcompat.py``, which continuous integration runs on the oldest and the newest
 JAX that are supported; others are tested with the code that uses them. How each use would be replaced if a release
-removed it:
+removed it, and whether the replacement is implemented:
 
 - **The constructor of Jaxpr** (``select_inputs``, ``constants_to_inputs``): the function is traced again by
-  ``jax.make_jaxpr``. A fallback here.
-- **batched_device_put** (``put_host_array``): ``jax.device_put``, ten times slower for a command. A fallback here, also
+  ``jax.make_jaxpr``. Implemented here.
+- **batched_device_put** (``put_host_array``): ``jax.device_put``, ten times slower for a command. Implemented here, and
   used where jaxlib lacks the function.
 - **Donation on the host**: steps without XLA (``engine/host_call.py``) rely on JAX to copy an array that is donated
-  while NumPy has a view of it. Replaced by the compiled step, while ``jit_donating`` donates nothing. A fallback here.
+  while NumPy has a view of it. The compiled step replaces them, and ``jit_donating`` donates nothing. Implemented here.
 - **The custom call __gpu$xla.gpu.ptx**, by which XLA launches kernels on a GPU (``engine/backends/cuda.py``): a handler
-  of XLA's foreign function interface that launches them (``engine/backends/ffi_handlers.py``). A fallback there.
+  of XLA's foreign function interface that launches them. Implemented in ``engine/backends/ffi_handlers.py``.
 - **Primitives of our own** (``batched_primitive``, ``simple_primitive``, ``primitive_by_platform``):
-  ``jax.custom_batching.custom_vmap``, ``jax.custom_jvp`` and ``jax.lax.platform_dependent``. No fallback.
-- **Rules that read equations** (``Equation``, ``bind``, ``as_function``, ``expand_primitive``): nothing else shows what
-  a function computes. A stage with a primitive that has changed is run unfused.
-- **Threefry's primitive** (``threefry2x32_p``): its rounds written out, as in ``engine/backends/interpret.py``.
+  ``jax.custom_batching.custom_vmap``, ``jax.custom_jvp`` and ``jax.lax.platform_dependent``. Not implemented.
+- **Rules that read equations** (``Equation``, ``bind``, ``as_function``, ``expand_primitive``): no replacement. A stage
+  with a primitive that has changed is run unfused.
+- **Threefry's primitive** (``threefry2x32_p``): its rounds as operations on integers. Implemented in
+  ``engine/backends/interpret.py``, for that engine only.
 - **The compilation cache of one thread** (``compilation_cache``): without it, programs are only kept in the folder that
   JAX is configured with. It is used where these names are missing.
 - **The log level of XLA** (``set_xla_log_level``): the variable ``TF_CPP_MIN_LOG_LEVEL`` alone, which has no effect if
   JAX was imported before crazysim. It is used where jaxlib lacks the function.
 - **The coordinator of several hosts** (``connected_hosts``, ``detect_hosts``): exchanges of arrays instead of its store
-  of texts, and the variables of SLURM. ``jax.experimental.multihost_utils``: programs with replicated results.
-- **_cache_size** (``n_compilations``): a counter in the traced function. Tests need it, and ``envs/stepper.py`` to keep
-  the program of its first step. No fallback.
+  of texts, and the variables of SLURM. Not implemented.
+- **jax.experimental.multihost_utils** (``gather_from_hosts``, ``broadcast_from_first``): programs with replicated
+  results. Not implemented.
+- **_cache_size** (``n_compilations``): a counter in the traced function. Not implemented.
 
 ``CRAZYSIM_JAX_FALLBACKS=1`` selects all fallbacks, to try them.
 """
@@ -104,7 +106,7 @@ __all__ = [
 ]
 
 FALLBACKS = os.environ.get("CRAZYSIM_JAX_FALLBACKS") == "1"
-"""True to use public functions of JAX wherever they can replace others, as listed above."""
+"""True to use the replacements that are listed above, where they are implemented."""
 
 
 # Jaxprs ---------------------------------------------------------------------------------------------------------
@@ -191,7 +193,7 @@ class Equation:
 def read_equation(eqn: Any) -> Iterator[Equation]:
     """Yield an equation for a rule, and report a parameter that JAX has renamed as unsupported.
 
-    Only a missing parameter, or a missing attribute of a parameter, counts. Any other error is the rule's own.
+    Any other error of the rule is passed on.
 
     Raises:
         UnsupportedError: If the rule reads a parameter, or an attribute of one, that this JAX does not have.
@@ -216,8 +218,8 @@ def batched_primitive(
     Args:
         name: Its name.
         result_types: Function from operands and parameters to the shapes and types of the results.
-        batching_rule: Function from the axis of ``vmap``, which has ``name`` and ``size``, the operands, their batched
-            dimensions and parameters to results and their batched dimensions.
+        batching_rule: Function of the axis of ``vmap`` (with ``name`` and ``size``), the operands, their batched
+            dimensions, and the parameters. It returns the results and their batched dimensions.
         refuse: Function that raises an error; called if no ``vmap`` has replaced the primitive.
     """
     primitive = Primitive(name)
@@ -265,10 +267,12 @@ def primitive_by_platform(
         functions: Functions that return a list of results, by platform: ``"cpu"``, ``"cuda"``, ...; ``""`` for all
             others.
         differentiable_fn: The same function, written so that JAX can differentiate it.
-        transpose_rule: For a function that is linear in all operands but the first ``n_nonlinear``, which is a
-            parameter: function from these operands and the cotangents of all results to the cotangents of the others.
-        batching_rule: Rule for ``vmap``: function from the primitive, the size of the axis, the operands, whose
-            batched axis comes first, and a flag for each that is batched, to results that are all batched.
+        transpose_rule: Rule for a primitive that is linear in all operands except for the first ``n_nonlinear``, a
+            parameter: function of the nonlinear operands and the cotangents of all results, which returns the
+            cotangents of the linear operands.
+        batching_rule: Rule for ``vmap``: function of the primitive, the size of the mapped axis, the operands, and a
+            list that is True for mapped operands. The first axis of mapped operands, and of all results, is the mapped
+            one.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -358,7 +362,7 @@ def bind(eqn: Any, *args: Any, **params: Any) -> list[Any]:
 
 
 def as_function(eqn: Any) -> Callable[..., Any]:
-    """Return an equation as a function of arrays, with its own rule of differentiation."""
+    """Return an equation as a function of arrays, which keeps the custom derivative of the equation."""
     return lambda *args: eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(dict(eqn.params)))
 
 
@@ -434,7 +438,7 @@ def is_symbolic_zero(tangent: Any) -> bool:
 
 
 def n_compilations(jitted: Callable[..., Any]) -> int:
-    """Return the number of programs that are compiled for a jitted function."""
+    """Return the number of programs that have been compiled for a jitted function."""
     return jitted._cache_size()  # type: ignore[attr-defined]
 
 
@@ -574,5 +578,8 @@ def broadcast_from_first(flag: bool) -> bool:
 
 
 def is_stop_requested(step: int) -> bool:
-    """Return True on all hosts at the same step, after one of them has received SIGTERM; all call it at each step."""
+    """Return True on all hosts at the same step, after one of them has received SIGTERM.
+
+    All hosts must call it at every step.
+    """
     return multihost_utils.reached_preemption_sync_point(step)

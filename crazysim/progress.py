@@ -14,7 +14,7 @@ def progress_bar(
     """Return a progress bar of tqdm, shown where stderr is a terminal; iterating over it returns the items.
 
     Args:
-        items: Items; None for a bar that ``update`` moves.
+        items: Items; None for a bar that advances when its method ``update`` is called.
         label: Text in front of the bar.
         unit: Name of one item.
         required: True to raise an error where tqdm is not installed; False to print the label and return the items.

@@ -17,9 +17,9 @@ from crazysim.errors import ConfigError
 Scope = Literal["drone", "member", "world", "batched", "shared", "opaque", "parameter"]
 
 WITHOUT_MEMBERS = ("world", "batched", "shared", "opaque")
-"""Scopes that ``scopes`` returns for leaves of no population; any other is ``drone`` or the name of a population."""
+"""Results of ``scopes`` for leaves without an axis over members; other results are ``drone`` or a population's name."""
 CORE_NDIM_KEY = "core_ndim"
-"""Key under which the metadata of a field give the number of dimensions without batch axes; Crazyflow's key too."""
+"""Key, in the metadata of a field, of the number of dimensions without batch axes; Crazyflow uses the same key."""
 
 T = TypeVar("T")
 
@@ -38,16 +38,18 @@ def leaf(
     Args:
         scope: Batch axes of the array. ``drone``: (n_worlds, n_drones, *core). ``member``, in a record of a population
             (``Members``): (n_worlds, n_members, *core). ``world``: (n_worlds, 1, *core). ``batched``: (n_worlds, ...),
-            with any further axes. ``shared``: core. ``parameter``: shared, or one per drone (or member), by its number
-            of dimensions. ``opaque``: undeclared; masked resets and sharding do not change it.
+            with any further axes. ``shared``: core. ``parameter``: either core, or core with the axes of ``drone`` (in
+            a population, of ``member``); the number of dimensions decides. ``opaque``: undeclared; masked resets and
+            sharding do not change it.
         core_ndim: Number of dimensions of the core shape; None for any.
         core: The core shape, if it is fixed. It prevents, for example, masses of three worlds from being taken
             for masses along three axes.
-        sparse: True for a parameter whose zeros are absent terms, as in an offset along one axis. While it is
-            shared, a step is compiled without these terms, and again after one of them changes.
+        sparse: True for a parameter in which zeros remove terms of the equations, such as an offset along one axis.
+            While the parameter is shared, a step is compiled without these terms. It is compiled again after a zero
+            changes.
         scratch: True for an array that only carries numbers from one stage of a step to another. Its values are not
             kept after the step.
-        default: Value of the field where none is given.
+        default: Default value of the field.
     """
     metadata = {"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse, "scratch": scratch}
     return dataclasses.field(default=default, metadata=metadata)
@@ -89,59 +91,60 @@ class PyTree:
             template = fields.get(_TEMPLATE)
             if template is None or name not in template.__dict__:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
-            return fields.setdefault(name, _lazy_child(template.__dict__[name], fields[_READ]))
+            return fields.setdefault(name, _lazy_child(template.__dict__[name], fields[_READ_LEAF]))
 
         def __getstate__(self) -> dict[str, Any]:
             """Return all fields, for copies and pickles."""
             return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
-_TEMPLATE, _READ = "_template", "_read"
+_TEMPLATE, _READ_LEAF = "_template", "_read_leaf"
 """Attributes of a record from ``lazy_record``."""
 
 
-def lazy_record(template: T, read: Callable[[Any], Any]) -> T:
-    """Return the record whose leaves are ``read(x)`` for the leaves of a template, each made when it is first read.
+def lazy_record(template: T, read_leaf: Callable[[Any], Any]) -> T:
+    """Return a record with the leaves ``read_leaf(x)`` of the leaves ``x`` of a template, each made at its first use.
 
     Leaves of fields with a default are made at once. The record behaves like any other: JAX, ``replace`` and ``copy``
     read all fields. To list its fields, use ``dataclasses.fields``: ``vars`` returns only fields that have been read.
 
     Args:
         template: A record of the same structure.
-        read: Returns a leaf. Two threads that read a field at once may both call it.
+        read_leaf: Function from a leaf of the template to a leaf of the record. Two threads that read a field at the
+            same time may both call it.
     """
     record, values = object.__new__(type(template)), template.__dict__
     fields = record.__dict__
-    fields[_TEMPLATE], fields[_READ] = template, read
-    for name, is_static in _present_fields(type(template)):
-        fields[name] = values[name] if is_static else _lazy_child(values[name], read)
+    fields[_TEMPLATE], fields[_READ_LEAF] = template, read_leaf
+    for name, is_static in _initial_fields(type(template)):
+        fields[name] = values[name] if is_static else _lazy_child(values[name], read_leaf)
     return record
 
 
-def _lazy_child(x: Any, read: Callable[[Any], Any]) -> Any:
+def _lazy_child(x: Any, read_leaf: Callable[[Any], Any]) -> Any:
     if isinstance(x, PyTree):
-        return lazy_record(x, read)
+        return lazy_record(x, read_leaf)
     if isinstance(x, dict):
-        return {k: _lazy_child(v, read) for k, v in x.items()}
+        return {k: _lazy_child(v, read_leaf) for k, v in x.items()}
     if x is None or isinstance(x, int):  # a fast path for the most common cases
-        return x if x is None else read(x)
-    return jax.tree.map(read, x)
+        return x if x is None else read_leaf(x)
+    return jax.tree.map(read_leaf, x)
 
 
 @functools.cache
-def _present_fields(cls: Any) -> list[tuple[str, bool]]:
-    """Return the fields that a lazy record has from the start, and which of them are static.
+def _initial_fields(cls: Any) -> list[tuple[str, bool]]:
+    """Return (name, True if it is static) of each field that a lazy record has from the start.
 
-    A field with a default is an attribute of the class, so it never seems to be missing.
+    The default of a field is an attribute of the class, so reading such a field would never call ``__getattr__``.
     """
     fields = [(field.name, bool(field.metadata.get("static"))) for field in dataclasses.fields(cls)]
     return [(name, is_static) for name, is_static in fields if is_static or hasattr(cls, name)]
 
 
 class Members(PyTree):
-    """Base class of records of a population: all things of one kind in a world, such as cars.
+    """Base class of records of a population: all objects of one kind in a world, such as cars.
 
-    The name of the population is the scope of its leaves, including records within it.
+    ``scopes`` returns the name of the population for its leaves of scope ``member``, also in nested records.
     """
 
     population: str = static()
@@ -149,7 +152,7 @@ class Members(PyTree):
     n_members: int = static()
     """Number of members in each world."""
     member_id: Array = leaf("member")
-    """Index of the member in its world; enters its random numbers. (n_worlds, n_members)"""
+    """Index of the member in its world. Its random numbers depend on it. (n_worlds, n_members)"""
 
 
 def has_members(scope: str) -> bool:
@@ -170,10 +173,10 @@ def n_world_axes(scope: str) -> int:
 def scopes(tree: Any) -> Any:
     """Return a tree of the same structure that holds the scope of every leaf.
 
-    For a leaf of members it is the name of their population; for a parameter ``shared``, ``drone`` or the name of a
-    population; for a leaf without a declaration ``opaque``. A leaf of another dataclass whose field has
-    ``CORE_NDIM_KEY`` in its metadata is ``batched`` if it has more dimensions than that: its first axis is over worlds,
-    and stages receive it like an opaque leaf.
+    A leaf of members has the name of their population as its scope, a parameter has ``shared``, ``drone`` or the name
+    of a population, and a leaf without a declaration is ``opaque``. Fields of dataclasses of other libraries can
+    declare ``CORE_NDIM_KEY`` in their metadata. A leaf with more dimensions than that is ``batched``: its first axis is
+    over worlds, and stages receive it like an opaque leaf.
     """
     return _map_leaves(lambda x, metadata, _, members: _scope(x, metadata, members), tree, {}, "", None)
 
@@ -202,7 +205,7 @@ def leaf_flags(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
 
 
 def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
-    """Check that every leaf has the axes of its scope: a parameter of one drone must not pass for one of a world."""
+    """Check that every leaf has the axes of its scope."""
     batches = {"world": (n_worlds, 1), "shared": ()}
 
     def check_leaf(x: Any, metadata: Any, name: str, members: Members | None) -> None:
@@ -290,7 +293,7 @@ def _is_record(node: Any) -> bool:
 
 
 def _is_foreign_record(node: Any) -> bool:
-    """Check for a dataclass of another library that JAX traverses."""
+    """Return True for a dataclass of another library that JAX traverses."""
     is_instance = dataclasses.is_dataclass(node) and not isinstance(node, (type, PyTree))
     return is_instance and not jax.tree_util.all_leaves([node])
 
@@ -310,7 +313,7 @@ def _scope(x: Any, metadata: Any, members: Members | None) -> str:
 
 
 def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
-    """Apply ``fn`` to the leaves that have an axis over worlds, and keep the rest."""
+    """Return the tree with ``fn`` applied to the leaves that have an axis over worlds; other leaves are unchanged."""
     return jax.tree.map(
         lambda scope, x, *rest: fn(x, *rest) if n_batch_axes(scope) else x,
         scopes(tree),

@@ -15,7 +15,7 @@ from jax import Array, lax
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the scalar product over the last axis, which is kept with length one. (..., 1)"""
+    """Return the scalar product over the last axis. (..., n) -> (..., 1)"""
     return jnp.sum(a * b, axis=-1, keepdims=True)
 
 
@@ -40,7 +40,7 @@ def along_z(value: Array) -> Array:
 
 
 def add_cross(offset: Array, a: Array, b: Array) -> Array:
-    """Return ``offset + a x b`` as six multiply-adds. (..., 3)"""
+    """Return ``offset + a x b``, computed by six multiply-adds. (..., 3)"""
     x, y, z = offset[..., 0], offset[..., 1], offset[..., 2]
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
@@ -101,7 +101,8 @@ def clip(x: Array, low: Array | float, high: Array | float) -> Array:
 def safe_arctan2(y: Array, x: Array) -> Array:
     """Return the angle of the point (x, y), rad, zero with gradient zero at the origin. (...)
 
-    A point counts as the origin where its squared distance, by which the gradient divides, vanishes or underflows.
+    A point close to the origin, with a squared distance that underflows to zero, is treated as the origin: the gradient
+    divides by the squared distance.
     """
     is_origin = x * x + y * y == 0
     return jnp.where(is_origin, 0.0, jnp.arctan2(y, jnp.where(is_origin, 1.0, x)))
@@ -128,10 +129,7 @@ def conjugate(q: Array) -> Array:
 
 
 def matrix(q: Array) -> Array:
-    """Return the rotation matrix of a unit quaternion, body to world. (..., 3, 3)
-
-    The matrix is reused for several vectors in a step.
-    """
+    """Return the rotation matrix of a unit quaternion, body to world. (..., 3, 3)"""
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     x2, y2, z2 = 2 * x, 2 * y, 2 * z
     wx, wy, wz, xx, yy, zz = w * x2, w * y2, w * z2, x * x2, y * y2, z * z2
@@ -159,19 +157,19 @@ def z_axis(q: Array) -> Array:
 
 
 def integrate_attitude(q: Array, ang_vel: Array, dt: float, normalize: bool = True) -> Array:
-    """Return the attitude after a rotation with a constant angular velocity by at most half a turn. (..., 4)
+    """Return the attitude after a rotation with constant angular velocity, by at most half a turn. (..., 4)
 
-    The result is ``q (sin(h) ang_vel / |ang_vel|, cos(h))`` with half the angle ``h = |ang_vel| dt / 2``, up to
-    rounding. ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of a physics step. A normalised result needs
-    only their ratio, which is the ratio of imaginary to real part of the numerator of the Pade approximation of
-    ``exp(2ih)``. Otherwise both are Taylor polynomials.
+    Up to rounding, the result is ``q (sin(h) ang_vel / |ang_vel|, cos(h))`` with half the angle,
+    ``h = |ang_vel| dt / 2``. ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of a physics step. A normalised
+    result needs only the ratio of sine to cosine. This is the ratio of imaginary to real part of the numerator of the
+    Pade approximation of ``exp(2ih)``. Without normalisation, Taylor polynomials replace sine and cosine.
 
     Args:
         q: Attitude, body to world, unit, xyzw. (..., 4)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         dt: Duration, s.
-        normalize: True to scale the result to unit length, which keeps rounding errors from accumulating. An attitude
-            that is used once, as in the stages of a Runge-Kutta step, can do without.
+        normalize: True to scale the result to unit length, which keeps rounding errors from accumulating. Attitudes at
+            intermediate points of a Runge-Kutta step do not need it.
     """
     is_float32 = ang_vel.dtype == jnp.float32
     if normalize:
@@ -190,7 +188,7 @@ def integrate_attitude(q: Array, ang_vel: Array, dt: float, normalize: bool = Tr
 def _polynomial(x: Array, coefficients: list[float]) -> Array:
     """Return the polynomial with these coefficients, constant term first. (...)"""
     value = jnp.full_like(x, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):  # Horner: one multiply-add for each
+    for coefficient in reversed(coefficients[:-1]):  # Horner's scheme: one multiply-add per coefficient
         value = value * x + coefficient
     return value
 
@@ -215,9 +213,9 @@ def from_rpy(rpy: Array) -> Array:
 def to_rpy(q: Array) -> Array:
     """Return roll, pitch, yaw in rad, pitch in [-pi/2, pi/2]. (..., 4) -> (..., 3)
 
-    Roll and yaw come from half their sum and half their difference (Bernardes and Viollet 2022), at least one of
-    which is well-defined at any pitch, so that :func:`from_rpy` gives the same rotation back. At a pitch of 90
-    degrees roll and yaw are not unique, and the half that is not well-defined is set to zero.
+    Roll and yaw are computed from half their sum and half their difference (Bernardes and Viollet 2022). At any pitch,
+    at least one of these two angles is well-defined, so :func:`from_rpy` returns the same rotation. At a pitch of 90
+    degrees, roll and yaw are not unique, and the angle that is not well-defined is set to zero.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     half_sum, half_difference = safe_arctan2(z + x, w - y), safe_arctan2(z - x, w + y)
@@ -228,7 +226,7 @@ def to_rpy(q: Array) -> Array:
 
 
 def _wrap_angle(angle: Array) -> Array:
-    """Return an angle of at most one turn, in either direction, as one in [-pi, pi], rad. (...)"""
+    """Return the angle in [-pi, pi] that is equivalent to an angle in [-2 pi, 2 pi], rad. (...)"""
     return angle - 2 * jnp.pi * ((angle > jnp.pi).astype(angle.dtype) - (angle < -jnp.pi).astype(angle.dtype))
 
 
@@ -247,7 +245,7 @@ def heading(q: Array) -> tuple[Array, Array]:
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     projection = jnp.stack([x * x + w * w - y * y - z * z, 2 * (x * y + w * z)], axis=-1)
     square = dot(projection, projection)
-    is_zero = square < 1e-24  # the gradient divides by its power 3/2
+    is_zero = square < 1e-24  # the gradient divides by ``square ** 1.5``
     inverse = 1 / jnp.sqrt(jnp.where(is_zero, 1.0, square))
     projection = jnp.where(is_zero, jnp.asarray([1.0, 0.0], q.dtype), projection * inverse)
     cos, sin, zero = projection[..., 0], projection[..., 1], jnp.zeros_like(x)
@@ -255,7 +253,11 @@ def heading(q: Array) -> tuple[Array, Array]:
 
 
 def heading_axes(yaw: Array) -> tuple[Array, Array]:
-    """Return the horizontal unit vectors along a yaw, rad (..., 1), and to its left. (..., 3) each"""
+    """Return the horizontal unit vectors along a yaw angle, and to the left of it. (..., 3) each
+
+    Args:
+        yaw: Yaw, rad. (..., 1)
+    """
     cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
     return jnp.concatenate([cos, sin, zero], axis=-1), jnp.concatenate([-sin, cos, zero], axis=-1)
 
@@ -264,7 +266,7 @@ def axes_from_z(z: Array, forward: Array, left: Array) -> tuple[Array, Array, Ar
     """Return unit axes x, y, z of the frame with z along a vector and x in the plane of z and a heading. (..., 3) each
 
     Args:
-        z: Vector of any length; zero counts as up. (..., 3)
+        z: Vector of any length; zero is replaced by up. (..., 3)
         forward: Horizontal unit vector of the heading. (..., 3)
         left: Horizontal unit vector to its left, the y axis where z is along the heading. (..., 3)
     """
@@ -289,9 +291,9 @@ def rpy_from_axes(x: Array, y: Array, z: Array) -> Array:
 def quat_from_axes(x: Array, y: Array, z: Array) -> Array:
     """Return the quaternion of the frame with these orthonormal axes in the world frame. (..., 3) -> (..., 4)
 
-    The products ``4 q_i q`` are linear in the axes. One with ``q_i^2 >= 1 / 4`` is scaled to length one, so that
+    The products ``4 q_i q`` are linear in the axes. A product with ``q_i^2 >= 1 / 4`` is scaled to length one, so that
     there is no division by small numbers, and value and gradient are accurate at every attitude. The sign of the
-    quaternion is not fixed.
+    quaternion is arbitrary.
     """
     xx, yy, zz = x[..., 0], y[..., 1], z[..., 2]
     xy, xz, yz = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]

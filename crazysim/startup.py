@@ -1,14 +1,14 @@
-"""The import of crazysim: variables of the environment, JAX and MuJoCo, and names that are imported at their first use.
+"""The import of crazysim: environment variables, JAX and MuJoCo, and names that are imported at their first use.
 
-JAX and MuJoCo read variables of the environment when they are imported, so these variables are set first.
+JAX and MuJoCo read environment variables when they are imported, so these variables are set first.
 
 XLA logs an error of 3,000 characters for each CPU program that it loads from a persistent cache, because the options
 ``prefer-no-gather`` and ``prefer-no-scatter``, with which it compiled the program, are not features of any CPU. Real
 failures are raised as exceptions.
 
-MuJoCo draws through GLFW, which needs a screen. Without a screen, and where EGL is installed, it draws through EGL. A
-``MUJOCO_GL`` that it refuses would make the import of crazysim fail, so MuJoCo is imported here, and without
-drawing if need be.
+MuJoCo draws through GLFW by default, which needs a screen. Without a screen, EGL is selected if it is installed. A
+value of ``MUJOCO_GL`` that MuJoCo refuses would make the import of crazysim fail. Therefore MuJoCo is imported here,
+and again without drawing if that fails.
 
 If JAX or MuJoCo is broken, the command ``crazysim``, including ``crazysim info``, ends with one line that says so.
 """
@@ -75,9 +75,9 @@ def import_required() -> None:
         ImportError: If one of them is broken or missing, with its name.
         SystemExit: Instead, in the command ``crazysim``, which prints the message.
     """
-    for name, load in (("jax", lambda: importlib.import_module("jax")), ("mujoco", import_mujoco)):
+    for name, import_package in (("jax", lambda: importlib.import_module("jax")), ("mujoco", import_mujoco)):
         try:
-            load()
+            import_package()
         except Exception as error:  # a damaged package can raise any error
             reason = str(error).strip().partition("\n")[0][:300]
             text = (

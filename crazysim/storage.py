@@ -1,4 +1,4 @@
-"""Files: written completely or not at all, read within bounds, and in folders of this user alone."""
+"""Files: written completely or not at all, read within limits of size, and in folders that only this user can write."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ MAX_TOML_BYTES = 2**20
 MAX_ARRAYS = 10_000
 """Largest number of arrays in an ``.npz`` file."""
 MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO = 2**30, 100
-"""Limit of bytes unpacked from an ``.npz`` file: the first number, or the second times its size if that is more."""
+"""Limit of the bytes unpacked from an ``.npz`` file: the larger of ``MAX_UNPACKED_BYTES`` and ``MAX_UNPACKED_RATIO``
+times the size of the file."""
 FOLDER_REMEDY = "Remove it, since its files may not be yours, or use another."
 """End of the message for a folder that is refused."""
 SYSTEM_USERS = (0, 65534)
@@ -189,7 +190,7 @@ class _NothingToWriteError(Exception):
 
 
 def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
-    """Check that a file can be written, before the work that produces its contents; it is not changed.
+    """Check that a file can be written, before the work that produces its contents; an existing file is not changed.
 
     Args:
         path: The file.
@@ -207,7 +208,7 @@ def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
 
 
 class ZipReader:
-    """A zip archive whose files are unpacked within bounds."""
+    """A zip archive from which files are unpacked within limits of number and size."""
 
     def __init__(self, file: BinaryIO, name: str, max_files: int, max_file_bytes: int, max_total_bytes: int):
         """Open an archive.
@@ -220,16 +221,12 @@ class ZipReader:
             max_total_bytes: Largest number of bytes that are unpacked in all.
 
         Raises:
-            ConfigError: If it has more files.
+            ConfigError: If it has more than ``max_files`` files.
             Exception: Of any type, if it is damaged; see ``wrap_read_errors``.
         """
-        self._zip = zipfile.ZipFile(file)
-        self._name, self._max_file_bytes, self._max_total_bytes, self._n_unpacked_bytes = (
-            name,
-            max_file_bytes,
-            max_total_bytes,
-            0,
-        )
+        self._zip, self._name = zipfile.ZipFile(file), name
+        self._max_file_bytes, self._max_total_bytes = max_file_bytes, max_total_bytes
+        self._n_unpacked_bytes = 0
         members = self._zip.infolist()
         if len(members) > max_files:
             raise ConfigError(f"expected at most {max_files} files, got {len(members)} in {name}")
@@ -241,7 +238,7 @@ class ZipReader:
         """Return the contents of a file of the archive.
 
         Raises:
-            ConfigError: If the file is too large, or all files that have been read are.
+            ConfigError: If the file is too large, or all files read so far are too large together.
             Exception: Of any type, if it is damaged; see ``wrap_read_errors``.
         """
         member = self._members[name]
@@ -252,11 +249,11 @@ class ZipReader:
                 f"{self._name}: {name}"
             )
         with self._zip.open(member) as file:
-            return file.read(member.file_size)  # with a length no more is unpacked, even if the archive holds more
+            return file.read(member.file_size)  # the length limits what is unpacked, if the archive states a wrong size
 
 
 def read_arrays(file: BinaryIO, name: str) -> dict[str, NDArray]:
-    """Return the arrays of an ``.npz`` file, after comparing their checksums.
+    """Return the arrays of an ``.npz`` file by name, after comparing their checksums.
 
     Args:
         file: The file.
@@ -292,7 +289,7 @@ def _parse_array(content: bytes, name: str) -> NDArray:
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder of the files of a command, and its parents; it may exist.
+    """Make the output folder of a command, and its parents; it may exist.
 
     Raises:
         ConfigError: If it cannot be made, or is a file.

@@ -1,4 +1,4 @@
-"""Tables of constants, of airframes and vehicles: shapes and ranges of their numbers, and the bases they extend."""
+"""Tables with the constants of airframes and vehicles: shapes and ranges of numbers, and tables that extend others."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Key(NamedTuple):
 
 
 def range_between(low: float = -np.inf, high: float = np.inf, positive: bool = False) -> Range:
-    """Return the range of finite numbers between two bounds, or of positive ones."""
+    """Return the range of finite numbers between two bounds; ``positive`` replaces ``low`` by the smallest number."""
     upper = "" if high > MAX_NUMBER else f" to {high:.6g}"
     if positive:
         return Range(f"positive{upper and f', at most {high:.6g}'}", 1 / MAX_NUMBER, min(high, MAX_NUMBER))
@@ -230,10 +230,10 @@ def read_source(
 
     Args:
         source: Name of a built-in file, path of another, or a dict of tables.
-        kind: Name of the kind of thing, for messages.
+        kind: Kind of object that the tables describe, such as ``"airframe"``, for messages.
         class_name: Name of its class with an article, for messages.
         folder: Folder of the built-in files.
-        names: Their names.
+        names: Names of the built-in files.
         guide: Page that lists the keys.
 
     Raises:
@@ -262,11 +262,11 @@ def _read_built_in(path: Path, guide: str) -> Mapping[str, Any]:
 
 
 def extend_bases(bases: tuple[str, ...], source: Any) -> tuple[str, ...]:
-    """Return a chain of sources, each the base of the previous one, extended by one.
+    """Return a chain of sources, extended by one source; each source is the base of the previous one.
 
     Args:
-        bases: Names, paths or kinds of the sources so far, each with the next one as its base.
-        source: Name, path or dict of the next one.
+        bases: The chain so far: names or paths of sources, or types of sources without a name.
+        source: Name, path or dict of the next source.
     """
     is_text = isinstance(source, (str, Path))
     name = str(source) if is_text else f"a {type(source).__name__}"

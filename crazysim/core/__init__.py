@@ -1,6 +1,7 @@
 """The core: records, stages, pipelines, integrators, plugins, random numbers and settings.
 
-It exports what plugins, stages and resets are written with, and the distribution of worlds over devices.
+The package exports the functions with which users write plugins, stages and resets, and the functions that distribute
+worlds over devices.
 """
 
 from crazysim.core.pipeline import append_fn, insert_fn_after, insert_fn_before, prepend_fn, remove_fn, replace_fn

@@ -68,9 +68,8 @@ def find_common_airframe(airframes: Airframes) -> Airframe:
 
 def max_n_rotors(airframes: Airframes) -> int:
     """Return the largest number of rotors of any of the airframes."""
-    distinct_airframes = {
-        id(airframe): airframe for airframe in as_airframes(airframes)
-    }  # thousands of drones share a few
+    # Thousands of drones share a few airframes.
+    distinct_airframes = {id(airframe): airframe for airframe in as_airframes(airframes)}
     return max(airframe.n_rotors for airframe in distinct_airframes.values())
 
 
@@ -95,7 +94,7 @@ def drone_names(airframes: Sequence[Airframe]) -> tuple[str, ...]:
 
 
 def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_worlds: int) -> T:
-    """Return one record for all drones: leaves that are equal for all airframes are shared, others have one per drone.
+    """Return one record for all drones: a leaf is shared if it is equal for all airframes, else it has a row per drone.
 
     If airframes have different numbers of rotors, axes over rotors are padded to the largest number. The padding
     repeats the last rotor in ``PER_ROTOR_FIELDS`` and is zero in other fields, such as a mixing matrix.
@@ -107,28 +106,28 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
     """
     airframes = as_airframes(airframes)
     distinct_airframes = list({id(airframe): airframe for airframe in airframes}.values())
-    records = [create(kind) for kind in distinct_airframes]
+    records = [create(airframe) for airframe in distinct_airframes]
     if len(distinct_airframes) == 1:
         return records[0]
-    counts = [kind.n_rotors for kind in distinct_airframes]
-    if len(set(counts)) > 1:
-        records = [_add_rotor_masks(record, n) for record, n in zip(records, counts, strict=True)]
+    rotor_counts = [airframe.n_rotors for airframe in distinct_airframes]
+    if len(set(rotor_counts)) > 1:
+        records = [_add_rotor_masks(record, n) for record, n in zip(records, rotor_counts, strict=True)]
     structures = [jax.tree.structure(record) for record in records]
-    for kind, structure in zip(distinct_airframes, structures, strict=True):
+    for airframe, structure in zip(distinct_airframes, structures, strict=True):
         if structure != structures[0]:
             raise ConfigError(
                 f"expected airframes with the same numbers for {type(records[0]).__name__}, got "
-                f"{distinct_airframes[0].name!r} and {kind.name!r}, of which one lacks some. Add "
+                f"{distinct_airframes[0].name!r} and {airframe.name!r}, of which one lacks some. Add "
                 f"them, with the key 'base', or use another controller."
             )
-    kind_indices = [distinct_airframes.index(airframe) for airframe in airframes]
+    airframe_indices = [distinct_airframes.index(airframe) for airframe in airframes]
 
     def stack_leaf(path: tuple[object, ...], *values: ArrayLike) -> np.ndarray:
         name = jax.tree_util.keystr(path[-1:]).strip("[].'\"")
         arrays = _pad_to_longest([np.asarray(x) for x in values], name)
         if all(np.array_equal(x, arrays[0]) for x in arrays):
             return arrays[0]
-        per_drone = np.stack([arrays[k] for k in kind_indices])
+        per_drone = np.stack([arrays[k] for k in airframe_indices])
         return np.array(np.broadcast_to(per_drone, (n_worlds, *per_drone.shape)))
 
     return jax.tree_util.tree_map_with_path(stack_leaf, *records)
@@ -154,7 +153,7 @@ def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
 
 
 def _add_rotor_masks(record: Any, n_rotors: int) -> Any:
-    """Return a record with the rotor masks filled in, where it or a record within it has a field for one."""
+    """Return a record in which empty fields ``ROTOR_MASK``, also of nested records, are True for its rotors."""
     if not isinstance(record, PyTree):
         return record
     changes = {}

@@ -1,4 +1,4 @@
-"""Branches and tables for functions of one element that engines compute for many elements side by side."""
+"""Branches and look-ups in tables, for functions of one element that engines compute for many elements in parallel."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Carry = TypeVar("Carry")
 
 
 def any_lane(condition: Array) -> Array:
-    """Return True where a condition holds for this element or, by choice of the engine, for another in its vector.
+    """Return True where a condition holds for this element or for another element that is computed together with it.
 
-    The result may be True where the condition is False, depending on which elements are computed together. It may
-    decide what is computed, but must not change the result. For example, if all elements of a vector take the same path
-    through a loop, the loop reads its tables once for all of them.
+    Which elements are computed together depends on the engine, so the return value may decide what is computed, but
+    must not change results. For example, if all elements of a vector take the same path through a loop, the loop reads
+    its tables once for all elements.
 
     Args:
         condition: The condition. ()
@@ -27,7 +27,7 @@ def any_lane(condition: Array) -> Array:
 
 
 def _batching_rule(args: Sequence[Array], dims: Sequence[int]) -> tuple[list[Array], list[None]]:
-    """Return True if the condition holds for any element of a batch, as a result that all of them share."""
+    """Return True if the condition holds for any element of a batch, as an unbatched result."""
     return any_lane_p.bind(jnp.any(args[0], axis=dims[0])), [None]
 
 
@@ -38,8 +38,8 @@ any_lane_p = simple_primitive("any_lane", lambda condition: [condition], _batchi
 def compute_where(condition: Array, fn: Callable[[Carry], Carry], value: Carry) -> Carry:
     """Return ``fn(value)`` where a condition holds and the value elsewhere; ``fn`` is skipped if it holds nowhere.
 
-    Kernels compile it to a branch; ``lax.cond`` in a function of one element would compute both cases. It has no
-    reverse-mode derivative.
+    Kernels compile this function to a branch; ``lax.cond`` in a function of one element would compute both cases. The
+    function has no reverse-mode derivative.
 
     Args:
         condition: The condition. ()

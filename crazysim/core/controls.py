@@ -29,12 +29,10 @@ class ControllerData(PyTree):
 
     @staticmethod
     def create(n_worlds: int, n_drones: int, controller: Controller, airframes: Airframes) -> ControllerData:
-        """Return a controller at rest, with the gains of each drone's airframe."""
+        """Return the record of a controller at rest, with the gains of each drone's airframe."""
         params = create_per_drone(airframes, controller.params, n_worlds)
-        memory, template = (
-            create_per_drone(airframes, controller.memory, n_worlds),
-            controller.memory(as_airframes(airframes)[0]),
-        )
+        memory = create_per_drone(airframes, controller.memory, n_worlds)
+        template = controller.memory(as_airframes(airframes)[0])
         for record, allowed_scopes in ((memory, ("drone",)), (params, ("shared", "drone"))):
             refused_scopes = set(jax.tree.leaves(scopes(record))) - set(allowed_scopes)
             if refused_scopes:
@@ -61,10 +59,13 @@ class ControllerData(PyTree):
 
 
 class _LevelData(PyTree):
-    """Base class with fields of the level's controller as properties, under Crazyflow's names; None if it lacks one."""
+    """Base class of the records of command levels that a controller follows.
+
+    Its properties have Crazyflow's names and return fields of the controller's record, or None if it lacks them.
+    """
 
     controller: ControllerData | None
-    """Controller that follows the commands; None for attitudes in fitted dynamics, which follow them themselves."""
+    """Controller that follows the commands; None for attitude commands in fitted dynamics, which contain one."""
 
     @property
     def params(self) -> Any:
@@ -144,7 +145,7 @@ class BodyRateControlData(_LevelData):
 
 
 class ForceTorqueControlData(PyTree):
-    """Command of the allocation."""
+    """Command of thrust and torque, and the allocation, which converts it to rotor speeds."""
 
     cmd: Array = leaf("drone", 1)
     """Command in force: collective thrust, N, and body torque, N m. (n_worlds, n_drones, 4)"""
@@ -157,7 +158,7 @@ class ForceTorqueControlData(PyTree):
 
 
 def check_same_controllers(controls: SimControls, reference: SimControls, name: str | None) -> None:
-    """Check that two simulations' controllers have the same records, with memory of the same shapes.
+    """Check that controllers have records of the same structure as in a simulation, with memory of the same shapes.
 
     Args:
         controls: Commands and controllers to check.
@@ -209,7 +210,7 @@ class SimControls(PyTree):
     body_rate: BodyRateControlData | None
     """Body-rate commands."""
     force_torque: ForceTorqueControlData | None
-    """Allocation."""
+    """Commands of thrust and torque, of the user or of a controller."""
     rotor_vel: Array | None = leaf("drone", 1)
     """Commanded rotor speeds, rpm; None in fitted dynamics. (n_worlds, n_drones, n_rotors)"""
 
@@ -235,7 +236,7 @@ class SimControls(PyTree):
         freqs: Mapping[Control, int],
         controller: Controller | None,
     ) -> SimControls:
-        """Return controllers at rest, with the gains of each drone's airframe.
+        """Return the records of controllers at rest, with the gains of each drone's airframe.
 
         Args:
             n_worlds: Number of worlds.
@@ -249,19 +250,17 @@ class SimControls(PyTree):
         shape = (n_worlds, n_drones)
         check_command_level(dynamics, control)
         check_controller(dynamics, control, controller)
-        followers, last_level = controller_chain(controller, control)
-        controller_by_level = dict(followers)
-        controller_data = {level: ControllerData.create(*shape, x, airframes) for level, x in followers}
+        chain, last_level = controller_chain(controller, control)
+        controller_by_level = dict(chain)
+        controller_data = {level: ControllerData.create(*shape, x, airframes) for level, x in chain}
 
         def zeros(n: int) -> Any:
             return host_array(0.0, *shape, n)
 
         state = attitude = body_rate = force_torque = rotor_vel = None
         if control == Control.state:
-            cmd, has_feedforward = (
-                host_array(np.eye(16)[12], *shape, 16),
-                controller_by_level[control].follows_feedforward,
-            )
+            cmd = host_array(np.eye(16)[12], *shape, 16)
+            has_feedforward = controller_by_level[control].follows_feedforward
             # A copy, because two leaves that share a buffer cannot both be donated.
             state = StateControlData(
                 controller_data[control],
@@ -272,13 +271,15 @@ class SimControls(PyTree):
                 staged_feedforward=zeros(8) if has_feedforward else None,
             )
         if Control.attitude in (*controller_by_level, last_level):
-            follower = controller_by_level.get(Control.attitude)
+            level_controller = controller_by_level.get(Control.attitude)
             attitude = AttitudeControlData(
                 controller_data.get(Control.attitude),
                 zeros(4),
                 zeros(4),
                 freqs[Control.attitude],
-                staged_ang_vel_des=zeros(3) if follower is not None and follower.follows_rates else None,
+                staged_ang_vel_des=zeros(3)
+                if level_controller is not None and level_controller.follows_rates
+                else None,
             )
         if control == Control.body_rate:
             body_rate = BodyRateControlData(controller_data[control], zeros(4), zeros(4), freqs[control])
@@ -301,15 +302,15 @@ def check_command_level(dynamics: Dynamics, control: Control) -> None:
 
 def check_controller(dynamics: Dynamics, control: Control, controller: Controller | None) -> None:
     """Check that controllers accept their command levels, and the dynamics the output of the last controller."""
-    followers, last_level = controller_chain(controller, control)
-    for level, follower in followers:
-        for member in follower.members:
+    chain, last_level = controller_chain(controller, control)
+    for level, level_controller in chain:
+        for member in level_controller.members:
             if level not in member.levels:
                 raise ConfigError(
                     f"expected a command level that controller {member.name!r} follows, {' or '.join(member.levels)}, "
                     f"got control={level.value!r}. Use another level, or controller='auto', which follows all."
                 )
-    name = followers[-1][1].name if followers else None
+    name = chain[-1][1].name if chain else None
     if dynamics != Dynamics.first_principles and last_level != Control.attitude:
         raise ConfigError(
             f"expected dynamics with rotors for controller {name!r}, got {dynamics.value!r}, which contains "

@@ -1,4 +1,4 @@
-"""Records of a simulation: states, time and sizes, objects, and all of them together."""
+"""Records of a simulation: states, time and sizes, objects, and its complete data."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class SimState(PyTree):
 
     @staticmethod
     def create(n_worlds: int, n_drones: int, n_rotors: int = 4) -> SimState:
-        """Return drones at rest on the floor, level, on a grid of 1 m around the origin of their world."""
+        """Return the state of drones at rest on the floor, level, on a grid with a spacing of 1 m around the origin."""
         shape = (n_worlds, n_drones)
         grid = np.zeros((n_drones, 3))
         grid[:, :2] = grid_2d(n_drones)
@@ -80,7 +80,7 @@ class SimStateDeriv(PyTree):
 
     @staticmethod
     def create(n_worlds: int, n_drones: int, device: jax.Device | None = None, n_rotors: int = 4) -> SimStateDeriv:
-        """Return zeros.
+        """Return a derivative of zeros.
 
         Args:
             n_worlds: Number of worlds.
@@ -103,21 +103,21 @@ class SimCore(PyTree):
     episode: Array = leaf("world")
     """Number of resets of the world. Its random numbers depend on it. (n_worlds, 1)"""
     nonfinite: Array = leaf("world")
-    """True where the world has become non-finite, or taken more than ``MAX_STEPS``, since its last reset.
+    """True where the world has become non-finite, or has taken more than ``MAX_STEPS`` steps, since its last reset.
     (n_worlds, 1)"""
     n_worlds: int = static()
     """Number of worlds."""
     n_drones: int = static()
     """Number of drones per world."""
     world_id: Array = leaf("world")
-    """Index of the world, within its block if blocks of worlds have keys of their own. Its random numbers depend on it.
-    (n_worlds, 1)"""
+    """Index of the world, or its index within its block if each block of worlds has a separate random key. The world's
+    random numbers depend on it. (n_worlds, 1)"""
     drone_id: Array = leaf("drone")
     """Index of the drone in its world. Its random numbers depend on it. (n_worlds, n_drones)"""
     drone_mocap_ids: Array = leaf("shared", 1)
     """MuJoCo mocap ids of the bodies of the drones. (n_drones,)"""
     rng_key: Array = leaf("parameter", 0)
-    """Random key; resets do not change it. There may be one for each drone of each world instead. ()"""
+    """Random key; resets do not change it. (), or (n_worlds, n_drones) for one key per drone"""
     mjx_synced: Array = leaf("shared", 0)
     """True if the scene matches this data. ()"""
 
@@ -156,14 +156,14 @@ class Objects(PyTree):
     recorded: bool = static(default=False)
     """True if a recording determines the poses of all objects, even those that plugins move, such as loads."""
 
-    def with_poses(self, rows: Mapping[str, tuple[Array, Array]]) -> Objects:
+    def with_poses(self, poses: Mapping[str, tuple[Array, Array]]) -> Objects:
         """Return the objects of one world with new poses for some of them.
 
         Args:
-            rows: Positions (n, 3) and attitudes, xyzw (n, 4), of all objects of a kind, by the kind's name.
+            poses: Positions, m, (n, 3) and attitudes, xyzw, (n, 4) of all objects of a kind, by the kind's name.
         """
         pos, quat = self.pos, self.quat
-        for kind, (kind_pos, kind_quat) in rows.items():
+        for kind, (kind_pos, kind_quat) in poses.items():
             indices = np.array([self.names.index(f"{kind}:{k}") for k in range(kind_pos.shape[0])])
             pos, quat = (
                 pos.at[indices].set(kind_pos.astype(pos.dtype)),
@@ -173,7 +173,7 @@ class Objects(PyTree):
 
 
 class SimData(PyTree):
-    """Complete data of a simulation, which a step takes and returns."""
+    """Complete data of a simulation: the argument and the result of a step."""
 
     states: SimState
     """Rigid-body and rotor state of the drones."""
@@ -185,7 +185,7 @@ class SimData(PyTree):
     """Time, sizes, seed and flags."""
     plugins: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Records of plugins and of user stages, by name. Records (``PyTree``) declare the scopes of their leaves and are
-    reset per world; bare arrays are opaque, and only full resets restore them."""
+    reset per world. Arrays outside of records are opaque: only resets of all worlds restore them."""
     objects: Objects | None = None
     """Movable objects of the scene; None if there are none."""
 
@@ -240,7 +240,7 @@ def n_rotor_states(dynamics: Dynamics, airframes: Airframes) -> int:
 
 
 def controls_of(data: SimData) -> Any:
-    """Return ``data.controls`` as ``Any``, because the command level and the model determine which fields are None."""
+    """Return ``data.controls``, for type checkers as ``Any``: command level and model decide which fields are None."""
     return data.controls
 
 

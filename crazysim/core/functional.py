@@ -52,7 +52,7 @@ def state_control(
         acc: Acceleration, world frame, m/s^2, with ``pos``. (..., 3)
         yaw: Yaw, rad, with ``pos``. (...)
         feedforward: Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2. None for the yaw rate of the
-            setpoint and zeros for the rest. Must be None if the controller has no feedforward, as Crazyflow's.
+            setpoint and zeros for the rest. Must be None if the controller has no feedforward, such as Crazyflow's.
             (n_worlds, n_drones, 8)
     """
     command, feedforward = check_setpoint(
@@ -98,11 +98,13 @@ def _join_setpoint(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.nda
     """Return the setpoint with the given parts, a NumPy array if no part is a JAX array. (n_worlds, n_drones, 16)"""
     if "pos" not in parts:
         raise ConfigError("expected a state command, got no position. Use pos=(0, 0, 1), or 16 numbers per drone.")
-    counts = data.states.pos.shape[:2]
-    checked = {name: _check_part(name, x, counts if name == "yaw" else (*counts, 3)) for name, x in parts.items()}
+    batch_shape = data.states.pos.shape[:2]
+    checked = {
+        name: _check_part(name, x, batch_shape if name == "yaw" else (*batch_shape, 3)) for name, x in parts.items()
+    }
     if any(isinstance(x, jax.Array) for x in checked.values()):
-        return _device_setpoint(counts, data.states.pos.dtype, checked)
-    return _setpoint(np, counts, float, checked)
+        return _device_setpoint(batch_shape, data.states.pos.dtype, checked)
+    return _setpoint(np, batch_shape, float, checked)
 
 
 def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | np.ndarray:
@@ -120,9 +122,9 @@ def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | 
     return array
 
 
-def _setpoint(xp: Any, counts: tuple[int, ...], dtype: DTypeLike, parts: Mapping[str, ArrayLike]) -> Any:
+def _setpoint(xp: Any, batch_shape: tuple[int, ...], dtype: DTypeLike, parts: Mapping[str, ArrayLike]) -> Any:
     """Return the setpoint with the given parts, and zeros for other parts and body rates. (n_worlds, n_drones, 16)"""
-    zeros = xp.zeros((*counts, 3), dtype)
+    zeros = xp.zeros((*batch_shape, 3), dtype)
     vectors = [xp.asarray(parts.get(name, zeros), dtype) for name in ("pos", "vel", "acc")]
     half_yaw = xp.asarray(parts.get("yaw", 0.0), dtype)[..., None] / 2 + zeros[..., :1]
     quat = [zeros[..., :2], xp.sin(half_yaw), xp.cos(half_yaw)]
@@ -203,7 +205,8 @@ def staged_leaves(data: SimData) -> list[Any]:
     """Return the leaves that ``stage_command`` writes, in the order of ``staged_fields``."""
     controls = data.controls
     level: Any = controls if controls.mode == Control.rotor_vel else getattr(controls, controls.mode.value)
-    return [getattr(level, name) for name in staged_fields(data, level, level)]
+    names = staged_fields(data, command=level, feedforward=level)  # the values are not used
+    return [getattr(level, name) for name in names]
 
 
 def default_feedforward(command: Any) -> Any:

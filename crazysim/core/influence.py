@@ -1,4 +1,4 @@
-"""Calls of plugins within the integration: influences, derivatives of their records, and constraints."""
+"""Calls of methods of plugins by the integration: influences, derivatives of plugins' states, and constraints."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
     paths, treedef = jax.tree_util.tree_flatten_with_path(data)
     if jax.tree.structure(changed_data) != treedef:
         raise ConfigError(
-            f"expected {title} to keep the structure of SimData, but a field became None, or a record came or "
-            f"went. Add records with sim.add."
+            f"expected {title} to keep the structure of SimData, but a field became None, or a record was added or "
+            f"removed. Add records with sim.add."
         )
     command = "controls.attitude.cmd" if data.controls.rotor_vel is None else "controls.rotor_vel"
     writable_fields = ("states.force", "states.torque", command)
@@ -55,7 +55,7 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
 
 
 def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
-    """Return the rates of the plugin's own states, checked."""
+    """Return the time derivatives of a plugin's states, by field of its record, after checking them."""
     title = f"derivative of plugin {plugin.name!r} ({type(plugin).__name__})"
     rates = _call_method(title, plugin.derivative, data, plugin.scope)
     if not isinstance(rates, Mapping):

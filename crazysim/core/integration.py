@@ -36,7 +36,8 @@ class Integrator(StrEnum):
     euler = "euler"
     """Explicit Euler, order 1: the fastest."""
     symplectic_euler = "symplectic_euler"
-    """Semi-implicit Euler, order 1: positions move with the new velocities. As fast, with less energy drift."""
+    """Semi-implicit Euler, order 1: positions move with the new velocities. As fast as explicit Euler, with less energy
+    drift."""
     rk4 = "rk4"
     """Classical Runge-Kutta, order 4: four evaluations of the derivative per step."""
     default = euler
@@ -168,8 +169,8 @@ class Integration:
     def stage(self) -> Stage:
         """Return the stage of a step pipeline.
 
-        Without plugins it accepts any leading batch axes; plugins are written for one drone or one world. ``deriv_fn``
-        must be one of the derivatives of this package, since the stage without plugins is traced once in a process.
+        Without plugins, the stage accepts any leading axes, and is traced once in a process; therefore ``deriv_fn``
+        must be one of the derivatives of ``crazysim.core.stages``. Plugins are written for one drone or one world.
         """
         scope = "world" if self.couples_world else "drone"
         return Stage(self, scope, batched=not self.plugins, name="integration", trace_once=not self.plugins)

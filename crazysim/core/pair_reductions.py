@@ -1,7 +1,7 @@
 """Reductions over the drones of a world, for functions that are written for one drone.
 
-Each drone publishes some of its values, and a function of one pair computes the effect of another drone's values on it.
-The function has no axis over pairs: the ``plain`` engine adds one, kernels loop over the drones of a world.
+Each drone publishes some of its values. A function of one pair computes the effect of another drone's values on a
+drone. It has no axis over pairs: the ``plain`` engine adds this axis, and kernels loop over the drones of a world.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ MAX_PAIRS = 2**20
 def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Reduction = "sum") -> Any:
     """Return the reduction of a function of pairs over all drones of the world, for use in functions of one drone.
 
-    ``fn`` also runs for the pair of the drone with itself, where ``is_self`` is true. Values of the drone itself are
-    captured by ``fn``. Compute anything that depends on the other drone alone in ``values``: it is computed once
-    for each drone, and ``fn`` once for each pair.
+    ``fn`` also runs for the pair of the drone with itself, where ``is_self`` is true. It captures the values of this
+    drone. Compute everything that only depends on the other drone in ``values``: they are computed once for each drone,
+    and ``fn`` once for each pair.
 
         gap = reduce_over_others(
             lambda other, is_self: jnp.where(is_self, jnp.inf, rotation.safe_norm(pos - other)), pos, "min"
@@ -55,7 +55,7 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
 
     Args:
         fn: ``fn(other, is_self)`` returns any tree of arrays for one pair: ``other`` are the ``values`` of the other
-            drone, ``is_self`` is true where it is the drone itself, ().
+            drone; ``is_self`` is true if the other drone is this drone, ().
         values: Values of this drone that are passed to all drones of its world, any tree of small arrays.
         reduce: ``"sum"``, ``"min"`` or ``"max"`` over all drones; for bools ``"max"`` is true where any is true.
 
@@ -104,7 +104,7 @@ def _result_types(*args: object, jaxpr: ClosedJaxpr, n_captured: int, reduce: st
 def _batching_rule(
     axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_captured: int, reduce: str
 ) -> Any:
-    """Batch the reduction: compute it over the axis of drones, and bind a batched reduction over any other axis."""
+    """Return the batched results and their axes: computed over the axis of drones, or bound again over other axes."""
     in_axes = [None if d is None else 0 for d in dims]
     rows = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
     if axis.name == MEMBER_AXIS:

@@ -52,7 +52,7 @@ class Simulation(Protocol):
 
     @property
     def airframe(self) -> Airframe:
-        """Airframe of all drones; an error where they have several."""
+        """Airframe of all drones; raises an error if the drones have different airframes."""
         ...
 
     def add(self, plugin: P, name: str | None = None) -> P:
@@ -73,9 +73,10 @@ class StagePlacement:
     before: str = "integration"
     """Name of the stage before which it is inserted."""
     replaces: str | None = None
-    """Name of the stage that it replaces instead, if the pipeline has it; removing the plugin puts that stage back."""
+    """Name of a stage to replace; if the pipeline has none of that name, ``before`` is used. Removing the plugin
+    restores the replaced stage."""
     name: str | None = None
-    """Name of the stage; None for the plugin's."""
+    """Name of the stage; None for the name of the plugin."""
 
 
 def parameter(
@@ -88,11 +89,11 @@ def parameter(
     dtype: DTypeLike | None = None,
     shapes: Shapes | None = None,
 ) -> Any:
-    """Declare a field of a plugin whose value only fills numbers of its record.
+    """Declare a field of a plugin that only provides numbers of the plugin's record.
 
-    ``sim.replace`` exchanges such numbers without compiling the step again. The plugin's stages, ``influence`` and
-    ``derivative`` must read the number from the record, never from the field. Its range is checked as in
-    ``setting``, and its shape by ``Plugin.fill_record`` or ``shapes``.
+    ``sim.replace`` changes such numbers without compiling the step again. The plugin's stages, ``influence`` and
+    ``derivative`` must read the number from the record, never from the field. ``low``, ``high`` and ``positive`` limit
+    the number as in ``setting``. Its shape is checked by ``Plugin.fill_record``, or here if ``shapes`` are given.
     """
     declaration = Setting(range_between(low, high, positive), True, per_axis, dtype, shapes)
     return dataclasses.field(default=default, metadata={"setting": declaration})
@@ -173,8 +174,8 @@ class Plugin:
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
 
     A subclass lists its settings as annotated fields, including ``name``; it becomes a frozen dataclass. It
-    overrides the methods below that it needs. Methods that take ``data`` are written for one drone, unless they say
-    otherwise: leaves of drones and worlds come without batch axes, ``data.states.pos`` is (3,).
+    overrides some of the methods below. Methods that take ``data`` are written for one drone, unless they say
+    otherwise: leaves of drones and worlds have no batch axes, so ``data.states.pos`` is (3,).
     """
 
     name: str
@@ -208,7 +209,7 @@ class Plugin:
 
     @property
     def constrains(self) -> bool:
-        """True if the plugin couples bodies of its own to the drones by ``constrain``."""
+        """True if the plugin overrides ``constrain``, which joins bodies of the plugin to drones."""
         return type(self).constrain is not Plugin.constrain
 
     @property
@@ -218,7 +219,7 @@ class Plugin:
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
-        """Terms of the model that the plugin replaces, such as ``"drag"``, or adds where the model has none.
+        """Terms of the dynamics model that the plugin replaces or adds, such as ``"drag"``.
 
         Two plugins that replace the same term are refused.
         """
@@ -237,15 +238,15 @@ class Plugin:
         return self.record(sim)
 
     def fill_record(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
-        """Return a record for all worlds; fields that are not passed follow from their declarations.
+        """Return a record for all worlds, with values for the fields that are not passed.
 
-        A parameter has the value of the plugin's setting of that name, checked; without a fixed core shape it has one
-        number for each rotor. A state of drones with a fixed core shape is zero. A setting of None gives None.
+        A parameter has the checked value of the plugin's setting with the same name; without a fixed core shape it has
+        one number for each rotor. A state of drones with a fixed core shape is zero. A setting of None gives None.
 
         Args:
             sim: The simulation.
             kind: Class of the record.
-            fields: Values of fields. Where one is None, the setting of its name is still checked.
+            fields: Values of fields. If a value is None, the setting with the same name is still checked.
         """
         settings = {
             name: declaration for name, declaration in collect_settings(type(self)).items() if declaration.is_parameter
@@ -265,7 +266,7 @@ class Plugin:
         return kind(**values)
 
     def check_plugins(self, sim: Simulation) -> None:
-        """Check the simulation with all of its plugins, which may be added in any order, before it steps."""
+        """Check the simulation with all of its plugins, before its first step; plugins may be added in any order."""
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of the plugin with their positions, in the order in which they are inserted."""
@@ -274,11 +275,11 @@ class Plugin:
     def reset_episode(self, data: SimData) -> SimData:
         """Return the data of one drone, or of ``scope``, at the beginning of an episode.
 
-        It may write leaves of that scope, such as values that are drawn for an episode. It is called at resets, and
-        again in the first step of every episode, also of worlds that were never reset, before all other stages and with
-        the same random numbers. So a second call must not change the result of the first, as adding to a leaf would.
-        Environments leave out the call in the first step, since all of their episodes begin with a reset. With
-        ``reset_before``, it is called in the first step only, in front of that stage.
+        It may write leaves of that scope, such as values that are drawn for an episode. It is called at resets. It is
+        called again in the first step of every episode, also in worlds that were never reset, before all other stages
+        and with the same random numbers. A second call must not change the result of the first call, as adding to a
+        leaf would. Environments omit the call in the first step, since all of their episodes begin with a reset. With
+        ``reset_before``, it is called only in the first step, before that stage.
         """
         return data
 
@@ -298,29 +299,29 @@ class Plugin:
         return data
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
-        """Return the time derivatives of fields of the record that are states of the plugin's own, per second.
+        """Return the time derivatives of the plugin's states, per second, by their fields of the record.
 
-        The integrator advances them together with the drone's states, in every scheme. ``data`` is of one drone, with
-        the influences of all plugins applied. A rate has the shape of its field, which is declared with
+        All integrators advance these states together with the drone's states. ``data`` is of one drone, with the
+        influences of all plugins applied. A derivative has the shape of its field, which is declared with
         ``leaf("drone", ...)``.
         """
         return {}
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
-        """Return the derivative with the reaction of bodies that are joined to the drone, and the bodies' own rates.
+        """Return the derivative with the reaction of bodies that are joined to the drone, and the rates of the bodies.
 
-        A joint is a constraint: the accelerations of drone and joined body follow from one system of equations. Here
-        ``deriv`` is the derivative of the drone as if it were free, evaluated once. The reaction is added to ``acc``
-        and ``ang_acc``, and the rates of fields of the record are put into ``deriv.plugins[self.name]``. A simulation
-        has at most one plugin that constrains.
+        A joint is a constraint: the accelerations of drone and joined body follow from one system of equations.
+        ``deriv`` is the derivative of the drone without the joint. The reaction is added to ``acc`` and ``ang_acc``,
+        and the rates of fields of the record are put into ``deriv.plugins[self.name]``. A simulation has at most one
+        plugin that constrains.
 
         Args:
-            data: Data of one drone with all influences applied, or of one world, without them, if ``coupling`` is
-                ``"world"``.
+            data: Data of one drone with all influences applied. If ``coupling`` is ``"world"``, data of one world
+                without influences.
             deriv: Derivative of the free drone or drones.
-            dt: Duration of the step that the derivative is for, s, in schemes of order 1: impulses of the step are
-                returned as mean accelerations, and added to ``vel`` and ``ang_vel`` too, with which the scheme moves
-                position and attitude. None for the derivative at an instant.
+            dt: Duration of the step, s, in schemes of order 1. An impulse in the step is then returned as its mean
+                acceleration, and its change of velocity is also added to ``vel`` and ``ang_vel``, with which the scheme
+                moves position and attitude. None for the derivative at an instant.
         """
         return deriv
 
@@ -333,7 +334,7 @@ class Plugin:
 
     @property
     def moved_kinds(self) -> tuple[str, ...] | None:
-        """Names of the objects that ``move_objects`` moves, without their numbers; None for any movable object."""
+        """Names of the objects that ``move_objects`` moves, without the number at the end; None for any object."""
         return None
 
     @property
@@ -346,7 +347,7 @@ class Plugin:
         return {}
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
-        """Return fields of ``data.states`` as the plugin measures them, by name, of one drone."""
+        """Return the measured values of some fields of ``data.states`` of one drone, by field."""
         return {}
 
     def draw(self, sim: Simulation, world: int) -> None:
@@ -387,7 +388,7 @@ def check_plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
 
 
 def with_measured_states(plugins: Sequence[Plugin], data: SimData) -> SimData:
-    """Return the data of one drone with the states that plugins measure instead of the true ones.
+    """Return the data of one drone in which true states are replaced by the values that plugins measure.
 
     Args:
         plugins: The plugins; if several measure the same state, the last one is used.

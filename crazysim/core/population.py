@@ -1,7 +1,7 @@
-"""Populations: all things of one kind in a world besides its drones, such as cars, loads or free bodies.
+"""Populations: all objects of one kind in a world other than drones, such as cars, loads or free bodies.
 
-A population is a plugin whose record has one row for each member. Most methods are written for one member; scopes,
-masks, seeds, sharding, engines and gradients treat members as they treat drones.
+A population is a plugin with a record that has one row for each member. Most methods are written for one member.
+Scopes, masks, seeds, sharding, engines and gradients treat members as they treat drones.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ class Population(Plugin):
     """Base class of populations, which ``sim.add`` adds.
 
     A subclass overrides ``record``, ``derivative`` and any other method it needs. ``control``, ``derivative`` and
-    ``reset_episode`` are written for one member: leaves of the population and of worlds come without batch axes, leaves
-    of other populations, drones included, as (n_members, ...), which they may only read. ``self.read(data)`` is the
-    record of the member. ``influence`` is written for one drone, as in other plugins.
+    ``reset_episode`` are written for one member: leaves of the population and of worlds have no batch axes, and
+    ``self.read(data)`` is the record of the member. Leaves of drones are (n_drones, ...), leaves of other populations
+    are (n_members, ...), and both may only be read. ``influence`` is written for one drone, as in other plugins.
 
-    A population has up to two stages, whose scope is its name: its controller runs before the integration of the
-    drones, its own integration after it.
+    A population has up to two stages with its name as their scope. The stage of its controller runs before the
+    integration of the drones, and the stage of its integration runs after it.
     """
 
     members: int | Sequence[str] = 1
@@ -101,8 +101,8 @@ class Population(Plugin):
         Args:
             sim: The simulation.
             kind: Class of the record.
-            fields: Values of its fields: for a leaf of members of shape (), (*core), (n_members, *core) or
-                (n_worlds, n_members, *core); other leaves and records within it as they are.
+            fields: Values of the fields. The value of a leaf of members has the shape (*core), (n_members, *core) or
+                (n_worlds, n_members, *core). Values of other leaves and nested records are used unchanged.
         """
         self.check(sim)
         counts = sim.n_worlds, self.n_members
@@ -126,7 +126,7 @@ class Population(Plugin):
         return self.read(data)
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
-        """Return the time derivatives of the states of one member by field of its record, per second.
+        """Return the time derivatives of the states of one member, per second, by field of its record.
 
         The integration advances them in the scheme of the simulation. The rate of a unit quaternion is the derivative
         of its four numbers; ``finish`` restores its length.
@@ -145,7 +145,7 @@ class Population(Plugin):
         return record
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the stages of ``control`` and ``derivative``, for each that the class overrides."""
+        """Return a stage for ``control`` and a stage for ``derivative``, if the class overrides these methods."""
         cls, placements = type(self), []
         if cls.control is not Population.control:
             control_freq = self.control_freq
@@ -229,7 +229,7 @@ def choose_scheme(integrator: Integrator, positions: Sequence[str]) -> Callable[
 
 
 def populations(data: SimData) -> dict[str, Members]:
-    """Return the records of all populations besides the drones, by name."""
+    """Return the records of all populations other than the drones, by name."""
     return {name: x for name, x in data.plugins.items() if isinstance(x, Members) and x.population == name}
 
 
@@ -254,7 +254,7 @@ def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: 
 def _repeat_for_members(name: str, value: Any, metadata: Mapping[str, Any], counts: tuple[int, int]) -> np.ndarray:
     """Return a value repeated for every member of every world."""
     array = np.asarray(value)
-    is_integer = array.dtype.kind in "iu" and hasattr(value, "dtype")  # a Python int such as 1 stands for the float 1.0
+    is_integer = array.dtype.kind in "iu" and hasattr(value, "dtype")  # a Python int such as 1 becomes the float 1.0
     dtype = np.int32 if is_integer else float_dtype() if array.dtype.kind in "iuf" else array.dtype
     n_core = metadata["core_ndim"]
     core = array.shape[max(array.ndim - n_core, 0) :] if array.ndim >= n_core else None

@@ -36,7 +36,7 @@ def seed_sim(data: SimData, seed: int | Array, device: jax.Device | None = None)
 
 
 def seed_key(data: SimData) -> Array:
-    """Return the random key of the seed of one drone or one world, which all its drones share. ()"""
+    """Return the random key of the seed from data of one drone or one world. ()"""
     key = data.core.rng_key
     return key[0] if key.ndim else key
 
@@ -95,9 +95,9 @@ def drone_keys(data: SimData, name: str) -> Array:
 
 
 def normal(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array:
-    """Return standard normal numbers, (*shape), at half the cost of ``jax.random.normal``, with other numbers.
+    """Return standard normal numbers, (*shape), at half the cost of ``jax.random.normal``, which draws other numbers.
 
-    In float32 every hash of the key gives two of them.
+    In float32, every hash of the key gives two numbers.
     """
     fractions = _fractions(key, shape, dtype)
     if fractions is None:
@@ -113,11 +113,11 @@ def uniform(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array
 
 
 def uniform_at(words: Array, index: Array | np.ndarray, dtype: Any = jnp.float32) -> Array:
-    """Return the random numbers with some indices of a stream, in steps of 2^-24 from zero to below one.
+    """Return the random numbers at some indices of a stream, multiples of 2^-24 from zero to below one. (...)
 
-    Any number of the stream follows from its index alone, for functions that read few numbers of a long stream. Two
-    rounds of an integer hash with good avalanche (Wellons 2018, "Prospecting for hash functions", with the later
-    constants 21f0aaad, d35a2d97) make each: a twentieth of the arithmetic of JAX's generator.
+    Any number of the stream depends on the key and its index only, for functions that read few numbers of a long
+    stream. Each number takes two rounds of an integer hash with good avalanche (Wellons 2018, "Prospecting for hash
+    functions", with the later constants 21f0aaad, d35a2d97): a twentieth of the arithmetic of JAX's generator.
 
     Args:
         words: Two words of a key, uint32. (..., 2)

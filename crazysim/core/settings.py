@@ -35,7 +35,7 @@ MAX_SOFTNESS = 10.0
 """Largest softness of contacts, s."""
 
 NUMERIC_TYPES = frozenset((int, float, np.ndarray))
-"""Types of fields with numbers; an array stands for ``ArrayLike``."""
+"""Types of fields with numbers; ``np.ndarray`` represents ``ArrayLike``."""
 SLOW_FREQ = 200
 """Rate of physics steps, Hz, that replaces a lower one in the check of default rates: a rate must be at least half of
 its default or of the rate of physics steps, whichever is smaller. The cascades of small drones are stable from 100 Hz
@@ -115,14 +115,14 @@ def setting(
 ) -> Any:
     """Declare a numeric field of a record of settings, such as a task, with the values that it may have.
 
-    ``check_settings`` checks it. Numbers of other fields must be finite.
+    ``check_settings`` checks the values. Numbers of fields without a declaration must be finite.
 
     Args:
         default: Default value.
         default_factory: Function that returns the default value.
         low: Smallest value allowed.
         high: Largest value allowed.
-        positive: Refuse zero and negative values.
+        positive: True to refuse zero and negative values.
         shapes: Shapes of an array, ``"any"`` for an axis of any length; None for any shape.
     """
     default = {"default": default} if default_factory is dataclasses.MISSING else {"default_factory": default_factory}
@@ -189,17 +189,17 @@ def check_settings(settings: Any) -> None:
 
 @functools.cache
 def allowed_types(kind: type) -> dict[str, tuple[type, ...]]:
-    """Return the types that each field may have; an empty tuple where the annotation cannot be checked.
+    """Return the types that each field may have, by its name; an empty tuple if its annotation cannot be checked.
 
-    An array stands for ``ArrayLike`` and sequences of numbers.
+    ``np.ndarray`` represents ``ArrayLike`` and sequences of numbers.
     """
-    types = {}
+    field_types = {}
     for base in reversed(kind.__mro__):
         module = getattr(sys.modules.get(base.__module__), "__dict__", {})  # a file that was run may have none
         names = module | {"ArrayLike": Numbers}
         for name, hint in inspect.get_annotations(base).items():
-            types[name] = _types(hint, names)
-    return {field.name: types.get(field.name, ()) for field in dataclasses.fields(kind)}
+            field_types[name] = _types(hint, names)
+    return {field.name: field_types.get(field.name, ()) for field in dataclasses.fields(kind)}
 
 
 def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
@@ -207,7 +207,7 @@ def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
     if isinstance(hint, str):
         try:
             hint = eval(hint, dict(names))
-        except Exception:  # a name that is imported for type checkers alone
+        except Exception:  # a name that is only imported for type checkers
             return ()
     if hint is Numbers or hint == ArrayLike:
         return (np.ndarray,)
@@ -222,7 +222,7 @@ def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
         return (np.ndarray,) if NUMERIC_TYPES.issuperset(inner) else ()
     if hint is None:
         return (type(None),)
-    # Fields of arrays are not checked: they may have any dtype, and NumPy arrays for JAX arrays.
+    # Fields that are annotated as arrays are not checked: they may hold NumPy or JAX arrays of any dtype.
     is_class = inspect.isclass(hint) and hint not in (Any, object, Array, np.ndarray) and not typing.get_args(hint)
     return (hint,) if is_class and not getattr(hint, "_is_protocol", False) else ()
 
@@ -235,7 +235,7 @@ def check_softness(freq: int, softness: ArrayLike) -> None:
 
 
 def physics_freq(freq: object) -> int:
-    """Return the rate of physics steps, Hz."""
+    """Check and return the rate of physics steps, Hz."""
     freq = positive_integer("freq", freq)
     if freq > 10_000 and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise ConfigError(
@@ -293,7 +293,7 @@ def as_rgba(rgba: object, n: int | None = None) -> NDArray[np.float64]:
 
 
 def as_mask(mask: object, *shapes: tuple[int, ...], item: str = "world") -> Array | None:
-    """Return a mask as an array; None, for all, stays None.
+    """Return a mask as an array; None, which selects all items, is returned unchanged.
 
     Shape and type are checked, also of a traced mask.
 
@@ -318,7 +318,7 @@ def as_mask(mask: object, *shapes: tuple[int, ...], item: str = "world") -> Arra
 
 
 def check_rates(control: Control, freq: int, rates: Mapping[Control, int | None]) -> None:
-    """Check requested rates, Hz; None stands for the rate of a controller."""
+    """Check requested rates, Hz; a rate of None is not checked."""
     used_levels = {
         Control.state: (Control.state, Control.attitude, Control.force_torque),
         Control.rotor_vel: (),
@@ -334,23 +334,23 @@ def check_rates(control: Control, freq: int, rates: Mapping[Control, int | None]
 def control_freqs(
     control: Control, freq: int, rates: Mapping[Control, int | None], controller: Controller | None
 ) -> dict[Control, int]:
-    """Return the rate at which commands of each level in use take effect, Hz.
+    """Return the rates at which commands take effect, Hz, by command level, for the levels in use.
 
-    The allocation and fitted dynamics, which have no memory, may be as slow as the physics.
+    The allocation and fitted dynamics have no memory, so their rate may be as low as the rate of physics steps.
 
     Args:
         control: Command level.
         freq: Rate of physics steps, Hz.
-        rates: Requested rates, Hz, of which the rate of the last level is used; None for the default, the largest
+        rates: Requested rates, Hz. Only the rate of the last level is used; None for the default, the largest
             divisor of ``freq`` up to 500 Hz.
-        controller: Controller of the command level, from ``controller_at_rates``, which has the rates of its levels;
-            None if commands need none.
+        controller: Controller of the command level, as ``controller_at_rates`` returns it, with the rates of the other
+            levels. None if the commands need no controller.
     """
-    followers, last_level = controller_chain(controller, control)
+    chain, last_level = controller_chain(controller, control)
     freqs = {}
-    for level, follower in followers:
-        outer_freq = follower.outer_freq if level == Control.state else None
-        freqs[level] = follower.freq if outer_freq is None else outer_freq
+    for level, level_controller in chain:
+        outer_freq = level_controller.outer_freq if level == Control.state else None
+        freqs[level] = level_controller.freq if outer_freq is None else outer_freq
     if last_level != Control.rotor_vel:
         name = f"{last_level.value}_freq"
         freqs[last_level] = rates.get(last_level) or default_rates(freq, {name: min(500, freq)})[name]

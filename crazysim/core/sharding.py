@@ -31,7 +31,7 @@ class Location(NamedTuple):
     mesh: Mesh | None = None
     """Mesh of the devices; None for a single one, or where an array's sharding names no mesh."""
     axis: Any = WORLD_AXIS
-    """Axis of the mesh, or axes, that worlds are split over; None where each device has all of them."""
+    """Axis or axes of the mesh over which worlds are split; None if each device has all worlds."""
 
     @property
     def is_distributed(self) -> bool:
@@ -53,8 +53,7 @@ def put_on_device(tree: T, device: jax.Device) -> T:
     """Return the tree committed to a device. Trees and leaves that are already committed to it stay the same objects.
 
     JAX compiles a function of uncommitted arrays for its default device. If that is another device, traced leaves get a
-    constraint, so that the compiled function runs on this one. Under a mesh, which has its own devices, they stay
-    unconstrained.
+    constraint, so that the compiled function runs on ``device``. Under a mesh, traced leaves get no constraint.
     """
     sharding = SingleDeviceSharding(device)
     leaves, treedef = jax.tree.flatten(tree)
@@ -83,10 +82,10 @@ def _runs_on(device: jax.Device) -> bool:
 
 
 def use_device_of(x: object) -> AbstractContextManager[object]:
-    """Return a context whose default device is the device of an array.
+    """Return a context manager that makes the device of an array the default device.
 
-    It has no effect on a traced array, whose program runs on the device of its arguments, or on an array of several
-    devices.
+    It has no effect for an array on several devices, or for a traced array: its program runs on the device of its
+    arguments.
     """
     devices = () if isinstance(x, jax.core.Tracer) or not isinstance(x, jax.Array) else tuple(x.devices())
     return jax.default_device(devices[0]) if len(devices) == 1 else nullcontext()
@@ -123,10 +122,10 @@ def shard(data: SimData, mesh: Mesh) -> SimData:
 
 
 def map_devices(fn: Callable[[SimData], R], data: SimData, mesh: Mesh) -> R:
-    """Return the results of a function of data, which each device of a mesh computes for its own worlds.
+    """Return the results of a function for all worlds; each device of a mesh computes the results of its worlds.
 
     Args:
-        fn: Function whose results have a leading axis over worlds.
+        fn: Function of data; its results have a leading axis over worlds.
         data: Data of all worlds.
         mesh: The devices.
     """
@@ -136,12 +135,12 @@ def map_devices(fn: Callable[[SimData], R], data: SimData, mesh: Mesh) -> R:
 
 
 def distribute(tree: T, shardings: Any) -> T:
-    """Return arrays distributed over devices: ``jax.device_put``, also onto the devices of several hosts.
+    """Return arrays distributed over devices like ``jax.device_put``, also over devices of several hosts.
 
     Args:
         tree: Pytree of arrays. An array that is not yet distributed must be the same on all hosts; each host puts
             its own part of it on its devices.
-        shardings: Sharding of every array, as a pytree of the same structure, or one for all.
+        shardings: Sharding of every array, as a pytree of the same structure, or one sharding for all arrays.
     """
     shardings = jax.tree.broadcast(shardings, tree)
     if all(sharding.is_fully_addressable for sharding in jax.tree.leaves(shardings)):
@@ -161,9 +160,9 @@ def _distribute_over_hosts(x: Any, sharding: Sharding) -> jax.Array:
 
 
 def fetch_arrays(tree: T) -> T:
-    """Return arrays as host arrays, random keys as their data.
+    """Return the tree with host arrays, and with the data of random keys.
 
-    Arrays that are distributed over several hosts are sent to all of them, which must all call this.
+    Arrays that are distributed over several hosts are sent to all hosts, which must all call this function.
     """
     leaves, treedef = jax.tree.flatten(tree)
     leaves = [jax.random.key_data(x) if isinstance(x, jax.Array) and is_key(x) else x for x in leaves]

@@ -29,7 +29,8 @@ StageScope = str
 """``"drone"``, ``"world"``, ``"batch"`` for all worlds, or the name of a population."""
 
 Phase = Literal["before", "each", "after"]
-"""Time within a call at which a stage runs: once before the first step, at each step, or once after the last."""
+"""Time within a call of the step function at which a stage runs: once before the first physics step, at each physics
+step, or once after the last."""
 
 PHASES: tuple[Phase, ...] = ("before", "each", "after")
 
@@ -41,7 +42,8 @@ class Stage:
     """A function ``SimData -> SimData``, with the scope that the function is written for.
 
     When the stage is called with the data of a simulation, it applies the function to every drone, to every member of a
-    population, or to every world; with the scope ``"batch"``, to the data of all worlds at once.
+    population, or to every world. With the scope ``"batch"``, it applies the function to the data of all worlds at
+    once.
     """
 
     def __init__(
@@ -57,9 +59,9 @@ class Stage:
     ):
         """Declare a stage; see ``stage``.
 
-        ``batched`` declares that ``fn`` and ``when`` also accept any leading axes. ``trace_once`` declares that they
-        always do the same, without reading ``n_worlds`` and ``n_drones``, so that an engine traces them only once in a
-        process. ``unfused_reason`` is the reason for the scope ``"batch"``, for messages.
+        ``batched`` declares that ``fn`` and ``when`` also accept any leading axes. ``trace_once`` declares that their
+        operations are the same in all simulations and do not depend on ``n_worlds`` and ``n_drones``, so that an engine
+        traces them only once in a process. ``unfused_reason`` is the reason for the scope ``"batch"``, for messages.
         """
         self.fn, self.when, self.batched, self.trace_once = fn, when, batched, trace_once
         self.unfused_reason = unfused_reason
@@ -72,10 +74,14 @@ class Stage:
         """Return the data after the stage, in every world and for every drone."""
         if self.batched or self.scope == "batch":
             return self.apply_unbatched(data)
-        return _apply_in_all_worlds(self, data)
+        return vmap_worlds(world_function(self, Axes(data)), 2)(data)
 
     def apply_unbatched(self, data: SimData) -> SimData:
-        """Return the data after the stage, for data of its scope, or with any leading axes if it is ``batched``."""
+        """Return the data after the stage, without mapping it over worlds or members.
+
+        Args:
+            data: Data as the function takes it: of one unit of the scope, or with any leading axes if ``batched``.
+        """
         data_after = self.fn(data)
         mask = None if self.when is None else self.when(data)
         if mask is None:
@@ -112,8 +118,8 @@ def stage(
     A stage without a declared scope receives the full batch.
 
     A stage with ``@stage("drone")`` receives the data of one drone. Leaves of drones and worlds have no batch axes:
-    ``pos`` is (3,), ``steps`` (). Leaves of other populations are (n_members, ...). The stage may write leaves of its
-    drone, and reads leaves of other drones with ``reduce_over_others``.
+    ``pos`` is (3,), and ``steps`` is (). Leaves of other populations are (n_members, ...). The stage may write leaves
+    of its drone, and can read leaves of other drones with ``reduce_over_others``.
 
     A stage with ``@stage("cars")`` receives the data of one member of the population ``cars``, in the same way. Leaves
     of drones are (n_drones, ...). The stage may write leaves of its member.
@@ -123,8 +129,8 @@ def stage(
 
     Args:
         scope: ``"drone"``, ``"world"`` or the name of a population.
-        when: Condition ``when(data)``, (): True if the stage acts at this step. None for a stage that always acts. At
-            steps at which it acts nowhere, an engine may skip the stage.
+        when: Function from the same data to a bool, (): True if the stage acts at this step. None for a stage that
+            always acts. An engine may skip the stage at steps at which the condition is True nowhere.
         phase: Time within a call of the step function: ``"before"`` the first physics step, at ``"each"`` physics step,
             or ``"after"`` the last.
     """
@@ -151,8 +157,8 @@ def is_tick(data: SimData, freq: int) -> Array | None:
 def is_first_step(data: SimData) -> Array:
     """Return True in the first step of an episode. (n_worlds, 1), or () for data of one world
 
-    An engine may run stages with this condition at the beginning of a step pipeline only once per call, before its
-    first step.
+    An engine may evaluate stages with this condition at the beginning of a step pipeline only once per call of the step
+    function, before its first physics step.
     """
     return data.core.steps == 0
 
@@ -185,15 +191,15 @@ class Axes:
 
         Args:
             before: Leaves before the stage.
-            after: Data after the stage. Leaves that are the same objects as before count as not written.
+            after: Data after the stage. A leaf that is the same object as before has not been written.
             stage: The stage.
         """
         name = stage.__name__
         new_leaves, treedef = jax.tree.flatten(after)
         if treedef != self.treedef:
             raise ConfigError(
-                f"stage {name!r} changed the structure of SimData (a field became None, or a plugin came or went); "
-                f"make such changes before the step, with sim.data = sim.data.replace(...)"
+                f"stage {name!r} changed the structure of SimData (a field became None, or a plugin was added or "
+                f"removed); make such changes before the step, with sim.data = sim.data.replace(...)"
             )
         written_indices = [i for i, (x, y) in enumerate(zip(before, new_leaves, strict=True)) if x is not y]
         writable_scopes = self.writable_scopes(stage)
@@ -250,7 +256,8 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
 
     Args:
         fn: The function of one world: takes any number of trees of arrays, and returns a tree of arrays.
-        min_batch_axes: Smallest number of batch axes with which a leaf is split into worlds: 2 excludes batched leaves.
+        min_batch_axes: Smallest number of batch axes of the leaves that are split into worlds: 2 excludes batched
+            leaves.
     """
 
     def apply_to_worlds(*args: Any) -> Any:
@@ -321,13 +328,8 @@ def _leaf_scopes(tree: object) -> list[str]:
     return jax.tree.leaves(jax.tree.map(lambda x: scopes(x) if is_record(x) else "batched", tree, is_leaf=is_record))
 
 
-def _apply_in_all_worlds(stage: Stage, data: SimData) -> SimData:
-    """Return the data after a stage, applied in every world, and to every drone or member if it is declared for one."""
-    return vmap_worlds(world_function(stage, Axes(data)), 2)(data)
-
-
 def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
-    """Return a stage as a function of the data of one world; its condition selects between new and old leaves."""
+    """Return a stage as a function from the data of one world to the data after it, for all drones or members."""
 
     def apply_in_world(world: SimData) -> SimData:
         leaves = jax.tree.leaves(world)

@@ -1,4 +1,4 @@
-"""The built-in stages: commands on their ticks, dynamics, floor and clock, as SimData -> SimData."""
+"""The built-in stages: commands that take effect at their ticks, dynamics, floor and step counter."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.pytree import Members, has_members, n_batch_axes, scopes, select_worlds
 
 FLOOR_HEIGHT = -0.001
-"""Height below which no drone falls, m: a little under zero, so that a negative height marks a landing."""
+"""Height of the floor, at which drones stop, m. It is slightly below zero: a negative height means a landed drone."""
 
 
 def _built_in_stage(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
-    """Return a decorator that declares a built-in stage, whose function takes data of one drone, one world or all."""
+    """Return a decorator that declares a built-in stage; the decorated function accepts any leading axes."""
     return lambda fn: Stage(fn, scope, when, batched=True, trace_once=True)
 
 
 def _rate_condition(controller: str) -> Callable[[SimData], Array | None]:
-    """Return the condition under which a controller acts: at its own rate."""
+    """Return the condition of a stage that acts at the rate of a command level, ``data.controls.<controller>.freq``."""
     return lambda data: is_tick(data, getattr(data.controls, controller).freq)
 
 
 def build_step_pipeline(
     control: Control, dynamics: Dynamics, integrator: Integrator, controller: Controller | None
 ) -> Pipeline:
-    """Return the stages of one physics step, in order; ``controller`` is None where commands need none."""
+    """Return the stages of one physics step, in order; ``controller`` is None if the commands need no controller."""
     is_fitted = dynamics != Dynamics.first_principles
     stages: Pipeline = {}
-    followers, last_level = controller_chain(controller, control)
-    for level, follower in followers:
-        stages |= controller_stages(follower, level)
+    chain, last_level = controller_chain(controller, control)
+    for level, level_controller in chain:
+        stages |= controller_stages(level_controller, level)
     if last_level == Control.attitude:
         stages["commit_attitude"] = commit_attitude
     if last_level == Control.force_torque:
@@ -64,7 +64,7 @@ def build_step_pipeline(
 
 @_built_in_stage("drone", when=_rate_condition("attitude"))
 def commit_attitude(data: SimData) -> SimData:
-    """Apply the staged attitude command; fitted dynamics contain the controller that follows it."""
+    """Apply the staged attitude command; fitted dynamics include the attitude controller."""
     attitude = data.controls.attitude
     attitude = attitude.replace(cmd=attitude.staged_cmd)
     return data.replace(controls=data.controls.replace(attitude=attitude))
@@ -121,10 +121,10 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
 
 @functools.cache  # the same function for equal derivatives, so that they share a trace
 def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
-    """Return a derivative in which a drone that stands on the floor and does not lift off neither slides nor turns.
+    """Return a derivative function in which a drone that stands on the floor and does not lift off has no acceleration.
 
-    Integrators that move positions with the velocities of the same step need it. Explicit Euler moves them with the
-    velocities of the previous step, which ``clip_floor_pos`` has set to zero.
+    Integrators that move positions with the velocities of the same step need it. Explicit Euler moves positions with
+    the velocities of the previous step, which ``clip_floor_pos`` has set to zero.
     """
 
     def derivative_on_floor(data: SimData) -> SimStateDeriv:
@@ -138,7 +138,7 @@ def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
 
 
 def stop_at_surface(s: SimState, surface_height: Array | float) -> SimState:
-    """Return the states with drones at rest on a surface if they are below it, or on it and not rising.
+    """Return the states in which drones that are below a surface, or on it and not rising, are at rest on it.
 
     Args:
         s: States.
@@ -166,7 +166,7 @@ def increment_steps(data: SimData) -> SimData:
 
 
 def watched_records(data: SimData) -> Any:
-    """Return the records in which NaN or infinity flags a world: states and controls of drones, other populations."""
+    """Return the records that ``nonfinite_worlds`` checks: states and controls of drones, and other populations."""
     populations = [record for record in data.plugins.values() if isinstance(record, Members)]
     return data.states, data.controls, populations
 
@@ -174,11 +174,11 @@ def watched_records(data: SimData) -> Any:
 def nonfinite_worlds(data: SimData) -> Array:
     """Return True for worlds that are flagged, hold NaN or infinity, or exceed ``MAX_STEPS``.
 
-    NaN and infinity count in ``watched_records``, in all leaves of drones and members: states, commands, memory of
-    controllers, and gains that are one per drone.
+    All leaves of drones and members in ``watched_records`` are checked: states, commands, memory of controllers, and
+    gains with one value per drone.
 
-    A count of steps beyond ``MAX_STEPS`` wraps around and is negative, as one call takes at most that many. The data
-    may be of all worlds or of one world.
+    The step counter overflows to a negative number after ``MAX_STEPS``, and one call takes too few steps for it to
+    become positive again. The data may be of all worlds or of one world.
 
     Returns:
         (n_worlds, 1), or () in one world
@@ -194,10 +194,10 @@ def nonfinite_worlds(data: SimData) -> Array:
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:
     """Return the data with some worlds, or the whole simulation, reset to the default data.
 
-    With a mask, everything that belongs to the worlds of the mask is restored. Data that all worlds share (parameters
-    that are not one per drone, plugins without declared axes) stays. Without a mask, shared data is restored too. In
-    both cases the seed stays, a parameter that has become one per drone stays one per drone, with its default values,
-    and plugins that the default data lack stay as they are.
+    With a mask, all leaves with batch axes are restored in the worlds of the mask. Other leaves are unchanged: shared
+    parameters, and opaque leaves of plugins. Without a mask, all leaves are restored. In both cases, the seed and the
+    records of plugins that the default data lack are unchanged. A parameter that has become one value per drone is
+    restored to its default value, but keeps its shape.
 
     Args:
         data: The simulation.

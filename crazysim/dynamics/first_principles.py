@@ -61,7 +61,7 @@ class Params(PyTree):
         """Return the shared parameters of an airframe."""
         require_support(airframe, Dynamics.first_principles)
         thrust_curve = airframe.value("rotors.thrust_curve")
-        # In float64, whatever the precision of the simulation: the limits are constants, not results.
+        # In float64 at any precision of the simulation: the limits are constants, not results.
         low, high = airframe.rotor_vel_limits
         return Params(
             mass=as_parameter(airframe.value("rigid_body.mass")),
@@ -105,8 +105,8 @@ def dynamics(
         dist_f: External force on the centre of mass, world frame, N. (..., 3)
         dist_t: External torque, world frame, N m. (..., 3)
         params: Parameters, shared or with the leading axes of the state.
-        dt: Duration of the Euler step that the derivatives are for, s: above 20 rad/s at 500 Hz the angular
-            acceleration is then ``stable_angular_acceleration``. None for the exact derivatives.
+        dt: Duration of an Euler step, s, to return ``stable_angular_acceleration``, which differs from the exact
+            derivative above 20 rad/s at 500 Hz. None for the exact derivatives.
 
     Returns:
         Velocity, m/s, acceleration, m/s^2 (both world frame), angular acceleration, rad/s^2 (body frame),

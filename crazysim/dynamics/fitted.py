@@ -3,10 +3,10 @@
     rpy'' = rpy_coef rpy + rpy_rates_coef rpy' + cmd_rpy_coef cmd_rpy
 
 The fits were made near level flight, and Euler angles are singular at a pitch of 90 degrees. Therefore the fit is used
-up to 80 degrees of pitch and blended into a spring and damper on the attitude error, which exists everywhere, between
-80 and 88 degrees. The same blend happens between 100 and 200 rad/s and between commands of 100 and 200 rad, where a
-drone passes the vertical so often that the singularity would add energy without bound. Outside of the fitted range the
-motion is bounded and continuous, but not identified.
+up to 80 degrees of pitch. Between 80 and 88 degrees it is blended into a spring and damper on the attitude error, which
+are defined at every attitude. The same blend is used between body rates of 100 and 200 rad/s, and between commands of
+100 and 200 rad: there, a drone passes the vertical so often that the singularity would add energy without bound.
+Outside of the fitted range the motion is bounded and continuous, but not identified.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from crazysim.rotation import along_z, matvec
 
 MIN_FITTED_COSINE = math.cos(math.radians(80))
 MIN_BLENDED_COSINE = math.cos(math.radians(88))
-"""Cosines of the pitch up to which the fit is used, and of the pitch at which its blend into the spring ends, 1."""
+"""Cosines of the pitch at which the blend of the fit into the spring begins, and of the pitch at which it ends, 1."""
 MAX_FITTED_MAGNITUDE = 100.0
 """Body rate, rad/s, and commanded angles, rad, up to which the fit is used; the blend ends at twice as much.
 

@@ -18,8 +18,8 @@ MIN_AIR_SPEED = 1e-3
 """Speed that is added in quadrature to the air speed at a rotor, m/s, so that a stopped rotor in still air has an
 inflow. An assumption; 1 mm/s has no other noticeable effect."""
 N_ITERATIONS = 3
-"""Newton steps from the solution without in-plane velocity. In-plane velocities of up to four times the induced one
-leave an error of at most 5e-7 of the static thrust (seen in float64 for 100,000 random states)."""
+"""Number of Newton steps, which begin at the solution without in-plane velocity. For in-plane velocities of up to four
+times the induced velocity, the error is at most 5e-7 of the static thrust (in float64, for 100,000 random states)."""
 
 
 def disc_factor(radius: Array, air_density: Array) -> Array:
@@ -36,7 +36,7 @@ def blade_coefficient(
     and ``T = B - b omega (u + v)`` together have the slope ``dT/du = -d`` with ``b omega = 2 d y / (y - d)`` and
     ``y = T / v``, where ``T = 2 rho A v^2``. d cannot exceed y, the limit of an infinite lift slope. Blades of constant
     chord and pitch have ``b = rho A R sigma a / 4`` with solidity sigma and lift slope a (the coefficient of inflow in
-    ``C_T = sigma a / 2 (theta / 3 - lambda / 2)``). The result is negative or infinite where no coefficient exists.
+    ``C_T = sigma a / 2 (theta / 3 - lambda / 2)``). The result is negative or infinite if no coefficient exists.
 
     Args:
         slope: Loss d of thrust per axial velocity of the hovering rotor, N s/m.
@@ -72,13 +72,13 @@ def thrust_in_flight(
 
         T = 2 rho A g^2 (w - u) sqrt(V^2 + w^2)
 
-    at axial velocity u and in-plane velocity V, with g = 1 far from a ceiling. The first falls and the second grows
-    with w, so that a climb loses thrust, and forward flight gains some (translational lift), at most ``b omega v_0`` by
-    the inflow. w does not fall below zero, and ``mu^2 = V^2 / ((omega R)^2 + V^2)`` is bounded by one: assumptions
-    for windmilling and stopped rotors, which neither theory describes.
+    at axial velocity u and in-plane velocity V, with g = 1 far from a ceiling. With growing w, the first expression
+    falls and the second rises. Therefore a climb loses thrust, and forward flight gains thrust (translational lift), at
+    most ``b omega v_0`` from its smaller inflow. w does not fall below zero, and ``mu^2 = V^2 / ((omega R)^2 + V^2)``
+    is bounded by one: assumptions for windmilling and stopped rotors, which neither theory describes.
 
     Args:
-        static_thrust: Thrust T_0 at this speed in still air, N; below zero counts as zero. (...)
+        static_thrust: Thrust T_0 at this speed in still air, N; negative values are replaced by zero. (...)
         ang_vel: Speed of the rotor, rad/s. (...)
         axial_vel: Velocity of the hub relative to the air along the thrust, m/s. (...)
         in_plane_square: Square of the velocity of the hub relative to the air across the thrust, m^2/s^2. (...)
@@ -109,13 +109,12 @@ def thrust_in_flight(
 def ceiling_factor(gap: Array, radius: Array) -> Array:
     """Return half the ratio of the air speed in the far wake to the air speed at the disc, below a ceiling, 1. (...)
 
-    ``1/2 + 1/2 sqrt(1 + (R / d)^2 / 8)`` for a disc at a distance d. The air flows in below the ceiling, at
-    ``v r / 2 d`` where it is r from the axis (conservation of mass), so that its suction there is
-    ``rho A v^2 (R / d)^2 / 16`` (Bernoulli). The momentum of the wake is thrust less suction,
-    ``rho A v v_wake``, and ``T = rho A v_wake^2 / 2``.
-    Hsiao and Chirarattananon (2019, arXiv 1905.04632) treat and measure propellers below a ceiling by momentum and
-    blade element theory. Gaps below a twentieth of the radius count as a twentieth, an assumption. A rotor above the
-    ceiling (negative gap) has the factor 1, as in free air.
+    The factor is ``1/2 + 1/2 sqrt(1 + (R / d)^2 / 8)`` for a disc at a distance d. Below the ceiling, the air flows
+    inwards at the velocity ``v r / (2 d)`` at a distance r from the axis (conservation of mass). Therefore the suction
+    on the ceiling is ``rho A v^2 (R / d)^2 / 16`` (Bernoulli). The momentum flow of the wake, ``rho A v v_wake``, is
+    thrust less suction, and ``T = rho A v_wake^2 / 2``. Hsiao and Chirarattananon (2019, arXiv 1905.04632) measured
+    propellers below a ceiling and describe them by momentum and blade element theory. Gaps are at least a twentieth of
+    the radius, an assumption. A rotor above the ceiling (negative gap) has the factor 1, as in free air.
 
     Args:
         gap: Height of the ceiling over the rotor, m. (...)

@@ -12,8 +12,8 @@ from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, UnknownNameError
 
 MAX_LAG_STEP = 1.5
-"""Longest time step over the time constant of a lag, 1. Euler steps diverge from 2 on; at 1.5, a lag overshoots by
-half its error."""
+"""Largest ratio of the time step to the time constant of a lag, 1. Euler steps diverge at a ratio of 2; at 1.5, a lag
+overshoots by half its error."""
 GRAVITY = (0.0, 0.0, -GRAVITY_MAGNITUDE)
 """Gravitational acceleration, world frame, m/s^2."""
 
@@ -33,7 +33,7 @@ class Dynamics(StrEnum):
 
 
 def supported_dynamics(drone: AirframeSource) -> tuple[Dynamics, ...]:
-    """Return the models for which an airframe, or a source of one as in ``load_airframe``, has parameters."""
+    """Return the models for which an airframe, or anything that ``load_airframe`` accepts, has parameters."""
     airframe = load_airframe(drone)
     fits = airframe.tables.get("fitted", {})
     has_curves = "thrust_curve" in airframe.table("rotors")
@@ -58,7 +58,7 @@ def require_support(airframe: Airframe, dynamics: Dynamics) -> None:
 
 
 def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
-    """Check that the lags and the damping of an airframe are slow enough for the rate of the physics.
+    """Check that lags and damping of an airframe are slow enough for the rate of physics steps.
 
     Raises:
         ConfigError: If a rate is above ``MAX_LAG_STEP * freq``; the message states the lowest ``freq`` that suffices

@@ -31,7 +31,7 @@ CRAZYFLOW_TABLES: tuple[tuple[str, str, dict[str, str]], ...] = (
     ("attitude2force_torque", "controller.attitude", {key: key for key in _ATTITUDE_KEYS}),
     ("body_rate2force_torque", "controller.attitude", {key: key for key in _ATTITUDE_KEYS}),
 )
-"""Crazyflow's table, the airframe's table with its values, and Crazyflow's name for each key of the airframe's."""
+"""Name of Crazyflow's table, name of the airframe's table with its values, and Crazyflow's name of each of its keys."""
 
 
 def load_params(
@@ -39,7 +39,7 @@ def load_params(
 ) -> dict:
     """Return the parameters of a drone for a dynamics model, in SI units, but rotor speeds in rpm.
 
-    ``thrust_min`` and ``thrust_max`` are of one rotor.
+    ``thrust_min`` and ``thrust_max`` are limits of one rotor.
 
     Args:
         dynamics: Dynamics model.
@@ -107,7 +107,7 @@ def load_controller_params(
     Parameters that the airframe lacks are left out.
 
     Args:
-        controller: ``"mellinger"``, Crazyflow's cascade; other controllers have parameters of their own.
+        controller: ``"mellinger"``, Crazyflow's cascade; other names are refused.
         drone: Airframe, or anything that ``load_airframe`` accepts.
         xp: Array module of the values, such as ``jax.numpy``; None for NumPy.
         device: Device of the values; None for the module's default.
@@ -141,9 +141,9 @@ def load_controller_fn_params(
 
 
 def rotor_vel_limits(dynamics: Dynamics | str, drone: AirframeSource) -> tuple[float, float]:
-    """Return the limits of ``states.rotor_vel`` of rotors that are on.
+    """Return the smallest and largest value of ``states.rotor_vel`` of rotors that are on.
 
-    They are the first rotor's speeds, rpm, or for fitted models the collective thrusts, N.
+    These are speeds of the first rotor, rpm, or for fitted models collective thrusts, N.
     """
     params = load_params(dynamics, drone)
     thrusts = np.array([params["thrust_min"], params["thrust_max"]])

@@ -53,15 +53,16 @@ def stable_angular_acceleration(
 ) -> Array:
     """Return the angular acceleration for one Euler step, with a gyroscopic torque that does not amplify a wobble.
 
-    A body that spins wobbles at a frequency k below its spin rate (plus what its rotors add). An explicit Euler step
-    of the wobble, ``z = i k dt``, multiplies its size by ``|1 + z| = sqrt(1 + (k dt)^2)``: at 60 rad/s and 500 Hz a
-    quadrotor gains a factor of 175 in 2 s. Here the gyroscopic torque is evaluated at the angular velocity to which it
-    alone would lead after ``theta dt``, so the factor is ``|1 + z + theta z^2|``. With ``theta = 1/2`` it is Heun's
-    method, whose factor exceeds one in fourth order only. With ``theta = (1 + x^2) / 2`` at a rotation of
-    ``x = |w| dt`` per step it stays at most one up to ``k dt = 1``, and the loss of energy is of fourth order.
+    A spinning body wobbles at a frequency k below its spin rate, if the momentum of its rotors is neglected. An
+    explicit Euler step of the wobble, ``z = i k dt``, multiplies its size by ``|1 + z| = sqrt(1 + (k dt)^2)``: at 60
+    rad/s and 500 Hz the wobble of a quadrotor grows by a factor of 175 in 2 s. Here the gyroscopic torque is evaluated
+    at the angular velocity that this torque alone would produce after ``theta dt``, so the factor is ``|1 + z + theta
+    z^2|``. ``theta = 1/2`` gives Heun's method; its factor exceeds one in fourth order only. ``theta = (1 + x^2) / 2``,
+    at a rotation of ``x = |w| dt`` per step, keeps the factor at most one up to ``k dt = 1``, with a loss of energy of
+    fourth order.
 
-    Up to ``MAX_EXPLICIT_ANGLE`` theta is zero and the result equals ``angular_acceleration``. From ``MIN_STABLE_ANGLE``
-    on it has the value above. In between it rises with the square of the rate.
+    Up to ``MAX_EXPLICIT_ANGLE``, theta is zero and the result equals ``angular_acceleration``. From
+    ``MIN_STABLE_ANGLE`` on, theta is ``(1 + x^2) / 2``. In between, theta rises with the square of the rate.
 
     Args:
         torque: Torque about the centre of mass, body frame, N m. (..., 3)
@@ -85,12 +86,13 @@ def stable_angular_acceleration(
 
 
 def free_rotation(quat: Array, ang_vel: Array, inertia: Array, dt: float) -> tuple[Array, Array]:
-    """Return attitude and angular velocity of a free body after a step in which it turns about its principal axes.
+    """Return attitude (..., 4) and angular velocity (..., 3) of a free body after a step of turns about principal axes.
 
     The kinetic energy has one term for each principal axis. Under one term alone, the body turns about that axis at the
-    constant rate ``H_k / J_k``. The turns follow each other as x, y, z, y, x, where all but z take half the step
-    (McLachlan 1993; Touma and Wisdom 1994). The method is of order 2, explicit and symplectic. It conserves the angular
-    momentum in the world frame up to rounding at any rate, so the energy is bounded, and its error does not grow.
+    constant rate ``H_k / J_k``. The step consists of turns about x, y, z, y, x; the turns about x and y last half the
+    step, and the turn about z lasts the whole step (McLachlan 1993; Touma and Wisdom 1994). The method is of order 2,
+    explicit and symplectic. It conserves the angular momentum in the world frame up to rounding at any rate, so the
+    energy is bounded, and its error does not grow.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)

@@ -97,7 +97,7 @@ def reaction_torque(rotor_acc: Array, yaw_torque_sign: Array, prop_inertia: Arra
 def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
     """Return the rotor speed that produces a thrust, rpm: the upper root of the thrust curve.
 
-    Below the minimum of the curve, where it has no root, the speed of that minimum is returned.
+    For a thrust below the minimum of the curve, which has no root, the speed at the minimum is returned.
 
     Args:
         thrust: Thrust of each rotor, N. (..., n_rotors)
@@ -110,7 +110,7 @@ def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
 
 
 def thrust_slope(thrust: Array, rpm2thrust: Array) -> Array:
-    """Return the slope of the thrust curve over the speed where it reaches a thrust, N/rpm; zero below its minimum.
+    """Return the slope of the thrust curve at the speed with a given thrust, N/rpm; zero for thrusts below its minimum.
 
     Args:
         thrust: Thrust of each rotor, N. (..., n_rotors)
