@@ -25,25 +25,25 @@ MAX_YAW = np.pi / 2
 MAX_BODY_RATES = (10.0, 10.0, 4.0)
 """Largest body rates of an action, rad/s."""
 MAX_OFFSET = (2.0, 2.0, 1.0)
-"""Largest distance of a position setpoint from 1 m above the origin, m."""
+"""Largest x, y and z of a position setpoint relative to the point 1 m above the origin, m."""
 
 
 class Actions:
-    """``command = centre + scale * action``, with the action clipped to [-1, 1].
+    """Map from actions to commands: ``command = centre + scale * action``, with the action clipped to [-1, 1].
 
-    A zero action is the command under which the nominal drone hovers, level and at yaw zero; at the state level that
-    is 1 m above the origin.
+    By default (``actions_of``), a zero action is the command under which the nominal drone hovers, level and at yaw
+    zero. At the state level, it hovers 1 m above the origin.
 
     | Level | Action | Command at -1, 0, 1 |
     | --- | --- | --- |
     | ``attitude`` | roll, pitch; yaw; collective thrust | -45, 0, 45 deg; -90, 0, 90 deg; see below |
     | ``body_rate`` | rates about x, y; z; collective thrust | -10, 0, 10 rad/s; -4, 0, 4 rad/s; see below |
-    | ``force_torque`` | collective thrust; body torque | see below; a quarter of the rotors' limit either way |
+    | ``force_torque`` | collective thrust; body torque | see below; -1/4, 0, 1/4 of the largest torque of the rotors |
     | ``rotor_vel`` | speed of each rotor | twice hover minus the maximum, hover, the maximum, rpm |
-    | ``state`` | position setpoint | 2 m to either side, 1 m down and up, of 1 m above the origin |
+    | ``state`` | position setpoint: x, y; z | -2, 0, 2 m; 0, 1, 2 m |
 
-    Collective thrust ranges from twice hover minus the maximum (motors off below zero), over hover, to the maximum of
-    all rotors, N.
+    Collective thrust at -1, 0, 1: twice the hover thrust minus the maximum of all rotors (motors are off below zero),
+    the hover thrust, and the maximum, N.
     """
 
     def __init__(self, centre: np.ndarray, scale: np.ndarray, control: Control):
@@ -63,7 +63,7 @@ class Actions:
 
     @property
     def size(self) -> int:
-        """Size of an action."""
+        """Numbers in the action of one drone, k."""
         return self.centre.shape[-1]
 
     def command(self, action: Array) -> Array:
@@ -83,27 +83,25 @@ class Actions:
 
 
 def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: float = MAX_TILT) -> Actions:
-    """Return the default map of a command level; see ``Actions``.
+    """Return the default actions of a command level; see ``Actions``.
 
     Args:
-        airframe: Airframe of all drones, or of each, for the limits of the rotors.
-        params: Parameters, for the hover command. If they differ between drones of one airframe, those of the
-            first drone are used.
+        airframe: Airframe of all drones, or one for each drone; its rotors limit the commands.
+        params: Parameters of the hover command. If all drones have one airframe, those of the first drone are used.
         control: Command level.
         tilt: Largest roll and pitch of the attitude level, rad.
     """
     airframes = as_airframes(airframe)
     if all(drone_airframe is airframes[0] for drone_airframe in airframes):
         return _drone_actions(airframes[0], params, control, tilt, 0)
-    drone_actions = [_drone_actions(drone, params, control, tilt, k) for k, drone in enumerate(airframes)]
-    return Actions(
-        np.stack([drone.centre for drone in drone_actions]), np.stack([drone.scale for drone in drone_actions]), control
-    )
+    by_drone = [_drone_actions(drone_airframe, params, control, tilt, k) for k, drone_airframe in enumerate(airframes)]
+    centres, scales = ([getattr(actions, name) for actions in by_drone] for name in ("centre", "scale"))
+    return Actions(np.stack(centres), np.stack(scales), control)
 
 
-def _drone_actions(airframe: Airframe, params: SimParams, control: Control, tilt: float, drone: int) -> Actions:
-    """Return the map of one drone of the first world."""
-    params = jax.tree.map(lambda scope, x: fetch_rows(x, (0, drone)) if scope == "drone" else x, scopes(params), params)
+def _drone_actions(airframe: Airframe, params: SimParams, control: Control, tilt: float, index: int) -> Actions:
+    """Return the default actions of the drone with an index in the first world."""
+    params = jax.tree.map(lambda scope, x: fetch_rows(x, (0, index)) if scope == "drone" else x, scopes(params), params)
     n_rotors = airframe.n_rotors
     max_thrust = float(airframe.value("rotors.thrust_max", ()))
     hover = float(jax.jit(hover_thrust)(params)[0])  # one program, instead of one for each operation

@@ -20,7 +20,7 @@ class State(PyTree):
     pipeline_state: EnvState
     """State of the environment."""
     obs: Array
-    """Observations of all drones, drone after drone, each concatenated by name. (n_worlds, observation_size)"""
+    """Observations: drone after drone, and for each drone concatenated by ``flatten``. (n_worlds, observation_size)"""
     reward: Array
     """Mean reward of the drones. (n_worlds,)"""
     done: Array
@@ -36,8 +36,8 @@ class BraxEnv:
 
     Brax batches an environment of one world with ``vmap``. Here the worlds are batched already, so this class
     corresponds to an environment after Brax's ``training.wrap``. Keys, observations and actions have an axis over
-    worlds. Episodes also end at their time limit, and the step that ends one also starts the next. ``info`` has
-    the entries that Brax's wrappers add.
+    worlds. Episodes also end at their time limit, and the step that ends an episode also starts the next episode.
+    ``info`` has the entries that Brax's wrappers add.
 
     Pass it to an algorithm with ``wrap_env=False`` and ``num_envs`` equal to the number of worlds. Pass another
     ``BraxEnv`` with ``num_eval_envs`` worlds as ``eval_env``.
@@ -67,7 +67,7 @@ class BraxEnv:
 
     @property
     def unwrapped(self) -> BraxEnv:
-        """The environment itself."""
+        """This object: it has no wrappers of Brax."""
         return self
 
     @property

@@ -37,24 +37,24 @@ from crazysim.sim.sim import Sim
 class Env(ABC):
     """A batched environment of many worlds, wrapped or not. Its functions are pure, for jit, scan, vmap and grad.
 
-    In a step, ``act`` stages the command of an action, the physics advances the simulation, ``observe`` evaluates the
-    task, inside ``AutoReset`` ``reset_episode`` starts a new episode where one is over, and ``look`` takes images if a
-    wrapper needs them.
+    A step has these phases: ``act`` stages the command of an action, the physics advances the simulation, ``observe``
+    evaluates the task, ``reset_episode`` starts a new episode where one is over (only inside ``AutoReset``), and
+    ``look`` takes images if a wrapper needs them.
     """
 
     @property
     @abstractmethod
     def base(self) -> DroneEnv:
-        """The environment inside all wrappers."""
+        """The environment without wrappers."""
 
     @property
     @abstractmethod
     def wrappers(self) -> tuple[Hooks, ...]:
-        """Wrappers around it, the innermost first."""
+        """All wrappers of the environment, this one included, the innermost first."""
 
     @property
     def sim(self) -> Sim:
-        """The simulation from which the environment was made. It is used for drawing; ``step`` does not advance it."""
+        """The simulation from which the environment was made. It renders states; ``step`` does not advance it."""
         return self.base.sim
 
     @property
@@ -79,23 +79,23 @@ class Env(ABC):
 
     def image_formats(self) -> dict[str, dict[str, Any]]:
         """Return the formats of observations that are images, by name; see ``Hooks.describe_images``."""
-        return {name: format for wrapper in self.wrappers for name, format in wrapper.describe_images().items()}
+        return {name: entries for wrapper in self.wrappers for name, entries in wrapper.describe_images().items()}
 
     @property
     def reset_policy(self) -> ResetPolicy | None:
-        """Rule by which new episodes begin within a step; None if none do."""
+        """Rule by which new episodes begin within a step; None if steps begin no episodes."""
         return None
 
     @functools.cached_property
     def phases(self) -> Phases:
-        """The phases of its step."""
-        base, last_step = self.base, self.max_steps * self.n_substeps
+        """The phases of an environment step."""
+        base = self.base
         return Phases(
             self.task,
             self.actions,
             self.wrappers,
             base.sim.n_drones,
-            last_step,
+            self.max_steps * self.n_substeps,
             base.episode_reset,
             self.reset_policy,
             base.measure_states,
@@ -104,25 +104,26 @@ class Env(ABC):
     @functools.cached_property
     def step_fn(self) -> Step:
         """The engine's step that ``step`` calls: the stages of the physics and of the phases."""
-        batched = [f"wrapper {wrapper.name!r}" for wrapper in self.wrappers if wrapper.batched]
-        batched += [f"task {self.task.name!r}"] if self.task.batched else []
-        unfused_reason = f"{', '.join(batched)} is declared to need all worlds at once" if batched else None
+        batched_parts = [f"wrapper {wrapper.name!r}" for wrapper in self.wrappers if wrapper.batched]
+        batched_parts += [f"task {self.task.name!r}"] if self.task.batched else []
+        unfused_reason = f"{', '.join(batched_parts)} is declared to need all worlds at once" if batched_parts else None
         if self.base.episode_reset.has_foreign_record:
-            unfused_reason = "a record in data.plugins is of another library, and is not divided among worlds"
+            unfused_reason = "a record in data.plugins is of another library and is not divided among worlds"
         physics = self.base.physics
         return physics.with_stages(self.phases.stages(physics.stages, unfused_reason))
 
     def reset(self, key: Array) -> EnvState:
-        """Return all worlds at the start of an episode; the same key gives the same episodes.
+        """Return the state of all worlds at the start of an episode; the same key gives the same episodes.
 
         Args:
-            key: Random key, as ``jax.random.key`` makes, (), or keys of blocks of worlds of equal size, (n_blocks,).
-                The episodes of a block are those of an environment with as many worlds, reset with the block's key.
+            key: Random key of ``jax.random.key`` for all worlds, (), or one key for each of several blocks of worlds,
+                (n_blocks,). All blocks have the same number of worlds. A block gets the same episodes as an environment
+                of that number of worlds that is reset with the block's key.
 
         Raises:
             ConfigError: If the number of keys does not divide the number of worlds, or if the task begins in a state
-                that is not finite. A compiled reset, such as ``jax.jit(env.reset)``, cannot raise: the episode of such
-                a world ends at its first step, with ``info["nonfinite"]``.
+                that is not finite. A compiled reset, such as ``jax.jit(env.reset)``, cannot raise an error for such a
+                state: the episode then ends at its first step, with ``info["nonfinite"]``.
         """
         key = put_on_device(key, self.sim.device) if self.sim.mesh is None else key
         with use_device_of(key):
@@ -205,8 +206,8 @@ class Env(ABC):
         expected = self.reset_policy is not None and self.reset_policy.keeps_final_obs
         if expected != ("final_obs" in state.record.drone_info):
             raise ConfigError(
-                f"expected a state of this environment, {'with' if expected else 'without'} info['final_obs'], got one "
-                f"of another mode of automatic resets. Use its own reset."
+                f"expected a state of this environment, {'with' if expected else 'without'} info['final_obs'], got a "
+                f"state of another mode of automatic resets. Use the reset of this environment."
             )
 
     def _reset_episodes(self, state: EnvState) -> EnvState:
@@ -222,7 +223,7 @@ class Env(ABC):
         return EnvState(full_data if self.sim.mesh is None else shard(full_data, self.sim.mesh))
 
     def _add_step_results(self, state: EnvState) -> EnvState:
-        """Return the state at the start of the first episode, with the fields that a step adds set to zero."""
+        """Return the state at the start of the first episode, with zeros in the fields that only a step computes."""
         state = state if self.reset_policy is None else self.reset_policy.after_step(state)
         state = state.replace(next_action=jnp.zeros_like(state.action), must_reset=jnp.zeros_like(state.terminated))
         leaves, treedef = jax.tree.flatten(state)
@@ -237,7 +238,7 @@ class Env(ABC):
 
     @functools.cached_property
     def _stepped_shapes(self) -> dict[Any, EnvState]:
-        """Cache of the shapes and dtypes of a state after a step, by structure and shapes of the state before."""
+        """Cache of the shapes and dtypes of the state after a step, by structure and shapes of the state before it."""
         return {}
 
     def explain(self) -> str:
@@ -314,7 +315,7 @@ class DroneEnv(Env):
         if measured:
             if not any(type(plugin).measured_states is not Plugin.measured_states for plugin in sim.plugins.values()):
                 raise ConfigError(
-                    "expected a sensor of states where measured=True, got a simulation without one. Use "
+                    "expected a simulation with a sensor of states for measured=True, got none. Use "
                     "sim.add(MotionCapture()) before the environment is made, or make(..., sensors=[MotionCapture()])."
                 )
             measure_world = sim.plugins.measured_states
@@ -366,7 +367,7 @@ class DroneEnv(Env):
         return self._max_steps
 
     def initial_data(self, key: Array) -> SimData:
-        """Return the data of all worlds before their first episode, with the random key of ``reset``."""
+        """Return the data of all worlds before their first episode, with the random key or keys of ``reset``."""
         plugins = tuple(self._sim.plugins.values())
         if [*map(id, plugins)] != [*map(id, self._plugins)]:
             names = ", ".join(plugin.name for plugin in self._plugins)
@@ -391,21 +392,20 @@ class DroneEnv(Env):
 
 
 def _set_keys(core: SimCore, key: Array) -> SimCore:
-    """Return the core with the key of all worlds, or with the keys of blocks of worlds."""
+    """Return the core with the key of all worlds, or with one key for each block of worlds."""
     if key.size == 1:
         return core.replace(rng_key=key.reshape(()))
-    n_worlds, remainder = divmod(core.n_worlds, key.size)
+    block_size, remainder = divmod(core.n_worlds, key.size)
     if key.ndim != 1 or remainder:
         raise ConfigError(
             f"expected one key, or keys of blocks that divide the {core.n_worlds} worlds, got keys of shape "
             f"{key.shape}. Use for example jax.random.key(0)."
         )
-    drones = (core.n_worlds, core.n_drones)
-    rng_key = jnp.broadcast_to(jnp.repeat(key, n_worlds)[:, None], drones)
-    return core.replace(rng_key=rng_key, world_id=core.world_id % n_worlds)
+    rng_key = jnp.broadcast_to(jnp.repeat(key, block_size)[:, None], (core.n_worlds, core.n_drones))
+    return core.replace(rng_key=rng_key, world_id=core.world_id % block_size)
 
 
 def _default_arrays(sim: Sim) -> list[Any]:
-    """Return the arrays from which episodes begin, except the scene's, which change when the scene is compiled."""
+    """Return the arrays from which episodes begin, without the scene's, which change when the scene is compiled."""
     data = sim.default_data
     return jax.tree.leaves((data.states, data.controls, data.params, data.plugins))

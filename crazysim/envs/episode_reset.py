@@ -21,7 +21,10 @@ from crazysim.sim.sim import Sim
 
 
 class EpisodeReset:
-    """Resets of data at the start of an episode, with the default data and reset pipeline that a simulation has now."""
+    """Resets of data at the start of an episode, with the default data and reset pipeline of a simulation.
+
+    Later changes of the simulation have no effect.
+    """
 
     def __init__(self, sim: Sim):
         self._default = default = deduplicate(sim.default_data)
@@ -29,11 +32,12 @@ class EpisodeReset:
         batched_stages = [name for name, fn in other_stages if not isinstance(fn, Stage)]
         batched_stages += [] if first_stage[1] is reset else [first_stage[0]]
         self.has_foreign_record = "batched" in jax.tree.leaves(scopes(sim.default_data))
-        """True if a record in ``data.plugins`` is of another library. Such a record is not divided among worlds."""
+        """True if a record in ``data.plugins`` is a class of another library. Such records are not split by world."""
         self.takes_all_worlds = bool(batched_stages) or self.has_foreign_record
         """True if ``reset_data`` takes all worlds at once."""
         self.batched_reason: str | None = None
-        """Reason why resets are computed in all worlds and then selected; None if each world is reset on its own."""
+        """Reason why resets are computed for all worlds and then used where an episode begins; None if each world is
+        reset on its own."""
         rows = zip(*map(jax.tree.leaves, (scopes(default), default, leaf_indices(default))), strict=True)
         world_id = leaf_indices(default).core.world_id
         if batched_stages:
@@ -43,18 +47,18 @@ class EpisodeReset:
         elif any(n_batch_axes(scope) == 2 and x.shape[0] > 1 and i != world_id for scope, x, i in rows):
             self.batched_reason = "episodes begin from different data in different worlds"
         movable = () if sim.data.objects is None else sim.data.objects.names
-        keep_objects = len(moving_plugins(sim.plugins.values(), movable)) == len(movable)
+        keeps_objects = len(moving_plugins(sim.plugins.values(), movable)) == len(movable)
         stages = [fn for _, fn in other_stages]
-        self.reset_data = _reset_all(sim) if self.takes_all_worlds else _reset_world(stages, keep_objects)
+        self.reset_data = _make_batched_reset(sim) if self.takes_all_worlds else _make_reset(stages, keeps_objects)
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``takes_all_worlds``."""
 
     def make_default(self, data: SimData) -> SimData:
-        """Return the data of all worlds from which an episode begins, with the seed and the ids of ``data``."""
+        """Return the default data of all worlds, with the seed and the ids of ``data``."""
         n_worlds, n_drones = data.states.pos.shape[:2]
         return copy_seed_and_ids(self.broadcast_default(n_worlds, n_drones), data)
 
     def make_world_default(self, data: SimData) -> SimData:
-        """Return the data of one world from which an episode begins; the default data must be equal in all worlds."""
+        """Return the default data of one world, with the seed and the ids of ``data``; equal in all worlds."""
 
         def first_world(scope: str, x: Array) -> Array:
             return x[(0,) * n_world_axes(scope)] if n_batch_axes(scope) == 2 else x
@@ -72,32 +76,33 @@ class EpisodeReset:
         return jax.tree.map(repeat, scopes(self._default), self._default)
 
 
-def _reset_all(sim: Sim) -> Callable[[SimData, SimData], SimData]:
-    reset_all, worlds = sim.build_reset_fn().plain, np.ones(sim.n_worlds, bool)
-    return lambda data, default: reset_all(data, default, worlds)
+def _make_batched_reset(sim: Sim) -> Callable[[SimData, SimData], SimData]:
+    """Return a function that resets all worlds with the reset pipeline of a simulation."""
+    reset_all, mask = sim.build_reset_fn().plain, np.ones(sim.n_worlds, bool)
+    return lambda data, default: reset_all(data, default, mask)
 
 
-def _reset_world(stages: Sequence[Any], keep_objects: bool) -> Callable[[SimData, SimData], SimData]:
+def _make_reset(stages: Sequence[Any], keeps_objects: bool) -> Callable[[SimData, SimData], SimData]:
     """Return a function that resets one world and applies stages of the reset pipeline to it.
 
     Args:
         stages: The stages.
-        keep_objects: True if plugins move all objects. Their poses in the data are not read then, and a kernel that
-            resets hundreds of them would take a minute to compile.
+        keeps_objects: True to leave the poses of objects unchanged. If plugins move all objects, nothing reads these
+            poses, and a kernel that resets hundreds of poses would take a minute to compile.
     """
 
-    def reset_single_world(data: SimData, default: SimData) -> SimData:
-        data = reset_world(data, default.replace(objects=data.objects) if keep_objects else default)
+    def reset_and_apply_stages(data: SimData, default: SimData) -> SimData:
+        data = reset_world(data, default.replace(objects=data.objects) if keeps_objects else default)
         axes = Axes(data)  # a wrapper may have given each drone its own parameters
         for stage in stages:
             data = world_function(stage, axes)(data)
         return data
 
-    return reset_single_world
+    return reset_and_apply_stages
 
 
 _BATCH_AXES = {"drone": (0, 1), "world": (0,)}
-"""Axes of worlds and drones by scope. The axis of members of other populations is never deduplicated."""
+"""Axes of worlds and drones by scope, which ``deduplicate`` may shorten. It never shortens the axis of members."""
 
 
 def deduplicate(data: SimData) -> SimData:

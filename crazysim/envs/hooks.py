@@ -28,11 +28,11 @@ class Hooks:
     """
 
     name: str = ""
-    """Key of the wrapper's memory in ``state.memory``; the name of the class if empty. A second wrapper of that name
-    around an environment gets a number appended."""
+    """Key of the wrapper's memory in ``state.memory``; the name of the class if empty. If another wrapper of an
+    environment has the same name, a number is appended."""
     batched: bool = False
     """True for a wrapper that needs all worlds at once: its hooks then receive the axis of worlds, and the phases of an
-    environment step are not fused; the stages of the physics still are. Leaves of its memory without that axis must be
+    environment step are not fused; the stages of the physics still are. Fields of its memory without that axis must be
     declared ``leaf("shared")``."""
 
     def prepare(self, data: SimData) -> SimData:
@@ -61,16 +61,16 @@ class Hooks:
     def look(self, state: EnvState) -> EnvState:
         """Return the state of all worlds with new images in ``state.record.images``, which are observations.
 
-        Images are taken by separate kernels, once at the end of each step, after any new episodes have begun in it. The
-        wrapper's memory may change, too; in the first call it has no entry unless ``after_reset`` made one.
+        Images are taken by separate kernels, once at the end of each step. New episodes have begun by then. A wrapper
+        may also change its memory, which has no entry in the first call unless ``after_reset`` made one.
         """
         return state
 
     def describe_images(self) -> dict[str, dict[str, Any]]:
         """Return the format of each image that ``look`` takes, by name, for networks and exports.
 
-        Each is a dict that JSON can hold: ``height`` and ``width``, pixels; ``unit``, the unit of a pixel's value, such
-        as ``"m"`` for depths; and entries that describe the camera (``ImageSensor.describe``).
+        A format is a dict that can be written as JSON: ``height`` and ``width``, pixels; ``unit``, the unit of a
+        pixel's value, such as ``"m"`` for depths; and entries that describe the camera (``ImageSensor.describe``).
         """
         return {}
 

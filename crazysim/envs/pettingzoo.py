@@ -28,8 +28,8 @@ except ImportError as error:
 class DroneParallelEnv(ParallelEnv):
     """PettingZoo's parallel interface to a functional environment of one world.
 
-    Agents are ``drone_0``, ``drone_1`` and so on, and an episode ends for all of them at once. Observations are named,
-    (k,) each; actions are (k,) within [-1, 1]; all are NumPy arrays, and every drone has a reward of its own.
+    Agents are ``drone_0``, ``drone_1`` and so on. An episode ends for all agents at once. Each agent has a dict of
+    named observations, (k,) each, an action, (k,), within [-1, 1], and its own reward. Observations are NumPy arrays.
     """
 
     def __init__(self, env: Env, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
@@ -83,7 +83,7 @@ class DroneParallelEnv(ParallelEnv):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode.
+        """Start an episode; return observations and infos by agent.
 
         Args:
             seed: Seed of all random numbers; None to continue the earlier sequence, or start from the system's entropy.
@@ -121,7 +121,7 @@ class DroneParallelEnv(ParallelEnv):
         )
 
     def state(self) -> np.ndarray:
-        """Return the observations of all drones as one vector: drone after drone, each sorted by name."""
+        """Return the observations of all drones as one vector: drone after drone, sorted by name for each drone."""
         if self.env_state is None:
             raise ConfigError("expected a reset before state(), got none. Call reset() first.")
         return np.array(flatten(self.env_state.obs)).ravel()
@@ -165,7 +165,7 @@ class DroneParallelEnv(ParallelEnv):
         return np.stack(rows)
 
     def _split_by_agent(self, tree: Any) -> dict[str, Any]:
-        """Return each agent's entries of arrays (1, n_drones, ...); arrays of the world, (1,), go to all agents."""
+        """Return the entries of each agent: its row of arrays (1, n_drones, ...), and arrays of the world, (1,)."""
 
         def agent_entry(x: Any, i: int) -> Any:
             # A copy, because arrays from JAX are read-only.

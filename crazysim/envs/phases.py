@@ -1,7 +1,7 @@
 """Phases of an environment step: act, (physics), observe, reset episode, look.
 
-They become stages of the step: ``act`` before the physics, ``observe`` after it, and ``reset_episode`` where a new
-episode begins. These are written for one world; ``look`` takes the images of all worlds. ``Env.reset`` and
+The phases become stages of the step: ``act`` before the physics, ``observe`` after it, and ``reset_episode`` where a
+new episode begins. These three are written for one world; ``look`` takes the images of all worlds. ``Env.reset`` and
 ``Env.restart`` also call ``reset_episode`` and ``look``, for all worlds.
 """
 
@@ -32,8 +32,8 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, select_worlds
 
 Vectorize = Callable[[Callable[..., Any], bool], Callable[..., Any]]
-"""``vectorize(fn, batched)``: the function that a phase calls: ``fn`` itself if the phase runs in one world, or ``fn``
-mapped over all worlds. ``batched`` is True if ``fn`` already takes all worlds."""
+"""``vectorize(fn, batched)``: the function that a phase calls. This is ``fn`` itself if the phase runs in one world or
+if ``batched`` is True (``fn`` takes all worlds), and otherwise ``fn`` mapped over all worlds."""
 
 
 def skip_vectorization(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
@@ -59,15 +59,15 @@ class Phases:
     """Hooks of the wrappers, the innermost first."""
     n_drones: int
     """Drones in a world."""
-    last_step: int
+    episode_length: int
     """Physics steps of an episode."""
     episode_reset: EpisodeReset
     """Resets of data at the start of an episode."""
     reset_policy: ResetPolicy | None = None
     """Rule by which new episodes begin within a step; None if none do."""
     measure_states: Callable[[SimData], SimData] | None = None
-    """``measure_states(data)``: the data that the task observes, of one world, or of all if it is batched; None for the
-    true states."""
+    """``measure_states(data)``: the data with measured states that the task observes, for one world, or for all worlds
+    if the task is batched; None if the task observes the true states."""
 
     def stages(self, physics: Sequence[Stage], batched_reason: str | None) -> list[Stage]:
         """Return the stages of an environment step.
@@ -95,7 +95,7 @@ class Phases:
         def must_reset(data: SimData) -> Array:
             return data.plugins[ENV_RECORD_NAME].must_reset
 
-        # The flag is set first, so that the task can read it and a new episode clears it.
+        # The flag of non-finite worlds is set before ``observe`` reads it and a new episode clears it.
         stages = [
             make_stage("act", self._act, "before", batched_reason),
             *physics,
@@ -169,7 +169,7 @@ class Phases:
         )
 
     def step_without_physics(self, state: EnvState) -> EnvState:
-        """Return the state of all worlds after a step without physics; shapes and types are as after a full step."""
+        """Return the state of all worlds after a step without physics; it has the shapes and types of a full step."""
         state, action = self.act(state, state.record.next_action, vectorize_over_worlds)
         return self.after_physics(state, action, vectorize_over_worlds)
 
@@ -195,14 +195,14 @@ class Phases:
         return state.replace(data=stage_command(data, self.actions.command(action))), action
 
     def observe(self, state: EnvState, action: Array, vectorize: Vectorize) -> EnvState:
-        """Return the state after the physics: observations, reward and the end of the episode.
+        """Return the state with observations, reward, ``terminated``, ``truncated`` and info of the step.
 
         Args:
             state: Result of ``act``, with the data after the physics.
             action: The action that ``act`` returned. (n_drones, k)
             vectorize: ``skip_vectorization`` or ``vectorize_over_worlds``.
         """
-        task, last_step = self.task, self.last_step
+        task, episode_length = self.task, self.episode_length
 
         def evaluate(data: SimData, action: Array, last_action: Array) -> Any:
             reward = jnp.asarray(sum_terms(task.rewards(data, action, last_action)), action.dtype)
@@ -215,7 +215,7 @@ class Phases:
                 obs=jax.tree.map(lambda x: jnp.where(nonfinite, jnp.zeros((), x.dtype), x), obs),
                 reward=jnp.where(nonfinite, jnp.zeros((), reward.dtype), reward),
                 terminated=terminated | nonfinite,
-                truncated=state.data.core.steps >= last_step,
+                truncated=state.data.core.steps >= episode_length,
                 action=action,
                 info=state.info | {"nonfinite": nonfinite} | info,
             )
@@ -272,7 +272,7 @@ def _flag_nonfinite(data: SimData, vectorize: Vectorize) -> SimData:
 
 
 def _restore_types(data: SimData, state: EnvState) -> SimData:
-    """Return the data of a state, cast to the dtypes of the data before."""
+    """Return the data of a state, cast to the dtypes of the earlier data."""
     if jax.tree.structure(state.full_data) != jax.tree.structure(data):
         return state.full_data  # the engine raises an error that names the change
 
@@ -283,12 +283,12 @@ def _restore_types(data: SimData, state: EnvState) -> SimData:
 
 
 def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:
-    """Return one state in the worlds of a mask, and another elsewhere. Shared leaves are taken from the new state.
+    """Return the new state in the worlds of a mask and the old state elsewhere. Shared leaves are of the new state.
 
     Args:
-        mask: True where the new state is taken; None for all. (n_worlds,)
-        new: State of the worlds in the mask.
-        old: State of the others.
+        mask: True where the new state is taken; None for all worlds. (n_worlds,)
+        new: The new state of all worlds.
+        old: The old state of all worlds.
     """
     return map_batched(functools.partial(select_worlds, mask), new, old)
 
@@ -298,7 +298,7 @@ def _step_info(task: Task, data: SimData) -> dict[str, Array]:
 
 
 def _check_spawn(task: Task, reset_data: SimData, spawned: Any) -> SimData:
-    """Return the data from ``spawn`` with its earlier shapes and dtypes, so that no step is compiled again."""
+    """Return the data from ``spawn`` with the shapes and dtypes before it, so that no step is compiled again."""
     if jax.tree.structure(spawned) != jax.tree.structure(reset_data):
         old_paths, new_paths = (
             {keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (reset_data, spawned)

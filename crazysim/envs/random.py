@@ -1,8 +1,8 @@
 """Random numbers of episodes: as reproducible as ``crazysim.core.random``, with a twentieth of the arithmetic.
 
-In every step all worlds draw the numbers of a new episode, although few begin one. For a million worlds with twenty
-numbers each, this must cost less than the physics. JAX's generator is a cipher of twenty rounds; here two rounds of an
-integer hash, ``core.random.mix_bits``, mix seed, world and episode.
+In every step all worlds draw the numbers of a new episode, although few worlds begin an episode. For a million worlds
+with twenty numbers each, this must take less time than the physics. JAX's generator is a cipher of twenty rounds; here
+two rounds of an integer hash, ``core.random.mix_bits``, mix seed, world and episode.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from crazysim.errors import ConfigError, short_repr
 
 
 def as_seed(seed: object) -> int | None:
-    """Return a validated seed of the random numbers of all worlds, or None for None."""
+    """Return the seed of all worlds as an integer after checking it; None for None."""
     if seed is None:
         return None
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**63:
@@ -54,28 +54,28 @@ def episode_key(data: SimData, name: str) -> Array:
 def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
     """Return uniformly distributed random numbers, in steps of 2^-24 of their range.
 
-    Unlike with ``jax.random``, a longer draw with the same key begins with the numbers of a shorter one.
+    Unlike with ``jax.random``, a longer draw with the same key begins with the numbers of a shorter draw.
 
     Args:
         key: Random key. ()
         shape: Shape of the numbers.
-        low: Lower ends; anything that broadcasts to the shape.
-        high: Upper ends.
+        low: Lower limits; anything that broadcasts to the shape.
+        high: Upper limits, not included.
 
     Returns:
         (*shape)
     """
     words = jax.random.key_data(key).astype(jnp.uint32)
     indices = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
-    x = uniform_at(words, indices, jnp.zeros(()).dtype)
-    return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
+    return scale_to(uniform_at(words, indices, jnp.zeros(()).dtype), low, high)
 
 
 def draw(key: Array, *batch: int, **sizes: int | tuple[int, ...]) -> dict[str, Array]:
     """Return random numbers in [0, 1) by name, from one draw that is split in the order of the names.
 
     ``draw(key, n_drones, start=3, yaw=1)`` gives ``start`` (n_drones, 3) and ``yaw`` (n_drones, 1). Without
-    leading axes, a name appended at the end does not change the numbers of the others; with leading axes it does.
+    leading axes, a name appended at the end does not change the numbers of the earlier names; with leading axes it
+    does.
 
     Args:
         key: Random key. ()

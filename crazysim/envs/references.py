@@ -1,8 +1,8 @@
 """References to tasks of users, ``FILE.py:NAME`` or ``MODULE:NAME``, and the list of references this user has named.
 
-Loading a file executes it. The files of a training run contain the reference of their task, and may come from other
-people. Therefore a reference that was read from them is only loaded if this user has named it before, in a call or on
-the command line. The references that the user names are kept in a list in the user's cache folder.
+Loading a task executes its file. The files of a training run contain the reference of its task, and other people may
+have written them. Therefore a reference from the files of a run is only loaded if this user has named the same
+reference before, in a call or on the command line. A list of the named references is in the user's cache folder.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from crazysim.storage import make_private_folder, untrusted_reason
 
 GUIDE = "docs/guides/tasks.md"
 _CLASSES_BY_REFERENCE: dict[str, type[Task]] = {}
-"""Classes for which this process has made references, by reference."""
+"""Classes that were passed to ``reference_of`` in this process, by reference."""
 _NAMED_REFERENCES: set[str] = set()
-"""References that were named in this process."""
+"""References that the user has named in this process."""
 
 
 def is_reference(name: str) -> bool:
@@ -49,12 +49,12 @@ def absolute_reference(reference: str) -> str:
 
 
 def reference_of(task: type[Task]) -> str:
-    """Return the reference of a class. If other processes can load it from a file, add it to the list."""
+    """Return the reference of a class. If the class is defined in a file, add the reference to the list."""
     module, name = sys.modules.get(task.__module__), task.__qualname__
     file = getattr(module, "__file__", None)
     is_in_file = file is not None and file.endswith(".py") and getattr(module, name, None) is task
-    in_package = "." in task.__module__
-    location = str(Path(file).resolve()) if file is not None and is_in_file and not in_package else task.__module__
+    is_in_package = "." in task.__module__
+    location = str(Path(file).resolve()) if file is not None and is_in_file and not is_in_package else task.__module__
     reference = f"{location}:{name}"
     _CLASSES_BY_REFERENCE[reference] = task
     if is_in_file:
@@ -67,10 +67,10 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
 
     Args:
         reference: ``FILE.py:NAME``, ``MODULE:NAME``, or ``FILE.py`` for the only task in it.
-        names: Names of the registered tasks, to which the file may add.
+        names: Names of the registered tasks. Executing the file may register more.
 
     Returns:
-        The class, or its name if the reference has the name of a registered task.
+        The class, or the name of a registered task if the reference contains such a name.
 
     Raises:
         ConfigError: If there is no such file, module or task.
@@ -96,10 +96,11 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
 
 
 def load_listed_task(reference: str, names: Container[str]) -> type[Task] | str:
-    """Load a task as ``load_task`` does, by a reference from the files of a run that this user has named before.
+    """Load a task as ``load_task`` does, if this user has named its reference before. For the files of training runs.
 
     Raises:
-        ConfigError: If this user has not named it before, if others could have changed its file, or as ``load_task``.
+        ConfigError: If this user has not named the reference before, if others could have changed its file, or if
+            there is no such file, module or task.
     """
     location, name = split_reference(reference)
     if reference in _CLASSES_BY_REFERENCE or reference in _NAMED_REFERENCES:
@@ -119,7 +120,7 @@ def load_listed_task(reference: str, names: Container[str]) -> type[Task] | str:
 
 
 def code_digest(reference: str) -> str:
-    """Return the hash of the file of a reference, as text; empty if it is not a file."""
+    """Return the SHA-256 hash of the file of a reference, hexadecimal; empty if there is no file."""
     location, _ = split_reference(reference)
     with contextlib.suppress(OSError):
         return hashlib.sha256(Path(location).read_bytes()).hexdigest() if location.endswith(".py") else ""
@@ -187,7 +188,7 @@ def _read_list() -> list[str]:
 
 
 def _add_to_list(reference: str) -> None:
-    """Add a reference to the list. If that is impossible, the user must name it again in another process."""
+    """Add a reference to the list. If that fails, the user has to name the reference again in the next process."""
     with contextlib.suppress(OSError, ConfigError):
         path = _list_path()
         make_private_folder(path.parent)

@@ -1,4 +1,4 @@
-"""Registry of tasks by name, also for Gymnasium, and ``make``, which creates their environments."""
+"""Registry of tasks by name, their registration with Gymnasium, and ``make``, which creates their environments."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ ENTRY_POINTS = "crazysim.tasks"
 RANDOMIZATIONS = {"crazyflie": Randomize.crazyflie, "generic": Randomize.generic}
 """Ready-made ranges of randomisation, by name."""
 SIM_OPTIONS = tuple(inspect.signature(Sim).parameters)
-"""Options of ``make`` that belong to the simulation."""
+"""Options of ``make`` that are passed to ``Sim``."""
 
 
 def make(
@@ -111,20 +111,20 @@ def make(
         task: One of ``TASKS``, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
         n_worlds: Number of worlds.
         freq: Environment steps per second, Hz.
-        actions: Meaning of an action; None for the usual one of the command level.
-        sensors: Sensors, such as ``MotionCapture``; the task observes the states as they measure them. Without
-            sensors, it observes the true states, or the estimated ones with the setting ``estimator`` of ``Sim``.
-        effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. If others are added later
+        actions: Meaning of an action; None for the default of the command level, ``actions_of``.
+        sensors: Sensors, such as ``MotionCapture``; the task observes the states that they measure. Without sensors,
+            it observes the true states, or the estimated states with the setting ``estimator`` of ``Sim``.
+        effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. If plugins are added later
             by ``env.sim.add``, ``reset`` raises an error.
-        randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
-            ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
-        camera: Camera or lidar whose images the drones observe in addition, or several; see ``CameraImages``. None for
-            the camera of the task if it has one, with images named by their output, such as ``"depth"``; ``()`` for no
-            images.
-        depth_image: Width and height in pixels of depth images that the drones observe as ``"depth"``. It stands for
-            a ``Camera`` that takes an image in every step and replaces the camera of the task. None for no such images.
+        randomize: Name of ready-made ranges of ``Randomize`` from which the parameters of the drones are drawn in every
+            episode: ``"crazyflie"`` or ``"generic"``. None for the parameters of the airframe.
+        camera: One or several cameras or lidars; their images are additional observations, see ``CameraImages``. None
+            for the camera of the task if it has one, with images named by their output, such as ``"depth"``; ``()`` for
+            no images.
+        depth_image: Width and height in pixels of depth images, which are an additional observation ``"depth"``. A
+            ``Camera`` takes them in every step, instead of the camera of the task. None for no such images.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
-            and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
+            and settings of the task, such as ``seconds``, which ``help(crazysim.envs.TASKS[name].task)`` lists.
     """
     entry = entry_of(task)
     name = task if isinstance(task, str) else entry.task.name or entry.task.__name__
@@ -174,9 +174,9 @@ def make(
 
 
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:
-    """Register a custom task by name, for ``make``, training and Gymnasium, and return its id there.
+    """Register a custom task by name, for ``make``, training and Gymnasium, and return its Gymnasium id.
 
-    Registering a name again, such as by executing a notebook cell again, replaces its class.
+    Registering a name again, such as by executing a notebook cell again, replaces the class of the name.
 
     Args:
         name: Name, such as ``"two_hoops"``: lower case letters, digits and underscores.
@@ -200,13 +200,13 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
 
 
 def entry_of(task: str | Task, is_named: bool = True) -> Entry:
-    """Return the registered entry of a task, or one with the usual command level for a custom class.
+    """Return the registered entry of a task, or a new entry with default values for a class that is not registered.
 
     Args:
         task: One of ``TASKS``, a name from the entry points of an installed package, the reference of your class, or
             a task.
-        is_named: True if this user has named the task; False for a reference from the files of a run, which may
-            come from other people, see ``crazysim.envs.references``.
+        is_named: True if this user has named the task; False for a reference from the files of a run, which other
+            people may have written, see ``crazysim.envs.references``.
 
     Raises:
         ConfigError: If there is no such file, module or class, or it may not be executed.

@@ -1,4 +1,4 @@
-"""Rendering for the adapters to other libraries: images of some worlds, or a window."""
+"""Rendering for the adapters to other libraries: images of chosen worlds, or a window."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RENDER_MODES = ("rgb_array", "human")
 
 
 class Renderer:
-    """Renderer of some worlds of a simulation in a given state."""
+    """Renderer of environment states: images of chosen worlds, or a window."""
 
     def __init__(
         self, sim: Sim, mode: str | None, worlds: Sequence[int] | None = (0,), size: tuple[int, int] = (640, 480)
@@ -40,7 +40,7 @@ class Renderer:
         self.sim, self.mode, self.worlds, self.size = sim, mode, indices.tolist(), size
 
     def __call__(self, state: EnvState | None) -> list[np.ndarray]:
-        """Return an image of each world, (height, width, 3), or an empty list after drawing into the window.
+        """Return an image of each chosen world, (height, width, 3), or an empty list after drawing into the window.
 
         Raises:
             RenderError: If this machine cannot render.
@@ -55,4 +55,4 @@ class Renderer:
         if self.mode == "human":
             self.sim.render("human", self.worlds[0], width=width, height=height)
             return []
-        return [np.asarray(self.sim.render("rgb_array", w, width=width, height=height)) for w in self.worlds]
+        return [np.asarray(self.sim.render("rgb_array", world, width=width, height=height)) for world in self.worlds]

@@ -17,17 +17,18 @@ from crazysim.pytree import PyTree, select_worlds
 
 Policy = Callable[[Obs, Any, Array], tuple[Array, Any, Any]]
 """``policy(obs, memory, key) -> (action, memory, extras)``, for all worlds at once. ``memory`` is the state that the
-policy keeps between steps, (n_worlds, ...) each, or ``()``; ``key`` is a random key, or several; ``action`` has the
-actions of all drones, (n_worlds, n_drones, k); ``extras`` is any tree of arrays, for ``Transition.extras``."""
+policy keeps between steps, (n_worlds, ...) each, or ``()``; ``key`` is one random key, or as many keys as ``rollout``
+got; ``action`` has the actions of all drones, (n_worlds, n_drones, k); ``extras`` is any tree of arrays, for
+``Transition.extras``."""
 
 
 class Transition(PyTree):
     """One step of all worlds; only the arrays that ``keep`` returns are stored."""
 
     obs: Obs
-    """Observations that the policy got. (n_worlds, n_drones, k) each"""
+    """Observations passed to the policy. (n_worlds, n_drones, k) each"""
     action: Array
-    """Actions. (n_worlds, n_drones, k)"""
+    """Actions of the policy. (n_worlds, n_drones, k)"""
     extras: Any
     """Third result of the policy."""
     state: EnvState
@@ -73,7 +74,7 @@ def rollout(
     initial_memory: Any = (),
     memory: Any = None,
 ) -> tuple[EnvState, Any, Any]:
-    """Run a policy for some steps in one ``jax.lax.scan``. The function is pure and works with jit and grad.
+    """Run a policy for ``n_steps`` steps in one ``jax.lax.scan``. The function is pure and works with jit and grad.
 
     Args:
         env: The environment, usually inside ``AutoReset``.

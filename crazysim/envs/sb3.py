@@ -31,11 +31,14 @@ except ImportError as error:
 class DroneVecEnv(VecEnv):
     """Vector environment of Stable-Baselines3 over a functional environment; each world is one of its environments.
 
-    A new episode starts within the step that ends one. The infos of worlds whose episode ended have what
-    ``DummyVecEnv`` adds (``terminal_observation``, ``TimeLimit.truncated``), what ``Monitor`` adds (``episode`` with
-    ``r``, ``l`` and ``t``), ``error``, the task's error at the end, and ``nonfinite``, which is True if a number was
-    not finite. Other infos are empty. With several drones reward and error are their means, and observations and
-    actions are concatenated, drone after drone.
+    A new episode starts within the step that ends an episode. The info of a world has entries in this step only:
+
+    - ``terminal_observation`` and ``TimeLimit.truncated``, as ``DummyVecEnv`` adds them;
+    - ``episode`` with ``r``, ``l`` and ``t``, as ``Monitor`` adds it;
+    - ``error``, the task error at the end, and ``nonfinite``, which is True if the world became non-finite.
+
+    With several drones, reward and error are means over the drones. Observations and actions are concatenated, drone
+    after drone.
     """
 
     def __init__(
@@ -52,8 +55,8 @@ class DroneVecEnv(VecEnv):
             env: The environment.
             dict_obs: True for named observations, for ``MultiInputPolicy``; False for one vector, concatenated by name,
                 for ``MlpPolicy``.
-            render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws the first of the worlds
-                into a window.
+            render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws the first of
+                ``render_worlds`` into a window.
             render_worlds: Worlds to render.
             render_size: Width and height of an image, pixels.
         """
@@ -76,9 +79,9 @@ class DroneVecEnv(VecEnv):
         )
 
     def reset(self) -> Any:
-        """Start new episodes in all worlds, from the seed last passed to ``seed``.
+        """Start new episodes in all worlds and return their observations.
 
-        If that has been used, the seed is the next random number of the generator that it seeded.
+        The first reset after ``seed`` uses its seed. Later resets draw their seeds from a generator of that seed.
         """
         seed = as_seed(self._seeds[0])
         key_seed = seed if seed is not None else int(self._generator.integers(2**31))
@@ -92,36 +95,36 @@ class DroneVecEnv(VecEnv):
         return self._to_numpy(jax.device_get(obs))
 
     def step_async(self, actions: ArrayLike) -> None:
-        """Store the actions for the next step. (num_envs, numbers of all drones)"""
+        """Store the actions for the next step. (num_envs, n_drones * k)"""
         if self.state is None:
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
         self._actions = check_actions(actions, (self.num_envs, *(self.action_space.shape or ())))
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Advance all worlds; return observations, rewards, True where an episode ended, and infos."""
+        """Advance all worlds; return observations, rewards, flags that are True where an episode ended, and infos."""
         if self._actions is None:
             raise ConfigError("expected actions before step_wait(), got none. Call step(actions).")
         self.state, arrays = self._step_fn(self.state, self._actions)
         self._actions = None
-        obs, final_obs, reward, done, results = jax.device_get(arrays)
+        obs, final_obs, reward, done, episode_results = jax.device_get(arrays)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for world in np.flatnonzero(done):
             world_final_obs = {name: x[world] for name, x in final_obs.items()}
             infos[world] = {
                 "terminal_observation": self._to_numpy(world_final_obs),
-                "TimeLimit.truncated": bool(results["out_of_time"][world]),
+                "TimeLimit.truncated": bool(episode_results["out_of_time"][world]),
                 "episode": {
-                    "r": float(results["return"][world]),
-                    "l": int(results["length"][world]),
+                    "r": float(episode_results["return"][world]),
+                    "l": int(episode_results["length"][world]),
                     "t": round(time.time() - self._start_time, 6),
                 },
-                "error": float(results["error"][world]),
-                "nonfinite": bool(results["nonfinite"][world]),
+                "error": float(episode_results["error"][world]),
+                "nonfinite": bool(episode_results["nonfinite"][world]),
             }
         return self._to_numpy(obs), np.array(reward), np.array(done), infos
 
     def get_attr(self, attr_name: str, indices: ArrayLike | None = None) -> list[Any]:
-        """Return an attribute of the functional environment, which all worlds share, once per world."""
+        """Return an attribute of the functional environment, repeated for each world."""
         value = self._renderer.mode if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value] * len(list(self._get_indices(indices)))
 
@@ -140,11 +143,11 @@ class DroneVecEnv(VecEnv):
         return list(self.get_images())
 
     def env_is_wrapped(self, wrapper_class: type, indices: ArrayLike | None = None) -> list[bool]:
-        """Return True for ``Monitor``, whose infos are provided; False for other wrappers of Stable-Baselines3."""
+        """Return True for ``Monitor``, because infos have its entries; False for other wrappers. One flag per world."""
         return [wrapper_class.__name__ == "Monitor"] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Return an image (height, width, 3) of each world to render, or draw the first into a window.
+        """Return an image (height, width, 3) of each of ``render_worlds``, or draw the first of them into a window.
 
         Raises:
             RenderError: If this machine cannot render.
@@ -156,7 +159,7 @@ class DroneVecEnv(VecEnv):
         return self.env.explain()
 
     def close(self) -> None:
-        """Close the window, and free the renderers."""
+        """Close the window and free the renderers."""
         self.sim.close()
 
     def _reset_state(self, key: Array) -> tuple[EnvState, Obs]:
@@ -183,7 +186,7 @@ class DroneVecEnv(VecEnv):
         return state, results
 
     def _merge_obs(self, obs: Obs) -> Obs:
-        """Return the observations of all drones as one vector ``all``, or by name if ``dict_obs``."""
+        """Return the observations of all drones as one vector named ``all``, or by name with ``dict_obs``."""
         if not self.dict_obs:
             obs = {"all": flatten(obs)}
         return {name: x.reshape(x.shape[0], -1).astype(jnp.float32) for name, x in obs.items()}

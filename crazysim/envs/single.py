@@ -22,7 +22,7 @@ class DroneSingleEnv(gymnasium.Env):
     """Gymnasium environment over a functional environment of one world.
 
     Use it for programs that support no other interface, and to look at one drone: a step takes nearly as long as a step
-    of thousands of worlds. Observations and rewards are NumPy arrays that belong to the caller.
+    of thousands of worlds. Observations are NumPy arrays that the caller may write to; the reward is a float.
     """
 
     def __init__(self, env: Env, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
@@ -44,7 +44,7 @@ class DroneSingleEnv(gymnasium.Env):
         self.action_space = self.vector.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start a new episode.
+        """Start a new episode; return its observations and infos.
 
         Without a seed, the random numbers continue the earlier sequence, or start from the system's entropy.
         """
@@ -55,10 +55,10 @@ class DroneSingleEnv(gymnasium.Env):
         return _squeeze_world(obs), _squeeze_world(info)
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance the world.
+        """Advance the world; return observations, reward, ``terminated``, ``truncated`` and infos.
 
         Args:
-            action: (k,), or (n_drones, k) with several drones.
+            action: Action in [-1, 1]. (k,), or (n_drones, k) with several drones
         """
         obs, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
         return _squeeze_world(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _squeeze_world(info)

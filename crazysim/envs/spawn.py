@@ -1,4 +1,4 @@
-"""Starts of episodes: drones that are already flying."""
+"""Starts of episodes with drones that are already flying."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from crazysim.envs.actions import hover_rotor_states
 def flying(
     data: SimData, pos: ArrayLike, quat: Array | None = None, vel: ArrayLike = 0.0, ang_vel: ArrayLike = 0.0
 ) -> SimData:
-    """Return the data with drones in the air, their rotors turning as in hover.
+    """Return the data with drones in the air and rotors at hover speed.
 
     Args:
-        data: One world, or all of them.
+        data: Data of one world, or of all worlds.
         pos: Positions, world frame, m. (..., n_drones, 3)
         quat: Attitudes, xyzw; None for level. (..., n_drones, 4)
         vel: Velocities, world frame, m/s; broadcasts to the shape of the positions.
-        ang_vel: Angular velocities, body frame, rad/s; broadcasts likewise.
+        ang_vel: Angular velocities, body frame, rad/s; broadcasts to the shape of the positions.
     """
-    s, controls = data.states, data.controls
-    level = jnp.array([0.0, 0.0, 0.0, 1.0], s.quat.dtype)
-    ang_vel = jnp.broadcast_to(ang_vel, s.ang_vel.shape)
-    states = s.replace(
-        pos=jnp.broadcast_to(pos, s.pos.shape),
-        quat=jnp.broadcast_to(level if quat is None else quat, s.quat.shape),
-        vel=jnp.broadcast_to(vel, s.vel.shape),
+    states, controls = data.states, data.controls
+    level_quat = jnp.array([0.0, 0.0, 0.0, 1.0], states.quat.dtype)
+    ang_vel = jnp.broadcast_to(ang_vel, states.ang_vel.shape)
+    states = states.replace(
+        pos=jnp.broadcast_to(pos, states.pos.shape),
+        quat=jnp.broadcast_to(level_quat if quat is None else quat, states.quat.shape),
+        vel=jnp.broadcast_to(vel, states.vel.shape),
         ang_vel=ang_vel,
-        rotor_vel=jnp.broadcast_to(hover_rotor_states(data.params), s.rotor_vel.shape),
+        rotor_vel=jnp.broadcast_to(hover_rotor_states(data.params), states.rotor_vel.shape),
     )
-    # Otherwise the angular velocity would jump for the derivative terms of the controllers at their first tick.
-    for level_name in ("attitude", "body_rate"):
-        ctrl = getattr(controls, level_name)
+    # Without this, the derivative terms of the controllers would react to a jump from zero at their first tick.
+    for command_level in ("attitude", "body_rate"):
+        ctrl = getattr(controls, command_level)
         if ctrl is not None and ctrl.prev_ang_vel is not None:
-            controls = controls.replace(**{level_name: ctrl.replace(prev_ang_vel=ang_vel)})
+            controls = controls.replace(**{command_level: ctrl.replace(prev_ang_vel=ang_vel)})
     return data.replace(states=states, controls=controls)
 
 

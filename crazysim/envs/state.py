@@ -1,4 +1,4 @@
-"""State of an environment, of all worlds or of one, and checks of actions and goals."""
+"""State of an environment, for all worlds or one world, and checks of actions and goals."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ Obs = dict[str, Array]
 
 
 class EnvRecord(PyTree):
-    """Record that an environment adds to the data of its simulation; ``EnvState`` shows it to users."""
+    """Record that an environment adds to the data of its simulation; ``EnvState`` is its public interface."""
 
     obs: Obs = leaf("drone", 1)
     """Observations. (n_worlds, n_drones, k) each"""
     images: Obs = leaf("drone", 1)
-    """Observations that are images, taken of all worlds at the end of the step. (n_worlds, n_drones, k) each"""
+    """Observations that are images, taken at the end of the step and flattened. (n_worlds, n_drones, k) each"""
     reward: Array = leaf("drone")
     """Reward of the last step. (n_worlds, n_drones)"""
     terminated: Array = leaf("world")
@@ -46,9 +46,9 @@ class EnvRecord(PyTree):
     world_info: dict[str, Array] = leaf("world")
     """Entries of ``info`` with one number per world. (n_worlds, 1) each"""
     memory: dict[str, Any] = leaf("world", None)
-    """Memory of the wrappers, by name of the wrapper. (n_worlds, 1, ...) each; records within declare their own axes"""
+    """Memory of the wrappers, by name of the wrapper. (n_worlds, 1, ...) each; a record in it declares its own axes"""
     next_action: Array = leaf("drone", 1, scratch=True)
-    """Action passed to ``step``; within a step, as changed by the wrappers. (n_worlds, n_drones, k)"""
+    """Action passed to ``step``; after ``act``, the action as changed by the wrappers. (n_worlds, n_drones, k)"""
     must_reset: Array = leaf("world", scratch=True)
     """True where a new episode begins within the step. (n_worlds, 1)"""
 
@@ -58,11 +58,10 @@ RESULT_FIELDS = ("obs", "images", "reward", "terminated", "truncated", "drone_in
 
 
 class EnvState(PyTree):
-    """An environment at one moment: argument and result of ``step``.
+    """State of an environment: argument and result of ``step``.
 
-    A view of the simulation's data and of the environment's record among its plugins. Functions of one world,
-    such as the methods of tasks and wrappers, receive it without the axis of worlds. ``replace`` takes the names of the
-    properties.
+    Its properties read the simulation's data and the environment's record in them; ``replace`` takes the names of the
+    properties. Functions of one world, such as hooks of wrappers, receive a state whose arrays have no axis of worlds.
     """
 
     full_data: SimData
@@ -85,7 +84,7 @@ class EnvState(PyTree):
 
     @property
     def reward(self) -> Array:
-        """Reward of the step that led here. (n_worlds, n_drones)"""
+        """Reward of the last step; zero at the start of an episode. (n_worlds, n_drones)"""
         return self.record.reward
 
     @property
@@ -105,7 +104,7 @@ class EnvState(PyTree):
 
     @property
     def action(self) -> Array:
-        """Action of the step that led here; zero at the start of an episode. (n_worlds, n_drones, k)"""
+        """Action of the last step; zero at the start of an episode. (n_worlds, n_drones, k)"""
         return self.record.action
 
     @property
@@ -116,12 +115,12 @@ class EnvState(PyTree):
 
     @property
     def memory(self) -> dict[str, Any]:
-        """State of the wrappers, by name of the wrapper. (n_worlds, ...) each; records declare their own axes"""
+        """Memory of the wrappers, by name of the wrapper. (n_worlds, ...) each; a record in it declares its own axes"""
         return _map_outside_records(self._squeeze_axis, self.record.memory)
 
     @property
     def final_obs(self) -> Obs:
-        """Observations at the end of the step: ``obs``, or those before a new episode began within the step.
+        """Observations at the end of the step: ``info["final_obs"]`` of ``AutoReset``, or ``obs`` if there is none.
 
         Returns:
             (n_worlds, n_drones, k) each
@@ -146,40 +145,40 @@ class EnvState(PyTree):
         return EnvState(full_data.replace(plugins=full_data.plugins | {ENV_RECORD_NAME: record}))
 
     def _drop_images(self, obs: Obs) -> Obs:
-        """Return observations without the images among them, which must be unchanged."""
+        """Return the observations that are not images, after checking that the images are unchanged."""
         images = self.record.images
         if changed := [name for name, image in images.items() if name in obs and obs[name] is not image]:
             raise ConfigError(
                 f"expected images unchanged in functions of one world, got a new {changed[0]!r}. Images are taken "
-                f"after them. Change them where they are used, in the policy."
+                f"after these functions. Change images where they are used, in the policy."
             )
         return {name: x for name, x in obs.items() if name not in images}
 
     def _split_info(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
         """Return the entries of ``info`` divided into ``drone_info`` and ``world_info``."""
-        n, n_drones = max(self.full_data.core.steps.ndim - 1, 0), self.full_data.core.n_drones
+        n_world_axes, n_drones = max(self.full_data.core.steps.ndim - 1, 0), self.full_data.core.n_drones
         drone_info, world_info = {}, {}
         for name, entry in info.items():
             shapes = [jnp.shape(x) for x in jax.tree.leaves(entry)]
-            if all(shape[n : n + 1] == (n_drones,) for shape in shapes):
+            if all(shape[n_world_axes : n_world_axes + 1] == (n_drones,) for shape in shapes):
                 drone_info[name] = entry
-            elif all(len(shape) == n for shape in shapes):
+            elif all(len(shape) == n_world_axes for shape in shapes):
                 world_info[name] = self._add_axis(entry)
             else:
                 raise ConfigError(
-                    f"expected info[{name!r}] as one number of a world, (), or with a row for each of {n_drones} "
-                    f"drones in front, ({n_drones}, ...), got {', '.join(str(shape[n:]) for shape in shapes)}. "
+                    f"expected info[{name!r}] as one number of a world, (), or with one row for each of {n_drones} "
+                    f"drones, ({n_drones}, ...), got {', '.join(str(shape[n_world_axes:]) for shape in shapes)}. "
                     f"Return one row for every drone."
                 )
         return {"drone_info": drone_info, "world_info": world_info}
 
     def _squeeze_axis(self, x: Any) -> Any:
-        """Return a per-world array without its axis of length 1, which the array of a single world does not have."""
+        """Return a per-world array without its axis of length 1; unchanged if the state is of one world."""
         axis = self.full_data.core.steps.ndim - 1
         return x if axis < 0 else _reshape(x, (*x.shape[:axis], *x.shape[axis + 1 :]))
 
     def _add_axis(self, x: Any) -> Any:
-        """Return a per-world array with an axis of length 1, which the array of a single world does not get."""
+        """Return a per-world array with an axis of length 1 after that of worlds; unchanged in a state of one world."""
         axis = self.full_data.core.steps.ndim - 1
         return x if axis < 0 else _reshape(x, (*jnp.shape(x)[:axis], 1, *jnp.shape(x)[axis:]))
 
@@ -198,7 +197,7 @@ def _map_outside_records(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
 
 
 def state_of_data(data: SimData) -> EnvState:
-    """Return a state with an empty record, from which an episode begins."""
+    """Return a state with an empty record, which the reset of an episode fills."""
     no_array: Any = None
     record = EnvRecord({}, {}, no_array, no_array, no_array, no_array, {}, {}, {}, no_array, no_array)
     return EnvState(data.replace(plugins=data.plugins | {ENV_RECORD_NAME: record}))
@@ -231,7 +230,7 @@ def validate_action(action: Array, state: EnvState, actions: Actions) -> Array:
 
 
 def validate_goals(pos: ArrayLike | Array, state: EnvState) -> Array:
-    """Return the goal of each drone, with the dtype of its position. (n_worlds, n_drones, 3)
+    """Return the goal of each drone, after checking shapes and host numbers. (n_worlds, n_drones, 3)
 
     Args:
         pos: One goal for all drones (3,), one per world (n_worlds, 3), or one per drone (n_worlds, n_drones, 3); an

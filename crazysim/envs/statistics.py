@@ -9,7 +9,7 @@ from jax import Array
 from crazysim.pytree import PyTree, leaf, static
 
 CLIP, EPSILON = 10.0, 1e-6
-"""Largest magnitude of a normalised observation, and the number that is added to a variance before taking its root."""
+"""Largest magnitude of a normalised observation, and the number that is added to a variance before its square root."""
 
 
 class RunningStats(PyTree):
@@ -22,7 +22,7 @@ class RunningStats(PyTree):
     count: Array = leaf("shared", 0)
     """Number of observations. ()"""
     unscaled: tuple[range, ...] = static(default=())
-    """Indices of observations that are not normalised, such as the pixels of images."""
+    """Ranges of indices into k that are not normalised, such as the pixels of images."""
 
     @staticmethod
     def create(size: int, unscaled: tuple[range, ...] = ()) -> RunningStats:
@@ -30,14 +30,14 @@ class RunningStats(PyTree):
         return RunningStats(jnp.zeros(size), jnp.ones(size), jnp.full((), 1e-4, jnp.result_type(float)), unscaled)
 
     def is_scaled(self) -> np.ndarray:
-        """Return True for observations that are normalised. (k,)"""
+        """Return a mask that is True for observations that are normalised. (k,)"""
         mask = np.ones(self.mean.shape[-1], bool)
         for indices in self.unscaled:
             mask[indices.start : indices.stop] = False
         return mask
 
     def update(self, x: Array) -> RunningStats:
-        """Return the statistics with one more batch. (..., k)"""
+        """Return the statistics updated with a batch of observations. (..., k)"""
         axes = tuple(range(x.ndim - 1))  # not flattened, so that worlds on several devices stay on their devices
         n, mean, var = x.size // x.shape[-1], x.mean(axis=axes), x.var(axis=axes)
         total = self.count + n
@@ -49,6 +49,6 @@ class RunningStats(PyTree):
         return self.replace(mean=mean, var=var, count=total)
 
     def normalize(self, x: Array) -> Array:
-        """Return observations with mean zero and variance one, clipped to [-10, 10], or unscaled. (..., k)"""
+        """Return observations normalised and clipped to [-10, 10], except for ``unscaled`` indices. (..., k)"""
         scaled = jnp.clip((x - self.mean) / jnp.sqrt(self.var + EPSILON), -CLIP, CLIP)
         return jnp.where(self.is_scaled(), scaled, x) if self.unscaled else scaled

@@ -1,4 +1,4 @@
-"""Environment steps in separate calls with few arrays: passing an array costs more than the arithmetic on it."""
+"""Environment steps in separate calls that pass few arrays: passing an array takes longer than computing it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Output = Callable[[EnvState], Any]
 class EnvStepper:
     """An environment state that is stored flattened and advanced in place.
 
-    Its compiled step returns only what ``output`` selects, and the ends of episodes.
+    Its compiled step returns the result of ``output``, ``terminated`` and ``truncated``.
     """
 
     def __init__(self, env: Env, output: Output):
@@ -47,7 +47,10 @@ class EnvStepper:
 
     @property
     def state(self) -> EnvState | None:
-        """The state; None before one is assigned. Fields that a step computes may still have their assigned values."""
+        """The state; None before the first assignment.
+
+        Results of steps, except for ``terminated`` and ``truncated``, may be those of the assigned state.
+        """
         return None if self._flat is None else self._unflatten(self._flat, *self._ends)
 
     @state.setter
@@ -89,9 +92,9 @@ class EnvStepper:
         self._carried_indices = carried_indices = [
             i for i in plan.written_leaves if i not in outputs - set(plan.inputs) and i not in flags
         ]
-        constant = outputs - set(plan.written_leaves)  # entries of info that only a reset sets
+        fixed_outputs = outputs - set(plan.written_leaves)  # entries of info that only a reset sets
         self._fixed_indices = fixed_indices = sorted(
-            {*plan.inputs, *constant} - {*carried_indices, *flags, record.next_action}
+            {*plan.inputs, *fixed_outputs} - {*carried_indices, *flags, record.next_action}
         )
         template = flat.leaves[record.next_action]
 
@@ -106,4 +109,4 @@ class EnvStepper:
                 (state.terminated, state.truncated),
             )
 
-        self.compiled = jaxcompat.jit_donating(step)  # no caller holds the carried arrays
+        self.compiled = jaxcompat.jit_donating(step)  # callers never get the carried arrays

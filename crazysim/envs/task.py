@@ -28,9 +28,9 @@ class Task:
     """A task: a frozen record of settings whose methods are pure functions of one world.
 
     Subclasses are frozen dataclasses. They define ``name``, ``spawn``, ``observe``, ``rewards``, ``terminated`` and
-    ``error``, and whatever else they need. In the data, leaves of drones are (n_drones, ...), and leaves of worlds have
-    no batch axes. State that the task keeps between steps is a record in ``data.plugins["task"]``, which ``install``
-    adds.
+    ``error``, and whatever else they need. In the data that they receive, arrays per drone are (n_drones, ...), and
+    arrays per world have no batch axes. A task keeps state between steps in a record ``data.plugins["task"]``, which
+    ``install`` adds.
     """
 
     name: ClassVar[str] = ""
@@ -38,8 +38,8 @@ class Task:
     Record: ClassVar[type[PyTree] | None] = None
     """Type of the record in ``data.plugins["task"]``; None if there is none."""
     batched: ClassVar[bool] = False
-    """True for a task that needs all worlds at once. Its methods then receive the data of all worlds with their batch
-    axes, and one key per world, and its steps are not fused."""
+    """True for a task that needs all worlds at once. Its methods then receive the data of all worlds, with all batch
+    axes, and one key per world. The phases of an environment step are then not fused."""
 
     unit: ClassVar[str] = "m"
     """Unit of ``error``."""
@@ -47,7 +47,7 @@ class Task:
     seconds: float = setting(default=5.0, positive=True, high=MAX_SECONDS)
     """Length of an episode, s."""
     tolerance: float = setting(default=0.05, positive=True)
-    """Error below which the task counts as done, in ``unit``."""
+    """Limit of the error for success, in ``unit``."""
     hold: float = setting(default=1.0, low=0.0)
     """Time at the end of an episode during which the error must stay below the tolerance, s."""
 
@@ -145,15 +145,15 @@ class Task:
         return None
 
     def camera(self, n_drones: int) -> Mapping[str, Any] | None:
-        """Return the camera's lookat, distance, azimuth and elevation in films; None to frame all starts.
+        """Return lookat, distance, azimuth and elevation of the camera of films; None to frame all starts.
 
-        With ``follow``, the index of a drone, it looks at that drone from the distance.
+        With the entry ``follow``, the index of a drone, the camera follows that drone at the distance.
         """
         del n_drones
         return None
 
     def policy_camera(self) -> ImageSensor | None:
-        """Return the camera of every drone whose images policies need; None for none. ``make`` adds it."""
+        """Return the camera that takes images for the policy on every drone; None for none. ``make`` adds it."""
         return None
 
     def succeeded(self, data: SimData) -> Array | None:

@@ -51,15 +51,15 @@ def require_finite_start(task: Task, state: EnvState) -> None:
 
 
 def check_record(state: EnvState, stepped: EnvState) -> None:
-    """Check that a step keeps observations, info and memory as they were at the start of an episode.
+    """Check that a step keeps names, shapes and types of observations, info and memory.
 
     Args:
         state: State at the start of an episode.
         stepped: Shapes and types of the state after a step.
     """
     leaf_scopes, n_drones = jax.tree.leaves(scopes(state.record)), state.full_data.core.n_drones
-    before, stepped_leaves = (dict(tree_leaves_with_path(x.record)) for x in (state, stepped))
-    for (path, x), scope in zip(before.items(), leaf_scopes, strict=True):
+    start_leaves, stepped_leaves = (dict(tree_leaves_with_path(x.record)) for x in (state, stepped))
+    for (path, x), scope in zip(start_leaves.items(), leaf_scopes, strict=True):
         name = keystr(path).lstrip(".")
         if scope in ("batched", "opaque"):
             raise ConfigError(
@@ -78,17 +78,17 @@ def check_record(state: EnvState, stepped: EnvState) -> None:
                 f"{'none' if y is None else _describe(y)}. Tasks and wrappers must always return the "
                 f"same names and shapes."
             )
-    if added_names := [keystr(path).lstrip(".") for path in stepped_leaves if path not in before]:
+    if added_names := [keystr(path).lstrip(".") for path in stepped_leaves if path not in start_leaves]:
         raise ConfigError(
             f"expected a step to return the entries that exist at the start of an episode, got "
-            f"{', '.join(added_names)} as well. Set it in after_reset, too."
+            f"{', '.join(added_names)} as well. Add the same entries in after_reset."
         )
 
 
 def check_task(task: Task, data: SimData, action_size: int) -> None:
     """Check that a task has all methods, and that observations and rewards have the documented shapes.
 
-    The methods are traced for shapes, once, and not executed.
+    The methods are traced once to get their shapes, not executed.
 
     Args:
         task: The task, installed.
@@ -103,7 +103,7 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
             f"{', '.join(undefined)}. {GUIDE} describes each method."
         )
     n_worlds, n_drones = data.states.pos.shape[:2]
-    batch, names = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
+    batch, batch_name = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
     world = data if task.batched else jax.tree.map(_world_shape, scopes(data), data)
     action = jax.ShapeDtypeStruct((*batch, n_drones, action_size), data.states.pos.dtype)
     obs, rewards, terminated, error, info = jax.eval_shape(
@@ -119,37 +119,37 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
                 f"{title}: expected {method} to return a dict of names to arrays, got {_describe(result)}. {GUIDE} "
                 f"has an example."
             )
-    per_drone = (*batch, n_drones)
+    drones = (*batch, n_drones)
     for name, x in obs.items():
         shape = getattr(x, "shape", ())
-        if shape[:-1] != per_drone or len(shape) != len(per_drone) + 1:
+        if shape[:-1] != drones or len(shape) != len(drones) + 1:
             raise ConfigError(
-                f"{title}: expected observation {name!r} of shape ({names}n_drones, k) = "
-                f"({', '.join(map(str, per_drone))}, k), got {_describe(x)}. For one number per drone use x[:, None]; "
+                f"{title}: expected observation {name!r} of shape ({batch_name}n_drones, k) = "
+                f"({', '.join(map(str, drones))}, k), got {_describe(x)}. For one number per drone use x[:, None]; "
                 f"for one array per drone use x.reshape(n_drones, -1)."
             )
     for name, x in [(f"reward term {name!r}", x) for name, x in rewards.items()] + [("error", error)]:
-        if getattr(x, "shape", None) != per_drone:
+        if getattr(x, "shape", None) != drones:
             raise ConfigError(
-                f"{title}: expected {name} of shape ({names}n_drones,) = {per_drone}, got {_describe(x)}. For the "
+                f"{title}: expected {name} of shape ({batch_name}n_drones,) = {drones}, got {_describe(x)}. For the "
                 f"same number for all drones use jnp.full(data.core.n_drones, x)."
             )
     for name, x in info.items():
-        if x.shape != batch and x.shape[: len(per_drone)] != per_drone:
+        if x.shape != batch and x.shape[: len(drones)] != drones:
             raise ConfigError(
-                f"{title}: expected info {name!r} of shape ({names.removesuffix(', ')}) or ({names}n_drones, ...) = "
-                f"({', '.join(map(str, per_drone))}, ...), got {_describe(x)}. For an array of the world use "
-                f"jnp.broadcast_to(x, (data.core.n_drones, *x.shape))."
+                f"{title}: expected info {name!r} of shape ({batch_name.removesuffix(', ')}) or "
+                f"({batch_name}n_drones, ...) = ({', '.join(map(str, drones))}, ...), got {_describe(x)}. For an array "
+                f"of the world use jnp.broadcast_to(x, (data.core.n_drones, *x.shape))."
             )
     if getattr(terminated, "shape", None) != batch or not jnp.issubdtype(terminated.dtype, jnp.bool_):
         raise ConfigError(
-            f"{title}: expected terminated of type bool and shape ({names.removesuffix(', ')}), got "
-            f"{_describe(terminated)}. It is one value per world: use jnp.any or jnp.all over its drones."
+            f"{title}: expected terminated of type bool and shape ({batch_name.removesuffix(', ')}), got "
+            f"{_describe(terminated)}. It is one value per world: use jnp.any or jnp.all over the drones."
         )
 
 
 def _world_shape(scope: str, x: Array) -> jax.ShapeDtypeStruct:
-    """Return shape and type of a leaf as functions of one world receive it."""
+    """Return shape and type of a leaf in one world, without batch axes of worlds."""
     return jax.ShapeDtypeStruct(x.shape[n_world_axes(scope) :], x.dtype)
 
 

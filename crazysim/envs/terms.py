@@ -11,12 +11,12 @@ from crazysim.core.data import SimData
 
 
 def proximity(distance: Array, coarse: float = 2.0, fine: float = 20.0) -> Array:
-    """Return ``exp(-coarse d) + exp(-fine d) / 2``: up to 1.5 at the goal, with a slope far from it and near it. (...)
+    """Return ``exp(-coarse d) + exp(-fine d) / 2``, with ``d`` the distance: 1.5 at the goal, zero far away. (...)
 
     Args:
         distance: Distance from the goal, m. (...)
-        coarse: Decay of the part that reaches far, 1/m.
-        fine: Decay of the part that rewards precision, 1/m.
+        coarse: Decay of the term that guides drones from afar, 1/m.
+        fine: Decay of the term that rewards precision near the goal, 1/m.
     """
     return jnp.exp(-coarse * distance) + 0.5 * jnp.exp(-fine * distance)
 

@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.errors import ConfigError
 
 CELL_SIZE = (1.0, 1.2)
-"""Size of the cells that a random course spreads its gates over, along x and y, m."""
+"""Size of the cells of a random course, along x and y, m. The start and each gate are in different cells."""
 CELL_MARGIN = (0.5, 0.3)
 """Distance of the cells from the limits of the arena along x and y, m."""
 CELL_JITTER = 0.05
@@ -36,7 +36,7 @@ class Track:
     gates_pos: Points = ((0.5, 0.25, 0.7), (1.05, 0.75, 1.2), (-1.0, -0.25, 0.7), (0.0, -0.75, 1.2))
     """Middle of each gate's opening, in the order of the race, m. (n_gates, 3)"""
     gates_rpy: Points = ((0, 0, -0.78), (0, 0, 2.35), (0, 0, 3.14), (0, 0, 0))
-    """Roll, pitch and yaw of each gate, rad; it is passed along its x axis. (n_gates, 3)"""
+    """Roll, pitch and yaw of each gate, rad; drones fly along the x axis of the gate. (n_gates, 3)"""
     obstacles_pos: Points = ((0.0, 0.75, 1.55), (1.0, 0.25, 1.55), (-1.5, -0.25, 1.55), (-0.5, -0.75, 1.55))
     """Upper end of each upright pole, m. (n_obstacles, 3)"""
     start: Sequence[float] = (-1.5, 0.75, 0.4)
@@ -65,7 +65,7 @@ class Track:
 
 
 def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> Track:
-    """Check that a track can be flown from its starts, and return it.
+    """Return a track after checking its numbers, its limits and the clearance of its starts.
 
     Args:
         track: The track.
@@ -88,8 +88,8 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
         if n_x * n_y < track.n_gates + 1 or (n_x + 1) * (n_y + 1) < track.n_obstacles:
             raise ConfigError(
                 f"expected an arena with room for a random course of {track.n_gates} gates and {track.n_obstacles} "
-                f"obstacles, got {n_x} x {n_y} cells of {CELL_SIZE[0]} x {CELL_SIZE[1]} m; start and gates take one "
-                f"each. Set wider limits with Track(low=..., high=...), or use fewer."
+                f"obstacles, got {n_x} x {n_y} cells of {CELL_SIZE[0]} x {CELL_SIZE[1]} m. Start and gates need a cell "
+                f"each. Set wider limits with Track(low=..., high=...), or use fewer gates or obstacles."
             )
         if n_drones > 8:
             raise ConfigError(f"expected at most 8 drones on a random course, got {n_drones}. Use level 0, 1 or 2.")
@@ -112,7 +112,7 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
 
 
 def start_offsets(n_drones: int) -> np.ndarray:
-    """Return the offsets of drones from the start, m: in layers of two by two, or in the middle for a single drone.
+    """Return the offsets of drones from the start, m: layers of two by two drones; zero for a single drone.
 
     Returns:
         (n_drones, 3)
@@ -124,24 +124,24 @@ def start_offsets(n_drones: int) -> np.ndarray:
 
 
 def count_random_numbers(track: Track) -> int:
-    """Return how many random numbers ``random_course`` takes."""
+    """Return the number of random numbers that ``random_course`` takes."""
     n_x, n_y = track.grid
     return n_x * n_y + (n_x + 1) * (n_y + 1) + 3 * track.n_gates
 
 
 def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
-    """Return a course drawn at random: start and gates in different cells, obstacles in corners of cells.
+    """Return a course drawn at random.
 
-    Therefore objects never overlap. Heights are those of the track. The axis of a gate points along the leg from the
-    previous gate, with a deviation of up to 1 rad.
+    Start and gates are in different cells and obstacles at corners of cells, so that objects never overlap. Gates and
+    obstacles have the heights of the track. The axis of a gate deviates by up to 1 rad from the leg to the gate.
 
     Args:
         track: Track with the heights and numbers of gates and obstacles, and the limits of the arena.
         x: Random numbers in [0, 1), ``count_random_numbers(track)`` of them. (..., n)
 
     Returns:
-        Start, m (..., 3), positions of gates, m (..., n_gates, 3), their attitudes, xyzw (..., n_gates, 4), positions
-        of obstacles, m (..., n_obstacles, 3).
+        Start, m (..., 3); positions of gates, m (..., n_gates, 3); attitudes of gates, xyzw (..., n_gates, 4);
+        positions of obstacles, m (..., n_obstacles, 3).
     """
     n, (n_x, n_y) = track.n_gates, track.grid
     cell_numbers, corner_numbers, shift_numbers, yaw_numbers = jnp.split(
@@ -167,7 +167,7 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def ranks(x: Array, n: int) -> Array:
-    """Return the rank of each of the first ``n`` numbers among all: ``n`` draws without replacement.
+    """Return the rank of each of the first ``n`` numbers among all numbers, which is a draw without replacement.
 
     Args:
         x: Random numbers, at least ``n``. (..., m)
@@ -176,7 +176,7 @@ def ranks(x: Array, n: int) -> Array:
     Returns:
         Different whole numbers from 0 to m - 1. (..., n)
     """
-    # Equal numbers are ranked by position, so that no two have the same rank.
+    # Equal numbers are ranked by their index, so that all ranks are different.
     earlier = np.arange(x.shape[-1])[None] < np.arange(n)[:, None]
     ranked, all_numbers = x[..., :n, None], x[..., None, :]
     return jnp.sum((all_numbers < ranked) | ((all_numbers == ranked) & earlier), axis=-1, dtype=jnp.int32)

@@ -27,10 +27,10 @@ from crazysim.errors import ConfigError, short_repr
 class DroneVectorEnv(gymnasium.vector.VectorEnv):
     """Vector environment of Gymnasium over a functional environment.
 
-    Observations are named, (num_envs, k) with one drone per world and (num_envs, n_drones, k) with several, and actions
-    likewise; with several drones the reward is their mean. All are JAX arrays on the simulation's device, which
-    Gymnasium's wrappers ``JaxToNumpy`` and ``JaxToTorch`` convert without a copy. With ``numpy=True`` they are NumPy
-    arrays that the caller may write to, as Gymnasium's own reward wrappers do.
+    Actions and each named observation are (num_envs, k) with one drone per world, and (num_envs, n_drones, k) with
+    several. With several drones, the reward is the mean over the drones. All are JAX arrays on the simulation's device,
+    which Gymnasium's wrappers ``JaxToNumpy`` and ``JaxToTorch`` convert without a copy. With ``numpy=True`` they are
+    NumPy arrays that the caller may write to, as Gymnasium's reward wrappers do.
     """
 
     def __init__(
@@ -47,8 +47,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Args:
             env: The environment.
             autoreset_mode: Mode of automatic resets.
-            render_mode: Mode of ``render``: ``"rgb_array"`` returns images, ``"human"`` draws the first of the worlds
-                into a window.
+            render_mode: Mode of ``render``: ``"rgb_array"`` returns images, ``"human"`` draws the first of
+                ``render_worlds`` into a window.
             render_worlds: Worlds to render; None for all, as Gymnasium's wrapper ``RecordVideo`` needs.
             render_size: Width and height of an image, pixels.
             numpy: True to return NumPy arrays, copies that may be written to.
@@ -78,7 +78,9 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start new episodes in all worlds, or where ``options["reset_mask"]`` is True, (num_envs,) of type bool.
+        """Start new episodes in all worlds, or where ``options["reset_mask"]`` is True, bool (num_envs,).
+
+        Return observations and infos.
 
         Without a seed, the random numbers continue the earlier sequence, or start from the system's entropy.
         """
@@ -90,7 +92,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         state_before = self.state
         if mask is not None and seed is not None:
             raise ConfigError(
-                "expected a seed or a reset_mask, got both. Leave the seed out: it belongs to all worlds."
+                "expected a seed or a reset_mask, got both. Leave the seed out: a seed is for all worlds."
             )
         if mask is not None and state_before is None:
             raise ConfigError("expected a reset of all worlds before the first reset_mask, got none. Call reset().")
@@ -107,7 +109,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def state(self) -> EnvState | None:
-        """State of the functional environment; each drone has the reward of its world. None before the first reset."""
+        """State of the functional environment; all drones of a world have its reward. None before the first reset."""
         state = self._stepper.state
         if state is None:
             return None
@@ -124,10 +126,10 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return state.replace(obs=obs, images=images, reward=jnp.broadcast_to(reward[:, None], n), info=entries)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Advance all worlds.
+        """Advance all worlds; return observations, rewards, ``terminated``, ``truncated`` and infos.
 
         Args:
-            actions: (num_envs, k), or (num_envs, n_drones, k) with several drones.
+            actions: Actions in [-1, 1]. (num_envs, k), or (num_envs, n_drones, k) with several drones
         """
         if self._outputs is None:
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
@@ -178,7 +180,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return gymnasium.spaces.Box(-limit, limit, shape, x.dtype)
 
     def render(self) -> tuple[Any, ...] | None:
-        """Render all worlds, or ``render_worlds``: return an image (height, width, 3) of each, or draw the first.
+        """Return an image (height, width, 3) of each of ``render_worlds``, or draw the first of them into a window.
 
         Raises:
             RenderError: If this machine cannot render.
@@ -214,7 +216,7 @@ def make_vector(
         num_envs: Number of worlds.
         autoreset_mode: Mode of automatic resets.
         render_mode: Mode of ``render``.
-        max_episode_steps: Length of an episode, steps; None for the task's, or its setting ``seconds``.
+        max_episode_steps: Length of an episode, environment steps; None for the length that ``seconds`` sets.
         numpy: True to return NumPy arrays, copies that may be written to.
         render_worlds: Worlds to render; None for all.
         render_size: Width and height of an image, pixels.

@@ -1,4 +1,4 @@
-"""Wrappers: environments around environments. Most are written for one world."""
+"""Wrappers: environments around environments. Most wrappers are written for one world."""
 
 from crazysim.envs.reset_policy import AutoresetMode, ResetPolicy
 from crazysim.envs.wrappers.action import ActionDelay

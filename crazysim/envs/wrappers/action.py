@@ -20,7 +20,7 @@ class ActionQueue(PyTree):
 
 
 class ActionDelay(Wrapper):
-    """Delay actions by ``n`` environment steps; until the first one arrives, the action is zero, which hovers."""
+    """Delay actions by ``n`` environment steps; the first ``n`` actions of an episode are zero, by default hover."""
 
     def __init__(self, env: Env, n: int):
         super().__init__(env)

@@ -1,4 +1,4 @@
-"""Automatic resets: when a new episode begins within a step."""
+"""Wrapper for automatic resets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from crazysim.envs.wrappers.base import Wrapper
 
 
 class AutoReset(Wrapper):
-    """Begin a new episode where one is over; the outermost of all wrappers."""
+    """Begin a new episode within a step where an episode is over. It must be the outermost wrapper."""
 
     def __init__(self, env: Env, mode: AutoresetMode | str = AutoresetMode.same_step):
         super().__init__(env)

@@ -10,7 +10,7 @@ from crazysim.errors import ConfigError
 
 
 class Wrapper(Hooks, Env):
-    """An environment around another one. Subclasses add to its phases by overriding hooks, written for one world."""
+    """An environment around another environment. Subclasses override hooks, which the phases of a step call."""
 
     def __init__(self, env: Env):
         if not isinstance(env, Env):
@@ -21,12 +21,12 @@ class Wrapper(Hooks, Env):
                 "adapters to other libraries add it themselves."
             )
         self.env = env
-        name, others = self.name or type(self).__name__, {wrapper.name for wrapper in env.wrappers}
-        numbers = range(2, len(others) + 2)
-        self.name = name if name not in others else next(x for k in numbers if (x := f"{name} {k}") not in others)
+        name, used_names = self.name or type(self).__name__, {wrapper.name for wrapper in env.wrappers}
+        numbered_names = [f"{name} {k}" for k in range(2, len(used_names) + 2)]
+        self.name = next(x for x in (name, *numbered_names) if x not in used_names)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Refuse subclasses that override ``reset``, ``restart`` or ``step``: the step is compiled as a whole."""
+        """Reject subclasses that override ``reset``, ``restart`` or ``step``, because a step is compiled as a whole."""
         super().__init_subclass__(**kwargs)
         overridden = {"reset", "restart", "step"} & set(vars(cls))
         if overridden:

@@ -1,4 +1,4 @@
-"""Images of cameras and lidars among the observations."""
+"""Wrapper that adds images of cameras and lidars to the observations."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from crazysim.plugins.sensors.image_sensor import OUTPUTS, ImageSensor
 
 
 class CameraImages(Wrapper):
-    """Add the images of a camera of each drone to the observations, row by row. (n_worlds, n_drones, k) each
+    """Add the images of a camera on each drone to the observations, flattened. (n_worlds, n_drones, k) each
 
-    Images are taken of all worlds at the end of environment steps, by one kernel, at the rate of the camera, and become
-    observations after its latency; a new episode begins with a new image. They do not change rewards or the ends of
-    episodes. Where an episode ends and another one begins in the same step, ``final_obs`` has the image of the step
-    before. Reshape an observation to ``shapes[name]`` for a convolution. Worlds on a mesh of devices have no images.
+    At the end of environment steps, at the rate of the camera, one kernel takes the images of all worlds. They become
+    observations after the camera's latency; a new episode begins with a new image. They do not change rewards or the
+    ends of episodes. Where an episode ends and a new episode begins in the same step, ``final_obs`` has the image of
+    the step before. Reshape an observation to ``shapes[name]`` for a convolution. Worlds on a mesh of devices have no
+    images.
     """
 
     def __init__(self, env: Env, camera: ImageSensor, names: Mapping[str, str] | None = None):
@@ -50,7 +51,7 @@ class CameraImages(Wrapper):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of the image of one drone by the name of its observation: (height, width), for normals with 3 last."""
+        """Shape of an image by the name of its observation: (height, width), or (height, width, 3) for normals."""
         return {name: self.camera.image_size + OUTPUTS[output] for output, name in self.names.items()}
 
     def describe_images(self) -> dict[str, dict[str, Any]]:

@@ -27,7 +27,7 @@ from crazysim.tables import NOT_NEGATIVE, read_number
 class Observe(Wrapper):
     """Change observations by ``fn(obs, data) -> obs``, a pure function of one world.
 
-    ``Observe(env, lambda obs, data: {"vector": flatten(obs)})`` concatenates all of them.
+    ``Observe(env, lambda obs, data: {"vector": flatten(obs)})`` concatenates all observations.
     """
 
     def __init__(self, env: Env, fn: Callable[[Obs, SimData], Obs]):
@@ -44,10 +44,13 @@ class Observe(Wrapper):
 class PrivilegedObservation(Observe):
     """Add ``obs["privileged"]``: true state and parameters, which a critic may use in training, but no policy.
 
-    It contains, for every drone: attitude (rotation matrix), angular velocity, position, velocity and rotor speeds; the
-    parameters of which each drone has its own, divided by the largest magnitude in the same parameter of the default
-    data; and the observations of plugins that change the dynamics, such as the factors that ``Randomize`` has drawn and
-    the charge of a ``Battery``; and ``task.privileged``.
+    Its parts, for every drone, are
+
+    - attitude (rotation matrix), angular velocity, position, velocity and rotor speeds;
+    - the parameters that have a value per drone, divided by the largest magnitude of the parameter in the default data;
+    - the observations of plugins that change the dynamics, such as the factors that ``Randomize`` has drawn and the
+      charge of a ``Battery``;
+    - the observations of ``task.privileged``.
     """
 
     def __init__(self, env: Env):
@@ -60,7 +63,7 @@ class PrivilegedObservation(Observe):
     def _add_privileged(self, obs: Obs, data: SimData) -> Obs:
         if PRIVILEGED in obs:
             raise ConfigError(
-                f"expected observations without {PRIVILEGED!r}, got {', '.join(obs)}. Give it another name in the task."
+                f"expected observations without {PRIVILEGED!r}, got {', '.join(obs)}. Use another name in the task."
             )
         params = zip(jax.tree.leaves(data.params), jax.tree.leaves(scopes(data.params)), self._scales, strict=True)
         drone_params = [(x / scale).reshape(len(x), -1) for x, scope, scale in params if scope == "drone"]
@@ -71,7 +74,7 @@ class PrivilegedObservation(Observe):
 
 
 class ObservationNoise(Wrapper):
-    """Add normal noise to observations, independent in every step; the same seed and world give the same noise.
+    """Add normally distributed noise to observations, independent in every step and repeatable by seed and world.
 
     ``std`` maps names of observations to standard deviations, each in the unit of the observation.
     """
@@ -101,18 +104,16 @@ class ObservationNoise(Wrapper):
         return noisy
 
 
-def _draw_normal(key: Array, number: int, template: Array) -> Array:
-    return normal(jax.random.fold_in(key, number), template.shape[1:], template.dtype)
+def _draw_normal(key: Array, index: int, template: Array) -> Array:
+    return normal(jax.random.fold_in(key, index), template.shape[1:], template.dtype)
 
 
 class Normalize(Wrapper):
-    """Normalise observations to mean zero and variance one over all worlds and drones so far, clipped to [-10, 10].
+    """Normalise observations to mean zero and variance one, and clip them to [-10, 10]. Images are not normalised.
 
-    Images are not normalised.
-
-    ``state.memory["Normalize"]`` holds the statistics, by name of the observation. To fly a policy with the
-    statistics of its training, pass them: ``Normalize(env, stats)`` does not update them. Blocks of worlds with
-    different keys, such as several seeds in one training, share the statistics.
+    Mean and variance are over all worlds, drones and steps so far; ``state.memory["Normalize"]`` has them by name of
+    the observation. To fly a policy with the statistics of its training, pass them: ``Normalize(env, stats)`` does not
+    update them. Blocks of worlds with different keys, such as several seeds in one training, share the statistics.
     """
 
     batched = True
@@ -126,10 +127,10 @@ class Normalize(Wrapper):
             return self._normalize(state, self.recall(state))
         obs = state.record.obs  # without images
         stats = self.stats or {name: RunningStats.create(x.shape[-1]) for name, x in obs.items()}
-        if missing := set(obs) ^ set(stats):
+        if unmatched := set(obs) ^ set(stats):
             raise ConfigError(
                 f"expected statistics of the observations {', '.join(sorted(obs))}, got "
-                f"{', '.join(sorted(stats))}: {', '.join(sorted(missing))} is in one of them only"
+                f"{', '.join(sorted(stats))}: {', '.join(sorted(unmatched))} is in one of them only"
             )
         return self._update(state, stats)
 

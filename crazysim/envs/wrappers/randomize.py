@@ -22,7 +22,7 @@ class RandomizeWith(Wrapper):
     """Wrapper that changes the data at the start of every episode with a function: masses, motors or other fields.
 
     ``fn(data, key) -> data`` receives the data of one world and the random key of its episode. Parameters that it
-    changes must have one value per drone. Name them in ``params``; parameters that drones share are then repeated for
+    changes must have one value per drone. Name these parameters in ``params``: shared values are then repeated for
     every drone.
     """
 
@@ -50,7 +50,7 @@ class RandomizeWith(Wrapper):
         shared_names = [name for name, scope, x, y in leaves if scope in ("shared", "opaque") and y is not x]
         if shared_names:
             raise ConfigError(
-                f"{', '.join(shared_names)} cannot be randomised: all worlds share it. Name parameters that should be "
-                f"one per drone in params=, as in RandomizeWith(env, fn, params=('mass',))."
+                f"{', '.join(shared_names)} cannot be randomised: all worlds share it. Name parameters that get a "
+                f"value per drone in params=, as in RandomizeWith(env, fn, params=('mass',))."
             )
         return randomised

@@ -1,4 +1,4 @@
-"""Wrappers that record rewards."""
+"""Wrappers that add returns and terms of rewards to ``info``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class EpisodeSums(PyTree):
     reward: Array = leaf("drone")
     """Sum of the rewards of the episode. (n_worlds, n_drones)"""
     length: Array = leaf("world")
-    """Number of its steps. (n_worlds, 1)"""
+    """Number of steps of the episode. (n_worlds, 1)"""
 
 
 class LastAction(PyTree):
@@ -31,9 +31,9 @@ class LastAction(PyTree):
 
 
 class EpisodeStatistics(Wrapper):
-    """Record return and length of episodes that end: ``info["episode_return"]``, ``info["episode_length"]``.
+    """Add return and length of episodes that end: ``info["episode_return"]``, ``info["episode_length"]``.
 
-    Both are zero in worlds whose episode continues.
+    Return and length are zero in worlds where the episode continues.
     """
 
     def after_reset(self, state: EnvState) -> EnvState:
@@ -54,7 +54,7 @@ class EpisodeStatistics(Wrapper):
 
 
 class RewardTerms(Wrapper):
-    """Record the terms of the reward by name: ``info["reward proximity"]`` and so on. (n_drones,) each"""
+    """Add the terms of the reward by name: ``info["reward proximity"]`` and so on. (n_worlds, n_drones) each"""
 
     def __init__(self, env: Env):
         super().__init__(env)
