@@ -8,7 +8,15 @@ import pytest
 from crazysim import ConfigError, rotation
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import PrivilegedObservation, make
-from crazysim.envs.tasks.forest import CEILING, EDGE_DISTANCE, HALF_WIDTH, HEIGHT, PRIVILEGED_TREES, VIEW_RANGE, Forest
+from crazysim.envs.tasks.forest import (
+    CEILING,
+    EDGE_DISTANCE,
+    HALF_WIDTH,
+    HEIGHT,
+    N_PRIVILEGED_TREES,
+    VIEW_RANGE,
+    Forest,
+)
 
 N_WORLDS, SEEN = 64, 6
 
@@ -107,7 +115,7 @@ def test_observed_vectors_turn_with_the_heading_and_the_critic_observes_trees(st
     np.testing.assert_allclose([*seen["goal_distance"], *seen["height"], *seen["offset"]], [27, 1.5, 1], rtol=1e-5)
     privileged = jax.eval_shape(PrivilegedObservation(env).reset, jax.random.key(0)).obs["privileged"]
     hover = jax.eval_shape(PrivilegedObservation(make("hover", 2)).reset, jax.random.key(0)).obs["privileged"]
-    assert privileged.shape[-1] - hover.shape[-1] == 3 * PRIVILEGED_TREES
+    assert privileged.shape[-1] - hover.shape[-1] == 3 * N_PRIVILEGED_TREES
 
 
 def test_hits_disable_and_crossing_the_line_is_a_success(start_state):

@@ -26,8 +26,8 @@ from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
 CELL_WIDTH, CELL_JITTER = 0.8, 0.15
-"""Width of the cells that hold at most one obstacle each, and largest component of the offset of an obstacle from the
-middle of its cell, m: a drone fits between a pole and whatever is next to it."""
+"""Width of the cells of the field, and largest component of the offset of an obstacle from the middle of its cell, m.
+A cell holds at most one obstacle. With these numbers a drone fits between a pole and its neighbours."""
 N_CELLS_ALONG = 4
 """Number of cells from the starts to the goals."""
 FIELD_GAP = 0.6
@@ -39,10 +39,10 @@ HEIGHT = 2.0
 START_JITTER = 0.15
 """Largest component of the offset of starts and goals from their mean positions, m."""
 CRUISE_SPEED = 2.0
-"""Speed above which flying faster costs reward, m/s. Actions tilt a drone by at most 45 degrees, so that it brakes
-with up to g and stops from this speed within v^2 / (2 g) = 0.2 m, a quarter of a cell."""
+"""Speed above which flying faster costs reward, m/s. At the largest tilt of an action, 45 degrees, a drone brakes with
+about g and stops from this speed within v^2 / (2 g) = 0.2 m, a quarter of a cell."""
 SPACING = 0.6
-"""Distance between the mean positions of the starts, and of the goals, of several drones, m."""
+"""Distance between the mean positions of neighbouring starts, and of neighbouring goals, m."""
 
 
 class Crossing(PyTree):
@@ -53,9 +53,9 @@ class Crossing(PyTree):
     reached: Array = leaf("drone", 0)
     """True where the drone has reached its goal. (n_worlds, n_drones)"""
     disabled: Array = leaf("drone", 0)
-    """True where it has touched something, or left the arena. (n_worlds, n_drones)"""
+    """True where the drone has touched something, or left the arena. (n_worlds, n_drones)"""
     flight_over_before: Array = leaf("drone", 0)
-    """True where it had arrived or was disabled before this environment step. (n_worlds, n_drones)"""
+    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
     remaining_way_before: Array = leaf("drone", 0)
     """Distance from the goal before this environment step, m. (n_worlds, n_drones)"""
     handles: tuple[Handle, ...] = static()
@@ -77,16 +77,16 @@ class Field(NamedTuple):
     arena_half_size: np.ndarray
     """Half the size of the arena, m. (2,)"""
     goals: np.ndarray
-    """Mean positions of the goals; the starts are opposite, m. (n_drones, 3)"""
+    """Mean positions of the goals, m; those of the starts have the opposite x. (n_drones, 3)"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Avoid(Task):
     """Fly about 4.7 m through a field of obstacles, which have new positions in every episode.
 
-    Poles reach from the floor to the ceiling; boxes hang in the air. A drone is disabled when it touches one, the floor
-    or another drone, or leaves the arena; contacts are checked at every physics step. An episode ends when every drone
-    is disabled or has reached its goal.
+    Poles reach from the floor to the ceiling; boxes hang in the air. A drone is disabled when it touches an obstacle,
+    the floor or another drone, or leaves the arena. Contacts are checked at every physics step. An episode ends when
+    every drone is disabled or has reached its goal.
     """
 
     name = "avoid"
@@ -101,7 +101,7 @@ class Avoid(Task):
     seconds: float = 8.0
     """Length of an episode, s."""
     tolerance: float = 0.2
-    """Distance at which a goal counts as reached, m."""
+    """Distance within which a drone has reached its goal, m."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -185,8 +185,8 @@ class Avoid(Task):
         """Return vectors from each drone to its nearest obstacles, and from there to their middles, world frame.
 
         Returns:
-            Vector to the nearest point of each obstacle, m; vector from that point to the middle of a box, which shows
-            how far the box extends to either side, or zero for a pole, m. (n_drones, n_seen, 3) each
+            Vectors to the nearest point of each obstacle, m, and vectors from that point to the middle of a box, m,
+            which are zero for poles. (n_drones, n, 3) each, with n at most ``n_seen``
         """
         dtype, handles = data.states.pos.dtype, crossing_of(data).handles
         rows = slice(handles[0].rows[0], handles[-1].rows[-1] + 1)
@@ -211,8 +211,8 @@ class Avoid(Task):
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and vectors to its goal, to the nearest obstacles and to other drones, m.
 
-        ``obstacles_near`` are vectors to their nearest points; ``obstacles_middle`` are vectors from there to the
-        middles of boxes, and zero for poles.
+        ``obstacles_near`` has vectors to the nearest points of obstacles; ``obstacles_middle`` has vectors from these
+        points to the middles of boxes, and zeros for poles.
         """
         n_drones = data.core.n_drones
         to_nearest, to_middle = self.nearest_obstacles(data)

@@ -1,4 +1,4 @@
-"""Bringing a load to a goal: remaining way, outcome and success, shared by ``deliver`` and ``transport``."""
+"""Parts that ``deliver`` and ``transport`` share: the base class, the record, the outcome and success."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from crazysim.plugins.payloads import load_pos, load_vel
 from crazysim.pytree import PyTree, device_array, leaf
 
 SETTLED_SPEED = 0.2
-"""Largest speed of a load that is delivered, m/s."""
+"""Speed below which a load at its goal is at rest, m/s."""
 
 
 class Delivery(PyTree):
@@ -26,9 +26,9 @@ class Delivery(PyTree):
     goal: Array = leaf("drone", 1)
     """Goal of the load, world frame, m. (n_worlds, n_drones, 3)"""
     remaining_way_before: Array = leaf("drone", 0)
-    """Result of ``remaining_way`` at the beginning of this environment step, m. (n_worlds, n_drones)"""
+    """Result of ``remaining_way`` before this environment step, m. (n_worlds, n_drones)"""
     steps_at_goal: Array = leaf("drone", 0)
-    """Number of physics steps for which the load has been at its goal without a break. (n_worlds, n_drones)"""
+    """Number of consecutive physics steps up to now at which the load was at its goal. (n_worlds, n_drones)"""
     delivered: Array = leaf("drone", 0)
     """True where the load has stayed at its goal for ``hold`` seconds. (n_worlds, n_drones)"""
     crashed: Array = leaf("drone", 0)
@@ -40,26 +40,26 @@ class BringLoad(Task):
     """Base of tasks in which every drone brings its load to a goal and holds it there.
 
     Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``remaining_way``, ``observe`` and
-    ``rewards``. Their ``install`` adds the load, whose plugin is named ``load``, and a stage of one drone that stores
-    the record that ``update_outcome`` returns. An episode ends when a drone crashes.
+    ``rewards``. Their ``install`` adds the load, as a plugin named ``load``, and a stage of one drone that stores the
+    result of ``update_outcome`` in the data. An episode ends when a drone crashes.
     """
 
     Record = Delivery
 
     tolerance: float = 0.1
-    """Largest distance of a load at its goal, m."""
+    """Distance below which a load is at its goal, m."""
     hold: float = 0.5
     """Time for which the load must stay at its goal, s."""
 
     def remaining_way(self, data: SimData) -> Array:
-        """Return the length of the remaining way, m. (...)"""
+        """Return the length of the remaining way to the goal, m. (...)"""
         raise NotImplementedError(self._undefined("remaining_way(data)"))
 
     def update_outcome(self, data: SimData, crashed: Array) -> Any:
         """Return the record after a physics step, with crashes and deliveries up to now.
 
         Args:
-            data: Simulation.
+            data: Data of one drone.
             crashed: True where the drone crashes in this step. (...)
         """
         record = delivery_of(data)
@@ -72,7 +72,7 @@ class BringLoad(Task):
         return with_record(data, delivery_of(data).replace(remaining_way_before=self.remaining_way(data)))
 
     def at_goal(self, data: SimData) -> Array:
-        """Return True where a load is near its goal and slow. (...)"""
+        """Return True where a load is near its goal and at rest. (...)"""
         vel = load_vel(data)
         return (rotation.dot(vel, vel)[..., 0] < SETTLED_SPEED**2) & (self.error(data) < self.tolerance)
 
@@ -98,12 +98,12 @@ class BringLoad(Task):
 
 
 def delivery_of(data: SimData) -> Any:
-    """Return the task's ``Delivery``, or the subclass of it that the task uses."""
+    """Return the task's record, a ``Delivery`` or a subclass."""
     return data.plugins[TASK_RECORD_NAME]
 
 
 def initial_outcome(data: SimData) -> dict[str, Array]:
-    """Return the fields of ``Delivery`` of all worlds at the start: nothing is delivered, and no drone has crashed."""
+    """Return the fields of ``Delivery`` for all worlds before any delivery or crash, by name."""
     pos = data.states.pos
     shape = pos.shape[:2]
     false = device_array(np.zeros(shape), bool)

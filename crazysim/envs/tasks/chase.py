@@ -24,15 +24,15 @@ from crazysim.plugins.vehicles.model import load_vehicle
 from crazysim.sim.sim import Sim
 
 CARS, VEHICLE = "cars", "f1tenth_ros"
-"""Name of the population, and vehicle model."""
+"""Name of the population of cars, and name of the vehicle model."""
 SPACING = 6.0
 """Distance between the initial positions of the cars of several drones, m; a drone observes its own car only."""
 MAX_DISTANCE, CEILING = 3.0, 2.5
 """Largest horizontal distance of a drone from the roof of its car, and largest height of a drone, m."""
 MIN_SPEED_FRACTION = 0.3
-"""Smallest speed of a car, as a fraction of the largest."""
+"""Smallest speed of a car, as a fraction of its setting ``speed``."""
 MAX_STEER = 0.25
-"""Largest steering angle of a car, rad: circles of 1.3 m radius."""
+"""Largest steering angle of a car, rad; the car then drives on a circle of 1.3 m radius."""
 TOUCH_DOWN_RADIUS = 0.12
 """Largest horizontal distance of a drone from the middle of the roof at touch-down, m."""
 
@@ -41,11 +41,11 @@ TOUCH_DOWN_RADIUS = 0.12
 class Chase(TouchDown):
     """Chase a car and land on its roof.
 
-    A car drives straight on or in circles, at a speed and with a steering angle of its own in every episode. A drone
-    starts in flight around it. It has landed when it touches the car from above, within 12 cm of the middle of the
-    roof, with at most 0.5 m/s relative to it and a tilt of at most 20 degrees; contact is checked at every physics
-    step. Any other contact with a car's body or the floor is a crash, as is being more than 3 m away from the
-    roof horizontally or higher than 2.5 m. An episode ends when every drone has landed or crashed.
+    A car drives in circles, or straight ahead. Every episode has a random speed and steering angle. A drone starts in
+    flight above or beside the car. It has landed when it touches the car from above, within 12 cm of the middle of the
+    roof, at a relative speed of at most 0.5 m/s and a tilt of at most 20 degrees. Contacts are checked at every physics
+    step. Any other contact with a car's body or the floor is a crash. Being more than 3 m from the roof horizontally,
+    or higher than 2.5 m, is also a crash. An episode ends when every drone has landed or crashed.
     """
 
     name = "chase"
@@ -54,7 +54,7 @@ class Chase(TouchDown):
     crash_cost = 4.0
 
     speed: float = setting(default=1.0, low=0.0, high=3.0)
-    """Largest speed of a car, m/s; the smallest is 0.3 times that."""
+    """Largest speed of a car, m/s; the smallest speed is 0.3 times that."""
 
     def install(self, sim: Sim) -> None:
         cars = Cars(sim.n_drones, vehicle=VEHICLE, pos=SPACING * grid_2d(sim.n_drones), level="speed", name=CARS)
@@ -94,7 +94,7 @@ class Chase(TouchDown):
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the vector to its roof, m, the roof's relative velocity, m/s, and the car's motion.
 
-        The latter is ``heading``, the unit vector along the car in the horizontal plane, and ``yaw_rate``, rad/s.
+        ``heading`` is the horizontal unit vector along the car, and ``yaw_rate`` its yaw rate, rad/s.
         """
         car, drone = data.plugins[CARS], data.core.drone_id
         heading = jnp.concatenate([jnp.cos(car.yaw), jnp.sin(car.yaw)], axis=-1)
@@ -109,7 +109,7 @@ class Chase(TouchDown):
 
 
 def rolling_car(car: CarData, yaw: Array, speed: Array, steer: Array) -> CarData:
-    """Return cars that roll without slip, and are commanded to go on; their tyres then slip a little.
+    """Return cars that roll without slip, with commands to keep speed and steering angle.
 
     Args:
         car: Cars of the model ``VEHICLE``.

@@ -30,43 +30,44 @@ from crazysim.pytree import device_array, leaf
 from crazysim.sim.sim import Sim
 
 CARS, VEHICLE = "cars", "f1tenth_ros"
-"""Name of the population, and vehicle model."""
+"""Name of the population of cars, and name of the vehicle model."""
 SPACING = 10.0
 """Distance between the initial positions of the cars of several drones, m."""
 HALF_WIDTH, MIN_HEIGHT, CEILING = 4.5, 0.25, 2.5
-"""Largest distance of a drone from its car's initial position along x and y, and its smallest and largest height, m.
-The smallest height keeps it above cars and trailers."""
+"""Largest distance of a drone from its car's initial position along x and y, and its smallest and largest height, m. A
+drone at the smallest height is above cars and trailers."""
 LOAD_SIZE, RING_HEIGHT = (0.08, 0.08, 0.05), 0.07
-"""Full lengths of a load, and height of its ring above its middle, m."""
+"""Length, width and height of a load, and height of its ring above its middle, m."""
 HOOK_MASS, HOOK_DAMPING, HOOK_REACH, MAX_HOOK_SPEED = 0.003, 2e-4, 0.07, 0.6
-"""Mass of the hook, kg; damping of its joint, N m s; largest distance, m, and speed relative to a ring, m/s, at
-which it picks up a load."""
+"""Mass of the hook, kg; damping of its joint, N m s; largest distance from a ring, m, and largest speed relative to the
+ring, m/s, at which the hook picks up a load."""
 MIN_SPEED_FRACTION = 0.3
-"""Smallest speed of a car, as a fraction of the largest."""
+"""Smallest speed of a car, as a fraction of its setting ``speed``."""
 MAX_STEER = 0.25
-"""Largest steering angle of a car, rad: circles of 1.3 m radius."""
+"""Largest steering angle of a car, rad; the car then drives on a circle of 1.3 m radius."""
 GOAL_BOX = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
 """Lower and upper corner of the box of a load's goals, relative to its car's initial position, m."""
 DROP_HEIGHT = 0.15
-"""Height of a ring below which a load that was taken counts as dropped, m; a ring on a trailer is higher."""
+"""Height of a ring below which a load that was taken is dropped, m; rings on trailers are higher."""
 
 
 class TrailerDelivery(Delivery):
-    """Goal of each load, whether the hook has it, and the outcome of its flight."""
+    """Goal of each load, whether the hook has taken the load, and the outcome of its flight."""
 
     taken: Array = leaf("drone", 0)
-    """True from the time at which the hook takes the load off the trailer. (n_worlds, n_drones)"""
+    """True where the hook has taken the load off the trailer. (n_worlds, n_drones)"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Deliver(BringLoad):
     """Pick up a load from a moving trailer with a hook, and hold it at a goal.
 
-    Behind a car that drives straight on or in circles, a trailer carries a load with a ring. A drone starts in flight
-    above it, with a hook on a swinging rod, which picks the load up within 7 cm of the ring at less than 0.6 m/s
-    relative to it. On the trailer the load does not slip. It is delivered when it has been within ``tolerance`` of its
-    goal, at most 0.2 m/s fast, for ``hold`` seconds. A drone crashes when it gets lower than 0.25 m, higher than 2.5 m
-    or too far away, or when the ring of its load, once picked up, sinks below 0.15 m. A crash ends the episode.
+    A car that drives in circles, or straight ahead, pulls a trailer with a load. The load has a ring, and does not slip
+    on the trailer. A drone starts in flight above it with a hook on a swinging rod. The hook picks up the load within
+    7 cm of the ring, at a relative speed below 0.6 m/s. The load is delivered when it has been within ``tolerance`` of
+    its goal, slower than 0.2 m/s, for ``hold`` seconds. A drone crashes when it is lower than 0.25 m, higher than 2.5 m
+    or more than 4.5 m from its car's initial position along x or y, or when the ring of its load sinks below 0.15 m
+    after the pick-up. A crash ends the episode.
     """
 
     name = "deliver"
@@ -77,7 +78,7 @@ class Deliver(BringLoad):
     length: float = setting(default=0.3, low=0.2, high=1.0)
     """Length of the rod, m."""
     speed: float = setting(default=0.5, low=0.0, high=2.0)
-    """Largest speed of a car, m/s; the smallest is 0.3 times that."""
+    """Largest speed of a car, m/s; the smallest speed is 0.3 times that."""
     seconds: float = 8.0
     """Length of an episode, s."""
 
@@ -96,7 +97,7 @@ class Deliver(BringLoad):
 
         @stage("drone")
         def update_record(data: SimData) -> SimData:
-            """Move each waiting load along with its trailer; record pick-ups, deliveries and crashes."""
+            """Move each load that was not taken along with its trailer; record pick-ups, deliveries and crashes."""
             load = data.plugins["load"]
             taken = delivery_of(data).taken | load.attached
             ring, vel = (pick_entry(x, data.core.drone_id) for x in ring_motion(data.plugins[CARS]))
@@ -109,7 +110,7 @@ class Deliver(BringLoad):
         install_rules(sim, TrailerDelivery(**initial_outcome(sim.data), taken=not_taken), update_record)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return cars that drive, loads on their trailers, drones in flight above, and goals."""
+        """Return cars that drive, loads on their trailers, drones in flight above the loads, and goals."""
         car, load = data.plugins[CARS], data.plugins["load"]
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1, goal=3)
         speed, steer = (
@@ -141,16 +142,16 @@ class Deliver(BringLoad):
         return with_record(data, delivery_of(data).replace(goal=goal))
 
     def remaining_way(self, data: SimData) -> Array:
-        """Return the distance of the hook from the load plus the task error, m. (...)"""
+        """Return the distance of the hook from the ring plus the task error, m. (...)"""
         load = data.plugins["load"]
         return rotation.safe_norm(load.pos - load.tip_pos)[..., 0] + self.error(data)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, and hook, load and goal relative to it.
+        """Return the drone's state, and relative positions and velocities of hook, load and goal.
 
-        These are ``hook_pos``, m, and ``hook_vel``, m/s, relative to the drone; ``difference_to_load``, m, and
-        ``difference_to_load_vel``, m/s, from the hook to the ring; ``difference_to_goal``, from the ring to its goal,
-        m; and ``taken``, 1 once the hook has taken the load.
+        ``hook_pos``, m, and ``hook_vel``, m/s, are relative to the drone. ``difference_to_load``, m, and
+        ``difference_to_load_vel``, m/s, are those of the ring relative to the hook. ``difference_to_goal``, m, is the
+        vector from the ring to its goal. ``taken`` is 1 after the hook has taken the load, and 0 before.
         """
         s, load, record = data.states, data.plugins["load"], delivery_of(data)
         return state_of(data) | {
@@ -187,7 +188,7 @@ class Deliver(BringLoad):
 
 
 def ring_positions(car: CarData) -> Array:
-    """Return the positions of the rings of loads that lie on the trailers' decks, of one world, m. (n_members, 3)"""
+    """Return the positions of the rings of loads on the trailers of one world, m. (n_members, 3)"""
     vehicle = load_vehicle(VEHICLE)
     centre, thickness = vehicle.value("trailer.deck_centre"), vehicle.value("trailer.deck")[2]
     front, _ = trailer_axles(car.state, car.params)
@@ -198,9 +199,9 @@ def ring_positions(car: CarData) -> Array:
 
 
 def ring_motion(car: CarData) -> tuple[Array, Array]:
-    """Return the positions of ``ring_positions``, m, and their velocities, m/s, of one world. (n_members, 3) each
+    """Return positions, m, and velocities, m/s, of the rings of loads on the trailers of one world. (n_members, 3) each
 
-    The velocities are exact derivatives. A difference of two float32 positions, times 500 Hz, would be off by 2e-4 m/s.
+    The velocities are exact derivatives. A difference of two float32 positions, times 500 Hz, has errors of 2e-4 m/s.
     """
 
     def positions_of_state(*state: Array) -> Array:
@@ -211,13 +212,13 @@ def ring_motion(car: CarData) -> tuple[Array, Array]:
 
 
 def initial_car_pos(data: SimData) -> Array:
-    """Return the initial position of each drone's car, of one drone or one world, m. (..., 3)"""
+    """Return the initial position of each drone's car, for the data of one drone or one world, m. (..., 3)"""
     car_positions = np.pad(SPACING * grid_2d(data.core.n_drones), ((0, 0), (0, 1)))
     return pick_entry(jnp.asarray(car_positions, data.states.pos.dtype), data.core.drone_id)
 
 
 def has_left_arena(data: SimData) -> Array:
-    """Return True where a drone has left its part of the arena. (...)"""
+    """Return True where a drone is too far from its car's initial position, too low or too high. (...)"""
     pos = data.states.pos
     is_far = jnp.any(jnp.abs(pos - initial_car_pos(data))[..., :2] > HALF_WIDTH, axis=-1)
     return is_far | (pos[..., 2] < MIN_HEIGHT) | (pos[..., 2] > CEILING)

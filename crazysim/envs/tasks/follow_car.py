@@ -1,4 +1,4 @@
-"""Follow a car, seen by a camera."""
+"""Follow a car that the drone observes with a camera."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 SPACING = 6.0
-"""Distance between the lanes of the cars of several drones, m; a drone follows its own car."""
+"""Distance along y between the cars of several drones at the start, m; a drone follows its own car."""
 FOLLOW_DISTANCE, FOLLOW_HEIGHT = 0.8, 0.7
-"""Distance of the point to keep behind a car's centre of mass, along its heading, and its height above it, m."""
+"""Distance behind and height above a car's centre of mass of the point at which the drone should be, m."""
 MAX_DISTANCE, MIN_HEIGHT = 2.0, 0.25
-"""Largest distance of a drone from this point, and smallest height of a drone, which is higher than cars, m."""
+"""Largest distance of a drone from this point, and smallest height of a drone, m; cars are lower."""
 SPEED_RANGE = (0.2, 0.8)
-"""Smallest and largest mean speed of a car, as a fraction of ``speed``."""
+"""Smallest and largest mean speed of a car, as fractions of ``speed``."""
 SPEED_AMPLITUDE = 0.2
 """Amplitude of a car's speed, as a fraction of ``speed``."""
 STEER_RANGE = (0.1, 0.25)
 """Smallest and largest amplitude of a car's steering angle, rad."""
-ANG_FREQS = ((0.5, 1.5), (1.0, 2.0))
-"""Range of the angular frequencies of speed and steering angle, rad/s."""
+ANG_FREQ_RANGES = ((0.5, 1.5), (1.0, 2.0))
+"""Smallest and largest angular frequency of the speed, and of the steering angle, rad/s."""
 MAX_YAW = 0.3
 """Largest angle between a car's mean heading at the start and the x axis, rad."""
 
 
 class Manoeuvre(PyTree):
-    """Motion of each drone's car: its speed oscillates about a mean, and its steering angle about zero."""
+    """Commands of each drone's car: the speed oscillates about a mean, and the steering angle about zero."""
 
     speed: Array = leaf("drone", 1)
     """Mean speed, m/s. (n_worlds, n_drones, 1)"""
@@ -57,20 +57,22 @@ class Manoeuvre(PyTree):
     """Phase of speed and steering angle at the start of the episode, rad. (n_worlds, n_drones, 2)"""
 
     def command(self, time: Array) -> Array:
-        """Return speed, m/s, and steering angle, rad, at some time of the episode, s. (..., 2)"""
-        change = self.amplitude * jnp.sin(self.ang_freq * time + self.phase)
-        return jnp.concatenate([self.speed + change[..., :1], change[..., 1:]], axis=-1)
+        """Return speed, m/s, and steering angle, rad, at a time since the start of the episode, s. (..., 2)"""
+        oscillation = self.amplitude * jnp.sin(self.ang_freq * time + self.phase)
+        return jnp.concatenate([self.speed + oscillation[..., :1], oscillation[..., 1:]], axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FollowCar(Task):
-    """Stay behind and above a car, seen by a camera.
+    """Stay behind and above a car that the drone observes with a camera.
 
-    Speed and steering angle of the car change differently in every episode; on average it drives along the x axis. A
-    drone starts near the point 0.8 m behind and 0.7 m above the car. It succeeds if its distance from this point is
-    below the tolerance during the last second. An episode ends when a drone is lower than 0.25 m, or more than 2 m away
-    from its point. Policies observe neither the car's position nor their own position over ground: ``segmentation`` is
-    1 where a pixel of the camera, which ``make`` adds, shows the car's body, and ``depth`` is its depth image.
+    Speed and steering angle of the car oscillate differently in every episode; its mean heading is within 0.3 rad of
+    the x axis. A drone starts near the point 0.8 m behind and 0.7 m above the car. It succeeds if its distance from
+    this point is below the tolerance during the last second. An episode ends when a drone is lower than 0.25 m, or more
+    than 2 m away from its point.
+
+    Policies observe neither the car's position nor the horizontal position of the drone. ``make`` adds a camera with
+    two images: ``segmentation`` is 1 where a pixel shows the car's body, and ``depth`` is the depth image.
     """
 
     name = "follow_car"
@@ -81,11 +83,11 @@ class FollowCar(Task):
     seconds: float = 6.0
     """Length of an episode, s."""
     tolerance: float = 0.3
-    """Distance from the point behind and above the car below which a drone follows it, m."""
+    """Distance from the point behind and above the car below which the drone follows the car, m."""
 
     def install(self, sim: Sim) -> None:
-        lanes = SPACING * (np.arange(sim.n_drones) - (sim.n_drones - 1) / 2)
-        pos = np.stack([np.zeros(sim.n_drones), lanes], axis=-1)
+        y = SPACING * (np.arange(sim.n_drones) - (sim.n_drones - 1) / 2)
+        pos = np.stack([0 * y, y], axis=-1)
         sim.add(Cars(sim.n_drones, vehicle=VEHICLE, pos=pos, level="speed", name=CARS))
         shape, dtype = (sim.n_worlds, sim.n_drones), sim.data.states.pos.dtype
         scalars, pairs = (device_array(np.zeros((*shape, n)), dtype) for n in (1, 2))
@@ -94,7 +96,7 @@ class FollowCar(Task):
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, and drones in flight behind them."""
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1, ang_freq=2, phase=2)
-        low, high = np.array(ANG_FREQS).T
+        low, high = np.array(ANG_FREQ_RANGES).T
         steer = scale_to(x["steer"], *STEER_RANGE)
         manoeuvre = Manoeuvre(
             speed=self.speed * scale_to(x["speed"], *SPEED_RANGE),

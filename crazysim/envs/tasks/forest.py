@@ -1,4 +1,4 @@
-"""Fly through a forest, seeing the trees by a depth image."""
+"""Fly through a forest, with the trees observed in a depth image."""
 
 from __future__ import annotations
 
@@ -27,27 +27,30 @@ from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 HALF_WIDTH, CEILING = 8.0, 4.0
-"""Half the width of the corridor of one drone, and its height, m: four trees side by side, all of them higher."""
+"""Half the width of the corridor of one drone, and its height, m. At the default density about four trees stand side by
+side in it; all trees are higher than the corridor."""
 HEIGHT = 1.5
 """Height of starts and goals, m."""
 TREE_HEIGHT = 5.0
 """Height of the trees, m."""
 EDGE_DISTANCE = 2.0
-"""Distance from the starts to the first trees, and from the goals beyond the goal line, m."""
+"""Distance from the starts to the first trees, and from the goal line to the goals, m."""
 MIN_TREE_GAP = 0.6
-"""Smallest distance between trees, m: see ``crazysim.plugins.scenery.Forest``."""
+"""Smallest distance between trees, m; ``gap`` of ``crazysim.plugins.scenery.Forest``."""
 START_JITTER = np.array([0.3, 1.0, 0.3])
-"""Largest components of the offset of starts and goals from their places, m; with several drones 0.2 m along y."""
+"""Largest components of the offset of starts and goals from their mean positions, m; with several drones 0.2 m along
+y."""
 SPACING = 1.5
-"""Distance between the starts, and between the goals, of several drones, m: with the offsets they do not touch."""
+"""Distance between the mean positions of neighbouring starts, and of neighbouring goals, m. With the offsets, drones at
+the start do not touch each other."""
 CHECK_FREQ = 100
-"""Rate at which drones are checked for contact, Hz. At 8 m/s a drone flies 8 cm between two checks. A contact of
-its collision sphere, 7 cm in radius, with a tree of 10 cm radius can be missed if they overlap by less than
+"""Rate at which drones are checked for contact, Hz. At 8 m/s a drone flies 8 cm between two checks. A contact of the
+drone's collision sphere, 7 cm in radius, with a tree of 10 cm radius can be missed if they overlap by less than
 0.08^2 / (8 * 0.17) = 5 mm."""
 VIEW_RANGE = 8.0
-"""Distance beyond which trees do not matter, m."""
-PRIVILEGED_TREES = 4
-"""Number of nearest trees that a privileged critic sees."""
+"""Largest distance of an observed tree, m; farther trees are observed at this distance."""
+N_PRIVILEGED_TREES = 4
+"""Number of nearest trees in privileged observations."""
 
 
 class Passage(PyTree):
@@ -58,23 +61,23 @@ class Passage(PyTree):
     reached: Array = leaf("drone", 0)
     """True where the drone has crossed the goal line. (n_worlds, n_drones)"""
     disabled: Array = leaf("drone", 0)
-    """True where it has touched something, or left the corridor. (n_worlds, n_drones)"""
+    """True where the drone has touched something, or left the corridor. (n_worlds, n_drones)"""
     flight_over_before: Array = leaf("drone", 0)
-    """True where its flight was over before this environment step. (n_worlds, n_drones)"""
+    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
 
     @property
     def flight_over(self) -> Array:
-        """True where the drone has arrived or is disabled. (n_worlds, n_drones)"""
+        """True where the drone has crossed the goal line or is disabled. (n_worlds, n_drones)"""
         return self.reached | self.disabled
 
 
 @dataclass(frozen=True, kw_only=True)
 class Forest(Task):
-    """Fly through a forest to a goal line at a set speed; every episode has a forest of its own.
+    """Fly through a forest to a goal line at a set speed; every episode has a new random forest.
 
-    A drone is disabled when it touches a tree, the ground or another drone, or leaves the corridor, whose ceiling is
-    below the tops of the trees. Contacts with trees are checked at 100 Hz. An episode ends when every drone is disabled
-    or has crossed the goal line. Policies see the trees in the depth image of a camera, which ``make`` adds.
+    A drone is disabled when it touches a tree, the ground or another drone, or leaves the corridor. The ceiling of the
+    corridor is below the tops of the trees. Contacts with trees are checked at 100 Hz. An episode ends when every drone
+    is disabled or has crossed the goal line. ``make`` adds a camera, and policies observe its depth image.
     """
 
     name = "forest"
@@ -89,22 +92,23 @@ class Forest(Task):
     radii: ArrayLike = setting(default=(0.1, 0.3), positive=True, shapes=((2,),))
     """Smallest and largest radius of the trees, m. (2,)"""
     difficulty: ArrayLike = setting(default=1.0, low=0.0, high=1.0, shapes=((), (2,)))
-    """Fraction of the trees that stand, or its range, lowest and highest, from which each episode draws. () or (2,)"""
+    """Fraction of the trees that stand, or the lowest and highest fraction, between which each episode draws. () or
+    (2,)"""
     trees_seen: int = setting(default=0, low=0, high=12)
-    """Number of nearest trees among the observations; zero for policies that see them in images."""
+    """Number of nearest trees among the observations; zero for policies that use the depth image."""
     seconds: float = 12.0
     """Length of an episode, s."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.trees(1)  # checks that they fit
+        self.trees(1)  # raises an error if the trees do not fit
 
     def half_width(self, n_drones: int) -> float:
         """Return half the width of the corridor, m."""
         return HALF_WIDTH + SPACING * (n_drones - 1) / 2
 
     def trees(self, n_drones: int) -> Trees:
-        """Return the layout of the trees."""
+        """Return the plugin of the trees, which cover the corridor."""
         cell = 1 / np.sqrt(self.density)
         size = np.array([self.length, 2 * self.half_width(n_drones)])
         size = cell * np.ceil(size / cell - 1e-6)
@@ -140,7 +144,7 @@ class Forest(Task):
         install_rules(sim, Passage(zero, false, false, false), update_record, collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight before another forest."""
+        """Return drones in flight in front of a new forest."""
         n_drones, dtype = data.core.n_drones, data.states.pos.dtype
         x = draw(key, n_drones, start=3, goal=3, rpy=3, vel=3)
         start, goal, rpy, vel = (2 * x[name] - 1 for name in ("start", "goal", "rpy", "vel"))
@@ -158,10 +162,10 @@ class Forest(Task):
         return with_record(data, record.replace(flight_over_before=record.flight_over))
 
     def nearest_trees(self, data: SimData, n: int) -> Array:
-        """Return the nearest trees of each drone: way to the trunk, ahead and to the left, and its radius, m.
+        """Return the nearest trees of each drone: distance to the trunk ahead and to the left, and its radius, m.
 
-        They are found among those of twelve cells around and before the drone. Trees farther than ``VIEW_RANGE``, and
-        those that do not stand, are at that distance.
+        The trees of twelve cells around and in front of the drone are searched. Trees that are farther away than
+        ``VIEW_RANGE``, and trees that do not stand, are returned at this distance.
 
         Returns:
             (n_drones, n, 3)
@@ -169,26 +173,27 @@ class Forest(Task):
         forest, pos = self.trees(data.core.n_drones), data.states.pos
         n_cells, cell = forest.n_cells, forest.cell
         corner = np.asarray(forest.center) - cell * np.asarray(n_cells) / 2
-        index = [
+        column, row = [
             jnp.floor(rotation.clip((pos[:, k] - corner[k]) / cell, -4.0, n_cells[k] + 4.0)).astype(jnp.int32)
             for k in range(2)
         ]
-        columns, rows = np.repeat(np.arange(-1, 3), 3).astype(np.int32), np.tile(np.arange(-1, 2), 4).astype(np.int32)
-        trees = forest.columns(data, index[0][:, None] + columns, index[1][:, None] + rows)
+        column_offsets = np.repeat(np.arange(-1, 3), 3).astype(np.int32)
+        row_offsets = np.tile(np.arange(-1, 2), 4).astype(np.int32)
+        trees = forest.columns(data, column[:, None] + column_offsets, row[:, None] + row_offsets)
         offset = jnp.stack([trees.x - pos[:, :1], trees.y - pos[:, 1:2]], axis=-1)
         distance = rotation.safe_norm(offset)[..., 0]
         gap = jnp.where(trees.is_standing, jnp.minimum(distance - trees.size, VIEW_RANGE), VIEW_RANGE)
-        way = offset * (gap / jnp.maximum(distance, 1e-3))[..., None]
+        to_trunk = offset * (gap / jnp.maximum(distance, 1e-3))[..., None]
         ahead, left = rotation.heading(data.states.quat)
-        components = [jnp.sum(way * axis[:, None, :2], axis=-1) for axis in (ahead, left)]
+        components = [jnp.sum(to_trunk * axis[:, None, :2], axis=-1) for axis in (ahead, left)]
         entries = jnp.stack([*components, trees.size], axis=-1)
         return nearest_entries(gap, entries, n)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return attitude, velocities, height, the way to the goal, and the nearest ``trees_seen`` trees.
+        """Return attitude, velocities, height, direction and distance of the goal, and the nearest trees.
 
-        The velocity and the ways to goal and trees are in the frame of the heading: ahead, left, up. ``offset`` is the
-        position to the left of the middle of the corridor, m.
+        Velocity and direction of the goal are in the frame of the heading: ahead, left, up. ``offset`` is y, the
+        distance to the left of the middle of the corridor, m. ``trees_near`` has the nearest ``trees_seen`` trees.
         """
         offset = passage_of(data).goal - data.states.pos
         distance = rotation.safe_norm(offset)
@@ -202,7 +207,7 @@ class Forest(Task):
         return obs
 
     def privileged(self, data: SimData) -> dict[str, Array]:
-        return {"trees_near": self.nearest_trees(data, PRIVILEGED_TREES).reshape(data.core.n_drones, -1)}
+        return {"trees_near": self.nearest_trees(data, N_PRIVILEGED_TREES).reshape(data.core.n_drones, -1)}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         record, s = passage_of(data), data.states

@@ -1,4 +1,4 @@
-"""Parts that tasks share: goals, the usual observations, limits of the arena, contacts between drones."""
+"""Parts that tasks share: goals, common observations, limits of the arena, contacts between drones."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ class GoalTask(Task):
 
 
 def install_goal(sim: Sim) -> None:
-    """Give every drone a goal, ``data.plugins["task"]``, at the origin and at rest."""
+    """Add the record of goals, ``data.plugins["task"]``, with all goals at the origin and at rest."""
     pos = sim.data.states.pos
     zero = device_array(np.zeros(pos.shape), pos.dtype)
     sim.add(FunctionPlugin(TASK_RECORD_NAME, Goal(zero, zero)))
 
 
 def goal_of(data: SimData) -> Goal:
-    """Return the goals."""
+    """Return the task's record of goals."""
     return data.plugins[TASK_RECORD_NAME]
 
 
@@ -91,7 +91,7 @@ def with_record(data: SimData, record: PyTree) -> SimData:
 
 
 def state_of(data: SimData) -> dict[str, Array]:
-    """Return the usual observations: ``pos`` m, ``rot`` (rotation matrix), ``vel`` m/s and ``ang_vel`` rad/s.
+    """Return the state of each drone: ``pos``, m, ``rot``, rotation matrix, ``vel``, m/s, and ``ang_vel``, rad/s.
 
     Returns:
         (..., n_drones, k) each
@@ -107,12 +107,11 @@ def state_of(data: SimData) -> dict[str, Array]:
 
 
 def motion_of(data: SimData) -> dict[str, Array]:
-    """Return attitude, velocities and height, the observations of tasks that are flown by a camera.
-
-    ``heading`` is the horizontal unit vector along the yaw, world frame, x and y; ``heading_vel`` the velocity along
-    the heading: ahead, left, up, m/s; ``up`` the upward unit vector, body frame; ``ang_vel`` in rad/s; ``height`` in m.
+    """Return attitude, velocities and height, the observations of tasks whose policies use a camera.
 
     Returns:
+        ``ang_vel``: angular velocity, rad/s; ``heading``: horizontal unit vector along the yaw, world frame, x and y;
+        ``heading_vel``: velocity ahead, left and up, m/s; ``height``, m; ``up``: upward unit vector, body frame.
         (..., n_drones, k) each
     """
     s = data.states
@@ -126,14 +125,14 @@ def motion_of(data: SimData) -> dict[str, Array]:
 
 
 def to_heading(data: SimData, vector: Array) -> Array:
-    """Return a vector of the world frame along the heading of each drone: ahead, left, up. (..., 3)"""
+    """Return a vector of the world frame in the frame of each drone's heading: ahead, left, up. (..., 3)"""
     ahead, left = rotation.heading(data.states.quat)
     parts = [jnp.sum(vector * axis, axis=-1) for axis in (ahead, left)]
     return jnp.stack([*parts, vector[..., 2]], axis=-1)
 
 
 def on_floor(data: SimData) -> Array:
-    """Return True where a drone is on the floor or below. (..., n_drones)"""
+    """Return True where a drone is on or below the floor. (..., n_drones)"""
     return data.states.pos[..., 2] < FLOOR
 
 
@@ -144,7 +143,7 @@ def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
 
 
 def pick_entry(x: Array, index: Array) -> Array:
-    """Return the entry with a given index, by masking all entries, which is faster than indexing.
+    """Return the entry with an index, by masking all entries, which is faster than indexing.
 
     Args:
         x: Entries. (..., n, k)
@@ -170,9 +169,9 @@ def nearest_entries(distance: Array, x: Array, n: int) -> Array:
     """
     entries = []
     for _ in range(n):
-        nearest = lax.argmin(distance, distance.ndim - 1, np.int32)
-        entries.append(pick_entry(x, nearest))
-        distance = jnp.where(nearest[..., None] == np.arange(x.shape[-2], dtype=np.int32), jnp.inf, distance)
+        nearest_index = lax.argmin(distance, distance.ndim - 1, np.int32)
+        entries.append(pick_entry(x, nearest_index))
+        distance = jnp.where(nearest_index[..., None] == np.arange(x.shape[-2], dtype=np.int32), jnp.inf, distance)
     return jnp.stack(entries, axis=-2)
 
 
@@ -183,7 +182,7 @@ def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = Fal
         sim: The simulation.
         record: Record of all worlds, for ``data.plugins["task"]``.
         rules: The stage.
-        collisions: True to disable drones that touch each other, before the stage.
+        collisions: True to disable drones that touch each other, in a stage before ``rules``.
     """
     placements = [StagePlacement(rules, before="increment_steps")]
     if collisions and sim.n_drones > 1:
@@ -196,8 +195,8 @@ def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = Fal
 def collision_stage(sim: Sim) -> Stage:
     """Return a stage that disables drones that touch each other, in the task's record.
 
-    Drones whose ``flight_over`` is true in the record are ignored. The record needs leaves ``disabled`` and
-    ``flight_over``, (n_worlds, n_drones) each.
+    The record needs ``disabled`` and ``flight_over``, (n_worlds, n_drones) each. Drones with ``flight_over`` collide
+    with nothing.
     """
     contacts = sim.scene.contact_fn((), floor=False)
 
@@ -205,11 +204,11 @@ def collision_stage(sim: Sim) -> Stage:
     def collide(data: SimData) -> SimData:
         record, s = data.plugins[TASK_RECORD_NAME], data.states
         flight_over = record.flight_over
-        # For this query only, drones whose flight is over are moved far away from each other and from all others.
+        # For this query only, drones whose flight is over are moved far away, to different heights.
         far_pos = 1000.0 * (1 + np.arange(len(flight_over)))[:, None] * np.array([0.0, 0.0, 1.0])
         query_pos = jnp.where(flight_over[:, None], far_pos.astype(s.pos.dtype), s.pos)
-        hit = contacts(data.replace(states=s.replace(pos=query_pos))).any & ~flight_over
-        return with_record(data, record.replace(disabled=record.disabled | hit))
+        collides = contacts(data.replace(states=s.replace(pos=query_pos))).any & ~flight_over
+        return with_record(data, record.replace(disabled=record.disabled | collides))
 
     return collide
 
@@ -219,11 +218,12 @@ def nearest_drones(data: SimData, n: int, is_visible: Array | None = None) -> tu
 
     Args:
         data: The data of one world.
-        n: Number of others to return; fewer if there are fewer.
-        is_visible: True where a drone can be seen; None for all. Entries for other drones are zero. (n_drones,)
+        n: Largest number of other drones to return, n.
+        is_visible: True where a drone may be returned; None for all drones. Entries of drones that may not are zero.
+            (n_drones,)
 
     Returns:
-        (n_drones, n, 3) each
+        (n_drones, min(n, n_drones - 1), 3) each
     """
     s = data.states
     n_drones = s.pos.shape[0]

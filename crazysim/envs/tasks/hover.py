@@ -18,14 +18,14 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import GoalTask, with_goal
 
 MIDDLE = np.array([0.0, 0.0, 1.2])
-"""Middle of the box that starts and goals are drawn from, m."""
+"""Middle of the box of starts and goals, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hover(GoalTask):
     """Reach a random point and hover there.
 
-    A drone starts in flight, slightly tilted and moving, in a box around (0, 0, 1.2), which also contains its goal. An
+    A drone starts in flight, slightly tilted and moving. Its start and its goal are in a box around (0, 0, 1.2). An
     episode ends when a drone touches the floor, rises above 3 m, or is more than 3 m from the z axis along x or y.
     """
 
@@ -33,11 +33,11 @@ class Hover(GoalTask):
     half_width, height = 3.0, 3.0
 
     reach: float = setting(default=1.0, low=0.0)
-    """Half the width of the box of starts and goals, m; its half height is 0.7 of that."""
+    """Half the width of the box of starts and goals, m; half its height is 0.7 times that."""
     seconds: float = 5.0
     """Length of an episode, s."""
     tolerance: float = 0.05
-    """Distance below which the goal counts as reached, m."""
+    """Distance below which the drone is at its goal, m."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight, and their goals."""
@@ -58,6 +58,5 @@ class Hover(GoalTask):
         }
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return the camera of images and films."""
         del n_drones
         return {"elevation": -20}

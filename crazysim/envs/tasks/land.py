@@ -1,4 +1,4 @@
-"""Land on a pad, which stands still or moves."""
+"""Land on a pad that stands still or moves."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from crazysim.sim.sim import Sim
 PAD = "pad"
 """Name of the pads in the scene, without their numbers."""
 RADIUS, HEIGHT = 0.25, 0.2
-"""Default radius of a pad, and height of its upper side, m."""
+"""Default radius of a pad, and height of its upper side above the floor, m."""
 SPACING = 3.0
 """Distance between the pads of several drones, m; a drone observes its own pad only."""
 HALF_WIDTH, CEILING = 1.4, 2.5
-"""Largest distance from the middle of the pad's path along x and y, and largest height, of a drone, m."""
+"""Largest distance of a drone from the middle of its pad's path along x and y, and largest height of a drone, m."""
 CIRCLE_RADII = (0.3, 0.7)
 """Smallest and largest radius of a moving pad's circle, m."""
 
@@ -40,7 +40,7 @@ class PadLanding(Landing):
     """Path of each drone's pad, and the outcome of its landing."""
 
     circle: Array = leaf("drone", 1)
-    """Radius of the circle that the pad moves on, m; zero for one that stands still. (n_worlds, n_drones, 1)"""
+    """Radius of the circle on which the pad moves, m; zero for a pad that stands still. (n_worlds, n_drones, 1)"""
     ang_vel: Array = leaf("drone", 1)
     """Angular velocity of the pad on the circle, rad/s. (n_worlds, n_drones, 1)"""
     phase: Array = leaf("drone", 1)
@@ -53,18 +53,17 @@ class PadLanding(Landing):
 class Land(TouchDown):
     """Land on a pad, 0.2 m above the floor.
 
-    A drone has landed when it touches the pad from above, within its radius, with at most 0.5 m/s relative to it and a
-    tilt of at most 20 degrees; contact is checked at every physics step. Any other contact is a crash, as is moving
-    more than 1.4 m along x or y from the middle of the pad's path, or above 2.5 m. An episode ends when every drone
-    has landed or crashed.
+    A drone has landed when it touches its pad from above, within the pad's radius, at a relative speed of at most
+    0.5 m/s and a tilt of at most 20 degrees. Contacts are checked at every physics step. Any other contact is a crash.
+    Being more than 1.4 m along x or y from the middle of the pad's path, or higher than 2.5 m, is also a crash. An
+    episode ends when every drone has landed or crashed.
     """
 
     name = "land"
     Record = PadLanding
     target_name = "pad"
-    crash_cost = (
-        2.0  # at 10, the reward of a landing, policies hover next to the pad: few of their first contacts are soft
-    )
+    # At a cost of 10, the reward of a landing, policies hover next to the pad: few of their first contacts are soft.
+    crash_cost = 2.0
     height: ClassVar[float] = HEIGHT
     """Height of the upper side of a pad, m."""
 
@@ -82,7 +81,7 @@ class Land(TouchDown):
 
         @stage("world")
         def move_pads(data: SimData) -> SimData:
-            """Move the pads to their places at the end of this step."""
+            """Move the pads to their positions at the end of this step."""
             pos, vel = self.pad_motion(data, data.core.steps + 1)
             return pads.set_pose(data, pos, vel=vel)
 
@@ -120,7 +119,6 @@ class Land(TouchDown):
         return self.pad_motion(data, data.core.steps + steps_ahead if steps_ahead else data.core.steps)
 
     def has_left_arena(self, data: SimData) -> Array:
-        """Return True where a drone has left its part of the arena. (...)"""
         pos = data.states.pos
         return jnp.any(jnp.abs(pos - self.path_centre(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
 
@@ -129,15 +127,16 @@ class Land(TouchDown):
         return np.concatenate([SPACING * grid_2d(n_drones), np.full((n_drones, 1), self.height)], axis=-1)
 
     def path_centre(self, data: SimData) -> Array:
-        """Return the middle of the path of each drone's pad, of one drone or one world, m. (..., 3)"""
+        """Return the middle of the path of each drone's pad, for the data of one drone or one world, m. (..., 3)"""
         centres = jnp.asarray(self.path_centres(data.core.n_drones), data.states.pos.dtype)
         return pick_entry(centres, data.core.drone_id)
 
     def pad_motion(self, data: SimData, steps: Array) -> tuple[Array, Array]:
-        """Return position, m, and velocity, m/s, of each drone's pad after some steps, of one drone or one world.
+        """Return position, m, and velocity, m/s, of each drone's pad. (..., 3) each
 
-        Returns:
-            (..., 3) each
+        Args:
+            data: Data of one drone or one world.
+            steps: Physics steps since the start of the episode.
         """
         record = landing_of(data)
         angle = record.phase + record.ang_vel * (steps / data.core.freq)
@@ -151,6 +150,5 @@ class Land(TouchDown):
         return (self.target(data)[:, None] + rim).reshape(-1, 3)
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return the camera of images and films."""
         del n_drones
         return {"elevation": -20}

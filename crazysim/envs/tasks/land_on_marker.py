@@ -1,4 +1,4 @@
-"""Land on a marker on the ground, seen by a camera that looks down."""
+"""Land on a marker on the ground that the drone observes with a camera."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from crazysim.envs.tasks.target_camera import TargetCamera
 
 @dataclass(frozen=True, kw_only=True)
 class LandOnMarker(Land):
-    """Land on a marker on the ground, 2 cm thick, seen by a camera that looks down.
+    """Land on a marker on the ground, 2 cm thick, that the drone observes with a camera.
 
     Rules and settings are those of ``land``, with a marker instead of the pad. Policies observe neither the marker's
-    position nor their own position over ground: ``segmentation`` is 1 where a pixel of the camera, which ``make`` adds,
-    shows the marker.
+    position nor the horizontal position of the drone. ``make`` adds a camera that looks down: ``segmentation`` is 1
+    where a pixel shows the marker.
     """
 
     name = "land_on_marker"

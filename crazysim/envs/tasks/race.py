@@ -1,4 +1,4 @@
-"""Race through gates, in their order, without touching anything."""
+"""Race through gates in their order without touching anything."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from crazysim.sim.sim import Sim
 SENSOR_RANGE = 0.7
 """Distance in the plane below which a drone observes the true pose of a gate or obstacle, m."""
 START_JITTER = (0.1, 0.1, 0.05, 0.1, 0.1, 0.1)
-"""Largest offset of a start from its place along x, y and z, m, and largest roll, pitch and yaw, rad."""
+"""Largest offset of a start along x, y and z, m, and largest roll, pitch and yaw at the start, rad."""
 MASS_DEVIATION, INERTIA_DEVIATION = 0.115, 0.04
-"""Largest relative deviation of mass and inertia from the airframe's values, from level 1 on: 5 g and 1e-6 kg m^2 of a
-cf21B_500, as in lsy_drone_racing."""
+"""Largest relative deviations of mass and inertia from the airframe's values, at level 1 and above. For a cf21B_500
+these are 5 g and 1e-6 kg m^2, as in lsy_drone_racing."""
 GATE_JITTER = (0.15, 0.15, 0.1, 0.05, 0.1, 0.2)
-"""Largest displacement along x, y and z, m, and largest roll, pitch and yaw, rad, of a gate from level 2 on."""
+"""Largest displacement of a gate along x, y and z, m, and by roll, pitch and yaw, rad, at level 2 and above."""
 OBSTACLE_JITTER = (0.15, 0.15, 0.05)
-"""Largest displacement of an obstacle along x, y and z from level 2 on, m."""
+"""Largest displacement of an obstacle along x, y and z at level 2 and above, m."""
 FOOT_TO_TOP = np.array([0.0, 0.0, POLE_HEIGHT])
 """Vector from the foot of an obstacle to its upper end, m."""
 
@@ -50,14 +50,14 @@ Rewards = Callable[[SimData, Array, Array], dict[str, Array]]
 class Race(Task):
     """Race through gates among obstacles, by the rules of lsy_drone_racing.
 
-    A gate is passed when its plane is crossed along its x axis within the opening. A drone is disabled when it touches
-    a gate, an obstacle, the floor or another drone, or leaves the arena; contacts are checked at every physics step.
-    The others continue and do not collide with it. An episode ends when every drone is disabled or has passed all
-    gates.
+    A drone passes a gate when it crosses the gate's plane within the opening, in the direction of the gate's x axis. A
+    drone is disabled when it touches a gate, an obstacle, the floor or another drone, or leaves the arena. Contacts are
+    checked at every physics step. The other drones continue, and do not collide with disabled drones. An episode ends
+    when every drone is disabled or has passed all gates.
 
-    | Level | Drawn for every episode |
+    | Level | Random in every episode |
     | --- | --- |
-    | 0 | starts, within 0.1 m, as at all levels |
+    | 0 | start of each drone, within 0.1 m |
     | 1 | also mass and inertia of each drone |
     | 2 | also the displacement of gates and obstacles from their nominal poses |
     | 3 | also the nominal poses |
@@ -69,7 +69,7 @@ class Race(Task):
     level: int = setting(default=0, low=0, high=3)
     """Amount of randomness, 0 to 3."""
     track: Track = field(default_factory=Track)
-    """The course. Level 3 uses only its limits, and the numbers and heights of its gates and obstacles."""
+    """The course. Level 3 uses only the limits of the arena, and numbers and heights of gates and obstacles."""
     sensor_range: float = setting(default=SENSOR_RANGE, low=0.0)
     """Distance in the plane below which a drone observes the true pose of a gate or obstacle, m."""
     seconds: float = 12.0
@@ -77,19 +77,20 @@ class Race(Task):
     reward: Rewards = dense
     """Function that returns the terms of the reward; ``race_rules.sparse`` is an alternative."""
     practice: bool = False
-    """True to start anywhere on the course, for learning: with equal probability at the start or behind any gate except
-    the last, with the gates up to there passed. Several drones all begin at the start, or behind different gates."""
+    """True to start anywhere on the course, for learning: with equal probability at the start or just behind any gate
+    except the last. The gates up to there are passed. Several drones all begin at the start, or behind different
+    gates."""
 
     def install(self, sim: Sim) -> None:
         if self.practice and sim.n_drones >= max(self.track.n_gates, 2):
             raise ConfigError(
                 f"expected fewer drones than gates for practice, got {sim.n_drones} drones and {self.track.n_gates} "
-                f"gates: they start behind different gates. Use practice=False."
+                f"gates: drones start behind different gates. Use practice=False."
             )
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
         course = check_track(self.track, sim.n_drones, float(jitter), self.level == 3)
         stand_height = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]
-        # All posts have the same length, so that they are computed as one batch; they extend below the floor.
+        # Posts of all gates have the same length, so that they are computed as one batch; most extend below the floor.
         gates = sim.scene.add("gate", count=course.n_gates, pos=course.gates_pos, quat=self._gates_quat(),
                               stand=stand_height, width=OPENING, height=OPENING)  # fmt: skip
         obstacles_pos = np.asarray(course.obstacles_pos, float) - FOOT_TO_TOP
@@ -122,7 +123,7 @@ class Race(Task):
 
         @stage("drone")
         def update_record(data: SimData) -> SimData:
-            """Disable a drone that touches something or leaves the arena; else count the gate that it passes."""
+            """Disable a drone that touches something or leaves the arena; otherwise count a gate that it passes."""
             record, pos = race_of(data), data.states.pos
             has_left = jnp.any((pos < low) | (pos > high), axis=-1)
             disabled = record.disabled | (~record.finished & (has_left | contacts(data).any))
@@ -132,7 +133,7 @@ class Race(Task):
         install_rules(sim, record, update_record, collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight at the start, and gates and obstacles in their places."""
+        """Return drones in flight, and gates and obstacles with the displacements and inertias of the level."""
         course, n_drones, dtype = self.track, data.core.n_drones, data.states.pos.dtype
         sizes: dict[str, int | tuple[int, ...]] = {"start": (n_drones, 6)}
         if self.level >= 1:
@@ -185,7 +186,7 @@ class Race(Task):
         return jnp.all(race_of(data).flight_over)
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the next gate, m; zero where all are passed."""
+        """Return the distance from the next gate, m; zero where all gates are passed."""
         return rules.next_gate_distance(data)
 
     def info(self, data: SimData) -> dict[str, Array]:
@@ -203,7 +204,7 @@ class Race(Task):
         return race_of(data).finished
 
     def _gates_quat(self) -> np.ndarray:
-        with jax.ensure_compile_time_eval():  # an array, also while a step is traced
+        with jax.ensure_compile_time_eval():  # returns an array even while a step is traced
             return np.asarray(jax.jit(rotation.from_rpy)(host_array(self.track.gates_rpy, self.track.n_gates, 3)))
 
     def _displace_objects(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Array]:
@@ -223,11 +224,11 @@ class Race(Task):
 
 
 def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
-    """Repeat parameters for every drone, by name and number of dimensions."""
+    """Repeat parameters of a simulation for every drone; ``names`` has their numbers of dimensions by name."""
 
     def repeat_params(data: SimData) -> SimData:
         params, shape, per_drone = data.params, data.states.pos.shape[:2], {}
-        for name, ndim in names.items():  # they may be one per drone already
+        for name, ndim in names.items():  # a parameter may already have one value per drone
             value = getattr(params, name)
             per_drone[name] = device_array(np.broadcast_to(value, (*shape, *value.shape[-ndim:])), value.dtype)
         return data.replace(params=params.replace(**per_drone))
@@ -236,7 +237,7 @@ def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
 
 
 def _randomize_inertia(params: SimParams, x: Array) -> SimParams:
-    """Return parameters with masses and inertias randomised by numbers in [-1, 1]. (n_drones, 4)"""
+    """Return parameters with randomised masses and inertias; ``x`` are numbers in [-1, 1]. (n_drones, 4)"""
     mass = params.mass * (1 + MASS_DEVIATION * x[..., :1])
     root = jnp.sqrt(1 + INERTIA_DEVIATION * x[..., 1:])
     scale = root[..., :, None] * root[..., None, :]
@@ -244,11 +245,12 @@ def _randomize_inertia(params: SimParams, x: Array) -> SimParams:
 
 
 def _pos_behind_gate(data: SimData, passed: Array, x: Array) -> tuple[Array, Array]:
-    """Return positions just behind the last gates passed, m, and velocities, m/s, which are zero where none is passed.
+    """Return positions 0.15 to 0.3 m behind the last gates passed, m, and velocities along the gates' axes, m/s.
 
     Args:
         data: The data of one world.
-        passed: Number of gates passed. (n_drones,)
+        passed: Number of gates passed; where it is zero, positions are behind the first gate and velocities are zero.
+            (n_drones,)
         x: Numbers in [0, 1). (n_drones, 2)
 
     Returns:

@@ -1,4 +1,4 @@
-"""Race through gates, seeing them by a depth image."""
+"""Race through gates that the drone observes in a depth image."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from crazysim.envs.tasks.race_rules import gates_of, next_gate, race_of
 from crazysim.plugins.sensors.camera import Camera
 
 AWAY_COST = 0.03
-"""Cost of an environment step for 1 minus the cosine of the angle between the camera's axis and the next gate."""
+"""Cost per environment step of looking away: factor of 1 - cos(angle between the camera's axis and the next gate)."""
 HASTE_COST = 0.1
-"""Cost of an environment step for each m/s beyond the task's speed. It exceeds the reward for faster progress: without
-it policies at body rates reach the side of a gate faster than they can turn, and end there."""
+"""Cost per environment step and m/s of a speed above the task's. It exceeds the reward of faster progress. Without the
+cost, policies with body rate commands reach the side of a gate faster than they can turn, and hit the frame."""
 PRIVILEGED_NAMES = ("gate_corners", "obstacles_near")
-"""Observations of the race that a privileged critic gets, and with ``gates_observed`` the policy."""
+"""Observations of the race for a critic, and with ``gates_observed`` also for the policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RaceByCamera(Race):
-    """Race by the rules of ``race``, seeing gates and obstacles in the depth image of a camera, which ``make`` adds.
+    """Race by the rules of ``race`` with a camera on each drone, which ``make`` adds.
 
-    Policies observe neither positions of gates and obstacles nor their own position over ground. The reward has two
-    more terms, costs of looking away from the next gate and of flying faster than ``speed``. Drones begin facing the
-    first gate, and in practice along the axis of the gate that they have passed. The setting ``sensor_range`` has no
-    effect.
+    Policies observe gates and obstacles in depth images only, and do not observe the horizontal position of the drone.
+    The reward has two more terms, costs of looking away from the next gate and of flying faster than ``speed``. Drones
+    at the start face the first gate; drones that start behind a gate look along its axis. The setting ``sensor_range``
+    has no effect.
     """
 
     name = "race_by_camera"
 
     speed: float = setting(default=1.5, positive=True)
-    """Speed up to which flying costs nothing, m/s."""
+    """Speed above which flying faster costs reward, m/s."""
     gates_observed: bool = False
-    """True for true positions of gates and obstacles among the observations, for a teacher."""
+    """True to add true positions of gates and obstacles to the observations, for a teacher."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         data = super().spawn(data, key)
@@ -56,9 +56,9 @@ class RaceByCamera(Race):
         return flying(data, s.pos, rotation.multiply(yaw_quat, s.quat), s.vel)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return attitude, velocity and angular velocity in the body frame, height, and which gate is the next.
+        """Return attitude, velocity and angular velocity in the body frame, height, and the number of the next gate.
 
-        ``next_gate`` has a 1 for the next gate and 0 for the others; it is zero where all are passed.
+        ``next_gate`` has 1 at the index of the next gate and 0 elsewhere; all entries are 0 where all gates are passed.
         """
         s, record = data.states, race_of(data)
         matrix = rotation.matrix(s.quat)

@@ -1,4 +1,4 @@
-"""Observations of the race: true poses of gates and obstacles that a drone has come near, nominal poses of others.
+"""Observations of the race, with true poses of gates and obstacles that the drone has been near, else nominal poses.
 
 All functions take the data of one world.
 """
@@ -15,11 +15,11 @@ from crazysim.envs.tasks.goals import nearest_drones, nearest_entries, pick_entr
 from crazysim.envs.tasks.race_rules import OPENING, gates_of, obstacles_of, race_of
 
 CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]])
-"""Corners of the opening in the gate's frame, m. (4, 3)"""
+"""Corners of a gate's opening in the gate's frame, m. (4, 3)"""
 
 
 def visited_objects(data: SimData, sensor_range: float) -> tuple[Array, Array]:
-    """Return True for gates and obstacles that each drone is or has been near. (n_drones, n) each"""
+    """Return masks of the gates and of the obstacles that each drone is or has been near. (n_drones, n) each"""
     record = race_of(data)
 
     def is_near(pos: Array) -> Array:
@@ -30,12 +30,16 @@ def visited_objects(data: SimData, sensor_range: float) -> tuple[Array, Array]:
 
 
 def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
-    """Return the observations of lsy_drone_racing, each flattened per drone, and further ones for small networks.
+    """Return the observations of lsy_drone_racing, and more observations that suit small networks. (n_drones, k) each
 
-    The further ones are ``rot``, the attitude as a matrix, body to world (9); and in the drone's frame ``vel_body``,
-    m/s (3), ``gate_corners``, vectors to the corners of the next two gates, m (24), ``obstacles_near``, horizontal
-    vectors to the axes of the nearest two poles, m (6), and with several drones ``drones_near``, vectors to the nearest
-    two that are still in the race, m (6, or 3 with two drones). Gates and poles have their observed poses.
+    The additional observations, in the body frame unless stated and with observed poses of gates and obstacles, are
+
+    - ``rot``: rotation matrix, body to world (9);
+    - ``vel_body``: velocity, m/s (3);
+    - ``gate_corners``: vectors to the corners of the next two gates, m (24);
+    - ``obstacles_near``: vectors to the axes of the nearest two obstacles, horizontal in the world, m (6);
+    - ``drones_near``, with several drones: vectors to the nearest two drones that are still in the race, m (6, or 3
+      with two drones).
     """
     record, s, n_drones = race_of(data), data.states, data.core.n_drones
     gates_pos, gates_quat, poles = (

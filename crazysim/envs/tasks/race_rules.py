@@ -1,4 +1,4 @@
-"""Rules of the race: gates and obstacles of a course, progress of each drone, and rewards for it.
+"""Rules of the race: gates and obstacles of a course, progress of each drone, and rewards of progress.
 
 All functions take the data of one world or, without the axis of drones, of one drone.
 """
@@ -20,37 +20,38 @@ from crazysim.scene.objects import Handle
 OPENING = 0.45
 """Width and height of a gate's opening, m."""
 POLE_HEIGHT = 1.7
-"""Length of an obstacle, m; if its upper end is lower than that, the rest is below the floor."""
+"""Length of an obstacle, m; if its upper end is lower than this length, its lower part is below the floor."""
 BYPASS_DISTANCE = 0.45
-"""Distance from the middle of a gate at which a detour passes its frame, m."""
+"""Distance from the middle of a gate at which the way around the frame passes it, m."""
 FUNNEL_RADIUS = 0.15
-"""Radius of the funnel before a gate, in the gate's plane, m; it grows by 1 m per metre of distance from the plane.
-Within the funnel, the way to the gate has no detour."""
+"""Radius, in the gate's plane, of a funnel in front of the gate, m. The radius grows by 1 m per metre of distance from
+the plane. Positions in the funnel have a straight way to the gate."""
 
 
 class RaceRecord(PyTree):
-    """Progress of each drone, and what it has observed of the course."""
+    """Progress of each drone, and the gates and obstacles that it has been near."""
 
     passed: Array = leaf("drone", 0)
-    """Number of gates passed, which is the index of the next. (n_worlds, n_drones)"""
+    """Number of gates passed, which is the index of the next gate. (n_worlds, n_drones)"""
     disabled: Array = leaf("drone", 0)
     """True where the drone has touched something, or left the arena. (n_worlds, n_drones)"""
     last_pos: Array = leaf("drone", 1)
     """Position one physics step ago, m. (n_worlds, n_drones, 3)"""
     gates_visited: Array = leaf("drone", 1)
-    """True for gates that it was near before this environment step. (n_worlds, n_drones, n_gates)"""
+    """True for gates that the drone was near before this environment step. (n_worlds, n_drones, n_gates)"""
     obstacles_visited: Array = leaf("drone", 1)
-    """True for obstacles that it was near before this environment step. (n_worlds, n_drones, n_obstacles)"""
+    """True for obstacles that the drone was near before this environment step. (n_worlds, n_drones, n_obstacles)"""
     passed_before: Array = leaf("drone", 0)
     """Number of gates passed before this environment step. (n_worlds, n_drones)"""
     flight_over_before: Array = leaf("drone", 0)
-    """True where it was finished or disabled before this environment step. (n_worlds, n_drones)"""
+    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
     remaining_way_before: Array = leaf("drone", 0)
-    """Way to go before this environment step, m. (n_worlds, n_drones)"""
+    """Result of ``remaining_way`` before this environment step, m. (n_worlds, n_drones)"""
     nominal_pos: Array | None = leaf("world", 2)
-    """Nominal positions of gates, then of obstacles, m; None if they are the true ones. (n_worlds, 1, n, 3)"""
+    """Nominal positions of gates, then of upper ends of obstacles, m; None if objects are not displaced.
+    (n_worlds, 1, n, 3)"""
     nominal_quat: Array | None = leaf("world", 2)
-    """Nominal attitudes of gates, xyzw; None if they are the true ones. (n_worlds, 1, n_gates, 4)"""
+    """Nominal attitudes of gates, xyzw; None if objects are not displaced. (n_worlds, 1, n_gates, 4)"""
     gates: Handle = static()
     """Handle of the gates, in their order."""
     obstacles: Handle = static()
@@ -63,7 +64,7 @@ class RaceRecord(PyTree):
 
     @property
     def flight_over(self) -> Array:
-        """True where a drone is finished or disabled. (n_worlds, n_drones)"""
+        """True where a drone has finished or is disabled. (n_worlds, n_drones)"""
         return self.finished | self.disabled
 
 
@@ -87,7 +88,7 @@ def obstacles_of(data: SimData) -> Array:
 
 
 def next_gate(data: SimData) -> tuple[Array, Array]:
-    """Return position and attitude of each drone's next gate, the last one where it has finished. (..., 3), (..., 4)"""
+    """Return position, m (..., 3), and attitude, xyzw (..., 4), of each drone's next gate; the last after finishing."""
     pos, quat = gates_of(data)
     index = jnp.minimum(race_of(data).passed, pos.shape[-2] - 1)
     return pick_entry(pos, index), pick_entry(quat, index)
@@ -105,13 +106,13 @@ def passes_gate(data: SimData) -> Array:
 
 
 def next_gate_distance(data: SimData) -> Array:
-    """Return the distance to the middle of the next gate, m; zero where all are passed. (n_drones,)"""
+    """Return the distance to the middle of the next gate, m; zero where all gates are passed. (n_drones,)"""
     pos, _ = next_gate(data)
     return jnp.where(race_of(data).finished, 0, rotation.safe_norm(data.states.pos - pos)[..., 0])
 
 
 def remaining_way(data: SimData) -> Array:
-    """Return the length of the way to the end of the course through the middles of the gates, m. (n_drones,)"""
+    """Return the length of the way through the middles of all gates that are not passed, m. (n_drones,)"""
     record = race_of(data)
     pos, quat = gates_of(data)
     legs = way_to_gate(rotation.rotate_inverse(quat[..., 1:, :], pos[..., :-1, :] - pos[..., 1:, :]))
@@ -122,9 +123,10 @@ def remaining_way(data: SimData) -> Array:
 
 
 def way_to_gate(pos: Array) -> Array:
-    """Return the length of the way to a gate's middle, with a detour from the side and around the frame from behind, m.
+    """Return the length of the way to a gate's middle that avoids the frame, m.
 
-    With the straight-line distance, a drone next to the frame would seem close, although the frame is in its way.
+    In front of the gate it is longer than the straight line for positions outside of the funnel (``FUNNEL_RADIUS``).
+    Behind the gate it leads around the frame.
 
     Args:
         pos: Position in the gate's frame, m. (..., 3)
@@ -141,7 +143,7 @@ def way_to_gate(pos: Array) -> Array:
 
 
 def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-    """Return rewards for progress, m, and gates, and costs of turning, changing actions and being disabled."""
+    """Return rewards of progress and of gates, and costs of turning, of changing actions and of being disabled."""
     record = race_of(data)
     reward_terms = {
         "progress": 2.0 * (record.remaining_way_before - remaining_way(data)),
@@ -154,7 +156,7 @@ def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
 
 
 def sparse(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-    """Return 1 for each gate passed and -1 when the drone is disabled."""
+    """Return a reward of 1 for each gate passed in the step, and of -1 when the drone is disabled."""
     del action, last_action
     record, dtype = race_of(data), data.states.pos.dtype
     gates, disabled = (record.passed - record.passed_before).astype(dtype), record.disabled.astype(dtype)

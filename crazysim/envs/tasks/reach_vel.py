@@ -1,4 +1,4 @@
-"""Fly with a given velocity."""
+"""Fly with a target velocity."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from crazysim.envs.tasks.goals import Goal, goal_of, install_goal, on_floor, sta
 from crazysim.sim.sim import Sim
 
 HEIGHT = 5.0
-"""Height of the start, m; enough to descend for a whole episode with usual values of ``speed``."""
+"""Height of the start, m; with the default settings it is enough to descend for a whole episode."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,17 +35,17 @@ class ReachVel(Task):
     Record = Goal
 
     speed: float = setting(default=1.0, low=0.0)
-    """Largest component of the target velocity, m/s; the vertical one is at most a quarter of that."""
+    """Largest x and y component of the target velocity, m/s; z is at most a quarter of that."""
     seconds: float = 4.0
     """Length of an episode, s."""
     tolerance: float = 0.1
-    """Difference below which the velocity counts as reached, m/s."""
+    """Difference below which the drone has the target velocity, m/s."""
 
     def install(self, sim: Sim) -> None:
         install_goal(sim)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight, and the velocities they should reach."""
+        """Return drones in flight, and their target velocities."""
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, ang_vel=3, goal=3)
         start = scale_symmetric(x["start"], np.array([1.0, 1.0, 0.0])) + np.array([0.0, 0.0, HEIGHT])
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.2))

@@ -23,7 +23,10 @@ GOAL = np.array([0.0, 0.0, 3.0])
 
 @dataclass(frozen=True, kw_only=True)
 class Recover(GoalTask):
-    """Catch a thrown drone, with any attitude, speed and spin, and hover at (0, 0, 3)."""
+    """Catch a thrown drone, and hover at (0, 0, 3). It starts with random attitude, velocity and angular velocity.
+
+    An episode ends when a drone touches the floor, rises above 8 m, or is more than 8 m from the z axis along x or y.
+    """
 
     name = "recover"
     half_width, height = 8.0, 8.0
@@ -35,10 +38,10 @@ class Recover(GoalTask):
     seconds: float = 5.0
     """Length of an episode, s."""
     tolerance: float = 0.1
-    """Distance below which the goal counts as reached, m."""
+    """Distance below which the drone is at its goal, m."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones just thrown, and their goals."""
+        """Return drones that were just thrown, and their goals."""
         x = draw(key, data.core.n_drones, start=3, vel=3, ang_vel=3, attitude=3)
         goal = GOAL.astype(data.states.pos.dtype)
         pos = goal + 2 * x["start"] - 1

@@ -1,4 +1,4 @@
-"""Change places, or form a formation, at a distance from each other and out of each other's downwash."""
+"""Change places, or form a formation, without coming too close or into each other's downwash."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 SEPARATION = (0.24, 0.24, 0.6)
-"""Half axes of the ellipsoid around a drone that no other's centre may enter, m: twice the radii of 0.12 m across and
-0.3 m along the thrust with which Preiss, Hoenig, Ayanian and Sukhatme (Downwash-aware trajectory planning for large
-quadrotor teams, 2017) describe a Crazyflie."""
+"""Half axes of the ellipsoid around a drone that the centre of another drone may not enter, m. They are twice the radii
+that Preiss, Hoenig, Ayanian and Sukhatme (Downwash-aware trajectory planning for large quadrotor teams, 2017) give for
+a Crazyflie: 0.12 m across the thrust and 0.3 m along it."""
 CROWDING_SEPARATION = 2.5
 """Separation below which another drone costs reward, in half axes of the ellipsoid. With 1.5, drones that cross the
-middle evade too late: a third of the episodes ended in a crash."""
+middle evade too late: a third of the episodes end in a crash."""
 MIN_START_SPACING = 0.9
 """Smallest distance between neighbours on the circle of the starts, and smallest radius of the circle, m."""
 HEIGHT = 1.2
@@ -42,7 +42,7 @@ START_JITTER = 0.1
 
 
 class SwarmRecord(PyTree):
-    """Goal of each drone, and how close others have come to it."""
+    """Goal of each drone, and its smallest separation from other drones."""
 
     goal: Array = leaf("drone", 1)
     """Position that the drone should take, m. (n_worlds, n_drones, 3)"""
@@ -54,11 +54,11 @@ class SwarmRecord(PyTree):
 class Swarm(Task):
     """Change places on a circle, or form a formation, at a distance from each other.
 
-    The drones start on a circle that is turned at random. Without a formation, all of them must move by the same random
-    number of places along the circle. No drone may enter the ellipsoid around another, with half axes of 0.24 m
-    horizontally and 0.6 m vertically because of the downwash; that is checked at every physics step. An episode ends
-    when a drone enters one, if ``strict``, when it touches the floor, or when it leaves the arena, whose limits are
-    1.5 m beyond the circle and the formation.
+    The drones start on a circle that is turned at random. Without a formation, the goal of each drone is the start of
+    another drone, the same random number of places further along the circle. Two drones are too close if one of them is
+    in the ellipsoid around the other, with half axes of 0.24 m horizontally and, because of the downwash, 0.6 m
+    vertically. This is checked at every physics step. An episode ends when two drones are too close (if ``strict``), or
+    when a drone touches the floor or leaves the arena, which extends 1.5 m beyond the circle and the formation.
     """
 
     name = "swarm"
@@ -69,14 +69,13 @@ class Swarm(Task):
     n_seen: int = setting(default=3, low=1)
     """Largest number of nearest other drones that a drone observes."""
     strict: bool = True
-    """True to end an episode when two drones come too close; they are penalised in any case."""
+    """True to end an episode when two drones are too close. Being too close costs reward in any case."""
     seconds: float = 8.0
     """Length of an episode, s."""
     tolerance: float = 0.1
-    """Distance below which a drone counts as in its place, m."""
+    """Distance below which a drone is at its goal, m."""
 
     def install(self, sim: Sim) -> None:
-        """Add the record and the stage that tracks the separation at every physics step."""
         if sim.n_drones < 2:
             raise ConfigError(f"expected at least two drones in a swarm, got {sim.n_drones}. Use n_drones=2 or more.")
         if self.formation is not None:
@@ -107,7 +106,7 @@ class Swarm(Task):
         x = draw(key, turn=1, places=1, drones=(n, 9))
         offset, rpy, vel = jnp.split(2 * x["drones"] - 1, 3, axis=-1)
         start_angle = 2 * jnp.pi * (x["turn"] + np.arange(n, dtype=dtype) / n)
-        # All drones move on by the same number of places, from 1 to n - 1.
+        # All drones move by the same number of places, from 1 to n - 1.
         places = 1 + jnp.floor((n - 1) * x["places"])
         goal_angle = start_angle + 2 * jnp.pi * places / n
         goal = (
@@ -121,7 +120,7 @@ class Swarm(Task):
         return with_record(data, SwarmRecord(goal, separation(data.states.pos)))
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, the way to its goal, and the nearest other drones, m and m/s."""
+        """Return the drone's state, the vector to its goal, m, and relative motion of other drones, m and m/s."""
         relative_pos, relative_vel = (x.reshape(x.shape[0], -1) for x in nearest_drones(data, self.n_seen))
         return state_of(data) | {
             "difference_to_goal": swarm_of(data).goal - data.states.pos,
@@ -141,7 +140,11 @@ class Swarm(Task):
         }
 
     def is_lost(self, data: SimData) -> Array:
-        """Return True where a drone is on the floor, outside of the arena, or too close to another. (n_drones,)"""
+        """Return True where a drone is on the floor, outside of the arena, or, if ``strict``, was too close to another.
+
+        Returns:
+            (n_drones,)
+        """
         pos = data.states.pos
         is_outside = jnp.any(jnp.abs(pos) > self.limits(data.core.n_drones).astype(pos.dtype), axis=-1)
         return on_floor(data) | is_outside | (self.strict & (swarm_of(data).closest < 1))
@@ -154,7 +157,6 @@ class Swarm(Task):
         return np.maximum(radius, np.abs(np.asarray(self.formation, float)).max(axis=0)) + ARENA_MARGIN
 
     def terminated(self, data: SimData) -> Array:
-        """Return True where a drone is lost."""
         return jnp.any(self.is_lost(data))
 
     def error(self, data: SimData) -> Array:
@@ -162,18 +164,15 @@ class Swarm(Task):
         return rotation.safe_norm(swarm_of(data).goal - data.states.pos)[..., 0]
 
     def info(self, data: SimData) -> dict[str, Array]:
-        """Return the smallest separation so far."""
         return {"separation": swarm_of(data).closest}
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return a camera that shows the whole circle."""
         return {"lookat": (0, 0, 1.0), "distance": 4.0 + 2 * circle_radius(n_drones), "elevation": -35}
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:
         return with_record(data, swarm_of(data).replace(goal=pos))
 
     def target(self, data: SimData) -> Array:
-        """Return the goal, m."""
         return swarm_of(data).goal
 
 
@@ -185,21 +184,21 @@ def swarm_of(data: SimData) -> SwarmRecord:
 def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndarray:
     """Return a validated formation as an array. (n_drones, 3)"""
     try:
-        slots = np.asarray(formation, float)
+        goals = np.asarray(formation, float)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"expected a formation of shape ({n_drones}, 3), got {formation!r}") from error
-    if slots.shape != (n_drones, 3) or not np.all(np.isfinite(slots)):
-        raise ConfigError(f"expected a formation of finite numbers ({n_drones}, 3), m, got shape {slots.shape}")
-    if slots[:, 2].min() < 0.2:
-        raise ConfigError(f"expected a formation at least 0.2 m over the floor, got {slots[:, 2].min()} m")
-    separations = np.asarray(separation(jnp.asarray(slots)))
+    if goals.shape != (n_drones, 3) or not np.all(np.isfinite(goals)):
+        raise ConfigError(f"expected a formation of finite numbers ({n_drones}, 3), m, got shape {goals.shape}")
+    if goals[:, 2].min() < 0.2:
+        raise ConfigError(f"expected a formation at least 0.2 m above the floor, got {goals[:, 2].min()} m")
+    separations = np.asarray(separation(jnp.asarray(goals)))
     if separations.min() < 1.2:
         pair = sorted(np.argsort(separations)[:2].tolist())
         raise ConfigError(
             f"expected places of the formation at least 1.2 times the smallest separation apart, {SEPARATION[0]} m "
             f"horizontally and {SEPARATION[2]} m vertically, got {separations.min():.2f} between places {pair}"
         )
-    return slots
+    return goals
 
 
 def circle_radius(n_drones: int) -> float:
@@ -214,7 +213,7 @@ def circle_points(angle: Array, n_drones: int) -> Array:
 
 
 def separation(pos: Array) -> Array:
-    """Return the distance to the nearest other drone in half axes of the ellipsoid; below 1 it is too close.
+    """Return the distance to the nearest other drone in half axes of the ellipsoid; a value below 1 is too close.
 
     Args:
         pos: Positions of a world's drones, m. (..., n_drones, 3)

@@ -1,4 +1,4 @@
-"""Camera whose segmentation shows the target of each drone, such as its car, and nothing else."""
+"""Camera with a segmentation of the target of each drone, such as its car."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from crazysim.plugins.sensors.image_sensor import ImageFn, Images
 
 
 class TargetCamera(Camera):
-    """Camera whose segmentation is 1 where a pixel shows the drone's target, and 0 elsewhere.
+    """Camera with a segmentation that is 1 where a pixel shows the drone's target, and 0 elsewhere.
 
-    Drones are invisible.
+    By default, its images do not show drones.
     """
 
     _: dataclasses.KW_ONLY
     target: str = ""
-    """Name of the targets without their numbers; object i of this name is the target of drone i."""
+    """Name of the targets without their numbers: ``{target}:{i}`` is the target of drone i."""
     outputs: Sequence[str] = ("segmentation",)
     drones: bool = False
 
@@ -32,7 +32,7 @@ class TargetCamera(Camera):
         return {k: x | ({"unit": "1", "far": 0} if k == "segmentation" else {}) for k, x in formats.items()}
 
     def image_fn(self, sim: Simulation) -> ImageFn:
-        take_all_bodies, names = super().image_fn(sim), self.segment_names(sim)
+        take_segmented_images, names = super().image_fn(sim), self.segment_names(sim)
         targets = [f"{self.target}:{k}" for k in range(sim.n_drones)]
         if missing := [name for name in targets if name not in names]:
             raise ConfigError(
@@ -42,7 +42,7 @@ class TargetCamera(Camera):
         target_indices = np.array([names.index(name) for name in targets], np.int32)[:, None, None]
 
         def take_images(data: SimData) -> Images:
-            images = take_all_bodies(data)
+            images = take_segmented_images(data)
             if "segmentation" not in images:
                 return images
             is_target = images["segmentation"] == target_indices

@@ -1,4 +1,4 @@
-"""Landing on a place that may stand still or move: the outcome, observations and rewards."""
+"""Landing on a target that stands still or moves, such as a pad or a roof: outcome, observations and rewards."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.contact_report import ContactFn
 
 MAX_TOUCH_DOWN_SPEED = 0.5
-"""Largest speed relative to the place at touch-down, m/s."""
+"""Largest speed relative to the target at touch-down, m/s."""
 MIN_UP_AXIS_Z = np.cos(np.pi / 9)
-"""Smallest vertical component of the body z axis at touch-down: 20 degrees of tilt."""
+"""Smallest vertical component of the body z axis at touch-down, at a tilt of 20 degrees."""
 
 
 class Landing(PyTree):
@@ -30,11 +30,11 @@ class Landing(PyTree):
     landed: Array = leaf("drone", 0)
     """True where the drone has touched down softly. (n_worlds, n_drones)"""
     crashed: Array = leaf("drone", 0)
-    """True where it has touched anything in another way, or left its part of the arena. (n_worlds, n_drones)"""
+    """True where the drone has touched anything in another way, or left its arena. (n_worlds, n_drones)"""
     flight_over_before: Array = leaf("drone", 0)
-    """True where it had landed or crashed before this environment step. (n_worlds, n_drones)"""
+    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
     remaining_way_before: Array = leaf("drone", 0)
-    """Distance from its place before this environment step, m. (n_worlds, n_drones)"""
+    """Distance from the target before this environment step, m. (n_worlds, n_drones)"""
 
     @property
     def flight_over(self) -> Array:
@@ -44,16 +44,16 @@ class Landing(PyTree):
 
 @dataclass(frozen=True, kw_only=True)
 class TouchDown(Task):
-    """Base of tasks in which every drone lands on a place of its own, which may move.
+    """Base of tasks in which every drone lands on its own target, which may move.
 
     Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``target_motion`` and ``has_left_arena``.
     """
 
     Record = Landing
     target_name: ClassVar[str] = "place"
-    """Name of the place in observations: ``difference_to_{target_name}``."""
+    """Name of the target in observations: ``difference_to_{target_name}``."""
     progress_reward: ClassVar[float] = 2.0
-    """Reward of a metre of progress towards the place."""
+    """Reward of a metre of progress towards the target."""
     crash_cost: ClassVar[float] = 10.0
     """Cost of a crash."""
 
@@ -61,25 +61,25 @@ class TouchDown(Task):
     """Length of an episode, s."""
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
-        """Return position, m, and velocity, m/s, of each drone's place, world frame. (..., 3) each
+        """Return position, m, and velocity, m/s, of each drone's target, world frame. (..., 3) each
 
         Args:
-            data: One world, or one drone.
-            steps_ahead: Physics steps to add to ``steps`` for a place whose motion is a function of time: 1 in a stage
-                after the integration and before ``steps`` increases.
+            data: Data of one drone or one world.
+            steps_ahead: Physics steps to add to ``data.core.steps``, for targets that move as a function of time. It is
+                1 in a stage after the integration and before ``increment_steps``.
         """
         raise NotImplementedError(self._undefined("target_motion(data)"))
 
     def has_left_arena(self, data: SimData) -> Array:
-        """Return True where a drone has left its part of the arena. (...)"""
+        """Return True where a drone has left its arena. (...)"""
         raise NotImplementedError(self._undefined("has_left_arena(data)"))
 
     def touch_down_stage(self, contacts: ContactFn, radius: float, scope: str = "drone") -> Stage:
-        """Return the stage that decides at the first contact whether it is a landing; runs before ``steps`` increases.
+        """Return the stage that records landings and crashes, to be placed before ``increment_steps``.
 
         Args:
-            contacts: Contacts with floor and objects; object i belongs to drone i.
-            radius: Largest horizontal distance from the middle of the place at touch-down, m.
+            contacts: Contacts with floor and objects; object i is the target of drone i.
+            radius: Largest horizontal distance from the middle of the target at touch-down, m.
             scope: Scope of the stage: ``drone``, or ``world`` for objects that a population moves.
         """
 
@@ -114,11 +114,11 @@ class TouchDown(Task):
         )
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, the vector to its place, m, and the place's relative velocity, m/s."""
+        """Return the drone's state, the vector to its target, m, and the target's relative velocity, m/s."""
         return state_of(data) | self.relative_target_motion(data)
 
     def relative_target_motion(self, data: SimData) -> dict[str, Array]:
-        """Return the vector to each drone's place, m, and the place's relative velocity, m/s, as observations."""
+        """Return the vector to each drone's target, m, and the target's relative velocity, m/s, as observations."""
         pos, vel = self.target_motion(data)
         return {
             f"difference_to_{self.target_name}": pos - data.states.pos,
@@ -142,7 +142,7 @@ class TouchDown(Task):
         return jnp.all(landing_of(data).flight_over)
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the place, m."""
+        """Return the distance from the target, m."""
         return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
 
     def info(self, data: SimData) -> dict[str, Array]:
@@ -161,7 +161,7 @@ def landing_of(data: SimData) -> Any:
 
 
 def initial_outcome(data: SimData) -> dict[str, Array]:
-    """Return the fields of ``Landing`` for drones in the air, of all worlds."""
+    """Return the fields of ``Landing`` for all worlds before any landing or crash, by name."""
     pos = data.states.pos
     zero, false = device_array(np.zeros(pos.shape[:2]), pos.dtype), device_array(np.zeros(pos.shape[:2]), bool)
     return {"landed": false, "crashed": false, "flight_over_before": false, "remaining_way_before": zero}

@@ -27,7 +27,7 @@ from crazysim.trajectories import Trajectory, figure_eight
 MAX_ERROR = 1.5
 """Distance from the trajectory at which an episode ends, m."""
 MAX_SAMPLES = 1000
-"""Largest number of future samples; they are 3,000 numbers of an observation."""
+"""Largest number of future samples; an observation then has 3,000 numbers of samples."""
 MAX_START_TIME = 20.0
 """Latest time on the trajectory at which an episode starts, s."""
 
@@ -43,8 +43,8 @@ class TrajectoryStart(PyTree):
 class TrackTrajectory(Task):
     """Follow a trajectory.
 
-    A drone starts near a random point of the trajectory, and observes the next samples of it. An episode ends when a
-    drone touches the floor, or is more than 1.5 m away from its position on the trajectory.
+    A drone starts near a random point of the trajectory, and observes the next samples of the trajectory. An episode
+    ends when a drone touches the floor, or is more than 1.5 m away from its position on the trajectory.
     """
 
     name = "track"
@@ -61,9 +61,9 @@ class TrackTrajectory(Task):
     seconds: float = 10.0
     """Length of an episode, s."""
     tolerance: float = 0.05
-    """Distance below which the drone counts as on the trajectory, m."""
+    """Distance below which the drone is on the trajectory, m."""
     hold: float = 5.0
-    """Time at the end of an episode during which it must stay there, s."""
+    """Time at the end of an episode during which the drone must stay on the trajectory, s."""
 
     def install(self, sim: Sim) -> None:
         self.add_record(
@@ -99,10 +99,10 @@ class TrackTrajectory(Task):
         return [x[..., :3] for x in evaluate(t)]
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, the differences from the trajectory, and vectors to its next samples, m."""
+        """Return the drone's state, and vectors to its target, m, to the target velocity, m/s, and to samples, m."""
         t, s = self.time(data), data.states
         times = t[..., None] + (self.spacing * np.arange(1 + self.n_samples)).astype(t.dtype)
-        pos, vel = self.motion(times)  # now, and at the samples
+        pos, vel = self.motion(times)  # at the current time and at the samples
         points = pos[..., 1:, :] - s.pos[..., None, :]
         return state_of(data) | {
             "difference_to_goal": pos[..., 0, :] - s.pos,

@@ -25,16 +25,16 @@ from crazysim.pytree import static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
-LANE_SPACING = 3.0
-"""Distance between the gates of several drones along y, m; each drone stays in its own lane."""
+CORRIDOR_SPACING = 3.0
+"""Distance along y between the corridors of several drones, m. Each drone has its own corridor with a gate."""
 HALF_SIZE, CEILING = (2.6, 1.4), 2.5
-"""Largest distance of a drone from the middle of its lane along x and y, and largest height, m."""
+"""Largest distance of a drone from the middle of its corridor along x and y, and largest height, m."""
 START_BOX = ((-2.2, -0.5, 1.2), (-1.4, 0.5, 1.7))
-"""Lowest and highest start of a drone in its lane, m."""
+"""Lower and upper corner of the box of starts, relative to the middle of the corridor on the floor, m."""
 GOAL_BOX = ((1.0, -0.5, 1.0), (1.8, 0.5, 1.5))
-"""Lowest and highest goal of a load in its lane, m."""
+"""Lower and upper corner of the box of goals, relative to the middle of the corridor on the floor, m."""
 GATE_BOX = ((0.0, -0.3, 1.2), (0.0, 0.3, 1.5))
-"""Lowest and highest middle of a gate in its lane, m."""
+"""Lower and upper corner of the box of middles of gates, relative to the middle of the corridor on the floor, m."""
 MAX_GATE_YAW = 0.3
 """Largest yaw of a gate, rad."""
 BAR_THICKNESS = 0.05
@@ -42,7 +42,8 @@ BAR_THICKNESS = 0.05
 LOAD_RADIUS = 0.03
 """Radius of a load, m."""
 MIN_OPENING_MARGIN = 0.25
-"""Smallest difference between the opening's height and the link's length, m: drone and load pass it together."""
+"""Smallest difference between the opening's height and the length of rod or cable, m. Drone and load pass the gate
+together."""
 
 
 class GateDelivery(Delivery):
@@ -56,10 +57,10 @@ class GateDelivery(Delivery):
 class Transport(BringLoad):
     """Carry a load on a rod or cable through a gate, and hold it at a goal behind it.
 
-    A drone starts in flight with a swinging load. Each drone has its own lane with a gate; drone and load must pass
-    the plane of the gate through the opening. Missing it is a crash, as is touching the frame or the
-    floor, and leaving the lane; this is checked at every physics step. A load is delivered when it has been within
-    ``tolerance`` of its goal, behind the gate, at most 0.2 m/s fast, for ``hold`` seconds. An episode ends when a drone
+    A drone starts in flight with a swinging load. Each drone has its own corridor with a gate. Drone and load must pass
+    the plane of the gate through the opening. Missing the opening, touching the frame or the floor, or leaving the
+    corridor is a crash; crashes are checked at every physics step. A load is delivered when it has been behind the
+    gate, within ``tolerance`` of its goal, slower than 0.2 m/s, for ``hold`` seconds. An episode ends when a drone
     crashes.
     """
 
@@ -75,8 +76,8 @@ class Transport(BringLoad):
     opening: float = setting(default=1.0, positive=True, high=1.6)
     """Width and height of the gate's opening, m."""
     swing: float = setting(default=0.4, low=0.0, high=1.0)
-    """Largest angle of the load from the vertical at the start along x and y, rad; its rate is up to 1.5 times that,
-    rad/s."""
+    """Largest angle of rod or cable from the vertical at the start, towards x and towards y, rad; the largest rate of
+    these angles is 1.5 times that, rad/s."""
     seconds: float = 6.0
     """Length of an episode, s."""
 
@@ -84,13 +85,13 @@ class Transport(BringLoad):
         super().__post_init__()
         if not self.length + MIN_OPENING_MARGIN <= self.opening <= 1.6:
             raise ConfigError(
-                f"expected opening from {self.length + MIN_OPENING_MARGIN:g} m, {MIN_OPENING_MARGIN} m above the "
-                f"length of the link, to 1.6 m, got {self.opening!r}"
+                f"expected opening from {self.length + MIN_OPENING_MARGIN:g} m, {MIN_OPENING_MARGIN} m more than the "
+                f"length of rod or cable, to 1.6 m, got {self.opening!r}"
             )
 
     def install(self, sim: Sim) -> None:
         sim.add(SlungLoad(mass=self.mass, length=self.length, cable=self.cable, size=LOAD_RADIUS))
-        middle = lanes(sim.n_drones) + np.mean(GATE_BOX, axis=0)
+        middle = corridor_centres(sim.n_drones) + np.mean(GATE_BOX, axis=0)
         gates = sim.scene.add(
             "gate", count=sim.n_drones, pos=middle, width=self.opening, height=self.opening, bar=BAR_THICKNESS
         )
@@ -99,37 +100,36 @@ class Transport(BringLoad):
         @stage("drone")
         def update_record(data: SimData) -> SimData:
             """Record crashes, and loads that stay at their goals."""
-            return with_record(
-                data, self.update_outcome(data, contacts(data).any | self.misses_gate(data) | out_of_lane(data))
-            )
+            crashed = contacts(data).any | self.misses_gate(data) | is_outside_or_on_floor(data)
+            return with_record(data, self.update_outcome(data, crashed))
 
         install_rules(sim, GateDelivery(**initial_outcome(sim.data), gates=gates), update_record)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight with swinging loads before the gates, and goals behind them."""
+        """Return drones in flight with swinging loads in front of the gates, and goals behind the gates."""
         n_drones, record = data.core.n_drones, delivery_of(data)
         x = draw(key, n_drones, start=3, goal=3, gate=3, turn=1, rpy=3, vel=3, swing=2, swing_rate=2)
-        lane = jnp.asarray(lanes(n_drones), data.states.pos.dtype)
+        centre = jnp.asarray(corridor_centres(n_drones), data.states.pos.dtype)
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.1))
-        data = flying(data, lane + scale_to(x["start"], *np.array(START_BOX)), quat, scale_symmetric(x["vel"], 0.3))
+        data = flying(data, centre + scale_to(x["start"], *np.array(START_BOX)), quat, scale_symmetric(x["vel"], 0.3))
         yaw = scale_symmetric(x["turn"], MAX_GATE_YAW)
         gate_quat = rotation.from_rpy(jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1))
-        data = record.gates.set_pose(data, lane + scale_to(x["gate"], *np.array(GATE_BOX)), gate_quat)
+        data = record.gates.set_pose(data, centre + scale_to(x["gate"], *np.array(GATE_BOX)), gate_quat)
         data = self.hang_loads(
             data, scale_symmetric(x["swing"], self.swing), scale_symmetric(x["swing_rate"], 1.5 * self.swing)
         )
-        return with_record(data, record.replace(goal=lane + scale_to(x["goal"], *np.array(GOAL_BOX))))
+        return with_record(data, record.replace(goal=centre + scale_to(x["goal"], *np.array(GOAL_BOX))))
 
     def hang_loads(self, data: SimData, angle: Array, rate: Array) -> SimData:
-        """Return the data with loads on taut links.
+        """Return the data with loads that hang on taut rods or cables.
 
         Args:
-            data: One world.
-            angle: Angle of the link from the vertical towards x, and then towards y, rad. (n_drones, 2)
-            rate: Rates of both, rad/s. (n_drones, 2)
+            data: Data of one world.
+            angle: Angles a and b of rod or cable: a from the vertical towards x, then b towards y, rad. (n_drones, 2)
+            rate: Rates of the angles, rad/s. (n_drones, 2)
         """
         (sin_a, sin_b), (cos_a, cos_b), (da, db) = (
-            jnp.moveaxis(f, -1, 0) for f in (jnp.sin(angle), jnp.cos(angle), rate)
+            jnp.moveaxis(x, -1, 0) for x in (jnp.sin(angle), jnp.cos(angle), rate)
         )
         link = jnp.stack([sin_a * cos_b, sin_b, -cos_a * cos_b], axis=-1)
         link_rate = jnp.stack(
@@ -140,10 +140,10 @@ class Transport(BringLoad):
         return data.replace(plugins=data.plugins | {"load": load})
 
     def remaining_way(self, data: SimData) -> Array:
-        """Return the length of the load's way to its goal, through the opening if it is before the gate, m. (...)
+        """Return the length of the load's way to its goal, m. (...)
 
-        The way leads through the opening half the link's length below its middle, so that drone and load pass with
-        equal margins.
+        If the load is in front of the gate, its way leads through the opening. There it is half the length of rod or
+        cable below the middle, so that drone and load pass with equal margins.
         """
         pos, quat = gate_of(data)
         load, goal = load_pos(data), delivery_of(data).goal
@@ -156,25 +156,25 @@ class Transport(BringLoad):
     def misses_gate(self, data: SimData) -> Array:
         """Return True where a drone or its load is between the faces of its gate, but not in the opening. (...)"""
         pos, quat = gate_of(data)
-        misses_opening = [
+        drone_misses, load_misses = (
             (jnp.abs(local_pos[..., 0]) <= BAR_THICKNESS / 2)
-            & (jnp.any(jnp.abs(local_pos[..., 1:]) > self.opening / 2 - r, axis=-1))
-            for local_pos, r in (
+            & (jnp.any(jnp.abs(local_pos[..., 1:]) > self.opening / 2 - radius, axis=-1))
+            for local_pos, radius in (
                 (rotation.rotate_inverse(quat, data.states.pos - pos), 0.0),
                 (rotation.rotate_inverse(quat, load_pos(data) - pos), LOAD_RADIUS),
             )
-        ]
-        return misses_opening[0] | misses_opening[1]
+        )
+        return drone_misses | load_misses
 
     def at_goal(self, data: SimData) -> Array:
         return is_behind(load_pos(data), *gate_of(data)) & super().at_goal(data)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, and load, gate and goal relative to it.
+        """Return the drone's state, and relative positions and velocities of load, gate and goal.
 
-        These are ``load_pos``, m, and ``load_vel``, m/s, relative to the drone; ``difference_to_gate``, from the drone
-        to the middle of the gate, m; ``gate_axis``, the unit vector along which it is passed; and
-        ``difference_to_goal``, from the load to its goal, m.
+        ``load_pos``, m, and ``load_vel``, m/s, are relative to the drone. ``difference_to_gate``, m, is the vector from
+        the drone to the middle of the gate. ``gate_axis`` is the unit vector of the direction through the gate.
+        ``difference_to_goal``, m, is the vector from the load to its goal.
         """
         s, (pos, quat) = data.states, gate_of(data)
         return state_of(data) | {
@@ -188,8 +188,8 @@ class Transport(BringLoad):
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return progress and proximity of the load, and costs of swinging, turning, changing actions and a crash.
 
-        The ``approach`` term reaches far, so that waiting before the gate pays less than passing it; ``proximity``
-        rewards rest at the goal.
+        ``approach`` still has a slope far from the goal, so that waiting in front of the gate gets less reward than
+        passing it. ``proximity`` rewards rest at the goal.
         """
         record, way = delivery_of(data), self.remaining_way(data)
         rate = direction(data)[1]
@@ -212,14 +212,14 @@ class Transport(BringLoad):
         return {"lookat": (0, 0, 1.1), "distance": 5.0, "azimuth": 60, "elevation": -20}
 
 
-def lanes(n_drones: int) -> np.ndarray:
-    """Return the middle of each drone's lane on the floor, m. (n_drones, 3)"""
-    y = LANE_SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
+def corridor_centres(n_drones: int) -> np.ndarray:
+    """Return the middle of each drone's corridor on the floor, m. (n_drones, 3)"""
+    y = CORRIDOR_SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
     return np.stack([0 * y, y, 0 * y], axis=-1)
 
 
 def gate_of(data: SimData) -> tuple[Array, Array]:
-    """Return position, m, and attitude, xyzw, of each drone's gate, of one drone or one world. (..., 3), (..., 4)"""
+    """Return position, m (..., 3), and attitude, xyzw (..., 4), of each drone's gate, for one drone or one world."""
     rows = delivery_of(data).gates.rows
     gate_rows = slice(rows[0], rows[-1] + 1)
     pos, quat = (x[..., gate_rows, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
@@ -227,7 +227,7 @@ def gate_of(data: SimData) -> tuple[Array, Array]:
 
 
 def gate_axis(quat: Array) -> Array:
-    """Return the unit vector along which a gate is passed. (..., 3)"""
+    """Return the unit vector of the direction through a gate, its x axis. (..., 3)"""
     return rotation.matrix(quat)[..., 0]
 
 
@@ -237,14 +237,14 @@ def is_behind(point: Array, pos: Array, quat: Array) -> Array:
     Args:
         point: Position, m. (..., 3)
         pos: Position of the gate, m. (..., 3)
-        quat: Its attitude, xyzw. (..., 4)
+        quat: Attitude of the gate, xyzw. (..., 4)
     """
     return rotation.dot(point - pos, gate_axis(quat))[..., 0] > 0
 
 
-def out_of_lane(data: SimData) -> Array:
-    """Return True where a drone has left its lane, or its load touches the floor. (...)"""
+def is_outside_or_on_floor(data: SimData) -> Array:
+    """Return True where a drone is outside of its corridor, or its load is on the floor. (...)"""
     pos = data.states.pos
-    middle = pick_entry(jnp.asarray(lanes(data.core.n_drones), pos.dtype), data.core.drone_id)
+    middle = pick_entry(jnp.asarray(corridor_centres(data.core.n_drones), pos.dtype), data.core.drone_id)
     is_far = jnp.any(jnp.abs(pos - middle)[..., :2] > np.array(HALF_SIZE, pos.dtype), axis=-1) | (pos[..., 2] > CEILING)
     return is_far | (load_pos(data)[..., 2] <= LOAD_RADIUS)
