@@ -123,7 +123,7 @@ def test_goals_can_be_a_formation():
         ({"n_drones": 1}, "at least two drones in a swarm, got 1"),
         ({"formation": [(0, 0, 1)]}, r"got shape \(1, 3\)"),
         ({"formation": [(0, 0, 1), (1, 0, 1), (0, 1, 1), (0, 0, 1.5)]}, r"places \[0, 3\]"),
-        ({"formation": [(0, 0, 0.1), (1, 0, 1), (0, 1, 1), (2, 0, 1.5)]}, "at least 0.2 m over the floor, got 0.1 m"),
+        ({"formation": [(0, 0, 0.1), (1, 0, 1), (0, 1, 1), (2, 0, 1.5)]}, "at least 0.2 m above the floor, got 0.1 m"),
         ({"formation": "abc"}, "got 'abc'"),
         ({"n_seen": 0}, "n_seen of Swarm to be finite and at least 1, got 0"),
     ],

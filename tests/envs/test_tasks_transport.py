@@ -191,7 +191,10 @@ def test_a_pilot_that_aims_at_the_opening_and_damps_the_swing_delivers_and_one_t
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"opening": 0.5}, "expected opening from 0.55 m, 0.25 m more than the length of rod or cable, to 1.6 m, got 0.5"),
+        (
+            {"opening": 0.5},
+            "expected opening from 0.55 m, 0.25 m more than the length of rod or cable, to 1.6 m, got 0.5",
+        ),
         ({"length": 1.0}, "expected opening from 1.25 m"),
         ({"swing": -0.1}, "swing of Transport to be from 0 to 1, got -0.1"),
         ({"mass": -1.0}, "mass"),
