@@ -35,10 +35,7 @@ class AllocationParams(PyTree):
 
     @staticmethod
     def create(airframe: Airframe) -> AllocationParams:
-        """Return the parameters of an airframe, shared by all drones.
-
-        The function ``torque_arms`` documents where the drag torque over thrust comes from.
-        """
+        """Return the parameters of an airframe, shared by all drones."""
         curve = airframe.value("rotors.thrust_curve")
         return AllocationParams(
             thrust_min=as_parameter(airframe.value("rotors.thrust_min", ())),
@@ -50,7 +47,7 @@ class AllocationParams(PyTree):
 
 
 def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
-    """Return the rotor speed at which each rotor lifts an equal share of the weight, rpm.
+    """Return the rotor speeds at which all rotors lift equal shares of the weight, rpm.
 
     Returns:
         (1,), or (n_rotors,) if each rotor has its own thrust curve
@@ -67,7 +64,7 @@ def max_thrust_without_torque(airframe: Airframe) -> float:
 def torque_arms(airframe: Airframe) -> np.ndarray:
     """Return the torque per thrust about x, y and z, m. (3,)
 
-    The third entry is the value ``controller.thrust2torque`` of the airframe, or ``yaw_arm`` if it has none.
+    The third entry is the value ``controller.thrust2torque`` of the airframe, or ``yaw_arm`` if there is no such value.
     """
     thrust2torque = airframe.values.get("controller.thrust2torque")
     return np.array([airframe.arm, airframe.arm, yaw_arm(airframe) if thrust2torque is None else float(thrust2torque)])
@@ -97,9 +94,9 @@ def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     """Return the rotor speeds that produce a wrench, each within its limits.
 
     The wrench is allocated with the least-norm inverse of the mixing matrix. Each rotor thrust is then clipped
-    independently, as in Crazyflow. The firmware instead lowers all motors by the excess of the highest one, which keeps
-    the torque; see ``crazysim.control.power_distribution``. If the collective thrust is zero or less, the motors are
-    off.
+    independently, as in Crazyflow. The Crazyflie firmware instead lowers all motors by the excess of the highest motor,
+    which keeps the torque; see ``crazysim.control.power_distribution``. If the collective thrust is zero or less, the
+    motors are off.
 
     Args:
         cmd: Collective thrust, N, and body torque, N m. (..., 4)
@@ -112,4 +109,4 @@ def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     force = cmd[..., :1]
     thrusts = matvec(p.allocation_matrix, jnp.concatenate([force, cmd[..., 1:] / p.torque_arms], axis=-1))
     rotor_vel = rotor_vel_of_thrust(clip(thrusts, p.thrust_min, p.thrust_max), p.rpm2thrust)
-    return jnp.where(force <= 0, 0.0, rotor_vel)  # NaN passes through, so that the world is flagged
+    return jnp.where(force <= 0, 0.0, rotor_vel)  # a NaN remains, so that the world is flagged as non-finite

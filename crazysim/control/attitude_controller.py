@@ -1,4 +1,4 @@
-"""Inner loop of the cascade: attitude or body rates and thrust to a wrench."""
+"""Inner loop of Crazyflow's cascade, from a command of attitude or body rates, with thrust, to a wrench."""
 
 from __future__ import annotations
 
@@ -45,11 +45,12 @@ class AttitudeParams(PyTree):
     torque_arms: Array = leaf("parameter", 1)
     """Torque per thrust about x and y (arm) and z (drag torque over thrust), m. (3,)"""
     mixing_matrix: Array = leaf("parameter", 2)
-    """Mixing matrix, rotor thrusts to torque over the arms, 1. (3, n_rotors)"""
+    """Matrix from rotor thrusts to torque divided by ``torque_arms``, 1. (3, n_rotors)"""
     torque_allocation: Array = leaf("parameter", 2)
-    """Torque commands to PWM of each rotor, with the firmware's factor 1/2 for roll and pitch, 1. (n_rotors, 3)"""
+    """Matrix from torque commands to PWM of the rotors, with the firmware's factor 1/2 for roll and pitch, 1.
+    (n_rotors, 3)"""
     rotors: Array | None = leaf("parameter", 1, default=None)
-    """True for the rotors that the drone has; None where all drones have equally many. (n_rotors,)"""
+    """True for the rotors that the drone has; None if all drones have the same number of rotors. (n_rotors,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> AttitudeParams:
@@ -86,10 +87,10 @@ def attitude2force_torque(
 ) -> tuple[Array, Array]:
     """Return the wrench that rotates the drone to an attitude, and the new integral.
 
-    The attitude part of the controller of Mellinger and Kumar (2011, eq. 10 to 13) as in the Crazyflie firmware:
-    without the factor one half on the rotation error, with a derivative on the rates, and in PWM units. Torques and
-    then rotors are clipped one by one, where the firmware lowers all rotors by the excess. A thrust of zero or less
-    switches the motors off.
+    This is the attitude part of the controller of Mellinger and Kumar (2011, eq. 10 to 13) as in the Crazyflie
+    firmware: without the factor one half on the rotation error, with a derivative of the rates, and in PWM units. Each
+    torque and then each rotor is clipped independently, whereas the firmware lowers all rotors by the largest excess. A
+    thrust of zero or less switches the motors off.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)
@@ -139,9 +140,9 @@ def body_rate2force_torque(
 ) -> tuple[Array, Array]:
     """Return the wrench that follows body rates, and the new integral.
 
-    As in Crazyflow, a rate setpoint enters the attitude controller, which also levels the drone at its present yaw.
-    ``Sim(controller="pid")`` follows rates only, as the firmware's rate mode does; so does this function with ``kR``
-    and ``ki_m`` of zero.
+    As in Crazyflow, the attitude controller follows the rates and also levels the drone at its current yaw.
+    ``Sim(controller="pid")`` follows rates only, as the firmware's rate mode does. This function also follows rates
+    only if ``kR`` and ``ki_m`` are zero.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)

@@ -1,12 +1,12 @@
-"""The default controller. It follows commands of every level, with gains from the physics of any airframe.
+"""The default controller. It computes its gains from the physics of any airframe.
 
-A force follows from the errors of position and velocity (``crazysim.control.position``), a torque from the errors of
-attitude and body rates. Forces and torques that the model lacks, such as wind, a load, a wrong mass or a shifted centre
-of mass, are estimated from the difference between the measured velocities and those that the rotors should have caused,
-and compensated.
+A force follows from the errors of position and velocity (``crazysim.control.position``), and a torque from the errors
+of attitude and body rates. The controller also compensates forces and torques that its model lacks, such as wind, a
+load, a wrong mass or a shifted centre of mass. It estimates them by comparing the measured velocities with the
+velocities that its model predicts.
 
-All gains follow from one rate ``a`` about each axis. A drone whose thrusts follow their command with the rate ``a``,
-under gains per inertia kp and kd on attitude and body rate, has the characteristic polynomial
+All gains follow from one rate ``a`` about each axis. If the thrusts follow their command with the rate ``a``, and kp
+and kd are the gains per inertia on attitude and body rate, the characteristic polynomial is
 ``s^3 / a + s^2 + kd s + kp``. With
 
     kd = 0.6 a,   kp = 0.12 a^2,   and at most half of the rate of roll and pitch about yaw,
@@ -15,22 +15,23 @@ body rates follow with a damping ratio of 0.65, which overshoots a step by 7%, a
 a pair of damping ratio 0.55, without overshoot. The attitude loop delays a slow command by kd / kp = 5 / a, from which
 the gains of the position loop follow.
 
-The rate has two limits. The first is lag: ``1 / a`` is at least the lag of the rotors, with feedback of their speeds,
-plus 1.5 periods of the controller. The second is the authority: a large error turns the drone along the line
-on which kp e + kd e' = 0, so that the rotors must brake it with (kp / kd)^2 e = 0.04 a^2 e. They can stop it from every
-error if this value at the largest e is at most the angular acceleration that they give in hover (``max_gain_ratios``).
-Without this limit, a drone with quick rotors turns faster than it can stop. Its rotors then saturate in one direction
-and the other, and it never settles.
+The rate has two limits. The first limit is lag: ``1 / a`` is at least the lag of the rotors, with feedback of their
+speeds, plus 1.5 periods of the controller. The second limit is the authority of the rotors. A large error e turns the
+drone along the line kp e + kd e' = 0, on which the rotors must brake with the angular acceleration
+(kp / kd)^2 e = 0.04 a^2 e. At the largest e, this may be at most the angular acceleration that the rotors give in hover
+(``max_gain_ratios``). Without this limit, a drone with quick rotors turns faster than it can stop: its rotors saturate
+in alternating directions, and it never settles.
 
-A rotor that speeds up turns the body the other way. For rotors of inertia I whose drag torque has the slope q over
-speed, a drag torque y comes with the yaw torque y + z y' with z = I / q, up to 0.13 s for the built-in airframes. Under
-feedback, this lead would reverse the demand on the rotors at every tick. The rotors are therefore given only the
-fraction 1 / (1 + r z) of the missing drag torque, with their rate r. The torque then follows its demand as
+A rotor that speeds up also turns the body the other way. Let I be the inertia of a rotor, and q the slope of its drag
+torque over its speed. A drag torque y then causes the yaw torque y + z y', with z = I / q, which is up to 0.13 s for
+the built-in airframes. Under feedback, this lead would reverse the demand on the rotors at every tick. Therefore only
+the fraction 1 / (1 + r z) of the missing drag torque is demanded, with the rate r of the rotors. The transfer function
+from desired to actual yaw torque is then
 
     (1 + z s) / (1 + (z + 1 / r) s),
 
-which is at most one at every frequency, and immediate for heavy rotors. Their momentum is added to the momentum of the
-body where unknown torques are estimated.
+which is at most one at every frequency, and close to one for heavy rotors. The estimate of unknown torques includes
+the angular momentum of the rotors.
 """
 
 from __future__ import annotations
@@ -66,8 +67,8 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import clip, cross, dot, matvec
 
 ROTOR_RATE = 50.0
-"""Rate up to which feedback of their speeds makes slower rotors faster, 1/s, where ``MAX_LEAD``, ``MAX_FEEDBACK_STEP``
-and the authority of the rotors allow it."""
+"""Largest rate that slower rotors reach by feedback of their speeds, 1/s. ``MAX_LEAD``, ``MAX_FEEDBACK_STEP`` or the
+authority of the rotors may set a lower limit."""
 MAX_LEAD = 5.0
 """Largest factor by which the feedback of rotor speeds makes the rotors faster than their own lag, 1."""
 MAX_FEEDBACK_STEP = 0.5
@@ -81,9 +82,11 @@ OBSERVER_RATE_RATIO = 0.6
 MAX_COMPENSATED_ERROR = 0.5
 """Rotation error whose commanded torque is the largest unknown torque that is compensated, rad."""
 YAW_RATE_MAX = 35.0
-"""Largest rate about body z that holds a heading, rad/s: the range of a Crazyflie's gyroscope (BMI088, data sheet)."""
+"""Largest desired rate about body z that holds a heading, rad/s. It is the range of a Crazyflie's gyroscope (BMI088,
+data sheet)."""
 MIN_TILT_COSINE_PLUS_ONE = 1e-6
-"""One plus the cosine of the tilt error below which its direction counts as undefined, 1: 0.08 degrees."""
+"""Limit of one plus the cosine of the tilt error, 1. Below this limit, within 0.08 degrees of a tilt error of 180
+degrees, the direction of the tilt error is undefined."""
 
 
 class AutoParams(RigidBodyParams):
@@ -104,21 +107,23 @@ class AutoParams(RigidBodyParams):
     reaction: Array = leaf("parameter", 1, (1,))
     """Angular momentum of the rotors about body z over their drag torque, both as changes around hover, s. (1,)"""
     drag_torque_share: Array = leaf("parameter", 1, (1,))
-    """Fraction of the missing yaw torque demanded from rotor drag, 1; the reaction to spin-up gives the rest. (1,)"""
+    """Fraction of the missing yaw torque that is demanded from rotor drag, 1. The reaction to spin-up gives the rest.
+    (1,)"""
     position: PositionParams | None
-    """Gains and limits of the position loop; None without one."""
+    """Gains and limits of the position loop; None without a position loop."""
 
     @staticmethod
     def create(airframe: Airframe, freq: int, outer_freq: int | None) -> AutoParams:
         """Return the shared parameters of an airframe.
 
-        A controller that runs every 1/freq s acts half a period late, and its input is one period old at worst, which
-        counts as lag of the rotors.
+        A controller that runs every 1/freq s acts half a period late, and its input is up to one period old. Both
+        delays are added to the lag of the rotors.
 
         Args:
             airframe: The airframe.
             freq: Rate of the controller, Hz.
-            outer_freq: Rate of its position loop, Hz, whose command is half a period old on average; None without one.
+            outer_freq: Rate of the position loop, Hz; its command is half a period old on average. None without a
+                position loop.
         """
         lag_rate, rate_limits = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * max_gain_ratios(airframe)
         needed_rate = 1 / max(1 / np.max(rate_limits[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
@@ -148,7 +153,7 @@ class AutoParams(RigidBodyParams):
 
 
 class AutoTarget(PyTree):
-    """Demand of the position loop on the loops below it, and its memory."""
+    """Result and memory of the position loop."""
 
     position: PositionMemory
     """Memory of the position loop."""
@@ -170,7 +175,7 @@ class AutoMemory(PyTree):
     """Memory of the default controller: target, expected angular momentum and estimated torque."""
 
     target: AutoTarget | None
-    """Result of the position loop; None at command levels below ``state``, which have none."""
+    """Result and memory of the position loop; None at command levels below ``state``."""
     momentum: Array = leaf("drone", 1)
     """Angular momentum expected at this tick from the known torques, body frame, N m s. (n_worlds, n_drones, 3)"""
     torque: Array = leaf("drone", 1)
@@ -188,11 +193,11 @@ class AutoMemory(PyTree):
 
 
 def quat_error(quat: Array) -> Array:
-    """Return the rotation vector, shortened to ``2 sin(angle / 2)``, that turns a body into a desired attitude.
+    """Return the rotation error between a body and a desired attitude, as tilt and yaw error.
 
-    The thrust is tilted the shortest way, and the remaining rotation is about it (Brescianini and D'Andrea 2018). The
-    first two entries are the tilt error, the third is the yaw error. Each error approximates the angle where it is
-    small, and is 2 at 180 degrees.
+    The tilt turns the thrust the shortest way; the yaw is the remaining rotation about the thrust (Brescianini and
+    D'Andrea 2018). The length of each error is ``2 sin(angle / 2)``, about the angle where it is small, and 2 at 180
+    degrees. The first two entries are the tilt error, the third entry is the yaw error.
 
     Args:
         quat: Attitude of the desired frame in the body frame, unit, xyzw. (..., 4)
@@ -201,19 +206,20 @@ def quat_error(quat: Array) -> Array:
         Rotation error, body frame, rad. (..., 3)
     """
     x, y, z, w = (quat[..., i : i + 1] for i in range(4))
-    squared = w * w + z * z
-    factor = 2 * lax.rsqrt(jnp.maximum(squared, MIN_TILT_COSINE_PLUS_ONE / 2))
-    roll = jnp.where(squared < MIN_TILT_COSINE_PLUS_ONE / 2, 2.0, (w * x - y * z) * factor)
+    square_cosine = w * w + z * z  # of half the tilt
+    factor = 2 * lax.rsqrt(jnp.maximum(square_cosine, MIN_TILT_COSINE_PLUS_ONE / 2))
+    roll = jnp.where(square_cosine < MIN_TILT_COSINE_PLUS_ONE / 2, 2.0, (w * x - y * z) * factor)
     yaw = jnp.where(w < 0, -z, z) * factor
     return jnp.concatenate([roll, (w * y + x * z) * factor, yaw], axis=-1)
 
 
 class Auto(Controller):
-    """Control of any airframe at every command level, with gains from its physics; needs measured rotor speeds.
+    """Controller of any airframe, with gains from its physics; needs measured rotor speeds.
 
-    At the level ``attitude`` it follows roll, pitch, yaw and collective thrust, at ``body_rate`` true body rates and
-    collective thrust (CTBR); there a thrust of zero or less switches the motors off. Saturated rotors give roll and
-    pitch torque first, then thrust, then yaw torque (``prioritized_thrusts``).
+    At the level ``attitude`` it follows roll, pitch, yaw and collective thrust. At the level ``body_rate`` it follows
+    body rates and collective thrust (CTBR), and does not level the drone. At both levels a thrust of zero or less
+    switches the motors off. Saturated rotors give roll and pitch torque first, then thrust, then yaw torque
+    (``prioritized_thrusts``).
     """
 
     name: ClassVar[str] = "auto"
@@ -234,29 +240,29 @@ class Auto(Controller):
         return FittedAuto(Dynamics(fitted_model), cast(int, self.outer_freq)) if control == Control.state else None
 
     def outer(self, data: DroneData, command: Setpoint, memory: AutoMemory, params: AutoParams) -> AutoMemory:
-        # The z axis of the body is to point along the specific force, its x axis closest to the heading, and their
-        # rates are fed forward from jerk and yaw rate, as in ``attitude_of_thrust``.
+        # The desired z axis of the body is along the specific force, and its x axis is closest to the heading. The
+        # rates of the axes follow from jerk and yaw rate, as in ``attitude_of_thrust``.
         s, p, sp = data.states, params, command
         matrix = rotation.matrix(s.quat)
         to_body = jnp.swapaxes(matrix, -1, -2)
         drag = matvec(matrix, matvec(p.drag_matrix, matvec(to_body, s.vel))) / p.mass
         rotor_acc = jnp.sum(quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust), axis=-1, keepdims=True) / p.mass
         known_acc = drag + rotor_acc * matrix[..., 2]
-        # None of these is None, since ``outer`` is only called with an ``outer_freq``.
+        # These are not None, because ``outer`` is only called with an ``outer_freq``.
         freq, loop, target = (
             cast(int, self.outer_freq),
             cast(PositionParams, p.position),
             cast(AutoTarget, memory.target),
         )
         specific_thrust, position = specific_force(s.pos, s.vel, known_acc, sp, target.position, freq, loop)
-        # The attitude is held for a period. Half a period later, the setpoint's acceleration has changed by this much.
+        # The desired attitude is constant for a period, so the setpoint's acceleration in the middle of it is used.
         specific_thrust = keep_upright(specific_thrust - drag + 0.5 / freq * sp.jerk, sp, loop)
 
-        # The heading of a state command follows from its quaternion, which needs no angles.
+        # The quaternion of a state command gives its heading without trigonometric functions.
         forward, left = rotation.heading(data.controls.state.cmd[..., 9:13])
-        squared = dot(specific_thrust, specific_thrust)
-        is_falling = squared < MIN_SPECIFIC_THRUST**2
-        inverse = jnp.where(is_falling, 0.0, lax.rsqrt(jnp.where(is_falling, 1.0, squared)))
+        square_norm = dot(specific_thrust, specific_thrust)
+        is_falling = square_norm < MIN_SPECIFIC_THRUST**2
+        inverse = jnp.where(is_falling, 0.0, lax.rsqrt(jnp.where(is_falling, 1.0, square_norm)))
         z = jnp.where(is_falling, jnp.asarray([0.0, 0.0, 1.0], specific_thrust.dtype), specific_thrust * inverse)
         z_cross_forward = cross(z, forward)
         x_forward = rotation.safe_norm(z_cross_forward)
@@ -266,7 +272,7 @@ class Auto(Controller):
         heading_terms = sp.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, forward)
         yaw_rate = heading_terms / jnp.maximum(x_forward, MIN_HEADING_SINE)
         ang_vel = cross(z, z_rate) + clip(yaw_rate, -YAW_RATE_MAX, YAW_RATE_MAX) * z
-        attitude, thrust = rotation.quat_from_axes(cross(y, z), y, z), p.mass * squared * inverse
+        attitude, thrust = rotation.quat_from_axes(cross(y, z), y, z), p.mass * square_norm * inverse
         return memory.replace(target=AutoTarget(position, attitude, matvec(to_body, ang_vel), thrust))
 
     def params(self, airframe: Airframe) -> AutoParams:
@@ -283,7 +289,7 @@ class Auto(Controller):
             target = cast(AutoTarget, memory.target)
             rotation_error = rotation.multiply(rotation.conjugate(s.quat), target.quat)
             z, w = rotation_error[..., 2:3], rotation_error[..., 3:]
-            thrust = target.thrust * (2 * (w * w + z * z) - 1)  # its component along the current z axis
+            thrust = target.thrust * (2 * (w * w + z * z) - 1)  # component along the current z axis
             rotation_error, ang_vel_des = quat_error(rotation_error), target.ang_vel
             is_on: Any = True
         else:
@@ -294,11 +300,11 @@ class Auto(Controller):
         rotor_torque = matvec(p.mixing_matrix, quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust))
         momentum = matvec(p.J, s.ang_vel)
         gyroscopic = cross(s.ang_vel, momentum)
-        # Rotors that speed up turn the body the other way: their momentum is added to the body's.
+        # The momentum of the rotors is included, because rotors that speed up turn the body the other way.
         total_momentum = momentum - rotation.along_z((p.reaction * rotor_torque[..., 2:])[..., 0])
         impulse = p.torque_max / self.freq
         measured_impulse = jnp.clip(total_momentum - memory.momentum, -impulse, impulse)
-        is_at_rest = dot(s.ang_vel, s.ang_vel) == 0  # taken to stand on the floor
+        is_at_rest = dot(s.ang_vel, s.ang_vel) == 0  # such a drone is assumed to stand on the floor
         disturbance_torque = (1 - p.observer) * memory.torque + jnp.where(
             is_at_rest, 0.0, p.observer * self.freq
         ) * measured_impulse
@@ -310,11 +316,11 @@ class Auto(Controller):
 
         wrench = jnp.concatenate([thrust, torque[..., :2], yaw_torque], axis=-1)
         thrusts = prioritized_thrusts(wrench, params=p.allocation)
-        # The rotor speeds of rotor_vel_of_thrust, approached with a lead.
+        # These are the speeds of ``rotor_vel_of_thrust``, with a lead that makes the rotors faster.
         _, k1, k2 = (p.allocation.rpm2thrust[..., i] for i in range(3))
         lead = p.lead / (2 * k2)
         rotor_vel = lead * thrust_slope(thrusts, p.allocation.rpm2thrust) + ((1 - p.lead) * s.rotor_vel - lead * k1)
-        rotor_vel = jnp.maximum(rotor_vel, 1.0)  # zero would be off
+        rotor_vel = jnp.maximum(rotor_vel, 1.0)  # zero would switch the rotor off
         return jnp.where(is_on, rotor_vel, 0.0), memory.replace(momentum=expected_momentum, torque=disturbance_torque)
 
     def _command_errors(self, state: FlightState, command: Array, mode: Control) -> tuple[Array | None, Array]:

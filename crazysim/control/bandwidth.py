@@ -1,21 +1,23 @@
 """Gains of controllers: the highest bandwidth that the rotors and the rate of a controller allow.
 
-A drone whose rotors have the lag rate ``a``, under feedback of attitude and body rate with gains per inertia kp and kd,
-has the characteristic polynomial ``s^3 / a + s^2 + kd s + kp``. The rule here is
+If the rotors have the lag rate ``a``, and kp and kd are the gains per inertia on attitude and body rate, the
+characteristic polynomial is ``s^3 / a + s^2 + kd s + kp``. The rule here is
 
     kd = a,   kp = 0.3 a^2,   about yaw with a / 2 or less in place of a, since rotors have less authority there,
 
 which puts the poles of the attitude at -0.39 a and (-0.30 +- 0.82i) a. The position loop is critically damped with a
-natural frequency of 0.12 a: together the five modes then have damping ratios of 0.39 and more
-(``test_geometric.py`` computes them). A controller that runs every 1/freq s acts half a period late, and its input is
-one period old at worst, which counts as lag: ``1 / a = 1 / rotor_rate + 1.5 / freq``.
+natural frequency of 0.12 a. Together, the five modes then have damping ratios of 0.39 and more (``test_geometric.py``
+computes them). A controller that runs every 1/freq s acts half a period late, and its input is up to one period old.
+Both delays are added to the lag: ``1 / a = 1 / rotor_rate + 1.5 / freq``.
 
-Two limits lower these rates. First, a large error e turns the drone along the line on which kp e + kd e' = 0, so the
-rotors have to brake it with (kp / kd)^2 e. If they cannot give as much (``max_ang_acc``), the drone turns faster than
-it can stop; therefore ``max_gain_ratios`` bounds kp / kd. Second, a rotor that speeds up turns the body the other way
-at once. With the lag rate r and the ratio z of the changes of a rotor's angular momentum and drag torque
-(``momentum_per_torque``), a demanded yaw torque acts up to 1 + r z times as strongly as demanded in the first tick. A
-controller without a model of this may remove no more than ``MAX_YAW_CORRECTION`` of an error of the yaw rate in a tick.
+Two limits lower these rates. The first limit is the authority of the rotors. A large error e turns the drone along the
+line kp e + kd e' = 0, on which the rotors must brake with the angular acceleration (kp / kd)^2 e. If they cannot give
+it (``max_ang_acc``), the drone turns faster than it can stop. Therefore ``max_gain_ratios`` bounds kp / kd.
+
+The second limit is the reaction to accelerating rotors: a rotor that speeds up turns the body the other way at once.
+Let r be the lag rate, and z the ratio of the changes of a rotor's angular momentum and drag torque
+(``momentum_per_torque``). In the first tick, the yaw torque is then up to 1 + r z times the demanded torque. A
+controller that does not model this may remove at most ``MAX_YAW_CORRECTION`` of an error of the yaw rate in a tick.
 """
 
 from __future__ import annotations
@@ -33,19 +35,19 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S
 ATTITUDE_STIFFNESS = 0.3
 """Stiffness over the squared damping of an axis, 1."""
 MAX_YAW_CORRECTION = 1 / 3
-"""Largest fraction of an error of the yaw rate that the demanded torque and the reaction to accelerating rotors remove
-together in a tick, 1."""
+"""Largest fraction of an error of the yaw rate that one tick removes, by the demanded torque and by the reaction to
+accelerating rotors, 1."""
 YAW_RATE_RATIO = 0.5
 """Largest damping about yaw over the lag rate, 1."""
 STOPPABLE_ERRORS = np.array([2.0, 2.0, 1.0])
-"""Rotation errors about x, y and z, 2 sin(angle / 2), from which a turn can be stopped: half a turn about x and y, and
-60 degrees about z."""
+"""Largest rotation errors about x, y and z, 2 sin(angle / 2), from which the rotors can stop a turn: 180 degrees about
+x and y, and 60 degrees about z."""
 POSITION_RATE_RATIO = 0.12
 """Natural frequency of the position loop over the smaller damping of roll and pitch, 1."""
 
 
 class Bandwidth(NamedTuple):
-    """Bandwidth of the loops of an airframe, as a natural frequency and gains per inertia."""
+    """Bandwidth of position and attitude loop: a natural frequency, and gains per inertia."""
 
     position: float
     """Natural frequency of the critically damped position loop, rad/s."""
@@ -56,7 +58,7 @@ class Bandwidth(NamedTuple):
 
 
 def rotor_rate(airframe: Airframe) -> float:
-    """Return the rate of the lag of the rotors around hover, in the slower direction, 1/s.
+    """Return the rate of the lag of the rotors around hover, on spin-up or spin-down, whichever is slower, 1/s.
 
     The lag is ``c1 (cmd - n) + c2 (cmd^2 - n^2)`` at the speed n; its slope at the hover speed is ``c1 + 2 c2 n``.
     """
@@ -64,7 +66,7 @@ def rotor_rate(airframe: Airframe) -> float:
 
 
 def fastest_rotor_rate(airframe: Airframe) -> float:
-    """Return the rate of the lag of the rotors at their highest speed, in the faster direction, 1/s."""
+    """Return the rate of the lag of the rotors at top speed, on spin-up or spin-down, whichever is faster, 1/s."""
     return float(np.max(_lag_rates(airframe, airframe.rotor_vel_limits[1])))
 
 
@@ -84,7 +86,7 @@ def momentum_per_torque(airframe: Airframe) -> float:
 def precession_rate(airframe: Airframe) -> float:
     """Return the angular acceleration about x or y that rotors cause in hover per body rate about the other axis, 1/s.
 
-    It is their net angular momentum over the smaller inertia, and zero if the rotors' angular momenta cancel.
+    It is the net angular momentum of the rotors over the smaller moment of inertia.
     """
     signs, hover = airframe.value("rotors.yaw_torque_sign"), RPM_TO_RAD_S * hover_rotor_vel(airframe)
     momentum = np.sum(signs * airframe.value("rotors.inertia") * hover)
@@ -92,7 +94,7 @@ def precession_rate(airframe: Airframe) -> float:
 
 
 def max_ang_acc(airframe: Airframe) -> np.ndarray:
-    """Return the angular acceleration that the rotors can give about each axis, either way, rad/s^2. (3,)
+    """Return the angular acceleration that the rotors can give about each axis in both directions, rad/s^2. (3,)
 
     Roll and pitch may lower the collective thrust below hover, as in ``prioritized_thrusts``; yaw may not.
     """
@@ -104,7 +106,7 @@ def max_ang_acc(airframe: Airframe) -> np.ndarray:
     for axis in (1, 2):
         ratio = thrusts_per_wrench[:, axis] / lift_shares
         # At a torque t, rotor i needs a collective thrust of at least low / lift_i - t ratio_i. Rotor k allows at most
-        # high / lift_k - t ratio_k, and the weight is an upper limit too.
+        # high / lift_k - t ratio_k. The weight is another upper limit.
         thrust_margins = np.append(high / lift_shares, weight)[None] - (low / lift_shares)[:, None]
         margin_rates = np.abs(np.append(ratio, 0.0)[None] - ratio[:, None])
         torques.append(np.min(thrust_margins[margin_rates > 0] / margin_rates[margin_rates > 0]))
@@ -116,12 +118,12 @@ def max_ang_acc(airframe: Airframe) -> np.ndarray:
 
 
 def max_gain_ratios(airframe: Airframe) -> np.ndarray:
-    """Return the largest ratio of attitude gain to damping whose turns the rotors can stop, 1/s. (3,)"""
+    """Return the largest ratio of stiffness to damping at which the rotors can stop turns, by axis, 1/s. (3,)"""
     return np.sqrt(max_ang_acc(airframe) / STOPPABLE_ERRORS)
 
 
 def bandwidth(airframe: Airframe, freq: int, lag_rate: float | None = None, limits_reaction: bool = True) -> Bandwidth:
-    """Return the bandwidth of the loops of an airframe under a controller that runs at ``freq`` Hz.
+    """Return the bandwidth of position and attitude loop of an airframe.
 
     Args:
         airframe: The airframe.

@@ -95,7 +95,7 @@ class Crazyflow(Controller):
         self, data: DroneData, command: Setpoint | Array, memory: AttitudeMemory, params: AttitudeParams
     ) -> tuple[Array, AttitudeMemory]:
         s, m = data.states, memory
-        cmd: Array = command  # type: ignore[assignment]  # it follows no setpoints
+        cmd: Array = command  # type: ignore[assignment]  # never a Setpoint at these levels
         if data.controls.mode == Control.body_rate:
             rates = cmd[..., :3]
             wrench, r_int_error = body_rate2force_torque(
@@ -103,7 +103,7 @@ class Crazyflow(Controller):
             )
         else:
             rates = data.controls.attitude.staged_ang_vel_des
-            if rates is None:  # without them, as one of several controllers
+            if rates is None:  # the controller is one of several
                 rates = jnp.zeros_like(s.ang_vel)
             wrench, r_int_error = attitude2force_torque(
                 s.quat, s.ang_vel, cmd, rates, m.prev_ang_vel, m.ang_vel_des, m.r_int_error, self.freq, params=params

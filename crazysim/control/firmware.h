@@ -4,8 +4,8 @@
  *
  *     cc -O2 -shared -fPIC -I FOLDER my_controller.c -o my_controller.so
  *
- * where `python -c "from crazysim.control import CFirmware; print(CFirmware.include)"` prints FOLDER. One library flies any
- * number of drones: everything that it remembers of a drone must be in the memory of that drone.
+ * where `python -c "from crazysim.control import CFirmware; print(CFirmware.include)"` prints FOLDER. One library controls
+ * any number of drones, so everything that it stores about a drone must be in the memory of that drone.
  */
 #ifndef CRAZYSIM_FIRMWARE_H
 #define CRAZYSIM_FIRMWARE_H
@@ -18,7 +18,7 @@
 extern "C" {
 #endif
 
-/* Meaning of the command. */
+/* Level of the command. */
 enum crazysim_level {
   CRAZYSIM_STATE = 0,     /* setpoint: position, m, velocity, m/s, acceleration, m/s^2, quaternion xyzw, rates, rad/s */
   CRAZYSIM_ATTITUDE = 1,  /* roll, pitch, yaw, rad, collective thrust, N */
@@ -43,10 +43,10 @@ size_t crazysim_memory_size(void);
 /* Initialise the memory of a drone at rest; all of its bytes are zero before the call. */
 void crazysim_init(void *memory);
 
-/* Write the motor commands of one drone, in the order of the airframe's rotors and the unit that CFirmware names. */
+/* Write the motor commands of one drone, in the order of the airframe's rotors and in the unit CFirmware.motors. */
 void crazysim_update(void *memory, enum crazysim_level level, const struct crazysim_input *input, float *motors);
 
-/* Called by crazysim: as above for `n` drones, whose memories are `stride` bytes apart. */
+/* Write the motor commands of `n` drones with memories `stride` bytes apart. crazysim calls this function. */
 #if defined(__GNUC__)
 __attribute__((visibility("default")))
 #endif

@@ -1,4 +1,4 @@
-"""Controllers in C: a compiled library commands the motors of every drone (``firmware.h`` has its interface)."""
+"""Controllers in C: a compiled library with the interface of ``firmware.h`` commands the motors of every drone."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from crazysim.storage import open_replacement, read_bytes
 INTERFACE_VERSION = 1
 """Version of the interface in ``firmware.h``."""
 COMMAND_LEVELS = (Control.state, Control.attitude, Control.body_rate)
-"""Command levels by their number in ``firmware.h``."""
+"""Command levels, in the order of ``enum crazysim_level`` in ``firmware.h``."""
 MOTOR_UNITS = ("throttle", "thrust", "rpm")
 """Units of motor commands."""
 LIBRARY_FUNCTIONS = ("crazysim_memory_size", "crazysim_init", "crazysim_update_all", "crazysim_version")
@@ -39,7 +39,7 @@ MAX_LIBRARY_BYTES, MAX_MEMORY_BYTES = 2**28, 2**24
 LOADING_TIMEOUT = 60
 """Longest time that loading a library may take, s."""
 COMMAND_SIZE, FEEDFORWARD_SIZE = 16, 8
-"""Number of entries of a state command, and number of entries of its feedforward."""
+"""Number of entries of ``command`` and of ``feedforward`` in ``struct crazysim_input``."""
 
 
 class CFirmwareMemory(PyTree):
@@ -52,8 +52,8 @@ class CFirmwareMemory(PyTree):
 class CFirmware(Controller):
     """Controller that a compiled library computes, for all drones of all worlds in one call.
 
-    The library runs on the host, between the kernels of the step, so a simulation on a GPU waits for it. Its steps have
-    no derivatives.
+    The library runs on the host, between the kernels of the step, so a simulation on a GPU waits for it. Steps with it
+    have no derivatives.
     """
 
     name: ClassVar[str] = "c_firmware"
@@ -62,12 +62,12 @@ class CFirmware(Controller):
     include: ClassVar[Path] = Path(__file__).parent
     """Folder of ``firmware.h``, for the compiler's option ``-I``."""
     library: str | Path
-    """Path of the shared library. A copy is loaded, so the next ``CFirmware`` uses a file that was compiled again.
-    Libraries on which it depends are therefore not found next to the original."""
+    """Path of the shared library. A copy in a temporary folder is loaded, so that a new ``CFirmware`` uses the new file
+    after a compilation. The library must not depend on other libraries in its folder."""
     motors: Literal["throttle", "thrust", "rpm"] = "throttle"
     """Unit of the motor commands: ``"throttle"``, the thrust of a rotor as a fraction of its maximum, like a
-    Crazyflie's PWM over 65,535; ``"thrust"``, N; or ``"rpm"``. Thrusts are limited to the range of the rotor, and 0 is
-    off."""
+    Crazyflie's PWM over 65,535; ``"thrust"``, N; or ``"rpm"``. Thrusts are limited to the range of the rotor; a command
+    of 0 switches the rotor off."""
     freq: int = 500
     """Rate, Hz."""
 
@@ -110,8 +110,8 @@ class CFirmware(Controller):
         @jax.custom_jvp
         def call_library(words: Array, inputs: Array) -> tuple[Array, Array]:
             shapes = (jax.ShapeDtypeStruct(words.shape, np.uint32), jax.ShapeDtypeStruct((n_motors,), np.float32))
-            library = functools.partial(_call_library, self._copy_path, level, n_motors)
-            return jax.pure_callback(library, shapes, words, inputs, vmap_method="broadcast_all")
+            call_on_host = functools.partial(_call_library, self._copy_path, level, n_motors)
+            return jax.pure_callback(call_on_host, shapes, words, inputs, vmap_method="broadcast_all")
 
         call_library.defjvp(self._refuse_derivative)
         words, motors = call_library(memory.words, inputs)
@@ -133,13 +133,13 @@ class CFirmware(Controller):
 
 
 def _call_library(library: str, level: int, n_motors: int, words: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return memories and motor commands after one call of a library for all drones.
+    """Return memories and motor commands after one call of a library for all drones. (..., n_words), (..., n_motors)
 
     Args:
         library: Path of the copy of the library.
-        level: Number of the command level in ``COMMAND_LEVELS``.
+        level: Index of the command level in ``COMMAND_LEVELS``.
         n_motors: Number of motors of a drone.
-        words: Memories; the library writes into a copy. (..., n_words)
+        words: Memories. The library writes into a copy of them. (..., n_words)
         inputs: ``struct crazysim_input`` of each drone. (..., n_inputs)
     """
     words, inputs = np.array(words, np.uint32, order="C"), np.ascontiguousarray(inputs, np.float32)
@@ -153,7 +153,8 @@ def copy_library(library: str | Path) -> str:
     """Load a copy of a library with its current content, and return the path of the copy.
 
     Raises:
-        ConfigError: If it cannot be loaded, lacks a function, or was compiled with another version of ``firmware.h``.
+        ConfigError: If the library cannot be loaded, lacks a function, needs too much memory, or was compiled with
+            another version of ``firmware.h``.
     """
     remedy, path = f"Compile it as {CFirmware.include / 'firmware.h'} says.", Path(library)
     try:
@@ -188,9 +189,9 @@ def copy_library(library: str | Path) -> str:
 
 
 def _loading_error(library: Path) -> str:
-    """Return the reason why a library cannot be loaded, empty if it can.
+    """Return the reason why a library cannot be loaded; empty if it can be loaded.
 
-    A separate process tries it, because the system kills a process that loads a truncated library.
+    A separate process tries to load it, because the system kills a process that loads a truncated library.
     """
     command = [sys.executable, "-I", "-S", "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", str(library)]
     try:
@@ -203,10 +204,11 @@ def _loading_error(library: Path) -> str:
 
 
 _open_library = functools.cache(ctypes.CDLL)
-"""Open a library by its path. The cache returns the same object each time, so its declared function types persist."""
+"""Function that opens a library by its path. It returns the same object at each call, with the function types that
+``copy_library`` has declared."""
 
 
 @functools.cache
 def _copies_folder() -> tempfile.TemporaryDirectory[str]:
-    """Return the folder of the copies of this process."""
+    """Return the temporary folder with the copies of libraries of this process."""
     return tempfile.TemporaryDirectory(prefix="crazysim-", ignore_cleanup_errors=True)

@@ -1,4 +1,4 @@
-"""The default controller for fitted dynamics: only its position loop, because they include the attitude response."""
+"""The default controller for fitted dynamics: only a position loop, because their models include the attitude loop."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from crazysim.rotation import dot, matvec
 
 
 class FittedParams(PyTree):
-    """Gains of the position loop, and the response that it assumes, each shared or one per drone."""
+    """Gains of the position loop, and the attitude response that it assumes, each shared or one per drone."""
 
     model: Params
     """Parameters of the fitted model that the controller assumes."""
     angle_ratio: Array = leaf("parameter", 1)
     """Ratio of commanded roll, pitch and yaw to the angles at which the model settles, 1. (3,)"""
     lead: Array = leaf("parameter", 1)
-    """Factors on jerk, s, and snap, s^2, that advance the attitude command to compensate the response's delay. (2,)"""
+    """Factors on jerk, s, and snap, s^2, which advance the attitude command by the delay of the response. (2,)"""
     position: PositionParams
     """Gains and limits of the position loop."""
 
@@ -36,8 +36,8 @@ class FittedParams(PyTree):
     def create(airframe: Airframe, dynamics: Dynamics, freq: int) -> FittedParams:
         """Return the shared parameters of an airframe.
 
-        The delay below the position loop is the larger one of the attitude's delay, damping over stiffness, and the
-        thrust's delay, plus 1.5 periods of the controller.
+        The delay below the position loop is the delay of the attitude (damping over stiffness) or of the thrust,
+        whichever is larger, plus 1.5 periods of the controller.
 
         Args:
             airframe: The airframe.

@@ -21,7 +21,7 @@ grows without bound. The limit takes effect below 3 degrees.
 """
 
 MIN_SPECIFIC_THRUST = 1e-3
-"""Thrust over mass below which the direction of the thrust counts as undefined, m/s^2. Hover needs 9.8."""
+"""Thrust over mass below which the direction of the thrust is undefined, m/s^2. Hover needs 9.8."""
 
 
 class Attitude(NamedTuple):
@@ -53,12 +53,12 @@ class FlatState(PyTree):
 def flat_state(
     setpoint: Setpoint, mass: Array | float, inertia: Array, gravity_vec: Array | tuple[float, ...] = GRAVITY
 ) -> FlatState:
-    """Return attitude, angular velocity, angular acceleration and wrench of a drag-free drone that tracks a setpoint.
+    """Return attitude, its derivatives and wrench of a drone without drag that tracks a setpoint exactly.
 
-    Position and yaw are flat outputs of a multirotor: with their derivatives they determine its state and its inputs
-    (Mellinger and Kumar 2011, section III). The thrust is ``m |acc - g|`` along ``acc - g``, and the torque follows
-    from Euler's equation, ``J w' + w x J w``. See ``attitude_of_thrust`` for setpoints that do not determine an
-    attitude.
+    Position and yaw are flat outputs of a multirotor: together with their derivatives they determine its state and its
+    inputs (Mellinger and Kumar 2011, section III). The thrust is ``m |acc - g|`` along ``acc - g``, and the torque
+    follows from Euler's equation, ``J w' + w x J w``. ``attitude_of_thrust`` explains what happens if a setpoint does
+    not determine an attitude.
 
     Args:
         setpoint: Position and yaw, with their derivatives.
@@ -99,22 +99,22 @@ def attitude_of_thrust(
 
     The derivatives of these equations give the angular acceleration.
 
-    A specific thrust below ``MIN_SPECIFIC_THRUST`` is replaced by a constant vertical one. Where thrust and heading are
-    parallel, y is the horizontal ``l``. Near there, the rate about z is limited (``MIN_HEADING_SINE``).
+    A specific thrust below ``MIN_SPECIFIC_THRUST`` is replaced by a constant vertical thrust. Where thrust and heading
+    are parallel, y is ``l``. Where they are nearly parallel, the rate about z is limited (``MIN_HEADING_SINE``).
 
     Args:
         specific_thrust: Thrust vector over the mass, world frame, m/s^2. (..., 3)
-        specific_thrust_rate: Its derivative, m/s^3. (..., 3)
-        specific_thrust_acc: Its second derivative, m/s^4. (..., 3)
+        specific_thrust_rate: First derivative of the specific thrust, m/s^3. (..., 3)
+        specific_thrust_acc: Second derivative of the specific thrust, m/s^4. (..., 3)
         yaw: Heading, rad. (..., 1)
-        yaw_rate: Its derivative, rad/s. (..., 1)
-        yaw_acc: Its second derivative, rad/s^2. (..., 1)
+        yaw_rate: First derivative of the heading, rad/s. (..., 1)
+        yaw_acc: Second derivative of the heading, rad/s^2. (..., 1)
     """
     forward, left = rotation.heading_axes(yaw)
     z, z_rate, z_acc = thrust_direction(specific_thrust, specific_thrust_rate, specific_thrust_acc)
     z_cross_forward = cross(z, forward)
     y = jnp.where(dot(z_cross_forward, z_cross_forward) < 1e-10, left, rotation.safe_normalize(z_cross_forward, left))
-    x = rotation.safe_normalize(cross(y, z), forward)  # of length one already, unless thrust and heading are parallel
+    x = rotation.safe_normalize(cross(y, z), forward)  # changes nothing unless thrust and heading are parallel
 
     x_forward = jnp.maximum(dot(x, forward), MIN_HEADING_SINE)
     z_forward, y_left, x_left, z_left = dot(z, forward), dot(y, left), dot(x, left), dot(z, left)
@@ -137,11 +137,11 @@ def thrust_direction(
 
     Args:
         specific_thrust: Thrust vector over the mass, m/s^2. (..., 3)
-        specific_thrust_rate: Its derivative, m/s^3. (..., 3)
-        specific_thrust_acc: Its second derivative, m/s^4. (..., 3)
+        specific_thrust_rate: First derivative of the specific thrust, m/s^3. (..., 3)
+        specific_thrust_acc: Second derivative of the specific thrust, m/s^4. (..., 3)
 
     Returns:
-        Direction, its derivative, 1/s, and its second derivative, 1/s^2. (..., 3) each
+        Unit vector, its first derivative, 1/s, and its second derivative, 1/s^2. (..., 3) each
     """
     is_undefined = dot(specific_thrust, specific_thrust) < MIN_SPECIFIC_THRUST**2
     inverse = jnp.where(is_undefined, 0.0, 1 / rotation.safe_norm(jnp.where(is_undefined, 1.0, specific_thrust)))

@@ -1,4 +1,4 @@
-"""Geometric tracking control on SE(3), from a setpoint to a wrench, without angles and their singularities."""
+"""Geometric tracking control on SE(3), from a setpoint to a wrench. It has no singularities of Euler angles."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Gains = Literal["bandwidth", "airframe"]
 
 
 MAX_INTEGRAL_RATIO = 0.5
-"""Largest acceleration by the integral of the position error along an axis, over gravity, 1."""
+"""Largest acceleration along an axis by the integral of the position error, over gravity, 1."""
 
 
 class GeometricMemory(PyTree):
@@ -56,9 +56,9 @@ class GeometricParams(RigidBodyParams):
         Args:
             airframe: The airframe.
             freq: Rate of the controller, Hz.
-            gains: ``"bandwidth"``: by the rule of ``crazysim.control.bandwidth``, times mass and inertia.
-                ``"airframe"``: the table ``[geometric]`` of the airframe, in the lab's airframes the gains
-                of AIMotionLab.
+            gains: ``"bandwidth"`` for the rule of ``crazysim.control.bandwidth``, times mass and inertia;
+                ``"airframe"`` for the table ``[geometric]`` of the airframe. Airframes of AIMotionLab have its gains
+                in this table.
         """
         if gains == "airframe":
             table = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
@@ -71,7 +71,7 @@ class GeometricParams(RigidBodyParams):
 
 
 def bandwidth_gains(airframe: Airframe, rates: Bandwidth) -> dict[str, Any]:
-    """Return the gains ``kr``, ``kv``, ``kR`` and ``kw`` with which an airframe has the rates of a ``Bandwidth``."""
+    """Return the gains ``kr``, ``kv``, ``kR`` and ``kw`` that give an airframe a bandwidth, by name."""
     mass, moments = airframe.value("rigid_body.mass", ()), np.diag(airframe.inertia)
     return {
         "kr": mass * rates.position**2,
@@ -94,12 +94,12 @@ def geometric_control(
 ) -> Array:
     """Return the wrench that tracks a setpoint.
 
-    The controller of Lee, Leok and McClamroch (2010): a force from the errors of position and velocity,
-    an attitude whose z axis is along that force, and a torque from the errors of rotation and body rates. The
-    desired attitude, rates and angular acceleration belong to a drone whose thrust is that force and changes with jerk
-    and snap of the setpoint (``attitude_of_thrust``). The drag at the setpoint's velocity and its derivatives are
-    compensated, at the current attitude (Faessler, Franchi and Scaramuzza 2018). The rotors' limits are respected by
-    priority (``prioritized_wrench``), so a saturated drone keeps its attitude and the motors stay on.
+    This is the controller of Lee, Leok and McClamroch (2010). A force follows from the errors of position and velocity.
+    The z axis of the desired attitude is along that force. Desired body rates and angular acceleration follow from the
+    force and from jerk and snap of the setpoint (``attitude_of_thrust``). A torque follows from the errors of rotation
+    and body rates. The drag of the setpoint's velocity, with its derivatives, is compensated at the current attitude
+    (Faessler, Franchi and Scaramuzza 2018). The wrench is limited by priority (``prioritized_wrench``), so that a
+    drone with saturated rotors keeps its attitude and the motors stay on.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -125,7 +125,7 @@ def geometric_control(
         feedback = feedback + integral
 
     def subtract_drag(motion: Array, derivative: Array) -> Array:
-        """Return the acceleration, or a derivative of it, that the rotors give for a motion under drag."""
+        """Return acceleration, jerk or snap without the part of the drag at velocity, acceleration or jerk."""
         if not feedforward:
             return derivative
         return derivative - matvec(matrix, matvec(p.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), motion))) / p.mass
@@ -177,7 +177,7 @@ def attitude_errors(matrix: Array, ang_vel: Array, desired: Attitude) -> tuple[A
         Rotation error, rad; rate error, rad/s; angular acceleration of a body that tracks, rad/s^2. (..., 3) each
     """
     columns = [(matrix[..., i], desired.matrix[..., i]) for i in range(3)]
-    # vee(R_d^T R - R^T R_d) is R^T times the sum of x_d cross x over the three axes.
+    # With the axes x_d of R_d and x of R, vee(R_d^T R - R^T R_d) is R^T times the sum of x_d cross x over three axes.
     to_body = jnp.swapaxes(matrix, -1, -2)
     cross_products = [cross(axis_d, axis) for axis, axis_d in columns]
     rotation_error = 0.5 * matvec(to_body, cross_products[0] + cross_products[1] + cross_products[2])
@@ -201,8 +201,8 @@ class Geometric(Controller):
     integral: float = 0.0
     """Rate at which the integral of the position error compensates a constant force, 1/s: the ratio of the integral
     gain to the position gain on each axis. 0 for no integral and no memory. Without delays, the loop is stable below
-    the ratio of ``kv`` to the mass. Errors for which the position gain alone demands more than ``MAX_INTEGRAL_RATIO``
-    times gravity are not integrated."""
+    the ratio of ``kv`` to the mass. An error is not integrated if the position gain alone demands more than
+    ``MAX_INTEGRAL_RATIO`` times gravity for it."""
 
     def params(self, airframe: Airframe) -> GeometricParams:
         if not (np.isfinite(self.integral) and self.integral >= 0):

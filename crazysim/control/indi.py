@@ -1,4 +1,4 @@
-"""Incremental nonlinear dynamic inversion: geometric tracking that measures disturbances instead of modelling them."""
+"""Incremental nonlinear dynamic inversion: geometric tracking control with measured, not modelled, disturbances."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MAX_FEEDBACK_STEP = 0.5
 DISTURBANCE_MAX = 5.0
 """Largest acceleration by a disturbance that is compensated along an axis, m/s^2: about half of gravity."""
 TORQUE_MAX = 0.5
-"""Largest torque by a disturbance that is compensated, as the rotation error whose feedback is as large, rad."""
+"""Rotation error with a feedback torque as large as the largest disturbance torque that is compensated, rad."""
 
 
 class INDIParams(PyTree):
@@ -48,7 +48,8 @@ class INDIParams(PyTree):
     reaction: Array = leaf("parameter", 1, (1,))
     """Ratio of the changes of a rotor's angular momentum and drag torque around hover, s. (1,)"""
     drag_torque_share: Array = leaf("parameter", 1, (1,))
-    """Fraction of the missing yaw torque demanded from rotor drag, 1; the reaction to spin-up gives the rest. (1,)"""
+    """Fraction of the missing yaw torque that is demanded from rotor drag, 1. The reaction to spin-up gives the rest.
+    (1,)"""
     filter: Array = leaf("parameter", 1)
     """Coefficients b0, a1, a2 of the low-pass filter. (3,)"""
 
@@ -62,7 +63,7 @@ class INDIParams(PyTree):
         Args:
             airframe: The airframe.
             freq: Rate of the controller, Hz.
-            cutoff: Cutoff frequency of the filter, Hz; values above ``0.45 freq`` are reduced to it.
+            cutoff: Cutoff frequency of the filter, Hz; values above ``0.45 freq`` are reduced to ``0.45 freq``.
         """
         if not 0 < cutoff < math.inf:
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
@@ -99,7 +100,9 @@ class INDIMemory(PyTree):
 
 
 def apply_filter(x: Array, state: Array, coefficients: Array) -> tuple[Array, Array]:
-    """Return signals after a second-order low-pass filter, and its new states (transposed direct form II).
+    """Return signals after a second-order low-pass filter, (..., n), and its new states, (..., 2 n).
+
+    The filter is computed in transposed direct form II.
 
     Args:
         x: Signals. (..., n)
@@ -133,21 +136,20 @@ def indi_control(
 ) -> tuple[Array, INDIMemory]:
     """Return the rotor speeds that track a setpoint under unknown forces and torques, and the memory.
 
-    The loops are the same as in ``geometric_control``. Its models of force and torque are replaced by increments of the
-    current force and torque of the rotors (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the
-    force):
+    The loops are those of ``geometric_control``, but force and torque are increments to the current force and torque of
+    the rotors (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the force):
 
         f = f_rotors + m (a_desired - a),   tau = tau_rotors + J (w'_desired - w')
 
     The disturbances ``m a - f_rotors - m g`` and ``J w' - tau_rotors`` are limited (``DISTURBANCE_MAX``,
-    ``TORQUE_MAX``), so that the rotors of a drone on the floor do not push it against the floor.
+    ``TORQUE_MAX``), so that the rotors do not push a drone on the floor against the floor.
 
     The acceleration a is the rate of change of the velocity over one tick. ``J w'`` is the rate of change of the
-    angular momentum of body and rotors, so that the reaction to accelerating rotors does not count as a disturbance.
-    Both pass through the same low-pass filter as the force and torque of the rotors, which follow from measured rotor
-    speeds, so that their delays cancel. Effects that the model omits, such as wind, a shifted load or a wrong mass,
-    appear in a and w', and are compensated. The returned speed is the current speed plus ``params.lead`` times the
-    difference to the desired speed, which makes the rotors faster than their lag.
+    angular momentum of body and rotors, so that the reaction to accelerating rotors is no disturbance. Force and torque
+    of the rotors follow from measured rotor speeds. The same low-pass filter is applied to all four, so that their
+    delays cancel. Effects that the model omits, such as wind, a shifted load or a wrong mass, appear in a and w', and
+    are compensated. The returned speed is the current speed plus ``params.lead`` times the difference to the desired
+    speed, which makes the rotors faster than their lag.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -219,7 +221,7 @@ class INDI(Controller):
     def take_over(
         self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array
     ) -> INDIMemory:
-        # the remembered velocities are older than the last tick
+        # Velocity and momentum in the memory are older than the last tick.
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:

@@ -12,14 +12,14 @@ from crazysim.drones import Airframe
 
 
 class Control(StrEnum):
-    """Command level: the input of the cascade. The levels below it are simulated."""
+    """Command level: the kind of command that the user sends. The simulation has all lower levels of the cascade."""
 
     state = "state"
     """Position, velocity, acceleration, quaternion (only its yaw is used) and body rates: 16 numbers."""
     attitude = "attitude"
     """Roll, pitch, yaw, rad, and collective thrust, N."""
     body_rate = "body_rate"
-    """Body rates, rad/s, and collective thrust, N. Crazyflow's cascade also levels the drone."""
+    """Body rates, rad/s, and collective thrust, N. Controller ``"crazyflow"`` also levels the drone."""
     force_torque = "force_torque"
     """Collective thrust, N, and body torque, N m."""
     rotor_vel = "rotor_vel"
@@ -32,7 +32,7 @@ COMMAND_FIELDS = {
     Control.attitude: "roll, pitch, yaw [rad], collective thrust [N]",
     Control.body_rate: "wx, wy, wz [rad/s], collective thrust [N]",
     Control.force_torque: "collective thrust [N], tx, ty, tz [N m]",
-    Control.rotor_vel: "one rotor speed each [rpm]",
+    Control.rotor_vel: "speed of each rotor [rpm]",
 }
 """Entries of a command of each level with their units, for messages and docs."""
 
@@ -43,7 +43,7 @@ def command_size(control: Control, n_rotors: int) -> int:
 
 
 def count_rotors(rotors: Array | None, n: int) -> Array | int:
-    """Return the number of True entries of a mask of rotors, (..., 1), or ``n`` if the mask is None."""
+    """Return the number of rotors in a mask, (..., 1), or ``n`` if the mask is None."""
     return n if rotors is None else jnp.sum(jnp.where(rotors, 1.0, 0.0), axis=-1, keepdims=True)
 
 
@@ -55,7 +55,7 @@ def mask_rotors(rotors: Array | None, x: Array, fill_value: float) -> Array:
 def allocation_matrix(airframe: Airframe) -> np.ndarray:
     """Return the matrix from collective thrust and torque over the torque arms to rotor thrusts. (n_rotors, 4)
 
-    It is the pseudoinverse of the mixing matrix with a row of ones above it, so the rotor thrusts have the least norm.
+    It is the pseudoinverse of the mixing matrix with a row of ones on top, so that rotor thrusts have the least norm.
     For a quadrotor in X its entries are the signs of the rotors divided by four.
     """
     mixing = airframe.mixing_matrix

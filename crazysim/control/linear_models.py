@@ -45,23 +45,24 @@ def load_derivative(
 ) -> Array:
     """Return the derivative of the state of a drone with a point load on a rigid, massless rod.
 
-    The rod hangs from a frictionless joint. A joint at the centre of mass exerts no torque on the drone. With the
-    thrust ``f`` and the unit vector q from joint to load (Sreenath, Lee and Kumar 2013):
+    The rod hangs from a frictionless joint. A joint at the centre of mass exerts no torque on the drone. With thrust f,
+    masses m of the drone and m_L of the load, length L of the rod and unit vector q from joint to load (Sreenath, Lee
+    and Kumar 2013):
 
         m L q'' = q x (q x f) - m L |q'|^2 q
         (m + m_L) (v' - g) = f - m_L L q''
 
-    A joint at ``d`` from the centre of mass has the acceleration p''. Let v_0', w_0' and p_0'' be the accelerations
-    without the rod, and ``t q`` the pull of the rod on the drone, divided by the mass of the load:
+    For a joint at the vector d from the centre of mass, let p'' be the acceleration of the joint, v_0', w_0' and p_0''
+    the accelerations without the rod, and m_L t q the force of the rod on the drone:
 
         t (1 + m_L / m + m_L (d x q).J^-1 (d x q)) = q.(g - p_0'') + L |q'|^2
         L q'' = g - t q - p'',   v' = v_0' + m_L / m t q,   w' = w_0' + m_L t J^-1 (d x q)
 
-    Two angles give the direction, ``q = (-sin b cos a, sin a, -cos b cos a)``: the rod turns about y by b, then about
-    its own x by a.
+    Two angles determine the direction, ``q = (-sin b cos a, sin a, -cos b cos a)``: the rod turns by b about y, and
+    then by a about its own x axis.
 
     Args:
-        x: The 12 states of the drone; a, b, rad; a', b', rad/s. (16,)
+        x: The 12 states of ``drone_derivative``; a, b, rad; a', b', rad/s. (16,)
         u: Collective thrust, N, and body torque, N m. (4,)
         mass: Mass of the drone, kg. (1,)
         J: Inertia of the drone, body frame, kg m^2. (3, 3)
@@ -86,7 +87,7 @@ def load_derivative(
         ang_acc_per_pull = jnp.linalg.solve(J, lever)
 
         def joint_acceleration(acc: Array, ang_acc: Array) -> Array:
-            """Return the acceleration of the joint."""
+            """Return the acceleration of the joint, world frame, m/s^2. (3,)"""
             return acc + matvec(matrix, cross(ang_acc, attach) + cross(ang_vel, cross(ang_vel, attach)))
 
         acc = force / mass + gravity_vec
@@ -110,11 +111,11 @@ def rod_direction(angles: Array) -> Array:
 def rod_angles(direction: Array, direction_rate: Array) -> tuple[Array, Array]:
     """Return the angles a, b of a rod, rad, and their rates, rad/s; the inverse of ``rod_direction``.
 
-    The result is finite everywhere: where the rod is level along y, b is zero and the rates are limited.
+    The result is always finite: if the rod is level along y, b is zero and the rates are limited.
 
     Args:
         direction: Unit vector from drone to load. (..., 3)
-        direction_rate: Its derivative, 1/s. (..., 3)
+        direction_rate: Derivative of the direction, 1/s. (..., 3)
 
     Returns:
         Angles (..., 2), rates (..., 2).

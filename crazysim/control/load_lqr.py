@@ -29,7 +29,8 @@ SetpointBody = Literal["load", "drone"]
 """Body that a setpoint describes."""
 
 ROD_JERK_MAX = 500.0
-"""Largest third derivative of the direction of the rod that is fed forward, 1/s^3: a swing of 0.5 rad at 10 rad/s."""
+"""Largest third derivative of the direction of the rod that is fed forward, 1/s^3. A swing with an amplitude of 0.5 rad
+and an angular frequency of 10 rad/s reaches it."""
 
 
 class LoadLQRParams(RigidBodyParams):
@@ -135,13 +136,14 @@ def load_gain(
 def load_reference(
     setpoint: Setpoint, params: LoadLQRParams, rod_jerk: Array | None = None
 ) -> tuple[Reference, Array, Array]:
-    """Return the motion of a drone that carries a load along a setpoint, and the direction of the rod and its rate.
+    """Return the reference of a drone that carries a load along a setpoint, and the direction of the rod and its rate.
 
-    The rod pulls the load along its specific force, ``q = -(a_L - g) / |a_L - g|``, so the drone is at ``r_L - L q``.
-    Its thrust is ``f = (m + m_L)(a_L - g) - m L q_tt``, and compensates the drag of a level drone too. The body rates
-    follow from ``f_t = (m + m_L) j_L - m L q_ttt``, whose last term needs the fifth derivative of the load's position,
-    which a setpoint does not have. A joint away from the centre of mass shifts the drone, and the load's pull adds a
-    torque; the acceleration of the joint relative to the centre of mass is neglected.
+    The setpoint gives position r_L, acceleration a_L and jerk j_L of the load. The rod of length L pulls the load along
+    its specific force, ``q = -(a_L - g) / |a_L - g|``, so that the drone is at ``r_L - L q``. The thrust is
+    ``f = (m + m_L)(a_L - g) - m L q_tt``, plus the drag of a level drone. The body rates follow from
+    ``f_t = (m + m_L) j_L - m L q_ttt``. Its last term needs the fifth derivative of the load's position, which a
+    setpoint does not have: it is the argument ``rod_jerk``. A joint away from the centre of mass shifts the drone, and
+    the load's pull then adds a torque. The acceleration of the joint relative to the centre of mass is neglected.
 
     Args:
         setpoint: Setpoint of the load.
@@ -149,7 +151,8 @@ def load_reference(
         rod_jerk: Third derivative q_ttt of the direction, 1/s^3; None for zero. (..., 3)
 
     Returns:
-        Reference of the drone; direction of the rod from drone to load (..., 3); its derivative, 1/s (..., 3).
+        Reference of the drone; direction q of the rod from drone to load (..., 3); derivative of the direction, 1/s
+        (..., 3).
     """
     p, sp = params, setpoint
     rod_up, rod_up_rate, rod_up_acc = thrust_direction(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
@@ -165,14 +168,14 @@ def load_reference(
 
 
 def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Reference, Array, Array]:
-    """Return the reference for a setpoint of the drone, with a load that hangs as if its acceleration were constant.
+    """Return the reference for a setpoint of the drone, with the load where it hangs at a constant acceleration.
 
     Args:
         setpoint: Setpoint of the drone.
         params: Masses, length, inertia.
 
     Returns:
-        As ``load_reference``.
+        The results of ``load_reference``.
     """
     p, sp = params, setpoint
     rod_up, rod_up_rate, _ = thrust_direction(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
@@ -191,9 +194,9 @@ def _joint_motion(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, 
 def _reference(
     pos: Array, vel: Array, force: Array, force_rate: Array, setpoint: Setpoint, p: LoadLQRParams
 ) -> Reference:
-    """Return the reference of a drone whose thrust vector is ``force``, N, with the derivative ``force_rate``, N/s.
+    """Return the reference of a drone with the thrust vector ``force``, N, and its derivative ``force_rate``, N/s.
 
-    The torque includes compensation for the pull at the joint of a load that accelerates like the setpoint.
+    The torque compensates the pull at the joint of a load with the acceleration of the setpoint.
     """
     total_mass = p.mass + p.load_mass
     attitude = attitude_of_thrust(
@@ -231,7 +234,7 @@ def load_lqr_control(
         vel: Velocity of the drone, world frame, m/s. (..., 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         direction: Unit vector from the joint of the rod to the load, world frame. (..., 3)
-        direction_rate: Its derivative, 1/s. (..., 3)
+        direction_rate: Derivative of the direction, 1/s. (..., 3)
         setpoint: Setpoint with the leading axes of the state.
         params: Gain, shared or with the leading axes of the state.
         target: ``"load"`` if the setpoint is of the load, ``"drone"`` if it is of the drone.
@@ -254,7 +257,7 @@ def load_lqr_control(
 
 
 class LoadLQRMemory(PyTree):
-    """Memory of the LQR with load: a derivative at the last tick, to compute the next derivative by differences."""
+    """Memory of the LQR with load. The third derivative of the rod's direction is computed from it by a difference."""
 
     rod_acc: Array = leaf("drone", 1)
     """Second derivative of the direction of the rod at the last tick, 1/s^2. (n_worlds, n_drones, 3)"""
@@ -279,8 +282,7 @@ class LoadLQR(Controller):
     target: SetpointBody = "load"
     """Body that setpoints describe."""
     load: str = "load"
-    """Name of the plugin of the load, whose record has ``tip_pos`` and ``tip_vel`` of a hook, or else ``pos`` and
-    ``vel`` of the load."""
+    """Name of the plugin of the load. Its record has ``tip_pos`` and ``tip_vel`` (a hook), or ``pos`` and ``vel``."""
     Q: ArrayLike | None = None
     """Weights of the states, as for ``LoadLQRParams.create``."""
     R: ArrayLike | None = None
@@ -295,7 +297,7 @@ class LoadLQR(Controller):
     def take_over(
         self, data: DroneData, command: Any, memory: LoadLQRMemory, params: LoadLQRParams, rotor_vel: Array
     ) -> LoadLQRMemory:
-        # the remembered derivative is older than the last tick
+        # The derivative in the memory is older than the last tick.
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(
@@ -307,7 +309,7 @@ class LoadLQR(Controller):
                 f"sim.add(SlungLoad(...)), or LoadLQR(load=...) with its name."
             )
         s, load = data.states, data.plugins[self.load]
-        # A hook's rod swings even when it holds no load.
+        # The rod of a hook swings even when the hook holds no load.
         tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
         offset, rate = tip_pos - s.pos, tip_vel - s.vel
         if params.attach is not None:

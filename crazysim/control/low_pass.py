@@ -8,7 +8,7 @@ import math
 def butterworth(cutoff: float, freq: float) -> list[float]:
     """Return the coefficients b0, a1, a2 of a low-pass Butterworth filter of order 2; ``b1 = 2 b0`` and ``b2 = b0``.
 
-    The bilinear transform is used with a warped frequency, so that the gain at the cutoff is 1/sqrt(2), as in
+    The frequency is prewarped for the bilinear transform, so that the gain at the cutoff is 1/sqrt(2), as in
     ``lpf2pSetCutoffFreq`` in filter.c of bitcraze/crazyflie-firmware.
 
     Args:

@@ -1,4 +1,4 @@
-"""Linear quadratic regulator about hover, for setpoints that move."""
+"""Linear quadratic regulator about hover, which tracks moving setpoints."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class LQRParams(RigidBodyParams):
 
         Args:
             airframe: The airframe.
-            freq: Rate of the controller, Hz, which enters the default weights.
+            freq: Rate of the controller, Hz, on which the default weights depend.
             Q: Weights of position, velocity, roll, pitch, yaw and body rates, a diagonal (12,) or a matrix (12, 12);
                 None for ``lqr_weights``.
             R: Weights of collective thrust and torque (4,) or (4, 4); None for ``lqr_weights``.
@@ -67,11 +67,11 @@ def lqr_weights(
     """Return the weights Q (n, n) and R (4, 4) as matrices; by default they suit the bandwidth of the airframe.
 
     The default follows Bryson's rule: each weight is one over the square of an acceptable error. The acceptable
-    position error is 1 m. The acceptable velocity, tilt, body rates, thrust and torque are the values with which the
-    rule of ``crazysim.control.bandwidth`` would answer such an error: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with
-    the natural frequency w of the position loop, the attitude stiffness k, and the mass m with the load. Yaw has the
-    same value as roll and pitch. The acceptable angle of a rod shifts its load by 1 m, which is 1 / length rad; the
-    acceptable rate is w times as much.
+    position error is 1 m. The acceptable velocity, tilt, body rates, thrust and torque are the responses to such an
+    error with the gains of ``crazysim.control.bandwidth``: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with the natural
+    frequency w of the position loop, the attitude stiffness k, and the mass m including the load. The acceptable yaw
+    error equals the acceptable tilt. The acceptable angle of a rod is 1 / length rad, which shifts its load by 1 m; the
+    acceptable rate of this angle is w times that.
 
     Args:
         airframe: The airframe.
@@ -79,7 +79,7 @@ def lqr_weights(
         Q: Weights of the n = 12 states, or 16 with a load: a diagonal or a matrix; None for the rule.
         R: Weights of the inputs: a diagonal or a matrix; None for the rule.
         load_mass: Mass of the load, kg.
-        length: Length of its rod, m; None without a load.
+        length: Length of the rod of the load, m; None without a load.
     """
     rates, g = bandwidth(airframe, freq), -GRAVITY[2]
     w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
@@ -95,7 +95,7 @@ def weight_matrix(name: str, weights: ArrayLike, n: int) -> np.ndarray:
     """Return weights as a matrix (n, n) of float64.
 
     Args:
-        name: ``"Q"`` for weights of states, which may be zero, or ``"R"`` for weights of inputs, which may not.
+        name: ``"Q"`` for weights of states, which may be zero, or ``"R"`` for weights of inputs, which are positive.
         weights: A diagonal (n,) or a symmetric matrix (n, n).
         n: Number of states or inputs.
     """
@@ -113,15 +113,15 @@ def weight_matrix(name: str, weights: ArrayLike, n: int) -> np.ndarray:
     return array
 
 
-def solve_on_host(gain: Callable[..., Array], *args: Any) -> np.ndarray:
-    """Return a gain computed in float64 on the CPU.
+def solve_on_host(compute_gain: Callable[..., Array], *args: Any) -> np.ndarray:
+    """Return ``compute_gain(*args)``, computed in float64 on the CPU.
 
     Raises:
         ConfigError: If the Riccati equation has no stabilising solution.
     """
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         args = jax.tree.map(lambda x: np.asarray(x, np.float64), args, is_leaf=lambda x: isinstance(x, list))
-        return check_gain(np.asarray(jax.jit(gain)(*args)))
+        return check_gain(np.asarray(jax.jit(compute_gain)(*args)))
 
 
 def hover_gain(mass: Array, J: Array, Q: Array, R: Array) -> Array:
@@ -147,7 +147,7 @@ def hover_gain(mass: Array, J: Array, Q: Array, R: Array) -> Array:
 
 
 class Reference(NamedTuple):
-    """State and wrench of a drone that flies a setpoint."""
+    """State and wrench of a drone that tracks a setpoint exactly."""
 
     pos: Array
     """Position, world frame, m. (..., 3)"""
@@ -162,7 +162,7 @@ class Reference(NamedTuple):
 
 
 def flat_reference(setpoint: Setpoint, params: RigidBodyParams) -> Reference:
-    """Return the reference of a setpoint, from flatness, with the drag of a level drone compensated.
+    """Return the reference of a setpoint by differential flatness, with the drag of a level drone compensated.
 
     Args:
         setpoint: The setpoint.
@@ -193,7 +193,7 @@ def state_error(
         vel: Velocity, world frame, m/s. (..., 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         reference: Reference.
-        yaw: Heading in whose frame the errors of position and velocity are returned, rad; None for the world frame.
+        yaw: Heading, rad, to return the errors of position and velocity in its frame; None for the world frame.
             (..., 1)
     """
     matrix = rotation.matrix(quat)
@@ -217,7 +217,7 @@ def state_error(
 
 
 def to_heading_frame(vector: Array, yaw: Array) -> Array:
-    """Return the components of a world vector in the frame that is turned by the yaw about z. (..., 3)"""
+    """Return a world vector in the frame that is turned by the yaw, rad, about z. (..., 3)"""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y, z = vector[..., :1], vector[..., 1:2], vector[..., 2:]
     return jnp.concatenate([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
@@ -226,8 +226,8 @@ def to_heading_frame(vector: Array, yaw: Array) -> Array:
 def lqr_control(pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: Setpoint, *, params: LQRParams) -> Array:
     """Return the wrench of the LQR about hover, with the wrench of the setpoint's motion as feedforward.
 
-    ``u = u_ref - K e``. Errors of position and velocity are taken in the frame of the desired heading, so that one gain
-    serves every yaw. Reference attitude, rates and wrench come from flatness (``flat_reference``).
+    The law is ``u = u_ref - K e``. Errors of position and velocity are in the frame of the desired heading, so that the
+    same gain is valid for every yaw. ``flat_reference`` gives the reference attitude, rates and wrench.
 
     Args:
         pos: Position, world frame, m. (..., 3)

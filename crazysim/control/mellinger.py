@@ -98,7 +98,9 @@ class MellingerMemory(PyTree):
 def desired_force(
     pos: Array, vel: Array, setpoint: Setpoint, integral: Array, freq: float, *, params: MellingerParams
 ) -> tuple[Array, Array]:
-    """Return the force that leads to a setpoint, world frame, N, and the integral (Mellinger 2011, eq. 6). (..., 3)
+    """Return the force that leads to a setpoint, world frame, N, and the new integral, m s. (..., 3) each
+
+    Source: Mellinger and Kumar (2011, eq. 6).
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -124,10 +126,10 @@ def torque_of_rotation(
     *,
     params: MellingerParams,
 ) -> tuple[Array, MellingerMemory]:
-    """Return the torque that turns the drone to an attitude, PWM, and the memory. (..., 3)
+    """Return the torque that turns the drone to an attitude, PWM (..., 3), and the memory.
 
-    Mellinger 2011, eq. 10 to 13, without the factor one half on the rotation error, and with an integral and a
-    derivative of the rates.
+    The law is that of Mellinger and Kumar (2011, eq. 10 to 13), without the factor one half on the rotation error, and
+    with an integral and a derivative of the rates.
 
     Args:
         axes: Rotation matrix, body to world. (..., 3, 3)
@@ -148,13 +150,13 @@ def torque_of_rotation(
 
 
 class Mellinger(Controller):
-    """The firmware's controller after Mellinger and Kumar (2011), position and attitude parts at one rate.
+    """Controller of the Crazyflie firmware after Mellinger and Kumar (2011).
 
-    Unlike Crazyflow's cascade, which is derived from it, it lowers all motors if one would exceed its maximum, has no
-    minimum PWM, resets its integrals at zero thrust, and runs the position part at the rate of the attitude part. The
-    firmware's version has no rate mode: use ``controller="pid"`` for body rates. At the level ``state`` the desired
-    body rates come from the command, ``cmd[13:16]``; a ``Setpoint`` has none. Source: controller_mellinger.c
-    of bitcraze/crazyflie-firmware, commit 2a18fc29.
+    Crazyflow's cascade is derived from this controller, but differs: this controller lowers all motors if one motor
+    would exceed its maximum, has no minimum PWM, resets its integrals at zero thrust, and runs position and attitude
+    part at the same rate. It does not follow body rates; use ``controller="pid"`` for them. At the level ``state`` the
+    desired body rates are those of the command, ``cmd[13:16]``, because a ``Setpoint`` has no body rates. Source:
+    controller_mellinger.c of bitcraze/crazyflie-firmware, commit 2a18fc29.
     """
 
     name: ClassVar[str] = "mellinger"
@@ -191,7 +193,7 @@ class Mellinger(Controller):
         params: MellingerParams,
         rotor_vel: Array,
     ) -> MellingerMemory:
-        # The integrals are set to continue the current force and torque, as far as their limits allow.
+        # The integrals are set so that force and torque continue without a jump, as far as their limits allow.
         p, s = params, data.states
         ang_vel_des = _desired_rates(data, command)
         zero = jnp.zeros_like(s.ang_vel)
@@ -240,7 +242,7 @@ def _divide_by_gain(x: Array, gain: Array) -> Array:
 
 
 def axes_of_force(force: Array, yaw: Array) -> Array:
-    """Return the rotation matrix with the body z axis along a force and the x axis closest to a yaw. (..., 3, 3)
+    """Return the rotation matrix with the z axis along a force and the x axis closest to a heading. (..., 3, 3)
 
     Args:
         force: Force, world frame, N. (..., 3)
@@ -250,7 +252,7 @@ def axes_of_force(force: Array, yaw: Array) -> Array:
 
 
 def rotation_error(axes: Array, axes_des: Array) -> Array:
-    """Return the rotation error ``vee(Rd^T R - R^T Rd)``, twice the sine of the angle about the axis. (..., 3)"""
+    """Return the rotation error ``vee(Rd^T R - R^T Rd)``: along the axis, with twice the sine of the angle. (..., 3)"""
     x, y, z = axes[..., 0], axes[..., 1], axes[..., 2]
     xd, yd, zd = axes_des[..., 0], axes_des[..., 1], axes_des[..., 2]
     parts = [dot(zd, y) - dot(yd, z), dot(xd, z) - dot(zd, x), dot(yd, x) - dot(xd, y)]

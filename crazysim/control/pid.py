@@ -36,9 +36,9 @@ class PID(Controller):
     """The firmware's default controller: PID loops for position, velocity, attitude and body rates.
 
     At the level ``state`` it follows position and yaw, as the firmware does with a full-state setpoint: velocity and
-    acceleration are not fed forward. At the level ``body_rate`` it follows only rates and does not level the drone:
-    CTBR (collective thrust and body rates) in the literature. Source: controller_pid.c, position_controller_pid.c,
-    attitude_pid_controller.c and pid.c of bitcraze/crazyflie-firmware, commit 2a18fc29.
+    acceleration are not fed forward. At the level ``body_rate`` it follows collective thrust and body rates (CTBR) and
+    does not level the drone. Source: controller_pid.c, position_controller_pid.c, attitude_pid_controller.c and pid.c
+    of bitcraze/crazyflie-firmware, commit 2a18fc29.
     """
 
     name: ClassVar[str] = "pid"
@@ -49,9 +49,9 @@ class PID(Controller):
     outer_freq: int = 100
     """Rate of the position and velocity loops, Hz (``POSITION_RATE``)."""
     hold_yaw: bool = False
-    """True if a commanded yaw rate moves a yaw angle that the attitude loop holds, as in the firmware. That loop acts
-    on Euler angles, so it disturbs the rates of a strongly tilted drone. If False, the rate loop follows the yaw rate
-    directly."""
+    """True to integrate a commanded yaw rate to a yaw that the attitude loop holds, as in the firmware. The attitude
+    loop acts on Euler angles, and therefore disturbs the rates of a strongly tilted drone. False to follow the yaw rate
+    in the rate loop."""
     whole_numbers: bool = False
     """True to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
 
@@ -63,7 +63,8 @@ class PID(Controller):
 
     def outer(self, data: DroneData, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
         s, heading = data.states, heading_vector(data.states.quat)
-        # In world axes, as in positionControllerResetAllPID; the firmware's derivative gain of this loop is zero.
+        # The first measurement is in world axes, as in positionControllerResetAllPID. It has no effect with the
+        # firmware's derivative gain, which is zero in this loop.
         position = memory.position.with_first_measurement(s.pos, memory.started)
         vel_des, position = desired_velocity(
             s.pos, heading, command.pos, position, self.outer_freq, loop=params.position
@@ -91,8 +92,8 @@ class PID(Controller):
     def take_over(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rotor_vel: Array
     ) -> PIDMemory:
-        # At the level ``state``, the integrals of the velocity loop absorb the difference in thrust, roll and pitch.
-        # At every level, the integrals of the rate loop absorb the difference in torque.
+        # The rotor speeds continue without a jump: at the level ``state``, the integrals of the velocity loop are set
+        # to the current thrust, roll and pitch, and at every level those of the rate loop to the current torque.
         s, p, initial_memory = data.states, params, jax.tree.map(jnp.zeros_like, memory)
         rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(s.quat), DEGREES_PER_RADIAN * s.ang_vel
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
@@ -143,12 +144,12 @@ class PID(Controller):
 
 
 def _reset_at_zero_thrust(memory: PIDMemory, rpy: Array, pos: Array) -> PIDMemory:
-    """Return the memory, reset where the thrust is zero or less, as by ``controllerPidReinitialize``."""
+    """Return the memory, reset where the thrust is zero or less, as ``controllerPidReinitialize`` does."""
     m, is_off = memory, memory.thrust <= 0
     return m.replace(
         position=m.position.reset_where(is_off, pos),
         velocity=m.velocity.reset_where(is_off, jnp.zeros_like(pos)),
-        attitude=m.attitude.reset_where(is_off, rpy, filters=False),
-        rate=m.rate.reset_where(is_off, jnp.zeros_like(rpy), filters=False),
+        attitude=m.attitude.reset_where(is_off, rpy, resets_filter=False),
+        rate=m.rate.reset_where(is_off, jnp.zeros_like(rpy), resets_filter=False),
         rpy_des=jnp.where(is_off, rpy, m.rpy_des),
     )

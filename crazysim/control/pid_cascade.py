@@ -40,8 +40,8 @@ class PIDParams(PyTree):
     position: PIDLoop
     """Position loop in the heading frame: position error, m, to desired velocity, m/s."""
     velocity: PIDLoop
-    """Velocity loop in the heading frame: velocity error, m/s, to pitch and negative roll, degrees, and thrust,
-    1000 PWM."""
+    """Velocity loop in the heading frame: velocity error, m/s, to pitch, degrees, negative roll, degrees, and thrust in
+    units of 1000 PWM."""
     attitude: PIDLoop
     """Attitude loop: error of roll, pitch and yaw, degrees, to desired body rates, degrees/s."""
     rate: PIDLoop
@@ -75,13 +75,13 @@ class PIDMemory(PyTree):
     """Memory of the cascade."""
 
     position: PIDLoopMemory
-    """Position loop."""
+    """Memory of the position loop."""
     velocity: PIDLoopMemory
-    """Velocity loop."""
+    """Memory of the velocity loop."""
     attitude: PIDLoopMemory
-    """Attitude loop."""
+    """Memory of the attitude loop."""
     rate: PIDLoopMemory
-    """Rate loop."""
+    """Memory of the rate loop."""
     rpy_des: Array = leaf("drone", 1)
     """Desired roll, pitch, yaw, degrees. (n_worlds, n_drones, 3)"""
     thrust: Array = leaf("drone", 1)
@@ -144,7 +144,9 @@ def desired_attitude(
 def desired_rates(
     rpy: Array, rpy_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
 ) -> tuple[Array, PIDLoopMemory]:
-    """Return the desired body rates, degrees/s, and the new memory of the attitude loop, which uses Euler angles.
+    """Return the desired body rates, degrees/s (..., 3), and the new memory of the attitude loop.
+
+    As in the firmware, the loop uses Euler angles.
 
     Args:
         rpy: Roll, pitch, yaw, degrees. (..., 3)
@@ -159,7 +161,7 @@ def desired_rates(
 def desired_torque(
     ang_vel: Array, ang_vel_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
 ) -> tuple[Array, PIDLoopMemory]:
-    """Return the torque that tracks the desired body rates, PWM, and the new memory of the rate loop.
+    """Return the torque that tracks the desired body rates, PWM (..., 3), and the new memory of the rate loop.
 
     Args:
         ang_vel: Angular velocity, body frame, degrees/s. (..., 3)
@@ -184,7 +186,7 @@ def to_heading_frame(heading: Array, vector: Array) -> Array:
 
 
 def heading_vector(quat: Array) -> Array:
-    """Return cosine and sine of an attitude's yaw; one and zero where body x points straight up or down. (..., 2)"""
+    """Return cosine and sine of the yaw of an attitude; (1, 0) where the body x axis is vertical. (..., 2)"""
     x, y, z, w = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
     projection = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1)
     return rotation.safe_normalize(projection, jnp.asarray([1.0, 0.0], quat.dtype))

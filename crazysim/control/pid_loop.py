@@ -1,4 +1,4 @@
-"""PID loops of the Crazyflie firmware, three at a time."""
+"""PID loops of the Crazyflie firmware, computed for three loops at a time."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import clip
 
 DEFAULT_INTEGRAL_MAX = 5000.0
-"""Limit of the integral of a loop that sets no limit (``DEFAULT_PID_INTEGRATION_LIMIT``)."""
+"""Limit of the integral for loops of airframes that do not set it (``DEFAULT_PID_INTEGRATION_LIMIT``)."""
 
 
 class PIDLoop(PyTree):
     """Gains and limits of three PID loops, each shared or one per drone.
 
-    An integral or derivative gain that is zero in all three loops is None, and its part of the loop and of the memory
-    is omitted.
+    Gains ``ki`` or ``kd`` that are zero in all three loops are None; integral or derivative are then not computed.
     """
 
     kp: Array = leaf("parameter", 1)
@@ -59,7 +58,7 @@ class PIDLoop(PyTree):
 
 
 class PIDLoopMemory(PyTree):
-    """Memory of three PID loops; a field is None where the loops have no such part."""
+    """Memory of three PID loops. Fields of integral, derivative or filter are None if the loops do not have it."""
 
     integral: Any = leaf("drone", 1)
     """Integrals of the error, input s. (n_worlds, n_drones, 3)"""
@@ -78,23 +77,23 @@ class PIDLoopMemory(PyTree):
         )
 
     def with_first_measurement(self, measured: Array, started: Array) -> PIDLoopMemory:
-        """Return the memory; where the loop has not started, ``measured`` (3,) are the last measured values."""
+        """Return the memory with ``measured`` (3,) as the last measured values where the loops have not started."""
         if self.measured is None:
             return self
         return self.replace(measured=jnp.where(started, self.measured, measured))
 
-    def reset_where(self, mask: Array, measured: Array, filters: bool = True) -> PIDLoopMemory:
+    def reset_where(self, mask: Array, measured: Array, resets_filter: bool = True) -> PIDLoopMemory:
         """Return the memory, with zero integrals and new last measured values where a mask is True.
 
         Args:
             mask: True where the loops are reset. (1,)
             measured: New last measured values. (3,)
-            filters: True to reset the filter of the derivative too.
+            resets_filter: True to reset the filter of the derivative too.
         """
         return PIDLoopMemory(
             integral=None if self.integral is None else jnp.where(mask, 0.0, self.integral),
             measured=None if self.measured is None else jnp.where(mask, measured, self.measured),
-            delays=jnp.where(mask, 0.0, self.delays) if filters and self.delays is not None else self.delays,
+            delays=jnp.where(mask, 0.0, self.delays) if resets_filter and self.delays is not None else self.delays,
         )
 
 
@@ -109,9 +108,9 @@ def pid_step(
 ) -> tuple[Array, PIDLoopMemory]:
     """Return the outputs of three PID loops, and their memory after a tick.
 
-    The derivative is taken of the measured value, so that a step of the setpoint gives no kick. Integral and output are
-    limited. Source: ``pidUpdate`` in pid.c of bitcraze/crazyflie-firmware, commit 2a18fc29, without its feedforward of
-    the setpoint, whose gains are zero on every platform.
+    The derivative is that of the measured value, so that a step of the setpoint causes no peak of the output. Integral
+    and output are limited. Source: ``pidUpdate`` in pid.c of bitcraze/crazyflie-firmware, commit 2a18fc29. Its
+    feedforward of the setpoint is left out, because the feedforward gains are zero on every platform.
 
     Args:
         error: Desired minus measured values. (..., 3)
@@ -141,19 +140,19 @@ def pid_step(
     return (output if loop.output_max is None else clip(output, -loop.output_max, loop.output_max)), memory
 
 
-def continue_integral(memory: PIDLoopMemory, output: Array, desired: Array, *, loop: PIDLoop) -> PIDLoopMemory:
-    """Return the memory with integrals, within their limits, that turn the outputs of a tick into desired ones.
+def continue_integral(memory: PIDLoopMemory, output: Array, desired_output: Array, *, loop: PIDLoop) -> PIDLoopMemory:
+    """Return the memory with integrals that give desired outputs, as far as the limits of the integrals allow.
 
     Args:
         memory: Memory of the loops.
         output: Outputs with this memory. (3,)
-        desired: Desired outputs. (3,)
+        desired_output: Desired outputs. (3,)
         loop: Gains and limits.
     """
     integral_max: Any = loop.integral_max
     if loop.ki is None:
         return memory
-    missing_integral = jnp.where(loop.ki == 0, 0.0, (desired - output) / jnp.where(loop.ki == 0, 1.0, loop.ki))
+    missing_integral = jnp.where(loop.ki == 0, 0.0, (desired_output - output) / jnp.where(loop.ki == 0, 1.0, loop.ki))
     return memory.replace(integral=clip(memory.integral + missing_integral, -integral_max, integral_max))
 
 
@@ -165,10 +164,9 @@ def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array,
     return b0 * (new_delay + 2 * last_delay + previous_delay), jnp.stack([new_delay, last_delay], axis=-2)
 
 
-def _wrap_angle(angle: Array, is_angle: Sequence[bool]) -> Array:
-    """Return the values; where ``is_angle``, one turn is subtracted above 180 degrees and added below -180 degrees."""
+def _wrap_angle(x: Array, is_angle: Sequence[bool]) -> Array:
+    """Return values with 360 degrees subtracted above 180 degrees and added below -180 degrees where ``is_angle``."""
     if not any(is_angle):
-        return angle
-    mask = jnp.asarray(is_angle)
-    correction = jnp.where(angle > 180, 360.0, jnp.where(angle < -180, -360.0, 0.0))
-    return jnp.where(mask, angle - correction, angle)
+        return x
+    correction = jnp.where(x > 180, 360.0, jnp.where(x < -180, -360.0, 0.0))
+    return jnp.where(jnp.asarray(is_angle), x - correction, x)

@@ -1,4 +1,4 @@
-"""Position loop of the default controller: setpoint to specific force, with an estimate of unknown forces."""
+"""Position loop of the default controller, from a setpoint to a specific force, with an estimate of unknown forces."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ POSITION_RATE_RATIO = 0.4
 OBSERVER_RATE_RATIO = 1.5
 """Rate of the estimate of unknown forces times the delay of the loop below the position loop, 1."""
 MAX_THRUST_SHARE = 0.9
-"""Fraction of the largest thrust that the feedback uses, 1; the rest is for the attitude."""
+"""Largest fraction of the maximum thrust that the feedback uses, 1; the attitude control uses the rest."""
 MAX_HORIZONTAL_RATIO = 1.0
-"""Largest horizontal acceleration by feedback over gravity, 1: a tilt of 45 degrees."""
+"""Largest horizontal acceleration by feedback over gravity, 1. It needs a tilt of 45 degrees."""
 MAX_FALL_RATIO = 0.5
-"""Largest downward acceleration by feedback over gravity, 1: half of the hover thrust remains to turn the drone."""
+"""Largest downward acceleration by feedback over gravity, 1. Half of the hover thrust remains to turn the drone."""
 MIN_UPWARD_RATIO = 0.1
-"""Upward force of the rotors over the weight that keeps a falling drone upright, 1.
+"""Smallest upward force of the rotors over the weight, 1. It keeps a falling drone upright.
 
-Of the built-in airframes, ``cf...`` and ``hb_x500`` have 1.6 to 2.1 times this force with all rotors at their least
-thrust. The other airframes then have none.
+With all rotors at minimum thrust, the built-in airframes ``cf...`` and ``hb_x500`` have 1.6 to 2.1 times this force;
+the other built-in airframes have no thrust.
 """
 MIN_FEEDBACK_RATIO = 0.1
 """Lower bound on the upward and horizontal limits of the feedback over gravity, 1, for drones with little lift."""
@@ -56,9 +56,9 @@ class PositionParams(PyTree):
         """Return the shared parameters of an airframe.
 
         The loop is critically damped at the natural frequency ``POSITION_RATE_RATIO / delay``. Its acceleration is
-        limited to what the rotors can give while they carry the drone. The position error is limited to twice the
-        distance that alone demands this acceleration, so that the drone approaches a distant setpoint at a speed from
-        which it can stop.
+        limited to the acceleration that the rotors can give while they carry the drone. The position error is limited
+        to twice the error at which the stiffness alone demands this acceleration. The drone then approaches a distant
+        setpoint at a speed from which it can stop.
 
         Args:
             airframe: The airframe.
@@ -109,10 +109,11 @@ def specific_force(
 ) -> tuple[Array, PositionMemory]:
     """Return the specific force that leads to a setpoint, and the memory.
 
-    The difference between the velocity and the velocity expected from the known forces, divided by one tick, measures
-    the unknown forces. It is limited (``MAX_DISTURBANCE_RATIO``) and then filtered, so that the estimate does not wind
-    up while a drone is held, or when it is moved by hand or by a reset. A drone whose velocity is exactly zero is taken
-    to stand on the floor: horizontal forces are not measured then, because compensating them would tilt it further.
+    The acceleration by unknown forces is the difference between the velocity and the velocity expected from the known
+    forces, divided by one period. It is limited (``MAX_DISTURBANCE_RATIO``) and then filtered, so that the estimate
+    does not wind up while a drone is held, or when it is moved by hand or by a reset. A drone with a velocity of
+    exactly zero is assumed to stand on the floor. Its horizontal forces are ignored, because compensating them would
+    tilt the drone further.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -145,9 +146,9 @@ def specific_force(
 def keep_upright(specific_thrust: Array, setpoint: Setpoint, params: PositionParams) -> Array:
     """Return the specific force of the rotors, raised so that it does not turn the drone on its back.
 
-    Where feedback, drag and estimates cancel the weight, as in a fall, the sum may point in any direction. A small
-    upward force is kept, which most rotors exceed even at their least thrust. A setpoint that accelerates downward by
-    more than gravity does turn the drone over: the limit is lowered by twice the excess over gravity.
+    In a fall, feedback, drag and estimates may cancel the weight, and the sum may then point in any direction. The
+    upward component is therefore at least ``MIN_UPWARD_RATIO`` times gravity. A setpoint that accelerates downward by
+    more than gravity is allowed to turn the drone over: it lowers this limit by twice the excess over gravity.
 
     Args:
         specific_thrust: Specific force of the rotors, world frame, m/s^2. (..., 3)
@@ -162,7 +163,7 @@ def keep_upright(specific_thrust: Array, setpoint: Setpoint, params: PositionPar
 
 
 def _limit_length(x: Array, limit: Array) -> Array:
-    """Return a vector, shortened where it is longer than a limit. (..., n)"""
+    """Return vectors, shortened to a limit where they are longer. (..., n)"""
     norm = safe_norm(x)
     return x * jnp.where(norm > limit, limit / jnp.where(norm > limit, norm, 1.0), 1.0)
 

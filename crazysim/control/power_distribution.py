@@ -1,4 +1,4 @@
-"""Power distribution of the Crazyflie firmware: thrust and torque in PWM units to the motors."""
+"""Power distribution of the Crazyflie firmware, from thrust and torque to the PWM of each motor."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ class PowerDistributionParams(PyTree):
     thrust_max: Array = leaf("parameter", 1, (1,))
     """Thrust of one rotor at maximum PWM, N. (1,)"""
     rpm2thrust: Array = leaf("parameter", 2)
-    """Thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
+    """Coefficients of the thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
     torque_allocation: Array = leaf("parameter", 2)
-    """Torque commands to PWM of each rotor, with the firmware's factor 1/2 for roll and pitch, 1. (n_rotors, 3)"""
+    """Matrix from torque commands to PWM of the rotors, with the firmware's factor 1/2 for roll and pitch, 1.
+    (n_rotors, 3)"""
     torque_of_pwm: Array = leaf("parameter", 2)
-    """Inverse of the allocation, PWM of each rotor to torque commands, 1. (3, n_rotors)"""
+    """Matrix from PWM of the rotors to torque commands: pseudoinverse of ``torque_allocation``, 1. (3, n_rotors)"""
     rotors: Array | None = leaf("parameter", 1, default=None)
-    """True for the rotors that the drone has; None where all drones have equally many. (n_rotors,)"""
+    """True for the rotors that the drone has; None if all drones have the same number of rotors. (n_rotors,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> PowerDistributionParams:
@@ -47,12 +48,12 @@ class PowerDistributionParams(PyTree):
 
 
 def torque_allocation(airframe: Airframe) -> np.ndarray:
-    """Return the shares of roll, pitch and yaw commands in the PWM of each rotor. (n_rotors, 3)
+    """Return the matrix from roll, pitch and yaw torque commands to PWM of the rotors. (n_rotors, 3)
 
     The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the least-norm
     allocation of a quadrotor in X. Other layouts get the same factors.
     """
-    # Without the rounding errors of the pseudoinverse, which would change what is truncated.
+    # Rounded, because ``truncate`` would amplify the rounding errors of the pseudoinverse.
     return np.round(allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0], 12)
 
 
@@ -61,12 +62,13 @@ def distribute_power(
 ) -> Array:
     """Return the PWM of the motors for a thrust and a torque.
 
-    Where a motor would exceed its maximum, all motors are lowered by the largest excess, which keeps the torque at the
+    If a motor would exceed its maximum, all motors are lowered by the largest excess, which keeps the torque at the
     expense of thrust. Then negative PWM is raised to zero, the firmware's default idle thrust. A thrust of zero or less
     switches the motors off. Source: ``powerDistributionLegacy`` and ``powerDistributionCap`` in
-    power_distribution_quadrotor.c of bitcraze/crazyflie-firmware, commit 2a18fc29. The firmware truncates the torque,
-    half of it for roll and pitch, and the PWM to integers. Without truncation, the PWM differs by less than 4, and by
-    less than 5 where a motor is at its maximum.
+    power_distribution_quadrotor.c of bitcraze/crazyflie-firmware, commit 2a18fc29.
+
+    The firmware truncates three numbers to integers: the torque, half of the roll and pitch torque, and the PWM.
+    Without truncation, the PWM differs by less than 4, or by less than 5 where a motor is at its maximum.
 
     Args:
         thrust: Thrust of each motor, PWM. (..., 1)
@@ -91,14 +93,14 @@ def distribute_power(
 
 
 def truncate(x: Array) -> Array:
-    """Return numbers without their fractional parts, as a conversion to integers in C; the gradient is one. (...)"""
+    """Return numbers truncated toward zero, as a conversion to integers in C does; the gradient is one. (...)"""
     return x + lax.stop_gradient(jnp.trunc(x) - x)
 
 
 def rotor_vel_of_pwm(pwm: Array, *, params: PowerDistributionParams) -> Array:
     """Return the rotor speeds for the PWM of the motors, rpm; zero for zero PWM. (..., n_rotors)
 
-    The thrust is proportional to the PWM, as the firmware's battery compensation makes it.
+    The thrust is proportional to the PWM, as with the firmware's battery compensation.
 
     Args:
         pwm: PWM of each motor. (..., n_rotors)
@@ -117,7 +119,7 @@ def pwm_of_thrust(thrust: Array, *, params: PowerDistributionParams) -> Array:
 
 
 def command_of_rotor_vel(rotor_vel: Array, *, params: PowerDistributionParams) -> tuple[Array, Array]:
-    """Return the thrust per motor (..., 1) and the torque (..., 3), both in PWM, that lead to given rotor speeds.
+    """Return the thrust of each motor (..., 1) and the torque (..., 3), both in PWM, that give rotor speeds.
 
     Args:
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)

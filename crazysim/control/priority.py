@@ -13,13 +13,13 @@ from crazysim.control.levels import mask_rotors
 from crazysim.rotation import clip, matvec
 
 UNLIMITED_THRUST = 1e9
-"""Collective thrust beyond the limits of any rotors, N."""
+"""Collective thrust that is larger than the limit of any drone, N."""
 
 
 def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
     """Return a desired wrench limited to what the rotors can give, with the priority of ``prioritized_thrusts``.
 
-    A wrench is returned unchanged if the rotors can give it both with its yaw torque and with the opposite yaw torque.
+    A wrench is returned unchanged if the rotors can give it, and could also give it with the opposite yaw torque.
 
     Args:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
@@ -35,17 +35,18 @@ def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
 def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
     """Return rotor thrusts within their limits that give a desired wrench by priority, N. (..., n_rotors)
 
-    ``force_torque2rotor_vel`` clips each rotor on its own, which changes the torque. Roll and pitch determine the
-    direction of the thrust and yaw does not, so this order of priority keeps a saturated drone stable (Faessler,
-    Falanga and Scaramuzza 2017). Roll and pitch torque are scaled down only if no collective thrust lets the rotors
-    give them. The collective thrust is clipped to the range in which the rotors can. The yaw torque is limited to what
-    the remaining range of every rotor allows in both directions. Rotors are never switched off.
+    ``force_torque2rotor_vel`` clips each rotor independently, which changes the torque. Here roll and pitch torque have
+    the highest priority, because they determine the direction of the thrust. This keeps a drone with saturated rotors
+    stable (Faessler, Falanga and Scaramuzza 2017). Roll and pitch torque are scaled down only if the rotors cannot give
+    them at any collective thrust. The collective thrust is clipped to the range in which the rotors can give roll and
+    pitch torque. The yaw torque is limited to what the remaining range of every rotor allows in both directions. Rotors
+    are never switched off.
 
-    Roll and pitch torque raise the collective thrust at most to the weight. Otherwise rotors that can carry ten times
-    the weight would accelerate the drone upwards while they turn it.
+    Roll and pitch torque raise the collective thrust at most to the weight. Without this limit, rotors that can carry
+    ten times the weight would accelerate the drone upwards while they turn it.
 
-    If all rotors carry the same fraction of the collective thrust, and the weight does not limit it, the scale of roll
-    and pitch torque is the largest that fits; otherwise it may be smaller.
+    The scale of roll and pitch torque is the largest possible scale if all rotors carry the same fraction of the
+    collective thrust and the weight does not limit it. Otherwise it may be smaller.
 
     Args:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
@@ -86,7 +87,7 @@ def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, 
     weight = high_untilted if p.weight is None else p.weight
     limit = jnp.maximum(wrench[..., :1], jnp.maximum(weight, low_untilted))
 
-    # The length of the interval of allowed F ("room") is a concave function of s. It is therefore at least its linear
+    # The length of the interval of allowed F ("room") is a concave function of s. Therefore it is at least the linear
     # interpolation between s = 0, where it is positive, and s = 1. The scale is 1 if the room at s = 1 is not negative,
     # and otherwise the s at which the interpolation is zero.
     room_untilted, room_tilted = (

@@ -42,7 +42,7 @@ class FlightState(Protocol):
 
     @property
     def rotor_vel(self) -> Array:
-        """Rotor speeds, rpm. (n_rotors,)"""
+        """Rotor speeds, rpm; with fitted dynamics the thrust, N. (n_rotors,)"""
         ...
 
 
@@ -75,28 +75,30 @@ class Controller:
     """Base class of controllers, which ``Sim(controller=...)`` uses at one of their command levels.
 
     A subclass lists its settings as annotated fields with defaults, including ``freq``; it becomes a frozen
-    dataclass. Its methods are pure and written for one drone. A controller whose slow part runs at a lower rate has a
-    field ``outer_freq`` and overrides ``outer``, which then precedes ``update`` at the level ``state``.
+    dataclass. Its methods are pure and written for one drone. A controller with an outer loop, which runs at a lower
+    rate, has a field ``outer_freq`` and overrides ``outer``. At the level ``state``, ``outer`` is then called before
+    ``update``.
     """
 
     name: ClassVar[str]
     """Name of the controller."""
     levels: ClassVar[tuple[Control, ...]]
-    """Command levels that it follows."""
+    """Command levels that the controller follows."""
     output: ClassVar[Control]
-    """Level of the commands that it returns: ``force_torque`` or ``rotor_vel``, or ``attitude`` with fitted dynamics or
-    an ``inner`` controller."""
+    """Level of the commands that the controller returns: ``force_torque`` or ``rotor_vel``, or ``attitude`` with fitted
+    dynamics or an ``inner`` controller."""
     freq: int
     """Rate of ``update``, Hz. A default that does not divide the simulation's rate is lowered to the next divisor."""
     outer_freq: int | None = None
     """Rate of ``outer``, Hz; None for a controller without an outer loop."""
     inner: Controller | None = None
-    """Controller that follows the commands of this one; None if the allocation, rotors or fitted dynamics do."""
+    """Controller that follows the commands of this controller; None if allocation, rotors or fitted dynamics do so."""
     follows_feedforward: ClassVar[bool] = True
-    """True if a state command may have a ``feedforward``, which ``PID`` and ``Mellinger`` accept but do not use. If
+    """True if a state command may have a ``feedforward``; ``PID`` and ``Mellinger`` accept it but do not use it. If
     False, a command with feedforward is an error."""
     follows_rates: ClassVar[bool] = False
-    """True if it follows an attitude command together with ``data.controls.attitude.staged_ang_vel_des``."""
+    """True if the controller also follows the body rates of an attitude command,
+    ``data.controls.attitude.staged_ang_vel_des``."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass, and check its declarations."""
@@ -137,10 +139,11 @@ class Controller:
         """Return the command of the level ``output``, and the memory after a tick.
 
         Args:
-            data: ``SimData`` of one drone, with the command in force in ``data.controls``; body rates of a state
+            data: ``SimData`` of one drone, with the command in force in ``data.controls``. The body rates of a state
                 command, which a ``Setpoint`` lacks, are ``data.controls.state.cmd[13:16]``.
-            command: Setpoint at the level ``state``; otherwise the command in force at the level that the controller
-                follows: ``data.controls.mode``, or the output of the controller whose ``inner`` it is. (4,)
+            command: Setpoint at the level ``state``; otherwise the command of the level that the controller follows.
+                This is the command in force at the level ``data.controls.mode``, or the command of the controller that
+                has this controller as ``inner``. (4,)
             memory: Memory of the drone.
             params: Parameters of the drone.
 
@@ -153,13 +156,13 @@ class Controller:
     def take_over(self, data: DroneData, command: Setpoint | Array, memory: Any, params: Any, rotor_vel: Array) -> Any:
         """Return the memory with which the controller takes over a drone in flight from another controller.
 
-        By default it is the memory from when the controller was last active. Override this method to make the first
-        command continue the last command of the other controller.
+        By default, this is the memory at the time when the controller was last active. Override this method to make the
+        first command continue the last command of the other controller.
 
         Args:
             data: ``SimData`` of one drone.
             command: Setpoint or command, as in ``update``.
-            memory: Memory from when the controller was last active.
+            memory: Memory at the time when the controller was last active.
             params: Parameters of the drone.
             rotor_vel: Rotor speeds that the other controller commanded last, rpm. (n_rotors,)
         """
@@ -176,7 +179,7 @@ class Controller:
 
     @property
     def members(self) -> tuple[Controller, ...]:
-        """Controllers that take turns; by default only this one."""
+        """Controllers that take turns; by default only this controller."""
         return (self,)
 
     @property
@@ -188,11 +191,15 @@ class Controller:
 def controller_chain(
     controller: Controller | None, control: Control
 ) -> tuple[list[tuple[Control, Controller]], Control]:
-    """Return the controllers from a command level down, each with its level, and the level of the last output.
+    """Return the controllers of a command level and of the levels below, and the level of the last output.
 
     Args:
         controller: Controller of the command level; None if commands need none.
-        control: Command level, which is returned as the last output if there is no controller.
+        control: Command level.
+
+    Returns:
+        Pairs of a command level and the controller that follows it, the highest level first, and the level of the
+        commands of the last controller, which is ``control`` without a controller.
     """
     chain = []
     while controller is not None:

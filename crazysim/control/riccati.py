@@ -15,7 +15,7 @@ from jax import Array
 from crazysim.errors import ConfigError
 
 N_DOUBLINGS = 30
-"""Number of doublings. Doubling k covers 2^k time steps, so a closed loop with an eigenvalue of 1 - 1e-8 converges."""
+"""Number of doublings. k doublings cover 2^k time steps, so a closed loop with an eigenvalue of 1 - 1e-8 converges."""
 N_REFINEMENTS = 2
 """Newton steps after the doubling; each doubles the number of correct digits."""
 
@@ -113,13 +113,13 @@ def _solve_smith(A: Array, Q: Array) -> Array:
 
 
 def gain_discrete(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """Return the gain K of the law ``u = -K x`` that minimises the sum of ``x'Qx + u'Ru``, or NaN. (m, n)"""
+    """Return the gain K of the law ``u = -K x`` that minimises the sum of ``x^T Q x + u^T R u``, or NaN. (m, n)"""
     P = solve_discrete(A, B, Q, R)
     return jnp.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
 
 
 def gain_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """Return the gain K of the law ``u = -K x`` that minimises the integral of ``x'Qx + u'Ru``, or NaN. (m, n)"""
+    """Return the gain K of the law ``u = -K x`` that minimises the integral of ``x^T Q x + u^T R u``, or NaN. (m, n)"""
     return jnp.linalg.solve(R, B.T @ solve_continuous(A, B, Q, R))
 
 
@@ -127,7 +127,7 @@ def check_gain(K: Any) -> Any:
     """Return a gain after checking on the host that it is finite.
 
     Raises:
-        ConfigError: If it is not finite, because the Riccati equation has no stabilising solution.
+        ConfigError: If the gain is not finite, because the Riccati equation has no stabilising solution.
     """
     if not np.all(np.isfinite(K)):
         raise ConfigError(

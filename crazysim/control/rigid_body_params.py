@@ -1,4 +1,4 @@
-"""Parameters of a drone that controllers assume which command a wrench."""
+"""Mass, inertia, drag and rotor limits that controllers assume."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 
 
 class RigidBodyParams(PyTree):
-    """Parameters of a drone that a controller assumes, each shared or one per drone; a base of records with gains."""
+    """Parameters of a drone that a controller assumes, each shared or one per drone. Subclasses add gains."""
 
     mass: Array = leaf("parameter", 1, (1,))
     """Mass that the controller assumes, kg. (1,)"""
@@ -28,7 +28,7 @@ class RigidBodyParams(PyTree):
 
 
 def rigid_body_params(airframe: Airframe) -> dict[str, Any]:
-    """Return the fields of ``RigidBodyParams`` for an airframe."""
+    """Return the fields of ``RigidBodyParams`` for an airframe, by name."""
     mass = airframe.value("rigid_body.mass")
     return {
         "mass": as_parameter(mass),

@@ -13,8 +13,8 @@ from crazysim.pytree import PyTree, leaf
 class Setpoint(PyTree):
     """Desired motion of one drone at one instant, with any leading axes: position, yaw and derivatives, world frame.
 
-    It has no body rates: they follow from the derivatives (``flatness.attitude_of_thrust``). A controller that follows
-    the body rates of a state command reads them from the command in force, ``data.controls.state.cmd[13:16]``.
+    A setpoint has no body rates, because they follow from its derivatives (``flatness.attitude_of_thrust``). A
+    controller that follows the body rates of a state command reads them from ``data.controls.state.cmd[13:16]``.
     """
 
     pos: Array = leaf("drone", 1)
@@ -38,7 +38,7 @@ class Setpoint(PyTree):
     def command(self) -> Array:
         """Return the state command: position, velocity, acceleration, quaternion of the yaw, body rates. (..., 16)
 
-        The quaternion is xyzw, and the body rates belong to a level drone, (0, 0, yaw rate).
+        The quaternion is xyzw, and the body rates are those of a level drone, (0, 0, yaw rate).
         """
         zeros = jnp.zeros_like(self.pos[..., :2])
         quat = [zeros, jnp.sin(self.yaw / 2), jnp.cos(self.yaw / 2)]
@@ -57,8 +57,8 @@ class Setpoint(PyTree):
         Args:
             cmd: Position, velocity, acceleration, quaternion of any length (only its yaw is used), and body
                 rates. (..., 16)
-            feedforward: Jerk, snap, yaw rate, second derivative of the yaw; None for the yaw rate in the command and
-                zeros. (..., 8)
+            feedforward: Jerk, snap, yaw rate, second derivative of the yaw; None for the yaw rate of the command, and
+                zeros for the others. (..., 8)
         """
         if feedforward is None:
             zeros = jnp.zeros_like(cmd[..., :6])

@@ -1,4 +1,4 @@
-"""Outer loop of the cascade: full-state setpoint to attitude and collective thrust."""
+"""Outer loop of Crazyflow's cascade, from a full-state setpoint to attitude and collective thrust."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StateParams(PyTree):
     gravity_vec: Array = leaf("parameter", 1)
     """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
     thrust_scale: Array = leaf("parameter", 1, (1,))
-    """Actual over desired thrust, 1: the firmware's mass_thrust does not match its mass. (1,)"""
+    """Actual over desired thrust, 1. It is not 1, because the firmware's mass_thrust does not match its mass. (1,)"""
     int_err_max: Array = leaf("parameter", 1)
     """Limit of the integral of the position error, m s. (3,)"""
 
@@ -69,9 +69,9 @@ def state2attitude(
 ) -> tuple[Array, Array]:
     """Return the attitude and thrust that track a full-state setpoint, and the new integral.
 
-    The position part of the controller of Mellinger and Kumar (2011, eq. 6 to 9) as in the Crazyflie firmware: a force
-    from the errors of position and velocity and the integral of the position error, a body z axis along that force, and
-    the x axis closest to the desired yaw. A zero quaternion in the setpoint means zero yaw.
+    This is the position part of the controller of Mellinger and Kumar (2011, eq. 6 to 9) as in the Crazyflie firmware.
+    A force follows from position error, velocity error and the integral of the position error. The body z axis is along
+    that force, and the x axis is closest to the desired yaw. A zero quaternion in the setpoint means zero yaw.
 
     Args:
         pos: Position, world frame, m. (..., 3)

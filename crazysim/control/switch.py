@@ -1,4 +1,4 @@
-"""Several controllers on one drone. A function of state, setpoint and time, or a fixed index, chooses one."""
+"""Several controllers on one drone. A function of state, setpoint and time, or a fixed index, selects a controller."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Switch(Controller):
     """Several controllers that take turns in commanding a drone. ``Sim(controller=[...], switch=...)`` creates it.
 
     Only the active controller's memory changes. When a controller becomes active, its ``take_over`` sets its memory, so
-    that its first command can continue the last one. The switch also allocates wrenches to the rotors.
+    that its first command can continue the last command. The switch also allocates wrenches to the rotors.
     """
 
     name: ClassVar[str] = "switch"
@@ -54,12 +54,12 @@ class Switch(Controller):
     controllers: tuple[Controller, ...]
     """The controllers."""
     switch: Any
-    """Function ``(state, setpoint, time) -> index`` of one drone, or indices of all drones, () or (n_worlds, n_drones).
+    """Function ``(state, setpoint, time) -> index`` for one drone, or indices, () or (n_worlds, n_drones).
 
-    ``state`` is the ``SimState`` of the drone, ``setpoint`` its ``Setpoint`` (the command at other levels), ``time``
-    the time since the last reset, s. An index that the function returns is clipped to the controllers that exist."""
+    ``state`` is the ``SimState`` of the drone; ``setpoint`` is its ``Setpoint``, or its command below the level
+    ``state``; ``time`` is the time since the last reset, s. A returned index that is out of range is clipped."""
     freq: int = 500
-    """Rate at which the switch is evaluated, Hz; in a simulation, a common multiple of all the controllers' rates."""
+    """Rate at which the switch is evaluated, Hz; in a simulation, a common multiple of the rates of all controllers."""
 
     @property
     def members(self) -> tuple[Controller, ...]:
@@ -141,5 +141,5 @@ def _is_tick(data: DroneData, freq: Any) -> Array | bool:
 
 
 def _select_tree(mask: Any, new: Any, old: Any) -> Any:
-    """Return ``new`` where a mask is True and ``old`` elsewhere. A leaf that is the same in both is returned as is."""
+    """Return ``new`` where a mask is True and ``old`` elsewhere. A leaf that is one object in both is unchanged."""
     return jax.tree.map(lambda x, y: y if x is y else jnp.where(mask, x, y), new, old)

@@ -1,4 +1,4 @@
-"""Time-varying linear quadratic regulator along a flat trajectory: gains from a backward Riccati recursion."""
+"""Time-varying linear quadratic regulator along a trajectory, with gains from a backward Riccati recursion."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from crazysim.pytree import as_parameter, leaf
 from crazysim.rotation import cross, matvec
 
 MAX_KNOTS = 60
-"""Largest number of gains in a table."""
+"""Largest number of knots, which are the times with a gain."""
 
 
 class TrackingLQRParams(RigidBodyParams):
@@ -48,9 +48,9 @@ class TrackingLQRParams(RigidBodyParams):
 
 
 def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc: Array, mass: Array, J: Array) -> Array:
-    """Return the derivative of the errors of a drone about a reference, under an error of its wrench.
+    """Return the derivative of the errors of a drone about a reference, for an error of its wrench.
 
-    The errors are ``state_error`` to first order: position, velocity, a small rotation e_R with
+    To first order, the errors are those of ``state_error``: position, velocity, a small rotation vector e_R with
     ``R = R_d exp(e_R^)``, and ``e_w = w - R^T R_d w_d``, so that ``e_R' = e_w``.
 
     Args:
@@ -77,29 +77,29 @@ def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc:
 
 
 def tracking_gains(
-    setpoints: Setpoint, dt: Array, mass: Array, J: Array, drag_matrix: Array, Q: Array, R: Array, substeps: int = 1
+    setpoints: Setpoint, dt: Array, mass: Array, J: Array, drag_matrix: Array, Q: Array, R: Array, n_steps: int = 1
 ) -> Array:
     """Return the gains of the LQR about the references of successive setpoints, or NaN; pure and differentiable.
 
-    The error dynamics are linearised at every setpoint, and kept constant until the next. A backward scan runs the
-    Riccati recursion in steps of ``dt / substeps``, discretised to second order. It starts from the solution of the
+    The error dynamics are linearised at every setpoint, and constant until the next setpoint. A backward scan runs the
+    Riccati recursion in steps of ``dt / n_steps``, discretised to second order. It starts from the solution of the
     algebraic equation at the last setpoint, as if that setpoint were held forever.
 
     Args:
         setpoints: Setpoints ``dt`` apart. (n, ...)
-        dt: Time from one to the next, s. ()
+        dt: Time from one setpoint to the next, s. ()
         mass: Mass, kg. () or (1,)
         J: Inertia, body frame, kg m^2. (3, 3)
         drag_matrix: Linear drag coefficients, body frame, N s/m. (3, 3)
         Q: Weights of the errors, per second. (12, 12)
         R: Weights of the wrench, per second. (4, 4)
-        substeps: Steps of the recursion from one setpoint to the next, each of a few milliseconds at most.
+        n_steps: Steps of the recursion from one setpoint to the next. A step should be a few milliseconds at most.
 
     Returns:
         (n, 4, 12)
     """
     mass = jnp.reshape(mass, (1,))
-    # A reference needs no allocation.
+    # ``flat_reference`` does not read the allocation.
     params = RigidBodyParams(mass, jnp.asarray(GRAVITY, J.dtype), J, drag_matrix, None)  # type: ignore[arg-type]
 
     def linearize_errors(setpoint: Setpoint) -> tuple[Array, Array]:
@@ -114,7 +114,7 @@ def tracking_gains(
         return jax.jacfwd(derivative, 0)(zero, no_wrench), jax.jacfwd(derivative, 1)(zero, no_wrench)
 
     A, B = jax.vmap(linearize_errors)(setpoints)
-    eye, h = jnp.eye(12, dtype=J.dtype), dt / substeps
+    eye, h = jnp.eye(12, dtype=J.dtype), dt / n_steps
     transition, input_matrix = eye + h * A + h * h / 2 * A @ A, h * B + h * h / 2 * A @ B
     end_gain = gain_continuous(A[-1], B[-1], Q, R)
     P = solve_lyapunov(A[-1] - B[-1] @ end_gain, Q + end_gain.T @ R @ end_gain)
@@ -129,7 +129,7 @@ def tracking_gains(
             P = closed_loop.T @ P @ closed_loop + h * (Q + K.T @ R @ K)
             return ((P + P.T) / 2, K), None
 
-        (P, K), _ = jax.lax.scan(riccati_step, (P, end_gain), length=substeps)
+        (P, K), _ = jax.lax.scan(riccati_step, (P, end_gain), length=n_steps)
         return P, K
 
     _, gains = jax.lax.scan(step_backward, P, (transition, input_matrix), reverse=True)
@@ -137,7 +137,10 @@ def tracking_gains(
 
 
 def interpolate_gain(time: Array, gains: Array, dt: Array) -> Array:
-    """Return the gain at a time, s, interpolated linearly between knots ``dt`` apart and held at the ends. (4, 12)"""
+    """Return the gain at a time, s, interpolated linearly between knots ``dt`` apart. (4, 12)
+
+    Before the first and after the last knot, the gain is that of the knot.
+    """
     last_index = gains.shape[-3] - 1
     knot = rotation.clip(time / dt, 0.0, float(last_index))
     gains, index = jnp.asarray(gains), jnp.minimum(jnp.floor(knot).astype(jnp.int32), last_index - 1)
@@ -172,9 +175,9 @@ def tracking_lqr_control(
 class TrackingLQR(Controller):
     """Time-varying LQR (``tracking_lqr_control``) along a trajectory that is known in advance.
 
-    The gains are indexed by the time since the reset of a world, so the commanded setpoints must follow the same
-    trajectory at the same times, as from ``Follow`` with the same start. It is the counterpart of AIMotionLab-Virtual's
-    LTV-LQR, without the load.
+    The gains depend on the time since the reset of a world, so the commanded setpoints must follow the same trajectory
+    at the same times. ``Follow`` with the same start commands such setpoints. AIMotionLab-Virtual's LTV-LQR is the
+    corresponding controller of a drone with a load.
     """
 
     name: ClassVar[str] = "tracking_lqr"
@@ -209,7 +212,7 @@ class TrackingLQR(Controller):
             )
         Q, R = lqr_weights(airframe, self.freq, self.Q, self.R)
         mass, drag = airframe.value("rigid_body.mass"), airframe.matrix("drag.coefficients")
-        compute_gains = functools.partial(tracking_gains, substeps=math.ceil(self.dt * self.freq))
+        compute_gains = functools.partial(tracking_gains, n_steps=math.ceil(self.dt * self.freq))
         gains = solve_on_host(compute_gains, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
         return TrackingLQRParams(
             **rigid_body_params(airframe),

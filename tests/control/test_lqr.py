@@ -173,8 +173,8 @@ def test_gains_along_a_hover_are_those_of_hover():
     p = LQRParams.create(load_airframe("bumblebee"), 500)
     still = jax.jit(jax.vmap(lambda t: path_setpoint(hover, t)))(np.arange(4) * 0.1)
     Q, R = np.diag(LAB_Q).astype(float), np.diag(LAB_R).astype(float)
-    gains = jax.jit(tracking_gains, static_argnames="substeps")(
-        still, 0.1, np.asarray(p.mass), np.asarray(p.J), np.zeros((3, 3)), Q, R, substeps=2000
+    gains = jax.jit(tracking_gains, static_argnames="n_steps")(
+        still, 0.1, np.asarray(p.mass), np.asarray(p.J), np.zeros((3, 3)), Q, R, n_steps=2000
     )
     expected = jax.jit(hover_gain)(np.asarray(p.mass), np.asarray(p.J), Q, R)
     np.testing.assert_allclose(gains[0], expected, atol=5e-3 * np.abs(expected).max())
