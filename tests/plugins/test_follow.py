@@ -39,7 +39,7 @@ def flight():
 
 
 def expected(world, drone, t):
-    """Return the setpoint of a drone at a time of its world, from the trajectory alone."""
+    """Return the setpoint of a drone at a time of its world, from the trajectory without the plugin."""
     rate = RATE[world, drone]
     s = jax.tree.map(np.asarray, evaluate([EIGHT, UP][drone], (t - START[world, drone]) * rate))
     scaled = {"vel": 1, "acc": 2, "jerk": 3, "snap": 4, "yaw_rate": 1, "yaw_acc": 2}
@@ -72,7 +72,7 @@ def test_a_drone_waits_for_its_start_and_stays_at_the_end(flight):
 
 
 def test_one_start_per_drone_spaces_them_along_a_curve():
-    """Negative starts: each drone is as far along at the reset, and a rate multiplies that."""
+    """With a negative start the drone is that many seconds along the curve at the reset, times its rate."""
     start, rate = np.array([-1.5, 0.4]), np.array([2.0, 1.0])
     sim = build()
     follow = sim.add(Follow(EIGHT, start=start, rate=rate))

@@ -19,14 +19,14 @@ SMALL, DIFFERENCE = 1e-9, 1e-5
 """Slope below which nothing is compared, and step of the differences as a multiple of the directions."""
 
 
-def filters():
+def create_filters():
     """Return a filter that controls the drones, another one that only estimates, and their sensors."""
     imu, tracked = IMU(ERRORS, ERRORS), MotionCapture(1e-3, 1e-2, delay=0.004)
     aids = [OpticalFlow(0.1), TimeOfFlight(resolution=None), UWB(ANCHORS[:2], 0.1, tdoa=True)]
     return [imu, tracked, *aids, Kalman([imu, tracked]), ESKF([imu, *aids], control=False)]
 
 
-def everything():
+def create_all_plugins():
     """Return effects, all sensors, and filters that use all sensors that they support."""
     imu, tracked = IMU(ERRORS, ERRORS, (0.01, 0.0, 0.0), imbalance=1e-8), MotionCapture(1e-3, 1e-2, delay=0.004)
     aids = [
@@ -41,8 +41,8 @@ def everything():
     ]
     effects = [Wind((1.0, 0.0, 0.0), 7.7), Downwash(), GroundEffect(), Battery(), Latency(2), RangeFinder()]
     others = [sensors.MultiRanger(0.01), sensors.RotorSpeeds(5.0), sensors.BatteryVoltage(0.01)]
-    watching = ESKF([imu, tracked, *aids], control=False)
-    return [*effects, *others, imu, tracked, *aids, Kalman([imu, tracked]), watching]
+    estimating_filter = ESKF([imu, tracked, *aids], control=False)
+    return [*effects, *others, imu, tracked, *aids, Kalman([imu, tracked]), estimating_filter]
 
 
 def is_float(x):
@@ -55,27 +55,27 @@ def push_forward(stage):
     def run(data, slopes):
         leaves, tree = jax.tree.flatten(data)
 
-        def real(numbers):
+        def advance_floats(numbers):
             rest = iter(numbers)
             after = jax.tree.leaves(stage(tree.unflatten([next(rest) if is_float(x) else x for x in leaves])))
             return [x for x in after if is_float(x)], after
 
-        _, slopes, after = jax.jvp(real, ([x for x in leaves if is_float(x)],), (slopes,), has_aux=True)
+        _, slopes, after = jax.jvp(advance_floats, ([x for x in leaves if is_float(x)],), (slopes,), has_aux=True)
         return tree.unflatten(after), slopes
 
     # Without optimisation: compiling takes longer than running.
     return jax.jit(run, compiler_options={"xla_backend_optimization_level": 0})
 
 
-SLOW = pytest.mark.slow("compiles the derivative of every plugin; the filters alone cover the method")
+SLOW = pytest.mark.slow("compiles the derivative of every plugin; the case of the filters covers the method")
 
 
 @pytest.mark.long("compiles the derivative of each stage, in float64")
-@pytest.mark.parametrize("plugins", [filters, pytest.param(everything, marks=SLOW)])
+@pytest.mark.parametrize("plugins", [create_filters, pytest.param(create_all_plugins, marks=SLOW)])
 def test_law_08_slopes_are_central_differences(plugins, x64):
     """Derivatives of every float of the data by the states at the start, with the stages as they are written.
 
-    Each stage is compiled alone, in forward mode; a gradient is its transpose. Differences have errors of their step
+    Each stage is differentiated in forward mode; a gradient is its transpose. Differences have errors of their step
     squared, and of the rounding of large numbers, such as a pressure of 1e5 Pa or a charge that hardly changes.
     """
     sim = Sim(n_drones=2, control="state", engine="plain")

@@ -33,7 +33,7 @@ OPTIONS = {"seconds": 0.1, "depth_image": (5, 4)}
 
 @pytest.fixture(scope="module", autouse=True)
 def shared_environments():
-    """Let runs with equal options share environments, and with them all that was compiled."""
+    """Let runs with equal options share environments and their compiled functions."""
 
     def freeze(**options):
         return {name: tuple(x) if isinstance(x, list) else x for name, x in options.items()}
@@ -235,10 +235,10 @@ def test_policies_of_several_seeds_have_convolutions_of_their_own(rng, meta):
 
 
 def test_a_student_learns_from_images(env, rng):
-    """Its labels follow from a pixel alone, not from other observations."""
+    """Its labels depend on one pixel only."""
     config = dagger.Config(iterations=30, minibatches=1, epochs=4, hidden=(8,), convolution=(4,), learning_rate=0.01)
-    seen = AutoReset(dagger.TeacherObservation(env, lambda data: {"pos": data.states.pos}))
-    init = jax.jit(functools.partial(dagger.init, seen, (config,), teacher=lambda obs: obs["pos"]))
+    teacher_env = AutoReset(dagger.TeacherObservation(env, lambda data: {"pos": data.states.pos}))
+    init = jax.jit(functools.partial(dagger.init, teacher_env, (config,), teacher=lambda obs: obs["pos"]))
     learner = init(jax.random.key(0)[None])
     agent, obs = take_seed(learner.agents, 0), jnp.asarray(rng.uniform(0, 2, size=(4, 64, 1, 41)), jnp.float32)
     (image,) = agent.network.images

@@ -21,7 +21,7 @@ from crazysim.train.training import CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE
 
 SMALL = "--worlds 64 --no-film --set seconds=0.2 --config n_steps=4 minibatches=2 epochs=1 hidden=[8]".split()
 HEARTBEAT = 20
-"""Time without a heartbeat after which a host is lost, s: others use the processor, too."""
+"""Time without a heartbeat after which a host is lost, s; it is long, as other processes use the processor too."""
 
 
 def free_address():
@@ -31,7 +31,7 @@ def free_address():
         return f"127.0.0.1:{s.getsockname()[1]}"
 
 
-def environment(**others):
+def process_environment(**others):
     flags = re.sub(r"device_count=\d+", "device_count=2", os.environ["XLA_FLAGS"])
     return os.environ | {"XLA_FLAGS": flags} | others
 
@@ -42,7 +42,7 @@ class Process:
     def __init__(self, folder, name, *command, **variables):
         self._path = folder / f"{name}.txt"
         with self._path.open("wb") as file:
-            self._process = subprocess.Popen(command, env=environment(**variables), stdout=file, stderr=file)
+            self._process = subprocess.Popen(command, env=process_environment(**variables), stdout=file, stderr=file)
 
     def end(self):
         """Wait for the end, and return the exit status and the output."""
@@ -67,7 +67,7 @@ def start(folder, arguments, others=((), ())):
     ]
 
 
-def training(out, *further):
+def training_arguments(out, *further):
     return ["train", "hover", *SMALL, "--out", str(out), *further]
 
 
@@ -77,10 +77,10 @@ def iteration(out):
     return int(checkpoint.read(path)[0]["['learner'].iteration"]) if path.exists() else -1
 
 
-def assert_same_files(actual_folder, others):
+def assert_same_files(actual_folder, expected_folder):
     """Assert that the checkpoints and policies of two runs agree to rounding."""
     for name in (CHECKPOINT_FILE, POLICY_FILE):
-        (x, _), (y, _) = (checkpoint.read(out / name) for out in (actual_folder, others))
+        (x, _), (y, _) = (checkpoint.read(out / name) for out in (actual_folder, expected_folder))
         assert x.keys() == y.keys()
         for key in x:
             np.testing.assert_allclose(x[key], y[key], rtol=1e-4, atol=1e-5, err_msg=key)
@@ -91,16 +91,16 @@ def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_pa
     """One training: complete; continued, and interrupted by Ctrl-C on one host; continued, until a host is killed;
     continued by one process with all devices."""
     out, alone = tmp_path / "two", tmp_path / "one"
-    ended = [process.end() for process in start(tmp_path, training(out, "--iterations", "3"))]
+    ended = [process.end() for process in start(tmp_path, training_arguments(out, "--iterations", "3"))]
     assert [status for status, _ in ended] == [0, 0], ended
     assert "16 on each of 4 devices" in ended[0][1]
     assert "host 1 of 2: 2 cpu" in ended[1][1]
     assert "success" not in ended[1][1], "only host 0 reports"
-    assert main(training(alone, "--iterations", "3", "--devices", "4")) == 0
+    assert main(training_arguments(alone, "--iterations", "3", "--devices", "4")) == 0
     assert_same_files(out, alone)
     assert len(json.loads((out / CURVE_FILE).read_text())) == 2
 
-    endless = training(out, "--resume", "--iterations", "100000", "--checkpoint-every", "0.01")
+    endless = training_arguments(out, "--resume", "--iterations", "100000", "--checkpoint-every", "0.01")
     first, second = start(tmp_path, endless)
     wait_for(lambda: iteration(out) > 3 or first.has_ended)
     second.signal(signal.SIGINT)
@@ -119,14 +119,14 @@ def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_pa
     assert f"crazysim train hover {shlex.join(SMALL)}" in text
 
     last = iteration(out)
-    assert main(training(out, "--resume", "--iterations", str(last + 1), "--devices", "4")) == 0
+    assert main(training_arguments(out, "--resume", "--iterations", str(last + 1), "--devices", "4")) == 0
     assert iteration(out) == last + 1
 
 
 @pytest.mark.long("two processes import JAX")
 def test_hosts_with_other_settings_stop_together(tmp_path):
     others = ((), ("--seed", "1"))
-    for i, process in enumerate(start(tmp_path, training(tmp_path / "out", "--iterations", "1"), others)):
+    for i, process in enumerate(start(tmp_path, training_arguments(tmp_path / "out", "--iterations", "1"), others)):
         status, text = process.end()
         assert status == 2
         assert "expected the same settings on all hosts, got seed = 0 on host 0 and 1 on host 1" in text, i
@@ -153,7 +153,9 @@ def test_hosts_with_other_versions_are_an_error(tmp_path):
 
 def test_a_coordinator_that_does_not_answer_is_an_error_with_its_address(tmp_path):
     address = free_address()
-    arguments = training(tmp_path, "--coordinator", address, "--hosts", "2", "--host-id", "1", "--connect-timeout", "1")
+    arguments = training_arguments(
+        tmp_path, "--coordinator", address, "--hosts", "2", "--host-id", "1", "--connect-timeout", "1"
+    )
     status, text = Process(tmp_path, "alone", sys.executable, "-m", "crazysim", *arguments).end()
     assert status == 128 + signal.SIGABRT
     assert f"expected 2 hosts to connect with {address} within 1 s, got no connection with host 0" in text

@@ -50,7 +50,7 @@ def compile_for_host(tmp_path_factory):
 
 @pytest.fixture
 def on_host(monkeypatch, compile_for_host):
-    """Kernels run on the host."""
+    """Run kernels on the host."""
     lock = threading.Lock()
 
     def run_kernel(source, name, grid, arrays, result):
@@ -81,18 +81,18 @@ def test_outputs_and_gradients_of_the_kernels_are_those_of_jax(on_host, sizes):
     cotangent *= jnp.array([1e-9, 1e4])[:, None, None, None]  # far beyond the range of 16 bits
 
     def outputs_and_gradients(apply):
-        def of_seed(layers, x, cotangent):
+        def compute_for_seed(layers, x, cotangent):
             out, backward = jax.vjp(lambda layers: apply(layers, x), layers)
             return out, backward(cotangent)[0]
 
-        return jax.jit(jax.vmap(of_seed))(layers, x, cotangent)
+        return jax.jit(jax.vmap(compute_for_seed))(layers, x, cotangent)
 
     found, expected = (jax.tree.leaves(outputs_and_gradients(apply)) for apply in (apply_mlp, mlp))
     assert len(found) == 2 * len(sizes) - 1
     for a, b in zip(found, expected, strict=True):
         assert a.shape == b.shape
-        for of_a, of_b in zip(a, b, strict=True):  # of each seed
-            assert np.linalg.norm(of_a - of_b) < 3e-3 * np.linalg.norm(of_b)  # 11 bits
+        for seed_a, seed_b in zip(a, b, strict=True):  # of each seed
+            assert np.linalg.norm(seed_a - seed_b) < 3e-3 * np.linalg.norm(seed_b)  # 11 bits
 
 
 @pytest.mark.parametrize("shape", [(8, 5, 13), (3, 4, 2, 5, 13), (6, 5, 13)])
@@ -117,10 +117,10 @@ def test_gradients_of_zeros_are_zero_and_inputs_get_none(on_host):
     layers = jax.tree.map(lambda x: x[0], networks((13, 48, 32, 3), 1))
     x = jnp.ones((5, 13))
     out, backward = jax.vjp(apply_mlp, layers, x)
-    of_layers, of_x = backward(jnp.zeros_like(out))
-    assert all((gradient == 0).all() for gradient in jax.tree.leaves((of_layers, of_x)))
-    _, of_x = backward(jnp.ones_like(out))
-    assert (of_x == 0).all()
+    layer_gradients, input_gradient = backward(jnp.zeros_like(out))
+    assert all((gradient == 0).all() for gradient in jax.tree.leaves((layer_gradients, input_gradient)))
+    _, input_gradient = backward(jnp.ones_like(out))
+    assert (input_gradient == 0).all()
 
 
 def test_gradients_that_grow_through_large_weights_are_finite(on_host):

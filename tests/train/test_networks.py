@@ -39,7 +39,7 @@ SIZES = {"n_worlds": 16, "options": {"seconds": 0.1, "randomize": "generic"}}
 
 @pytest.fixture(scope="module", autouse=True)
 def shared_environments():
-    """Let runs with equal options share environments, and with them all that was compiled."""
+    """Let runs with equal options share environments and their compiled functions."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(configs, "make", functools.cache(make))
         yield
@@ -201,12 +201,12 @@ def test_policies_of_several_seeds_have_separate_memories(rng):
 def test_privileged_observations_are_true_states_and_drawn_parameters():
     """With a sensor, the task observes measurements; the critic also gets true states, factors and masses."""
 
-    def heavier(data, key):
+    def draw_masses(data, key):
         mass = data.params.mass * uniform(key, data.core.n_drones, 1, low=0.9, high=1.1)
         return data.replace(params=data.params.replace(mass=mass))
 
     base = make("hover", 3, randomize="generic", sensors=[MotionCapture(noise=0.1)], engine="interpret")
-    env = AutoReset(PrivilegedObservation(RandomizeWith(base, heavier, params=("mass",))))
+    env = AutoReset(PrivilegedObservation(RandomizeWith(base, draw_masses, params=("mass",))))
     state = env.reset(jax.random.key(0))
     for _ in range(2):
         data, seen = state.data, np.asarray(state.obs["privileged"])
@@ -235,8 +235,7 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
 
 
 def test_an_observation_of_the_task_may_be_named_privileged(rng):
-    """Without a privileged critic it is an observation like the others: before, the policy got its first columns and
-    was trained without the last ones."""
+    """Without a privileged critic it is an observation like the others."""
     base = make("hover", 2, seconds=0.06, engine="interpret")
     add = lambda obs, data: obs | {"privileged": data.states.rotor_vel, "zeros": 0 * obs["pos"]}  # noqa: E731
     env = AutoReset(Observe(base, add))
@@ -254,7 +253,7 @@ def test_a_critic_of_all_drones_gets_all_observations_with_those_of_its_drone_fi
 
 
 def test_a_critic_may_see_all_drones_and_their_true_states():
-    """Its inputs are the observations and privileged observations of each drone; the policy has its own alone."""
+    """Its inputs are the observations and privileged observations of all drones; the policy gets its own drone's."""
     base = make("swarm", 2, seconds=0.1, engine="interpret")
     env = AutoReset(PrivilegedObservation(base))
     learner, _ = init_learner(env, minibatches=1, critic="all_drones_privileged")

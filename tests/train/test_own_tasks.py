@@ -307,7 +307,7 @@ def test_law_09_wrong_places_and_names_are_errors(file, tmp_path):
 
     text_file = tmp_path / "task.txt"
     text_file.touch()
-    for given, message in (
+    for reference, message in (
         (f"{tmp_path / 'no.py'}:High", "expected a file with a task, got .*no.py': No such file"),
         (f"{file}:Hihg", "expected the name of a task in .*, got 'Hihg'; it defines High"),
         (f"{file}:Hover2", "it defines High"),
@@ -316,7 +316,7 @@ def test_law_09_wrong_places_and_names_are_errors(file, tmp_path):
         (Hover, r"expected the name of a task or a task, got <class.*Task\(\)"),
     ):
         with pytest.raises(ConfigError, match=message):
-            envs.make(given)
+            envs.make(reference)
     for name in ("hover", "Two Hoops", "a:b", 3):
         with pytest.raises(ConfigError, match="expected a name of lower case letters"):
             envs.register(name, Low)

@@ -106,7 +106,7 @@ def train_quietly(folder, log=lambda line: None, **settings):
 
 @pytest.fixture(scope="module", autouse=True)
 def shared_environments():
-    """Let runs with equal options share environments, and with them all that was compiled."""
+    """Let runs with equal options share environments and their compiled functions."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(configs, "make", functools.cache(make))
         patch.setattr(trainings, "AutoReset", functools.cache(AutoReset))
@@ -121,7 +121,7 @@ def sweep_run(tmp_path_factory):
 
 
 @pytest.mark.long("compiles a training of four seeds")
-def test_each_training_has_a_policy_and_a_row_and_one_that_diverges_ends_alone(sweep_run):
+def test_each_training_has_a_policy_and_a_row_and_one_that_diverges_ends_no_other(sweep_run):
     results, folder, lines = sweep_run
     names = [f"learning_rate-{rate}-seed-{seed}" for rate in (0.001, 1e38) for seed in (3, 5)]
     assert list(results) == names
@@ -180,7 +180,7 @@ def test_a_seed_trains_in_a_run_of_several_as_alone_and_an_interrupted_run_resum
 def test_seeds_that_are_interrupted_before_the_first_iteration_have_files_and_all_that_diverged_are_named(
     tmp_path, monkeypatch
 ):
-    """Regression: the interrupt raised StopIteration, and the error named only one iteration of one seed."""
+    """The error names the iteration of each seed."""
 
     def interrupt(*_):
         raise KeyboardInterrupt

@@ -37,7 +37,7 @@ def policy(meta):
 
 
 @pytest.fixture(scope="module")
-def flights(meta, policy):
+def observations_and_actions(meta, policy):
     """Return observations, some of them far outside of the statistics, and their actions in JAX."""
     rng = np.random.default_rng(1)
     n = sum(meta["observations"].values())
@@ -61,9 +61,9 @@ def with_memory(policy, size):
 
 
 @pytest.fixture(scope="module")
-def episodes(policy, flights):
+def episodes(policy, observations_and_actions):
     """Return a policy with memory, observations of 25 steps of 20 drones, where memories begin anew, and actions."""
-    policy, obs = with_memory(policy, 9), flights[0].reshape(25, 20, -1)
+    policy, obs = with_memory(policy, 9), observations_and_actions[0].reshape(25, 20, -1)
     reset = np.random.default_rng(4).uniform(size=(25, 20)) < 0.1
     seen, memory, actions = jnp.asarray(obs), policy.initial_memory(20), []
     act = jax.jit(policy.act)
@@ -97,8 +97,8 @@ def compile_header(path, folder, name="policy"):
     return actions
 
 
-def test_c_gives_the_actions_of_jax(tmp_path, policy, meta, flights):
-    obs, actions = flights
+def test_c_gives_the_actions_of_jax(tmp_path, policy, meta, observations_and_actions):
+    obs, actions = observations_and_actions
     path = to_c(policy, tmp_path / "policy.h", meta)
     np.testing.assert_allclose(compile_header(path, tmp_path)(obs), actions, atol=5e-6)
 
@@ -151,8 +151,10 @@ def test_onnx_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta,
     np.testing.assert_allclose(memory, last, atol=2e-5)
 
 
-def test_the_function_may_have_another_name_and_the_header_compiles_as_cpp(tmp_path, policy, meta, flights):
-    obs, actions = flights
+def test_the_function_may_have_another_name_and_the_header_compiles_as_cpp(
+    tmp_path, policy, meta, observations_and_actions
+):
+    obs, actions = observations_and_actions
     path = to_c(policy, str(tmp_path / "hover.h"), meta, name="hover_v2")
     np.testing.assert_allclose(compile_header(path, tmp_path, "hover_v2")(obs[:9]), actions[:9], atol=5e-6)
     both = tmp_path / "both.cpp"
@@ -173,9 +175,9 @@ def test_the_header_describes_inputs_and_outputs(tmp_path, policy, meta):
     assert text.count("#include") == 1
 
 
-def test_onnx_gives_the_actions_of_jax(tmp_path, policy, meta, flights):
+def test_onnx_gives_the_actions_of_jax(tmp_path, policy, meta, observations_and_actions):
     runtime = pytest.importorskip("onnxruntime")
-    obs, actions = flights
+    obs, actions = observations_and_actions
     path = to_onnx(policy, tmp_path / "policy.onnx", meta)
     assert path.stat().st_size < 40_000
     session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
@@ -213,7 +215,7 @@ def test_a_policy_of_other_sizes_or_with_nan_is_refused(tmp_path, policy, meta, 
 
 
 def test_a_custom_network_with_the_weights_of_a_gru_is_an_error(tmp_path, policy, meta):
-    """Before, only the type of the weights was checked, and the file computed another function."""
+    """Its outputs are not those of the built-in network, although its weights have the same type."""
     policy_with_memory = with_memory(policy, 3)
     network = Network(policy_with_memory.network.init, lambda gru, obs, memory: (obs, -gru(obs, memory)), np.zeros(3))
     with pytest.raises(ConfigError, match="expected a policy with the built-in network, got one with a custom"):

@@ -57,7 +57,7 @@ def train_quietly(folder, config, **options):
 
 @pytest.fixture(scope="module", autouse=True)
 def shared_environments():
-    """Let runs with equal options share environments, and with them all that was compiled."""
+    """Let runs with equal options share environments and their compiled functions."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(configs, "make", functools.cache(make))
         patch.setattr(runs, "AutoReset", functools.cache(AutoReset))
@@ -155,7 +155,7 @@ def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path):
 
 
 def test_a_later_policy_within_two_standard_errors_is_kept():
-    """Of 1,000 starts 1.26% at 80%, by hand; 100% is not certain either."""
+    """The standard error of 1,000 starts at 80% is 1.26%, by hand; at 100% it is not zero."""
     assert runs.least_kept_success(0.80, 1000) == pytest.approx(0.80 - 2 * 0.01262, abs=1e-4)
     assert runs.least_kept_success(0.80, 1000) < 0.797
     assert 0.996 < runs.least_kept_success(1.0, 1000) < 0.999
@@ -233,7 +233,7 @@ def test_resuming_with_another_configuration_is_an_error(uninterrupted_run, tmp_
 
 
 def test_a_finished_run_resumes_with_more_iterations(uninterrupted_run, tmp_path):
-    """What is given changes; everything else, the number of worlds too, is that of the run."""
+    """Settings that are passed change; all others, also the number of worlds, are those of the run."""
     shutil.copy(uninterrupted_run.folder / CHECKPOINT_FILE, tmp_path)
     lines = []
     quiet_options = {"film": False, "evaluation_worlds": 8, "progress": False, "log": lines.append}
@@ -251,7 +251,7 @@ def test_a_finished_run_resumes_with_more_iterations(uninterrupted_run, tmp_path
 
 
 def test_metrics_of_each_iteration_are_passed_on(uninterrupted_run, tmp_path, monkeypatch):
-    """Those of evaluations too, in an interrupted and a resumed run as well; the run is the same."""
+    """Metrics of evaluations are passed on too, also in interrupted and resumed runs. The run does not change."""
     recipe = dataclasses.replace(configs.RECIPES["hover"], evaluate_every=2)
     monkeypatch.setitem(configs.RECIPES, "hover", recipe)
     seen = []
@@ -316,12 +316,12 @@ def truncate(content):
     return content[: len(content) // 2]
 
 
-def flipped(content):
-    at = content.index(b"NUMPY") + 300
-    return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
+def flip_bit(content):
+    position = content.index(b"NUMPY") + 300
+    return content[:position] + bytes([content[position] ^ 1]) + content[position + 1 :]
 
 
-def other_meta(content):
+def replace_meta(content):
     with np.load(io.BytesIO(content)) as file:
         stored_arrays = dict(file)
     changed = io.BytesIO()
@@ -332,10 +332,10 @@ def other_meta(content):
 
 
 @pytest.mark.parametrize("damage",
-                         [truncate, flipped, other_meta, lambda _: b"", lambda _: b"nothing", np.random.bytes],
+                         [truncate, flip_bit, replace_meta, lambda _: b"", lambda _: b"nothing", np.random.bytes],
                          ids=["cut", "flipped", "other", "empty", "text", "random"])  # fmt: skip
 def test_a_damaged_run_is_refused_with_the_name_of_the_file(uninterrupted_run, tmp_path, damage):
-    """At once: nothing is compiled for it, and the file stays as it is."""
+    """It is refused before anything is compiled."""
     for name in (CHECKPOINT_FILE, POLICY_FILE):
         content = (uninterrupted_run.folder / name).read_bytes()
         (tmp_path / name).write_bytes(damage(content) if damage is not np.random.bytes else damage(1000))
@@ -361,7 +361,7 @@ def test_a_run_without_its_learning_curve_resumes(uninterrupted_run, tmp_path):
     assert not list(tmp_path.glob("*.part"))
 
 
-INVALID = {
+INVALID_HYPERPARAMETERS = {
     "init_std": (
         {"init_std": -0.5},
         "expected init_std as a finite number larger than 0, got -0.5. Use for example 0.5",
@@ -389,7 +389,7 @@ INVALID = {
 }
 
 
-@pytest.mark.parametrize(("config", "message"), INVALID.values(), ids=INVALID)
+@pytest.mark.parametrize(("config", "message"), INVALID_HYPERPARAMETERS.values(), ids=INVALID_HYPERPARAMETERS)
 def test_invalid_hyperparameters_are_refused(config, message):
     with pytest.raises(ConfigError, match=message):
         small_config(config=config)
@@ -435,7 +435,7 @@ def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(tmp_path):
     assert all(np.isfinite(x).all() for name, x in checkpoint_arrays(tmp_path).items() if ".policy" in name)
 
 
-def interrupting(name, count):
+def make_interrupt(name, count):
     """Return a function for ``sys.settrace`` that presses Ctrl-C where a function of that name is called again."""
     calls = [0]
 
@@ -457,10 +457,9 @@ def traced():
 
 
 def test_an_interrupt_before_nan_is_found_keeps_the_last_checkpoint(tmp_path, traced):
-    """The first iteration diverges, which is only looked at while the second one runs. Before, Ctrl-C in between wrote
-    the weights that are not finite."""
+    """The first iteration diverges, which is checked while the second one runs. Ctrl-C in between writes no NaN."""
     config = small_config(config=SMALL | {"iterations": 4, "learning_rate": 1e38})
-    traced(interrupting("mark_diverged", 2))  # the first call is that of the evaluation before the training
+    traced(make_interrupt("mark_diverged", 2))  # the first call is that of the evaluation before the training
     with pytest.raises(DivergedError, match=r"NaN or infinity in iteration 1 of hover .*iteration 0\. Use a sm"):
         train_quietly(tmp_path, config)
     assert [point["iteration"] for point in read_curve(tmp_path)] == [0]
@@ -470,11 +469,11 @@ def test_an_interrupt_before_nan_is_found_keeps_the_last_checkpoint(tmp_path, tr
 def test_an_interrupt_during_a_planned_evaluation_leaves_the_curve_of_an_uninterrupted_run(
     tmp_path, monkeypatch, traced
 ):
-    """Before, its point was marked as not kept, so that the resumed run could end with another policy."""
+    """Otherwise the resumed run could end with another policy."""
     recipe = dataclasses.replace(configs.RECIPES["hover"], evaluate_every=2)
     monkeypatch.setattr(runs, "find_recipe", lambda *_: recipe)
     train_quietly(tmp_path / "whole", small_config())
-    traced(interrupting("add_evaluation", 2))
+    traced(make_interrupt("add_evaluation", 2))
     with pytest.raises(KeyboardInterrupt):
         train_quietly(tmp_path / "cut", small_config())
     sys.settrace(None)
@@ -600,7 +599,7 @@ def test_ppo_finds_the_action_that_pays():
 
     @dataclasses.dataclass(frozen=True, kw_only=True)
     class Pays(Hover):
-        """Hovering with a reward for the action alone."""
+        """Hovering with a reward for the action only."""
 
         def rewards(self, data, action, last_action):
             return {"action": -jnp.sum((action - 0.5) ** 2, axis=-1)}

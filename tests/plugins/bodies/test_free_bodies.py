@@ -210,7 +210,7 @@ def test_bounces_as_in_mujoco():
     z^2)).
 
     In crazysim a ball bounces in the step in which it would reach the floor: above the floor by up to v dt, and with a
-    speed that is wrong by up to g dt. The error of the height is then apexes most v dt plus e^2 times the error of the
+    speed that is wrong by up to g dt. The error of the height is then at most v dt plus e^2 times the error of the
     bounce before, and that of the time two steps for each bounce. MuJoCo's heights are wrong by about a percent, as the
     contact lasts 100 of its steps.
     """

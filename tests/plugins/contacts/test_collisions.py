@@ -24,7 +24,7 @@ def build(n_worlds=1, n_drones=1, height=3.0, **kwargs):
     return sim
 
 
-def without_gravity(sim):
+def remove_gravity(sim):
     """Return the simulation after its gravity was set to zero."""
     sim.data = with_params(sim.data, gravity_vec=0 * np.asarray(sim.data.params.gravity_vec))
     return sim
@@ -120,13 +120,13 @@ def test_a_released_load_slides_on_a_box_until_friction_stops_it():
 
 
 def test_a_moving_object_pushes_a_load():
-    sim = without_gravity(build(engine="interpret"))
+    sim = remove_gravity(build(engine="interpret"))
     load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
     ball = sim.scene.add("sphere", radius=0.1)
     sim.add(ContactResponse(restitution=0.0, friction=0.0))
     leave_out_drones(sim)
-    at = load_motion(load, sim)[0] - [0.129, 0, 0]
-    sim.data = ball.set_pose(load.release(sim.data), at, vel=[0.5, 0, 0])
+    ball_pos = load_motion(load, sim)[0] - [0.129, 0, 0]
+    sim.data = ball.set_pose(load.release(sim.data), ball_pos, vel=[0.5, 0, 0])
     sim.step()
     np.testing.assert_allclose(load_motion(load, sim)[1][0], [0.5, 0, 0], atol=5e-3)
 
@@ -150,9 +150,9 @@ def energy(load, data, mass):
 
 @pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
 def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
-    """Released loads hit two drones from all sides. The contact stage alone keeps momentum and adds no energy."""
+    """Released loads hit two drones from all sides. The contact stage by itself keeps momentum and adds no energy."""
     n = 60
-    sim = without_gravity(build(n, 2))
+    sim = remove_gravity(build(n, 2))
     load = sim.add(SlungLoad(mass=0.2, size=size))
     sim.add(ContactResponse(restitution=0.7, friction=0.5))
     step = Step({"hit": sim.step_pipeline["contact_response_of_load_and_drones"]}, "interpret")
@@ -161,8 +161,8 @@ def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
         load.release(sim.data), vel=rng.normal(size=(n, 2, 3)), ang_vel=3 * rng.normal(size=(n, 2, 3)),
         quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
     )  # fmt: skip
-    at = np.asarray(data.states.pos) + rng.uniform(-0.12, 0.12, (n, 2, 3))
-    before = with_load(load, data, pos=at, vel=2 * rng.normal(size=(n, 2, 3)))
+    load_pos = np.asarray(data.states.pos) + rng.uniform(-0.12, 0.12, (n, 2, 3))
+    before = with_load(load, data, pos=load_pos, vel=2 * rng.normal(size=(n, 2, 3)))
     after = step(before, np.int32(1))
     for old, new in zip(momentum(load, before, 0.2), momentum(load, after, 0.2), strict=True):
         np.testing.assert_allclose(new, old, atol=1e-12)
@@ -173,7 +173,7 @@ def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
 
 def test_a_load_hits_a_drone_head_on(x64):
     """From below along the centre line: speeds after an impact of two bodies with restitution, by hand."""
-    sim = without_gravity(build(n_drones=2, engine="interpret"))
+    sim = remove_gravity(build(n_drones=2, engine="interpret"))
     load = sim.add(SlungLoad(mass=0.2, size=RADIUS))
     sim.add(ContactResponse(restitution=0.5, friction=0.0))
     leave_out_drones(sim)
@@ -188,12 +188,12 @@ def test_a_load_hits_a_drone_head_on(x64):
 
 def test_two_loads_head_on(x64):
     """Released loads of different mass, along the line between them: speeds by hand."""
-    sim = without_gravity(build(n_drones=2, engine="interpret"))
+    sim = remove_gravity(build(n_drones=2, engine="interpret"))
     load = sim.add(SlungLoad(mass=[[0.1, 0.3]], size=RADIUS))
     sim.add(ContactResponse(restitution=0.5, friction=0.0))
     leave_out_drones(sim)
-    at = [[[0, 0, 1.0], [0.1, 0, 1.0]]]
-    sim.data = with_load(load, load.release(sim.data), pos=at, vel=[[[2.0, 0, 0], [0, 0, 0]]])
+    load_pos = [[[0, 0, 1.0], [0.1, 0, 1.0]]]
+    sim.data = with_load(load, load.release(sim.data), pos=load_pos, vel=[[[2.0, 0, 0], [0, 0, 0]]])
     sim.step(25)
     after = 2.0 * 0.1 * 1.5 / 0.4
     np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0], [[after - 1.0, 0, 0], [after, 0, 0]], atol=1e-9)
@@ -201,9 +201,9 @@ def test_two_loads_head_on(x64):
 
 @pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
 def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, x64, rng):
-    """Three released loads and three empty hooks overlap. The contact stage alone keeps momentum and adds no energy."""
+    """Three released loads and three empty hooks overlap. The contact stage keeps momentum and adds no energy."""
     n = 60
-    sim = without_gravity(build(n, 3))
+    sim = remove_gravity(build(n, 3))
     load_mass = np.broadcast_to([0.1, 0.2, 0.3], (n, 3))
     hook = sim.add(Hook(mass=load_mass, hook_mass=0.05, size=size, ring=0.1, load_at=[0, 0, 1.0]))
     sim.add(ContactResponse(restitution=0.7, friction=0.5))
@@ -225,7 +225,7 @@ def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, x64, rng
 
 def test_an_empty_hook_stops_at_an_obstacle_and_pushes_a_load():
     """It hits a box 1 cm ahead of it, in the other world a load of the same mass, both at its height."""
-    sim = without_gravity(build(2, strict=True, engine="interpret"))
+    sim = remove_gravity(build(2, strict=True, engine="interpret"))
     sim.data = with_params(sim.data, mass=np.full(1, 1e9, np.float32))
     hook = sim.add(Hook(mass=0.1, hook_mass=0.1, damping=0.0, size=RADIUS, ring=0.01, load_at=[0, 0, 1.0]))
     box = sim.scene.add("box", pos=[5, 0, 0], size=(0.1, 1.0, 1.0))
@@ -257,7 +257,7 @@ def test_a_contact_report_contains_empty_hooks():
 
 def test_a_wall_that_stops_a_load_holds_back_the_drone():
     """Through the taut rod: the drone flies on towards the wall only until the load has reached it."""
-    sim = without_gravity(build())
+    sim = remove_gravity(build())
     load = sim.add(SlungLoad(mass=0.2, size=RADIUS))
     sim.scene.add("box", pos=[0.4 + RADIUS + 0.05 + 0.01, 0, 3], size=(0.1, 1.0, 1.0))
     sim.add(ContactResponse(restitution=0.0))
@@ -271,17 +271,17 @@ def test_a_wall_that_stops_a_load_holds_back_the_drone():
 
 
 def test_shared_loads_and_hooks_collide():
-    sim = without_gravity(build(n_drones=2, integrator="symplectic_euler"))
+    sim = remove_gravity(build(n_drones=2, integrator="symplectic_euler"))
     load = sim.add(SharedLoad(mass=0.2, length=3.0, size=RADIUS))
-    at = np.asarray(load.read(sim.data).pos)
-    sim.scene.add("sphere", pos=at[0, 0] + [0.2, 0, 0], radius=0.1)
+    load_pos = np.asarray(load.read(sim.data).pos)
+    sim.scene.add("sphere", pos=load_pos[0, 0] + [0.2, 0, 0], radius=0.1)
     sim.add(ContactResponse(restitution=0.5, friction=0.0))
     leave_out_drones(sim)
     sim.data = with_load(load, load.release(sim.data), vel=[1.0, 0, 0])
     sim.step(80)
     np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0, 0], [-0.5, 0, 0], atol=0.01)
 
-    sim = without_gravity(build())
+    sim = remove_gravity(build())
     hook = sim.add(Hook(mass=0.2, damping=0.0, size=RADIUS, ring=0.05))
     sim.scene.add("sphere", pos=np.asarray(hook.read(sim.data).pos)[0, 0] + [0.2, 0, -0.05], radius=0.1)
     sim.add(ContactResponse(restitution=0.5, friction=0.0))
@@ -295,7 +295,7 @@ def test_shared_loads_and_hooks_collide():
 
 def test_the_log_has_the_step_in_which_a_load_touches():
     """Without gravity loads move into drones at a known speed: a contact is logged in the step of the first overlap."""
-    sim = without_gravity(build(2, 2))
+    sim = remove_gravity(build(2, 2))
     load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
     pole = sim.scene.add("sphere", pos=[0, 0, 9], radius=0.1)
     log = sim.add(ContactLog(floor=False, drones=False))
@@ -347,7 +347,7 @@ def test_the_bounce_has_gradients(x64):
     Gradients by all states are finite: of a hit (first world), and of loads within their drones, far away, and in the
     middle of an obstacle.
     """
-    sim = without_gravity(build(4, 2, engine="plain"))
+    sim = remove_gravity(build(4, 2, engine="plain"))
     load = sim.add(SlungLoad(mass=0.2, size=RADIUS))
     sim.scene.add("sphere", pos=[5, 0, 3], radius=0.1)
     sim.add(ContactResponse(restitution=0.5, friction=0.3))

@@ -65,10 +65,10 @@ def test_beyond_the_border_is_the_floor_or_the_height_of_the_border():
     height, normal = ground_at(sim.data, far)
     np.testing.assert_array_equal(height, 0)
     np.testing.assert_array_equal(normal, [[0, 0, 1], [0, 0, 1]])
-    alone, plugin = build(floor=False, pos=(0, 0, 2.0))
-    edge = plugin.read(alone.data).surface_at(np.float32([2.0, 0.0, 0.0]))[0]
-    np.testing.assert_allclose(ground_height(alone.data, np.float32([7.0, 0.0, 0.0])), edge)
-    assert not any(g.type == mujoco.mjtGeom.mjGEOM_PLANE for g in alone.scene.spec.worldbody.geoms)
+    sim_without_floor, plugin = build(floor=False, pos=(0, 0, 2.0))
+    edge = plugin.read(sim_without_floor.data).surface_at(np.float32([2.0, 0.0, 0.0]))[0]
+    np.testing.assert_allclose(ground_height(sim_without_floor.data, np.float32([7.0, 0.0, 0.0])), edge)
+    assert not any(g.type == mujoco.mjtGeom.mjGEOM_PLANE for g in sim_without_floor.scene.spec.worldbody.geoms)
     np.testing.assert_array_equal(ground_height(Sim().data, far), 0)
 
 
@@ -109,9 +109,9 @@ def test_a_drone_on_a_slope_rests_with_contact_response_where_friction_holds_it(
         sim, _ = build(slope, n_worlds=1, n_drones=1, pos=(0.5, 0.2, 0.83))
         sim.add(ContactResponse(friction=friction))
         sim.step(700)
-        at = np.asarray(sim.data.states.pos)[0, 0]
+        pos_before = np.asarray(sim.data.states.pos)[0, 0]
         sim.step(300)
-        moved = np.asarray(sim.data.states.pos)[0, 0] - at
+        moved = np.asarray(sim.data.states.pos)[0, 0] - pos_before
         if holds:
             assert np.abs(moved).max() < 2e-3
             q = np.asarray(sim.data.states.quat)[0, 0]
@@ -119,7 +119,9 @@ def test_a_drone_on_a_slope_rests_with_contact_response_where_friction_holds_it(
                 [2 * (q[0] * q[2] + q[1] * q[3]), 2 * (q[1] * q[2] - q[0] * q[3]), 1 - 2 * (q[0] ** 2 + q[1] ** 2)]
             )
             np.testing.assert_allclose(z, np.array([-0.3, 0, 1]) / np.sqrt(1.09), atol=0.01)
-            np.testing.assert_allclose((at - [at[0], at[1], 0.3 * (at[0] + 2)]) @ z, 0.02, atol=1e-3)
+            np.testing.assert_allclose(
+                (pos_before - [pos_before[0], pos_before[1], 0.3 * (pos_before[0] + 2)]) @ z, 0.02, atol=1e-3
+            )
         else:
             assert moved[0] < -0.05
 
@@ -146,7 +148,7 @@ def test_loads_rest_on_terrain():
     np.testing.assert_allclose(np.asarray(plugin.read(hook.data).pos)[0, 0, 2], 0.48, atol=1e-5)
 
 
-def test_height_above_ground_counts_for_ground_effect_and_wind():
+def test_ground_effect_and_wind_use_the_height_above_ground():
     sim, _ = build(flat(1.0), pos=(0, 0, 1.05))
     plain = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
     plain.data = with_states(plain.data, pos=[0, 0, 0.05])

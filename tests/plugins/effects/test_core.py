@@ -155,17 +155,17 @@ def test_law_01_a_stage_computes_the_same_for_one_and_for_all(sim_with_effects, 
     apply_to_world = jax.jit(vmap_drones(stage.apply_unbatched))
     for index in [(0, 0), (1, 1), (2, 0)]:
 
-        def at(scope, x, index=index):
+        def select(scope, x, index=index):
             if scope == "world":
                 return x[index[0], 0]
             return x[index if stage.scope == "drone" else index[0]] if scope == "drone" else x
 
-        expected = jax.tree.map(at, scopes(flight_data), all_at_once)
-        if name == "downwash":  # a drone alone has no others
+        expected = jax.tree.map(select, scopes(flight_data), all_at_once)
+        if name == "downwash":  # a single drone has no neighbours
             world = jax.tree.map(lambda scope, x, w=index[0]: at_world(scope, x, w), scopes(flight_data), flight_data)
             found = jax.tree.map(lambda x, k=index[1]: x[k], on_host(apply_to_world(world)))
         else:
-            found = apply_to_one(jax.tree.map(at, scopes(flight_data), flight_data))
+            found = apply_to_one(jax.tree.map(select, scopes(flight_data), flight_data))
         for x, y in zip(*map(jax.tree.leaves, (expected, found)), strict=True):
             if jnp.issubdtype(y.dtype, jnp.floating):
                 # float32: one drone's arithmetic is fused in another way

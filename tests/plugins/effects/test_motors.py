@@ -26,7 +26,7 @@ def effectiveness(sim):
 
 
 @pytest.fixture(scope="module")
-def weak():
+def weak_sim():
     effectiveness = np.ones((3, 2, 4))
     effectiveness[0, 0] = 0.0  # all gone
     effectiveness[0, 1, 2] = 0.0  # rotor 2 gone
@@ -35,9 +35,9 @@ def weak():
     return build(effectiveness=effectiveness)
 
 
-def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak):
+def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak_sim):
     """One step from hover: v = g dt (mean effectiveness - 1), and J w' = the torque that remains."""
-    sim, before = weak, weak.data
+    sim, before = weak_sim, weak_sim.data
     sim.step()
     after, sim.data = sim.data, before
     states = jax.device_get(after.states)
@@ -57,10 +57,10 @@ def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak):
     assert np.array_equal(p.rpm2thrust, after.params.rpm2thrust)
 
 
-def test_a_drone_without_rotors_falls(weak):
+def test_a_drone_without_rotors_falls(weak_sim):
     """It falls as explicit Euler with linear drag computes, however fast its rotors still turn; commands do not
     change."""
-    sim, before = weak, weak.data
+    sim, before = weak_sim, weak_sim.data
     sim.step(100)
     states, controls, sim.data = *jax.device_get((sim.data.states, sim.data.controls)), before
     decay = 1 - 0.02477138502714662 / 0.0434 * DT
@@ -101,22 +101,22 @@ def test_rotors_fail_at_random_at_their_rate():
     assert abs(pairs.mean() - np.exp(-1.0)) < 4 * np.sqrt(0.25 / n), "rotors fail independently"
 
 
-def test_fail_stops_the_rotors_of_its_mask(weak):
-    before = weak.data
+def test_fail_stops_the_rotors_of_its_mask(weak_sim):
+    before = weak_sim.data
     mask = np.zeros((3, 2, 4), bool)
     mask[2, 1, 3] = True
-    weak.data = weak.plugins["motors"].fail(weak.data, mask)
-    changed, weak.data = effectiveness(weak), before
-    np.testing.assert_array_equal(changed != effectiveness(weak), mask)
+    weak_sim.data = weak_sim.plugins["motors"].fail(weak_sim.data, mask)
+    changed, weak_sim.data = effectiveness(weak_sim), before
+    np.testing.assert_array_equal(changed != effectiveness(weak_sim), mask)
     assert changed[2, 1, 3] == 0
 
 
-def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak):
+def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak_sim):
     """dv_z / de_i = dt thrust_i / m: a fault can be identified by descent."""
-    step = build_stagewise_step(weak)
+    step = build_stagewise_step(weak_sim)
 
     def climb(e):
-        data = weak.data.replace(plugins={"motors": weak.data.plugins["motors"].replace(effectiveness=e)})
+        data = weak_sim.data.replace(plugins={"motors": weak_sim.data.plugins["motors"].replace(effectiveness=e)})
         return jnp.sum(step(data, 1).states.vel[..., 2])
 
     gradient = jax.jit(jax.grad(climb))(np.full((3, 2, 4), 0.8, np.float32))

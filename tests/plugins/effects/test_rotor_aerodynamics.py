@@ -246,10 +246,10 @@ def test_law_08_gradients_equal_central_differences(x64):
         return jnp.sum(s.pos * jnp.array([1.0, -2.0, 3.0]) + 0.5 * s.vel**2 + s.quat[..., :3])
 
     loss_and_gradient = jax.jit(jax.value_and_grad(loss))
-    at = {name: jnp.float64(1.0) for name in scales}
-    gradient = loss_and_gradient(at)[1]
+    ones = {name: jnp.float64(1.0) for name in scales}
+    gradient = loss_and_gradient(ones)[1]
     for name in scales:
-        ahead, behind = (loss_and_gradient(at | {name: at[name] + h})[0] for h in (1e-6, -1e-6))
+        ahead, behind = (loss_and_gradient(ones | {name: ones[name] + h})[0] for h in (1e-6, -1e-6))
         np.testing.assert_allclose(gradient[name], (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-8, err_msg=name)
         assert abs(gradient[name]) > 1e-6, name
 
@@ -270,7 +270,7 @@ def test_law_09_wrong_settings_and_models_are_errors():
 
 
 def test_terms_can_be_left_out_and_a_ceiling_below_the_drone_has_no_effect():
-    """At 2 m/s: drag alone, thrust alone, neither, and a ceiling below and above the drone."""
+    """At 2 m/s: only drag, only thrust, neither, and a ceiling below and above the drone."""
     vel = [2.0, 0, 0]
     for settings, drag, lift in (
         ({"inflow": 0.0}, 2 * DRAG_XY, 0.0),

@@ -22,16 +22,16 @@ def build(velocity=(0.0, 0.0, 0.0), n_worlds=2, n_drones=2, **kwargs):
 
 
 @pytest.fixture(scope="module")
-def steady():
+def steady_wind_sim():
     """Return four drones in winds of 3 m/s along x, y and z, and in calm air; nose up, so that body z lies along x."""
     sim = build(np.array([[[3, 0, 0], [0, 3, 0]], [[0, 0, 3], [0, 0, 0.0]]]))
     sim.data = with_states(sim.data, quat=[0, HALF, 0, HALF])
     return sim
 
 
-def test_a_steady_wind_pushes_with_the_drag_by_hand(steady):
+def test_a_steady_wind_pushes_with_the_drag_by_hand(steady_wind_sim):
     """At rest with still rotors: v = dt (-R D R^T w / m + g), D = -(21.64, 21.64, 24.77) mN s/m, m = 43.4 g."""
-    sim = steady
+    sim = steady_wind_sim
     sim.data = with_states(sim.data, vel=0.0)
     before = sim.data
     sim.step()
@@ -43,8 +43,8 @@ def test_a_steady_wind_pushes_with_the_drag_by_hand(steady):
     sim.data = before
 
 
-def test_a_drone_that_drifts_with_the_wind_has_no_drag(steady):
-    sim, before = steady, steady.data
+def test_a_drone_that_drifts_with_the_wind_has_no_drag(steady_wind_sim):
+    sim, before = steady_wind_sim, steady_wind_sim.data
     sim.data = with_states(sim.data, vel=np.asarray(sim.data.plugins["wind"].velocity))
     sim.step()
     fall = np.asarray(sim.data.plugins["wind"].velocity) - [0, 0, DT * 9.81]
@@ -52,8 +52,8 @@ def test_a_drone_that_drifts_with_the_wind_has_no_drag(steady):
     sim.data = before
 
 
-def test_the_force_of_the_user_stays_and_is_added(steady):
-    sim, before = steady, steady.data
+def test_the_force_of_the_user_stays_and_is_added(steady_wind_sim):
+    sim, before = steady_wind_sim, steady_wind_sim.data
     force = np.float32([0.1, -0.2, 0.3])
     vel = []
     for f in (0 * force, force):

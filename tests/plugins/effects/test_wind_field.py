@@ -56,9 +56,9 @@ def test_law_10_displacements_depend_on_world_and_episode():
     assert not found[..., 2].any()
     sim.reset(np.array([True, False, False, False]))
     sim.step(2)
-    again = np.asarray(sim.data.plugins["wind_field"].shift)
-    np.testing.assert_array_equal(again[1:], found[1:])
-    assert not np.isclose(again[0], found[0]).all(axis=-1).any()
+    redrawn = np.asarray(sim.data.plugins["wind_field"].shift)
+    np.testing.assert_array_equal(redrawn[1:], found[1:])
+    assert not np.isclose(redrawn[0], found[0]).all(axis=-1).any()
 
 
 def test_displacements_follow_the_setting_spread():
@@ -121,9 +121,9 @@ def test_law_08_gradients_of_a_flight_equal_central_differences(x64, rng):
         data, _ = jax.lax.scan(step, data, length=20)
         return jnp.sum(data.states.vel * np.array([1.0, 2.0, 3.0]))
 
-    at, h = np.array([[[0.31, -0.22, 2.13]]]), 1e-5
-    found = np.asarray(end(at)[1])
-    central = [float(end(at + h * e)[0] - end(at - h * e)[0]) / (2 * h) for e in np.eye(3)]
+    start, h = np.array([[[0.31, -0.22, 2.13]]]), 1e-5
+    found = np.asarray(end(start)[1])
+    central = [float(end(start + h * e)[0] - end(start - h * e)[0]) / (2 * h) for e in np.eye(3)]
     assert np.abs(central).max() > 1e-3
     np.testing.assert_allclose(found[0, 0], central, rtol=1e-5, atol=1e-9)
 

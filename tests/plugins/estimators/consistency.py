@@ -9,7 +9,7 @@ from crazysim import rotation
 
 
 def errors(sim, name):
-    """Return the errors of position, world frame, velocity and attitude, body frame, of a filter. (n_worlds, 9)"""
+    """Return a filter's errors of position (world frame), velocity and attitude (body frame). (n_worlds, 9)"""
     e, s = sim.data.plugins[name].estimate, sim.data.states
     vel = rotation.rotate_inverse(s.quat, s.vel) - e.vel
     turn = 2 * rotation.multiply(rotation.conjugate(e.quat), s.quat)
@@ -20,7 +20,8 @@ def errors(sim, name):
 def assert_chi_squared(values, k):
     """Check that values have the mean of a chi-square distribution with k degrees of freedom.
 
-    The mean of n values has the standard deviation sqrt(2 k / n); it is off by 3.3 of them for one seed in a thousand.
+    The mean of n values has the standard deviation sqrt(2 k / n). The mean is off by more than 3.3 standard deviations
+    for one seed in a thousand.
     """
     assert abs(np.mean(values) - k) < 3.3 * math.sqrt(2 * k / len(values))
 

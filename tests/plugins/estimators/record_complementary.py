@@ -78,11 +78,11 @@ def compile_filter(firmware: Path) -> ctypes.CDLL:
 
 
 def float_array(x):
-    """Return numbers as an array of C."""
+    """Return numbers as a C array of floats."""
     return (ctypes.c_float * len(x))(*[float(a) for a in x])
 
 
-def run(lib, uses_ground: bool, ticks=2000):
+def run(lib, measures_distance: bool, ticks=2000):
     """Return inputs of each millisecond (gyro, degrees/s, accel, g, height, distance, age, ms) and outputs."""
     rng, inputs, outputs = np.random.default_rng(7), [], []
     phase, measured_at = rng.normal(size=3), -1000
@@ -92,7 +92,7 @@ def run(lib, uses_ground: bool, ticks=2000):
         accel = np.array([0.0, 0.0, 1.0]) + (k > 0) * 0.1 * rng.normal(size=3)
         height = 1.0 + 0.3 * np.sin(t) + 0.05 * rng.normal()
         distance = 1.1 + 0.3 * np.sin(t) + 0.01 * rng.normal()
-        if uses_ground and k >= 500 and k % 25 == 0 and not 1000 < k < 1300:
+        if measures_distance and k >= 500 and k % 25 == 0 and not 1000 < k < 1300:
             measured_at = k
         row = np.float32([*gyro, *accel, height, distance, k - measured_at])
         if k % 4 == 0:
@@ -109,6 +109,8 @@ def run(lib, uses_ground: bool, ticks=2000):
 
 if __name__ == "__main__":
     recorded = {}
-    for name, uses_ground in (("pressure", False), ("ground", True)):
-        recorded[f"{name}/inputs"], recorded[f"{name}/outputs"] = run(compile_filter(Path(sys.argv[1])), uses_ground)
+    for name, measures_distance in (("pressure", False), ("ground", True)):
+        recorded[f"{name}/inputs"], recorded[f"{name}/outputs"] = run(
+            compile_filter(Path(sys.argv[1])), measures_distance
+        )
     np.savez_compressed(Path(__file__).parent / "firmware_complementary.npz", **recorded)

@@ -50,7 +50,7 @@ c_float = ctypes.c_float
 
 
 def float_array(x):
-    """Return numbers as an array of C."""
+    """Return numbers as a C array of floats."""
     return (c_float * len(x))(*[float(a) for a in x])
 
 
@@ -75,7 +75,7 @@ FRAMES = np.stack([station_attitude(pos) for pos in STATIONS])
 def flight():
     """Return position, velocity, attitude as matrices, angular velocity and specific force in each loop.
 
-    A Lissajous figure that starts at rest, whose thrust points along the acceleration, with a heading that turns.
+    The path is a Lissajous figure. The drone starts at rest, turns, and points its thrust along the specific force.
     """
     t = np.arange(-5, LOOPS + 6) / 1000
     s = np.clip(t, 0, 1)

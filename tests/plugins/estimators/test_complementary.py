@@ -1,4 +1,4 @@
-"""The complementary filter: agreement with the compiled firmware, flight on it, and errors for states that it lacks."""
+"""The complementary filter: agreement with the compiled firmware, flight on it, and wrong input."""
 
 import math
 
@@ -14,8 +14,8 @@ from crazysim.plugins.sensors import IMU
 
 
 @pytest.mark.parametrize("kind", ["pressure", "ground"])
-def test_the_filter_is_that_of_the_compiled_firmware(kind):
-    """In 2 s of 1 ms, except for rounding in float32, in 500 updates of numbers around one."""
+def test_the_filter_agrees_with_the_compiled_firmware(kind):
+    """In 2,000 steps of 1 ms, except for the rounding of 500 updates in float32."""
     found, recorded = firmware_filters.complementary_states(kind)
     assert np.ptp(recorded[:, [0, 1, 2, 4, 5]], axis=0).min() > 0.05, "nothing moved in the recording"
     np.testing.assert_allclose(found[:, :4], recorded[:, :4], rtol=0, atol=5e-6)
@@ -37,7 +37,7 @@ def fly(estimator, n_worlds=4, engine="auto", seconds=2.0):
 
 @pytest.fixture(scope="module")
 def flown_sim():
-    """Return a simulation that has flown with the filter given by its name, with the Crazyflie's sensors."""
+    """Return a simulation that has flown with the filter by its name, which adds the Crazyflie's sensors."""
     return fly("complementary")
 
 
@@ -54,7 +54,7 @@ def test_drones_fly_on_the_estimate(flown_sim):
     assert list(flown_sim.plugins) == ["imu", "barometer", "complementary"]
 
 
-def test_gradients_of_the_estimate_are_central_differences(x64):
+def test_gradients_of_the_estimate_equal_central_differences(x64):
     """With respect to rates and forces, away from the kinks at the dead band and at fresh measurements."""
     quat = jnp.array([0.1, -0.2, 0.05, 0.97])
     quat = quat / jnp.linalg.norm(quat)
@@ -69,7 +69,7 @@ def test_gradients_of_the_estimate_are_central_differences(x64):
     np.testing.assert_allclose(jax.grad(loss)(x), slope, rtol=1e-6, atol=1e-9)
 
 
-def test_levels_and_sensors_that_it_does_not_support_are_errors():
+def test_levels_and_sensors_that_the_filter_does_not_support_are_errors():
     with pytest.raises(ConfigError, match="estimates no position"):
         Sim(control="state", estimator="complementary")
     with pytest.raises(ConfigError, match="a TimeOfFlight or one of each"):

@@ -29,7 +29,7 @@ POS, ANGLE = 0.01, 0.02
 
 
 def add_error(estimate, error):
-    """Return the true state of an estimate with these errors, (15,)."""
+    """Return the true state: an estimate plus its errors, (15,)."""
     turn = jnp.concatenate([0.5 * error[6:9], jnp.ones(1)])
     return estimate.replace(
         pos=estimate.pos + error[:3],
@@ -58,56 +58,56 @@ def estimate(x64):
 
 
 def test_the_covariance_moves_with_the_derivatives_of_the_step(estimate):
-    """``F P F' + G Q G'`` with F by automatic differentiation; half of dt^2 times 10 m/s^2 is neglected."""
+    """``F P F' + G Q G'`` with F by automatic differentiation; the filter neglects dt^2 / 2 times 10 m/s^2."""
     accel, gyro, gravity, dt = jnp.array([0.5, 1.0, 9.0]), jnp.array([3.0, -2.0, 1.0]), jnp.array([0, 0, -9.81]), 1e-3
     noise = jnp.array([10.0, 20.0, 30.0]), jnp.array([40.0, 50.0, 60.0])
 
-    def step(at):
-        return error_state.predict_biased(at, accel, gyro, dt, gravity, *noise)
+    def step(state):
+        return error_state.predict_biased(state, accel, gyro, dt, gravity, *noise)
 
     after = jax.jit(step)(estimate)
     f = jax.jit(jax.jacfwd(lambda error: error_of(step(add_error(estimate, error)), after)))(jnp.zeros(15))
-    g = f[:, 9:] * (np.arange(15) < 9)[:, None]  # noise acts as a bias of one interval, and leaves the biases
+    g = f[:, 9:] * (np.arange(15) < 9)[:, None]  # noise acts like a bias for one interval; biases stay
     expected = f @ error_state.covariance(estimate.cov) @ f.T + g @ jnp.diag(jnp.concatenate(noise)) @ g.T
     np.testing.assert_allclose(error_state.covariance(after.cov), expected, rtol=0, atol=5e-6)
     assert (g @ g.T)[3:9, 3:9].max() * 40 > 1e-4, "the noise would be too small to matter"
 
 
-KNOWN, SCALE, GYRO_NOW = jnp.array([0.6, 0.0, -0.8]), 0.49, jnp.array([0.3, -0.2, 0.1])
+KNOWN_DIRECTION, FLOW_SCALE, MEASURED_RATE = jnp.array([0.6, 0.0, -0.8]), 0.49, jnp.array([0.3, -0.2, 0.1])
 ANCHORS = jnp.array([[-3.0, -3.0, 0.2], [3.0, -3.0, 2.4], [3.0, 3.0, 0.2], [-3.0, 3.0, 2.4]])
 
 
-def image_motion(at, upright):
+def image_motion(state, cos_tilt):
     """Return the motion of the image; the filter neglects that its attitude has errors."""
-    turn = GYRO_NOW - at.gyro_bias
-    return SCALE * (at.vel[:2] * upright / at.pos[2] + jnp.array([-1.0, 1.0]) * turn[1::-1])
+    turn = MEASURED_RATE - state.gyro_bias
+    return FLOW_SCALE * (state.vel[:2] * cos_tilt / state.pos[2] + jnp.array([-1.0, 1.0]) * turn[1::-1])
 
 
-def differences(at):
-    distance = jnp.linalg.norm(at.pos - ANCHORS, axis=-1)
+def differences(state):
+    distance = jnp.linalg.norm(state.pos - ANCHORS, axis=-1)
     return distance[1:] - distance[0]
 
 
 MEASURED = {
-    "vel": lambda at, _: rotation.rotate(at.quat, at.vel),
-    "direction": lambda at, _: rotation.rotate_inverse(at.quat, KNOWN),
-    "flow": lambda at, rot: image_motion(at, rot[2, 2]),
-    "ray": lambda at, _: at.pos[2:] / rotation.matrix(at.quat)[2, 2:],
-    "differences": lambda at, _: differences(at),
+    "vel": lambda state, _: rotation.rotate(state.quat, state.vel),
+    "direction": lambda state, _: rotation.rotate_inverse(state.quat, KNOWN_DIRECTION),
+    "flow": lambda state, rot: image_motion(state, rot[2, 2]),
+    "ray": lambda state, _: state.pos[2:] / rotation.matrix(state.quat)[2, 2:],
+    "differences": lambda state, _: differences(state),
 }
 """Measurements of a state, by kind."""
 UPDATES = {
-    "vel": lambda at, z, rot, std: updates.update_vel(at, z, std),
-    "direction": lambda at, z, rot, std: updates.update_direction(at, z, KNOWN, std),
-    "flow": lambda at, z, rot, std: updates.update_flow(at, rot, z, GYRO_NOW, jnp.asarray(SCALE), std),
-    "ray": lambda at, z, rot, std: updates.update_ray(at, z[0], std),
-    "differences": lambda at, z, rot, std: updates.update_differences(at, ANCHORS, z, std),
+    "vel": lambda state, z, rot, std: updates.update_vel(state, z, std),
+    "direction": lambda state, z, rot, std: updates.update_direction(state, z, KNOWN_DIRECTION, std),
+    "flow": lambda state, z, rot, std: updates.update_flow(state, rot, z, MEASURED_RATE, jnp.asarray(FLOW_SCALE), std),
+    "ray": lambda state, z, rot, std: updates.update_ray(state, z[0], std),
+    "differences": lambda state, z, rot, std: updates.update_differences(state, ANCHORS, z, std),
 }
 
 
 @pytest.mark.parametrize("kind", MEASURED)
-def test_updates_move_by_the_derivatives_of_the_measurement(estimate, kind):
-    """A measurement of the state with a tiny error, all axes at once with the gain of its derivatives."""
+def test_updates_have_the_gain_of_the_derivatives_of_the_measurement(estimate, kind):
+    """The measurement has a tiny error; the expected gain is that of all axes at once."""
     rot = rotation.matrix(estimate.quat)
     prediction = MEASURED[kind](estimate, rot)
     error = 1e-7 * jnp.array([1.0, -2.0, 1.5])[: len(prediction)]
@@ -143,8 +143,8 @@ def test_a_path_propagates_covariance_and_state(estimate):
     for k in range(20):
         path = path.extend(jnp.array([0.5, 1.0, 9.0 + 0.1 * k]), jnp.array([1.0, -0.8, 0.5 - 0.02 * k]), 0.01)
 
-    def carry(at):
-        return propagate_along(at, path.without_biases(at), gravity)
+    def carry(state):
+        return propagate_along(state, path.without_biases(state), gravity)
 
     there = jax.jit(carry)(estimate)
     f = jax.jit(jax.jacfwd(lambda error: error_of(carry(add_error(estimate, error)), there)))(jnp.zeros(15))
@@ -170,7 +170,8 @@ def fly(n_worlds, aids, steps, engine="auto"):
 
 
 @pytest.fixture(scope="module")
-def indoors():
+def indoor_sim():
+    """Return a simulation that has flown with motion capture and GPS."""
     return fly(128, [MotionCapture(noise=POS, angle_noise=ANGLE), GPS(noise=POS, vel_noise=0.02, delay=0.2)], 2000)
 
 
@@ -182,29 +183,29 @@ def all_errors(sim, name="eskf"):
     return error, np.asarray(error_state.covariance(estimate.cov), np.float64)[:, 0]
 
 
-def test_the_covariance_is_that_of_the_errors(indoors):
+def test_the_errors_have_the_covariance_of_the_filter(indoor_sim):
     """NEES: 15 states, one degree of freedom each."""
-    assert_chi_squared(normalised_square(*all_errors(indoors)), 15)
-    assert not np.asarray(indoors.data.plugins["eskf"].failures).any()
+    assert_chi_squared(normalised_square(*all_errors(indoor_sim)), 15)
+    assert not np.asarray(indoor_sim.data.plugins["eskf"].failures).any()
 
 
-def test_biases_are_estimated(indoors):
+def test_biases_are_estimated(indoor_sim):
     """After 4 s with 1 cm and 0.02 rad of noise the errors are a fraction of the spread of the biases."""
-    error, _ = all_errors(indoors)
+    error, _ = all_errors(indoor_sim)
     rms = np.sqrt(np.mean(error**2, axis=0))
     assert rms[9:12].max() < 0.1 * 0.2
     assert rms[12:].max() < 0.1 * 0.0175
-    measured = indoors.plugins.observations(indoors.data)["eskf.ang_vel"]
-    rate_error = np.asarray(measured - indoors.data.states.ang_vel)
+    measured = indoor_sim.plugins.observations(indoor_sim.data)["eskf.ang_vel"]
+    rate_error = np.asarray(measured - indoor_sim.data.states.ang_vel)
     white_noise = 2.4e-4 * np.sqrt(250)  # of one sample at 500 Hz
     assert np.sqrt(np.mean(rate_error**2)) < 1.1 * white_noise
 
 
-def test_innovations_are_as_the_filter_expects(indoors):
+def test_innovations_are_as_the_filter_expects(indoor_sim):
     """NIS: poses that the filter does not use yet, minus predictions, normalised by ``H P H' + R``."""
-    record, step = indoors.data.plugins["eskf"], indoors.data.core.steps[0, 0]
-    data = ESKF(()).write(indoors.data, record.replace(used_steps=jnp.full_like(record.used_steps, step)))
-    data = indoors.step_fn(data, jnp.int32(1))
+    record, step = indoor_sim.data.plugins["eskf"], indoor_sim.data.core.steps[0, 0]
+    data = ESKF(()).write(indoor_sim.data, record.replace(used_steps=jnp.full_like(record.used_steps, step)))
+    data = indoor_sim.step_fn(data, jnp.int32(1))
     estimate, pose = data.plugins["eskf"].estimate, data.plugins["motion_capture"].samples.value[:, 0]
     turn = rotation.multiply(rotation.conjugate(estimate.quat[:, 0]), pose[:, 3:7])
     error = np.concatenate([pose[:, :3] - estimate.pos[:, 0], 2 * turn[:, :3] / turn[:, 3:]], axis=-1)
@@ -221,7 +222,7 @@ STATIONS = [[-2, -2, 2.5], [2, 2, 2.5]], [[0, 0.5, 0.8], [0, 0.5, -2.4]]
 
 
 def fly_with_filters(filters):
-    """Return a simulation of 128 drones that move by 0.4 m, with filters, by name, that start with errors."""
+    """Return a simulation of 128 drones after a move by 0.4 m; each filter, {name: aids}, has started with errors."""
     sim, imu = Sim(128, control="state", integrator="rk4", rng_key=2), IMU(
         gyro=Triad(noise=2.4e-4, bias_spread=DEVIATIONS[-1], random_walk=1e-5),
         accel=Triad(noise=2e-3, bias_spread=DEVIATIONS[9], random_walk=1e-4),
@@ -246,7 +247,7 @@ def fly_with_filters(filters):
     return sim
 
 
-def test_flow_range_and_differences_are_used_with_their_errors():
+def test_errors_with_flow_range_and_differences_have_the_covariance_of_the_filter():
     """NEES of the states, and NIS of the next differences, with correlated errors, and ranges along a tilted ray."""
     sim = fly_with_filters({"eskf": [*FLOW, UWB(ANCHORS, noise=0.1, tdoa=True)]})
     error, cov = all_errors(sim)
@@ -260,23 +261,23 @@ def test_flow_range_and_differences_are_used_with_their_errors():
     plugins = sim.step_fn(data, jnp.int32(1)).plugins
     values = jnp.concatenate([plugins[name].samples.value[:, 0] for name in ("uwb", "time_of_flight")], axis=-1)
 
-    def predict(at):
-        return jnp.concatenate([MEASURED["differences"](at, None), MEASURED["ray"](at, None)])
+    def predict(state):
+        return jnp.concatenate([MEASURED["differences"](state, None), MEASURED["ray"](state, None)])
 
-    at = jax.tree.map(lambda x: x[:, 0], plugins["eskf"].estimate)
-    h = jax.jit(jax.vmap(lambda at: jax.jacfwd(lambda e: predict(add_error(at, e)))(jnp.zeros(15))))(at)
+    state = jax.tree.map(lambda x: x[:, 0], plugins["eskf"].estimate)
+    h = jax.jit(jax.vmap(lambda state: jax.jacfwd(lambda e: predict(add_error(state, e)))(jnp.zeros(15))))(state)
     noise = np.zeros((4, 4))
     noise[:3, :3] = 0.1**2 * (np.eye(3) + 1)
     noise[3, 3] = (
         0.005 + 0.0025 * (1 + np.exp(2.92 * (1 - 2.5)))
     ) ** 2 + 0.001**2  # at 1 m, plus the smallest deviation
-    innovation = np.asarray(values - jax.vmap(predict)(at), np.float64)
-    h, cov = np.asarray(h, np.float64), np.asarray(error_state.covariance(at.cov), np.float64)
+    innovation = np.asarray(values - jax.vmap(predict)(state), np.float64)
+    h, cov = np.asarray(h, np.float64), np.asarray(error_state.covariance(state.cov), np.float64)
     assert_chi_squared(normalised_square(innovation, h @ cov @ h.transpose(0, 2, 1) + noise), 4)
 
 
 @pytest.mark.slow("four filters of 128 drones for 4 s; the test above flies three of the aids together")
-def test_every_kind_of_aid_is_used_with_its_errors():
+def test_errors_with_every_kind_of_aid_have_the_covariance_of_the_filter():
     """NEES of filters on one kind of sensor."""
     filters = {
         "flow": FLOW,
@@ -291,7 +292,7 @@ def test_every_kind_of_aid_is_used_with_its_errors():
 
 @pytest.mark.slow("128 drones for 8 s; the tests above fly other aids through the same filter")
 def test_satellites_barometer_and_magnetometer_are_enough():
-    """NEES after 8 s; the heading follows from the magnetic field alone, whose noise is 0.08 rad in a sample."""
+    """NEES after 8 s; only the magnetic field shows the heading, with a noise of 0.08 rad in each sample."""
     field = Magnetometer((2e-5, 0.0, -4.5e-5), Triad(noise=5e-7))
     sim = fly(128, [GPS(noise=0.3, vel_noise=0.05), Barometer(noise=3.0), field], 4000)
     error, cov = all_errors(sim)
@@ -300,15 +301,15 @@ def test_satellites_barometer_and_magnetometer_are_enough():
     assert np.sqrt(np.mean(error[:, 12:] ** 2)) < 0.1 * 0.0175
 
 
-def test_an_impossible_estimate_is_reset(indoors):
+def test_an_impossible_estimate_is_reset(indoor_sim):
     """In world 1 the position is out of bounds, then in world 0 the velocity."""
 
     def after_a_step(data, **changes):
         record = data.plugins["eskf"]
         data = ESKF(()).write(data, record.replace(estimate=record.estimate.replace(**changes)))
-        return indoors.step_fn(data, jnp.int32(1))
+        return indoor_sim.step_fn(data, jnp.int32(1))
 
-    data = after_a_step(indoors.data, pos=indoors.data.plugins["eskf"].estimate.pos.at[1].set(1.1e4))
+    data = after_a_step(indoor_sim.data, pos=indoor_sim.data.plugins["eskf"].estimate.pos.at[1].set(1.1e4))
     record = data.plugins["eskf"]
     assert np.asarray(record.failures)[:3, 0, 0].tolist() == [0, 1, 0]
     assert np.abs(np.asarray(record.estimate.pos)[1]).max() < 20.0

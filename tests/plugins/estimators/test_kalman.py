@@ -17,7 +17,7 @@ ANCHORS = [[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]]
 
 
 @pytest.mark.parametrize("kind", firmware_filters.MEASUREMENT_KINDS)
-def test_the_filter_is_that_of_the_compiled_firmware(kind):
+def test_the_filter_agrees_with_the_compiled_firmware(kind):
     """In fast flights of 4 s, except for the rounding in float32 of 4,000 loops of 1 ms."""
     found, recorded = firmware_filters.kalman_states(kind)
     assert np.ptp(recorded[:, :3], axis=0).max() > (0.01 if kind == "ground" else 1.0), "nothing moved"
@@ -27,7 +27,7 @@ def test_the_filter_is_that_of_the_compiled_firmware(kind):
 
 
 def test_flow_is_two_updates_from_one_prediction(x64):
-    """In closed form: both derivatives and innovations are those of the estimate before, but not the second gain."""
+    """In closed form: both updates use the innovations of the first estimate, the second gain the new covariance."""
     rng = np.random.default_rng(1)
     root = 0.3 * rng.normal(size=(9, 9))
     level, vel = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([3.0, -2.0, 0.5])
@@ -94,7 +94,7 @@ def test_drones_hover_on_the_estimate(flown_sim):
     assert not flown_sim.data.plugins["kalman"].failures.any()
 
 
-def test_the_covariance_is_that_of_the_errors(flown_sim):
+def test_the_errors_have_the_covariance_of_the_filter(flown_sim):
     """NEES: squared errors normalised by the covariance are chi-square distributed, one degree for each state."""
     cov = np.asarray(error_state.covariance(flown_sim.data.plugins["kalman"].estimate.cov))[:, 0]
     assert_chi_squared(normalised_square(errors(flown_sim, "kalman"), cov), 9)
@@ -142,8 +142,8 @@ def test_an_impossible_estimate_is_reset():
 
 
 @pytest.mark.parametrize("drone", ["cf2x_L250", "bumblebee"])
-def test_all_axes_of_the_accelerometer_serve_any_airframe(drone):
-    """Under a constant force of a tenth of the weight, which the firmware's filter does not model."""
+def test_with_all_axes_of_the_accelerometer_the_filter_fits_any_airframe(drone):
+    """Drones feel a constant force of a tenth of their weight, which the firmware's filter does not model."""
     vel_errors = []
     for all_axes in (False, True):
         estimator = Kalman([IMU(), MotionCapture()], all_axes=all_axes, control=False)
@@ -177,11 +177,11 @@ def test_one_argument_adds_filter_and_sensors():
     for sim in sims:
         sim.state_control(pos=(0.2, 0.0, 0.5))
         sim.step(1000)
-    one, other = (np.asarray(sim.data.states.pos) for sim in sims)
+    by_argument, by_add = (np.asarray(sim.data.states.pos) for sim in sims)
     assert list(sims[0].plugins) == ["imu", "motion_capture", "kalman"]
-    np.testing.assert_array_equal(one, other)
-    assert np.abs(one - [0.2, 0.0, 0.5]).max() < 0.05
-    assert np.ptp(one, axis=0).max() > 1e-5, "estimates differ between worlds"
+    np.testing.assert_array_equal(by_argument, by_add)
+    assert np.abs(by_argument - [0.2, 0.0, 0.5]).max() < 0.05
+    assert np.ptp(by_argument, axis=0).max() > 1e-5, "estimates differ between worlds"
 
 
 @pytest.mark.parametrize("controller", ["pid", "crazyflow"])
@@ -235,7 +235,7 @@ def test_a_task_observes_the_estimate():
     state = env.step(state, action)
     record = state.data.plugins["kalman"]
     moved = record.replace(estimate=record.estimate.replace(pos=record.estimate.pos + 1.0))
-    other = state.replace(data=state.data.replace(plugins=state.data.plugins | {"kalman": moved}))
-    one, two = env.step(state, action), env.step(other, action)
-    np.testing.assert_allclose(two.obs["pos"] - one.obs["pos"], 1.0, rtol=0, atol=1e-5)
-    np.testing.assert_array_equal(one.reward, two.reward)
+    moved_state = state.replace(data=state.data.replace(plugins=state.data.plugins | {"kalman": moved}))
+    after, after_move = env.step(state, action), env.step(moved_state, action)
+    np.testing.assert_allclose(after_move.obs["pos"] - after.obs["pos"], 1.0, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(after.reward, after_move.reward)

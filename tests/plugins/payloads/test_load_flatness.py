@@ -51,7 +51,7 @@ def state_at(flat, k):
     return jax.tree.map(lambda x: x[k], flat[0])
 
 
-def test_derivatives_are_those_of_the_states_in_time(flat, x64):
+def test_rates_are_the_time_derivatives_of_the_states(flat, x64):
     before, now, after = (state_at(flat, k) for k in range(3))
     for value, rate in (("pos", "vel"), ("vel", "acc"), ("direction", "direction_rate"), ("ang_vel", "ang_acc")):
         slope = (getattr(after, value) - getattr(before, value)) / (2 * DT)
@@ -81,7 +81,7 @@ def test_the_dynamics_have_the_accelerations_of_the_flat_states(sim, flat, x64):
         np.testing.assert_allclose(deriv.plugins["load"]["vel"], path[2], rtol=1e-9, atol=1e-9)
 
 
-def test_at_rest_the_load_hangs_below(flat, x64):
+def test_at_rest_the_load_hangs_below_the_drone(flat, x64):
     flat_state = state_at(flat, -1)
     np.testing.assert_allclose(flat_state.pos, REST_POS + [0, 0, LENGTH])
     np.testing.assert_allclose(flat_state.thrust, [(0.605 + LOAD) * 9.81])

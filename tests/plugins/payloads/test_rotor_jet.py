@@ -42,7 +42,7 @@ def build(n_worlds=2, n_drones=1, rotor_vel=1000.0, engine="interpret", **kwargs
 
 
 def jet_record(sim):
-    """Return the record of the jet after its stage alone."""
+    """Return the record of the jet after only its stage."""
     return jax.jit(sim.step_pipeline["rotor_jet"])(sim.data).plugins["rotor_jet"]
 
 
@@ -90,12 +90,12 @@ def test_outside_the_box_of_the_table_there_is_no_jet():
     assert not np.asarray(jet_record(sim).force).any()
 
 
-def test_the_analytic_jet_is_that_of_downwash():
+def test_the_analytic_jet_has_the_speed_of_downwash():
     """One panel for the whole top: rho u^2 A at its centre, DEPTH - 0.02 below the drone, in the middle of the jet."""
     sim, _plugin = build(panel=1.0)
     force = np.asarray(jet_record(sim).force)
     radius = float(sim.airframe.value("shape.propeller_radius", ()))
-    thrust = 4 * 9.3945e-7 * 1000**2  # N, of the lab's coefficient
+    thrust = 4 * 9.3945e-7 * 1000**2  # N, with the lab's coefficient
     below, ones = np.array([[0.0, 0.0, -(DEPTH - 0.02)]]), np.ones((1, 1))
     speed = jax.jit(hover_jet_speed)(
         below, np.array([[0, 0, 1.0]]), thrust * ones, np.sqrt(8) * radius * ones, 1.225 * ones
@@ -124,27 +124,27 @@ def test_the_force_of_a_jet_accelerates_the_load():
     assert force[0, 0, 2] < -0.2
     expected = before + (force / 0.2 + np.array([0, 0, -9.81])) / 500
     np.testing.assert_allclose(load.read(sim.data).vel, expected, rtol=1e-5, atol=1e-6)
-    hook = Sim(drone="bumblebee", control="rotor_vel", engine="interpret")
-    hook.data = with_states(hook.data, pos=[0, 0, 2.0], rotor_vel=1000 * RPM)
-    hook.add(Hook.bumblebee(0.2, load_at=(0, 0, 1.5)))
-    hook.add(RotorJet(pressure_table(400.0, 400.0)))
-    hook.step()
-    plugins = hook.data.plugins
+    hook_sim = Sim(drone="bumblebee", control="rotor_vel", engine="interpret")
+    hook_sim.data = with_states(hook_sim.data, pos=[0, 0, 2.0], rotor_vel=1000 * RPM)
+    hook_sim.add(Hook.bumblebee(0.2, load_at=(0, 0, 1.5)))
+    hook_sim.add(RotorJet(pressure_table(400.0, 400.0)))
+    hook_sim.step()
+    plugins = hook_sim.data.plugins
     fall, force = (np.asarray(x)[0, 0, 2] for x in (plugins["load"].vel, plugins["rotor_jet"].force))
     np.testing.assert_allclose(fall, (force / 0.2 - 9.81) / 500, rtol=1e-4)
 
 
 def test_a_load_gets_the_jets_of_all_drones_above():
-    """A drone flies above another: the load of the lower drone gets both jets, that of the upper one only its own."""
+    """A drone flies above another: the load of the lower drone gets both jets, that of the upper drone one jet."""
     sim, _plugin = build(n_drones=2, n_worlds=1, all_drones=True)
     sim.data = with_states(sim.data, pos=np.array([[[0, 0, 2.0], [0.0, 0, 3.0]]]))
     load = sim.plugins["load"]
     sim.data = load.hang(sim.data)
     force_of_all = np.asarray(jet_record(sim).force)[0, :, 2]
-    own, _ = build(n_drones=2, n_worlds=1)
-    own.data = with_states(own.data, pos=np.array([[[0, 0, 2.0], [0.0, 0, 3.0]]]))
-    own.data = own.plugins["load"].hang(own.data)
-    force_of_own = np.asarray(jet_record(own).force)[0, :, 2]
+    own_sim, _ = build(n_drones=2, n_worlds=1)
+    own_sim.data = with_states(own_sim.data, pos=np.array([[[0, 0, 2.0], [0.0, 0, 3.0]]]))
+    own_sim.data = own_sim.plugins["load"].hang(own_sim.data)
+    force_of_own = np.asarray(jet_record(own_sim).force)[0, :, 2]
     assert force_of_all[0] < 1.1 * force_of_own[0] < 0
     np.testing.assert_allclose(force_of_all[1], force_of_own[1], rtol=1e-5)
 
@@ -173,10 +173,10 @@ def test_law_08_gradients_of_a_step_equal_central_differences(x64):
             data = stage(data)
         return load.read(data).vel[0, 0, 2]
 
-    at, h = 900 * RPM, 0.1
-    central = (end(at + h)[0] - end(at - h)[0]) / (2 * h)
+    start, h = 900 * RPM, 0.1
+    central = (end(start + h)[0] - end(start - h)[0]) / (2 * h)
     assert abs(float(central)) > 1e-8
-    np.testing.assert_allclose(end(at)[1], central, rtol=1e-5)
+    np.testing.assert_allclose(end(start)[1], central, rtol=1e-5)
 
 
 def write_tables(folder, speeds, rows):

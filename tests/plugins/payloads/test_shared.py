@@ -68,8 +68,7 @@ def test_slack_and_released_cables_do_not_pull(x64):
     np.testing.assert_allclose(moved[2, :2], 0, atol=1e-12)
 
 
-def test_where_gravity_differs_the_load_falls_with_the_mean(x64):
-    """The mean of the gravity of its drones."""
+def test_a_load_falls_with_the_mean_gravity_of_its_drones(x64):
     sim, load = build(2, "symplectic_euler", "interpret")
     gravity = np.zeros((1, 2, 3))
     gravity[0, :, 2] = [-8.0, -10.0]

@@ -26,6 +26,7 @@ def build(n_worlds=1, n_drones=1, height=500.0, **kwargs):
 
 
 def with_load(load, data, **changes):
+    """Return the data with changed fields of the load's record."""
     record = load.read(data)
     return load.write(data, record.replace(**{k: broadcast_like(v, getattr(record, k)) for k, v in changes.items()}))
 
@@ -61,8 +62,9 @@ def test_law_08_momentum_and_energy_of_drone_and_load_are_kept(integrator, x64):
     np.testing.assert_allclose(p, p0 + [0, 0, -9.81 * n / 500 * (MASS + LOAD)], atol=1e-11)
     assert np.abs(relative_energy(load, sim.data) / e0 - 1).max() < 2e-3
     assert (np.linalg.norm(spin - l0, axis=-1) < 1e-2 * np.linalg.norm(l0, axis=-1)).all()
-    pos, quat, at = (np.asarray(x)[:, 0] for x in (sim.data.states.pos, sim.data.states.quat, load.read(sim.data).pos))
-    length = np.linalg.norm(at - pos - Rotation.from_quat(quat).apply(attach), axis=-1)
+    record, states = load.read(sim.data), sim.data.states
+    load_pos, pos, quat = (np.asarray(x)[:, 0] for x in (record.pos, states.pos, states.quat))
+    length = np.linalg.norm(load_pos - pos - Rotation.from_quat(quat).apply(attach), axis=-1)
     assert np.abs(length - 0.4).max() < 1e-4
 
 
@@ -80,8 +82,8 @@ def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
 
     def energy():
         r, s = load.read(sim.data), sim.data.states
-        at, vel, pos, drone_vel = (np.asarray(x)[:, 0] for x in (r.pos, r.vel, s.pos, s.vel))
-        return 9.81 * (at - pos)[:, 2] + np.sum((vel - drone_vel) ** 2, axis=-1) / 2
+        load_pos, vel, pos, drone_vel = (np.asarray(x)[:, 0] for x in (r.pos, r.vel, s.pos, s.vel))
+        return 9.81 * (load_pos - pos)[:, 2] + np.sum((vel - drone_vel) ** 2, axis=-1) / 2
 
     start, energies = energy(), []
     for _ in range(60):
@@ -96,7 +98,7 @@ def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_without_mass_the_drone_flies_as_without_load(integrator):
+def test_a_load_without_mass_does_not_change_the_flight(integrator):
     flights = []
     for mass in (None, 0.0):
         sim = build(integrator=integrator, height=5.0)
@@ -111,7 +113,7 @@ def test_without_mass_the_drone_flies_as_without_load(integrator):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_cable_that_becomes_taut(integrator, x64):
+def test_a_cable_that_becomes_taut_ends_the_relative_motion_along_it(integrator, x64):
     """The impulse of two masses along the line, with and without a bounce: speeds by hand."""
     sim, restitution = build(2, integrator=integrator, engine="interpret"), np.array([0.0, 0.6])
     load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=restitution[:, None], in_scene=False))
@@ -148,7 +150,7 @@ def test_impulse_by_hand():
     np.testing.assert_allclose(q @ (vel - after.vel), 0, atol=1e-4)
 
 
-def test_order_of_convergence(x64):
+def test_the_order_of_convergence_is_that_of_the_integrator(x64):
     """With a load Runge-Kutta has order four and Euler's scheme order one; both converge to the same flight.
 
     The load has drag, and its joint damping and a position far from the centre of mass. Each of them reduces the order
@@ -194,10 +196,12 @@ def test_law_08_gradients_are_central_differences(cable, x64):
     def forward(x):
         return jax.vmap(lambda change: jax.jvp(end, (x,), (change,)), out_axes=(None, 0))(np.eye(5))
 
-    both = jax.jit(jax.value_and_grad(end) if cable else forward)
-    gradient = np.asarray(both(x)[1])
+    value_and_gradient = jax.jit(jax.value_and_grad(end) if cable else forward)
+    gradient = np.asarray(value_and_gradient(x)[1])
     for k, d in enumerate(1e-5 * np.eye(5)):
-        np.testing.assert_allclose(gradient[k], (both(x + d)[0] - both(x - d)[0]) / 2e-5, rtol=2e-4, atol=1e-6)
+        np.testing.assert_allclose(
+            gradient[k], (value_and_gradient(x + d)[0] - value_and_gradient(x - d)[0]) / 2e-5, rtol=2e-4, atol=1e-6
+        )
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -228,7 +232,7 @@ def test_law_07_no_nan_in_gradients():
     load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=0.3, in_scene=False))
     data = with_load(load, sim.data, pos=np.asarray(sim.data.states.pos))
 
-    def advanced(data):
+    def advance(data):
         for stage in sim.step_pipeline.values():
             data = stage(data)
         return data
@@ -238,7 +242,7 @@ def test_law_07_no_nan_in_gradients():
         """Return gradients of the sum of all states after a step, and the data after it."""
 
         def total(data):
-            after = advanced(data)
+            after = advance(data)
             numbers = jax.tree.leaves((after.states, load.read(after)))
             return sum(jnp.sum(x) for x in numbers if jnp.issubdtype(x.dtype, jnp.floating)), after
 
@@ -259,11 +263,11 @@ def test_law_01_a_world_flies_as_it_does_alone():
     sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
     sim.step(50)
     heights = np.asarray(load.read(sim.data).pos)[..., 2]
-    alone = build(1, 1, height=2.0)
-    load = alone.add(SlungLoad(mass=0.2, attach=OFFSET, cable=True, in_scene=False))
-    alone.rotor_vel_control(np.full((1, 1, 4), 13000.0))
-    alone.step(50)
-    rise = np.asarray(load.read(alone.data).pos)[0, 0, 2]
+    single_sim = build(1, 1, height=2.0)
+    load = single_sim.add(SlungLoad(mass=0.2, attach=OFFSET, cable=True, in_scene=False))
+    single_sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
+    single_sim.step(50)
+    rise = np.asarray(load.read(single_sim.data).pos)[0, 0, 2]
     np.testing.assert_allclose(heights[1, 0], rise, atol=1e-5)
     np.testing.assert_allclose(heights[1, 1], 2 - 0.03 - 0.4 - 9.81 * 0.1**2 / 2, atol=3e-3)  # cut loose
 

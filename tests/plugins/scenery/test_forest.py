@@ -28,7 +28,7 @@ def build(n_worlds=3, n_drones=2, **settings):
 
 @pytest.fixture(scope="module")
 def half_forest():
-    """Return a simulation with a forest of which half the trees stand, and its plugin."""
+    """Return a simulation with a forest where half of the trees stand, and its plugin."""
     return build(difficulty=0.5)
 
 
@@ -110,7 +110,7 @@ def test_clearance_points_away_from_the_nearest_tree(half_forest):
 
 
 def test_a_path_leads_through_each_of_1000_forests():
-    """On a grid of 0.2 m, from the middle of the near edge to that of the far one, with 0.2 m to all trees."""
+    """On a grid of 0.2 m, from the near to the far edge, at least 0.2 m from all trees."""
     _, forest = build(1, density=0.25, size=(14.0, 8.0), center=(0.0, 0.0), free=np.zeros((0, 3)))
     x, y = np.meshgrid(np.arange(-7.0, 7.1, 0.2), np.arange(-4.0, 4.1, 0.2), indexing="ij")
     points = jnp.float32(np.stack([x, y, np.ones_like(x)], axis=-1).reshape(1, -1, 3))

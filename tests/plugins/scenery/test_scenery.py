@@ -73,7 +73,7 @@ def test_moving_obstacles_stay_in_their_regions_below_their_speed(plugin):
     assert np.abs(vel).max() <= 1.5 + 1e-3
     assert np.quantile(np.abs(vel[..., 0]), 0.9) > 1.2
     middle = np.concatenate([model.pos for model in plugin.models()])
-    if not isinstance(plugin, Clutter):  # whose regions depend on the layout
+    if not isinstance(plugin, Clutter):  # regions of clutter depend on the layout
         shift = np.abs(path - middle)[..., 0]
         reach = plugin.offset[0] if isinstance(plugin, Gates) else (plugin.cell - plugin.gap) / 2
         assert shift.max() <= reach + 1e-5
@@ -105,7 +105,7 @@ def test_difficulty_moves_gates_off_their_line():
 
 
 def test_a_path_leads_from_each_room_to_all_others():
-    """On a grid of 0.2 m, with 0.2 m to all walls, in 100 buildings."""
+    """On a grid of 0.2 m, at least 0.2 m from all walls, in 100 buildings."""
     plugin = Rooms(count=(3, 2))
     sim = build(plugin, 100, 1)
     x, y = np.meshgrid(np.arange(-5.9, 6, 0.2), np.arange(-3.9, 4, 0.2), indexing="ij")

@@ -52,7 +52,7 @@ def test_images_are_taken_at_a_rate_and_delivered_late(flight):
     assert np.ptp([x["depth"] for x in images], axis=0).max() > 1e-4
 
 
-def test_outputs_are_those_of_c_mujoco_in_the_frame_of_the_camera(flight):
+def test_outputs_agree_with_rays_of_c_mujoco_in_the_frame_of_the_camera(flight):
     sim, camera, images_of_steps, _ = flight
     images, names = images_of_steps[-1], camera.segment_names(sim)
     assert names == ("floor", "wall:0", "sphere:0")

@@ -1,4 +1,4 @@
-"""Errors of cameras and lidars: noise and holes against their formulas, lenses against OpenCV's, lidars' patterns."""
+"""Errors of cameras and lidars: noise and holes against their formulas, lenses against OpenCV's, patterns of lidars."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.006, "k3": 0.01}
 
 
 @pytest.fixture(scope="module")
-def wall():
+def wall_images():
     """Return drones at 1 to 6 m from a wall in 6 worlds, cameras and a lidar with errors, and their images."""
     sim = Sim(6, control="attitude", rng_key=2)
     sim.scene.add("wall", pos=[6.055, 0, -20], length=80, height=80, mocap=False)
@@ -29,9 +29,9 @@ def wall():
     return sim, sensors, jax.device_get([jax.jit(sensor.image_fn(sim))(sim.data) for sensor in sensors])
 
 
-def test_stereo_noise_grows_with_the_square_of_the_distance(wall):
+def test_stereo_noise_grows_with_the_square_of_the_distance(wall_images):
     """The standard deviation z^2 s / (f b) of a D435: 0.4% at 1 m, 2.3% at 6 m, and no bias."""
-    _, (camera, *_), (images, *_) = wall
+    _, (camera, *_), (images, *_) = wall_images
     depth = np.arange(1.0, 7.0)
     expected = depth**2 * 0.08 / (424 * 0.05)
     errors = images["depth"][:, 0] - depth[:, None, None]
@@ -43,8 +43,8 @@ def test_stereo_noise_grows_with_the_square_of_the_distance(wall):
     assert len(np.unique(standard.round(5))) > 0.95 * standard.size, "worlds and pixels have different random numbers"
 
 
-def test_depth_has_a_resolution_and_a_smallest_value(wall):
-    _, _, (_, images, _) = wall
+def test_depth_has_a_resolution_and_a_smallest_value(wall_images):
+    _, _, (_, images, _) = wall_images
     depth = images["depth"][:, 0]
     assert (depth[0] == 0).all()
     np.testing.assert_allclose(depth[1:], np.broadcast_to(np.arange(2.0, 7.0)[:, None, None], (5, 3, 4)), atol=0.026)
@@ -65,8 +65,8 @@ def test_pixels_behind_an_edge_are_holes_where_the_second_imager_does_not_see_th
     assert (np.asarray(StereoNoise(has_holes=False).apply(jnp.asarray(depth), 100.0, jax.random.key(0))) > 0).all()
 
 
-def test_a_lidar_has_noise_and_lost_returns(wall):
-    _, (*_, lidar), (*_, images) = wall
+def test_a_lidar_has_noise_and_lost_returns(wall_images):
+    _, (*_, lidar), (*_, images) = wall_images
     distance, true = images["distance"][:, 0], np.arange(1.0, 7.0)[:, None, None] / lidar.rays[..., 0]
     lost = distance == 9.0
     assert abs(lost.mean() - 0.25) < 4 * np.sqrt(0.25 * 0.75 / lost.size)
@@ -75,8 +75,8 @@ def test_a_lidar_has_noise_and_lost_returns(wall):
     assert standard.std() == pytest.approx(1.0, rel=4 / np.sqrt(2 * standard.size))
 
 
-def test_noise_of_a_world_does_not_depend_on_other_worlds_and_changes_with_the_step(wall):
-    sim, (camera, *_), (images, *_) = wall
+def test_noise_of_a_world_does_not_depend_on_other_worlds_and_changes_with_the_step(wall_images):
+    sim, (camera, *_), (images, *_) = wall_images
     steps = sim.data.core.steps + 1
     take_image = jax.jit(camera.image_fn(sim))
     later = take_image(sim.data.replace(core=sim.data.core.replace(steps=steps)))
@@ -90,7 +90,7 @@ def test_noise_of_a_world_does_not_depend_on_other_worlds_and_changes_with_the_s
     )
 
 
-def test_a_lens_has_the_pixels_of_the_formula_of_opencv():
+def test_a_lens_maps_rays_to_pixels_by_the_formula_of_opencv():
     """x'' = x' (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x' y' + p2 (r^2 + 2 x'^2), and y'' alike, y down."""
     camera = Camera(20, 14, fovy=75.0, distortion=Distortion(**LENS))
     ahead, left, up = np.moveaxis(camera.rays, -1, 0)
@@ -108,7 +108,7 @@ def test_a_lens_has_the_pixels_of_the_formula_of_opencv():
     np.testing.assert_allclose(plain.rays, Camera(20, 14).rays, atol=1e-12)
 
 
-def test_patterns_of_lidars_are_those_of_their_data_sheets():
+def test_patterns_of_lidars_agree_with_their_data_sheets():
     lidar, zones = Lidar.vlp16(90), Lidar.vl53l5cx()
     assert (lidar.image_size, zones.image_size) == ((16, 90), (8, 8))
     elevation = np.degrees(np.arcsin(lidar.rays[..., 2]))
@@ -122,9 +122,9 @@ def test_patterns_of_lidars_are_those_of_their_data_sheets():
     assert (zones.far, lidar.far, lidar.noise) == (4.0, 100.0, 0.03)
 
 
-def test_gradients_pass_through_noise_and_lens(wall):
+def test_gradients_pass_through_noise_and_lens(wall_images):
     """The slope of the mean distance to the wall by the position equals central differences."""
-    sim, _, _ = wall
+    sim, _, _ = wall_images
     camera = Camera(4, 3, fovy=20.0, noise=StereoNoise(), distortion=Distortion(k1=-0.1))
     take_image = camera.image_fn(sim)
 

@@ -129,9 +129,9 @@ def test_each_episode_draws_new_errors():
     np.testing.assert_array_equal(imu.read(sim.data).gyro.bias, first.bias)
     sim.reset(np.arange(1000) < 500)
     sim.step()
-    again = np.asarray(imu.read(sim.data).gyro.bias)
-    np.testing.assert_array_equal(again[500:], first.bias[500:])
-    assert abs(np.corrcoef(again[:500].ravel(), np.asarray(first.bias)[:500].ravel())[0, 1]) < 4 / np.sqrt(3000)
+    redrawn = np.asarray(imu.read(sim.data).gyro.bias)
+    np.testing.assert_array_equal(redrawn[500:], first.bias[500:])
+    assert abs(np.corrcoef(redrawn[:500].ravel(), np.asarray(first.bias)[:500].ravel())[0, 1]) < 4 / np.sqrt(3000)
 
 
 def test_an_unbalanced_rotor_shakes_at_its_own_frequency():
@@ -169,7 +169,7 @@ NOISE, RANDOM_WALK, INSTABILITY, CORRELATION_TIME = 0.02, 0.01, 0.05, 0.5
 @pytest.fixture(scope="module")
 def measurements_at_rest():
     """Return measurements of gyroscope and accelerometer at rest for 200 s, with white noise in a third of the drones,
-    a random walk of the bias in another, and a Gauss-Markov bias in the last. (3 kinds, n_channels, N)"""
+    a random walk of the bias in another third, and a Gauss-Markov bias in the last third. (3 kinds, n_channels, N)"""
     n = 12
     kind = np.repeat(np.eye(3)[:, :, None, None], n, axis=2)  # of each error: (3 kinds, n, 1)
     noise, walk, wander = (np.broadcast_to(k.reshape(3 * n, 1, 1), (3 * n, 1, 3)) for k in kind)
@@ -208,7 +208,7 @@ def expected_deviation(kind, t):
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2])
-def test_the_allan_deviation_is_that_of_the_parameters(measurements_at_rest, kind):
+def test_the_allan_deviation_agrees_with_the_parameters(measurements_at_rest, kind):
     times = np.array([0.01, 0.1, 0.5, 0.95, 2.0, 10.0])[1 if kind == 2 else 0 :]
     variance = [np.square(allantools.oadev(x, FREQ, "freq", times)[1]) for x in measurements_at_rest[kind]]
     found = np.sqrt(np.mean(variance, axis=0))

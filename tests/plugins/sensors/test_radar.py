@@ -42,7 +42,7 @@ def test_law_07_margin_and_gradient_are_finite_everywhere():
         assert np.isfinite(slope).all()
 
 
-def test_detection_counts_time_and_is_reset():
+def test_exposure_is_the_time_of_detection_since_the_reset():
     sim = Sim(n_worlds=3, n_drones=2, control="rotor_vel")
     sim.data = with_states(
         sim.data, pos=np.array([[[5, 0, 4.0], [6, 0, 9.3]], [[9, 0, 4.0], [11, 0, 4]], [[0, 2, 4], [0, 2, 9]]])

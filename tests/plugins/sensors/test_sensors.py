@@ -116,7 +116,7 @@ def test_time_of_flight_by_hand():
     sim = build(sensors.TimeOfFlight(far_noise=0.0, freq=None), n_worlds=4, pos=pos, quat=quat)
     sim.step()
     found = read(sim, "time_of_flight.distance")[:, 0, 0]
-    np.testing.assert_allclose(found, [1, 1 / np.cos(0.5), 4, 4], atol=1e-3)  # of one step, rounded
+    np.testing.assert_allclose(found, [1, 1 / np.cos(0.5), 4, 4], atol=1e-3)  # the motion of one step, and rounding
     for height in (0.5, 2.5, 3.5):
         deviation = 0.01 + 0.0025 * (1 + 80 ** ((height - 2.5) / 1.5))
         sim = build(sensors.TimeOfFlight(0.01, resolution=None), n_worlds=N, pos=[0, 0, height])
@@ -178,7 +178,7 @@ def test_telemetry_and_battery():
     np.testing.assert_allclose(voltage.std(), np.sqrt(0.02**2 + 0.01**2 / 12), rtol=std_tolerance(N))
 
 
-def test_multi_ranger_measures_what_the_range_finder_does():
+def test_a_multi_ranger_measures_the_distances_of_the_range_finder():
     sim = build(RangeFinder(max_range=2.0), sensors.MultiRanger(0.05, freq=None), n_worlds=N)
     sim.step()
     distance = read(sim, "multi_ranger.distance")[:, 0]
@@ -218,8 +218,8 @@ def test_sweep_angles_by_hand(x64):
             np.testing.assert_allclose(np.dot(normal, pos), 0, atol=1e-12)
 
 
-def test_a_lighthouse_has_its_view_and_noise():
-    """One station looks along x at the drone from 3 m; one looks away; one is below the deck."""
+def test_a_lighthouse_sees_drones_in_front_of_it_with_noise():
+    """The first station looks along x at the drone from 3 m; the second looks away; the third is below the deck."""
     stations, rpy = [(-3.0, 0, 1.5), (3.0, 0, 1.5), (-3.0, 0, 0.5)], [(0, 0, 0), (0, 0, 0), (0, 0, 0)]
     sim = build(sensors.Lighthouse(stations, rpy, 1e-3, diodes=[(0, 0.3, 0)]), n_worlds=N)
     sim.step()
@@ -273,8 +273,8 @@ def test_a_multi_ranger_has_the_rays_of_its_range_finder():
         build(RangeFinder(directions=[(0, 0, 1)]), sensors.MultiRanger())
 
 
-def test_observations_of_measured_states():
-    """Slung loads, say, are observed relative to the measured position; measurements themselves stay as they are."""
+def test_observations_of_other_plugins_use_measured_states():
+    """A plugin observes measured states in place of the true ones; observations of sensors do not change."""
     sim = build(sensors.MotionCapture(pos=(0, 0, 0.5)), RangeFinder(directions=[(0, 0, -1)]))
     sim.add(Relative())
     sim.step()

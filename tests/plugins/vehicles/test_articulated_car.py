@@ -2,7 +2,7 @@
 
 MuJoCo's wheels have Coulomb friction, regularised by its solver: they hardly slip below the limit. The models differ
 in slip, so the tests compare yaw rates, radii, distances and angles of joints, and not states over time. They use the
-kinematic model, and the single-track model with tyres so stiff that they hardly slip, too.
+kinematic model, and the single-track model with tyres so stiff that they hardly slip either.
 """
 
 import functools
@@ -60,7 +60,7 @@ def test_steady_circles_agree(reference, steer):
 def test_yaw_rates_after_a_step_of_the_steering_agree():
     """The yaw rate reaches 90% at the same time within 30 ms, and ends at the same value within 1%.
 
-    The difference in time is that of the servos: MuJoCo's turns the wheels at once, ours at 3.2 rad/s at most.
+    The servos differ: MuJoCo's servo turns the wheels at once, ours at 3.2 rad/s at most.
     """
     car = Articulated(vehicle())
     while car.time < 3:
@@ -80,7 +80,7 @@ def test_yaw_rates_after_a_step_of_the_steering_agree():
 
 
 @pytest.mark.parametrize("torque", [-0.5, -1.0, -2.0])
-def test_braking_with_the_motors(torque):
+def test_braking_with_the_motors_agrees(torque):
     """Distance and time agree within 0.5%: wheels roll, with the inertia of wheels and motors."""
     car = Articulated(vehicle())
     while car.body_vel[0] < 1.5:
@@ -90,14 +90,14 @@ def test_braking_with_the_motors(torque):
     while car.body_vel[0] > 0.3:
         car.torque(torque)
         car.step()
-    # The drive has neither damping nor friction: its force follows from the torque alone.
+    # The drive has neither damping nor friction: only the torque determines its force.
     path = simulate(single_track, [4 * torque / 0.052388, 0.0], 3.5, speed, drive=np.array([1.0, 0.0, 0.0]))
     stop = int(np.argmax(np.asarray(path.body_vel)[:, 0] < 0.3))
     assert float(path.pos[stop, 0]) == pytest.approx(car.pos[0] - start, rel=5e-3)
     assert stop / 1000 == pytest.approx(car.time - start_time, rel=5e-3)
 
 
-def test_braking_with_locked_wheels():
+def test_braking_with_locked_wheels_agrees():
     """On ground of friction 0.3 distances agree within 2%: ``v^2 / (2 friction g)``, and the lock takes 20 ms."""
     slippery = vehicle(friction=0.3, armature=1e-4)
     car = Articulated(slippery)
@@ -131,8 +131,8 @@ def test_joint_angles_of_a_trailer_agree():
         car.step()
         angles.append((car.yaw, car.yaw_of("bar"), car.yaw_of("deck")))
     yaw, bar, deck = np.unwrap(np.array(angles), axis=0).T
-    light = CarParams.create(vehicle(), 1000).towed_mass + 0.05 + 0.3 + 4 * (0.1 + 5e-5 / 0.0315**2)
-    path = simulate(kinematic, [0.1, 0.2], 6.0, trailer=True, towed_mass=light)
+    towed_mass = CarParams.create(vehicle(), 1000).towed_mass + 0.05 + 0.3 + 4 * (0.1 + 5e-5 / 0.0315**2)
+    path = simulate(kinematic, [0.1, 0.2], 6.0, trailer=True, towed_mass=towed_mass)
     hitch, joint = path.yaw[:, 0] - path.joints[:, 0], path.joints[:, 0] - path.joints[:, 1]
     n = min(len(yaw), len(path.yaw))
     for k in (1500, 3000, n - 1):

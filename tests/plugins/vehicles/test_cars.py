@@ -49,12 +49,12 @@ def test_cars_follow_their_commands_for_any_counts(n_worlds, n_drones, n_cars):
 def deviations(record, time):
     """Return the distances of the cars of a world from their path, and their lags behind it, m. (n_cars,) each"""
 
-    def of_one(pos, arc, start):
+    def deviation(pos, arc, start):
         arc = record.path.project(0, pos[:2], arc[0])
         reference = record.path.time_reference(0, time - start[0])[0]
         return jnp.linalg.norm(pos[:2] - record.path.point_at(0, arc).pos), reference[0] - arc
 
-    return jax.vmap(of_one)(record.pos[0], record.arc[0], record.start_time[0])
+    return jax.vmap(deviation)(record.pos[0], record.arc[0], record.start_time[0])
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
@@ -116,9 +116,9 @@ def test_references_by_arc_length_stop_at_the_end():
 def test_a_car_drives_as_it_does_alone():
     sim, _ = build(2, 1, members=3, path=[EIGHT, circle(2.0, speed=1.0)], in_scene=False)
     sim.step(60)
-    alone, _ = build(1, 1, path=circle(2.0, speed=1.0), in_scene=False)
-    alone.step(60)
-    for name, value in car_states(alone).items():
+    single_sim, _ = build(1, 1, path=circle(2.0, speed=1.0), in_scene=False)
+    single_sim.step(60)
+    for name, value in car_states(single_sim).items():
         np.testing.assert_allclose(car_states(sim)[name][1, 1], value[0, 0], rtol=1e-5, atol=1e-5)
 
 

@@ -64,7 +64,7 @@ def end_of(name, car, start, command, duration):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_for_small_slip_the_model_is_the_published_one(seed):
+def test_for_small_slip_the_model_tends_to_the_published_one(seed):
     """The equations of the lab's simulator assume small slip angles: the difference is of order three."""
     with jax.enable_x64(True):
         car = jax.tree.map(lambda x: np.asarray(x, np.float64), CarParams.create(load_vehicle("f1tenth_ros"), 500))
