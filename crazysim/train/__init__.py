@@ -1,4 +1,4 @@
-"""Training policies: environments in, policies out."""
+"""Training, evaluation and plots of policies."""
 
 from typing import TYPE_CHECKING
 

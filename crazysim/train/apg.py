@@ -21,11 +21,11 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Layers, Policies, Policy, all_finite, init_mlp
-from crazysim.train.seeds import SweptValues, for_each_seed, split_blocks, stack_swept_values
+from crazysim.train.seeds import SweptValues, are_seeds_divided, for_each_seed, split_blocks, stack_swept_values
 
 T = TypeVar("T")
 STATS_ITERATIONS = 20
-"""Iterations during which the observation statistics are updated."""
+"""Number of iterations at the start during which the observation statistics are updated."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Config:
 
 
 class Agent(PyTree):
-    """Network, optimiser and statistics of one seed; in a ``Learner`` stacked, with a leading axis over seeds."""
+    """Network, optimiser and statistics of one seed; in a ``Learner``, the arrays of all seeds are stacked."""
 
     policy: Layers
     """Network from normalised observations to the action before tanh."""
@@ -79,10 +79,10 @@ class Learner(PyTree):
 
 
 def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
-    """Return an untrained learner; ``env`` has no automatic resets.
+    """Return an untrained learner.
 
     Args:
-        env: Environment, with a block of worlds for each seed.
+        env: Environment without automatic resets, with a block of worlds for each seed.
         configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
     """
@@ -104,8 +104,9 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     """Return the learner after one rollout and one update, and the metrics of the iteration. (n_seeds,) each
 
     The metric ``finite`` is True if weights, optimiser state, statistics and loss are finite. The rollout starts where
-    the previous one ended; worlds whose episode is over start a new one. A non-finite gradient is skipped. The scan
-    stores its intermediates instead of recomputing them under ``jax.checkpoint``: tens of steps fit in memory.
+    the previous rollout ended; worlds in which the episode is over start a new episode. A seed with a non-finite
+    gradient keeps its weights and optimiser state. The scan stores its intermediates instead of recomputing them under
+    ``jax.checkpoint``: tens of steps fit in memory.
     """
     initial_state = env.restart(learner.env, learner.env.done)
     agents, swept_values, config = learner.agents, stack_swept_values(configs), configs[0]
@@ -161,13 +162,13 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
 
 
 def _count_policy_copies(env: Env, n_seeds: int) -> int:
-    """Return the number of copies of the policy of a seed, each of which controls worlds of one device.
+    """Return the number of copies of each seed's policy. Each copy controls worlds of one device.
 
-    Devices sum the gradients of the copies once, after all steps; they would sum the gradients of a single policy in
-    every step.
+    The devices sum the gradients of the copies once, after all steps. With a single policy they would sum its gradients
+    in every step.
     """
     mesh = env.sim.mesh
-    return 1 if mesh is None or n_seeds % mesh.size == 0 else mesh.size
+    return 1 if mesh is None or are_seeds_divided(n_seeds, mesh) else mesh.size
 
 
 def _copy_per_device(tree: T, n_copies: int, env: Env) -> T:
@@ -175,8 +176,10 @@ def _copy_per_device(tree: T, n_copies: int, env: Env) -> T:
     mesh = env.sim.mesh
     if mesh is None or n_copies == 1:
         return tree
-    over_devices = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
-    return jax.lax.with_sharding_constraint(jax.tree.map(lambda x: jnp.repeat(x, n_copies, axis=0), tree), over_devices)
+    device_sharding = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
+    return jax.lax.with_sharding_constraint(
+        jax.tree.map(lambda x: jnp.repeat(x, n_copies, axis=0), tree), device_sharding
+    )
 
 
 def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:

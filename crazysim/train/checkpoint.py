@@ -60,7 +60,7 @@ def restore(path: str | Path, arrays: Mapping[str, NDArray], template: T) -> T:
 
     Args:
         path: The file, for messages.
-        arrays: Its arrays, from ``read``.
+        arrays: Arrays of the file, from ``read``.
         template: Pytree of the same structure and shapes, of arrays or of ``jax.ShapeDtypeStruct``.
     """
     named_leaves = _named_leaves(template)

@@ -41,17 +41,17 @@ class Recipe:
     practice: dict[str, Any] = field(default_factory=dict)
     """Options of the training environment that the evaluation environment does not have."""
     evaluate_every: int = 20
-    """Iterations between evaluations; a checkpoint is written at each."""
+    """Iterations between evaluations; a checkpoint is written at each evaluation."""
     options: dict[str, Any] = field(default_factory=dict)
-    """Options of ``crazysim.envs.make`` of a teacher, in addition to those of its student."""
+    """Options of ``crazysim.envs.make`` for a teacher, in addition to the options of its student."""
     teacher: Recipe | None = None
     """Recipe of the teacher that ``run`` trains first; None if the recipe needs none."""
 
 
 _LONG_ROLLOUTS = {"n_steps": 64, "minibatches": 32, "hidden": (128, 128), "discount": 0.99}
-"""Hyperparameters of tasks in which a reward follows seconds after the actions that earn it."""
-_BY_CAMERA = {**_LONG_ROLLOUTS, "entropy": 0.003, "convolution": (8, 16), "critic": "privileged"}
-"""Hyperparameters with which PPO learns to fly by the images of a camera."""
+"""Hyperparameters of tasks in which rewards follow seconds after the actions that earn them."""
+_CAMERA_POLICY = {**_LONG_ROLLOUTS, "entropy": 0.003, "convolution": (8, 16), "critic": "privileged"}
+"""Hyperparameters with which PPO learns to fly from camera images."""
 
 RECIPES: dict[str, Recipe] = {
     "hover": Recipe(config={"iterations": 80, "minibatches": 16, "learning_rate": 2e-3}),
@@ -96,7 +96,7 @@ RECIPES: dict[str, Recipe] = {
     "avoid": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400, "minibatches": 64, "entropy": 0.003}),
     "forest": Recipe(
         n_worlds=4096,
-        config={**_BY_CAMERA, "iterations": 400, "minibatches": 64},
+        config={**_CAMERA_POLICY, "iterations": 400, "minibatches": 64},
         practice={"difficulty": (0.0, 1.0)},
     ),
     "transport": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400}),
@@ -117,8 +117,8 @@ RECIPES: dict[str, Recipe] = {
         n_worlds=2048,
         config={"iterations": 200, "n_steps": 64, "minibatches": 32, "discount": 0.99, "entropy": 0.003},
     ),
-    "land_on_marker": Recipe(n_worlds=4096, config={**_BY_CAMERA, "iterations": 150}),
-    "follow_car": Recipe(n_worlds=2048, config={**_BY_CAMERA, "iterations": 100}),
+    "land_on_marker": Recipe(n_worlds=4096, config={**_CAMERA_POLICY, "iterations": 150}),
+    "follow_car": Recipe(n_worlds=2048, config={**_CAMERA_POLICY, "iterations": 100}),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 150}),
 }
 """Recipes by task."""
@@ -167,8 +167,8 @@ class TrainConfig:
     network: Network | None = field(default=None, compare=False)
     """Custom network; None for the built-in one. The files of a run hold its weights, but not its functions."""
     devices: Devices | None = field(default=None, compare=False)
-    """Devices that the worlds of the training are distributed over; None for the device of the options alone. The files
-    of a run do not hold them: a resumed run may have others."""
+    """Devices over which the worlds of the training are distributed; None for the single device in ``options``. The
+    files of a run do not hold them: a resumed run may use other devices."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -216,16 +216,16 @@ class TrainConfig:
         """Return the configuration of a run; omitted values come from the recipe of the task.
 
         Args:
-            task: Name of a task, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
+            task: Name of a task, reference of your class (``FILE.py:NAME`` or ``MODULE:NAME``), or a ``Task``.
             algorithm: Name of the algorithm, a key of ``ALGORITHMS``.
             seed: Random seed; None for 0.
             n_worlds: Number of parallel worlds.
             options: Options of ``crazysim.envs.make``.
             config: Hyperparameters of the algorithm.
-            resumed: Configuration of the run to continue, which then provides omitted values; None for a new run.
+            resumed: Configuration of the run to continue, from which omitted values are taken; None for a new run.
             network: Custom network; None for the built-in one.
-            devices: Devices that the worlds are distributed over: ``"all"``, their number, or their indices; of the
-                platform ``options["device"]``, or else of JAX's default platform. None for one device.
+            devices: Devices over which the worlds are distributed: ``"all"``, their number, or their indices. Their
+                platform is that of ``options["device"]``, by default JAX's default platform. None for one device.
         """
         entry = entry_of(task)
         stored_options = {} if resumed is None else resumed.options
@@ -255,7 +255,7 @@ class TrainConfig:
 
     @property
     def title(self) -> str:
-        """Name of the task in messages and of the default folder: without file or module, in lower case."""
+        """Name of the task in messages and in the default folder: lower case, without file or module."""
         name = split_reference(self.task)[1] if is_reference(self.task) else self.task
         return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(".")[2]).lower()
 
@@ -263,7 +263,7 @@ class TrainConfig:
         """Return the training environment of some seeds, with its worlds on the devices of the training.
 
         Args:
-            n_seeds: Number of seeds, each with the worlds of the run.
+            n_seeds: Number of seeds; each has ``n_worlds`` worlds.
 
         Raises:
             ConfigError: As ``make_env``; if a device does not exist, or if the worlds cannot be distributed evenly.
@@ -277,8 +277,8 @@ class TrainConfig:
         """Return an environment of the run, on one device.
 
         Args:
-            n_worlds: Number of worlds; None for the run's.
-            **defaults: Options of ``crazysim.envs.make`` where the run does not set them.
+            n_worlds: Number of worlds; None for the number of the run.
+            **defaults: Options of ``crazysim.envs.make`` for those that the run does not set.
 
         Raises:
             ConfigError: If the task is in a file that this user has not named before; see ``load_policy``.

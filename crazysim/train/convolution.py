@@ -1,8 +1,8 @@
 """Convolutions over the images among the observations of a policy.
 
-A layer multiplies patches of 3 by 3 pixels, two pixels apart, by one matrix: the same product as in a layer of a
-perceptron, so it compiles as fast, and several seeds are one batched product. XLA's convolution is slower on CPUs in
-the gradient, and with the weights of several seeds.
+A layer multiplies patches of 3 by 3 pixels, two pixels apart, by one matrix. A perceptron layer is the same product, so
+convolutions compile as fast, and several seeds form one batched product. XLA's convolution is slower on CPUs for
+gradients, and for the weights of several seeds.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from jax import Array
 from crazysim.errors import ConfigError
 
 KERNEL_SIZE, STRIDE = 3, 2
-"""Side of a patch, and distance between neighbouring patches, pixels. An image has a border of one zero."""
+"""Side of a patch, and distance between neighbouring patches, pixels. Images are padded by one zero on each side."""
 
 
 class Image(NamedTuple):
-    """Position and format of an image among the concatenated observations."""
+    """Position and format of an image within the concatenated observations."""
 
     start: int
     """Index of its first pixel."""
     height: int
-    """Pixels."""
+    """Height, pixels."""
     width: int
-    """Pixels."""
+    """Width, pixels."""
     channels: int = 1
-    """Number of values of a pixel."""
+    """Number of values per pixel."""
     is_depth: bool = True
     """True if pixels are depths or distances, m."""
 
@@ -42,7 +42,7 @@ class Image(NamedTuple):
 
     @property
     def pixels(self) -> range:
-        """Indices of its pixels, row by row."""
+        """Indices of the pixels within the observations, row by row."""
         return range(self.start, self.start + math.prod(self.shape))
 
     def shapes(self, channels: Sequence[int]) -> Iterator[tuple[int, int, int]]:
@@ -83,7 +83,7 @@ def scale_depth(depth: Array) -> Array:
     """Return 1 / (1 + d) for a depth of d metres: 1 at the lens, 1/2 at 1 m, and nearly 0 where nothing is near.
 
     Normalisation by running statistics would scale every pixel differently, and the depth itself varies most where it
-    is large and matters least. The inverse resolves what is near; adding 1 m keeps it and its derivative finite.
+    is large and matters least. The inverse resolves small depths; adding 1 m keeps it and its derivative finite.
     """
     return 1.0 / (1.0 + depth)
 

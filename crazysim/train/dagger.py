@@ -1,7 +1,7 @@
 """DAgger (Ross, Gordon and Bagnell 2011): a student learns a teacher's actions from other observations.
 
-The student flies, so that it learns in the states that its own errors lead to, and the teacher's action in each state
-is its label. The paper's algorithm fits all samples so far. This one takes gradient steps on each rollout and then
+The student flies, so that it learns in the states to which its own errors lead. The label of each state is the
+teacher's action. The paper's algorithm fits all samples so far. This one takes gradient steps on each rollout and then
 discards it; the paper's bounds hold for any no-regret learner. A rollout of hundreds of worlds has enough samples for
 these steps, and the images of all iterations would not fit in memory.
 """
@@ -38,7 +38,7 @@ from crazysim.train.networks import Network, Policy, Weights, all_finite, choose
 from crazysim.train.seeds import SweptValues, for_each_seed, join_blocks, split_blocks, stack_swept_values, take_seed
 
 TEACHER_PREFIX = "teacher "
-"""Beginning of the names of the teacher's observations."""
+"""Prefix of the names of the teacher's observations."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,12 @@ class Config:
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers of the student."""
     convolution: tuple[int, ...] = ()
-    """Channels of the layers of a convolution over each image, as in PPO; none to observe the pixels as they are."""
+    """Channels of the layers of a convolution over each image, as in PPO; empty to use the pixels without
+    convolution."""
     learning_rate: float = 3e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     teacher_decay: float = 0.8
-    """Factor from one iteration to the next of the probability that the teacher acts in a step, which begins at 1."""
+    """Factor per iteration of the probability that the teacher acts in a step; the probability begins at 1."""
     max_grad_norm: float = 1.0
     """Largest global norm of a gradient; larger ones are scaled down to it."""
 
@@ -74,7 +75,7 @@ class Config:
 
 
 class Agent(PyTree):
-    """Network, optimiser and statistics of one student; in a ``Learner`` stacked, with a leading axis over seeds."""
+    """Network, optimiser and statistics of one student; in a ``Learner``, the arrays of all seeds are stacked."""
 
     student: Weights
     """Weights from normalised observations to the action before tanh."""
@@ -118,8 +119,8 @@ class TeacherObservation(Wrapper):
 
         Args:
             env: Environment without automatic resets.
-            observe: Function from the true data to the teacher's observations, of one world, or of all if the task of
-                the environment is batched.
+            observe: Function from the true data to the teacher's observations: of one world, or of all worlds if the
+                task of the environment is batched.
         """
         super().__init__(env)
         self.observe, self.batched = observe, env.task.batched
@@ -135,7 +136,7 @@ class TeacherObservation(Wrapper):
 
 
 def wrap_with_teacher(env: Env, config: Config) -> TeacherObservation:
-    """Return an environment with the observations of the teacher in ``config.teacher`` as well.
+    """Return an environment that adds the observations of the teacher in ``config.teacher``.
 
     Raises:
         ConfigError: If there is no teacher, or the student's task does not have the teacher's task record.
@@ -205,8 +206,8 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
 
     def act(agent: Agent, raw_obs: Array, label: Array, key: Array) -> tuple[Array, Any]:
         action = agent.act(agent.stats.normalize(raw_obs))
-        teacher_acts = jax.random.bernoulli(key, teacher_probability, (len(action), 1, 1))
-        return jnp.where(teacher_acts, label, action), (raw_obs, label, jnp.square(action - label).mean())
+        is_teacher_acting = jax.random.bernoulli(key, teacher_probability, (len(action), 1, 1))
+        return jnp.where(is_teacher_acting, label, action), (raw_obs, label, jnp.square(action - label).mean())
 
     def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:
         obs, teacher_obs = split_obs(obs)
@@ -284,7 +285,7 @@ def split_obs(obs: Obs) -> tuple[Obs, Obs]:
 
 
 def _load_teacher_run(folder: str) -> tuple[Policy, Any, dict[str, Any]]:
-    """Return what ``load_policy`` returns for the folder of a teacher; the message of an error names the teacher."""
+    """Return the result of ``load_policy`` for a teacher's folder; the error for a missing folder names the teacher."""
     from crazysim.train.training import load_policy
 
     if not Path(folder).exists():
@@ -321,7 +322,7 @@ def _update_agent(
     """Return the student of one seed after the updates on its rollout, and True if all its numbers are finite.
 
     Args:
-        agent: The student before.
+        agent: The student before the updates.
         raw_obs: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
         labels: Actions of the teacher. (n_steps, n_worlds, n_drones, n_actions)
         swept_values: Hyperparameters of the seed that may differ between seeds. () each

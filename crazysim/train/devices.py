@@ -49,7 +49,7 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
     """Return the devices of a training.
 
     Args:
-        device: Platform of the devices; if ``devices`` is a number, also the name of the first one.
+        device: Platform of the devices; if ``devices`` is a number, it may also be the name of the first device.
         devices: The devices.
 
     Raises:
@@ -62,8 +62,8 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
     elif selection is None:
         indices = list(range(len(available)))
     else:
-        first = available.index(first_device) if isinstance(device, str) and ":" in device else 0
-        indices = list(range(first, first + selection))
+        start = available.index(first_device) if isinstance(device, str) and ":" in device else 0
+        indices = list(range(start, start + selection))
     if missing := [i for i in indices if i >= len(available)]:
         hint = "" if platform != "cpu" else (
             " A CPU is one device, or N with XLA_FLAGS=--xla_force_host_platform_device_count=N in the environment."
@@ -76,7 +76,7 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
 
 
 def device_options(device: str, devices: Devices, n_worlds: int) -> dict[str, Any]:
-    """Return the options of ``Sim`` with which its worlds are distributed over the devices of a training.
+    """Return the options of ``Sim`` that distribute its worlds over the devices of a training.
 
     Args:
         device: Platform of the devices, or one of them.
@@ -103,8 +103,8 @@ def device_options(device: str, devices: Devices, n_worlds: int) -> dict[str, An
 def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
     """Return the sharding of every array of a learner, as a learner.
 
-    Arrays over worlds are split. Networks, optimisers and statistics are replicated, or split over the seeds where
-    their number is a multiple of the number of devices: then each device trains its own seeds.
+    Arrays over worlds are split. Networks, optimisers and statistics are split over the seeds if the number of seeds is
+    a multiple of the number of devices: each device then trains its own seeds. Otherwise they are replicated.
 
     Args:
         shapes: Shapes of the learner.
@@ -137,7 +137,7 @@ def replicated_sharding(sim: Sim) -> jax.sharding.Sharding:
 def exchanged_bytes(program: str) -> dict[str, int]:
     """Return the bytes of the arrays that the devices exchange in one call of a compiled program, by operation.
 
-    The body of a loop counts once for each iteration if their number is known, otherwise once.
+    The bytes of a loop body are multiplied by the number of iterations if the text states it.
 
     Args:
         program: Text of the program, ``compiled.as_text()``.
@@ -174,7 +174,7 @@ def exchanged_bytes(program: str) -> dict[str, int]:
 
 
 def _read_devices(devices: Devices) -> int | tuple[int, ...] | None:
-    """Return a number of devices, or their indices; None for all."""
+    """Return a number of devices, or the indices of devices; None for all devices."""
     if devices == "all":
         return None
     try:

@@ -20,13 +20,14 @@ from crazysim.pytree import PyTree, static
 from crazysim.train.networks import Policies, Policy
 
 EVALUATION_SEED = 0x5EED
-"""Seed of the held-out initial states. Keys of training are made with ``fold_in``, and never coincide with its key."""
+"""Seed of the held-out initial states. Training keys are made with ``fold_in``, so they differ from the key of this
+seed."""
 TERM_PREFIX = "reward "
-"""Beginning of the names of the terms of a reward, as in ``RewardTerms``."""
+"""Prefix of the names of the terms of a reward, as in ``RewardTerms``."""
 
 
 class _FunctionPolicy(PyTree):
-    """Policy of a plain function, which JAX treats as static."""
+    """Policy that is a plain function, which JAX treats as static."""
 
     fn: Callable[[Obs], Array] = static()
     """Function from observations to actions."""
@@ -61,21 +62,23 @@ def initial_memory(policy: Callable[[Obs], Array], env: Env) -> Any:
 
 @partial(jax.jit, static_argnames=("env", "n_blocks"))
 def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[str, Array]:
-    """Fly one episode in every world and return its record.
+    """Fly one episode in every world, and return errors, rewards and ends by name.
 
     Args:
         env: Environment without automatic resets.
         policy: Policy of all worlds.
         key: Random key of the initial states.
-        n_blocks: Number of blocks of worlds of equal size, which begin from the same initial states.
+        n_blocks: Number of blocks of worlds, of equal size. All blocks begin from the same initial states.
 
     Returns:
         ``error``: task error after every step, constant after the end of the episode (n_steps, n_worlds, n_drones);
-        ``over``: True once the episode has terminated (n_steps, n_worlds); ``nonfinite``: True where it terminated
-        because the world became non-finite (n_worlds,); ``reward``: sum over the episode (n_worlds, n_drones);
-        ``terms``: terms of the reward by name, means over the worlds and drones of a block, zero from the end of an
-        episode on (n_steps, n_blocks) each;
-        ``succeeded``: True where a task with ``task.succeeded`` was completed during the episode (n_worlds, n_drones).
+        ``over``: True once the episode has terminated (n_steps, n_worlds);
+        ``nonfinite``: True where the episode terminated because the world became non-finite (n_worlds,);
+        ``reward``: return of the episode (n_worlds, n_drones);
+        ``terms``: terms of the reward by name, means over the worlds and drones of a block, zero after the end of an
+        episode (n_steps, n_blocks) each;
+        ``succeeded``: True where the episode satisfied ``task.succeeded``; only for tasks that define it (n_worlds,
+        n_drones).
     """
     env = RewardTerms(env)
     state = env.reset(jnp.broadcast_to(key, (n_blocks,)))
@@ -86,46 +89,46 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
 
     def record_transition(transition: Transition) -> dict[str, Any]:
         state = transition.state
-        record = {
+        values = {
             name: state.info[name]
             for name in state.info
             if name in ("error", "nonfinite") or name.startswith(TERM_PREFIX)
         }
-        return record | {"reward": state.reward, "terminated": state.terminated, "succeeded": env.succeeded(state)}
+        return values | {"reward": state.reward, "terminated": state.terminated, "succeeded": env.succeeded(state)}
 
-    _, _, records = rollout(env, state, fly_step, key, env.max_steps, record_transition, initial_memory(policy, env))
-    is_over = jnp.cumsum(records["terminated"], axis=0) > 0
+    _, _, history = rollout(env, state, fly_step, key, env.max_steps, record_transition, initial_memory(policy, env))
+    is_over = jnp.cumsum(history["terminated"], axis=0) > 0
     was_over = jnp.concatenate([jnp.zeros_like(is_over[:1]), is_over[:-1]])
     is_flying = ~was_over[..., None]
     last_step = jnp.minimum(jnp.arange(env.max_steps)[:, None], was_over.shape[0] - was_over.sum(axis=0) - 1)[..., None]
 
     def split_blocks(x: Array) -> Array:
-        """Return numbers with an axis of blocks.
+        """Return an array with an additional axis of blocks.
 
         (n_steps, n_worlds, n_drones) -> (n_steps, n_blocks, n_worlds / n_blocks, n_drones)
         """
         return x.reshape(x.shape[0], n_blocks, -1, x.shape[-1])
 
     flight = {
-        "error": jnp.take_along_axis(records["error"], last_step, axis=0),
+        "error": jnp.take_along_axis(history["error"], last_step, axis=0),
         "over": is_over,
-        "nonfinite": jnp.any(records["nonfinite"] & ~was_over, axis=0),
-        "reward": jnp.where(is_flying, records["reward"], 0.0).sum(axis=0),
+        "nonfinite": jnp.any(history["nonfinite"] & ~was_over, axis=0),
+        "reward": jnp.where(is_flying, history["reward"], 0.0).sum(axis=0),
         "terms": {
             name[len(TERM_PREFIX) :]: split_blocks(jnp.where(is_flying, x, 0.0)).mean(axis=(2, 3))
-            for name, x in records.items()
+            for name, x in history.items()
             if name.startswith(TERM_PREFIX)
         },
     }
-    succeeded = records["succeeded"]
+    succeeded = history["succeeded"]
     return flight if succeeded is None else flight | {"succeeded": jnp.any(succeeded & is_flying, axis=0)}
 
 
 def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None) -> dict[str, float]:
     """Return the success rate of a policy, its crash rate, its mean error and its mean return.
 
-    A drone succeeds if its error stays below ``task.tolerance`` for the last ``task.hold`` seconds of the episode. A
-    task with a criterion of its own, ``task.succeeded``, is judged by that instead.
+    A drone succeeds if its error stays below ``task.tolerance`` for the last ``task.hold`` seconds of the episode. If
+    the task defines ``succeeded``, this criterion replaces the tolerance.
 
     Args:
         env: Environment without automatic resets; each world flies from one initial state.
@@ -133,17 +136,20 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
         key: Random key of the initial states; None for the held-out ones.
 
     Returns:
-        ``success``: fraction of drones that succeed; ``crashed``: fraction of worlds that terminated although not all
-        of their drones had succeeded; ``nonfinite``: fraction of worlds that became non-finite; ``length``: mean
-        length of an episode, s; ``error``: mean error of the worlds that did not crash over the last ``task.hold``
-        seconds, in ``task.unit`` (at the end of the episode for tasks with ``task.succeeded``), NaN if all crashed;
-        ``reward``: mean return of an episode; ``reward NAME``: contribution of each term to it.
+        ``success``: fraction of drones that succeed;
+        ``crashed``: fraction of worlds that terminated although not all of their drones had succeeded;
+        ``nonfinite``: fraction of worlds that became non-finite;
+        ``length``: mean length of an episode, s;
+        ``error``: mean error of the worlds that did not crash, in ``task.unit``, over the last ``task.hold`` seconds,
+        or at the end of the episode if the task defines ``succeeded``; NaN if all worlds crashed;
+        ``reward``: mean return of an episode;
+        ``reward NAME``: contribution of each term to the mean return.
     """
     return evaluate_blocks(env, as_tree(policy), key)[0]
 
 
 def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: int = 1) -> list[dict[str, float]]:
-    """Return the metrics of ``evaluate`` for blocks of worlds of equal size, which begin from the same initial states.
+    """Return the metrics of ``evaluate`` for each block of worlds; all blocks begin from the same initial states.
 
     Args:
         env: Environment without automatic resets; each world flies from one initial state.
@@ -152,7 +158,7 @@ def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: i
         n_blocks: Number of blocks.
     """
     key = jax.random.key(EVALUATION_SEED) if key is None else key
-    # Computing the rest on the host takes less time than compiling it would.
+    # Computing the metrics on the host takes less time than compiling them would.
     flight = jax.device_get(fly_episodes(env, policy, key, n_blocks))
     n_worlds = env.sim.n_worlds // n_blocks
     return [_metrics(env, flight, i, slice(i * n_worlds, (i + 1) * n_worlds)) for i in range(n_blocks)]
@@ -185,10 +191,10 @@ def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dic
 
 
 def describe_outcome(metrics: Mapping[str, float], unit: str) -> str:
-    """Return the error and the crashes in the metrics of ``evaluate`` as text, which explains a missing error.
+    """Return the error and the crashes in the metrics of ``evaluate`` as text, with the reason for a missing error.
 
     Args:
-        metrics: From ``evaluate``.
+        metrics: Metrics, from ``evaluate``.
         unit: Unit of the error, ``task.unit``.
     """
     crashed = f"crashed {metrics['crashed']:.1%}"

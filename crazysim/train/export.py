@@ -1,8 +1,8 @@
 """Export of policies: an ONNX file, and a C header that includes only ``math.h``.
 
-Both take the observations of one drone, concatenated in the order of their names, and return its action in [-1, 1].
-Both contain a description of their inputs and outputs, with the camera of each image. A policy with memory also takes
-and returns its memory, which is zero at the start of an episode.
+The exported functions take the observations of one drone, concatenated in the order of their names, and return its
+action in [-1, 1]. Both files describe these inputs and outputs, with the camera of each image. A policy with memory
+also takes and returns its memory, which is zero at the start of an episode.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ COMMAND_COMPONENTS: dict[Control, Sequence[str]] = {
     Control.body_rate: ("rate about x, rad/s", "rate about y, rad/s", "rate about z, rad/s", "collective thrust, N"),
     Control.force_torque: ("collective thrust, N", "torque about x, N m", "about y, N m", "about z, N m"),
 }
-"""Components of a command with their units; a rotor command is one speed per rotor, rpm."""
+"""Components of a command with their units. Commands of rotor speeds are left out: they have one speed per rotor,
+rpm."""
 GRU_GATES = ("reset", "update", "candidate")
 """Gates of a gated recurrent unit, in the order of its weights."""
 OPSET, IR_VERSION = 17, 8
@@ -68,10 +69,10 @@ class PolicyNumbers(NamedTuple):
     convolutions: Sequence[Sequence[tuple[Any, Any]]]
     """Weights (9 n_in, n_out) and biases of the layers of each image."""
     gru: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
-    """Weights of the inputs, (n_inputs, n_memory), and of the memory, (n_memory, n_memory), and bias of each gate;
-    empty without memory."""
+    """Weights of the inputs (n_inputs, n_memory), weights of the memory (n_memory, n_memory) and biases (n_memory,) of
+    each gate; empty without memory."""
     layers: list[tuple[np.ndarray, np.ndarray]]
-    """Weights and biases of the layers."""
+    """Weights and biases of the layers after convolutions and memory."""
 
     @property
     def n_memory(self) -> int:
@@ -116,7 +117,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     A policy with memory also has the input ``memory`` (batch, n_memory), zero at the start of an episode, and the
     output ``next_memory``, which is the input of the next step. The description of inputs and outputs is stored in the
     model's ``metadata_props`` as JSON: ``observations`` (names and sizes, in order), ``images`` (size and camera of
-    those that are images, row by row), and ``level``, ``centre``, ``scale`` and ``units`` of the actions.
+    each image; pixels are row by row), and ``level``, ``centre``, ``scale`` and ``units`` of the actions.
 
     Args:
         policy: The policy.
@@ -293,7 +294,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
 
 
 def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
-    """Return the numbers of a policy, after checking them."""
+    """Return the numbers of a policy after a check of their sizes and values."""
     if not policy.network.is_built_in:
         raise ConfigError(
             "expected a policy with the built-in network, got one with a custom network. Export it with its "
@@ -345,7 +346,7 @@ def _description_lines(meta: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
-    """Yield the lines of the function's body."""
+    """Yield the lines of the body of the C function."""
     n_inputs, n_memory, limit = numbers.n_inputs, numbers.n_memory, float_literal(CLIP)
     yield f"float x0[{n_inputs + n_memory}];"
     offset = 0
@@ -385,7 +386,7 @@ def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
 
 
 def _convolution_lines(name: str, i: int, image: Image, layers: Sequence[Any], offset: int) -> Iterator[str]:
-    """Yield the lines that write the features of an image into the inputs, from an index on."""
+    """Yield the lines that write the features of an image into ``x0``, from index ``offset`` on."""
     shapes = list(image.shapes([len(bias) for _, bias in layers]))
     yield f"float image{i}_0[{len(image.pixels)}];"
     yield f"for (int p = 0; p < {len(image.pixels)}; ++p)"

@@ -1,4 +1,4 @@
-"""Checks and decisions that keep the hosts of a training in agreement: all of them run the same program in lockstep."""
+"""Checks and decisions for a training on several hosts, which run the same program in lockstep."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from crazysim import jaxcompat
 from crazysim.errors import ConfigError
 
 SETTINGS_TIMEOUT = 300
-"""Time that a host waits for the settings of the others, s; JAX waits as long for their connection."""
+"""Time that a host waits for the settings of the other hosts, s; JAX waits as long for their connections."""
 _exchange_numbers = itertools.count()
-"""Numbers of the exchanges of texts. All hosts make the exchanges in the same order."""
+"""Counter that numbers the exchanges of texts. All hosts make the same exchanges in the same order."""
 
 
 def is_first_host() -> bool:
@@ -59,7 +59,7 @@ def _require_same_values(kind: str, values: Mapping[str, Any], remedy: str) -> N
 
 
 def _exchange_texts(text: str, hosts: jaxcompat.Hosts) -> list[str]:
-    """Return the texts of all hosts, in the order of the hosts. They go through the coordinator, not the devices."""
+    """Return the texts of all hosts, in the order of the hosts. The coordinator transfers them, not the devices."""
     client, host_id, n_hosts = hosts
     folder = f"crazysim/exchange-{next(_exchange_numbers)}"
     client.key_value_set(f"{folder}/{host_id}", text)
@@ -67,7 +67,7 @@ def _exchange_texts(text: str, hosts: jaxcompat.Hosts) -> list[str]:
 
 
 def must_stop(iteration: int) -> bool:
-    """Return True if a host has received SIGTERM: on all hosts after the same iteration; False if there is one host.
+    """Return True on all hosts, after the same iteration, if one has received SIGTERM; always False for a single host.
 
     Args:
         iteration: Number of the iteration that has ended.
@@ -76,5 +76,5 @@ def must_stop(iteration: int) -> bool:
 
 
 def broadcast_decision(decision: bool) -> bool:
-    """Return the decision of host 0 on all hosts, whose clocks differ. Waits for the devices of all hosts."""
+    """Return the decision of host 0 on all hosts, after waiting for the devices of all hosts."""
     return decision if jax.process_count() == 1 else jaxcompat.broadcast_from_first(decision)

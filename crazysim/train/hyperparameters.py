@@ -13,7 +13,7 @@ from crazysim.errors import ConfigError
 
 SWEEPABLE = ("learning_rate", "discount", "gae_lambda", "clip", "entropy", "value_weight", "max_grad_norm")
 """Hyperparameters that may differ between the seeds of one program, and may change when a run is resumed: shapes and
-counters of its state do not depend on them."""
+counters of the learner do not depend on them."""
 FRACTION_NAMES = ("discount", "gae_lambda", "teacher_decay")
 """Hyperparameters from 0 to 1."""
 WEIGHT_NAMES = ("entropy", "value_weight")
@@ -23,7 +23,7 @@ LIMIT_NAMES = ("max_grad_norm",)
 COUNT_NAMES = ("memory",)
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
 CHOICES_BY_NAME = {"critic": ("observations", "privileged", "all_drones", "all_drones_privileged")}
-"""Values of the hyperparameters that are one of several words, by name."""
+"""Allowed words of the hyperparameters that are words, by name."""
 
 
 def check_hyperparameters(config: Any) -> None:

@@ -1,12 +1,12 @@
-"""Outputs and gradients of tanh networks by one CUDA kernel each, for PPO on NVIDIA GPUs of the Hopper architecture.
+"""CUDA kernels for outputs and gradients of tanh networks, for PPO on NVIDIA GPUs of the Hopper architecture.
 
 XLA writes the activations of every layer to memory and reads them again, which takes most of the time of an update.
-Here a warp computes all layers of 16 samples in its registers. For gradients it computes the activations again; each
-block adds up the gradients of the weights over its samples, and XLA adds the sums of the blocks.
+Here a warp computes all layers of 16 samples in its registers. The kernel of gradients computes the activations again.
+Each block adds up the gradients of the weights over its samples, and XLA adds the sums of the blocks.
 
 Tensor cores compute the products, with operands of 16 bits and sums of 32 bits. The operands have 11 bits of
-precision, as in TF32, which XLA uses on the same GPUs, but a smaller range: weights, normalised observations
-and activations are within it, and gradients of the outputs are scaled such that the largest is between 1 and 2.
+precision, as in TF32, which XLA uses on the same GPUs, but a smaller range. Weights, normalised observations
+and activations are within this range; gradients of the outputs are scaled such that the largest is between 1 and 2.
 
 Lanes of a warp hold operands as in the PTX manual, "Matrix Fragments for mma.m16n8k16": of a sum of 16 x 8 numbers,
 lane 4 g + t has columns 2 t and 2 t + 1 of rows g and g + 8. Two sums, rounded to 16 bits, form a left operand of the
@@ -32,11 +32,12 @@ from crazysim.train.networks import MEMORYLESS_NETWORK, ApplyLayers, Layers, Net
 from crazysim.train.seeds import are_seeds_divided
 
 MAX_WIDTH, MAX_UNITS, MAX_LAYERS = 128, 64, 4
-"""Largest number of inputs or outputs, of units of a hidden layer, and of layers."""
+"""Largest number of inputs or outputs, largest size of a hidden layer, and largest number of layers."""
 WARPS_AND_BLOCKS = {(False, False): (4, 4), (False, True): (4, 3), (True, False): (4, 2), (True, True): (8, 1)}
-"""Warps of a block, and blocks on a multiprocessor, by whether there are more than 64 inputs and whether the kernel is
-for gradients: about the fastest of three to six pairs on an H100, with 21 inputs for the first two."""
+"""Warps per block and blocks per multiprocessor, by whether there are more than 64 inputs and whether the kernel
+computes gradients. They were about the fastest of three to six pairs on an H100, with 21 inputs for the first two."""
 KERNEL_NAMES = ("mlp_outputs", "mlp_gradients")
+"""Names of the kernel of outputs and the kernel of gradients."""
 CAPABILITY, MAX_SHARED_BYTES, MULTIPROCESSORS = 90, 227 * 2**10, 132
 """Compute capability of the GPUs that use the kernels (Hopper architecture), times ten; the largest shared
 memory of a block there (CUDA C++ Programming Guide), bytes; and the number of multiprocessors of an H100 SXM."""
@@ -227,18 +228,18 @@ template <int K, int N> struct Sums {
 warp of a block has 16 samples."""
 
 
-def cuda_source(sizes: tuple[int, ...], gradient: bool) -> tuple[str, int]:
+def cuda_source(sizes: tuple[int, ...], is_gradient: bool) -> tuple[str, int]:
     """Return the CUDA source of a kernel without ``INTRINSICS``, and the shared memory of a block, bytes.
 
     Args:
         sizes: Number of inputs, sizes of the hidden layers, number of outputs.
-        gradient: True for the kernel of gradients, False for the kernel of outputs.
+        is_gradient: True for the kernel of gradients, False for the kernel of outputs.
     """
-    n_warps, n_blocks = WARPS_AND_BLOCKS[sizes[0] > 64, gradient]
+    n_warps, n_blocks = WARPS_AND_BLOCKS[sizes[0] > 64, is_gradient]
     padded, layers = [-(-size // 16) * 16 for size in sizes], range(len(sizes) - 1)
     memory = [(f"u16* w{i}", 2 * padded[i] * (padded[i + 1] + 8)) for i in layers]
     memory += [(f"float* b{i}", 4 * padded[i + 1]) for i in layers]
-    if gradient:
+    if is_gradient:
         memory += [(f"u16* rows{i}", 2 * 16 * n_warps * (padded[i] + 8)) for i in layers]
         memory += [(f"u16* below{i}", 2 * 16 * n_warps * (padded[i + 1] + 8)) for i in layers]
     ends = list(itertools.accumulate((size for _, size in memory), initial=0))
@@ -254,7 +255,7 @@ def cuda_source(sizes: tuple[int, ...], gradient: bool) -> tuple[str, int]:
         if i < layers[-1]:
             body += [f"u32 a{i + 1}[{padded[i + 1] // 16}][4]; apply_hidden<{shape}>(a{i + 1}, a{i}, w{i}, b{i});"]
     epilogue, (inner, outer), width, last = [], padded[-2:], sizes[-1], layers[-1]
-    if gradient:
+    if is_gradient:
         n_weights = sum((k + 1) * n for k, n in itertools.pairwise(sizes))
         setup += [f"cotangent += (size_t)blockIdx.y * n * {width};"]
         body += [f"u32 d{last}[{outer // 16}][4];"]
@@ -273,11 +274,11 @@ def cuda_source(sizes: tuple[int, ...], gradient: bool) -> tuple[str, int]:
         body += [f"float c[{outer // 8}][4]; apply_layer<{inner}, {outer}>(c, a{last}, w{last}, b{last});"]
         body += [f"write_rows<{outer}>(out, c, row, n, {width});"]
     names = ["const int* count", "const float* x"]
-    names += ["const float* scale", "const float* cotangent"] if gradient else []
+    names += ["const float* scale", "const float* cotangent"] if is_gradient else []
     names += [f"const float* {name}{i}" for i in layers for name in ("weight", "bias")] + ["float* out"]
     text = [
         f"#define WARPS {n_warps}", FUNCTIONS, f'extern "C" __global__ void __launch_bounds__(THREADS, {n_blocks})',
-        f"{KERNEL_NAMES[gradient]}({', '.join(names)}) {{",
+        f"{KERNEL_NAMES[is_gradient]}({', '.join(names)}) {{",
         "extern __shared__ __align__(16) unsigned char memory[];", *setup, "__syncthreads();",
         "for (int first = blockIdx.x * 16 * WARPS; first < n; first += gridDim.x * 16 * WARPS) {",
         "int row = first + 16 * WARP;", *body, "}", *epilogue, "}",
@@ -289,8 +290,8 @@ def choose_mlp(network: Network, device: jax.Device, mesh: Mesh | None = None, n
     """Return a function that runs the kernels, on each device for its own samples, or ``mlp`` if they cannot be used.
 
     Args:
-        network: Network before the layers; one with weights needs gradients with respect to its features, which kernels
-            do not give.
+        network: Network before the layers. It must have no weights, since the kernels compute no gradients with respect
+            to features.
         device: Device of the training.
         mesh: Devices of the training; None for one device.
         n_seeds: Number of seeds. If several cannot be divided among the devices, XLA computes the networks.
@@ -343,39 +344,39 @@ def apply_mlp(layers: Layers, x: Array) -> Array:
     return _apply(layers, x.reshape(-1, sizes[0])).reshape(*x.shape[:-1], sizes[-1])
 
 
-def _make_launcher(gradient: bool) -> Callable[..., Array]:
+def _make_launcher(is_gradient: bool) -> Callable[..., Array]:
     """Return ``_launch`` for the network of one seed; ``jax.vmap`` over seeds launches one kernel for all of them."""
 
     @jaxcompat.custom_vmap
     def run(*args: Any) -> Array:
-        return _launch(gradient, *_add_seed_axis(1, None, *args))[0]
+        return _launch(is_gradient, *_add_seed_axis(1, None, *args))[0]
 
     @run.def_vmap
     def _run_seeds(n_seeds: int, batched: Any, *args: Any) -> tuple[Array, bool]:
-        return _launch(gradient, *_add_seed_axis(n_seeds, batched, *args)), True
+        return _launch(is_gradient, *_add_seed_axis(n_seeds, batched, *args)), True
 
     return run
 
 
-_outputs, _gradients = _make_launcher(False), _make_launcher(True)
+_compute_outputs, _compute_gradients = _make_launcher(False), _make_launcher(True)
 
 
 @jax.custom_vjp
 def _apply(layers: Layers, x: Array) -> Array:
     """Return outputs, (n, n_out), for inputs (n, n_in)."""
-    return _outputs(layers, x)
+    return _compute_outputs(layers, x)
 
 
 def _forward(layers: Layers, x: Array) -> tuple[Array, Any]:
-    return _outputs(layers, x), (layers, x)
+    return _compute_outputs(layers, x), (layers, x)
 
 
 def _backward(residuals: Any, cotangent: Array) -> Any:
     layers, x = residuals
     max_cotangent = jnp.max(jnp.abs(cotangent))
     exponent = jnp.where((max_cotangent > 0) & jnp.isfinite(max_cotangent), -jnp.floor(jnp.log2(max_cotangent)), 0.0)
-    scale = jnp.exp2(jnp.clip(exponent, -100, 100))  # an infinite one would make zeros NaN
-    sums = _gradients(layers, x, scale, cotangent).sum(axis=0) / scale
+    scale = jnp.exp2(jnp.clip(exponent, -100, 100))  # an infinite scale would turn zeros into NaN
+    sums = _compute_gradients(layers, x, scale, cotangent).sum(axis=0) / scale
     ends = np.cumsum([array.size for layer in layers for array in layer])
     arrays = iter(jnp.split(sums, ends[:-1]))
     return [tuple(next(arrays).reshape(array.shape) for array in layer) for layer in layers], jnp.zeros_like(x)
@@ -385,7 +386,7 @@ _apply.defvjp(_forward, _backward)
 
 
 def _add_seed_axis(n_seeds: int, batched: Any, *args: Any) -> Any:
-    """Return the arguments with a first axis of seeds, which those already have where the tree ``batched`` is True."""
+    """Return the arguments with a first axis of seeds; those with True in the tree ``batched`` already have it."""
 
     def stack(x: Array, is_stacked: bool = False) -> Array:
         return x if is_stacked else jnp.broadcast_to(x, (n_seeds, *x.shape))
@@ -393,11 +394,11 @@ def _add_seed_axis(n_seeds: int, batched: Any, *args: Any) -> Any:
     return jax.tree.map(stack, args) if batched is None else jax.tree.map(stack, args, tuple(batched))
 
 
-def _launch(gradient: bool, layers: Layers, x: Array, *cotangent: Array) -> Array:
+def _launch(is_gradient: bool, layers: Layers, x: Array, *cotangent: Array) -> Array:
     """Return the results of a kernel for the networks of all seeds.
 
     Args:
-        gradient: True for the kernel of gradients, False for the kernel of outputs.
+        is_gradient: True for the kernel of gradients, False for the kernel of outputs.
         layers: Weights (n_seeds, n_in, n_out) and biases (n_seeds, n_out).
         x: Inputs. (n_seeds, n, n_in)
         cotangent: For gradients, their scale, (n_seeds,), and the gradients of the outputs, (n_seeds, n, n_out).
@@ -406,18 +407,18 @@ def _launch(gradient: bool, layers: Layers, x: Array, *cotangent: Array) -> Arra
         Outputs, (n_seeds, n, n_out), or gradients of all weights, summed by blocks, (n_seeds, n_blocks, n_weights).
     """
     (n_seeds, n, _), sizes = x.shape, _layer_sizes(layers)
-    source, shared_bytes = cuda_source(sizes, gradient)
-    n_warps, n_resident = WARPS_AND_BLOCKS[sizes[0] > 64, gradient]
+    source, shared_bytes = cuda_source(sizes, is_gradient)
+    n_warps, n_resident = WARPS_AND_BLOCKS[sizes[0] > 64, is_gradient]
     n_blocks = min(-(-n_resident * MULTIPROCESSORS // n_seeds), -(-n // (16 * n_warps)))
-    shape = (n_blocks, sum(x.size for x in jax.tree.leaves(layers)) // n_seeds) if gradient else (n, sizes[-1])
+    shape = (n_blocks, sum(x.size for x in jax.tree.leaves(layers)) // n_seeds) if is_gradient else (n, sizes[-1])
     result = jax.ShapeDtypeStruct((n_seeds, *shape), np.float32)
     arrays = [np.asarray([n], np.int32), x, *cotangent, *jax.tree.leaves(layers)]
     grid = (n_blocks, n_seeds, 32 * n_warps, shared_bytes)
-    return _run_kernel(source, KERNEL_NAMES[gradient], grid, arrays, result)
+    return _run_kernel(source, KERNEL_NAMES[is_gradient], grid, arrays, result)
 
 
 def _run_kernel(source: str, name: str, grid: tuple[int, ...], arrays: list[Any], result: Any) -> Array:
-    """Return the result of a kernel; ``grid`` is blocks along x and y, threads of a block and its shared memory."""
+    """Return the result of a kernel; ``grid`` is blocks along x and y, threads per block, shared bytes per block."""
     names = ("grid_x", "grid_y", "block_x", "shared_mem_bytes", "grid_z", "block_y", "block_z")
     integers: dict[str, Any] = {name: np.int32(x) for name, x in zip(names, (*grid, 1, 1, 1), strict=True)}
     code = cuda.compile_source(INTRINSICS + source, f"compute_{CAPABILITY}", "PTX").decode()

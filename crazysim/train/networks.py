@@ -1,9 +1,9 @@
 """Networks as pure functions of weights, observations and memory.
 
-A policy and a value function are a ``Network``, which turns the normalised observations of a drone into features and
-may keep a memory between steps, and a multilayer perceptron from the features to the outputs. The built-in network
-replaces images by the features of a convolution, then appends a memory; without both, the features are the observations
-themselves.
+A policy or a value function consists of a ``Network`` and a multilayer perceptron. The network turns the normalised
+observations of a drone into features, and may keep a memory between steps. The perceptron turns features into outputs.
+The built-in network replaces images by the features of a convolution, then appends a memory. Without convolution and
+memory, its features are the observations.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from crazysim.train.seeds import for_each_seed, join_blocks, split_blocks
 Layers = list[tuple[Array, Array]]
 """Weights (n_in, n_out) and biases (n_out,), first layer first."""
 ApplyLayers = Callable[[Layers, Array], Array]
-"""Function from layers and inputs, (..., n_in), to outputs, (..., n_out), such as ``mlp``."""
+"""Function from layers and inputs (..., n_in) to outputs (..., n_out), such as ``mlp``."""
 
 
 def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
@@ -55,7 +55,7 @@ def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
 
 
 def mlp(layers: Layers, x: Array) -> Array:
-    """Return the outputs, with tanh between layers, computed in the dtype of the weights.
+    """Return the outputs of a perceptron with tanh between layers, computed in the dtype of the weights.
 
     Args:
         layers: Weights and biases.
@@ -74,10 +74,11 @@ def mlp(layers: Layers, x: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """A network from the normalised observations of one drone to features, in place of the built-in one.
+    """Network from the normalised observations of one drone to features.
 
-    Its functions are pure and written for one drone. A linear layer from the features to the actions before tanh, or to
-    the value, follows. ``Network(init, apply)`` has no memory; its ``apply`` returns the memory that it gets, ``()``.
+    Its functions are pure and written for one drone. After a custom network, one linear layer computes the actions
+    before tanh, or the value, from the features. ``Network(init, apply)`` has no memory: its ``apply`` gets and returns
+    ``()`` as memory.
     """
 
     init: Callable[[Array, int], Any]
@@ -88,7 +89,7 @@ class Network:
     initial_memory: Any = ()
     """Memory at the start of an episode, any pytree of arrays; ``()`` for none."""
     images: tuple[Image, ...] = ()
-    """Images among the observations, which are passed without normalisation."""
+    """Images among the observations; they are passed to the network without normalisation."""
 
     @property
     def has_memory(self) -> bool:
@@ -103,7 +104,7 @@ class Network:
 
     @property
     def pixels(self) -> tuple[range, ...]:
-        """Indices of the pixels of its images among the observations."""
+        """Indices of the pixels of each image within the observations."""
         return tuple(image.pixels for image in self.images)
 
     def make_memory(self, *batch: int) -> Any:
@@ -134,17 +135,17 @@ class Gru(PyTree):
 
 
 MEMORYLESS_NETWORK = Network(lambda _key, _n_obs: (), lambda _weights, obs, memory: (obs, memory))
-"""The network without weights, whose features are the observations."""
+"""Network without weights; its features are the observations."""
 
 
 def gru_network(size: int) -> Network:
-    """Return the network with the memory of a gated recurrent unit; features are the observations and the memory."""
+    """Return the network with a gated recurrent unit as memory; its features are the observations and the memory."""
     return _gru_network(size, np.dtype(float_dtype()))
 
 
 @functools.cache
 def _gru_network(size: int, dtype: np.dtype) -> Network:
-    """Return the network of ``gru_network``, the same object for the same size and type of the memory."""
+    """Return the network of ``gru_network``: the same object for the same size and dtype of the memory."""
 
     def init(key: Array, n_obs: int) -> Gru:
         k_inputs, k_recurrent = jax.random.split(key)
@@ -171,7 +172,7 @@ class Encoder(PyTree):
 
 @functools.cache
 def _convolution_network(channels: tuple[int, ...], images: tuple[Image, ...], base: Network) -> Network:
-    """Return a network that applies ``base`` to observations with features in place of images."""
+    """Return a network that replaces images by features of convolutions, and then applies the network ``base``."""
 
     def init(key: Array, n_obs: int) -> Encoder:
         keys = jax.random.split(jax.random.fold_in(key, 2), (len(images), len(channels)))
@@ -210,7 +211,7 @@ def choose_network(
     Args:
         memory: Size of the memory of the built-in network; 0 for none.
         network: Custom network; None for the built-in one.
-        convolution: Channels of the layers of the convolution of the built-in network; none without.
+        convolution: Channels of the layers of the convolution of the built-in network; empty for no convolution.
         images: Images among the observations, for the convolution.
 
     Raises:
@@ -239,7 +240,7 @@ class Weights(PyTree):
     layers: Layers
     """Layers from the features to the outputs."""
     body: Any = ()
-    """Weights of the network; ``()`` for the built-in one without convolution and memory."""
+    """Weights of the network; ``()`` for the built-in network without convolution and memory."""
 
 
 def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int], last_scale: float) -> Weights:
@@ -275,7 +276,7 @@ def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int],
 def forward(
     network: Network, weights: Weights, obs: Array, memory: Any, apply_layers: ApplyLayers = mlp
 ) -> tuple[Array, Any]:
-    """Return the outputs of one step, and the memory after it.
+    """Return the outputs of one step, (..., n_outputs), and the memory after it.
 
     Args:
         network: The network.
@@ -291,7 +292,7 @@ def forward(
 def unroll(
     network: Network, weights: Weights, obs: Array, memory: Any, done: Array, apply_layers: ApplyLayers = mlp
 ) -> Array:
-    """Return the outputs of consecutive steps, through which gradients flow back in time.
+    """Return the outputs of consecutive steps, (n_steps, ..., n_outputs); gradients flow back through the steps.
 
     Args:
         network: The network.
@@ -315,7 +316,7 @@ def unroll(
 
 
 def _batch_apply(network: Network, weights: Weights, n_axes: int) -> Callable[[Array, Any], tuple[Array, Any]]:
-    """Return ``network.apply`` with its weights, mapped over the leading axes of observations and memory."""
+    """Return ``network.apply`` with its weights, mapped over ``n_axes`` leading axes of observations and memory."""
     apply: Any = functools.partial(network.apply, weights.body)
     for _ in range(n_axes):
         apply = jax.vmap(apply)
@@ -366,7 +367,7 @@ class Policy(PyTree):
 
         Args:
             obs: Observations by name. (..., k) each
-            memory: Memory before the step. (..., ...) each; ``()`` without memory
+            memory: Memory before the step, (..., ...) each; ``()`` for a policy without memory.
         """
         output, memory = forward(
             self.network, Weights(self.layers, self.body), self.stats.normalize(flatten(obs)), memory

@@ -62,11 +62,11 @@ class Config:
     """Size of the memory of policy and value function, a gated recurrent unit before the hidden layers; 0 for none."""
     convolution: tuple[int, ...] = ()
     """Channels of the layers of a convolution over each image, with patches of 3 x 3 pixels and stride 2, before the
-    memory and the hidden layers; none to observe the pixels as they are."""
+    memory and the hidden layers; empty to use the pixels without convolution."""
     critic: str = "observations"
-    """Inputs of the value function: ``observations``, the observations of the policy; ``privileged``, the same and the
-    true state and parameters of the drone; ``all_drones``, the observations of all drones of the world;
-    ``all_drones_privileged``, the same and the true states and parameters of all of them."""
+    """Inputs of the value function: ``observations``, the observations of the policy; ``privileged``, also the true
+    state and parameters of the drone; ``all_drones``, the observations of all drones of the world;
+    ``all_drones_privileged``, also the true states and parameters of all drones of the world."""
     learning_rate: float = 1e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     discount: float = 0.98
@@ -90,7 +90,7 @@ class Config:
 
 
 class Agent(PyTree):
-    """Networks, optimiser and statistics of one seed; in a ``Learner`` stacked, with a leading axis over seeds."""
+    """Networks, optimiser and statistics of one seed; in a ``Learner``, the arrays of all seeds are stacked."""
 
     policy: Weights
     """Weights from normalised observations to the mean action before tanh."""
@@ -103,7 +103,7 @@ class Agent(PyTree):
     stats: RunningStats
     """Mean and variance with which observations are normalised; the policy's observations come first."""
     returns: RunningStats
-    """Mean and variance of returns, with which the outputs of the value network are scaled. (1,) each"""
+    """Mean and variance of returns, to scale the outputs of the value network. (1,) each"""
     key: Array
     """Random key. ()"""
     n_obs: int = static()
@@ -160,11 +160,11 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
 
     Args:
         env: Environment that resets automatically within the step that ends an episode, with a block of worlds for
-            each seed; with the wrapper ``PrivilegedObservation`` for a privileged critic. The worlds of
-            all seeds share the statistics of a ``Normalize`` wrapper.
+            each seed. A privileged critic also needs the wrapper ``PrivilegedObservation``. The worlds of all seeds
+            share the statistics of a ``Normalize`` wrapper.
         configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
-        network: Custom network, for policy and value function; None for the built-in one.
+        network: Custom network of policy and value function; None for the built-in one.
     """
     config, n_worlds = configs[0], env.sim.n_worlds // len(configs)
     if n_worlds % config.minibatches:
@@ -200,7 +200,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
 def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Learner, dict[str, Array]]:
     """Return the learner after one rollout and its updates, and the metrics of the iteration. (n_seeds,) each
 
-    The metric ``finite`` is True if weights, optimiser state, statistics and losses are finite.
+    The metric ``finite`` is True if weights, optimiser state, statistics and losses are finite; ``ratio_off`` is the
+    mean distance of the probability ratio from 1.
     """
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
     agents, swept_values = learner.agents.replace(key=key), stack_swept_values(configs)
@@ -218,9 +219,10 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
 def _collect_samples(
     agents: Agent, learner: Learner, env: Env, config: Config, swept_values: SweptValues, keys: Array
 ) -> tuple[EnvState, tuple[Any, Any], Sample, Array, dict[str, Array]]:
-    """Return state and memories after a rollout of all seeds, samples, observations before normalisation, and metrics.
+    """Return the environment state and memories after a rollout, samples, raw observations, and metrics of all seeds.
 
-    Samples and observations have leading axes (n_steps, n_seeds, n_worlds, n_drones), metrics (n_seeds,).
+    Samples and observations have leading axes (n_steps, n_seeds, n_worlds, n_drones); metrics have (n_seeds,). Raw
+    observations are not normalised.
     """
     split_seeds = partial(split_blocks, n_seeds=keys.shape[0])
 
@@ -228,7 +230,7 @@ def _collect_samples(
         normalized_obs = agent.stats.normalize(raw_obs)
         policy_obs = normalized_obs[..., : agent.n_obs]
         output, policy_memory = forward(agent.network, agent.policy, policy_obs, memory[0], agent.apply_layers)
-        value, value_memory = _value(agent, normalized_obs, memory[1], config)
+        value, value_memory = _compute_value(agent, normalized_obs, memory[1], config)
         mean = jnp.tanh(output)
         action = mean + jnp.exp(agent.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
         log_prob = _log_prob(mean, agent.log_std, action)
@@ -252,7 +254,7 @@ def _collect_samples(
         )
 
         def compute_final_value(agent: Agent, raw_obs: Array, memory: Any) -> Array:
-            return _value(agent, agent.stats.normalize(raw_obs), memory, config)[0]
+            return _compute_value(agent, agent.stats.normalize(raw_obs), memory, config)[0]
 
         final_values = for_each_seed(
             compute_final_value,
@@ -299,18 +301,18 @@ def _update_agent(
     """Return the agent of one seed after the updates on its rollout, and metrics.
 
     Args:
-        agent: The agent before.
-        samples: Its samples. (n_steps, n_worlds, n_drones, ...) each
+        agent: The agent before the updates.
+        samples: Samples of the rollout. (n_steps, n_worlds, n_drones, ...) each
         raw_obs: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
         memory: Memories of policy and value function before the rollout. (n_worlds, n_drones, ...) each
-        final_critic_inputs: Observations, (n_worlds, n_drones, n_obs), and memory of the value function, after the
+        final_critic_inputs: Observations (n_worlds, n_drones, n_obs) and memory of the value function after the
             rollout.
         swept_values: Hyperparameters of the seed that may differ between seeds. () each
         key: Random key.
         config: Hyperparameters of the first seed; values in ``swept_values`` take precedence.
     """
     last_obs, last_memory = final_critic_inputs
-    last_value, _ = _value(agent, agent.stats.normalize(last_obs), last_memory, config)
+    last_value, _ = _compute_value(agent, agent.stats.normalize(last_obs), last_memory, config)
     advantages, targets = _estimate_advantages(samples, last_value, swept_values)
     returns = agent.returns.update(targets[..., None])
     targets = (targets - returns.mean) / _return_std(returns)
@@ -332,10 +334,10 @@ def _estimate_advantages(samples: Sample, last_value: Array, swept_values: Swept
     def accumulate_advantage(
         carry: tuple[Array, Array], sample: tuple[Array, Array, Array]
     ) -> tuple[tuple[Array, Array], Array]:
-        advantage, value_after = carry
+        advantage, next_value = carry
         reward, value, done = sample
         discount = swept_values["discount"] * ~done
-        advantage = reward + discount * value_after - value + discount * swept_values["gae_lambda"] * advantage
+        advantage = reward + discount * next_value - value + discount * swept_values["gae_lambda"] * advantage
         return (advantage, value), advantage
 
     sequence = (samples.reward, samples.value, samples.done)
@@ -352,13 +354,13 @@ def _run_epochs(
     transform = _optimizer(config, swept_values["learning_rate"], swept_values["max_grad_norm"])
 
     def select_minibatch(worlds: Array) -> Any:
-        """Return the samples of some worlds, by their indices in each group, and their memories before the rollout.
+        """Return the samples of the worlds of a minibatch, and their memories before the rollout.
 
         Args:
-            worlds: Indices. (n_groups, k)
+            worlds: Indices of worlds in each group. (n_groups, k)
 
         Returns:
-            Samples, (n_steps, n_groups, k, n_drones, ...) each, and memories, (n_groups, k, n_drones, ...) each.
+            Samples (n_steps, n_groups, k, n_drones, ...) and memories (n_groups, k, n_drones, ...).
         """
         index_groups = jax.vmap(lambda x, worlds: x[:, worlds], (1, 0), 1)
 
@@ -427,13 +429,13 @@ def _critic_obs(obs: Obs, config: Config) -> Array:
 
 
 def _policy_obs(obs: Obs, config: Config) -> Obs:
-    """Return the observations of the policy: all except the one that only a privileged critic gets."""
+    """Return the observations of the policy: all except the observation of a privileged critic."""
     is_hidden = config.critic in PRIVILEGED_CRITICS
     return {name: x for name, x in obs.items() if not (is_hidden and name == PRIVILEGED)}
 
 
 def _critic_input(obs: Array, config: Config) -> Array:
-    """Return the inputs of the value function for each drone. A critic of all drones also gets the other drones'.
+    """Return the inputs of the value function for each drone: its observations, or the observations of all drones.
 
     Args:
         obs: Result of ``_critic_obs``, normalised or not. (..., n_drones, k)
@@ -450,7 +452,7 @@ def _initial_memories(network: Network, state: EnvState) -> tuple[Any, Any]:
     return network.make_memory(*batch), network.make_memory(*batch)
 
 
-def _value(agent: Agent, obs: Array, memory: Any, config: Config) -> tuple[Array, Any]:
+def _compute_value(agent: Agent, obs: Array, memory: Any, config: Config) -> tuple[Array, Any]:
     """Return the expected return for normalised observations, and the memory after the step. (..., k) -> (...)"""
     output, memory = forward(agent.network, agent.value, _critic_input(obs, config), memory, agent.apply_layers)
     return output[..., 0] * _return_std(agent.returns) + agent.returns.mean, memory
@@ -462,7 +464,7 @@ def _return_std(returns: RunningStats) -> Array:
 
 
 def _rescale_value(weights: Weights, old_stats: RunningStats, new_stats: RunningStats) -> Weights:
-    """Return the value network with outputs rescaled so that its values are the same with the new statistics."""
+    """Return the value network with its last layer rescaled, so that values are the same with the new statistics."""
     *hidden, (weight, bias) = weights.layers
     ratio = _return_std(old_stats) / _return_std(new_stats)
     return weights.replace(

@@ -54,24 +54,24 @@ def run(
     ``policy.mp4``. Where matplotlib, the encoder or OpenGL is missing, the plots or the film are left out, and a line
     is logged. An interrupt (Ctrl-C) writes a checkpoint first, and so does a ``SystemExit`` from a signal handler.
 
-    If the recipe of the task has a teacher, such as that of ``race_by_camera``, and the settings name neither another
-    teacher nor another algorithm, the teacher is trained first, in the folder ``teacher`` of the run. ``options`` hold
-    for both; ``n_worlds``, ``config`` and ``on_iteration`` only for the student. If the teacher is interrupted, call
-    ``run`` again with the same settings and ``resume=True``.
+    Some recipes have a teacher, such as the recipe of ``race_by_camera``. The teacher is trained first, in the folder
+    ``teacher`` of the run, unless the settings name another teacher or another algorithm. ``options`` apply to teacher
+    and student; ``n_worlds``, ``config`` and ``on_iteration`` apply only to the student. If the teacher is interrupted,
+    call ``run`` again with the same settings and ``resume=True``.
 
     Args:
-        task: Name of a task, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task, such
-            as ``TwoHoops(radius=0.4)``.
+        task: Name of a task, reference of your class (``FILE.py:NAME`` or ``MODULE:NAME``), or a ``Task`` such as
+            ``TwoHoops(radius=0.4)``.
         folder: Folder of the run; None for ``out/NAME``.
-        resume: True to continue from the checkpoint in the folder, with its settings where none are given.
+        resume: True to continue from the checkpoint in the folder; omitted settings are those of the checkpoint.
         film: True to write a film.
         evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.
         progress: True to show progress bars, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
-        on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
-            names of metrics of an evaluation after it begin with ``"evaluation "``. Each call waits for the device.
-            None for none.
+        on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name, or
+            None. After an evaluation it also gets the metrics of the evaluation, with names that begin with
+            ``"evaluation "``. Each call waits for the device.
         settings: ``algorithm``, ``seed``, ``n_worlds``, ``options``, ``config``, ``network`` and ``devices`` of
             ``TrainConfig.create``.
 
@@ -122,19 +122,20 @@ def run_many(
     on_iteration: Callable[[int, dict[str, Any]], None] | None = None,
     **settings: Any,
 ) -> dict[str, TrainResult]:
-    """Train with several seeds, and several values of hyperparameters, in one program: ``crazysim train --seeds``.
+    """Train with several seeds and values of hyperparameters in one program, as ``crazysim train --seeds`` does.
 
     A seed gives the same training, to rounding, whichever other seeds are trained with it. The folder then has one
-    ``checkpoint.npz`` of all trainings, ``seeds.csv`` and ``seeds.json`` with a row for each training, ``curve.png``
-    with medians, quartiles and extremes, and for each training a folder with ``policy.npz`` and ``curve.json``, such as
-    ``seed-3`` or ``learning_rate-0.0003-seed-3``. If the recipe has a teacher, as in ``run``, it is trained with the
-    first seed, and teaches all students.
+    ``checkpoint.npz`` of all trainings, ``seeds.csv`` and ``seeds.json`` with a row for each training, and
+    ``curve.png`` with medians, quartiles and extremes. Each training has a folder with ``policy.npz`` and
+    ``curve.json``, such as ``seed-3`` or ``learning_rate-0.0003-seed-3``. A teacher of the recipe, see ``run``, is
+    trained with the first seed and teaches all students.
 
     Args:
         task: As in ``run``.
         folder: Folder of the run; None for ``out/NAME``.
         seeds: Seeds.
-        sweep: Values of hyperparameters by name, each trained with each seed; names of ``SWEEPABLE``.
+        sweep: Values of hyperparameters by name, which is one of ``SWEEPABLE``. Every combination of values is trained
+            with every seed.
         resume: True to continue from the checkpoint in the folder, with the same seeds and values.
         evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.
@@ -145,7 +146,7 @@ def run_many(
             ``TrainConfig.create``.
 
     Returns:
-        The results by the names of their folders.
+        Results by the name of the folder of the training.
 
     Raises:
         ConfigError, DivergedError, KeyboardInterrupt, SystemExit: As ``run``, but a training that diverges does not
@@ -231,13 +232,13 @@ def _train_teacher(
     progress: bool,
     checkpoint_every: float | None,
 ) -> bool:
-    """Train the teacher of the recipe, and return True; return False if the run needs none or its student has begun.
+    """Train the teacher of the recipe and return True, or return False if there is none or the student has begun.
 
     Args:
         student: Configuration of the student.
         folder: Folder of the student's run.
         resume: True to continue an interrupted run, of the teacher or of the student.
-        evaluation_worlds: As in ``run``, and so are the rest.
+        evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.
         progress: True to show progress bars.
         checkpoint_every: Time between checkpoints, s.
@@ -266,7 +267,7 @@ def _check_student(student: TrainConfig) -> None:
 
 
 def _with_teacher(student: TrainConfig, folder: Path) -> TrainConfig:
-    """Return the configuration of a student with the teacher in the folder of its run."""
+    """Return the configuration of a student whose teacher is in the folder of the student's run."""
     return dataclasses.replace(student, config=student.config | {"teacher": str(folder / TEACHER_FOLDER)})
 
 
@@ -280,7 +281,7 @@ def _check_settings(settings: Mapping[str, Any], names: Sequence[str]) -> None:
 
 
 def _stored_config(folder: Path) -> TrainConfig:
-    """Return the configuration of a folder that holds a run of one training."""
+    """Return the configuration of the run in a folder, which must have a single training."""
     configs = stored_configs(folder)
     if list(configs) != [""]:
         raise ConfigError(

@@ -24,17 +24,17 @@ from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE_FILE
 
 TARGET_COLOR, TARGET_SIZE = (0.1, 0.8, 0.3, 0.6), 0.03
-"""Colour of the mark of a drone's target, RGBA, and its smallest radius, m."""
+"""Colour, RGBA, and smallest radius, m, of the mark at a drone's target."""
 DEPTH_COLORS = ((10, 8, 30), (90, 20, 110), (200, 60, 70), (250, 160, 40), (255, 250, 190))
 """Colours of depths from far to near, RGB."""
 
 
 def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
-    """Plot success, error and reward terms over the course of training, as measured by the evaluations.
+    """Plot success, error and reward terms in the evaluations of trainings.
 
     Args:
         curves: Contents of ``curve.json`` of each run, by the name of the run. Reward terms are plotted for the
-            first one only.
+            first run only.
         path: Image to write, such as a ``.png``.
 
     Raises:
@@ -71,7 +71,7 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> 
 
     Args:
         groups: Contents of ``curve.json`` of the trainings of each group, such as all seeds of one learning rate. The
-            curve of a training that diverged ends earlier, and counts up to its end.
+            curve of a training that diverged ends earlier; it is included up to its end.
         path: Image to write, such as a ``.png``.
 
     Raises:
@@ -144,13 +144,13 @@ def plot_episode(
 
 
 def _use_log_scale(axis: Any) -> None:
-    """Scale the ordinate logarithmically if any of its values is positive; the error of a finished race is zero."""
+    """Make the vertical axis logarithmic if any value is positive; the error of a finished race is zero."""
     if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axis.lines):
         axis.set_yscale("log")
 
 
 def _make_figure(n: int) -> Any:
-    """Return a figure with panels in a row.
+    """Return a figure and the axes of ``n`` panels in a row.
 
     Raises:
         ImportError: If matplotlib is not installed.
@@ -210,9 +210,9 @@ def color_depth(depth: np.ndarray, far: float) -> np.ndarray:
 def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False) -> int:
     """Film one episode of a policy in several worlds side by side, and return the number of frames.
 
-    The first depth image among the observations of the first drone, or else the first segmentation that shows its
-    target, is drawn into each world: near pixels, or pixels of the target, are bright. Then worlds with obstacles also
-    have a map from above.
+    If the policy observes images, the first depth image of the first drone, or else its first segmentation of the
+    target, is drawn into each world. Near pixels, or pixels of the target, are bright. Worlds with obstacles then also
+    show a map from above.
 
     Args:
         env: Environment to fly in.

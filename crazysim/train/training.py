@@ -49,13 +49,13 @@ from crazysim.train.networks import Network, Policies, Policy, choose_network, i
 from crazysim.train.seeds import take_seed
 
 CHECKPOINT_FILE, POLICY_FILE, CURVE_FILE, TABLE_FILE = "checkpoint.npz", "policy.npz", "curve.json", "seeds.json"
-"""Names of the files of a run: its checkpoint, the kept policy, the learning curve, and the table of all seeds."""
+"""Names of the files of a run: checkpoint, kept policy, learning curve, and table of all seeds."""
 
 TEACHER_FOLDER = "teacher"
-"""Name of the folder, within the folder of a run, of the teacher that the recipe of a task trains first."""
+"""Name of the subfolder of a run for the teacher that the recipe of the task trains first."""
 
 CHECK_SEED = 0xC4EC
-"""Seed of the initial states of the check set, which differ from the held-out ones of ``EVALUATION_SEED``."""
+"""Seed of the initial states of the check set, which differ from the held-out states of ``EVALUATION_SEED``."""
 Learner = ppo.Learner | apg.Learner | dagger.Learner
 """State of a training run."""
 
@@ -67,13 +67,14 @@ class TrainResult:
     folder: Path
     """Folder of the files of the run."""
     metrics: dict[str, float]
-    """Metrics of ``evaluate`` for the kept policy on held-out initial states; ``iteration``, its iteration;
-    ``check``, its success on the check set; and for the whole run ``seconds``, its duration, s, ``compile_seconds``,
-    the compilation time within it, s, and ``env_steps``, environment steps of all drones."""
+    """Metrics of the kept policy: those of ``evaluate`` on held-out initial states; ``iteration``, the number of
+    iterations that trained it; ``check``, its success on the check set. Metrics of the whole run: ``seconds``,
+    duration, s; ``compile_seconds``, the part for compilation, s; ``env_steps``, environment steps of all drones."""
     policy: Policy
-    """Kept policy: the latest evaluated one with a success on the check set within two standard errors of the best."""
+    """Kept policy: the latest evaluated policy with a success on the check set within two standard errors of the
+    best."""
     env: Env
-    """Environment of the evaluations of all trainings of the program, without automatic resets."""
+    """Environment in which all trainings of the program are evaluated, without automatic resets."""
 
 
 def train(
@@ -86,7 +87,7 @@ def train(
     checkpoint_every: float | None = None,
     on_iteration: Callable[[int, dict[str, Any]], None] | None = None,
 ) -> TrainResult:
-    """Train a policy and write checkpoint, learning curve and policy into a folder: ``train_many`` with one training.
+    """Train a policy and write checkpoint, learning curve and policy into a folder, as ``train_many`` for one training.
 
     Raises:
         ConfigError, DivergedError, KeyboardInterrupt, SystemExit: As ``train_many``.
@@ -107,28 +108,27 @@ def train_many(
 ) -> dict[str, TrainResult]:
     """Train policies in one program and write their files.
 
-    Each training has a block of worlds, and its own folder for its learning curve and policy. Their parent folder holds
-    one checkpoint of all trainings. Every evaluation flies from two sets of initial states that are not used for
-    training. The success on the check set decides which policy is kept; the held-out set is only used for the reported
-    figures.
+    Each training has a block of worlds, and a folder for its learning curve and policy. The parent folder holds one
+    checkpoint of all trainings. Every evaluation flies from two sets of initial states that are not used for training.
+    The success on the check set decides which policy is kept; the held-out set is only used for the reported figures.
 
-    Each evaluation writes a checkpoint. So does an interrupt (Ctrl-C), or a ``SystemExit`` from a signal handler,
-    before it is raised again. A resumed run is bit for bit the same as an uninterrupted one on the same machine. If a
-    training diverges, its kept policy stays and the other trainings go on.
+    Each evaluation writes a checkpoint. An interrupt (Ctrl-C), or a ``SystemExit`` from a signal handler, also writes a
+    checkpoint before it is raised again. A resumed run is bit for bit the same as an uninterrupted run on the same
+    machine. If a training diverges, its kept policy stays and the other trainings continue.
 
     Args:
         configs: Configuration of each training, by the name of its folder. Only the seed and the ``SWEEPABLE``
-            hyperparameters may differ. The name may be empty if there is only one.
+            hyperparameters may differ. A single training may have an empty name.
         folder: Folder of the run.
         resume: True to continue from the checkpoint in the folder, also with another number of devices.
         evaluation_worlds: Number of initial states of the held-out set, and of the check set.
         log: Function that is called with each line of output.
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
-        checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
-        on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
-            names of metrics of an evaluation after the iteration begin with ``"evaluation "``. A metric is a number, or
-            an array with one number for each training if there are several. Each call waits for the device. None for
-            none.
+        checkpoint_every: Time after which a checkpoint is also written between evaluations, s; None to write none.
+        on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name, or
+            None. After an evaluation it also gets the metrics of the evaluation, with names that begin with
+            ``"evaluation "``. A metric is a number, or an array with one number for each training if there are several.
+            Each call waits for the device.
 
     Raises:
         ConfigError: If the folder holds a run and ``resume`` is False, or the run has another configuration or is
@@ -225,11 +225,11 @@ def train_many(
     n_done = saved_iteration = int(learner.iteration)
     save_time = time.perf_counter()
     steps_per_iteration = config.n_worlds * base_env.sim.n_drones * n_steps
-    times = "" if n_trainings == 1 else f"{n_trainings} times "
+    repetition_text = "" if n_trainings == 1 else f"{n_trainings} times "
     log(
         f"{config.title} by {config.algorithm}, {f'seed {config.seed}' if n_trainings == 1 else ', '.join(configs)}: "
-        f"{_iterations_text(n_iterations)} of {times}{steps_per_iteration:,} steps "
-        f"in {times}{config.n_worlds:,} worlds, "
+        f"{_iterations_text(n_iterations)} of {repetition_text}{steps_per_iteration:,} steps "
+        f"in {repetition_text}{config.n_worlds:,} worlds, "
         f"{_describe_devices(base_env.sim, iterate)}"
         f"{base_env.sim.control.value} commands, {engine}" + (f"; continues after iteration {n_done}" if n_done else "")
     )
@@ -255,7 +255,7 @@ def train_many(
         saved_iteration, save_time = int(learner.iteration), time.perf_counter()
 
     def evaluate_and_save(learner: Learner, metrics: dict[str, Array]) -> list[dict[str, Any]]:
-        """Evaluate the policies, update the kept ones, write all files, and return the last point of each curve."""
+        """Evaluate the policies, update the kept policies, write all files, and return the last point of each curve."""
         iteration, policies = int(learner.iteration), fetch_arrays(learner.as_policy())
         mark_diverged(metrics, iteration)
         is_planned = iteration % evaluation_period == 0 or iteration == n_iterations
@@ -365,22 +365,22 @@ def require_no_run(folder: Path) -> None:
 
 @dataclass
 class _Training:
-    """One of the trainings that run in a program."""
+    """One of the trainings of a program."""
 
     name: str
     """Name in messages and of its folder; empty for a single training."""
     config: TrainConfig
-    """Its configuration."""
+    """Configuration."""
     folder: Path
-    """Folder of its learning curve and policy."""
+    """Folder of the learning curve and the policy."""
     meta: dict[str, Any]
-    """Metadata of its files."""
+    """Metadata of the files."""
     curve: list[dict[str, Any]] = field(default_factory=list)
-    """Its evaluations."""
+    """Evaluations so far."""
     kept_policy: Any = None
     """The kept policy."""
     divergence_iteration: int | None = None
-    """Iteration in which it became non-finite; None if it did not."""
+    """Iteration in which weights or losses became non-finite; None if they are finite."""
 
     def add_evaluation(
         self, point: dict[str, Any], policy: Policy, n_starts: int, description: dict[str, Any], is_planned: bool
@@ -392,9 +392,10 @@ class _Training:
             policy: The evaluated policy.
             n_starts: Number of starts of the check set.
             description: Description of the policy's inputs and outputs.
-            is_planned: True if an uninterrupted run makes this evaluation too. Others must not influence a resumed run.
+            is_planned: True if an uninterrupted run makes this evaluation too. Unplanned evaluations do not influence a
+                resumed run.
         """
-        # A planned evaluation that is repeated, after a run was resumed at its end, stays a planned one.
+        # A run that is resumed at its end repeats its last evaluation, which was planned.
         is_planned |= any(
             earlier_point["iteration"] == point["iteration"] and earlier_point["kept"] for earlier_point in self.curve
         )
@@ -410,7 +411,7 @@ class _Training:
 
     @property
     def row(self) -> dict[str, Any]:
-        """Its row in the table of all trainings: the settings that may differ, and its latest kept evaluation."""
+        """Row in the table of all trainings: the settings that may differ, and the evaluation of the kept policy."""
         best, latest = kept_point(self.curve), self.curve[-1]
         swept = {name: self.config.config[name] for name in SWEEPABLE if name in self.config.config}
         names = ("success", "crashed", "error", "reward", "check", "iteration")
@@ -424,7 +425,7 @@ class _Training:
 
 
 def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
-    """Write the table of the trainings of a program as JSON and CSV, with empty cells where a value is missing."""
+    """Write the table of all trainings as JSON and CSV, with null or an empty cell for a missing value."""
     rows = [{name: None if x != x else x for name, x in row.items()} for row in rows]
     with open_replacement(folder / TABLE_FILE) as file:
         file.write(json.dumps(rows, indent=1).encode())
@@ -437,9 +438,9 @@ def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def _host_metrics(metrics: dict[str, Array], points: list[dict[str, Any]] | None) -> dict[str, Any]:
-    """Return the metrics of an iteration, and of the evaluations after it if there were any.
+    """Return the metrics of an iteration, and of the evaluations after it if there are any.
 
-    They are floats, or arrays with one number for each training if there are several.
+    Metrics are floats, or arrays with one number for each training if there are several.
     """
     numbers = {name: x for name, x in jax.device_get(metrics).items() if name != "finite"}
     for name in points[0] if points else ():
@@ -451,12 +452,12 @@ def _host_metrics(metrics: dict[str, Array], points: list[dict[str, Any]] | None
 def least_kept_success(success: float, n_worlds: int) -> float:
     """Return the lowest success rate with which a later policy is kept: two standard errors below the best.
 
-    The standard error is computed for the rate after two more successes and two more failures (Agresti and Coull 1998,
-    "Approximate is better than exact"), which is not zero where all have succeeded.
+    The standard error is computed with two more successes and two more failures (Agresti and Coull 1998, "Approximate
+    is better than exact"), so that it is not zero where all have succeeded.
 
     Args:
         success: Best success rate so far.
-        n_worlds: Number of starts with which it was measured.
+        n_worlds: Number of starts of the check set.
     """
     n = n_worlds + 4
     rate = (success * n_worlds + 2) / n
@@ -469,7 +470,7 @@ def kept_point(curve: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _describe_devices(sim: Sim, iterate: Any) -> str:
-    """Return the worlds of each device and the bytes that they exchange, for the log; nothing for one device."""
+    """Return the text of the log on worlds per device and bytes exchanged between devices; empty for one device."""
     if sim.mesh is None:
         return ""
     n, n_bytes = sim.mesh.size, sum(exchanged_bytes(iterate.as_text()).values())
@@ -490,9 +491,9 @@ def load_policy(
 
     Args:
         folder: Folder of the run.
-        task: Reference of the task's class, ``FILE.py:NAME`` or ``MODULE:NAME``, if it has moved since the training, or
-            if this user has never named it on this machine. Its code is executed. None for the reference in the run,
-            which ``config.make_env`` only loads if this user has named it before.
+        task: Reference of the task's class, ``FILE.py:NAME`` or ``MODULE:NAME``, if the class has moved since the
+            training, or if this user has never named it on this machine. Its code is executed. None for the reference
+            in the run; ``config.make_env`` loads it only if this user has named it before.
         network: Custom network with which the policy was trained; None for the built-in one.
 
     Raises:
@@ -589,7 +590,7 @@ def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
 def _read_run(
     path: Path, configs: Mapping[str, TrainConfig]
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str, float]:
-    """Return arrays, metadata of each training, hash of the task's code and time so far, s, of a checkpoint.
+    """Return the contents of a checkpoint: arrays, metadata by training, hash of the task's code, and time so far, s.
 
     Raises:
         ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.
@@ -614,7 +615,7 @@ def _read_run(
 
 
 def _require_same_settings(path: Path, settings: dict[str, Any], config: TrainConfig) -> None:
-    """Check that a stored run has this configuration, except for settings that may change."""
+    """Check that the settings of a stored run equal a configuration, except for settings that may change."""
     stored_settings, requested_settings = (
         _fixed_settings(settings) for settings in (settings, _run_metadata(config)["settings"])
     )
@@ -644,19 +645,19 @@ def _fixed_settings(settings: dict[str, Any]) -> dict[str, Any]:
     return run_settings | {"task": f"{Path(location).name}:{name}" if location else name} | options | hyperparameters
 
 
-def _require_same_on_hosts(metadata: Mapping[str, dict[str, Any]], **others: Any) -> None:
-    """Check that all hosts have the same metadata of each training, by name, and the same other settings."""
+def _require_same_on_hosts(metadata: Mapping[str, dict[str, Any]], **other_settings: Any) -> None:
+    """Check that all hosts have the same settings of each training, by its name, and the same other settings."""
     runs = {
         name: _fixed_settings(x["settings"]) | x["settings"]["config"] | {"code": x["code"]}
         for name, x in metadata.items()
     }
     settings = {f"{name} {key}".strip(): x for name, run in runs.items() for key, x in run.items()}
-    require_same_settings({"trainings": list(metadata)} | others | settings)
+    require_same_settings({"trainings": list(metadata)} | other_settings | settings)
 
 
 @contextmanager
 def _iteration_bar(total: int, n_done: int, enabled: bool) -> Iterator[Callable[..., None]]:
-    """Yield a function that shows metrics on a progress bar, or does nothing if not ``enabled`` or without tqdm."""
+    """Yield a function that shows metrics on a progress bar, or that does nothing without ``enabled`` or tqdm."""
     bar = progress_bar(unit="iteration", total=total, initial=n_done, ncols=100) if enabled else None
     if bar is None:
         yield lambda *_: None

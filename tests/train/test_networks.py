@@ -223,7 +223,7 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
     config = ppo.Config(critic="privileged")
     agent = take_seed(learner.agents, 0)
     values = [
-        ppo._value(agent, agent.stats.normalize(ppo._critic_obs(obs, config)), (), config)[0]
+        ppo._compute_value(agent, agent.stats.normalize(ppo._critic_obs(obs, config)), (), config)[0]
         for obs in (state.obs, other)
     ]
     assert np.abs(values[0] - values[1]).min() > 1e-4

@@ -571,7 +571,7 @@ def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
     n_truncated = 0
     for k in range(4):
         state = step(state, samples.action[k, 0])
-        value, _ = ppo._value(agent, agent.stats.normalize(flatten(state.info["final_obs"])), (), config)
+        value, _ = ppo._compute_value(agent, agent.stats.normalize(flatten(state.info["final_obs"])), (), config)
         truncated = np.asarray(state.truncated & ~state.terminated)[:, None]
         n_truncated += truncated.sum()
         np.testing.assert_allclose(samples.reward[k, 0], state.reward + 0.5 * truncated * value, atol=1e-5)
@@ -586,11 +586,11 @@ def test_values_stay_when_the_returns_that_scale_them_change(rng):
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     agent = take_seed(learner.agents, 0)
     obs = jnp.asarray(rng.normal(size=(5, agent.stats.mean.shape[0])), jnp.float32)
-    before = ppo._value(agent, obs, (), config)[0]
+    before = ppo._compute_value(agent, obs, (), config)[0]
     returns = agent.returns.update(jnp.asarray(rng.normal(30.0, 7.0, (1000, 1)), jnp.float32))
     after = agent.replace(value=ppo._rescale_value(agent.value, agent.returns, returns), returns=returns)
-    np.testing.assert_allclose(ppo._value(after, obs, (), config)[0], before, atol=30 * 1e-6)
-    assert np.abs(ppo._value(agent.replace(returns=returns), obs, (), config)[0] - before).min() > 1
+    np.testing.assert_allclose(ppo._compute_value(after, obs, (), config)[0], before, atol=30 * 1e-6)
+    assert np.abs(ppo._compute_value(agent.replace(returns=returns), obs, (), config)[0] - before).min() > 1
     np.testing.assert_allclose(ppo._return_std(returns), 7.0, rtol=0.1)
 
 
