@@ -10,7 +10,7 @@ from crazysim.core import functional as F
 
 
 def path_setpoint(path, t):
-    """Return the setpoint at a time of a path, a function of time to (x, y, z, yaw), which jax.jvp differentiates."""
+    """Return the setpoint of a path at a time. The path is a function of time to (x, y, z, yaw)."""
     values = []
     for _ in range(5):
         values.append(path)
@@ -20,14 +20,14 @@ def path_setpoint(path, t):
 
 
 def figure_eight(t, width=2.0, speed=2.0, height=1.0):
-    """Return the point at a time of a figure eight, ``width`` m long in x, half as long in y, of maximum ``speed``."""
+    """Return (x, y, z, yaw) of a figure eight at a time: ``width`` m in x, half of it in y, at most ``speed`` m/s."""
     rate = speed / (width / np.sqrt(2))
     x, y = width / 2 * jnp.sin(rate * t), width / 4 * jnp.sin(2 * rate * t)
     return jnp.stack([x, y, height + 0 * t, 0 * t])
 
 
 def hover(t):
-    """Return a point 1 m above the floor."""
+    """Return (x, y, z, yaw) of a point 1 m above the floor."""
     return jnp.stack([0 * t, 0 * t, 1 + 0 * t, 0 * t])
 
 
@@ -44,9 +44,9 @@ def start_on_path(sim, path):
 
 
 def fly(sim, law, path, seconds, memory=None, change=None):
-    """Return the states over time, and the setpoints, of one drone under ``law(data, setpoint, memory)``.
+    """Return states, setpoints and outputs over time under ``law(data, setpoint, memory)``, and the last data.
 
-    The law runs at every tick of the commands of ``sim``, whose level is the level of its output. ``change(data, t)``
+    The law runs at every tick of the commands of ``sim``; its outputs are such commands. ``change(data, t)``
     changes the data before each tick.
     """
     step, n_substeps = sim.build_step_fn(), sim.freq // sim.control_freq
@@ -72,7 +72,7 @@ def fly(sim, law, path, seconds, memory=None, change=None):
 
 
 def rms_error(states, setpoints, start=0.0, total=1.0):
-    """Return the root of the mean square of the position error, m, in the part of a flight after a fraction of it."""
+    """Return the RMS position error of a flight after its fraction ``start / total``, m."""
     error = np.linalg.norm(states.pos - np.asarray(setpoints.pos), axis=-1)
     return float(np.sqrt(np.mean(error[int(len(error) * start / total) :] ** 2)))
 

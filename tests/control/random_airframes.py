@@ -35,11 +35,11 @@ def draw_airframe(rng, n, name):
     """
     while True:
         mass, ratio, tau = log_uniform(rng, 0.02, 20), log_uniform(rng, 1.3, 10), log_uniform(rng, 0.002, 0.2)
-        arm, uneven = 0.17 * (mass / 0.5) ** 0.4 * rng.uniform(0.6, 1.4), rng.choice([0.0, 1.0])
-        angles = 2 * np.pi * (np.arange(n) + rng.choice([0.0, 0.5]) + uneven * rng.uniform(-0.15, 0.15, n)) / n
-        aspect, radii = rng.uniform(0.84, 1.18), arm * (1 + uneven * rng.uniform(-0.15, 0.15, n))
+        arm, asymmetry = 0.17 * (mass / 0.5) ** 0.4 * rng.uniform(0.6, 1.4), rng.choice([0.0, 1.0])
+        angles = 2 * np.pi * (np.arange(n) + rng.choice([0.0, 0.5]) + asymmetry * rng.uniform(-0.15, 0.15, n)) / n
+        aspect, radii = rng.uniform(0.84, 1.18), arm * (1 + asymmetry * rng.uniform(-0.15, 0.15, n))
         x, y = aspect * radii * np.cos(angles), radii * np.sin(angles) / aspect
-        x, y = (p - np.mean(p) + uneven * rng.uniform(-0.08, 0.08) * arm for p in (x, y))
+        x, y = (p - np.mean(p) + asymmetry * rng.uniform(-0.08, 0.08) * arm for p in (x, y))
         signs = np.array([1, -1] * (n // 2) + [1] * (n % 2))
         size = rng.uniform(0.3, 1.0) * mass
         inertia = size * np.array([np.mean(y**2), np.mean(x**2), 0]) * rng.uniform(0.8, 1.25, 3)
@@ -137,20 +137,20 @@ def alternation(sim):
     return np.abs(np.diff(commands, 2, axis=0)).max((0, 1, 3)) / hover
 
 
-def fly_airframes(airframes, controller, worlds, seconds, seed, **start):
+def fly_airframes(airframes, controller, n_worlds, seconds, seed, **start):
     """Return the distances from the setpoint and heights after each 0.1 s, m, and the alternation of rotors at the end.
 
     (n_times, n_worlds, n_drones), the same, (n_drones,)
     """
-    sim = Sim(worlds, drone=airframes, control="state", controller=controller)
+    sim = Sim(n_worlds, drone=airframes, control="state", controller=controller)
     throw_drones(sim, seed, **start)
     sim.state_control(pos=[0.0, 0.0, 0.0])
-    track = []
+    positions = []
     for _ in range(round(10 * seconds)):
         sim.step(50)
-        track.append(np.asarray(sim.data.states.pos))
-    track = np.array(track)
-    return np.linalg.norm(track, axis=-1), track[..., 2], alternation(sim)
+        positions.append(np.asarray(sim.data.states.pos))
+    positions = np.array(positions)
+    return np.linalg.norm(positions, axis=-1), positions[..., 2], alternation(sim)
 
 
 def settling_time(distances, limit):

@@ -35,7 +35,7 @@ def test_a_wrench_within_the_limits_is_given_exactly(name, thrusts):
 
 
 @given(cmd=arrays(np.float64, 4, elements=st.floats(-1, 1, allow_subnormal=False)))
-def test_law_09_every_rotor_stays_within_its_limits_or_stands(cmd):
+def test_law_09_every_rotor_stays_within_its_limits_or_stops(cmd):
     _, params = setup()
     thrusts = quadratic_curve(allocate(cmd, params=params), params.rpm2thrust)
     if cmd[0] <= 0:

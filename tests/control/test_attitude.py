@@ -17,13 +17,15 @@ from crazysim.control import AttitudeParams, attitude2force_torque, body_rate2fo
 pytestmark = pytest.mark.usefixtures("x64")
 
 LEVEL, ZERO = np.array([0.0, 0, 0, 1]), np.zeros(3)
-HALF = 0.4  # N, half of what the four rotors give: as far from every limit as can be
+HALF_THRUST = 0.4  # N, half of the largest thrust of the four rotors, far from all limits
 attitude = jax.jit(attitude2force_torque, static_argnames="ctrl_freq")
 body_rate = jax.jit(body_rate2force_torque, static_argnames="ctrl_freq")
 params = functools.partial(controller_params, AttitudeParams)
 
 
-def hold(cmd, quat=LEVEL, rates=ZERO, desired=ZERO, before=None, desired_before=None, integral=ZERO, freq=500, p=None):
+def run_controller(
+    cmd, quat=LEVEL, rates=ZERO, desired=ZERO, before=None, desired_before=None, integral=ZERO, freq=500, p=None
+):
     before = rates if before is None else before
     desired_before = desired if desired_before is None else desired_before
     args = (quat, rates, np.asarray(cmd, float), desired, before, desired_before, integral, freq)
@@ -31,27 +33,27 @@ def hold(cmd, quat=LEVEL, rates=ZERO, desired=ZERO, before=None, desired_before=
 
 
 def torque_of_pwm(roll, pitch, yaw):
-    """Return the torque that PWM commands become on a Crazyflie, N m: the firmware mixes roll/2, pitch/2, yaw."""
+    """Return the torque of PWM commands on a Crazyflie, N m: the firmware mixes roll/2, pitch/2, yaw."""
     newton, arm, yaw_arm = 0.2 / 65535, 0.035355, 0.00593893393599368
     return np.array([4 * roll / 2 * newton * arm, 4 * pitch / 2 * newton * arm, 4 * yaw * newton * yaw_arm])
 
 
-def test_at_its_attitude_it_passes_the_thrust_on():
-    wrench, integral = hold([0, 0, 0, HALF])
-    np.testing.assert_allclose(wrench, [HALF, 0, 0, 0], atol=1e-15)
+def test_at_the_desired_attitude_the_wrench_is_the_thrust():
+    wrench, integral = run_controller([0, 0, 0, HALF_THRUST])
+    np.testing.assert_allclose(wrench, [HALF_THRUST, 0, 0, 0], atol=1e-15)
     np.testing.assert_array_equal(integral, ZERO)
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_it_turns_towards_the_wanted_attitude(axis):
+def test_the_torque_turns_the_drone_towards_the_desired_attitude(axis):
     """By hand: a small error e about one axis is vee(Rd^T R - R^T Rd) = 2 sin e, times kR, in PWM."""
-    cmd = np.array([0, 0, 0, HALF])
+    cmd = np.array([0, 0, 0, HALF_THRUST])
     cmd[axis] = 0.02
     p = params(ki_m=ZERO)
-    wrench, _ = hold(cmd, p=p)
+    wrench, _ = run_controller(cmd, p=p)
     pwm = np.zeros(3)
     pwm[axis] = 2 * np.sin(0.02) * p.kR[axis]
-    np.testing.assert_allclose(wrench, [HALF, *torque_of_pwm(*pwm)], atol=1e-9)
+    np.testing.assert_allclose(wrench, [HALF_THRUST, *torque_of_pwm(*pwm)], atol=1e-9)
     assert wrench[1 + axis] > 0
 
 
@@ -59,14 +61,14 @@ def test_it_turns_towards_the_wanted_attitude(axis):
     quat=vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1),
     rpy=st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3)).map(np.array),
 )
-def test_rotation_error_is_that_of_mellinger_and_kumar(quat, rpy):
-    """Eq. 10 without its one half; small gains keep every limit far."""
+def test_the_rotation_error_agrees_with_mellinger_and_kumar(quat, rpy):
+    """Eq. 10 without its one half; small gains avoid all limits."""
     p = params(kR=[100.0, 100, 100], ki_m=ZERO)
     quat = quat / np.linalg.norm(quat)
     now, desired = Rotation.from_quat(quat).as_matrix(), Rotation.from_euler("ZYX", rpy[::-1]).as_matrix()
     difference = desired.T @ now - now.T @ desired
     error = np.array([difference[2, 1], difference[0, 2], difference[1, 0]])
-    wrench, integral = hold([*rpy, HALF], quat, p=p)
+    wrench, integral = run_controller([*rpy, HALF_THRUST], quat, p=p)
     np.testing.assert_allclose(wrench[1:], torque_of_pwm(*(-100 * error)), atol=1e-9)
     np.testing.assert_allclose(integral, np.clip(-error / 500, -p.int_err_max, p.int_err_max), atol=1e-12)
 
@@ -74,25 +76,27 @@ def test_rotation_error_is_that_of_mellinger_and_kumar(quat, rpy):
 @given(rates=vectors(3, 0.3), desired=vectors(3, 0.3))
 def test_rate_error_is_damped(rates, desired):
     p = params(kd_omega=ZERO, ki_m=ZERO)
-    wrench, _ = hold([0, 0, 0, HALF], rates=rates, desired=desired, p=p)
+    wrench, _ = run_controller([0, 0, 0, HALF_THRUST], rates=rates, desired=desired, p=p)
     np.testing.assert_allclose(wrench[1:], torque_of_pwm(*(np.asarray(p.kw) * (desired - rates))), atol=1e-12)
 
 
 @pytest.mark.parametrize("freq", [100, 500])
-def test_the_derivative_acts_on_roll_and_pitch_and_knows_its_rate(freq):
+def test_the_derivative_acts_on_roll_and_pitch_at_any_rate(freq):
     p = params(kw=ZERO, ki_m=ZERO, kd_omega=[200.0, 200.0, 200.0])
     before, now = np.array([0.0, 0.01, -0.01]), np.array([0.01, -0.01, 0.02])
-    wrench, _ = hold([0, 0, 0, HALF], rates=now, before=before, freq=freq, p=p)
+    wrench, _ = run_controller([0, 0, 0, HALF_THRUST], rates=now, before=before, freq=freq, p=p)
     pwm = -200 * (now - before) * freq * [1, 1, 0]
     np.testing.assert_allclose(wrench[1:], torque_of_pwm(*pwm), atol=1e-12)
-    # A jump of the desired rates counts the other way round, so following them exactly costs nothing.
-    wrench, _ = hold([0, 0, 0, HALF], rates=now, before=before, desired=now, desired_before=before, freq=freq, p=p)
+    # The derivative of the desired rates is subtracted: a drone that follows them exactly gets no torque.
+    wrench, _ = run_controller(
+        [0, 0, 0, HALF_THRUST], rates=now, before=before, desired=now, desired_before=before, freq=freq, p=p
+    )
     np.testing.assert_allclose(wrench[1:], ZERO, atol=1e-15)
 
 
 def test_the_integral_acts_and_is_limited():
     p = params(ki_m=[0, 0, 500.0], kR=ZERO, int_err_max=[1.0, 1.0, 2.0])
-    wrench, integral = hold([0, 0, 0, HALF], integral=np.array([0, 0, 5.0]), p=p)
+    wrench, integral = run_controller([0, 0, 0, HALF_THRUST], integral=np.array([0, 0, 5.0]), p=p)
     np.testing.assert_allclose(integral, [0, 0, 2.0])
     np.testing.assert_allclose(wrench[1:], torque_of_pwm(0, 0, 1000.0), atol=1e-15)
 
@@ -100,7 +104,7 @@ def test_the_integral_acts_and_is_limited():
 @given(cmd=vectors(4, 3.0), rates=vectors(3, 30))
 def test_law_09_thrusts_saturate_rotor_by_rotor_as_documented(cmd, rates):
     """The output is possible with four rotors, each between pwm_min and full thrust, or all of them off."""
-    wrench, _ = hold(cmd, rates=rates)
+    wrench, _ = run_controller(cmd, rates=rates)
     airframe = load_airframe("cf21B_500")
     mixing = np.vstack([np.ones(4), airframe.mixing_matrix * [[0.035355], [0.035355], [0.00593893393599368]]])
     thrusts = np.linalg.solve(mixing, wrench)
@@ -113,13 +117,13 @@ def test_law_09_thrusts_saturate_rotor_by_rotor_as_documented(cmd, rates):
 
 def test_torque_commands_saturate_one_by_one():
     p = params(torque_pwm_max=[100.0, 200.0, 300.0])
-    wrench, _ = hold([1.0, 1.0, 1.0, HALF], p=p)
+    wrench, _ = run_controller([1.0, 1.0, 1.0, HALF_THRUST], p=p)
     np.testing.assert_allclose(wrench[1:], torque_of_pwm(100, 200, 300), atol=1e-12)
 
 
 @pytest.mark.parametrize("thrust", [0.0, -1.0])
 def test_fault_06_no_thrust_means_no_torque_either(thrust):
-    wrench, _ = hold([1.0, 1.0, 1.0, thrust], rates=np.ones(3))
+    wrench, _ = run_controller([1.0, 1.0, 1.0, thrust], rates=np.ones(3))
     np.testing.assert_array_equal(wrench, np.zeros(4))
 
 
@@ -127,19 +131,19 @@ def test_fault_06_no_thrust_means_no_torque_either(thrust):
 def test_body_rate_is_the_attitude_controller_at_level_with_the_present_yaw(rates, cmd, yaw):
     quat = Rotation.from_euler("ZYX", [yaw, 0.1, -0.2]).as_quat()
     before, cmd_before = 0.5 * rates, np.append(0.5 * cmd, 0.3)
-    out, integral = body_rate(quat, rates, np.append(cmd, HALF), before, cmd_before, ZERO, 500, params=params())
-    expected, expected_integral = hold(
-        [0, 0, yaw, HALF], quat, rates, desired=cmd, before=before, desired_before=cmd_before[:3]
+    out, integral = body_rate(quat, rates, np.append(cmd, HALF_THRUST), before, cmd_before, ZERO, 500, params=params())
+    expected, expected_integral = run_controller(
+        [0, 0, yaw, HALF_THRUST], quat, rates, desired=cmd, before=before, desired_before=cmd_before[:3]
     )
     np.testing.assert_allclose(out, expected, atol=1e-12)
     np.testing.assert_allclose(integral, expected_integral, atol=1e-12)
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_body_rate_alone_follows_rates_without_levelling(axis):
+def test_body_rate_without_attitude_gains_does_not_level(axis):
     """With kR and ki_m zero the attitude does not matter, as the docstring says."""
     p = params(kR=ZERO, ki_m=ZERO)
-    cmd = np.array([0, 0, 0, HALF])
+    cmd = np.array([0, 0, 0, HALF_THRUST])
     cmd[axis] = 0.1
     tilted = Rotation.from_euler("ZYX", [0.3, 0.8, -0.5]).as_quat()
     outs = [body_rate(q, ZERO, cmd, ZERO, cmd, ZERO, 500, params=p)[0] for q in (LEVEL, tilted)]
@@ -167,6 +171,8 @@ def test_law_07_gradients_are_finite_in_every_pose_and_at_saturation(level, dtyp
         return jnp.sum(wrench) + jnp.sum(integral)
 
     gradient = jax.jit(jax.vmap(jax.vmap(jax.grad(total, argnums=(0, 1, 2)), (None, None, 0)), (0, None, None)))
-    cmds = jnp.array([[0, 0, 0, HALF], [0, 0, 0, 0], [0, 0, 0, 99], [9, 9, 9, HALF], [0, 0, 0, -1]], dtype)
+    cmds = jnp.array(
+        [[0, 0, 0, HALF_THRUST], [0, 0, 0, 0], [0, 0, 0, 99], [9, 9, 9, HALF_THRUST], [0, 0, 0, -1]], dtype
+    )
     for out in gradient(jnp.array(list(POSES.values()), dtype), zero, cmds):
         assert np.all(np.isfinite(out))

@@ -45,7 +45,7 @@ def airframes():
 # Flights --------------------------------------------------------------------------------------------------------
 
 
-def test_every_airframe_goes_where_it_is_sent():
+def test_every_airframe_flies_as_accurately_as_documented():
     """The figures of the page on controllers for all built-in airframes and three generic ones."""
     found = benchmark().fly_airframes("auto", airframes(), 2.0, 100)
     assert len(found) == 11
@@ -68,7 +68,7 @@ def test_the_position_loop_flies_fitted_dynamics(dynamics):
         assert row["heavier"] < 0.01, (name, row)
 
 
-def flying(level, worlds, controller="auto", **settings):
+def hovering_sim(level, worlds, controller="auto", **settings):
     """Return a simulation of all airframes, high up at rest with rotors at hover, and their weights, N."""
     sim = Sim(worlds, drone=airframes(), control=level, controller=controller, **settings)
     s, high = sim.data.states, np.zeros((worlds, len(airframes()), 3), np.float32)
@@ -79,7 +79,7 @@ def flying(level, worlds, controller="auto", **settings):
 
 
 @pytest.mark.parametrize("level", ["attitude", "body_rate"])
-def test_steps_of_the_command_settle_without_overshoot(level):
+def test_steps_of_the_command_settle_with_little_overshoot(level):
     """Overshoot is at most 10%, the error 2% after 2 s, and half of a step takes 0.3 s, for yaw 0.6 s."""
     y = benchmark().step_responses("auto", airframes(), level)
     assert y.max() < 1.1
@@ -89,8 +89,8 @@ def test_steps_of_the_command_settle_without_overshoot(level):
 
 
 def test_body_rates_are_followed_and_nothing_levels_the_drone():
-    """Half a turn of roll in 1 s at pi rad/s: CTBR."""
-    sim, weights = flying("body_rate", 1)
+    """Half a turn of roll in 1 s at pi rad/s."""
+    sim, weights = hovering_sim("body_rate", 1)
     sim.body_rate_control(np.stack([np.array([np.pi, 0, 0, w], np.float32) for w in weights])[None])
     sim.step(500)
     tilt = np.arccos(np.clip(1 - 2 * np.sum(np.asarray(sim.data.states.quat)[0, :, :2] ** 2, axis=-1), -1, 1))
@@ -98,7 +98,7 @@ def test_body_rates_are_followed_and_nothing_levels_the_drone():
 
 
 def test_the_third_entry_of_an_attitude_may_be_a_yaw_rate():
-    sim, weights = flying("attitude", 1, Auto(yaw_rate=True))
+    sim, weights = hovering_sim("attitude", 1, Auto(yaw_rate=True))
     sim.attitude_control(np.stack([np.array([0.2, 0.0, 0.8, w], np.float32) for w in weights])[None])
     sim.step(1500)
     quat, ang_vel = np.asarray(sim.data.states.quat)[0], np.asarray(sim.data.states.ang_vel)[0]
@@ -109,15 +109,15 @@ def test_the_third_entry_of_an_attitude_may_be_a_yaw_rate():
 
 @pytest.mark.parametrize("level", ["attitude", "body_rate"])
 def test_zero_thrust_switches_the_motors_off(level):
-    sim, _ = flying(level, 1)
+    sim, _ = hovering_sim(level, 1)
     getattr(sim, f"{level}_control")(np.full((1, len(airframes()), 4), [0.3, -0.2, 0.1, 0.0], np.float32))
     sim.step(10)
     np.testing.assert_array_equal(sim.data.controls.rotor_vel, 0.0)
 
 
 def test_an_unknown_torque_leaves_no_error():
-    """A torque that would turn each drone by 0.2 rad under its gains alone."""
-    sim, weights = flying("attitude", 1)
+    """Without an estimate the torque would turn each drone by 0.2 rad."""
+    sim, weights = hovering_sim("attitude", 1)
     params = sim.data.controls.controller.params
     torque = 0.2 * np.asarray(params.torque_max)[:1] / 0.5
     sim.data = sim.data.replace(states=sim.data.states.replace(torque=jnp.asarray(torque * [1.0, -1.0, 0.0])))
@@ -133,7 +133,7 @@ def test_an_unknown_torque_leaves_no_error():
 @pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy", "so_rpy_rotor_drag"])
 @pytest.mark.parametrize("acc", [-9.81, -9.5, -9.0])
 def test_a_fall_does_not_turn_a_drone_on_its_back(dynamics, acc):
-    """Compensation of drag and estimates may then need more downward acceleration than gravity, or any direction."""
+    """With drag and estimates compensated, the desired force may then point down, or in any direction."""
     sim = Sim(dynamics=dynamics, control="state", controller="auto", engine="lanes")
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(100.0)))
@@ -156,7 +156,7 @@ def test_a_setpoint_that_falls_faster_than_gravity_turns_a_drone_over():
 
 def test_a_far_setpoint_is_approached_without_losing_height():
     """For a setpoint 30 m aside, the feedback limits the tilt to what the rotors can carry."""
-    sim, _ = flying("state", 1)
+    sim, _ = hovering_sim("state", 1)
     command = np.zeros((1, len(airframes()), 16), np.float32)
     command[..., :3], command[..., 12] = [30.0, 0.0, HIGH], 1.0
     sim.state_control(command)
@@ -176,7 +176,7 @@ def test_a_far_setpoint_is_approached_without_losing_height():
     body=np.array([0.74740932, 0, 0, -0.66436384]), desired=np.array([0.10349082, 0.98124632, 0.1149898, 0.1149898])
 )
 def test_the_rotation_error_is_a_shortest_tilt_and_a_turn(body, desired):
-    """The error of SciPy's rotations, whose length is 2 sin(angle / 2)."""
+    """Against SciPy's rotations; tilt and turn have the length 2 sin(angle / 2)."""
     relative = Rotation.from_quat(body).inv() * Rotation.from_quat(desired)
     z = relative.as_matrix()[:, 2]
     tilt = np.arccos(np.clip(z[2], -1, 1))
@@ -186,20 +186,20 @@ def test_the_rotation_error_is_a_shortest_tilt_and_a_turn(body, desired):
     axis = axis / max(np.linalg.norm(axis), 1e-12)
     turn = (Rotation.from_rotvec(tilt * axis).inv() * relative).as_rotvec()[2]
     expected = 2 * np.array([*(np.sin(tilt / 2) * axis[:2]), np.sin(turn / 2)])
-    found = np.asarray(jitted_quat(relative.as_quat().astype(np.float32)))
+    found = np.asarray(jitted_quat_error(relative.as_quat().astype(np.float32)))
     np.testing.assert_allclose(found[:2], expected[:2], atol=5e-3)
     np.testing.assert_allclose(np.abs(found[2]), np.abs(expected[2]), atol=5e-3)
     if abs(turn) < 3.0:
         np.testing.assert_allclose(found[2], expected[2], atol=5e-3)
 
 
-jitted_quat = jax.jit(quat_error)
+jitted_quat_error = jax.jit(quat_error)
 
 
 def test_upside_down_the_error_is_a_full_turn_about_x():
     """The direction of the shortest turn is undefined there, but the drone must not stay there."""
-    np.testing.assert_allclose(jitted_quat(np.float32([1, 0, 0, 0])), [2, 0, 0])
-    np.testing.assert_allclose(jitted_quat(np.float32([0, 0, 1, 0]))[2], 2.0, atol=1e-3)  # turned by 180 degrees
+    np.testing.assert_allclose(jitted_quat_error(np.float32([1, 0, 0, 0])), [2, 0, 0])
+    np.testing.assert_allclose(jitted_quat_error(np.float32([0, 0, 1, 0]))[2], 2.0, atol=1e-3)  # turned by 180 degrees
 
 
 def test_the_gains_are_damped_as_documented():
@@ -224,7 +224,7 @@ def test_gains_by_hand():
     np.testing.assert_allclose(p.stiffness, 0.12 * rate**2 * np.array([1, 1, 0.25]))
     np.testing.assert_allclose(p.position.damping, 2 * 0.4 / (5 / rate + 0.5 / 100))
     slow = AutoParams.create(load_airframe("cf2x_L250"), 500, 100)
-    np.testing.assert_allclose(slow.lead, 5.0)  # the most
+    np.testing.assert_allclose(slow.lead, 5.0)  # the largest lead
     assert AutoParams.create(airframe, 50, 50).lead < p.lead  # half of what is missing in a tick of 20 ms
 
 
@@ -270,7 +270,7 @@ def test_heavy_rotors_give_yaw_torque_by_their_acceleration():
     assert np.all(gain > 0.95 * lag * reaction * share)
 
 
-def test_the_drag_torque_over_thrust_of_the_curves_is_that_of_the_tables():
+def test_the_drag_torque_over_thrust_of_the_curves_agrees_with_the_tables():
     """Derived from thrust and torque curves around hover, within 15% of the firmware's number where there is one."""
     for name in ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "crazyflie", "bumblebee", "bumblebee_lab"):
         airframe = load_airframe(name)
@@ -285,19 +285,19 @@ def test_the_drag_torque_over_thrust_of_the_curves_is_that_of_the_tables():
 )
 def test_any_state_and_command_give_finite_rotor_speeds(quat, pos, vel, ang_vel, command):
     """Outputs are finite at every level, from saturation to free fall, and so is the memory."""
-    for level, run in steppers().items():
+    for level, run in steps_of_levels().items():
         data, step = run
         s = data.states
-        new = {"pos": pos, "quat": quat, "vel": vel, "ang_vel": ang_vel}
-        states = s.replace(**{key: jnp.asarray(x, jnp.float32)[None, None] for key, x in new.items()})
-        given = np.concatenate([command, command, command, [0, 0, 0, 0]]) if level == "state" else command
-        out = step(data.replace(states=states), jnp.asarray(given, jnp.float32)[None, None])
+        changes = {"pos": pos, "quat": quat, "vel": vel, "ang_vel": ang_vel}
+        states = s.replace(**{key: jnp.asarray(x, jnp.float32)[None, None] for key, x in changes.items()})
+        full_command = np.concatenate([command, command, command, [0, 0, 0, 0]]) if level == "state" else command
+        out = step(data.replace(states=states), jnp.asarray(full_command, jnp.float32)[None, None])
         for leaf in jax.tree.leaves((out.states, out.controls)):
             assert np.isfinite(leaf).all(), level
 
 
 @functools.cache
-def steppers():
+def steps_of_levels():
     """Return data and a compiled step with a command, for every level that the controller follows."""
     found = {}
     for level in ("state", "attitude", "body_rate"):
@@ -316,8 +316,8 @@ def test_gradients_equal_central_differences(level, rng):
     command = getattr(F, f"{level}_control")
     step, s = build_stagewise_step(sim), sim.data.states
     rotor_vel = first_principles.hover_rotor_vel(sim.data.params)
-    wanted = {"state": [*rng.normal(size=9), 0, 0, 0.3, 0.9, 0, 0, 0.2], "attitude": [0.2, -0.1, 0.3, 0.5]}
-    wanted["body_rate"] = wanted["attitude"]
+    commands = {"state": [*rng.normal(size=9), 0, 0, 0.3, 0.9, 0, 0, 0.2], "attitude": [0.2, -0.1, 0.3, 0.5]}
+    commands["body_rate"] = commands["attitude"]
 
     def end(x):
         states = s.replace(
@@ -326,7 +326,7 @@ def test_gradients_equal_central_differences(level, rng):
             ang_vel=s.ang_vel + x[6:9],
             rotor_vel=jnp.broadcast_to(rotor_vel, s.rotor_vel.shape) * (1 + 0.1 * x[9:13]),
         )
-        data = command(sim.data.replace(states=states), jnp.asarray(wanted[level])[None, None] * (1 + x[13]))
+        data = command(sim.data.replace(states=states), jnp.asarray(commands[level])[None, None] * (1 + x[13]))
         out = step(data, 10).states
         return jnp.sum(out.pos * jnp.array([1.0, 2.0, 3.0])) + jnp.sum(out.quat) + 1e-2 * jnp.sum(out.ang_vel)
 
@@ -340,9 +340,9 @@ def test_gradients_equal_central_differences(level, rng):
 
 
 @pytest.mark.parametrize("level", ["state", "attitude", "body_rate"])
-def test_worlds_and_drones_fly_alike_alone_and_together(level):
-    """``f(batch)[i] == f(batch[i])``, fused: every drone of a mixed batch, by rounding of different code, 1e-4."""
-    together, weights = flying(level, 2, strict=True)
+def test_a_drone_flies_alike_by_itself_and_in_a_mixed_batch(level):
+    """``f(batch)[i] == f(batch[i])`` up to 1e-4, the rounding of different fused code."""
+    mixed_sim, weights = hovering_sim(level, 2, strict=True)
     n = len(weights)
     command = np.zeros((2, n, 16 if level == "state" else 4), np.float32)
     if level == "state":
@@ -350,22 +350,24 @@ def test_worlds_and_drones_fly_alike_alone_and_together(level):
         command[1, :, 0] = -1.0
     else:
         command[..., 3], command[0, :, 0], command[1, :, 1] = weights, 0.3, -0.4
-    getattr(together, f"{level}_control")(command)
-    together.step(100)
+    getattr(mixed_sim, f"{level}_control")(command)
+    mixed_sim.step(100)
     for k in (0, n - 1):
-        alone = Sim(drone=airframes()[k], control=level, controller="auto", strict=True)
-        s = alone.data.states
-        rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(alone.data.params), s.rotor_vel.shape)
-        alone.data = alone.data.replace(states=s.replace(pos=s.pos + np.array([0, 0, HIGH]), rotor_vel=rotor_vel))
-        getattr(alone, f"{level}_control")(command[1:, k : k + 1])
-        alone.step(100)
+        single_sim = Sim(drone=airframes()[k], control=level, controller="auto", strict=True)
+        s = single_sim.data.states
+        rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(single_sim.data.params), s.rotor_vel.shape)
+        single_sim.data = single_sim.data.replace(
+            states=s.replace(pos=s.pos + np.array([0, 0, HIGH]), rotor_vel=rotor_vel)
+        )
+        getattr(single_sim, f"{level}_control")(command[1:, k : k + 1])
+        single_sim.step(100)
         for name in ("pos", "quat", "vel", "ang_vel"):
-            mine, ours = getattr(alone.data.states, name)[0, 0], getattr(together.data.states, name)[1, k]
-            np.testing.assert_allclose(ours, mine, atol=1e-4, err_msg=name)
+            single, mixed = getattr(single_sim.data.states, name)[0, 0], getattr(mixed_sim.data.states, name)[1, k]
+            np.testing.assert_allclose(mixed, single, atol=1e-4, err_msg=name)
 
 
 @pytest.mark.parametrize("drone", ["cf21B_500", "cf2x_T350", "bumblebee"])
-def test_a_slow_climb_beside_the_start_leaves_the_floor(drone):
+def test_drones_beside_the_start_of_a_slow_climb_leave_the_floor(drone):
     """The floor stops every motion of a drone on it, so measurements there must not tilt the drone."""
     sim = Sim(n_worlds=32, drone=drone, control="state")
     away = np.random.default_rng(0).uniform(-2.0, 2.0, (32, 1, 2))

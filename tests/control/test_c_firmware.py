@@ -95,7 +95,7 @@ def library(tmp_path_factory):
     """Return the path of a compiled library for its source."""
     folder = tmp_path_factory.mktemp("c")
 
-    def compiled(name, source):
+    def compile_library(name, source):
         path = folder / f"{name}.so"
         if not path.exists():
             (folder / f"{name}.c").write_text(source)
@@ -103,7 +103,7 @@ def library(tmp_path_factory):
             subprocess.run([*words, f"-I{CFirmware.include}", folder / f"{name}.c", "-o", path], check=True)
         return path
 
-    return compiled
+    return compile_library
 
 
 class HeightMemory(PyTree):
@@ -132,8 +132,8 @@ class Height(Controller):
         return jnp.broadcast_to(jnp.where(thrust > 0, speed, 0.0), (4,)), HeightMemory(throttle)
 
 
-def flown(controller, n_steps=1000):
-    """Return a simulation whose drones rise to different heights."""
+def fly_to_heights(controller, n_steps=1000):
+    """Return a simulation after some steps in which each drone rises to its own height."""
     sim = Sim(WORLDS, DRONES, control="state", controller=controller)
     pos = np.array(sim.data.states.pos)
     pos[..., 2] = np.linspace(0.5, 2.0, WORLDS * DRONES).reshape(WORLDS, DRONES)
@@ -143,15 +143,15 @@ def flown(controller, n_steps=1000):
 
 
 def test_a_law_in_c_flies_as_the_same_law_in_jax(library):
-    found = flown(CFirmware(library("hover", HOVER)))
-    expected = flown(Height())
+    found = fly_to_heights(CFirmware(library("hover", HOVER)))
+    expected = fly_to_heights(Height())
     assert np.ptp(expected.data.states.pos[..., 2]) > 1.0
-    # The two round differently at each of 1,000 steps, by parts of 1e-7.
+    # Both laws round differently, by 1e-7 in each of 1,000 steps.
     np.testing.assert_allclose(found.data.states.pos, expected.data.states.pos, atol=1e-5)
 
 
-def test_it_remembers_each_drone_until_its_world_is_reset(library):
-    sim = flown(CFirmware(library("hover", HOVER)), n_steps=20)
+def test_the_memory_of_each_drone_lasts_until_its_world_is_reset(library):
+    sim = fly_to_heights(CFirmware(library("hover", HOVER)), n_steps=20)
     sim.reset(np.arange(WORLDS) == 1)
     sim.step(5)
     memory = np.asarray(sim.data.controls.controller.memory.words)
@@ -160,7 +160,7 @@ def test_it_remembers_each_drone_until_its_world_is_reset(library):
 
 
 @pytest.mark.parametrize("level", ["state", "attitude", "body_rate"])
-def test_it_receives_state_command_and_time(library, level):
+def test_a_library_receives_state_command_and_time(library, level):
     sim = Sim(2, 1, control=level, controller=CFirmware(library("echo", ECHO), motors="thrust", freq=250))
     rng = np.random.default_rng(1)
     quat = rng.normal(size=(2, 1, 4))
@@ -178,41 +178,43 @@ def test_it_receives_state_command_and_time(library, level):
     sim.step(1)
     memory = np.asarray(sim.data.controls.controller.memory.words)
     received, clock = memory[..., :-1].view(np.float32), np.float32([2 / 500, 1 / 250])
-    given = np.zeros((2, 1, 24), np.float32)
-    given[..., : command.shape[-1]] = command
+    expected_command = np.zeros((2, 1, 24), np.float32)
+    expected_command[..., : command.shape[-1]] = command
     if level == "state":
-        given[..., 16:] = sim.data.controls.state.feedforward
-        assert given[0, 0, 22] == command[0, 0, 15]  # the yaw rate
-    rows = [states.pos, states.quat, states.vel, states.ang_vel, given]
+        expected_command[..., 16:] = sim.data.controls.state.feedforward
+        assert expected_command[0, 0, 22] == command[0, 0, 15]  # the yaw rate
+    rows = [states.pos, states.quat, states.vel, states.ang_vel, expected_command]
     expected = np.concatenate([np.broadcast_to(clock, (2, 1, 2)), *map(np.asarray, rows)], axis=-1)
     np.testing.assert_array_equal(received, expected)
     assert np.all(memory[..., -1] == ["state", "attitude", "body_rate"].index(level))
 
 
 @pytest.mark.parametrize("motors", ["throttle", "thrust", "rpm"])
-def test_motor_commands_have_the_unit_that_was_named(library, motors):
+def test_motor_commands_have_the_unit_of_the_setting_motors(library, motors):
     sim = Sim(1, 1, drone="bumblebee", control="attitude", controller=CFirmware(library("echo", ECHO), motors=motors))
     sim.step(1)
     commanded, params = np.asarray(sim.data.controls.rotor_vel[0, 0]), sim.data.controls.controller.params
-    given = np.array([0.0, 0.1, 0.2, 0.3])
+    motor_commands = np.array([0.0, 0.1, 0.2, 0.3])
     if motors == "rpm":
-        idle = float(sim.data.params.rotor_vel_min[0])  # what turns, turns at least so fast
-        np.testing.assert_allclose(commanded, np.where(given > 0, np.maximum(given, idle), 0), rtol=1e-6)
+        idle = float(sim.data.params.rotor_vel_min[0])  # the lowest speed of a rotor that turns
+        np.testing.assert_allclose(
+            commanded, np.where(motor_commands > 0, np.maximum(motor_commands, idle), 0), rtol=1e-6
+        )
         return
-    least, most = float(params.thrust_min[0]), float(params.thrust_max[0])
-    thrust = np.clip(given * (most if motors == "throttle" else 1.0), least, most)
+    min_thrust, max_thrust = float(params.thrust_min[0]), float(params.thrust_max[0])
+    thrust = np.clip(motor_commands * (max_thrust if motors == "throttle" else 1.0), min_thrust, max_thrust)
     assert commanded[0] == 0
     # The inverse of the curve is a square root in float32.
     np.testing.assert_allclose(quadratic_curve(commanded, params.rpm2thrust)[1:], thrust[1:], rtol=1e-4)
 
 
 def test_the_step_is_split_without_a_warning_and_explained(library):
-    sim = flown(CFirmware(library("hover", HOVER)), n_steps=1)
+    sim = fly_to_heights(CFirmware(library("hover", HOVER)), n_steps=1)
     assert "'state_controller' is not fused" in sim.explain()
     assert "it calls a function on the host" in sim.explain()
 
 
-def test_a_library_that_is_compiled_again_is_another_one_to_the_next_controller(tmp_path):
+def test_a_new_controller_loads_a_library_that_was_compiled_again(tmp_path):
     sims = []
     for rpm in (9000, 12000):
         (tmp_path / "constant.c").write_text(CONSTANT.replace("RPM", f"{rpm}"))
@@ -225,11 +227,11 @@ def test_a_library_that_is_compiled_again_is_another_one_to_the_next_controller(
         np.testing.assert_array_equal(sim.data.controls.rotor_vel, np.full((1, 1, 4), rpm))
 
 
-def test_the_example_hands_the_firmware_what_it_expects(tmp_path):
-    """The types are from stabilizer_types.h of the firmware, the controller a sum of what it receives."""
+def test_the_example_gives_the_firmware_its_inputs(tmp_path):
+    """The types are those of the firmware's stabilizer_types.h; the controller returns sums of its inputs."""
     for name in ("math3d", "controller_lee", "controller_mellinger", "power_distribution"):
         (tmp_path / f"{name}.h").write_text(STAND_IN if name == "math3d" else '#include "math3d.h"')
-    words = [
+    command_line = [
         "cc",
         "-shared",
         "-fPIC",
@@ -240,7 +242,7 @@ def test_the_example_hands_the_firmware_what_it_expects(tmp_path):
         f"-I{CFirmware.include}",
         "-I.",
     ]
-    subprocess.run([*words, EXAMPLE, "-o", "lee.so"], cwd=tmp_path, check=True)
+    subprocess.run([*command_line, EXAMPLE, "-o", "lee.so"], cwd=tmp_path, check=True)
     controller = CFirmware(tmp_path / "lee.so")
     memory = np.asarray(controller.memory(None).words)
     x = np.arange(1.0, 40.0, dtype=np.float32) / 8  # time, dt, pos, quat, vel, ang_vel, command

@@ -96,17 +96,17 @@ def test_memory_of_crazyflows_cascade_is_read_under_crazyflows_names(control):
     if control == "state":  # the body rates of a state command go along with the attitude
         assert controls.state.feedforward is controls.state.staged_feedforward is None
         np.testing.assert_array_equal(controls.attitude.staged_ang_vel_des, command[..., 13:])
-    others = Sim(control=control).data.controls
+    other_controls = Sim(control=control).data.controls
     for level, memory in names.items():
-        record = getattr(others, level)
+        record = getattr(other_controls, level)
         assert record is None or all(getattr(record, name) is None for name in memory)
 
 
 def test_gains_of_crazyflow_are_set_under_crazyflows_names():
     sim = Sim(control="attitude", controller="crazyflow", engine="interpret")
     controls, ctrl = sim.data.controls, sim.data.controls.attitude
-    twice = ctrl.params.replace(kR=2 * ctrl.params.kR)
-    sim.data = sim.data.replace(controls=controls.replace(attitude=ctrl.replace(params=twice)))
+    doubled = ctrl.params.replace(kR=2 * ctrl.params.kR)
+    sim.data = sim.data.replace(controls=controls.replace(attitude=ctrl.replace(params=doubled)))
     np.testing.assert_array_equal(sim.data.controls.controller.params.kR, 2 * ctrl.params.kR)
     own = sim.data.controls.controller
     sim.data = sim.data.replace(controls=sim.data.controls.replace(controller=own.replace(params=ctrl.params)))
@@ -161,7 +161,7 @@ def test_a_controller_of_attitudes_is_followed_by_its_inner_one():
 
 
 def test_the_cascade_of_crazyflow_takes_turns_with_another_controller():
-    """At the levels that the cascade follows, it flies in a switch as it does alone."""
+    """At the levels that the cascade follows, it flies in a switch as it does without one."""
     command = np.array([[[0.1, -0.1, 0.3, 0.33]]])
 
     def fly(**settings):
@@ -171,7 +171,7 @@ def test_the_cascade_of_crazyflow_takes_turns_with_another_controller():
         sim.step(50)
         return np.asarray(sim.data.states.quat)
 
-    alone, first, second = (
+    without_switch, cascade, mellinger = (
         fly(**settings)
         for settings in (
             {"controller": "crazyflow"},
@@ -179,13 +179,13 @@ def test_the_cascade_of_crazyflow_takes_turns_with_another_controller():
             {"controller": ["crazyflow", "mellinger"], "switch": 1},
         )
     )
-    np.testing.assert_allclose(first, alone, atol=1e-6)
-    assert np.abs(second - alone).max() > 1e-4
+    np.testing.assert_allclose(cascade, without_switch, atol=1e-6)
+    assert np.abs(mellinger - without_switch).max() > 1e-4
 
 
 @pytest.mark.parametrize("drone", ["cf2x_L250", "cf21B_500"])
 @pytest.mark.parametrize("controller, error", [("pid", 0.02), ("mellinger", 0.09)])
-def test_the_firmware_reaches_a_setpoint(controller, error, drone):
+def test_controllers_of_the_firmware_reach_a_setpoint(controller, error, drone):
     """Mellinger's nominal mass leaves an offset in height; PID has an integral large enough."""
     sim = Sim(drone=drone, control="state", controller=controller)
     cmd = make_setpoint(sim)
@@ -196,7 +196,7 @@ def test_the_firmware_reaches_a_setpoint(controller, error, drone):
     np.testing.assert_allclose(np.asarray(sim.data.states.pos)[0, 0], [1.0, 0.0, 1.0], atol=error)
 
 
-def test_body_rates_are_followed_and_nothing_levels():
+def test_pid_follows_body_rates_and_does_not_level():
     """A commanded roll rate turns the drone over, whereas Crazyflow's cascade levels it."""
     for controller in (PID(hold_yaw=False), PID(hold_yaw=True), "crazyflow"):
         sim = Sim(drone="cf2x_L250", control="body_rate", controller=controller)
@@ -211,8 +211,8 @@ def test_body_rates_are_followed_and_nothing_levels():
             assert abs(quat[0]) > 0.7  # over 90 degrees
 
 
-def test_rates_through_a_flip():
-    """A pitch rate through 90 degrees, where Euler angles jump, disturbs no other axis."""
+def test_a_pitch_rate_through_a_flip_disturbs_no_other_axis():
+    """Euler angles jump at a pitch of 90 degrees."""
     sim = Sim(drone="cf2x_L250", control="body_rate", controller="pid")
     sim.data = with_states(sim.data, pos=[0, 0, 50.0])
     sim.body_rate_control(np.array([[[0.0, 6.0, 0.0, 0.25]]], np.float32))
@@ -223,7 +223,7 @@ def test_rates_through_a_flip():
     assert rate[1] > 5.5
 
 
-def test_a_controller_fires_at_its_rate_and_resets_per_world():
+def test_a_controller_runs_at_its_rate_and_resets_per_world():
     sim = take_off(Spring(), 101)
     np.testing.assert_array_equal(np.asarray(controller_memory(sim).n_ticks)[..., 0], 21.0)
     sim.reset(np.array([True, False, True]))
@@ -307,7 +307,7 @@ def test_wrong_settings_are_refused(settings, message):
         Sim(**({"control": "state"} | settings)).step()
 
 
-def test_records_declare_their_scopes():
+def test_a_memory_without_scopes_is_refused():
     class Bare(Spring):
         def memory(self, airframe):
             return {"count": np.zeros(1)}
@@ -330,8 +330,8 @@ def test_incomplete_controllers_are_refused():
 
 
 def test_controllers_run_on_two_devices():
-    one, two = (take_off("pid", 50, mesh=mesh, n_worlds=4) for mesh in (None, world_mesh(jax.devices()[:2])))
-    np.testing.assert_allclose(one.data.states.rotor_vel, two.data.states.rotor_vel, rtol=1e-5)
+    on_one, on_two = (take_off("pid", 50, mesh=mesh, n_worlds=4) for mesh in (None, world_mesh(jax.devices()[:2])))
+    np.testing.assert_allclose(on_one.data.states.rotor_vel, on_two.data.states.rotor_vel, rtol=1e-5)
 
 
 def test_an_environment_uses_the_controller():
@@ -355,18 +355,18 @@ def test_a_switch_function_exchanges_controllers_in_flight():
     assert "not fused" not in sim.explain()
 
 
-def test_each_drone_has_its_own():
+def test_a_switch_chooses_a_controller_for_each_drone():
     index = np.array([[0, 1], [1, 0], [0, 0]])
-    both = take_off(["pid", "mellinger"], 300, switch=index)
-    apart = [take_off(name, 300) for name in ("pid", "mellinger")]
-    expected = np.where(index[..., None] == 0, *(np.asarray(sim.data.states.pos) for sim in apart))
-    np.testing.assert_allclose(both.data.states.pos, expected, atol=1e-5)
-    np.testing.assert_array_equal(np.asarray(controller_memory(both).active)[..., 0], index)
+    switched_sim = take_off(["pid", "mellinger"], 300, switch=index)
+    separate_sims = [take_off(name, 300) for name in ("pid", "mellinger")]
+    expected = np.where(index[..., None] == 0, *(np.asarray(sim.data.states.pos) for sim in separate_sims))
+    np.testing.assert_allclose(switched_sim.data.states.pos, expected, atol=1e-5)
+    np.testing.assert_array_equal(np.asarray(controller_memory(switched_sim).active)[..., 0], index)
     # The memory of an inactive controller does not change.
-    assert not np.any(np.asarray(controller_memory(both).controllers[1].ang_vel)[index == 0])
+    assert not np.any(np.asarray(controller_memory(switched_sim).controllers[1].ang_vel)[index == 0])
 
 
-def test_the_choice_sees_state_and_setpoint():
+def test_a_switch_function_gets_state_and_setpoint():
     def switch_when_high(state, setpoint, time):
         assert isinstance(setpoint, Setpoint)
         return (state.pos[2] > 0.5 * setpoint.pos[2]).astype(int)
@@ -391,7 +391,7 @@ def test_a_switch_in_hover_is_bumpless(names, bump):
 
 # Laws -----------------------------------------------------------------------------------------------------------
 
-EXTREME = {
+EXTREME_ATTITUDES = {
     "level": [0.0, 0, 0, 1],
     "upside down": [1.0, 0, 0, 0],
     "straight up": [0.0, -np.sqrt(0.5), 0, np.sqrt(0.5)],
@@ -414,17 +414,17 @@ def is_number(x):
 
 
 @functools.cache
-def every_controller(control):
-    """Return a simulation with 8 worlds for each controller of a level, and the slope of their climb by the command.
+def all_controllers(control):
+    """Return a simulation with 8 worlds for each controller of a level, and a function: the gradient by the command.
 
-    The slope is the slope of 10 steps, pulled back step by step through one compiled program.
+    The gradient is that of the climb after 10 steps, pulled back step by step through one compiled program.
     """
     names = LEVELS[control]
     switch = np.repeat(np.arange(len(names)), 8)[:, None]
     sim = Sim(8 * len(names), drone="cf2x_L250", control=control, controller=names, switch=switch)
 
     @jax.jit
-    def pulled(command, data, slopes):
+    def pull_back(command, data, slopes):
         """Return the data a step later, and gradients by command and by the numbers of the data."""
         leaves, treedef = jax.tree.flatten(data)
         numbers = [k for k, x in enumerate(leaves) if is_number(x)]
@@ -441,7 +441,7 @@ def every_controller(control):
         return after, *pull(slopes)
 
     def slope(command, data):
-        # What is on a device and what is not would compile twice.
+        # Arrays on the host and arrays on a device would compile two programs.
         put = functools.partial(jax.device_put, device=jax.devices()[0])
         command, data = put((command, data))
         climb = data.replace(states=data.states.replace(vel=np.tile(np.float32([0, 0, 1]), (sim.n_worlds, 1, 1))))
@@ -449,10 +449,10 @@ def every_controller(control):
         slopes = put([np.zeros(y.shape, y.dtype) if x is y else x for x, y in numbers])
         flight = [data]
         for _ in range(N_STEPS):
-            flight.append(pulled(command, flight[-1], slopes)[0])
+            flight.append(pull_back(command, flight[-1], slopes)[0])
         total = np.zeros(command.shape)
         for data in reversed(flight[:-1]):
-            _, by_command, slopes = pulled(command, data, slopes)
+            _, by_command, slopes = pull_back(command, data, slopes)
             total += np.asarray(by_command)
         return total
 
@@ -463,9 +463,9 @@ def every_controller(control):
 @pytest.mark.parametrize("control", LEVELS)
 def test_no_nan_in_values_or_gradients(control):
     """Law 7: from any attitude, at rest, spinning at 100 rad/s, with commands far beyond all limits, and motors off."""
-    sim, slope = every_controller(control)
+    sim, slope = all_controllers(control)
     repeats = sim.n_worlds // 8
-    quat = np.tile(np.repeat(np.array(list(EXTREME.values())), 2, axis=0), (repeats, 1))[:, None]
+    quat = np.tile(np.repeat(np.array(list(EXTREME_ATTITUDES.values())), 2, axis=0), (repeats, 1))[:, None]
     ang_vel = np.tile(np.array([[0.0] * 3, [100.0, -100, 100]]), (4 * repeats, 1))[:, None]
     start = with_states(sim.default_data, quat=quat, ang_vel=ang_vel)
     for scale in (1.0, 0.0):
@@ -481,7 +481,7 @@ def test_no_nan_in_values_or_gradients(control):
 
 def test_gradients_flow_through_the_step():
     """A higher setpoint makes every controller climb faster."""
-    sim, slope = every_controller("state")
+    sim, slope = all_controllers("state")
     sim.reset()
     command = jnp.asarray(make_setpoint(sim))
     sim.state_control(command)
@@ -496,18 +496,18 @@ def test_ten_steps_and_commands_trace_once():
     sim = Sim(control="state", controller="pid", engine="plain")
     n_traces = 0
 
-    def counted(data):
+    def count_trace(data):
         nonlocal n_traces
         n_traces += 1
         return data
 
-    sim.step_pipeline["counted"] = counted
+    sim.step_pipeline["counted"] = count_trace
     sim.build_step_fn()
     cmd = make_setpoint(sim)
-    for each in (cmd, jnp.asarray(cmd), cmd.tolist(), cmd.astype(np.float64)):
-        sim.state_control(each)
+    for equal_cmd in (cmd, jnp.asarray(cmd), cmd.tolist(), cmd.astype(np.float64)):
+        sim.state_control(equal_cmd)
         sim.step(5)
-        sim.state_control(each, feedforward=np.zeros((1, 1, 8)))
+        sim.state_control(equal_cmd, feedforward=np.zeros((1, 1, 8)))
         sim.step(3)
     assert n_traces == 1
 

@@ -14,31 +14,31 @@ from crazysim.control.power_distribution import PowerDistributionParams, distrib
 from crazysim.drones import load_airframe
 from crazysim.dynamics.rotor import quadratic_curve
 from crazysim.errors import ConfigError
-from crazysim.lab.validate import firmware_controllers as flown
+from crazysim.lab.validate import firmware_controllers
 
-jitted = jax.jit(distribute_power, static_argnames="whole_numbers")
+distribute = jax.jit(distribute_power, static_argnames="whole_numbers")
 
 
-@pytest.mark.parametrize("name", flown.CASES)
-def test_the_motors_are_those_of_the_firmware(name):
-    """Results of the compiled C sources (docs/guides/controllers.md), whose integers differ by up to 5 PWM from reals.
+@pytest.mark.parametrize("name", firmware_controllers.CASES)
+def test_motor_commands_agree_with_the_firmware(name):
+    """The compiled C sources (docs/guides/controllers.md) use integers, which differ by up to 5 PWM from real numbers.
 
-    Roll, pitch, yaw and motor lose less than one each. Where all motors are lowered by the excess of the highest, the
-    difference of two motors counts: twice two of the torques, and less than one.
+    Truncation of roll, pitch, yaw and motor loses less than one each. Where all motors are lowered by the excess of
+    the highest, the error is that of the difference of two motors: twice that of two torques, and less than one.
     """
-    expected = flown.recorded_pwm(name)
+    expected = firmware_controllers.recorded_pwm(name)
     assert 0.05 < np.mean(expected == 0) < 0.5
     assert 0.05 < np.mean(expected == 65535) < 0.5
-    smooth = flown.pwm_differences(name)
-    assert smooth.max() < flown.MAX_TRUNCATION + flown.MAX_ROUNDING
+    smooth = firmware_controllers.pwm_differences(name)
+    assert smooth.max() < firmware_controllers.MAX_TRUNCATION + firmware_controllers.MAX_ROUNDING
     assert np.mean(smooth < 4) > 0.998
-    whole = flown.pwm_differences(name, whole_numbers=True)
-    assert whole.max() < 1.0 + flown.MAX_ROUNDING
+    whole = firmware_controllers.pwm_differences(name, whole_numbers=True)
+    assert whole.max() < 1.0 + firmware_controllers.MAX_ROUNDING
     assert np.mean(whole < 0.5) > 0.9  # equal; rounding of float32 moves a number across an integer
 
 
 @pytest.mark.usefixtures("x64")
-def test_whole_numbers_leave_the_gradient(motors):
+def test_rounding_to_whole_numbers_does_not_change_the_gradient(motors):
     def total(torque, whole):
         return distribute_power(jnp.array([30000.3]), torque, params=motors, whole_numbers=whole) @ jnp.array(
             [1.0, 2, 3, 5]
@@ -48,7 +48,7 @@ def test_whole_numbers_leave_the_gradient(motors):
     smooth, whole = (jax.jit(jax.grad(total), static_argnums=1)(torque, flag) for flag in (False, True))
     np.testing.assert_allclose(whole, smooth)
     # 1001 / 2, 500 / 2 and 300, truncated, with the signs of each rotor.
-    pwm = jitted(np.array([30000.3]), torque, params=motors, whole_numbers=True)
+    pwm = distribute(np.array([30000.3]), torque, params=motors, whole_numbers=True)
     np.testing.assert_allclose(sorted(np.asarray(pwm)), [29450, 29550, 29950, 31050], atol=1e-9)
 
 
@@ -58,18 +58,18 @@ def motors():
 
 
 def test_saturation_lowers_all_motors_and_keeps_the_torque(motors):
-    """60000 +- 10000 PWM: the excess of 4465 leaves all four, so the difference stays 20000."""
-    pwm = jitted(np.array([60000.0]), np.array([20000.0, 0, 0]), params=motors)
+    """60000 +- 10000 PWM: the excess of 4465 is subtracted from all four, so the difference stays 20000."""
+    pwm = distribute(np.array([60000.0]), np.array([20000.0, 0, 0]), params=motors)
     np.testing.assert_allclose(pwm, [45535, 45535, 65535, 65535], atol=0.02)
 
 
 @given(vectors(3, 60000.0), st.floats(1.0, 65535.0))
 def test_power_distribution_stays_within_the_limits(torque, thrust):
     motors = PowerDistributionParams.create(load_airframe("cf2x_L250"))
-    pwm = np.asarray(jitted(np.array([thrust]), np.asarray(torque, np.float32), params=motors))
+    pwm = np.asarray(distribute(np.array([thrust]), np.asarray(torque, np.float32), params=motors))
     assert pwm.min() >= 0
     assert pwm.max() <= 65535.01
-    assert not np.any(np.asarray(jitted(np.array([0.0]), np.asarray(torque, np.float32), params=motors)))
+    assert not np.any(np.asarray(distribute(np.array([0.0]), np.asarray(torque, np.float32), params=motors)))
 
 
 def test_thrust_is_proportional_to_pwm_and_idle_is_off(motors):
@@ -104,7 +104,7 @@ def test_gradients_are_finite_at_rest_and_at_saturation(controller):
     commands[:, 1, :3] = 50.0
 
     def total(commands):
-        return flown.traceable_pwm(controller, "state", jnp.asarray(states), commands).sum()
+        return firmware_controllers.traceable_pwm(controller, "state", jnp.asarray(states), commands).sum()
 
     gradient = jax.jit(jax.grad(total))(jnp.asarray(commands))
     assert np.all(np.isfinite(gradient))

@@ -77,8 +77,8 @@ def test_hover_takes_the_weight_and_no_torque():
 def test_law_01_and_07_many_setpoints_free_fall_and_finite_gradients():
     """In free fall, nose down and upside down, values and gradients are finite, and equal for one state and a batch."""
     accelerations = np.array([[0, 0, 0], [0, 0, -9.81], [9.81, 0, -9.81], [0, 0, -30.0], [1.0, 2.0, 3.0]])
-    one = np.ones((5, 1))
-    setpoints = Setpoint(*[np.ones((5, 3))] * 2, accelerations, *[np.ones((5, 3))] * 2, 0 * one, one, one)
+    ones = np.ones((5, 1))
+    setpoints = Setpoint(*[np.ones((5, 3))] * 2, accelerations, *[np.ones((5, 3))] * 2, 0 * ones, ones, ones)
     batched = compute_state(setpoints)
     for k in range(5):
         single = compute_state(jax.tree.map(lambda x, k=k: x[k], setpoints))

@@ -73,9 +73,9 @@ def test_level_and_turning_by_hand():
     "thrust", [[0, 0, 0], [9.81, 0, 0], [-9.81, 0, 0], [0, 0, -9.81], [0, 9.81, 0], [1e-20, 0, 0], [0, 1e-3, 0]]
 )
 def test_singular_directions_give_rotations_and_finite_gradients(thrust):
-    thrust, other, one = np.array(thrust, float), np.array([1.0, 2.0, 3.0]), np.ones(1)
-    now = attitude(thrust, other, other, np.zeros(1), one, one)
+    thrust, rate_of_thrust, ones = np.array(thrust, float), np.array([1.0, 2.0, 3.0]), np.ones(1)
+    now = attitude(thrust, rate_of_thrust, rate_of_thrust, np.zeros(1), ones, ones)
     np.testing.assert_allclose(now.matrix.T @ now.matrix, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(now.matrix), 1.0)
-    gradient = slopes(thrust, other, other, np.zeros(1), one, one)
+    gradient = slopes(thrust, rate_of_thrust, rate_of_thrust, np.zeros(1), ones, ones)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((now, gradient)))

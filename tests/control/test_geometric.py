@@ -42,8 +42,8 @@ def law(drone, gains="bandwidth", freq=500, feedforward=True):
 
     def wrench(data, setpoint, memory):
         s = data.states
-        one = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0])
-        return geometric_control(*one, setpoint, params=p, feedforward=feedforward), memory
+        state = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0])
+        return geometric_control(*state, setpoint, params=p, feedforward=feedforward), memory
 
     return wrench
 
@@ -66,7 +66,7 @@ def lab_wrench(pos, matrix, vel, ang_vel, yaw, drone):
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("drone", ["crazyflie", "bumblebee_lab"])
-def test_the_lab_law_and_its_gains(drone, rng):
+def test_the_wrench_agrees_with_the_lab_law(drone, rng):
     """Small errors, so that no rotor saturates; the lab's law has no limits."""
     p = GeometricParams.create(load_airframe(drone), 500, "airframe")
     for _ in range(20):
@@ -149,7 +149,7 @@ def test_a_wrench_is_brought_within_the_limits_by_priority(wrench):
         np.testing.assert_allclose(out, wrench, atol=1e-12)
     tilt = thrusts_of(np.array([0, *wrench[1:3], 0]), p)
     limit = max(wrench[0], float(p.weight[0]))
-    assert out[0] <= limit + 1e-12  # torque alone does not lift the drone
+    assert out[0] <= limit + 1e-12  # a torque does not lift the drone
     fits = min((high - low) / max(np.ptp(tilt), 1e-12), (limit / 4 - low) / max(-tilt.min(), 1e-12))
     if fits >= 1:
         np.testing.assert_allclose(out[1:3], wrench[1:3], atol=1e-12)  # thrust and yaw give way
@@ -203,7 +203,7 @@ def test_singular_commands_have_finite_gradients():
 
 
 def test_rotor_rates_by_hand():
-    """13.996 + 2 x 1.1093e-4 x 15900 = 17.5 up, 5.933 + 2 x 3.1951e-4 x 15900 = 16.1 down; no lag term there: 50."""
+    """13.996 + 2 x 1.1093e-4 x 15900 = 17.5 up, 5.933 + 2 x 3.1951e-4 x 15900 = 16.1 down; 50 without a lag."""
     assert rotor_rate(load_airframe("cf21B_500")) == pytest.approx(16.094, abs=2e-3)
     assert rotor_rate(load_airframe("crazyflie")) == 50
 
@@ -222,7 +222,7 @@ def test_gains_by_bandwidth_are_stable_and_damped(drone):
 
 @pytest.mark.parametrize(("drone", "freq", "bound"), [("cf21B_500", 500, 0.02), ("cf21B_500", 100, 0.02),
                                                       ("bumblebee", 500, 0.02)])  # fmt: skip
-def test_figure_eight_of_two_metres_at_two_metres_per_second(drone, freq, bound):
+def test_a_figure_eight_is_tracked_within_two_centimetres(drone, freq, bound):
     """The error is 2 cm RMS, with the full dynamics (rotor lag, drag and limits), from a start that is not at rest."""
     sim = make_sim(drone, force_torque_freq=freq)
     start_on_path(sim, figure_eight)
@@ -238,7 +238,7 @@ def test_without_feedforward_the_error_is_tens_of_centimetres():
     assert rms_error(states, setpoints) > 0.3
 
 
-def test_it_recovers_from_upside_down():
+def test_a_drone_recovers_from_upside_down():
     sim = make_sim("cf21B_500")
     start_on_path(sim, hover)
     s = sim.data.states
@@ -251,7 +251,7 @@ def test_it_recovers_from_upside_down():
 
 
 @pytest.mark.parametrize("freq", [100, 500])
-def test_figure_eight_in_a_simulation(freq):
+def test_a_figure_eight_in_a_simulation_is_tracked_within_two_centimetres(freq):
     """With ``Follow`` and ``Sim(controller=Geometric(...))`` in a fused step, the error is 2 cm RMS."""
     eight = curves.figure_eight(2.0, 1.0, speed=2.0)
     sim = Sim(control="state", controller=Geometric(freq=freq), strict=True)
@@ -267,7 +267,7 @@ def test_figure_eight_in_a_simulation(freq):
 
 
 @pytest.mark.parametrize("drone", ["cf21B_500", "bumblebee"])
-def test_an_integral_takes_up_a_push(drone):
+def test_an_integral_compensates_a_push(drone):
     """The force is a tenth of the weight. With an integral the error is below 1 cm after 5 s, else force over gain."""
     offsets, gains = {}, Geometric().params(load_airframe(drone))
     for integral in (0.0, 0.6):
@@ -283,7 +283,7 @@ def test_an_integral_takes_up_a_push(drone):
         offsets[integral] = np.linalg.norm(np.asarray(sim.data.states.pos)[0, 0] - [0, 0, 1])
         assert (sim.data.controls.controller.memory is None) == (integral == 0)
     assert offsets[0.6] < 0.01
-    # Drag and the last hundredth of the approach are what the law leaves out.
+    # The expected offset neglects drag and the last hundredth of the approach.
     np.testing.assert_allclose(offsets[0.0], 0.1 * 9.81 * gains.mass[0] / gains.kr[0], rtol=0.02)
 
 

@@ -16,13 +16,13 @@ from crazysim.control.indi import INDI, INDIMemory, INDIParams, apply_filter, in
 from crazysim.control.low_pass import butterworth
 
 
-def test_the_filter_is_that_of_scipy():
+def test_the_filter_agrees_with_scipy():
     b, a = scipy.signal.butter(2, 12.0, fs=500.0)
     np.testing.assert_allclose(butterworth(12.0, 500.0), [b[0], *a[1:]], rtol=1e-12)
     x = np.random.default_rng(0).normal(size=(50, 2))
-    state, out, one = np.zeros(4, np.float32), [], jax.jit(apply_filter)
+    state, out, update = np.zeros(4, np.float32), [], jax.jit(apply_filter)
     for value in x:
-        y, state = one(np.float32(value), state, np.float32(butterworth(12.0, 500.0)))
+        y, state = update(np.float32(value), state, np.float32(butterworth(12.0, 500.0)))
         out.append(y)
     np.testing.assert_allclose(out, scipy.signal.lfilter(b, a, x, axis=0), atol=1e-5)
 
@@ -41,8 +41,8 @@ def law(drone):
 
     def rotors(data, setpoint, memory):
         s = data.states
-        one = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0], s.rotor_vel[0, 0])
-        return indi_control(*one, setpoint, memory, 500, params=p)
+        state = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0], s.rotor_vel[0, 0])
+        return indi_control(*state, setpoint, memory, 500, params=p)
 
     return rotors
 
@@ -66,15 +66,15 @@ def test_a_return_to_the_controller_starts_its_filter_anew():
     assert np.max(np.abs(np.asarray(update(stale)) - first)) > 100
 
 
-def test_figure_eight_of_two_metres_at_two_metres_per_second():
+def test_a_figure_eight_is_tracked_within_two_centimetres():
     sim = make_sim("cf21B_500", "rotor_vel")
     start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, law("cf21B_500"), figure_eight, 9.0, memory())
     assert rms_error(states, setpoints) < 0.02
 
 
-def pushed(data, t):
-    """A tenth of the weight along x, and a torque about y that would turn the drone by 0.2 rad, from 2 s on."""
+def push(data, t):
+    """Apply a tenth of the weight along x, and a torque about y that would turn the drone by 0.2 rad, from 2 s on."""
     s = data.states
     force = jnp.asarray([0.0426, 0, 0], jnp.float32) * (t > 2)
     torque = jnp.asarray([0, 3e-4, 0], jnp.float32) * (t > 2)
@@ -86,7 +86,7 @@ def test_a_force_and_a_torque_are_compensated():
     """Within 1 mm after 7 s; geometric control without an integral stays decimetres away."""
     sim = make_sim("cf21B_500", "rotor_vel")
     start_on_path(sim, hover)
-    states, setpoints, _, _ = fly(sim, law("cf21B_500"), hover, 9.0, memory(), pushed)
+    states, setpoints, _, _ = fly(sim, law("cf21B_500"), hover, 9.0, memory(), push)
     error = np.linalg.norm(states.pos - np.asarray(setpoints.pos), axis=-1)
     assert error[-1] < 1e-3
     assert error.max() < 0.1
@@ -95,18 +95,18 @@ def test_a_force_and_a_torque_are_compensated():
 
     def geometric(data, setpoint, nothing):
         s = data.states
-        one = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0])
-        return geometric_control(*one, setpoint, params=p), nothing
+        state = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0])
+        return geometric_control(*state, setpoint, params=p), nothing
 
     sim = make_sim("cf21B_500")
     start_on_path(sim, hover)
-    states, setpoints, _, _ = fly(sim, geometric, hover, 9.0, None, pushed)
+    states, setpoints, _, _ = fly(sim, geometric, hover, 9.0, None, push)
     assert np.linalg.norm(states.pos[-1] - np.asarray(setpoints.pos)[-1]) > 0.2
 
 
 @pytest.fixture(scope="module")
-def flown():
-    """Four worlds from the floor to a point 1 m high and 1 m aside, for 6 s, by each controller."""
+def flown_sims():
+    """Return simulations, by controller, after 6 s of flight from the floor to a point 1 m high and 1 m aside."""
     ends = {}
     for name in ("geometric", "indi", "lqr"):
         sim = Sim(n_worlds=4, control="state", controller=name, strict=True)
@@ -119,8 +119,8 @@ def flown():
 
 
 @pytest.mark.parametrize("name", ["geometric", "indi", "lqr"])
-def test_from_the_floor_in_a_simulation(flown, name):
-    """It can be chosen by name, is fused (``strict``), and flies alike in every world."""
-    pos = np.asarray(flown[name].data.states.pos)
+def test_a_controller_by_name_flies_from_the_floor_to_a_setpoint(flown_sims, name):
+    """Its step is fused (``strict``), and the flights in all worlds are equal."""
+    pos = np.asarray(flown_sims[name].data.states.pos)
     np.testing.assert_allclose(pos[:, 0], np.broadcast_to([1.0, 0.5, 1.0], (4, 3)), atol=0.05)
     np.testing.assert_array_equal(pos, np.broadcast_to(pos[:1], pos.shape))

@@ -23,7 +23,7 @@ slopes_of_rod = jax.jit(jax.jacrev(rod_angles, argnums=(0, 1)))
 linear = jax.jit(lambda x, u: linearize(load, x, u))
 
 
-def advanced(f, x, u, dt, n):
+def integrate(f, x, u, dt, n):
     for _ in range(n):
         k1 = f(x, u)
         k2 = f(x + dt / 2 * k1, u)
@@ -36,7 +36,7 @@ def advanced(f, x, u, dt, n):
 def test_euler_angles_turn_as_the_matrix_does(rpy, ang_vel):
     """d/dt R = R w^, by differences of 1e-5 s."""
     x = np.concatenate([np.zeros(6), rpy, ang_vel])
-    after = advanced(drone, x, np.array([1.0, 0, 0, 0]), 1e-5, 1)
+    after = integrate(drone, x, np.array([1.0, 0, 0, 0]), 1e-5, 1)
     before = Rotation.from_euler("ZYX", rpy[::-1])
     turned = (before.inv() * Rotation.from_euler("ZYX", after[8:5:-1])).as_rotvec()
     np.testing.assert_allclose(turned / 1e-5, ang_vel, atol=1e-4)
@@ -54,7 +54,7 @@ def test_drone_and_load_keep_energy_and_the_height_of_free_fall():
     """Without thrust the centre of mass falls freely, whatever the rod does."""
     x = np.zeros(16)
     x[3:6], x[12:16] = [1, 2, 3], [0.6, -0.4, 2.0, 3.0]
-    after = advanced(load, x, np.zeros(4), 1e-3, 500)
+    after = integrate(load, x, np.zeros(4), 1e-3, 500)
     assert energy(after) == pytest.approx(energy(x), rel=1e-8)
 
     def centre(x):
@@ -69,11 +69,11 @@ def test_drone_and_load_keep_energy_and_the_height_of_free_fall():
 def test_a_load_off_the_centre_keeps_energy_and_momentum():
     """Without thrust and gravity: linear and angular momentum about the origin, and energy."""
     attach, still = np.array([0.05, -0.03, 0.02]), np.zeros(3)
-    off = jax.jit(lambda x, u: load_derivative(x, u, MASS, J, still, LOAD, LENGTH, attach))
+    rates_off_centre = jax.jit(lambda x, u: load_derivative(x, u, MASS, J, still, LOAD, LENGTH, attach))
     x = np.linspace(-0.4, 0.5, 16)
     x[14:16] = [2.0, 3.0]
 
-    def kept(x):
+    def invariants(x):
         turn = Rotation.from_euler("ZYX", x[8:5:-1])
         q, q_rate = rod(x[12:14], x[14:16])
         pos = x[:3] + turn.apply(attach) + LENGTH * np.asarray(q)
@@ -83,8 +83,8 @@ def test_a_load_off_the_centre_keeps_energy_and_momentum():
         energy = 0.5 * (MASS * x[3:6] @ x[3:6] + LOAD * vel @ vel + x[9:12] @ J @ x[9:12])
         return np.concatenate([MASS * x[3:6] + LOAD * vel, angular, [energy]])
 
-    after = advanced(off, x, np.zeros(4), 1e-3, 300)
-    np.testing.assert_allclose(kept(after), kept(x), rtol=1e-8, atol=1e-10)
+    after = integrate(rates_off_centre, x, np.zeros(4), 1e-3, 300)
+    np.testing.assert_allclose(invariants(after), invariants(x), rtol=1e-8, atol=1e-10)
     u = np.array([7.0, 0.01, -0.02, 0.003])
     centred = jax.jit(load_derivative)(x, u, MASS, J, GRAVITY, LOAD, LENGTH, np.zeros(3))
     np.testing.assert_allclose(centred, load(x, u), rtol=1e-10)
@@ -98,8 +98,8 @@ def test_a_small_swing_has_the_period_of_a_pendulum_on_a_free_body():
     np.testing.assert_allclose(A[15, 13], -(frequency**2), rtol=1e-12)
 
 
-def test_linearisation_with_load_as_the_lab():
-    """The facts on AIMotionLab-Virtual, section 2.4."""
+def test_the_linearisation_with_a_load_agrees_with_the_lab():
+    """Numbers of the facts on AIMotionLab-Virtual, section 2.4."""
     A, B = (np.asarray(x) for x in linear(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0])))
     assert round(float(A[3, 7]), 4) == 10.6207
     assert round(float(A[3, 13]), 4) == -0.8107
@@ -108,7 +108,7 @@ def test_linearisation_with_load_as_the_lab():
     np.testing.assert_allclose(B[5], [1 / 0.655, 0, 0, 0])
 
 
-def test_without_a_load_mass_the_drone_is_the_bare_one():
+def test_a_load_without_mass_does_not_change_the_drone():
     x, u = np.linspace(-0.3, 0.4, 16), np.array([7.0, 0.01, -0.02, 0.003])
     bare = jax.jit(load_derivative)(x, u, MASS, J, GRAVITY, np.zeros(1), LENGTH)[:12]
     np.testing.assert_allclose(bare, drone(x[:12], u), rtol=1e-12)

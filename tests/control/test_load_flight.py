@@ -18,7 +18,7 @@ SIZE, SPEED = np.array([1.0, 0.5]), 2.0
 """Half of the figure eight, m, and its speed in the middle, m/s."""
 
 
-def at_the_start(sim):
+def start_of_flight(sim):
     """Return states of a drone whose load is in the middle of the figure eight, and derivatives of the load's path."""
     w = SPEED / np.linalg.norm([SIZE[0], 2 * SIZE[1]])
     path = np.zeros((7, 3))
@@ -31,12 +31,12 @@ def at_the_start(sim):
 
 
 @pytest.mark.parametrize("freq", [500, 100])
-def test_load_along_a_figure_eight(freq):
-    """Of 2 m at 2 m/s, 0.2 kg on 0.4 m below a Bumblebee: 5 cm RMS is required at the load, 1 cm is reached."""
+def test_a_load_tracks_a_figure_eight_within_one_centimetre(freq):
+    """0.2 kg on 0.4 m below a Bumblebee, along 2 m at 2 m/s: 5 cm RMS are required at the load, 1 cm is reached."""
     eight = figure_eight(*2 * SIZE, speed=SPEED)
     sim = Sim(drone="bumblebee", control="state", controller=LoadLQR(load_mass=LOAD, length=LENGTH, freq=freq))
     sim.add(Follow(eight, visible=False))
-    start, path = at_the_start(sim)
+    start, path = start_of_flight(sim)
     motion = {"pos": start.pos, "vel": start.vel, "quat": start.quat, "ang_vel": start.ang_vel}
     rotor_vel = jax.jit(rotor_vel_of_thrust)(np.tile(start.thrust / 4, 4), sim.data.params.rpm2thrust)
     sim.data = with_states(sim.data, **motion, rotor_vel=rotor_vel)
@@ -55,12 +55,12 @@ def test_load_along_a_figure_eight(freq):
 
 
 @pytest.mark.parametrize("target", ["load", "drone"])
-def test_a_load_that_hangs_off_the_centre(target):
-    """Of the drone: load or drone come to rest at the setpoint, which a controller without the offset misses.
+def test_the_target_rests_at_the_setpoint_with_a_load_off_the_centre(target):
+    """The target is the load or the drone. A controller without the offset of the load misses the setpoint.
 
-    With RK4, whose velocities match the motion: symplectic Euler's are offset by the impulses of half a step.
+    With RK4 velocities match the motion; those of symplectic Euler are offset by the impulses of half a step.
     """
-    attach, at = np.array([0.05, -0.02, -0.03]), np.array([0.3, 0.2, 1.5])
+    attach, goal = np.array([0.05, -0.02, -0.03]), np.array([0.3, 0.2, 1.5])
     with_offset, without = (
         LoadLQR(load_mass=LOAD, length=LENGTH, attach=assumed, target=target) for assumed in (attach, 1e-9 * attach)
     )
@@ -68,7 +68,7 @@ def test_a_load_that_hangs_off_the_centre(target):
     sim.data = with_states(sim.data, pos=np.array([0.0, 0.0, 1.8]))
     load = sim.add(SlungLoad(mass=LOAD, length=LENGTH, attach=attach, in_scene=False))
     command = np.zeros((1, 1, 16))
-    command[..., :3], command[..., 12] = at, 1.0
+    command[..., :3], command[..., 12] = goal, 1.0
     sim.state_control(command)
     start, misses = sim.data, []
     for controller in (with_offset, without):
@@ -77,14 +77,14 @@ def test_a_load_that_hangs_off_the_centre(target):
         sim.data = start.replace(controls=controls.replace(controller=record))
         sim.step(3000)
         body = load.read(sim.data) if target == "load" else sim.data.states
-        misses.append(np.linalg.norm(np.asarray(body.pos)[0, 0] - at))
+        misses.append(np.linalg.norm(np.asarray(body.pos)[0, 0] - goal))
         assert np.abs(np.asarray(body.vel)).max() < 1e-3
     assert misses[0] < 1e-3
     assert misses[1] > 0.03
 
 
-def test_an_empty_hook_is_the_load():
-    """The load stands elsewhere, so the tip of the hook flies to the setpoint, and its swing is damped."""
+def test_the_tip_of_an_empty_hook_flies_to_the_setpoint():
+    """The load stands elsewhere. The swing of the hook is damped."""
     sim = Sim(drone="bumblebee", control="state", controller=LoadLQR(load_mass=0.0203, length=LENGTH))
     sim.data = with_states(sim.data, pos=np.array([0.0, 0.0, 1.4]))
     hook = sim.add(Hook.bumblebee(LOAD, load_at=(2.0, 1.0, 0.0), in_scene=False))

@@ -35,8 +35,8 @@ def rounded(x):
 
 
 @pytest.mark.usefixtures("x64")
-def test_gain_about_hover_as_the_lab():
-    """The facts on AIMotionLab-Virtual, section 2.4, for the Bumblebee and the Crazyflie."""
+def test_gains_about_hover_equal_those_of_the_lab():
+    """Numbers of the facts on AIMotionLab-Virtual, section 2.4, for the Bumblebee and the Crazyflie."""
     gain = np.asarray(LQRParams.create(load_airframe("bumblebee_lab"), 500, LAB_Q, LAB_R).gain)
     assert rounded(gain[0, [2, 5]]) == [1.4142, 1.9264]
     assert rounded(gain[2, [0, 3, 7, 10]]) == [1.4142, 1.6341, 2.3243, 0.1635]
@@ -79,7 +79,7 @@ def test_gains_inside_jit_have_gradients():
     np.testing.assert_allclose([value, slope], [root, np.sqrt(2) / root], rtol=1e-3)
 
 
-BAD = {
+WRONG_WEIGHTS = {
     "number of weights": ({"Q": [1, 2, 3]}, r"expected weights Q of shape \(12,\) or \(12, 12\), got \(3,\)"),
     "asymmetric": ({"Q": np.triu(np.ones((12, 12)))}, "positive semidefinite matrix, got a matrix that is not symm"),
     "not finite": ({"R": [1, np.nan, 1, 1]}, "expected R of LQR to be finite"),
@@ -91,9 +91,9 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_wrong_weights(case):
-    settings, message = BAD[case]
+@pytest.mark.parametrize("case", WRONG_WEIGHTS)
+def test_wrong_weights_are_refused(case):
+    settings, message = WRONG_WEIGHTS[case]
     with pytest.raises(ConfigError, match=message):
         Sim(drone="bumblebee", control="state", controller=LQR(**settings))
 
@@ -104,11 +104,11 @@ def test_weights_may_be_singular_matrices():
     np.testing.assert_array_equal(weight_matrix("Q", np.outer(direction, direction), 3), np.outer(direction, direction))
 
 
-def a_setpoint():
+def zero_setpoint():
     return Setpoint(*[np.zeros(3)] * 5, *[np.zeros(1)] * 3)
 
 
-def test_a_trajectory_is_needed_along_a_trajectory():
+def test_tracking_lqr_needs_the_setpoints_of_a_trajectory():
     with pytest.raises(ConfigError, match="setpoints of one drone"):
         Sim(control="state", controller="tracking_lqr")
 
@@ -117,13 +117,13 @@ def test_a_trajectory_is_needed_along_a_trajectory():
     "shape, dt, got", [((), 0.1, r"shape \(3,\) and 0.1"), ((4,), np.nan, r"shape \(4, 3\) and nan")]
 )
 def test_a_trajectory_has_one_leading_axis_and_a_time(shape, dt, got):
-    setpoints = jax.tree.map(lambda x: np.broadcast_to(x, (*shape, *x.shape)), a_setpoint())
+    setpoints = jax.tree.map(lambda x: np.broadcast_to(x, (*shape, *x.shape)), zero_setpoint())
     with pytest.raises(ConfigError, match=f"got positions of {got}"):
         TrackingLQR(setpoints=setpoints, dt=dt).params(load_airframe("bumblebee"))
 
 
 def test_setpoints_of_a_trajectory_are_finite():
-    setpoints = jax.tree.map(lambda x: np.zeros((4, *x.shape)), a_setpoint())
+    setpoints = jax.tree.map(lambda x: np.zeros((4, *x.shape)), zero_setpoint())
     setpoints = setpoints.replace(jerk=np.full((4, 3), np.nan), yaw=np.full((4, 1), np.inf))
     with pytest.raises(ConfigError, match=r"expected finite setpoints, got NaN or infinity in jerk, yaw\. Evaluate"):
         TrackingLQR(setpoints=setpoints, dt=0.1).params(load_airframe("bumblebee"))
@@ -134,12 +134,13 @@ def test_setpoints_of_a_trajectory_are_finite():
 
 @pytest.fixture(scope="module")
 def knots():
+    """Return setpoints along a figure eight, every 0.1 s."""
     times = np.arange(50) * 0.1
     return jax.jit(jax.vmap(lambda t: path_setpoint(figure_eight, t)))(times)
 
 
 @pytest.mark.usefixtures("x64")
-def test_error_dynamics_are_those_of_the_drone(knots):
+def test_error_dynamics_agree_with_flights(knots):
     """Derivatives equal differences of errors after 1e-5 s of flight of a reference drone and a disturbed one."""
     p = jax.tree.map(np.asarray, LQRParams.create(load_airframe("bumblebee"), 500))
     sp = jax.tree.map(lambda x: np.asarray(x, np.float64)[7], knots)
@@ -152,7 +153,7 @@ def test_error_dynamics_are_those_of_the_drone(knots):
     error, extra = size * rng.normal(size=12), size * rng.normal(size=4)
     slope = jax.jit(error_derivative)(error, extra, reference, ang_acc, p.mass, p.J)
 
-    def flown(matrix, ang_vel, vel, pos, wrench):
+    def advance(matrix, ang_vel, vel, pos, wrench):
         turned = matrix @ Rotation.from_rotvec(h * np.array(ang_vel)).as_matrix()
         rate = np.linalg.solve(p.J, wrench[1:] - np.cross(ang_vel, p.J @ ang_vel))
         return turned, ang_vel + h * rate, vel + h * (wrench[0] * matrix[:, 2] / p.mass + GRAVITY), pos + h * vel
@@ -160,8 +161,8 @@ def test_error_dynamics_are_those_of_the_drone(knots):
     target = np.array(reference.matrix)
     matrix = target @ Rotation.from_rotvec(np.array(error[6:9])).as_matrix()
     ang_vel = error[9:] + matrix.T @ target @ w
-    after = flown(matrix, ang_vel, reference.vel + error[3:6], reference.pos + error[:3], reference.wrench + extra)
-    later = flown(target, np.asarray(w), reference.vel, reference.pos, reference.wrench)
+    after = advance(matrix, ang_vel, reference.vel + error[3:6], reference.pos + error[:3], reference.wrench + extra)
+    later = advance(target, np.asarray(w), reference.vel, reference.pos, reference.wrench)
     moved = reference._replace(pos=later[3], vel=later[2], matrix=later[0], ang_vel=later[1])
     quat = Rotation.from_matrix(np.array(after[0])).as_quat()
     found = jax.jit(state_error)(after[3], quat, after[2], after[1], moved)
@@ -169,7 +170,7 @@ def test_error_dynamics_are_those_of_the_drone(knots):
 
 
 @pytest.mark.usefixtures("x64")
-def test_gains_along_a_hover_are_those_of_hover():
+def test_gains_along_a_hover_equal_the_gain_for_hover():
     p = LQRParams.create(load_airframe("bumblebee"), 500)
     still = jax.jit(jax.vmap(lambda t: path_setpoint(hover, t)))(np.arange(4) * 0.1)
     Q, R = np.diag(LAB_Q).astype(float), np.diag(LAB_R).astype(float)
@@ -195,19 +196,19 @@ def state_of(data):
 
 
 @pytest.mark.parametrize(("drone", "bound"), [("cf21B_500", 0.04), ("bumblebee", 0.01)])
-def test_figure_eight(drone, bound, knots):
-    """It follows one of 2 m at 2 m/s, with the gain for hover and with gains along the trajectory."""
+def test_a_figure_eight_is_tracked(drone, bound, knots):
+    """The figure eight has 2 m and 2 m/s. Gains are those for hover, then those along the trajectory."""
     sim = make_sim(drone)
     p = LQRParams.create(load_airframe(drone), 500)
     start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, lambda d, sp, m: (lqr_control(*state_of(d), sp, params=p), m), figure_eight, 4.8)
     assert rms_error(states, setpoints) < bound
 
-    along = TrackingLQR(setpoints=knots, dt=0.1).params(load_airframe(drone))
-    assert np.ptp(np.asarray(along.gains), axis=0).max() > 0.01 * np.abs(along.gains).max()
+    tracking_params = TrackingLQR(setpoints=knots, dt=0.1).params(load_airframe(drone))
+    assert np.ptp(np.asarray(tracking_params.gains), axis=0).max() > 0.01 * np.abs(tracking_params.gains).max()
 
     def law(data, sp, tick):
-        return tracking_lqr_control(*state_of(data), sp, tick / 500, params=along), tick + 1
+        return tracking_lqr_control(*state_of(data), sp, tick / 500, params=tracking_params), tick + 1
 
     sim.reset()
     start_on_path(sim, figure_eight)
@@ -254,23 +255,23 @@ def fly_with_load(load_mass, length, seconds, freq=500):
         return (x, memory), (x[:3] + length * rod_direction(x[12:14]), path_setpoint(figure_eight, (k + 1) / freq).pos)
 
     @jax.jit
-    def flown(steps):
+    def run(steps):
         reference, rod, rod_rate = load_reference(path_setpoint(figure_eight, jnp.float32(0)), p)
         start = [reference.pos, reference.vel, jnp.zeros(6), *rod_angles(rod, rod_rate), reference.wrench]
         return jax.lax.scan(tick, (jnp.concatenate(start), memory), steps)[1]
 
-    return [np.asarray(x) for x in flown(np.arange(seconds * freq, dtype=np.float32))]
+    return [np.asarray(x) for x in run(np.arange(seconds * freq, dtype=np.float32))]
 
 
 @pytest.mark.parametrize(("load_mass", "length", "freq"), [(0.05, 0.4, 500), (0.2, 0.57, 100)])
-def test_load_along_a_figure_eight(load_mass, length, freq):
+def test_a_load_tracks_a_figure_eight_within_one_centimetre(load_mass, length, freq):
     """The figure eight of 2 m at 2 m/s is tracked with 1 cm RMS at the load; 5 cm are required."""
     load, target = fly_with_load(load_mass, length, 9, freq)
     assert np.sqrt(np.mean(np.sum((load - target) ** 2, axis=-1))) < 0.01
 
 
 @pytest.mark.usefixtures("x64")
-def test_load_gain_at_zero_load_and_any_rod_is_that_of_the_drone():
+def test_the_gain_with_a_load_without_mass_is_that_of_the_drone():
     """The rod has no weights, so it has no influence."""
     J, mass, none = np.diag([1.5e-3, 1.45e-3, 2.66e-3]), np.array([0.605]), np.zeros(1)
     Q = np.diag([*LAB_Q, 1e-9, 1e-9, 1e-9, 1e-9])
@@ -279,8 +280,8 @@ def test_load_gain_at_zero_load_and_any_rod_is_that_of_the_drone():
     np.testing.assert_allclose(gain[:, :12], expected, atol=0.02)
 
 
-def test_setpoints_of_the_drone_leave_it_where_they_say():
-    """At rest below its setpoint the drone does not turn, and its thrust carries drone and load."""
+def test_at_rest_at_the_setpoint_the_thrust_carries_drone_and_load():
+    """There is no torque, with the drone at the setpoint, and with the load there."""
     p = LoadLQRParams.create(load_airframe("bumblebee"), 500, 0.1, 0.4)
     zero, down, none = np.zeros(3, np.float32), np.float32([0, 0, -1.0]), np.zeros(1, np.float32)
     sp = Setpoint(zero, zero, zero, zero, zero, none, none, none)

@@ -36,8 +36,8 @@ LEVELS += [pytest.param(level, *each.values, marks=SLOW) for level in STEPS for 
 def test_setpoints_are_reached_from_any_throw(n, seed, count):
     """45 degrees, 2 rad/s, 2 m/s and up to 2 m off: within 2 mm after the time that the bandwidth promises.
 
-    That is the far part of the way at the speed from which the drone can stop, 14 time constants of the position loop,
-    and half a turn of yaw.
+    The time is the sum of three: the far part of the way at the speed from which the drone can stop, 14 time constants
+    of the position loop, and half a turn of yaw.
     """
     airframes = draw_airframes(n, count, seed)
     distances, heights, alternating = fly_airframes(airframes, "auto", 4, 40, seed)
@@ -45,25 +45,25 @@ def test_setpoints_are_reached_from_any_throw(n, seed, count):
     for k, airframe in enumerate(airframes):
         position = Auto().params(airframe).position
         frequency, acc = float(np.sqrt(position.stiffness[0])), float(np.min(position.acc_max))
-        turn = 2 * np.sqrt(np.pi / max_ang_acc(airframe)[2])
-        promised = distances[:, :, k].max(0) * frequency / acc + 14 / frequency + turn
+        turn_time = 2 * np.sqrt(np.pi / max_ang_acc(airframe)[2])
+        promised = distances[:, :, k].max(0) * frequency / acc + 14 / frequency + turn_time
         assert np.all(times[:, k] < promised), (airframe.name, times[:, k], promised)
         assert heights[:, :, k].max() < 4.0, airframe.name
         assert alternating[k] < 1e-3, airframe.name
 
 
 @pytest.mark.parametrize(("level", "n", "seed", "count"), LEVELS)
-def test_commands_below_are_followed_without_overshoot(level, n, seed, count):
+def test_attitudes_and_body_rates_are_followed_with_little_overshoot(level, n, seed, count):
     """Steps overshoot by at most 10%, and thrown drones follow random commands after 36 s, which weak yaw needs."""
     airframes, steps, throws = draw_airframes(n, count, seed), STEPS[level], 4
     rng = np.random.default_rng(seed)
     sim = Sim(len(steps) + throws, drone=airframes, control=level)
     throw_drones(sim, seed)
     s = sim.data.states
-    rest = np.arange(sim.n_worlds) < len(steps)
+    starts_at_rest = np.arange(sim.n_worlds) < len(steps)
     quat, ang_vel = np.array(s.quat), np.array(s.ang_vel)
-    quat[rest], ang_vel[rest] = [0, 0, 0, 1], 0
-    set_flying_states(sim, s.pos, s.vel * ~rest[:, None, None], quat, ang_vel)
+    quat[starts_at_rest], ang_vel[starts_at_rest] = [0, 0, 0, 1], 0
+    set_flying_states(sim, s.pos, s.vel * ~starts_at_rest[:, None, None], quat, ang_vel)
     command = np.zeros((sim.n_worlds, count, 4), np.float32)
     if level == "attitude":
         command[..., :3] = rng.uniform(-1, 1, command[..., :3].shape) * [0.5, 0.5, 3]
@@ -104,14 +104,14 @@ OTHERS = {
     "indi": {},
     "lqr": {"tilt": 0.35, "rate": 1.0, "speed": 0.5, "away": 0.5, "heading": 0.5},
 }
-"""Throws that other controllers catch, where they differ from the default controller's."""
+"""Throws that other controllers recover, where they differ from those of the default controller."""
 
 
-ALL = [pytest.param(name, n, marks=SLOW) for name in OTHERS for n in (4, 5, 6, 8)]
+SLOW_CASES = [pytest.param(name, n, marks=SLOW) for name in OTHERS for n in (4, 5, 6, 8)]
 
 
-@pytest.mark.parametrize(("controller", "n"), [("geometric", 4), ("indi", 6), ("lqr", 4), *ALL])
-def test_other_controllers_by_bandwidth_catch_their_drones(controller, n):
+@pytest.mark.parametrize(("controller", "n"), [("geometric", 4), ("indi", 6), ("lqr", 4), *SLOW_CASES])
+def test_other_controllers_recover_thrown_drones(controller, n):
     """99% of the flights end within 5 cm after 60 s, as position loops above slow rotors are slow; none alternates."""
     airframes = draw_airframes(n, 40, 0)
     distances, heights, alternating = fly_airframes(airframes, controller, 4, 60, 0, **OTHERS[controller])
@@ -152,7 +152,7 @@ RACER = {
 }
 
 
-def heavy(inertia, torque):
+def heavy_drone(inertia, torque):
     """Return an estimated drone of 4 kg with factors on the inertia of its rotors and on their drag torque."""
     numbers = tomllib.loads(estimate_airframe(4.0, 0.38, arm=0.3, thrust_to_weight=2.5))
     rotors = {key: entry["value"] for key, entry in numbers["rotors"].items()}
@@ -162,8 +162,12 @@ def heavy(inertia, torque):
 
 @pytest.mark.parametrize("controller", ["auto", "indi"])
 def test_quick_and_heavy_rotors_hover_and_reach_far_setpoints(controller):
-    """Within 2 mm, with rotors at constant speeds: near, 30 m aside, which nothing lifts, and 30 m below."""
-    sources = [HUMMINGBIRD, RACER, *(heavy(*each) for each in ((1, 1), (2, 1), (3, 1), (5, 1), (1, 0.25), (3, 0.25)))]
+    """To 2 mm, with constant rotor speeds: near setpoints, 30 m aside, without climbing, and 30 m below."""
+    sources = [
+        HUMMINGBIRD,
+        RACER,
+        *(heavy_drone(*each) for each in ((1, 1), (2, 1), (3, 1), (5, 1), (1, 0.25), (3, 0.25))),
+    ]
     sim = Sim(3, drone=[load_airframe(source) for source in sources], control="state", controller=controller)
     set_flying_states(sim)
     goals = np.array([[1.0, 0.0, 1.0], [30.0, 0.0, 0.0], [0.0, 0.0, -30.0]])[:, None]

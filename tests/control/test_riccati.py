@@ -17,7 +17,7 @@ GAINS = {gain: jax.jit(gain) for gain in (gain_continuous, gain_discrete)}
 SIZES = [(2, 1), (4, 2), (12, 4), (16, 4)]
 
 
-def problem(n, m, seed):
+def random_problem(n, m, seed):
     rng = np.random.default_rng(seed)
     A, B = rng.normal(size=(n, n)) / np.sqrt(n), rng.normal(size=(n, m))
     return A, B, np.diag(rng.uniform(0.01, 10, n)), np.diag(rng.uniform(0.1, 10, m))
@@ -29,42 +29,42 @@ def problem(n, m, seed):
 def test_solutions_equal_those_of_scipy(kind, n, m):
     solve, reference = SOLVERS[kind]
     for seed in range(5):
-        expected = reference(*problem(n, m, seed))
-        np.testing.assert_allclose(solve(*problem(n, m, seed)), expected, atol=1e-10 * np.abs(expected).max())
+        expected = reference(*random_problem(n, m, seed))
+        np.testing.assert_allclose(solve(*random_problem(n, m, seed)), expected, atol=1e-10 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("kind", SOLVERS)
 @pytest.mark.parametrize(("n", "m"), SIZES)
 def test_solutions_in_float32_are_accurate_to_half_a_percent(kind, n, m):
-    """To half a percent: 30 doublings of matrices of up to 16 x 16 add up some 1e5 roundings of 6e-8."""
+    """30 doublings of matrices of up to 16 x 16 add up some 1e5 roundings of 6e-8."""
     solve, reference = SOLVERS[kind]
     for seed in range(5):
-        matrices = [x.astype(np.float32) for x in problem(n, m, seed)]
-        expected, found = reference(*problem(n, m, seed)), solve(*matrices)
+        matrices = [x.astype(np.float32) for x in random_problem(n, m, seed)]
+        expected, found = reference(*random_problem(n, m, seed)), solve(*matrices)
         assert found.dtype == np.float32
         np.testing.assert_allclose(found, expected, atol=5e-3 * np.abs(expected).max())
 
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("gain", [gain_continuous, gain_discrete])
-def test_gradients_of_gains(gain):
-    """Of either kind, against differences; the weights enter through their logarithms, which keeps them positive."""
-    A, B, Q, R = problem(4, 2, 3)
+def test_gradients_of_gains_equal_central_differences(gain):
+    """The weights enter through their logarithms, which keeps them positive."""
+    A, B, Q, R = random_problem(4, 2, 3)
 
-    def of(A, B, q, r):
+    def diagonal_gain(A, B, q, r):
         return gain(A, B, jnp.diag(jnp.exp(q)), jnp.diag(jnp.exp(r)))
 
     args = (A, B, np.log(np.diag(Q)), np.log(np.diag(R)))
     rng = np.random.default_rng(0)
-    ways, weights = tuple(rng.normal(size=x.shape) for x in args), rng.normal(size=(2, 4))
+    directions, weights = tuple(rng.normal(size=x.shape) for x in args), rng.normal(size=(2, 4))
 
     @jax.jit
     def slopes(*args):
-        value, forward = jax.jvp(of, args, ways)
-        backward = jax.vjp(of, *args)[1](weights)
-        return value, forward, sum(jnp.sum(x * y) for x, y in zip(backward, ways, strict=True))
+        value, forward = jax.jvp(diagonal_gain, args, directions)
+        backward = jax.vjp(diagonal_gain, *args)[1](weights)
+        return value, forward, sum(jnp.sum(x * y) for x, y in zip(backward, directions, strict=True))
 
-    after, before = (slopes(*(x + h * y for x, y in zip(args, ways, strict=True)))[0] for h in (1e-6, -1e-6))
+    after, before = (slopes(*(x + h * y for x, y in zip(args, directions, strict=True)))[0] for h in (1e-6, -1e-6))
     central = np.asarray(after - before) / 2e-6
     _, forward, backward = slopes(*args)
     np.testing.assert_allclose(forward, central, atol=1e-6, rtol=1e-6)
@@ -88,7 +88,7 @@ UNSOLVABLE = {
 
 
 @pytest.mark.parametrize("case", UNSOLVABLE)
-def test_without_a_solution_it_is_nan_and_the_host_raises(case):
+def test_a_gain_without_a_solution_is_nan_and_its_check_raises(case):
     continuous, discrete, B, Q = UNSOLVABLE[case]
     for gain, A in ((gain_continuous, continuous), (gain_discrete, discrete)):
         K = GAINS[gain](A, B, Q, np.eye(2))
@@ -98,6 +98,6 @@ def test_without_a_solution_it_is_nan_and_the_host_raises(case):
 
 
 def test_a_slow_closed_loop_is_solved():
-    """A mode of 1e-3 of the fastest, stable by a weight of 1e-6."""
+    """A weight of 1e-6 gives a closed loop of 1e-3 1/s."""
     K = GAINS[gain_continuous](*(np.asarray(x, np.float32) for x in ([[0]], [[1]], [[1e-6]], [[1]])))
     np.testing.assert_allclose(K, [[1e-3]], rtol=1e-4)

@@ -30,13 +30,13 @@ def test_a_command_has_the_fields_in_the_order_of_the_state_controller():
 @pytest.mark.parametrize("batch", [(), (2, 3)])
 def test_a_command_and_its_feedforward_give_the_setpoint_back(batch):
     s = random_setpoint(*batch)
-    again = Setpoint.of_command(s.command(), s.feedforward())
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-14), again, s)
+    restored = Setpoint.of_command(s.command(), s.feedforward())
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-14), restored, s)
 
 
-def test_a_command_alone_gives_the_yaw_rate_and_no_further_derivatives():
+def test_a_command_without_feedforward_gives_the_yaw_rate_and_no_further_derivatives():
     s = random_setpoint(2)
-    again = Setpoint.of_command(s.command())
-    np.testing.assert_array_equal(again.yaw_rate, s.yaw_rate)
+    restored = Setpoint.of_command(s.command())
+    np.testing.assert_array_equal(restored.yaw_rate, s.yaw_rate)
     for name in ("jerk", "snap", "yaw_acc"):
-        np.testing.assert_array_equal(getattr(again, name), np.zeros_like(getattr(s, name)))
+        np.testing.assert_array_equal(getattr(restored, name), np.zeros_like(getattr(s, name)))
