@@ -23,9 +23,9 @@ from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.trajectories.trajectory import Trajectory
 
 MIN_SLOT_DEGREE = 7
-"""Smallest degree of slots that have room for later trajectories: the degree of minimum snap and of shows."""
+"""Smallest degree of slots if later trajectories are expected: the degree of minimum snap and of drone shows."""
 DRAWN_TIME = 2.0
-"""Time of the path ahead that is drawn, s."""
+"""Duration of the path ahead that is drawn, s."""
 N_DRAWN_LINES = 40
 """Number of line segments of the drawn path."""
 PATH_COLOR = (0.1, 0.9, 0.3, 0.8)
@@ -33,7 +33,7 @@ PATH_COLOR = (0.1, 0.9, 0.3, 0.8)
 
 
 class FollowData(PyTree):
-    """Trajectories in slots, and the slot, start and rate of every drone."""
+    """Trajectories in slots (rows of arrays, one trajectory each), and the slot, start and rate of every drone."""
 
     ends: Array = leaf("shared", 2)
     """End of each piece of the trajectory in each slot, s since its start. (n_slots, max_pieces)"""
@@ -46,9 +46,9 @@ class FollowData(PyTree):
     start: Array = leaf("parameter", 1, (1,))
     """Time since the reset of the world at which a drone starts, s. (1,)"""
     rate: Array = leaf("parameter", 1, (1,))
-    """Speed at which a drone goes through its trajectory, 1: at 2 it takes half the time. (1,)"""
+    """Factor of the speed along the trajectory, 1: with 2 a drone takes half the time. (1,)"""
     degrees: tuple[int, ...] = static()
-    """Largest degrees of x, y, z and yaw in the slots, -1 where all are zero; no trajectory in a slot may exceed them.
+    """Largest degrees of x, y, z and yaw that a trajectory in a slot may have, -1 where all coefficients are zero.
     (4,)"""
 
     @property
@@ -65,13 +65,13 @@ class FollowData(PyTree):
 class Follow(Plugin):
     """State commands from trajectories, each drone with its own trajectory, start and rate.
 
-    At every tick of the state controller it stages the setpoint of that time. A drone waits at the first point of its
-    trajectory until it starts, and stays at the last one after the end, unless the trajectory repeats. Needs
+    At every tick of the state controller the plugin stages the setpoint of that time. A drone waits at the first point
+    of its trajectory until it starts, and stays at the last point after the end, unless the trajectory repeats. Needs
     ``Sim(control="state")``.
     """
 
     trajectories: Trajectory | Sequence[Trajectory]
-    """Trajectories in the first slots: one, a sequence, or one record with a leading axis."""
+    """Trajectories in the first slots: one trajectory, a sequence of them, or a ``Trajectory`` with a leading axis."""
     index: ArrayLike | None = parameter(default=None, low=0, dtype=np.int32)
     """Slot that a drone follows; with None, drone i follows trajectory i modulo the number of trajectories. (),
     (n_drones,) or (n_worlds, n_drones)"""
@@ -79,7 +79,7 @@ class Follow(Plugin):
     """Time since the reset of the world at which a drone starts, s. A drone with a negative start is in the middle of
     its trajectory at the reset: with -2 and a rate of 1, at 2 s. (), (n_drones,) or (n_worlds, n_drones)"""
     rate: ArrayLike = parameter(default=1.0, positive=True)
-    """Speed at which a drone goes through its trajectory, 1. (), (n_drones,) or (n_worlds, n_drones)"""
+    """Factor of the speed along the trajectory, 1. (), (n_drones,) or (n_worlds, n_drones)"""
     n_slots: int | None = setting(default=None, low=1)
     """Number of slots; None for one per trajectory. Additional slots hold the first trajectory until ``upload``."""
     max_pieces: int | None = setting(default=None, low=1)
@@ -168,9 +168,10 @@ class Follow(Plugin):
         return self.write(data, record.replace(ends=ends, coefficients=coefficients, repeats=repeats))
 
     def upload(self, sim: Simulation, slot: int, trajectory: Trajectory) -> None:
-        """Put another trajectory into a slot of a simulation, between two steps and without compiling it again.
+        """Put another trajectory into a slot of a simulation, between two steps. The step is not compiled again.
 
-        A full reset restores the trajectories of the default data; ``sim.build_default_data()`` puts this one there.
+        A full reset restores the trajectories of the default data. ``sim.build_default_data()`` makes the current ones
+        the default.
         """
         with sim.lock:
             sim.data = self.uploaded(sim.data, slot, trajectory)
@@ -191,7 +192,7 @@ class Follow(Plugin):
             index: Slots. (), (n_drones,) or (n_worlds, n_drones)
             start: Times since the reset of the worlds at which the drones start, s; may be negative. (), (n_drones,) or
                 (n_worlds, n_drones)
-            rate: Speeds at which they go through their trajectories, 1. (), (n_drones,) or (n_worlds, n_drones)
+            rate: Factors of the speed along the trajectories, 1. (), (n_drones,) or (n_worlds, n_drones)
         """
         new_values = {
             name: value for name, value in (("index", index), ("start", start), ("rate", rate)) if value is not None
@@ -232,7 +233,10 @@ class Follow(Plugin):
 
 
 def _check_slot_value(sim: Simulation, name: str, value: ArrayLike, n_slots: int) -> Array:
-    """Return a checked index, start or rate. An array with one axis has a value per drone, for all worlds."""
+    """Return a checked index, start or rate, (1,) or (n_worlds, n_drones, 1).
+
+    An array with one axis has a value for each drone, in all worlds.
+    """
     if np.shape(value) == (sim.n_drones,):
         value = np.broadcast_to(np.asarray(value), (sim.n_worlds, sim.n_drones))
     elif np.ndim(value) == 1 and np.shape(value) != (1,):
@@ -267,7 +271,7 @@ def _future_paths(record: FollowData, slot_values: list[Array], times: Array) ->
     """
 
     def drone_path(index: Array, start: Array, rate: Array) -> Array:
-        vehicle = record.replace(index=index, start=start, rate=rate)
-        return jax.vmap(lambda t: vehicle.setpoint(t).pos)(times)
+        drone_record = record.replace(index=index, start=start, rate=rate)
+        return jax.vmap(lambda t: drone_record.setpoint(t).pos)(times)
 
     return jax.vmap(drone_path)(*slot_values)

@@ -29,7 +29,7 @@ from crazysim.pytree import PyTree, n_batch_axes
 P = TypeVar("P", bound=Plugin)
 
 _SETTING_SCOPES = ("parameter", "shared")
-"""Scopes of leaves that hold settings; the others hold states."""
+"""Scopes of leaves that contain settings. Leaves of all other scopes contain states."""
 
 
 class _InstalledPlugin(NamedTuple):
@@ -39,7 +39,7 @@ class _InstalledPlugin(NamedTuple):
     stages: dict[str, Callable[..., Any]]
     """The stages by name."""
     replaced: dict[str, tuple[str, Callable[..., Any]]]
-    """Name and function of the replaced stage, for each stage that replaced one."""
+    """Name and function of the stage that was replaced, by the name of the stage that replaced it."""
 
 
 class PluginRegistry(Mapping[str, Plugin]):
@@ -88,10 +88,12 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._require_unique_terms(plugin, self.values())
         with self._restore_on_error():
             record, default = plugin.record(self._sim), plugin.default_record(self._sim)
-            pipeline, installed = _add_stages(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
+            pipeline, installed = _add_stages(
+                dict(self._sim.step_pipeline), plugin, _stage_placements(plugin, self._sim)
+            )
             pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
             resets = dict(self._sim.reset_pipeline)
-            if _in_reset_pipeline(plugin):
+            if _is_in_reset_pipeline(plugin):
                 append_fn(resets, Stage(plugin.reset_episode, plugin.scope), name)
             self._put_records(name, record, default)
             self._installed[name] = installed
@@ -101,11 +103,11 @@ class PluginRegistry(Mapping[str, Plugin]):
     def remove(self, plugin: Plugin | str) -> None:
         """Remove a plugin; see ``Sim.remove``."""
         name = plugin.name if isinstance(plugin, Plugin) else plugin
-        self[name]
+        removed_plugin = self[name]
         pipeline = _remove_stages(dict(self._sim.step_pipeline), self._installed[name])
         pipeline = _with_influences(pipeline, [p for p in self.values() if p.name != name])
         resets = dict(self._sim.reset_pipeline)
-        if _in_reset_pipeline(self[name]):
+        if _is_in_reset_pipeline(removed_plugin):
             resets.pop(name, None)
         self._put_records(name, None, None)
         del self._installed[name]
@@ -128,20 +130,20 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._require_unique_terms(plugin, [other for other in self.values() if other is not old_plugin])
         old_record, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
         if _have_same_code(old_plugin, plugin) and jax.tree.structure(old_record) == jax.tree.structure(record):
-            self._put_records(name, _continue_states(record, old_record), default)
+            self._put_records(name, _carry_over_states(record, old_record), default)
             self._installed[name] = self._installed[name]._replace(plugin=plugin)
             self._is_checked = False
             return plugin
         # The plugin's stages must be created for a pipeline without the plugin.
         sim.step_pipeline = _remove_stages(dict(sim.step_pipeline), self._installed[name])
-        pipeline, installed = _add_stages(dict(sim.step_pipeline), plugin, _placements(plugin, sim))
+        pipeline, installed = _add_stages(dict(sim.step_pipeline), plugin, _stage_placements(plugin, sim))
         pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
         resets = dict(self._sim.reset_pipeline)
-        if _in_reset_pipeline(plugin) and (name in resets or not _in_reset_pipeline(old_plugin)):
+        if _is_in_reset_pipeline(plugin) and (name in resets or not _is_in_reset_pipeline(old_plugin)):
             resets[name] = Stage(plugin.reset_episode, plugin.scope)
-        elif _in_reset_pipeline(old_plugin):
+        elif _is_in_reset_pipeline(old_plugin):
             resets.pop(name, None)
-        self._put_records(name, _continue_states(record, old_record), default)
+        self._put_records(name, _carry_over_states(record, old_record), default)
         self._installed[name] = installed
         self._build(pipeline, resets)
         return plugin
@@ -167,9 +169,9 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     @property
     def reset_stages(self) -> tuple[str, ...]:
-        """Names of the stages that repeat, in the first step of an episode, what the reset pipeline does to plugins."""
+        """Names of the stages that call ``reset_episode`` in the first step, as the reset pipeline did before."""
         resets = self._sim.reset_pipeline
-        return tuple([_reset_stage_name(p) for p in self.values() if _in_reset_pipeline(p) and p.name in resets])
+        return tuple([_reset_stage_name(p) for p in self.values() if _is_in_reset_pipeline(p) and p.name in resets])
 
     @property
     def members(self) -> tuple[str, ...]:
@@ -247,7 +249,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def _put_records(self, name: str, record: PyTree | None, default: PyTree | None) -> None:
         """Put a record into the data and the default data, or remove it, without other changes.
 
-        Both records go through ``sim.data``, which puts them on the simulation's devices.
+        Each record is first assigned to ``sim.data``, which moves it to the simulation's devices.
         """
         self._set_record(name, default)
         current = self._sim.data.plugins.get(name)
@@ -275,19 +277,19 @@ def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
     return data.replace(plugins=others if record is None else others | {name: record})
 
 
-def _placements(plugin: Plugin, sim: Simulation) -> object:
-    """Return the placements of a plugin's stages, after the stage that resets it in the first step of an episode."""
+def _stage_placements(plugin: Plugin, sim: Simulation) -> object:
+    """Return the placements of a plugin's stages, led by the stage that calls ``reset_episode``, if there is one."""
     placements = plugin.stages(sim)
     if not plugin.resets_episode or not isinstance(placements, (list, tuple)):
         return placements
     episode_stage = Stage(plugin.reset_episode, plugin.scope, is_first_step)
     before = plugin.reset_before
-    if before is None:  # before all stages that do not begin an episode
+    if before is None:  # after the stages that begin an episode for other plugins, before all other stages
         before = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not is_first_step)
     return [StagePlacement(episode_stage, before=before, name=_reset_stage_name(plugin)), *placements]
 
 
-def _in_reset_pipeline(plugin: Plugin) -> bool:
+def _is_in_reset_pipeline(plugin: Plugin) -> bool:
     return plugin.resets_episode and plugin.reset_before is None
 
 
@@ -368,11 +370,11 @@ def _are_equal(a: Any, b: Any) -> bool:
         return type(a) is type(b) and np.array_equal(a, b)
     try:
         return bool(a == b)
-    except ValueError:  # sequences of arrays count as different: the step is compiled again
+    except ValueError:  # sequences of arrays have no truth value: assume a difference, and compile the step again
         return False
 
 
-def _continue_states(record: PyTree | None, old_record: PyTree | None) -> PyTree | None:
+def _carry_over_states(record: PyTree | None, old_record: PyTree | None) -> PyTree | None:
     """Return a record with the states of the previous record, wherever structure, shape and type agree."""
     if record is None or type(record) is not type(old_record):
         return record
@@ -380,7 +382,7 @@ def _continue_states(record: PyTree | None, old_record: PyTree | None) -> PyTree
     for f in dataclasses.fields(record):  # type: ignore[arg-type]
         new, old = getattr(record, f.name), getattr(old_record, f.name)
         if isinstance(new, PyTree):
-            states[f.name] = _continue_states(new, old)
+            states[f.name] = _carry_over_states(new, old)
         elif not f.metadata.get("static") and f.metadata.get("scope") not in _SETTING_SCOPES:
             states[f.name] = old if _signature(old) == _signature(new) else new
     return record.replace(**states)

@@ -1,4 +1,4 @@
-"""Free rigid bodies: balls and boxes that drones, vehicles and each other push."""
+"""Free rigid bodies: balls and boxes that push each other, and that drones and vehicles push."""
 
 from crazysim.plugins.bodies.free_bodies import FreeBodies, FreeBodiesData
 

@@ -31,9 +31,7 @@ from crazysim.tables import MASS
 MAX_BODIES = 1000
 """Largest number of bodies in a world."""
 START_SPACING = 0.5
-"""Distance between neighbours that start in a row, m."""
-
-
+"""Distance between neighbours of the default row of bodies, m."""
 BODY_SETTINGS = ("mass", "friction", "restitution")
 """Settings with a number for each body."""
 
@@ -59,7 +57,8 @@ class FreeBodiesData(Members):
     """Impulses of the last step along the normals of the contact points, N s, with which the next step begins.
     (n_worlds, 1, n_contacts)"""
     friction_impulse: Array = leaf("world", 2)
-    """The same across the normals, world frame, N s. (n_worlds, 1, n_contacts, 3)"""
+    """Impulses of the last step across the normals, world frame, N s, with which the next step begins.
+    (n_worlds, 1, n_contacts, 3)"""
     mass: Array = leaf("member", 1, (1,))
     """Mass, kg. (n_worlds, n_members, 1)"""
     inertia: Array = leaf("member", 1, (3,))
@@ -74,13 +73,13 @@ class FreeBodies(Population):
     """Balls and boxes that fall, slide, roll, bounce and stack.
 
     They touch the ground, objects of the scene, other populations with shapes, drones and each other. Drones and bodies
-    are pushed back; objects and other populations are not. One ``FreeBodies`` holds all free bodies of a simulation.
+    are pushed back; objects and other populations are not. A simulation has at most one ``FreeBodies``.
     """
 
     members: int | Sequence[str] = 1
     """Number of bodies in each world, or their names."""
     size: Any = (0.2, 0.2, 0.2)
-    """Full lengths of a box, m (3,), or radius of a ball, m, for all; or a list of one for each body."""
+    """Full lengths of a box, m (3,), or radius of a ball, m, for all bodies; or a list with an entry for each body."""
     mass: ArrayLike = parameter(default=0.1, low=MASS.low, high=MASS.high)
     """Mass, kg. (), (n_members,) or (n_worlds, n_members)"""
     pos: ArrayLike | None = parameter(default=None)
@@ -96,7 +95,7 @@ class FreeBodies(Population):
     """Ratio of the speeds after and before a bounce, 0 to 1; the larger one of two bodies is used. (), (n_members,) or
     (n_worlds, n_members)"""
     objects: ObjectSelection = None
-    """Handles, or names of objects that the bodies touch; None for all that are in the scene when the plugin is added,
+    """Handles, or names of objects that the bodies touch; None for all objects in the scene when the plugin is added,
     () for the ground alone."""
     drones: bool = True
     """True for contact with drones."""
@@ -122,7 +121,7 @@ class FreeBodies(Population):
 
     @property
     def pushes_drones(self) -> bool:
-        """True if this plugin handles its contacts with drones, so that ``ContactResponse`` leaves them out."""
+        """True if this plugin computes the contacts of its bodies with drones; ``ContactResponse`` leaves them out."""
         return self.drones
 
     @property
@@ -183,7 +182,7 @@ class FreeBodies(Population):
         }
 
     def scheme(self, integrator: Integrator) -> Callable[..., FreeBodiesData]:
-        """Return the scheme of the simulation, in which bodies turn by ``free_rotation`` if it is an Euler scheme."""
+        """Return the simulation's scheme; an Euler scheme integrates rotations by ``free_rotation``."""
         scheme = super().scheme(integrator)
 
         def integrate_motion(body: FreeBodiesData, rates_fn: RatesFn, dt: float) -> FreeBodiesData:
@@ -228,7 +227,7 @@ def inertia_per_mass(shape: Shape) -> np.ndarray:
 
 
 def body_geom_xml(shape: Shape, rgba: Iterable[float]) -> str:
-    """Return MJCF of the geom of a body, which drones touch."""
+    """Return the MJCF of a body's geom, which drones can touch."""
     size, color = (" ".join(f"{float(x):.9g}" for x in values) for values in (shape.size, rgba))
     geom = f'<geom type="{shape.kind}" size="{size}" contype="0" conaffinity="2" rgba="{color}"/>'
     return f"<mujoco><worldbody>{geom}</worldbody></mujoco>"

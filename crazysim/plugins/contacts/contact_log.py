@@ -21,19 +21,19 @@ class ContactLogData(PyTree):
     """Contacts of each drone since its world's last reset."""
 
     floor: Array = leaf("drone", 0)
-    """True where it has touched the floor. (n_worlds, n_drones)"""
+    """True where the drone has touched the floor. (n_worlds, n_drones)"""
     objects: Array = leaf("drone", 1)
-    """True where it has touched an object. (n_worlds, n_drones, n_objects)"""
+    """True where the drone has touched the object. (n_worlds, n_drones, n_objects)"""
     drones: Array = leaf("drone", 0)
-    """True where it has touched another drone. (n_worlds, n_drones)"""
+    """True where the drone has touched another drone. (n_worlds, n_drones)"""
     first_step: Array = leaf("drone", 0)
-    """Step in which it first touched anything; -1 before. (n_worlds, n_drones)"""
+    """Step in which the drone first touched anything; -1 before. (n_worlds, n_drones)"""
     object_names: tuple[str, ...] = static()
-    """Names of the objects' bodies."""
+    """Names of the bodies of the objects. (n_objects,)"""
 
     @property
     def any(self) -> Array:
-        """True where it has touched anything. (n_worlds, n_drones)"""
+        """True where the drone has touched anything. (n_worlds, n_drones)"""
         return self.first_step >= 0
 
 
@@ -44,15 +44,15 @@ class ContactLog(Plugin):
     """
 
     objects: ObjectSelection = None
-    """Handles, or names of bodies; None for all that are in the scene when the plugin is added, () for none."""
+    """Handles, or names of bodies; None for all bodies in the scene when the plugin is added, () for none."""
     floor: bool = True
-    """True to check the floor. Drones that start on it touch it at once."""
+    """True to check the floor. Drones that start on the floor touch it at once."""
     drones: bool = True
     """True to check drones against each other."""
     name: str = "contacts"
 
     def record(self, sim: Simulation) -> ContactLogData:
-        names = self._names(sim)
+        names = self._object_names(sim)
         if not (names or self.floor or self.drones):
             raise ConfigError("expected something to check for contacts, got nothing. Use floor, drones or objects.")
         shape = (sim.n_worlds, sim.n_drones)
@@ -67,24 +67,24 @@ class ContactLog(Plugin):
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return a stage of one drone, and a stage of one world for loads and other objects that plugins move.
 
-        There are two because a stage of one world computes everything for all of its drones.
+        A stage of one world computes everything for all of its drones, so it checks nothing else.
         """
-        names, placements = self._names(sim), []
+        names, placements = self._object_names(sim), []
         moved_names = moving_plugins(sim.scene.plugins(), names)
         static_names = [name for name in names if name not in moved_names]
         if static_names or self.floor or self.drones:
-            drone_stage = self._stage(sim.scene.contact_fn(static_names, self.floor, self.drones), "drone")
+            drone_stage = self._log_stage(sim.scene.contact_fn(static_names, self.floor, self.drones), "drone")
             placements.append(StagePlacement(drone_stage, before="increment_steps"))
         if moved_names:
-            object_stage = self._stage(sim.scene.contact_fn(list(moved_names), floor=False, drones=False), "world")
+            object_stage = self._log_stage(sim.scene.contact_fn(list(moved_names), floor=False, drones=False), "world")
             placements.append(StagePlacement(object_stage, before="increment_steps", name=f"{self.name}_of_moved"))
         return placements
 
-    def _names(self, sim: Simulation) -> tuple[str, ...]:
+    def _object_names(self, sim: Simulation) -> tuple[str, ...]:
         return tuple(body.name for body in select_bodies(sim.scene.collision_model, self.objects))
 
-    def _stage(self, contacts: Callable[[SimData], ContactReport], scope: StageScope) -> Stage:
-        def check(data: SimData) -> SimData:
+    def _log_stage(self, contacts: Callable[[SimData], ContactReport], scope: StageScope) -> Stage:
+        def log_contacts(data: SimData) -> SimData:
             log, report = self.read(data), contacts(data)
             new_log = log.replace(
                 floor=_logical_or(log.floor, report.floor),
@@ -94,7 +94,7 @@ class ContactLog(Plugin):
             )
             return self.write(data, new_log)
 
-        return Stage(check, scope)
+        return Stage(log_contacts, scope)
 
 
 def _merge_objects(log: ContactLogData, report: ContactReport) -> Array:

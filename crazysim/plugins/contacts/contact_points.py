@@ -29,8 +29,8 @@ from crazysim.scene.contact_report import ObjectSelection, select_bodies
 FLAT_KINDS = ("plane", "box", "cylinder")
 """Kinds of geoms with flat faces, which the corners of a drone's box touch."""
 PLATE_HEIGHT_FRACTION = 0.05
-"""Height of the upper and lower plate of a drone's box, as a fraction of the box's height; both plates touch an
-object next to the drone."""
+"""Height of the plates at the top and at the bottom of a drone's box, as a fraction of the box's height. An object next
+to the drone touches both plates."""
 
 
 class Carrier(NamedTuple):
@@ -115,7 +115,7 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
     """Return all contact points of every drone.
 
     Args:
-        data: The simulation, or one drone of it.
+        data: Data of all drones or of one drone.
         surfaces: Surfaces of floor and objects.
         box: Centre and half extents of the drone's collision box, body frame, m. (6,)
     """
@@ -159,9 +159,9 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
     """Return the points of loads that are nearest to each surface.
 
     Args:
-        data: One drone or one world.
-        body: Its loads.
-        shape: Their shape.
+        data: Data of one drone or one world.
+        body: The loads.
+        shape: Shape of the loads.
         surfaces: At least one surface.
     """
     pos, quat = body.pos[..., None, :], body.quat[..., None, :]
@@ -188,7 +188,7 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
 def _height_above_field(
     data: SimData, geom: CollisionGeom, points: Array, to_geom: Callable, to_world: Callable
 ) -> tuple[Array, Array]:
-    """Return the distance of points to the plane of a height field below them, m, and its normal, world frame."""
+    """Return the distance of points to the plane of the terrain's triangle below, m, and its normal, world frame."""
     terrain = data.plugins.get(geom.name)
     if isinstance(terrain, TerrainData):
         return terrain.gap_at(points)
@@ -197,7 +197,7 @@ def _height_above_field(
 
 
 def _extent_along(shape: Shape, direction: Array) -> Array:
-    """Return the distance of the outermost point of a ball or box along a direction in its frame, m. (...)"""
+    """Return the extent of a ball or box from its centre along a direction in its frame, m. (...)"""
     if shape.kind == "sphere":
         return jnp.full(direction.shape[:-1], shape.size[0], direction.dtype)
     return jnp.sum(jnp.abs(direction) * jnp.asarray(shape.size, direction.dtype), axis=-1)
@@ -208,9 +208,9 @@ def _nearest_plate_point(
 ) -> ContactPoints:
     """Return the point of a plate that is nearest to a geom.
 
-    The gradient of the gap with respect to the drone's position is the normal. The gradient with respect to its
+    The gradient of the gap with respect to the drone's position is the normal. The gradient with respect to the drone's
     attitude is the cross product of the lever and the normal, which determines the torque of a normal force. The
-    position along the normal affects friction only; the point is put on the plate's face.
+    position of the point along the normal affects friction only; it is on the plate's face.
     """
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
@@ -235,7 +235,7 @@ def _nearest_plate_point(
 def _distance_and_slopes(shape: Shape, other: Shape, pos: Array, rot: Array) -> tuple[Array, tuple[Array, Array]]:
     """Return ``distance``, m, (...), and its gradients with respect to position and rotation matrix.
 
-    It is traced only once for both plates and all geoms of one shape, such as the wheels of cars.
+    JAX traces it only once for both plates and all geoms of one shape, such as the wheels of cars.
 
     Args:
         shape: Shape of the plate.
@@ -248,21 +248,21 @@ def _distance_and_slopes(shape: Shape, other: Shape, pos: Array, rot: Array) -> 
 
 
 def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Callable | None]:
-    """Return functions that transform points and directions into a geom's frame, and directions back, and its velocity.
+    """Return functions from points and directions to a geom's frame, from directions back to the world, and a velocity.
 
-    The velocity is a function of points in the world frame; it is None for a fixed surface.
+    The velocity of the surface is a function of points in the world frame; None for a fixed surface.
     """
     geom, row = surface.geom, surface.row
     dtype = data.states.pos.dtype
     pos = jnp.asarray(geom.pos, dtype)
     rot = None if geom.rot is None else jnp.asarray(geom.rot, dtype)
-    object_pos = object_quat = vel = spin = None
+    object_pos = object_quat = vel = world_ang_vel = None
     if surface.population is not None:
         record = data.plugins[surface.population]
         object_pos, object_quat, vel, ang_vel = (
             getattr(record, name)[..., row, :] for name in ("pos", "quat", "vel", "ang_vel")
         )
-        spin = rotation.rotate(object_quat, ang_vel)
+        world_ang_vel = rotation.rotate(object_quat, ang_vel)
     elif row is not None:
         objects: Any = data.objects
         object_pos, object_quat, vel = (x[..., row, :] for x in (objects.pos, objects.quat, objects.vel))
@@ -279,8 +279,10 @@ def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Ca
 
     def velocity_at(x: Array) -> Array:
         point_vel = jnp.broadcast_to(vel[..., None, :], x.shape)  # type: ignore[index]
-        if spin is None or object_pos is None:
+        if world_ang_vel is None or object_pos is None:
             return point_vel
-        return point_vel + rotation.cross(jnp.broadcast_to(spin[..., None, :], x.shape), x - object_pos[..., None, :])
+        return point_vel + rotation.cross(
+            jnp.broadcast_to(world_ang_vel[..., None, :], x.shape), x - object_pos[..., None, :]
+        )
 
     return to_geom, to_world, None if vel is None else velocity_at

@@ -26,7 +26,7 @@ def collision_boxes(sim: Simulation) -> DroneBoxes:
 
 
 def select_airframe(results: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) -> Any:
-    """Return the result of each drone's own airframe.
+    """Return for each drone the result that belongs to its airframe.
 
     Args:
         results: For each airframe: its drones, with a result that was computed as if all drones had this airframe. A
@@ -35,7 +35,7 @@ def select_airframe(results: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) 
     """
     (_, result), *others = results
     for group, other in others:
-        in_group: Any = group.drone_mask(drone_id)
-        mask = in_group[..., None] if in_group.ndim else in_group
+        is_in_group: Any = group.drone_mask(drone_id)
+        mask = is_in_group[..., None] if is_in_group.ndim else is_in_group
         result = jax.tree.map(lambda x, y, mask=mask: x if y is x else jnp.where(mask, y, x), result, other)
     return result

@@ -41,11 +41,11 @@ class DroneCollisionsData(PyTree):
     """Impulses along the normals of the contact points, N s, with which the next step begins.
     (n_worlds, 1, n_contacts)"""
     friction_impulse: Array = leaf("world", 2)
-    """The same across the normals, world frame, N s. (n_worlds, 1, n_contacts, 3)"""
+    """Impulses across the normals, world frame, N s, with which the next step begins. (n_worlds, 1, n_contacts, 3)"""
 
 
 class DroneCollisions(Plugin):
-    """Drones of a world that push each other where their collision boxes meet.
+    """Contacts between the drones of a world, which push each other where their collision boxes overlap.
 
     All pairs are checked, which suits small swarms only. Momentum and angular momentum are conserved.
     """

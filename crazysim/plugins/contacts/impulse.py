@@ -57,7 +57,7 @@ def velocity_after_contact(
     n, p, s = points.normal, points.point, points.vel
     is_active = points.gap < 0
     stiffness = PENALTY_STIFFNESS * mass
-    normal_wrench = _with_torque(n, p)
+    normal_wrench = _force_and_torque(n, p)
     surface_speed = jnp.sum(n * s, axis=-1)
 
     def point_speeds(u: Array) -> tuple[Array, Array]:
@@ -75,8 +75,8 @@ def velocity_after_contact(
         is_pressed = is_active & (normal_speed < target_speed)
         normal_impulse = jnp.where(is_pressed, stiffness * (target_speed - normal_speed), 0.0)
         w_n = jnp.where(is_pressed, stiffness, 0.0)
-        # In the first iteration every point stops the whole fall on its own. The normal forces, and hence the
-        # friction forces, are known only from the second iteration on.
+        # In the first iteration every normal impulse is as large as if its point stopped the body alone. So friction,
+        # which depends on the normal impulses, begins in the second iteration.
         w_t = jnp.where(
             k == 0, 0.0, jnp.minimum(w_n, material.friction * normal_impulse / (slip_speed + STICKING_SPEED))
         )
@@ -85,7 +85,7 @@ def velocity_after_contact(
             w_rest[..., None, None] * normal_wrench[..., None] * normal_wrench[..., None, :], axis=-3
         )
         matrix = inertia + _weighted_inertia(w_t, p, n.dtype) + normal_stiffness
-        friction_pull = w_t[..., None] * _with_torque(s, p)
+        friction_pull = w_t[..., None] * _force_and_torque(s, p)
         normal_pull = (w_rest * surface_speed + w_n * target_speed)[..., None] * normal_wrench
         return solve_symmetric(
             matrix, rotation.matvec(inertia, initial_vel) + jnp.sum(friction_pull + normal_pull, axis=-2)
@@ -123,7 +123,7 @@ def inertia_matrix(mass: Array, inertia: Array | None = None) -> Array:
     return jnp.concatenate([upper, jnp.concatenate([zero, inertia], axis=-1)], axis=-2)
 
 
-def _with_torque(force: Array, p: Array | None) -> Array:
+def _force_and_torque(force: Array, p: Array | None) -> Array:
     """Return forces at points followed by their torques; forces alone for a point mass. (..., n, 6) or (..., n, 3)"""
     return force if p is None else jnp.concatenate([force, rotation.cross(p, force)], axis=-1)
 

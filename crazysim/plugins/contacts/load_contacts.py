@@ -28,7 +28,7 @@ from crazysim.plugins.contacts.impulse import (
 from crazysim.plugins.payloads.colliders import Collider, CollidingPlugin
 
 SELF_GAP = 1e3
-"""Distance of a body to itself, m: large, so that it never touches itself."""
+"""Distance that is assumed between a body and itself, m, so that it never touches itself."""
 
 
 def load_plugins(sim: Simulation) -> list[CollidingPlugin]:
@@ -52,7 +52,7 @@ def resolve_surface_contacts(
     follows in the next step, from the constraint.
     """
     body = collider.body(data)
-    # A load of a whole world takes the material of its first drone.
+    # A load that the drones of a world share has the material of the first drone.
     material = Material(*(x[:1] if x.ndim > 1 else x for x in material))
     points, unit_mass = load_points(data, body, collider.shape, surfaces), jnp.ones_like(body.mass)
     vel = velocity_after_contact(points, body.vel, unit_mass, inertia_matrix(unit_mass), material, iterations)
@@ -65,13 +65,13 @@ def resolve_drone_contacts(
 ) -> tuple[SimData, Array]:
     """Return one world after the impulses between loads or hooks and drones, and the impulses on the drones, N s.
 
-    The impulse acts at the load's centre, on both, which conserves momentum and angular momentum. The normal impulse,
-    with restitution, is computed first, and then friction, limited by Coulomb's law and by the impulse that stops the
-    slip. Each impulse is divided by the larger number of contacts of its two bodies, so that together they create no
-    energy. A load and a drone that a rod joins do not touch.
+    The impulse acts on both bodies at the load's centre, which conserves momentum and angular momentum. The normal
+    impulse, with restitution, is computed first, and then friction, limited by Coulomb's law and by the impulse that
+    stops the slip. Each impulse is divided by the larger number of contacts of its two bodies, so that all impulses
+    together create no energy. A load and a drone that a rod joins do not touch.
 
     Args:
-        data: One world.
+        data: Data of one world.
         collider: The loads, or the hooks.
         material: Parameters of the contacts.
         boxes: Collision boxes of the drones.
@@ -100,23 +100,23 @@ def resolve_drone_contacts(
         return change + mass * (change / p.mass + rotation.cross(ang_vel_change, lever))
 
     vel = rotation.rotate_inverse(quat, body.vel[:, None] - s.vel) - rotation.cross(s.ang_vel[None], lever)
-    change = velocity_change(gap, normal, vel, material, response)
+    load_vel_change = velocity_change(gap, normal, vel, material, response)
     n_load, n_drone = (jnp.sum(is_touching, axis=axis, keepdims=True, dtype=gap.dtype) for axis in (1, 0))
     weight = jnp.where(is_touching, 1 / jnp.maximum(jnp.maximum(n_load, n_drone), 1.0), 0.0)[..., None]
-    change = weight * change
+    load_vel_change = weight * load_vel_change
 
-    turn_rate = rotation.matvec(p.J_inv, rotation.cross(lever, change))
-    change = rotation.rotate(quat, change)
-    impulse = -jnp.sum(mass * change, axis=0)
-    states = s.replace(vel=s.vel + impulse / p.mass, ang_vel=s.ang_vel - jnp.sum(mass * turn_rate, axis=0))
-    data = collider.with_vel(data, body.vel + jnp.sum(change, axis=1))
+    ang_vel_change = rotation.matvec(p.J_inv, rotation.cross(lever, load_vel_change))
+    load_vel_change = rotation.rotate(quat, load_vel_change)
+    impulse = -jnp.sum(mass * load_vel_change, axis=0)
+    states = s.replace(vel=s.vel + impulse / p.mass, ang_vel=s.ang_vel - jnp.sum(mass * ang_vel_change, axis=0))
+    data = collider.with_vel(data, body.vel + jnp.sum(load_vel_change, axis=1))
     return data.replace(states=states), impulse
 
 
 def velocity_change(
     gap: Array, normal: Array, vel: Array, material: Material, response: Callable[[Array], Array]
 ) -> Array:
-    """Return the change of a body's velocity by a contact; the other body responds to it. (..., 3)
+    """Return the change of a body's velocity by a contact with another body, m/s. (..., 3)
 
     Args:
         gap: Distance of the bodies, negative where they overlap, m. (...)
@@ -141,34 +141,35 @@ def velocity_change(
     return speed * normal - friction_speed * slip_direction
 
 
-class _PairContacts(NamedTuple):
+class _VelocityChanges(NamedTuple):
     """Changes of velocity by the contacts of two groups of bodies with each other."""
 
     is_touching: Array
-    """True where two touch. (n, m)"""
+    """True where a body of the first group touches a body of the second group. (n, m)"""
     first: Array
-    """Change of each body of the first group, m/s. (n, m, 3)"""
+    """Change of the velocity of the body of the first group, m/s. (n, m, 3)"""
     second: Array
-    """Change of each body of the second group, m/s. (n, m, 3)"""
+    """Change of the velocity of the body of the second group, m/s. (n, m, 3)"""
 
 
 def resolve_load_contacts(data: SimData, colliders: Sequence[Collider], material: Material) -> SimData:
     """Return one world after the impulses of loads and hooks on each other.
 
-    They are point masses, so an impulse changes velocities only. Momentum is conserved. The impulse has a
+    Loads and hooks are point masses, so an impulse changes velocities only. Momentum is conserved. The impulse has a
     normal part with restitution, and friction, limited by Coulomb's law and by the impulse that stops the slip. Each
-    impulse is divided by the larger number of contacts of its two bodies, so that together they create no energy. The
-    effect of the impulse on a drone with a taut link follows in the next step, from the constraint.
+    impulse is divided by the larger number of contacts of its two bodies, so that all impulses together create no
+    energy. The effect on a drone with a taut link follows in the next step, from the constraint.
 
     Args:
-        data: One world.
+        data: Data of one world.
         colliders: Loads, and hooks.
         material: Parameters of the contacts.
     """
-    groups = list(combinations_with_replacement(range(len(colliders)), 2))
+    index_pairs = list(combinations_with_replacement(range(len(colliders)), 2))
     material = Material(*(x.reshape(-1)[:1] for x in material))
     contacts = {
-        (a, b): _pair_contacts(data, colliders[a], colliders[b], material, is_same_kind=a == b) for a, b in groups
+        (a, b): _pair_velocity_changes(data, colliders[a], colliders[b], material, is_same_kind=a == b)
+        for a, b in index_pairs
     }
     n_touches: list[Any] = [
         sum(pairs.is_touching.sum(axis=1) for (a, _), pairs in contacts.items() if a == k)
@@ -187,10 +188,10 @@ def resolve_load_contacts(data: SimData, colliders: Sequence[Collider], material
     return data
 
 
-def _pair_contacts(
+def _pair_velocity_changes(
     data: SimData, first: Collider, second: Collider, material: Material, is_same_kind: bool
-) -> _PairContacts:
-    """Return the contacts of two groups of bodies, or of one group, in which each pair counts once."""
+) -> _VelocityChanges:
+    """Return the changes by contacts between two groups of bodies, or within one group (``is_same_kind``)."""
     a, b = first.body(data), second.body(data)
     second_quat = b.quat[None]
     offset = rotation.rotate_inverse(second_quat, a.pos[:, None] - b.pos[None])
@@ -209,6 +210,8 @@ def _pair_contacts(
 
     vel = a.vel[:, None] - b.vel[None]
     change = velocity_change(gap, normal, vel, material, lambda change: change)
-    total = a.mass[:, None] + b.mass[None]
-    inv_total = 1 / jnp.where(total > 0, total, 1.0)
-    return _PairContacts(is_touching, b.mass[None] * inv_total * change, -a.mass[:, None] * inv_total * change)
+    total_mass = a.mass[:, None] + b.mass[None]
+    inv_total_mass = 1 / jnp.where(total_mass > 0, total_mass, 1.0)
+    return _VelocityChanges(
+        is_touching, b.mass[None] * inv_total_mass * change, -a.mass[:, None] * inv_total_mass * change
+    )

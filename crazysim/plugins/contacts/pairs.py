@@ -50,20 +50,25 @@ class PairContacts(NamedTuple):
 
 
 def contacts_between(solids: Solids, pairs: np.ndarray) -> list[PairContacts]:
-    """Return the contact points of solids by kind of pair, for pairs of indices (n_pairs, 2)."""
+    """Return the contact points of pairs of solids, one record for each kind of pair, such as ball and box.
+
+    Args:
+        solids: The solids.
+        pairs: Indices of the two solids of each pair. (n_pairs, 2)
+    """
     contacts = []
     kinds = solids.is_ball[pairs]
-    for first, second in ((True, True), (True, False), (False, True), (False, False)):
-        pairs_of_kind = pairs[(kinds[:, 0] == first) & (kinds[:, 1] == second)]
+    for is_a_ball, is_b_ball in ((True, True), (True, False), (False, True), (False, False)):
+        pairs_of_kind = pairs[(kinds[:, 0] == is_a_ball) & (kinds[:, 1] == is_b_ball)]
         if not len(pairs_of_kind):
             continue
-        if second and not first:
+        if is_b_ball and not is_a_ball:
             pairs_of_kind = pairs_of_kind[:, ::-1]
         a, b = pairs_of_kind.T
         size = jnp.asarray(solids.size, solids.pos.dtype)
-        if first and second:
+        if is_a_ball and is_b_ball:
             points = jax.vmap(ball_contacts)(size[a, 0], solids.pos[a], size[b, 0], solids.pos[b])
-        elif first or second:
+        elif is_a_ball or is_b_ball:
             points = jax.vmap(ball_box_contacts)(size[a, 0], solids.pos[a], size[b], solids.pos[b], solids.rot[b])
         else:
             points = jax.vmap(box_contacts)(
@@ -84,7 +89,7 @@ def contacts_on_surface(
         solids: The solids.
         solid_index: Index of the solid.
         geom: The geom.
-        carrier: Index of the body that carries it.
+        carrier: Index of the body that carries the geom.
         pose: Position, m (3,), and rotation matrix (3, 3) of the geom, world frame.
     """
     (surface_pos, surface_rot), shape = pose, geom.shape
@@ -106,7 +111,7 @@ def contacts_on_surface(
 
 
 def contacts_on_ground(solids: Solids, solid_index: int, carrier: int, gap_at: GapFn) -> PairContacts:
-    """Return the contact points of a solid with terrain; ``gap_at(points)`` returns its gaps and normals."""
+    """Return the contact points of a solid with a surface, whose gaps and normals ``gap_at`` returns."""
     pos, rot = solids.pos[solid_index], solids.rot[solid_index]
     if solids.is_ball[solid_index]:
         radius = float(solids.size[solid_index, 0])
@@ -125,7 +130,7 @@ def join_contacts(pairs: list[PairContacts], friction: Array, restitution: Array
     Args:
         pairs: Contact points of pairs of bodies.
         friction: Coulomb's coefficients of the bodies, 1. (n,)
-        restitution: Their coefficients of restitution, 1. (n,)
+        restitution: Coefficients of restitution of the bodies, 1. (n,)
     """
     pairs = sorted(pairs, key=_n_points)
     first, second = (np.concatenate([pair[k] for pair in pairs]) for k in range(2))
@@ -143,13 +148,13 @@ def _n_points(contacts: PairContacts) -> int:
 
 
 def _distance_and_normal(shape: Shape, point: Array) -> tuple[Array, Array]:
-    """Return the distance of points to a shape, and its normal there, in the shape's frame."""
+    """Return the distances of points to a shape, and the outward normals, in the frame of the shape."""
     gap, pull_back = jax.vjp(lambda p: point_distance(shape, p), point)
     return gap, pull_back(jnp.ones_like(gap))[0]
 
 
 def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, shape_pos: Array, shape_rot: Array) -> Manifold:
-    """Return the contact at a box's point nearest to a shape; normal and torque are the gradient of the gap."""
+    """Return the contact at the point of a box that is nearest to a shape, from the gradient of the gap."""
 
     def gap_at(displacement: Array, rotvec: Array) -> Array:
         turned_rot = rot + jnp.stack([rotation.cross(rotvec, rot[:, k]) for k in range(3)], axis=-1)

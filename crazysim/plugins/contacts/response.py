@@ -1,9 +1,8 @@
-"""Contact response: floor and objects push, brake and bounce drones. Without it the floor only stops them.
+"""Contact response: normal forces, friction and bounces of drones at floor and objects.
 
-Time stepping on velocities (Moreau 1988; the convex form of Todorov 2014): after a step, impulses at the contact points
-change the velocity into one that no longer approaches. An overlap is pushed out with a time constant, so that the
-ground is soft and no drone is thrown out of it. The points come from ``contact_points``, and the
-impulses from ``impulse``.
+Without contact response the floor only stops drones. Time stepping on velocities (Moreau 1988; the convex form of
+Todorov 2014): after a step, impulses at the contact points change the velocity so that the drone no longer approaches
+the surface. An overlap is pushed out with a time constant, so that the ground is soft and no drone is thrown out of it.
 """
 
 from __future__ import annotations
@@ -55,15 +54,15 @@ class ContactResponseData(PyTree):
 class ContactResponse(Plugin):
     """Response of floor and objects to contacts with drones and loads; replaces the stage ``clip_floor_pos``.
 
-    Drones do not push each other (``DroneCollisions``), and objects do not move; drones ride on members of populations,
-    such as cars, that are in the scene when the plugin is added. The centre of a drone that stands on the floor is half
-    the height of its collision box above the floor. Loads and empty hooks that are in the scene when the plugin is
-    added are stopped by all objects except the flat floor, which stops them even without this plugin. Loads and hooks
-    that are among ``objects`` exchange impulses with drones and with each other.
+    Drones do not push each other (see ``DroneCollisions``), and objects do not move. Drones can ride on members of
+    populations, such as cars, that are in the scene when the plugin is added. The centre of a drone that stands on the
+    floor is half the height of its collision box above the floor. Objects stop the loads and empty hooks that are in
+    the scene when the plugin is added. The flat floor stops them even without this plugin. Loads and hooks that are
+    among ``objects`` exchange impulses with drones and with each other.
     """
 
     objects: ObjectSelection = None
-    """Handles, or names of bodies; None for all that are in the scene when the plugin is added, () for the floor
+    """Handles, or names of bodies; None for all bodies in the scene when the plugin is added, () for the floor
     alone."""
     friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION, shapes=((),))
     """Coulomb's coefficient."""
@@ -154,7 +153,7 @@ class ContactResponse(Plugin):
 def _respond_to_contacts(
     data: SimData, record: ContactResponseData, surfaces: list[Surface], box: np.ndarray, iterations: int
 ) -> tuple[SimState, ContactResponseData]:
-    """Return the states with the velocity after contact, and the record with the impulse."""
+    """Return the states with the velocities after contact, and the record with the impulses, for boxes of one size."""
     states, params = data.states, data.params
     old_vel = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)
     points, inertia = contact_points(data, surfaces, box), inertia_matrix(params.mass, params.J)

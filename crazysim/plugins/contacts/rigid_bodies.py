@@ -32,7 +32,7 @@ from crazysim.plugins.effects.ground import TerrainData
 from crazysim.scene.collision import CollisionGeom
 
 MAX_CONTACTS = 250_000
-"""Largest number of contact points in a world, about as many as the pairs of 250 drones or boxes have."""
+"""Largest number of contact points in a world; 250 drones or boxes have about as many."""
 EXACT_KINDS = ("sphere", "box")
 """Kinds of geoms that touch balls and boxes in the same way as bodies do; geoms of other kinds touch only their corners
 and nearest point."""
@@ -49,20 +49,21 @@ class BodyContacts:
         self.carriers = find_carriers(sim, plugin.objects, (plugin.name,))
 
     def n_contacts(self, terrains: Collection[str]) -> int:
-        """Return the number of contact points; most of them are out of contact.
+        """Return the number of contact points in a world, including points that are not in contact.
 
         Args:
             terrains: Names of the plugins whose height fields are terrain.
         """
-        balls = [shape.kind == "sphere" for shape in self.shapes]
+        is_ball = [shape.kind == "sphere" for shape in self.shapes]
         geoms = [geom for carrier in self.carriers for geom in carrier.geoms]
-        others = [False] * self.n_drones + [g.shape.kind == "sphere" for g in geoms if g.shape.kind in EXACT_KINDS]
-        pairs = [*combinations(balls, 2), *product(balls, others)]
+        is_other_ball = [False] * self.n_drones
+        is_other_ball += [geom.shape.kind == "sphere" for geom in geoms if geom.shape.kind in EXACT_KINDS]
+        pairs = [*combinations(is_ball, 2), *product(is_ball, is_other_ball)]
         n = sum(1 if any(pair) else N_BOX_POINTS for pair in pairs)
         for geom in geoms:
             if geom.shape.kind not in EXACT_KINDS:
                 has_only_corners = geom.shape.kind == "plane" or geom.name in terrains
-                n += sum(1 if ball else len(CORNERS) + (not has_only_corners) for ball in balls)
+                n += sum(1 if ball else len(CORNERS) + (not has_only_corners) for ball in is_ball)
         return n
 
     def respond(self, data: SimData) -> SimData:
@@ -81,9 +82,9 @@ class BodyContacts:
             groups += self._contacts_on_carrier(data, solids, free_solids, carrier, first_carrier + k)
         if not groups:
             return data
-        size = bodies.pos.shape[0]
+        n_fixed = bodies.pos.shape[0] - n_free
         friction, restitution = (
-            jnp.concatenate([x[:, 0], jnp.zeros(size - n_free, x.dtype)]) for x in (record.friction, record.restitution)
+            jnp.concatenate([x[:, 0], jnp.zeros(n_fixed, x.dtype)]) for x in (record.friction, record.restitution)
         )
         contacts = join_contacts(groups, friction, restitution)
         old_impulses = Impulses(record.normal_impulse, record.friction_impulse)
@@ -108,8 +109,8 @@ class BodyContacts:
             rows.append(drones_as_bodies(data))
         for carrier in self.carriers:
             pos, quat, vel, ang_vel = _carrier_motion(data, carrier)
-            spin = rotation.rotate(quat, ang_vel)
-            rows.append((pos[None], vel[None], spin[None], jnp.zeros(1, dtype), jnp.zeros((1, 3, 3), dtype)))
+            ang_vel = rotation.rotate(quat, ang_vel)
+            rows.append((pos[None], vel[None], ang_vel[None], jnp.zeros(1, dtype), jnp.zeros((1, 3, 3), dtype)))
         return Bodies(*(jnp.concatenate(column) for column in zip(*rows, strict=True)))
 
     def _solids(self, data: SimData, record: Any) -> Solids:
@@ -165,7 +166,7 @@ def require_few_contacts(n_contacts: int, bodies: str) -> int:
 
     Args:
         n_contacts: Number of contact points in a world.
-        bodies: Bodies to which they belong, for the message.
+        bodies: Number and kind of the bodies, for the message.
     """
     if n_contacts > MAX_CONTACTS:
         raise ConfigError(

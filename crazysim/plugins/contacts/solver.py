@@ -71,9 +71,9 @@ class Impulses(NamedTuple):
     """Impulses at the contacts, on the first bodies."""
 
     normal: Array
-    """Along the normals, N s. (k,)"""
+    """Impulses along the normals, N s. (k,)"""
     friction: Array
-    """Across the normals, world frame, N s. (k, 3)"""
+    """Impulses across the normals, world frame, N s. (k, 3)"""
 
 
 class SolvedBodies(NamedTuple):
@@ -99,15 +99,15 @@ def solve_contacts(
     Coulomb's limit. Where impacts of several bodies with restitution and friction (Kane 1984), or too few iterations,
     would add energy, all impulses are scaled down to conserve it.
 
-    Overlaps are removed within ``softness`` seconds, at up to 0.25 m/s, by moving the bodies without changing their
-    velocities, so that this does not drive the motion of a stack.
+    Overlaps shrink with the time constant ``softness``, at up to 0.25 m/s. For this the bodies are moved without
+    changing their velocities, which would set a stack in motion.
 
     Args:
         bodies: The bodies.
         contacts: The contacts, each with at least one body that can be pushed.
         initial_impulses: Initial impulses. With the impulses of the last step, bodies at rest stay at rest from the
             first iteration on.
-        dt: Step, s.
+        dt: Duration of the step, s.
         softness: Time constant with which an overlap is pushed out, s.
         iterations: Iterations of the solver.
     """
@@ -126,7 +126,7 @@ def solve_contacts(
         return relative_vel[pair] + rotation.cross((ang_vel[a] - ang_vel[b])[pair], arm)
 
     def velocity_change(impulse: Array) -> tuple[Array, Array]:
-        """Return the changes of the velocities by impulses on the first bodies and opposite ones on the second."""
+        """Return the changes by impulses on the first bodies, and their opposites on the second bodies. (n, 3) each"""
         force, torque = contacts.sum_pairs(impulse), contacts.sum_pairs(rotation.cross(arm, impulse))
         second_torque = torque + rotation.cross(offset, force)
         force, torque = (
@@ -169,6 +169,7 @@ def solve_contacts(
     def iterate(_: int, carry: tuple[Impulses, Impulses, Array]) -> tuple[Impulses, Impulses, Array]:
         current, previous, n_accelerated = carry
         momentum = n_accelerated / (n_accelerated + 3)
+        # y and z are the extrapolated impulses, along and across the normals.
         y = current.normal + momentum * (current.normal - previous.normal)
         z = current.friction + momentum * (current.friction - previous.friction)
         contact_vel = initial_vel + contact_velocity(*velocity_change(y[:, None] * normal + z))
@@ -206,12 +207,12 @@ def solve_contacts(
     gap_rate = jnp.sum(
         push_speed / normal_response * rotation.dot(contact_velocity(vel_change, ang_vel_change), normal)[:, 0]
     )
-    size = dt * jnp.sum(push_speed / normal_response * push_speed) / jnp.where(gap_rate > 0, gap_rate, 1.0)
+    step_size = dt * jnp.sum(push_speed / normal_response * push_speed) / jnp.where(gap_rate > 0, gap_rate, 1.0)
     moved_bodies = bodies._replace(
-        pos=bodies.pos + size * vel_change, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel
+        pos=bodies.pos + step_size * vel_change, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel
     )
     impulse = _sum_for_bodies(sum_matrices[0] - sum_matrices[1], contacts.sum_pairs(total))
-    return SolvedBodies(moved_bodies, size * ang_vel_change, impulses, impulse)
+    return SolvedBodies(moved_bodies, step_size * ang_vel_change, impulses, impulse)
 
 
 def _shared_response(
@@ -223,11 +224,11 @@ def _shared_response(
     normal_weight: Array,
     slip_weight: Array,
 ) -> Array:
-    """Return for each body the ratio of its contacts' response to all impulses to the response to their own. (n,)
+    """Return for each body the response of its contacts to all impulses, per response to their own impulse alone. (n,)
 
-    It is an upper bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, too large by at most a quarter. ``M`` is
-    the inertia of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` holds the inverse
-    responses.
+    The ratio is an upper bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, too large by at most a quarter.
+    ``M`` is the inertia of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` contains the
+    inverse responses.
 
     Args:
         bodies: The bodies.
@@ -236,7 +237,7 @@ def _shared_response(
         normal: Normals. (k, 3)
         lever_matrix: Torque of impulses about the body. (k, 3, 3)
         normal_weight: Inverse responses to impulses along the normals, kg; zero where nothing acts. (k,)
-        slip_weight: The same across the normals. (k,)
+        slip_weight: Inverse responses to impulses across the normals, kg. (k,)
     """
     eye = jnp.eye(3, dtype=normal.dtype)
     weight = (
@@ -251,8 +252,8 @@ def _shared_response(
     response = jnp.concatenate(
         [bodies.inv_mass[:, None, None] * total[:, :3], matmul(bodies.inv_inertia, total[:, 3:])], axis=-2
     )
-    fourth = matmul(matmul(response, response), matmul(response, response))
-    trace = jnp.sum(fourth * jnp.swapaxes(fourth, -1, -2), axis=(-2, -1))
+    fourth_power = matmul(matmul(response, response), matmul(response, response))
+    trace = jnp.sum(fourth_power * jnp.swapaxes(fourth_power, -1, -2), axis=(-2, -1))
     return jnp.where(trace > 0, jnp.where(trace > 0, trace, 1.0) ** 0.125, 1.0)
 
 
@@ -264,14 +265,14 @@ def _energy_factor(impulse: Array, initial_vel: Array, vel_change: Array) -> Arr
 
     Args:
         impulse: Impulses on the first bodies, N s. (k, 3)
-        initial_vel: Velocities of the contacts before, m/s. (k, 3)
-        vel_change: Their changes by the impulses, m/s. (k, 3)
+        initial_vel: Velocities of the contacts before the impulses, m/s. (k, 3)
+        vel_change: Changes of these velocities by the impulses, m/s. (k, 3)
     """
-    first, second = jnp.sum(impulse * initial_vel), jnp.sum(impulse * vel_change)
-    adds_energy = first + 0.5 * second > 0
-    return jnp.where(adds_energy, jnp.maximum(-2 * first, 0.0) / jnp.where(adds_energy, second, 1.0), 1.0)
+    linear, quadratic = jnp.sum(impulse * initial_vel), jnp.sum(impulse * vel_change)
+    adds_energy = linear + 0.5 * quadratic > 0
+    return jnp.where(adds_energy, jnp.maximum(-2 * linear, 0.0) / jnp.where(adds_energy, quadratic, 1.0), 1.0)
 
 
 def _sum_for_bodies(sum_matrix: Array, values: Array) -> Array:
-    """Sum the pairs' values for every body, element-wise because a GPU may round matrix products. (n, m)"""
+    """Sum the values of pairs for every body. (n, m) It is no matrix product, which a GPU may round."""
     return jnp.sum(sum_matrix[:, :, None] * values[None], axis=1)

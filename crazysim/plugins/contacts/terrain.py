@@ -24,7 +24,7 @@ from crazysim.pytree import device_array
 from crazysim.storage import read_bytes
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-"""First bytes of a PNG image; its width and height are bytes 16 to 24."""
+"""First bytes of a PNG image. Bytes 16 to 23 of the file are width and height."""
 MAX_FILE_BYTES = 256 * 2**20
 """Largest file of an image, bytes."""
 MAX_PIXELS = 2**24
@@ -32,7 +32,7 @@ MAX_PIXELS = 2**24
 BASE_THICKNESS = 1.0
 """Thickness of the ground below the lowest height, m."""
 MIN_HEIGHT_RANGE = 1e-3
-"""Smallest range of heights of a MuJoCo height field, m, which flat terrain gets too."""
+"""Smallest range of heights that is set for MuJoCo's height field, m, also for flat terrain."""
 
 
 class Terrain(Plugin):
@@ -43,15 +43,15 @@ class Terrain(Plugin):
     """
 
     heights: ArrayLike | str | Path = parameter()
-    """Heights, m, rows along y and columns along x (n_rows, n_columns); or the path of a PNG image, whose brightness is
-    the height, from its darkest to its brightest pixel, and whose upper edge lies at the largest y."""
+    """Heights, m, rows along y and columns along x (n_rows, n_columns); or the path of a PNG image. Its brightness is
+    the height, zero at the darkest pixel, and its upper edge is at the largest y."""
     size: ArrayLike = setting(positive=True, shapes=((2,), (3,)))
-    """Full lengths along x and y, m (2,); with an image also the height of the brightest over the darkest (3,)."""
+    """Full lengths along x and y, m (2,); for an image, also the height of its brightest pixel (3,)."""
     pos: ArrayLike = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Middle of the terrain at height zero, world frame, m. (3,)"""
     floor: bool = True
-    """True to keep the flat floor around it; False to remove it, which depressions below z = 0 need. The heights of the
-    border then extend outwards without end."""
+    """True to keep the flat floor around the terrain. False to remove the floor, which depressions below z = 0 need;
+    the heights of the border then extend outwards without end."""
     rgba: ArrayLike | None = color()
     """Colour; None for the colour of the floor. (4,)"""
     name: str = "terrain"
@@ -75,7 +75,7 @@ class Terrain(Plugin):
         return [StagePlacement(stop_stage, before="increment_steps", replaces="clip_floor_pos")]
 
     def stop_drones(self, data: SimData) -> SimData:
-        """Stop drones at the ground: one that is below it, or on it and not rising, is set on it, at rest."""
+        """Return the data with drones that are below the ground, or on it and not rising, on the ground at rest."""
         ground = ground_height(data, data.states.pos)
         states = stop_at_surface(data.states, ground + FLOOR_HEIGHT)
         return self.write(data.replace(states=states), self.read(data).replace(height_below=ground))
@@ -103,7 +103,7 @@ class Terrain(Plugin):
             )
         if any(isinstance(plugin, ContactResponse) for plugin in sim.scene.plugins()):
             raise ConfigError(
-                "expected terrain before contact response, whose surfaces are those of the scene when it is added, "
+                "expected terrain before contact response, which finds the surfaces of the scene when it is added, "
                 "got a ContactResponse. Use sim.remove, then add Terrain and ContactResponse in this order."
             )
         return heights, size[:2], pos
@@ -112,7 +112,7 @@ class Terrain(Plugin):
 def read_image(path: str | Path) -> np.ndarray:
     """Return the brightness of a PNG image, its lowest row first, from 0 at the darkest pixel to 1. (n_rows, n_columns)
 
-    MuJoCo reads it, with 8 bits per pixel.
+    MuJoCo reads the image with 8 bits per pixel.
 
     Raises:
         ConfigError: If the file cannot be read, is no PNG image, or has more than ``MAX_PIXELS`` pixels.

@@ -28,8 +28,6 @@ from crazysim.pytree import PyTree, leaf
 NOMINAL_VOLTAGE = 3.7
 """Nominal voltage of a lithium-polymer cell, V, as printed on cells; the voltage assumed for full rotor speed if an
 airframe has no table ``[battery]``."""
-
-
 MAX_CELLS = 100
 """Largest number of cells in series, the same limit as in airframes."""
 
@@ -64,9 +62,9 @@ class BatteryData(PyTree):
 class Battery(Plugin):
     """Batteries that the rotors discharge, with a voltage that limits the rotor speed; needs rotors.
 
-    The voltage sags under load. The no-load speed of a DC motor is proportional to its voltage; the largest rotor speed
-    is assumed to be so too below ``full_speed_voltage``. An empty battery stops the rotors. Each parameter is one
-    number for all drones, (), or one number per drone, (n_worlds, n_drones).
+    The voltage sags under load. The no-load speed of a DC motor is proportional to its voltage. Below
+    ``full_speed_voltage`` the largest rotor speed is assumed to be proportional to the voltage too. An empty battery
+    stops the rotors. Each parameter is one number for all drones, (), or one number per drone, (n_worlds, n_drones).
     """
 
     capacity: ArrayLike | None = parameter(default=None, positive=True)
@@ -85,8 +83,8 @@ class Battery(Plugin):
     charge: ArrayLike = parameter(default=1.0, low=0.0, high=1.0)
     """State of charge at the beginning of an episode, 0 to 1."""
     command_voltage: ArrayLike | None = parameter(default=None, positive=True)
-    """Voltage at which rotors turn as commanded, V: their speeds are proportional to the voltage, as with firmware that
-    does not compensate for it; None for firmware that does."""
+    """Voltage at which rotors turn as commanded, V, for firmware that does not compensate for the voltage: the speeds
+    are proportional to it. None for firmware that compensates."""
     name: str = "battery"
 
     @property
@@ -160,7 +158,7 @@ class Battery(Plugin):
             power, open_circuit_voltage(battery.charge, battery.n_cells), battery.resistance
         )
 
-        # Compensated summation (Kahan 1965): a step draws some millionths of the charge, mostly lost in float32.
+        # Compensated summation (Kahan 1965): in float32 most of the millionths that a step draws would be rounded off.
         charge_used = current / (3600.0 * data.core.freq * battery.capacity) + battery.rounding
         charge = battery.charge - charge_used
         rounding = charge_used - (battery.charge - charge)

@@ -1,4 +1,4 @@
-"""Downwash: the jets of air below the drones of a world, acting on the others through their drag."""
+"""Downwash: the jets of air below drones, which push the other drones of a world through drag."""
 
 from __future__ import annotations
 
@@ -63,7 +63,6 @@ class Downwash(Plugin):
     def record(self, sim: Simulation) -> DownwashData:
         require_drag(sim, "downwash")
         radius = checked_propeller_radius(sim, self.propeller_radius)
-        # Far below a rotor the cross-section of its stream is half the rotor's disc (momentum theory).
         return self.fill_record(sim, DownwashData, diameter=stream_diameter(sim, radius))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
@@ -83,18 +82,21 @@ class Downwash(Plugin):
         axis = rotation.z_axis(s.quat)
         sources = jet_source(collective_thrust(data), record.diameter, record.air_density)
 
-        def velocities_of_jet(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
+        def jet_velocities(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
             origin, axis, source = other
             return {name: jet_speed(pos - origin, axis, source) * axis for name, pos in positions.items()}
 
-        air_velocity = reduce_over_others(velocities_of_jet, (s.pos, axis, sources))
+        air_velocity = reduce_over_others(jet_velocities, (s.pos, axis, sources))
         bodies_in_jets = {name: x.replace(air_vel=-air_velocity[name]) for name, x in bodies.items()}
         data = data.replace(plugins=data.plugins | bodies_in_jets)
         return self.write(data, record.replace(air_vel=-air_velocity[self.name]))
 
 
 def stream_diameter(sim: Simulation, radius: Array) -> Array:
-    """Return the diameter of each drone's contracted stream, m, for a propeller radius, m. (1,) or one per drone"""
+    """Return the diameter of each drone's contracted stream, m, for a propeller radius, m. (1,) or one per drone
+
+    Far below a rotor the cross-section of its stream is half the rotor's disc (momentum theory).
+    """
     factor = np.sqrt(2 * airframe_numbers(sim, lambda airframe: airframe.n_rotors))
     factor = factor[..., None] if factor.ndim else factor
     return device_array(factor * np.asarray(radius), radius.dtype)
@@ -116,13 +118,13 @@ def hover_jet_speed(offset: Array, axis: Array, thrust: Array, diameter: Array, 
 
     Args:
         offset: Position relative to the drone, world frame, m. (..., 3)
-        axis: The drone's body z axis, along which it thrusts, world frame. (..., 3)
-        thrust: Its collective thrust, N; below zero counts as none. (..., 1)
-        diameter: Diameter d of its contracted stream, m. (..., 1)
+        axis: Body z axis of the drone, world frame. (..., 3)
+        thrust: Collective thrust of the drone, N; below zero there is no jet. (..., 1)
+        diameter: Diameter d of the drone's contracted stream, m. (..., 1)
         air_density: Density of air, kg/m^3. (..., 1)
 
     Returns:
-        Speed against the axis. (..., 1)
+        Speed, in the direction of ``-axis``. (..., 1)
     """
     return jet_speed(offset, axis, jet_source(thrust, diameter, air_density))
 
@@ -157,14 +159,14 @@ def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
     positive_depth = jnp.where(depth < 0, 0.0, depth)
     q = positive_depth + source.origin
     w = q / (q * q + (math.sqrt(2) - 1) / JET_SPREAD**2 * rotation.dot(off_axis, off_axis))
-    x = positive_depth * source.inverse_diameter
+    x = positive_depth * source.inverse_diameter  # depth in diameters
     x = jnp.where(x > 1, 1.0, x)
     fade_in = x * x * (3 - 2 * x)
     return fade_in * source.strength * q * w * w
 
 
 def mean_rotor_vel(data: SimData) -> Array:
-    """Return the mean speed of the rotors that a drone has, rpm. (..., 1)"""
+    """Return the mean speed of a drone's rotors, rpm, without the rotors that it lacks (their limit is 0). (..., 1)"""
     rotor_vel, limit = data.states.rotor_vel, data.params.rotor_vel_max  # type: ignore[union-attr]
     if limit.shape[-1] == 1:
         return jnp.mean(rotor_vel, axis=-1, keepdims=True)

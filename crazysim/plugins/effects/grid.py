@@ -21,7 +21,7 @@ MAX_FUSED_VALUES = 400_000
 """Largest number of values of a table that a fused kernel reads; each value adds 8 µs to the compilation of the
 step."""
 UNFUSED_REASON = f"its table has more than {MAX_FUSED_VALUES:,} numbers"
-"""Reason why a stage that reads a table is not fused."""
+"""Reason why a stage that reads a larger table is not fused."""
 MAX_FILE_BYTES = 2**30
 """Largest file of a grid, bytes."""
 MAX_SPACING_ERROR = 1e-3
@@ -147,7 +147,7 @@ def load_wind_grid(path: str | Path) -> Grid:
             f"expected finite numbers in {str(path)!r}, got NaN, infinity or a number above {MAX_NUMBER:g}. "
             f"Fill the gaps."
         )
-    axes, indices = zip(*(_nodes(table[:, k]) for k in range(3)), strict=True)
+    axes, indices = zip(*(_find_nodes(table[:, k]) for k in range(3)), strict=True)
     shape = tuple(map(len, axes))
     is_full = len(table) == math.prod(shape)  # checked before an array of that size is allocated
     values = np.full((*shape, 3), np.nan) if is_full else np.array(np.nan)
@@ -170,10 +170,10 @@ def load_wind_grid(path: str | Path) -> Grid:
     return Grid(values, tuple(float(axis[0]) for axis in axes), tuple(spacing))
 
 
-def _nodes(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_nodes(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct coordinates along an axis, in order, and the index of each point's coordinate among them."""
-    order = np.sort(coordinates)
-    size = max(order[-1] - order[0], 1e-9)
-    axis = order[np.concatenate([[True], np.diff(order) > 1e-6 * size])]
+    ascending = np.sort(coordinates)
+    extent = max(ascending[-1] - ascending[0], 1e-9)
+    axis = ascending[np.concatenate([[True], np.diff(ascending) > 1e-6 * extent])]
     middles = (axis[1:] + axis[:-1]) / 2
     return axis, np.searchsorted(middles, coordinates)

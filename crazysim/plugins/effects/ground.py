@@ -27,7 +27,7 @@ class TerrainData(PyTree):
 
     @jit_eager_calls()
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
-        """Return height and normal of the ground at a position, whose z is ignored.
+        """Return height and normal of the ground at the x and y of a position.
 
         The surface is linear on the two triangles of each cell, as MuJoCo draws and collides it: contacts, rays and
         images have the same ground.
@@ -61,12 +61,12 @@ class TerrainData(PyTree):
 
 @jit_eager_calls()
 def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
-    """Return height and normal of the ground at a position, whose z is ignored; zero and upwards without terrain.
+    """Return height and normal of the ground at the x and y of a position; height zero and normal z without terrain.
 
     Where terrains overlap, the highest one is used.
 
     Args:
-        data: Simulation, one world or one drone of it.
+        data: Data of one world or of one drone.
         pos: Position, world frame, m. (..., 3)
 
     Returns:

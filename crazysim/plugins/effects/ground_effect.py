@@ -26,7 +26,7 @@ class GroundEffectData(PyTree):
 
 
 class GroundEffect(Plugin):
-    """Thrust of every rotor that grows near the ground, flat floor or terrain; needs rotors."""
+    """Increase of every rotor's thrust near the ground, flat floor or terrain; needs rotors."""
 
     propeller_radius: ArrayLike | None = parameter(default=None, positive=True)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
@@ -65,7 +65,8 @@ def thrust_gain(height: Array, upright: Array, radius: Array) -> Array:
 
     ``1 / (1 - (R / 4 z)^2)`` (Cheeseman and Bennett 1955, ARC R&M 3021, for hover). Their image source has a pole at
     z = R / 4; ``z^2 + R^2 / 4`` replaces ``z^2`` here, so that the ratio is at most 4/3, on the floor. At z = R it is
-    1.3 % below theirs, farther up less. The effect decreases with the cosine of the tilt. Both are assumptions.
+    1.3 % below theirs; the difference shrinks with height. The increase is proportional to the cosine of the tilt to
+    first order. The replacement and the dependence on the tilt are assumptions.
 
     Args:
         height: Height of the rotors above the floor, m; below zero counts as zero. (..., n_rotors)

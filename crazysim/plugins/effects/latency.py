@@ -20,7 +20,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf
 
 MAX_DELAY = 100_000
-"""Longest delay, steps; a queue has one row more than the largest delay that it is made for."""
+"""Upper limit of the delay, steps."""
 
 
 class LatencyData(PyTree):
@@ -29,17 +29,18 @@ class LatencyData(PyTree):
     delay: Array = leaf("parameter", 1, (1,))
     """Steps from sending a command to its arrival. (1,)"""
     queue: Array = leaf("drone", 2)
-    """Commands of the last steps; step i is in row i modulo n_rows. (n_worlds, n_drones, n_rows, k)"""
+    """Commands of the last steps; the command of step i is in row i modulo n_rows. n_rows is the largest possible delay
+    plus one. (n_worlds, n_drones, n_rows, k)"""
     arrived: Array = leaf("drone", 1)
     """Latest command that has arrived. (n_worlds, n_drones, k)"""
 
 
 class Latency(Plugin):
-    """Commands of the simulation's own level that arrive late.
+    """A delay of the commands, for the command level of the simulation.
 
     A command that is sent before step i reaches the controller at step i + delay; a rotor command reaches the motors in
-    that step. Until the first command arrives, the command that was staged when the plugin was added stays in force
-    (after a reset, the command of the default data).
+    that step. Until the first command arrives, the drone follows the command that was staged when the plugin was added,
+    or after a reset the command of the default data.
     """
 
     delay: ArrayLike = parameter(low=0, high=MAX_DELAY, dtype=np.int32)
@@ -95,7 +96,7 @@ class Latency(Plugin):
 
 
 def _controller_stage(sim: Simulation) -> str:
-    """Return the name of the stage that takes over commands of the simulation's own level."""
+    """Return the name of the stage that uses the commands of the simulation's command level."""
     mode = sim.data.controls.mode.value
     for name in (f"{mode}_controller", f"commit_{mode}"):
         if name in sim.step_pipeline:
@@ -106,11 +107,11 @@ def _controller_stage(sim: Simulation) -> str:
 
 
 def _staged_command(data: SimData) -> Array:
-    """Return the staged command of the simulation's own level, with the feedforward of a setpoint. (..., k)"""
+    """Return the staged command of the simulation's command level, with the feedforward of a setpoint. (..., k)"""
     return jnp.concatenate(staged_leaves(data), axis=-1)
 
 
 def _with_command(data: SimData, command: Array) -> SimData:
-    """Return the data with another command of the simulation's own level."""
+    """Return the data with another command of the simulation's command level."""
     n = staged_leaves(data)[0].shape[-1]
     return stage_command(data, command[..., :n], command[..., n:])

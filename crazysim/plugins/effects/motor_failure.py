@@ -33,8 +33,8 @@ class MotorFailureData(PyTree):
 class MotorFailure(Plugin):
     """Rotors that are weaker than the airframe's, or fail; needs rotors.
 
-    A rotor of effectiveness e gives e times the thrust and the drag torque of its speed. A failed rotor gives neither,
-    ignores its commands and runs down. Controllers keep the airframe's parameters.
+    A rotor of effectiveness e gives e times the airframe's thrust and drag torque at the same speed. A failed rotor
+    gives no thrust and no drag torque, ignores its commands and runs down. Controllers use the airframe's parameters.
     """
 
     effectiveness: ArrayLike = parameter(default=1.0, low=0.0, high=1.0)
@@ -81,7 +81,7 @@ class MotorFailure(Plugin):
         """Return the data with failed rotors; a reset of their world restores them.
 
         Args:
-            data: The simulation, all worlds of it.
+            data: Data of all worlds.
             mask: True for rotors that fail; None for all. (n_worlds, n_drones, n_rotors)
         """
         if self.name not in data.plugins:

@@ -1,4 +1,4 @@
-"""Helpers that effects share: requirements on the model, records and forces of moving air, radii of propellers."""
+"""Helpers of several effects: requirements on the model, records and forces of moving air, radii of propellers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from crazysim.pytree import PyTree, leaf
 
 
 class BodiesInAir(PyTree):
-    """Record of bodies that wind and downwash act on: one for each drone, such as its load."""
+    """Record of bodies that wind and downwash act on, one body for each drone, such as its load."""
 
     pos: Array = leaf("drone", 1, (3,))
     """Position of the body, world frame, m. (n_worlds, n_drones, 3)"""
@@ -61,7 +61,7 @@ def with_moving_air(data: SimData, air_vel: Array) -> SimData:
     ``-air_vel``.
 
     Args:
-        data: The simulation, of a model with drag.
+        data: The data, of dynamics with drag.
         air_vel: Velocity of the air, world frame, m/s. (..., 3)
     """
     s = data.states
@@ -70,7 +70,7 @@ def with_moving_air(data: SimData, air_vel: Array) -> SimData:
 
 
 def has_drag(sim: Simulation) -> bool:
-    """Return True if the model has drag, and the airframe's is not zero."""
+    """Return True if the model has drag, and the drag of at least one airframe is not zero."""
     drag = getattr(sim.data.params, "drag_matrix", None)
     return drag is not None and bool(np.any(np.asarray(drag)))
 
@@ -91,7 +91,7 @@ def require_rotors(sim: Simulation, effect: str) -> None:
 
 
 def checked_propeller_radius(sim: Simulation, radius: ArrayLike | None) -> Array:
-    """Return the checked radius of propellers, m; None stands for the radius of the airframes."""
+    """Return the checked radius of propellers, m; for None, the radius of the airframes. (1,) or one per drone"""
     if radius is None:
         radius = airframe_numbers(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
     return check_parameter(sim, "propeller_radius", radius, positive=True)

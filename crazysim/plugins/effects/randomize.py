@@ -1,4 +1,4 @@
-"""Randomisation: drones that differ from their airframe, drawn at the beginning of every episode."""
+"""Randomisation: parameters of the drones that are drawn at random at the beginning of every episode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamicsData
 from crazysim.pytree import leaf
 
 FACTOR_SETTINGS = ("mass", "inertia", "torque", "lag", "drag")
-"""Settings that give one factor per drone, in the order of ``RandomizeData.factors``."""
+"""Settings whose factors are the entries of ``RandomizeData.factors``, in this order."""
 RANGE_SETTINGS = (*FACTOR_SETTINGS, "thrust", "rotor_thrust", "wind", "charge", "delay")
 """Settings that are ranges (low, high)."""
 
@@ -67,13 +67,13 @@ class RandomizeData(MovingAir):
 
 
 class Randomize(Plugin):
-    """Drones that differ from their airframe, in a way drawn anew for every episode; needs rotors.
+    """Random differences of the drones from their airframe, drawn anew for every episode; needs rotors.
 
     Each setting is a range (low, high): one for all drones, (2,), or one per drone, (n_worlds, n_drones, 2). A number
     is drawn uniformly from it for every drone at every reset, or in the first step of a simulation that was not reset.
-    Two equal numbers give a fixed number; None changes nothing. Controllers keep the airframe's numbers. The number
+    Two equal numbers give a fixed number; None changes nothing. Controllers use the airframe's numbers. The number
     drawn for a setting does not depend on the other settings. ``Randomize.crazyflie()`` and ``Randomize.generic()``
-    have ranges with sources.
+    have ranges from the literature.
     """
 
     mass: ArrayLike | None = parameter(default=None, positive=True)
@@ -97,8 +97,8 @@ class Randomize(Plugin):
     delay: ArrayLike | None = parameter(default=None, low=0.0)
     """Delay of commands, steps, rounded down; needs ``Latency`` with one delay per drone."""
     optional: Sequence[str] = ()
-    """Settings that are ignored, instead of an error, if the simulation lacks the model they act on: ``charge``,
-    ``drag``, ``wind``, ``delay``. Settings of presets are optional."""
+    """Settings that are ignored if the simulation lacks what they act on, where other settings raise an error. This
+    concerns ``charge``, ``drag``, ``wind`` and ``delay``. The ranges of presets are optional."""
     name: str = "randomize"
     order: ClassVar[int] = -2  # before effects that change the same parameters
 
@@ -113,7 +113,7 @@ class Randomize(Plugin):
 
     @classmethod
     def crazyflie(cls, **changes: ArrayLike | None) -> Randomize:
-        """Return ranges that cover the spread of published identifications of Crazyflies 2.x, and of different flights.
+        """Return a plugin with ranges that cover the published identifications of Crazyflies 2.x in several flights.
 
         The page *Disturbances, randomisation, sim to real* has the source of each range.
 
@@ -134,9 +134,9 @@ class Randomize(Plugin):
 
     @classmethod
     def generic(cls, **changes: ArrayLike | None) -> Randomize:
-        """Return ranges of 30 % either way for the factors, the widest of Ferede et al. 2025 (arXiv 2504.21586).
+        """Return a plugin with factors of 0.7 to 1.3, the widest range of Ferede et al. 2025 (arXiv 2504.21586).
 
-        The factor of each rotor's thrust has a range of 5 % either way, and the charge the range 0.1 to 1.
+        The additional factor of each rotor's thrust has the range 0.95 to 1.05, and the charge the range 0.1 to 1.
 
         Args:
             changes: Other settings, by name.
@@ -146,7 +146,7 @@ class Randomize(Plugin):
 
     @classmethod
     def _preset(cls, ranges: dict[str, Any], changes: dict[str, Any]) -> Randomize:
-        """Return a plugin with the ranges of a preset and changes to them; unchanged ranges are optional."""
+        """Return a plugin with the ranges of a preset, and with changes; ranges without a change are optional."""
         settings: dict[str, Any] = {"optional": tuple([name for name in ranges if name not in changes])}
         return cls(**(settings | ranges | changes))
 
@@ -206,7 +206,7 @@ class Randomize(Plugin):
         return 0 if self.delay is None else int(np.max(np.asarray(self.delay)))
 
     def _latency_code(self, sim: Simulation) -> str:
-        """Return the expression, for messages, of a ``Latency`` whose delays can be drawn."""
+        """Return the code, for messages, of a ``Latency`` that allows one random delay per drone."""
         return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._max_delay})"
 
     def influence(self, data: SimData) -> SimData:

@@ -37,20 +37,20 @@ class ResidualData(PyTree):
     def create(airframe: Airframe) -> ResidualData:
         """Return the coefficients of an airframe, the same for all drones."""
         dtype = jnp.result_type(float)
-        names = ("hidden", "output") if "residual.hidden" in airframe.values else ()
+        has_network = "residual.hidden" in airframe.values
         return ResidualData(
             linear=device_array(airframe.value("residual.linear"), dtype),
-            hidden=device_array(airframe.value("residual.hidden"), dtype) if names else None,
-            output=device_array(airframe.value("residual.output"), dtype) if names else None,
+            hidden=device_array(airframe.value("residual.hidden"), dtype) if has_network else None,
+            output=device_array(airframe.value("residual.output"), dtype) if has_network else None,
         )
 
 
 class Residual(Plugin):
     """Identified force and torque that the model lacks: linear terms and an optional network; needs rotors.
 
-    They depend on the velocity over ground, so that wind does not change them. Coefficients have the shapes below, for
-    all drones, or (n_worlds, n_drones) in front of them, for each drone. By default they are the coefficients in the
-    airframe's table ``[residual]``. Those were fitted with the linear drag, and so cannot be combined with
+    Force and torque depend on the velocity over ground, so that wind does not change them. Coefficients have the shapes
+    below, for all drones, or (n_worlds, n_drones) in front, for each drone. By default they are the coefficients in the
+    airframe's table ``[residual]``. These were fitted with the linear drag, and so cannot be combined with
     ``RotorAerodynamics``.
     """
 
@@ -104,8 +104,8 @@ def residual_inputs(
 ) -> Array:
     """Return the inputs of a residual, all in the body frame.
 
-    They are 1; velocity, m/s; velocity times speed, m^2/s^2; angular velocity, rad/s; collective thrust divided by
-    weight; torque of the rotors divided by weight times arm length.
+    They are the number 1; velocity, m/s; velocity times speed, m^2/s^2; angular velocity, rad/s; collective thrust
+    divided by weight; torque of the rotors divided by weight times arm length.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)
@@ -153,7 +153,7 @@ def residual_wrench(inputs: Array, residual: ResidualData) -> tuple[Array, Array
 
 
 def _airframe_coefficients(sim: Simulation) -> dict[str, Any]:
-    """Return the coefficients of the airframes. Either all airframes or none have a network, of the same size."""
+    """Return the coefficients of the airframes; an error if their networks differ in size, or only some have one."""
     drone = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
     if drone is not None:
         raise ConfigError(
@@ -164,7 +164,8 @@ def _airframe_coefficients(sim: Simulation) -> dict[str, Any]:
     sizes = {len(airframe.values.get("residual.hidden", ())) for airframe in sim.airframes}
     if len(sizes) > 1:
         raise ConfigError(
-            f"expected residuals of one number of hidden units, got {sorted(sizes)}. Use airframes of equal networks."
+            f"expected residuals with the same number of hidden units, got {sorted(sizes)}. Use airframes with "
+            f"networks of the same size."
         )
     keys = ("linear", "hidden", "output") if max(sizes) else ("linear",)
     coefficients = {key: airframe_numbers(sim, lambda a, key=key: a.value(f"residual.{key}")) for key in keys}

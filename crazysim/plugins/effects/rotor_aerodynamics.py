@@ -141,19 +141,19 @@ class RotorAerodynamics(Plugin):
         hub_vel = vel + rotation.cross(s.ang_vel, record.hub_pos)
         u, v, axial = hub_vel[..., 0], hub_vel[..., 1], hub_vel[..., 2]
         speed = RPM_TO_RAD_S * s.rotor_vel
-        static = quadratic_curve(s.rotor_vel, p.rpm2thrust)
+        static_thrust = quadratic_curve(s.rotor_vel, p.rpm2thrust)
         blade, drag = drag_factor(data) * record.blade, drag_factor(data) * record.drag
         ceiling_gain: Array | float = 1.0
         if record.ceiling is not None:
             height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.hub_pos)[..., 2]
             ceiling_gain = ceiling_factor(record.ceiling - height, record.propeller_radius)
         thrust = thrust_in_flight(
-            static, speed, axial, u * u + v * v, blade, record.propeller_radius, record.air_density, ceiling_gain
+            static_thrust, speed, axial, u * u + v * v, blade, record.propeller_radius, record.air_density, ceiling_gain
         )
-        gain = jnp.where(blade > 0, thrust - jnp.where(static > 0, static, 0.0), 0.0)
+        thrust_change = jnp.where(blade > 0, thrust - jnp.where(static_thrust > 0, static_thrust, 0.0), 0.0)
 
         drag_per_vel, moment_per_vel = drag * speed, record.flapping * speed
-        forces = jnp.stack([-drag_per_vel * u, -drag_per_vel * v, gain], axis=-1)
+        forces = jnp.stack([-drag_per_vel * u, -drag_per_vel * v, thrust_change], axis=-1)
         moments = jnp.stack([moment_per_vel * v, -moment_per_vel * u, jnp.zeros_like(moment_per_vel)], axis=-1)
         force = jnp.sum(forces, axis=-2) - rotation.matvec(p.drag_matrix, vel)
         torque = jnp.sum(rotation.cross(record.hub_pos, forces) + moments, axis=-2)

@@ -31,7 +31,7 @@ field the gust at such a drone would never change."""
 
 
 class WindData(MovingAir):
-    """Velocity of the air at every drone."""
+    """Parameters of the wind, and the gust at every drone."""
 
     velocity: Array = leaf("parameter", 1, (3,))
     """Mean wind, at the reference height if it depends on the height, world frame, m/s. (3,)"""
@@ -128,17 +128,18 @@ class Wind(Plugin):
         length, deviation = low_altitude_gusts(s.pos[..., 2:] - ground, wind.speed_20ft)
         relative_vel = s.vel - mean
         airspeed = jnp.sqrt(dot(relative_vel, relative_vel) + MIN_AIRSPEED**2)
-        step = airspeed / (data.core.freq * length)
+        step_ratio = airspeed / (data.core.freq * length)  # duration of the step per time constant of the filters
 
         noise = normal(drone_key(data, self.name), (6,), s.vel.dtype)
         is_first_step = data.core.steps == 0
-        first, second = wind.filters[:3], wind.filters[3:]
-        first = jnp.where(is_first_step, noise[3:], first)
-        filters = shape_noise(first, second, noise[:3], jnp.where(is_first_step, 1.0, step / (1 + step / 2)))
+        x1, x2 = wind.filters[:3], wind.filters[3:]
+        x1 = jnp.where(is_first_step, noise[3:], x1)
+        loss = jnp.where(is_first_step, 1.0, step_ratio / (1 + step_ratio / 2))
+        filters = shape_noise(x1, x2, noise[:3], loss)
 
-        first, second = filters[:3], filters[3:]
-        transverse = (3**0.5 * first[1:] + (1 - 3**0.5) * second) / 2**0.5
-        gust = wind_axes_to_world(deviation * jnp.concatenate([first[:1], transverse]), mean)
+        x1, x2 = filters[:3], filters[3:]
+        transverse = (3**0.5 * x1[1:] + (1 - 3**0.5) * x2) / 2**0.5
+        gust = wind_axes_to_world(deviation * jnp.concatenate([x1[:1], transverse]), mean)
         return self.write(data, wind.replace(filters=filters, gust=gust))
 
 
@@ -152,7 +153,7 @@ def wind_at(data: SimData, pos: Array) -> Array:
 
 
 def log_profile(height: Array, reference_height: Array, roughness: Array) -> Array:
-    """Return the ratio of the mean wind at a height to that at the reference height.
+    """Return the ratio of the mean wind at a height to the mean wind at the reference height.
 
     ``ln(z / z_0) / ln(z_ref / z_0)``, zero below the roughness length z_0: the wind shear of MIL-F-8785C with z_ref =
     20 ft, stated for 3 to 1000 ft (quoted by MathWorks, Aerospace Blockset, Wind Shear Model).
@@ -167,9 +168,9 @@ def log_profile(height: Array, reference_height: Array, roughness: Array) -> Arr
 
 
 def power_profile(height: Array, reference_height: Array, exponent: Array) -> Array:
-    """Return the ratio of the mean wind at a height to that at the reference height.
+    """Return the ratio of the mean wind at a height to the mean wind at the reference height.
 
-    ``(z / z_ref)^alpha``, as in the normal wind profile of IEC 61400-1; with ``MIN_PROFILE_HEIGHT`` for lower heights.
+    ``(z / z_ref)^alpha``, as in the normal wind profile of IEC 61400-1; constant below ``MIN_PROFILE_HEIGHT``.
 
     Args:
         height: Height above ground, m. (..., 1)
@@ -195,37 +196,37 @@ def low_altitude_gusts(height: Array, speed_20ft: Array) -> tuple[Array, Array]:
     """
     h = clip(height / METRES_PER_FOOT, MIN_HEIGHT_FT, MAX_HEIGHT_FT)
     log = jnp.log(0.177 + 0.000823 * h)
-    horizontal, sigma = h * jnp.exp(-1.2 * log), 0.1 * speed_20ft
-    length = METRES_PER_FOOT * jnp.concatenate([horizontal, horizontal, h], axis=-1)
-    sigma_h = sigma * jnp.exp(-0.4 * log)
-    return length, jnp.concatenate([sigma_h, sigma_h, sigma + jnp.zeros_like(h)], axis=-1)
+    length_u, sigma_w = h * jnp.exp(-1.2 * log), 0.1 * speed_20ft
+    length = METRES_PER_FOOT * jnp.concatenate([length_u, length_u, h], axis=-1)
+    sigma_u = sigma_w * jnp.exp(-0.4 * log)
+    return length, jnp.concatenate([sigma_u, sigma_u, sigma_w + jnp.zeros_like(h)], axis=-1)
 
 
-def shape_noise(first: Array, second: Array, noise: Array, loss: Array) -> Array:
+def shape_noise(x1: Array, x2: Array, noise: Array, loss: Array) -> Array:
     """Return the states of the shaping filters one step later.
 
     ``x1' + x1 / t = sqrt(2 / t) w`` and ``x2' = (x1 - x2) / t``, both by the trapezoidal rule, which preserves the
     covariance of the continuous filters, ((1, 1/2), (1/2, 1/2)), exactly for steps of any and of varying length.
 
     Args:
-        first: x1 along the mean wind, across and vertically, 1. (..., 3)
-        second: x2 across and vertically, 1. (..., 2)
+        x1: First states, along the mean wind, across and vertically, 1. (..., 3)
+        x2: Second states, across and vertically, 1. (..., 2)
         noise: Standard normal numbers. (..., 3)
         loss: Fraction of a filter's state that is lost in the step, ``h / (1 + h / 2)`` with h = dt / t; at 1 the new
-            state is independent of the old. (..., 3)
+            x1 does not depend on the old x1. (..., 3)
 
     Returns:
-        x1, then x2. (..., 5)
+        New x1, then new x2. (..., 5)
     """
-    new_first = first - loss * first + jnp.sqrt(loss * (2 - loss)) * noise
-    mean = 0.5 * (first + new_first)[..., 1:]
-    return jnp.concatenate([new_first, second - loss[..., 1:] * (second - mean)], axis=-1)
+    new_x1 = x1 - loss * x1 + jnp.sqrt(loss * (2 - loss)) * noise
+    mean_x1 = 0.5 * (x1 + new_x1)[..., 1:]
+    return jnp.concatenate([new_x1, x2 - loss[..., 1:] * (x2 - mean_x1)], axis=-1)
 
 
 def wind_axes_to_world(vector: Array, velocity: Array) -> Array:
     """Transform a vector from wind axes (along the mean wind, to its left, up) to the world frame. (..., 3)
 
-    The axes are level, as in MIL-F-8785C at low altitude; without mean wind they are the world's.
+    The axes are level, as in MIL-F-8785C at low altitude; without mean wind they are the axes of the world.
     """
     direction = safe_normalize(velocity[..., :2], jnp.asarray([1.0, 0.0], velocity.dtype))
     c, s = direction[..., 0], direction[..., 1]

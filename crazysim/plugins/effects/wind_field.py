@@ -32,9 +32,9 @@ class WindFieldData(MovingAir):
     scale: Array = leaf("parameter", 1, (1,))
     """Factor of all velocities, 1. (1,)"""
     spread: Array | None = leaf("parameter", 1, (3,))
-    """Largest random displacement along each axis, m; None for no displacement. (3,)"""
+    """Largest random displacement along each axis, m; None for no random displacement. (3,)"""
     shift: Array | None = leaf("drone", 1)
-    """Random displacement in this episode, the same for all drones of a world, m; None without one.
+    """Random displacement in this episode, m; None without one.
     (n_worlds, n_drones, 3)"""
     air_vel: Array = leaf("drone", 1, (3,))
     """Velocity of the air at the drone, world frame, m/s. (n_worlds, n_drones, 3)"""
@@ -44,16 +44,16 @@ class WindFieldData(MovingAir):
 
     def velocity_at(self, pos: Array) -> Array:
         """Return the velocity of the air at a position, world frame, m/s. (..., 3)"""
-        field_pos = pos - self.origin - self.offset
-        field_pos = field_pos if self.shift is None else field_pos - self.shift
-        return self.scale * interpolate(self.field, field_pos / self.spacing)
+        grid_pos = pos - self.origin - self.offset
+        grid_pos = grid_pos if self.shift is None else grid_pos - self.shift
+        return self.scale * interpolate(self.field, grid_pos / self.spacing)
 
 
 class WindField(Plugin):
     """Wind from velocities on a grid, as drag of the velocity relative to the air; needs a model with drag.
 
-    Velocities are interpolated trilinearly between the nodes, and are constant outside the grid. They are looked up
-    once a step, at drones and at loads with drag. Winds add up.
+    Velocities are interpolated trilinearly between the nodes. Outside the grid they have the values of its border. They
+    are looked up once a step, at drones and at loads with drag. Several winds add up.
     """
 
     field: Grid = parameter()
@@ -63,7 +63,7 @@ class WindField(Plugin):
     scale: ArrayLike = parameter(default=1.0)
     """Factor of all velocities, 1. () or (n_worlds, n_drones)"""
     spread: ArrayLike | None = parameter(default=None, low=0.0)
-    """Largest random displacement along each axis, m, uniform, drawn for each world and episode; None for no
+    """Largest random displacement along each axis, m, drawn uniformly for each world and episode; None for no random
     displacement. (3,) or (n_worlds, n_drones, 3)"""
     name: str = "wind_field"
 
@@ -103,7 +103,7 @@ class WindField(Plugin):
         return self.write(data, record.replace(shift=record.spread * sample))
 
     def look_up(self, data: SimData) -> SimData:
-        """Look up the velocity of the air at drones and loads."""
+        """Look up the velocity of the air at a drone; at its loads, the sum over all wind fields."""
         record = self.read(data)
         data = self.write(data, record.replace(air_vel=record.velocity_at(data.states.pos)))
         fields = [x for x in data.plugins.values() if isinstance(x, WindFieldData)]

@@ -34,7 +34,7 @@ class LoadBody(NamedTuple):
 
 
 class Collider(NamedTuple):
-    """Bodies of one shape, one for each load, as used by contacts. The functions take one drone or one world."""
+    """Bodies of one shape, one for each load, for contacts. The functions take the data of one drone or one world."""
 
     shape: Shape
     """Shape of each body."""
@@ -48,7 +48,7 @@ class Collider(NamedTuple):
 
 
 class CollidingPlugin:
-    """Interface of plugins whose loads collide; mixed into a ``Plugin``."""
+    """Interface of plugins whose loads collide, for subclasses of ``Plugin`` to inherit from as well."""
 
     coupling: Any
     """``"drone"`` for loads of one drone each, ``"world"`` for loads of a world."""
@@ -59,7 +59,7 @@ class CollidingPlugin:
 
     @property
     def solid_kinds(self) -> tuple[str, ...]:
-        """Names of the objects of the scene that represent its bodies, without their numbers."""
+        """Names of the scene's objects that show the colliding bodies, without their numbers."""
         return (self.name,)
 
     @property
@@ -89,7 +89,7 @@ class CollidingPlugin:
 
 
 def load_shape(size: ArrayLike) -> Shape:
-    """Return a ball of a radius, or a box of three full lengths, m."""
+    """Return a ball from its radius, m, or a box from its three full lengths, m."""
     lengths = as_number_array("a body", "size", size)
     if lengths.shape not in ((), (3,)) or not np.all((lengths >= LENGTH.low) & (lengths <= LENGTH.high)):
         raise ConfigError(

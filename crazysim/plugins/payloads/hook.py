@@ -54,9 +54,10 @@ class HookData(LoadData):
 class Hook(CollidingPlugin, Plugin):
     """A hook on a rigid rod, with one load for each drone.
 
-    With two degrees of freedom the rod swings freely. With one it turns about the body's y axis, and passes roll and
-    yaw torque to the drone. A load is a point mass at its ring. It is picked up if the hook is near and slow, in an
-    impact after which the two stay together; a load that is let go falls freely.
+    With two degrees of freedom the rod swings freely. With one degree of freedom it turns about the body's y axis, and
+    passes roll and yaw torque to the drone. A load is a point mass at its ring. The hook picks up a load if hook and
+    ring are near each other and their relative speed is low; they stay together after the impact. A load that is let go
+    falls freely.
     """
 
     mass: ArrayLike = parameter(low=0.0)
@@ -141,11 +142,11 @@ class Hook(CollidingPlugin, Plugin):
         motion = couple_bodies(
             data.states, deriv, p.mass, p.J_inv, link, load.tip_pos, load.tip_vel, tip_free_acc, dt, data.core.freq
         )
-        free_rate = load.vel if dt is None else load.vel + dt * fall_acc
+        free_pos_rate = load.vel if dt is None else load.vel + dt * fall_acc
         rates = {
             "tip_pos": motion.pos_rate,
             "tip_vel": motion.acc,
-            "pos": jnp.where(load.attached, motion.pos_rate, free_rate),
+            "pos": jnp.where(load.attached, motion.pos_rate, free_pos_rate),
             "vel": jnp.where(load.attached, motion.acc, fall_acc),
         }
         return motion.deriv.replace(plugins=deriv.plugins | {self.name: rates})
@@ -166,17 +167,19 @@ class Hook(CollidingPlugin, Plugin):
         is_picked_up = load.grip & ~load.attached & can_grip[..., 0]
         new_load = load.replace(attached=load.grip & (load.attached | is_picked_up))
         link = self._link_params(new_load)
-        joint_vel = load.tip_vel + load.mass / (link.mass + MIN_MASS) * relative_vel
-        new_state, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, joint_vel)
+        common_vel = load.tip_vel + load.mass / (link.mass + MIN_MASS) * relative_vel
+        new_state, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, common_vel)
 
-        def where_picked(new: Array, old: Array) -> Array:
+        def select_picked_up(new: Array, old: Array) -> Array:
             return jnp.where(is_picked_up, new, old)
 
-        tip_vel = where_picked(tip_vel, load.tip_vel)
+        tip_vel = select_picked_up(tip_vel, load.tip_vel)
         new_load = new_load.replace(
-            tip_vel=tip_vel, vel=where_picked(tip_vel, load.vel), pos=where_picked(load.tip_pos, load.pos)
+            tip_vel=tip_vel, vel=select_picked_up(tip_vel, load.vel), pos=select_picked_up(load.tip_pos, load.pos)
         )
-        states = s.replace(vel=where_picked(new_state.vel, s.vel), ang_vel=where_picked(new_state.ang_vel, s.ang_vel))
+        states = s.replace(
+            vel=select_picked_up(new_state.vel, s.vel), ang_vel=select_picked_up(new_state.ang_vel, s.ang_vel)
+        )
         return self.write(data.replace(states=states), new_load)
 
     def stop_at_floor(self, data: SimData) -> SimData:

@@ -1,4 +1,4 @@
-"""Tables of the air below a drone: pressure or velocity on a grid in its frame, for several rotor speeds."""
+"""Tables of the air below a drone: pressure or velocity on a grid in the drone's frame, for several rotor speeds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LAB_VOXELS = 81
 
 
 class JetTable(NamedTuple):
-    """Air around a hovering drone on a regular grid that moves and turns with it, by rotor speed."""
+    """Air around a hovering drone for several rotor speeds, on a regular grid that moves and turns with the drone."""
 
     speeds: ArrayLike
     """Mean rotor speeds of the tables, rad/s, ascending. (k,)"""
@@ -28,7 +28,7 @@ class JetTable(NamedTuple):
     velocity: Any = None
     """Velocities of the air, body frame, m/s; None without velocities. (k, n_x, n_y, n_z, 3)"""
     origin: ArrayLike = (0.0, 0.0, 0.0)
-    """Node with the smallest x, y and z, relative to the drone's centre of mass, body frame, m. (3,)"""
+    """Position of the first node, relative to the drone's centre of mass, body frame, m. (3,)"""
     spacing: ArrayLike = VOXEL_EDGE
     """Distance between neighbouring nodes, m: () or (3,)."""
 
@@ -79,15 +79,15 @@ def load_jet_table(
     """Return the table in a folder of text files as AIMotionLab writes them.
 
     Each file ``*_NNNN.txt`` is the air at NNNN rad/s, the mean of the rotors' speeds: one row per node, z fastest, then
-    y, then x, with one number for a pressure, Pa, or three for a velocity, m/s. A folder may have both.
+    y, then x, with one number for a pressure, Pa, or three for a velocity, m/s. A folder may have files of both kinds.
 
     Args:
         folder: The folder.
         shape: Nodes along x, y and z; None for a cube if the number of rows is a cube number, and otherwise 81 x 81 x
             n.
         spacing: Distance between nodes, m.
-        origin: First node relative to the drone's centre of mass, m (3,); None for a box centred below the drone, as in
-            the lab.
+        origin: Position of the first node relative to the drone's centre of mass, m (3,); None for a box centred below
+            the drone, as in the lab.
 
     Raises:
         ConfigError: If the folder has no such files, or their sizes do not match.
@@ -117,12 +117,16 @@ def load_jet_table(
     n_rows = {len(rows) for tables in (pressure, velocity) for rows in tables.values()}
     if len(n_rows) > 1:
         raise ConfigError(f"expected the same number of rows in all files of {str(folder)!r}, got {sorted(n_rows)}")
-    dims = _table_shape(n_rows.pop(), shape)
-    corner = np.array([-dims[0] / 2, -dims[1] / 2, -dims[2]]) * spacing if origin is None else np.asarray(origin)
+    table_shape = _table_shape(n_rows.pop(), shape)
+    corner = (
+        np.array([-table_shape[0] / 2, -table_shape[1] / 2, -table_shape[2]]) * spacing
+        if origin is None
+        else np.asarray(origin)
+    )
     return JetTable(
         speeds=np.array(speeds, np.float64),
-        pressure=np.stack([pressure[s].reshape(dims) for s in speeds]) if pressure else None,
-        velocity=np.stack([velocity[s].reshape(*dims, 3) for s in speeds]) if velocity else None,
+        pressure=np.stack([pressure[s].reshape(table_shape) for s in speeds]) if pressure else None,
+        velocity=np.stack([velocity[s].reshape(*table_shape, 3) for s in speeds]) if velocity else None,
         origin=tuple(map(float, corner)),
         spacing=spacing,
     ).checked()

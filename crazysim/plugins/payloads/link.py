@@ -7,10 +7,10 @@ vector q from the attachment p to the mass, the tension T per mass (the *specifi
 
 where a_tip and a_p are the accelerations of mass and attachment without the link, w is the velocity of the mass across
 the link, relative to the attachment, and A maps a force at the attachment to its acceleration. Nothing divides by
-m_tip: at zero the body is free, and the mass still swings.
+m_tip: with m_tip = 0 the body moves freely, and the mass still swings.
 
-A hinge about the body's y axis keeps the mass in the body's x-z plane. That is a second constraint along the body's y
-axis, whose force acts on the body as if the rod were part of it, and so turns it.
+A hinge about the body's y axis keeps the mass in the body's x-z plane. That is a second constraint, along the body's y
+axis. Its force acts on the body as if the rod were part of the body, and so turns the body.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ step removes. The order of the scheme requires a rate that does not depend on th
 SLACK_ACCELERATION = 1e9
 """Acceleration that no tension of a slack cable outweighs, m/s^2."""
 TAUT_BAND = 1e-4
-"""Relative slack up to which a cable counts as taut: 0.04 mm of 0.4 m."""
+"""Relative slack up to which a cable is treated as taut: 0.04 mm of 0.4 m."""
 
 
 class LinkParams(NamedTuple):
@@ -85,8 +85,8 @@ def link_geometry(state: SimState, pos: Array, vel: Array, attach: Array | None)
         arm = matvec(rot, attach)
         offset, rel_vel = offset - arm, matvec(rot, -cross(state.ang_vel, attach), rel_vel)
     square = dot(offset, offset)
-    inverse = lax.rsqrt(square + MIN_SQUARED_LENGTH)
-    return LinkGeometry(rot, arm, offset, square * inverse, offset * inverse, rel_vel)
+    inverse_distance = lax.rsqrt(square + MIN_SQUARED_LENGTH)
+    return LinkGeometry(rot, arm, offset, square * inverse_distance, offset * inverse_distance, rel_vel)
 
 
 class LinkedMotion(NamedTuple):
@@ -106,9 +106,9 @@ class UnitPull(NamedTuple):
     direction: Array
     """Direction, world frame. (3,)"""
     lever: Array | None
-    """Torque on the body, body frame, m; None without torque. (3,)"""
+    """Torque on the body per unit force, body frame, m; None without torque. (3,)"""
     ang_acc: Array | None
-    """Angular acceleration of the body, body frame, 1/(kg m). (3,)"""
+    """Angular acceleration of the body per unit force, body frame, 1/(kg m); None without torque. (3,)"""
 
     @staticmethod
     def create(direction: Array, rot: Array, J_inv: Array, point: Array | None) -> UnitPull:
@@ -132,17 +132,17 @@ def couple_bodies(
 ) -> LinkedMotion:  # fmt: skip
     """Return the derivative of a body and a tip that a link joins.
 
-    Schemes of order 1 get the mean over a step. Then the impulse that ends all relative motion along the link is part
-    of the tension: of a rod in every step, of a cable where it would be longer than ``length`` at the end of the step.
-    The change of the constraint's direction counts half: the other half follows as an impulse in the next step, which
-    makes the swing time-reversible (the two kicks of RATTLE, Andersen 1983). The tip moves with its new velocity,
-    relative to the attachment. Errors in length are removed from positions only.
+    For schemes of order 1 the result is the mean over a step. The tension then includes the impulse that ends all
+    relative motion along the link: for a rod in every step, for a cable if it would be longer than ``length`` at the
+    end of the step. It includes half the effect of the constraint's change of direction. The other half follows as an
+    impulse in the next step, which makes the swing time-reversible (the two kicks of RATTLE, Andersen 1983). The tip
+    moves with its new velocity, relative to the attachment. Errors in length are removed from positions only.
 
     Args:
         state: State of the body. Leaves (k,)
         deriv: Derivative of the free body.
         mass: Mass of the body, kg. (1,)
-        J_inv: Inverse of its inertia, 1/(kg m^2). (3, 3)
+        J_inv: Inverse of the body's inertia, 1/(kg m^2). (3, 3)
         link: Parameters.
         pos: Position of the tip, world frame, m. (3,)
         vel: Velocity of the tip, world frame, m/s. (3,)
@@ -168,9 +168,9 @@ def couple_bodies(
         hinge_pull, hinge_rhs = _hinge_pull(state, deriv, geometry, rel_acc, J_inv, link, dt, freq)
         cross_ratio = dot(link_pull.direction, hinge_pull.direction) + m * link_pull.response(hinge_pull, mass)
         hinge_ratio = m * hinge_pull.response(hinge_pull, mass)
-        inverse = 1 / ((1 + mass_ratio) * (1 + hinge_ratio) - cross_ratio * cross_ratio)
-        tension = ((1 + hinge_ratio) * rhs - cross_ratio * hinge_rhs) * inverse
-        hinge_tension = ((1 + mass_ratio) * hinge_rhs - cross_ratio * rhs) * inverse
+        inverse_determinant = 1 / ((1 + mass_ratio) * (1 + hinge_ratio) - cross_ratio * cross_ratio)
+        tension = ((1 + hinge_ratio) * rhs - cross_ratio * hinge_rhs) * inverse_determinant
+        hinge_tension = ((1 + mass_ratio) * hinge_rhs - cross_ratio * rhs) * inverse_determinant
         tensions, pulls = [tension, hinge_tension], [link_pull, hinge_pull]
     else:
         tension = rhs * (1 / (1 + mass_ratio))
@@ -178,22 +178,22 @@ def couple_bodies(
     if link.is_attached is not None:
         tensions = [jnp.where(link.is_attached, t, 0.0) for t in tensions]
     damping = None
-    if link.damping is not None:  # it pulls against the swing across the link
+    if link.damping is not None:  # damping acts against the swing across the link
         damping_rate, swing = _damping_rate(link, dt, freq), _swing_velocities(state, geometry)[1]
         damping = damping_rate * swing
         tensions[0] = tensions[0] - damping_rate * radial_speed
     parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
     pull = sum(parts[1:], parts[0])
-    # Products of constants come first: they are computed once, and the rest are multiply-adds.
+    # Products of constants come first: they are computed once, and multiply-adds remain.
     mass_ratio, new_deriv = m / mass, deriv
     if damping is not None:
         pull = pull + damping
-        # A force on the tip turns the body as if the tip were part of it: a force along the link has the same lever.
+        # A force on the tip turns the body as if the tip were part of the body: along the link the lever is the same.
         torque = to_body_frame(geometry.rot, cross(pos - state.pos, pull))
-        new_deriv = _with_torque(deriv, m * J_inv, torque, dt)
+        new_deriv = _add_torque(deriv, m * J_inv, torque, dt)
     elif any(p.ang_acc is not None for p in pulls):
         angular_terms = [m * t * p.ang_acc for t, p in zip(tensions, pulls, strict=True) if p.ang_acc is not None]
-        new_deriv = _with_torque(deriv, None, sum(angular_terms[1:], angular_terms[0]), dt)
+        new_deriv = _add_torque(deriv, None, sum(angular_terms[1:], angular_terms[0]), dt)
     tip_acc = free_acc - pull
     new_deriv = new_deriv.replace(acc=deriv.acc + mass_ratio * pull)
     new_deriv = new_deriv if dt is None else new_deriv.replace(vel=deriv.vel + dt * mass_ratio * pull)
@@ -201,8 +201,8 @@ def couple_bodies(
     return LinkedMotion(new_deriv, pos_rate, tip_acc)
 
 
-def _with_torque(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
-    """Return a derivative with the angular acceleration ``factor @ torque`` added, and its share in the velocity."""
+def _add_torque(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
+    """Return a derivative with the angular acceleration ``factor @ torque`` added; with ``dt`` also to ``ang_vel``."""
     if factor is None:
         result = deriv.replace(ang_acc=deriv.ang_acc + torque)
         return result if dt is None else result.replace(ang_vel=deriv.ang_vel + dt * torque)
@@ -239,8 +239,8 @@ def correction_rate(freq: int) -> float:
 def drag_rate(coefficient: Array, mass: Array, dt: float | None, freq: int) -> Array:
     """Return the deceleration by a linear drag divided by the speed, 1/s, which cannot reverse a motion in a step. (1,)
 
-    In a step of a scheme of order 1 it is implicit in time. The derivative at an instant is exact up to a rate of one
-    per step, and limited to that.
+    In a step of a scheme of order 1 the drag is implicit in time. In the derivative at an instant, the rate is exact up
+    to one per step, and limited to this value.
 
     Args:
         coefficient: Drag per speed, N s/m. (1,)
@@ -259,9 +259,9 @@ def _damping_rate(link: LinkParams, dt: float | None, freq: int) -> Array:
 
 
 def _radial_term(
-    geometry: LinkGeometry, radial_speed: Array, free_acc: Array, link: LinkParams, dt: float | None, freq: int
+    geometry: LinkGeometry, radial_speed: Array, radial_acc: Array, link: LinkParams, dt: float | None, freq: int
 ) -> Array:
-    """Return the term of the right-hand side of the equation that ends relative motion along the link, m/s^2. (1,)"""
+    """Return the term of the equation's right-hand side that ends relative motion along the link, m/s^2. (1,)"""
     if dt is None:
         if not link.is_cable:
             return 2 * correction_rate(freq) * radial_speed
@@ -275,12 +275,12 @@ def _radial_term(
     gap = jnp.where(slack > TAUT_BAND * link.length, freq * slack, 0.0)
     if link.restitution is None:
         return freq * (radial_speed - gap)
-    # It bounces in the step at whose end it would be taut, with the speed that it had when it became taut.
+    # The tip bounces in the step at whose end the cable would be taut, with its speed when the cable became taut.
     overshoot = jnp.maximum(geometry.distance - link.length, 0.0)
     rebound_speed = link.restitution * rotation.safe_sqrt(
-        radial_speed * radial_speed - 2 * overshoot * jnp.maximum(free_acc, 0.0)
+        radial_speed * radial_speed - 2 * overshoot * jnp.maximum(radial_acc, 0.0)
     )
-    is_bouncing = (link.restitution > 0) & (radial_speed > BOUNCE_SPEED) & (radial_speed + dt * free_acc > gap)
+    is_bouncing = (link.restitution > 0) & (radial_speed > BOUNCE_SPEED) & (radial_speed + dt * radial_acc > gap)
     return freq * (radial_speed - jnp.where(is_bouncing, -rebound_speed, gap))
 
 
@@ -310,15 +310,14 @@ def _tip_pos_rate(
         stretch = jnp.where(stretch > -TAUT_BAND * link.length, stretch, 0.0)
     correction = freq if dt is not None else correction_rate(freq)
     correction = correction if is_attached is None else jnp.where(is_attached, correction, 0.0)
-    pos_rate = (
-        vel if dt is None else vel + dt * tip_acc
-    )  # the same expression as in the integrator, so it is computed once
+    # The integrator has the same expression, so the compiler computes it once.
+    pos_rate = vel if dt is None else vel + dt * tip_acc
     pos_rate = pos_rate - correction * stretch * geometry.direction
     if link.is_hinge:
         pos_rate = pos_rate - correction * dot(geometry.rot[..., 1], geometry.offset) * geometry.rot[..., 1]
     if dt is None:
         return pos_rate
-    # ``deriv.vel`` moves the body; the tip moves with its new velocity relative to that.
+    # The scheme moves the body with ``deriv.vel``, and the tip with the new velocity of the tip relative to the body.
     attach_motion = attach_acc
     if deriv.vel is not state.vel:  # it is the new velocity of the body
         attach_motion = attach_motion - deriv.acc
@@ -332,13 +331,13 @@ def end_relative_motion(
 ) -> tuple[SimState, Array]:
     """Return the body and the tip's velocity after the impulse that ends relative motion along the link.
 
-    A cable exerts it only if it is taut and the tip moves outwards; above ``BOUNCE_SPEED`` it bounces by the
-    restitution. Momentum is conserved, and no energy is gained.
+    A cable exerts this impulse only if it is taut and the tip moves outwards. Above ``BOUNCE_SPEED`` the tip bounces
+    with the restitution of the link. Momentum is conserved, and no energy is gained.
 
     Args:
         state: State of the body. Leaves (k,)
         mass: Mass of the body, kg. (1,)
-        J_inv: Inverse of its inertia, 1/(kg m^2). (3, 3)
+        J_inv: Inverse of the body's inertia, 1/(kg m^2). (3, 3)
         link: Parameters.
         pos: Position of the tip, world frame, m. (3,)
         vel: Velocity of the tip, world frame, m/s. (3,)

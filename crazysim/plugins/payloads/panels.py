@@ -36,19 +36,21 @@ def shape_panels(shape: Shape, max_edge: float) -> Panels:
     """
     if shape.kind == "sphere":
         return _ball_panels(shape.size[0], max_edge)
-    half = np.array(shape.size)
+    half_lengths = np.array(shape.size)
     pos, normal, area = [], [], []
     for axis in range(3):
         side_axes = [k for k in range(3) if k != axis]
-        counts = [max(1, math.ceil(2 * half[k] / max_edge - 1e-9)) for k in side_axes]
-        lines = [half[k] * (2 * (np.arange(n) + 0.5) / n - 1) for k, n in zip(side_axes, counts, strict=True)]
+        counts = [max(1, math.ceil(2 * half_lengths[k] / max_edge - 1e-9)) for k in side_axes]
+        lines = [half_lengths[k] * (2 * (np.arange(n) + 0.5) / n - 1) for k, n in zip(side_axes, counts, strict=True)]
         grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
         for side in (-1.0, 1.0):
             points = np.zeros((len(grid), 3))
-            points[:, side_axes], points[:, axis] = grid, side * half[axis]
+            points[:, side_axes], points[:, axis] = grid, side * half_lengths[axis]
             pos.append(points)
             normal.append(np.tile(side * np.eye(3)[axis], (len(grid), 1)))
-            area.append(np.full((len(grid), 1), 4 * half[side_axes[0]] * half[side_axes[1]] / len(grid)))
+            area.append(
+                np.full((len(grid), 1), 4 * half_lengths[side_axes[0]] * half_lengths[side_axes[1]] / len(grid))
+            )
     return Panels(*(np.concatenate(x) for x in (pos, normal, area)))
 
 

@@ -34,7 +34,7 @@ WIRE_RADIUS, HOOK_RADIUS = 0.003, 0.0045
 HOOK_OUTLINE = ((0, -0.045), (-0.02, -0.025), (-0.014, -0.004), (0, 0.003), (0.014, -0.004), (0.02, -0.02))
 """Drawn shape of a hook: x, and z towards the load from the hook's position, m."""
 HEAD_RADIUS, HEAD_HEIGHT = 0.0245, 0.021
-"""Radius of the ball around that outline, with which a hook collides, and its height above the hook's position, m."""
+"""Radius of the ball that represents a hook in collisions, and height of its centre above the hook's position, m."""
 DARK, STEEL, YELLOW = (0.15, 0.15, 0.15, 1.0), (0.35, 0.35, 0.4, 1.0), (0.95, 0.75, 0.1, 1.0)
 """Colours of rods, wires and hooks."""
 DRONE_TOUCH_ATTRIBUTES = 'contype="0" conaffinity="2"'
@@ -67,7 +67,7 @@ class LoadData(BodiesInAir):
 
 
 class PointLoad(CollidingPlugin):
-    """A load that is one point mass on links that can be cut; mixed into a ``Plugin``."""
+    """Interface of plugins with loads that are point masses on links, for subclasses of ``Plugin`` to inherit from."""
 
     read: Any
     """``Plugin.read``."""
@@ -82,12 +82,12 @@ class PointLoad(CollidingPlugin):
         return self.write(data, load.replace(pos=pos, vel=vel))
 
     def release(self, data: SimData, mask: ArrayLike | None = None) -> SimData:
-        """Return the data with links of loads cut.
+        """Return the data with the links of some loads cut.
 
         Args:
             data: Simulation.
-            mask: True for drones that let go, or for worlds in which all do; None for all. (n_worlds, n_drones) or
-                (n_worlds,)
+            mask: True for drones that let go of their loads, or for worlds in which all drones do; None for all.
+                (n_worlds, n_drones) or (n_worlds,)
         """
         load = self.read(data)
         shape = load.attached.shape
@@ -128,7 +128,7 @@ def free_acceleration(data: SimData, load: LoadData, name: str, dt: float | None
 def clip_to_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple[Array, Array]:
     """Return position and velocity of a body that does not fall through the floor.
 
-    Friction brakes it there, along x and y separately.
+    On the floor, friction brakes the body along x and y separately.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -136,11 +136,11 @@ def clip_to_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> 
         clearance: Height of the body above the floor where it rests, m. (..., 1)
         friction: Coulomb's coefficient, 1. (..., 1)
     """
-    height, climb, horizontal_vel = pos[..., 2:], vel[..., 2:], vel[..., :2]
+    height, climb_rate, horizontal_vel = pos[..., 2:], vel[..., 2:], vel[..., :2]
     is_landed = height <= clearance
-    brake = jnp.where(is_landed, friction * jnp.maximum(-climb, 0.0), 0.0)
-    horizontal_vel = horizontal_vel - jnp.maximum(jnp.minimum(horizontal_vel, brake), -brake)
-    vel = jnp.concatenate([horizontal_vel, jnp.where(is_landed, jnp.maximum(climb, 0.0), climb)], axis=-1)
+    max_speed_loss = jnp.where(is_landed, friction * jnp.maximum(-climb_rate, 0.0), 0.0)
+    horizontal_vel = horizontal_vel - jnp.maximum(jnp.minimum(horizontal_vel, max_speed_loss), -max_speed_loss)
+    vel = jnp.concatenate([horizontal_vel, jnp.where(is_landed, jnp.maximum(climb_rate, 0.0), climb_rate)], axis=-1)
     return jnp.concatenate([pos[..., :2], jnp.maximum(height, clearance)], axis=-1), vel
 
 
@@ -180,10 +180,10 @@ def direction(data: SimData, name: str = "load") -> tuple[Array, Array]:
     """
     load: Any = data.plugins[name]
     pos, vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
-    r = link_geometry(data.states, pos, vel, load.attach)
-    swing_vel = r.vel - rotation.dot(r.direction, r.vel) * r.direction
-    is_zero = r.distance == 0
-    return r.direction, jnp.where(is_zero, 0.0, swing_vel / jnp.where(is_zero, 1.0, r.distance))
+    link = link_geometry(data.states, pos, vel, load.attach)
+    swing_vel = link.vel - rotation.dot(link.direction, link.vel) * link.direction
+    is_zero = link.distance == 0
+    return link.direction, jnp.where(is_zero, 0.0, swing_vel / jnp.where(is_zero, 1.0, link.distance))
 
 
 def load_pos(data: SimData, name: str = "load") -> Array:

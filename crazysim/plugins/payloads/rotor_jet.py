@@ -61,8 +61,8 @@ class RotorJet(Plugin):
     The force on a panel of area A with the outward normal n is ``-P A n`` for a pressure P of a table, and ``rho v
     max(-v.n, 0) A`` for air of velocity v relative to the load: the momentum of the air that arrives. The analytic jet
     is the same as in ``Downwash``. A table is interpolated linearly between nodes and between rotor speeds, and is zero
-    outside its box. Below its smallest rotor speed the jet decreases to zero with the speed; above its largest one it
-    stays constant.
+    outside its grid. Below the smallest rotor speed of the table the jet decreases to zero with the speed; above the
+    largest rotor speed it stays constant.
     """
 
     table: JetTable | None = None
@@ -151,11 +151,11 @@ def jet_pressure(
     """Return the force of a drone's jet per area of panels, world frame, Pa. (..., n, 3)
 
     Args:
-        data: One drone, one world or all worlds.
+        data: Data of one drone, one world or all worlds.
         record: Record of the jets.
         drone: Index of the drone whose jet acts; None for each load's own drone.
         pos: Centres of the panels, world frame, m. (..., n, 3)
-        normal: Their outward normals, world frame. (..., n, 3)
+        normal: Outward normals of the panels, world frame. (..., n, 3)
         vel: Velocity of the loads, world frame, m/s. (..., 3)
     """
     s = data.states

@@ -36,7 +36,7 @@ TENSION_REGULARIZATION = 1e-6
 makes the tensions unique already. With four or more links and a light load, the matrix is close to singular without
 this term."""
 N_ITERATIONS = 3
-"""Number of times that the tensions are solved for, each without the cables that would push in the previous
+"""Number of times that the tensions are solved for, each time without the cables that would push in the previous
 solution."""
 
 
@@ -74,7 +74,7 @@ def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Arr
         Position and velocity, world frame, m and m/s. (n_worlds, 1, 3) each
     """
     mean = states.pos.mean(axis=1, keepdims=True)
-    # As low as the cables of the drones around it allow.
+    # The load is as low as all links allow.
     horizontal_distance = rotation.safe_norm((states.pos - mean)[..., :2])
     drop = rotation.safe_sqrt((length - horizontal_distance) * (length + horizontal_distance))
     height = jnp.maximum(jnp.max(states.pos[..., 2:] - drop, axis=1, keepdims=True), clearance)
@@ -84,9 +84,9 @@ def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Arr
 class SharedLoad(PointLoad, Plugin):
     """One load, a point mass, on rods or cables from all drones of a world.
 
-    The tensions follow from one system of equations of all drones. It needs an integrator that updates positions with
-    the new velocities, ``symplectic_euler`` or ``rk4``. It starts at rest below the drones' mean position. Its
-    gravitational acceleration is the mean of the drones'.
+    The tensions follow from one system of equations of all drones. The integrator must update positions with the new
+    velocities: ``symplectic_euler`` or ``rk4``. The load starts at rest below the drones' mean position. Its
+    gravitational acceleration is the mean of the drones' gravitational accelerations.
     """
 
     coupling: ClassVar[Literal["drone", "world"]] = "world"
@@ -148,27 +148,27 @@ class SharedLoad(PointLoad, Plugin):
         load, p, s, freq = self.read(data), data.params, data.states, data.core.freq
         m, n = load.mass, s.pos.shape[0]
         gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else jnp.mean(p.gravity_vec, axis=0)
-        r = link_geometry(s, load.pos, load.vel, load.attach)
-        q, radial_speed = r.direction, rotation.dot(r.direction, r.vel)
-        pull = UnitPull.create(q, r.rot, p.J_inv, load.attach)
+        link = link_geometry(s, load.pos, load.vel, load.attach)
+        q, radial_speed = link.direction, rotation.dot(link.direction, link.vel)
+        pull = UnitPull.create(q, link.rot, p.J_inv, load.attach)
         swing_factor = 1.0 if dt is None else 0.5
-        rel_acc = gravity - acceleration_at(s, deriv, r.rot, load.attach, swing_factor)
+        rel_acc = gravity - acceleration_at(s, deriv, link.rot, load.attach, swing_factor)
         rhs = rotation.dot(q, rel_acc) + swing_factor / load.length * (
-            rotation.dot(r.vel, r.vel) - radial_speed * radial_speed
+            rotation.dot(link.vel, link.vel) - radial_speed * radial_speed
         )
         is_active = load.attached
         if dt is None:
             rhs = rhs + 2 * correction_rate(freq) * radial_speed
-            is_active = is_active & (r.distance > (1 - TAUT_BAND) * load.length)[..., 0] if self.cable else is_active
+            is_active = is_active & (link.distance > (1 - TAUT_BAND) * load.length)[..., 0] if self.cable else is_active
         else:
-            gap = jnp.maximum(load.length - r.distance, 0.0) if self.cable else 0.0
+            gap = jnp.maximum(load.length - link.distance, 0.0) if self.cable else 0.0
             rhs = rhs + freq * (radial_speed - freq * gap)
         ratio = jnp.broadcast_to(m / p.mass, (n, 1))
         ratio = (
             ratio if pull.lever is None or pull.ang_acc is None else ratio + m * rotation.dot(pull.lever, pull.ang_acc)
         )
         gram = jnp.sum(q[:, None] * q[None], axis=-1) + jnp.eye(n, dtype=q.dtype) * (ratio + TENSION_REGULARIZATION)
-        tension = _tensions(gram, rhs[:, 0], is_active, self.cable)[:, None]
+        tension = _solve_tensions(gram, rhs[:, 0], is_active, self.cable)[:, None]
 
         force = tension * q
         acc = m / p.mass * force
@@ -181,7 +181,7 @@ class SharedLoad(PointLoad, Plugin):
             changes["ang_acc"] = deriv.ang_acc + ang_acc
             if dt is not None:
                 changes["ang_vel"] = deriv.ang_vel + dt * ang_acc
-        stretch = r.distance - load.length
+        stretch = link.distance - load.length
         stretch = jnp.maximum(stretch, 0.0) if self.cable else stretch
         error = jnp.sum(jnp.where(load.attached[:, None], stretch * q, 0.0), axis=0) / n
         pos_rate = load.vel - correction_rate(freq) * error if dt is None else load.vel + dt * tip_acc - freq * error
@@ -192,9 +192,9 @@ class SharedLoad(PointLoad, Plugin):
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
-        r = link_geometry(data.states, load.pos, load.vel, load.attach)
-        offset = jnp.where(load.attached[:, None], r.offset, -load.length * r.rot[..., 2])
-        top = data.states.pos if r.arm is None else data.states.pos + r.arm
+        link = link_geometry(data.states, load.pos, load.vel, load.attach)
+        offset = jnp.where(load.attached[:, None], link.offset, -load.length * link.rot[..., 2])
+        top = data.states.pos if link.arm is None else data.states.pos + link.arm
         links = link_pieces(top, offset, load.length, CABLE_SEGMENTS if self.cable else 1)
         z_axis = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
         rows = {self.name: (load.pos[None], rotation_from_z(z_axis)), f"{self.name}_link": links}
@@ -212,11 +212,11 @@ class SharedLoad(PointLoad, Plugin):
         return self.read(data).attached[None] & (not self.cable)
 
 
-def _tensions(matrix: Array, rhs: Array, is_active: Array, one_sided: bool) -> Array:
+def _solve_tensions(matrix: Array, rhs: Array, is_active: Array, one_sided: bool) -> Array:
     """Return the tensions per mass of the load, m/s^2; cables that would push are slack. (n,)
 
     Args:
-        matrix: Accelerations along each link under a unit tension in each, symmetric, positive definite. (n, n)
+        matrix: Accelerations along the links per unit tension of each link, symmetric, positive definite. (n, n)
         rhs: Relative accelerations that the tensions prevent, m/s^2. (n,)
         is_active: True for links that can pull. (n,)
         one_sided: True for cables.
