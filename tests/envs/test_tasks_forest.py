@@ -44,7 +44,7 @@ def standing_trees(env, data):
     forest = env.task.trees(env.sim.n_drones)
     pos = np.asarray(vmap_worlds(lambda data: forest.poses(data)[0])(data))
     cells = np.divmod(forest.order, forest.n_cells[1])
-    trees = vmap_worlds(lambda data: forest.columns(data, *cells))(data)
+    trees = vmap_worlds(lambda data: forest.obstacles_in_cells(data, *cells))(data)
     np.testing.assert_allclose(pos[..., 0], trees.x, atol=1e-5)
     radius = np.broadcast_to(np.asarray(trees.size), trees.is_standing.shape)
     return np.stack([trees.x, trees.y], axis=-1), radius, np.asarray(trees.is_standing)

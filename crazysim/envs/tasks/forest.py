@@ -179,7 +179,7 @@ class Forest(Task):
         ]
         column_offsets = np.repeat(np.arange(-1, 3), 3).astype(np.int32)
         row_offsets = np.tile(np.arange(-1, 2), 4).astype(np.int32)
-        trees = forest.columns(data, column[:, None] + column_offsets, row[:, None] + row_offsets)
+        trees = forest.obstacles_in_cells(data, column[:, None] + column_offsets, row[:, None] + row_offsets)
         offset = jnp.stack([trees.x - pos[:, :1], trees.y - pos[:, 1:2]], axis=-1)
         distance = rotation.safe_norm(offset)[..., 0]
         gap = jnp.where(trees.is_standing, jnp.minimum(distance - trees.size, VIEW_RANGE), VIEW_RANGE)

@@ -13,7 +13,7 @@ ESTIMATORS: dict[str, type[Estimator]] = {"kalman": Kalman, "eskf": ESKF, "compl
 
 
 def find_estimator(estimator: str | Estimator) -> Estimator:
-    """Return an estimator; a name stands for the estimator on its default sensors."""
+    """Return an estimator; for a name, the estimator with its default sensors."""
     if isinstance(estimator, Estimator):
         return estimator
     if not isinstance(estimator, str) or estimator not in ESTIMATORS:

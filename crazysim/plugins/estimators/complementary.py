@@ -31,7 +31,7 @@ HEIGHT_WEIGHT, VELOCITY_DECAY = 0.9, 0.995
 """Weight of the previous height in an update, and factor of the velocity in each update
 (position_estimator_altitude.c)."""
 CLIMB_DEADBAND = 0.04
-"""Vertical acceleration that counts as zero, in units of gravity (position_estimator_altitude.c)."""
+"""Vertical acceleration below which it is set to zero, in units of gravity (position_estimator_altitude.c)."""
 MAX_RANGE_AGE = 0.05
 """Greatest age of a distance to the ground that is used, s (position_estimator_altitude.c)."""
 
@@ -128,7 +128,7 @@ class Complementary(Estimator):
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated attitude, position and velocity of one drone; x and y of the last two are zero."""
+        """Return the estimated attitude, position and velocity of one drone, the last two with zero x and y."""
         record, s = self.read(data), data.states
         zero = jnp.zeros_like(s.pos[..., :2])
         pos, vel = (jnp.concatenate([zero, z], axis=-1) for z in (record.height, record.climb))
@@ -140,7 +140,7 @@ class Complementary(Estimator):
         return self.write(data, record.replace(quat=s.quat, height=s.pos[2:], climb=climb, inertial_climb=climb))
 
     def _height(self, data: SimData, record: ComplementaryData, dt: float) -> tuple[Array, Array]:
-        """Return the height of one drone, m, and its new ``over_surface``. (1,) each"""
+        """Return the new height of one drone, m, and the new ``over_surface``. (1,) each"""
         height, over_surface, shift = record.height, record.over_surface, dt * record.inertial_climb
         new_height = height
         for sensor in self.aiding_sensors:
@@ -160,7 +160,7 @@ def filtered_height(height: Array, measured: Array, shift: Array) -> Array:
     """Return the height after an update, m. (1,)
 
     Args:
-        height: Height before, m. (1,)
+        height: Height before the update, m. (1,)
         measured: Measured height, m. (1,)
         shift: Change of the height in the interval by the inertial velocity, m. (1,)
     """
@@ -173,7 +173,7 @@ def height_over_surface(
     """Return the height after an update, m, and the new ``over_surface`` (``positionEstimateInternal``). (1,) each
 
     Args:
-        height: Height before, m. (1,)
+        height: Height before the update, m. (1,)
         pressure_height: Height to use if the distance to the ground was never measured, m. (1,)
         distance: Distance to the ground, m. (1,)
         is_useful: True where the distance is recent and within the sensor's range. (1,)
@@ -213,7 +213,7 @@ def inertial_climb(climb: Array, quat: Array, accel: Array, dt: float) -> Array:
     """Return the upward velocity after an interval, m/s (``positionUpdateVelocity``). (1,)
 
     Args:
-        climb: Upward velocity before, m/s. (1,)
+        climb: Upward velocity before the interval, m/s. (1,)
         quat: Attitude, body to world, unit, xyzw. (4,)
         accel: Specific force, body frame, m/s^2. (3,)
         dt: Length of the interval, s.

@@ -64,7 +64,7 @@ class Estimate(PyTree):
 
 
 def covariance(upper: Array) -> Array:
-    """Return the covariance whose upper triangle, row by row, is given as (..., n (n + 1) / 2). (..., n, n)"""
+    """Return the covariance (..., n, n) from its upper triangle, row by row, (..., n (n + 1) / 2)."""
     n = _n_errors(upper)
     # Unsigned, because JAX 0.10 adds the axis size to signed indices, with an integer type that depends on whether
     # float32 or float64 was indexed first.
@@ -107,7 +107,7 @@ def predict(
         accel: Specific force, body frame, m/s^2. (3,)
         gyro: Angular velocity, body frame, rad/s. (3,)
         dt: Length of the interval, s.
-        resting_quat: Attitude towards which a drone on the ground is drawn, (4,); None in flight.
+        resting_quat: Attitude that is mixed into the attitude of a drone on the ground; None in flight. (4,)
         all_axes: True to use the force along all axes in flight; False to use only the force along the z axis of the
             body, as the firmware does, because rotors can generate no other force.
     """
@@ -149,11 +149,11 @@ def propagate(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, 
         gravity: Acceleration of gravity, world frame, m/s^2. (3,)
     """
     angle = dt * (gyro - estimate.gyro_bias)  # type: ignore[operator]
-    middle, end = turn_attitude(estimate.quat, 0.5 * angle), turn_attitude(estimate.quat, angle)
-    acc = rotation.matvec(rotation.matrix(middle), accel - estimate.accel_bias, gravity)  # type: ignore[operator]
+    mid_quat, end_quat = turn_attitude(estimate.quat, 0.5 * angle), turn_attitude(estimate.quat, angle)
+    acc = rotation.matvec(rotation.matrix(mid_quat), accel - estimate.accel_bias, gravity)  # type: ignore[operator]
     vel = rotation.rotate(estimate.quat, estimate.vel)
     pos = estimate.pos + dt * vel + 0.5 * dt**2 * acc
-    return estimate.replace(pos=pos, vel=rotation.rotate_inverse(end, vel + dt * acc), quat=end)
+    return estimate.replace(pos=pos, vel=rotation.rotate_inverse(end_quat, vel + dt * acc), quat=end_quat)
 
 
 def predict_biased(
@@ -167,7 +167,7 @@ def predict_biased(
 ) -> Estimate:
     """Return the estimate with biases after an interval, with the noise of the inertial sensors.
 
-    Position and velocity move with the mean specific force, turned by half of the rotation in the interval; the errors
+    Position and velocity follow the mean specific force, turned by half of the rotation in the interval. The errors
     follow Solà (2017), section 5.4.3, with the velocity turned into the body frame. R and v are attitude and
     velocity before the interval, R' and v' after it, M is the rotation in its first half, E = R'^T R, g gravity in the
     world frame, a and w are the errors of accelerometer and gyroscope, and [ ]x is the matrix of a cross product:
@@ -186,8 +186,8 @@ def predict_biased(
         gyro_variance: Variances of the mean angular velocity, rad^2/s^2. (3,)
     """
     vel, predicted = estimate.vel, propagate(estimate, accel, gyro, dt, gravity)
-    middle = turn_attitude(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
-    rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, middle, predicted.quat))
+    mid_quat = turn_attitude(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
+    rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, mid_quat, predicted.quat))
 
     error_rot, accel_to_vel = rot_end.T @ rot, -dt * (rot_end.T @ rot_middle)
     vel_to_pos, att_to_pos = dt * rot, -dt * rot @ rotation.cross_matrix(vel)
@@ -225,7 +225,7 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     Args:
         estimate: The estimate.
         rows: Indices of the errors that the measurement depends on, such as ``POS``.
-        h: Its derivatives with respect to them. (len(rows),)
+        h: Derivatives of the measurement with respect to these errors. (len(rows),)
         error: The measurement minus its prediction by the estimate, in the unit of the measurement. ()
         deviation: Standard deviation of the measurement, in the same unit. ()
     """
@@ -260,7 +260,7 @@ def finalize(estimate: Estimate, min_angle: float = SMALL_ANGLE) -> Estimate:
 
     Args:
         estimate: The estimate.
-        min_angle: Size, rad, up to which an error is dropped; by default the firmware's.
+        min_angle: Size up to which an error is dropped, rad; by default the value of the firmware.
     """
     error, p = estimate.att_error, covariance(estimate.cov)
     size = jnp.abs(error)
@@ -273,7 +273,7 @@ def finalize(estimate: Estimate, min_angle: float = SMALL_ANGLE) -> Estimate:
 
 
 def is_within_bounds(estimate: Estimate, max_pos: float = MAX_POS, max_vel: float = MAX_VEL) -> Array:
-    """Return True where all coordinates, m, and velocities, m/s, are within bounds, by default the firmware's. ()"""
+    """Return True where all coordinates, m, and velocities, m/s, are within bounds. ()"""
     return jnp.all(jnp.abs(estimate.pos) <= max_pos) & jnp.all(jnp.abs(estimate.vel) <= max_vel)
 
 
@@ -323,7 +323,7 @@ def _is_variance(n: int) -> np.ndarray:
 
 
 def _n_errors(upper: Array) -> int:
-    """Return the number of errors of a covariance whose upper triangle is given."""
+    """Return the number of errors of a covariance, from its upper triangle."""
     return math.isqrt(2 * upper.shape[-1])
 
 
@@ -334,6 +334,10 @@ def _upper_triangle(n: int) -> tuple[np.ndarray, ...]:
 
 
 def _error_rotation(half_angle: Array) -> Array:
-    """Return the rotation of the error of an attitude that turns by twice ``half_angle``, to second order. (3, 3)"""
+    """Return the matrix by which an attitude error changes as the attitude turns, to second order. (3, 3)
+
+    Args:
+        half_angle: Half the rotation vector, body frame, rad. (3,)
+    """
     cross = rotation.cross_matrix(half_angle)
     return jnp.eye(3, dtype=half_angle.dtype) - cross + 0.5 * (cross @ cross)

@@ -1,4 +1,4 @@
-"""Base class of filters with error states: sums of inertial measurements, and other measurements used on arrival."""
+"""Base class of filters with error states, which add up inertial measurements and use others on arrival."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ class ErrorStateFilter(Estimator):
     def initial_record(self, sim: Simulation, record_type: type[R], estimate: Estimate, **fields: Any) -> R:
         """Return the record before the first step.
 
-        In ``used_steps``, the step in which the latest used measurement of each sensor was taken, all values are -1.
-        ``failures``, the number of times that the estimate left its bounds and the filter restarted, is zero.
+        ``used_steps`` has the step in which the latest used measurement of each sensor was taken; here -1. ``failures``
+        counts the restarts of the filter after the estimate left its bounds; here 0.
 
         Args:
             sim: The simulation.
@@ -77,12 +77,12 @@ class ErrorStateFilter(Estimator):
         return self.fill_record(sim, record_type, estimate=estimate, used_steps=used_steps, failures=failures, **fields)
 
     def prediction_schedule(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
-        """Return the steps between predictions at ``freq`` steps per second, and the predicate for when one is due."""
+        """Return the steps between predictions, at ``freq`` steps per second, and a function: True if one is due."""
         period = freq // dividing_rate("freq", self.freq, freq)
         return period, lambda data: (data.core.steps + 1) % period == 0
 
     def fusion_stages(self) -> list[tuple[str, Stage]]:
-        """Return the stages that use the measurements of the sensors, by their names."""
+        """Return the names of the sensors with the stages that use their measurements."""
         return [
             (s.name, Stage(self._fusion_fn(k, s), "drone", self._is_new(k, s)))
             for k, s in enumerate(self.aiding_sensors)
@@ -102,7 +102,7 @@ class ErrorStateFilter(Estimator):
         return lambda data: sensor.read(data).samples.taken_step[0] != self.read(data).used_steps[k]
 
     def _fusion_fn(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
-        def fuse(data: SimData) -> SimData:
+        def fuse_measurement(data: SimData) -> SimData:
             """Use a new measurement of one sensor."""
             record, taken_step = self.read(data), sensor.read(data).samples.taken_step
             used_steps = record.used_steps.at[k].set(taken_step[0])
@@ -110,10 +110,10 @@ class ErrorStateFilter(Estimator):
                 data, record.replace(estimate=self.update_estimate(sensor, data, record), used_steps=used_steps)
             )
 
-        return fuse
+        return fuse_measurement
 
     def _restart(self, data: SimData) -> SimData:
-        """Restart the filter of one drone at the origin, level."""
+        """Restart the filter of one drone with a level attitude at the origin."""
         record = self.read(data)
         pos, quat = jnp.zeros_like(record.estimate.pos), jnp.zeros_like(record.estimate.quat).at[3].set(1.0)
         return self.write(

@@ -41,12 +41,12 @@ INITIAL_STD = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
 """Standard deviations at the start: position, m, velocity, m/s, attitude, rad. These are assumptions: the estimate
 starts at the true state."""
 RESTART_STD = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
-"""The same for the restart of a filter that diverged. These are assumptions: 10 is the square root of
-``error_state.MAX_COVARIANCE``."""
+"""Standard deviations after the restart of a filter that diverged, in the same units. These are assumptions: 10 is the
+square root of ``error_state.MAX_COVARIANCE``."""
 MIN_STD = 1e-3
-"""Smallest standard deviation assumed for a measurement: in m, m/s, rad or pixels, and as a share of the field for a
-magnetometer. It is 100 times as large for pressures, 0.1 Pa, and a tenth for sweeps of a ``Lighthouse``, 1e-4 rad. This
-is an assumption, for sensors without noise and for float32."""
+"""Smallest standard deviation assumed for a measurement: in m, m/s, rad or pixels, and for a magnetometer as a fraction
+of the field. For pressures the limit is 100 times as large, 0.1 Pa, and for sweeps of a ``Lighthouse`` a tenth, 1e-4
+rad. This is an assumption, for sensors without noise and for float32."""
 
 
 class ESKFData(PyTree):
@@ -73,8 +73,8 @@ class ESKF(ErrorStateFilter):
     """Error-state Kalman filter: position, velocity, attitude and biases of the ``IMU``, for any airframe.
 
     The filter of J. Solà, Quaternion kinematics for the error-state Kalman filter (2017, arXiv 1711.02508), with the
-    velocity in the body frame. It reads the noise from the records of its sensors, so it has no gains to tune. Of the
-    ``IMU`` it uses the noise densities, and the random walk, wander and spread of the biases. Wandering and constant
+    velocity in the body frame. It reads the noise from the records of its sensors, so it has no gains to tune. It uses
+    the noise densities of the ``IMU``, and the random walk, wander and spread of its biases. Wandering and constant
     errors of the other sensors are treated as white noise.
 
     The filter takes any of ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``, ``OpticalFlow``,
@@ -98,13 +98,12 @@ class ESKF(ErrorStateFilter):
     def record(self, sim: Simulation) -> ESKFData:
         self.check_sensors(sim)
         n = error_state.N_BIASED
-        level, zero = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
+        quat, zero = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
         cov = drone_array(sim, 0.0, n * (n + 1) // 2)
-        rows = sum(_rows_in_transit(sensor, sim.data) for sensor in self.aiding_sensors)
-        paths = (
-            drone_array(sim, inertial_path.EMPTY_PATH_ROW, rows, len(inertial_path.EMPTY_PATH_ROW)) if rows else None
-        )
-        return self.initial_record(sim, ESKFData, Estimate(zero, zero, level, zero, cov, zero, zero), paths=paths)
+        n_rows = sum(_n_rows_in_transit(sensor, sim.data) for sensor in self.aiding_sensors)
+        row = inertial_path.EMPTY_PATH_ROW
+        paths = drone_array(sim, row, n_rows, len(row)) if n_rows else None
+        return self.initial_record(sim, ESKFData, Estimate(zero, zero, quat, zero, cov, zero, zero), paths=paths)
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         period, is_due = self.prediction_schedule(freq)
@@ -180,7 +179,7 @@ class ESKF(ErrorStateFilter):
         def start_path(data: SimData) -> SimData:
             """Start a path at a new measurement of one sensor.
 
-            It leads back to the last prediction; the next prediction extends it.
+            The path leads back to the last prediction; the next prediction extends it.
             """
             record, (gyro, accel) = self.read(data), self.inertial(data)
             since_prediction = ((data.core.steps + 1) % period).astype(gyro.dtype) / data.core.freq
@@ -198,8 +197,8 @@ class ESKF(ErrorStateFilter):
         return start_path
 
     def _path_rows(self, sensor: Sensor, data: SimData) -> tuple[int, int]:
-        """Return the first row of the paths of one sensor, and the row after its last one."""
-        counts = [_rows_in_transit(other, data) for other in self.aiding_sensors]
+        """Return the first row of the paths of one sensor, and the row after the last."""
+        counts = [_n_rows_in_transit(other, data) for other in self.aiding_sensors]
         first = sum(counts[: self.aiding_sensors.index(sensor)])
         return first, first + counts[self.aiding_sensors.index(sensor)]
 
@@ -210,9 +209,8 @@ class ESKF(ErrorStateFilter):
         """
         steps, taken_step, gravity = data.core.steps, sensor.read(data).samples.taken_step[0], data.params.gravity_vec
         period, (gyro, accel) = self.prediction_schedule(data.core.freq)[0], self.inertial(data)
-        since_prediction = (taken_step - steps + (steps + 1) % period).astype(
-            gyro.dtype
-        ) / data.core.freq  # negative before the last prediction
+        # Negative before the last prediction.
+        since_prediction = (taken_step - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq
         if not sensor.is_late:
             past_estimate = error_state.propagate(record.estimate, accel, gyro, since_prediction, gravity)
             past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
@@ -235,7 +233,7 @@ class ESKF(ErrorStateFilter):
         return self._initial_estimate(data, pos, jnp.zeros_like(pos), quat, RESTART_STD)
 
 
-def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
+def _n_rows_in_transit(sensor: Sensor, data: SimData) -> int:
     """Return the number of measurements of one sensor that can be in transit."""
     arrival_steps = sensor.read(data).samples.arrival_steps
     return 0 if arrival_steps is None else arrival_steps.shape[-1]

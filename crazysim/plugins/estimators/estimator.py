@@ -30,8 +30,8 @@ class Estimator(Plugin):
     """
 
     sensors: Sequence[Sensor]
-    """Sensors: an ``IMU``, and others. Add them before ``sim.add`` of the estimator; ``Sim(estimator=...)`` adds them
-    itself."""
+    """An ``IMU`` and other sensors. Add them to the simulation before the estimator, except with
+    ``Sim(estimator=...)``, which adds them itself."""
     control: bool = True
     """True if the controllers of the simulation use the estimate."""
     reset_before: ClassVar[str | None] = "increment_steps"
@@ -48,7 +48,7 @@ class Estimator(Plugin):
 
     @classmethod
     def default(cls) -> Estimator:
-        """Return the filter with its default sensors, for users who give only its name."""
+        """Return the filter with its default sensors, for users who only pass its name."""
         raise NotImplementedError
 
     @property
@@ -57,11 +57,11 @@ class Estimator(Plugin):
 
     @property
     def kinds(self) -> tuple[type[Sensor], ...]:
-        """Classes of the sensors that the filter can use besides the inertial measurement unit."""
+        """Classes of the sensors that the filter can use in addition to the ``IMU``."""
         raise NotImplementedError
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
-        """Return the stages of the filter by name, in their order, the last without a name.
+        """Return the names and stages of the filter, in their order; the name of the last stage is empty.
 
         Args:
             freq: Steps of the simulation per second, Hz.
@@ -79,7 +79,7 @@ class Estimator(Plugin):
 
     @property
     def aiding_sensors(self) -> list[Sensor]:
-        """Sensors besides the inertial measurement unit."""
+        """All sensors except for the inertial measurement unit."""
         return [sensor for sensor in self.sensors if not isinstance(sensor, IMU)]
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
@@ -95,7 +95,7 @@ class Estimator(Plugin):
         return placements
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated state of one drone, the true one in a world's first step."""
+        """Return the estimated state of one drone; in a world's first step, the true state."""
         s, estimate = data.states, self.estimated_states(data)
         is_first_step = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
         states = {name: jnp.where(is_first_step, getattr(s, name), value) for name, value in estimate.items()}

@@ -1,10 +1,10 @@
 """Paths of integrated inertial measurements, along which an estimate and its covariance move back in time and forward.
 
-A measurement that arrives late is used with the estimate of the time at which it was taken. The path since then is
-integrated without subtracting biases and without the estimate, so that it stays valid while both are corrected: the
-preintegration of C. Forster, L. Carlone, F. Dellaert and D. Scaramuzza, On-manifold preintegration for real-time
-visual-inertial odometry, IEEE Transactions on Robotics 33 (2017), with their derivatives with respect to biases in
-closed form for a uniform motion.
+A measurement that arrives late corrects the estimate for the time at which it was taken. The path since then is
+integrated without subtracting biases and without the estimate, so that it stays valid when biases and estimate are
+corrected. This is the preintegration of C. Forster, L. Carlone, F. Dellaert and D. Scaramuzza, On-manifold
+preintegration for real-time visual-inertial odometry, IEEE Transactions on Robotics 33 (2017). The derivatives of a
+path with respect to biases are in closed form, for a uniform motion.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ EMPTY_PATH_ROW = np.concatenate([IDENTITY_QUAT, np.zeros(6, np.float32)])
 
 
 class InertialPath(NamedTuple):
-    """Motion of a body during an interval, in its frame at the start, without gravity and the velocity at the start."""
+    """Motion of a body in an interval, in the body frame at the start, without gravity and the initial velocity."""
 
     quat: Array
     """Attitude at the end, end to start, unit, xyzw. (4,)"""
@@ -64,7 +64,7 @@ class InertialPath(NamedTuple):
         return InertialPath(inverse, -rotation.rotate(inverse, self.vel), pos, -self.duration)
 
     def without_biases(self, estimate: Estimate) -> InertialPath:
-        """Return the path for measurements without the biases of an estimate, to first order in them."""
+        """Return the path for measurements without the biases of an estimate, to first order in the biases."""
         half_quat, t = _half_rotation(self.quat), self.duration
         rate, force = (rotation.rotate(half_quat, x) for x in (estimate.gyro_bias, estimate.accel_bias))  # type: ignore[arg-type]
         vel, pos = self.vel - t * force, self.pos - 0.5 * t**2 * force
@@ -118,5 +118,5 @@ def propagate_along(estimate: Estimate, path: InertialPath, gravity: Array) -> E
 
 def _half_rotation(quat: Array) -> Array:
     """Return half of a rotation by less than a turn. (4,)"""
-    level = jnp.asarray(IDENTITY_QUAT, quat.dtype)
-    return rotation.safe_normalize(quat + level * jnp.where(quat[3] < 0, -1.0, 1.0), level)
+    identity = jnp.asarray(IDENTITY_QUAT, quat.dtype)
+    return rotation.safe_normalize(quat + identity * jnp.where(quat[3] < 0, -1.0, 1.0), identity)

@@ -1,4 +1,4 @@
-"""The extended Kalman filter of the Crazyflie's firmware on the measurements of sensors, and control with it."""
+"""The extended Kalman filter of the Crazyflie's firmware, which fuses the measurements of sensors."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ class KalmanData(PyTree):
     failures: Array = leaf("drone", 1)
     """Number of times that the estimate left its bounds and the filter restarted. (n_worlds, n_drones, 1)"""
     accel_noise: Array = leaf("parameter", 1, (3,))
-    """Standard deviation of accelerations in a loop, body frame, m/s^2. (3,)"""
+    """Standard deviation of accelerations in a loop of the firmware, body frame, m/s^2. (3,)"""
     gyro_noise: Array = leaf("parameter", 1, (3,))
-    """Standard deviation of angular velocities in a loop, body frame, rad/s. (3,)"""
+    """Standard deviation of angular velocities in a loop of the firmware, body frame, rad/s. (3,)"""
     deviations: Array = leaf("parameter", 1)
     """Standard deviations that the filter assumes for the measurements, in the order of ``MEASUREMENT_STD``. (n,)"""
 
@@ -74,10 +74,10 @@ class KalmanData(PyTree):
 class Kalman(ErrorStateFilter):
     """The Crazyflie's extended Kalman filter: position, velocity and attitude of every drone from its sensors.
 
-    It begins at the true state after a world's first step, with the uncertainty of the firmware after switching on.
-    Predictions run at ``freq`` on the mean of the inertial measurements between them; a measurement of another sensor
-    is used in the step in which it arrives. Besides an ``IMU`` it takes any of ``MotionCapture``, ``OpticalFlow``,
-    ``TimeOfFlight``, ``UWB`` and ``Lighthouse``.
+    The filter begins at the true state after a world's first step, with the uncertainty of the firmware after switching
+    on. Predictions run at ``freq`` and use the mean of the inertial measurements since the last prediction; a
+    measurement of another sensor is used in the step in which it arrives. In addition to an ``IMU``, the filter takes
+    any of ``MotionCapture``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and ``Lighthouse``.
     """
 
     _: dataclasses.KW_ONLY
@@ -89,7 +89,7 @@ class Kalman(ErrorStateFilter):
     gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1), low=0.0)
     """Standard deviation of angular velocities, body frame, rad/s. (3,) or (n_worlds, n_drones, 3)"""
     deviations: Mapping[str, float] = setting(default_factory=dict, positive=True)
-    """Standard deviations that differ from ``MEASUREMENT_STD``, by its names."""
+    """Standard deviations that differ from ``MEASUREMENT_STD``, by the names in it."""
     name: str = "kalman"
 
     @property
@@ -103,15 +103,15 @@ class Kalman(ErrorStateFilter):
                 f"expected deviations of {', '.join(MEASUREMENT_STD)}, got {', '.join(map(repr, unknown_names))}"
             )
         deviations = MEASUREMENT_STD | dict(self.deviations)
-        level = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4)
+        quat = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4)
         zeros = drone_array(sim, 0.0, 3)
         cov = np.diag(np.square(INITIAL_STD))[np.triu_indices(error_state.N)]
         return self.initial_record(
             sim,
             KalmanData,
-            Estimate(zeros, zeros, level, zeros, drone_array(sim, cov, *cov.shape), None, None),
-            previous_quat=level,
-            deviations=device_array(np.array([deviations[name] for name in MEASUREMENT_STD]), level.dtype),
+            Estimate(zeros, zeros, quat, zeros, drone_array(sim, cov, *cov.shape), None, None),
+            previous_quat=quat,
+            deviations=device_array(np.array([deviations[name] for name in MEASUREMENT_STD]), quat.dtype),
         )
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
@@ -208,10 +208,10 @@ def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: 
 
 
 def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
-    system = sensor.read(data)
+    lighthouse = sensor.read(data)
     angle, visibility, k = sensor.part(data, "angle"), sensor.part(data, "visible"), 0
-    for pos, quat in zip(system.stations, system.quat, strict=True):
-        for diode in system.diodes:
+    for pos, quat in zip(lighthouse.stations, lighthouse.quat, strict=True):
+        for diode in lighthouse.diodes:
             for plane, tilt in enumerate(SWEEP_TILTS):
                 station = pos, rotation.matrix(quat)
                 updated = updates.update_sweep(estimate, rot, diode, station, tilt, angle[2 * k + plane], std["sweep"])
@@ -227,4 +227,4 @@ UPDATE_FNS: dict[type, Callable[..., Estimate]] = {
     UWB: _use_beacons,
     Lighthouse: _use_sweeps,
 }
-"""Functions that use the measurements of each kind of sensor."""
+"""Functions that update an estimate with a measurement, by the class of the sensor."""

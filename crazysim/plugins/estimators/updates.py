@@ -20,11 +20,11 @@ MIN_FLOW_HEIGHT = 0.1
 MIN_TILT_COSINE = 0.1
 """Least cosine of the tilt at which a distance to the ground is used (mm_tof.c)."""
 HALF_CONE_ANGLE = 0.5 * 15 * math.pi / 180
-"""Half the opening angle of the sensor's cone, rad (mm_tof.c)."""
+"""Half the opening angle of the time-of-flight sensor's cone, rad (mm_tof.c)."""
 
 
 def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured position, world frame, m, (3,), of a standard deviation, m. () or (3,)"""
+    """Return the estimate after a measured position, world frame, m (3,), with its standard deviation, m. () or (3,)"""
     for k, std in enumerate(_std_per_axis(deviation)):
         estimate = update(estimate, [k], jnp.ones_like(pos[:1]), pos[k] - estimate.pos[k], std)
     return estimate
@@ -79,8 +79,8 @@ def update_flow(
 ) -> Estimate:
     """Return the estimate after a measured motion of the image of the ground.
 
-    Without biases, both components are predicted from the prior estimate, as in the firmware, although the second one
-    is then correlated with the first. With biases, the second one is predicted after the first update.
+    Without biases, both components are predicted from the prior estimate, as in the firmware, although the second
+    prediction is then correlated with the first. With biases, the second component is predicted after the first update.
 
     Args:
         estimate: The estimate.
@@ -94,11 +94,8 @@ def update_flow(
     for k, (axis, sign) in enumerate(((1, -1.0), (0, 1.0))):
         height = jnp.maximum(prior.pos[2], MIN_FLOW_HEIGHT)
         flow_per_vel = rot[2, 2] / height
-        turn_rate, rows, slopes = (
-            gyro[axis],
-            [POS[2], VEL[k]],
-            [-prior.vel[k] * flow_per_vel / height, flow_per_vel],
-        )
+        turn_rate, rows = gyro[axis], [POS[2], VEL[k]]
+        slopes = [-prior.vel[k] * flow_per_vel / height, flow_per_vel]
         if prior.gyro_bias is not None:
             turn_rate = turn_rate - prior.gyro_bias[axis]
             rows, slopes = [*rows, GYRO[axis]], [*slopes, jnp.full_like(flow_per_vel, -sign)]
@@ -144,7 +141,7 @@ def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) ->
 
 
 def update_distance(estimate: Estimate, anchor: Array, distance: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured distance, m, () to an anchor, world frame, m. (3,)"""
+    """Return the estimate after a measured distance, m (), to an anchor at a position, world frame, m. (3,)"""
     offset = estimate.pos - anchor
     predicted = rotation.safe_norm(offset)
     is_apart = predicted > 0
@@ -175,11 +172,11 @@ def update_difference(
 
 
 def update_differences(estimate: Estimate, anchors: Array, differences: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after differences of simultaneous distances, to each other anchor minus to the first one.
+    """Return the estimate after measured differences of distances: to each other anchor minus to the first anchor.
 
-    The differences share the error of the first distance. A distance minus the mean of the k distances before it is a
-    combination of differences; such combinations have independent errors, with ``1 + 1 / k`` times the variance of one
-    distance.
+    The distances are measured at the same time, so all differences contain the error of the first distance. A distance
+    minus the mean of the k distances before it is a combination of differences. Such combinations have independent
+    errors, with ``1 + 1 / k`` times the variance of one distance.
 
     Args:
         estimate: The estimate.
@@ -218,16 +215,16 @@ def update_sweep(
         angle: The angle of the sweep, rad. ()
         deviation: Standard deviation of the angle, rad.
     """
-    origin, frame = station
-    x, y, z = frame.T @ (rotation.matvec(rot, sensor, estimate.pos) - origin)
-    tangent, squared = math.tan(tilt), x * x + y * y
-    radicand = squared - (z * tangent) ** 2
+    station_pos, station_rot = station
+    x, y, z = station_rot.T @ (rotation.matvec(rot, sensor, estimate.pos) - station_pos)
+    tangent, r_squared = math.tan(tilt), x * x + y * y
+    radicand = r_squared - (z * tangent) ** 2
     is_visible = radicand > 1e-4
-    squared, radicand = jnp.where(is_visible, squared, 1.0), jnp.where(is_visible, radicand, 1.0)
-    ratio = jnp.where(is_visible, z * tangent, 0.0) / jnp.sqrt(squared)
+    r_squared, radicand = jnp.where(is_visible, r_squared, 1.0), jnp.where(is_visible, radicand, 1.0)
+    ratio = jnp.where(is_visible, z * tangent, 0.0) / jnp.sqrt(r_squared)
     predicted = rotation.safe_arctan2(y, x) + rotation.safe_arctan2(ratio, jnp.sqrt((1 - ratio) * (1 + ratio)))
     q = tangent / jnp.sqrt(radicand)
-    h = frame @ jnp.stack([(-y - x * z * q) / squared, (x - y * z * q) / squared, q])
+    h = station_rot @ jnp.stack([(-y - x * z * q) / r_squared, (x - y * z * q) / r_squared, q])
     return select_estimate(is_visible, update(estimate, POS, h, angle - predicted, deviation), estimate)
 
 

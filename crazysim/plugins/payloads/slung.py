@@ -39,8 +39,8 @@ ABSENT_LOAD_DEPTH = 1000.0
 class SlungLoad(PointLoad, Plugin):
     """A load on a rod or a cable, a point mass that hangs from each drone.
 
-    Load and drone are integrated together. A cable is slack while the load is nearer than its length, and pulls as soon
-    as it is taut. The load starts at rest below the drone's position at the time when the plugin is added.
+    Load and drone are integrated together. A cable is slack while the load is nearer than the cable's length, and pulls
+    as soon as it is taut. The load starts at rest below the drone's position at the time when the plugin is added.
     """
 
     mass: ArrayLike = parameter(low=0.0)
@@ -72,7 +72,7 @@ class SlungLoad(PointLoad, Plugin):
         return load_record(self, sim, LoadData, self.cable, rest_height(self.size))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the floor's stage, and for cables with ``rk4`` the stage in which they become taut."""
+        """Return the stage that stops loads at the floor, and for cables with ``rk4`` the stage of their impulses."""
         placements = [StagePlacement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
         method = find_integrator(sim)
         if self.cable and method is rk4:
@@ -154,7 +154,7 @@ def load_record(
     ring: float | None = None,
     **fields: Any,
 ) -> L:
-    """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked.
+    """Return the record of loads at rest below their drones, from the settings of a plugin, after checks.
 
     Args:
         plugin: The plugin.
@@ -198,20 +198,20 @@ def move_loads(
     Loads without mass, which do not exist, are out of sight.
 
     Args:
-        data: One world.
+        data: Data of one world.
         name: Name of the plugin.
-        load: Its record.
+        load: Record of the loads.
         tip: Ends of the links, world frame, m. (n_drones, 3)
-        is_held: True where something is attached to the end; other links hang along the body's z axis. (n_drones,)
+        is_held: True for links with a load or hook at their end; other links point down the body's z axis. (n_drones,)
         n_pieces: Number of straight pieces of a link.
         ring: Height of the point by which a load hangs above its middle, m.
         show_free_links: True to show links of loads that do not exist.
     """
     hidden_offset = jnp.where(load.mass > 0, 0.0, ABSENT_LOAD_DEPTH) * np.array([0.0, 0.0, 1.0], tip.dtype)
-    r = link_geometry(data.states, tip, load.vel, load.attach)
-    offset = jnp.where(is_held[..., None], r.offset, -load.length * r.rot[..., 2])
+    link = link_geometry(data.states, tip, load.vel, load.attach)
+    offset = jnp.where(is_held[..., None], link.offset, -load.length * link.rot[..., 2])
     load_axis = shape_axis(data, load, tip)
-    top = data.states.pos if r.arm is None else data.states.pos + r.arm
+    top = data.states.pos if link.arm is None else data.states.pos + link.arm
     links = link_pieces(top if show_free_links else top - hidden_offset, offset, load.length, n_pieces)
     rows = {name: (load.pos - hidden_offset - ring * load_axis, rotation_from_z(load_axis)), f"{name}_link": links}
     return data.objects.with_poses(rows)  # type: ignore[union-attr]
@@ -221,7 +221,7 @@ def shape_axis(data: SimData, load: LoadData, tip: Array) -> Array:
     """Return the axis of the loads' shapes: along the link where a load hangs, else vertical. (..., 3)
 
     Args:
-        data: One drone or one world.
+        data: Data of one drone or one world.
         load: Record of the loads.
         tip: Ends of the links, world frame, m. (..., 3)
     """

@@ -25,10 +25,10 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 
 class Clutter(Scenery):
-    """Boxes, balls and convex meshes at any attitude, one in each cubic cell of ``1 / density``.
+    """Boxes, balls and convex meshes at any attitude, one in each cubic cell of volume ``1 / density``.
 
     An obstacle keeps a distance of ``gap / 2`` from the sides of its cell, so that aisles of width ``gap`` lead along
-    all sides. The cells take boxes and balls, of 4 sizes each, and meshes in turn, the same in all worlds.
+    all sides. Successive cells contain boxes and balls, of 4 sizes each, and meshes, in the same order in all worlds.
 
     ``difficulty`` is the fraction of the obstacles that are present.
     """
@@ -42,7 +42,7 @@ class Clutter(Scenery):
     sizes: ArrayLike = setting(default=(0.2, 0.6), positive=True, shapes=((2,),))
     """Smallest and largest edge of a box and diameter of a ball, m. (2,)"""
     meshes: Sequence[Any] = ()
-    """Corners of convex bodies, in the frame of each, m. (n, 3) each"""
+    """Corners of each convex mesh, in its own frame, m. (n, 3) each"""
     gap: float = setting(default=0.6, low=0.0)
     """Smallest distance between two obstacles, m."""
     name: str = "clutter"
@@ -52,7 +52,7 @@ class Clutter(Scenery):
         low, high = np.asarray(self.sizes, np.float64)
         if low > high:
             raise ConfigError(f"expected sizes as smallest and largest, got {self.sizes!r}")
-        diameter = 2 * max(_radius(shape) for _, _, shape in self._kinds())
+        diameter = 2 * max(_bounding_radius(shape) for _, _, shape in self._kinds())
         if diameter + self.gap > self.cell:
             raise ConfigError(
                 f"expected obstacles that fit into their cells of {self.cell:.3g} m with half the gap on each side, "
@@ -83,13 +83,15 @@ class Clutter(Scenery):
     def poses(self, data: SimData) -> tuple[Array, Array]:
         record, kinds, n = self.read(data), self._kinds(), math.prod(self.n_cells.tolist())
         cell = np.concatenate([np.arange(k, n, len(kinds)) for k in range(len(kinds))])
-        radius = np.concatenate([np.full(len(range(k, n, len(kinds))), _radius(x[2])) for k, x in enumerate(kinds)])
+        radius = np.concatenate(
+            [np.full(len(range(k, n, len(kinds))), _bounding_radius(x[2])) for k, x in enumerate(kinds)]
+        )
         u = [record.uniform(cell + k * n) for k in range(10)]
         dtype = u[0].dtype
         radius, *middle = jnp.asarray(np.concatenate([radius[:, None], self._middles()[cell]], axis=1).T, dtype)
-        reach = self.cell - self.gap - 2 * radius
-        pos = [middle[k] + self.wander(data, u[k], u[k + 3], reach) for k in range(3)]
-        is_present = (u[6] < record.difficulty) & self.is_free(pos[:2], middle[:2], radius, reach)
+        region_length = self.cell - self.gap - 2 * radius
+        pos = [middle[k] + self.wander(data, u[k], u[k + 3], region_length) for k in range(3)]
+        is_present = (u[6] < record.difficulty) & self.is_free(pos[:2], middle[:2], radius, region_length)
         pos[2] = jnp.where(is_present, pos[2], pos[2] - HIDDEN_DEPTH)
         r1, r2 = jnp.sqrt(1 - u[7]), jnp.sqrt(u[7])
         a, b = 2 * jnp.pi * u[8], 2 * jnp.pi * u[9]
@@ -118,7 +120,7 @@ class Clutter(Scenery):
         return kinds
 
 
-def _radius(shape: Shape) -> float:
+def _bounding_radius(shape: Shape) -> float:
     """Return the radius of the ball around the origin that contains a shape, m."""
     if shape.kind == "mesh":
         return float(np.linalg.norm(shape.array("vertices"), axis=-1).max())
@@ -126,7 +128,7 @@ def _radius(shape: Shape) -> float:
 
 
 def _mesh_xml(corners: np.ndarray) -> str:
-    """Return MJCF of a convex mesh that drones touch."""
+    """Return the MJCF of a convex mesh that drones can touch."""
     numbers = " ".join(f"{x:.9g}" for x in corners.reshape(-1))
     geom = '<geom type="mesh" mesh="mesh" contype="0" conaffinity="2" rgba="0.55 0.5 0.35 1"/>'
     return (

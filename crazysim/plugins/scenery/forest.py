@@ -22,18 +22,19 @@ from crazysim.geometry.rays import SizedShapes
 from crazysim.plugins.scenery.scenery import HIDDEN_DEPTH, Model, Scenery
 
 SIZE_BITS = 3
-"""Bits of the number of a size: there are 8, so that a contact report computes obstacles of one size side by side."""
+"""Number of bits of the index of a size. There are only 8 sizes, because contact reports compute all obstacles of one
+size together."""
 
 
-class Columns(NamedTuple):
+class CellObstacles(NamedTuple):
     """Obstacles of some cells."""
 
     x: Array
-    """Position of the axis, m. (...)"""
+    """Position of the vertical axis along x, m. (...)"""
     y: Array
-    """Position of the axis, m. (...)"""
+    """Position of the vertical axis along y, m. (...)"""
     half_turn: Array
-    """Half the angle about the axis, rad. (...)"""
+    """Half the angle of rotation about the axis, rad. (...)"""
     size: Array
     """Size, m. (...)"""
     is_standing: Array
@@ -41,11 +42,12 @@ class Columns(NamedTuple):
 
 
 class StandingObstacles(Scenery):
-    """Base class of upright obstacles, one in each square cell of ``1 / density``.
+    """Base class of upright obstacles, one in each square cell of area ``1 / density``.
 
     Rows of cells along y are shifted against each other by a random length, so that there are no straight aisles along
-    x. An obstacle keeps a distance of ``gap / 2`` from the edges of its cell: from every point beside the obstacles
-    there is a path of width ``gap`` to every other. Which obstacle has which of 8 sizes is the same in all worlds.
+    x. An obstacle keeps a distance of ``gap / 2`` from the edges of its cell: from every point outside the obstacles
+    there is a path of width ``gap`` to every other point. The sizes of the obstacles, 8 different ones, are the same in
+    all worlds.
 
     ``difficulty`` is the fraction of the obstacles that stand.
     """
@@ -71,15 +73,15 @@ class StandingObstacles(Scenery):
         raise NotImplementedError
 
     def model(self, size: float) -> tuple[str, dict[str, Any], Shape]:
-        """Return name and settings of the primitive of obstacles of a size, and its shape."""
+        """Return the primitive of obstacles of a size, the settings of the primitive, and the shape."""
         raise NotImplementedError
 
-    def distance(self, columns: Columns, offset: Sequence[Array]) -> Array:
+    def distance(self, obstacles: CellObstacles, offset: Sequence[Array]) -> Array:
         """Return the distance to obstacles, m. (...)
 
         Args:
-            columns: The obstacles.
-            offset: Components of the vectors from their middles to a point, world frame, m. 3 of (...)
+            obstacles: The obstacles.
+            offset: Components of the vectors from the middles of the obstacles to a point, world frame, m. 3 of (...)
         """
         raise NotImplementedError
 
@@ -108,12 +110,12 @@ class StandingObstacles(Scenery):
         return n_x, n_y
 
     @functools.cached_property
-    def order(self) -> np.ndarray:
-        """Cell of each obstacle: obstacles of one size are neighbours. (n,)"""
+    def cells_by_size(self) -> np.ndarray:
+        """Cell of each obstacle, sorted by the size of the obstacles. (n,)"""
         return np.argsort(self._size_index(np.arange(math.prod(self.n_cells))), kind="stable")
 
     def models(self) -> Sequence[Model]:
-        cells, models = self.order, []
+        cells, models = self.cells_by_size, []
         middle = np.stack([*self._middle(*np.divmod(cells, self.n_cells[1])), np.zeros(len(cells))], axis=-1)
         size_index = self._size_index(cells)
         for index in np.unique(size_index):
@@ -123,43 +125,43 @@ class StandingObstacles(Scenery):
         return models
 
     def poses(self, data: SimData) -> tuple[Array, Array]:
-        columns = self.columns(data, *np.divmod(self.order, self.n_cells[1]))
-        z = jnp.where(columns.is_standing, 0.0, -HIDDEN_DEPTH)
-        pos, zero = jnp.stack([columns.x, columns.y, z], axis=-1), jnp.zeros_like(z)
-        quat = jnp.stack([zero, zero, jnp.sin(columns.half_turn), jnp.cos(columns.half_turn)], axis=-1)
+        obstacles = self.obstacles_in_cells(data, *np.divmod(self.cells_by_size, self.n_cells[1]))
+        z = jnp.where(obstacles.is_standing, 0.0, -HIDDEN_DEPTH)
+        pos, zero = jnp.stack([obstacles.x, obstacles.y, z], axis=-1), jnp.zeros_like(z)
+        quat = jnp.stack([zero, zero, jnp.sin(obstacles.half_turn), jnp.cos(obstacles.half_turn)], axis=-1)
         return pos, quat
 
-    def columns(self, data: SimData, column: Any, row: Any) -> Columns:
-        """Return the obstacles of cells, absent for cells outside of the area.
+    def obstacles_in_cells(self, data: SimData, column: Any, row: Any) -> CellObstacles:
+        """Return the obstacles of cells; cells outside the area have none.
 
         Args:
-            data: All worlds, one world, or one drone.
+            data: Data of all worlds, one world, or one drone.
             column: Index of each cell along x, integer; it broadcasts with the axes of worlds. (...)
-            row: Index along y. (...)
+            row: Index of each cell along y, integer. (...)
         """
         record, (n_x, n_y) = self.read(data), self.n_cells
         cell = column * n_y + row
         start_x, start_y, random_number = (record.uniform(3 * cell + k) for k in range(3))
         turn, vel_x, vel_y = (record.uniform(4 * n_x * n_y + 3 * cell + k) for k in range(3))
         size = self._size(self._size_index(cell)).astype(start_x.dtype)
-        reach = self.cell - self.gap - 2 * self.radius(size)
+        region_length = self.cell - self.gap - 2 * self.radius(size)
         middle_x, middle_y = self._middle(column, row)
         middle_y = middle_y + self._shift(data, column)
-        x = middle_x + self.wander(data, start_x, vel_x, reach)
-        y = middle_y + self.wander(data, start_y, vel_y, reach)
+        x = middle_x + self.wander(data, start_x, vel_x, region_length)
+        y = middle_y + self.wander(data, start_y, vel_y, region_length)
         is_inside = (column >= 0) & (column < n_x) & (row >= 0) & (row < n_y)
-        is_free = self.is_free((x, y), (middle_x, middle_y), self.radius(size), reach)
+        is_free = self.is_free((x, y), (middle_x, middle_y), self.radius(size), region_length)
         is_standing = is_inside & (random_number < record.difficulty) & is_free
-        return Columns(x, y, jnp.pi * turn, size, is_standing)
+        return CellObstacles(x, y, jnp.pi * turn, size, is_standing)
 
     def clearance(self, data: SimData, pos: Array) -> Array:
         """Return the distance from points to the surface of the nearest obstacle, m, negative inside. (...)
 
-        Distances are computed up to the width of a cell; where the nearest obstacle is farther away, that is the
-        result. Only the nine cells around a point are read, so the cost does not depend on the size of the area.
+        Distances are limited to the width of a cell. Only the nine cells around a point are read, so the cost does not
+        depend on the size of the area.
 
         Args:
-            data: All worlds, one world, or one drone.
+            data: Data of all worlds, one world, or one drone.
             pos: Points, world frame, m: (n_worlds, n, 3), without n_worlds in one world, or (3,) for one drone.
         """
         n_x, n_y = self.n_cells
@@ -167,13 +169,13 @@ class StandingObstacles(Scenery):
         neighbours = np.arange(-1, 2, dtype=np.int32).reshape(3, *[1] * (pos.ndim - 1))
         column = neighbours + _cell_index((pos[..., 0] - corner_x) / self.cell, n_x)
         row = neighbours[:, None] + _cell_index((pos[..., 1] - corner_y - self._shift(data, column)) / self.cell, n_y)
-        columns = self.columns(data, column, row)
-        offset = [pos[..., 0] - columns.x, pos[..., 1] - columns.y, pos[..., 2] - self.height / 2]
-        distance = self.distance(columns, jnp.broadcast_arrays(*offset))
-        return jnp.min(jnp.where(columns.is_standing & (distance < self.cell), distance, self.cell), axis=(0, 1))
+        obstacles = self.obstacles_in_cells(data, column, row)
+        offset = [pos[..., 0] - obstacles.x, pos[..., 1] - obstacles.y, pos[..., 2] - self.height / 2]
+        distance = self.distance(obstacles, jnp.broadcast_arrays(*offset))
+        return jnp.min(jnp.where(obstacles.is_standing & (distance < self.cell), distance, self.cell), axis=(0, 1))
 
     def _middle(self, column: Any, row: Any) -> tuple[Any, Any]:
-        """Return the middle of cells, before the shifts of their rows, m. (...) and (...)"""
+        """Return x and y of the middles of cells, before the shifts of their rows, m. (...) each"""
         x, y = (
             middle + self.cell * (index - (n - 1) / 2)
             for middle, index, n in zip(np.asarray(self.center).tolist(), (column, row), self.n_cells, strict=True)
@@ -181,25 +183,26 @@ class StandingObstacles(Scenery):
         return x, y
 
     def _shift(self, data: SimData, column: Any) -> Array:
-        """Return the shift along y of the cells with an index along x, m. (...)"""
+        """Return the shift along y of cells, from their index along x, m. (...)"""
         return (self.read(data).uniform(3 * math.prod(self.n_cells) + column) - 0.5) * self.cell
 
     def _size_index(self, cell: Any) -> Any:
-        """Return the number of the size of the obstacles of cells, from 0 to 7. (...)"""
+        """Return the index of the size of the obstacles in cells, from 0 to 7. (...)"""
         return (cell.astype(np.uint32) * GOLDEN_STRIDE) >> (32 - SIZE_BITS)
 
     def _size(self, size_index: Any) -> Any:
-        """Return the size with a number, m. (...)"""
+        """Return the size with an index, m. (...)"""
         low, high = self.sizes
         return low + (high - low) / (2**SIZE_BITS - 1) * size_index
 
 
 class Forest(StandingObstacles):
-    """Upright trunks, one in each square cell of ``1 / density``, at another position in it in every world and episode.
+    """Upright trunks, one at a random position in each square cell of area ``1 / density``.
 
     Rows of cells along y are shifted against each other by a random length, so that there are no straight aisles along
-    x. A tree keeps a distance of ``gap / 2`` from the edges of its cell: from every point beside the trees there is a
-    path of width ``gap`` to every other. Which tree has which of 8 radii is the same in all worlds.
+    x. A tree keeps a distance of ``gap / 2`` from the edges of its cell: from every point outside the trees there is a
+    path of width ``gap`` to every other point. The radii of the trees, 8 different ones, are the same in all worlds.
+    Positions differ between worlds and episodes.
 
     ``difficulty`` is the fraction of the trees that stand.
     """
@@ -219,13 +222,16 @@ class Forest(StandingObstacles):
     def model(self, size: float) -> tuple[str, dict[str, Any], Shape]:
         return "cylinder", {"radius": size, "height": self.height}, Shape("cylinder", (size, self.height / 2))
 
-    def distance(self, columns: Columns, offset: Sequence[Array]) -> Array:
-        trunk = SizedShapes("cylinder", [columns.size, jnp.full_like(columns.size, self.height / 2)])
+    def distance(self, obstacles: CellObstacles, offset: Sequence[Array]) -> Array:
+        trunk = SizedShapes("cylinder", [obstacles.size, jnp.full_like(obstacles.size, self.height / 2)])
         return POINT_DISTANCE["cylinder"](trunk, jnp.stack(offset, axis=-1))
 
 
 class Pillars(StandingObstacles):
-    """Square pillars that are turned about their axes, one in each square cell of ``1 / density``; see ``Forest``."""
+    """Square pillars, randomly turned about their axes, one in each square cell of area ``1 / density``.
+
+    For their layout see ``Forest``.
+    """
 
     widths: ArrayLike = setting(default=(0.3, 0.8), positive=True, shapes=((2,),))
     """Smallest and largest width, m. (2,)"""
@@ -244,12 +250,12 @@ class Pillars(StandingObstacles):
         shape = Shape("box", (size / 2, size / 2, self.height / 2))
         return "wall", {"thickness": size, "length": size, "height": self.height}, shape
 
-    def distance(self, columns: Columns, offset: Sequence[Array]) -> Array:
-        sin, cos = jnp.sin(2 * columns.half_turn), jnp.cos(2 * columns.half_turn)
+    def distance(self, obstacles: CellObstacles, offset: Sequence[Array]) -> Array:
+        sin, cos = jnp.sin(2 * obstacles.half_turn), jnp.cos(2 * obstacles.half_turn)
         x, y, z = offset
-        half = columns.size / 2
-        local = cos * x + sin * y, cos * y - sin * x, z
-        return box_distance((half, half, jnp.full_like(half, self.height / 2)), local)  # type: ignore[arg-type]
+        half_width = obstacles.size / 2
+        box_pos = cos * x + sin * y, cos * y - sin * x, z
+        return box_distance((half_width, half_width, jnp.full_like(half_width, self.height / 2)), box_pos)  # type: ignore[arg-type]
 
 
 def _cell_index(position: Array, n: int) -> Array:

@@ -1,4 +1,4 @@
-"""Gates: a course of gates at other positions in every world and episode."""
+"""Gates: a course of gates at random positions, drawn again in every world and episode."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Gates(Scenery):
     start: ArrayLike = setting(default=(3.0, 0.0, 1.5), shapes=((3,),))
     """Middle of the first gate before it is displaced, m. (3,)"""
     spacing: float = setting(default=4.0, positive=True)
-    """Distance between neighbours along x, m."""
+    """Distance between neighbouring gates along x, before they are displaced, m."""
     offset: ArrayLike = setting(default=(0.5, 2.0, 0.5), low=0.0, shapes=((3,),))
     """Largest displacement along x, y and z, m. (3,)"""
     turn: float = setting(default=0.6, low=0.0, high=np.pi)
@@ -59,9 +59,10 @@ class Gates(Scenery):
     def poses(self, data: SimData) -> tuple[Array, Array]:
         record, gate = self.read(data), np.arange(self.count)
         u = [record.uniform(gate + k * self.count) for k in range(7)]
-        reach = 2 * np.asarray(self.offset, np.float64)
+        region_length = 2 * np.asarray(self.offset, np.float64)
         pos = [
-            self._undisplaced_positions()[:, k] + self.wander(data, u[k], u[k + 3], record.difficulty * reach[k])
+            self._undisplaced_positions()[:, k]
+            + self.wander(data, u[k], u[k + 3], record.difficulty * region_length[k])
             for k in range(3)
         ]
         half_turn = (u[6] - 0.5) * self.turn * record.difficulty

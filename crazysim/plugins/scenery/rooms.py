@@ -1,4 +1,4 @@
-"""Rooms: a building whose doors are elsewhere in every world and episode."""
+"""Rooms: a building with doors at random positions, drawn again in every world and episode."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from crazysim.plugins.scenery.scenery import HIDDEN_DEPTH, Model, Scenery
 
 
 class Rooms(Scenery):
-    """A building of square rooms in rows, with a door, without a lintel, somewhere in each wall between two rooms.
+    """A building of square rooms in rows, with a door at a random position in each wall between two rooms.
 
-    So there is a path between any two rooms. A wall consists of panels as wide as a door, one of which is left out.
-    The outer walls have no doors. ``free`` and ``speed`` have no effect.
+    There is a path between any two rooms. A wall between rooms consists of panels, and its door is a missing panel
+    without a lintel. The outer walls have no doors. ``free`` and ``speed`` have no effect.
 
     ``difficulty`` is the fraction of the walls between rooms that are present: with 0 the building is a hall.
     """
@@ -54,52 +54,56 @@ class Rooms(Scenery):
         return int(self.room / self.door + 1e-6)
 
     def models(self) -> Sequence[Model]:
-        outer_walls = [Model(*self._wall(length), np.array([middle])) for length, middle in self._outer_walls()]
-        inner_walls = [Model(*self._wall(self.room / self.n_panels), self._panels())] if self.n_walls else []
+        outer_walls = [Model(*self._wall_model(length), np.array([middle])) for length, middle in self._outer_walls()]
+        inner_walls = (
+            [Model(*self._wall_model(self.room / self.n_panels), self._panel_positions())] if self.n_walls else []
+        )
         return [*outer_walls, *inner_walls]
 
     @property
     def n_walls(self) -> int:
         """Number of walls between rooms."""
-        n_x, n_y = self._counts()
+        n_x, n_y = self._room_counts()
         return (n_x - 1) * n_y + n_x * (n_y - 1)
 
     def poses(self, data: SimData) -> tuple[Array, Array]:
         record, n_panels = self.read(data), self.n_panels
         wall, panel = np.divmod(np.arange(self.n_walls * n_panels), n_panels)
-        is_along_x = wall >= (self._counts()[0] - 1) * self._counts()[1]
+        is_along_x = wall >= (self._room_counts()[0] - 1) * self._room_counts()[1]
         is_standing = record.uniform(self.n_walls + wall) < record.difficulty
         has_door = jnp.floor(record.uniform(wall) * n_panels) == panel
         depth = jnp.where(is_standing & ~has_door, 0.0, HIDDEN_DEPTH).astype(record.difficulty.dtype)
         outer_walls = np.array([middle for _, middle in self._outer_walls()])
-        pos = jnp.asarray(np.concatenate([outer_walls, self._panels()]), depth.dtype)
+        pos = jnp.asarray(np.concatenate([outer_walls, self._panel_positions()]), depth.dtype)
         depth = jnp.concatenate([jnp.zeros((*depth.shape[:-1], 4), depth.dtype), depth], axis=-1)
         half_turn = np.concatenate([[0.0, 0.0, np.pi / 4, np.pi / 4], is_along_x * np.pi / 4])
         quat = jnp.asarray(np.stack([0 * half_turn, 0 * half_turn, np.sin(half_turn), np.cos(half_turn)], axis=-1))
         pos = jnp.broadcast_to(pos, (*depth.shape, 3)) - depth[..., None] * np.array([0, 0, 1], depth.dtype)
         return pos, jnp.broadcast_to(quat.astype(depth.dtype), (*depth.shape, 4))
 
-    def _counts(self) -> tuple[int, int]:
+    def _room_counts(self) -> tuple[int, int]:
         n_x, n_y = np.asarray(self.count).astype(int).tolist()
         return n_x, n_y
 
-    def _wall(self, length: float) -> tuple[str, dict[str, float], list[tuple[Shape, tuple[float, float, float]]]]:
-        """Return primitive, settings and shape of a wall of a length along y."""
+    def _wall_model(
+        self, length: float
+    ) -> tuple[str, dict[str, float], list[tuple[Shape, tuple[float, float, float]]]]:
+        """Return the primitive of a wall of a length along y, the settings of the primitive, and the wall's shape."""
         options = {"length": length, "height": self.height, "thickness": self.thickness}
         shape = Shape("box", (self.thickness / 2, length / 2, self.height / 2))
         return "wall", options, [(shape, (0.0, 0.0, self.height / 2))]
 
     def _outer_walls(self) -> list[tuple[float, np.ndarray]]:
-        """Return length and middle of the two walls along y, then of the two along x, m."""
-        (x, y), size = np.asarray(self.center, np.float64), self.room * np.array(self._counts())
+        """Return length and middle of the two outer walls along y, then of the two outer walls along x, m."""
+        (x, y), size = np.asarray(self.center, np.float64), self.room * np.array(self._room_counts())
         along_y = [(float(size[1]) + self.thickness, np.array([x + side * size[0] / 2, y, 0.0])) for side in (-1, 1)]
         return along_y + [
             (float(size[0]) + self.thickness, np.array([x, y + side * size[1] / 2, 0.0])) for side in (-1, 1)
         ]
 
-    def _panels(self) -> np.ndarray:
-        """Return the middles of the panels: of the walls along y, then of those along x, m. (n_walls * n_panels, 3)"""
-        n_x, n_y = self._counts()
+    def _panel_positions(self) -> np.ndarray:
+        """Return the middles of all panels, first in walls along y, then along x, m. (n_walls * n_panels, 3)"""
+        n_x, n_y = self._room_counts()
         corner = np.asarray(self.center, np.float64) - self.room * np.array([n_x, n_y]) / 2
         offsets = self.room * (np.arange(self.n_panels) + 0.5) / self.n_panels
         panels = [

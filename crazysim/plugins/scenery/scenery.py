@@ -30,8 +30,8 @@ from crazysim.pytree import PyTree, device_array, leaf
 
 HIDDEN_DEPTH = 100.0
 """Depth by which obstacles that a layout leaves out are moved down, m."""
-MIN_REACH = 1e-3
-"""Length of a region below which an obstacle counts as standing still, m."""
+MIN_REGION_LENGTH = 1e-3
+"""Smallest length of a region for the speed of obstacles, m; in a shorter region they move slower."""
 MAX_OBSTACLES = 10_000
 """Largest number of obstacles of a layout."""
 DIFFICULTY_INDEX = np.uint32(2**32 - 1)
@@ -63,9 +63,8 @@ class Model(NamedTuple):
     shapes: Sequence[tuple[Shape, tuple[float, float, float]]]
     """Shapes of an obstacle, and their positions in its frame, m."""
     pos: np.ndarray
-    """Middles of the regions of the obstacles, m: their positions in the compiled scene, by which ray casting sorts
-    them.
-    (n, 3)"""
+    """Middles of the regions of the obstacles, m. They are the positions in the compiled scene, by which ray casting
+    sorts the obstacles. (n, 3)"""
 
 
 class Scenery(Plugin):
@@ -76,7 +75,7 @@ class Scenery(Plugin):
     """
 
     difficulty: ArrayLike = parameter(default=1.0, low=0.0, high=1.0, shapes=((), (2,)))
-    """Difficulty, 0 to 1, or its range, lowest and highest, from which every world draws one at its resets. () or
+    """Difficulty, 0 to 1, or a range, lowest and highest, from which it is drawn at every reset of a world. () or
     (2,)"""
     speed: float = setting(default=0.0, low=0.0)
     """Largest component of the velocities of obstacles that move to and fro in their regions, m/s; 0 for obstacles that
@@ -94,14 +93,14 @@ class Scenery(Plugin):
         return tuple(f"{self.name}_{k}" for k in range(len(self.models())))
 
     def models(self) -> Sequence[Model]:
-        """Return the obstacles by shape."""
+        """Return the obstacles, one entry for each kind."""
         raise NotImplementedError
 
     def poses(self, data: SimData) -> tuple[Array, Array]:
         """Return the positions, m, and attitudes, xyzw, of the bodies of all obstacles, in the order of ``models``.
 
         Args:
-            data: All worlds, or one world.
+            data: Data of all worlds or of one world.
 
         Returns:
             (n_worlds, n, 3) and (n_worlds, n, 4), without n_worlds in one world
@@ -119,7 +118,7 @@ class Scenery(Plugin):
         """Return the distance from points to the surface of the nearest obstacle, m, negative inside. (...)
 
         Args:
-            data: All worlds, one world, or one drone.
+            data: Data of all worlds, one world, or one drone.
             pos: Points, world frame, m: (n_worlds, n, 3), without n_worlds in one world, or (3,) for one drone.
         """
         obstacle_pos, quat = (x[..., None, :, :] if x.ndim == 3 else x for x in self.poses(data))
@@ -132,10 +131,10 @@ class Scenery(Plugin):
         return functools.reduce(jnp.minimum, [jnp.min(gap, axis=-1) for gap in gaps])
 
     def sample_layout(self, data: SimData, key: Array, difficulty: Array | None = None) -> SimData:
-        """Return the data of one world with another layout. Pure; tasks call it in ``spawn``.
+        """Return the data of one world with another layout. Tasks call it in ``spawn``.
 
         Args:
-            data: One world.
+            data: Data of one world.
             key: Random key. ()
             difficulty: Difficulty, 0 to 1; None to draw it from the range of the setting. ()
         """
@@ -153,7 +152,7 @@ class Scenery(Plugin):
             if other.name == self.name and isinstance(other, Scenery) and repr(other.models()) != repr(models):
                 raise ConfigError(
                     f"expected the obstacles of {self.name!r} that the scene already has, got others. "
-                    f"Use sim.replace only to change difficulty=; for the rest use another name= or a new simulation."
+                    f"Use sim.replace only to change difficulty=, otherwise use another name= or a new simulation."
                 )
         for kind, model in zip(self.moved_kinds, models, strict=True):
             sim.scene.add_once(model.source, kind, len(model.pos), pos=model.pos, **model.options)
@@ -180,32 +179,34 @@ class Scenery(Plugin):
         }
         return objects.replace(**rows)
 
-    def wander(self, data: SimData, start: Any, velocity: Any, reach: Any) -> Array:
-        """Return the coordinate of points that move to and fro between ``-reach / 2`` and ``reach / 2``, m. (...)
+    def wander(self, data: SimData, start: Any, velocity: Any, region_length: Any) -> Array:
+        """Return the coordinate of points that move to and fro in their regions, relative to the middle, m. (...)
 
         Args:
-            data: All worlds, one world, or one drone, for the time since the reset.
+            data: Data of all worlds, one world, or one drone, for the time since the reset.
             start: Random numbers from 0 to 1 that give the coordinates at the reset. (...)
             velocity: Random numbers from 0 to 1 that give the velocities. (...)
-            reach: Length of the regions, m. (...)
+            region_length: Length of the regions, m. (...)
         """
         if not self.speed:
-            return (start - 0.5) * reach
+            return (start - 0.5) * region_length
         travelled = (data.core.steps / data.core.freq).astype(start.dtype) * (2 * velocity - 1) * self.speed
-        phase = (start + travelled / jnp.maximum(reach, MIN_REACH)) / 2  # of a triangle wave with period 1
+        phase = (
+            start + travelled / jnp.maximum(region_length, MIN_REGION_LENGTH)
+        ) / 2  # of a triangle wave with period 1
         phase = phase - jnp.floor(phase)
-        return (2 * jnp.minimum(phase, 1 - phase) - 0.5) * reach
+        return (2 * jnp.minimum(phase, 1 - phase) - 0.5) * region_length
 
-    def is_free(self, pos: Sequence[Any], middle: Sequence[Any], radius: Any, reach: Any) -> Array:
+    def is_free(self, pos: Sequence[Any], middle: Sequence[Any], radius: Any, region_length: Any) -> Array:
         """Return True for obstacles that do not meet the discs of ``free``, wherever they move. (...)
 
         Args:
             pos: Position, x and y, m. Two arrays of shape (...)
             middle: Middle of the square region, x and y, m. Two arrays of shape (...)
             radius: Radius of the circle around an obstacle, m. (...)
-            reach: Length of the sides of the region, m. (...)
+            region_length: Length of the sides of the region, m. (...)
         """
-        (x, y), radius = (middle, radius + reach / math.sqrt(2)) if self.speed else (pos, radius)
+        (x, y), radius = (middle, radius + region_length / math.sqrt(2)) if self.speed else (pos, radius)
         is_free = jnp.ones(jnp.shape(pos[0]), bool)
         for free_x, free_y, free_radius in np.asarray(self.free, np.float64).tolist():
             is_free &= (x - free_x) ** 2 + (y - free_y) ** 2 > (free_radius + radius) ** 2

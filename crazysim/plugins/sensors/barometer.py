@@ -46,7 +46,7 @@ class BarometerData(PyTree):
 
 
 class Barometer(Sensor):
-    """Pressure, Pa, and the height above the world's origin that it corresponds to in the standard atmosphere, m."""
+    """Pressure, Pa, and the height above the world's origin, m, that follows from it in the standard atmosphere."""
 
     kind: ClassVar[type[PyTree]] = BarometerData
     noise: ArrayLike = parameter(default=0.0, low=0.0)
@@ -54,7 +54,7 @@ class Barometer(Sensor):
     drift: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of the drift error, as from weather and temperature, Pa. () or (n_worlds, n_drones)"""
     drift_time: ArrayLike = parameter(default=60.0, positive=True)
-    """Correlation time of that error, s. () or (n_worlds, n_drones)"""
+    """Correlation time of the drift error, s. () or (n_worlds, n_drones)"""
     offset_spread: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of an error that is constant in an episode, Pa. () or (n_worlds, n_drones)"""
     altitude: ArrayLike = parameter(default=0.0, low=-500.0, high=9000.0)

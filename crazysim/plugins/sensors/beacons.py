@@ -120,12 +120,12 @@ class LighthouseData(PyTree):
 
 
 class Lighthouse(Sensor):
-    """Angles at which the two light planes of base stations pass photodiodes, rad, and whether these are in view.
+    """Angles at which the two light planes of base stations pass photodiodes, rad, and 1 for each diode in view.
 
     In a station's frame, x forwards and z upwards, a plane with tilt t passes the point (x, y, z) at
-    ``atan2(y, x) + asin(z tan(t) / sqrt(x^2 + y^2))`` (Taffanel et al. 2021, arXiv:2104.11523). A diode is in view if
-    it is in front of a station that is above the plane of the body's x and y axes; the angles of all others are zero.
-    Objects do not hide diodes.
+    ``atan2(y, x) + asin(z tan(t) / sqrt(x^2 + y^2))`` (Taffanel et al. 2021, arXiv:2104.11523). A diode is in view of a
+    station if it is in front of the station, and the station is above the plane of the body's x and y axes. Angles of
+    diodes out of view are zero. Objects do not hide diodes.
     """
 
     stations: ArrayLike = parameter()
@@ -143,7 +143,7 @@ class Lighthouse(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement: by station, then diode, then plane."""
+        """Names and lengths of the parts of a measurement, which are sorted by station, then diode, then plane."""
         n = len(np.asarray(self.stations)) * len(np.asarray(self.diodes))
         return {"angle": 2 * n, "visible": n}
 
@@ -165,10 +165,10 @@ class Lighthouse(Sensor):
         record, s = self.read(data), data.states
         diodes = rotation.rotate(s.quat, record.diodes, s.pos)
         offset = diodes - record.stations[:, None]
-        local = rotation.rotate_inverse(record.quat[:, None], offset)
-        angle = jnp.stack([sweep_angle(local, tilt) for tilt in SWEEP_TILTS], axis=-1)
+        station_frame_pos = rotation.rotate_inverse(record.quat[:, None], offset)
+        angle = jnp.stack([sweep_angle(station_frame_pos, tilt) for tilt in SWEEP_TILTS], axis=-1)
         is_above = -rotation.dot(offset, rotation.z_axis(s.quat))[..., 0] > 0
-        is_visible = (local[..., 0] > 0) & is_above
+        is_visible = (station_frame_pos[..., 0] > 0) & is_above
         angle = jnp.where(is_visible[..., None], angle, 0.0)
         return jnp.concatenate([angle.reshape(-1), is_visible.astype(angle.dtype).reshape(-1)])
 

@@ -1,6 +1,6 @@
 """Depth cameras: images of depth, normals and bodies, of all drones, with rate and latency.
 
-The same description serves a simulation and an environment::
+The same plugin serves simulations and environments::
 
     Camera(width=64, height=48, fovy=70.0, *, pos=None, rpy=(0, 0, 0), outputs=("depth",), max_depth=10.0,
            noise=None, distortion=None, drones=True, freq=None, latency=0.0, name="camera")
@@ -32,7 +32,7 @@ from crazysim.scene.depth import pixel_directions
 
 
 class Camera(ImageSensor):
-    """Depth camera on every drone, with the pinhole model, or with a lens, and with noise.
+    """Depth camera on every drone, with the pinhole model or a distorting lens, and with noise.
 
     A camera within an object sees its inner side: the surface where a ray leaves the object, as with MuJoCo's rays.
     """

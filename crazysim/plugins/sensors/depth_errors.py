@@ -28,7 +28,7 @@ D435_RESOLUTION = 1e-3
 """Steps in which a D400 camera reports depth by default, m (librealsense issue 999: 1000 um)."""
 
 MAX_ITERATIONS = 30
-"""Steps of Newton's method after which a distortion counts as one that cannot be inverted."""
+"""Number of Newton steps in which a distortion must be inverted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Distortion:
         check_settings(self)
 
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where points at distance 1 appear, in units of the focal length. (...) each"""
+        """Return the image positions of points at distance 1, in units of the focal length. (...) each"""
         r2 = x**2 + y**2
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         return (
@@ -117,10 +117,10 @@ class Distortion:
         )
 
     def undistort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the points that appear at given places, the inverse of ``distort``, by Newton's method. (...) each
+        """Return the points at distance 1 that have image positions, the inverse of ``distort``. (...) each
 
         Raises:
-            ConfigError: If there is none at one of the places, or several: the distortion folds the image.
+            ConfigError: If an image position has no point, or several, because the distortion folds the image.
         """
         u, v = x.copy(), y.copy()
         with np.errstate(all="ignore"):
@@ -138,7 +138,7 @@ class Distortion:
         return u, v
 
     def _slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of ``distort``: of x by x, of x by y (equal to y by x), and of y by y."""
+        """Return the derivatives of ``distort``: of x by x, of x by y (equal to that of y by x), and of y by y."""
         r2 = x**2 + y**2
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         slope = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3))

@@ -150,19 +150,20 @@ class TimeOfFlight(Sensor):
 
 
 def range_deviation(distance: Array, scale: Array) -> Array:
-    """Return the standard deviation of a measured distance that grows with it as in ``FAR_NOISE``, m. (...)"""
+    """Return the part of a distance's standard deviation that grows with the distance as in ``FAR_NOISE``, m. (...)"""
     growth, reference, _ = FAR_NOISE
     return scale * (1 + jnp.exp(growth * (distance - reference)))
 
 
 def ground_distance(data: SimData, pos: Array) -> tuple[Array, Array]:
-    """Return the distance to level ground along the body's negative z axis, m, and True where it is in view.
-
-    Both are (1,).
+    """Return the distance to level ground along the body's negative z axis, m, and True if the ground is in view.
 
     Args:
         data: The data of one drone.
-        pos: Point from which it is measured, relative to the centre of mass, body frame, m. (3,)
+        pos: Position of the sensor relative to the centre of mass, body frame, m. (3,)
+
+    Returns:
+        (1,) each
     """
     s = data.states
     cosine = rotation.z_axis(s.quat)[2:]

@@ -46,7 +46,7 @@ class GPS(Sensor):
     drift: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
     """Standard deviation of the drift error of the position, world frame, m. (), (3,) or (n_worlds, n_drones, 3)"""
     drift_time: ArrayLike = parameter(default=60.0, positive=True)
-    """Correlation time of that error, s. () or (n_worlds, n_drones)"""
+    """Correlation time of the drift error, s. () or (n_worlds, n_drones)"""
     vel_noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
     """Standard deviation of a velocity, world frame, m/s. (), (3,) or (n_worlds, n_drones, 3)"""
     pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))

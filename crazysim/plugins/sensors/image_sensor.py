@@ -1,6 +1,6 @@
 """Base class of sensors that take images by rays: mounting, rate, latency and outputs.
 
-A plugin of the simulation takes images in the step, and keeps the last one in its record. An environment takes them at
+In a simulation the plugin takes images in the step, and its record has the last image. An environment takes images at
 the end of its steps instead, by the wrapper ``crazysim.envs.CameraImages``. Both call ``image_fn`` and ``update``.
 """
 
@@ -47,7 +47,7 @@ class ImageData(PyTree):
     taken_step: Array = leaf("world")
     """Step in which these images were taken, negative before the first ones. (n_worlds, 1)"""
     transit: dict[str, Array] = leaf("drone", None)
-    """Images of each output that were taken last, newest first; empty without latency. (n_worlds, n_drones, n_rows,
+    """The last images of each output that were taken, newest first; empty without latency. (n_worlds, n_drones, n_rows,
     height, width), for normals (n_worlds, n_drones, n_rows, height, width, 3)"""
 
 
@@ -55,8 +55,8 @@ class ImageSensor(Plugin):
     """Base class of sensors that take images by rays, on every drone.
 
     A subclass defines ``rays``, ``optics``, ``image_size`` and ``far``, and ``measure`` if images have errors.
-    Images are of the state after a step, as measurements of other sensors are; the latest image is held. The first
-    image of an episode is delivered at once.
+    Images show the state after a step, and stay in the record until the next image is delivered. The first image of an
+    episode is delivered at once.
     """
 
     _: dataclasses.KW_ONLY
@@ -166,7 +166,7 @@ class ImageSensor(Plugin):
     def image_fn(self, sim: Simulation) -> ImageFn:
         """Return a pure function of the data of all worlds that returns their images, without rate and latency.
 
-        It is for the scene as it is now.
+        The function is for the scene as it is now.
         """
         self.check(sim)
         rays, far, camera = self.rays, self.far, self._drone_camera(sim)
@@ -182,7 +182,7 @@ class ImageSensor(Plugin):
             images = {}
             for name in self.outputs:
                 if name == "depth":
-                    # Without rounding where nothing is nearer.
+                    # Exactly ``far`` where nothing is nearer.
                     images[name] = jnp.where(distance * cosine < far * (1 - 1e-6), distance * cosine, far)
                 elif name == "distance":
                     images[name] = jnp.minimum(distance, far)
@@ -210,29 +210,31 @@ class ImageSensor(Plugin):
         return ImageData(images=images, taken_step=data.core.steps, transit=transit)
 
     def update(self, take_images: ImageFn, data: SimData, record: ImageData, period: int) -> ImageData:
-        """Return the record of all worlds after a step: images are taken where they are due, and delivered.
+        """Return the record of all worlds after a step: due images are taken, and images that arrive are delivered.
 
         Args:
             take_images: Function that ``image_fn`` returned.
             data: Data of all worlds.
-            record: The record before.
+            record: The record before the step.
             period: Steps between images.
         """
         steps, latency = data.core.steps, self._latency_steps(data)
         is_due = steps % period == 0
 
-        def select(new: Array, old: Array) -> Array:
+        def select_due(new: Array, old: Array) -> Array:
             return jnp.where(is_due.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
-        def capture(record: ImageData) -> ImageData:
+        def capture_images(record: ImageData) -> ImageData:
             images = take_images(data)
             if not latency:
-                return record.replace(images=jax.tree.map(select, images, record.images))
+                return record.replace(images=jax.tree.map(select_due, images, record.images))
             queues = {k: jnp.concatenate([x[:, :, None], record.transit[k][:, :, :-1]], 2) for k, x in images.items()}
-            return record.replace(transit=jax.tree.map(select, queues, record.transit))
+            return record.replace(transit=jax.tree.map(select_due, queues, record.transit))
 
         record = (
-            jax.lax.cond(jnp.any(is_due), capture, lambda record: record, record) if period > 1 else capture(record)
+            jax.lax.cond(jnp.any(is_due), capture_images, lambda record: record, record)
+            if period > 1
+            else capture_images(record)
         )
         # Images are numbered from the beginning of the episode; the first one is delivered at once.
         delivered_index = jnp.maximum((steps - latency) // period, 0)
@@ -295,6 +297,6 @@ class ImageSensor(Plugin):
         return math.floor(float(self.latency) * data.core.freq + 0.5)
 
     def _n_rows(self, data: SimData, period: int) -> int:
-        """Return the number of images in transit that the record has room for; zero without latency."""
+        """Return the number of rows for images in transit in the record; zero without latency."""
         latency = self._latency_steps(data)
         return -(-latency // period) + 1 if latency else 0

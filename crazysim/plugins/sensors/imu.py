@@ -60,7 +60,8 @@ CRAZYFLIE: dict[str, Any] = {
 """BMI088 after processing by the firmware of the Crazyflie (sensors_bmi088_bmp3xx.c). Before take-off the mean of 512
 samples of the gyroscope is subtracted, so the mean of their noise is the remaining bias; the accelerometer is scaled to
 1 g, which leaves no bias along gravity. The filters of the chip are followed by second-order Butterworth filters with
-corners of 80 and 30 Hz; the corners here belong to a first-order filter with the same delay as both together."""
+corners of 80 and 30 Hz. Each bandwidth here is the corner of a first-order filter with the same delay as the filter of
+the chip and the Butterworth filter together."""
 
 MPU9250: dict[str, Any] = {
     "gyro": Triad(
@@ -139,11 +140,11 @@ class IMU(Sensor):
     accel: Triad = parameter(default=Triad())
     """Errors of the accelerometer, m/s^2."""
     pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Position relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    """Position of the accelerometer relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
     rpy: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Roll, pitch and yaw of the sensor in the body frame, rad. (3,) or (n_worlds, n_drones, 3)"""
     imbalance: ArrayLike | None = parameter(default=None, low=0.0)
-    """Mass of a rotor times the distance of its centre from its axis, kg m; None for no vibration.
+    """Mass of a rotor times the distance of its centre of mass from its axis, kg m; None for no vibration.
     (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
     _: dataclasses.KW_ONLY
     name: str = "imu"
@@ -193,7 +194,7 @@ class IMU(Sensor):
         return [velocity_stage, *stages]
 
     def ideal(self, data: SimData) -> Array:
-        """Return the measurement of a perfect unit of a drone that does not accelerate. (6,)"""
+        """Return the measurement without errors, for a drone that does not accelerate. (6,)"""
         record, s = self.read(data), data.states
         zero = jnp.zeros_like(s.vel)
         force = specific_force(s.quat, zero, s.ang_vel, zero, data.params.gravity_vec, record.pos)

@@ -1,4 +1,4 @@
-"""Lidars: distances along the rays of a pattern, rotating or of a solid state."""
+"""Lidars, rotating or solid-state: distances along the rays of a pattern."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class Lidar(ImageSensor):
     max_range: float = setting(default=VLP16_RANGE, positive=True)
     """Largest distance, m; also the value without a return."""
     min_range: float = setting(default=0.0, low=0.0)
-    """Smallest distance, m; nothing nearer gives a return."""
+    """Smallest distance, m; nearer surfaces give no return."""
     noise: float = setting(default=0.0, low=0.0)
     """Standard deviation of a distance, m."""
     relative_noise: float = setting(default=0.0, low=0.0)
-    """Standard deviation that grows with the distance, as a fraction of it, 1."""
+    """Additional standard deviation of a distance, as a fraction of the distance, 1."""
     resolution: float = setting(default=0.0, low=0.0)
     """Steps of a distance, m; 0 for none."""
     dropout: float = setting(default=0.0, low=0.0, high=1.0)

@@ -19,8 +19,8 @@ from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
 
 MAX_FIELD = 1e-3
-"""Strongest field accepted, T, some fifteen times the earth's, so that fields in other units are rejected. An
-assumption."""
+"""Strongest field accepted, T, about fifteen times the field of the earth, so that fields in other units are rejected.
+An assumption."""
 
 
 class MagnetometerData(PyTree):
@@ -37,7 +37,7 @@ class MagnetometerData(PyTree):
 
 
 class Magnetometer(Sensor):
-    """Magnetic field in the sensor's frame, T. The bias of its errors is known as hard iron."""
+    """Magnetic field in the sensor's frame, T. The bias in ``errors`` is known as hard iron."""
 
     field: ArrayLike = parameter()
     """Magnetic field, world frame, T: (0, 2e-5, -4.5e-5) with x east, y north and z up has the magnitude of the field

@@ -36,7 +36,7 @@ class MotionCaptureData(PyTree):
     pos: Array = leaf("parameter", 1, (3,), sparse=True)
     """Origin of the tracked body relative to the centre of mass, body frame, m. (3,)"""
     quat: Array = leaf("parameter", 1, (4,), sparse=True)
-    """Attitude of the tracked body, its frame to the drone's, unit, xyzw. (4,)"""
+    """Attitude of the tracked body, tracked body to drone, unit, xyzw. (4,)"""
 
 
 class MotionCapture(Sensor):

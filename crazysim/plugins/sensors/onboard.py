@@ -38,7 +38,7 @@ class NoisyData(PyTree):
 
 
 class NoisySensor(Sensor):
-    """Base class of sensors whose measurement is the true one with white noise, rounded."""
+    """Base class of sensors that measure the true value plus white noise, rounded."""
 
     kind: ClassVar[type[PyTree]] = NoisyData
     noise: ArrayLike = parameter(default=0.0, low=0.0)
@@ -116,7 +116,7 @@ class BatteryVoltage(NoisySensor):
 
 
 class MultiRanger(NoisySensor):
-    """Distances of a ``RangeFinder``, added before, with a rate, a delay and noise, m.
+    """Distances of a ``RangeFinder`` with a rate, a delay and noise, m. The range finder must be added before.
 
     A distance beyond the range is the range finder's ``max_range``, without noise.
     """

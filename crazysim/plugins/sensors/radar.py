@@ -49,7 +49,7 @@ class RadarData(PyTree):
 
 
 class Radar(Plugin):
-    """Radars that detect the drones within their lobes; objects do not block them.
+    """Radars that detect the drones within their lobes. Objects do not block radars.
 
     The lobe is a teardrop in a vertical plane, revolved about the vertical axis: the range is the same in all
     directions. Each setting is one number for all radars, or one number per radar.
@@ -91,7 +91,7 @@ class Radar(Plugin):
         return [StagePlacement(Stage(self.count_exposure, "drone"), before="increment_steps")]
 
     def count_exposure(self, data: SimData) -> SimData:
-        """Add one step to the time of one drone within each lobe that it is in."""
+        """Add the duration of a step to the exposure of one drone, for each lobe that contains the drone."""
         record = self.read(data)
         time = jnp.where(record.margin_at(data.states.pos) > 0, 1 / data.core.freq, 0.0)
         return self.write(data, record.replace(exposure=record.exposure + time))
@@ -108,12 +108,12 @@ class Radar(Plugin):
     def draw(self, sim: Simulation, world: int) -> None:
         if not self.visible:
             return
-        detected = np.any(np.asarray(self.detects(sim.data))[world], axis=0).reshape(-1)
+        is_detected = np.any(np.asarray(self.detects(sim.data))[world], axis=0).reshape(-1)
         record = self.read(sim.data)
         for k, pos in enumerate(np.asarray(record.pos, np.float64)):
             shape = (float(x[k]) for x in (record.max_range, record.exponent, record.height_scale, record.tilt))
             for curve in lobe_curves(*shape):
-                sim.scene.renderer.overlays.line(pos + curve, ALARM_COLOR if detected[k] else CLEAR_COLOR, 2.0, 2.0)
+                sim.scene.renderer.overlays.line(pos + curve, ALARM_COLOR if is_detected[k] else CLEAR_COLOR, 2.0, 2.0)
 
 
 @jit_eager_calls()
@@ -136,20 +136,20 @@ def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: 
     half_range, c, s = 0.5 * max_range, jnp.cos(tilt), jnp.sin(tilt)
 
     def margin(level_distance: Array) -> Array:
-        axial, lateral = c * level_distance + s * height, c * height - s * level_distance
-        u = axial / half_range
-        clipped = clip(u, 1e-6, 2.0)
-        root = rotation.safe_sqrt(2 - clipped)
-        limit = (
+        axial_pos, lateral_pos = c * level_distance + s * height, c * height - s * level_distance
+        u = axial_pos / half_range
+        clipped_u = clip(u, 1e-6, 2.0)
+        root = rotation.safe_sqrt(2 - clipped_u)
+        half_thickness = (
             height_scale
             * half_range
-            * jnp.exp(0.5 * ((1 + exponent) * jnp.log(clipped) - exponent * math.log(2)))
+            * jnp.exp(0.5 * ((1 + exponent) * jnp.log(clipped_u) - exponent * math.log(2)))
             * root
         )
         overshoot = jnp.maximum(u - 2, 0.0) + jnp.maximum(-u, 0.0)
-        return limit - jnp.abs(lateral) - half_range * overshoot
+        return half_thickness - jnp.abs(lateral_pos) - half_range * overshoot
 
-    # A steep lobe reaches across the vertical axis, so that the lobe in the opposite direction counts too.
+    # A steep lobe extends across the vertical axis, so a point can also be in the lobe of the opposite direction.
     return jnp.maximum(margin(level_distance), margin(-level_distance))
 
 

@@ -80,18 +80,20 @@ class RangeFinder(Plugin):
         return RangeFinderData(device_array(distance), device_array(rays), device_array(max_range))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the stage that measures: for one drone; for one world if distances to drones or loads are measured; or
-        for all worlds if more geoms can move than a fused kernel can unroll.
+        """Return the stage that measures.
+
+        Its scope is a drone; a world if distances to drones or loads are measured; or the whole batch if more geoms can
+        move than a fused kernel can unroll.
         """
-        visual, solid = sim.scene.visual_model, sim.scene.collision_model
-        movers_by_name = moving_plugins(sim.scene.plugins(), [body.name for body in visual.objects])
-        moved_objects = {body.name for body in solid.objects}
+        visual_model, collision_model = sim.scene.visual_model, sim.scene.collision_model
+        movers_by_name = moving_plugins(sim.scene.plugins(), [body.name for body in visual_model.objects])
+        colliding_objects = {body.name for body in collision_model.objects}
         objects = tuple(
-            body for body in visual.objects if body.name in moved_objects or body.name not in movers_by_name
+            body for body in visual_model.objects if body.name in colliding_objects or body.name not in movers_by_name
         )
         # The collision shape of a drone is enough for a few rays.
-        model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
-        movers_by_name = {name: plugin for name, plugin in movers_by_name.items() if name in moved_objects}
+        model = dataclasses.replace(visual_model, objects=objects, drones=collision_model.drones)
+        movers_by_name = {name: plugin for name, plugin in movers_by_name.items() if name in colliding_objects}
         n_movable = sum(len(body.geoms) for body in objects if body.row is not None)
         if self.drones:
             n_movable += sum(
@@ -101,7 +103,7 @@ class RangeFinder(Plugin):
         period, scene = sampling_period(self, sim), sim.scene
 
         def is_due(data: SimData) -> Array:
-            """Return which worlds measure after this step."""
+            """Return True for worlds that measure in this step."""
             return data.core.steps % period == 0
 
         def measure(data: SimData) -> SimData:

@@ -1,4 +1,4 @@
-"""Base class of sensors: a rate, a delay with jitter, and lost measurements; each sensor has its own errors."""
+"""Base class of sensors, with a rate, a delay with jitter, and lost measurements."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class Samples(PyTree):
 
 
 class Sensor(Plugin):
-    """Base class of sensors that measure at a rate, and whose measurements may arrive late or never.
+    """Base class of sensors that measure at a rate; measurements may arrive late or never.
 
-    A subclass defines ``kind`` or ``record``, ``channels``, ``ideal`` and ``measure``, and ``reset_episode`` if a
-    sensor has errors of its own, drawn once an episode with ``episode_key``. Its record has a field ``samples``.
-    Measurements are taken after the state of the step is known; the latest one is held. A measurement that is overtaken
-    by a newer one is discarded.
+    A subclass defines ``kind`` or ``record``, ``channels``, ``ideal`` and ``measure``, and ``reset_episode`` if some
+    errors are drawn once an episode, with ``episode_key``. Its record has a field ``samples``. Measurements are of the
+    state after the step. The record has the latest measurement that has arrived; measurements that arrive after a newer
+    one are discarded.
     """
 
     kind: ClassVar[type[PyTree]]
@@ -85,7 +85,7 @@ class Sensor(Plugin):
         raise NotImplementedError
 
     def ideal(self, data: SimData) -> Array:
-        """Return the measurement of a perfect sensor, of one drone. (k,)"""
+        """Return the measurement without errors, of one drone. (k,)"""
         raise NotImplementedError
 
     def measure(self, data: SimData, record: Any, key: Array) -> tuple[Array, Any]:
@@ -144,7 +144,7 @@ class Sensor(Plugin):
         return placements
 
     def latest(self, data: SimData) -> Array:
-        """Return the latest measurement of one drone; a perfect one before the first arrives. (k,)"""
+        """Return the latest measurement of one drone; before the first arrives, one without errors. (k,)"""
         samples = self.read(data).samples
         return jnp.where(samples.taken_step >= 0, samples.value, self.ideal(data))
 
@@ -180,13 +180,13 @@ class Sensor(Plugin):
 
     @property
     def _max_delay(self) -> float:
-        """Longest delay that a record has room for, s."""
+        """Longest sum of delay and jitter for which the record has a queue, s."""
         if self.max_delay is not None:
             return float(self.max_delay)
         return float(np.max(np.asarray(self.delay, np.float64)) + np.max(np.asarray(self.jitter, np.float64)))
 
     def _take_measurement(self, data: SimData) -> SimData:
-        """Take a measurement of one drone, and queue it, or hold it if there is no delay."""
+        """Take a measurement of one drone, and put it into the queue; without delay, it becomes the latest one."""
         key, step = drone_key(data, self.name), data.core.steps
         value, record = self.measure(data, self.read(data), key)
         samples, is_lost, jitter_fraction = record.samples, False, 0.0
@@ -229,7 +229,7 @@ def sampling_period(sensor: Any, sim: Simulation) -> int:
 
 
 def mounting_quat(sim: Simulation, rpy: ArrayLike) -> Array:
-    """Return the attitude of a sensor, sensor to body, as a parameter of quaternions, xyzw.
+    """Return the attitude of a sensor, sensor to body, xyzw. (4,) or (n_worlds, n_drones, 4)
 
     Args:
         sim: The simulation.
@@ -257,10 +257,10 @@ def gauss_markov_step(state: Array, deviation: Array, time: Array, dt: float, no
     """Return a first-order Gauss-Markov process one interval later; the variance is exact for any interval.
 
     Args:
-        state: The process. (..., k)
-        deviation: Its standard deviation. (..., k)
-        time: Its correlation time, s. (..., k)
-        dt: The interval, s.
+        state: Value of the process. (..., k)
+        deviation: Standard deviation of the process. (..., k)
+        time: Correlation time of the process, s. (..., k)
+        dt: Length of the interval, s.
         noise: Standard normal numbers. (..., k)
     """
     decay = jnp.exp(-dt / time)

@@ -60,9 +60,9 @@ class TriadData(PyTree):
         triad = self.replace(
             bias=values[:3], scale=values[3:6], misalignment=values[6:], wander=self.instability * noise[9:]
         )
-        return triad if self.filtered is None else triad.replace(filtered=triad.without_noise(truth))
+        return triad if self.filtered is None else triad.replace(filtered=triad.noiseless_measurement(truth))
 
-    def without_noise(self, truth: Array) -> Array:
+    def noiseless_measurement(self, truth: Array) -> Array:
         """Return the measurement of one sensor before noise, low-pass, saturation and rounding, u. (3,)"""
         misaligned = truth - rotation.cross(self.misalignment, truth)
         return misaligned + self.scale * misaligned + self.bias + self.wander
@@ -79,7 +79,7 @@ class TriadData(PyTree):
         wander = gauss_markov_step(self.wander, self.instability, self.correlation_time, dt, noise[6:])
         triad = self.replace(bias=bias, wander=wander)
         # The one-sided density extends up to half the sampling rate.
-        value = triad.without_noise(truth) + self.noise * math.sqrt(0.5 / dt) * noise[:3]
+        value = triad.noiseless_measurement(truth) + self.noise * math.sqrt(0.5 / dt) * noise[:3]
         if self.filtered is not None and self.bandwidth is not None:
             value = self.filtered + (1 - jnp.exp(-2 * math.pi * dt * self.bandwidth)) * (value - self.filtered)
             triad = triad.replace(filtered=value)
@@ -93,7 +93,7 @@ class TriadData(PyTree):
 class Triad:
     """Errors of a three-axis sensor, in the unit u of the measurement.
 
-    Each is one number for all axes, (3,), or (n_worlds, n_drones, 3). The Allan deviation of the measurement at rest is
+    Each setting is one number for all axes, (3,), or (n_worlds, n_drones, 3). The Allan deviation of a measurement is
     ``noise / sqrt(2 t)`` from white noise, ``random_walk sqrt(t / 3)`` from the random walk, and at most
     0.62 ``instability``, at ``t = 1.89 correlation_time``, from the wandering bias.
     """
@@ -108,9 +108,9 @@ class Triad:
     random_walk: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation of the random walk of the bias after 1 s, u/sqrt(s)."""
     instability: ArrayLike = setting(default=0.0, low=0.0)
-    """Standard deviation of a bias that wanders, a first-order Gauss-Markov process, u."""
+    """Standard deviation of the wandering bias, a first-order Gauss-Markov process, u."""
     correlation_time: ArrayLike = setting(default=100.0, positive=True)
-    """Correlation time of the bias that wanders, s. () or (n_worlds, n_drones)"""
+    """Correlation time of the wandering bias, s. () or (n_worlds, n_drones)"""
     scale: ArrayLike = 0.0
     """Mean relative error of the scale, 1."""
     scale_spread: ArrayLike = setting(default=0.0, low=0.0)
@@ -118,9 +118,9 @@ class Triad:
     misalignment: ArrayLike = 0.0
     """Mean of a small rotation of the axes relative to the mounting, rad."""
     misalignment_spread: ArrayLike = setting(default=0.0, low=0.0)
-    """Standard deviation of that rotation between episodes, rad."""
+    """Standard deviation of this rotation between episodes, rad."""
     bandwidth: ArrayLike | None = setting(default=None, positive=True)
-    """Corner frequency of a first-order low-pass filter, Hz; None for none. () or (n_worlds, n_drones)"""
+    """Corner frequency of a first-order low-pass filter, Hz; None for no filter. () or (n_worlds, n_drones)"""
     limit: ArrayLike | None = setting(default=None, positive=True)
     """Largest magnitude of a measurement, u; None for no limit."""
     resolution: ArrayLike | None = setting(default=None, positive=True)
@@ -142,7 +142,7 @@ class Triad:
             parts = [np.broadcast_to(x, (*batch, 3)) for x in parts]
             return check_parameter(sim, name, np.concatenate(parts, axis=-1), (9,))
 
-        def optional_field(field: str, n: int) -> Array | None:
+        def read_optional(field: str, n: int) -> Array | None:
             value = getattr(self, field)
             setting_name = f"{field} of {name}"
             return None if value is None else check_parameter(sim, setting_name, value, (n,), per_axis=True)
@@ -161,7 +161,7 @@ class Triad:
             correlation_time=check_parameter(sim, f"correlation_time of {name}", self.correlation_time, (1,)),
             mean=mean,
             spread=join_fields("bias_spread", "scale_spread", "misalignment_spread"),
-            bandwidth=optional_field("bandwidth", 1),
-            limit=optional_field("limit", 3),
-            resolution=optional_field("resolution", 3),
+            bandwidth=read_optional("bandwidth", 1),
+            limit=read_optional("limit", 3),
+            resolution=read_optional("resolution", 3),
         )

@@ -41,16 +41,16 @@ def _object_name(cars: Any, part: str) -> str:
 def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
     """Add the objects of cars to the scene, if they are not there yet."""
     number, n = vehicle.number, cars.n_members
-    wheel = _wheel(number("wheels.radius"), number("wheels.width"))
-    parts = {"body": (_body(vehicle, as_rgba(BODY_COLOR if cars.rgba is None else cars.rgba)), n)}
+    wheel = _wheel_geoms(number("wheels.radius"), number("wheels.width"))
+    parts = {"body": (_body_geoms(vehicle, as_rgba(BODY_COLOR if cars.rgba is None else cars.rgba)), n)}
     parts["wheel"] = (wheel, n * len(wheel_positions(vehicle)))
     if cars.trailer:
         length, trailer_wheel = (
             number("trailer.drawbar"),
-            _wheel(number("trailer.wheel_radius"), number("trailer.wheel_width")),
+            _wheel_geoms(number("trailer.wheel_radius"), number("trailer.wheel_width")),
         )
-        parts["drawbar"] = (_drawbar(length, number("trailer.track")), n)
-        parts["trailer"] = (_deck(vehicle), n)
+        parts["drawbar"] = (_drawbar_geoms(length, number("trailer.track")), n)
+        parts["trailer"] = (_deck_geoms(vehicle), n)
         parts["trailer_wheel"] = (trailer_wheel, 4 * n)
     for part, (geoms, count) in parts.items():
         sim.scene.add_once(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", _object_name(cars, part), count)
@@ -59,7 +59,8 @@ def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
 def wheel_positions(vehicle: VehicleModel) -> np.ndarray:
     """Return the positions of the wheels, body frame, m. (n, 2)
 
-    Four wheels are front left, front right, rear left and rear right; otherwise there are two, front and rear.
+    The order of four wheels is front left, front right, rear left, rear right. Other vehicles have two wheels, front
+    and rear.
     """
     front, rear = vehicle.number("axles.front"), -vehicle.number("axles.rear")
     half_track = vehicle.number("axles.track") / 2
@@ -67,22 +68,22 @@ def wheel_positions(vehicle: VehicleModel) -> np.ndarray:
     return np.array([(x, y) for x in (front, rear) for y in sides])
 
 
-def with_poses(objects: Objects, cars: Any, car: CarData) -> Objects:
+def move_cars(objects: Objects, cars: Any, car: CarData) -> Objects:
     """Return the objects of a world with its cars at their poses.
 
     Args:
         objects: Objects of the world.
         cars: The population.
-        car: Its record, for one world. Leaves (n_members, ...)
+        car: Record of the population, for one world. Leaves (n_members, ...)
     """
     vehicle = load_vehicle(cars.vehicle)
-    rows = {"body": (car.pos, car.quat), "wheel": _wheels(vehicle, car)}
+    rows = {"body": (car.pos, car.quat), "wheel": _wheel_poses(vehicle, car)}
     if cars.trailer:
-        rows |= _trailers(vehicle, car)
+        rows |= _trailer_poses(vehicle, car)
     return objects.with_poses({_object_name(cars, part): row for part, row in rows.items()})
 
 
-def _wheels(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
+def _wheel_poses(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
     """Return positions, m, and attitudes of all wheels; a wheel's axis is its y axis. (n_members n_wheels, ...)"""
     positions = wheel_positions(vehicle)
     shape = (car.pos.shape[0], len(positions))
@@ -95,7 +96,7 @@ def _wheels(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
     return pos.reshape(-1, 3), quat.reshape(-1, 4)
 
 
-def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]:
+def _trailer_poses(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]:
     """Return positions, m, and attitudes of drawbars, decks and wheels of trailers, on the plane below their cars."""
     number = vehicle.number
     radius, half_track = number("trailer.wheel_radius"), number("trailer.track") / 2
@@ -125,7 +126,7 @@ def _rolling_quat(angle: Array) -> Array:
     return jnp.concatenate([zero, jnp.sin(angle / 2), zero, jnp.cos(angle / 2)], axis=-1)
 
 
-def _geom(
+def _geom_xml(
     kind: str,
     size: Iterable[float],
     pos: Iterable[float],
@@ -138,69 +139,69 @@ def _geom(
     return f'<geom type="{kind}" size="{text[0]}" pos="{text[1]}" rgba="{colour}" {contact_attributes} {attributes}/>'
 
 
-def _body(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
-    """Return geoms of a vehicle in the frame of its centre of mass.
+def _body_geoms(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
+    """Return the MJCF geoms of a vehicle in the frame of its centre of mass.
 
-    With four wheels they are a plate, a hood, a cabin with a flat roof, and bumpers; otherwise one box.
+    A vehicle with four wheels has a plate, a hood, a cabin with a flat roof, and bumpers. Other vehicles are one box.
     """
-    length, width, height = (vehicle.number(f"shape.{x}") / 2 for x in ("length", "width", "height"))
+    half_length, half_width, half_height = (vehicle.number(f"shape.{x}") / 2 for x in ("length", "width", "height"))
     front, floor = vehicle.number("axles.front"), 0.02
     if vehicle.number("wheels.number") != 4:
-        return _geom("box", (length, width / 2, height * 2), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
-    inner_width = min(width, vehicle.number("axles.track") / 2 - vehicle.number("wheels.width") / 2 - 0.005)
-    roof = (height - floor / 2, 0.12 * length, floor + height)
+        return _geom_xml("box", (half_length, half_width / 2, half_height * 2), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
+    inner_width = min(half_width, vehicle.number("axles.track") / 2 - vehicle.number("wheels.width") / 2 - 0.005)
+    cabin_half_height, cabin_x = half_height - floor / 2, -0.12 * half_length
     return (
-        _geom("box", (length * 0.92, inner_width, floor), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
-        + _geom(
+        _geom_xml("box", (half_length * 0.92, inner_width, floor), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
+        + _geom_xml(
             "box",
-            (length * 0.45, inner_width * 0.8, roof[0]),
-            (-roof[1], 0, 2 * height - roof[0]),
+            (half_length * 0.45, inner_width * 0.8, cabin_half_height),
+            (cabin_x, 0, 2 * half_height - cabin_half_height),
             rgba,
             CONTACT_ATTRIBUTES,
         )
-        + _geom(
+        + _geom_xml(
             "box",
-            (length * 0.2, inner_width * 0.7, floor / 2),
-            (front - length * 0.12, 0, 1.5 * floor),
+            (half_length * 0.2, inner_width * 0.7, floor / 2),
+            (front - half_length * 0.12, 0, 1.5 * floor),
             rgba,
             NO_CONTACT_ATTRIBUTES,
         )
-        + _geom("box", (0.008, width * 0.85, floor), (length - 0.008, 0, 0), DARK, CONTACT_ATTRIBUTES)
-        + _geom("box", (0.008, width * 0.85, floor), (0.008 - length, 0, 0), DARK, CONTACT_ATTRIBUTES)
+        + _geom_xml("box", (0.008, half_width * 0.85, floor), (half_length - 0.008, 0, 0), DARK, CONTACT_ATTRIBUTES)
+        + _geom_xml("box", (0.008, half_width * 0.85, floor), (0.008 - half_length, 0, 0), DARK, CONTACT_ATTRIBUTES)
     )
 
 
-def _wheel(radius: float, width: float) -> str:
-    """Return geoms of a wheel whose axis is y: a tyre, a rim and spokes."""
+def _wheel_geoms(radius: float, width: float) -> str:
+    """Return the MJCF geoms of a wheel with the axis y: a tyre, a rim and spokes."""
     axis, reach = 'zaxis="0 1 0"', 0.29 * radius
-    rim = _geom("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, NO_CONTACT_ATTRIBUTES, axis)
+    rim = _geom_xml("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, NO_CONTACT_ATTRIBUTES, axis)
     spokes = ""
     for angle in np.arange(N_SPOKES) * 2 * np.pi / N_SPOKES:
         pos, quat_wy = (reach * np.cos(angle), 0, -reach * np.sin(angle)), (np.cos(angle / 2), np.sin(angle / 2))
         quat = f'quat="{quat_wy[0]:.6g} 0 {quat_wy[1]:.6g} 0"'
-        spokes += _geom("box", (reach, width / 2 + 0.0016, 0.06 * radius), pos, STEEL, NO_CONTACT_ATTRIBUTES, quat)
-    return _geom("cylinder", (radius, width / 2), (0, 0, 0), RUBBER, CONTACT_ATTRIBUTES, axis) + rim + spokes
+        spokes += _geom_xml("box", (reach, width / 2 + 0.0016, 0.06 * radius), pos, STEEL, NO_CONTACT_ATTRIBUTES, quat)
+    return _geom_xml("cylinder", (radius, width / 2), (0, 0, 0), RUBBER, CONTACT_ATTRIBUTES, axis) + rim + spokes
 
 
-def _drawbar(length: float, track: float) -> str:
-    """Return geoms of a drawbar and the axle behind it, in the frame of the axle's middle."""
-    bar = _geom("box", (length / 2, 0.004, 0.004), (length / 2, 0, 0), DARK, NO_CONTACT_ATTRIBUTES)
-    return bar + _geom("box", (0.0075, track / 2, 0.0075), (0, 0, 0), DARK, CONTACT_ATTRIBUTES)
+def _drawbar_geoms(length: float, track: float) -> str:
+    """Return the MJCF geoms of a drawbar and the axle behind it, in the frame of the axle's middle."""
+    bar = _geom_xml("box", (length / 2, 0.004, 0.004), (length / 2, 0, 0), DARK, NO_CONTACT_ATTRIBUTES)
+    return bar + _geom_xml("box", (0.0075, track / 2, 0.0075), (0, 0, 0), DARK, CONTACT_ATTRIBUTES)
 
 
-def _deck(vehicle: VehicleModel) -> str:
-    """Return geoms of the deck of a trailer with its rear axle, in the frame of the middle of its front axle."""
+def _deck_geoms(vehicle: VehicleModel) -> str:
+    """Return the MJCF geoms of a trailer's deck and rear axle, in the frame of the middle of its front axle."""
     size, centre = vehicle.value("trailer.deck") / 2, vehicle.value("trailer.deck_centre")
     axles, track = vehicle.number("trailer.axle_distance"), vehicle.number("trailer.track")
     posts = "".join(
-        _geom("cylinder", (0.008, centre[2] / 2), (x, 0, centre[2] / 2), DARK, NO_CONTACT_ATTRIBUTES)
+        _geom_xml("cylinder", (0.008, centre[2] / 2), (x, 0, centre[2] / 2), DARK, NO_CONTACT_ATTRIBUTES)
         for x in (0.0, -axles)
     )
     return (
-        _geom("box", size, centre, WOOD, CONTACT_ATTRIBUTES)
-        + _geom(
+        _geom_xml("box", size, centre, WOOD, CONTACT_ATTRIBUTES)
+        + _geom_xml(
             "box", (axles / 2 + 0.025, track / 2 - 0.025, 0.0025), (-axles / 2, 0, 0.014), STEEL, NO_CONTACT_ATTRIBUTES
         )
-        + _geom("box", (0.0075, track / 2, 0.0075), (-axles, 0, 0), DARK, CONTACT_ATTRIBUTES)
+        + _geom_xml("box", (0.0075, track / 2, 0.0075), (-axles, 0, 0), DARK, CONTACT_ATTRIBUTES)
         + posts
     )

@@ -43,7 +43,7 @@ class CarData(Members):
     force: Array = leaf("member", 1)
     """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_members, 3)"""
     torque: Array = leaf("member", 1)
-    """External torque, world frame, N m; only z acts. It stays until it is changed. (n_worlds, n_members, 3)"""
+    """External torque, world frame, N m, of which only z acts; kept until it is changed. (n_worlds, n_members, 3)"""
     params: CarParams
     """Parameters of the dynamics."""
     path: Path | None
@@ -71,13 +71,13 @@ class CarData(Members):
 
     @property
     def vel(self) -> Array:
-        """Velocity of the centre of mass, world frame, m/s; z is zero, on slopes too. (n_worlds, n_members, 3)"""
+        """Velocity of the centre of mass, world frame, m/s; z is zero even on slopes. (n_worlds, n_members, 3)"""
         return _level_vel(self.yaw, self.body_vel)
 
     @property
     def ang_vel(self) -> Array:
         """Angular velocity, body frame, rad/s. (n_worlds, n_members, 3)"""
-        return _about_z(self.yaw_rate)
+        return _ang_vel_about_z(self.yaw_rate)
 
     def with_vel(self, vel: Array, ang_vel: Array) -> CarData:
         """Return the record with other velocities; only the horizontal velocity and the yaw rate are used.
@@ -96,6 +96,6 @@ def _level_vel(yaw: Array, body_vel: Array) -> Array:
 
 
 @jit_eager_calls()
-def _about_z(yaw_rate: Array) -> Array:
+def _ang_vel_about_z(yaw_rate: Array) -> Array:
     zero = jnp.zeros_like(yaw_rate)
     return jnp.concatenate([zero, zero, yaw_rate], axis=-1)

@@ -16,7 +16,7 @@ SLIP_SPEED = 0.1
 
 
 class CarParams(PyTree):
-    """Parameters of a ground vehicle with two axles, each shared or one per vehicle."""
+    """Parameters of a ground vehicle with two axles, each with one value for all vehicles or one for each."""
 
     mass: Array = leaf("parameter", 1, (1,))
     """Mass of the vehicle with its wheels, kg. (1,)"""
@@ -39,7 +39,7 @@ class CarParams(PyTree):
     rolling: Array = leaf("parameter", 1, (2,))
     """Resistance of the wheels: increase with speed, N s/m, and dry friction, N. (2,)"""
     towed_mass: Array = leaf("parameter", 1, (1,))
-    """Mass that the drive accelerates besides the vehicle's: a trailer, and J / r^2 of wheels and motors, kg. (1,)"""
+    """Mass that the drive accelerates in addition to ``mass``: trailer, and J / r^2 of wheels and motors, kg. (1,)"""
     steer_max: Array = leaf("parameter", 1, (1,))
     """Largest steering angle, rad. (1,)"""
     steer_rate_max: Array = leaf("parameter", 1, (1,))
@@ -76,11 +76,10 @@ class CarParams(PyTree):
         is_kinematic = vehicle.dynamics == "kinematic"
         stiffness = [0.0, 0.0] if is_kinematic else [number("tyres.front"), number("tyres.rear")]
         moments = front**2 * stiffness[0] + rear**2 * stiffness[1]
-        # The fastest rate of lateral motion is at most this divided by the speed; its product with the step must stay
-        # below 1.
-        rate = max(sum(stiffness) / mass, moments / yaw_inertia)
+        # The rates of lateral motion are at most ``rate_times_speed / speed``. Times the step they must stay below 1.
+        rate_times_speed = max(sum(stiffness) / mass, moments / yaw_inertia)
         drive, drive_max = drive_constants(vehicle)
-        slip_speed = max(SLIP_SPEED, rate / freq)
+        slip_speed = max(SLIP_SPEED, rate_times_speed / freq)
         rolling = [n * number("wheels.damping") / radius**2, n * number("wheels.friction_loss") / radius]
         towed_mass = n * wheel_spin_inertia / radius**2 + (number("trailer.mass") if trailer else 0.0)
         damping = (drive[1] + rolling[0]) / (mass + towed_mass)
@@ -114,7 +113,7 @@ class CarParams(PyTree):
 def drive_constants(vehicle: VehicleModel) -> tuple[list[float], float]:
     """Return gain, N, damping, N s/m, and friction, N, of the force of the whole drive, and its limit, N.
 
-    Published forces are for one axle of two; published torques are for one driven wheel.
+    The table's forces are for one of two axles, its torques for one driven wheel.
     """
     share = vehicle.number("drive.front_share")
     if "drive.force" in vehicle.numbers:

@@ -77,11 +77,11 @@ def ackermann(steer: Array, wheelbase: float, kingpin_track: float) -> Array:
         Steering angles of the left and the right wheel, rad. (..., 2)
     """
     tan = jnp.tan(steer)
-    wheelbase_rise, half_track_rise = wheelbase * tan, kingpin_track / 2 * tan
+    wheelbase_tan, half_track_tan = wheelbase * tan, kingpin_track / 2 * tan
     return jnp.concatenate(
         [
-            jnp.arctan2(wheelbase_rise, wheelbase - half_track_rise),
-            jnp.arctan2(wheelbase_rise, wheelbase + half_track_rise),
+            jnp.arctan2(wheelbase_tan, wheelbase - half_track_tan),
+            jnp.arctan2(wheelbase_tan, wheelbase + half_track_tan),
         ],
         axis=-1,
     )

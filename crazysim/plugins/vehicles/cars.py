@@ -46,7 +46,7 @@ class Cars(Population):
 
     Commands are held until they change: at the level ``drive`` the motor reference and the steering angle, at ``speed``
     the speed and the steering angle. With a path the cars need no commands. On terrain the dynamics are the same as on
-    level ground, plus the pull of the slope; height and tilt follow the ground. Wheels do not leave it.
+    level ground, plus the pull of the slope; height and tilt follow the ground. Wheels do not leave the ground.
     """
 
     members: int | Sequence[str] = 1
@@ -122,7 +122,7 @@ class Cars(Population):
         pos, yaw = starts.row_positions(self.n_members), np.zeros((self.n_members, 1))
         if paths is not None and controller is not None:
             controller.check(vehicle, paths)
-            index = starts.member_numbers("index", self._indices(paths), counts, paths.n_paths)
+            index = starts.member_numbers("index", self._path_indices(paths), counts, paths.n_paths)
             start_times = starts.spread_start_times(paths, index, self.n_members) if self.start is None else self.start
             start = starts.member_numbers("start", start_times, counts)
             pos, yaw, arc = starts.path_poses(paths, index, start, counts)
@@ -205,12 +205,12 @@ class Cars(Population):
         """Return the rates of position and normal of one car that follows terrain."""
         height, normal = ground_at(data, car.pos)
         vel, rate = car.vel, 1 / max(SETTLING_TIME, 2 / data.core.freq)
-        climb = -(normal[:1] * vel[:1] + normal[1:2] * vel[1:2]) / normal[2:]
-        sink = rate * (height + self.model.number("wheels.radius") - car.pos[2:])
-        return {"pos": jnp.concatenate([vel[:2], climb + sink]), "normal": rate * (normal - car.normal)}
+        climb_rate = -(normal[:1] * vel[:1] + normal[1:2] * vel[1:2]) / normal[2:]
+        settling_vel = rate * (height + self.model.number("wheels.radius") - car.pos[2:])
+        return {"pos": jnp.concatenate([vel[:2], climb_rate + settling_vel]), "normal": rate * (normal - car.normal)}
 
     def move_objects(self, data: SimData) -> Objects:
-        return appearance.with_poses(data.objects, self, self.read(data))  # type: ignore[arg-type]
+        return appearance.move_cars(data.objects, self, self.read(data))  # type: ignore[arg-type]
 
     @property
     def moved_kinds(self) -> tuple[str, ...] | None:
@@ -243,7 +243,7 @@ class Cars(Population):
             )
         return Path.stack([Path.of_trajectory(x) if isinstance(x, Trajectory) else x for x in paths])
 
-    def _indices(self, paths: Path) -> ArrayLike:
+    def _path_indices(self, paths: Path) -> ArrayLike:
         return np.arange(self.n_members) % paths.n_paths if self.index is None else self.index
 
 

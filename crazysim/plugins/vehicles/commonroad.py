@@ -80,8 +80,8 @@ def commonroad_single_track(state: CommonRoadState, command: Array, params: Comm
 
     Althoff, Koschi and Manzinger, "CommonRoad: Composable Benchmarks for Motion Planning on Roads", 2017, vehicle
     models, single-track model: slip angles and steering angle are small, the speed is prescribed by the acceleration,
-    and the loads of the axles shift with it. Below 0.5 m/s it is kinematic and not continuous with the rest. Backwards
-    its slip forces push instead of holding; ``single_track`` is right there.
+    and the loads of the axles shift with the acceleration. Below 0.5 m/s the model is kinematic, with a jump at this
+    speed. When the vehicle drives backwards, its slip forces increase the slip; the forces of ``single_track`` do not.
 
     Args:
         state: State.
@@ -93,16 +93,16 @@ def commonroad_single_track(state: CommonRoadState, command: Array, params: Comm
     acc = limited_acceleration(v, command[..., 1:], p)
     front, rear = p.axle_distances[..., :1], p.axle_distances[..., 1:]
     wheelbase = front + rear
-    # Slip forces divided by the mass: for an axle of load m (g l -+ a h) / L, friction times stiffness times load times
-    # angle.
+    # An axle has the load m (g l -+ a h) / L. Its slip force is friction times stiffness times load times slip angle.
+    # Here forces are divided by the mass.
     grip_front = p.friction * p.stiffness[..., :1] * (g * rear - acc * p.height) / wheelbase
     grip_rear = p.friction * p.stiffness[..., 1:] * (g * front + acc * p.height) / wheelbase
     is_slow = jnp.abs(v) < MAX_KINEMATIC_SPEED
     safe_speed = jnp.where(is_slow, 1.0, v)
-    push_front = grip_front * (d - state.slip - front * state.yaw_rate / safe_speed)
-    push_rear = grip_rear * (rear * state.yaw_rate / safe_speed - state.slip)
-    yaw_acc = p.mass / p.yaw_inertia * (front * push_front - rear * push_rear)
-    slip_rate = (push_front + push_rear) / safe_speed - state.yaw_rate
+    lateral_acc_front = grip_front * (d - state.slip - front * state.yaw_rate / safe_speed)
+    lateral_acc_rear = grip_rear * (rear * state.yaw_rate / safe_speed - state.slip)
+    yaw_acc = p.mass / p.yaw_inertia * (front * lateral_acc_front - rear * lateral_acc_rear)
+    slip_rate = (lateral_acc_front + lateral_acc_rear) / safe_speed - state.yaw_rate
     tan = jnp.tan(d)
     course = state.yaw + jnp.where(is_slow, 0.0, state.slip)
     return CommonRoadState(

@@ -22,7 +22,7 @@ class PathState(NamedTuple):
     """A vehicle relative to its path at one instant.
 
     Offset, heading error and curvature refer to the path in the direction in which the vehicle points. If the path is
-    driven backwards, that is opposite to the path's own direction.
+    driven backwards, this direction is opposite to the direction of the path.
 
     A reference by time prescribes the position along the path and the speed at each time. A reference by arc length
     prescribes only the speed, at the position where the vehicle is.
@@ -43,8 +43,8 @@ class PathState(NamedTuple):
     speed: Array
     """Reference speed, m/s; negative backwards. (1,)"""
     lag: Array
-    """Distance that the vehicle is behind where it should be at this time, m, positive if it is behind in the direction
-    in which it points; zero for a reference by arc length. (1,)"""
+    """Distance along the path from the vehicle to its reference position at this time, m, positive if the vehicle
+    points towards it; zero for a reference by arc length. (1,)"""
 
     @property
     def direction(self) -> Array:
@@ -60,8 +60,8 @@ def path_state(
     Args:
         state: State of the vehicle.
         path: Paths.
-        index: Index of its path. ()
-        guess: Arc length near its projection, m. (1,)
+        index: Index of the vehicle's path. ()
+        guess: Arc length near the projection of the vehicle, m. (1,)
         reference_offset: Distance from the centre of mass forwards to the point of the vehicle that is projected, m.
             (1,)
         time: Time since the start for a reference by time, s; None for a reference by arc length. ()
@@ -116,7 +116,7 @@ class PathController:
     """
 
     can_reverse: ClassVar[bool] = True
-    """True if it can drive backwards."""
+    """True if the controller can drive backwards."""
     position_gain: float = setting(default=4.0, low=0.0)
     """Acceleration per distance from a reference by time, 1/s^2."""
     speed_gain: float = setting(default=4.0, low=0.0)
@@ -148,7 +148,7 @@ class PathController:
 
         Args:
             vehicle: The vehicle.
-            car: Its parameters.
+            car: Parameters of the vehicle.
             freq: Rate of the controller, Hz.
         """
         return None
@@ -176,9 +176,7 @@ class PathController:
         raise NotImplementedError(f"{type(self).__name__} does not define steering")
 
     def driving(self, state: CarState, tracking: PathState, gains: Any, car: CarParams) -> Array:
-        """Return the motor reference that makes the vehicle follow the reference speed and, for a reference by time,
-        the reference position. (1,)
-        """
+        """Return the motor reference that reduces the errors of speed and, for a reference by time, position. (1,)"""
         acc = self.position_gain * tracking.lag + self.speed_gain * (tracking.speed - state.body_vel[:1])
         return motor_reference(tracking.speed, acc, car)
 
@@ -195,9 +193,9 @@ class PurePursuit(PathController):
     """Pure pursuit: the rear axle drives on the circle to a point ahead on the path.
 
     ``tan(d) = L 2 y / (x^2 + y^2)`` with the wheelbase L and the point (x, y) relative to the rear axle; the formula
-    also holds backwards. Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm", 1992. It needs no
-    gains, and cuts corners: where the curvature jumps, by about a tenth of the jump times the square of the look-ahead
-    distance.
+    also holds backwards. Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm", 1992. The controller
+    needs no gains. It cuts corners: where the curvature jumps, the offset is about a tenth of the jump times the square
+    of the look-ahead distance.
     """
 
     lookahead: float = setting(default=0.3, positive=True)
@@ -215,15 +213,14 @@ class PurePursuit(PathController):
         goal = tracking.path.point_at(tracking.index, tracking.arc[0] + distance).pos
         axle = state.pos[:2] - car.rear * jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
         offset = to_world_frame(-state.yaw, goal - axle)
-        square = offset[:1] * offset[:1] + offset[1:] * offset[1:]
-        # Past the end of an open path the goal is that end, whose distance may be arbitrarily small.
-        curvature = 2 * offset[1:] / jnp.maximum(square, 0.25 * self.lookahead * self.lookahead + 1e-4)
+        squared_distance = offset[:1] * offset[:1] + offset[1:] * offset[1:]
+        # Past the end of an open path the goal is the end of the path. Its distance may be arbitrarily small.
+        curvature = 2 * offset[1:] / jnp.maximum(squared_distance, 0.25 * self.lookahead * self.lookahead + 1e-4)
         return jnp.arctan((car.front + car.rear) * curvature), memory
 
 
 class Stanley(PathController):
-    """Stanley's law: the front wheels point along the path, and turn towards it by an angle that grows with the front
-    axle's offset.
+    """Stanley's law: front wheels along the path, plus an angle that grows with the offset of the front axle.
 
     ``d = -heading_error - arctan(k offset / (v_0 + v))`` (Hoffmann, Tomlin, Montemerlo and Thrun, "Autonomous
     Automobile Trajectory Tracking for Off-Road Driving", 2007). Forwards only.
@@ -233,7 +230,7 @@ class Stanley(PathController):
     gain: float = setting(default=2.5, low=0.0)
     """Gain k, 1/s."""
     soft_speed: float = setting(default=0.5, positive=True)
-    """Speed v_0 that is added, so that slow vehicles steer gently, m/s."""
+    """Speed v_0 that is added to the vehicle's speed, so that slow vehicles steer gently, m/s."""
 
     def reference_offset(self, car: CarParams) -> Array:
         return car.front

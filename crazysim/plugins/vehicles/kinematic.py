@@ -17,15 +17,15 @@ def kinematic(state: CarState, command: Array, params: CarParams, wrench: Array 
     """Return the time derivative of the state of a vehicle that rolls without slip.
 
     The yaw rate is ``w = v_x tan(d) / L`` and the velocity of the centre of mass to the left ``l_r w`` (Rajamani,
-    "Vehicle Dynamics and Control", 2012, section 2.2). Along the vehicle the drive, limited by the grip, and external
-    forces accelerate it; the wheels balance forces across it.
+    "Vehicle Dynamics and Control", 2012, section 2.2). The drive, limited by the grip, and the external force
+    accelerate the vehicle along its axis. The wheels balance all forces across the axis.
 
     Args:
         state: State.
         command: Motor reference, 1, and steering angle, rad. (..., 2)
         params: Parameters.
         wrench: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None
-            for no external force. (..., 3)
+            for no external wrench. (..., 3)
     """
     p, speed, wheelbase = params, state.body_vel[..., :1], params.front + params.rear
     drive, grip = drive_force(command[..., :1], speed, p), p.grip[..., :1] + p.grip[..., 1:]

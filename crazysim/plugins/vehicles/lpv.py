@@ -1,4 +1,4 @@
-"""The lab's gain-scheduled path controller: polynomials of speed, with the sign of the curvature."""
+"""AIMotionLab's gain-scheduled path controller, with gains that are polynomials of the speed."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ LATERAL_GAINS = {
 AIMotionLab-Virtual, commit ea392436, aiml_virtual/controller/car_controller.py, and commit fc1bc3e0,
 aiml_virtual/controller/car_lpv_controller.py."""
 LONGITUDINAL_GAINS = ((0.0010, -0.0132, 0.4243), (-0.0044, 0.0563, 0.0959))
-"""Gains of distance and speed as polynomials of the model's parameter p, highest power first. Sources: the same."""
+"""Gains of lag and speed error as polynomials of p (see ``LPV``), highest power first. Sources as above."""
 INTEGRAL_FREQ, INTEGRAL_MAX, RATE_WEIGHT = 40, 0.1, 0.5
 """Rate of the controller to which the integral's gain refers, Hz, limit of the integral, m, and weight of the newest
-difference in the rate of the offset. Sources: the same."""
+difference in the rate of the offset. Sources as above."""
 
 
 class LPVGains(PyTree):
@@ -56,16 +56,18 @@ class LPVMemory(PyTree):
 class LPV(PathController):
     """Linear parameter-varying control of AIMotionLab's cars: gains that are polynomials of the speed.
 
-    With e the distance of the path to the left of the car, its sum q and its smoothed rate, at forward speed v:
+    With the distance e of the path from the car, positive if the path is to the left, the sum q of e, the smoothed rate
+    e' of e, and the forward speed v:
 
         steer = -heading_error + k1(v) q + k2(v) e + k3(v) e' + f curvature
 
-    Along the path, with ``p = |cos(heading_error + slip) / cos(slip) / (1 - curvature offset)|`` and the lag l behind a
-    reference by time, the motor reference belongs to the speed ``v_ref / p``, plus ``kl1(p) l + kl2(p) (v_ref / p -
+    Let p be ``|cos(heading_error + slip) / cos(slip) / (1 - curvature offset)|``, and l the lag behind a reference by
+    time. The motor reference is the value that holds the speed ``v_ref / p``, plus ``kl1(p) l + kl2(p) (v_ref / p -
     v)``.
 
-    Gains and feed-forward f are published (``LATERAL_GAINS``, ``LONGITUDINAL_GAINS``). The lab's curvature has no sign,
-    which steers the wrong way in one direction of turning; here it has one. Forwards only, for the F1TENTH cars.
+    Gains and feed-forward f are published (``LATERAL_GAINS``, ``LONGITUDINAL_GAINS``). The lab uses the absolute value
+    of the curvature, which steers the wrong way in curves to one side; here the curvature is signed. Forwards only, for
+    the F1TENTH cars.
     """
 
     can_reverse: ClassVar[bool] = False
@@ -84,8 +86,12 @@ class LPV(PathController):
     def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> LPVGains:
         """Return the gains; the feed-forward is ``(m / C_f) (1 - (l_r C_r - l_f C_f) / m)``."""
         m, front, rear = (float(np.asarray(x)[0]) for x in (car.mass, car.front, car.rear))
-        stiff_front, stiff_rear = (float(x) for x in np.asarray(car.stiffness))
-        feedforward = m / stiff_front * (1 - (rear * stiff_rear - front * stiff_front) / m) if stiff_front else 0.0
+        stiffness_front, stiffness_rear = (float(x) for x in np.asarray(car.stiffness))
+        feedforward = (
+            m / stiffness_front * (1 - (rear * stiffness_rear - front * stiffness_front) / m)
+            if stiffness_front
+            else 0.0
+        )
         return LPVGains(as_parameter(feedforward), as_parameter(1 / freq))
 
     def memory(self) -> LPVMemory:

@@ -78,8 +78,8 @@ KEYS: dict[str, Key] = {
 }
 """Shapes and ranges of all numbers, by table and key."""
 OPTIONAL_KEYS = ("tyres.front", "tyres.rear", "drive.", "trailer.")
-"""Prefixes of the keys without which a vehicle can be loaded; of ``drive`` it needs the force or the torque.
-``CarParams.create`` needs the limit of the drive and ``drive.front_share`` too."""
+"""Prefixes of the keys that a vehicle may lack, except that it needs ``drive.force`` or ``drive.torque``.
+``CarParams.create`` also needs the limit of the drive and ``drive.front_share``."""
 LAYOUT = Layout(KEYS, ("name", "base", "model", "sources"), GUIDE)
 """Keys of vehicles."""
 
@@ -140,7 +140,7 @@ def load_vehicle(source: VehicleSource) -> VehicleModel:
 
     Raises:
         UnknownNameError: If the source is neither the name of a vehicle nor a file.
-        ConfigError: If a table or key does not exist, or the numbers cannot belong to a vehicle.
+        ConfigError: If a table or key is unknown or missing, or a number is out of range.
     """
     return _load_model(source, ())
 
@@ -165,7 +165,7 @@ def _load_model(source: Any, bases: tuple[str, ...]) -> VehicleModel:
 
 
 def _check_model(vehicle: VehicleModel) -> None:
-    """Check that a vehicle with these numbers can drive."""
+    """Check that a vehicle model has all required numbers, and that they are in range."""
     name, numbers = vehicle.name, vehicle.numbers
     if vehicle.dynamics not in DYNAMICS_NAMES:
         raise ConfigError(

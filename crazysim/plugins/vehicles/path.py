@@ -63,7 +63,7 @@ class Path(PyTree):
     """
 
     coefficients: Array = leaf("shared", 4)
-    """Coefficients of x and y, m, in each piece, constant term first; the argument is the fraction of the piece's
+    """Coefficients of x and y, m, in each piece, constant term first, as a function of the fraction of the piece's
     length. Padding repeats the last piece. (n_paths, n_pieces, 2, 6)"""
     length: Array = leaf("shared", 1)
     """Length of each path, m. (n_paths,)"""
@@ -84,7 +84,7 @@ class Path(PyTree):
 
         Args:
             trajectory: Trajectory of one vehicle.
-            backwards: True to drive along it in reverse gear.
+            backwards: True to drive along the path in reverse gear.
         """
         pieces, curve = _horizontal_curve(trajectory)
 
@@ -99,10 +99,10 @@ class Path(PyTree):
     def of_points(points: ArrayLike, speed: float = 1.0, closed: bool = False) -> Path:
         """Return the smoothest path through points, at a constant speed.
 
-        It is a quintic spline, parametrised by the cumulative chord length.
+        The path is a quintic spline, parametrised by the cumulative chord length.
 
         Args:
-            points: Points, x and y, world frame, m; a closed path does not repeat the first one. (n_points, 2)
+            points: Points, x and y, world frame, m; a closed path does not repeat its first point. (n_points, 2)
             speed: Speed, m/s; negative to drive backwards.
             closed: True for a path that ends at its start.
         """
@@ -137,7 +137,7 @@ class Path(PyTree):
 
     @staticmethod
     def stack(paths: Sequence[Path]) -> Path:
-        """Stack several paths into one record with a slot for each."""
+        """Return one record of several paths."""
         if not paths:
             raise ConfigError("expected at least one path, got none. Use Path.stack([Path.of_points(points)]).")
         n = max(path.n_pieces for path in paths)
@@ -166,10 +166,10 @@ class Path(PyTree):
         return bool(np.any(np.asarray(self.speeds) < 0))
 
     def point_at(self, index: Array | int, s: Array) -> PathPoint:
-        """Return the point of a path at an arc length; closed paths start again, open ones stay at their ends.
+        """Return the point of a path at an arc length; closed paths start again, open paths stay at their ends.
 
         Args:
-            index: Number of the path. ()
+            index: Index of the path. ()
             s: Arc length, m. ()
         """
         piece, u = self._locate(index, s)
@@ -192,7 +192,7 @@ class Path(PyTree):
         both directions, and the arc length increases with every lap.
 
         Args:
-            index: Number of the path. ()
+            index: Index of the path. ()
             t: Time since the start, s. ()
 
         Returns:
@@ -200,13 +200,13 @@ class Path(PyTree):
         """
         duration, is_closed = _entry_at(self.duration, index), _entry_at(self.closed, index)
         laps = jnp.where(is_closed, lax.floor(t / duration), 0.0)
-        local = clip(t - laps * duration, 0.0, duration)
+        lap_time = clip(t - laps * duration, 0.0, duration)
         step = duration / (N_TIMES - 1)
-        node = jnp.minimum(lax.floor(local / step), N_TIMES - 2.0)
-        k, u = node.astype(jnp.int32), local / step - node
+        node = jnp.minimum(lax.floor(lap_time / step), N_TIMES - 2.0)
+        k, u = node.astype(jnp.int32), lap_time / step - node
         (s0, v0), (s1, v1) = _entry_at(self.progress, index, k), _entry_at(self.progress, index, k + 1)
-        rise, v0, v1 = s1 - s0, v0 * step, v1 * step
-        c2, c3 = 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise  # cubic of Hermite
+        ds, v0, v1 = s1 - s0, v0 * step, v1 * step
+        c2, c3 = 3 * ds - 2 * v0 - v1, v0 + v1 - 2 * ds  # cubic Hermite interpolation
         s = s0 + u * (v0 + u * (c2 + u * c3))
         is_moving = is_closed | ((t >= 0) & (t <= duration))
         v = jnp.where(is_moving, (v0 + u * (2 * c2 + 3 * u * c3)) / step, 0.0)
@@ -221,12 +221,12 @@ class Path(PyTree):
         compiled code. On a closed path the arc length increases with every lap.
 
         Args:
-            index: Number of the path. ()
+            index: Index of the path. ()
             pos: Position, world frame, m. (2,)
             guess: Arc length nearby, m. ()
 
         Returns:
-            m. ()
+            Arc length, m. ()
         """
         s, length, is_closed = guess, _entry_at(self.length, index), _entry_at(self.closed, index)
         for _ in range(NEWTON_STEPS):
@@ -241,16 +241,16 @@ class Path(PyTree):
         return s
 
     def nearest_arc(self, index: int, pos: ArrayLike) -> float:
-        """Return the arc length, m, of the sample of a path nearest to a position, anywhere on it, on the host.
+        """Return the arc length, m, of the sample of a whole path that is nearest to a position, on the host.
 
         Args:
-            index: Number of the path.
+            index: Index of the path.
             pos: Position, world frame, m. (2,)
         """
-        count = round(float(self.length[index]) / float(self.spacing[index]))
+        n_pieces = round(float(self.length[index]) / float(self.spacing[index]))
         u = np.linspace(0.0, 1.0, 9)[:-1]
         powers = u[:, None] ** np.arange(6)
-        points = np.einsum("uk,pak->pua", powers, np.asarray(self.coefficients[index][:count], float)).reshape(-1, 2)
+        points = np.einsum("uk,pak->pua", powers, np.asarray(self.coefficients[index][:n_pieces], float)).reshape(-1, 2)
         k = int(np.argmin(np.sum((points - np.asarray(pos, float)[:2]) ** 2, axis=1)))
         return k / 8 * float(self.spacing[index])
 
@@ -258,7 +258,7 @@ class Path(PyTree):
         """Return position, m (2,), heading of the vehicle, rad, and arc length, m, at time zero, on the host.
 
         Args:
-            index: Number of the path.
+            index: Index of the path.
             start: Time at which the vehicle is at the start of the path, s.
         """
         point, arc = jax.device_get(_point_at_time(self, np.int32(index), np.asarray(-start, float_dtype())))
@@ -266,17 +266,17 @@ class Path(PyTree):
         return np.asarray(point.pos, float), float(np.arctan2(y, x)), float(arc[0])
 
     def _locate(self, index: Array | int, s: Array) -> tuple[Array, Array]:
-        """Return the piece at an arc length, and the position in it as a fraction of its length."""
+        """Return the index of the piece at an arc length, and the position in it as a fraction of its length."""
         length, spacing = _entry_at(self.length, index), _entry_at(self.spacing, index)
-        local_s = s - length * lax.floor(s / length)
-        local = jnp.where(_entry_at(self.closed, index), local_s, clip(s, 0.0, length)) / spacing
-        piece = clip(lax.floor(local), 0.0, lax.floor(length / spacing - 0.5))
-        return piece.astype(jnp.int32), local - piece
+        s_in_lap = s - length * lax.floor(s / length)
+        position = jnp.where(_entry_at(self.closed, index), s_in_lap, clip(s, 0.0, length)) / spacing
+        piece = clip(lax.floor(position), 0.0, lax.floor(length / spacing - 0.5))
+        return piece.astype(jnp.int32), position - piece
 
 
 @jax.jit
 def _point_at_time(path: Path, index: Array, t: Array) -> tuple[PathPoint, Array]:
-    """Return the point of a path at a time since the start, s, and its arc length, m (1,)."""
+    """Return the point of a path at a time since the start, s, and the arc length of the point, m (1,)."""
     arc, _ = path.time_reference(index, t)
     return path.point_at(index, arc[0]), arc
 
@@ -296,12 +296,12 @@ def _path_of_curve(
     backwards: bool,
     speed: float | None = None,
 ) -> Path:
-    """Return a path of one slot.
+    """Return a record with one path.
 
     Args:
         curve: Function from parameters (n,) and the order of a derivative to x and y. (n, 2)
         parameters: Parameters, equally spaced. (n,)
-        parametric_speed: Length of the derivative there. (n,)
+        parametric_speed: Lengths of the derivatives at the parameters. (n,)
         progress: Arc length and its rate over time. (n_times, 2)
         closed: True for a path that ends at its start.
         backwards: True to drive backwards.
@@ -326,28 +326,26 @@ def _path_of_curve(
         )
     n = max(4, int(np.ceil(arc[-1] / MAX_PIECE_LENGTH)))
     nodes = np.interp(np.linspace(0.0, arc[-1], n + 1), arc, parameters)
-    inner_nodes = np.clip(
-        nodes, parameters[moving_samples[0]], parameters[moving_samples[-1]]
-    )  # at rest the tangent is undefined
+    # At rest the tangent is undefined.
+    inner_nodes = np.clip(nodes, parameters[moving_samples[0]], parameters[moving_samples[-1]])
     pos, vel, acc = curve(nodes, 0), curve(inner_nodes, 1), curve(inner_nodes, 2)
     if closed and not np.allclose(pos[0], pos[-1], atol=1e-3):
         raise ConfigError(
             f"expected a closed path that ends at its start, got a gap of {np.hypot(*(pos[0] - pos[-1])):.3g} m. Let "
             f"the trajectory end where it starts, or not repeat."
         )
-    size = np.hypot(*vel.T)[:, None]
-    tangent = vel / size
-    curvature = (acc - np.sum(acc * tangent, axis=1, keepdims=True) * tangent) / size**2
-    curvature[size[:, 0] < MIN_CURVED_SPEED_FRACTION * parametric_speed.max()] = (
-        0.0  # near rest the curvature of a polynomial grows without bound
-    )
+    node_speed = np.hypot(*vel.T)[:, None]
+    tangent = vel / node_speed
+    curvature = (acc - np.sum(acc * tangent, axis=1, keepdims=True) * tangent) / node_speed**2
+    # Near rest the curvature of a polynomial grows without bound.
+    curvature[node_speed[:, 0] < MIN_CURVED_SPEED_FRACTION * parametric_speed.max()] = 0.0
     spacing = arc[-1] / n
     derivatives = np.stack([pos, tangent, curvature], axis=1)
     coefficients = interpolation.unit_coefficients(derivatives, np.full(n, spacing))
     speeds = (
         np.full(n, speed)
         if speed is not None
-        else np.maximum(size[:-1, 0], MIN_SPEED_FRACTION * parametric_speed.max())
+        else np.maximum(node_speed[:-1, 0], MIN_SPEED_FRACTION * parametric_speed.max())
     )
     duration = progress[-1, 0] / speed if speed is not None else parameters[-1]
     arrays = (coefficients, arc[-1], spacing, speeds * (-1 if backwards else 1), progress, duration)
@@ -377,5 +375,5 @@ def _evaluate(coefficients: Array, u: Array) -> PathPoint:
 
 
 def _entry_at(x: Array, *index: Array | int) -> Array:
-    """Return an entry of an array; an index that is out of range is clipped to the last or first one."""
+    """Return an entry of an array; an index that is out of range is clipped to the first or last entry."""
     return jnp.asarray(x).at[index].get(mode="clip", wrap_negative_indices=False)

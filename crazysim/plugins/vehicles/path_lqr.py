@@ -1,4 +1,4 @@
-"""A linear quadratic regulator of offset and heading, with gains for each speed from the vehicle's own model."""
+"""A linear quadratic regulator of offset and heading, with gains for each speed from the vehicle's dynamics."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import clip
 
 SPEED_STEP, N_SPEEDS = 0.25, 24
-"""Interval between the speeds in the table of gains, m/s, and their number: the table extends to 6 m/s."""
-
+"""Interval between the speeds in the table of gains, m/s, and number of speeds: the table extends to 6 m/s."""
 N_SQUARINGS = 14
 """Number of squarings in the matrix exponential."""
 
@@ -43,8 +42,8 @@ class PathLQR(PathController):
     """Linear quadratic regulator of a vehicle about its path, forwards and backwards.
 
     ``steer = f curvature - K (offset, sideways velocity, heading error, yaw rate)``. At each speed the model is
-    linearised about straight driving and K minimises the weighted squares; f gives the steering angle and the sideways
-    velocity of steady cornering, at which the offset is zero.
+    linearised about straight driving, and K minimises the weighted squares. With the feed-forward f the offset is zero
+    in steady cornering.
     """
 
     Q: ArrayLike = (100.0, 0.1, 10.0, 0.1)
@@ -81,7 +80,7 @@ def lateral_model(model: Callable[..., CarState], car: CarParams, speed: Array) 
 
     Args:
         model: Dynamics of the vehicle.
-        car: Its parameters.
+        car: Parameters of the vehicle.
         speed: Speed about which the dynamics are linearised, m/s. ()
     """
     reference = motor_reference(speed[None], jnp.zeros(1, speed.dtype), car)
@@ -100,18 +99,18 @@ def lateral_model(model: Callable[..., CarState], car: CarParams, speed: Array) 
 def lateral_gains(
     model: Callable[..., CarState], car: CarParams, speed: Array, period: Array | float, Q: Array, R: Array
 ) -> Array:
-    """Return the gain of the regulator at a speed and the feed-forward of curvature. (5,)"""
+    """Return the four gains of the regulator at a speed, followed by the feed-forward of curvature. (5,)"""
     A, B = lateral_model(model, car, speed)
-    block = jnp.zeros((5, 5), A.dtype).at[:4, :4].set(A).at[:4, 4:].set(B)
-    discrete = matrix_exponential(block * period)  # the input is held for a period
+    augmented = jnp.zeros((5, 5), A.dtype).at[:4, :4].set(A).at[:4, 4:].set(B)
+    discrete = matrix_exponential(augmented * period)  # the input is constant over a period
     K = gain_discrete(discrete[:4, :4], discrete[:4, 4:], Q, R)[0]
     # Steady cornering of curvature 1: the yaw rate is the speed, and sideways velocity and steering angle balance it.
     # Without slip both rates are multiples of the tangent of the steering angle, and the matrix is still regular.
     rows = jnp.array([1, 3])
     balance = jnp.stack([A[rows, 1], B[rows, 0]], axis=1)
     side_vel, steer = jnp.linalg.solve(balance, -A[rows, 3] * speed)
-    row = jnp.stack([jnp.zeros_like(speed), side_vel, -side_vel / speed, speed])
-    return jnp.concatenate([K, (steer + K @ row)[None]])
+    steady_state = jnp.stack([jnp.zeros_like(speed), side_vel, -side_vel / speed, speed])
+    return jnp.concatenate([K, (steer + K @ steady_state)[None]])
 
 
 def _gain_rows(
@@ -125,7 +124,8 @@ GAIN_FUNCTIONS = {
     "kinematic": functools.partial(_gain_rows, kinematic),
     "single_track": functools.partial(_gain_rows, single_track),
 }
-"""``lateral_gains`` at several speeds, by the vehicle's dynamics: one function for all vehicles, compiled once."""
+"""``lateral_gains`` at several speeds, by the name of the dynamics. Vehicles share these functions, which JAX compiles
+once."""
 
 
 def matrix_exponential(matrix: Array) -> Array:

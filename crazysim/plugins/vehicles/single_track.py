@@ -14,9 +14,9 @@ from crazysim.rotation import clip
 def drive_force(reference: Array, speed: Array, params: CarParams) -> Array:
     """Return the force with which the wheels push the vehicle forwards on ground with enough grip, N. (..., 1)
 
-    The motor's force ``gain d - damping v - friction sgn(v)``, limited, minus the resistance of the wheels. Part of
-    it accelerates wheels, motors and a trailer; the rest acts on the vehicle. The sign of the speed changes smoothly
-    within ``slip_speed``.
+    The total is the motor's force ``gain d - damping v - friction sgn(v)``, limited, minus the resistance of the
+    wheels. A part of the total accelerates wheels, motors and a trailer, and the rest acts on the vehicle. The sign of
+    the speed changes smoothly within ``slip_speed``.
 
     Args:
         reference: Motor reference d, 1. (..., 1)
@@ -35,9 +35,9 @@ def tyre_force(drive: Array, vel: Array, stiffness: Array, grip: Array, slip_spe
     """Return the force of the tyres of an axle along and across its wheels, N. (..., 1) each
 
     The force across is the cornering stiffness times the lateral slip ``-v_across / |v_along|``, the tangent of the
-    slip angle; ``|v|`` is ``sqrt(v^2 + slip_speed^2)``, so that the tyre of a slow wheel is a damper that makes it roll
-    without slip. Both forces together are ``f / sqrt(1 + |f|^2 / grip^2)`` of the forces f without a limit: equal to f
-    where they are small, and never larger than the grip (a friction circle).
+    slip angle. Here ``|v_along|`` is ``sqrt(v_along^2 + slip_speed^2)``, so that the tyre of a slow wheel damps lateral
+    motion. With the vector f of both forces without a limit, the result is ``f / sqrt(1 + |f|^2 / grip^2)``: close to f
+    where f is small, and never larger than the grip (a friction circle).
 
     Args:
         drive: Force of the drive along the wheel without a limit, N. (..., 1)
@@ -47,10 +47,10 @@ def tyre_force(drive: Array, vel: Array, stiffness: Array, grip: Array, slip_spe
         slip_speed: Speed below which slip forces decrease, m/s. (..., 1)
     """
     longitudinal_vel, lateral_vel = vel[..., :1], vel[..., 1:]
-    lateral = -stiffness * lateral_vel * lax.rsqrt(longitudinal_vel * longitudinal_vel + slip_speed * slip_speed)
-    grip_ratio_square = (drive * drive + lateral * lateral) / (grip * grip)
-    scale = lax.rsqrt(1 + grip_ratio_square)
-    return drive * scale, lateral * scale
+    slip_force = -stiffness * lateral_vel * lax.rsqrt(longitudinal_vel * longitudinal_vel + slip_speed * slip_speed)
+    squared_grip_ratio = (drive * drive + slip_force * slip_force) / (grip * grip)
+    scale = lax.rsqrt(1 + squared_grip_ratio)
+    return drive * scale, slip_force * scale
 
 
 def steer_rate(state: CarState, command: Array, params: CarParams) -> Array:
@@ -61,7 +61,7 @@ def steer_rate(state: CarState, command: Array, params: CarParams) -> Array:
 
 
 def single_track(state: CarState, command: Array, params: CarParams, wrench: Array | None = None) -> CarState:
-    """Return the time derivative of the state of a vehicle whose axles have one tyre each.
+    """Return the time derivative of the state of a vehicle with one tyre per axle.
 
     Newton's equations in the body frame, with the forces of ``tyre_force`` on both axles:
 
@@ -69,14 +69,14 @@ def single_track(state: CarState, command: Array, params: CarParams, wrench: Arr
         I w' = l_f (F_f sin(d) + S_f cos(d)) - l_r S_r
 
     with forces along F and across S of front and rear wheels and the steering angle d. Rajamani, "Vehicle Dynamics and
-    Control", 2012, section 2.3; the forces of the drive act on both axles as in the simulator of the lab's cars.
+    Control", 2012, section 2.3; the forces of the drive act on both axles as in the simulator of AIMotionLab's cars.
 
     Args:
         state: State.
         command: Motor reference, 1, and steering angle, rad. (..., 2)
         params: Parameters.
         wrench: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None
-            for no external force. (..., 3)
+            for no external wrench. (..., 3)
     """
     p, vx, vy, w = params, state.body_vel[..., :1], state.body_vel[..., 1:], state.yaw_rate
     drive = drive_force(command[..., :1], vx, p)
@@ -96,7 +96,7 @@ def single_track(state: CarState, command: Array, params: CarParams, wrench: Arr
 
 
 def state_rates(state: CarState, acc: Array, yaw_acc: Array, steer_vel: Array, params: CarParams) -> CarState:
-    """Return the derivative of a state from rates of velocities, (..., 2), yaw rate and steering angle. (..., 1)"""
+    """Return the derivative of a state from the rates of body velocity, yaw rate and steering angle."""
     vel = to_world_frame(state.yaw, state.body_vel)
     return CarState(
         pos=jnp.concatenate([vel, jnp.zeros_like(yaw_acc)], axis=-1),

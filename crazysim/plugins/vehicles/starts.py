@@ -12,7 +12,7 @@ from crazysim.plugins.vehicles.path import Path
 from crazysim.pytree import float_dtype
 
 START_SPACING = 1.0
-"""Distance between neighbours that start in a row, m."""
+"""Distance between neighbours of the default row of cars, m."""
 
 
 def row_positions(n: int) -> NDArray:
@@ -42,26 +42,26 @@ def member_array(
     return array
 
 
-def member_numbers(name: str, value: ArrayLike, counts: tuple[int, int], n: int | None = None) -> NDArray:
+def member_numbers(name: str, value: ArrayLike, counts: tuple[int, int], n_paths: int | None = None) -> NDArray:
     """Return one number for all cars, (1,), or one per car, (n_worlds, n_members, 1).
 
     Args:
         name: Name of the setting, for errors.
         value: Number or numbers.
         counts: Numbers of worlds and of cars.
-        n: Number of paths, for indices of paths; None for real numbers.
+        n_paths: Number of paths, for indices of paths; None for real numbers.
     """
     array = np.asarray(value)
-    is_index = n is None or (array.dtype.kind in "iu" and np.all((array >= 0) & (array < n)))
-    if array.shape not in ((), counts[1:], counts) or array.dtype.kind not in "iuf" or not is_index:
-        kind = "a number" if n is None else f"a whole number from 0 to {n - 1}"
+    is_valid = n_paths is None or (array.dtype.kind in "iu" and np.all((array >= 0) & (array < n_paths)))
+    if array.shape not in ((), counts[1:], counts) or array.dtype.kind not in "iuf" or not is_valid:
+        kind = "a number" if n_paths is None else f"a whole number from 0 to {n_paths - 1}"
         raise ConfigError(
             f"expected {name} as {kind} for all cars, or for each, {counts[1:]} or {counts} = (n_worlds, n_members), "
             f"got {value!r}. Use one number, or an array of one of these shapes."
         )
     if not np.all(np.isfinite(array)):
         raise ConfigError(f"expected {name} to be finite, got {value!r}. Use a time in seconds, such as 0.0.")
-    array = array.astype(float_dtype() if n is None else np.int32)
+    array = array.astype(float_dtype() if n_paths is None else np.int32)
     return array[None] if array.ndim == 0 else np.array(np.broadcast_to(array, counts))[..., None]
 
 
@@ -110,7 +110,7 @@ def project_arcs(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
 
 
 def spread_start_times(paths: Path, index: NDArray, n: int) -> NDArray:
-    """Return start times of n cars, s: spaced equally over the duration of a closed path, zero on others. (n,)"""
+    """Return start times of n cars, s: equally spaced over the duration of a closed path, zero on open paths. (n,)"""
     indices = np.broadcast_to(index.reshape(-1)[:n], (n,))
     times = np.zeros(n)
     for path in np.unique(indices):

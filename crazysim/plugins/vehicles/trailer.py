@@ -11,7 +11,7 @@ from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
 
 
 def trailer_rates(state: CarState, params: CarParams) -> Array:
-    """Return the rates of the headings of drawbar and deck, whose axles roll without slip, rad/s. (..., 2)
+    """Return the rates of the headings of drawbar and deck, with axles that roll without slip, rad/s. (..., 2)
 
     The hitch moves with the vehicle. The component of its velocity across the drawbar turns the drawbar, and the
     component along it moves the front axle. The front axle's velocity across the deck turns the deck.
@@ -24,9 +24,9 @@ def trailer_rates(state: CarState, params: CarParams) -> Array:
     vx, vy = state.body_vel[..., :1], state.body_vel[..., 1:] - hitch * state.yaw_rate
     bar_angle = state.yaw - state.joints[..., :1]
     cos, sin = jnp.cos(bar_angle), jnp.sin(bar_angle)
-    longitudinal, lateral = cos * vx - sin * vy, sin * vx + cos * vy
+    longitudinal_vel, lateral_vel = cos * vx - sin * vy, sin * vx + cos * vy
     deck_angle = state.joints[..., :1] - state.joints[..., 1:]
-    return jnp.concatenate([lateral / drawbar, longitudinal * jnp.sin(deck_angle) / axles], axis=-1)
+    return jnp.concatenate([lateral_vel / drawbar, longitudinal_vel * jnp.sin(deck_angle) / axles], axis=-1)
 
 
 def trailer_axles(state: CarState, params: CarParams) -> tuple[Array, Array]:
