@@ -80,7 +80,7 @@ STIFFNESS_RATIO = 0.12
 OBSERVER_RATE_RATIO = 0.6
 """Rate of the estimate of unknown torques over the largest rate about an axis, 1."""
 MAX_COMPENSATED_ERROR = 0.5
-"""Rotation error whose commanded torque is the largest unknown torque that is compensated, rad."""
+"""Rotation error with a feedback torque as large as the largest unknown torque that is compensated, rad."""
 YAW_RATE_MAX = 35.0
 """Largest desired rate about body z that holds a heading, rad/s. It is the range of a Crazyflie's gyroscope (BMI088,
 data sheet)."""
@@ -226,7 +226,7 @@ class Auto(Controller):
     levels: ClassVar[tuple[Control, ...]] = (Control.state, Control.attitude, Control.body_rate)
     output: ClassVar[Control] = Control.rotor_vel
     freq: int = 500
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
     outer_freq: int | None = 100
     """Rate at which setpoints take effect, Hz; ``state_freq`` of a simulation replaces it. None without setpoints."""
     yaw_rate: bool = False

@@ -45,7 +45,7 @@ class CrazyflowState(Controller):
     output: ClassVar[Control] = Control.attitude
     follows_feedforward: ClassVar[bool] = False
     freq: int = 100
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
     inner: Controller | None = None
     """Controller that follows the attitude commands; None with fitted dynamics, which take attitude commands."""
 
@@ -78,7 +78,7 @@ class Crazyflow(Controller):
     output: ClassVar[Control] = Control.force_torque
     follows_rates: ClassVar[bool] = True
     freq: int = 500
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
 
     def adapt(self, control: Control, fitted_model: str | None) -> Controller | None:
         if control == Control.state:

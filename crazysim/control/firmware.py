@@ -69,7 +69,7 @@ class CFirmware(Controller):
     Crazyflie's PWM over 65,535; ``"thrust"``, N; or ``"rpm"``. Thrusts are limited to the range of the rotor; a command
     of 0 switches the rotor off."""
     freq: int = 500
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
 
     def __post_init__(self) -> None:
         """Load the library.
@@ -169,9 +169,9 @@ def copy_library(library: str | Path) -> str:
             copy_path.unlink()
             raise ConfigError(f"expected a shared library at {path}, got one that cannot be loaded: {reason}. {remedy}")
     library_copy = _open_library(str(copy_path))
-    missing = [name for name in LIBRARY_FUNCTIONS if not hasattr(library_copy, name)]
-    if missing:
-        required_names, missing_names = ", ".join(LIBRARY_FUNCTIONS), ", ".join(missing)
+    missing_functions = [name for name in LIBRARY_FUNCTIONS if not hasattr(library_copy, name)]
+    if missing_functions:
+        required_names, missing_names = ", ".join(LIBRARY_FUNCTIONS), ", ".join(missing_functions)
         raise ConfigError(f"expected the functions {required_names} in {path}, got no {missing_names}. {remedy}")
     if (version := library_copy.crazysim_version()) != INTERFACE_VERSION:
         raise ConfigError(f"expected version {INTERFACE_VERSION} of firmware.h in {path}, got {version}. {remedy}")

@@ -1,4 +1,4 @@
-"""The default controller for fitted dynamics: only a position loop, because their models include the attitude loop."""
+"""The default controller for fitted dynamics: only a position loop, because fitted models include the attitude loop."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class FittedAuto(Controller):
     dynamics: Dynamics
     """Fitted model."""
     freq: int = 100
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
 
     def params(self, airframe: Airframe) -> FittedParams:
         return FittedParams.create(airframe, self.dynamics, self.freq)

@@ -193,7 +193,7 @@ class Geometric(Controller):
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
     output: ClassVar[Control] = Control.force_torque
     freq: int = 500
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
     gains: Gains = "bandwidth"
     """Rule for the gains, as for ``GeometricParams.create``."""
     feedforward: bool = True

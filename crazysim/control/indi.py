@@ -208,7 +208,7 @@ class INDI(Controller):
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
     output: ClassVar[Control] = Control.rotor_vel
     freq: int = 500
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
     cutoff: float = 12.0
     """Cutoff frequency of the filter, Hz."""
 

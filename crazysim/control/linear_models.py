@@ -69,7 +69,7 @@ def load_derivative(
         gravity_vec: Gravitational acceleration, m/s^2. (3,)
         load_mass: Mass of the load, kg. (1,)
         length: Length of the rod, m. (1,)
-        attach: Joint, from the centre of mass, body frame, m; None for the centre of mass. (3,)
+        attach: Position of the joint relative to the centre of mass, body frame, m; None for zero. (3,)
 
     Returns:
         Derivative, per second. (16,)

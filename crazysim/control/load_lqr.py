@@ -44,7 +44,7 @@ class LoadLQRParams(RigidBodyParams):
     """Gain K from the errors of position, velocity, rotation, body rates, rod angles and their rates to the wrench.
     (4, 16)"""
     attach: Array | None = leaf("parameter", 1, (3,))
-    """Joint of the rod, from the centre of mass, body frame, m; None for the centre of mass. (3,)"""
+    """Position of the rod's joint relative to the centre of mass, body frame, m; None for zero. (3,)"""
 
     @staticmethod
     def create(
@@ -66,7 +66,7 @@ class LoadLQRParams(RigidBodyParams):
             Q: Weights of position, velocity, roll, pitch, yaw, body rates, rod angles and their rates, (16,) or
                 (16, 16); None for ``lqr_weights``.
             R: Weights of collective thrust and torque (4,) or (4, 4); None for ``lqr_weights``.
-            attach: Joint of the rod, from the centre of mass, body frame, m. (3,)
+            attach: Position of the rod's joint relative to the centre of mass, body frame, m. (3,)
 
         Raises:
             ConfigError: If no gain stabilises the drone.
@@ -116,7 +116,7 @@ def load_gain(
         dt: Period of the controller, s. ()
         Q: Weights of the states. (16, 16)
         R: Weights of collective thrust and torque. (4, 4)
-        attach: Joint of the rod, from the centre of mass, body frame, m; None for the centre of mass. (3,)
+        attach: Position of the rod's joint relative to the centre of mass, body frame, m; None for zero. (3,)
 
     Returns:
         Gain K of ``u = -K x``. (4, 16)
@@ -225,8 +225,8 @@ def load_lqr_control(
 ) -> Array:
     """Return the wrench of the LQR with load, with the wrench of the setpoint's motion as feedforward.
 
-    ``u = u_ref - K e`` with the errors of the drone as in ``lqr_control``, and the errors of the two angles of the rod
-    and of their rates (``rod_angles``), all in the frame of the desired heading.
+    The law is ``u = u_ref - K e``. The errors e are the errors of ``lqr_control``, and the errors of the two angles of
+    the rod and of their rates (``rod_angles``). The angles are in the frame of the desired heading.
 
     Args:
         pos: Position of the drone, world frame, m. (..., 3)
@@ -272,13 +272,13 @@ class LoadLQR(Controller):
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
     output: ClassVar[Control] = Control.force_torque
     freq: int = 500
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
     load_mass: float = 0.05
     """Mass of the load, kg."""
     length: float = 0.4
     """Length of the rod, m."""
     attach: ArrayLike = (0.0, 0.0, 0.0)
-    """Joint of the rod, from the centre of mass, body frame, m: the ``attach`` of the load's plugin. (3,)"""
+    """Position of the rod's joint relative to the centre of mass, body frame, m; ``attach`` of the load. (3,)"""
     target: SetpointBody = "load"
     """Body that setpoints describe."""
     load: str = "load"

@@ -252,7 +252,7 @@ class LQR(Controller):
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
     output: ClassVar[Control] = Control.force_torque
     freq: int = 500
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
     Q: ArrayLike | None = None
     """Weights of the states, as for ``LQRParams.create``."""
     R: ArrayLike | None = None

@@ -155,7 +155,7 @@ class Mellinger(Controller):
     Crazyflow's cascade is derived from this controller, but differs: this controller lowers all motors if one motor
     would exceed its maximum, has no minimum PWM, resets its integrals at zero thrust, and runs position and attitude
     part at the same rate. It does not follow body rates; use ``controller="pid"`` for them. At the level ``state`` the
-    desired body rates are those of the command, ``cmd[13:16]``, because a ``Setpoint`` has no body rates. Source:
+    desired body rates are read from the command, ``cmd[13:16]``, because a ``Setpoint`` has no body rates. Source:
     controller_mellinger.c of bitcraze/crazyflie-firmware, commit 2a18fc29.
     """
 

@@ -92,8 +92,9 @@ class PID(Controller):
     def take_over(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rotor_vel: Array
     ) -> PIDMemory:
-        # The rotor speeds continue without a jump: at the level ``state``, the integrals of the velocity loop are set
-        # to the current thrust, roll and pitch, and at every level those of the rate loop to the current torque.
+        # The rotor speeds continue without a jump. At the level ``state``, the integrals of the velocity loop are set
+        # so that thrust, roll and pitch continue. At every level, the integrals of the rate loop are set so that the
+        # torque continues.
         s, p, initial_memory = data.states, params, jax.tree.map(jnp.zeros_like, memory)
         rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(s.quat), DEGREES_PER_RADIAN * s.ang_vel
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)

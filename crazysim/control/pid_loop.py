@@ -108,8 +108,8 @@ def pid_step(
 ) -> tuple[Array, PIDLoopMemory]:
     """Return the outputs of three PID loops, and their memory after a tick.
 
-    The derivative is that of the measured value, so that a step of the setpoint causes no peak of the output. Integral
-    and output are limited. Source: ``pidUpdate`` in pid.c of bitcraze/crazyflie-firmware, commit 2a18fc29. Its
+    The measured value is differentiated, not the error, so that a step of the setpoint causes no peak of the output.
+    Integral and output are limited. Source: ``pidUpdate`` in pid.c of bitcraze/crazyflie-firmware, commit 2a18fc29. Its
     feedforward of the setpoint is left out, because the feedforward gains are zero on every platform.
 
     Args:

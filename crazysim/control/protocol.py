@@ -106,9 +106,9 @@ class Controller:
         dataclasses.dataclass(frozen=True, eq=False)(cls)
         if "freq" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
             raise TypeError(f"controller {cls.__name__} has no field 'freq'; add one, such as freq: int = 500")
-        missing = [key for key in ("name", "levels", "output") if not hasattr(cls, key)]
-        if missing:
-            raise TypeError(f"controller {cls.__name__} has no class variables {missing}; add them")
+        missing_names = [key for key in ("name", "levels", "output") if not hasattr(cls, key)]
+        if missing_names:
+            raise TypeError(f"controller {cls.__name__} has no class variables {missing_names}; add them")
         if cls.output not in OUTPUT_LEVELS:
             raise TypeError(f"controller {cls.__name__}: expected output as one of {OUTPUT_LEVELS}, got {cls.output!r}")
 

@@ -13,7 +13,7 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 
 
 class RigidBodyParams(PyTree):
-    """Parameters of a drone that a controller assumes, each shared or one per drone. Subclasses add gains."""
+    """Physical parameters that a controller assumes, each shared or one per drone. Subclasses add gains."""
 
     mass: Array = leaf("parameter", 1, (1,))
     """Mass that the controller assumes, kg. (1,)"""

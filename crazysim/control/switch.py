@@ -140,6 +140,6 @@ def _is_tick(data: DroneData, freq: Any) -> Array | bool:
     return data.core.steps % (data.core.freq // freq) == 0
 
 
-def _select_tree(mask: Any, new: Any, old: Any) -> Any:
-    """Return ``new`` where a mask is True and ``old`` elsewhere. A leaf that is one object in both is unchanged."""
-    return jax.tree.map(lambda x, y: y if x is y else jnp.where(mask, x, y), new, old)
+def _select_tree(mask: Any, new_tree: Any, old_tree: Any) -> Any:
+    """Return ``new_tree`` where a mask is True and ``old_tree`` elsewhere. A leaf that is one object in both stays."""
+    return jax.tree.map(lambda x, y: y if x is y else jnp.where(mask, x, y), new_tree, old_tree)

@@ -139,7 +139,7 @@ def tracking_gains(
 def interpolate_gain(time: Array, gains: Array, dt: Array) -> Array:
     """Return the gain at a time, s, interpolated linearly between knots ``dt`` apart. (4, 12)
 
-    Before the first and after the last knot, the gain is that of the knot.
+    Before the first knot and after the last knot, the gain is constant.
     """
     last_index = gains.shape[-3] - 1
     knot = rotation.clip(time / dt, 0.0, float(last_index))
@@ -190,7 +190,7 @@ class TrackingLQR(Controller):
     start: float = 0.0
     """Time of the first setpoint, s since the reset."""
     freq: int = 500
-    """Rate, Hz."""
+    """Rate of the controller, Hz."""
     Q: ArrayLike | None = None
     """Weights of the states, as for ``LQRParams.create``."""
     R: ArrayLike | None = None

@@ -50,7 +50,7 @@ class Env(ABC):
     @property
     @abstractmethod
     def wrappers(self) -> tuple[Hooks, ...]:
-        """All wrappers of the environment, this one included, the innermost first."""
+        """All wrappers of the environment, the innermost first; a wrapper is the last of its own ``wrappers``."""
 
     @property
     def sim(self) -> Sim:
@@ -141,7 +141,7 @@ class Env(ABC):
 
         Args:
             state: The state of all worlds.
-            mask: True where a new episode begins; None for all. (n_worlds,)
+            mask: True where a new episode begins; None for all worlds. (n_worlds,)
         """
         steps = state.full_data.core.steps
         with use_device_of(steps):
@@ -192,7 +192,7 @@ class Env(ABC):
         return self.step_fn.flatten(state.full_data, (), self.n_substeps, frozenset(outputs))
 
     def advance(self, flat: FlatData, action: Array) -> FlatData:
-        """Return flat data one environment step later; ``EnvState(flat.data())`` is its state.
+        """Return flat data one environment step later; ``EnvState(flat.data())`` is the state of flat data.
 
         Args:
             flat: Result of ``flatten`` or ``advance``.
@@ -310,8 +310,8 @@ class DroneEnv(Env):
         self._actions = actions_of(sim.airframes, sim.default_data.params, sim.control) if actions is None else actions
         check_task(task, sim.default_data, self._actions.size)
         self.measure_states: Callable[[SimData], SimData] | None = None
-        """``measure_states(data)``: the data with measured states, of one world, or of all if the task is batched;
-        None if the task observes the true states."""
+        """``measure_states(data)``: the data with measured states, for one world, or for all worlds if the task is
+        batched; None if the task observes the true states."""
         if measured:
             if not any(type(plugin).measured_states is not Plugin.measured_states for plugin in sim.plugins.values()):
                 raise ConfigError(

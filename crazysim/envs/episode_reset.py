@@ -36,8 +36,8 @@ class EpisodeReset:
         self.takes_all_worlds = bool(batched_stages) or self.has_foreign_record
         """True if ``reset_data`` takes all worlds at once."""
         self.batched_reason: str | None = None
-        """Reason why resets are computed for all worlds and then used where an episode begins; None if each world is
-        reset on its own."""
+        """Reason why resets are computed for all worlds and then used where an episode begins; None if only worlds in
+        which an episode begins are reset."""
         rows = zip(*map(jax.tree.leaves, (scopes(default), default, leaf_indices(default))), strict=True)
         world_id = leaf_indices(default).core.world_id
         if batched_stages:
@@ -58,7 +58,10 @@ class EpisodeReset:
         return copy_seed_and_ids(self.broadcast_default(n_worlds, n_drones), data)
 
     def make_world_default(self, data: SimData) -> SimData:
-        """Return the default data of one world, with the seed and the ids of ``data``; equal in all worlds."""
+        """Return the default data of one world, with the seed and the ids of ``data``.
+
+        The default data must be equal in all worlds.
+        """
 
         def first_world(scope: str, x: Array) -> Array:
             return x[(0,) * n_world_axes(scope)] if n_batch_axes(scope) == 2 else x

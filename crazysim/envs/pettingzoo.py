@@ -149,12 +149,12 @@ class DroneParallelEnv(ParallelEnv):
 
     def _stack_actions(self, actions: Mapping[str, Any]) -> np.ndarray:
         """Return the validated actions of all agents as one array. (n_drones, k)"""
-        if unknown := set(actions) - set(self.agents):
+        if unknown_agents := set(actions) - set(self.agents):
             raise UnknownNameError(
-                f"expected actions of {', '.join(self.agents)}, got one of {', '.join(sorted(unknown))}"
+                f"expected actions of {', '.join(self.agents)}, got one of {', '.join(sorted(unknown_agents))}"
             )
-        if missing := [agent for agent in self.agents if agent not in actions]:
-            raise ConfigError(f"expected an action of every drone, got none of {', '.join(missing)}")
+        if missing_agents := [agent for agent in self.agents if agent not in actions]:
+            raise ConfigError(f"expected an action of every drone, got none of {', '.join(missing_agents)}")
         shape = self.action_spaces[self.agents[0]].shape
         rows = [np.asarray(actions[agent], np.float32) for agent in self.agents]
         for agent, row in zip(self.agents, rows, strict=True):

@@ -64,7 +64,7 @@ class Phases:
     episode_reset: EpisodeReset
     """Resets of data at the start of an episode."""
     reset_policy: ResetPolicy | None = None
-    """Rule by which new episodes begin within a step; None if none do."""
+    """Rule by which new episodes begin within a step; None if steps begin no episodes."""
     measure_states: Callable[[SimData], SimData] | None = None
     """``measure_states(data)``: the data with measured states that the task observes, for one world, or for all worlds
     if the task is batched; None if the task observes the true states."""
@@ -74,7 +74,7 @@ class Phases:
 
         Args:
             physics: Stages of a physics step.
-            batched_reason: Reason why all phases need all worlds at once; None if each runs in one world.
+            batched_reason: Reason why all phases need all worlds at once; None if phases run in one world.
         """
 
         def make_stage(
@@ -137,7 +137,7 @@ class Phases:
         images = state.record.images
         if duplicates := images.keys() & state.record.obs.keys():
             raise ConfigError(
-                f"expected other names of images than those of observations, got {min(duplicates)!r} as both"
+                f"expected different names for images and other observations, got {min(duplicates)!r} for both"
             )
         nonfinite = state.full_data.core.nonfinite[..., None]
         images = {name: jnp.where(nonfinite, jnp.zeros((), x.dtype), x) for name, x in images.items()}
@@ -282,15 +282,15 @@ def _restore_types(data: SimData, state: EnvState) -> SimData:
     return jax.tree.map(cast, state.full_data, data)
 
 
-def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:
+def select_states(mask: Array | None, new_state: EnvState, old_state: EnvState) -> EnvState:
     """Return the new state in the worlds of a mask and the old state elsewhere. Shared leaves are of the new state.
 
     Args:
         mask: True where the new state is taken; None for all worlds. (n_worlds,)
-        new: The new state of all worlds.
-        old: The old state of all worlds.
+        new_state: The new state of all worlds.
+        old_state: The old state of all worlds.
     """
-    return map_batched(functools.partial(select_worlds, mask), new, old)
+    return map_batched(functools.partial(select_worlds, mask), new_state, old_state)
 
 
 def _step_info(task: Task, data: SimData) -> dict[str, Array]:

@@ -105,7 +105,7 @@ def make(
     depth_image: Sequence[int] | None = None,
     **options: Any,
 ) -> Env:
-    """Return an environment of many worlds of a task, with a simulation of its own.
+    """Return an environment of many worlds of a task, with a new simulation.
 
     Args:
         task: One of ``TASKS``, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
@@ -237,9 +237,9 @@ def _check_class(task: object) -> type[Task]:
         raise ConfigError(f"expected a subclass of Task, got {task!r}. docs/guides/tasks.md has an example.")
     fields = {f.name for f in dataclasses.fields(task)}
     annotations = inspect.get_annotations(task).items()
-    if others := [name for name, kind in annotations if name not in fields and "ClassVar" not in str(kind)]:
+    if non_fields := [name for name, kind in annotations if name not in fields and "ClassVar" not in str(kind)]:
         raise ConfigError(
-            f"expected {', '.join(others)} as a setting of a dataclass, got the class {task.__name__} without the "
+            f"expected {', '.join(non_fields)} as a setting of a dataclass, got the class {task.__name__} without the "
             f"decorator. Write @dataclass(frozen=True, kw_only=True) above it."
         )
     return task

@@ -29,9 +29,9 @@ except ImportError as error:
 
 
 class DroneVecEnv(VecEnv):
-    """Vector environment of Stable-Baselines3 over a functional environment; each world is one of its environments.
+    """Vector environment of Stable-Baselines3 over a functional environment; each world is one sub-environment.
 
-    A new episode starts within the step that ends an episode. The info of a world has entries in this step only:
+    A new episode starts within the step that ends an episode. The info of a world has entries in such a step only:
 
     - ``terminal_observation`` and ``TimeLimit.truncated``, as ``DummyVecEnv`` adds them;
     - ``episode`` with ``r``, ``l`` and ``t``, as ``Monitor`` adds it;
@@ -81,7 +81,8 @@ class DroneVecEnv(VecEnv):
     def reset(self) -> Any:
         """Start new episodes in all worlds and return their observations.
 
-        The first reset after ``seed`` uses its seed. Later resets draw their seeds from a generator of that seed.
+        The first reset after ``seed(seed)`` uses that seed. Later resets use random seeds from a generator that was
+        initialised with it.
         """
         seed = as_seed(self._seeds[0])
         key_seed = seed if seed is not None else int(self._generator.integers(2**31))

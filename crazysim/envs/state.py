@@ -178,7 +178,7 @@ class EnvState(PyTree):
         return x if axis < 0 else _reshape(x, (*x.shape[:axis], *x.shape[axis + 1 :]))
 
     def _add_axis(self, x: Any) -> Any:
-        """Return a per-world array with an axis of length 1 after that of worlds; unchanged in a state of one world."""
+        """Return a per-world array with an axis of length 1 after the worlds; unchanged in a state of one world."""
         axis = self.full_data.core.steps.ndim - 1
         return x if axis < 0 else _reshape(x, (*jnp.shape(x)[:axis], 1, *jnp.shape(x)[axis:]))
 

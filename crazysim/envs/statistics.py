@@ -40,13 +40,13 @@ class RunningStats(PyTree):
         """Return the statistics updated with a batch of observations. (..., k)"""
         axes = tuple(range(x.ndim - 1))  # not flattened, so that worlds on several devices stay on their devices
         n, mean, var = x.size // x.shape[-1], x.mean(axis=axes), x.var(axis=axes)
-        total = self.count + n
+        total_count = self.count + n
         delta = mean - self.mean
-        sum_of_squares = self.var * self.count + var * n + delta * delta * self.count * n / total
-        mean, var = self.mean + delta * n / total, sum_of_squares / total
+        sum_of_squares = self.var * self.count + var * n + delta * delta * self.count * n / total_count
+        mean, var = self.mean + delta * n / total_count, sum_of_squares / total_count
         if self.unscaled:
             mean, var = (jnp.where(self.is_scaled(), x, y) for x, y in ((mean, self.mean), (var, self.var)))
-        return self.replace(mean=mean, var=var, count=total)
+        return self.replace(mean=mean, var=var, count=total_count)
 
     def normalize(self, x: Array) -> Array:
         """Return observations normalised and clipped to [-10, 10], except for ``unscaled`` indices. (..., k)"""

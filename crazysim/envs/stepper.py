@@ -1,4 +1,4 @@
-"""Environment steps in separate calls that pass few arrays: passing an array takes longer than computing it."""
+"""Environment steps in separate calls that pass few arrays, because passing an array takes longer than computing it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class EnvStepper:
     def state(self) -> EnvState | None:
         """The state; None before the first assignment.
 
-        Results of steps, except for ``terminated`` and ``truncated``, may be those of the assigned state.
+        Results of steps, except for ``terminated`` and ``truncated``, may still have the values of the assigned state.
         """
         return None if self._flat is None else self._unflatten(self._flat, *self._ends)
 

@@ -25,7 +25,7 @@ TASK_RECORD_NAME = "task"
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A task: a frozen record of settings whose methods are pure functions of one world.
+    """A task: settings in a frozen dataclass, and methods that are pure functions of one world.
 
     Subclasses are frozen dataclasses. They define ``name``, ``spawn``, ``observe``, ``rewards``, ``terminated`` and
     ``error``, and whatever else they need. In the data that they receive, arrays per drone are (n_drones, ...), and

@@ -150,7 +150,7 @@ def test_law_09_wrong_images_are_refused():
             call()
     for wrap, message in [
         (lambda env: CameraImages(env, Camera(), {"depth": "pos"}),
-         "expected other names of images than those of obs.*, got 'pos'"),
+         "expected different names for images and other obs.*, got 'pos'"),
         (lambda env: Observe(CameraImages(env, Camera(), DEPTH), lambda obs, _: {k: 2 * x for k, x in obs.items()}),
          "expected images unchanged in functions of one world, got a new 'depth'"),
     ]:  # fmt: skip

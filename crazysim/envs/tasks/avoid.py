@@ -77,7 +77,7 @@ class Field(NamedTuple):
     arena_half_size: np.ndarray
     """Half the size of the arena, m. (2,)"""
     goals: np.ndarray
-    """Mean positions of the goals, m; those of the starts have the opposite x. (n_drones, 3)"""
+    """Mean positions of the goals, m; mean positions of the starts have the opposite x. (n_drones, 3)"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +147,7 @@ class Avoid(Task):
             return with_record(data, record.replace(disabled=disabled, reached=reached))
 
         record = Crossing(zero, false, false, false, zero[..., 0], tuple(handles))
-        install_rules(sim, record, update_record, collisions=True)
+        install_rules(sim, record, update_record, checks_collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight before the field, and obstacles in different cells."""
@@ -222,8 +222,8 @@ class Avoid(Task):
             "obstacles_middle": to_middle.reshape(n_drones, -1),
         }
         if n_drones > 1:
-            others, _ = nearest_drones(data, 2, ~crossing_of(data).flight_over)
-            obs["drones_near"] = others.reshape(n_drones, -1)
+            relative_pos, _ = nearest_drones(data, 2, ~crossing_of(data).flight_over)
+            obs["drones_near"] = relative_pos.reshape(n_drones, -1)
         return obs
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:

@@ -147,11 +147,12 @@ class Deliver(BringLoad):
         return rotation.safe_norm(load.pos - load.tip_pos)[..., 0] + self.error(data)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, and relative positions and velocities of hook, load and goal.
+        """Return the drone's state, the relative motion of hook and load, and the vector to the goal.
 
         ``hook_pos``, m, and ``hook_vel``, m/s, are relative to the drone. ``difference_to_load``, m, and
-        ``difference_to_load_vel``, m/s, are those of the ring relative to the hook. ``difference_to_goal``, m, is the
-        vector from the ring to its goal. ``taken`` is 1 after the hook has taken the load, and 0 before.
+        ``difference_to_load_vel``, m/s, are position and velocity of the ring relative to the hook.
+        ``difference_to_goal``, m, is the vector from the ring to its goal. ``taken`` is 1 after the hook has taken the
+        load, and 0 before.
         """
         s, load, record = data.states, data.plugins["load"], delivery_of(data)
         return state_of(data) | {

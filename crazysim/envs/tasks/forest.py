@@ -141,7 +141,7 @@ class Forest(Task):
             reached = record.reached | (~disabled & (pos[0] >= self.length))
             return with_record(data, record.replace(disabled=disabled, reached=reached))
 
-        install_rules(sim, Passage(zero, false, false, false), update_record, collisions=True)
+        install_rules(sim, Passage(zero, false, false, false), update_record, checks_collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight in front of a new forest."""

@@ -175,17 +175,17 @@ def nearest_entries(distance: Array, x: Array, n: int) -> Array:
     return jnp.stack(entries, axis=-2)
 
 
-def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = False) -> None:
+def install_rules(sim: Sim, record: PyTree, rules: Stage, checks_collisions: bool = False) -> None:
     """Add a task's record, and a stage that updates it at the end of every physics step.
 
     Args:
         sim: The simulation.
         record: Record of all worlds, for ``data.plugins["task"]``.
         rules: The stage.
-        collisions: True to disable drones that touch each other, in a stage before ``rules``.
+        checks_collisions: True to disable drones that touch each other, in a stage before ``rules``.
     """
     placements = [StagePlacement(rules, before="increment_steps")]
-    if collisions and sim.n_drones > 1:
+    if checks_collisions and sim.n_drones > 1:
         placements.insert(
             0, StagePlacement(collision_stage(sim), before="increment_steps", name=f"{TASK_RECORD_NAME}_collisions")
         )

@@ -17,9 +17,9 @@ from crazysim.envs.tasks.target_camera import TargetCamera
 class LandOnMarker(Land):
     """Land on a marker on the ground, 2 cm thick, that the drone observes with a camera.
 
-    Rules and settings are those of ``land``, with a marker instead of the pad. Policies observe neither the marker's
-    position nor the horizontal position of the drone. ``make`` adds a camera that looks down: ``segmentation`` is 1
-    where a pixel shows the marker.
+    Rules and settings are the same as in ``land``, with a marker instead of the pad. Policies observe neither the
+    position of the marker nor the horizontal position of the drone. ``make`` adds a camera that looks down:
+    ``segmentation`` is 1 where a pixel shows the marker.
     """
 
     name = "land_on_marker"

@@ -130,7 +130,7 @@ class Race(Task):
             passed = record.passed + (rules.passes_gate(data) & ~disabled)
             return with_record(data, record.replace(passed=passed, disabled=disabled, last_pos=pos))
 
-        install_rules(sim, record, update_record, collisions=True)
+        install_rules(sim, record, update_record, checks_collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight, and gates and obstacles with the displacements and inertias of the level."""

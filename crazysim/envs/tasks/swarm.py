@@ -86,8 +86,8 @@ class Swarm(Task):
             """Keep the smallest separation from another drone."""
             record, scaled_pos = swarm_of(data), data.states.pos / np.array(SEPARATION, data.states.pos.dtype)
 
-            def square_separation(other: Array, is_self: Array) -> Array:
-                return jnp.where(is_self, jnp.inf, jnp.sum((scaled_pos - other) ** 2))
+            def square_separation(other_pos: Array, is_self: Array) -> Array:
+                return jnp.where(is_self, jnp.inf, jnp.sum((scaled_pos - other_pos) ** 2))
 
             nearest = rotation.safe_sqrt(reduce_over_others(square_separation, scaled_pos, "min"))
             return with_record(data, record.replace(closest=jnp.minimum(record.closest, nearest)))

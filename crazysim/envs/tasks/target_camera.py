@@ -34,10 +34,10 @@ class TargetCamera(Camera):
     def image_fn(self, sim: Simulation) -> ImageFn:
         take_segmented_images, names = super().image_fn(sim), self.segment_names(sim)
         targets = [f"{self.target}:{k}" for k in range(sim.n_drones)]
-        if missing := [name for name in targets if name not in names]:
+        if missing_targets := [name for name in targets if name not in names]:
             raise ConfigError(
                 f"expected target of {self.name!r} as the name of objects, one per drone, got {self.target!r} without "
-                f"an object {missing[0]!r}. Use sim.scene.add(..., name={self.target!r}, count=sim.n_drones)."
+                f"an object {missing_targets[0]!r}. Use sim.scene.add(..., name={self.target!r}, count=sim.n_drones)."
             )
         target_indices = np.array([names.index(name) for name in targets], np.int32)[:, None, None]
 

@@ -170,7 +170,7 @@ class Transport(BringLoad):
         return is_behind(load_pos(data), *gate_of(data)) & super().at_goal(data)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, and relative positions and velocities of load, gate and goal.
+        """Return the drone's state, the relative motion of its load, and vectors to gate and goal.
 
         ``load_pos``, m, and ``load_vel``, m/s, are relative to the drone. ``difference_to_gate``, m, is the vector from
         the drone to the middle of the gate. ``gate_axis`` is the unit vector of the direction through the gate.

@@ -94,8 +94,8 @@ class ObservationNoise(Wrapper):
         return state.replace(obs=self._add_noise(state.record.obs, state.data))
 
     def _add_noise(self, obs: Obs, data: SimData) -> Obs:
-        if missing := set(self.std) - set(obs):
-            raise ConfigError(f"expected names of observations, {', '.join(obs)}, got {', '.join(sorted(missing))}")
+        if unknown_obs := set(self.std) - set(obs):
+            raise ConfigError(f"expected names of observations, {', '.join(obs)}, got {', '.join(sorted(unknown_obs))}")
         key = world_key(data, f"observation noise {self.name}")
         keys = jax.vmap(lambda drone: jax.random.fold_in(key, drone))(data.core.drone_id)
         noisy = dict(obs)

@@ -30,9 +30,9 @@ class RandomizeWith(Wrapper):
         super().__init__(env)
         sim_params = env.sim.data.params
         fields = {field.name: getattr(sim_params, field.name) for field in dataclasses.fields(sim_params)}
-        if missing := [name for name in params if fields.get(name) is None]:
+        if unknown_params := [name for name in params if fields.get(name) is None]:
             raise ConfigError(
-                f"expected parameters of {env.sim.dynamics.value}, {', '.join(fields)}, got {', '.join(missing)}"
+                f"expected parameters of {env.sim.dynamics.value}, {', '.join(fields)}, got {', '.join(unknown_params)}"
             )
         self.fn, self.params = fn, tuple(params)
 
