@@ -19,7 +19,7 @@ force and torque then stay constant. The keys of a file are `<integrator>[-slow]
 * `float32_error_pos` and so on have shape (10,) and hold the largest absolute difference of a float32 run of
   the same flight from the float64 run. The float32 run begins from the start rounded to float32.
 
-Each precision runs in a process of its own, since the peer needs the switch for 64 bit numbers before its
+Each precision runs in a process of its own, since Crazyflow needs the switch for 64 bit numbers before its
 import. Both processes raise an exception when a flight comes near the floor, tips over or stays at an actuator
 limit, where a wrong model would go unseen. The controllers of the first-principles flights may clip a rotor
 command in the first 0.3 s, while they catch the disturbed start.
@@ -69,7 +69,7 @@ SLOW_FREQS = {
     ("first_principles", "state"): {"state_freq": 50, "attitude_freq": 250, "force_torque_freq": 250},
     ("first_principles", "attitude"): {"attitude_freq": 100, "force_torque_freq": 500},
 }
-# The section of the peer's controller parameters that belongs to each stage of its controller.
+# The section of Crazyflow's controller parameters that belongs to each stage of its controller.
 CONTROLLER_SECTIONS = {
     "state": "state2attitude",
     "attitude": "attitude2force_torque",
@@ -230,13 +230,13 @@ def check_dtypes(sim, dtype: np.dtype, where: str) -> None:
 
 
 def check_params(sim, params: dict, gains: dict, dtype: np.dtype, where: str) -> None:
-    """Raise unless the parameters inside a sim are those of the peer's files to the last bit of the type.
+    """Raise unless the parameters inside a sim are those of Crazyflow's files to the last bit of the type.
 
     A parameter that was float32 for a moment is float64 again afterwards, but has lost its last digits.
     """
     pairs = []
     for name in params.keys() & vars(sim.data.params).keys():
-        if name != "J_inv":  # The peer inverts J in its own float type.
+        if name != "J_inv":  # Crazyflow inverts J in its own float type.
             pairs.append((name, getattr(sim.data.params, name), params[name]))
     for stage, section in CONTROLLER_SECTIONS.items():
         if (data := getattr(sim.data.controls, stage)) is not None:
@@ -279,7 +279,7 @@ def check_sample(
 def fly(
     dynamics: str, control: str, airframe: str, integrator: str, freqs: dict[str, int], dtype: np.dtype
 ) -> dict[str, np.ndarray]:
-    """Fly one flight with the peer and return its start, its command and its samples."""
+    """Fly one flight with Crazyflow and return its start, its command and its samples."""
     import jax.numpy as jnp
     from crazyflow.control import load_params as load_gains
     from crazyflow.dynamics import load_params
@@ -319,7 +319,7 @@ def fly(
         for name in FIELDS:
             samples[name].append(state[name].astype(np.float64))
     if not np.all(np.asarray(sim.data.core.steps) == steps[-1]):
-        raise RuntimeError(f"{where}: the peer counted {sim.data.core.steps} steps")
+        raise RuntimeError(f"{where}: Crazyflow counted {sim.data.core.steps} steps")
     sim.close()
     flight["steps"] = steps
     return flight | {name: np.stack(values) for name, values in samples.items()}

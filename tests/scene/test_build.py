@@ -17,7 +17,7 @@ from crazysim.sim import Sim
 
 @pytest.fixture(scope="module")
 def sim():
-    """One world of two drones, whose spec these tests do not touch."""
+    """Return one world of two drones; tests do not change its spec."""
     return Sim(n_drones=2)
 
 
@@ -48,7 +48,7 @@ SCENE = """
 
 @pytest.fixture
 def scene_file(tmp_path):
-    """A scene file with a mesh and a texture, which it names by relative paths."""
+    """Return a scene file that names a mesh and a texture by relative paths."""
     for folder in ("meshes", "textures"):
         (tmp_path / folder).mkdir()
     write_stl(tmp_path / "meshes" / "rock.stl", 0.3)
@@ -115,8 +115,10 @@ def test_the_tracking_camera_looks_at_its_drone():
     assert to_drone @ -back > 0
     assert up[2] > 0
     assert abs(right[2]) < 1e-9
-    forward = model.camera("fpv_cam:0").id
-    np.testing.assert_allclose(-data.cam_xmat[forward].reshape(3, 3)[:, 2], [np.cos(0.8), 0, -np.sin(0.8)], atol=1e-6)
+    fpv_camera = model.camera("fpv_cam:0").id
+    np.testing.assert_allclose(
+        -data.cam_xmat[fpv_camera].reshape(3, 3)[:, 2], [np.cos(0.8), 0, -np.sin(0.8)], atol=1e-6
+    )
 
 
 def test_a_swarm_built_in_chunks_equals_one_built_one_by_one(monkeypatch):
@@ -232,7 +234,7 @@ def broken_scene(tmp_path, text):
 
 
 WORLD = "<mujoco><worldbody>{}</worldbody></mujoco>"
-BROKEN = {
+BROKEN_SCENES = {
     "no XML": ("this is no XML", "expected a scene that MuJoCo can read"),
     "empty": ("", "expected a scene that MuJoCo can read"),
     "cut off": ("<mujoco><worldbody>", "expected a scene that MuJoCo can read"),
@@ -257,9 +259,9 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("case", BROKEN)
+@pytest.mark.parametrize("case", BROKEN_SCENES)
 def test_a_broken_scene_is_refused_at_construction(tmp_path, case):
-    text, message = BROKEN[case]
+    text, message = BROKEN_SCENES[case]
     with pytest.raises(ValueError, match=message):
         Sim(xml_path=broken_scene(tmp_path, text))
 
@@ -311,7 +313,7 @@ def test_a_spec_that_has_lost_a_drone_is_refused():
 
 @pytest.fixture(scope="module")
 def unsupported_by_mjx():
-    """A world that MJX cannot check for contacts: a box and a cylinder that are moved through mjx_data."""
+    """Return a world that MJX cannot check for contacts: a box and a cylinder that are moved through mjx_data."""
     sim = Sim()
     shapes = [(mujoco.mjtGeom.mjGEOM_BOX, [0.1, 0.1, 0.1]), (mujoco.mjtGeom.mjGEOM_CYLINDER, [0.1, 0.1, 0])]
     for i, (kind, size) in enumerate(shapes):

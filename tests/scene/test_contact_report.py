@@ -34,7 +34,7 @@ def build_course():
 
 
 @pytest.fixture(scope="module")
-def scattered(request):
+def scattered_course(request):
     """Return the course with drones and boxes at random poses, close to each other."""
     sim, handles = build_course()
     rng = np.random.default_rng(5)
@@ -67,8 +67,8 @@ def mujoco_distances(sim, world, names, geom):
     return np.array(floor), np.array(objects), np.array(drones)
 
 
-def test_every_distance_equals_that_of_c_mujoco(scattered):
-    sim, _ = scattered
+def test_every_distance_equals_that_of_c_mujoco(scattered_course):
+    sim, _ = scattered_course
     report = jax.device_get(sim.contact_report())
     for world in range(N_WORLDS):
         floor, objects, drones = mujoco_distances(sim, world, report.object_names, "col_sphere")
@@ -87,8 +87,8 @@ def test_every_distance_equals_that_of_c_mujoco(scattered):
     np.testing.assert_array_equal(report.any, report.floor | report.drones | report.objects.any(axis=-1))
 
 
-def test_a_report_allocates_nothing_of_mujoco(scattered):
-    sim, _ = scattered
+def test_a_report_allocates_nothing_of_mujoco(scattered_course):
+    sim, _ = scattered_course
     sim.contact_report()
     assert not sim.scene.is_allocated
 
@@ -96,8 +96,8 @@ def test_a_report_allocates_nothing_of_mujoco(scattered):
 def test_box_collision_changes_the_distances():
     sim = Sim(n_worlds=2, control="attitude")
     sim.scene.add("box", pos=[0, 0, 1.0], size=(1, 1, 1))
-    half = np.asarray(sim.airframe.value("shape.collision_box"))[5]
-    pos = np.float32([[[0, 0, 1.5 + half + 0.01]], [[0, 0, 1.5 + half - 0.01]]])
+    half_height = np.asarray(sim.airframe.value("shape.collision_box"))[5]
+    pos = np.float32([[[0, 0, 1.5 + half_height + 0.01]], [[0, 0, 1.5 + half_height - 0.01]]])
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     touches = np.asarray(sim.contact_report(drones=False).objects)[:, 0, 0]
     np.testing.assert_array_equal(touches, [True, True])  # the sphere is taller
@@ -107,8 +107,8 @@ def test_box_collision_changes_the_distances():
     np.testing.assert_allclose(distance, [0.01 + offset, offset - 0.01], atol=1e-5)
 
 
-def test_fields_that_were_not_requested_are_none(scattered):
-    sim, handles = scattered
+def test_fields_that_were_not_requested_are_none(scattered_course):
+    sim, handles = scattered_course
     full_report, box_report = sim.contact_report(), sim.contact_report(handles["box"], floor=False, drones=False)
     assert box_report.object_names == ("box:0", "box:1")
     assert box_report.floor is None
@@ -121,8 +121,8 @@ def test_fields_that_were_not_requested_are_none(scattered):
     assert sim.contact_report((), drones=False).objects is None
 
 
-def test_reports_of_one_drone_one_world_and_all_worlds_agree(scattered):
-    sim, _ = scattered
+def test_reports_of_one_drone_one_world_and_all_worlds_agree(scattered_course):
+    sim, _ = scattered_course
     full_report = jax.device_get(sim.contact_report())
     contacts_in_world = sim.scene.contact_fn()
     contacts_of_drone = sim.scene.contact_fn(drones=False)
@@ -147,8 +147,8 @@ def test_reports_of_one_drone_one_world_and_all_worlds_agree(scattered):
     np.testing.assert_allclose(states.torque, full_report.object_distance[..., :3], atol=1e-5)
 
 
-def test_the_gradient_of_the_distance_is_a_unit_vector(scattered):
-    sim, handles = scattered
+def test_the_gradient_of_the_distance_is_a_unit_vector(scattered_course):
+    sim, handles = scattered_course
     contacts = sim.scene.contact_fn(handles["ball"], floor=False, drones=False)
 
     def distance(pos):
@@ -158,7 +158,7 @@ def test_the_gradient_of_the_distance_is_a_unit_vector(scattered):
     np.testing.assert_allclose(np.linalg.norm(gradient, axis=-1), 1.0, atol=1e-4)
 
 
-def test_large_swarms_are_computed_in_chunks():
+def test_distances_in_a_large_swarm_are_computed_in_chunks():
     n = DRONES_PER_CHUNK + 9
     sim = Sim(n_worlds=2, n_drones=n, control="attitude")
     rng = np.random.default_rng(1)
@@ -221,8 +221,8 @@ def test_contacts_are_logged_at_the_step_at_which_they_begin():
 
 
 @pytest.fixture(scope="module")
-def attached():
-    """Two worlds with bodies of three kinds: with a handle, attached and moved through mjx_data, attached and fixed."""
+def attached_bodies():
+    """Return two worlds with three kinds of bodies: with a handle, attached and moved through mjx_data, and fixed."""
     sim = Sim(n_worlds=2, n_drones=2)
     ball = sim.scene.add("sphere", "ball", pos=[0, 2, 1], radius=0.1)
     rock = mujoco.MjSpec.from_string(
@@ -240,19 +240,19 @@ def attached():
 
 
 def move_rocks(sim, shift):
-    """Move and rotate the movable rocks through mjx_data, in each world in another way."""
+    """Move the movable rocks through mjx_data, differently in each world, and rotate them."""
     ids = np.array([sim.mj_model.body(f"rock:{k}").mocapid[0] for k in (0, 2)])
     pos = np.float32([[[0, 0, 1], [2, 0, 1]], [[0.2, 0, 1], [2, 0.3, 1]]]) + np.float32(shift)
-    half = np.float32([np.cos(0.3), 0, 0, np.sin(0.3)])  # wxyz, by 0.6 rad about z
+    turned = np.float32([np.cos(0.3), 0, 0, np.sin(0.3)])  # wxyz, by 0.6 rad about z
     data = sim.mjx_data
     mocap_pos, mocap_quat = np.array(data.mocap_pos), np.array(data.mocap_quat)
-    mocap_pos[:, ids], mocap_quat[:, ids] = pos, half
+    mocap_pos[:, ids], mocap_quat[:, ids] = pos, turned
     sim.mjx_data = data.replace(mocap_pos=mocap_pos, mocap_quat=mocap_quat)
 
 
-def test_bodies_moved_through_mjx_data_are_reported_at_their_poses(attached):
+def test_bodies_moved_through_mjx_data_are_reported_at_their_poses(attached_bodies):
     """After every move, distances in every world equal those of C MuJoCo; a move compiles nothing."""
-    sim, ball = attached
+    sim, ball = attached_bodies
     n_touches = []
     for shift in ([0, 0, 0], [0.3, -0.2, 0.1], [0, 1.0, 0]):
         move_rocks(sim, shift)
@@ -283,9 +283,9 @@ def test_before_mjx_data_is_read_bodies_are_at_their_poses_in_the_spec():
     assert not sim.scene.is_allocated
 
 
-def test_a_pure_function_takes_poses_of_bodies_moved_through_mjx_data(attached):
+def test_a_pure_function_takes_poses_of_bodies_moved_through_mjx_data(attached_bodies):
     """Poses are passed as mjx_data or as a pair, for all worlds or for one."""
-    sim, _ = attached
+    sim, _ = attached_bodies
     move_rocks(sim, [0.1, 0.1, 0])
     expected = np.asarray(sim.contact_report().object_distance)
     contacts, mjx_data = jax.jit(sim.scene.contact_fn()), sim.mjx_data
@@ -302,35 +302,35 @@ def test_a_pure_function_takes_poses_of_bodies_moved_through_mjx_data(attached):
 
     gradient = np.asarray(jax.jit(jax.grad(distance))(pair[0][0, 0]))
     assert np.abs(gradient).sum() > 0.5, "the distance has a slope by the body's position"
-    seen = Step({"one": stage("world")(
+    forces = Step({"one": stage("world")(
         lambda d: d.replace(states=d.states.replace(force=d.states.force.at[:, 0].set(
             contacts_of_rock(d, (pair[0][0], pair[1][0])).object_distance[:, 0])))
     )}, "lanes")(sim.data, 1).states.force  # fmt: skip
-    np.testing.assert_allclose(np.asarray(seen)[0, :, 0], expected[0, :, column], atol=1e-5)
+    np.testing.assert_allclose(np.asarray(forces)[0, :, 0], expected[0, :, column], atol=1e-5)
 
 
-def test_cameras_see_such_bodies_and_hang_on_them(attached):
-    sim, _ = attached
+def test_cameras_see_bodies_moved_through_mjx_data_and_move_with_them(attached_bodies):
+    sim, _ = attached_bodies
     move_rocks(sim, [0, 0, 0])
-    look = {"camera": "eye:0", "width": 4, "height": 4, "drones": False}
-    first = np.asarray(sim.depth(**look))
-    hits = jax.device_get(jax.jit(sim.scene.depth_fn(**look))(sim.data, sim.mjx_data))
+    view = {"camera": "eye:0", "width": 4, "height": 4, "drones": False}
+    first = np.asarray(sim.depth(**view))
+    hits = jax.device_get(jax.jit(sim.scene.depth_fn(**view))(sim.data, sim.mjx_data))
     np.testing.assert_allclose(hits.distance, first, atol=1e-6)
     assert "rock:0" in {hits.names[k] for k in np.unique(hits.body_index)}
     np.testing.assert_allclose(first.min(), 1 - 0.3, atol=1e-5)  # from 1 m over its middle to its upper side
     move_rocks(sim, [0, 0, 3])
-    depth = np.asarray(sim.depth(**look))
+    depth = np.asarray(sim.depth(**view))
     np.testing.assert_allclose(depth.min(), 0.7, atol=1e-5)
     assert depth.max() > 3.9, "beside it, the floor is 3 m further away"
 
 
-def test_law_09_wrong_queries_are_refused(attached):
-    sim, _ = attached
-    for refused in (lambda: sim.scene.contact_fn()(sim.data), lambda: sim.scene.depth_fn("fpv_cam", 2, 2)(sim.data)):
+def test_law_09_wrong_queries_are_refused(attached_bodies):
+    sim, _ = attached_bodies
+    for query in (lambda: sim.scene.contact_fn()(sim.data), lambda: sim.scene.depth_fn("fpv_cam", 2, 2)(sim.data)):
         with pytest.raises(
             ConfigError, match=r"'rock:0', which is moved through sim.mjx_data.*Pass mocap=sim.mjx_data"
         ):
-            refused()
+            query()
     with pytest.raises(ConfigError, match=r"expected mocap_pos of shape \(2, n_mocap, 3\), got \(5, 3\)"):
         sim.scene.contact_fn()(sim.data, (np.zeros((5, 3)), np.zeros((5, 4))))
     with pytest.raises(ConfigError, match="objects whose poses are in the data, got body 'rock:0'"):
@@ -342,16 +342,16 @@ def test_law_09_wrong_queries_are_refused(attached):
 
 
 @pytest.mark.long("compiles contacts in the step and in a report")
-@pytest.mark.parametrize("box", [False, True])
+@pytest.mark.parametrize("has_boxes", [False, True])
 @pytest.mark.parametrize("n_drones", [1, 3, 9])
-def test_the_log_and_a_report_have_the_same_contacts_between_drones(n_drones, box, rng):
+def test_the_log_and_a_report_have_the_same_contacts_between_drones(n_drones, has_boxes, rng):
     """In the step one drone loops over the others; a report has all pairs of a world.
 
     With boxes, nine drones loop in a kernel; all pairs of three drones, unrolled, would take g++ 18 s.
     """
-    engine = "interpret" if box and n_drones == 3 else "auto"
+    engine = "interpret" if has_boxes and n_drones == 3 else "auto"
     sim = Sim(n_worlds=4, n_drones=n_drones, control="rotor_vel", engine=engine)
-    if box:
+    if has_boxes:
         use_box_collision(sim)
     pos = rng.uniform(-0.2, 0.2, (4, n_drones, 3)) * [1, 1, 0.2] + [0, 0, 1]
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.float32(pos)))
@@ -383,14 +383,14 @@ BALL = "<geom type='sphere' size='.1' pos='{} {} {}' conaffinity='2'/>"
 
 
 @pytest.mark.long("builds a scene of 3,031 objects, and another program to compare")
-@pytest.mark.parametrize("box", [False, True])
-def test_thousands_of_objects_are_reported_by_a_small_program(box, rng):
+@pytest.mark.parametrize("has_boxes", [False, True])
+def test_thousands_of_objects_are_reported_by_a_small_program(has_boxes, rng):
     """Movable and fixed balls, boxes in any attitude, and a body of forty balls.
 
     The distances of few objects are computed one by one, and compared with those of C MuJoCo above.
     """
     sim = Sim(n_worlds=1, n_drones=1)
-    if box:
+    if has_boxes:
         use_box_collision(sim)
     n, positions, positions_in_body = 1500, rng.uniform(-3, 3, (2, 1500, 3)), rng.uniform(-3, 3, (40, 3))
     sim.scene.add("sphere", "moves", count=n, pos=positions[0])
@@ -409,7 +409,7 @@ def test_thousands_of_objects_are_reported_by_a_small_program(box, rng):
     np.testing.assert_allclose(
         distances[[report.object_names.index(name) for name in chosen_names]], chosen_distances, atol=1e-5
     )
-    if not box:
+    if not has_boxes:
         centre, reach = np.array([0, 0, 0.02]), 0.086 + 0.1
         expected = np.linalg.norm(np.concatenate(positions) - centre, axis=-1) - reach
         np.testing.assert_allclose(distances[: 2 * n], expected, atol=1e-5)

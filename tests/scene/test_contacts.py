@@ -58,8 +58,8 @@ def scatter_poses(sim):
 
 
 @pytest.fixture(scope="module")
-def scattered():
-    """Worlds of two drones, a fixed ball, and a pole with another pose in every world."""
+def scattered_scene():
+    """Return worlds of two drones, a fixed ball, and a pole with another pose in every world, and the poses."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=2)
     add_obstacles(sim)
     return sim, *scatter_poses(sim)
@@ -93,9 +93,9 @@ def test_contacts_of_mocap_bodies_are_not_empty():
     assert np.asarray(contacts).all(), "a drone that stands on the floor touches it"
 
 
-def test_geoms_touch_where_their_distance_is_negative(scattered):
+def test_geoms_touch_where_their_distance_is_negative(scattered_scene):
     """Every pair of spheres, capsules and floor touches where the distance from its formula is negative."""
-    sim, pos, quat, pole_pos, pole_quat = scattered
+    sim, pos, quat, pole_pos, pole_quat = scattered_scene
     spheres = pos + rotate_vector(quat, OFFSET)
     half = rotate_vector(pole_quat, np.array([0.0, 0.0, POLE_HALF]))
     distances = {
@@ -158,9 +158,9 @@ def test_boxes_touch_where_c_mujocos_distances_are_negative():
 
 
 @pytest.mark.parametrize("body", ["drone:0", "drone:1", "pole", "ball", "world"])
-def test_contacts_of_a_body_are_its_own_slots(scattered, body):
+def test_contacts_of_a_body_are_its_own_slots(scattered_scene, body):
     """Contacts of a body keep the slots of its geoms and clear the others, in every world."""
-    sim = scattered[0]
+    sim = scattered_scene[0]
     sim.contacts()  # the first sync determines the geoms of each slot
     contact = jax.device_get(sim.mjx_data._impl.contact)
     bodies = sim.mj_model.geom_bodyid[np.stack([contact.geom1, contact.geom2])]
@@ -169,13 +169,13 @@ def test_contacts_of_a_body_are_its_own_slots(scattered, body):
     np.testing.assert_array_equal(sim.contacts(body), np.asarray(sim.contacts()) & belongs_to_body)
 
 
-def test_a_body_without_geoms_touches_nothing(scattered):
-    assert not np.asarray(scattered[0].contacts("_dummy")).any()
+def test_a_body_without_geoms_touches_nothing(scattered_scene):
+    assert not np.asarray(scattered_scene[0].contacts("_dummy")).any()
 
 
-def test_a_closed_over_scene_gives_the_same_contacts(scattered):
+def test_a_closed_over_scene_gives_the_same_contacts(scattered_scene):
     """The contact check for tight loops: the scene is a constant of the compiled function, the poles an argument."""
-    sim = scattered[0]
+    sim = scattered_scene[0]
     expected = np.asarray(sim.contacts())
     _mjx_data, mjx_model = sim.mjx_data, sim.mjx_model
     traces = []
@@ -200,9 +200,9 @@ def test_a_closed_over_scene_gives_the_same_contacts(scattered):
     assert sim.mjx_data is _mjx_data, "the check is pure"
 
 
-def test_worlds_on_two_devices_have_the_same_contacts(scattered):
+def test_worlds_on_two_devices_have_the_same_contacts(scattered_scene):
     """Contacts on two devices equal those on one, whether sharded at construction or later, after poles have moved."""
-    expected = np.asarray(scattered[0].contacts())
+    expected = np.asarray(scattered_scene[0].contacts())
     mesh = world_mesh(jax.devices()[:2])
     built_on_mesh = Sim(n_worlds=N_WORLDS, n_drones=2, mesh=mesh)
     add_obstacles(built_on_mesh)
@@ -240,18 +240,18 @@ def test_a_large_swarm_keeps_the_nearest_pairs():
         ("mocap_pos", np.full((64, 3, 3), np.nan), "expected finite numbers"),
     ],
 )
-def test_invalid_poses_are_refused(scattered, name, value, message):
+def test_invalid_poses_are_refused(scattered_scene, name, value, message):
     """Poses without a world axis, for another number of bodies, or not finite raise, and change nothing."""
-    sim = scattered[0]
+    sim = scattered_scene[0]
     before = sim.mjx_data
     with pytest.raises(ValueError, match=message):
         sim.mjx_data = sim.mjx_data.replace(**{name: value})
     assert sim.mjx_data is before
 
 
-def test_poses_may_be_numpy_arrays_of_any_dtype(scattered):
+def test_poses_may_be_numpy_arrays_of_any_dtype(scattered_scene):
     """Positions written as integers or float64 are cast; drones do not snap to whole metres."""
-    sim, pos, _quat, *_ = scattered
+    sim, pos, _quat, *_ = scattered_scene
     expected = np.asarray(sim.contacts())
     mocap_pos, mjx_data = np.asarray(sim.mjx_data.mocap_pos), sim.mjx_data
     sim.mjx_data = mjx_data.replace(mocap_pos=np.rint(mocap_pos).astype(int))

@@ -34,7 +34,7 @@ def pixel_directions_in_world(width=WIDTH, height=HEIGHT, fovy=FOVY):
 
 @pytest.fixture(scope="module")
 def room():
-    """Two worlds of two drones in front of a wall and a ball, and a movable box below the floor."""
+    """Return two worlds of two drones in front of a wall and a ball, and a movable box below the floor."""
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     sim.scene.add("wall", pos=[3, 0, 0], length=20, height=20, mocap=False)
     ball = sim.scene.add("sphere", pos=[1.5, 0.2, 1.1], radius=0.2)
@@ -105,7 +105,7 @@ def compiled_depth(sim, camera, hide_own):
 def test_a_drone_sees_other_drones_but_not_itself(room):
     """The second drone flies in front of the first, to the right, and sees no other drone."""
     sim, _, _ = room
-    hits, own, hidden = (
+    hits, hits_with_own, hits_without_own = (
         jax.device_get(compiled_depth(sim, camera, hide_own)(sim.data))
         for camera, hide_own in (("fpv_cam", True), ("track_cam:1", False), ("track_cam:1", True))
     )
@@ -115,8 +115,8 @@ def test_a_drone_sees_other_drones_but_not_itself(room):
     assert not (hits.body_index[:, 0] == first).any()
     assert 4 < others.sum() < 400
     assert np.argwhere(others)[:, 1].min() > 48, "a drone at -y is in the right half"
-    assert (own.body_index[0, 0] == first + 1).sum() > 8
-    assert not (hidden.body_index[0, 0] == first + 1).any()
+    assert (hits_with_own.body_index[0, 0] == first + 1).sum() > 8
+    assert not (hits_without_own.body_index[0, 0] == first + 1).any()
 
 
 def test_images_of_one_world_equal_those_of_all_worlds(room):
@@ -358,7 +358,7 @@ ALL_KINDS = """<mujoco><asset>
 
 @pytest.fixture(scope="module")
 def mixed_scene():
-    """Two worlds of two drones among geoms of all kinds, some fixed and some movable."""
+    """Return two worlds of two drones among geoms of all kinds, some fixed and some movable."""
     sim = Sim(n_worlds=2, n_drones=2)
     sim.scene.add("box", "fixed", pos=[2, 0, 1], quat=[0.1, 0.2, 0.3, 0.9], size=(0.5, 1.0, 1.5), mocap=False)
     quat = np.random.default_rng(1).normal(size=(2, 1, 4))
@@ -490,7 +490,7 @@ def test_rays_hit_geoms_of_every_kind_where_rays_of_c_mujoco_do(mixed_scene, rng
 
 @pytest.fixture(scope="module")
 def forest():
-    """A world of many equal geoms, some fixed and some movable, in front of a camera."""
+    """Return a world of many equal geoms, some fixed and some movable, in front of a camera."""
     sim = Sim(n_drones=2)
     rng = np.random.default_rng(5)
     for primitive, name, count, options in (

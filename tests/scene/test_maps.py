@@ -90,7 +90,7 @@ def test_files_of_all_kinds_are_read(name, tmp_path):
 
 @pytest.mark.parametrize("name", FILES)
 def test_law_09_damaged_files_raise_one_kind_of_error(name, tmp_path, rng):
-    """A file that is cut off, or that has a byte changed, is read or refused, never half read or an inner error."""
+    """A file that is cut off, or has a changed byte, is read whole or refused by a ConfigError."""
     path, content = tmp_path / name, FILES[name]
     for cut in (0, 1, 5, len(content) // 2, len(content) - 9):
         path.write_bytes(content[:cut])
@@ -160,8 +160,8 @@ def test_merged_boxes_fill_the_voxels_once(rng):
     np.testing.assert_array_equal(merge_voxels(wall), [[0, 0, 0, 0, 29, 19]])
 
 
-def test_voxels_of_triangles_are_those_that_they_meet(rng, monkeypatch):
-    """Each point of a triangle is in one of its voxels, and each voxel has a point of it, or nearly."""
+def test_triangles_have_the_voxels_that_they_meet(rng, monkeypatch):
+    """Each point of a triangle is in a voxel, and each voxel is at most 3 cm from a sampled point."""
     corners, resolution = rng.uniform(-1, 1, (3, 3, 3)), 0.1
     voxels = voxels_of_triangles(corners, resolution)
     monkeypatch.setattr("crazysim.scene.voxels.MAX_CANDIDATES", 1000)
@@ -171,13 +171,13 @@ def test_voxels_of_triangles_are_those_that_they_meet(rng, monkeypatch):
     sampled = voxels_of_points(points, resolution)
     known = {tuple(v) for v in voxels}
     assert {tuple(v) for v in sampled} <= known
-    assert len(sampled) > 0.9 * len(known)  # samples miss some of those that are met by a corner alone
+    assert len(sampled) > 0.9 * len(known)  # samples miss voxels that a triangle meets only at a corner
     gaps = [np.abs(points - np.array(v) * resolution).max(axis=1).min() for v in known]
     assert max(gaps) < 0.5 * resolution + 0.03
 
 
 def room():
-    """Return a hollow box of triangles, open at the top, turned and scaled: rays and drones get inside of it."""
+    """Return corners and triangles of the four sides of a cube."""
     low = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
     sides = [[k, (k + 1) % 4, (k + 1) % 4 + 4, k + 4] for k in range(4)]
     faces = [[q[0], q[1], q[2]] for q in sides] + [[q[0], q[2], q[3]] for q in sides]
@@ -193,8 +193,8 @@ def test_a_mesh_is_hollow_for_drones_and_cameras(tmp_path):
     path = tmp_path / "room.ply"
     path.write_bytes(ply(*room()))
     sim = Sim(n_worlds=2)
-    half_turn = np.sqrt(0.5)  # a quarter turn about z: x of the file is y of the world, y is -x
-    handle = sim.scene.add_map(path, pos=(2, -2, 0), quat=(0, 0, half_turn, half_turn), scale=4.0)
+    sin_45 = np.sqrt(0.5)  # a quarter turn about z: x of the file is y of the world, y is -x
+    handle = sim.scene.add_map(path, pos=(2, -2, 0), quat=(0, 0, sin_45, sin_45), scale=4.0)
     assert handle.bodies == ("room:0",)
     assert not handle.movable
     assert len(sim.scene.collision_model.objects[0].geoms) == 4  # one for each side
@@ -208,8 +208,8 @@ def test_a_mesh_is_hollow_for_drones_and_cameras(tmp_path):
 
 
 @pytest.mark.parametrize("box", [False, True])
-def test_many_boxes_of_different_sizes_are_reported_as_few_are(box, rng):
-    """Boxes of a map differ in size: their distances are computed side by side, and equal those of single objects."""
+def test_distances_to_many_boxes_of_different_sizes_are_exact(box, rng):
+    """Boxes of a map differ in size; a report computes their distances side by side."""
     sim = Sim(n_worlds=3)
     if box:
         use_box_collision(sim)
@@ -231,7 +231,7 @@ def test_many_boxes_of_different_sizes_are_reported_as_few_are(box, rng):
 
 @pytest.mark.parametrize("kind", ["upright", "turned", "balls", "balls and a box"])
 def test_code_of_one_drone_finds_the_nearest_of_many_geoms(kind, rng):
-    """A search in a hierarchy, for steps and kernels, has the distance and the slope of the nearest geom of all."""
+    """The search in a hierarchy, used in steps, gives the distance to the nearest geom, and its slope."""
     sim, n_worlds = Sim(n_worlds=12), 12
     if kind == "balls and a box":
         use_box_collision(sim)

@@ -25,7 +25,7 @@ TOWER = """
 
 @pytest.fixture(scope="module")
 def course():
-    """Three worlds with two movable gates, a fixed pole, and a movable tower."""
+    """Return three worlds with two movable gates, a fixed pole, and a movable tower, and the handles."""
     sim = Sim(n_worlds=3, n_drones=2, control="attitude")
     gates = sim.scene.add("gate", count=2, pos=[[1, 0, 1], [2, 0, 1]])
     pole = sim.scene.add("pole", pos=[0, 1, 0], mocap=False)
@@ -46,7 +46,7 @@ def test_a_handle_stays_valid_when_objects_are_added(course):
     np.testing.assert_allclose(np.asarray(tower.pose(later_data)[0])[:, 0, 2], [1, 2, 3])
 
 
-def test_everything_is_compiled_once_at_the_next_use(monkeypatch):
+def test_added_objects_are_compiled_once_at_the_next_use(monkeypatch):
     sim, compiled = Sim(), []
     compile_spec = build.compile_spec
     monkeypatch.setattr(build, "compile_spec", lambda spec: (compiled.append(1), compile_spec(spec))[1])
@@ -135,7 +135,7 @@ def test_every_primitive_is_touched_by_drones_only(primitive):
         np.testing.assert_allclose(model.geom_rgba[g], (1, 0, 0, 1))
 
 
-BAD = {
+INVALID_OBJECTS = {
     "taken": (lambda s: s.scene.add("gate"), "got 'gate:0', a body of the scene"),
     "drone": (lambda s: s.scene.add("box", "drone"), "got 'drone:0', a body of the scene"),
     "unknown": (
@@ -162,16 +162,16 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
+@pytest.mark.parametrize("name", INVALID_OBJECTS)
 def test_law_09_invalid_objects_are_refused(name):
-    call, message = BAD[name]
+    call, message = INVALID_OBJECTS[name]
     sim = Sim()
     sim.scene.add("gate")
     with pytest.raises(ConfigError) as error:
         call(sim)
     assert message in str(error.value)
     assert [body.name for body in sim.spec.worldbody.bodies] == ["drone:0", "_dummy", "gate:0"]
-    sim.step()  # and the simulation goes on
+    sim.step()  # the simulation continues
 
 
 def test_law_09_invalid_poses_are_refused(course):

@@ -25,7 +25,7 @@ RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
 
 @pytest.fixture(scope="module")
 def sim(opengl, plain_scene):
-    """Two worlds of two drones near a camera that looks straight down on a plain floor."""
+    """Return two worlds of two drones near a camera that looks straight down on a plain floor."""
     sim = Sim(n_worlds=2, n_drones=2, xml_path=plain_scene)
     pos = np.tile(np.float32(DRONES), (2, 1, 1))
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
@@ -33,35 +33,35 @@ def sim(opengl, plain_scene):
     sim.close()
 
 
-def shoot(sim, **options):
+def take_picture(sim, **options):
     picture = sim.render(**{"mode": "rgb_array", "camera": "down", "width": WIDTH, "height": HEIGHT} | options)
     return picture.astype(int)
 
 
-def seen_at(mask):
-    """Return the rows and columns of a mask's pixels in metres east and north of the camera, one metre away."""
+def positions_of_pixels(mask):
+    """Return metres east and north of the camera of a mask's pixels, for points one metre below it."""
     rows, columns = np.nonzero(mask)
     return (columns + 0.5 - 0.5 * WIDTH) / FOCAL, (0.5 * HEIGHT - rows - 0.5) / FOCAL
 
 
 def test_points_are_spheres_of_their_radius(sim):
     """Two green points are discs of their radii at their positions, and absent from the next image."""
-    plain = shoot(sim)
+    plain = take_picture(sim)
     draw_points(sim, [[0.0, 0.2, 1.0], [0.0, -0.3, 1.0]], rgba=GREEN, size=0.05)
-    marked = shoot(sim)
-    x, y = seen_at(has_colour(marked, GREEN))  # one metre below the camera
+    marked = take_picture(sim)
+    x, y = positions_of_pixels(has_colour(marked, GREEN))  # one metre below the camera
     for north in (0.2, -0.3):
         near = np.sign(y) == np.sign(north)
         np.testing.assert_allclose([x[near].mean(), y[near].mean()], [0, north], atol=0.01)
         area = near.sum() / FOCAL**2
         np.testing.assert_allclose(area, np.pi * 0.05**2, rtol=0.15)
-    np.testing.assert_array_equal(shoot(sim), plain)
+    np.testing.assert_array_equal(take_picture(sim), plain)
 
 
 def test_a_line_goes_through_its_points(sim):
     """Blue along an L: every pixel lies on one of its two legs, and both legs are covered end to end."""
     draw_line(sim, [[-0.4, -0.3, 1.0], [0.4, -0.3, 1.0], [0.4, 0.3, 1.0]], rgba=BLUE, start_size=3, end_size=3)
-    x, y = seen_at(has_colour(shoot(sim), BLUE))
+    x, y = positions_of_pixels(has_colour(take_picture(sim), BLUE))
     first, second = np.abs(y + 0.3) < 2 / FOCAL, np.abs(x - 0.4) < 2 / FOCAL
     assert (first | second).all()
     np.testing.assert_allclose([x[first].min(), x[first].max()], [-0.4, 0.4], atol=0.02)
@@ -72,7 +72,7 @@ def test_a_line_has_the_requested_width(sim):
     """Its width in pixels grows from piece to piece, as a trail's does."""
     points = np.linspace([-0.5, 0.3, 1.0], [0.5, 0.3, 1.0], 13)
     draw_line(sim, points, rgba=BLUE, start_size=2, end_size=8)
-    mask = has_colour(shoot(sim), BLUE)
+    mask = has_colour(take_picture(sim), BLUE)
     widths = mask.sum(0)[mask.any(0)]
     assert abs(widths[:10].mean() - 2) < 1.5
     assert abs(widths[-10:].mean() - 8) < 1.5
@@ -82,20 +82,20 @@ def test_a_line_has_the_requested_width(sim):
 def test_a_capsule_reaches_from_end_to_end(sim, cylinder):
     """A capsule is longer by its round ends than a cylinder; both are as wide as twice their radius."""
     draw_capsule(sim, [-0.2, 0.3, 1.0], [0.3, 0.3, 1.0], radius=0.06, rgba=BLUE, cylinder=cylinder)
-    x, y = seen_at(has_colour(shoot(sim), BLUE))
+    x, y = positions_of_pixels(has_colour(take_picture(sim), BLUE))
     end = 0.0 if cylinder else 0.06
     np.testing.assert_allclose([x.min(), x.max()], [-0.2 - end, 0.3 + end], atol=0.02)
     np.testing.assert_allclose([y.min(), y.max()], [0.24, 0.36], atol=0.02)
 
 
 def test_overlays_are_red_by_default(sim):
-    nose = has_colour(shoot(sim), RED)
+    nose = has_colour(take_picture(sim), RED)
     draw_points(sim, [0.0, 0.3, 1.0], size=0.05)
     draw_line(sim, [[-0.4, -0.3, 1], [0.4, -0.3, 1]])
     draw_capsule(sim, [-0.4, 0.2, 1], [-0.4, 0.3, 1])
-    x, y = seen_at(has_colour(shoot(sim), RED) & ~nose)
-    for at in ([0, 0.3], [0.2, -0.3], [-0.4, 0.25]):
-        assert (np.hypot(x - at[0], y - at[1]) < 0.03).sum() > 20, at
+    x, y = positions_of_pixels(has_colour(take_picture(sim), RED) & ~nose)
+    for point in ([0, 0.3], [0.2, -0.3], [-0.4, 0.25]):
+        assert (np.hypot(x - point[0], y - point[1]) < 0.03).sum() > 20, point
 
 
 def test_overlays_are_not_in_depth_images(sim):
@@ -108,7 +108,7 @@ def test_overlays_are_not_in_depth_images(sim):
 
 
 def test_overlays_drawn_before_the_first_image_are_in_it(opengl):
-    """The peer's draw functions do nothing until something has been rendered."""
+    """Crazyflow's draw functions do nothing until something has been rendered."""
     sim = Sim(n_worlds=2)
     draw_points(sim, [[0.0, 0.0, 0.5]], rgba=GREEN, size=0.2)
     view = {"lookat": [0, 0, 0.5], "distance": 2.0}
@@ -122,16 +122,16 @@ def test_overlays_are_kept_through_steps_and_failed_images(sim):
     draw_points(sim, [[0.0, 0.4, 1.0]], rgba=GREEN, size=0.05)
     sim.step()
     with pytest.raises(ValueError):
-        shoot(sim, camera="nobody")
-    assert has_colour(shoot(sim), GREEN).any()
+        take_picture(sim, camera="nobody")
+    assert has_colour(take_picture(sim), GREEN).any()
     sim.data = data
 
 
-def test_drawing_draws_no_random_numbers(sim):
-    """The peer's draw_line takes from NumPy's global generator, so that looking changes what is flown."""
+def test_drawing_uses_no_global_random_numbers(sim):
+    """Crazyflow's draw_line draws from NumPy's global generator, so that images change a flight with random numbers."""
     before = np.random.get_state()  # noqa: NPY002
     draw_line(sim, np.zeros((5, 3)))
-    shoot(sim)
+    take_picture(sim)
     for found, expected in zip(np.random.get_state(), before, strict=True):  # noqa: NPY002
         np.testing.assert_array_equal(found, expected)  # the position in the generator's block of numbers, too
 
@@ -142,10 +142,10 @@ def test_drawing_draws_no_random_numbers(sim):
 @pytest.mark.parametrize("corner", ["top left", "top right", "bottom left", "bottom right"])
 def test_text_is_in_its_corner_and_nowhere_else(sim, corner):
     """Two lines, written one after the other, change pixels of one corner only, some of them to bright letters."""
-    plain = shoot(sim)
+    plain = take_picture(sim)
     draw_text(sim, "height", corner)
     draw_text(sim, "1.4 m", corner)
-    written = shoot(sim)
+    written = take_picture(sim)
     rows, columns = np.nonzero((written != plain).any(-1))
     down, right = corner.startswith("bottom"), corner.endswith("right")
     assert (rows > HEIGHT / 2).all() == down
@@ -155,10 +155,10 @@ def test_text_is_in_its_corner_and_nowhere_else(sim, corner):
     assert 24 < np.ptp(rows) < 60, "two lines of 10 to 20 pixels"
     letters = written[rows.min() : rows.max(), columns.min() : columns.max()].min(-1) > 230
     assert 30 < letters.sum() < 0.4 * letters.size
-    np.testing.assert_array_equal(shoot(sim), plain)
+    np.testing.assert_array_equal(take_picture(sim), plain)
 
 
-def test_text_is_not_in_depth_and_is_beside_it(sim):
+def test_text_is_in_the_colours_and_not_in_the_depth(sim):
     plain = sim.render("depth_array", camera="down", width=WIDTH, height=HEIGHT)
     draw_text(sim, "depth")
     color, depth = sim.render("rgbd_tuple", camera="down", width=WIDTH, height=HEIGHT)
@@ -168,21 +168,24 @@ def test_text_is_not_in_depth_and_is_beside_it(sim):
 
 def test_a_label_stands_at_its_point(sim):
     """Letters begin at the point, anywhere in the image, and are bright on a dark outline."""
-    plain = shoot(sim)
+    plain = take_picture(sim)
     for east, north in ((-0.3, 0.3), (0.2, -0.2)):
         draw_label(sim, [east, north, 1.0], "gate 3")
-        x, y = seen_at((shoot(sim) != plain).any(-1))
+        x, y = positions_of_pixels((take_picture(sim) != plain).any(-1))
         assert len(x) > 100
         assert abs(y.mean() - north) < 0.05
         assert abs(x.mean() - east) < 0.2
-    np.testing.assert_array_equal(shoot(sim), plain)
+    np.testing.assert_array_equal(take_picture(sim), plain)
 
 
 def test_a_line_may_change_its_colour(sim):
     """Each piece has its own colour: the first green, the second blue."""
     draw_line(sim, [[-0.4, 0.3, 1], [0, 0.3, 1], [0.4, 0.3, 1]], rgba=[GREEN, BLUE])
-    picture = shoot(sim)
-    (green, _), (blue, _) = seen_at(has_colour(picture, GREEN)), seen_at(has_colour(picture, BLUE))
+    picture = take_picture(sim)
+    (green, _), (blue, _) = (
+        positions_of_pixels(has_colour(picture, GREEN)),
+        positions_of_pixels(has_colour(picture, BLUE)),
+    )
     np.testing.assert_allclose([green.min(), green.max()], [-0.4, 0], atol=0.02)
     np.testing.assert_allclose([blue.min(), blue.max()], [0, 0.4], atol=0.02)
 
@@ -194,9 +197,9 @@ def test_setpoints_are_where_the_last_command_of_a_world_is(opengl, plain_scene)
     command[1, :, :3] = [[0.2, 0.3, 1.0], [-0.2, -0.3, 1.0]]
     sim.state_control(command)
     draw_setpoints(sim, world=1, rgba=[GREEN, BLUE], size=0.05)
-    picture = shoot(sim, world=1)
+    picture = take_picture(sim, world=1)
     for rgba, (east, north, _) in zip((GREEN, BLUE), command[1, :, :3], strict=True):
-        x, y = seen_at(has_colour(picture, rgba))
+        x, y = positions_of_pixels(has_colour(picture, rgba))
         np.testing.assert_allclose([x.mean(), y.mean()], [east, north], atol=0.01)
         np.testing.assert_allclose(len(x) / FOCAL**2, np.pi * 0.05**2, rtol=0.15)
     with pytest.raises(ValueError, match="expected a world from 0 to 1, got 2"):
@@ -209,34 +212,34 @@ def test_setpoints_are_where_the_last_command_of_a_world_is(opengl, plain_scene)
 
 def test_an_led_lights_up_on_its_drone_only(sim):
     """Drone 1's upper LED turns red: pixels change at drone 1, none elsewhere; then it glows brighter."""
-    before = shoot(sim)
+    before = take_picture(sim)
     change_material(sim, "led_top", [1], rgba=RED)
-    dull = shoot(sim)
+    dull = take_picture(sim)
     change_material(sim, "led_top", [1], emission=1.0)
-    bright = shoot(sim)
+    bright = take_picture(sim)
     change_material(sim, "led_top", [0, 1], rgba=[1, 1, 1, 0.15], emission=0.0)
-    x, y = seen_at(np.abs(dull - before).sum(-1) > 30)
+    x, y = positions_of_pixels(np.abs(dull - before).sum(-1) > 30)
     assert len(x) > 3
     distance = CAMERA_HEIGHT - DRONES[1, 2]
     assert np.hypot(x * distance - DRONES[1, 0], y * distance - DRONES[1, 1]).max() < 0.02
     lit = has_colour(bright, RED)
     assert lit.any()
     assert bright[lit][:, 0].mean() > dull[lit][:, 0].mean() + 10
-    np.testing.assert_array_equal(shoot(sim), before)
+    np.testing.assert_array_equal(take_picture(sim), before)
 
 
 def test_colours_may_be_one_for_each_drone(sim):
-    before = shoot(sim)
+    before = take_picture(sim)
     change_material(sim, "led_top", [0, 1], rgba=[RED, BLUE], emission=[1.0, 1.0])
-    picture = shoot(sim)
+    picture = take_picture(sim)
     change_material(sim, "led_top", [0, 1], rgba=[1, 1, 1, 0.15], emission=0.0)
     (east, _), (west, _) = (
-        seen_at(has_colour(picture, rgba) & ~has_colour(before, rgba)) for rgba in (RED, BLUE)
+        positions_of_pixels(has_colour(picture, rgba) & ~has_colour(before, rgba)) for rgba in (RED, BLUE)
     )  # the noses of the drones are red, too
     assert len(east) > 0
     assert len(west) > 0
     assert east.min() > 0 > west.max()
-    np.testing.assert_array_equal(shoot(sim), before)
+    np.testing.assert_array_equal(take_picture(sim), before)
 
 
 def test_the_lower_led_is_visible_from_below(opengl):
@@ -312,13 +315,13 @@ def test_the_limit_of_overlays_can_be_raised():
 
 
 def test_as_many_overlays_as_allowed_fit_into_an_image(sim):
-    """The limit is for overlays: bodies of the scene take none of it."""
+    """Bodies of the scene do not count towards the limit."""
     limit = sim.max_visual_geom
     try:
         sim.max_visual_geom = 200
         xy = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 20), np.linspace(-0.35, 0.35, 10)), -1).reshape(-1, 2)
         draw_points(sim, np.concatenate([xy, np.ones((200, 1))], 1), rgba=GREEN, size=0.01)
-        picture = shoot(sim)
+        picture = take_picture(sim)
         columns = [int(0.5 * WIDTH + FOCAL * x) for x in xy[:, 0]]
         rows = [int(0.5 * HEIGHT - FOCAL * y) for y in xy[:, 1]]
         assert has_colour(picture, GREEN)[rows, columns].mean() > 0.9  # a few are hidden by the drones above them

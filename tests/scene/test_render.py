@@ -18,8 +18,8 @@ from screens import screen_pixels, virtual_screen
 from crazysim.errors import RenderError
 from crazysim.sim import Sim
 
-PLACES = np.array([[[0.4, 0.2, 0.5]], [[-0.5, -0.3, 1.0]]])
-"""Where the drone of each world is, m. (2, 1, 3)"""
+POSITIONS = np.array([[[0.4, 0.2, 0.5]], [[-0.5, -0.3, 1.0]]])
+"""Position of the drone of each world, m. (2, 1, 3)"""
 SHOT = {"mode": "rgb_array", "camera": "down", "width": WIDTH, "height": HEIGHT}
 
 
@@ -29,64 +29,66 @@ def place(sim, pos):
 
 @pytest.fixture(scope="module")
 def sim(opengl, plain_scene):
-    """Two worlds over a plain floor, each with its drone elsewhere, and a camera that looks straight down."""
+    """Return two worlds, each with a drone elsewhere over a plain floor, and a camera that looks straight down."""
     sim = Sim(n_worlds=2, xml_path=plain_scene)
-    place(sim, PLACES)
+    place(sim, POSITIONS)
     yield sim
     sim.close()
 
 
 @pytest.fixture(scope="module")
-def empty(sim):
-    """The image from above without any drone in it."""
-    place(sim, PLACES + [100, 0, 0])
+def empty_image(sim):
+    """Return the image from above without any drone in it."""
+    place(sim, POSITIONS + [100, 0, 0])
     picture = sim.render(**SHOT)
-    place(sim, PLACES)
+    place(sim, POSITIONS)
     return picture
 
 
-def difference(picture, empty):
-    return np.abs(picture.astype(int) - empty.astype(int)).sum(-1) > 30
+def difference(picture, empty_image):
+    return np.abs(picture.astype(int) - empty_image.astype(int)).sum(-1) > 30
 
 
 # Contents of an image -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("world", [0, 1])
-def test_the_drone_of_the_world_is_drawn_where_it_is(sim, empty, world):
+def test_the_drone_of_the_world_is_drawn_where_it_is(sim, empty_image, world):
     """Pixels that differ from the empty floor lie around the drone's projection, as wide as the drone is there."""
-    changed = difference(sim.render(**SHOT, world=world), empty)
+    changed = difference(sim.render(**SHOT, world=world), empty_image)
     rows, columns = np.nonzero(changed)
-    row, column = pixel(PLACES[world, 0])
+    row, column = pixel(POSITIONS[world, 0])
     assert len(rows) > 20
     np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [row, column], atol=1.0)
     focal = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
-    reach = 0.09 * focal / (CAMERA_HEIGHT - PLACES[world, 0, 2])  # the propellers' tips are within 9 cm of the centre
+    reach = (
+        0.09 * focal / (CAMERA_HEIGHT - POSITIONS[world, 0, 2])
+    )  # the propellers' tips are within 9 cm of the centre
     assert 0.5 * reach < np.abs(np.stack([rows - row, columns - column])).max() < reach + 1
 
 
-def test_the_empty_image_is_plain_floor(empty):
-    assert empty.shape == (HEIGHT, WIDTH, 3)
-    assert empty.dtype == np.uint8
-    assert empty.min() > 100
-    assert np.ptp(empty.reshape(-1, 3), axis=0).max() < 20
+def test_the_empty_image_is_plain_floor(empty_image):
+    assert empty_image.shape == (HEIGHT, WIDTH, 3)
+    assert empty_image.dtype == np.uint8
+    assert empty_image.min() > 100
+    assert np.ptp(empty_image.reshape(-1, 3), axis=0).max() < 20
 
 
-def test_a_drone_that_moved_is_drawn_at_its_new_place(sim, empty):
+def test_a_drone_that_moved_is_drawn_at_its_new_place(sim, empty_image):
     """The next image shows every change of the state."""
     place(sim, [[[0.0, 0.4, 0.3]], [[0.0, 0.0, 0.3]]])
-    rows, columns = np.nonzero(difference(sim.render(**SHOT), empty))
-    place(sim, PLACES)
+    rows, columns = np.nonzero(difference(sim.render(**SHOT), empty_image))
+    place(sim, POSITIONS)
     np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], pixel([0, 0.4, 0.3]), atol=1.0)
 
 
-def test_a_drone_that_rolled_shows_its_side(sim, empty):
+def test_a_drone_that_rolled_shows_its_side(sim, empty_image):
     """Attitude is converted to MuJoCo's order: rolled by 90 degrees the drone is narrow across, as long ahead."""
 
     def widths(quat_xyzw):
         states = sim.data.states
         sim.data = sim.data.replace(states=states.replace(quat=np.tile(np.float32(quat_xyzw), (2, 1, 1))))
-        rows, columns = np.nonzero(difference(sim.render(**SHOT), empty))
+        rows, columns = np.nonzero(difference(sim.render(**SHOT), empty_image))
         return np.ptp(rows), np.ptp(columns)
 
     half = np.sqrt(0.5)
@@ -107,20 +109,20 @@ def test_a_body_that_a_user_moved_is_drawn_where_it_is(opengl):
     shot = {"mode": "rgb_array", "width": 64, "height": 48}
     view = {"lookat": [0, 0, 1], "distance": 4, "azimuth": 90, "elevation": 0}  # along +y: x is right
 
-    def where(world):
+    def column_of_ball(world):
         picture = sim.render(**shot, world=world, cam_config=view).astype(int)
         columns = np.nonzero((picture[..., 0] > 80) & (picture[..., 1] < 60))[1]
         assert len(columns) > 20
         return columns.mean() + 0.5
 
-    assert abs(where(0) - 32) < 1
+    assert abs(column_of_ball(0) - 32) < 1
     assert not sim.scene.is_allocated
     k = sim.mj_model.body("ball").mocapid.item()
     mocap_pos = np.array(sim.mjx_data.mocap_pos)
     mocap_pos[:, k, 0] = -0.8, 0.8
     sim.mjx_data = sim.mjx_data.replace(mocap_pos=mocap_pos)
-    assert where(0) < 25
-    assert where(1) > 39
+    assert column_of_ball(0) < 25
+    assert column_of_ball(1) > 39
     sim.close()
 
 
@@ -133,20 +135,20 @@ def test_a_camera_by_name_is_the_camera_of_its_id(sim):
         np.testing.assert_array_equal(sim.render(**SHOT | {"camera": name}), by_id)
 
 
-def test_the_free_camera_follows_cam_config(sim, empty):
-    """A free camera at the place of the fixed one sees what it sees; every call may tell another place."""
+def test_the_free_camera_follows_cam_config(sim, empty_image):
+    """A free camera at the pose of the fixed camera has the same image; every call may set another pose."""
     free = {"lookat": [0, 0, 0], "distance": CAMERA_HEIGHT, "azimuth": 90, "elevation": -90}
     sim.mj_model.vis.global_.fovy = FOVY
     shot = SHOT | {"camera": -1}
-    seen = difference(sim.render(**shot, cam_config=free), empty)
-    fixed = difference(sim.render(**SHOT), empty)
-    assert np.mean(seen == fixed) > 0.995
-    moved = difference(sim.render(**shot, cam_config=free | {"lookat": [0.4, 0.2, 0]}), empty)
+    wait_for_color = difference(sim.render(**shot, cam_config=free), empty_image)
+    fixed = difference(sim.render(**SHOT), empty_image)
+    assert np.mean(wait_for_color == fixed) > 0.995
+    moved = difference(sim.render(**shot, cam_config=free | {"lookat": [0.4, 0.2, 0]}), empty_image)
     rows, columns = np.nonzero(moved)
-    x, y, z = PLACES[0, 0] - [0.4, 0.2, 0]
+    x, y, z = POSITIONS[0, 0] - [0.4, 0.2, 0]
     np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], pixel((x, y, z)), atol=1.0)
     array = sim.render(**shot, cam_config=free | {"lookat": np.array([0.4, 0.2, 0])})
-    np.testing.assert_array_equal(difference(array, empty), moved)
+    np.testing.assert_array_equal(difference(array, empty_image), moved)
 
 
 def test_the_onboard_camera_turns_with_the_drone(sim):
@@ -160,29 +162,29 @@ def test_the_onboard_camera_turns_with_the_drone(sim):
     sim.data = sim.data.replace(states=states.replace(quat=down))
     depth = sim.render(**shot)
     sim.data = sim.data.replace(states=states)
-    np.testing.assert_allclose(depth[0], PLACES[0, 0, 2] - 0.03, atol=5e-3)  # the camera is 3 cm ahead of the centre
+    np.testing.assert_allclose(depth[0], POSITIONS[0, 0, 2] - 0.03, atol=5e-3)  # the camera is 3 cm ahead of the centre
 
 
-# Every call counts (fault 12) -----------------------------------------------------------------------------------
+# Arguments of each call (fault 12) -----------------------------------------------------------------------------------
 
 
-def test_every_argument_counts_at_every_call(sim, empty):
+def test_every_call_uses_its_own_arguments(sim, empty_image):
     """Size, camera, world and mode of a later call are not those of the first."""
     first = sim.render(**SHOT)
     small = sim.render(**SHOT | {"width": 40, "height": 30})
     large = sim.render(**SHOT | {"width": 320, "height": 240})
     assert (small.shape, large.shape) == ((30, 40, 3), (240, 320, 3))
     for picture, factor in ((small, 4), (large, 0.5)):
-        rows, columns = np.nonzero(np.abs(picture.astype(int) - empty[0, 0]).sum(-1) > 40)
-        row, column = pixel(PLACES[0, 0])
+        rows, columns = np.nonzero(np.abs(picture.astype(int) - empty_image[0, 0]).sum(-1) > 40)
+        row, column = pixel(POSITIONS[0, 0])
         np.testing.assert_allclose(factor * np.array([rows.mean() + 0.5, columns.mean() + 0.5]), [row, column], atol=3)
-    assert not difference(sim.render(**SHOT | {"camera": "aside"}), empty).any()
+    assert not difference(sim.render(**SHOT | {"camera": "aside"}), empty_image).any()
     assert difference(sim.render(**SHOT, world=1), first).any()
     np.testing.assert_array_equal(sim.render(**SHOT), first)
 
 
-def test_many_sizes_follow_each_other(sim):
-    """More sizes than contexts are kept, some larger than any before, give the same images again."""
+def test_images_of_many_sizes_are_drawn_in_turn(sim):
+    """There are more sizes than kept contexts, and some are larger than any before."""
     sizes = [(48, 32), (2000, 40), (64, 64), (33, 17), (40, 1100), (160, 120), (48, 32)]
     for width, height in sizes:
         assert sim.render(**SHOT | {"width": width, "height": height}).shape == (height, width, 3)
@@ -214,16 +216,16 @@ def test_depth_is_the_distance_along_the_axis_in_metres(sim):
     assert depth.dtype == np.float32
     floor = np.abs(depth - CAMERA_HEIGHT) < 2e-3
     assert floor[[0, 0, -1, -1], [0, -1, 0, -1]].all()
-    row, column = (int(x) for x in pixel(PLACES[0, 0]))
+    row, column = (int(x) for x in pixel(POSITIONS[0, 0]))
     around = depth[row - 6 : row + 7, column - 6 : column + 7]
-    distance = CAMERA_HEIGHT - PLACES[0, 0, 2]
+    distance = CAMERA_HEIGHT - POSITIONS[0, 0, 2]
     assert distance - 0.05 < around.min() < distance
     outside = depth.copy()
     outside[row - 12 : row + 13, column - 12 : column + 13] = CAMERA_HEIGHT
     np.testing.assert_allclose(outside, CAMERA_HEIGHT, atol=2e-3)
 
 
-def test_colour_and_depth_together_are_colour_and_depth_alone(sim):
+def test_colour_and_depth_of_one_call_equal_those_of_two_calls(sim):
     color, depth = sim.render(**SHOT | {"mode": "rgbd_tuple"})
     np.testing.assert_array_equal(color, sim.render(**SHOT))
     np.testing.assert_array_equal(depth, sim.render(**SHOT | {"mode": "depth_array"}))
@@ -321,7 +323,7 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
         [sys.executable, "-c", WINDOW], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
     )
 
-    def seen(word):
+    def wait_for_color(word):
         """Return the screen once it shows the point of this colour: a screen server draws with a delay."""
         assert program.stdout.readline().strip() == word
         for _ in range(100):
@@ -336,14 +338,14 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
         return picture, red, blue
 
     try:
-        first, red, blue = seen("red")
+        first, red, blue = wait_for_color("red")
         lit = np.nonzero(first.max(-1) > 20)
         assert np.ptp(lit[0]) + 1 == 300
         assert np.ptp(lit[1]) + 1 == 400
         assert red.sum() > 100
         assert not blue.any()
         assert np.nonzero(red)[1].mean() > lit[1].mean() + 20, "x is right in a view from above"
-        second, red, blue = seen("blue")
+        second, red, blue = wait_for_color("blue")
         for picture, written in ((first, False), (second, True)):
             shown = picture[lit[0].min() : lit[0].max() + 1, lit[1].min() : lit[1].max() + 1]
             for corner in (shown[-40:, -150:], shown[:40, :100]):
@@ -360,13 +362,13 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
         program.stdout.close()
 
 
-PRINTED = textwrap.dedent("""
+CRAZYFLOW_CODE = textwrap.dedent("""
     import crazysim.scene.mjx_scene as place
     from crazysim.sim.sim import sync_sim2mjx as whole
     syncs = []
     place.sync_sim2mjx = lambda *args: syncs.append(1) or whole(*args)
 
-    # What follows is code as it is printed for the peer, with the name of the package exchanged.
+    # The following code is from Crazyflow's documentation, with the name of the package replaced.
 
     import mujoco
     from crazysim.sim import Sim
@@ -430,18 +432,20 @@ PRINTED = textwrap.dedent("""
 """).replace("BOX", BOX.replace('type="box"', 'type="box" contype="0"'))  # XLA takes 3 s for a box against a box
 
 
-def test_code_written_for_the_peer_runs_as_printed(screen, opengl):
-    """Boxes, sync loop, grouped and interleaved calls in a window, and the compiled check, line for line."""
+def test_code_of_crazyflows_documentation_runs(screen, opengl):
+    """Boxes, a sync loop, grouped and interleaved calls in a window, and a compiled check of contacts."""
     display, _ = screen
     environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": "glfw"}
-    done = subprocess.run([sys.executable, "-c", PRINTED], capture_output=True, text=True, env=environment, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", CRAZYFLOW_CODE], capture_output=True, text=True, env=environment, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout == "done\n"
 
 
 @pytest.mark.parametrize("display", [None, ":54321"])
 def test_without_a_screen_a_window_is_refused_in_one_line(display, monkeypatch):
-    """There is nothing to open a window on: the error says so, and what to do instead."""
+    """The error says that there is no screen, and what to do instead."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     if display is not None:
@@ -475,8 +479,8 @@ def test_an_image_that_is_too_large_for_opengl_leaves_other_sizes_as_they_were()
     sim.close()
 
 
-def test_any_thread_draws_and_frees_what_another_has_drawn_with(opengl, plain_scene):
-    """Garbage, too, is collected in any thread, while the one that drew still runs."""
+def test_any_thread_may_draw_with_and_free_contexts_of_another_thread(opengl, plain_scene):
+    """Garbage collection may run in any thread while the drawing thread still runs."""
     sim, end = Sim(n_worlds=2, xml_path=plain_scene), threading.Event()
     images = queue.Queue()
 
@@ -494,8 +498,8 @@ def test_any_thread_draws_and_frees_what_another_has_drawn_with(opengl, plain_sc
         thread.join()
 
 
-def test_a_program_that_forgets_to_close_ends_well(opengl):
-    """Contexts are freed before the interpreter goes: no error is printed at exit."""
+def test_a_program_that_does_not_close_its_simulation_exits_without_errors(opengl):
+    """Contexts are freed before the interpreter ends: no error is printed at exit."""
     program = "from crazysim.sim import Sim; sim = Sim(2); sim.render('rgb_array', width=32, height=24)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0

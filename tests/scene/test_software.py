@@ -1,4 +1,4 @@
-"""Images of machines without a GPU: recognised, drawn with less work, and of the same scene."""
+"""Machines without a GPU are recognised, and draw the same scene with less work."""
 
 import mujoco
 import numpy as np
@@ -9,8 +9,8 @@ from crazysim.scene import software
 
 
 @pytest.fixture
-def renderer(monkeypatch):
-    """Return a function that gives OpenGL's renderer another name; each name is looked at again."""
+def set_renderer(monkeypatch):
+    """Return a function that sets the name of OpenGL's renderer, and clears what was concluded from the last name."""
     from OpenGL import GL
 
     def rename(name):
@@ -32,17 +32,17 @@ def renderer(monkeypatch):
         (None, False),
     ],
 )
-def test_the_name_of_the_renderer_tells_a_cpu_from_a_gpu(opengl, renderer, name, expected):
-    renderer(name)
+def test_the_name_of_the_renderer_tells_a_cpu_from_a_gpu(opengl, set_renderer, name, expected):
+    set_renderer(name)
     assert software.uses_cpu_quality() == expected
     assert software.film_size(960, 544) == ((640, 362) if expected else (960, 544))
 
 
-def test_the_variable_takes_precedence_over_the_renderer(opengl, renderer, monkeypatch):
-    renderer(b"llvmpipe")
+def test_the_variable_takes_precedence_over_the_renderer(opengl, set_renderer, monkeypatch):
+    set_renderer(b"llvmpipe")
     monkeypatch.setenv(software.QUALITY_VARIABLE, "full")
     assert not software.uses_cpu_quality()
-    renderer(b"NVIDIA H200/PCIe/SSE2")
+    set_renderer(b"NVIDIA H200/PCIe/SSE2")
     monkeypatch.setenv(software.QUALITY_VARIABLE, "fast")
     assert software.uses_cpu_quality()
 
@@ -53,7 +53,7 @@ def test_a_wrong_variable_is_an_error(monkeypatch):
         Sim().render("rgb_array", width=32, height=24)
 
 
-def test_the_settings_hold_while_a_context_is_made(monkeypatch):
+def test_quality_settings_change_only_while_a_context_is_made(monkeypatch):
     model = mujoco.MjModel.from_xml_string(
         "<mujoco><visual><quality offsamples='8' shadowsize='512'/></visual></mujoco>"
     )
@@ -72,7 +72,7 @@ def test_a_fast_image_shows_the_same_scene_with_jagged_edges(opengl, monkeypatch
         config = {"lookat": [0, 0, 0.3], "distance": 1.5, "azimuth": 90, "elevation": -20}
         images[chosen] = sim.render("rgb_array", cam_config=config, width=240, height=180).astype(int)
         sim.close()
-    off = np.abs(images["full"] - images["fast"]).max(-1)
-    assert np.mean(off > 24) < 0.05, "edges and shadows differ, and nothing else"
+    difference = np.abs(images["full"] - images["fast"]).max(-1)
+    assert np.mean(difference > 24) < 0.05, "edges and shadows differ, and nothing else"
     n_colors = {chosen: len(np.unique(image.reshape(-1, 3), axis=0)) for chosen, image in images.items()}
     assert n_colors["fast"] < n_colors["full"], "samples of a pixel mix the colours at edges"

@@ -29,7 +29,8 @@ def sim():
 
 
 @pytest.fixture(scope="module")
-def look(sim):
+def draw_splats(sim):
+    """Return a function from data and Gaussians to images of all drones."""
     return jax.jit(sim.scene.splat_fn(**SIZE, background=(0.1, 0.2, 0.3)))
 
 
@@ -55,14 +56,14 @@ def test_files_are_read(n_colors, tmp_path):
     assert len(splats.points(0.6)) == opaque.sum() > 0
 
 
-def test_one_splat_is_its_analytic_projection(sim):
+def test_the_image_of_one_splat_equals_its_analytic_projection(sim):
     """A round Gaussian ahead is a round spot, of the standard deviation f s / z and the low-pass of 0.3 pixels^2."""
-    look = sim.scene.splat_fn("fpv_cam:0", 33, 33, background=(0, 0, 0), min_coverage=0.2)
+    draw_splats = sim.scene.splat_fn("fpv_cam:0", 33, 33, background=(0, 0, 0), min_coverage=0.2)
     ahead = float(sim.mj_model.cam("fpv_cam:0").pos[0])
     z, s, opacity, color = 2.0, 0.1, 0.8, np.array([0.9, 0.5, 0.2])
     eye = np.array([ahead, 0, float(sim.mj_model.cam("fpv_cam:0").pos[2]) + 1.0])
     spot = make_splat(eye + [z, 0.2, 0.1], s, opacity, color)
-    image = look(sim.data, spot)
+    image = draw_splats(sim.data, spot)
     assert image.color.shape == (2, 1, 33, 33, 3)
     focal = 33 / 2 / np.tan(np.deg2rad(float(sim.mj_model.cam("fpv_cam:0").fovy[0])) / 2)
     alpha = spot_alpha([z, 0.2, 0.1], s, opacity, focal, 33)
@@ -71,10 +72,10 @@ def test_one_splat_is_its_analytic_projection(sim):
     np.testing.assert_allclose(image.depth[0, 0], np.where(alpha < 0.2, np.inf, z), rtol=1e-5)
 
 
-def test_many_splats_are_blended_from_near_to_far(sim, look, tmp_path):
-    """The image is what a loop over pixels and splats paints, in the order of depth; splats behind are left out."""
+def test_many_splats_are_blended_from_near_to_far(sim, draw_splats, tmp_path):
+    """The image equals that of a loop over splats in the order of depth; splats behind the camera are not drawn."""
     g = gaussians_of(write_splats(tmp_path / "a.ply", n=70, x=np.random.default_rng(1).uniform(-1, 3, 70)))
-    image = look(sim.data, g)
+    image = draw_splats(sim.data, g)
     pos, rot = sim_camera(sim, 1, 1)
     color = np.tile([0.1, 0.2, 0.3], (16, 24, 1))
     eye = jnp.float32(pos), jnp.float32(rot)
@@ -104,7 +105,7 @@ def focal_of(sim):
     return 16 / 2 / np.tan(np.deg2rad(float(sim.mj_model.cam("fpv_cam:0").fovy[0])) / 2)
 
 
-def test_a_scene_looks_the_same_at_any_pose_and_scale(sim, look, tmp_path):
+def test_a_scene_looks_the_same_at_any_pose_and_scale(sim, draw_splats, tmp_path):
     """A file of other axes and units, registered with the world, gives the image of the file in the world's frame."""
     columns = write_splats(tmp_path / "world.ply")
     quat, pos, scale = np.array([0.3, -0.2, 0.5, 0.7]), np.array([1.0, -2.0, 0.5]), 2.5
@@ -126,7 +127,10 @@ def test_a_scene_looks_the_same_at_any_pose_and_scale(sim, look, tmp_path):
     changes |= {f"f_rest_{15 * c + k}": colors[:, c, 1 + k] for c in range(3) for k in range(15)}
     write_splats(tmp_path / "file.ply", **changes)
     registered = SplatScene(tmp_path / "file.ply", pos=pos, quat=quat, scale=scale)
-    expected, found = look(sim.data, SplatScene(tmp_path / "world.ply").gaussians), look(sim.data, registered.gaussians)
+    expected, found = (
+        draw_splats(sim.data, SplatScene(tmp_path / "world.ply").gaussians),
+        draw_splats(sim.data, registered.gaussians),
+    )
     np.testing.assert_allclose(found.color, expected.color, atol=2e-3)
     np.testing.assert_allclose(found.coverage, expected.coverage, atol=2e-3)
     assert np.asarray(expected.coverage).std() > 0.1
@@ -137,11 +141,11 @@ def test_images_have_gradients_to_splats_and_poses(sim, tmp_path):
     large = {f"scale_{k}": np.full(4, 0.2 * k) for k in range(3)} | {f"f_dc_{k}": np.zeros(4) for k in range(3)}
     write_splats(tmp_path / "a.ply", n=4, n_colors=4, x=np.linspace(3, 4, 4), opacity=np.linspace(-1, 0, 4), **large)
     g = SplatScene(tmp_path / "a.ply").gaussians
-    look = sim.scene.splat_fn("fpv_cam:0", 6, 4)
+    draw_splats = sim.scene.splat_fn("fpv_cam:0", 6, 4)
 
     def loss(g, pos):
         data = sim.data.replace(states=sim.data.states.replace(pos=pos))
-        image = look(data, g)
+        image = draw_splats(data, g)
         return jnp.sum(jnp.sin(image.color * 3)) + jnp.sum(image.coverage**2)
 
     pos = jnp.asarray(sim.data.states.pos)
@@ -150,25 +154,25 @@ def test_images_have_gradients_to_splats_and_poses(sim, tmp_path):
     rng = np.random.default_rng(0)
     for _ in range(3):
         step = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), (g, pos))
-        along = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slopes), jax.tree.leaves(step), strict=True))
+        slope = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slopes), jax.tree.leaves(step), strict=True))
         plus, minus = (jax.tree.map(lambda x, d, s=s: x + s * 1e-3 * d, (g, pos), step) for s in (1, -1))
         difference = float(value(*plus) - value(*minus)) / 2e-3
-        assert abs(along - difference) < 0.02 * abs(difference) + 0.02
-        assert abs(along) > 0.1
+        assert abs(slope - difference) < 0.02 * abs(difference) + 0.02
+        assert abs(slope) > 0.1
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))
 
 
-def test_one_world_gets_the_image_of_all(sim, look, tmp_path):
+def test_cameras_of_a_list_have_the_images_of_their_drones(sim, draw_splats, tmp_path):
     write_splats(tmp_path / "a.ply", n=9, n_colors=4)
     g = SplatScene(tmp_path / "a.ply").gaussians
-    image = look(sim.data, g)
+    image = draw_splats(sim.data, g)
     assert image.color.shape == (2, 2, 16, 24, 3)
     assert image.depth.shape == image.coverage.shape == (2, 2, 16, 24)
     chosen = sim.scene.splat_fn(["fpv_cam:1", "fpv_cam:0"], **SIZE, background=(0.1, 0.2, 0.3))(sim.data, g)
     np.testing.assert_allclose(chosen.color[:, ::-1], image.color, atol=1e-5)
 
 
-def stand_in_for_splax(record):
+def fake_splax(record):
     """Return a module with the signature of splax 0.2.3, which draws with the plain renderer."""
 
     def render(
@@ -185,14 +189,14 @@ def stand_in_for_splax(record):
     return types.SimpleNamespace(render=render)
 
 
-def test_splax_gets_the_cameras_that_the_plain_renderer_has(sim, look, tmp_path, monkeypatch):
+def test_splax_gets_the_cameras_of_the_plain_renderer(sim, draw_splats, tmp_path, monkeypatch):
     write_splats(tmp_path / "a.ply", n=9, n_colors=4)
     g, record = SplatScene(tmp_path / "a.ply").gaussians, []
-    monkeypatch.setitem(sys.modules, "splax", stand_in_for_splax(record))
+    monkeypatch.setitem(sys.modules, "splax", fake_splax(record))
     choose = splat_images._choose_renderer
     monkeypatch.setattr(splat_images, "_choose_renderer", lambda renderer, platform: choose(renderer, "gpu"))
     by_splax = sim.scene.splat_fn(**SIZE, background=(0.1, 0.2, 0.3), renderer="splax")(sim.data, g)
-    (shape, focal, near, depth), expected = record[0], look(sim.data, g)
+    (shape, focal, near, depth), expected = record[0], draw_splats(sim.data, g)
     assert (shape, near, depth) == ((16, 24), splat_images.MIN_DEPTH, True)
     np.testing.assert_allclose(focal, focal_of(sim), rtol=1e-6)
     for x, y in zip(jax.tree.leaves(by_splax), jax.tree.leaves(expected), strict=True):

@@ -50,7 +50,7 @@ DERIVED = (
 
 @pytest.fixture(scope="module", params=["", '<joint type="hinge"/>'], ids=["fixed", "joint"])
 def sim(request):
-    """Three worlds of two drones at random poses, a tower with children that is moved through mjx_data, and a shelf."""
+    """Return three worlds of two drones at random poses, a tower with children, moved through mjx_data, and a shelf."""
     sim = Sim(n_worlds=3, n_drones=2)
     shelf = mujoco.MjSpec.from_string(SHELF.format(joint=request.param))
     sim.spec.worldbody.add_frame().attach_body(shelf.body("shelf"), "", "")
@@ -71,8 +71,8 @@ def sim(request):
 
 
 @pytest.fixture(scope="module")
-def synced(sim):
-    """The data and, on the host, the scene after a sync."""
+def synced_data(sim):
+    """Return the data, and the scene on the host, after a sync."""
     data, mjx_data = sync_sim2mjx(sim.data, sim.mjx_data, sim.mjx_model)
     return data, jax.device_get(mjx_data)
 
@@ -96,9 +96,9 @@ def c_mujoco_state(sim, world):
 
 @pytest.mark.long("compiles MJX's kinematics, for the tests after it")
 @pytest.mark.parametrize("world", range(3))
-def test_every_transform_equals_that_of_c_mujoco(sim, synced, world):
+def test_every_transform_equals_that_of_c_mujoco(sim, synced_data, world):
     """Bodies, geoms and cameras of every world have the poses of C MuJoCo, with quaternions as wxyz."""
-    _, mjx_data = synced
+    _, mjx_data = synced_data
     expected = c_mujoco_state(sim, world)
     for name in DERIVED:
         value = getattr(mjx_data, name)[world].reshape(getattr(expected, name).shape)
@@ -116,9 +116,9 @@ def test_a_world_to_draw_equals_that_of_c_mujoco(sim, world):
         np.testing.assert_allclose(getattr(data, name), getattr(expected, name), atol=1e-6, err_msg=name)
 
 
-def test_a_sync_leaves_bodies_of_users_unchanged(sim, synced):
+def test_a_sync_leaves_bodies_of_users_unchanged(sim, synced_data):
     """Poses of attached bodies, and positions and velocities of joints, stay as they were."""
-    _, mjx_data = synced
+    _, mjx_data = synced_data
     tower = sim.mj_model.body("tower").mocapid.item()
     for name in ("mocap_pos", "mocap_quat"):
         before = np.asarray(getattr(sim.mjx_data, name))[:, tower]
@@ -127,8 +127,8 @@ def test_a_sync_leaves_bodies_of_users_unchanged(sim, synced):
         np.testing.assert_array_equal(getattr(mjx_data, name), getattr(sim.mjx_data, name), err_msg=name)
 
 
-def test_a_sync_only_sets_the_flag_in_the_data(sim, synced):
-    data, _ = synced
+def test_a_sync_only_sets_the_flag_in_the_data(sim, synced_data):
+    data, _ = synced_data
     assert bool(data.core.mjx_synced)
     assert not bool(sim.data.core.mjx_synced), "the original data are unchanged"
     before, after = (d.replace(core=d.core.replace(mjx_synced=None, rng_key=None)) for d in (sim.data, data))
@@ -136,7 +136,7 @@ def test_a_sync_only_sets_the_flag_in_the_data(sim, synced):
 
 
 @pytest.mark.long("compiles MJX's kinematics and contacts in a scan")
-def test_a_sync_works_in_jit_and_scan(sim, synced):
+def test_a_sync_works_in_jit_and_scan(sim, synced_data):
     """In jit and scan a sync has the same result, so that rollouts may query contacts at every step."""
 
     @jax.jit
@@ -150,7 +150,7 @@ def test_a_sync_works_in_jit_and_scan(sim, synced):
     (data, _), dist = sync_twice(sim.data, sim.mjx_data)
     assert bool(data.core.mjx_synced)
     for k in range(2):
-        np.testing.assert_allclose(np.asarray(dist)[k], synced[1]._impl.contact.dist, atol=1e-6)
+        np.testing.assert_allclose(np.asarray(dist)[k], synced_data[1]._impl.contact.dist, atol=1e-6)
 
 
 def test_a_sync_compiles_once(sim):

@@ -13,7 +13,7 @@ BUTTONS = {"left": 0, "right": 1, "middle": 2}
 
 @pytest.fixture
 def window():
-    """A window on a fake screen of 100 x 100 pixels, with a button pressed as ``pressed`` says."""
+    """Return a window on a fake screen of 100 x 100 pixels; ``pressed`` is the name of the pressed button."""
     window = object.__new__(SceneWindow)
     window._model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     window._camera = mujoco.MjvCamera()
