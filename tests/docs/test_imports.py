@@ -23,7 +23,7 @@ MODULES = {
     "crazysim.trajectories",
 }
 STAND_IN = {"crazysim.lab.live.crazyflie_py"}
-"""Module that has the name of Crazyswarm2's, for its scripts."""
+"""Module with the name of a module of Crazyswarm2, for scripts that import it."""
 OPTIONAL_NAMES = {"crazysim.envs": ["DroneVecEnv", "make_parallel"]}
 """Public names that need optional packages, which are not in ``__all__``."""
 EXEMPT = (ROOT / "docs" / "coming-from-crazyflow.md", ROOT / "docs" / "concepts" / "engine-design.md")

@@ -26,7 +26,7 @@ def run_steps(env, state, device):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_tasks_are_those_of_the_cpu_and_stay_on_their_device(name):
+def test_tasks_agree_with_the_cpu_and_stay_on_their_device(name):
     """Also, an environment on the CPU steps on the accelerator if its state is moved there."""
     envs = {device: AutoReset(make(name, N_WORLDS, device=device)) for device in NAMES}
     starts = {device: require_device(device, jax.jit(env.reset)(jax.random.key(0))) for device, env in envs.items()}

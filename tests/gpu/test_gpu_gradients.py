@@ -31,15 +31,15 @@ def value_and_gradient(sim, n_steps=50, of_params=False):
     def loss(x):
         states, commands, params = x
         data = start.replace(states=states, params=start.params if params is None else params)
-        for cmd in commands:  # another one each time
+        for cmd in commands:  # a different command each time
             data = step(send(data, cmd), n_steps // len(commands), zeros)
         after = data.states
         return jnp.sum(after.pos**2) + jnp.sum(after.vel * jnp.array([1.0, -2.0, 3.0])) + jnp.sum(after.ang_vel**2)
 
     data = getattr(start.controls, level)
     cmd = getattr(data, "staged_cmd", data)
-    at = start.states, [cmd, cmd * 1.01], start.params if of_params else None
-    return jax.value_and_grad(loss, allow_int=True), at
+    point = start.states, [cmd, cmd * 1.01], start.params if of_params else None
+    return jax.value_and_grad(loss, allow_int=True), point
 
 
 def floating_leaves(tree):
@@ -52,8 +52,8 @@ def compare_gradients(build, tolerance=ROUNDING, **options):
 
     def run(device):
         sim = build(device, "plain" if device == "cpu" else "auto")
-        fn, at = value_and_gradient(sim, **options)
-        out = jax.jit(fn)(at)
+        fn, point = value_and_gradient(sim, **options)
+        out = jax.jit(fn)(point)
         if device == ACCELERATOR:
             assert "gradient: one kernel" in sim.explain()
         return floating_leaves(out)
@@ -64,7 +64,7 @@ def compare_gradients(build, tolerance=ROUNDING, **options):
 
 
 @pytest.mark.parametrize("control", ["state", "attitude", "rotor_vel"])
-def test_gradients_are_those_of_the_reference_on_the_cpu(control):
+def test_gradients_equal_those_of_the_reference_on_the_cpu(control):
     compare_gradients(lambda device, engine: make_flying_sim(device, control=control, engine=engine))
 
 
@@ -72,7 +72,7 @@ def test_gradients_of_shared_parameters_are_sums():
     compare_gradients(lambda device, engine: make_flying_sim(device, control="attitude", engine=engine), of_params=True)
 
 
-def test_gradients_in_float64_are_those_of_the_reference(x64):
+def test_gradients_in_float64_equal_those_of_the_reference(x64):
     compare_gradients(lambda device, engine: make_flying_sim(device, control="state", engine=engine), 1e-9)
 
 
@@ -101,8 +101,8 @@ def test_drones_that_act_on_each_other_are_differentiated(n_drones, stage):
 
 
 @pytest.mark.parametrize("n_drones", [1, 12, 33])
-def test_tangents_are_those_of_the_reference_on_the_cpu(n_drones):
-    """Drones fly alone, or act on each other within a warp or within a block."""
+def test_tangents_equal_those_of_the_reference_on_the_cpu(n_drones):
+    """A world has one drone, or drones that act on each other within a warp or within a block."""
 
     def run(name):
         sim = make_flying_sim(name, 4, n_drones, control="attitude", engine="plain" if name == "cpu" else "auto")
@@ -114,8 +114,8 @@ def test_tangents_are_those_of_the_reference_on_the_cpu(n_drones):
             after = step(sim.data.replace(states=start.replace(pos=x[0], vel=x[1])), 20).states
             return after.pos, after.vel, after.quat
 
-        at = start.pos, start.vel
-        out = jax.jit(lambda x: jax.jvp(end, (x,), (jax.tree.map(jnp.cos, x),))[1])(at)
+        point = start.pos, start.vel
+        out = jax.jit(lambda x: jax.jvp(end, (x,), (jax.tree.map(jnp.cos, x),))[1])(point)
         assert name == "cpu" or "jvp: one kernel" in sim.explain()
         return out
 
@@ -129,15 +129,17 @@ def test_gradients_are_equal_to_the_bit_in_any_run_and_with_little_memory(monkey
     found = []
     for memory in (cuda.MAX_GRADIENT_MEMORY_BYTES, cuda.MAX_GRADIENT_MEMORY_BYTES, 2**18):
         monkeypatch.setattr(cuda, "MAX_GRADIENT_MEMORY_BYTES", memory)
-        fn, at = value_and_gradient(make_flying_sim(ACCELERATOR, 100, control="attitude"), n_steps=100, of_params=True)
-        found.append(floating_leaves(jax.jit(fn)(at)))
+        fn, point = value_and_gradient(
+            make_flying_sim(ACCELERATOR, 100, control="attitude"), n_steps=100, of_params=True
+        )
+        found.append(floating_leaves(jax.jit(fn)(point)))
     assert trees_equal(found[0], found[1])
     assert trees_equal(found[0], found[2])
 
 
-def test_a_batch_of_worlds_is_more_worlds():
-    fn, at = value_and_gradient(make_flying_sim(ACCELERATOR, 5, control="attitude"), n_steps=10)
-    many = jax.tree.map(lambda x: jnp.stack([x, 1.01 * x, 0.99 * x]), at)
+def test_a_vmapped_gradient_equals_gradients_one_by_one():
+    fn, point = value_and_gradient(make_flying_sim(ACCELERATOR, 5, control="attitude"), n_steps=10)
+    many = jax.tree.map(lambda x: jnp.stack([x, 1.01 * x, 0.99 * x]), point)
     found = floating_leaves(jax.jit(jax.vmap(fn))(many))
     for k in range(3):
         assert_agree([x[k] for x in found], floating_leaves(jax.jit(fn)(jax.tree.map(lambda x, k=k: x[k], many))), 1e-6)

@@ -16,7 +16,7 @@ from crazysim import Sim, SplatScene
 from crazysim.sim.sensors.splat import render_splat_rgbd
 from crazysim.sim.splat import attach_splats
 
-os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before SciPy is imported, by whatever test
+os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before any test imports SciPy
 splax = pytest.importorskip("splax")
 
 
@@ -30,13 +30,13 @@ def sim():
     return sim
 
 
-def test_a_known_splat_is_its_analytic_projection(sim):
-    look = jax.jit(sim.scene.splat_fn("fpv_cam:0", 33, 33, (0, 0, 0), min_coverage=0.2, renderer="splax"))
+def test_the_image_of_a_known_splat_equals_its_analytic_projection(sim):
+    draw = jax.jit(sim.scene.splat_fn("fpv_cam:0", 33, 33, (0, 0, 0), min_coverage=0.2, renderer="splax"))
     camera = sim.mj_model.cam("fpv_cam:0")
     offset, deviation, opacity, color = np.array([2.0, 0.2, 0.1]), 0.1, 0.8, np.array([0.9, 0.5, 0.2])
     eye = np.array([camera.pos[0], camera.pos[1], camera.pos[2] + 1.0])
     image = require_device(
-        ACCELERATOR, look(sim.data, jax.device_put(make_splat(eye + offset, deviation, opacity, color), sim.device))
+        ACCELERATOR, draw(sim.data, jax.device_put(make_splat(eye + offset, deviation, opacity, color), sim.device))
     )
     focal = 33 / 2 / np.tan(np.deg2rad(float(camera.fovy[0])) / 2)
     alpha = spot_alpha(offset, deviation, opacity, focal, 33)
@@ -47,7 +47,7 @@ def test_a_known_splat_is_its_analytic_projection(sim):
 
 
 @pytest.mark.parametrize("n_colors", [1, 4, 9, 16])
-def test_scenes_look_as_in_plain_jax(n_colors, sim, tmp_path):
+def test_images_agree_with_plain_jax(n_colors, sim, tmp_path):
     write_splats(tmp_path / "a.ply", n=2000, n_colors=n_colors)
     gaussians = jax.device_put(SplatScene(tmp_path / "a.ply").gaussians, sim.device)
     size = {"width": 64, "height": 48, "background": (0.1, 0.2, 0.3)}
@@ -59,20 +59,20 @@ def test_scenes_look_as_in_plain_jax(n_colors, sim, tmp_path):
         error = np.abs(np.asarray(getattr(by_splax, name)) - np.asarray(getattr(plain, name)))
         assert error.mean() < 2e-3, name  # splax sorts by depths of few bits, so single pixels differ
         assert np.quantile(error, 0.99) < 0.03, name
-    both = np.isfinite(by_splax.depth) & np.isfinite(plain.depth)
-    assert both.mean() > 0.2
-    assert np.quantile(np.abs(np.asarray(by_splax.depth)[both] - np.asarray(plain.depth)[both]), 0.99) < 0.05
+    is_hit = np.isfinite(by_splax.depth) & np.isfinite(plain.depth)
+    assert is_hit.mean() > 0.2
+    assert np.quantile(np.abs(np.asarray(by_splax.depth)[is_hit] - np.asarray(plain.depth)[is_hit]), 0.99) < 0.05
 
 
-def test_gradients_are_those_of_plain_jax(sim, tmp_path):
+def test_gradients_agree_with_plain_jax(sim, tmp_path):
     write_splats(tmp_path / "a.ply", n=50, n_colors=4)
     gaussians = jax.device_put(SplatScene(tmp_path / "a.ply").gaussians, sim.device)
     slopes = []
     for renderer in ("splax", "plain"):
-        look = sim.scene.splat_fn(width=32, height=24, renderer=renderer)
+        draw = sim.scene.splat_fn(width=32, height=24, renderer=renderer)
 
-        def loss(gaussians, pos, look=look):
-            image = look(sim.data.replace(states=sim.data.states.replace(pos=pos)), gaussians)
+        def loss(gaussians, pos, draw=draw):
+            image = draw(sim.data.replace(states=sim.data.states.replace(pos=pos)), gaussians)
             return jnp.mean(image.color**2) + jnp.mean(image.coverage)
 
         slopes.append(jax.jit(jax.grad(loss, argnums=(0, 1)))(gaussians, sim.data.states.pos))

@@ -17,7 +17,7 @@ from sweep import ROUNDING, assert_agree, make_flying_sim
 from crazysim import Downwash, Kalman, Sim, Wind
 
 N_STEPS = 100
-FALLBACK_TESTS = "law_01 or law_10 or on_each_other_are_differentiated or tangents or what_drones_share"
+FALLBACK_TESTS = "law_01 or law_10 or on_each_other_are_differentiated or tangents or shared_parameters"
 """Expression of pytest that selects tests with all kinds of kernels."""
 
 
@@ -28,7 +28,7 @@ def run_on_both(run):
 
 
 @pytest.mark.parametrize("name", sweep.CASES)
-def test_simulations_are_those_of_the_cpu(name):
+def test_simulations_agree_with_the_cpu(name):
     def run(device):
         sim = sweep.CASES[name](device=device)
         lines = sim.explain().splitlines()
@@ -52,7 +52,7 @@ def test_drones_that_act_on_each_other_fly_as_on_the_cpu(n_drones):
     assert_agree(*run_on_both(run), ROUNDING)
 
 
-def test_steps_in_float64_are_those_of_the_cpu(x64):
+def test_steps_in_float64_agree_with_the_cpu(x64):
     def run(device):
         sim = make_flying_sim(device, control="state")
         sim.step(N_STEPS)
@@ -77,16 +77,16 @@ def test_law_01_one_world_flies_as_among_many():
     many = make_flying_sim(ACCELERATOR, 100, control="state")
     start = many.data.states, many.data.controls.state.staged_cmd
     many.step(N_STEPS)
-    one = make_flying_sim(ACCELERATOR, 1, control="state")
-    begin = one.data
+    single_sim = make_flying_sim(ACCELERATOR, 1, control="state")
+    single_start = single_sim.data
     for world in (0, 37, 99):
         states, command = jax.tree.map(lambda x, w=world: x[w : w + 1], start)
-        one.data = send(begin.replace(states=states), command)
-        one.step(N_STEPS)
-        assert trees_equal(one.data.states, jax.tree.map(lambda x, w=world: x[w : w + 1], many.data.states))
+        single_sim.data = send(single_start.replace(states=states), command)
+        single_sim.step(N_STEPS)
+        assert trees_equal(single_sim.data.states, jax.tree.map(lambda x, w=world: x[w : w + 1], many.data.states))
 
 
-def test_law_07_a_world_that_is_not_finite_touches_no_other():
+def test_law_07_a_world_that_is_not_finite_does_not_change_others():
     sim = make_flying_sim(ACCELERATOR, 100, plugins=[Downwash(), Wind(speed_20ft=7.7)], control="attitude")
     start = sim.data
     sim.step(N_STEPS)
@@ -103,12 +103,12 @@ def test_law_10_the_same_seed_gives_the_same_numbers():
     sims = [make_flying_sim(ACCELERATOR, n, plugins=[Wind(speed_20ft=7.7)], control="attitude") for n in (100, 100, 7)]
     for sim in sims:
         sim.step(N_STEPS)
-    first, again, few = (sim.data.plugins for sim in sims)
-    assert trees_equal(first, again)
+    first, second, few = (sim.data.plugins for sim in sims)
+    assert trees_equal(first, second)
     assert_agree(jax.tree.map(lambda x: x[:7], first["wind"].gust), few["wind"].gust, 0)
 
 
-def test_queries_of_the_scene_are_those_of_the_cpu():
+def test_queries_of_the_scene_agree_with_the_cpu():
     def run(device):
         sim = make_flying_sim(device, control="attitude")
         ball = sim.scene.add("sphere", pos=(0.0, 0.0, 1.5), radius=0.2)
@@ -121,8 +121,8 @@ def test_queries_of_the_scene_are_those_of_the_cpu():
         return report, depth, moved, sim.contacts()
 
     found, expected = run_on_both(run)
-    seen = [np.isfinite(x[1]) for x in (found, expected)]
-    assert_agree(*seen, 0)
+    has_depth = [np.isfinite(x[1]) for x in (found, expected)]
+    assert_agree(*has_depth, 0)
     assert_agree(*(jax.tree.map(lambda x: jnp.where(jnp.isinf(x), 0, x), x) for x in (found, expected)), 1e-5)
 
 

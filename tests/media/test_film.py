@@ -31,11 +31,11 @@ def move_to_step(sim, steps):
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos), core=core)
 
 
-def view(**options):
+def make_view(**options):
     return View(**{"camera": "down", "width": WIDTH, "height": HEIGHT} | options)
 
 
-def column(frame):
+def column_of_drone(frame):
     """Return the mean column of the pixels that are darker than the floor."""
     return np.nonzero(frame.astype(int).max(-1) < 130)[1].mean()
 
@@ -44,13 +44,13 @@ def column(frame):
 def test_a_film_shows_the_drone_fly_from_left_to_right(sim, tmp_path, suffix):
     """One second at 1 m/s has 11 frames at 10 Hz; from frame to frame the drone moves right by 0.1 m."""
     path = tmp_path / f"flight{suffix}"
-    with Film(path, view(), fps=10) as film:
+    with Film(path, make_view(), fps=10) as film:
         for k in range(11):
             move_to_step(sim, 50 * k)
             assert film.add(sim) == 1
     frames = read_frames(path, HEIGHT, WIDTH)
     assert len(frames) == film.n_frames == 11
-    columns = [column(frame) for frame in frames]
+    columns = [column_of_drone(frame) for frame in frames]
     focal = 0.5 * HEIGHT / np.tan(np.deg2rad(45 / 2))
     np.testing.assert_allclose(np.diff(columns), 0.1 * focal, atol=1.5)
     np.testing.assert_allclose(columns[5] + 0.5, WIDTH / 2, atol=1.5)
@@ -59,7 +59,7 @@ def test_a_film_shows_the_drone_fly_from_left_to_right(sim, tmp_path, suffix):
 def test_a_film_stays_in_its_folder_when_the_working_directory_changes(tmp_path, monkeypatch):
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path)
-    with Film("flight.gif", view()) as film:
+    with Film("flight.gif", make_view()) as film:
         film.write(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
         monkeypatch.chdir(tmp_path / "other")
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["flight.gif", "other"]
@@ -69,7 +69,7 @@ def test_a_film_stays_in_its_folder_when_the_working_directory_changes(tmp_path,
 def test_the_number_of_frames_follows_from_simulated_time(sim, tmp_path, fps, speed, n_frames):
     """At any rate of calls, a second has fps / speed frames and the first one; with few calls images are repeated."""
     n_frames_of_calls = []
-    with Film(tmp_path / "flight.mp4", view(), fps=fps, speed=speed) as film:
+    with Film(tmp_path / "flight.mp4", make_view(), fps=fps, speed=speed) as film:
         for k in range(21):
             move_to_step(sim, 25 * k)
             n_frames_of_calls.append(film.add(sim))
@@ -80,7 +80,7 @@ def test_the_number_of_frames_follows_from_simulated_time(sim, tmp_path, fps, sp
 
 
 def test_a_reset_does_not_turn_the_film_back(sim, tmp_path):
-    with Film(tmp_path / "flight.mp4", view(), fps=10) as film:
+    with Film(tmp_path / "flight.mp4", make_view(), fps=10) as film:
         for steps in (0, 50, 100, 0, 50, 100):
             move_to_step(sim, steps)
             film.add(sim)
@@ -94,7 +94,7 @@ def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path, capfd):
         move_to_step(sim, 50 * k)
         recorder.add()
     move_to_step(sim, 5000)
-    two_worlds = view(worlds=[0, 1], columns=1, border=0)
+    two_worlds = make_view(worlds=[0, 1], columns=1, border=0)
     with Film(tmp_path / "flight.mp4", two_worlds, fps=20, progress=True) as film:
         assert film.play(sim, recorder.flight()) == 11
     assert not capfd.readouterr().err  # no bar without a terminal
@@ -102,23 +102,23 @@ def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path, capfd):
     np.testing.assert_array_equal(sim.data.core.steps, 5000)
     frames = read_frames(tmp_path / "flight.mp4", HEIGHT, WIDTH)
     for k in range(2):
-        columns = [column(frame[two_worlds.tile(k)]) for frame in frames]
+        columns = [column_of_drone(frame[two_worlds.tile(k)]) for frame in frames]
         focal = 0.25 * HEIGHT / np.tan(np.deg2rad(45 / 2))
         np.testing.assert_allclose(np.diff(columns), 0.05 * focal, atol=1.0)
         np.testing.assert_allclose(columns[10] - columns[0], 0.5 * focal, atol=1.5)
 
 
 def test_images_can_be_written_as_frames(sim, tmp_path):
-    with Film(tmp_path / "flight.mp4", view(), fps=10) as film:
+    with Film(tmp_path / "flight.mp4", make_view(), fps=10) as film:
         film.write(np.full((HEIGHT, WIDTH, 3), 200, np.uint8), 3)
     frames = read_frames(tmp_path / "flight.mp4", HEIGHT, WIDTH)
     assert len(frames) == 3
     np.testing.assert_allclose(frames.astype(int), 200, atol=3)
 
 
-def test_a_name_that_looks_like_an_option_is_a_name(tmp_path, monkeypatch):
+def test_a_file_name_may_look_like_an_option(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with Film("-y.mp4", view(), fps=10) as film:
+    with Film("-y.mp4", make_view(), fps=10) as film:
         film.write(np.full((HEIGHT, WIDTH, 3), 200, np.uint8), 2)
     assert len(read_frames(tmp_path / "-y.mp4", HEIGHT, WIDTH)) == 2
 
@@ -151,13 +151,13 @@ def test_a_film_without_frames_is_refused(tmp_path):
 
 
 def test_wrong_worlds_cameras_and_images_are_refused(sim, tmp_path):
-    with pytest.raises(ConfigError, match="got 2"), Film(tmp_path / "a.mp4", view(worlds=[2])) as film:
+    with pytest.raises(ConfigError, match="got 2"), Film(tmp_path / "a.mp4", make_view(worlds=[2])) as film:
         film.add(sim)
-    with pytest.raises(ConfigError, match="got 'up'"), Film(tmp_path / "a.mp4", view(camera="up")) as film:
+    with pytest.raises(ConfigError, match="got 'up'"), Film(tmp_path / "a.mp4", make_view(camera="up")) as film:
         film.add(sim)
     with (
         pytest.raises(ConfigError, match=r"image of shape \(64, 96, 3\), uint8, got \(9, 9, 3\), float64"),
-        Film(tmp_path / "a.mp4", view()) as film,
+        Film(tmp_path / "a.mp4", make_view()) as film,
     ):
         film.write(np.zeros((9, 9, 3)))
     assert not list(tmp_path.iterdir())
@@ -166,7 +166,7 @@ def test_wrong_worlds_cameras_and_images_are_refused(sim, tmp_path):
 def test_an_unwritable_file_is_refused(sim, tmp_path):
     (tmp_path / "flight.mp4").mkdir()
     with pytest.raises(ConfigError, match=r"can be written, got the folder .*flight\.mp4'"):
-        Film(tmp_path / "flight.mp4", view())
+        Film(tmp_path / "flight.mp4", make_view())
 
 
 def test_a_film_replaces_an_older_one_only_when_it_is_complete(sim, tmp_path):
@@ -174,7 +174,7 @@ def test_a_film_replaces_an_older_one_only_when_it_is_complete(sim, tmp_path):
     path.write_bytes(b"before")
 
     def film_until_the_disk_is_full():
-        with full_disk(), Film(path, view()) as film:
+        with full_disk(), Film(path, make_view()) as film:
             film.add(sim)
             assert path.read_bytes() == b"before"
 
@@ -182,7 +182,7 @@ def test_a_film_replaces_an_older_one_only_when_it_is_complete(sim, tmp_path):
         film_until_the_disk_is_full()
     assert path.read_bytes() == b"before"
     assert [p.name for p in tmp_path.iterdir()] == ["flight.mp4"]
-    with Film(path, view()) as film:
+    with Film(path, make_view()) as film:
         film.add(sim)
     assert path.read_bytes()[4:8] == b"ftyp"
     assert [p.name for p in tmp_path.iterdir()] == ["flight.mp4"]

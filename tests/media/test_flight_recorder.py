@@ -30,7 +30,7 @@ def build(n_worlds=3, **options):
 
 @pytest.fixture(scope="module")
 def sim():
-    """Return a simulation whose balls are 0, 1 and 2 m to the east, and rolled."""
+    """Return a simulation with its rolled balls 0, 1 and 2 m to the east in its three worlds."""
     sim = build()
     k = sim.mj_model.body("ball").mocapid.item()
     sim.mjx_data = sim.mjx_data.replace(
@@ -111,7 +111,7 @@ def test_meshes_and_children_of_moving_bodies_are_shapes():
 
 
 def test_poses_between_two_samples_are_interpolated(flight):
-    """At half the time it is at half the height and half the turn; times beyond the ends are clipped."""
+    """At half the time the drone is at half the height and half the turn; times beyond the ends are clipped."""
     half = flight.at(0.25)
     np.testing.assert_allclose(half["pos"][0, 1], [0.5, 0, 1.5])
     angle = np.arctan2(0.6, 0.8) / 2
@@ -122,11 +122,11 @@ def test_poses_between_two_samples_are_interpolated(flight):
 
 def test_a_file_keeps_the_whole_flight(flight, tmp_path):
     flight.save(tmp_path / "flight.npz")
-    again = Flight.load(tmp_path / "flight.npz")
+    loaded = Flight.load(tmp_path / "flight.npz")
     for name in ("time", "pos", "quat", "body_pos", "body_quat", "setpoint", "worlds", "drone_ids", "body_ids"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(flight, name))
-    assert len(again.shapes) == len(flight.shapes)
-    for found, expected in zip(again.shapes, flight.shapes, strict=True):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(flight, name))
+    assert len(loaded.shapes) == len(flight.shapes)
+    for found, expected in zip(loaded.shapes, flight.shapes, strict=True):
         assert (found.kind, found.mocap) == (expected.kind, expected.mocap)
         for name in ("size", "rgba", "pos", "quat", "vertices", "faces"):
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
@@ -134,28 +134,28 @@ def test_a_file_keeps_the_whole_flight(flight, tmp_path):
 
 def test_another_simulation_shows_the_flight(flight, opengl):
     """A new simulation shows drones and ball of world 2 where they were, also where its own ball was elsewhere."""
-    other = build()
-    show_flight_at(other, flight, 0.25)
-    np.testing.assert_allclose(other.data.states.pos[2, 1], [0.5, 0, 1.5])
-    np.testing.assert_allclose(other.time[:, 0], [0.25, 0, 0.25], atol=2e-3)
-    np.testing.assert_allclose(other.data.controls.state.staged_cmd[2, 0, :3], 0.15, atol=1e-6)
-    k = other.mj_model.body("ball").mocapid.item()
-    np.testing.assert_allclose(other.mjx_data.mocap_pos[2, k], [2, 0, 0.3], atol=1e-6)
-    np.testing.assert_allclose(other.mjx_data.mocap_quat[2, k], np.roll(ROLL[1], 1), atol=1e-6)
+    other_sim = build()
+    show_flight_at(other_sim, flight, 0.25)
+    np.testing.assert_allclose(other_sim.data.states.pos[2, 1], [0.5, 0, 1.5])
+    np.testing.assert_allclose(other_sim.time[:, 0], [0.25, 0, 0.25], atol=2e-3)
+    np.testing.assert_allclose(other_sim.data.controls.state.staged_cmd[2, 0, :3], 0.15, atol=1e-6)
+    k = other_sim.mj_model.body("ball").mocapid.item()
+    np.testing.assert_allclose(other_sim.mjx_data.mocap_pos[2, k], [2, 0, 0.3], atol=1e-6)
+    np.testing.assert_allclose(other_sim.mjx_data.mocap_quat[2, k], np.roll(ROLL[1], 1), atol=1e-6)
     above = {"lookat": [2, 0, 0.3], "distance": 2.0, "azimuth": 90, "elevation": -89}
     for world, is_visible in ((2, True), (0, False)):
-        picture = View(worlds=world, width=64, height=48, cam_config=above).render(other).astype(int)
+        picture = View(worlds=world, width=64, height=48, cam_config=above).render(other_sim).astype(int)
         red = has_colour(picture, [1, 0, 0])
         assert red[23:25, 31:33].all() == red.any() == is_visible
-    other.close()
+    other_sim.close()
 
 
 def test_setpoints_replace_the_feedforward_of_earlier_ones(flight):
-    """Worlds that are not in the flight keep theirs."""
-    other = build()
-    other.state_control(pos=[0.0, 0.0, 1.0], feedforward=np.ones((3, 2, 8)))
-    show_flight_at(other, flight, 0.25)
-    found = np.asarray(other.data.controls.state.staged_feedforward)
+    """Worlds that are not in the flight keep their feedforward."""
+    other_sim = build()
+    other_sim.state_control(pos=[0.0, 0.0, 1.0], feedforward=np.ones((3, 2, 8)))
+    show_flight_at(other_sim, flight, 0.25)
+    found = np.asarray(other_sim.data.controls.state.staged_feedforward)
     np.testing.assert_array_equal(found, np.broadcast_to(np.array([0.0, 1.0, 0.0])[:, None, None], (3, 2, 8)))
 
 
@@ -177,9 +177,9 @@ def test_objects_with_handles_are_recorded_and_shown():
     flight = recorder.flight()
     np.testing.assert_allclose(flight.body_pos[1], [[[1, 0, 0.5], [2, 1, 1]], [[1, 1, 0.5], [2, 1, 1]]], atol=1e-6)
     np.testing.assert_allclose(flight.body_quat[1], np.broadcast_to(ROLL[1], (2, 2, 4)), atol=1e-6)
-    other, other_boxes = build()
-    show_flight_at(other, flight, 0.5)
-    pos, quat = other_boxes.pose(other.data)
+    other_sim, other_boxes = build()
+    show_flight_at(other_sim, flight, 0.5)
+    pos, quat = other_boxes.pose(other_sim.data)
     np.testing.assert_allclose(pos, flight.at(0.5)["body_pos"], atol=1e-6)
     np.testing.assert_allclose(quat, flight.at(0.5)["body_quat"], atol=1e-6)
     np.testing.assert_allclose(pos[:, 0, 0], 0.5, atol=1e-6)
@@ -187,7 +187,7 @@ def test_objects_with_handles_are_recorded_and_shown():
 
 @pytest.mark.parametrize("cable", [True, False], ids=["cable", "rod"])
 def test_loads_are_shown_at_their_recorded_poses(cable):
-    """Also if the load of the simulation has been released since."""
+    """The load of the simulation has been released since the recording."""
     sim = Sim(n_worlds=2, control="rotor_vel")
     load = sim.add(SlungLoad(mass=0.1, length=0.5, cable=cable))
     recorder = Recorder(sim)
@@ -223,8 +223,7 @@ def test_a_reset_does_not_turn_the_recording_back(sim):
     np.testing.assert_allclose(recorder.flight().time, [0, 0.1, 0.2, 0.3], atol=1e-6)
 
 
-def test_states_of_a_rollout_can_become_a_flight():
-    """States of a rollout become a flight of the requested worlds."""
+def test_states_of_a_rollout_can_become_a_flight_of_chosen_worlds():
     sim = Sim(n_worlds=2, control="attitude")
     thrust = 1.2 * sim.data.params.mass.ravel()[0] * 9.81
 
@@ -232,11 +231,11 @@ def test_states_of_a_rollout_can_become_a_flight():
         return jnp.zeros((2, 1, 4)).at[1, :, 3].set(thrust)
 
     states = sim.rollout(policy, n_control_steps=200, every=50)
-    flown = flight_of(sim, states, dt=50 / sim.control_freq, worlds=[1])
-    np.testing.assert_allclose(flown.time, np.arange(4) * 50 / sim.control_freq)
-    np.testing.assert_allclose(flown.pos[:, 0], states.pos[:, 1])
-    assert flown.pos[-1, 0, 0, 2] > 0
-    assert flown.setpoint.shape == (4, 1, 0, 3)
+    rollout_flight = flight_of(sim, states, dt=50 / sim.control_freq, worlds=[1])
+    np.testing.assert_allclose(rollout_flight.time, np.arange(4) * 50 / sim.control_freq)
+    np.testing.assert_allclose(rollout_flight.pos[:, 0], states.pos[:, 1])
+    assert rollout_flight.pos[-1, 0, 0, 2] > 0
+    assert rollout_flight.setpoint.shape == (4, 1, 0, 3)
 
 
 # Wrong input ----------------------------------------------------------------------------------------------------

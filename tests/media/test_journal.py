@@ -98,7 +98,7 @@ def test_a_recording_without_samples_is_refused(tmp_path):
         Flight.load(tmp_path / "f.journal")
 
 
-KILLED = textwrap.dedent("""
+KILLED_PROGRAM = textwrap.dedent("""
     import os, signal, sys
     import numpy as np
     from crazysim.media import Film, View
@@ -113,15 +113,15 @@ KILLED = textwrap.dedent("""
 def test_a_film_survives_the_end_of_its_process(tmp_path):
     """A killed simulation loses no frame; a killed encoder loses the last seconds, which it had not encoded yet."""
     film = path = tmp_path / "film.mp4"
-    ended = subprocess.run([sys.executable, "-c", KILLED, path, "200", "python"], check=False)
+    ended = subprocess.run([sys.executable, "-c", KILLED_PROGRAM, path, "200", "python"], check=False)
     assert ended.returncode == -signal.SIGKILL
     path = unfinished_path(path)  # only a film that is closed gets its name
     wait_for(lambda: path.exists() and path.stat().st_size and len(read_frames(path, 48, 64)) == 200)
-    subprocess.run([sys.executable, "-c", KILLED, film, "400", "ffmpeg"], check=True)
+    subprocess.run([sys.executable, "-c", KILLED_PROGRAM, film, "400", "ffmpeg"], check=True)
     assert len(read_frames(path, 48, 64)) > 200
 
 
-def test_film_closes_in_order(tmp_path):
+def test_a_closed_film_has_all_frames(tmp_path):
     with Film(tmp_path / "film.mp4", View(width=64, height=48), fps=10) as film:
         film.write(np.zeros((48, 64, 3), np.uint8), 30)
     assert len(read_frames(tmp_path / "film.mp4", 48, 64)) == 30

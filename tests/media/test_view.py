@@ -1,4 +1,4 @@
-"""A view is looked at: which world is in which tile, what the camera follows, and what is drawn over it."""
+"""Views: which world is in which tile, what the camera follows, and what is drawn over the image."""
 
 import re
 
@@ -13,16 +13,16 @@ from crazysim.media import View, render_worlds
 from crazysim.sim import Sim
 from crazysim.sim.visualize import draw_points
 
-PLACES = np.array([[0.4, 0.2, 0.5], [-0.4, 0.2, 0.5], [-0.4, -0.2, 0.5], [0.4, -0.2, 0.5]])
-"""Where the drone of each world is, m. (4, 3)"""
+POSITIONS = np.array([[0.4, 0.2, 0.5], [-0.4, 0.2, 0.5], [-0.4, -0.2, 0.5], [0.4, -0.2, 0.5]])
+"""Position of the drone of each world, m. (4, 3)"""
 RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
 
 
 @pytest.fixture(scope="module")
 def sim(opengl, plain_scene):
-    """Four worlds over a plain floor, the drone of each in another corner, under a camera that looks down."""
+    """Return four worlds over a plain floor, each with a drone in another corner, and a camera that looks down."""
     sim = Sim(n_worlds=4, control="state", xml_path=plain_scene)
-    place(sim, PLACES, 0.0)
+    place(sim, POSITIONS, 0.0)
     yield sim
     sim.close()
 
@@ -33,14 +33,14 @@ def place(sim, pos, time):
     sim.data = sim.data.replace(states=states, core=core)
 
 
-def dark(tile):
-    """Return the mean row and column of what is darker than the floor."""
+def center_of_dark_pixels(tile):
+    """Return the mean row and column of the pixels that are darker than the floor."""
     rows, columns = np.nonzero(tile.astype(int).max(-1) < 100)
     assert len(rows) > 5
     return rows.mean() + 0.5, columns.mean() + 0.5
 
 
-def view(**options):
+def make_view(**options):
     return View(**{"camera": "down", "width": WIDTH, "height": HEIGHT} | options)
 
 
@@ -48,18 +48,18 @@ def view(**options):
 
 
 def test_each_tile_shows_its_world(sim):
-    """Tile k of a grid is the image of the k-th requested world alone, with borders between."""
+    """Tile k of a grid equals the image of the k-th requested world; there are borders between tiles."""
     worlds = [2, 0, 3, 1]
-    grid = view(worlds=worlds, width=2 * WIDTH + 4, height=2 * HEIGHT + 4, border=4)
+    grid = make_view(worlds=worlds, width=2 * WIDTH + 4, height=2 * HEIGHT + 4, border=4)
     picture = grid.render(sim)
     assert picture.shape == (2 * HEIGHT + 4, 2 * WIDTH + 4, 3)
     assert picture.dtype == np.uint8
     upper, lower, left, right = slice(HEIGHT), slice(HEIGHT + 4, None), slice(WIDTH), slice(WIDTH + 4, None)
     for k, tile in enumerate([(upper, left), (upper, right), (lower, left), (lower, right)]):
-        np.testing.assert_allclose(dark(picture[tile]), pixel(PLACES[worlds[k]]), atol=1.5)
-        alone = sim.render("rgb_array", worlds[k], "down", None, WIDTH, HEIGHT)
-        np.testing.assert_array_equal(picture[tile], alone)
-        np.testing.assert_array_equal(picture[grid.tile(k)], alone)
+        np.testing.assert_allclose(center_of_dark_pixels(picture[tile]), pixel(POSITIONS[worlds[k]]), atol=1.5)
+        single = sim.render("rgb_array", worlds[k], "down", None, WIDTH, HEIGHT)
+        np.testing.assert_array_equal(picture[tile], single)
+        np.testing.assert_array_equal(picture[grid.tile(k)], single)
     assert (picture[HEIGHT : HEIGHT + 4] == 40).all()
     assert (picture[:, WIDTH : WIDTH + 4] == 40).all()
 
@@ -84,8 +84,8 @@ def test_grids_are_filled_row_by_row(n, columns, grid, size):
     assert seen.sum() == n * size[0] * size[1]
 
 
-def test_what_a_user_drew_is_in_every_tile_and_only_once(sim):
-    grid = view(worlds=[0, 1], width=2 * WIDTH, border=0)
+def test_overlays_are_in_every_tile_of_one_image(sim):
+    grid = make_view(worlds=[0, 1], width=2 * WIDTH, border=0)
     draw_points(sim, [[0, 0, 1.0]], rgba=GREEN, size=0.05)
     picture = grid.render(sim)
     for k in range(2):
@@ -97,10 +97,10 @@ def test_what_a_user_drew_is_in_every_tile_and_only_once(sim):
 def test_overlays_are_kept_when_an_image_fails(sim):
     draw_points(sim, [[0, 0, 1.0]], rgba=GREEN, size=0.05)
     with pytest.raises(ConfigError, match="got 'up'"):
-        view(camera="up", text="failed").render(sim)
-    picture = view().render(sim)
+        make_view(camera="up", text="failed").render(sim)
+    picture = make_view().render(sim)
     assert has_colour(picture, GREEN).any()
-    np.testing.assert_array_equal(view().render(sim), sim.render("rgb_array", 0, "down", None, WIDTH, HEIGHT))
+    np.testing.assert_array_equal(make_view().render(sim), sim.render("rgb_array", 0, "down", None, WIDTH, HEIGHT))
 
 
 # Cameras --------------------------------------------------------------------------------------------------------
@@ -111,9 +111,9 @@ def test_a_batch_holds_an_image_of_each_world_in_the_requested_order(sim):
     assert batch.shape == (3, HEIGHT, WIDTH, 3)
     assert batch.dtype == np.uint8
     for picture, world in zip(batch, (2, 0, 3), strict=True):
-        np.testing.assert_allclose(dark(picture), pixel(PLACES[world]), atol=2)
-    every = render_worlds(sim, camera="down", width=WIDTH, height=HEIGHT)
-    np.testing.assert_array_equal(every[[2, 0, 3]], batch)
+        np.testing.assert_allclose(center_of_dark_pixels(picture), pixel(POSITIONS[world]), atol=2)
+    all_images = render_worlds(sim, camera="down", width=WIDTH, height=HEIGHT)
+    np.testing.assert_array_equal(all_images[[2, 0, 3]], batch)
     free = {"lookat": [0, 0, 0], "distance": CAMERA_HEIGHT, "azimuth": 90, "elevation": -90}
     draw_points(sim, np.array([[0, 0, 0.5]]), rgba=RED, size=0.05)
     marked = render_worlds(sim, [1, 1], cam_config=free, width=WIDTH, height=HEIGHT)
@@ -141,18 +141,20 @@ def test_law_09_invalid_batches_are_refused(sim, wrong, message):
 def test_a_camera_that_follows_keeps_each_worlds_drone_in_its_middle(sim):
     """Without lag every drone is in the middle of its tile; a camera that stands still sees it elsewhere."""
     down = {"distance": 1.5, "azimuth": 90, "elevation": -90}
-    follow = view(worlds=[0, 2], camera=-1, cam_config=down, follow=0, lag=0, width=2 * WIDTH, border=0)
-    fixed = view(worlds=[0, 2], camera=-1, cam_config=down | {"lookat": [0, 0, 0.5]}, width=2 * WIDTH, border=0)
+    follow = make_view(worlds=[0, 2], camera=-1, cam_config=down, follow=0, lag=0, width=2 * WIDTH, border=0)
+    fixed = make_view(worlds=[0, 2], camera=-1, cam_config=down | {"lookat": [0, 0, 0.5]}, width=2 * WIDTH, border=0)
     for k in range(2):
-        np.testing.assert_allclose(dark(follow.render(sim)[follow.tile(k)]), [HEIGHT / 2, WIDTH / 2], atol=2)
-        assert abs(dark(fixed.render(sim)[fixed.tile(k)])[1] - WIDTH / 2) > 20
+        np.testing.assert_allclose(
+            center_of_dark_pixels(follow.render(sim)[follow.tile(k)]), [HEIGHT / 2, WIDTH / 2], atol=2
+        )
+        assert abs(center_of_dark_pixels(fixed.render(sim)[fixed.tile(k)])[1] - WIDTH / 2) > 20
 
 
 def test_a_camera_holds_drones_and_points_of_each_world_in_view(sim):
     """The points of every world are in its tile, near its edges; a second image without lag is the same."""
     goal = {0: [0.9, 0.3, 0.5], 2: [-0.2, 1.0, 0.8]}
-    place(sim, PLACES, 0.0)
-    held = view(
+    place(sim, POSITIONS, 0.0)
+    held = make_view(
         worlds=[0, 2],
         camera=-1,
         cam_config={"azimuth": 90, "elevation": -90},
@@ -165,24 +167,24 @@ def test_a_camera_holds_drones_and_points_of_each_world_in_view(sim):
     image = held.render(sim)
     for k in range(2):
         tile = image[held.tile(k)]
-        spots = np.array([dark(tile), np.argwhere(has_colour(tile, RED)).mean(axis=0)])
-        off = np.linalg.norm(spots - [HEIGHT / 2, WIDTH / 2], axis=-1)
-        assert (off > 0.25 * HEIGHT).all()
-        assert (off < 0.45 * HEIGHT).all()
+        spots = np.array([center_of_dark_pixels(tile), np.argwhere(has_colour(tile, RED)).mean(axis=0)])
+        distance = np.linalg.norm(spots - [HEIGHT / 2, WIDTH / 2], axis=-1)
+        assert (distance > 0.25 * HEIGHT).all()
+        assert (distance < 0.45 * HEIGHT).all()
     np.testing.assert_array_equal(held.render(sim), image)
 
 
 def test_a_camera_that_follows_lags_behind(sim):
-    """After a jump of 0.2 m its centre has moved by 1 - exp(-t / lag) of it; after a reset by all of it."""
+    """After a jump of 0.2 m the camera has moved by the fraction 1 - exp(-t / lag); after a reset by the whole way."""
     config = {"distance": 1.5, "azimuth": 90, "elevation": -90}
-    follow = view(camera=-1, cam_config=config, follow=0, lag=0.5)
-    place(sim, PLACES, 1.0)
+    follow = make_view(camera=-1, cam_config=config, follow=0, lag=0.5)
+    place(sim, POSITIONS, 1.0)
     follow.render(sim)
-    place(sim, PLACES + [0.2, 0, 0], 1.5)
-    moved = dark(follow.render(sim))[1] - WIDTH / 2
-    place(sim, PLACES + [0.1, 0, 0], 0.0)
-    after_reset = dark(follow.render(sim))[1] - WIDTH / 2
-    place(sim, PLACES, 0.0)
+    place(sim, POSITIONS + [0.2, 0, 0], 1.5)
+    moved = center_of_dark_pixels(follow.render(sim))[1] - WIDTH / 2
+    place(sim, POSITIONS + [0.1, 0, 0], 0.0)
+    after_reset = center_of_dark_pixels(follow.render(sim))[1] - WIDTH / 2
+    place(sim, POSITIONS, 0.0)
     focal = 0.5 * HEIGHT / np.tan(np.deg2rad(sim.mj_model.vis.global_.fovy / 2))
     np.testing.assert_allclose(moved, focal * 0.2 * np.exp(-1) / 1.5, atol=1.5)
     np.testing.assert_allclose(after_reset, 0, atol=1.5)
@@ -192,9 +194,9 @@ def test_an_inset_is_drawn_enlarged_at_the_bottom_right_of_each_world(sim):
     """Each pixel of a picture of 2 x 3 is a block of whole pixels, and the rest of the image stays."""
     pictures = np.random.default_rng(0).integers(0, 255, (4, 2, 3, 3)).astype(np.uint8)
     options = {"worlds": [1, 3], "width": 2 * WIDTH, "border": 0}
-    place(sim, PLACES, 0.0)
-    shown = view(**options, inset=lambda sim, world: pictures[world] if world == 3 else None).render(sim)
-    plain, scale = view(**options).render(sim), WIDTH // 9
+    place(sim, POSITIONS, 0.0)
+    shown = make_view(**options, inset=lambda sim, world: pictures[world] if world == 3 else None).render(sim)
+    plain, scale = make_view(**options).render(sim), WIDTH // 9
     block = slice(HEIGHT - 2 * scale, HEIGHT), slice(2 * WIDTH - 3 * scale, 2 * WIDTH)
     np.testing.assert_array_equal(shown[block], pictures[3].repeat(scale, axis=0).repeat(scale, axis=1))
     frame = slice(block[0].start - 2, None), slice(block[1].start - 2, None)
@@ -210,7 +212,7 @@ def test_a_top_view_shows_obstacles_paths_and_headings_of_each_world(opengl, pla
     posts = sim.scene.add("box", "post", count=3, pos=start, size=(0.2, 0.6, 1.0))
     sim.scene.add("box", "marker", pos=[0, 0.8, 0.02], size=(0.4, 0.4, 0.04))
     options = {"worlds": [0, 1], "width": 2 * WIDTH, "border": 0}
-    shown, plain, scale = view(**options, top_view=True, rgba=RED), view(**options), 8.2 / 80
+    shown, plain, scale = make_view(**options, top_view=True, rgba=RED), make_view(**options), 8.2 / 80
     north = jnp.broadcast_to(jnp.array([0, 0, 0.5**0.5, 0.5**0.5], jnp.float32), (2, 1, 4))
     for k, x in enumerate(np.linspace(-2, 1, 7)):
         place(sim, [[x, 0.0, 1], [x, 0.4, 1]], 0.1 * k)
@@ -242,13 +244,13 @@ def test_a_top_view_shows_obstacles_paths_and_headings_of_each_world(opengl, pla
 
 
 def test_a_top_view_of_a_large_area_moves_along_with_the_first_drone(opengl, plain_scene):
-    """Of 60 m it shows 24 m around the drone, but nothing beyond the ends; a scene without obstacles has no map."""
+    """The map shows 24 of 60 m, around the drone and not beyond the ends; a scene without obstacles has no map."""
     sim = Sim(control="state", xml_path=plain_scene)
-    shown, plain = view(top_view=True, rgba=RED), view()
+    shown, plain = make_view(top_view=True, rgba=RED), make_view()
     np.testing.assert_array_equal(shown.render(sim), plain.render(sim))
     sim.scene.add("cylinder", "post", count=3, pos=[[0, 0, 0], [30, 0, 0], [60, 0, 0]], radius=0.5, height=2.0)
-    for at, drone, post in [(1, 2.5, 1.5), (25, 12.0, 17.0), (55, 17.5, 22.5)]:  # m from the left edge
-        sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.array([[[at, 3.0, 1.0]]])))
+    for x, drone, post in [(1, 2.5, 1.5), (25, 12.0, 17.0), (55, 17.5, 22.5)]:  # m from the left edge
+        sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.array([[[x, 3.0, 1.0]]])))
         chart = shown.render(sim)[-45:, :80]
         spots = np.nonzero(has_colour(chart, RED))[1].mean(), np.nonzero(chart[23:].max(-1) < 150)[1].mean()
         np.testing.assert_allclose((np.array(spots) + 0.5) * 24 / 80, [drone, post], atol=0.3)
@@ -256,38 +258,38 @@ def test_a_top_view_of_a_large_area_moves_along_with_the_first_drone(opengl, pla
     chart = shown.render(sim)[-45:, :80]
     assert not has_colour(chart, RED).any()
     assert (chart.max(-1) < 150).any()
-    assert view(top_view=True, width=3, height=2).render(sim).shape == (2, 3, 3)
+    assert make_view(top_view=True, width=3, height=2).render(sim).shape == (2, 3, 3)
     sim.close()
 
 
 def test_a_camera_may_move_with_time(sim):
     """Its settings may be a function of time: here the camera goes east by 0.1 m/s, and the drone west."""
-    moving = view(
+    moving = make_view(
         camera=-1,
         cam_config=lambda time: {"lookat": [0.1 * time, 0, 0.5], "distance": 1.5, "azimuth": 90, "elevation": -90},
     )
     columns = []
     for time in (0.0, 2.0):
-        place(sim, PLACES, time)
-        columns.append(dark(moving.render(sim))[1])
-    place(sim, PLACES, 0.0)
+        place(sim, POSITIONS, time)
+        columns.append(center_of_dark_pixels(moving.render(sim))[1])
+    place(sim, POSITIONS, 0.0)
     focal = 0.5 * HEIGHT / np.tan(np.deg2rad(sim.mj_model.vis.global_.fovy / 2))
     np.testing.assert_allclose(columns[0] - columns[1], focal * 0.2 / 1.5, atol=1.5)
 
 
-# What is drawn over it ------------------------------------------------------------------------------------------
+# What is drawn over the image ----------------------------------------------------------------------------------
 
 
 def test_a_trail_follows_the_way_of_each_worlds_drone(sim):
     """Its pixels lie on the flown path, from end to end, in its own world only, and fade towards its beginning."""
-    shown = view(worlds=[0, 1], width=2 * WIDTH, border=0, trail=5.0, rgba=BLUE)
+    shown = make_view(worlds=[0, 1], width=2 * WIDTH, border=0, trail=5.0, rgba=BLUE)
     x = np.linspace(-0.5, 0.5, 11)
     for k in range(11):
-        pos = PLACES.copy()
+        pos = POSITIONS.copy()
         pos[0], pos[1] = [x[k], 0.1, 1.0], [0.3, 0.6 * x[k], 1.0]
         place(sim, pos, 0.1 * k)
         picture = shown.render(sim)
-    place(sim, PLACES, 0.0)
+    place(sim, POSITIONS, 0.0)
     east, north = (has_colour(picture[shown.tile(k)], BLUE) for k in range(2))
     rows, columns = np.nonzero(east)
     assert np.abs(rows + 0.5 - pixel([0, 0.1, 1])[0]).max() < 3
@@ -298,7 +300,7 @@ def test_a_trail_follows_the_way_of_each_worlds_drone(sim):
     assert np.abs(columns + 0.5 - pixel([0.3, 0, 1])[1]).max() < 3
     blueness = picture[shown.tile(0)].astype(int) @ [-1, 0, 1]
     row = int(pixel([0, 0.1, 1])[0])
-    old, new = (blueness[row - 2 : row + 3, int(pixel([at, 0.1, 1])[1])].max() for at in (-0.35, 0.35))
+    old, new = (blueness[row - 2 : row + 3, int(pixel([east, 0.1, 1])[1])].max() for east in (-0.35, 0.35))
     assert 20 < old < new - 60
 
 
@@ -306,10 +308,10 @@ def test_setpoints_are_drawn_at_the_commanded_positions(sim):
     """Each world's tile has a green sphere at its own setpoint."""
     command = np.zeros((4, 1, 16))
     command[..., 12] = 1
-    command[:, 0, :3] = -PLACES + [0, 0, 1.5]
+    command[:, 0, :3] = -POSITIONS + [0, 0, 1.5]
     data = sim.data
     sim.state_control(command)
-    shown = view(worlds=[0, 1, 2, 3], width=2 * WIDTH, height=2 * HEIGHT, border=0, setpoints=True, rgba=GREEN)
+    shown = make_view(worlds=[0, 1, 2, 3], width=2 * WIDTH, height=2 * HEIGHT, border=0, setpoints=True, rgba=GREEN)
     picture = shown.render(sim)
     sim.data = data
     for k in range(4):
@@ -318,9 +320,9 @@ def test_setpoints_are_drawn_at_the_commanded_positions(sim):
 
 
 def test_text_changes_its_corner_and_nothing_else(sim):
-    """Text stands at the top left of each tile, says which world it is, and leaves every other pixel alone."""
+    """Text stands at the top left of each tile, names its world, and changes no other pixel."""
     options = {"worlds": [0, 1], "width": 2 * WIDTH, "border": 0}
-    plain, shown = view(**options), view(**options, text="world {world}  {time:.2f} s")
+    plain, shown = make_view(**options), make_view(**options, text="world {world}  {time:.2f} s")
     before, after = plain.render(sim), shown.render(sim)
     tiles = []
     for k in range(2):
@@ -367,7 +369,7 @@ def test_text_changes_its_corner_and_nothing_else(sim):
 )
 def test_invalid_views_are_refused(sim, wrong, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        view(**wrong).render(sim)
+        make_view(**wrong).render(sim)
     assert len(sim.overlays) == 0
 
 
@@ -379,13 +381,13 @@ def test_warp_draws_what_the_plain_renderer_draws(opengl, plain_scene):
     pytest.importorskip("warp")
     sim = Sim(n_worlds=4, control="state", xml_path=plain_scene)
     sim.scene.add("box", "lamp", pos=[0.0, 0.1, 0.2], size=(0.1, 0.1, 0.1), rgba=(1, 0, 0, 1))
-    place(sim, PLACES, 0.0)
+    place(sim, POSITIONS, 0.0)
     size = {"camera": "down", "width": WIDTH, "height": HEIGHT}
     plain, warp = (render_worlds(sim, [2, 0, 3], renderer=name, **size) for name in ("plain", "warp"))
     assert warp.shape == plain.shape
     assert warp.dtype == plain.dtype
     for picture, expected, world in zip(warp, plain, (2, 0, 3), strict=True):
-        np.testing.assert_allclose(dark(picture), pixel(PLACES[world]), atol=2)
+        np.testing.assert_allclose(center_of_dark_pixels(picture), pixel(POSITIONS[world]), atol=2)
         places = [np.argwhere(has_colour(x, RED)).mean(axis=0) for x in (picture, expected)]
         np.testing.assert_allclose(*places, atol=1)
     assert np.abs(warp.astype(int) - plain).mean() < 6, "of 255: floor and sky are the same"
@@ -404,11 +406,11 @@ def test_warp_draws_what_the_plain_renderer_draws(opengl, plain_scene):
 
 def test_an_image_of_a_single_world_needs_no_mjx(opengl):
     near = {"lookat": [0.0, 0.0, 0.1], "distance": 0.8}  # else the drone is smaller than a pixel
-    sim, view = Sim(control="rotor_vel", engine="interpret"), View(width=32, height=24, cam_config=near)
-    first = view.render(sim)
+    sim, near_view = Sim(control="rotor_vel", engine="interpret"), View(width=32, height=24, cam_config=near)
+    first = near_view.render(sim)
     sim.rotor_vel_control(np.full((1, 1, 4), 25_000.0))
     sim.step(100)
-    second = view.render(sim)
+    second = near_view.render(sim)
     assert not sim.scene.is_allocated
     assert not sim.data.core.mjx_synced
     assert (first != second).any()

@@ -83,7 +83,7 @@ def scrub(browser, fraction):
 
 
 def pixel(browser, flight, point, world):
-    """Return column and row at which a page's camera sees a point at first."""
+    """Return column and row of a point in the initial image of a page."""
     position, target = initial_camera_pose(flight, world)
     ahead = (target - position) / np.linalg.norm(target - position)
     right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))

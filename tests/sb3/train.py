@@ -20,7 +20,7 @@ POS = slice(6, 9)
 
 
 def raises(error, fn, *args):
-    """Return the message of an error that must come."""
+    """Return the message of the error that a call must raise."""
     try:
         fn(*args)
     except error as found:
@@ -59,8 +59,8 @@ def check_contract():
         assert info["episode"]["l"] == N_STEPS
         np.testing.assert_allclose(info["episode"]["r"], rewards[world], rtol=1e-5)
         last = info["terminal_observation"][POS]
-        assert np.abs(last - before[world][POS]).max() < 0.02, "it is the last of the old episode"
-        assert np.abs(last - obs[world][POS]).max() > 0.1, "what is returned is of the new one"
+        assert np.abs(last - before[world][POS]).max() < 0.02, "it is the last observation of the old episode"
+        assert np.abs(last - obs[world][POS]).max() > 0.1, "the returned observation is of the new episode"
     assert not env.step(np.zeros((3, 4)))[2].any()
     assert "of shape (3, 4), got (2, 4)" in raises(ValueError, env.step, np.zeros((2, 4)))
     assert "world(s) [0, 1, 2]" in raises(ConfigError, env.step, np.full((3, 4), np.nan))
@@ -93,18 +93,18 @@ def check_named_observations():
 def check_training():
     """Check that PPO learns to hover: reward and distance from the goal, on starts that it has not seen."""
     env = VecNormalize(DroneVecEnv(make("hover", N_ENVS)), norm_reward=False)
-    judge = VecNormalize(DroneVecEnv(make("hover", N_ENVS)), norm_reward=False, training=False)
-    judge.obs_rms = env.obs_rms
+    evaluation_env = VecNormalize(DroneVecEnv(make("hover", N_ENVS)), norm_reward=False, training=False)
+    evaluation_env.obs_rms = env.obs_rms
     errors = []
 
-    def keep(scope, _):
-        if info := scope["info"]:
+    def keep_error(local_variables, _):
+        if info := local_variables["info"]:
             errors.append(info["error"])
 
     def score(model):
-        judge.seed(999)
+        evaluation_env.seed(999)
         errors.clear()
-        mean, _ = evaluate_policy(model, judge, N_ENVS, callback=keep)
+        mean, _ = evaluate_policy(model, evaluation_env, N_ENVS, callback=keep_error)
         return mean, float(np.median(errors))
 
     kwargs = {"log_std_init": -0.7, "net_arch": [64, 64]}

@@ -25,7 +25,7 @@ def distances(table, i, j, times):
 
 
 @given(seed=st.integers(0, 10_000), n_drones=st.integers(2, 4))
-def test_distances_are_those_of_dense_samples(seed, n_drones):
+def test_distances_agree_with_dense_samples(seed, n_drones):
     rng = np.random.default_rng(seed)
     trajectories = [
         spline(np.cumsum(rng.uniform(0.3, 2.0, n)), rng.normal(size=(n, 3)), rng.choice([3, 5, 7]))
@@ -43,9 +43,9 @@ def test_distances_are_those_of_dense_samples(seed, n_drones):
 
 def test_crossing_flights_by_hand():
     """They pass the crossing half a second apart, at 1 m/s and at right angles: sqrt(2) / 4 m."""
-    one = fly_straight([-5, 0, 1], [5, 0, 1], 10.0)
-    other = fly_straight([0, -5.5, 1], [0, 4.5, 1], 10.0)
-    (approach,) = closest_approaches(PieceTable.create([one, other]))
+    first = fly_straight([-5, 0, 1], [5, 0, 1], 10.0)
+    second = fly_straight([0, -5.5, 1], [0, 4.5, 1], 10.0)
+    (approach,) = closest_approaches(PieceTable.create([first, second]))
     np.testing.assert_allclose(approach.distance, 0.5 / np.sqrt(2), atol=1e-3)
     np.testing.assert_allclose(approach.time, 5.25, atol=0.01)
 
@@ -53,9 +53,9 @@ def test_crossing_flights_by_hand():
 def test_a_short_approach_at_high_speed_is_found():
     """Two drones pass each other head on at 40 m/s, 1 cm apart for a millisecond, in an hour of hovering."""
     wait, rush = fly_straight([0, 0, 1], [0, 0, 1], 1800.123), fly_straight([0, 0, 1], [20, 0, 1], 1.0)
-    one = wait.then(rush).then(fly_straight([20, 0, 1], [20, 0, 1], 1800.0))
-    other = fly_straight([20, 0.01, 1], [20, 0.01, 1], 1800.123).then(fly_straight([20, 0.01, 1], [0, 0.01, 1], 1.0))
-    (approach,) = closest_approaches(PieceTable.create([one, other]))
+    first = wait.then(rush).then(fly_straight([20, 0, 1], [20, 0, 1], 1800.0))
+    second = fly_straight([20, 0.01, 1], [20, 0.01, 1], 1800.123).then(fly_straight([20, 0.01, 1], [0, 0.01, 1], 1.0))
+    (approach,) = closest_approaches(PieceTable.create([first, second]))
     np.testing.assert_allclose(approach.distance, 0.01, atol=1e-3)
     np.testing.assert_allclose(approach.time, 1800.623, atol=1e-3)
 
@@ -68,14 +68,14 @@ def test_a_dash_within_a_cell_is_found(smooth):
         return spline([0.0, 0.08], [begin, end], 7) if smooth else fly_straight(begin, end, 0.08)
 
     home, away = np.array([0, 0, 1.0]), np.array([1, 0, 1.0])
-    one = (
+    first = (
         fly_straight(home, home, 0.82)
         .then(dash(home, away))
         .then(dash(away, home))
         .then(fly_straight(home, home, 3.02))
     )
-    other = fly_straight(away + [0.02, 0, 0], away + [0.02, 0, 0], 4.0)
-    (approach,) = closest_approaches(PieceTable.create([one, other]))
+    second = fly_straight(away + [0.02, 0, 0], away + [0.02, 0, 0], 4.0)
+    (approach,) = closest_approaches(PieceTable.create([first, second]))
     np.testing.assert_allclose(approach.distance, 0.02, atol=1e-3)
     np.testing.assert_allclose(approach.time, 0.9, atol=0.01)
 
@@ -89,7 +89,7 @@ def test_starts_shift_the_approach():
 
 
 def test_a_jump_of_the_position_has_no_points_in_between():
-    """Only the distances before and after the jump count."""
+    """The result is the smaller of the distances before and after the jump."""
     jumps = fly_straight([-2, 0, 0], [-2, 0, 0], 1.05).then(fly_straight([1, 0, 0], [1, 0, 0], 1.0))
     stays = fly_straight([0, 0, 0], [0, 0, 0], 2.05)
     (approach,) = closest_approaches(PieceTable.create([jumps, stays]))

@@ -17,7 +17,7 @@ def evaluate(trajectory, t):
     return jax.tree.map(np.asarray, on_device(trajectory, t))
 
 
-def check(trajectory, curve, duration, scale=1.0):
+def check_curve(trajectory, curve, duration, scale=1.0):
     """Compare position and yaw with a curve, and derivatives with its central differences."""
     np.testing.assert_allclose(trajectory.duration, duration, rtol=1e-12)
     t = np.linspace(0.01, 0.99, 500) * duration
@@ -33,9 +33,9 @@ def check(trajectory, curve, duration, scale=1.0):
 @pytest.mark.parametrize(
     "width, depth, period", [(2.0, 1.0, 5.0), (40.0, 30.0, 20.0), (0.2, 0.1, 0.5), (0.0, 3.0, 1.0)]
 )
-def test_figure_eight(width, depth, period):
+def test_a_figure_eight_has_its_equation(width, depth, period):
     w = 2 * np.pi / period
-    check(
+    check_curve(
         figure_eight(width, depth, period, height=1.5),
         lambda t: np.stack([width / 2 * np.sin(w * t), depth / 2 * np.sin(2 * w * t), 1.5 + 0 * t, 0 * t], axis=-1),
         period,
@@ -43,10 +43,10 @@ def test_figure_eight(width, depth, period):
     )
 
 
-def test_lissajous():
+def test_a_lissajous_curve_has_its_equation():
     w = 2 * np.pi / 7
     trajectory = lissajous((1, 2, 0.3), (3, 2, 5), (0, 0.5, 1), period=7, center=(1, -1, 2))
-    check(
+    check_curve(
         trajectory,
         lambda t: np.stack(
             [1 + np.sin(3 * w * t), -1 + 2 * np.sin(2 * w * t + 0.5), 2 + 0.3 * np.sin(5 * w * t + 1), 0 * t], axis=-1
@@ -57,7 +57,7 @@ def test_lissajous():
 
 
 @pytest.mark.parametrize("along", [False, True])
-def test_circle_and_helix(along):
+def test_circle_and_helix_have_their_equations(along):
     w = 2 * np.pi / 4
 
     def curve(climb, height):
@@ -65,8 +65,8 @@ def test_circle_and_helix(along):
             [1.5 * np.cos(w * t), 1.5 * np.sin(w * t), height + climb * t / 4, along * (w * t + np.pi / 2)], axis=-1
         )
 
-    check(circle(1.5, 4, height=2, along=along), curve(0, 2), 4, 4.0)
-    check(helix(1.5, 0.7, 2.5, 4, along=along), curve(0.7, 0.5), 10, 4.0)
+    check_curve(circle(1.5, 4, height=2, along=along), curve(0, 2), 4, 4.0)
+    check_curve(helix(1.5, 0.7, 2.5, 4, along=along), curve(0.7, 0.5), 10, 4.0)
     assert circle().repeats
     assert not helix().repeats
 
@@ -84,13 +84,13 @@ def test_line_goes_from_rest_to_rest():
     "make", [lambda v: figure_eight(speed=v), lambda v: circle(speed=v), lambda v: helix(speed=v),
              lambda v: line([0, 0, 1], [3, 1, 1], speed=v)]
 )  # fmt: skip
-def test_the_speed_is_the_largest_one(make):
+def test_the_setting_speed_is_the_largest_speed(make):
     trajectory = make(2.0)
     s = evaluate(trajectory, np.linspace(0, float(trajectory.duration), 2001))
     np.testing.assert_allclose(np.linalg.norm(s.vel, axis=-1).max(), 2.0, rtol=1e-5)
 
 
-def test_hover_stays():
+def test_a_hover_stays_at_its_position():
     s = evaluate(hover([1, 2, 3], yaw=0.5), np.array([-1.0, 0.5, 7.0]))
     np.testing.assert_array_equal(s.pos, [[1, 2, 3]] * 3)
     np.testing.assert_array_equal(s.vel, np.zeros((3, 3)))

@@ -11,7 +11,7 @@ from crazysim.trajectories import interpolation
 ORDERS = [2, 3, 4]
 
 
-def problem(order, n_pieces, seed, spread=1.0):
+def random_problem(order, n_pieces, seed, spread=1.0):
     """Return nodes at rest at both ends and free elsewhere, and durations."""
     rng = np.random.default_rng(seed)
     nodes = np.full((n_pieces + 1, order, 2), np.nan)
@@ -30,7 +30,7 @@ def test_each_basis_polynomial_has_one_derivative(order):
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_cost_is_the_integral_of_the_square(order):
-    nodes, durations = problem(order, 3, 0)
+    nodes, durations = random_problem(order, 3, 0)
     filled = interpolation.fill_derivatives(nodes, durations)
     total = 0.0
     for h, piece in zip(durations, interpolation.unit_coefficients(filled, durations), strict=True):
@@ -43,7 +43,7 @@ def test_the_cost_is_the_integral_of_the_square(order):
 @pytest.mark.parametrize("order", ORDERS)
 @given(seed=st.integers(0, 1000))
 def test_other_derivatives_cost_more(order, seed):
-    nodes, durations = problem(order, 5, seed)
+    nodes, durations = random_problem(order, 5, seed)
     filled = interpolation.fill_derivatives(nodes, durations)
     least = interpolation.derivative_cost(filled, durations)
     change = np.where(np.isnan(nodes), np.random.default_rng(seed).normal(size=nodes.shape), 0.0)
@@ -53,8 +53,8 @@ def test_other_derivatives_cost_more(order, seed):
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_the_gradient_with_respect_to_durations_is_that_of_differences(order):
-    nodes, durations = problem(order, 4, 3, 0.5)
+def test_the_gradient_with_respect_to_durations_equals_differences(order):
+    nodes, durations = random_problem(order, 4, 3, 0.5)
 
     def least(lengths):
         return interpolation.derivative_cost(interpolation.fill_derivatives(nodes, lengths), lengths)
@@ -68,7 +68,7 @@ def test_the_gradient_with_respect_to_durations_is_that_of_differences(order):
 @pytest.mark.parametrize("order", ORDERS)
 def test_derivatives_are_continuous_over_many_uneven_pieces(order):
     """Derivative 2k - 2 is the highest continuous one; the durations of 60 pieces vary by a factor of 50."""
-    nodes, durations = problem(order, 60, 4, 2.0)
+    nodes, durations = random_problem(order, 60, 4, 2.0)
     c = interpolation.unit_coefficients(interpolation.fill_derivatives(nodes, durations), durations)
     for derivative in range(2 * order - 1):
         weights = np.array([np.prod(np.arange(k - derivative + 1, k + 1)) for k in range(2 * order)], float)
@@ -80,7 +80,7 @@ def test_derivatives_are_continuous_over_many_uneven_pieces(order):
 
 
 def test_units_of_time_do_not_matter():
-    nodes, durations = problem(4, 6, 5)
+    nodes, durations = random_problem(4, 6, 5)
     scale = 1e3 ** np.arange(4)[:, None]
     np.testing.assert_allclose(
         interpolation.fill_derivatives(nodes * scale, durations / 1e3) / scale,
@@ -90,7 +90,7 @@ def test_units_of_time_do_not_matter():
 
 
 def test_too_few_fixed_derivatives_are_an_error():
-    nodes, durations = problem(4, 1, 6)
+    nodes, durations = random_problem(4, 1, 6)
     nodes[:, 1:] = np.nan
     with pytest.raises(np.linalg.LinAlgError):
         interpolation.fill_derivatives(nodes, durations)

@@ -24,7 +24,7 @@ def fly_from_derivatives(*derivatives):
 
 
 @given(seed=st.integers(0, 10_000))
-def test_peaks_are_those_of_dense_samples(seed):
+def test_peaks_agree_with_dense_samples(seed):
     rng = np.random.default_rng(seed)
     trajectories = [
         spline(np.cumsum(rng.uniform(0.8, 2.0, n)), rng.normal(size=(n, 3)), rng.choice([3, 5, 7]), rng.normal(size=n))
@@ -46,7 +46,7 @@ def test_peaks_are_those_of_dense_samples(seed):
             assert np.min(np.abs(quantity.compute(*derivatives) - peak.value[k])) < 1e-3 * (1 + abs(found_peak)), name
 
 
-def test_body_rate_peaks_are_those_of_dense_samples():
+def test_body_rate_peaks_agree_with_dense_samples():
     rng = np.random.default_rng(1)
     table = PieceTable.create(
         [spline(np.arange(5.0), 0.5 * rng.normal(size=(5, 3)), 7, rng.normal(size=5)) for _ in range(3)]
@@ -58,7 +58,7 @@ def test_body_rate_peaks_are_those_of_dense_samples():
         np.testing.assert_allclose(peak.value[k], np.max(quantity.compute(*derivatives)), rtol=1e-6)
 
 
-def test_values_by_hand():
+def test_peaks_by_hand():
     """Derivatives at the start, largest there or constant: 3-4-5 triangles, and 0.75 g sideways."""
     g = 9.81
     moving = fly_from_derivatives([0, 0, 1, 0], [3, 0, -4, -0.5])

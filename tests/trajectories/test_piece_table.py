@@ -38,7 +38,7 @@ EARLY_TABLE = PieceTable.create(TRAJECTORIES, EARLY_STARTS, duration=12.0)
 
 @given(drone=st.integers(0, 2), t=st.floats(0.0, 12.0))
 def test_drones_that_started_before_zero_are_in_the_middle(drone, t):
-    """One that repeats is in one of its rounds, and one whose end is over rests there."""
+    """A trajectory that repeats is in one of its rounds; a trajectory that has ended stays at its end."""
     setpoint = evaluate(drone, t - EARLY_STARTS[drone])
     np.testing.assert_allclose(EARLY_TABLE.evaluate(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
     assert EARLY_TABLE.start[EARLY_TABLE.first_pieces].tolist() == [0.0, 0.0, 0.0]
@@ -47,9 +47,9 @@ def test_drones_that_started_before_zero_are_in_the_middle(drone, t):
 
 def test_a_batch_is_evaluated_as_one_by_one():
     drones, times = np.repeat([0, 1, 2], 7), np.tile(np.linspace(0, 12, 7), 3)
-    together = TABLE.evaluate(drones, times, 1)
-    alone = [TABLE.evaluate(int(d), float(t), 1) for d, t in zip(drones, times, strict=True)]
-    np.testing.assert_array_equal(together, alone)
+    batch = TABLE.evaluate(drones, times, 1)
+    one_by_one = [TABLE.evaluate(int(d), float(t), 1) for d, t in zip(drones, times, strict=True)]
+    np.testing.assert_array_equal(batch, one_by_one)
 
 
 def test_padding_adds_no_pieces():

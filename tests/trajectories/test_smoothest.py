@@ -14,7 +14,7 @@ METHODS = {4: minimum_snap, 3: minimum_jerk}
 
 
 @pytest.mark.parametrize("order", METHODS)
-def test_trajectory_and_cost_are_those_of_the_host(order, x64):
+def test_trajectory_and_cost_equal_those_of_the_host(order, x64):
     trajectory, cost = jax.jit(smoothest, static_argnums=2)(WAYPOINTS, DURATIONS, order)
     expected = METHODS[order](WAYPOINTS, DURATIONS)
     nodes = np.full((6, order, 3), np.nan)
@@ -37,7 +37,7 @@ def test_float32_is_as_accurate_as_documented(n):
     np.testing.assert_allclose(found, exact, atol=4e-3)  # 1e-3 of 4 m
 
 
-def test_gradients_are_those_of_differences(x64):
+def test_gradients_equal_differences(x64):
     def objective(waypoints, durations):
         trajectory, cost = smoothest(waypoints, durations)
         setpoint = trajectory.evaluate(2.3)

@@ -29,7 +29,7 @@ def positions(trajectory, times):
 
 
 @pytest.mark.parametrize("degree", [3, 5, 7])
-def test_a_spline_at_rest_is_that_of_scipy(degree, x64):
+def test_a_spline_at_rest_equals_that_of_scipy(degree, x64):
     rest = [(k, np.zeros(3)) for k in range(1, (degree + 1) // 2)]
     expected = make_interp_spline(TIMES, POINTS, k=degree, bc_type=(rest, rest))
     trajectory = spline(TIMES, POINTS, degree)
@@ -40,7 +40,7 @@ def test_a_spline_at_rest_is_that_of_scipy(degree, x64):
         np.testing.assert_allclose(value[10], expected.derivative(k)(times[10]), rtol=1e-7)
 
 
-def test_a_natural_spline_is_that_of_scipy(x64):
+def test_a_natural_spline_equals_that_of_scipy(x64):
     expected = CubicSpline(TIMES, POINTS, bc_type="natural")
     times = np.linspace(0, 4, 23)
     np.testing.assert_allclose(positions(spline(TIMES, POINTS, 3, at_rest=False), times), expected(times), atol=1e-12)
@@ -63,7 +63,7 @@ def test_yaw_turns_the_shorter_way(x64):
     n_axes=st.sampled_from([3, 4]),
     seed=st.integers(0, 1000),
 )
-def test_bezier_curves_are_those_of_scipy(counts, n_axes, seed):
+def test_bezier_curves_equal_those_of_scipy(counts, n_axes, seed):
     rng = np.random.default_rng(seed)
     curves = [rng.uniform(-3, 3, (count, n_axes)) for count in counts]
     ends = np.cumsum(rng.uniform(0.1, 3.0, len(counts)))

@@ -53,19 +53,19 @@ def check_same(setpoint, durations, c, t, rtol=1e-10):
 
 @pytest.mark.parametrize("n_pieces", [1, 2, 3, 5, 8, 13])
 @pytest.mark.parametrize("degree", [0, 1, 3, 7, 9])
-def test_position_yaw_and_derivatives_are_those_of_the_polynomials(n_pieces, degree):
+def test_position_yaw_and_derivatives_equal_those_of_the_polynomials(n_pieces, degree):
     durations, c = random_pieces(n_pieces, degree)
     t = np.linspace(0, durations.sum() * (1 - 1e-9), 41)
     check_same(evaluate(Trajectory.of_pieces(durations, c), t), durations, c, t)
 
 
-def test_where_two_pieces_meet_the_later_one_counts():
+def test_where_two_pieces_meet_the_later_one_is_evaluated():
     trajectory = Trajectory.of_pieces([1, 2, 1], np.arange(3.0)[:, None, None] * np.ones((1, 4, 1)))
     s = evaluate(trajectory, np.array([0, 1 - 1e-9, 1, 3 - 1e-9, 3, 4, 9]))
     np.testing.assert_array_equal(s.pos[:, 0], [0, 0, 1, 1, 2, 2, 2])
 
 
-def test_before_the_start_and_after_the_end_it_is_at_rest():
+def test_before_the_start_and_after_the_end_a_trajectory_is_at_rest():
     durations, c = random_pieces()
     trajectory, end = Trajectory.of_pieces(durations, c), durations.sum()
     s = evaluate(trajectory, np.array([-1e9, -1e-9, end + 1e-9, 1e9]))
@@ -85,17 +85,17 @@ def test_a_trajectory_that_repeats_starts_again():
     np.testing.assert_array_equal(before.vel, np.zeros((1, 3)))
 
 
-def test_stacked_trajectories_are_the_same_as_alone_within_and_beyond_their_ends():
+def test_stacked_trajectories_keep_their_setpoints_within_and_beyond_their_ends():
     pieces = [random_pieces(1, 7, 1), random_pieces(4, 3, 2), random_pieces(6, 5, 3)]
-    alone = [Trajectory.of_pieces(*p, repeats=k == 1) for k, p in enumerate(pieces)]
-    stacked = Trajectory.stack(alone)
+    trajectories = [Trajectory.of_pieces(*p, repeats=k == 1) for k, p in enumerate(pieces)]
+    stacked = Trajectory.stack(trajectories)
     assert stacked.coefficients.shape == (3, 6, 4, 8)
     assert (stacked.n_pieces, stacked.degree, stacked.duration.shape) == (6, 7, (3,))
-    for k, (trajectory, (durations, _)) in enumerate(zip(alone, pieces, strict=True)):
+    for k, (trajectory, (durations, _)) in enumerate(zip(trajectories, pieces, strict=True)):
         end = durations.sum()
         t = np.concatenate([np.linspace(-1, end + 2, 50), [end, np.nextafter(end, 0), np.nextafter(end, 9e9)]])
-        of_stacked = jax.tree.map(lambda x, k=k: np.asarray(x)[k], stacked)
-        expected, found = (evaluate(x, t) for x in (trajectory, of_stacked))
+        from_stack = jax.tree.map(lambda x, k=k: np.asarray(x)[k], stacked)
+        expected, found = (evaluate(x, t) for x in (trajectory, from_stack))
         inside = (t < end - 1e-9) | (t > end + 1e-9) | (k == 1)  # at the end itself padding is already at rest
         for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
             np.testing.assert_allclose(x[inside], y[inside], atol=1e-9)
@@ -104,15 +104,15 @@ def test_stacked_trajectories_are_the_same_as_alone_within_and_beyond_their_ends
 
 def test_then_appends_a_trajectory():
     (d1, c1), (d2, c2) = random_pieces(2, 3, 1), random_pieces(3, 7, 2)
-    both = Trajectory.of_pieces(d1, c1).then(Trajectory.of_pieces(d2, c2))
+    joined = Trajectory.of_pieces(d1, c1).then(Trajectory.of_pieces(d2, c2))
     t = np.linspace(0, d1.sum() + d2.sum() - 1e-9, 60)
     c = np.concatenate([np.pad(c1, ((0, 0), (0, 0), (0, 4))), c2])
-    check_same(evaluate(both, t), np.concatenate([d1, d2]), c, t)
+    check_same(evaluate(joined, t), np.concatenate([d1, d2]), c, t)
     endless = Trajectory.of_pieces(d1, c1, repeats=True)
     with pytest.raises(ConfigError, match=r"got a second one that repeats.*repeat\(1\) for one round"):
-        both.then(endless)
+        joined.then(endless)
     with pytest.raises(ConfigError, match="got a first one that repeats"):
-        endless.then(both)
+        endless.then(joined)
 
 
 def test_repeat_gives_rounds_that_end():
@@ -130,21 +130,21 @@ def test_repeat_gives_rounds_that_end():
 
 
 @pytest.mark.parametrize("turns", [-3, 0, 2])
-def test_a_transition_connects_two_smoothly_and_turns_the_shorter_way(turns):
+def test_a_transition_connects_two_trajectories_smoothly_and_turns_the_shorter_way(turns):
     (d1, c1), (d2, c2) = random_pieces(2, 3, 1), random_pieces(3, 7, 2)
     c2[:, 3, 0] += 2 * np.pi * turns
     first, second = Trajectory.of_pieces(d1, c1).padded(4, 3), Trajectory.of_pieces(d2, c2)
-    both = first.then(second, transition=1.5)
+    joined = first.then(second, transition=1.5)
     ends = [d1.sum(), d1.sum() + 1.5]
-    assert float(both.duration) == pytest.approx(d1.sum() + 1.5 + d2.sum())
+    assert float(joined.duration) == pytest.approx(d1.sum() + 1.5 + d2.sum())
     for t in ends:
-        setpoints = evaluate(both, np.array([t - 1e-8, t + 1e-8]))
+        setpoints = evaluate(joined, np.array([t - 1e-8, t + 1e-8]))
         for name in ("pos", "vel", "acc", "jerk", "yaw", "yaw_rate", "yaw_acc"):
             before, after = getattr(setpoints, name)
             np.testing.assert_allclose(before, after, atol=2e-4, err_msg=name)  # 2e-8 s of derivatives up to 1e4
-    at_start = evaluate(both, np.array([ends[1]]))
+    at_start = evaluate(joined, np.array([ends[1]]))
     np.testing.assert_allclose(at_start.pos[0], c2[0, :3, 0], atol=1e-9)
-    turned = evaluate(both, np.array(ends)).yaw[:, 0]
+    turned = evaluate(joined, np.array(ends)).yaw[:, 0]
     assert abs(turned[1] - turned[0]) <= np.pi + 1e-9
     np.testing.assert_allclose(np.exp(1j * turned[1]), np.exp(1j * c2[0, 3, 0]), atol=1e-9)
     for wrong in (-1.0, np.inf, "long"):
@@ -175,7 +175,7 @@ def test_each_derivative_is_the_gradient_of_the_one_before(t, repeats):
         np.testing.assert_allclose(getattr(slopes, low), getattr(s, high), rtol=1e-9, atol=1e-9)
 
 
-def test_it_is_linear_in_its_coefficients_and_has_their_gradient():
+def test_the_gradient_by_coefficients_is_that_of_a_linear_function():
     durations, c = random_pieces()
     trajectory = Trajectory.of_pieces(durations, c)
     grad = jax.jit(jax.grad(lambda c: trajectory.replace(coefficients=c).evaluate(durations[0] + 0.1).pos[1]))(

@@ -86,13 +86,13 @@ def test_the_plan_is_the_solution_of_the_kkt_system(method, velocity, x64):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_sixty_pieces_are_the_spline_of_scipy(method, x64):
+def test_sixty_pieces_equal_the_spline_of_scipy(method, x64):
     rng = np.random.default_rng(7)
     waypoints, durations = np.cumsum(rng.normal(size=(61, 3)), axis=0), rng.uniform(0.3, 3.0, 60)
-    order, at = METHODS[method], np.concatenate([[0.0], np.cumsum(durations)])
+    order, knot_times = METHODS[method], np.concatenate([[0.0], np.cumsum(durations)])
     rest = [(k, np.zeros(3)) for k in range(1, order)]
-    expected = make_interp_spline(at, waypoints, k=2 * order - 1, bc_type=(rest, rest))
-    times = np.linspace(0, at[-1], 500)
+    expected = make_interp_spline(knot_times, waypoints, k=2 * order - 1, bc_type=(rest, rest))
+    times = np.linspace(0, knot_times[-1], 500)
     table = PieceTable.create([method(waypoints, durations)])
     for k in range(3):
         values = expected.derivative(k)(times) if k else expected(times)
@@ -127,7 +127,7 @@ def test_planned_flights_pass_the_waypoints_at_rest_within_tight_limits(method, 
 
 
 @pytest.mark.parametrize("name, value", [("body_rate", 1.0), ("yaw_rate", 0.5), ("vertical_speed", 0.3)])
-def test_each_limit_alone_sets_the_duration(name, value):
+def test_a_single_limit_sets_the_duration(name, value):
     limits = Limits(**{name: value})
     report = check(minimum_snap(WAYPOINTS, limits=limits, yaw=[0, 1, 2, 3, 4]), limits)
     assert report.ok
@@ -165,8 +165,8 @@ def test_fixed_derivatives_are_met_and_the_others_are_free():
     velocities[[0, -1]], velocities[2] = 0.0, [0.0, 1.0, 0.5]
     trajectory = minimum_snap(WAYPOINTS, limits=LIMITS, velocities=velocities)
     assert check(trajectory, LIMITS).ok
-    table, at = PieceTable.create([trajectory]), float(trajectory.ends[1])
-    np.testing.assert_allclose(table.evaluate(0, at, 1)[:3], velocities[2], atol=1e-4)
+    table, time = PieceTable.create([trajectory]), float(trajectory.ends[1])
+    np.testing.assert_allclose(table.evaluate(0, time, 1)[:3], velocities[2], atol=1e-4)
     passing = minimum_snap(WAYPOINTS[:2], [1.0], velocities=[[1, 0, 0], [1, 0, 0]], jerks=np.full((2, 3), np.nan))
     np.testing.assert_allclose(PieceTable.create([passing]).evaluate(0, 1.0, 1)[:3], [1, 0, 0], atol=1e-5)
 
@@ -174,11 +174,11 @@ def test_fixed_derivatives_are_met_and_the_others_are_free():
 def test_yaw_turns_the_shorter_way_and_ends_at_rest(x64):
     trajectory = minimum_snap(WAYPOINTS, DURATIONS, yaw=[3.0, -3.0, -2.0, 0.0, 1.0])
     expected = np.unwrap([3.0, -3.0, -2.0, 0.0, 1.0])
-    table, at = PieceTable.create([trajectory]), np.concatenate([[0], np.cumsum(DURATIONS)])
-    np.testing.assert_allclose(table.evaluate(np.zeros(5, int), at)[:, 3], expected, atol=1e-9)
-    np.testing.assert_allclose(table.evaluate(np.zeros(2, int), at[[0, -1]], 1)[:, 3], 0.0, atol=1e-9)
+    table, knot_times = PieceTable.create([trajectory]), np.concatenate([[0], np.cumsum(DURATIONS)])
+    np.testing.assert_allclose(table.evaluate(np.zeros(5, int), knot_times)[:, 3], expected, atol=1e-9)
+    np.testing.assert_allclose(table.evaluate(np.zeros(2, int), knot_times[[0, -1]], 1)[:, 3], 0.0, atol=1e-9)
     rest = [(1, 0.0)]
-    spline = make_interp_spline(at, expected, k=3, bc_type=(rest, rest))
+    spline = make_interp_spline(knot_times, expected, k=3, bc_type=(rest, rest))
     np.testing.assert_allclose(table.evaluate(0, 2.0)[3], spline(2.0), atol=1e-9)
 
 
@@ -204,7 +204,7 @@ def test_flights_stay_in_their_corridors(method, seed, n, radius):
     assert np.all(found <= radii + 1e-5)
 
 
-def test_a_wide_corridor_changes_nothing_and_one_may_be_bounded_alone():
+def test_a_wide_corridor_changes_nothing_and_a_single_piece_may_be_bounded():
     free = minimum_snap(WAYPOINTS, DURATIONS)
     wide = minimum_snap(WAYPOINTS, DURATIONS, corridors=10.0)
     np.testing.assert_array_equal(wide.coefficients, free.coefficients)
@@ -237,7 +237,7 @@ def test_the_cost_in_a_corridor_is_the_optimum_of_scipy(x64):
     parts = np.array([coefficients(e) - base for e in np.eye(6)])
 
     def clearance(x):
-        """Return the squared radius, of which 0.5% to 1% is kept free, less the squared distance to the segments."""
+        """Return the squared radius, which is reduced by 0.75%, less the squared distances to the segments."""
         pos = np.einsum("uk,pak->pua", powers, base + np.tensordot(x, parts, 1))
         begin, along = waypoints[:2, None, :2], np.diff(waypoints, axis=0)[:, None, :2]
         nearest = begin + np.clip(np.sum((pos - begin) * along, axis=-1), 0, 1)[..., None] * along
@@ -262,7 +262,7 @@ BENT = [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
 @pytest.mark.parametrize("method", METHODS)
 @given(seed=st.integers(0, 10_000), n=st.integers(2, 8), passes=st.booleans())
 def test_planned_flights_stay_between_floor_and_height(method, seed, n, passes):
-    """Through waypoints of which many are on the floor or at the height, with free and with fixed velocities."""
+    """Many waypoints are on the floor or at the height; velocities are free or fixed."""
     rng = np.random.default_rng(seed)
     waypoints = rng.uniform(-3, 3, (n, 3))
     waypoints[:, 2] = rng.choice([0.5, 0.6, 1.5, 2.0], n)
@@ -281,7 +281,7 @@ def test_a_plan_through_high_gates_does_not_dip_below_the_floor():
     assert check(free, Limits(floor=None)).peaks["floor"].value < -0.1
     bound = minimum_snap(gates, limits=Limits(speed=3.0))
     assert check(bound, Limits()).ok
-    assert check(bound, Limits()).peaks["floor"].value < 1e-3  # it is used
+    assert check(bound, Limits()).peaks["floor"].value < 1e-3  # the flight reaches the floor
 
 
 NAN = np.full((3, 3), np.nan)
@@ -320,7 +320,7 @@ def test_law_09_waypoints_that_cannot_be_flown_are_errors(make, message):
         make()
 
 
-def test_the_factor_of_the_error_is_the_remedy():
+def test_durations_times_the_factor_of_the_error_meet_the_limits():
     with pytest.raises(ConfigError, match="Multiply the durations by") as caught:
         minimum_snap(BENT, [0.5, 0.5], limits=LIMITS)
     factor = float(str(caught.value).split("durations by ")[1].split(",")[0])

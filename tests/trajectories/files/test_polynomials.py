@@ -32,7 +32,7 @@ FIGURE_EIGHT = (
 """First piece of Bitcraze's public example of a figure eight."""
 
 
-def trajectory(seed=0, n=4, degree=7, size=0.5):
+def random_trajectory(seed=0, n=4, degree=7, size=0.5):
     rng = np.random.default_rng(seed)
     c = size * rng.normal(size=(n, 4, degree + 1)) / np.arange(1, degree + 2)
     for k in range(1, n):  # continuous
@@ -42,12 +42,12 @@ def trajectory(seed=0, n=4, degree=7, size=0.5):
 
 
 def check_same(a, b, atol):
-    (ends, c), (again, d) = trajectory_pieces(a), trajectory_pieces(b)
-    np.testing.assert_allclose(ends, again, atol=1e-6)
+    (ends, c), (other_ends, d) = trajectory_pieces(a), trajectory_pieces(b)
+    np.testing.assert_allclose(ends, other_ends, atol=1e-6)
     u = np.linspace(0, 1, 11)
-    at = u[:, None, None, None]
+    u_column = u[:, None, None, None]
     np.testing.assert_allclose(
-        (c * at ** np.arange(c.shape[2])).sum(-1), (d * at ** np.arange(d.shape[2])).sum(-1), atol=atol
+        (c * u_column ** np.arange(c.shape[2])).sum(-1), (d * u_column ** np.arange(d.shape[2])).sum(-1), atol=atol
     )
 
 
@@ -60,7 +60,7 @@ def test_poly4d_is_33_floats_with_the_duration_last():
 
 
 def test_poly4d_and_csv_are_read_back(tmp_path):
-    t = trajectory()
+    t = random_trajectory()
     check_same(unpack_poly4d(pack_poly4d(t)), t, 1e-5)
     save_memory(t, tmp_path / "a.bin")
     check_same(load_memory(tmp_path / "a.bin"), t, 1e-5)
@@ -70,7 +70,7 @@ def test_poly4d_and_csv_are_read_back(tmp_path):
 
 
 def test_compressed_bytes_by_hand():
-    """A start, a straight piece in x with a quarter turn, and a cubic one in z, as cflib packs them."""
+    """A start, a straight piece in x with a quarter turn, and a cubic piece in z, as cflib packs them."""
     c = np.zeros((2, 4, 4))
     c[0, :, 0] = 1.0, -2.0, 0.5, 0.0
     c[0, 0, 1], c[0, 3, 1] = 0.25, np.pi / 2
@@ -88,7 +88,7 @@ def test_compressed_bytes_by_hand():
 
 
 def test_compressed_trajectories_are_read_back(tmp_path):
-    t = trajectory(seed=1)
+    t = random_trajectory(seed=1)
     check_same(unpack_compressed(pack_compressed(t)), t, 2e-3)
     save_memory(t, tmp_path / "a.bin", compressed=True)
     check_same(load_memory(tmp_path / "a.bin", compressed=True), t, 2e-3)
@@ -99,12 +99,12 @@ def test_long_pieces_are_split():
     c = np.zeros((1, 4, 2))
     c[0, 0, 1] = 0.1
     t = Trajectory.of_pieces([150.0], c)
-    again = unpack_compressed(pack_compressed(t))
-    np.testing.assert_allclose(trajectory_pieces(again)[0], [65.0, 130.0, 150.0])
-    np.testing.assert_allclose(trajectory_pieces(again)[1][:, 0].sum(-1), [6.5, 13.0, 15.0], atol=1e-5)
+    restored = unpack_compressed(pack_compressed(t))
+    np.testing.assert_allclose(trajectory_pieces(restored)[0], [65.0, 130.0, 150.0])
+    np.testing.assert_allclose(trajectory_pieces(restored)[1][:, 0].sum(-1), [6.5, 13.0, 15.0], atol=1e-5)
 
 
-def test_crazyswarm_csv(tmp_path):
+def test_csv_of_crazyswarm_is_read(tmp_path):
     path = tmp_path / "figure8.csv"
     for header in (
         POLYNOMIAL_HEADER,
@@ -143,7 +143,7 @@ def test_saved_samples_become_a_trajectory(tmp_path):
 
 WRONG_CSV = {
     "empty": ("", "at least one row"),
-    "header alone": (POLYNOMIAL_HEADER, "at least one row"),
+    "only a header": (POLYNOMIAL_HEADER, "at least one row"),
     "words": ("0,0,0,0\n1,2,x,4", "line 2"),
     "columns": ("1,2,3", "4, 5, 25 or 33 columns"),
     "other columns": ("0,0,0,0\n1,1,1,1,1", "4 columns, as before"),
@@ -169,7 +169,7 @@ def test_wrong_memories_and_trajectories_are_errors(tmp_path):
     for content in (b"", bytes(100), bytes(132)):
         with pytest.raises(ConfigError):
             unpack_poly4d(content)
-    whole = pack_compressed(trajectory())
+    whole = pack_compressed(random_trajectory())
     for content in (b"", whole[:7], whole[:8], whole[:12], whole[:-4]):
         with pytest.raises(ConfigError):
             unpack_compressed(content)
@@ -213,7 +213,7 @@ def test_any_csv_is_loaded_or_refused(tmp_path_factory, rows, newline):
 
 
 def test_a_jump_cannot_be_compressed():
-    """Compressed pieces begin where the one before ends: a second line 3 m further was flown as another path."""
+    """A compressed piece begins where the piece before it ends; here the second line begins 3 m further."""
     first, second = (line((x, 0, 1), (x + 1, 0, 1), duration=1.0) for x in (0.0, 4.0))
     with pytest.raises(ConfigError, match="got a jump in x of 3 m at 1 s"):
         pack_compressed(first.then(second))
